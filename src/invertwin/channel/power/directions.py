@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from invertwin.channel.power.integrand import Place
-from invertwin.channel.power.surface import Surfaces, gaussian
+from invertwin.channel.power.surface import Surfaces, gaussian, single_row
 from invertwin.channel.rays.arrays import to_float
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import RayScene
@@ -55,6 +55,7 @@ class Directions:
         shares = _shares(rays.geometry.surfaces)
         self.shares = to_float(shares)
         self.width = shares.shape[1]
+        self._only = single_row(shares) if len(shares) == 1 else None
 
     def draw(self, point: Place, back: Any, numbers: list[Any], scene: Any) -> Direction:
         """A direction from uniform numbers.
@@ -129,8 +130,7 @@ class Directions:
             if not present:
                 continue
             axis = mi.Vector3f(back if number == 2 else mirror)
-            exponents = self.surfaces.tables["exponents"]
-            exponent = dr.gather(mi.Float, exponents, point.surface * 3 + number)
+            exponent = self.surfaces.exponent(number, point.surface)
             # Height of the cap that a lobe ((1 + cosψ)/2)^p fills to the share of the number.
             fall = dr.log(dr.maximum(1 - numbers[2], 1e-9)) / (exponent + 1)
             series = -fall * (1 + fall * (1 / 2 + fall / 6))  # a narrow lobe keeps its digits
@@ -186,6 +186,8 @@ class Directions:
         return density
 
     def _share(self, point: Place, number: int) -> Any:
+        if self._only is not None:
+            return mi.Float(self._only[number])  # a copy, which callers may add to
         return dr.gather(mi.Float, self.shares, point.surface * self.width + number)
 
 

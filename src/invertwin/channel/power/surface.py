@@ -8,13 +8,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from invertwin.channel.rays.arrays import to_float
+from torch import Tensor
+
+from invertwin.channel.rays.arrays import opaque, to_float
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.scene import Surface
 
 #: Names of a surface's tables that kernels read; depolarisation scales others (``deposit_power``).
 SURFACE = tuple(field.name for field in fields(Surface) if field.name != "depolarisation")
+_COLUMNS = ("diffuse", "lobes", "exponents", "index", "attenuation")
 
 
 @dataclass(frozen=True)
@@ -27,13 +30,21 @@ class Surfaces:
     sheets: bool  # whether something passes straight through any surface
     bodies: bool  # whether any surface is the skin of a refracting body
     spread: bool  # whether any specular lobe lacks what is mirrored
+    known: Mapping[str, list[Any]]  # columns that are the same in all rows, and need no look-up
 
     @staticmethod
     def of(geometry: Geometry) -> "Surfaces":
         """Upload the surfaces of a scene."""
+        rows = geometry.surfaces
+        known = {}
+        if len(rows.diffuse) == 1:
+            known = {name: single_row(getattr(rows, name)) for name in _COLUMNS}
+        if bool((rows.amplitude == rows.amplitude[0, 0]).all()):  # conductors
+            known["amplitude"] = single_row(rows.amplitude[:1, :1])
         return Surfaces(
-            {name: to_float(getattr(geometry.surfaces, name)) for name in SURFACE},
-            cosines=geometry.surfaces.amplitude.shape[1],
+            {name: to_float(getattr(rows, name)) for name in SURFACE},
+            known=known,
+            cosines=rows.amplitude.shape[1],
             lobed=geometry.lobed,
             sheets=geometry.sheets,
             bodies=geometry.bodies,
@@ -48,7 +59,13 @@ class Surfaces:
             row: Row of the surface.
             active: Lanes.
         """
-        return self._read(name, row, active)
+        return self._column(name, 0, 1, row, active)
+
+    def _column(self, name: str, number: int, count: int, row: Any, active: Any) -> Any:
+        """One of the ``count`` numbers that a table has for every row."""
+        if name in self.known and not dr.grad_enabled(self.tables[name]):
+            return mi.Float(self.known[name][number])
+        return self._read(name, row * count + number, active)
 
     def _read(self, name: str, at: Any, active: Any) -> Any:
         """Entries of a table; by all lanes where it has no derivatives, so that it is read once."""
@@ -64,6 +81,8 @@ class Surfaces:
             cosine: Of the angle of incidence, at least 0.
             active: Lanes.
         """
+        if name in self.known and not dr.grad_enabled(self.tables[name]):
+            return mi.Float(self.known[name][0])
         t = dr.minimum(cosine, 1.0) * (self.cosines - 1)
         low = dr.minimum(mi.UInt32(dr.detach(t)), self.cosines - 2)
         first = self._read(name, row * self.cosines + low, active)
@@ -102,8 +121,18 @@ class Surfaces:
         else:
             both, across = on + back, dr.dot(normal, on) - dr.dot(normal, back)
             apart = dr.squared_norm(both - normal * dr.dot(normal, both)) + dr.square(across)
-        exponent = self._read("exponents", row * 3 + number, active)
+        exponent = self.exponent(number, row, active)
         return dr.exp(exponent * log_less(0.25 * apart)), exponent
+
+    def exponent(self, number: int, row: Any, active: Any = True) -> Any:
+        """Exponent of a lobe.
+
+        Args:
+            number: 0 specular, 1 directive, 2 backscattering.
+            row: Of the surface.
+            active: Lanes.
+        """
+        return self._column("exponents", number, 3, row, active)
 
     def scattered(self, row: Any, normal: Any, back: Any, on: Any, active: Any = True) -> Any:
         """``f |cosθ| |cosθ'|`` between two unit directions that point away from the surface.
@@ -134,7 +163,7 @@ class Surfaces:
                     for direction in (back, on):
                         cosine = dr.abs(dr.dot(normal, direction))
                         lobe *= self.tabulated("spread", row, cosine, active)
-                shape += self._read("lobes", row * 3 + number, active) * lobe
+                shape += self._column("lobes", number, 3, row, active) * lobe
         value = dr.select(dr.detach(product) > 0, reflectance * shape * product, 0.0)
         if self.bodies and on is not back:
             through = self.refracted(row, normal, back, on, active)
@@ -192,13 +221,22 @@ class Surfaces:
             row: Row of the surface.
             active: Lanes.
         """
-        exponent = self._read("exponents", row * 3, active)
+        exponent = self.exponent(0, row, active)
         return 2 / dr.maximum(exponent, 1.0)
 
     def is_skin(self, row: Any) -> Any:
         """Whether a surface is the skin of a refracting body."""
         last = (row + 1) * self.cosines - 1
         return dr.detach(dr.gather(mi.Float, self.tables["refraction"], last)) > 0
+
+
+def single_row(row: Tensor) -> list[Any]:
+    """The numbers of a table of one row, each for all lanes.
+
+    Args:
+        row: The table.
+    """
+    return [opaque(float(number), "Float") for number in row.detach().ravel()]
 
 
 def log_less(share: Any) -> Any:
