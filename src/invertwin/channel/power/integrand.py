@@ -258,6 +258,44 @@ def place(inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True) -> Pl
     )
 
 
+def pull_place(
+    inputs: Inputs,
+    face: Any,
+    b1: Any,
+    b2: Any,
+    active: Any,
+    position: Any,
+    normal: Any,
+    jacobian: Any,
+) -> None:
+    """The adjoint of ``place``, written out: add to the gradient of the corners.
+
+    Args:
+        inputs: Attached tables.
+        face: Triangle.
+        b1, b2: Barycentric coordinates.
+        active: Lanes.
+        position, normal, jacobian: Derivatives of the loss by what ``place`` gives.
+    """
+    first, second = (
+        dr.gather(mi.Vector4f, inputs.triangles, face * 3 + k, active).xyz for k in (1, 2)
+    )
+    crossed = dr.cross(first, second)
+    scale = dr.rsqrt(dr.squared_norm(crossed))
+    unit = crossed * scale
+    # By the cross product of the sides, then by these.
+    turn = (normal + unit * (jacobian - dr.dot(unit, normal))) * scale
+    by_first, by_second = dr.cross(second, turn), dr.cross(turn, first)
+    bars = (
+        position * (1 - b1 - b2) - by_first - by_second,
+        position * b1 + by_first,
+        position * b2 + by_second,
+    )
+    # Only the derivatives of this sum count: its value is never computed.
+    corner = corners(inputs, face, active)
+    dr.backward_from(sum(dr.dot(point, bar) for point, bar in zip(corner, bars, strict=True)))
+
+
 def segment(start: Any, end: Any) -> tuple[Any, Any]:
     """Unit direction and distance from one point to another.
 

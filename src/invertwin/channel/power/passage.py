@@ -82,17 +82,17 @@ def crossed(
     def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
         state = dict(state)
         at, active = state["at"], state["active"]
-        hit = rays.scene.ray_intersect_preliminary(
+        hit = rays.nearest(
             mi.Ray3f(mi.Point3f(origin + offset * at), mi.Vector3f(offset), 1 - NEAR - at, 0.0, []),
-            active=active,
+            active,
         )
-        found = active & hit.is_valid()
-        face = dr.select(found, hit.prim_index, rays.sound_face)
+        found = hit.valid
+        face = dr.select(found, hit.face, rays.sound_face)
         with dr.resume_grad():
             transmittance, extra = _through(inputs, face, start(), end(), found)
             act(state, dr.select(found, transmittance, 1.0), dr.select(found, extra, 0.0))
         state["active"] = found & (dr.detach(transmittance) > 0)
-        state["at"] = dr.select(found, at + hit.t + NEAR, at)
+        state["at"] = dr.select(found, at + hit.along + NEAR, at)
         state["count"] = state["count"] + 1
         return (state,)
 
@@ -156,15 +156,14 @@ def land(
             pass are spread as evenly as all.
     """
     one = mi.Float(1.0)
-    hit = rays.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+    hit = rays.nearest(ray, active, coherent=coherent)
     if not inputs.surfaces.sheets:
-        valid = active & hit.is_valid()
-        face = dr.select(valid, hit.prim_index, rays.sound_face)
-        b1, b2 = (dr.select(valid, b, 0.25) for b in (hit.prim_uv.x, hit.prim_uv.y))
-        return Hit(valid, face, b1, b2, one, mi.Float(0.0), one)
+        face = dr.select(hit.valid, hit.face, rays.sound_face)
+        b1, b2 = (dr.select(hit.valid, b, 0.25) for b in (hit.b1, hit.b2))
+        return Hit(hit.valid, face, b1, b2, one, mi.Float(0.0), one)
     lanes = max(dr.width(active), dr.width(ray.d))
     state = {
-        "going": active & hit.is_valid(),
+        "going": hit.valid,
         "valid": dr.zeros(mi.Bool, lanes),
         "face": dr.zeros(mi.UInt32, lanes) + rays.sound_face,
         "b1": dr.full(mi.Float, 0.25, lanes),
@@ -180,10 +179,10 @@ def land(
     def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
         state = dict(state)
         going, origin = state["going"], state["origin"]
-        hit = rays.scene.ray_intersect_preliminary(mi.Ray3f(origin, ray.d), active=going)
-        found = going & hit.is_valid()
-        face = dr.select(found, hit.prim_index, rays.sound_face)
-        point = origin + ray.d * dr.select(found, hit.t, 0.0)
+        hit = rays.nearest(mi.Ray3f(origin, ray.d), going)
+        found = hit.valid
+        face = dr.select(found, hit.face, rays.sound_face)
+        point = origin + ray.d * dr.select(found, hit.along, 0.0)
         transmittance, extra = _through(inputs, face, origin, origin + ray.d, found)
         chance = dr.select(transmittance > 0, _CHANCE, 0.0)
         dice, _ = uniform_pair(index, seed + state["count"] * 0x85EBCA6B)
@@ -192,7 +191,7 @@ def land(
             dice = dr.select(state["count"] < DEALT, mi.Float(bit), dice)
         passes = found & (dice < chance)
         ends = found & ~passes
-        for name, value in (("face", face), ("b1", hit.prim_uv.x), ("b2", hit.prim_uv.y)):
+        for name, value in (("face", face), ("b1", hit.b1), ("b2", hit.b2)):
             state[name] = dr.select(ends, value, state[name])
         state["valid"] = state["valid"] | ends
         state["transmittance"] = dr.select(
@@ -201,7 +200,7 @@ def land(
         state["extra"] = dr.select(passes, state["extra"] + extra, state["extra"])
         odds = dr.select(passes, chance, dr.select(ends, 1 - chance, 1.0))
         state["chance"] = state["chance"] * odds
-        step = NEAR * (hit.t + dr.norm(point))
+        step = NEAR * (hit.along + dr.norm(point))
         state["origin"] = dr.select(passes, point + ray.d * step, origin)
         state["count"] = state["count"] + 1
         state["going"] = passes & (state["count"] < _MOST)

@@ -213,9 +213,8 @@ def pull(
             range_sum = range_sum + 0.5 * length
             so_far = _per(vertex.active, power_sum, vertex.arriving) * vertex.arriving
             so_far += range_sum * vertex.segment
-            objective = dr.select(vertex.active, so_far, 0.0) + dr.select(vertex.seen, ending, 0.0)
-            objective += dr.select(vertex.goes_on, later, 0.0)
-            dr.backward_from(objective)
+            # What multiplies the attached values is zero where they do not count.
+            dr.backward_from(so_far + ending + later)
             if carried:
                 pending = moved_on(near, pending)
         if inputs.surfaces.sheets:
@@ -256,10 +255,16 @@ def pull(
         }
 
     def told(vertex: Recorded, pending: Any, active: Any) -> None:
-        place = vertex.place(inputs, active)
-        total = dr.dot(place.position, pending["position"])
-        total += dr.dot(place.normal, pending["normal"]) + place.jacobian * pending["jacobian"]
-        dr.backward_from(dr.select(active, total, 0.0))
+        bars = tuple(pending[name] for name in ("position", "normal", "jacobian"))
+
+        def act(*known: Any) -> tuple[()]:
+            with dr.resume_grad():
+                integrand.pull_place(inputs, *known)
+            return ()
+
+        # Packets of paths of which none goes on spare it.
+        known = vertex.face, vertex.b1, vertex.b2, mi.Bool(active), *bars
+        dr.if_stmt(known, active, act, lambda *_: (), mode="symbolic")
 
     def waiting() -> Any:
         """Nothing is known but which vertex is the last."""

@@ -46,6 +46,13 @@ class Contacts:
         return replace(self, **rows)
 
 
+_NONE = Contacts(
+    *(torch.zeros(0, dtype=torch.int64) for _ in range(2)),
+    *(torch.zeros(0, 3, dtype=torch.float64) for _ in range(2)),
+    touching=torch.zeros(0, dtype=torch.bool),
+)
+
+
 def may_meet(geometry: Geometry) -> tuple[Bool[Tensor, "object object"], Tensor, Tensor]:
     """Which objects' boxes overlap while one moves past the other, and where, per object.
 
@@ -104,7 +111,9 @@ def contacts_of(rays: RayScene) -> Contacts | None:
         met = pairs[geometry.face_object[first], geometry.face_object[second]]
         corners = topology.welded[first], topology.welded[second]
         met &= ~(corners[0][:, :, None] == corners[1][:, None]).flatten(1).any(1)
-        found = common_segments(points, topology, first[met], second[met])
+        found = _NONE
+        if bool(met.any()):
+            found = common_segments(points, topology, first[met], second[met])
         parts.append(found)
         if not len(found.first):
             break
@@ -140,12 +149,12 @@ def _passed(
     rows, faces = [edges[:0]], [edges[:0]]
     for _ in range(_MOST):
         ray = mi.Ray3f(mi.Point3f(start + offset * at), mi.Vector3f(offset), until - at, 0.0, [])
-        hit = rays.scene.ray_intersect_preliminary(ray, active=at < until)
-        at = at + hit.t + step
-        lanes = dr.compress(hit.is_valid())
+        hit = rays.nearest(ray, at < until)
+        at = at + hit.along + step
+        lanes = dr.compress(hit.valid)
         if not dr.width(lanes):
             break
-        face = dr.gather(mi.UInt32, hit.prim_index, lanes)
+        face = dr.gather(mi.UInt32, hit.face, lanes)
         edge, start, offset, at, until, step = (
             dr.gather(type(value), value, lanes)
             for value in (edge, mi.Point3f(start), mi.Vector3f(offset), at, until, step)

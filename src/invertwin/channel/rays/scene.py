@@ -1,6 +1,7 @@
 """What rays need: the ray scene and the antennas, in float32 about a local origin."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -18,7 +19,8 @@ from invertwin.channel.rays.arrays import (
     to_points,
     to_torch,
 )
-from invertwin.channel.rays.backend import dr, mi, tracing
+from invertwin.channel.rays.backend import backend, dr, mi, tracing
+from invertwin.channel.rays.few import MOST, Few
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.channel.rays.spheres import Spheres
 from invertwin.channel.rays.topology import Topology, topology_of
@@ -30,6 +32,24 @@ from invertwin.scene.mesh import Mesh
 # enough that the dark side of a 0.3 m ball stays dark from a kilometre away.
 NEAR = 3e-6
 _SLIVER = 1e-3  # a triangle's area over its squared sides, below which it is one
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """What a ray meets first.
+
+    Attributes:
+        valid: Whether it meets anything; else the rest is not defined.
+        face: Triangle.
+        b1, b2: Barycentric coordinates.
+        along: How far along the ray, in lengths of its direction.
+    """
+
+    valid: Any
+    face: Any
+    b1: Any
+    b2: Any
+    along: Any
 
 
 class Occluders:
@@ -47,6 +67,8 @@ class Occluders:
         self.topology = topology
         self.origin = origin
         self.local_vertices = (vertices.detach() - origin).to(torch.float32)
+        #: The triangles by themselves, where they are so few that no tree is needed.
+        self.few: Few | None = None
 
     @property
     def scene(self) -> Any:
@@ -56,7 +78,7 @@ class Occluders:
     def loop(self, state: Any, going: Callable[..., Any], step: Callable[..., Any]) -> Any:
         """Record a loop in which rays are cast; all loops of kernels over rays are made here.
 
-        The tree is built before: to build it while a loop is recorded aborts the process. The step
+        A tree is built before: to build it while a loop is recorded aborts the process. The step
         is not recorded a second time, which would gain the kernel nothing.
 
         Args:
@@ -64,7 +86,8 @@ class Occluders:
             going: Takes the state; which lanes go on.
             step: Takes the state and returns the next one.
         """
-        _ = self.scene
+        if self.few is None:
+            _ = self.scene
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
             return dr.while_loop(state, going, step, mode="symbolic")
 
@@ -75,9 +98,24 @@ class Occluders:
             start, end: Points.
             active: Lanes.
         """
-        return active & ~self.scene.ray_test(
-            mi.Ray3f(start + (end - start) * NEAR, end - start, 1 - 2 * NEAR, 0.0, []), active
-        )
+        ray = mi.Ray3f(start + (end - start) * NEAR, end - start, 1 - 2 * NEAR, 0.0, [])
+        if self.few is not None:
+            return active & ~self.few.blocked(ray, active)
+        return active & ~self.scene.ray_test(ray, active)
+
+    def nearest(self, ray: Any, active: Any, *, coherent: bool = False) -> "Nearest":
+        """The first triangle on a ray.
+
+        Args:
+            ray: Origin, direction, and how far it goes.
+            active: Lanes.
+            coherent: Whether neighbouring rays are alike.
+        """
+        if self.few is not None:
+            return Nearest(*self.few.nearest(ray, active))
+        hit = self.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+        valid = active & hit.is_valid()
+        return Nearest(valid, hit.prim_index, hit.prim_uv.x, hit.prim_uv.y, hit.t)
 
     def located(self, place: Float64[Tensor, "n 3"]) -> Any:
         """World points as Dr.Jit points about the origin."""
@@ -96,6 +134,9 @@ class RayScene(Occluders):
     def __init__(self, geometry: Geometry, link: Link) -> None:
         origin = link.tx.detach().mean(dim=0)
         super().__init__(geometry.vertices, geometry.topology, origin)
+        # A GPU walks trees in hardware.
+        if len(geometry.faces) <= MOST and backend() == "cpu":
+            self.few = Few(geometry.vertices.detach() - origin, geometry.faces)
         self.geometry = geometry
         self.link = link
         self.vertices = to_points(self.local_vertices)
