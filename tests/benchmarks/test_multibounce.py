@@ -4,6 +4,7 @@ import json
 import sys
 
 import pytest
+import torch
 from rich.console import Console
 
 SMALL = {"samples": 20_000, "memory_samples": 20_000, "steps": 1}
@@ -48,9 +49,19 @@ def test_both_trace_the_same_room(multibounce):
     assert ours.amin(dim=0).tolist() == pytest.approx([float(x) for x in box.min])
     assert ours.amax(dim=0).tolist() == pytest.approx([float(x) for x in box.max])
     assert len(multibounce.room().scene["room"].mesh.faces) == walls.mi_mesh.face_count()
-    found = multibounce.compared(2, 20_000, 1, theirs)
+    found = multibounce.compared(2, 20_000, 1, theirs, multibounce.bare_rays_per_second(20_000, 1))
     # Every vertex is diffuse with probability 1/4, and sees the receiver; or is, and does.
     assert found["paths_sionna"] == pytest.approx(2 * 20_000 / 4, rel=0.05)
     assert found["paths_sionna_diffuse"] == pytest.approx(2 * 20_000, rel=0.01)
     assert found["forward_ratio_sionna"] > 0
     assert found["step_ratio_sionna"] > 0
+    assert found["step_ratio_sionna_tree"] > 0
+
+
+def test_a_tree_is_asked_in_the_divided_room_alone(multibounce):
+    plain, divided = (multibounce.room(count).scene["room"].mesh for count in (0, 2))
+    assert (len(plain.faces), len(divided.faces)) == (12, 192)
+    for mesh in (plain, divided):
+        p0, p1, p2 = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+        area = 0.5 * torch.linalg.cross(p1 - p0, p2 - p0).norm(dim=1).sum()
+        assert float(area) == pytest.approx(2 * (100 + 50 + 50))

@@ -129,3 +129,13 @@ def test_sums_of_many_paths_are_rounded_little():
     assert (
         abs(float(bins.map().double().sum()) / exact - 1) < 5e-5
     )  # one sum of float32 is off by percents
+
+
+def test_many_amounts_in_few_bins_are_rounded_little():
+    """A million equal amounts in one bin: one sum in single precision would be 0.01 off."""
+    count = 1_000_000
+    ones, zeros = dr.full(mi.Float, 0.1, count), dr.zeros(mi.Float, count)
+    out = Bins(Layout(GRIDS["nothing"], 1))
+    out.add(Contribution(dr.zeros(mi.UInt32, count), ones, ones, zeros, zeros), mi.Bool(True))
+    total = float(out.map().double().sum())
+    assert total == pytest.approx(count * float(np.float32(0.1)), rel=2e-5)

@@ -23,7 +23,7 @@ from invertwin.channel.rays.backend import backend, dr, mi
 _COPIES = 2**28
 # Numbers up to which a map has further copies, and the most of them: sums of many amounts are
 # rounded less where each copy takes some. They fit a core's cache.
-_ROUNDED_LESS, _MOST_COPIES = 2**16, 64
+_ROUNDED_LESS, _MOST_COPIES = 2**16, 1024
 
 
 @dataclass(frozen=True)

@@ -160,7 +160,7 @@ def _vertex(
         goes_on=goes_on,
         seen=seen,
         throughput=own.throughput,
-        length=records.length_at(number),
+        length=records.length_at(number, active),
         frame=frame,
         arriving=arriving,
         segment=optical,

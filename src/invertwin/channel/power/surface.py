@@ -116,13 +116,17 @@ class Surfaces:
             on: Where it goes on.
             active: Lanes.
         """
-        if number == 2:
-            apart = dr.squared_norm(on - back)
-        else:
-            both, across = on + back, dr.dot(normal, on) - dr.dot(normal, back)
-            apart = dr.squared_norm(both - normal * dr.dot(normal, both)) + dr.square(across)
+        axis = back if number == 2 else normal * (2 * dr.dot(normal, back)) - back
+        apart = dr.squared_norm(on - axis)
         exponent = self.exponent(number, row, active)
-        return dr.exp(exponent * log_less(0.25 * apart)), exponent
+        share = 0.25 * apart
+        low = log_less(dr.detach(share))
+        value = dr.exp(dr.detach(exponent) * low)
+        if dr.grad_enabled(share, exponent):
+            # Written out: through logarithm and exponential it would cost more than all the rest.
+            slope = -value * dr.detach(exponent) / dr.maximum(1 - dr.detach(share), 1e-7)
+            value = dr.replace_grad(value, slope * share + value * low * exponent)
+        return value, exponent
 
     def exponent(self, number: int, row: Any, active: Any = True) -> Any:
         """Exponent of a lobe.

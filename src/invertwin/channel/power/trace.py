@@ -150,8 +150,10 @@ class Trace:
             elif record:
                 records = Records.single(state, exists)
 
-        self._walk.run(state, depth, visit)
-        return records
+        if looped:
+            state["count"] = records.count
+        done = self._walk.run(state, depth, visit)
+        return replace(records, count=done["count"]) if looped else records
 
     def _started(self, index: Any) -> State:
         """Paths at their first vertex."""

@@ -107,12 +107,20 @@ class Walk:
         # Carried, since a vertex is located where it is found.
         state |= self._place(state).parts
 
+        def extended(state: State) -> tuple[State]:
+            state = dict(state)
+            self._extend(state, Place.of(state), directions)
+            return (state,)
+
+        def ended(state: State) -> tuple[State]:
+            return ({**state, "active": mi.Bool(False)},)
+
         def body(state: State) -> tuple[State]:
             state = dict(state)
-            point = Place.of(state)
-            visit(state, point)
-            self._extend(state, point, directions)
-            return (state,)
+            visit(state, Place.of(state))
+            # Packets of paths that have come to their last vertex spare the next one.
+            going = state["active"] & (state["number"] < state["last"])
+            return dr.if_stmt((state,), going, extended, ended, mode="symbolic")
 
         (state,) = self.rays.loop((state,), lambda state: state["active"], body)
         return state
@@ -288,12 +296,14 @@ class Records:
     """Vertices of paths.
 
     What tells a vertex is written and read at once, as four numbers: triangle (its bits), two
-    barycentric coordinates, and the throughput, negative where the vertex is not seen.
+    barycentric coordinates, and the throughput, negative where the vertex is not seen. Of vertices
+    that a path never had, nothing is written.
     """
 
     lanes: int  # paths
     depth: int  # vertices of a path
     frame: Any  # radar pose of a lane
+    count: Any  # vertices of a lane
     rows: Any  # four numbers each: [vertex × lane], or four arrays for paths of one vertex
     length: Any  # from the transmitter to the vertex [m], [vertex × lane]
 
@@ -306,7 +316,8 @@ class Records:
             seen: Whether the vertex is connected to the receiver.
         """
         lanes = dr.width(state["index"])
-        return Records(lanes, 1, state["frame"], _row(state, seen), state["length"])
+        count = dr.ones(mi.UInt32, lanes)
+        return Records(lanes, 1, state["frame"], count, _row(state, seen), state["length"])
 
     @staticmethod
     def empty(state: State, depth: int) -> "Records":
@@ -317,13 +328,14 @@ class Records:
             depth: Most vertices of a path.
         """
         lanes = dr.width(state["index"])
-        rows, length = dr.zeros(mi.Float, 4 * lanes * depth), dr.zeros(mi.Float, lanes * depth)
-        return Records(lanes, depth, state["frame"], rows, length)
+        rows, length = dr.empty(mi.Float, 4 * lanes * depth), dr.empty(mi.Float, lanes * depth)
+        count = dr.zeros(mi.UInt32, lanes)
+        return Records(lanes, depth, state["frame"], count, rows, length)
 
     @property
     def columns(self) -> list[Any]:
         """All arrays."""
-        return [self.frame, self.rows, self.length]
+        return [self.frame, self.count, self.rows, self.length]
 
     def at(self, number: Any, active: Any = True) -> Recorded:
         """One vertex of every path.
@@ -334,27 +346,30 @@ class Records:
         """
         row = self.rows
         if self.depth > 1:
-            row = dr.gather(mi.Vector4f, self.rows, self._places(number), active)
+            there = active & (number < self.count)
+            row = dr.gather(mi.Vector4f, self.rows, self._places(number), there)
         face = dr.reinterpret_array(mi.UInt32, row.x)
         return Recorded(face, row.y, row.z, dr.abs(row.w), row.w > 0)
 
-    def length_at(self, number: Any) -> Any:
+    def length_at(self, number: Any, active: Any) -> Any:
         """Length of every path up to one of its vertices [m].
 
         Args:
             number: Of the vertex, from 0.
+            active: Paths that have it.
         """
         if self.depth == 1:
             return self.length
-        return dr.gather(mi.Float, self.length, self._places(number))
+        return dr.gather(mi.Float, self.length, self._places(number), active)
 
     def write(self, state: State, seen: Any) -> None:
         """Store the latest vertex.
 
         Args:
-            state: The path so far.
+            state: The path so far; ``count`` in it comes to be the number of its vertices.
             seen: Whether the vertex is connected to the receiver.
         """
+        state["count"] = state["number"]
         at = (state["number"] - 1) * self.lanes + state["lane"]
         dr.scatter(self.rows, _row(state, seen), at, state["active"])
         dr.scatter(self.length, state["length"], at, state["active"])

@@ -140,12 +140,21 @@ def _loaded(module: str, name: str) -> Any:
 class _Mitsuba:
     """Mitsuba, set to the backend in force; imported when it is first used."""
 
+    def __init__(self) -> None:
+        self._types: dict[tuple[str, str], type] = {}
+
     def __getattr__(self, name: str) -> Any:
         wanted = backend()
+        if (wanted, name) in self._types:
+            return self._types[wanted, name]
         module = _loaded("mitsuba", wanted)
         if module.variant() != VARIANTS[wanted]:
             module.set_variant(VARIANTS[wanted])
-        return getattr(module, name)
+        found = getattr(module, name)
+        # Types are those of one variant, whichever is set; kernels ask for them a thousand times.
+        if isinstance(found, type):
+            self._types[wanted, name] = found
+        return found
 
 
 class _DrJit:

@@ -1,0 +1,144 @@
+"""Few triangles, tested one by one, against the tree."""
+
+import gc
+import weakref
+
+import pytest
+import torch
+from torch import Tensor
+
+from invertwin.channel import Grid, Sampling, deposit_power
+from invertwin.channel.power import trace
+from invertwin.channel.rays.arrays import to_torch
+from invertwin.channel.rays.backend import dr, mi, tracing
+from invertwin.channel.rays.few import MOST, Few
+from invertwin.channel.rays.geometry import flatten
+from invertwin.scene import Mesh, Scene, box, plate
+from scenes import link, relative, thing
+
+RAYS = 20_000
+RANGES = Grid(1.0, 0.05, 80)
+
+
+def moved_box(shift: Tensor) -> Mesh:
+    mesh = box((0.4, 0.5, 0.3))
+    return Mesh(mesh.vertices + shift, mesh.faces)
+
+
+def corners(count: int, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    centres = 3 * torch.rand(count, 1, 3, generator=generator, dtype=torch.float64)
+    return centres + torch.rand(count, 3, 3, generator=generator, dtype=torch.float64)
+
+
+def met_first(triangles: Tensor, start: Tensor, way: Tensor) -> tuple[Tensor, Tensor]:
+    """The first triangle on each ray (−1: none) and its distance, in float64."""
+    p0, p1, p2 = triangles.unbind(1)
+    matrix = torch.stack([p1 - p0, p2 - p0], dim=2)[None].expand(len(start), -1, -1, -1)
+    matrix = torch.cat([matrix, -way[:, None, :, None].expand(-1, len(p0), -1, -1)], dim=3)
+    b1, b2, along = torch.linalg.solve(matrix, start[:, None] - p0).unbind(2)
+    inside = (b1 >= 0) & (b2 >= 0) & (b1 + b2 <= 1) & (along > 0)
+    nearest = torch.where(inside, along, torch.inf).min(1)
+    return torch.where(nearest.values < torch.inf, nearest.indices, -1), nearest.values
+
+
+def rays(seed: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    start, end = 4 * torch.rand(2, RAYS, 3, generator=generator, dtype=torch.float64)
+    return start, end - start
+
+
+def device(start: Tensor, way: Tensor) -> tuple[object, object]:
+    return tuple(  # type: ignore[return-value]
+        kind(*(mi.Float(column.float().numpy()) for column in values.T))
+        for kind, values in ((mi.Point3f, start), (mi.Vector3f, way))
+    )
+
+
+@pytest.mark.parametrize("count", [1, 12, MOST])
+def test_rays_meet_what_they_meet_in_float64(count):
+    triangles, (start, way) = corners(count, 1), rays(2)
+    faces = torch.arange(3 * count).reshape(-1, 3)
+    truth, distance = met_first(triangles, start, way)
+    with tracing("cpu"):
+        few = Few(triangles.reshape(-1, 3), faces)
+        origin, direction = device(start, way)
+        valid, face, b1, b2, along = few.nearest(mi.Ray3f(origin, direction), mi.Bool(True))
+        blocked = few.blocked(mi.Ray3f(origin, direction, 1.0, 0.0, []), mi.Bool(True))
+        found = to_torch(dr.select(valid, mi.Int32(face), -1)).long()
+        same = found == truth
+        assert int((~same).sum()) <= 3  # at rims
+        hit = same & (truth >= 0)
+        assert int(hit.sum()) > 20
+        weights = torch.stack([to_torch(b1), to_torch(b2)], 1).double()[hit]
+        p0, p1, p2 = triangles[truth[hit]].unbind(1)
+        place = p0 + weights[:, :1] * (p1 - p0) + weights[:, 1:] * (p2 - p0)
+        # Rays that graze a plane tell badly where they meet it, but not that they do.
+        reached = start[hit] + way[hit] * to_torch(along).double()[hit, None]
+        assert (place - reached).norm(dim=1).max() < 1e-4
+        normal = torch.linalg.cross(p1 - p0, p2 - p0)
+        height = ((reached - p0) * normal).sum(1) / normal.norm(dim=1)
+        assert height.abs().max() < 1e-5
+        assert int((to_torch(blocked).bool() != (distance < 1)).sum()) <= 3
+
+
+def test_inactive_rays_and_triangles_without_area_meet_nothing():
+    flat = torch.tensor([[0, 0, 1], [1, 0, 1], [2, 0, 1.0]], dtype=torch.float64)
+    whole = torch.tensor([[-1, -1, 1], [1, -1, 1], [0, 1, 1.0]], dtype=torch.float64)
+    with tracing("cpu"):
+        ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(0, 0, 1))
+        for triangle, active, met in (
+            (flat, True, False),
+            (whole, True, True),
+            (whole, False, False),
+        ):
+            few = Few(triangle, torch.tensor([[0, 1, 2]]))
+            valid = few.nearest(ray, mi.Bool(active))[0]
+            assert bool(to_torch(valid)[0]) == met
+            assert bool(to_torch(few.blocked(ray, mi.Bool(active)))[0]) == met
+
+
+@pytest.mark.parametrize("divisions", [1, 4])
+def test_maps_and_derivatives_are_those_of_the_tree(divisions, monkeypatch):
+    """A box before a wall: 14 triangles, and 44 where the wall is divided."""
+
+    def result() -> tuple[Tensor, Tensor]:
+        wall = thing(plate(2.0, 2.0, divisions=divisions), (0.0, 0.0, 3.0))
+        shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+        front = thing(moved_box(shift), (0.1, 0.0, 2.0))
+        scene = Scene({"wall": wall, "front": front})
+        assert (len(flatten(scene, 0.004).faces) <= MOST) == (divisions == 1)
+        sampling = Sampling(depth=2, samples=100_000, boundary_samples=50_000)
+        out = deposit_power(scene, link(), RANGES, sampling=sampling, seed=1)
+        (out / out.detach().mean()).square().mean().backward()
+        assert shift.grad is not None
+        return out.detach(), shift.grad
+
+    first = result()
+    monkeypatch.setattr("invertwin.channel.rays.scene.MOST", 0)
+    second = result()
+    for one, other in zip(first, second, strict=True):
+        assert relative(one, other) < 1e-3
+
+
+def test_a_call_leaves_nothing_to_the_garbage_collector(monkeypatch):
+    """Records of paths are large; they go with the last reference to the map."""
+    alive = []
+
+    class Seen(trace.Trace):
+        def __init__(self, *given, **named):
+            super().__init__(*given, **named)
+            alive.append(weakref.ref(self))
+
+    monkeypatch.setattr("invertwin.channel.power.deposit.Trace", Seen)
+    shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    scene = Scene({"box": thing(moved_box(shift), (0.1, 0.0, 2.0))})
+    gc.collect()
+    gc.disable()
+    try:
+        sampling = Sampling(depth=2, samples=1000, boundary_samples=500)
+        deposit_power(scene, link(), RANGES, sampling=sampling, seed=1).sum().backward()
+        assert shift.grad is not None
+        assert [ref() for ref in alive] == [None]
+    finally:
+        gc.enable()
