@@ -23,8 +23,9 @@ its twelve).
 
 `of_ray_limit` is how near this is to bare ray casting with a tree: the rays that our forward pass
 casts in the room of 192 triangles (a counter in each, in a run of its own) over its time, relative
-to the rays per second that the same tree answers when nothing else is asked: from random points to
-random points of the room, half of them for the nearest hit and half for any, as many as paths need.
+to the rays per second that the same tree answers when nothing else is asked: those of paths of two
+bounces, from antenna to wall to wall and from both to the other antenna, drawn before and read from
+memory.
 1 would mean that all the rest, drawing, radiometry, deposit and tracing, is free.
 
 Further, on a scene with shadows (a ball in front of a wall and above a floor, depth 3):
@@ -179,26 +180,37 @@ def forward_seconds(task: Task, samples: int, depth: int) -> float:
     return statistics.median(times[WARM_UP:])
 
 
-def bare_rays_per_second(rays: int = 4_000_000, repeats: int = 5) -> float:
-    """Rays between random points of the room on a tree, half of them for any hit."""
+def bare_rays_per_second(paths: int = 1_000_000, repeats: int = 5) -> float:
+    """Rays of paths of two bounces in the divided room on its tree, drawn before and cast alone."""
     import drjit as dr
 
     mesh = walls_of(DIVISIONS)
     tree = Topology(mesh.faces, torch.zeros(len(mesh.faces), dtype=torch.int64), mesh.vertices)
     scene = tree.ray_scene(mesh.vertices.float())
-    half = np.array(SIZE)[:, None] / 2.002
-    ends = np.random.default_rng(0).uniform(-half, half, (2, 3, rays // 2)).astype(np.float32)
-    start, end = (mi.Point3f(*(mi.Float(row) for row in place)) for place in ends)
-    dr.eval(start, end)
+    start, end = (mi.Point3f(x, y, z - SIZE[2] / 2) for x, y, z in (TRANSMITTER, RECEIVER))
+    count, numbers = int(math.sqrt(paths)), np.random.default_rng(0)
+    index = dr.arange(mi.UInt32, count**2)
+    cell = mi.Point2f(index % count, index // count)
+    jitter, other = (
+        mi.Point2f(*(mi.Float(numbers.random(count**2, np.float32)) for _ in range(2)))
+        for _ in range(2)
+    )
+    nearest, tests = [], []
+    for square in ((cell + jitter) / count, other):
+        ray = mi.Ray3f(start, mi.warp.square_to_uniform_sphere(square))
+        place = ray(0.9999 * scene.ray_intersect_preliminary(ray).t)
+        nearest.append(ray)
+        tests.append(mi.Ray3f(place, end - place, 0.999, 0.0, []))
+        start = place
+    dr.eval(nearest, tests)
     times = []
     for _ in range(repeats + 1):
         begun = perf_counter()
-        nearest = scene.ray_intersect_preliminary(mi.Ray3f(start, end - start)).t
-        blocked = scene.ray_test(mi.Ray3f(start, end - start, 0.999, 0.0, []))
-        dr.eval(nearest, blocked)
+        dr.eval([scene.ray_intersect_preliminary(ray).t for ray in nearest])
+        dr.eval([scene.ray_test(ray) for ray in tests])
         dr.sync_thread()
         times.append(perf_counter() - begun)
-    return rays / statistics.median(times[1:])
+    return 4 * count**2 / statistics.median(times[1:])
 
 
 class Theirs:

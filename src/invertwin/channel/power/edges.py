@@ -259,8 +259,6 @@ class EdgeSampler:
         reach = beside - away * _BEFORE if self.close else beside
         before = passage(rays, self.inputs, reach, origin, pmf > 0)
         valid = (pmf > 0) & (before.transmittance > 0) & sides.unlike
-        near = _MISSED * dr.norm(exact)
-        valid &= ~folded(rays, edge, y, exact, sides.outwards, aside, near, valid)
         key = index, self.dice
         hit = _ahead(
             rays, self.inputs, (edge, along), beside, away, valid, key, close=self.close,
@@ -268,6 +266,9 @@ class EdgeSampler:
         )  # fmt: skip
         valid &= hit.valid & _not_grazing(rays, hit.face, away, hit.valid)
         valid &= rays.in_scene(frame, hit.face, hit.valid)
+        # Last, since it takes longest: packets without a shadow spare it.
+        near = _MISSED * dr.norm(exact)
+        valid &= ~folded(rays, edge, y, exact, sides.outwards, aside, near, valid)
         found = EdgePoints(
             index, receiver, frame, first, second, sides.side, along, hit.face,
             weight=1 / (pmf * self.size * hit.chance),
@@ -386,8 +387,6 @@ class InteriorEdgeSampler:
         aside = _BESIDE * (dr.norm(place) + dr.norm(y1 - y0))
         y, beside = mi.Point3f(place), mi.Point3f(place + sides.outwards * aside)
         valid = (pmf > 0) & sides.unlike
-        near = _MISSED * dr.norm(place)
-        valid &= ~folded(rays, edge, place, exact, sides.outwards, aside, near, valid)
         hits = []
         for sign, dice in zip((-1.0, 1.0), self.dice, strict=True):
             hit = _ahead(
@@ -397,6 +396,8 @@ class InteriorEdgeSampler:
             valid &= hit.valid & _not_grazing(rays, hit.face, omega, hit.valid)
             valid &= rays.in_scene(frame, hit.face, hit.valid)
             hits.append(hit)
+        near = _MISSED * dr.norm(place)
+        valid &= ~folded(rays, edge, place, exact, sides.outwards, aside, near, valid)
         behind, ahead = hits
         triangle = p0, p1, p2 = rays.corners(behind.face, valid)
         b1, b2 = behind.b1, behind.b2
