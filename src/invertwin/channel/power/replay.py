@@ -224,10 +224,26 @@ def pull(
     def waited(number: Any, pending: Any) -> _Near:
         """A vertex and its neighbours; only the one before has not been read yet."""
         own, later = (Recorded(**pending[name], seen=pending["seen"]) for name in ("own", "later"))
-        earlier = records.at(number - 1, number > 0)
-        before = earlier.place(fixed, number > 0)
+        identity, seen, before = dr.if_stmt((number,), number > 0, read, nothing, mode="symbolic")
         here, goes_on = Place.of(pending["here"]), own.exists & later.exists
-        return _Near(own, earlier, goes_on, here, before, pending["onward"])
+        earlier = Recorded(**identity, seen=seen)
+        return _Near(own, earlier, goes_on, here, Place.of(before), pending["onward"])
+
+    def read(number: Any) -> tuple[Any, ...]:
+        earlier = records.at(number - 1)
+        return _identity(earlier), earlier.seen, earlier.place(fixed).parts
+
+    def nothing(_: Any) -> tuple[Any, ...]:
+        # Before the first vertex there is none, which spares reading it.
+        lanes, zero = records.lanes, dr.zeros(mi.Float, records.lanes)
+        face = dr.zeros(mi.UInt32, lanes)
+        identity = {"face": face, "b1": zero, "b2": zero, "throughput": zero}
+        place = {
+            "position": dr.zeros(mi.Point3f, lanes),
+            "normal": dr.zeros(mi.Vector3f, lanes),
+            "surface": face,
+        }
+        return identity, dr.zeros(mi.Bool, lanes), place
 
     def moved_on(near: _Near, pending: Any) -> Any:
         """Ask the triangle of the next vertex, of which all is known now; this one waits."""
