@@ -105,7 +105,7 @@ def walls_of(divisions: int) -> Mesh:
     mesh = box(SIZE)
     vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
     for _ in range(divisions):
-        vertices, faces = subdivide(vertices, faces)
+        vertices, faces, *_ = subdivide(vertices, faces)
     return Mesh(torch.from_numpy(vertices), torch.from_numpy(faces))
 
 

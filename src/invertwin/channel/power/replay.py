@@ -197,10 +197,9 @@ def pull(
 
     def sweep(number: Any, sums: Any, pending: Any) -> tuple[Any, Any]:
         power_sum, range_sum = sums
-        if carried:
-            near = waited(number, pending)
+        known = waited(number, pending) if carried else None
         with dr.resume_grad():
-            near = near.leaves() if carried else _Near.of(inputs, records, number, depth)
+            near = known.leaves() if known else _Near.of(inputs, records, number, depth)
             vertex = _vertex(rays, inputs, records, antennas, number, near)
             path = vertex.path()
             power, length, u, v = (
