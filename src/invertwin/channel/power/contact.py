@@ -20,7 +20,7 @@ from invertwin.channel.power.edges import (
     by_scene,
     place_along,
 )
-from invertwin.channel.power.integrand import Inputs, Place
+from invertwin.channel.power.integrand import Inputs, Place, Spot
 from invertwin.channel.power.passage import Passage, land, passage
 from invertwin.channel.power.walk import State, Walk
 from invertwin.channel.rays.arrays import (
@@ -38,29 +38,6 @@ from invertwin.errors import InputError
 
 _LOOKED_AT = 65_536  # points that tell whether paths run between surfaces that meet
 _ACUTE = -0.98  # least cosine between the normals of surfaces between which rays start
-
-
-@dataclass(frozen=True)
-class Spot:
-    """A point of a surface.
-
-    Attributes:
-        face: Triangle.
-        b1, b2: Barycentric coordinates.
-    """
-
-    face: Any
-    b1: Any
-    b2: Any
-
-    def place(self, inputs: Inputs, active: Any = True) -> Place:
-        """Where it is.
-
-        Args:
-            inputs: Tables of the kernel.
-            active: Lanes.
-        """
-        return integrand.place(inputs, self.face, self.b1, self.b2, active)
 
 
 @dataclass(frozen=True)

@@ -258,6 +258,29 @@ def place(inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True) -> Pl
     )
 
 
+@dataclass(frozen=True)
+class Spot:
+    """A point of a surface.
+
+    Attributes:
+        face: Triangle.
+        b1, b2: Barycentric coordinates.
+    """
+
+    face: Any
+    b1: Any
+    b2: Any
+
+    def place(self, inputs: Inputs, active: Any = True) -> Place:
+        """Where it is.
+
+        Args:
+            inputs: Tables of the kernel.
+            active: Lanes.
+        """
+        return place(inputs, self.face, self.b1, self.b2, active)
+
+
 def pull_place(
     inputs: Inputs,
     face: Any,

@@ -267,12 +267,9 @@ def connect(
 
 
 @dataclass(frozen=True)
-class Recorded:
+class Recorded(integrand.Spot):
     """One vertex of every path."""
 
-    face: Any  # triangle
-    b1: Any  # barycentric coordinates
-    b2: Any
     throughput: Any  # all factors so far; zero where the path has ended before
     seen: Any  # whether the vertex is connected to the receiver
 
@@ -280,15 +277,6 @@ class Recorded:
     def exists(self) -> Any:
         """Which paths come here."""
         return self.throughput != 0
-
-    def place(self, inputs: Inputs, active: Any = True) -> Place:
-        """Where it lies now.
-
-        Args:
-            inputs: Tables of the kernel.
-            active: Lanes.
-        """
-        return integrand.place(inputs, self.face, self.b1, self.b2, active)
 
 
 @dataclass(frozen=True)
