@@ -119,14 +119,7 @@ class Surfaces:
         axis = back if number == 2 else normal * (2 * dr.dot(normal, back)) - back
         apart = dr.squared_norm(on - axis)
         exponent = self.exponent(number, row, active)
-        share = 0.25 * apart
-        low = log_less(dr.detach(share))
-        value = dr.exp(dr.detach(exponent) * low)
-        if dr.grad_enabled(share, exponent):
-            # Written out: through logarithm and exponential it would cost more than all the rest.
-            slope = -value * dr.detach(exponent) / dr.maximum(1 - dr.detach(share), 1e-7)
-            value = dr.replace_grad(value, slope * share + value * low * exponent)
-        return value, exponent
+        return dr.exp(exponent * log_less(0.25 * apart)), exponent
 
     def exponent(self, number: int, row: Any, active: Any = True) -> Any:
         """Exponent of a lobe.
