@@ -44,7 +44,7 @@ def test_scenes_repeat_and_starts_are_off(case: ModuleType):
 
 @pytest.mark.slow
 def test_both_sensors_bring_a_crate_nearer(case: ModuleType, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(case, "STEPS", 40)
+    monkeypatch.setattr(case, "STEPS", 60)
     seen = case.view(1000)
     found = case.fit(seen, "both", 0)
     assert found["position"] < 0.06
