@@ -161,8 +161,6 @@ class Spheres:
             return place + 1, total, inside + dr.select(there & within, 1.0, 0.0)
 
         none = dr.zeros(mi.Float, lanes)
-        if self.count == 1:
-            return step(start, none, none)[1:]
         state = rays.loop((start, none, none), lambda place, *_: place < end, step)
         return state[1], state[2]
 
