@@ -284,8 +284,8 @@ def compared(
     cast, seconds = rays_cast(divided, samples, depth), forward_seconds(divided, samples, depth)
     found["rays_per_second"] = cast / seconds
     found["of_ray_limit"] = found["rays_per_second"] / bare
-    compared = {"": (ours, listed), "_diffuse": (ours, diffuse), "_tree": (by_tree, listed)}
-    for suffix, (own, other) in compared.items():
+    sides = {"": (ours, listed), "_diffuse": (ours, diffuse), "_tree": (by_tree, listed)}
+    for suffix, (own, other) in sides.items():
         pairs = list(zip(own, other, strict=False))[WARM_UP:]
         ratios: dict[str, float | None] = {"forward": None, "step": None}
         if pairs:

@@ -1,5 +1,7 @@
 """The fused deposit against its slow references, its own adjoint, and itself."""
 
+import gc
+import weakref
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +11,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_power
+from invertwin.channel.power import trace
 from invertwin.channel.rays.geometry import flatten
 from invertwin.errors import InputError
 from invertwin.scene import (
@@ -363,3 +366,33 @@ def test_a_batch_of_scenes_says_what_to_do(part):
 
     with pytest.raises(InputError, match="predict_batch"):
         torch.func.vmap(of)(torch.ones(2, part.stop - part.start, dtype=torch.float64))
+
+
+def test_a_call_leaves_nothing_to_the_garbage_collector(monkeypatch):
+    """Records of paths are large; they go with the last reference to the map."""
+    alive = []
+
+    class Seen(trace.Trace):
+        def __init__(self, *given, **named):
+            super().__init__(*given, **named)
+            alive.append(weakref.ref(self))
+
+    monkeypatch.setattr("invertwin.channel.power.deposit.Trace", Seen)
+    shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    scene = Scene(
+        {
+            "box": thing(
+                Mesh(box((0.4, 0.5, 0.3)).vertices + shift, box((0.4, 0.5, 0.3)).faces),
+                (0.1, 0.0, 2.0),
+            )
+        }
+    )
+    gc.collect()
+    gc.disable()
+    try:
+        sampling = Sampling(depth=2, samples=1000, boundary_samples=500)
+        deposit_power(scene, link(), GRID, sampling=sampling, seed=1).sum().backward()
+        assert shift.grad is not None
+        assert [ref() for ref in alive] == [None]
+    finally:
+        gc.enable()

@@ -1,14 +1,10 @@
 """Few triangles, tested one by one, against the tree."""
 
-import gc
-import weakref
-
 import pytest
 import torch
 from torch import Tensor
 
 from invertwin.channel import Grid, Sampling, deposit_power
-from invertwin.channel.power import trace
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
 from invertwin.channel.rays.few import MOST, Few
@@ -119,26 +115,3 @@ def test_maps_and_derivatives_are_those_of_the_tree(divisions, monkeypatch):
     second = result()
     for one, other in zip(first, second, strict=True):
         assert relative(one, other) < 1e-3
-
-
-def test_a_call_leaves_nothing_to_the_garbage_collector(monkeypatch):
-    """Records of paths are large; they go with the last reference to the map."""
-    alive = []
-
-    class Seen(trace.Trace):
-        def __init__(self, *given, **named):
-            super().__init__(*given, **named)
-            alive.append(weakref.ref(self))
-
-    monkeypatch.setattr("invertwin.channel.power.deposit.Trace", Seen)
-    shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    scene = Scene({"box": thing(moved_box(shift), (0.1, 0.0, 2.0))})
-    gc.collect()
-    gc.disable()
-    try:
-        sampling = Sampling(depth=2, samples=1000, boundary_samples=500)
-        deposit_power(scene, link(), RANGES, sampling=sampling, seed=1).sum().backward()
-        assert shift.grad is not None
-        assert [ref() for ref in alive] == [None]
-    finally:
-        gc.enable()

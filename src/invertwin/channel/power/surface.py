@@ -63,9 +63,12 @@ class Surfaces:
 
     def _column(self, name: str, number: int, count: int, row: Any, active: Any) -> Any:
         """One of the ``count`` numbers that a table has for every row."""
-        if name in self.known and not dr.grad_enabled(self.tables[name]):
+        if self._is_known(name):
             return mi.Float(self.known[name][number])
         return self._read(name, row * count + number, active)
+
+    def _is_known(self, name: str) -> bool:
+        return name in self.known and not dr.grad_enabled(self.tables[name])
 
     def _read(self, name: str, at: Any, active: Any) -> Any:
         """Entries of a table; by all lanes where it has no derivatives, so that it is read once."""
@@ -81,7 +84,7 @@ class Surfaces:
             cosine: Of the angle of incidence, at least 0.
             active: Lanes.
         """
-        if name in self.known and not dr.grad_enabled(self.tables[name]):
+        if self._is_known(name):
             return mi.Float(self.known[name][0])
         t = dr.minimum(cosine, 1.0) * (self.cosines - 1)
         low = dr.minimum(mi.UInt32(dr.detach(t)), self.cosines - 2)
