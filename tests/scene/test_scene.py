@@ -168,6 +168,28 @@ def test_bad_scenes_are_refused_in_one_line(make, message):
     assert "\n" not in str(caught.value)
 
 
+def test_many_objects_are_placed_as_each_by_itself():
+    from invertwin.scene.scene import placed
+
+    turn = rotation_from_vector(vector(0.1, 0.2, 0.3)).requires_grad_()
+    poses = [rigid(turn, vector(k, 1.0, 2.0)) for k in range(3)]
+    bent = Mesh(PLATE.vertices + 0.1, PLATE.faces)
+    objects = [
+        Object(PLATE, METAL, poses[0]),
+        Object(PLATE, METAL),
+        Object(plate(1.0, 1.0, divisions=3), METAL, poses[1]),
+        Object(bent, METAL, poses[2]),
+    ]
+    found = placed(objects)
+    slopes = []
+    for vertices in (found, [item.vertices for item in objects]):
+        total = sum((k + 1) * v.square().sum() for k, v in enumerate(vertices))
+        assert isinstance(total, torch.Tensor)
+        slopes.append(torch.autograd.grad(total, turn, retain_graph=True)[0])
+    torch.testing.assert_close(found, [item.vertices for item in objects])
+    torch.testing.assert_close(*slopes)
+
+
 def test_scenes_of_mirrors_get_a_warning():
     from invertwin.scene import Dielectric, RoughConductor, Slab
     from invertwin.scene.scene import warn_of_mirrors

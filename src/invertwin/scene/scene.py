@@ -1,7 +1,7 @@
 """Scenes: named objects, each a mesh with a material, a pose and a motion."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
@@ -74,7 +74,7 @@ class Object:
     @property
     def vertices(self) -> Float64[Tensor, "v 3"]:
         """Vertex positions in the world [m], with the gradients of the mesh and the pose."""
-        return self._to_world(self.mesh.vertices)
+        return self.mesh.vertices if self.pose is None else _moved(self.mesh.vertices, self.pose)
 
     @property
     def center(self) -> Float64[Tensor, "3"]:
@@ -82,7 +82,8 @@ class Object:
 
         Rotations and scalings act about it. Differentiable like `vertices`.
         """
-        return self._to_world(self.mesh.center)
+        center = self.mesh.center
+        return center if self.pose is None else _moved(center[None], self.pose)[0]
 
     def at(self, time: float) -> "Object":
         """The object after it has moved with its velocity for `time` [s]; the result is at rest."""
@@ -97,10 +98,29 @@ class Object:
         mesh = Mesh(self.mesh.vertices + offsets, self.mesh.faces)
         return replace(self, mesh=mesh, velocity=None)
 
-    def _to_world(self, points: Tensor) -> Tensor:
-        if self.pose is None:
-            return points
-        return points @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+def placed(objects: Sequence[Object]) -> list[Float64[Tensor, "v 3"]]:
+    """The ``vertices`` of many objects; those of as many vertices are placed at once.
+
+    Args:
+        objects: any number.
+    """
+    found: dict[int, Tensor] = {}
+    alike: dict[int, list[int]] = {}
+    for number, item in enumerate(objects):
+        if item.pose is None:
+            found[number] = item.mesh.vertices
+        else:
+            alike.setdefault(len(item.mesh.vertices), []).append(number)
+    for numbers in alike.values():
+        points = torch.stack([objects[n].mesh.vertices for n in numbers])
+        moved = _moved(points, torch.stack([objects[n].transform for n in numbers]))
+        found |= zip(numbers, moved.unbind(), strict=True)
+    return [found[number] for number in range(len(objects))]
+
+
+def _moved(points: Float64[Tensor, "*n v 3"], pose: Float64[Tensor, "*n 4 4"]) -> Tensor:
+    return points @ pose[..., :3, :3].mT + pose[..., None, :3, 3]
 
 
 @dataclass(frozen=True, eq=False)

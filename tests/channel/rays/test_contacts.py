@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from invertwin.channel.rays.contacts import Contacts, contacts_of
+from invertwin.channel.rays.contacts import Contacts, contacts_of, may_meet
 from invertwin.channel.rays.geometry import flatten
 from invertwin.channel.rays.scene import RayScene
 from invertwin.scene import Mesh, Object, Scene, box, plate, rigid, sphere
@@ -89,3 +89,28 @@ def test_a_mesh_meets_itself_only_where_its_shape_changes():
 def test_nothing_is_looked_for_where_nothing_moves():
     balls = Scene({name: thing(sphere(0.25, 2), (x, 0, 1.5)) for name, x in (("a", 0), ("b", 0.1))})
     assert contacts_of(RayScene(flatten(balls, WAVELENGTH), link())) is None
+
+
+def test_boxes_that_overlap_are_found_with_what_they_share():
+    """Against all pairs, one by one."""
+    places = torch.rand(30, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    objects = {
+        str(k): Object(
+            box(0.2), FLOOR.material, rigid(translation=place.clone().requires_grad_(bool(k % 3)))
+        )
+        for k, place in enumerate(places.clone())
+    }
+    geometry = flatten(Scene(objects), WAVELENGTH)
+    pairs, low, high = may_meet(geometry)
+    for i in range(30):
+        shared = [
+            (torch.maximum(places[i], places[j]) - 0.1, torch.minimum(places[i], places[j]) + 0.1)
+            for j in range(30)
+            if i != j and (i % 3 or j % 3) and float((places[i] - places[j]).abs().max()) < 0.2
+        ]
+        assert int(pairs[i].sum()) == len(shared)
+        if shared:
+            first, last = (torch.stack(ends) for ends in zip(*shared, strict=True))
+            torch.testing.assert_close(low[i], first.amin(0), rtol=0, atol=1e-4)
+            torch.testing.assert_close(high[i], last.amax(0), rtol=0, atol=1e-4)
+    assert bool(pairs.any())

@@ -73,9 +73,15 @@ def may_meet(geometry: Geometry) -> tuple[Bool[Tensor, "object object"], Tensor,
     low, high = low - margin, high + margin
     moving, deforming = (torch.tensor(flags) for flags in (geometry.moving, geometry.deforming))
     pairs = (moving[:, None] | moving).fill_diagonal_(False) | torch.diag(deforming)
-    pairs &= ((low[:, None] <= high) & (low <= high[:, None])).all(2)
-    place = torch.where(pairs[..., None], torch.maximum(low[:, None], low), torch.inf).amin(1)
-    until = torch.where(pairs[..., None], torch.minimum(high[:, None], high), -torch.inf).amax(1)
+    for axis in range(3):
+        reaches = low[:, None, axis] <= high[:, axis]
+        pairs &= reaches & reaches.T
+    first, second = pairs.nonzero(as_tuple=True)
+    rows = first[:, None].expand(-1, 3)
+    place = torch.full_like(low, torch.inf)
+    place.scatter_reduce_(0, rows, torch.maximum(low[first], low[second]), "amin")
+    until = torch.full_like(high, -torch.inf)
+    until.scatter_reduce_(0, rows, torch.minimum(high[first], high[second]), "amax")
     return pairs, place, until
 
 

@@ -16,7 +16,7 @@ from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import Material, Surface
-from invertwin.scene.scene import Object, Scene
+from invertwin.scene.scene import Object, Scene, placed
 
 _WIDE = 0.2  # radians: no mesh is too coarse for such lobes
 
@@ -42,7 +42,7 @@ class Geometry:
         faces: Vertex indices of all triangles.
         face_object: Index of the object of each triangle.
         face_surface: Row of each triangle in the tables of surfaces.
-        surfaces: What surfaces do, one row per object or per triangle.
+        surfaces: What surfaces do, one row per material, or per triangle where its values differ.
         lobed: Which lobes have weight, or a derivative that could give them some.
         sheets: Whether something passes straight through any surface.
         bodies: Whether any surface is the skin of a refracting body.
@@ -171,10 +171,9 @@ def flatten(
             f"expected {what} velocities on {names}; a frame is one instant: use scene.at(time) "
             "and then replace(name, velocity=None), or simulate_chirps for motion within a frame"
         )
-    placed = [item.vertices for item in objects]
-    vertices = torch.cat(placed)
+    vertices = torch.cat(placed(objects))
     topology = topology_of([item.mesh for item in objects])
-    surfaces, face_surface = _surfaces(objects, SPEED_OF_LIGHT / wavelength)
+    surfaces, face_surface = _surfaces(objects, SPEED_OF_LIGHT / wavelength, topology.face_object)
     skins = surfaces.refraction.any(1)
     for number, name in enumerate(scene.objects) if bool(skins.any()) else ():
         own = topology.face_object == number
@@ -183,6 +182,7 @@ def flatten(
                 name, vertices.detach()[topology.faces[own]], number in topology.open_objects
             )
     _warn_of_facets(list(scene.objects), topology, vertices, surfaces, face_surface)
+    deforming = tuple(differentiated(item.mesh.vertices) for item in objects)
     weights, free = surfaces.lobes, differentiated(surfaces.lobes)
     return Geometry(
         vertices=vertices,
@@ -196,8 +196,8 @@ def flatten(
         spread=bool((surfaces.spread != 1).any()),
         names=tuple(scene.objects),
         coherent=tuple(item.material.coherent for item in objects),
-        moving=tuple(map(differentiated, placed)),
-        deforming=tuple(differentiated(item.mesh.vertices) for item in objects),
+        moving=tuple(o or differentiated(i.pose) for o, i in zip(deforming, objects, strict=True)),
+        deforming=deforming,
         topology=topology,
         velocities=torch.cat([vertex_velocities(item) for item in objects]) if moving else None,
     )
@@ -250,26 +250,51 @@ def _remembered(material: Material, frequency: float) -> Surface:
     return material.surface(frequency)
 
 
-def _surfaces(objects: list[Object], frequency: float) -> tuple[Surface, Tensor]:
-    """The rows of all surfaces, and the row of every triangle."""
-    columns: dict[str, list[Tensor]] = {field.name: [] for field in fields(Surface)}
-    face_surface, offset = [], 0
+def _surfaces(objects: list[Object], frequency: float, owner: Tensor) -> tuple[Surface, Tensor]:
+    """The rows of all surfaces, and the row of every triangle.
+
+    Objects of one material share its rows.
+
+    Args:
+        objects: Whose surfaces.
+        frequency: [Hz].
+        owner: Object of every triangle.
+    """
+    rows: dict[int, tuple[int, Surface]] = {}  # the first row, and what the surface does
+    of_material: dict[int, Surface] = {}
+    count, first, single = 0, [], []
     for item in objects:
-        surface, count = _surface(item.material, frequency), len(item.mesh.faces)
+        key, faces = id(item.material), len(item.mesh.faces)
+        if key not in of_material:
+            of_material[key] = _surface(item.material, frequency)
+        surface = of_material[key]
         per_face = surface.diffuse.ndim == 1
-        if per_face and len(surface.diffuse) != count:
+        if per_face and len(surface.diffuse) != faces:
             raise InputError(
-                f"expected one value of a material per triangle ({count}), got "
+                f"expected one value of a material per triangle ({faces}), got "
                 f"{len(surface.diffuse)}; give as many, or a single one"
             )
-        for name, column in columns.items():
-            value = getattr(surface, name)
-            column.append(value if per_face else value[None])
-        numbers = torch.arange(count) if per_face else torch.zeros(count, dtype=torch.int64)
-        face_surface.append(numbers + offset)
-        offset += count if per_face else 1
-    rows = Surface(**{name: torch.cat(column) for name, column in columns.items()})
-    return rows, torch.cat(face_surface)
+        if id(surface) not in rows:
+            rows[id(surface)] = count, surface
+            count += faces if per_face else 1
+        first.append(rows[id(surface)][0])
+        single.append(not per_face)
+    columns = {
+        field.name: torch.cat(
+            [
+                getattr(surface, field.name)[None if surface.diffuse.ndim == 0 else ...]
+                for _, surface in rows.values()
+            ]
+        )
+        for field in fields(Surface)
+    }
+    face_surface = torch.tensor(first)[owner]
+    if not all(single):
+        # Triangles of an object lie side by side, each with a row of its own.
+        counts = torch.tensor([len(item.mesh.faces) for item in objects])
+        number = torch.arange(len(owner)) - (counts.cumsum(0) - counts)[owner]
+        face_surface += torch.where(torch.tensor(single)[owner], 0, number)
+    return Surface(**columns), face_surface
 
 
 def _moves(item: Object) -> bool:

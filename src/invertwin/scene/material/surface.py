@@ -26,6 +26,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
@@ -90,7 +91,8 @@ class Surface:
         """Give all fields the same rows."""
         given = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         widths = {n: v.shape[v.ndim - (n not in _SCALARS) :] for n, v in given.items()}
-        row = torch.broadcast_shapes(
+        # NumPy's: torch's takes seconds where it is first called.
+        row = np.broadcast_shapes(
             *(values.shape[: values.ndim - len(widths[n])] for n, values in given.items())
         )
         for name, values in given.items():
