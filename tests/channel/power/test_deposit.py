@@ -134,8 +134,11 @@ def test_forward_and_reverse_mode_agree(bistatic):
     for (name, value), bar in zip(values.items(), pulled, strict=True):
         tangent = torch.randn(value.shape, generator=generator, dtype=torch.float64)
         with forward_ad.dual_level():
-            dual = {k: v.detach() for k, v in values.items()}
-            dual[name] = forward_ad.make_dual(dual[name], tangent)
+            # All carry derivatives, as in reverse mode: edges are drawn for what moves.
+            dual = {
+                k: forward_ad.make_dual(v.detach(), tangent if k == name else torch.zeros_like(v))
+                for k, v in values.items()
+            }
             pushed = forward_ad.unpack_dual(
                 deposit_power(*built(dual), GRID, sampling=COUNTS, seed=3)
             ).tangent

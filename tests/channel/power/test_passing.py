@@ -12,7 +12,17 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Sampling, deposit_power, trace_power
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.scene import Mesh, Object, RefractingBody, RoughConductor, Scene, Slab, box, plate
+from invertwin.scene import (
+    Mesh,
+    Object,
+    RefractingBody,
+    RoughConductor,
+    Scene,
+    Slab,
+    box,
+    plate,
+    sphere,
+)
 from scenes import WAVELENGTH, float64, link, noise, thing
 
 WHITE = RoughConductor(scattering=1.0)
@@ -57,26 +67,49 @@ def test_a_wall_behind_a_board_is_fainter_and_later(angle):
     assert ranges[1] - ranges[0] == pytest.approx(extra, abs=3e-4)
 
 
+def slopes(still: dict[str, Object], item: Object, depth: int, seeds: int) -> list[Tensor]:
+    """Derivatives of a map as an object slides across, one a seed."""
+    grid = Grid(0.5, 0.1, 40, u_start=-0.6, u_step=0.1, u_count=13)
+    sampling = Sampling(depth=depth, samples=50_000, boundary_samples=10_000)
+    found = []
+    for seed in range(seeds):
+        with forward_ad.dual_level():
+            shift = forward_ad.make_dual(float64([0.0, 0.0, 0.0]), float64([1.0, 0.0, 0.0]))
+            mesh = Mesh(item.mesh.vertices + shift, item.mesh.faces)
+            moved = still | {"target": Object(mesh, item.material, item.pose)}
+            out = deposit_power(Scene(moved), link(), grid, sampling=sampling, seed=seed)
+            found.append(forward_ad.unpack_dual(out).tangent)
+    return found
+
+
+WALL = {"wall": thing(plate(4.0, 4.0), (0.0, 0.0, 3.0))}
+
+
 def test_a_board_in_front_adds_little_noise():
     """What passes it is spread as evenly as what meets it; thrown dice would add 30 times more."""
     target = thing(plate(0.5, 0.4), (0.1, 0.05, 2.0), (0.1, 0.2, 0.0))
-    scene = {"wall": thing(plate(4.0, 4.0), (0.0, 0.0, 3.0))}
     board = thing(plate(3.0, 3.0), (0.0, 0.0, 1.0), (0.0, 0.1, 0.0), Slab(2.7, thickness=0.0125))
-    grid = Grid(0.5, 0.1, 40, u_start=-0.6, u_step=0.1, u_count=13)
-    sampling = Sampling(depth=1, samples=50_000, boundary_samples=10_000)
-    found = []
-    for shown in (scene, scene | {"board": board}):
-        derivatives = []
-        for seed in range(8):
-            with forward_ad.dual_level():
-                shift = forward_ad.make_dual(float64([0.0, 0.0, 0.0]), float64([1.0, 0.0, 0.0]))
-                mesh = Mesh(target.mesh.vertices + shift, target.mesh.faces)
-                moved = shown | {"target": Object(mesh, target.material, target.pose)}
-                out = deposit_power(Scene(moved), link(), grid, sampling=sampling, seed=seed)
-                derivatives.append(forward_ad.unpack_dual(out).tangent)
-        found.append(noise(derivatives))
-    assert found[0] < 0.01
-    assert found[1] < 3 * found[0]
+    bare, covered = (
+        noise(slopes(still, target, 1, seeds=8)) for still in (WALL, WALL | {"board": board})
+    )
+    assert bare < 0.01
+    assert covered < 3 * bare
+
+
+@pytest.mark.slow
+def test_objects_that_are_sheets_all_round_add_bounded_noise():
+    """Against white ones: a box of its derivative, what is faint of that of the white one."""
+    pane = Slab(2.7, thickness=0.0125, scattering=1.0)
+    at = (0.1, 0.05, 2.0), (0.1, 0.2, 0.0)
+
+    def ratios(shape: Mesh, depth: int) -> tuple[float, float]:
+        hollow, full = (slopes(WALL, thing(shape, *at, m), depth, 16) for m in (pane, WHITE))
+        spread = [float(torch.stack(found).std(0).sum()) for found in (hollow, full)]
+        return noise(hollow) / noise(full), spread[0] / spread[1]
+
+    assert ratios(box(0.5), 1)[0] < 2
+    assert ratios(box(0.5), 2)[1] < 1.2
+    assert ratios(sphere(0.3, 4), 1)[1] < 3
 
 
 def block(index: float, thickness: float, near: float, slope: float, width: float) -> Object:

@@ -154,6 +154,7 @@ def _shares(
         )
     turned = geometry.surfaces.depolarisation
     depolarised = differentiated(turned) or bool(turned.any())
+    antennas_move = differentiated(link.tx) or differentiated(link.rx)
     maps = []
     for share in power_shares(link, depolarised=depolarised):
         lossy = geometry
@@ -164,8 +165,9 @@ def _shares(
             bare = without_derivatives(lossy, link)
             coupling = share.odd, share.even
             trace = Trace(
-                *bare, sampling, seed, scheme=scheme, reference=reference, coupling=coupling
-            )
+                *bare, sampling, seed, scheme=scheme, reference=reference, coupling=coupling,
+                antennas_move=antennas_move,
+            )  # fmt: skip
         tables = tables_of(lossy, link)
         layout = bins.Layout.of(grid, link)
         maps.append(_Deposit.apply(trace, layout, any(map(differentiated, tables)), *tables))

@@ -227,7 +227,10 @@ class EdgeSampler:
         self.size = samples if entries else 0
         if self.size:
             seen = mi.Float(dr.norm(y1 - y0) / dr.norm(away))
-            weight = dr.select(sides.unlike, seen, 0.0)
+            counts = sides.unlike
+            if rays.movers is not None:
+                counts &= rays.movers.has_edge(edge) | rays.movers.beyond(edge, origin, y0, y1)
+            weight = dr.select(counts, seen * sides.step, 0.0)
             self.choice = Proportional(by_object(rays, edge, weight, receiver, len(centres)))
         self.seed, self.dice = scrambled(seed, 3), scrambled(seed, 9)
 
@@ -266,6 +269,8 @@ class EdgeSampler:
         )  # fmt: skip
         valid &= hit.valid & _not_grazing(rays, hit.face, away, hit.valid)
         valid &= rays.in_scene(frame, hit.face, hit.valid)
+        if rays.movers is not None:
+            valid &= rays.movers.has_edge(edge) | rays.movers.has_face(hit.face, hit.valid)
         # Last, since it takes longest: packets without a shadow spare it.
         near = _MISSED * dr.norm(exact)
         valid &= ~folded(rays, edge, y, exact, sides.outwards, aside, near, valid)
@@ -396,6 +401,11 @@ class InteriorEdgeSampler:
             valid &= hit.valid & _not_grazing(rays, hit.face, omega, hit.valid)
             valid &= rays.in_scene(frame, hit.face, hit.valid)
             hits.append(hit)
+        if rays.movers is not None:
+            moves = rays.movers.has_edge(edge)
+            for hit in hits:
+                moves |= rays.movers.has_face(hit.face, hit.valid)
+            valid &= moves
         near = _MISSED * dr.norm(place)
         valid &= ~folded(rays, edge, place, exact, sides.outwards, aside, near, valid)
         behind, ahead = hits
@@ -460,6 +470,11 @@ class _Sides:
     covered: Any
     covered_extra: Any
     outwards: Any  # unit direction off the covered side; zero where there is something on both
+
+    @property
+    def step(self) -> Any:
+        """How much of what passes changes from side to side; little where only its length does."""
+        return dr.abs(self.open - self.covered) + 0.05 * (self.open + self.covered)
 
     @property
     def unlike(self) -> Any:

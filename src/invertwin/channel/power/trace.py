@@ -68,6 +68,7 @@ class Trace:
         scheme: str = "rays",
         reference: tuple[Geometry, Link] | None = None,
         coupling: tuple[float, float] = (1.0, 1.0),
+        antennas_move: bool = True,
     ) -> None:
         """Upload a scene and prepare the samplers.
 
@@ -79,10 +80,11 @@ class Trace:
             scheme: Where paths start, see ``deposit_power``.
             reference: What fixes how starts are drawn, see ``deposit_power``.
             coupling: Factors of paths with an odd and an even number of bounces.
+            antennas_move: Whether derivatives may flow through the places of antennas.
         """
         self.sampling, self.seed = sampling, seed
         self.recorded: Records | None = None  # the last paths, where they fit
-        self.rays = RayScene(geometry, link)
+        self.rays = RayScene(geometry, link, antennas_move=antennas_move)
         sampler = RaySampler if scheme == "rays" else AreaSampler
         self.sampler = sampler(self.rays, sampling.samples * self.rays.scenes, seed, reference)
         one_place = bool((link.tx == link.rx).all())

@@ -22,6 +22,7 @@ from invertwin.channel.rays.arrays import (
 from invertwin.channel.rays.backend import backend, dr, mi, tracing
 from invertwin.channel.rays.few import MOST, Few
 from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.movers import Movers
 from invertwin.channel.rays.spheres import Spheres
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.errors import InputError
@@ -129,9 +130,10 @@ class RayScene(Occluders):
     Args:
         geometry: The scene.
         link: The antennas; the local origin is the mean place of the transmitters.
+        antennas_move: Whether derivatives may flow through the places of antennas.
     """
 
-    def __init__(self, geometry: Geometry, link: Link) -> None:
+    def __init__(self, geometry: Geometry, link: Link, *, antennas_move: bool = True) -> None:
         origin = link.tx.detach().mean(dim=0)
         super().__init__(geometry.vertices, geometry.topology, origin)
         # A GPU walks trees in hardware.
@@ -149,6 +151,11 @@ class RayScene(Occluders):
         #: Radar poses that look at one scene; those of the first scene come first.
         self.looks = link.frame_count // self.scenes
         self._scene_of = None if owners is None else to_index(owners)
+        some = any(geometry.moving) and not all(geometry.moving)
+        #: Objects that move where others and the antennas do not; None where that is not so.
+        self.movers = None
+        if some and not antennas_move:
+            self.movers = Movers(torch.tensor(geometry.moving), self)
 
     @cached_property
     def spheres(self) -> Spheres:

@@ -10,6 +10,7 @@ from torch import Tensor
 from invertwin.channel.rays.arrays import opaque, to_float, to_index
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.topology import side_by_side
 
 _TOGETHER = 8  # objects of a group
 _NOWHERE = (0.0, 0.0, 0.0, -1.0)  # a sphere that nothing meets
@@ -32,7 +33,7 @@ class Spheres:
             margin: By how much spheres are larger than they need to be.
         """
         centres, radii = _around(geometry)
-        order = _side_by_side(centres)
+        order = side_by_side(centres)
         self.count = len(order)  # of all scenes
         scene = np.zeros(self.count, dtype=np.int64)
         if geometry.object_scene is not None:
@@ -52,6 +53,9 @@ class Spheres:
         of_object[order] = places // self.size
         self.groups = len(rows) // self.size  # of all scenes
         self._group = to_index(torch.from_numpy(of_object))
+        place = np.empty_like(order)
+        place[order] = places
+        self._place = to_index(torch.from_numpy(place))
         self._owner = geometry.topology.device_face_object
         self._size = opaque(self.size)
         self._scenes: dict[str, Any] | None = None
@@ -98,6 +102,14 @@ class Spheres:
         if self._scenes is None:
             return dr.minimum(self.size, self.count - group * self.size)
         return dr.gather(mi.UInt32, self._scenes["members"], group)
+
+    def around(self, number: Any) -> Any:
+        """Centre and radius of the spheres of objects.
+
+        Args:
+            number: Of the objects, as the scene numbers them.
+        """
+        return dr.gather(mi.Vector4f, self.table, dr.gather(mi.UInt32, self._place, number))
 
     def cap(self, place: Any, point: Any) -> tuple[Any, Any, Any]:
         """Axis and height 1 − cos of the cap of directions in which an object lies.
@@ -178,10 +190,3 @@ def _around(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
     centre = 0.5 * (low + high)
     away = np.square(corners - centre[owner]).sum(1)
     return centre, np.sqrt(np.maximum.reduceat(away, first))
-
-
-def _side_by_side(places: np.ndarray) -> np.ndarray:
-    """Objects in the order of a curve that fills space (Morton)."""
-    cells = ((places - places.min(0)) / (np.ptp(places) or 1.0) * 1023).astype(np.int64)
-    bits = (cells[..., None] >> np.arange(10)) & 1
-    return np.argsort((bits << (3 * np.arange(10) + np.arange(3)[:, None])).sum((1, 2)))

@@ -44,7 +44,11 @@ class Topology:
         first = torch.searchsorted(owner[used], torch.arange(int(owner.max()) + 1))
         self.used = used.numpy(), first.numpy(), owner[used].numpy()
         places = torch.cat([owner[:, None].double(), vertices], dim=1).numpy()
-        self.edges, self.opposite, self.beside = edges_of(faces.numpy(), places)
+        tables = edges_of(faces.numpy(), places)
+        # Of each object, side by side: samples that follow this order are spread over its surface.
+        order = torch.from_numpy(side_by_side(vertices[tables[0]].mean(1).numpy()))
+        order = order[owner[tables[0][order, 0]].argsort(stable=True)]
+        self.edges, self.opposite, self.beside = (table[order] for table in tables)
         beside = self.beside
         alone = (self.opposite >= 0).sum(1) == 1
         self.open_objects = set(face_object[beside[alone, 0]].tolist())
@@ -211,3 +215,16 @@ def edges_of(
     opposite[at], beside[at] = apex[order], triangle[order]
     tables = edges.astype(np.int64), opposite, beside
     return torch.from_numpy(tables[0]), torch.from_numpy(tables[1]), torch.from_numpy(tables[2])
+
+
+def side_by_side(places: np.ndarray) -> np.ndarray:
+    """The order of places along a curve that fills space (Morton).
+
+    Args:
+        places: [n, 3].
+    """
+    if not len(places):
+        return np.zeros(0, dtype=np.int64)
+    cells = ((places - places.min(0)) / (np.ptp(places) or 1.0) * 1023).astype(np.int64)
+    bits = (cells[..., None] >> np.arange(10)) & 1
+    return np.argsort((bits << (3 * np.arange(10) + np.arange(3)[:, None])).sum((1, 2)))

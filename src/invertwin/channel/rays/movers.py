@@ -1,0 +1,105 @@
+"""Which shadows a derivative can move, in scenes of which a part stands still."""
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from invertwin.channel.rays.arrays import opaque, to_index
+from invertwin.channel.rays.backend import dr, mi
+
+if TYPE_CHECKING:
+    from invertwin.channel.rays.scene import RayScene
+
+_SLACK = 1e-4  # of a distance: far more than rounding
+
+
+class Movers:
+    """Objects through whose vertices derivatives flow, where the antennas and others stand still.
+
+    A shadow moves over a surface if what casts it moves or the surface does. So an edge at rest
+    counts only if its shadow may fall on an object that moves.
+
+    Args:
+        moving: Per object, whether it moves; some do.
+        rays: The scene.
+    """
+
+    def __init__(self, moving: Bool[Tensor, " object"], rays: "RayScene") -> None:
+        self._rays = rays
+        self._moving = to_index(moving)
+        self._numbers = to_index(torch.nonzero(moving)[:, 0])
+        self._count = opaque(int(moving.sum()))
+
+    def has(self, owner: Any, active: Any = True) -> Any:
+        """Whether objects move.
+
+        Args:
+            owner: Numbers of the objects.
+            active: Lanes.
+        """
+        return dr.gather(mi.UInt32, self._moving, owner, active) > 0
+
+    def has_face(self, face: Any, active: Any = True) -> Any:
+        """Whether triangles are parts of objects that move.
+
+        Args:
+            face: Triangles.
+            active: Lanes.
+        """
+        owners = self._rays.topology.device_face_object
+        return self.has(dr.gather(mi.UInt32, owners, face, active), active)
+
+    def has_edge(self, edge: Any) -> Any:
+        """Whether edges are parts of objects that move.
+
+        Args:
+            edge: Edges.
+        """
+        return self.has(dr.gather(mi.UInt32, self._rays.topology.device_edge_object, edge))
+
+    def beyond(self, edge: Any, origin: Any, y0: Any, y1: Any) -> Any:
+        """Whether shadows of edges may fall on an object that moves: its sphere is asked.
+
+        Args:
+            edge: Edges.
+            origin: From where they are seen.
+            y0, y1: Their ends.
+        """
+        rays, spheres = self._rays, self._rays.spheres
+        first, second = (mi.Vector3f(y - mi.Vector3d(origin)) for y in (y0, y1))
+        normal = dr.cross(first, second)
+        length = dr.norm(normal)
+        # An edge that points at the antenna may cast its shadow anywhere.
+        normal = dr.select(length > 0, normal / length, 0.0)
+        rims = [dr.normalize(end) for end in (first, second)]
+        along = second - first
+        foot = dr.clip(-dr.dot(first, along) / dr.squared_norm(along), 0.0, 1.0)
+        near = dr.norm(first + along * foot)
+        scene = rays.edge_scene(edge)
+
+        def step(number: Any, found: Any) -> tuple[Any, Any]:
+            owner = dr.gather(mi.UInt32, self._numbers, number)
+            sphere = spheres.around(owner)
+            centre, radius = sphere.xyz - origin, sphere.w
+            # Within the sector of directions through the edge, or beside one of its rims.
+            height = dr.dot(centre, normal)
+            inside = (dr.dot(dr.cross(first, centre), normal) >= 0) & (
+                dr.dot(dr.cross(centre, second), normal) >= 0
+            )
+            away = dr.select(inside, dr.abs(height), dr.inf)
+            for rim in rims:
+                at = dr.maximum(dr.dot(centre, rim), 0.0)
+                away = dr.minimum(away, dr.norm(centre - rim * at))
+            far = dr.norm(centre) + radius
+            met = (away <= radius + _SLACK * far) & (far * (1 + _SLACK) >= near)
+            return number + 1, found | (met & (rays.object_scene(owner) == scene))
+
+        lanes = dr.width(edge)
+        state = rays.loop(
+            (dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Bool, lanes)),
+            lambda number, found: ~found & (number < self._count),
+            step,
+        )
+        return state[1]

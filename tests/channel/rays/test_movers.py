@@ -1,0 +1,152 @@
+"""Shadows that a derivative can move, where a part of the scene stands still."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+import torch.autograd.forward_ad as forward_ad
+from torch import Tensor
+
+from invertwin.channel import Sampling, deposit_power
+from invertwin.channel.power.edges import EdgeSampler
+from invertwin.channel.power.integrand import Inputs
+from invertwin.channel.rays import scene as ray_scene
+from invertwin.channel.rays.arrays import to_torch
+from invertwin.channel.rays.backend import dr, mi, tracing
+from invertwin.channel.rays.geometry import flatten
+from invertwin.channel.rays.scene import RayScene
+from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, rigid, sphere
+from scenes import GRID, WAVELENGTH, float64, link, thing
+
+OBJECTS = {
+    "wall": thing(plate(2.0, 2.0), (0.0, 0.0, 2.4)),
+    "screen": thing(plate(0.5, 0.4), (0.1, 0.05, 1.5), (0.1, 0.2, 0.0)),
+    "aside": thing(plate(2.0, 3.0), (1.4, 0.0, 2.0), (0.0, 1.3, 0.0)),
+    "before": thing(box(0.2), (-0.1, 0.1, 0.9), (0.3, 0.2, 0.1)),
+}
+
+
+def slope(moved: str, depth: int, seed: int) -> Tensor:
+    """Derivative of a map while one object moves obliquely and all others are at rest."""
+    with forward_ad.dual_level():
+        shift = forward_ad.make_dual(float64([0.0, 0.0, 0.0]), float64([1.0, 0.5, 0.3]))
+        item = OBJECTS[moved]
+        mesh = Mesh(item.mesh.vertices + shift, item.mesh.faces)
+        scene = Scene(OBJECTS | {moved: Object(mesh, item.material, item.pose)})
+        sampling = Sampling(depth=depth, samples=2000, boundary_samples=100_000)
+        out = deposit_power(scene, link(), GRID, sampling=sampling, seed=seed)
+        tangent = forward_ad.unpack_dual(out).tangent
+        assert tangent is not None
+        return tangent.double()
+
+
+@pytest.mark.parametrize("depth", [1, 2])
+@pytest.mark.parametrize("moved", list(OBJECTS))
+def test_only_shadows_that_cannot_move_are_left_out(moved, depth, monkeypatch):
+    """Whatever moves: also a wall on which things at rest cast shadows."""
+    seeds = range(4)
+    chosen = torch.stack([slope(moved, depth, seed) for seed in seeds])
+    monkeypatch.setattr(ray_scene, "Movers", lambda *_: None)
+    every = torch.stack([slope(moved, depth, seed) for seed in seeds])
+    gap = (chosen.mean(0) - every.mean(0)).abs().sum() / every.mean(0).abs().sum()
+    assert float(gap) < 0.02
+
+
+def drawn(scene: Scene, samples: int = 4000) -> tuple[Tensor, Tensor]:
+    """Per boundary sample, the object of its edge and of the triangle in its shadow."""
+    with tracing():
+        geometry = flatten(scene, WAVELENGTH)
+        rays = RayScene(geometry, link(), antennas_move=False)
+        sampler = EdgeSampler(rays, Inputs.of(rays), ("tx",), samples, 1)
+        points = sampler.draw(dr.arange(mi.UInt32, samples)).kept()
+        first, face = to_torch(mi.Int32(points.first)), to_torch(mi.Int32(points.face))
+        owner = geometry.topology.vertex_object
+        return owner[first.long()], geometry.face_object[face.long()]
+
+
+def test_samples_go_where_something_moves():
+    """Outlines of a wall and of a ball at rest take none of what a small ball in motion needs."""
+    place = float64([0.3, 0.0, 2.0]).requires_grad_()
+    matt = RoughDielectric(4.0)
+    scene = Scene(
+        {
+            "wall": thing(plate(4.0, 4.0), (0.0, 0.0, 3.0)),
+            "still": thing(sphere(0.3, 3), (-0.6, 0.0, 2.0)),
+            "moving": Object(sphere(0.05, 3), matt, rigid(translation=place)),
+        }
+    )
+    edges, _ = drawn(scene)
+    assert len(edges) > 3500
+    assert bool((edges == 2).all())
+
+
+def test_a_thing_at_rest_before_one_that_moves_is_sampled():
+    place = float64([0.0, 0.0, 2.0]).requires_grad_()
+    scene = Scene(
+        {
+            "moving": Object(plate(2.0, 2.0), RoughDielectric(4.0), rigid(translation=place)),
+            "still": thing(plate(0.3, 0.3), (0.1, 0.0, 1.0)),
+            "behind": thing(plate(6.0, 6.0), (0.0, 0.0, 4.0)),
+        }
+    )
+    edges, shadows = drawn(scene)
+    assert bool((edges == 1).any())
+    assert bool((shadows[edges == 1] == 0).all())
+    assert bool((shadows[edges == 0] == 2).all())
+    assert not bool((edges == 2).any())
+
+
+def reach(offset: Callable[[float], list[float]]) -> list[bool]:
+    """Whether an edge along y at a distance of one is asked for a ball in some places."""
+    found = []
+    for at in (0.0, 0.05, 0.15, 0.4):
+        place = float64(offset(at)).requires_grad_()
+        ball = Object(sphere(0.1, 2), RoughDielectric(4.0), rigid(translation=place))
+        scene = Scene({"edge": thing(plate(0.5, 0.5), (0.25, 0.0, 1.0)), "ball": ball})
+        with tracing():
+            rays = RayScene(flatten(scene, WAVELENGTH), link(), antennas_move=False)
+            assert rays.movers is not None
+            edge = dr.arange(mi.UInt32, 5)  # those of the plate
+            y0, y1 = rays.exact_ends(edge)
+            asked = to_torch(rays.movers.beyond(edge, mi.Point3f(0.0), y0, y1)).bool()
+            ends = rays.geometry.vertices.detach()[rays.topology.edges[:5]]
+            upright = (ends[..., 0].abs() < 1e-9).all(1)
+            assert int(upright.sum()) == 1
+            found.append(bool(asked[upright]))
+    return found
+
+
+def test_a_ball_is_asked_for_where_a_shadow_may_reach_it():
+    """Beside the sector of directions through an edge, beyond its end, and before it."""
+    assert reach(lambda at: [at, 0.0, 2.0]) == [True, True, False, False]
+    assert reach(lambda at: [0.0, 0.5 + at, 2.0]) == [True, True, False, False]
+    assert reach(lambda at: [0.0, 0.0, 1.0 - at]) == [True, True, False, False]
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_antennas_that_move_move_all_shadows(moves, monkeypatch):
+    asked = []
+
+    class Seen(ray_scene.Movers):
+        def __init__(self, *given):
+            super().__init__(*given)
+            asked.append(self)
+
+    monkeypatch.setattr(ray_scene, "Movers", Seen)
+    item = OBJECTS["screen"]
+    vertices = item.mesh.vertices.clone().requires_grad_()
+    scene = Scene(OBJECTS).replace("screen", mesh=Mesh(vertices, item.mesh.faces))
+    antennas = link()
+    antennas = replace(antennas, tx=antennas.tx.clone().requires_grad_(moves))
+    sampling = Sampling(depth=1, samples=2000, boundary_samples=2000)
+    deposit_power(scene, antennas, GRID, sampling=sampling, seed=1)
+    assert len(asked) == (not moves)
+
+
+def test_a_scene_of_which_nothing_or_all_moves_asks_nobody():
+    still = flatten(Scene(OBJECTS), WAVELENGTH)
+    with tracing():
+        for flags in ((False,) * 4, (True,) * 4):
+            rays = RayScene(replace(still, moving=flags), link(), antennas_move=False)
+            assert rays.movers is None
