@@ -20,6 +20,7 @@ from invertwin.channel.power.walk import Records, State, Walk
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.contacts import contacts_of
+from invertwin.channel.rays.coplanar import warn_of_coplanar
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.channel.rays.scene import RayScene
 from invertwin.channel.sampling import Sampling
@@ -90,6 +91,7 @@ class Trace:
         one_place = bool((link.tx == link.rx).all())
         self.fixed = replace(Inputs.of(self.rays, monostatic=one_place), coupling=coupling)
         self._walk = Walk(self.rays, self.fixed, seed)
+        warn_of_coplanar(self.rays)
         edges = sampling.boundary and sampling.contacts and sampling.boundary_samples
         self.contacts = contacts_of(self.rays) if edges else None
         if self.contacts is not None and len(self.contacts.first) and sampling.depth > 1:

@@ -61,6 +61,20 @@ def may_meet(geometry: Geometry) -> tuple[Bool[Tensor, "object object"], Tensor,
     Args:
         geometry: The scene.
     """
+    moving, deforming = (torch.tensor(flags) for flags in (geometry.moving, geometry.deforming))
+    pairs = (moving[:, None] | moving).fill_diagonal_(False) | torch.diag(deforming)
+    return shared_boxes(geometry, pairs)
+
+
+def shared_boxes(
+    geometry: Geometry, pairs: Bool[Tensor, "object object"]
+) -> tuple[Bool[Tensor, "object object"], Tensor, Tensor]:
+    """Those of some pairs of objects whose boxes overlap, and where, per object.
+
+    Args:
+        geometry: The scene.
+        pairs: Of objects.
+    """
     count = len(geometry.moving)
     owner = geometry.topology.vertex_object[:, None].expand(-1, 3)
     points = geometry.vertices.detach()
@@ -71,11 +85,9 @@ def may_meet(geometry: Geometry) -> tuple[Bool[Tensor, "object object"], Tensor,
     low, high = reduced
     margin = 1e-5 * (high - low).amax().clamp_min(1.0)
     low, high = low - margin, high + margin
-    moving, deforming = (torch.tensor(flags) for flags in (geometry.moving, geometry.deforming))
-    pairs = (moving[:, None] | moving).fill_diagonal_(False) | torch.diag(deforming)
     for axis in range(3):
         reaches = low[:, None, axis] <= high[:, axis]
-        pairs &= reaches & reaches.T
+        pairs = pairs & reaches & reaches.T
     first, second = pairs.nonzero(as_tuple=True)
     rows = first[:, None].expand(-1, 3)
     place = torch.full_like(low, torch.inf)

@@ -1,0 +1,150 @@
+"""Surfaces in one plane that are seen: which of them a ray meets is left to rounding."""
+
+import warnings
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from invertwin.channel.rays.contacts import shared_boxes
+from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.scene import NEAR, RayScene, visible
+from invertwin.errors import PhysicsWarning
+
+_PAIRS = 20_000  # of triangles in one plane that are compared, evenly chosen of more
+_PLACES = 64  # of a pair of objects that are looked at
+_LOOKS = 16  # radar poses that are asked
+_INSIDE = 1e-6  # least barycentric coordinate: what only touches does not overlap
+_ALIKE = 1e-3  # largest sine of the angle between planes that are one
+#: Barycentric coordinates of a triangle's middle, and of places just within corners and sides.
+_WITHIN = torch.tensor(
+    [
+        [1 / 3, 1 / 3, 1 / 3],
+        *([0.98 if k == j else 0.01 for k in range(3)] for j in range(3)),
+        *([0.02 if k == j else 0.49 for k in range(3)] for j in range(3)),
+    ],
+    dtype=torch.float64,
+)
+
+
+def warn_of_coplanar(rays: RayScene) -> None:
+    """Warn where an antenna sees two objects in one place, unless it makes no difference.
+
+    It makes none where both are at rest and of one material. What is hidden, as the underside of a
+    box that stands on a floor, is not seen.
+
+    Args:
+        rays: The scene and its antennas.
+    """
+    geometry = rays.geometry
+    pairs, low, high = shared_boxes(geometry, _matters(geometry))
+    if not bool(pairs.any()):
+        return
+    points = geometry.vertices.detach() - rays.origin
+    triangles, owner = points[geometry.faces], geometry.face_object
+    near = (triangles.amin(1) <= (high - rays.origin)[owner]) & (
+        triangles.amax(1) >= (low - rays.origin)[owner]
+    )
+    faces = near.all(1).nonzero()[:, 0]
+    first, second = _in_one_plane(triangles[faces])
+    first, second = faces[first], faces[second]
+    kept = pairs[owner[first], owner[second]]
+    first, second = first[kept], second[kept]
+    face, place, normal = _shared(triangles, first, second)
+    if not len(face):
+        return
+    couple = torch.stack([owner[first], owner[second]], 1).sort(1).values[face]
+    for one, other in couple.unique(dim=0).tolist():
+        here = ((couple[:, 0] == one) & (couple[:, 1] == other)).nonzero()[:, 0]
+        here = here[:: -(-len(here) // _PLACES)]
+        scene = 0 if geometry.object_scene is None else int(geometry.object_scene[one])
+        if _seen(rays, place[here], normal[here], scene):
+            names = [geometry.names[number] for number in (one, other)]
+            warnings.warn(
+                f"{names[0]} and {names[1]} lie in one plane, in a place that an antenna sees: "
+                "which of them a ray meets there is left to rounding, so that values and "
+                "derivatives mean nothing there; lift one of them off the other, or cut a hole",
+                PhysicsWarning,
+                stacklevel=2,
+            )
+
+
+def _matters(geometry: Geometry) -> Tensor:
+    """Pairs of objects of which one moves, or which differ in their material."""
+    count, owner = len(geometry.names), geometry.face_object
+    lowest, highest = (
+        torch.zeros(count, dtype=torch.int64).scatter_reduce(
+            0, owner, geometry.face_surface, how, include_self=False
+        )
+        for how in ("amin", "amax")
+    )
+    moving = torch.tensor(geometry.moving)
+    pairs = moving[:, None] | moving
+    pairs |= (lowest[:, None] != lowest) | (lowest != highest)[:, None] | (lowest != highest)
+    return pairs.fill_diagonal_(False)
+
+
+def _reach(places: Float64[Tensor, "*n 3"]) -> Float64[Tensor, "*n"]:
+    """How near surfaces are that rays take for one [m]."""
+    return NEAR * places.norm(dim=-1) + 1e-9
+
+
+def _in_one_plane(
+    triangles: Float64[Tensor, "n 3 3"],
+) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
+    """Pairs of triangles whose planes are as far from the origin, on the same side of it."""
+    normal = _unit_normal(triangles)
+    largest = normal.gather(1, normal.abs().argmax(1, keepdim=True))
+    away = (normal * triangles[:, 0]).sum(1) * largest[:, 0].sign()
+    away, order = away.sort()
+    most = _reach(triangles).max() if len(triangles) else 0.0
+    until = torch.searchsorted(away, away + most, right=True)
+    counts = until - torch.arange(len(away)) - 1
+    total, sums = int(counts.sum()), counts.cumsum(0)
+    chosen = torch.arange(0, total, max(1, -(-total // _PAIRS)))
+    first = torch.searchsorted(sums, chosen, right=True)
+    second = first + 1 + chosen - (sums - counts)[first]
+    return order[first], order[second]
+
+
+def _shared(
+    triangles: Float64[Tensor, "f 3 3"], first: Int64[Tensor, " n"], second: Int64[Tensor, " n"]
+) -> tuple[Int64[Tensor, " m"], Float64[Tensor, "m 3"], Float64[Tensor, "m 3"]]:
+    """Places that two triangles have in common: number of the pair, place and normal."""
+    parts = []
+    normals = [_unit_normal(triangles[face]) for face in (first, second)]
+    alike = torch.linalg.cross(*normals).norm(dim=1) < _ALIKE
+    for own, other, normal in ((first, second, normals[1]), (second, first, normals[0])):
+        places = (_WITHIN[:, :, None] * triangles[own][:, None]).sum(2)  # [n, 7, 3]
+        a, b, c = triangles[other][:, None].unbind(2)
+        height = ((places - a) * normal[:, None]).sum(2)
+        area = (torch.linalg.cross(b - a, c - a) * normal[:, None]).sum(2)
+        shares = [
+            (torch.linalg.cross(y - x, places - x) * normal[:, None]).sum(2) / area
+            for x, y in ((a, b), (b, c), (c, a))
+        ]
+        inside = torch.stack(shares).amin(0) > _INSIDE
+        pair, place = (inside & (height.abs() <= _reach(places)) & alike[:, None]).nonzero().T
+        parts.append((pair, places[pair, place], normal[pair]))
+    pair, place, normal = (torch.cat(column) for column in zip(*parts, strict=True))
+    return pair, place, normal
+
+
+def _seen(
+    rays: RayScene, place: Float64[Tensor, "n 3"], normal: Float64[Tensor, "n 3"], scene: int
+) -> bool:
+    """Whether an antenna sees any of some places past all surfaces but those in their plane."""
+    looks = scene * rays.looks + torch.arange(0, rays.looks, max(1, -(-rays.looks // _LOOKS)))
+    link = rays.link
+    antennas = torch.cat([link.tx.detach()[looks], link.rx.detach()[looks]]) - rays.origin
+    towards = torch.nn.functional.normalize(antennas[:, None] - place, dim=2)
+    tilt = (towards * normal).sum(2)
+    above = place + normal * (2 * tilt.sign() * _reach(place))[..., None]
+    ends = antennas[:, None].expand_as(above)
+    clear = tilt.abs() > _ALIKE
+    return bool(visible(rays, above[clear] + rays.origin, ends[clear] + rays.origin).any())
+
+
+def _unit_normal(triangles: Float64[Tensor, "n 3 3"]) -> Float64[Tensor, "n 3"]:
+    a, b, c = triangles.unbind(1)
+    return torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)

@@ -1,0 +1,117 @@
+"""Two objects in one place that is seen."""
+
+import math
+import warnings
+from collections.abc import Sequence
+
+import pytest
+import torch
+
+from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.coplanar import warn_of_coplanar
+from invertwin.channel.rays.geometry import flatten
+from invertwin.channel.rays.scene import RayScene
+from invertwin.errors import PhysicsWarning
+from invertwin.scene import Mesh, Object, RoughConductor, RoughDielectric, Scene, box, plate, rigid
+from scenes import WAVELENGTH, float64, link, thing
+
+METAL, PAINT = RoughConductor(scattering=1.0), RoughDielectric(4.0)
+FLAT = (math.pi / 2, 0.0, 0.0)  # a plate that lies
+
+
+def told(
+    *, antennas: Sequence[Sequence[float]] = ((0.0, 1.0, 0.0),), moving: str = "", **objects: Object
+) -> bool:
+    """Whether a scene gives a warning that names the first two objects."""
+    if moving:
+        item = objects[moving]
+        objects[moving] = Object(item.mesh, item.material, item.transform.clone().requires_grad_())
+    with tracing(), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        rays = RayScene(flatten(Scene(objects), WAVELENGTH), link(tuple(map(tuple, antennas))))
+        warn_of_coplanar(rays)
+    one, other = list(objects)[:2]
+    for warning in caught:
+        assert warning.category is PhysicsWarning
+        assert str(warning.message).startswith(f"{one} and {other} lie in one plane, in a place")
+    return bool(caught)
+
+
+def floor(divisions: int = 1) -> Object:
+    return thing(plate(4.0, 4.0, divisions=divisions), (0.0, 0.0, 2.0), FLAT, PAINT)
+
+
+def rug(height: float, divisions: int = 1, at: tuple[float, float] = (0.3, 2.1)) -> Object:
+    return thing(plate(0.6, 0.4, divisions=divisions), (at[0], height, at[1]), FLAT, METAL)
+
+
+@pytest.mark.parametrize("divisions", [(1, 1), (12, 1), (1, 12), (30, 25)])
+def test_a_rug_in_the_plane_of_the_floor_is_told(divisions):
+    pieces = floor(divisions[0])
+    assert told(floor=pieces, rug=rug(0.0, divisions[1]))
+    assert told(floor=pieces, rug=rug(1e-7, divisions[1]))
+    assert not told(floor=pieces, rug=rug(1e-4, divisions[1]))
+    assert not told(floor=pieces, rug=rug(0.0, divisions[1], at=(4.0, 2.1)))
+
+
+def test_whatever_the_plane_and_the_distance():
+    turn = (0.4, 0.3, 0.2)
+    for scale in (1.0, 300.0):
+        wall = thing(plate(2 * scale, 2 * scale), (0.0, 0.0, 2 * scale), turn, PAINT)
+        sign = thing(plate(0.5 * scale, 0.3 * scale), (0.0, 0.0, 2 * scale), turn, METAL)
+        assert told(wall=wall, sign=sign)
+        pose = sign.transform.clone()
+        pose[:3, 3] -= 1e-4 * scale * pose[:3, 2]
+        assert not told(wall=wall, sign=Object(sign.mesh, METAL, pose))
+
+
+def test_what_makes_no_difference_is_not_told():
+    """Both at rest and of one material; to move one of them makes a difference."""
+    same = Object(rug(0.0).mesh, PAINT, rug(0.0).pose)
+    assert not told(floor=floor(), rug=same)
+    assert told(floor=floor(), rug=same, moving="rug")
+    assert told(floor=floor(), rug=same, moving="floor")
+
+
+def test_what_is_hidden_is_not_told():
+    """The underside of a box on the floor, two boxes side by side, a rug under a box."""
+    chest = thing(box((0.5, 0.4, 0.5)), (0.0, 0.2, 2.0), material=METAL)
+    assert not told(floor=floor(), chest=chest, moving="chest")
+    # From below a ray meets either.
+    assert told(floor=floor(), chest=chest, antennas=[(0.0, -1.0, 0.0)])
+    next_one = thing(box((0.5, 0.4, 0.5)), (0.5, 0.2, 2.0), material=PAINT)
+    assert not told(chest=chest, next_one=next_one, moving="chest")
+    assert not told(floor=floor(), rug=rug(0.0, at=(0.0, 2.0)), chest=thing(
+        box((0.9, 0.4, 0.9)), (0.0, 0.21, 2.0), material=METAL
+    ))  # fmt: skip
+
+
+def test_any_antenna_that_sees_it_counts():
+    for places, seen in (([(0.0, 1.0, 0.0)], False), ([(0.0, 1.0, 0.0), (0.0, 1.0, 1.0)], True)):
+        screen = thing(plate(6.0, 6.0), (0.0, 0.0, 0.5))
+        pair = {"floor": floor(), "rug": rug(0.0, at=(0.0, 2.0))}
+        assert told(**pair, screen=screen, antennas=places) == seen  # pyright: ignore[reportArgumentType]
+
+
+def test_triangles_that_cross_like_a_star_overlap():
+    def triangle(material: RoughConductor | RoughDielectric, turned: float) -> Object:
+        angles = float64([0.0, 2.0, 4.0]) * math.pi / 3 + turned
+        corners = torch.stack([angles.cos(), angles.sin(), torch.full((3,), 2.0)], 1).double()
+        return Object(Mesh(corners, torch.tensor([[0, 1, 2]])), material)
+
+    assert told(one=triangle(PAINT, 0.0), other=triangle(METAL, math.pi / 3))
+
+
+def test_scenes_of_a_batch_are_told_by_their_own_antennas():
+    from invertwin.channel import Grid, Sampling
+    from invertwin.channel.power.deposit import deposit_batch
+
+    shift = rigid(translation=(0.1, 0.0, 0.0))
+    good, bad = (Scene({"floor": floor(), "rug": rug(h)}) for h in (0.01, 0.0))
+    moved = Scene(
+        {n: Object(o.mesh, o.material, shift @ o.transform) for n, o in good.objects.items()}
+    )
+    grid, sampling = Grid(0.5, 0.1, 40), Sampling(depth=1, samples=1000)
+    deposit_batch([good, moved], link(((0.0, 1.0, 0.0),)), grid, sampling=sampling, seed=1)
+    with pytest.warns(PhysicsWarning, match="floor of scene 1 and rug of scene 1 lie in one plane"):
+        deposit_batch([good, bad], link(((0.0, 1.0, 0.0),)), grid, sampling=sampling, seed=1)
