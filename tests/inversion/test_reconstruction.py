@@ -62,20 +62,22 @@ class InterruptError(Exception):
     """Stands for whatever ends a run."""
 
 
-@pytest.mark.parametrize("kind", ["mse", "likelihood"])
-def test_a_displaced_plate_is_found(case, kind):
+# Speckle of the one recording moves the minima by 19 and 11 mm, whatever the paths drawn.
+@pytest.mark.parametrize(("kind", "bound"), [("mse", 0.022), ("likelihood", 0.015)])
+def test_a_displaced_plate_is_found(case, kind, bound):
+    settings = case.settings(steps=60, grid=case.radar.grid(1.0, 2.4, 0.5, oversample=2))
     found = fit(
         case.scene,
         case.radar,
         case.capture,
         case.parameters(),
         loss=SpectrumLoss(kind=kind),
-        **case.settings(steps=60),
+        **settings,
     )
     assert found.status in ("budget", "converged")
     error = case.error(found.scene)
     assert float(case.error(case.scene).norm()) > 0.1
-    assert float(error[[0, 2]].norm()) < 0.02
+    assert float(error[[0, 2]].norm()) < bound
     assert len(found.history) == found.steps == 60
     assert set(found.history[0]) >= {"step", "loss", "values"}
     assert found.history[-1]["values"].keys() == {"plate.translation"}

@@ -1,6 +1,6 @@
 """Which shadows a derivative can move, in scenes of which a part stands still."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -8,9 +8,6 @@ from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_index
 from invertwin.channel.rays.backend import dr, mi
-
-if TYPE_CHECKING:
-    from invertwin.channel.rays.scene import RayScene
 
 _SLACK = 1e-4  # of a distance: far more than rounding
 
@@ -23,10 +20,10 @@ class Movers:
 
     Args:
         moving: Per object, whether it moves; some do.
-        rays: The scene.
+        rays: The ray scene whose kernels this is a part of.
     """
 
-    def __init__(self, moving: Bool[Tensor, " object"], rays: "RayScene") -> None:
+    def __init__(self, moving: Bool[Tensor, " object"], rays: Any) -> None:
         self._rays = rays
         self._moving = to_index(moving)
         self._numbers = to_index(torch.nonzero(moving)[:, 0])
