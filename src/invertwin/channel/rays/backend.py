@@ -25,6 +25,7 @@ alone = threading.RLock()
 class _ThisThread(threading.local):
     def __init__(self) -> None:
         self.chosen: list[str] = []  # backends, the innermost one last
+        self.traces = False
 
 
 _here = _ThisThread()
@@ -70,10 +71,17 @@ def _resolved(name: str) -> str:
 def use_backend(name: str | None) -> Iterator[None]:
     """Choose ``cpu``, ``cuda`` or ``auto`` inside a ``with`` block; ``None`` changes nothing."""
     _here.chosen.append(backend() if name is None else _resolved(name))
+    _turn()
     try:
         yield
     finally:
         _here.chosen.pop()
+        _turn()
+
+
+def _turn() -> None:
+    if _here.traces:
+        mi.turn(backend())
 
 
 @contextmanager
@@ -92,10 +100,18 @@ def tracing(name: str | None = None) -> Iterator[None]:
             "rays; start processes by multiprocessing.get_context('spawn')"
         )
     with alone, use_backend(name):
-        yield
-        # Side effects and kernels under way are the thread's own: others would not wait for them.
-        dr.eval()
-        dr.sync_thread()
+        outer = _here.traces
+        _here.traces = True
+        _turn()
+        try:
+            yield
+            # Side effects and kernels under way are the thread's own: others would not wait.
+            dr.eval()
+            dr.sync_thread()
+        finally:
+            _here.traces = outer
+            if not outer:
+                mi.turn(None)
 
 
 def _after_fork() -> None:
@@ -141,19 +157,29 @@ class _Mitsuba:
     """Mitsuba, set to the backend in force; imported when it is first used."""
 
     def __init__(self) -> None:
-        self._types: dict[tuple[str, str], type] = {}
+        self._types: dict[str, dict[str, type]] = {}
+
+    def turn(self, wanted: str | None) -> None:
+        """Know the types of one backend, or of none: where no one traces.
+
+        Args:
+            wanted: The backend.
+        """
+        types = self._types
+        self.__dict__.clear()
+        # Kernels ask for types a thousand times, so that those in force are plain attributes.
+        self.__dict__.update(types.get(wanted or "", {}), _types=types)
 
     def __getattr__(self, name: str) -> Any:
         wanted = backend()
-        if (wanted, name) in self._types:
-            return self._types[wanted, name]
         module = _loaded("mitsuba", wanted)
         if module.variant() != VARIANTS[wanted]:
             module.set_variant(VARIANTS[wanted])
         found = getattr(module, name)
-        # Types are those of one variant, whichever is set; kernels ask for them a thousand times.
-        if isinstance(found, type):
-            self._types[wanted, name] = found
+        # Types are those of one variant, whichever is set.
+        if isinstance(found, type) and _here.traces:
+            self._types.setdefault(wanted, {})[name] = found
+            setattr(self, name, found)
         return found
 
 
