@@ -3,7 +3,7 @@
 import warnings
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.rays.contacts import shared_boxes
@@ -37,9 +37,39 @@ def warn_of_coplanar(rays: RayScene) -> None:
         rays: The scene and its antennas.
     """
     geometry = rays.geometry
-    pairs, low, high = shared_boxes(geometry, _matters(geometry))
+    for one, other in sorted(_told(rays, _matters(geometry))):
+        warnings.warn(
+            f"{geometry.names[one]} and {geometry.names[other]} lie in one plane, in a place that "
+            "an antenna sees: which of them a ray meets there is left to rounding, so that values "
+            "and derivatives mean nothing there; lift one of them off the other, or cut a hole",
+            PhysicsWarning,
+            stacklevel=2,
+        )
+
+
+def _told(rays: RayScene, pairs: Bool[Tensor, "object object"]) -> set[tuple[int, int]]:
+    """Pairs of objects that lie in one place that is seen; what has not moved is known by now."""
+    topology, points = rays.topology, rays.geometry.vertices.detach()
+    antennas = torch.cat([rays.link.tx.detach(), rays.link.rx.detach()])
+    known, asked = set[tuple[int, int]](), pairs
+    if topology.looked is not None:
+        found, *before = topology.looked
+        if torch.equal(before[0], pairs) and torch.equal(before[1], antennas):
+            moved = torch.zeros(len(pairs), dtype=torch.bool)
+            moved[topology.vertex_object[(points != before[2]).any(1)]] = True
+            asked = pairs & (moved[:, None] | moved)
+            known = {(one, other) for one, other in found if not bool(asked[one, other])}
+    known |= _in_one_place(rays, asked) if bool(asked.any()) else set()
+    topology.looked = known, pairs, antennas, points
+    return known
+
+
+def _in_one_place(rays: RayScene, pairs: Bool[Tensor, "object object"]) -> set[tuple[int, int]]:
+    """Those of some pairs of objects that lie in one plane where an antenna sees it."""
+    geometry, told = rays.geometry, set[tuple[int, int]]()
+    pairs, low, high = shared_boxes(geometry, pairs)
     if not bool(pairs.any()):
-        return
+        return told
     points = geometry.vertices.detach() - rays.origin
     triangles, owner = points[geometry.faces], geometry.face_object
     near = (triangles.amin(1) <= (high - rays.origin)[owner]) & (
@@ -51,25 +81,17 @@ def warn_of_coplanar(rays: RayScene) -> None:
     kept = pairs[owner[first], owner[second]]
     first, second = first[kept], second[kept]
     face, place, normal = _shared(triangles, first, second)
-    if not len(face):
-        return
     couple = torch.stack([owner[first], owner[second]], 1).sort(1).values[face]
     for one, other in couple.unique(dim=0).tolist():
         here = ((couple[:, 0] == one) & (couple[:, 1] == other)).nonzero()[:, 0]
         here = here[:: -(-len(here) // _PLACES)]
         scene = 0 if geometry.object_scene is None else int(geometry.object_scene[one])
         if _seen(rays, place[here], normal[here], scene):
-            names = [geometry.names[number] for number in (one, other)]
-            warnings.warn(
-                f"{names[0]} and {names[1]} lie in one plane, in a place that an antenna sees: "
-                "which of them a ray meets there is left to rounding, so that values and "
-                "derivatives mean nothing there; lift one of them off the other, or cut a hole",
-                PhysicsWarning,
-                stacklevel=2,
-            )
+            told.add((one, other))
+    return told
 
 
-def _matters(geometry: Geometry) -> Tensor:
+def _matters(geometry: Geometry) -> Bool[Tensor, "object object"]:
     """Pairs of objects of which one moves, or which differ in their material."""
     count, owner = len(geometry.names), geometry.face_object
     lowest, highest = (

@@ -1,6 +1,7 @@
 """Scenes of a few triangles: rays are tested against each of them, and no tree is asked.
 
-A tree spends on a packet of rays as much as some dozens of tests that all lanes do alike.
+A tree spends on a packet of rays as much as some dozens of tests that all lanes do alike. Two
+triangles that make a parallelogram, as those of a box's side, are one test.
 """
 
 from typing import Any
@@ -9,36 +10,59 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.rays.arrays import opaque
+from invertwin.channel.rays.arrays import opaque, to_index
 from invertwin.channel.rays.backend import dr, mi
 
-#: Most triangles of such a scene: with 24 paths take three quarters of their time, from 40 on more.
+#: Most tests of such a scene: with 24 paths take three quarters of their time, from 40 on more.
 MOST = 24
+_SAME = 1e-9  # how near corners are that are one, of the largest coordinate
 
 
 class Few:
     """A few triangles, each known to all lanes.
 
-    Every triangle is a corner, its normal (of any length), and two vectors in its plane whose
-    products with a point, from the corner on, are the point's barycentric coordinates.
+    Every test has a corner, its normal (of any length), and two vectors in its plane whose products
+    with a point, from the corner on, are the point's coordinates along the two sides.
 
     Args:
         vertices: About the local origin [m].
-        faces: At least one triangle, at most ``MOST``.
+        faces: At least one triangle.
     """
 
+    @staticmethod
+    def of(vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]) -> "Few | None":
+        """None where there are too many of them.
+
+        Args:
+            vertices: About the local origin [m].
+            faces: At least one triangle.
+        """
+        if len(faces) > 2 * MOST:
+            return None
+        few = Few(vertices, faces)
+        return few if few.tests <= MOST else None
+
     def __init__(self, vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]) -> None:
-        p0, p1, p2 = (vertices[faces[:, k]] for k in range(3))
-        first, second = p1 - p0, p2 - p0
-        normal = torch.linalg.cross(first, second)
+        triangles = vertices[faces]
+        pairs = _parallelograms(triangles)
+        paired = {face for pair in pairs for face in (pair[0], pair[2])}
+        alone = [(face, 0, face, 0) for face in range(len(faces)) if face not in paired]
+        rows = torch.tensor([*pairs, *alone])
+        first, turn = rows[:, :1], rows[:, 1:2]
+        p0, p1, p2 = (triangles[first[:, 0], ((turn + k) % 3)[:, 0]] for k in range(3))
+        sides = p1 - p0, p2 - p0
+        normal = torch.linalg.cross(*sides)
         square = normal.square().sum(1, keepdim=True)
         along = (
-            torch.linalg.cross(second, normal) / square,
-            torch.linalg.cross(normal, first) / square,
+            torch.linalg.cross(sides[1], normal) / square,
+            torch.linalg.cross(normal, sides[0]) / square,
         )
         # A triangle without area is met by no ray: products with NaN are not in any interval.
-        rows = torch.stack([p0, normal, *along], dim=1)
-        self._triangles = [[_point(vector) for vector in row] for row in rows.tolist()]
+        numbers = torch.stack([p0, normal, *along], dim=1).tolist()
+        self._pairs, self.tests = len(pairs), len(rows)
+        self._patches = [[_point(vector) for vector in row] for row in numbers]
+        #: Of every test, for its near and its far half: the triangle, and which corner comes first.
+        self._halves = to_index(rows)
 
     def nearest(self, ray: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
         """The first triangle on a ray.
@@ -50,13 +74,26 @@ class Few:
         Returns:
             Whether there is one, its number, barycentric coordinates, and the distance.
         """
-        far, b1, b2 = mi.Float(ray.maxt), mi.Float(0.0), mi.Float(0.0)
-        face, valid = mi.UInt32(0), mi.Bool(False)
-        for number, triangle in enumerate(self._triangles):
-            along, u, v, met = _met(triangle, ray, far)
-            far, b1, b2 = dr.select(met, along, far), dr.select(met, u, b1), dr.select(met, v, b2)
-            face, valid = dr.select(met, number, face), valid | met
-        return valid & active, face, b1, b2, far
+        far, u, v = mi.Float(ray.maxt), mi.Float(0.0), mi.Float(0.0)
+        test, valid = mi.UInt32(0), mi.Bool(False)
+        for number in range(self.tests):
+            along, x, y, met = self._met(number, ray, far)
+            far, u, v = dr.select(met, along, far), dr.select(met, x, u), dr.select(met, y, v)
+            test, valid = dr.select(met, number, test), valid | met
+        valid &= active
+        beyond, rest = u + v > 1, 1 - u - v
+        half = dr.gather(mi.Vector2u, self._halves, 2 * test + dr.select(beyond, 1, 0), valid)
+        # Weights of the corners from the one that comes first.
+        weights = [
+            dr.select(beyond, other, own) for own, other in ((rest, -rest), (u, 1 - u), (v, 1 - v))
+        ]
+        b1, b2 = (
+            dr.select(
+                half.y == 0, weights[k], dr.select(half.y == 1, weights[k - 1], weights[k - 2])
+            )
+            for k in (1, 2)
+        )
+        return valid, half.x, b1, b2, far
 
     def blocked(self, ray: Any, active: Any) -> Any:
         """Whether any triangle is on a ray.
@@ -66,20 +103,44 @@ class Few:
             active: Lanes.
         """
         blocked = mi.Bool(False)
-        for triangle in self._triangles:
-            blocked |= _met(triangle, ray, ray.maxt)[3]
+        for number in range(self.tests):
+            blocked |= self._met(number, ray, ray.maxt)[3]
         return blocked & active
+
+    def _met(self, number: int, ray: Any, far: Any) -> tuple[Any, Any, Any, Any]:
+        """Distance and coordinates where a ray meets a plane, and whether that is within."""
+        corner, normal, first, second = self._patches[number]
+        origin = mi.Vector3f(ray.o - corner)
+        along = -dr.dot(normal, origin) / dr.dot(normal, ray.d)
+        place = dr.fma(ray.d, along, origin)
+        u, v = dr.dot(first, place), dr.dot(second, place)
+        within = (u <= 1) & (v <= 1) if number < self._pairs else u + v <= 1
+        return along, u, v, (along > 0) & (along < far) & (u >= 0) & (v >= 0) & within
 
 
 def _point(numbers: list[float]) -> Any:
     return mi.Vector3f(*(opaque(number, "Float") for number in numbers))
 
 
-def _met(triangle: list[Any], ray: Any, far: Any) -> tuple[Any, Any, Any, Any]:
-    """Distance and barycentric coordinates where a ray meets a triangle's plane, and if within."""
-    corner, normal, first, second = triangle
-    origin = mi.Vector3f(ray.o - corner)
-    along = -dr.dot(normal, origin) / dr.dot(normal, ray.d)
-    place = dr.fma(ray.d, along, origin)
-    u, v = dr.dot(first, place), dr.dot(second, place)
-    return along, u, v, (along > 0) & (along < far) & (u >= 0) & (v >= 0) & (u + v <= 1)
+def _parallelograms(triangles: Float64[Tensor, "n 3 3"]) -> list[tuple[int, int, int, int]]:
+    """Pairs of triangles that make one, no triangle twice.
+
+    Of both: its number, and which of its corners is opposite to the side that they have in common.
+    """
+    after, last = triangles.roll(-1, 1), triangles.roll(-2, 1)
+    opposite = after + last - triangles
+    most = _SAME * triangles.abs().max()
+
+    def alike(one: Tensor, other: Tensor) -> Tensor:
+        return (one.flatten(0, 1)[:, None] - other.flatten(0, 1)).abs().amax(2) <= most
+
+    found = alike(opposite, triangles) & alike(after, last) & alike(last, after)
+    solid = torch.linalg.cross(after - triangles, last - triangles).flatten(0, 1).abs().amax(1) > 0
+    found &= solid[:, None] & solid
+    taken, pairs = set[int](), []
+    for one, other in found.nonzero().tolist():
+        ends = one // 3, other // 3
+        if not taken.intersection(ends):
+            taken.update(ends)
+            pairs.append((ends[0], one % 3, ends[1], other % 3))
+    return pairs

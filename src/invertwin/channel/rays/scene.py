@@ -20,7 +20,7 @@ from invertwin.channel.rays.arrays import (
     to_torch,
 )
 from invertwin.channel.rays.backend import backend, dr, mi, tracing
-from invertwin.channel.rays.few import MOST, Few
+from invertwin.channel.rays.few import Few
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.channel.rays.movers import Movers
 from invertwin.channel.rays.spheres import Spheres
@@ -137,8 +137,8 @@ class RayScene(Occluders):
         origin = link.tx.detach().mean(dim=0)
         super().__init__(geometry.vertices, geometry.topology, origin)
         # A GPU walks trees in hardware.
-        if len(geometry.faces) <= MOST and backend() == "cpu":
-            self.few = Few(geometry.vertices.detach() - origin, geometry.faces)
+        if backend() == "cpu":
+            self.few = Few.of(geometry.vertices.detach() - origin, geometry.faces)
         self.geometry = geometry
         self.link = link
         self.vertices = to_points(self.local_vertices)

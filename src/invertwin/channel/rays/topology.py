@@ -36,6 +36,8 @@ class Topology:
         self.faces = faces
         self.face_object = face_object
         self.sound_face: int | None = None  # a triangle that was no sliver when last looked at
+        #: Objects in one place, when last looked at, and for which pairs, antennas and vertices.
+        self.looked: tuple[set[tuple[int, int]], Tensor, Tensor, Tensor] | None = None
         owner = torch.zeros(len(vertices), dtype=torch.int64)
         owner[faces.ravel()] = face_object.repeat_interleave(3)
         self.vertex_object = owner
