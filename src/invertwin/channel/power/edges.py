@@ -222,11 +222,11 @@ class EdgeSampler:
         entries = len(centres) * rays.looks * len(topology.edges)
         edge, _, receiver, origin = self._seen(dr.arange(mi.UInt32, entries))
         y0, y1 = rays.exact_ends(edge)
-        away = 0.5 * (y0 + y1) - mi.Vector3d(origin)
-        sides = _sides(rays, inputs, edge, away)
+        ends = [mi.Vector3d(y - mi.Vector3d(origin)) for y in (y0, y1)]
+        sides = _sides(rays, inputs, edge, 0.5 * (ends[0] + ends[1]))
         self.size = samples if entries else 0
         if self.size:
-            seen = mi.Float(dr.norm(y1 - y0) / dr.norm(away))
+            seen = mi.Float(dr.atan2(dr.norm(dr.cross(*ends)), dr.dot(*ends)))
             counts = sides.unlike
             if rays.movers is not None:
                 counts &= rays.movers.has_edge(edge) | rays.movers.beyond(edge, origin, y0, y1)
