@@ -76,7 +76,9 @@ def _in_one_place(rays: RayScene, pairs: Bool[Tensor, "object object"]) -> set[t
         triangles.amax(1) >= (low - rays.origin)[owner]
     )
     faces = near.all(1).nonzero()[:, 0]
-    first, second = _in_one_plane(triangles[faces])
+    if not len(faces):
+        return told
+    first, second = _in_one_plane(triangles[faces], owner[faces])
     first, second = faces[first], faces[second]
     kept = pairs[owner[first], owner[second]]
     first, second = first[kept], second[kept]
@@ -112,14 +114,16 @@ def _reach(places: Float64[Tensor, "*n 3"]) -> Float64[Tensor, "*n"]:
 
 
 def _in_one_plane(
-    triangles: Float64[Tensor, "n 3 3"],
+    triangles: Float64[Tensor, "n 3 3"], owner: Int64[Tensor, " n"]
 ) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
     """Pairs of triangles whose planes are as far from the origin, on the same side of it."""
     normal = _unit_normal(triangles)
     largest = normal.gather(1, normal.abs().argmax(1, keepdim=True))
     away = (normal * triangles[:, 0]).sum(1) * largest[:, 0].sign()
+    most = _reach(triangles).max()
     away, order = away.sort()
-    most = _reach(triangles).max() if len(triangles) else 0.0
+    near = _beside_another(away, owner[order], most)
+    away, order = away[near], order[near]
     until = torch.searchsorted(away, away + most, right=True)
     counts = until - torch.arange(len(away)) - 1
     total, sums = int(counts.sum()), counts.cumsum(0)
@@ -127,6 +131,20 @@ def _in_one_plane(
     first = torch.searchsorted(sums, chosen, right=True)
     second = first + 1 + chosen - (sums - counts)[first]
     return order[first], order[second]
+
+
+def _beside_another(
+    away: Float64[Tensor, " n"], owner: Int64[Tensor, " n"], most: Tensor
+) -> Bool[Tensor, " n"]:
+    """Which of some sorted numbers have one of another owner within reach."""
+    change = (owner[1:] != owner[:-1]).nonzero()[:, 0]  # the last number of every run
+    if not len(change):
+        return torch.zeros(len(away), dtype=torch.bool)
+    number = torch.arange(len(away))
+    run = torch.searchsorted(change, number)
+    after = (run < len(change)) & (away[change[run.clamp_max(len(change) - 1)] + 1] - away <= most)
+    before = (run > 0) & (away - away[change[(run - 1).clamp_min(0)]] <= most)
+    return after | before
 
 
 def _shared(
