@@ -65,7 +65,7 @@ def test_three_bounces_in_a_corner():
 @pytest.mark.slow
 def test_an_object_seen_by_way_of_a_wall():
     """All of its shadows are those that surfaces cast on each other."""
-    found = checked("nlos_edge", 2_000_000, 4_000_000, pairs=16)
+    found = checked("nlos_edge", 2_000_000, 16_000_000, pairs=16)
     assert found.difference_noise < 0.03
     assert found.full.relative_l1 < 0.06
     assert found.no_interior_edges is not None
