@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from invertwin.channel.paths import Grid, Link
-from invertwin.channel.rays.arrays import to_float, to_torch
+from invertwin.channel.rays.arrays import shared, to_float
 from invertwin.channel.rays.backend import backend, dr, mi
 
 # Bytes that copies of a map, one a thread, may take; beyond, additions are atomic.
@@ -103,7 +103,8 @@ class Layout:
         Args:
             strips: A flat Dr.Jit array, one or more of the shape ``strips``.
         """
-        parts = to_torch(strips).reshape(-1, *self.strips).sum(0)
+        parts = shared(strips).reshape(-1, *self.strips)
+        parts = parts[0] if len(parts) == 1 else parts.sum(0)
         total = parts[..., 2:, 0] + parts[..., 1:-1, 1] + parts[..., :-2, 2]
         return total.movedim(-1, self.fine + 1)
 

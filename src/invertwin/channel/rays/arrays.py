@@ -39,8 +39,8 @@ def _aligned(values: Tensor, kind: torch.dtype) -> np.ndarray:
     kernels of their own for it.
     """
     with _DisableFuncTorch():  # within `torch.func`, even new tensors are wrapped
-        flat = plain(values).cpu().ravel()
-        return torch.empty_like(flat, dtype=kind).copy_(flat).numpy()
+        given = plain(values).cpu()
+        return torch.empty(given.shape, dtype=kind).copy_(given).ravel().numpy()
 
 
 def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> Any:
@@ -68,6 +68,17 @@ def from_points(values: Any) -> Float32[Tensor, "n 3"]:
 def to_torch(values: Any) -> Tensor:
     """A torch tensor on the CPU of a flat Dr.Jit array."""
     return torch.from_numpy(np.array(values))
+
+
+def shared(values: Any) -> Tensor:
+    """The same as ``to_torch``, but in Dr.Jit's own memory where that is the CPU's: only to read.
+
+    Args:
+        values: A flat Dr.Jit array.
+    """
+    dr.eval(values)
+    dr.sync_thread()
+    return torch.from_dlpack(values).cpu()
 
 
 def opaque(value: float | int, kind: str = "UInt32") -> Any:
