@@ -9,7 +9,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from invertwin.channel import Sampling, deposit_power
-from invertwin.channel.power.edges import EdgeSampler
+from invertwin.channel.power.edges import EdgeSampler, InteriorEdgeSampler
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.rays import scene as ray_scene
 from invertwin.channel.rays.arrays import to_torch
@@ -150,3 +150,60 @@ def test_a_scene_of_which_nothing_or_all_moves_asks_nobody():
         for flags in ((False,) * 4, (True,) * 4):
             rays = RayScene(replace(still, moving=flags), link(), antennas_move=False)
             assert rays.movers is None
+
+
+@pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (0.5, 0.0, 2.05)])
+def test_lines_towards_what_moves_are_as_likely_as_said(at):
+    """From afar, and from within one of the spheres."""
+    matt, count = RoughDielectric(4.0), 4_000_000
+    balls = {
+        f"ball {k}": Object(sphere(size, 2), matt, rigid(translation=place.requires_grad_()))
+        for k, (size, place) in enumerate(
+            [(0.3, float64([0.5, 0.0, 2.0])), (0.5, float64([-0.2, 0.1, 1.5]))]
+        )
+    }
+    scene = Scene({"wall": thing(plate(4.0, 4.0), (0.0, 0.0, 3.0)), **balls})
+    with tracing():
+        movers = RayScene(flatten(scene, WAVELENGTH), link(), antennas_move=False).movers
+        assert movers is not None
+        sampler = mi.PCG32(count)
+        place = mi.Point3f(*at)
+        every = mi.warp.square_to_uniform_sphere(
+            mi.Point2f(sampler.next_float32(), sampler.next_float32())
+        )
+        evenly = to_torch(movers.line_density(place, mi.Vector3f(every))).double()
+        drawn = movers.line(place, [sampler.next_float32() for _ in range(3)])
+        aimed = to_torch(movers.line_density(place, drawn)).double()
+    sphere_area = 4 * torch.pi
+    assert float(evenly.mean()) * sphere_area == pytest.approx(1.0, rel=0.02)
+    assert float(aimed.min()) > 0
+    # Both say how much of the sphere such lines fill, and the mean square of the density.
+    filled = float((evenly > 0).double().mean()) * sphere_area
+    assert float((1 / aimed).mean()) == pytest.approx(filled, rel=0.02)
+    square = float(evenly.square().mean()) * sphere_area
+    assert float(aimed.mean()) == pytest.approx(square, rel=0.02)
+
+
+def test_shadows_of_things_at_rest_on_what_moves_are_found_more_often(monkeypatch):
+    """A small ball behind a screen's edge, which only a wall shows: fewer samples are void."""
+
+    def kept() -> int:
+        place = float64([0.25, 0.0, 1.35]).requires_grad_()
+        scene = Scene(
+            {
+                "wall": thing(plate(2.0, 1.2), (-1.0, 0.0, 1.4), (0.0, -1.57, 0.0)),
+                "screen": thing(plate(1.0, 1.2), (0.3, 0.0, 1.0)),
+                "ball": Object(sphere(0.05, 2), RoughDielectric(4.0), rigid(translation=place)),
+            }
+        )
+        with tracing():
+            geometry = flatten(scene, WAVELENGTH)
+            rays = RayScene(geometry, link(), antennas_move=False)
+            sampler = InteriorEdgeSampler(rays, Inputs.of(rays), 100_000, 1)
+            points = sampler.draw(dr.arange(mi.UInt32, sampler.size)).kept().edge
+            owner = geometry.topology.vertex_object[to_torch(mi.Int32(points.first)).long()]
+            return int((owner != 2).sum())
+
+    aimed = kept()
+    monkeypatch.setattr(InteriorEdgeSampler, "_aimed", lambda *given: given[-2:])
+    assert aimed > 3 * kept() > 0

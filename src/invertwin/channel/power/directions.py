@@ -14,6 +14,7 @@ from invertwin.channel.power.surface import Surfaces, gaussian, single_row
 from invertwin.channel.rays.arrays import to_float
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.spheres import in_cap
 from invertwin.scene import Surface
 
 _TOWARDS = 0.5  # share of the directions that aim at other objects, where there are some
@@ -86,7 +87,7 @@ class Directions:
                 taken = towards & outside & (aimed == _ANY)
                 axis, height = dr.select(taken, direction, axis), dr.select(taken, cap, height)
                 aimed = dr.select(taken, place, aimed)
-            omega = dr.select(aimed != _ANY, _in_cap(axis, height, numbers[2:4]), omega)
+            omega = dr.select(aimed != _ANY, in_cap(axis, height, numbers[2:4]), omega)
             group = dr.select(towards, drawn, _ANY)
         density = self._density(point, back, facing, omega)
         if self.surfaces.bodies:
@@ -135,7 +136,7 @@ class Directions:
             fall = dr.log(dr.maximum(1 - numbers[2], 1e-9)) / (exponent + 1)
             series = -fall * (1 + fall * (1 / 2 + fall / 6))  # a narrow lobe keeps its digits
             height = 2 * dr.select(fall > -0.01, series, 1 - dr.exp(fall))
-            lobe = _in_cap(axis, height, [mi.Float(1.0), numbers[3]])
+            lobe = in_cap(axis, height, [mi.Float(1.0), numbers[3]])
             share = self._share(point, number + 1)
             chosen = (numbers[0] >= limit) & (numbers[0] < limit + share)
             omega = dr.select(chosen, lobe, omega)
@@ -189,14 +190,6 @@ class Directions:
         if self._only is not None:
             return mi.Float(self._only[number])  # a copy, which callers may add to
         return dr.gather(mi.Float, self.shares, point.surface * self.width + number)
-
-
-def _in_cap(axis: Any, height: Any, numbers: list[Any]) -> Any:
-    """Uniform on the spherical cap of a height 1 − cos about an axis."""
-    depth = numbers[0] * height
-    sine = dr.sqrt(dr.maximum(depth * (2 - depth), 0.0))
-    s, c = dr.sincos(2 * dr.pi * numbers[1])
-    return dr.normalize(mi.Frame3f(axis).to_world(mi.Vector3f(c * sine, s * sine, 1 - depth)))
 
 
 def _shares(surfaces: Surface) -> torch.Tensor:

@@ -16,6 +16,7 @@ from invertwin.channel.power.passage import Hit, land, passage
 from invertwin.channel.rays.arrays import between, point_at, scrambled, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.contacts import IN_PLANE
+from invertwin.channel.rays.movers import Movers
 from invertwin.channel.rays.scene import NEAR, RayScene
 
 _GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
@@ -334,6 +335,7 @@ class InteriorEdgeSampler:
             self.choice = Proportional(by_scene(rays, rays.edge_scene(edge), weight))
         self.seeds = scrambled(seed, 4), scrambled(seed, 5)
         self.dice = scrambled(seed, 10), scrambled(seed, 11)
+        self.aims = scrambled(seed, 12), scrambled(seed, 13)
 
     def _opening(self, edge: Any, y0: Any, y1: Any) -> tuple[Any, Any]:
         """Start and span of the tangential directions' azimuth about the edge, up to sign.
@@ -385,10 +387,12 @@ class InteriorEdgeSampler:
         frame = rays.edge_scene(edge) * rays.looks + look
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0, y1 = rays.exact_ends(edge)
+        place = y0 + (y1 - y0) * mi.Float64(along)
         omega, density = self._direction(index, edge, y0, y1)
+        if self.weighted and rays.movers is not None and rays.scenes == 1:
+            omega, density = self._aimed(rays.movers, index, edge, place, omega, density)
         exact = mi.Vector3d(omega)
         sides = _sides(rays, self.inputs, edge, exact)
-        place = y0 + (y1 - y0) * mi.Float64(along)
         aside = _BESIDE * (dr.norm(place) + dr.norm(y1 - y0))
         y, beside = mi.Point3f(place), mi.Point3f(place + sides.outwards * aside)
         valid = (pmf > 0) & sides.unlike
@@ -424,6 +428,17 @@ class InteriorEdgeSampler:
             covered=sides.covered, covered_extra=sides.covered_extra,
         )  # fmt: skip
         return Drawn(valid, (points, Behind(behind.face, b1, b2)), TwoSided)
+
+    def _aimed(
+        self, movers: Movers, index: Any, edge: Any, place: Any, omega: Any, density: Any
+    ) -> tuple[Any, Any]:
+        """Half of the directions through edges at rest go where something moves."""
+        still = ~movers.has_edge(edge)
+        (coin, first), (second, third) = (uniform_pair(index, seed) for seed in self.aims)
+        at = mi.Point3f(place)
+        line = movers.line(at, [first, second, third])
+        omega = dr.select(still & (coin < 0.5), line, omega)
+        return omega, dr.select(still, 0.5 * (density + movers.line_density(at, omega)), density)
 
     def _direction(self, index: Any, edge: Any, y0: Any, y1: Any) -> tuple[Any, Any]:
         """A tangential direction and its probability per solid angle."""

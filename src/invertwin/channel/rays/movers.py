@@ -8,6 +8,7 @@ from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_index
 from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.spheres import in_cap
 
 _SLACK = 1e-4  # of a distance: far more than rounding
 
@@ -56,6 +57,45 @@ class Movers:
         """
         return self.has(dr.gather(mi.UInt32, self._rays.topology.device_edge_object, edge))
 
+    def line(self, place: Any, numbers: list[Any]) -> Any:
+        """A direction on whose line, ahead or behind, the sphere of an object that moves lies.
+
+        Args:
+            place: From where.
+            numbers: Three uniform numbers.
+        """
+        spheres, turn = self._rays.spheres, 2 * numbers[0]
+        sign = dr.select(turn < 1, 1.0, -1.0)
+        rest = (turn - dr.select(turn < 1, 0.0, 1.0)) * self._count
+        owner = dr.gather(mi.UInt32, self._numbers, dr.minimum(mi.UInt32(rest), self._count - 1))
+        axis, height, _ = spheres.cap(spheres.place(owner), place)
+        return sign * in_cap(axis, height, numbers[1:])
+
+    def line_density(self, place: Any, direction: Any) -> Any:
+        """Probability per solid angle of such directions.
+
+        Args:
+            place: From where.
+            direction: Unit vectors.
+        """
+        rays = self._rays
+
+        def step(number: Any, total: Any) -> tuple[Any, Any]:
+            owner = dr.gather(mi.UInt32, self._numbers, number)
+            axis, height, _ = rays.spheres.cap(rays.spheres.place(owner), place)
+            along, share = dr.dot(axis, direction), 1 / (4 * dr.pi * height)
+            for cosine in (along, -along):
+                total = total + dr.select(cosine >= 1 - height, share, 0.0)
+            return number + 1, total
+
+        lanes = dr.width(direction)
+        state = rays.loop(
+            (dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes)),
+            lambda number, _: number < self._count,
+            step,
+        )
+        return state[1] / mi.Float(self._count)
+
     def beyond(self, edge: Any, origin: Any, y0: Any, y1: Any) -> Any:
         """Whether shadows of edges may fall on an object that moves: its sphere is asked.
 
@@ -78,7 +118,7 @@ class Movers:
 
         def step(number: Any, found: Any) -> tuple[Any, Any]:
             owner = dr.gather(mi.UInt32, self._numbers, number)
-            sphere = spheres.around(owner)
+            sphere = dr.gather(mi.Vector4f, spheres.table, spheres.place(owner))
             centre, radius = sphere.xyz - origin, sphere.w
             # Within the sector of directions through the edge, or beside one of its rims.
             height = dr.dot(centre, normal)

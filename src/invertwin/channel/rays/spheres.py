@@ -103,13 +103,13 @@ class Spheres:
             return dr.minimum(self.size, self.count - group * self.size)
         return dr.gather(mi.UInt32, self._scenes["members"], group)
 
-    def around(self, number: Any) -> Any:
-        """Centre and radius of the spheres of objects.
+    def place(self, number: Any) -> Any:
+        """Places of objects in the table.
 
         Args:
             number: Of the objects, as the scene numbers them.
         """
-        return dr.gather(mi.Vector4f, self.table, dr.gather(mi.UInt32, self._place, number))
+        return dr.gather(mi.UInt32, self._place, number)
 
     def cap(self, place: Any, point: Any) -> tuple[Any, Any, Any]:
         """Axis and height 1 − cos of the cap of directions in which an object lies.
@@ -175,6 +175,20 @@ class Spheres:
         none = dr.zeros(mi.Float, lanes)
         state = rays.loop((start, none, none), lambda place, *_: place < end, step)
         return state[1], state[2]
+
+
+def in_cap(axis: Any, height: Any, numbers: list[Any]) -> Any:
+    """Uniform on the spherical cap of a height 1 − cos about an axis.
+
+    Args:
+        axis: Unit vector.
+        height: Of the cap, at most 2.
+        numbers: Two uniform numbers.
+    """
+    depth = numbers[0] * height
+    sine = dr.sqrt(dr.maximum(depth * (2 - depth), 0.0))
+    s, c = dr.sincos(2 * dr.pi * numbers[1])
+    return dr.normalize(mi.Frame3f(axis).to_world(mi.Vector3f(c * sine, s * sine, 1 - depth)))
 
 
 def _height(sine: Any) -> Any:
