@@ -15,6 +15,7 @@ from invertwin.channel.rays import scene as ray_scene
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
 from invertwin.channel.rays.geometry import flatten
+from invertwin.channel.rays.movers import NO_PLACE
 from invertwin.channel.rays.scene import RayScene
 from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, rigid, sphere
 from scenes import GRID, WAVELENGTH, float64, link, thing
@@ -171,9 +172,9 @@ def test_lines_towards_what_moves_are_as_likely_as_said(at):
         every = mi.warp.square_to_uniform_sphere(
             mi.Point2f(sampler.next_float32(), sampler.next_float32())
         )
-        evenly = to_torch(movers.line_density(place, mi.Vector3f(every))).double()
-        drawn = movers.line(place, [sampler.next_float32() for _ in range(3)])
-        aimed = to_torch(movers.line_density(place, drawn)).double()
+        evenly = to_torch(movers.line_density(place, mi.Vector3f(every), NO_PLACE)).double()
+        drawn, ball = movers.towards(place, [sampler.next_float32() for _ in range(3)])
+        aimed = to_torch(movers.line_density(place, drawn, ball)).double()
     sphere_area = 4 * torch.pi
     assert float(evenly.mean()) * sphere_area == pytest.approx(1.0, rel=0.02)
     assert float(aimed.min()) > 0
@@ -207,3 +208,18 @@ def test_shadows_of_things_at_rest_on_what_moves_are_found_more_often(monkeypatc
     aimed = kept()
     monkeypatch.setattr(InteriorEdgeSampler, "_aimed", lambda *given: given[-2:])
     assert aimed > 3 * kept() > 0
+
+
+def test_directions_to_something_small_and_far_are_as_likely_as_said():
+    """A ball of 5 cm at 200 m, whose cap is lower than a float32 near one resolves."""
+    place = float64([0.0, 0.0, 200.0]).requires_grad_()
+    ball = Object(sphere(0.05, 2), RoughDielectric(4.0), rigid(translation=place))
+    scene = Scene({"wall": thing(plate(4.0, 4.0), (0.0, 0.0, 3.0)), "ball": ball})
+    with tracing():
+        movers = RayScene(flatten(scene, WAVELENGTH), link(), antennas_move=False).movers
+        assert movers is not None
+        sampler, at = mi.PCG32(10_000), mi.Point3f(0.0)
+        drawn, aimed = movers.towards(at, [sampler.next_float32() for _ in range(3)])
+        density = to_torch(movers.line_density(at, drawn, aimed)).double()
+    area = torch.pi * (0.05 / 200) ** 2
+    assert float((density * 2 * area - 1).abs().max()) < 0.01

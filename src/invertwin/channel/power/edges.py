@@ -16,7 +16,7 @@ from invertwin.channel.power.passage import Hit, land, passage
 from invertwin.channel.rays.arrays import between, point_at, scrambled, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.contacts import IN_PLANE
-from invertwin.channel.rays.movers import Movers
+from invertwin.channel.rays.movers import NO_PLACE, Movers
 from invertwin.channel.rays.scene import NEAR, RayScene
 
 _GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
@@ -435,10 +435,12 @@ class InteriorEdgeSampler:
         """Half of the directions through edges at rest go where something moves."""
         still = ~movers.has_edge(edge)
         (coin, first), (second, third) = (uniform_pair(index, seed) for seed in self.aims)
+        chosen, turned = still & (coin < 0.5), coin < 0.25
         at = mi.Point3f(place)
-        line = movers.line(at, [first, second, third])
-        omega = dr.select(still & (coin < 0.5), line, omega)
-        return omega, dr.select(still, 0.5 * (density + movers.line_density(at, omega)), density)
+        towards, aimed = movers.towards(at, [first, second, third])
+        line, aimed = dr.select(chosen, towards, omega), dr.select(chosen, aimed, NO_PLACE)
+        mixed = 0.5 * (density + movers.line_density(at, line, aimed))
+        return dr.select(chosen & turned, -line, line), dr.select(still, mixed, density)
 
     def _direction(self, index: Any, edge: Any, y0: Any, y1: Any) -> tuple[Any, Any]:
         """A tangential direction and its probability per solid angle."""

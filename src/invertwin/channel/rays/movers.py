@@ -10,6 +10,7 @@ from invertwin.channel.rays.arrays import opaque, to_index
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.spheres import in_cap
 
+NO_PLACE = 0xFFFFFFFF  # no place in a table
 _SLACK = 1e-4  # of a distance: far more than rounding
 
 
@@ -57,36 +58,35 @@ class Movers:
         """
         return self.has(dr.gather(mi.UInt32, self._rays.topology.device_edge_object, edge))
 
-    def line(self, place: Any, numbers: list[Any]) -> Any:
-        """A direction on whose line, ahead or behind, the sphere of an object that moves lies.
+    def towards(self, place: Any, numbers: list[Any]) -> tuple[Any, Any]:
+        """A direction to the sphere of an object that moves, and the object's place in the table.
 
         Args:
             place: From where.
             numbers: Three uniform numbers.
         """
-        spheres, turn = self._rays.spheres, 2 * numbers[0]
-        sign = dr.select(turn < 1, 1.0, -1.0)
-        rest = (turn - dr.select(turn < 1, 0.0, 1.0)) * self._count
-        owner = dr.gather(mi.UInt32, self._numbers, dr.minimum(mi.UInt32(rest), self._count - 1))
-        axis, height, _ = spheres.cap(spheres.place(owner), place)
-        return sign * in_cap(axis, height, numbers[1:])
+        spheres = self._rays.spheres
+        number = dr.minimum(mi.UInt32(numbers[0] * self._count), self._count - 1)
+        aimed = spheres.place(dr.gather(mi.UInt32, self._numbers, number))
+        axis, height, _ = spheres.cap(aimed, place)
+        return in_cap(axis, height, numbers[1:]), aimed
 
-    def line_density(self, place: Any, direction: Any) -> Any:
-        """Probability per solid angle of such directions.
+    def line_density(self, place: Any, direction: Any, aimed: Any) -> Any:
+        """Probability per solid angle of such directions, of which half are turned round.
 
         Args:
             place: From where.
             direction: Unit vectors.
+            aimed: What ``towards`` drew them for; any other number where it did not.
         """
-        rays = self._rays
+        rays, spheres = self._rays, self._rays.spheres
 
         def step(number: Any, total: Any) -> tuple[Any, Any]:
-            owner = dr.gather(mi.UInt32, self._numbers, number)
-            axis, height, _ = rays.spheres.cap(rays.spheres.place(owner), place)
-            along, share = dr.dot(axis, direction), 1 / (4 * dr.pi * height)
-            for cosine in (along, -along):
-                total = total + dr.select(cosine >= 1 - height, share, 0.0)
-            return number + 1, total
+            at = spheres.place(dr.gather(mi.UInt32, self._numbers, number))
+            ahead, within = spheres.share(at, place, direction, aimed)
+            behind, _ = spheres.share(at, place, -direction, NO_PLACE)
+            found = dr.select(within, 1 / (4 * dr.pi), 0.5 * (ahead + behind))
+            return number + 1, total + found
 
         lanes = dr.width(direction)
         state = rays.loop(

@@ -140,6 +140,28 @@ class Spheres:
         owner = dr.gather(mi.UInt32, self._owner, face, active)
         return dr.gather(mi.UInt32, self._group, owner, active)
 
+    def share(self, place: Any, point: Any, direction: Any, aimed: Any) -> tuple[Any, Any]:
+        """One over the solid angle of an object's cap, if that holds a direction, else 0.
+
+        Args:
+            place: Of the object in the table.
+            point: From where it is seen.
+            direction: Unit vector.
+            aimed: Place of the object that the direction was drawn for, whose cap holds it.
+
+        Returns:
+            This, and whether the point is inside of the sphere, which then has no cap.
+        """
+        sphere = dr.gather(mi.Vector4f, self.table, place)
+        offset = sphere.xyz - point
+        # The distance of the line from the centre, without a difference of squares.
+        beside = dr.squared_norm(dr.cross(offset, direction))
+        square, far = dr.square(sphere.w), dr.squared_norm(offset)
+        within, there = far <= square, sphere.w > 0
+        met = (place == aimed) | ((dr.dot(offset, direction) > 0) & (beside <= square))
+        share = 1 / (2 * dr.pi * _height(sphere.w * dr.rsqrt(far)))
+        return dr.select(there & met & ~within, share, 0.0), there & within
+
     def density(
         self, rays: Any, group: Any, point: Any, direction: Any, active: Any, aimed: Any
     ) -> tuple[Any, Any]:
@@ -161,16 +183,8 @@ class Spheres:
         end = dr.select(active, start + self._size, 0)
 
         def step(place: Any, total: Any, inside: Any) -> tuple[Any, Any, Any]:
-            sphere = dr.gather(mi.Vector4f, self.table, place)
-            offset = sphere.xyz - point
-            # The distance of the line from the centre, without a difference of squares.
-            beside = dr.squared_norm(dr.cross(offset, direction))
-            square, far = dr.square(sphere.w), dr.squared_norm(offset)
-            within, there = far <= square, sphere.w > 0
-            met = (place == aimed) | ((dr.dot(offset, direction) > 0) & (beside <= square))
-            share = 1 / (2 * dr.pi * _height(sphere.w * dr.rsqrt(far)))
-            total = total + dr.select(there & met & ~within, share, 0.0)
-            return place + 1, total, inside + dr.select(there & within, 1.0, 0.0)
+            share, within = self.share(place, point, direction, aimed)
+            return place + 1, total + share, inside + dr.select(within, 1.0, 0.0)
 
         none = dr.zeros(mi.Float, lanes)
         state = rays.loop((start, none, none), lambda place, *_: place < end, step)
