@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from invertwin.channel import Sampling
+from invertwin.forward_model import ForwardModel
 from invertwin.inversion import SpectrumLoss
-from invertwin.models import ForwardModel
 from invertwin.scene import Scene, sphere
 from scenes import thing
 

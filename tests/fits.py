@@ -6,6 +6,7 @@ from typing import Any
 
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
+from invertwin.forward_model import ForwardModel
 from invertwin.inversion import (
     Checkpoint,
     Observation,
@@ -16,7 +17,7 @@ from invertwin.inversion import (
     reconstruct,
 )
 from invertwin.inversion.fit import Callback
-from invertwin.models import ExactMap, ForwardModel, SurrogateMap
+from invertwin.models import ExactMap, SurrogateMap
 from invertwin.radar import Radar, Surrogate
 from invertwin.scene import Scene
 

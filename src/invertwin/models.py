@@ -6,7 +6,6 @@ recording to a map of the same shape; a loss compares the two. A model of one's 
 """
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Literal
@@ -31,7 +30,9 @@ from invertwin.channel import (
     trace_target,
     without_echoes,
 )
+from invertwin.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
 from invertwin.limits import Positive
 from invertwin.links.metasurface import Metasurface, panel_response
 from invertwin.links.places import Places
@@ -51,120 +52,10 @@ from invertwin.radar.surrogate import (
     surrogate_spectrum,
 )
 from invertwin.radar.waveform import SampledWaveform
-from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derived_seed
 from invertwin.signatures import Signature
 from invertwin.simulation import simulate
-
-
-class ForwardModel(ABC):
-    """What a sensor would show of a scene.
-
-    Attributes:
-        redraws: Whether a fit gives the model another seed at every step. False for a model
-            whose random numbers belong to the scene.
-        smooth: Whether the derivative of the mean is the mean of derivatives, visibility
-            included. Gauss–Newton and gradient checks need that.
-        random: Whether maps depend on the seed. Of a model whose maps do not, gradient checks take
-            one derivative and one pair of differences.
-        fields: Whether maps hold parts of fields, of either sign, not power.
-    """
-
-    redraws: ClassVar[bool] = True
-    smooth: ClassVar[bool] = True
-    random: ClassVar[bool] = True
-    fields: ClassVar[bool] = False
-
-    @abstractmethod
-    def predict(self, scene: Scene, sensor: Any, seed: int) -> Float[Tensor, "frame *map"]:
-        """The map that the sensor would show.
-
-        Args:
-            scene: What is seen.
-            sensor: What sees it, with its poses.
-            seed: Same seed, same map.
-        """
-
-    @abstractmethod
-    def observe(self, recording: Any) -> Float[Tensor, "frame *map"]:
-        """A recording as a map of the same form."""
-
-    def prepared(self, scene: Scene, sensor: Any, seed: int) -> "ForwardModel":
-        """The model with everything drawn that stays the same during a fit.
-
-        Args:
-            scene: The scene at the start of the fit.
-            sensor: What sees it.
-            seed: Of what is drawn.
-        """
-        return self
-
-    def for_differences(
-        self, scene: Scene, sensor: Any, samples: int, scheme: Literal["rays", "area"]
-    ) -> "ForwardModel":
-        """The model with common random numbers for scenes that differ a little.
-
-        Args:
-            scene: The scene at the middle of the difference.
-            sensor: The sensor there.
-            samples: Samples of one map.
-            scheme: "rays" or "area": how surfaces are sampled.
-        """
-        return self
-
-    def looks(self, scene: Scene, sensor: Any, seed: int) -> Callable[[int, float], Tensor] | None:
-        """What the sensor might have recorded of a scene: other speckle and noise each time.
-
-        The error bars of a fit and the test of its goodness draw from it.
-
-        Args:
-            scene: What is seen.
-            sensor: What sees it.
-            seed: Of the points on rough surfaces.
-
-        Returns:
-            A function of a seed and of the mean noise in a bin, of ``fields`` its mean square, that
-            returns a map, as ``observe`` would show it. None where the model cannot say.
-        """
-        return None
-
-    def sampled_by(self, **changes: Any) -> "ForwardModel":
-        """The model with other fields of its ``sampling``, where it has one."""
-        return replace(self, sampling=replace(self.sampling, **changes))  # type: ignore
-
-    def ablations(self) -> "dict[str, ForwardModel]":
-        """Models whose derivatives leave something out, by the field that says so.
-
-        Gradient checks compare with them: ``boundary``, ``interior_edges``, ``contacts``.
-        """
-        sampling = getattr(self, "sampling", None)
-        if sampling is None or not sampling.boundary:
-            return {}
-        fields = ["boundary"]
-        fields += ["interior_edges"] if sampling.depth > 1 else []
-        fields += ["contacts"] if sampling.contacts else []
-        return {name: self.sampled_by(**{name: False}) for name in fields}
-
-    @property
-    def widened(self) -> bool:
-        """Whether the model has extra widths."""
-        return False
-
-    def narrowed(self, share: float) -> "ForwardModel":
-        """The model with this share of its extra widths; 0 takes them away."""
-        return self
-
-    def blurred(self, observed: Tensor, sensor: Any) -> Tensor:
-        """An observed map with the model's extra widths, of plain torch: no rays are traced here.
-
-        A fit calls it in a thread of its own, while it predicts.
-
-        Args:
-            observed: From ``observe``.
-            sensor: What recorded it.
-        """
-        return observed
 
 
 @dataclass(frozen=True)

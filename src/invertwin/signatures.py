@@ -14,11 +14,11 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import differentiated, trace_signature
+from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.scene import Scene
-from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.scene.polarisation import jones_basis
 
 _AT_ONCE = 1 << 22  # frequencies × aspects × points

@@ -16,6 +16,7 @@ from invertwin.channel import (
     torch_threads,
     trace_field,
 )
+from invertwin.checks import checked_count, checked_type
 from invertwin.errors import InputError
 from invertwin.radar.blocks import Blocks, displacements
 from invertwin.radar.impairments import Impairments
@@ -23,7 +24,6 @@ from invertwin.radar.motion import Chirps, Places, Train, every_ramp, sample_int
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.spectrum import exact_spectrum
-from invertwin.scene.checks import checked_count, checked_type
 from invertwin.scene.scene import Scene, warn_of_mirrors
 
 # Motion over half a ramp is straight where it bends by less than this, in wavelengths.

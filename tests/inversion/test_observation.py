@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from invertwin.capture import Capture
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
 from invertwin.inversion import (
     Observation,
     Optimizer,
@@ -19,7 +20,7 @@ from invertwin.inversion import (
     reconstruct,
 )
 from invertwin.inversion.gradcheck import Check, gradcheck
-from invertwin.models import ForwardModel, SurrogateMap
+from invertwin.models import SurrogateMap
 from invertwin.radar import Radar, RadarPose, RangeBias, Surrogate
 from invertwin.scene import Scene, Translation, look_at, sphere
 from invertwin.simulation import simulate

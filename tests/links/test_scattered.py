@@ -12,9 +12,10 @@ from torch.func import jvp
 from invertwin.channel import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
 from invertwin.links import CellSampling, MapPlane, Points, Reception, Terminals, Transmitters
 from invertwin.links import scattered as scattered_module
-from invertwin.models import ForwardModel, RadioMap, ResponseMap
+from invertwin.models import RadioMap, ResponseMap
 from invertwin.scene import (
     AntennaArray,
     Cosine,

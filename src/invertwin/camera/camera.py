@@ -9,8 +9,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.channel import differentiated
+from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor, plain
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor, plain
 from invertwin.scene.parameters import Coordinate, RigidMotion
 
 _MOST_PIXELS = 1 << 26

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from invertwin.camera.camera import Camera
 from invertwin.channel import Curves, Sight
+from invertwin.checks import plain
 from invertwin.errors import InputError
 from invertwin.limits import Count
-from invertwin.scene.checks import plain
 from invertwin.scene.scene import Scene
 
 _ASIDE = 0.01  # pixel between an outline and the rays at its sides

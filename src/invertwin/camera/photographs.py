@@ -12,8 +12,8 @@ from torch import Tensor
 
 from invertwin.camera.camera import Camera
 from invertwin.channel import Sight
+from invertwin.checks import checked_number
 from invertwin.errors import InputError
-from invertwin.scene.checks import checked_number
 from invertwin.scene.scene import Scene
 
 

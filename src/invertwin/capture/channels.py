@@ -12,12 +12,12 @@ from torch import Tensor
 from invertwin.capture.capture import BEAT_DIMS, Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.radar_fields import labelled
+from invertwin.checks import checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.folders import replacing
 from invertwin.radar.radar import sampled
 from invertwin.radar.waveform import unit_window
-from invertwin.scene.checks import checked_tensor
 from invertwin.untrusted import existing_file, reading
 
 Recorded = TypeVar("Recorded", bound=Capture | ChirpCapture)

@@ -8,10 +8,10 @@ from jaxtyping import Complex, Float64
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
+from invertwin.checks import check_shape
 from invertwin.errors import InputError
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
-from invertwin.scene.checks import check_shape
 
 
 @dataclass(frozen=True, eq=False)

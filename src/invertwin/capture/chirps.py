@@ -13,13 +13,13 @@ from scipy.signal import hilbert
 from torch import Tensor
 
 from invertwin.capture.chirp_capture import ChirpCapture
+from invertwin.checks import check_fields, check_shape, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Among, Count, Frequency, NonNegative, Positive, Several, Usual
 from invertwin.radar.boards import Elements, Mounting
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, PhysicsWarning
-from invertwin.scene.checks import check_fields, check_shape, checked_number
 
 CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")
 Pause = Annotated[NonNegative, Usual("seconds", 5e-6, high=1.0)]

@@ -14,11 +14,11 @@ import torch
 
 from invertwin.apart import read_apart
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
+from invertwin.checks import checked_tensor
 from invertwin.errors import InputError
 from invertwin.folders import replacing
 from invertwin.radar.boards import Elements, Mounting
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.checks import checked_tensor
 from invertwin.untrusted import (
     existing_file,
     read_arrays,

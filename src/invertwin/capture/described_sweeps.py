@@ -19,11 +19,11 @@ from invertwin.capture.described_arrays import (
     load_description,
 )
 from invertwin.capture.signature_files import load_touchstone
+from invertwin.checks import checked_tensor
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SteppedFrequency
 from invertwin.scene import look_at
-from invertwin.scene.checks import checked_tensor
 from invertwin.untrusted import read_npy, read_text, reader, reading
 
 TOUCHSTONE = re.compile(r"\.s\d+p", re.IGNORECASE)

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.checks import checked_tensor
 from invertwin.errors import InputError
-from invertwin.scene.checks import checked_tensor
 
 
 @dataclass(frozen=True, eq=False)

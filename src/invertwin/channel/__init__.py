@@ -31,7 +31,6 @@ from invertwin.channel.rays.backend import alone as alone
 from invertwin.channel.rays.backend import backend as backend
 from invertwin.channel.rays.backend import torch_threads as torch_threads
 from invertwin.channel.rays.backend import use_backend as use_backend
-from invertwin.channel.rays.geometry import differentiated as differentiated
 from invertwin.channel.rays.scene import visible_points as visible_points
 from invertwin.channel.reference.cross_sections import CrossSection as CrossSection
 from invertwin.channel.reference.cross_sections import DihedralByMoments as DihedralByMoments
@@ -48,3 +47,4 @@ from invertwin.channel.sampling import Densities as Densities
 from invertwin.channel.sampling import Sampling as Sampling
 from invertwin.channel.sight import Curves as Curves
 from invertwin.channel.sight import Sight as Sight
+from invertwin.checks import differentiated as differentiated

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Complex128, Float, Float64, Int64
 from torch import Tensor
 
+from invertwin.checks import check_fields
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
-from invertwin.scene.checks import check_fields
 from invertwin.scene.polarisation import VERTICAL, Polarisation
 
 

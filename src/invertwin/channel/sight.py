@@ -20,11 +20,10 @@ from invertwin.channel.field.waves import cross, dot
 from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
 from invertwin.channel.rays.contacts import common_segments
-from invertwin.channel.rays.geometry import differentiated
 from invertwin.channel.rays.scene import Occluders
 from invertwin.channel.rays.topology import topology_of
+from invertwin.checks import differentiated, plain
 from invertwin.errors import InputError
-from invertwin.scene.checks import plain
 from invertwin.scene.scene import Scene
 
 

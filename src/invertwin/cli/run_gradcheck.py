@@ -21,10 +21,11 @@ from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.cli.schema.signature import swept
 from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
 from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck
 from invertwin.inversion.lines import line_of
 from invertwin.links import MapPlane, Points
-from invertwin.models import ForwardModel, PanelMap, SignatureMap, SurrogateMap
+from invertwin.models import PanelMap, SignatureMap, SurrogateMap
 from invertwin.radar.radar import Radar
 from invertwin.runs import RunFolder
 from invertwin.scene import Scene

@@ -8,6 +8,7 @@ import torch
 from annotated_types import MinLen
 from torch import Tensor, nn
 
+from invertwin.checks import ArrayLike, Point
 from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
@@ -40,7 +41,6 @@ from invertwin.scene import (
     rotation_from_vector,
     shapes,
 )
-from invertwin.scene.checks import ArrayLike, Point
 from invertwin.scene.files import load_mesh
 from invertwin.scene.geometry.body import BodyTemplate
 from invertwin.scene.geometry.body_models import body, body_template

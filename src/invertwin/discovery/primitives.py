@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from invertwin.checks import check_fields
 from invertwin.inversion.initial import Ground
 from invertwin.limits import Positive
 from invertwin.scene import (
@@ -21,7 +22,6 @@ from invertwin.scene import (
     Surface,
     person,
 )
-from invertwin.scene.checks import check_fields
 from invertwin.scene.geometry.gait import hanging
 from invertwin.scene.parameters import Coordinate
 from invertwin.scene.shapes import box, cylinder, sphere

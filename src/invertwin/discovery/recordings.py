@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 
 from invertwin.capture import Capture, ChirpCapture
 from invertwin.channel import Grid, Sight
+from invertwin.checks import checked_count, checked_number, checked_tensor
 from invertwin.discovery.assembly import Assembly, sampling_of
 from invertwin.discovery.certainty import deviations, kind_probabilities, presence, rivals, widened
 from invertwin.discovery.channels import apart, channels_of_scene
@@ -27,7 +28,6 @@ from invertwin.inversion.initial import Ground
 from invertwin.models import SurrogateMap
 from invertwin.radar import Radar, SampledWaveform
 from invertwin.scene import Scene
-from invertwin.scene.checks import checked_count, checked_number, checked_tensor
 
 _NEAREST = 4  # range cells, in which transmitters leak into receivers
 _HEIGHT = 0.6  # of radars above a ground of which nothing is said [m]

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torch.autograd import grad
 
 from invertwin.channel import alone
+from invertwin.checks import checked_count
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Maps, Objective, SpectrumLoss
-from invertwin.scene.checks import checked_count
 
 _MOST = 64  # parameters; each costs a derivative of the map per step
 _TRIES = 4  # dampings of one step

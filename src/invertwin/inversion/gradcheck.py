@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from invertwin.channel import alone
 from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
 from invertwin.inversion.lines import line_of
 from invertwin.inversion.tangents import Change
 from invertwin.limits import Count, NonNegative, Positive
-from invertwin.models import ForwardModel
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derived_seed
 

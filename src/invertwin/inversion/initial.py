@@ -19,13 +19,13 @@ from torch import Tensor
 from invertwin.capture.backprojection import backproject
 from invertwin.capture.capture import Capture
 from invertwin.channel import Grid, Sampling
+from invertwin.checks import ArrayLike, check_fields, checked_number
 from invertwin.errors import InputError
 from invertwin.memory import require_at_most
 from invertwin.radar.detection import ordered_statistics_cfar, peaks
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate, surrogate_spectrum
 from invertwin.scene import DensityGrid, Object, Scene, rigid, rotation_from_vector
-from invertwin.scene.checks import ArrayLike, check_fields, checked_number
 from invertwin.scene.geometry.lattice import Lattice
 
 _TURNS = 91  # yaws that a rectangle is tried at, over a quarter turn

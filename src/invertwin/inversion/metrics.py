@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from invertwin.channel import visible_points
+from invertwin.checks import ArrayLike, checked_count, checked_number
 from invertwin.errors import InputError
 from invertwin.scene import Itu, Material
-from invertwin.scene.checks import ArrayLike, checked_count, checked_number
 from invertwin.scene.material.materials import held_by
 from invertwin.scene.material.values import Value, evaluated
 from invertwin.scene.mesh import Mesh

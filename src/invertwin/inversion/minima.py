@@ -11,7 +11,9 @@ import torch
 from torch import Tensor
 
 from invertwin.channel import Sampling
+from invertwin.checks import Point
 from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
 from invertwin.inversion.fit import Callback
 from invertwin.inversion.loss import Objective, SpectrumLoss
 from invertwin.inversion.metrics import residual
@@ -24,8 +26,6 @@ from invertwin.inversion.schedule import Schedule
 from invertwin.inversion.starts import displaced
 from invertwin.limits import Count, Positive
 from invertwin.memory import require_at_most
-from invertwin.models import ForwardModel
-from invertwin.scene.checks import Point
 from invertwin.scene.scene import Object, Scene
 from invertwin.seeds import derived_seed
 

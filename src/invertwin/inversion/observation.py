@@ -7,8 +7,8 @@ from typing import Any
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
 from invertwin.inversion.regularization import Regularizer
-from invertwin.models import ForwardModel
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 

@@ -9,10 +9,10 @@ import torch
 from annotated_types import Ge, Lt
 from torch import nn
 
+from invertwin.checks import check_fields
 from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.loss import Objective
 from invertwin.limits import Count, NonNegative, Positive
-from invertwin.scene.checks import check_fields
 
 
 @dataclass(frozen=True)

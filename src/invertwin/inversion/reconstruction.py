@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
 from invertwin.inversion.draws import End
 from invertwin.inversion.fit import Callback, Fit, Settings, Status
 from invertwin.inversion.loss import SpectrumLoss
@@ -18,7 +19,6 @@ from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule, Stage, checked_stages
 from invertwin.inversion.uncertainty import Evidence, Uncertainty
 from invertwin.inversion.verdict import LEAST_SHARE, Verdict, shares_explained, verdict
-from invertwin.models import ForwardModel
 from invertwin.outward import shown_by
 from invertwin.scene.geometry.density import without_clouds
 from invertwin.scene.scene import Scene

@@ -13,9 +13,9 @@ import igl
 import numpy as np
 import torch
 
+from invertwin.checks import checked_number
 from invertwin.errors import InputError
 from invertwin.memory import require_at_most
-from invertwin.scene.checks import checked_number
 from invertwin.scene.mesh import Mesh
 
 _MOST_TRIANGLES = 1e6  # each is moved by itself

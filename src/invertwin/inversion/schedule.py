@@ -7,9 +7,9 @@ from typing import Annotated
 from annotated_types import Ge, Gt, Le
 
 from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.limits import Count, NonNegative
-from invertwin.models import ForwardModel
 from invertwin.scene.mesh import Mesh
 
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from invertwin.checks import ArrayLike, Point
 from invertwin.errors import InputError
 from invertwin.limits import Positive
-from invertwin.scene.checks import ArrayLike, Point
 from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.parameters import Entries
 

@@ -20,12 +20,12 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import RayPaths, trace_coverage
+from invertwin.checks import ArrayLike, check_fields, checked_number, checked_tensor, plain
 from invertwin.errors import InputError
 from invertwin.limits import Count
 from invertwin.links.places import Places
 from invertwin.links.received import Received, Reception, spread_of
 from invertwin.links.transmitters import Transmitters
-from invertwin.scene.checks import ArrayLike, check_fields, checked_number, checked_tensor, plain
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
 

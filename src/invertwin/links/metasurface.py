@@ -25,10 +25,10 @@ from invertwin.channel import (
     lit_fractions,
     polarisations,
 )
+from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene import Scene
-from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
 
 _VALUES_AT_ONCE = 1 << 22  # of antennas and elements
 _UP = (0.0, 0.0, 1.0)  # of V in ``RayPaths``

@@ -7,10 +7,10 @@ from typing import ClassVar
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.checks import checked_tensor
 from invertwin.errors import InputError
 from invertwin.links.received import Received, Reception
 from invertwin.links.transmitters import Transmitters
-from invertwin.scene.checks import checked_tensor
 from invertwin.scene.scene import Scene
 
 

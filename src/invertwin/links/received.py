@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from invertwin.channel import RayPaths, Sampling, trace_paths
+from invertwin.checks import checked_number
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links.metasurface import Metasurface, panel_paths
@@ -28,7 +29,6 @@ from invertwin.links.responses import Terminals, frequency_response, path_amplit
 from invertwin.links.scattered import scattered_moments
 from invertwin.links.spreads import path_powers, root
 from invertwin.links.transmitters import Transmitters
-from invertwin.scene.checks import checked_number
 from invertwin.scene.scene import Scene
 
 _RECEIVERS_AT_ONCE = 512

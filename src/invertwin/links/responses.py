@@ -13,11 +13,11 @@ from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import RayPaths, polarisations
+from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.memory import require_memory
 from invertwin.scene import AntennaArray
-from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
 
 _VALUES_AT_ONCE = 1 << 21
 _VERTICAL = (0.0, 0.0, 1.0)  # of V in ``RayPaths``

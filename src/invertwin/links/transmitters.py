@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
 from invertwin.limits import Axes
 from invertwin.links.responses import Terminals
-from invertwin.scene.checks import ArrayLike, checked_tensor
 from invertwin.scene.parameters import Coordinate, axes_mask, free_part
 
 _PLACE = 0.1  # m: an error that matters

@@ -14,11 +14,11 @@ import torch
 from annotated_types import Len, MinLen
 from torch import Tensor
 
+from invertwin.checks import ArrayLike, check_fields, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Among, Frequency, Positive
 from invertwin.scene.antenna import AntennaArray, Isotropic, Pattern, Polarised
-from invertwin.scene.checks import ArrayLike, check_fields, checked_tensor
 
 Elements = tuple[AntennaArray, AntennaArray]  # TX and RX
 Places = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]

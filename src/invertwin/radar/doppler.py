@@ -9,13 +9,13 @@ from jaxtyping import Complex, Float, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import Grid
+from invertwin.checks import check_shape
 from invertwin.errors import InputError
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import range_profile
 from invertwin.radar.spectrum import beamform
 from invertwin.radar.waveform import unit_window
-from invertwin.scene.checks import check_shape
 
 
 @dataclass(frozen=True, eq=False)

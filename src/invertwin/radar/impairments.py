@@ -20,13 +20,13 @@ from jaxtyping import Complex, Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import Paths
+from invertwin.checks import check_fields, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, NonNegative, Positive, Usual
 from invertwin.radar.motion import Chirps, moving_beat
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, PhysicsWarning, SteppedFrequency
-from invertwin.scene.checks import check_fields, checked_number
 
 # Phase of the highest offset between delays at which the residual is computed; linear between
 # them it is then off by less than 1 % there.

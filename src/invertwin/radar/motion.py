@@ -9,6 +9,7 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import Paths, alone
+from invertwin.checks import check_fields
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
@@ -22,7 +23,6 @@ from invertwin.radar.nonuniform import (
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.range_profile import beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, SampledWaveform, SteppedFrequency
-from invertwin.scene.checks import check_fields
 
 # Largest error of interpolating a path's phase factor between the instants of a ramp.
 _INTERPOLATION_ERROR = 1e-6

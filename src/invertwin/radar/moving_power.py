@@ -8,13 +8,13 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import Grid, Paths
+from invertwin.checks import check_shape
 from invertwin.radar.doppler import velocity_span
 from invertwin.radar.motion import Chirps
 from invertwin.radar.point_spread import interpolated
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import aperture
 from invertwin.radar.waveform import FMCW, SteppedFrequency, Waveform, unit_window
-from invertwin.scene.checks import check_shape
 
 
 def moving_power(

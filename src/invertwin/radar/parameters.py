@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from invertwin.checks import checked_count, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Axes, Count, Positive
 from invertwin.radar.radar import Radar
-from invertwin.scene.checks import checked_count, checked_number
 from invertwin.scene.parameters import Coordinate, RigidMotion, axes_mask, free_part
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Complex, Complex128, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Paths, differentiated
+from invertwin.checks import ArrayLike, check_fields, check_shape, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import MOST, Among
@@ -20,7 +21,6 @@ from invertwin.memory import require_at_most
 from invertwin.outward import shown_by
 from invertwin.radar.waveform import WINDOWS, PhysicsWarning, SampledWaveform, Waveform
 from invertwin.scene.antenna import AntennaArray
-from invertwin.scene.checks import ArrayLike, check_fields, check_shape, checked_tensor
 
 Window = Annotated[str, Among(WINDOWS)]
 Cosine = Annotated[float, Gt(0), Le(1)]

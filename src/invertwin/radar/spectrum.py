@@ -9,11 +9,11 @@ from jaxtyping import Complex, Float, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import Grid
+from invertwin.checks import check_shape
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import range_profile
 from invertwin.radar.waveform import taper
-from invertwin.scene.checks import check_shape
 
 # Depth of an array along boresight, in wavelengths, that (u, v) steering may leave out.
 _FLATNESS = 0.05

@@ -24,6 +24,7 @@ from invertwin.channel import (
     use_backend,
     without_echoes,
 )
+from invertwin.checks import check_fields
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.point_spread import (
@@ -37,7 +38,6 @@ from invertwin.radar.point_spread import (
 from invertwin.radar.radar import Radar
 from invertwin.radar.spectrum import Aperture, aperture
 from invertwin.radar.waveform import PhysicsWarning, Waveform
-from invertwin.scene.checks import check_fields
 from invertwin.scene.scene import Scene
 
 # Kernels are tabulated at least this far out, so that short grids do not truncate them.

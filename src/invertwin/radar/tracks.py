@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.checks import Point, checked_tensor
 from invertwin.limits import Angle, Count, NonNegative, Positive
 from invertwin.memory import require_at_most
-from invertwin.scene.checks import Point, checked_tensor
 
 _MOST_POSITIONS = 1e6
 

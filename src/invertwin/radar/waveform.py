@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Complex, Float, Float64
 from torch import Tensor
 
+from invertwin.checks import check_fields
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.errors import PhysicsWarning as PhysicsWarning
 from invertwin.limits import Bandwidth, Duration, Frequency, Several, Step
-from invertwin.scene.checks import check_fields
 
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 

@@ -15,10 +15,10 @@ from annotated_types import MinLen
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Count, NonNegative, Positive
 from invertwin.memory import require_at_most
-from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.scene.polarisation import JonesTable, Polarisation
 
 Polarised = str | ArrayLike | JonesTable

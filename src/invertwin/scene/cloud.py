@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.checks import checked_number, checked_tensor
 from invertwin.errors import InputError
-from invertwin.scene.checks import checked_number, checked_tensor
 from invertwin.scene.geometry.lattice import Lattice
 
 

@@ -16,10 +16,10 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
+from invertwin.checks import checked_tensor
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.folders import replacing
 from invertwin.scene import shapes
-from invertwin.scene.checks import checked_tensor
 from invertwin.scene.material.materials import (
     PerfectConductor,
     RoughConductor,

@@ -9,8 +9,8 @@ from annotated_types import MinLen
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from invertwin.checks import checked_tensor
 from invertwin.errors import InputError
-from invertwin.scene.checks import checked_tensor
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.checks import ArrayLike, Point, checked_number, checked_tensor, checked_type
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike, Point, checked_number, checked_tensor, checked_type
 from invertwin.scene.pose import compose, rigid, rotation_from_vector
 from invertwin.scene.scene import Object, Scene
 

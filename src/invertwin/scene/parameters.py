@@ -14,9 +14,9 @@ from annotated_types import Ge, MinLen
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.errors import InputError
 from invertwin.limits import Axes
-from invertwin.scene.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.scene.material.itu import Itu
 from invertwin.scene.material.materials import held_by
 from invertwin.scene.material.values import (

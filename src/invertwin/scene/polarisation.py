@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
+from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike, checked_tensor
 
 JONES: Mapping[str, tuple[complex, complex]] = MappingProxyType(
     {"V": (1.0, 0.0), "H": (0.0, 1.0), "circular": (0.5**0.5, 0.5**0.5 * 1j)}

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike, checked_tensor
 
 
 def quaternion_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:

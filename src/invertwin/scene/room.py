@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import torch
 
+from invertwin.checks import checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Positive
-from invertwin.scene.checks import checked_number
 from invertwin.scene.material.materials import RoughDielectric
 from invertwin.scene.mesh import Mesh, joined
 from invertwin.scene.pose import rigid

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.checks import checked_number, checked_tensor
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.outward import shown_by
-from invertwin.scene.checks import checked_number, checked_tensor
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.material.roughness import ROUGH_LOBE_WIDTH, lobe_exponent
 from invertwin.scene.material.surface import Material

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
+from invertwin.checks import checked_count, checked_number
 from invertwin.errors import InputError
-from invertwin.scene.checks import checked_count, checked_number
 from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.geometry.prior import Decoder, ShapePrior
 from invertwin_studies.vehicles import car_distance, sample_car

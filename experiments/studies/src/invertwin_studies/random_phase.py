@@ -10,7 +10,7 @@ from torch import Tensor
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Paths, Sampling, trace_power
 from invertwin.errors import InputError
-from invertwin.models import ForwardModel
+from invertwin.forward_model import ForwardModel
 from invertwin.radar.point_spread import airy_field, airy_radii, normalized_gaussian
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate

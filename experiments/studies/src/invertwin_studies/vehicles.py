@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from invertwin.checks import checked_count, checked_number
 from invertwin.errors import InputError
-from invertwin.scene.checks import checked_count, checked_number
 from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.mesh import Mesh

@@ -22,9 +22,8 @@ from invertwin.channel.field.shadow_edges import ASIDE, Screen, rim_points, rims
 from invertwin.channel.field.specular import Stage, paths_of, powers_of, staged
 from invertwin.channel.ray_paths import RayPaths, joined
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.geometry import differentiated
 from invertwin.channel.rays.topology import topology_of
-from invertwin.scene.checks import ArrayLike, plain
+from invertwin.checks import ArrayLike, differentiated, plain
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
 

@@ -18,7 +18,7 @@ from invertwin.channel.field.shadow_edges import Screen, spread_along
 from invertwin.channel.field.waves import cross, dot
 from invertwin.channel.rays.contacts import common_segments
 from invertwin.channel.rays.topology import Topology
-from invertwin.scene.checks import plain
+from invertwin.checks import plain
 
 _PAIRS = 1 << 22  # triangles × triangles whose boxes are compared at a time
 

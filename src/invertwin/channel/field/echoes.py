@@ -16,9 +16,9 @@ from invertwin.channel.field.specular import trace_paths
 from invertwin.channel.field.waves import polarisations
 from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.ray_paths import RayPaths
+from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike, checked_tensor
 from invertwin.scene.scene import Scene
 
 _UP = (0.0, 0.0, 1.0)  # of V in ``RayPaths``

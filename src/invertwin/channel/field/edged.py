@@ -24,7 +24,7 @@ from invertwin.channel.field.wedges import (
     joined_wedges,
 )
 from invertwin.channel.rays.topology import Topology
-from invertwin.scene.checks import plain
+from invertwin.checks import plain
 from invertwin.scene.material.fresnel import FieldCoefficients
 
 Coefficients = Callable[[Int64[Tensor, " n"], Float64[Tensor, " n"]], FieldCoefficients]

@@ -18,9 +18,9 @@ from invertwin.channel.field.waves import cross, dot
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.scene import Occluders, visible
 from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.checks import plain
 from invertwin.errors import InputError
 from invertwin.scene import Scene
-from invertwin.scene.checks import plain
 
 _PAIRS = 1 << 21  # of edges and places, or of edges and cells, at a time
 _LEVEL = 0.999  # of the way up to the place: edges above it cast no shadow onto the panel

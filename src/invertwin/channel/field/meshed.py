@@ -15,7 +15,7 @@ from invertwin.channel.field.conforming import Conforming, conforming
 from invertwin.channel.field.currents import Currents, keeps_power
 from invertwin.channel.field.moments import Moments, functions_of
 from invertwin.channel.field.waves import cross, dot, polarisations, turned
-from invertwin.channel.rays.geometry import differentiated
+from invertwin.checks import differentiated
 from invertwin.errors import InputError
 from invertwin.scene import Mesh, signed_distance
 

@@ -34,14 +34,14 @@ from invertwin.channel.paths import Link
 from invertwin.channel.ray_paths import REFLECTION, RayPaths, joined
 from invertwin.channel.rays.backend import torch_threads, tracing
 from invertwin.channel.rays.contacts import contacts_of
-from invertwin.channel.rays.geometry import Geometry, differentiated, flatten
+from invertwin.channel.rays.geometry import Geometry, flatten
 from invertwin.channel.rays.scene import RayScene, face_areas
 from invertwin.channel.reference.radar_equation import Place, SurfacePaths, scattered
 from invertwin.channel.sampling import Sampling
+from invertwin.checks import ArrayLike, differentiated, plain
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene import Isotropic
-from invertwin.scene.checks import ArrayLike, plain
 from invertwin.scene.scene import Scene
 
 _AT_ONCE = 1 << 14  # points

@@ -27,7 +27,7 @@ from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import NEAR, Occluders
 from invertwin.channel.rays.topology import Topology
-from invertwin.scene.checks import plain
+from invertwin.checks import plain
 
 ASIDE = 10.0  # margins between where power jumps and the two sides that are compared
 _GRAZING = 1e-4  # least cosine between a ray and the normal of the surface that it lights

@@ -45,9 +45,9 @@ from invertwin.channel.field.wedges import (
     run_on,
 )
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.geometry import differentiated
 from invertwin.channel.rays.scene import Occluders, visible
 from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.checks import differentiated
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.progress import told

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.field.waves import Skins, Vectors, cross, dot
-from invertwin.channel.rays.geometry import differentiated
+from invertwin.checks import differentiated
 from invertwin.errors import InputError
 
 OPAQUE = 1e-4

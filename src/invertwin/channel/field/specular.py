@@ -44,17 +44,17 @@ from invertwin.channel.ray_paths import REFLECTION, TRANSMISSION, RayPaths, join
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.geometry import vertex_velocities
 from invertwin.channel.rays.topology import Topology, topology_of
-from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.errors import InputError
-from invertwin.limits import MOST
-from invertwin.scene import FieldCoefficients
-from invertwin.scene.checks import (
+from invertwin.checks import (
     ArrayLike,
     checked_count,
     checked_number,
     checked_tensor,
     plain,
 )
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.limits import MOST
+from invertwin.scene import FieldCoefficients
 from invertwin.scene.scene import Scene
 
 _DEEPEST, _MOST_EDGES = 6, 3

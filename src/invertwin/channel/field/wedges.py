@@ -21,7 +21,7 @@ from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
 from invertwin.channel.field.waves import cross, dot
-from invertwin.scene.checks import plain
+from invertwin.checks import plain
 
 LEAST_ANGLE = math.radians(10.0)
 """Nearer to grazing, or to the edge itself, fringe currents are not valid."""

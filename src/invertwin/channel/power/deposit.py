@@ -21,11 +21,11 @@ from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table, to_tab
 from invertwin.channel.power.trace import Trace, tables_of, without_derivatives
 from invertwin.channel.rays.apart import stand_apart
 from invertwin.channel.rays.backend import backend, dr, mi, torch_threads, tracing
-from invertwin.channel.rays.geometry import Geometry, differentiated, flatten, require_edges
+from invertwin.channel.rays.geometry import Geometry, flatten, require_edges
 from invertwin.channel.sampling import Sampling
+from invertwin.checks import differentiated, plain
 from invertwin.errors import InputError
 from invertwin.limits import MOST
-from invertwin.scene.checks import plain
 from invertwin.scene.scene import Object, Scene
 
 

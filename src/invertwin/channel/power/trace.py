@@ -24,7 +24,7 @@ from invertwin.channel.rays.coplanar import warn_of_coplanar
 from invertwin.channel.rays.geometry import Geometry
 from invertwin.channel.rays.scene import RayScene
 from invertwin.channel.sampling import Sampling
-from invertwin.scene.checks import plain
+from invertwin.checks import plain
 
 _BYTES_PER_VERTEX = 20  # one record: triangle, two barycentrics, throughput, length
 

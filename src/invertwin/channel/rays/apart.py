@@ -9,7 +9,7 @@ from torch import Tensor
 
 from invertwin.channel.paths import Link
 from invertwin.channel.rays.geometry import Geometry
-from invertwin.scene.checks import plain
+from invertwin.checks import plain
 
 _GAP = 0.02  # between scenes, of the largest side of any
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch._C import _DisableFuncTorch
 
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.scene.checks import plain
+from invertwin.checks import plain
 
 
 def to_float(values: Tensor) -> Any:

@@ -7,12 +7,12 @@ from functools import lru_cache
 from typing import Literal
 
 import torch
-import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.paths import Link
 from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.checks import differentiated
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import Material, Surface
@@ -104,13 +104,6 @@ class Geometry:
                 f"expected depth 1 for objects in motion, got {depth}; the range rate of longer "
                 "paths is not modelled"
             )
-
-
-def differentiated(value: Tensor | None) -> bool:
-    """Whether derivatives flow through a tensor, in reverse or in forward mode."""
-    if value is None:
-        return False
-    return value.requires_grad or forward_ad.unpack_dual(value).tangent is not None
 
 
 def silhouettes_move(geometry: Geometry, link: Link) -> bool:

@@ -25,8 +25,8 @@ from invertwin.channel.rays.geometry import Geometry
 from invertwin.channel.rays.movers import Movers
 from invertwin.channel.rays.spheres import Spheres
 from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike, checked_tensor
 from invertwin.scene.mesh import Mesh
 
 # Offset along a ray, relative to its length: fifty float32 roundings of a coordinate, and small

@@ -13,7 +13,7 @@ from torch._C import _DisableFuncTorch
 
 from invertwin.channel.rays.arrays import to_float, to_index, to_signed
 from invertwin.channel.rays.backend import VARIANTS, backend, mi
-from invertwin.scene.checks import plain
+from invertwin.checks import plain
 from invertwin.scene.mesh import Mesh
 
 _KEPT_TOPOLOGIES = 8

@@ -23,8 +23,9 @@ from invertwin.cli.schema import SAMPLED, Measures, Reconstruct, RunFile, Simula
 from invertwin.cli.schema import Stage as StageTable
 from invertwin.cli.shape_tables import shape_terms
 from invertwin.errors import InputError, PhysicsWarning
+from invertwin.forward_model import ForwardModel
 from invertwin.inversion import Observation, Stage, Unknown, remeshed
-from invertwin.models import ChainMap, ExactMap, ForwardModel, SurrogateMap
+from invertwin.models import ChainMap, ExactMap, SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate

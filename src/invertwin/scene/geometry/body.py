@@ -10,8 +10,8 @@ from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from invertwin.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.scene.mesh import Mesh, joined
 from invertwin.scene.parameters import Entries, ObjectModule, axes_mask, free_part
 from invertwin.scene.pose import rotation_angle, rotation_from_vector

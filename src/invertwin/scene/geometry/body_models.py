@@ -5,8 +5,8 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal
 
+from invertwin.checks import Point
 from invertwin.limits import RADIANS, Positive
-from invertwin.scene.checks import Point
 from invertwin.scene.geometry.anny_body import load_anny
 from invertwin.scene.geometry.body import BodyTemplate, load_smpl
 from invertwin.scene.geometry.person import person

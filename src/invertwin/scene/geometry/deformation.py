@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from invertwin.checks import Counts, Point
 from invertwin.errors import InputError
-from invertwin.scene.checks import Counts, Point
 from invertwin.scene.geometry.lattice import Lattice, tensor_product
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule

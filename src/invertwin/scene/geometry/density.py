@@ -8,9 +8,9 @@ from skimage.measure import marching_cubes
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from invertwin.checks import ArrayLike, Counts, Point, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Positive
-from invertwin.scene.checks import ArrayLike, Counts, Point, checked_number
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.geometry.distance import signed_distance
 from invertwin.scene.geometry.lattice import Lattice

@@ -13,8 +13,7 @@ from annotated_types import Ge, Le
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.limits import NonNegative, Positive
-from invertwin.scene.checks import (
+from invertwin.checks import (
     ArrayLike,
     Counts,
     Point,
@@ -22,6 +21,7 @@ from invertwin.scene.checks import (
     checked_number,
     checked_tensor,
 )
+from invertwin.limits import NonNegative, Positive
 from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice, cubic
 from invertwin.scene.mesh import Mesh

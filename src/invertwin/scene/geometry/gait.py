@@ -22,9 +22,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.checks import checked_number, checked_type
 from invertwin.errors import InputError
 from invertwin.limits import Positive
-from invertwin.scene.checks import checked_number, checked_type
 from invertwin.scene.geometry.body import BodyTemplate
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import compose, rigid, rotation_from_vector

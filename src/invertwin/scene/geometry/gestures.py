@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from invertwin.checks import checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Positive
-from invertwin.scene.checks import checked_number
 from invertwin.scene.geometry.body import BodyTemplate
 from invertwin.scene.geometry.gait import (
     Posture,

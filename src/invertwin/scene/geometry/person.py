@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.scene.checks import checked_number
+from invertwin.checks import checked_number
 from invertwin.scene.geometry.body import BodyTemplate
 from invertwin.scene.geometry.iso_surface import iso_surface
 from invertwin.scene.geometry.lattice import Lattice

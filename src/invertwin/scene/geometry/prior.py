@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
+from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike, checked_tensor
 from invertwin.scene.geometry.iso_surface import follow, surface_of
 from invertwin.scene.geometry.lattice import Lattice, cubic, cubic_slices
 from invertwin.scene.mesh import Mesh

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor, nn
 
+from invertwin.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.errors import InputError
-from invertwin.scene.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
 

@@ -9,8 +9,8 @@ from scipy.sparse import coo_array, csc_array, csgraph, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor, nn
 
+from invertwin.checks import checked_number
 from invertwin.errors import InputError
-from invertwin.scene.checks import checked_number
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
 

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Complex128, Float, Float64, Shaped
 from torch import Tensor
 
+from invertwin.checks import checked_number
 from invertwin.constants import SPEED_OF_LIGHT, VACUUM_PERMITTIVITY
-from invertwin.scene.checks import checked_number
 from invertwin.scene.material.values import Value, checked_value, evaluated
 
 LEAST_COSINE = 1e-9

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from invertwin.checks import checked_number
 from invertwin.errors import InputError
-from invertwin.scene.checks import checked_number
 
 
 class OutsideTableWarning(UserWarning):

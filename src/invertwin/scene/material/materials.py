@@ -14,9 +14,9 @@ from annotated_types import MinLen
 from jaxtyping import Float64, Int64, Shaped
 from torch import Tensor
 
+from invertwin.checks import checked_number
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS
-from invertwin.scene.checks import checked_number
 from invertwin.scene.material.fresnel import (
     FieldCoefficients,
     attenuation,

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.errors import InputError
 from invertwin.limits import Among
-from invertwin.scene.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.scene.mesh import Mesh, checked_faces
 
 

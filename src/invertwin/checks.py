@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
+import torch.autograd.forward_ad as forward_ad
 from annotated_types import Ge, Gt, Le, Len, Lt
 from torch import Tensor
 from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wrapped_tensor
@@ -226,3 +227,10 @@ def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]
     if usual and not usual.low <= number <= usual.high:
         meant = usual.meant(float(number))
         raise InputError(f"expected {name} in {usual.unit}, got {number:g}; did you mean {meant}?")
+
+
+def differentiated(value: Tensor | None) -> bool:
+    """Whether derivatives flow through a tensor, in reverse or in forward mode."""
+    if value is None:
+        return False
+    return value.requires_grad or forward_ad.unpack_dual(value).tangent is not None
