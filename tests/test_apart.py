@@ -11,7 +11,8 @@ import scipy.io
 import xarray as xr
 
 from invertwin.apart import read_apart
-from invertwin.capture import Capture, described_arrays
+from invertwin.capture import Capture
+from invertwin.capture.readers import described_arrays
 from invertwin.errors import InputError
 
 DESCRIPTION = """

@@ -6,8 +6,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from invertwin.capture import described_arrays
-from invertwin.capture.channels import ChannelCalibration
+from invertwin.capture.channel_calibration import ChannelCalibration
+from invertwin.capture.readers import described_arrays
 from invertwin.capture.ti.mmwave_studio import read_studio
 from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.cli import build

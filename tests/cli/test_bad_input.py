@@ -6,7 +6,7 @@ import torch
 
 from cli.small import BEHIND, MATERIAL, RUN, call, read_metrics
 from invertwin.capture import Capture
-from invertwin.capture.files import write_dataset
+from invertwin.capture.readers.netcdf import write_dataset
 from invertwin.cli import build
 from invertwin.cli.run_file import load_run
 from invertwin.folders import MANIFEST

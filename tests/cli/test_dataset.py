@@ -14,7 +14,7 @@ import torch
 
 import invertwin
 from cli.small import call, read_metrics
-from invertwin.capture import described_arrays
+from invertwin.capture.readers import described_arrays
 from invertwin.cli import build
 from invertwin.cli.run_dataset import sample_run, shard_content
 from invertwin.cli.run_file import load_run, to_toml, validate

@@ -10,14 +10,8 @@ import pytest
 import torch
 
 from cli.small import call, read_metrics
-from invertwin.capture import (
-    Capture,
-    ChannelCalibration,
-    ChirpData,
-    ChirpSettings,
-    adc_counts,
-    described_arrays,
-)
+from invertwin.capture import Capture, ChannelCalibration, ChirpData, ChirpSettings, adc_counts
+from invertwin.capture.readers import described_arrays
 from invertwin.capture.ti import write_cfg, write_samples, write_setup, write_studio
 from invertwin.radar import Chirps, Radar, sharp_map, snapshots_of, velocity_span
 from invertwin.radar.boards import board

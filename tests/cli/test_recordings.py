@@ -10,7 +10,8 @@ import torch
 
 from cli.small import RUN, call, read_metrics
 from cli.test_build import RADAR, read
-from invertwin.capture import Capture, ChannelCalibration, ChirpData, described_arrays
+from invertwin.capture import Capture, ChannelCalibration, ChirpData
+from invertwin.capture.readers import described_arrays
 from invertwin.capture.ti import read_cfg, read_recording, read_settings
 from invertwin.cli import build, schema, sensors
 from invertwin.cli.raw_files import settings_of_run

@@ -5,7 +5,7 @@ import torch
 
 from cli.small import call, read_metrics
 from invertwin.capture import Capture, calibrate, locate
-from invertwin.capture.radar_fields import labelled
+from invertwin.capture.readers.radar_fields import labelled
 from invertwin_studies.recordings import rail_sar
 
 

@@ -10,9 +10,9 @@ import xarray as xr
 from jaxtyping import Complex, Float, Float64, Int64
 from torch import Tensor
 
-from invertwin.capture.files import read_dataset, write_dataset
-from invertwin.capture.radar_fields import labelled, radar_fields, radar_from_fields, tensor
 from invertwin.capture.range_interpolation import RangeInterpolator
+from invertwin.capture.readers.netcdf import read_dataset, write_dataset
+from invertwin.capture.readers.radar_fields import labelled, radar_fields, radar_from_fields, tensor
 from invertwin.capture.track import Track
 from invertwin.channel import Grid
 from invertwin.errors import InputError

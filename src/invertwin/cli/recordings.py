@@ -6,16 +6,9 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge
 from pydantic import GetCoreSchemaHandler, model_validator
 
-from invertwin.capture import (
-    Capture,
-    ChannelCalibration,
-    ChirpCapture,
-    ChirpData,
-    described_arrays,
-    described_sweeps,
-    ti,
-)
-from invertwin.capture.radar_fields import WAVEFORMS
+from invertwin.capture import Capture, ChannelCalibration, ChirpCapture, ChirpData, ti
+from invertwin.capture.readers import described_arrays, described_sweeps
+from invertwin.capture.readers.radar_fields import WAVEFORMS
 from invertwin.cli.sensors import Posed
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive

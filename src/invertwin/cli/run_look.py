@@ -14,7 +14,6 @@ from invertwin.capture import (
     Capture,
     ChannelCalibration,
     ChirpCapture,
-    described_arrays,
     estimate_channels,
     faults_of,
     is_sweeps,
@@ -22,6 +21,7 @@ from invertwin.capture import (
     shown_ranges,
     ti,
 )
+from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid
 from invertwin.cli.options import Look, Recorded
 from invertwin.cli.report import Table, finish, picture, quantities, texts

@@ -10,7 +10,8 @@ import torch
 from matplotlib.figure import Figure
 
 from invertwin import plotting
-from invertwin.capture import Capture, ChirpData, described_arrays
+from invertwin.capture import Capture, ChirpData
+from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid, Sampling
 from invertwin.cli import build, sensors
 from invertwin.cli.estimate import Sensor, require_room

@@ -8,7 +8,7 @@ from annotated_types import Ge, MinLen
 from pydantic import GetCoreSchemaHandler, Tag, model_validator
 from torch import Tensor
 
-from invertwin.capture.radar_fields import WAVEFORMS
+from invertwin.capture.readers.radar_fields import WAVEFORMS
 from invertwin.channel import Grid
 from invertwin.limits import Count, Positive
 from invertwin.radar import boards, tracks

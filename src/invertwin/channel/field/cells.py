@@ -20,7 +20,7 @@ _LEAN = 0.7  # cells' sides that normals at right angles are apart
 _NEIGHBOURS = 9
 _TURNED = 0.6  # cosine of neighbours' normals, below which an edge lies between
 _ASIDE = 1e-3  # of the size: nearer to the tangent plane, nothing faces a cell from within
-_ROWS_AT_ONCE = 1 << 21
+_CURVATURE_ROWS = 1 << 21
 _BURIED, _SOME = 0.35, 0.02  # off half a solid angle, and share of the surface where it may be
 
 Array = NDArray[np.float64]
@@ -151,7 +151,7 @@ def _surroundings(point: Array, normal: Array, area: Array) -> tuple[Array, bool
     count = len(point)
     ball, angle = np.full(count, np.inf), np.zeros(count)
     least = _ASIDE * float(np.ptp(point, axis=0).max())
-    for rows in np.array_split(np.arange(count), math.ceil(count**2 / _ROWS_AT_ONCE)):
+    for rows in np.array_split(np.arange(count), math.ceil(count**2 / _CURVATURE_ROWS)):
         away = point - point[rows, None]
         square = np.einsum("rcx,rcx->rc", away, away)
         below = -np.einsum("rcx,rx->rc", away, normal[rows])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from invertwin.capture.capture import BEAT_DIMS, Capture
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.capture.radar_fields import labelled
+from invertwin.capture.readers.radar_fields import labelled
 from invertwin.checks import checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError

@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
-from invertwin.capture import described_arrays, described_sweeps, ti
+from invertwin.capture import ti
 from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.chirps import ChirpSettings
+from invertwin.capture.readers import described_arrays, described_sweeps
 from invertwin.errors import InputError
 from invertwin.radar.boards import Elements, Mounting
 

@@ -167,7 +167,7 @@ def test_no_bag_is_one_line(tmp_path):
 
 
 def test_messages_of_different_sizes_do_not_stack():
-    from invertwin.capture.bags import Messages
+    from invertwin.capture.readers.bags import Messages
 
     with pytest.raises(InputError, match="got 2 sizes"):
         Messages(torch.zeros(2).double(), [np.zeros(3), np.zeros(4)]).stacked()

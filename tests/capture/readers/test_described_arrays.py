@@ -9,7 +9,7 @@ import scipy.io
 import torch
 
 from invertwin.capture import ChirpData, ChirpSettings, read
-from invertwin.capture.described_arrays import described_board, read_chirps, write_chirps
+from invertwin.capture.readers.described_arrays import described_board, read_chirps, write_chirps
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
 from invertwin.radar.waveform import PhysicsWarning

@@ -11,7 +11,7 @@ import scipy.io
 import torch
 
 from invertwin.capture import Capture, backproject, is_sweeps, read
-from invertwin.capture.described_sweeps import read_sweeps
+from invertwin.capture.readers.described_sweeps import read_sweeps
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar import SteppedFrequency, range_profile

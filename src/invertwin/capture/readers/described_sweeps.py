@@ -12,13 +12,13 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
-from invertwin.capture.described_arrays import (
+from invertwin.capture.readers.described_arrays import (
     arranged,
     element_array,
     load_array,
     load_description,
 )
-from invertwin.capture.signature_files import load_touchstone
+from invertwin.capture.readers.touchstone import load_touchstone
 from invertwin.checks import checked_tensor
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
