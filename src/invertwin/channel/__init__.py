@@ -1,20 +1,20 @@
 """From a scene to propagation paths: the only room that knows the ray tracer."""
 
-from invertwin.channel.field.chains import trace_chains as trace_chains
+from invertwin.channel.beams.coherent_targets import interference as interference
+from invertwin.channel.beams.coherent_targets import trace_target as trace_target
+from invertwin.channel.beams.coherent_targets import without_echoes as without_echoes
+from invertwin.channel.beams.facet_paths import trace_chains as trace_chains
+from invertwin.channel.beams.partial_visibility import PanelCells as PanelCells
+from invertwin.channel.beams.partial_visibility import lit_fractions as lit_fractions
 from invertwin.channel.field.coverage import trace_coverage as trace_coverage
 from invertwin.channel.field.echoes import trace_echoes as trace_echoes
 from invertwin.channel.field.field import trace_field as trace_field
-from invertwin.channel.field.lit import PanelCells as PanelCells
-from invertwin.channel.field.lit import lit_fractions as lit_fractions
 from invertwin.channel.field.rough_points import densities_of as densities_of
 from invertwin.channel.field.scattered import trace_scattered as trace_scattered
 from invertwin.channel.field.signature import trace_signature as trace_signature
 from invertwin.channel.field.speckle import Speckle as Speckle
 from invertwin.channel.field.speckle import draw_speckle as draw_speckle
 from invertwin.channel.field.specular import trace_paths as trace_paths
-from invertwin.channel.field.targets import interference as interference
-from invertwin.channel.field.targets import trace_target as trace_target
-from invertwin.channel.field.targets import without_echoes as without_echoes
 from invertwin.channel.field.waves import polarisations as polarisations
 from invertwin.channel.paths import Grid as Grid
 from invertwin.channel.paths import Link as Link

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from invertwin.channel.field.beams import Bounce
+from invertwin.channel.beams.beam_tracing import Bounce
 from invertwin.channel.field.passages import at_surface, passage
 from invertwin.channel.field.solids import Solids, normal_part, refracted
 from invertwin.channel.field.waves import Skins, dot, mirrored, reflected

@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel import SphereSection, trace_signature
+from invertwin.channel.beams.beam_tracing import clip
 from invertwin.channel.field import meshed, signature
-from invertwin.channel.field.beams import clip
 from invertwin.channel.field.waves import (
     Skins,
     area_vector,

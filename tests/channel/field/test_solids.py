@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 import invertwin as iw
+from invertwin.channel.beams.beam_tracing import beams, facets_of
 from invertwin.channel.field import signature
-from invertwin.channel.field.beams import beams, facets_of
 from invertwin.channel.field.passages import at_surface
 from invertwin.channel.field.solids import interiors
 from invertwin.channel.field.waves import area_vector, dot

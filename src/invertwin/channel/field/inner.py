@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.beams import Bounce, Facets, joined, left, rows_of
+from invertwin.channel.beams.beam_tracing import Bounce, Facets, joined, left, rows_of
 from invertwin.channel.field.patches import above, divided, inner_points
 from invertwin.channel.field.solids import Solids
 from invertwin.channel.field.waves import cross, dot, mirrored, points_at, shares, unit_across

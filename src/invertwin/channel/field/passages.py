@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Complex128
 from torch import Tensor
 
-from invertwin.channel.field.beams import Bounce
+from invertwin.channel.beams.beam_tracing import Bounce
 from invertwin.channel.field.solids import Solids, normal_part
 from invertwin.channel.field.waves import (
     Skins,

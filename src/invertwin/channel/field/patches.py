@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.field.beams import Bounce, Facets, in_air
+from invertwin.channel.beams.beam_tracing import Bounce, Facets, in_air
 from invertwin.channel.field.waves import dot
 
 _LARGE = 8.0  # times the smallest piece: larger triangles are split before they are looked at

@@ -18,7 +18,7 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.beams import FEW, Bounce, Facets, beams, facets_of
+from invertwin.channel.beams.beam_tracing import FEW, Bounce, Facets, beams, facets_of
 from invertwin.channel.field.inner import SMOOTH, Curved, curved, require_apart, with_inner
 from invertwin.channel.field.meshed import SolvedMeshes
 from invertwin.channel.field.passages import at_surface

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from torch import Tensor
 
-from invertwin.channel.field.beams import Bounce, Facets, in_air
+from invertwin.channel.beams.beam_tracing import Bounce, Facets, in_air
 from invertwin.channel.field.patches import above, divided
 from invertwin.channel.field.waves import dot, mirrored
 from invertwin.channel.rays.scene import Occluders, next_surface

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.beams import FEW, Bounce, Facets, beams, facets_of
+from invertwin.channel.beams.beam_tracing import FEW, Bounce, Facets, beams, facets_of
 from invertwin.channel.field.polarised import (
     antenna_fields,
     combined,

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.channel.field.chains import trace_chains
-from invertwin.channel.field.lit import PanelCells, lit_fractions
+from invertwin.channel.beams.facet_paths import trace_chains
+from invertwin.channel.beams.partial_visibility import PanelCells, lit_fractions
 from invertwin.channel.field.waves import cross, unit_across
 from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.sampling import Sampling
