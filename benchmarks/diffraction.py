@@ -52,28 +52,28 @@ from report import MetricTable, Required, write
 from rich.table import Table
 from torch import Tensor
 
+from invertwin.channel.em.plane_waves import cross, dot, mirrored, plane_of_incidence
+from invertwin.channel.em.transition_functions import transition
+from invertwin.channel.em.utd import Faces, Turn, conductor, diffraction_dyad
+from invertwin.channel.em.wedges import Wedges, azimuth_outside, edge_axis
 from invertwin.channel.field.bends import Bends, find_bends
 from invertwin.channel.field.diffracted import DiffractedPaths, diffracted_paths
-from invertwin.channel.field.diffraction import Faces, Turn, conductor, diffraction_dyad
 from invertwin.channel.field.edge_paths import Edge, over_edges
 from invertwin.channel.field.edged import EdgedScene
 from invertwin.channel.field.images import Walls
 from invertwin.channel.field.sequences import Powers
-from invertwin.channel.field.transition import transition
-from invertwin.channel.field.waves import cross, dot, mirrored, plane_of_incidence
-from invertwin.channel.field.wedges import Wedges, azimuth_outside, edge_axis
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.scene import visible
 from invertwin.channel.rays.topology import topology_of
-from invertwin.channel.reference.wedges import (
-    half_plane_of_plane_wave,
-    half_plane_of_point_source,
-    wedge_of_plane_wave,
-)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.scene import box
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
 from invertwin.scene.material.slab import Sheet, slab_coefficients
+from oracles.exact_wedge import (
+    half_plane_of_plane_wave,
+    half_plane_of_point_source,
+    wedge_of_plane_wave,
+)
 
 WAVE_NUMBER = 2 * math.pi  # a wavelength is a metre
 PERMITTIVITY = 5 - 0.3j

@@ -35,7 +35,7 @@ from rich.table import Table
 from torch import Tensor
 
 from invertwin import Object, Scene, rcs
-from invertwin.channel.field.waves import polarisations
+from invertwin.channel.em.plane_waves import polarisations
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import PhysicsWarning
 from invertwin.scene import Mesh, PerfectConductor

@@ -6,16 +6,17 @@ from invertwin.channel.beams.coherent_targets import without_echoes as without_e
 from invertwin.channel.beams.facet_paths import trace_chains as trace_chains
 from invertwin.channel.beams.partial_visibility import PanelCells as PanelCells
 from invertwin.channel.beams.partial_visibility import lit_fractions as lit_fractions
+from invertwin.channel.coherent.field import trace_field as trace_field
+from invertwin.channel.coherent.power_paths import trace_power as trace_power
+from invertwin.channel.coherent.speckle import Speckle as Speckle
+from invertwin.channel.coherent.speckle import densities_of as densities_of
+from invertwin.channel.coherent.speckle import draw_speckle as draw_speckle
+from invertwin.channel.em.plane_waves import polarisations as polarisations
 from invertwin.channel.field.coverage import trace_coverage as trace_coverage
 from invertwin.channel.field.echoes import trace_echoes as trace_echoes
-from invertwin.channel.field.field import trace_field as trace_field
-from invertwin.channel.field.rough_points import densities_of as densities_of
 from invertwin.channel.field.scattered import trace_scattered as trace_scattered
 from invertwin.channel.field.signature import trace_signature as trace_signature
-from invertwin.channel.field.speckle import Speckle as Speckle
-from invertwin.channel.field.speckle import draw_speckle as draw_speckle
 from invertwin.channel.field.specular import trace_paths as trace_paths
-from invertwin.channel.field.waves import polarisations as polarisations
 from invertwin.channel.paths import Grid as Grid
 from invertwin.channel.paths import Link as Link
 from invertwin.channel.paths import Paths as Paths
@@ -41,7 +42,6 @@ from invertwin.channel.reference.cross_sections import (
     SquareTrihedralSection as SquareTrihedralSection,
 )
 from invertwin.channel.reference.cross_sections import TrihedralSection as TrihedralSection
-from invertwin.channel.reference.power import trace_power as trace_power
 from invertwin.channel.sampling import REST as REST
 from invertwin.channel.sampling import Densities as Densities
 from invertwin.channel.sampling import Sampling as Sampling

@@ -15,8 +15,8 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.field.cuts import close_pairs
-from invertwin.channel.field.waves import cross, dot
 from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
 from invertwin.channel.rays.contacts import common_segments

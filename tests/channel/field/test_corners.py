@@ -5,15 +5,15 @@ import math
 import pytest
 import torch
 
+from invertwin.channel.em.utd import conductor
+from invertwin.channel.em.wedges import Wedges
 from invertwin.channel.field.bends import find_bends
 from invertwin.channel.field.corners import round_corner
 from invertwin.channel.field.diffracted import diffracted_paths
-from invertwin.channel.field.diffraction import conductor
 from invertwin.channel.field.edge_paths import Edge, over_edges
 from invertwin.channel.field.edged import EdgedScene
 from invertwin.channel.field.images import Walls
 from invertwin.channel.field.sequences import Powers
-from invertwin.channel.field.wedges import Wedges
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.topology import topology_of
 from invertwin.scene import box

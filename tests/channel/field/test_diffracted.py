@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
+from invertwin.channel.em.utd import conductor
 from invertwin.channel.field.bends import find_bends
 from invertwin.channel.field.diffracted import diffracted_paths
-from invertwin.channel.field.diffraction import conductor
 from invertwin.channel.field.edged import EdgedScene
 from invertwin.channel.field.images import Walls
 from invertwin.channel.field.sequences import Powers

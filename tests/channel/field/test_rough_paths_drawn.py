@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from invertwin.channel import Link
-from invertwin.channel.field.rough_paths import draw_rough_paths
+from invertwin.channel.coherent.radar_equation import SurfacePaths, path_view, unblocked
+from invertwin.channel.coherent.rough_paths import draw_rough_paths
 from invertwin.channel.rays.geometry import Geometry, flatten
 from invertwin.channel.rays.scene import RayScene, face_areas
-from invertwin.channel.reference.radar_equation import SurfacePaths, path_view, unblocked
 from invertwin.scene import RoughConductor, Scene, plate
 from scenes import link, thing
 

@@ -12,8 +12,7 @@ from torch.nn.functional import normalize
 
 from invertwin.channel import SphereSection, trace_signature
 from invertwin.channel.beams.beam_tracing import clip
-from invertwin.channel.field import meshed, signature
-from invertwin.channel.field.waves import (
+from invertwin.channel.em.plane_waves import (
     Skins,
     area_vector,
     dot,
@@ -23,7 +22,8 @@ from invertwin.channel.field.waves import (
     radiated,
     reflected,
 )
-from invertwin.channel.field.wedges import Wedges, find_wedges, fringe_field, run_on
+from invertwin.channel.em.wedges import Wedges, find_wedges, fringe_field, run_on
+from invertwin.channel.field import meshed, signature
 from invertwin.channel.rays.topology import topology_of
 from invertwin.channel.reference.cross_sections import strip_across, strip_along
 from invertwin.constants import SPEED_OF_LIGHT

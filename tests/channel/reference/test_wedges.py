@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import hankel2
 
-from invertwin.channel.reference.wedges import (
+from oracles.exact_wedge import (
     half_plane_of_plane_wave,
     half_plane_of_point_source,
     wedge_of_line_source,

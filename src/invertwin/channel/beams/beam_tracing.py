@@ -16,8 +16,8 @@ from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.solids import AIR, Solids, refracted
-from invertwin.channel.field.waves import area_vector, cross, dot, mirrored, polygon_integral
+from invertwin.channel.em.dielectric_solids import AIR, Solids, refracted
+from invertwin.channel.em.plane_waves import area_vector, cross, dot, mirrored, polygon_integral
 from invertwin.channel.rays.topology import Topology
 
 FEW = 24

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from invertwin.channel.beams.facet_paths import trace_chains
 from invertwin.channel.beams.partial_visibility import PanelCells, lit_fractions
-from invertwin.channel.field.waves import cross, unit_across
+from invertwin.channel.em.plane_waves import cross, unit_across
 from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT

@@ -14,13 +14,13 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.beams.beam_tracing import FEW, Bounce, Facets, beams, facets_of
-from invertwin.channel.field.polarised import (
+from invertwin.channel.em.antenna_fields import (
     antenna_fields,
     combined,
     conductor_field,
     current_kernel,
 )
-from invertwin.channel.field.waves import area_vector, dot, polygon_integral
+from invertwin.channel.em.plane_waves import area_vector, dot, polygon_integral
 from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.rays.geometry import flatten
 from invertwin.constants import SPEED_OF_LIGHT

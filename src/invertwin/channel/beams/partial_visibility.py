@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.field.waves import cross, dot
+from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.scene import Occluders, visible
 from invertwin.channel.rays.topology import Topology, topology_of

@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
+from invertwin.channel.em.plane_waves import dot
 from invertwin.channel.field.corners import face_share
 from invertwin.channel.field.edge_paths import several_turning_points, turning_points
 from invertwin.channel.field.edged import EdgedScene, exterior
@@ -33,7 +34,6 @@ from invertwin.channel.field.sequences import (
     every_sequence,
     sequences_from_edges,
 )
-from invertwin.channel.field.waves import dot
 from invertwin.channel.ray_paths import REFLECTION, TRANSMISSION
 
 Corner = Literal["first", "last"] | None

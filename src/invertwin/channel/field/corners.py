@@ -17,10 +17,10 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.diffraction import Order, Turn, diffraction_dyads
+from invertwin.channel.em.plane_waves import cross, dot
+from invertwin.channel.em.utd import Order, Turn, diffraction_dyads
+from invertwin.channel.em.wedges import Wedges, azimuth_outside, edge_axis
 from invertwin.channel.field.edge_paths import Edge, EdgePaths, Route, find_route, transfers
-from invertwin.channel.field.waves import cross, dot
-from invertwin.channel.field.wedges import Wedges, azimuth_outside, edge_axis
 
 _LOW = 1e-18  # sin² of angles that count as none
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel.field.waves import turned
+from invertwin.channel.em.plane_waves import turned
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import PhysicsWarning
 

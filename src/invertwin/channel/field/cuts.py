@@ -13,9 +13,9 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.field.images import Walls
 from invertwin.channel.field.shadow_edges import Screen, spread_along
-from invertwin.channel.field.waves import cross, dot
 from invertwin.channel.rays.contacts import common_segments
 from invertwin.channel.rays.topology import Topology
 from invertwin.checks import plain

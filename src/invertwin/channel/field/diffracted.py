@@ -14,13 +14,13 @@ from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.em.plane_waves import cross, dot, mirrored, plane_of_incidence
+from invertwin.channel.em.wedges import edge_axis
 from invertwin.channel.field.bends import Bends, Corner, Legs, along_faces
 from invertwin.channel.field.corners import round_corner
 from invertwin.channel.field.edge_paths import Edge, EdgePaths, over_edges
 from invertwin.channel.field.edged import EdgedScene, on_edge
 from invertwin.channel.field.images import corners_of, images
-from invertwin.channel.field.waves import cross, dot, mirrored, plane_of_incidence
-from invertwin.channel.field.wedges import edge_axis
 from invertwin.channel.ray_paths import DIFFRACTION
 
 

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel.field.polarised import antenna_fields, combined
+from invertwin.channel.em.antenna_fields import antenna_fields, combined
+from invertwin.channel.em.plane_waves import polarisations
 from invertwin.channel.field.specular import trace_paths
-from invertwin.channel.field.waves import polarisations
 from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.ray_paths import RayPaths
 from invertwin.checks import ArrayLike, checked_tensor

@@ -23,7 +23,8 @@ import torch
 from jaxtyping import Bool, Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel.field.diffraction import (
+from invertwin.channel.em.plane_waves import cross, dot
+from invertwin.channel.em.utd import (
     Faces,
     Order,
     Turn,
@@ -32,8 +33,7 @@ from invertwin.channel.field.diffraction import (
     double_dyad,
     triple_dyad,
 )
-from invertwin.channel.field.waves import cross, dot
-from invertwin.channel.field.wedges import Wedges, azimuth_outside, edge_axis
+from invertwin.channel.em.wedges import Wedges, azimuth_outside, edge_axis
 
 _STEPS = 40  # of the search for the shortest path over two edges
 _LIFTS = (0.1, 0.01, 0.0)  # of the antennas' distance, one after the other

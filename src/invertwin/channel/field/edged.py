@@ -13,16 +13,16 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.edge_paths import Edge
-from invertwin.channel.field.images import Walls, clear_ways
-from invertwin.channel.field.waves import dot
-from invertwin.channel.field.wedges import (
+from invertwin.channel.em.plane_waves import dot
+from invertwin.channel.em.wedges import (
     Wedges,
     azimuth,
     edge_axis,
     find_wedges,
     joined_wedges,
 )
+from invertwin.channel.field.edge_paths import Edge
+from invertwin.channel.field.images import Walls, clear_ways
 from invertwin.channel.rays.topology import Topology
 from invertwin.checks import plain
 from invertwin.scene.material.fresnel import FieldCoefficients

@@ -19,8 +19,8 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.em.plane_waves import cross, dot, mirrored, unit_across
 from invertwin.channel.field.planes import Planes, planes_of
-from invertwin.channel.field.waves import cross, dot, mirrored, unit_across
 from invertwin.channel.rays.arrays import opaque, to_double, to_float, to_index, to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import NEAR, Occluders

@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 
+from invertwin.channel.em.plane_waves import cross, dot, polarisations, turned
 from invertwin.channel.field.conforming import Conforming, conforming
 from invertwin.channel.field.currents import Currents, keeps_power
 from invertwin.channel.field.moments import Moments, functions_of
-from invertwin.channel.field.waves import cross, dot, polarisations, turned
 from invertwin.checks import differentiated
 from invertwin.errors import InputError
 from invertwin.scene import Mesh, signed_distance

@@ -25,7 +25,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from invertwin.channel.field.waves import cross, dot, turned
+from invertwin.channel.em.plane_waves import cross, dot, turned
 
 _NEAR = 1.6  # of the radii of two triangles, up to which their distance counts as near
 _DOUBLE = 2500  # unknowns up to which all is in double precision

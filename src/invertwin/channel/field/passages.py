@@ -11,8 +11,8 @@ from jaxtyping import Complex128
 from torch import Tensor
 
 from invertwin.channel.beams.beam_tracing import Bounce
-from invertwin.channel.field.solids import Solids, normal_part
-from invertwin.channel.field.waves import (
+from invertwin.channel.em.dielectric_solids import Solids, normal_part
+from invertwin.channel.em.plane_waves import (
     Skins,
     Vectors,
     dot,

@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.beams.beam_tracing import Bounce, Facets, in_air
-from invertwin.channel.field.waves import dot
+from invertwin.channel.em.plane_waves import dot
 
 _LARGE = 8.0  # times the smallest piece: larger triangles are split before they are looked at
 _INSET = 0.02  # from a corner to the middle, where a corner is looked at

@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.channel.field.waves import cross, dot, parallelogram_integral
-from invertwin.channel.field.wedges import LEAST_ANGLE, Wedges
+from invertwin.channel.em.plane_waves import cross, dot, parallelogram_integral
+from invertwin.channel.em.wedges import LEAST_ANGLE, Wedges
 
 _SAMPLES = 16  # of the lit part of the last edge
 _FLAT = 1e-6

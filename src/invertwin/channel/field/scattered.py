@@ -24,19 +24,19 @@ from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
+from invertwin.channel.coherent.radar_equation import Place, SurfacePaths, scattered
+from invertwin.channel.em.plane_waves import dot
 from invertwin.channel.field.images import Chains, Walls, chains_from
 from invertwin.channel.field.joint import joint
 from invertwin.channel.field.sequences import every_sequence, sequences_from_edges
 from invertwin.channel.field.shadow_edges import OwnSurfaces, rim_points, rims
 from invertwin.channel.field.specular import Stage, paths_of, powers_of, staged
-from invertwin.channel.field.waves import dot
 from invertwin.channel.paths import Link
 from invertwin.channel.ray_paths import REFLECTION, RayPaths, joined
 from invertwin.channel.rays.backend import torch_threads, tracing
 from invertwin.channel.rays.contacts import contacts_of
 from invertwin.channel.rays.geometry import Geometry, flatten
 from invertwin.channel.rays.scene import RayScene, face_areas
-from invertwin.channel.reference.radar_equation import Place, SurfacePaths, scattered
 from invertwin.channel.sampling import Sampling
 from invertwin.checks import ArrayLike, differentiated, plain
 from invertwin.constants import SPEED_OF_LIGHT

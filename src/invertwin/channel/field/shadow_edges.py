@@ -20,9 +20,9 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
+from invertwin.channel.em.plane_waves import cross, dot, mirrored, points_at
 from invertwin.channel.field.images import Chains, Walls, chains_between, images
 from invertwin.channel.field.sequences import Powers
-from invertwin.channel.field.waves import cross, dot, mirrored, points_at
 from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import NEAR, Occluders

@@ -19,15 +19,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.beams.beam_tracing import FEW, Bounce, Facets, beams, facets_of
-from invertwin.channel.field.inner import SMOOTH, Curved, curved, require_apart, with_inner
-from invertwin.channel.field.meshed import SolvedMeshes
-from invertwin.channel.field.passages import at_surface
-from invertwin.channel.field.patches import lit_triangles
-from invertwin.channel.field.plates import plates_of, several_diffractions
-from invertwin.channel.field.solids import Solids, homogeneous, interiors
-from invertwin.channel.field.solved import SolvedBodies
-from invertwin.channel.field.tubes import tubes
-from invertwin.channel.field.waves import (
+from invertwin.channel.em.dielectric_solids import Solids, homogeneous, interiors
+from invertwin.channel.em.plane_waves import (
     Skins,
     dot,
     parallelogram_integral,
@@ -35,7 +28,7 @@ from invertwin.channel.field.waves import (
     radiated,
     reflected,
 )
-from invertwin.channel.field.wedges import (
+from invertwin.channel.em.wedges import (
     LEAST_ANGLE,
     Wedges,
     find_wedges,
@@ -44,6 +37,13 @@ from invertwin.channel.field.wedges import (
     outside,
     run_on,
 )
+from invertwin.channel.field.inner import SMOOTH, Curved, curved, require_apart, with_inner
+from invertwin.channel.field.meshed import SolvedMeshes
+from invertwin.channel.field.passages import at_surface
+from invertwin.channel.field.patches import lit_triangles
+from invertwin.channel.field.plates import plates_of, several_diffractions
+from invertwin.channel.field.solved import SolvedBodies
+from invertwin.channel.field.tubes import tubes
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.scene import Occluders, visible
 from invertwin.channel.rays.topology import Topology, topology_of

@@ -20,9 +20,9 @@ import torch
 from jaxtyping import Complex64, Complex128, Float64
 from torch import Tensor
 
+from invertwin.channel.em.plane_waves import cross, dot, polarisations, turned
 from invertwin.channel.field.cells import Cells, cells_of
 from invertwin.channel.field.currents import Currents, keeps_power
-from invertwin.channel.field.waves import cross, dot, polarisations, turned
 
 MOST = 6000
 """Cells up to which currents are solved: twice as many unknowns."""

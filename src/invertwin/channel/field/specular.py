@@ -17,6 +17,13 @@ from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
+from invertwin.channel.em.plane_waves import (
+    dot,
+    mirrored,
+    plane_of_incidence,
+    points_at,
+    polarisations,
+)
 from invertwin.channel.field.bends import Bends, find_bends
 from invertwin.channel.field.diffracted import diffracted_paths
 from invertwin.channel.field.edged import EdgedScene
@@ -32,13 +39,6 @@ from invertwin.channel.field.sequences import (
     Sequences,
     every_sequence,
     shot_sequences,
-)
-from invertwin.channel.field.waves import (
-    dot,
-    mirrored,
-    plane_of_incidence,
-    points_at,
-    polarisations,
 )
 from invertwin.channel.ray_paths import REFLECTION, TRANSMISSION, RayPaths, joined
 from invertwin.channel.rays.backend import tracing

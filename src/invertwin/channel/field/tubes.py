@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from torch import Tensor
 
 from invertwin.channel.beams.beam_tracing import Bounce, Facets, in_air
+from invertwin.channel.em.plane_waves import dot, mirrored
 from invertwin.channel.field.patches import above, divided
-from invertwin.channel.field.waves import dot, mirrored
 from invertwin.channel.rays.scene import Occluders, next_surface
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import grid_sample
 
-from invertwin.channel.coupling import power_shares
+from invertwin.channel.em.depolarisation import power_shares
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins
 from invertwin.channel.power.explicit import Splat

@@ -13,7 +13,7 @@ from jaxtyping import Float32
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 
-from invertwin.channel.coupling import power_shares
+from invertwin.channel.em.depolarisation import power_shares
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins, replay
 from invertwin.channel.power.clouds import deposit_density

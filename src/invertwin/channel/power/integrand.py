@@ -1,7 +1,7 @@
 """What one vertex of a path contributes, in Dr.Jit: the integrand of the path integral.
 
 Everything here is differentiable or not, as its ``Inputs`` are. The torch form of these formulas,
-in float64, is ``channel/reference/radar_equation.py``; tests hold the two equal.
+in float64, is ``channel/coherent/radar_equation.py``; tests hold the two equal.
 """
 
 from dataclasses import dataclass, replace

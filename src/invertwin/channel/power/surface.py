@@ -1,7 +1,7 @@
 """What a surface does to a path, in Dr.Jit: tables of ``scene.material.Surface`` and their law.
 
 Everything here is differentiable or not, as the tables are. The same law in torch, float64, is
-``channel/reference/radar_equation.py``; tests hold the two equal.
+``channel/coherent/radar_equation.py``; tests hold the two equal.
 """
 
 from collections.abc import Mapping

@@ -7,20 +7,21 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from invertwin.channel.field.mirrors import mirrored_paths, spread_points
-from invertwin.channel.field.polarised import combined, mirror_matrix, rough_matrix
-from invertwin.channel.field.speckle import Speckle, draw_speckle
-from invertwin.channel.paths import Link, Paths, joined
-from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.geometry import flatten, require_edges, silhouettes_move
-from invertwin.channel.rays.scene import RayScene, face_areas
-from invertwin.channel.reference.radar_equation import (
+from invertwin.channel.coherent.boundary_paths import ShadowEdge, boundary_rows
+from invertwin.channel.coherent.multibounce_po import mirrored_paths, spread_points
+from invertwin.channel.coherent.polarised_scattering import mirror_matrix, rough_matrix
+from invertwin.channel.coherent.radar_equation import (
     Echo,
     SurfacePaths,
     path_view,
     unblocked,
 )
-from invertwin.channel.reference.shadows import ShadowEdge, boundary_rows
+from invertwin.channel.coherent.speckle import Speckle, draw_speckle
+from invertwin.channel.em.antenna_fields import combined
+from invertwin.channel.paths import Link, Paths, joined
+from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.geometry import flatten, require_edges, silhouettes_move
+from invertwin.channel.rays.scene import RayScene, face_areas
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.progress import told

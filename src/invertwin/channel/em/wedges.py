@@ -20,7 +20,7 @@ from torch import Tensor
 from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.waves import cross, dot
+from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.checks import plain
 
 LEAST_ANGLE = math.radians(10.0)

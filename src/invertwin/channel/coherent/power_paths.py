@@ -4,15 +4,15 @@ from collections.abc import Iterator
 
 import torch
 
-from invertwin.channel.coupling import coupled_power
+from invertwin.channel.coherent.boundary_paths import ShadowEdge, boundary_rows
+from invertwin.channel.coherent.radar_equation import Echo, SurfacePaths, path_view
+from invertwin.channel.em.depolarisation import coupled_power
 from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.power.trace import Trace
 from invertwin.channel.power.walk import Records
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.geometry import Geometry, flatten, require_edges, silhouettes_move
-from invertwin.channel.reference.radar_equation import Echo, SurfacePaths, path_view
-from invertwin.channel.reference.shadows import ShadowEdge, boundary_rows
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene

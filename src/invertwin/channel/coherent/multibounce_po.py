@@ -14,17 +14,17 @@ from jaxtyping import Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.polarised import (
+from invertwin.channel.coherent.radar_equation import SurfacePaths, passed
+from invertwin.channel.em.antenna_fields import (
     antenna_fields,
     combined,
     conductor_field,
     current_kernel,
 )
-from invertwin.channel.field.waves import dot, mirrored
+from invertwin.channel.em.plane_waves import dot, mirrored
 from invertwin.channel.paths import Paths
 from invertwin.channel.rays.geometry import silhouettes_move
 from invertwin.channel.rays.scene import NEAR, RayScene, face_areas, next_surface
-from invertwin.channel.reference.radar_equation import SurfacePaths, passed
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError

@@ -8,6 +8,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.coherent.radar_equation import Echo, Place, radar_equation
 from invertwin.channel.paths import Paths
 from invertwin.channel.power.edges import EdgePoints, EdgeSampler
 from invertwin.channel.power.integrand import Inputs
@@ -15,7 +16,6 @@ from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import mixed
 from invertwin.channel.rays.scene import RayScene, visible
-from invertwin.channel.reference.radar_equation import Echo, Place, radar_equation
 
 
 @dataclass(frozen=True)

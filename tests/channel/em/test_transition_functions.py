@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from invertwin.channel.field.transition import (
+from invertwin.channel.em.transition_functions import (
     chain_transition,
     corner_transition,
     end_transition,

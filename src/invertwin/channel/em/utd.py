@@ -25,15 +25,15 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.transition import (
+from invertwin.channel.em.plane_waves import cross, dot, mirrored, plane_of_incidence
+from invertwin.channel.em.transition_functions import (
     chain_transition,
     corner_transition,
     edge_transition,
     edge_transition_slope,
     transition,
 )
-from invertwin.channel.field.waves import cross, dot, mirrored, plane_of_incidence
-from invertwin.channel.field.wedges import Wedges, edge_axis
+from invertwin.channel.em.wedges import Wedges, edge_axis
 from invertwin.scene.material.fresnel import FieldCoefficients
 
 _TURN = complex(math.sqrt(0.5), -math.sqrt(0.5))  # exp(−jπ/4)

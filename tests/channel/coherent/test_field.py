@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Paths, Sampling, deposit_power, trace_field, trace_power
-from invertwin.channel.field.rough_points import draw_rough_points
+from invertwin.channel.coherent.speckle import draw_rough_points
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene import (

@@ -9,10 +9,10 @@ from torch import Tensor
 
 import invertwin as iw
 from invertwin.channel.beams.beam_tracing import beams, facets_of
+from invertwin.channel.em.dielectric_solids import interiors
+from invertwin.channel.em.plane_waves import area_vector, dot
 from invertwin.channel.field import signature
 from invertwin.channel.field.passages import at_surface
-from invertwin.channel.field.solids import interiors
-from invertwin.channel.field.waves import area_vector, dot
 from invertwin.channel.rays.topology import topology_of
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.field.waves import Skins, Vectors, cross, dot
+from invertwin.channel.em.plane_waves import Skins, Vectors, cross, dot
 from invertwin.checks import differentiated
 from invertwin.errors import InputError
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.coherent.radar_equation import SurfacePaths, passed, radar_equation
 from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand, walk
 from invertwin.channel.rays.arrays import (
@@ -24,7 +25,6 @@ from invertwin.channel.rays.arrays import (
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import Geometry, flatten
 from invertwin.channel.rays.scene import RayScene, face_areas
-from invertwin.channel.reference.radar_equation import SurfacePaths, passed, radar_equation
 from invertwin.progress import told
 from invertwin.scene.scene import Scene
 

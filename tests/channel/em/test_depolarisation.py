@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_power, trace_power
-from invertwin.channel.coupling import coupled_field, coupled_power
+from invertwin.channel.em.depolarisation import coupled_field, coupled_power
 from invertwin.errors import InputError
 from invertwin.scene import Dielectric, JonesTable, Object, Scene, linear_array, plate
 from invertwin.scene.polarisation import Polarisation
