@@ -33,9 +33,9 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Sampling, backend
 from invertwin.channel.power import boundary
-from invertwin.channel.power.edges import InteriorEdgeSampler
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.walk import Walk
+from invertwin.channel.power.interior_silhouettes import InteriorEdgeSampler
+from invertwin.channel.power.random_walk import Walk
 from invertwin.channel.rays.arrays import from_points
 from invertwin.channel.rays.backend import mi, torch_threads
 from invertwin.channel.rays.geometry import flatten

@@ -21,10 +21,10 @@ from invertwin.channel.paths import Grid as Grid
 from invertwin.channel.paths import Link as Link
 from invertwin.channel.paths import Paths as Paths
 from invertwin.channel.paths import Pattern as Pattern
+from invertwin.channel.power.bins import deposit_paths as deposit_paths
 from invertwin.channel.power.clouds import deposit_density as deposit_density
 from invertwin.channel.power.deposit import deposit_batch as deposit_batch
 from invertwin.channel.power.deposit import deposit_power as deposit_power
-from invertwin.channel.power.explicit import deposit_paths as deposit_paths
 from invertwin.channel.ray_paths import KINDS as KINDS
 from invertwin.channel.ray_paths import METASURFACE as METASURFACE
 from invertwin.channel.ray_paths import RayPaths as RayPaths

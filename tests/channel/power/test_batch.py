@@ -9,8 +9,9 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_batch, deposit_power
-from invertwin.channel.power.edges import EdgeSampler, InteriorEdgeSampler
 from invertwin.channel.power.integrand import Inputs
+from invertwin.channel.power.interior_silhouettes import InteriorEdgeSampler
+from invertwin.channel.power.silhouettes import EdgeSampler
 from invertwin.channel.rays.apart import stand_apart
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import tracing

@@ -10,8 +10,8 @@ from torch.nn.functional import normalize
 
 from invertwin.channel.coherent.radar_equation import Echo, Place, radar_equation
 from invertwin.channel.paths import Paths
-from invertwin.channel.power.edges import EdgePoints, EdgeSampler
 from invertwin.channel.power.integrand import Inputs
+from invertwin.channel.power.silhouettes import EdgePoints, EdgeSampler
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.geometry import mixed

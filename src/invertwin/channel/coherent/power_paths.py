@@ -8,8 +8,8 @@ from invertwin.channel.coherent.boundary_paths import ShadowEdge, boundary_rows
 from invertwin.channel.coherent.radar_equation import Echo, SurfacePaths, path_view
 from invertwin.channel.em.depolarisation import coupled_power
 from invertwin.channel.paths import Link, Paths, joined
+from invertwin.channel.power.random_walk import Records
 from invertwin.channel.power.trace import Trace
-from invertwin.channel.power.walk import Records
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.geometry import Geometry, flatten, require_edges, silhouettes_move

@@ -13,7 +13,8 @@ from torch.nn.functional import normalize
 
 from invertwin.channel.coherent.radar_equation import SurfacePaths, passed, radar_equation
 from invertwin.channel.paths import Link
-from invertwin.channel.power import integrand, walk
+from invertwin.channel.power import integrand
+from invertwin.channel.power import random_walk as walk
 from invertwin.channel.rays.arrays import (
     opaque,
     scrambled,

@@ -9,21 +9,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from invertwin.channel.power import integrand, walk
+from invertwin.channel.power import integrand
+from invertwin.channel.power import random_walk as walk
 from invertwin.channel.power.bins import Contribution
-from invertwin.channel.power.contact import ContactSampler, Meeting, contact_paths
-from invertwin.channel.power.edges import (
-    Drawn,
-    EdgePoints,
-    EdgeSampler,
-    InteriorEdgeSampler,
-    Shadow,
-    TwoSided,
-    shadow_speed,
-)
 from invertwin.channel.power.integrand import Inputs, Place
-from invertwin.channel.power.passage import Passage
-from invertwin.channel.power.walk import State, Walk
+from invertwin.channel.power.interior_silhouettes import InteriorEdgeSampler, TwoSided
+from invertwin.channel.power.intersection_curves import ContactSampler, Meeting, contact_paths
+from invertwin.channel.power.random_walk import State, Walk
+from invertwin.channel.power.silhouettes import Drawn, EdgePoints, EdgeSampler, Shadow, shadow_speed
+from invertwin.channel.power.transmission import Passage
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.contacts import Contacts

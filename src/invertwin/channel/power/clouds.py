@@ -19,7 +19,7 @@ from torch.nn.functional import grid_sample
 from invertwin.channel.em.depolarisation import power_shares
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins
-from invertwin.channel.power.explicit import Splat
+from invertwin.channel.power.bins import Splat
 from invertwin.channel.rays.backend import use_backend
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError

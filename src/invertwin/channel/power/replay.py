@@ -13,8 +13,8 @@ from typing import Any
 from invertwin.channel.power import integrand
 from invertwin.channel.power.bins import Contribution
 from invertwin.channel.power.integrand import Inputs, Place
-from invertwin.channel.power.passage import Passage, crossed, passage
-from invertwin.channel.power.walk import Recorded, Records
+from invertwin.channel.power.random_walk import Recorded, Records
+from invertwin.channel.power.transmission import Passage, crossed, passage
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import RayScene

@@ -8,15 +8,16 @@ from typing import Any
 from torch import Tensor
 
 from invertwin.channel.paths import Link
-from invertwin.channel.power import integrand, walk
+from invertwin.channel.power import integrand
+from invertwin.channel.power import random_walk as walk
 from invertwin.channel.power.bins import Bins
 from invertwin.channel.power.boundary import BoundaryPaths, BoundaryPoints, boundary_paths
-from invertwin.channel.power.contact import require_unlit
 from invertwin.channel.power.integrand import DIFFERENTIABLE, Inputs, Place
-from invertwin.channel.power.passage import Passage
-from invertwin.channel.power.starts import AreaSampler, RaySampler
+from invertwin.channel.power.intersection_curves import require_unlit
+from invertwin.channel.power.random_walk import Records, State, Walk
+from invertwin.channel.power.start_points import AreaSampler, RaySampler
 from invertwin.channel.power.surface import SURFACE
-from invertwin.channel.power.walk import Records, State, Walk
+from invertwin.channel.power.transmission import Passage
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.contacts import contacts_of

@@ -11,9 +11,9 @@ from typing import Any
 
 from invertwin.channel.power import integrand
 from invertwin.channel.power.bins import Contribution
-from invertwin.channel.power.directions import Directions
+from invertwin.channel.power.direction_sampling import Directions
 from invertwin.channel.power.integrand import Inputs, Place
-from invertwin.channel.power.passage import Passage, land, passage
+from invertwin.channel.power.transmission import Passage, land, passage
 from invertwin.channel.rays.arrays import opaque, scrambled, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene import NEAR, RayScene

@@ -11,18 +11,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from invertwin.channel.power import integrand, walk
+from invertwin.channel.power import integrand
+from invertwin.channel.power import random_walk as walk
 from invertwin.channel.power.bins import Contribution
-from invertwin.channel.power.edges import (
-    Drawn,
-    Proportional,
-    barycentric,
-    by_scene,
-    place_along,
-)
+from invertwin.channel.power.discrete import Proportional, by_scene, place_along
 from invertwin.channel.power.integrand import Inputs, Place, Spot
-from invertwin.channel.power.passage import Passage, land, passage
-from invertwin.channel.power.walk import State, Walk
+from invertwin.channel.power.random_walk import State, Walk
+from invertwin.channel.power.silhouettes import Drawn, barycentric
+from invertwin.channel.power.transmission import Passage, land, passage
 from invertwin.channel.rays.arrays import (
     opaque,
     point_at,

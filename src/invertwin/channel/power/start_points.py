@@ -13,7 +13,7 @@ import numpy as np
 from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.passage import DEALT, land, passage
+from invertwin.channel.power.transmission import DEALT, land, passage
 from invertwin.channel.rays.arrays import (
     between,
     point_at,

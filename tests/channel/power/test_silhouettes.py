@@ -9,7 +9,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from invertwin.channel import Grid, Sampling, deposit_power, use_backend
-from invertwin.channel.power.edges import Proportional
+from invertwin.channel.power.discrete import Proportional
 from invertwin.channel.rays.backend import mi
 from invertwin.scene import Mesh, Object, Scene, plate, sphere
 from scenes import float64, link, noise, thing

@@ -1,0 +1,90 @@
+"""TODO."""
+
+from typing import Any
+
+from invertwin.channel.rays.arrays import uniform_pair
+from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.scene import RayScene
+
+_RESOLVED = 5e-5  # chance of an edge from which float32 resolves a sample's place within it
+_LAST_BELOW_ONE = 1 - 2.0**-24
+
+
+class Proportional:
+    """Draws entries in proportion to weights, without reading any back."""
+
+    def __init__(self, weights: Any) -> None:
+        self.weights, self.sums = weights, dr.cumsum(weights)
+        self.entries = dr.width(weights)
+        self.total = dr.gather(mi.Float, self.sums, self.entries - 1)
+
+    def draw(self, spread: Any) -> tuple[Any, Any, Any]:
+        """Entry, the rest of the number within it, and probability: zero if there is no entry."""
+        target = spread * self.total
+
+        def below(at: Any) -> Any:
+            return dr.gather(mi.Float, self.sums, at) <= target
+
+        place: Any = dr.binary_search(0, self.entries - 1, below)
+        weight = dr.gather(mi.Float, self.weights, place)
+        last = dr.gather(mi.Float, self.sums, place) - weight
+        rest = dr.clip((target - last) / weight, 0.0, _LAST_BELOW_ONE)
+        return place, rest, dr.select(weight > 0, weight / self.total, 0.0)
+
+
+def by_object(rays: RayScene, edge: Any, weight: Any, receiver: Any, centres: int) -> Any:
+    """Weights of edges by which no object drowns another.
+
+    An object gets the square root of the sum of its edges' weights, which is between a share by
+    size and one share for each. Both antennas get the same sum, and so do all scenes.
+
+    Args:
+        rays: The scene.
+        edge: Edges.
+        weight: Of each, by itself.
+        receiver: Whether it is the receiver's silhouette.
+        centres: 2 if there are silhouettes of a receiver, else 1.
+    """
+    objects = len(rays.geometry.names)
+    antenna = dr.select(receiver, mi.UInt32(1), 0)
+    row = dr.gather(mi.UInt32, rays.topology.device_edge_object, edge) + antenna * objects
+    totals, sums = dr.zeros(mi.Float, centres * objects), dr.zeros(mi.Float, centres * rays.scenes)
+    dr.scatter_add(totals, weight, row)
+    roots, rows = dr.sqrt(totals), dr.arange(mi.UInt32, centres * objects)
+    scene = rays.object_scene(rows % objects)
+    dr.scatter_add(sums, roots, rows // objects * rays.scenes + scene)
+    part = antenna * rays.scenes + rays.edge_scene(edge)
+    share: Any = weight / (dr.gather(mi.Float, roots, row) * dr.gather(mi.Float, sums, part))
+    return dr.select(weight > 0, share, 0.0)
+
+
+def by_scene(rays: RayScene, scene: Any, weight: Any) -> Any:
+    """Weights of which all scenes have the same sum, if they have any.
+
+    Args:
+        rays: The scenes.
+        scene: Of each weight.
+        weight: The weights.
+    """
+    if rays.scenes == 1:
+        return weight
+    totals = dr.zeros(mi.Float, rays.scenes)
+    dr.scatter_add(totals, weight, scene)
+    return dr.select(weight > 0, weight / dr.gather(mi.Float, totals, scene), 0.0)
+
+
+def place_along(
+    choice: Proportional, index: Any, count: int, seed: Any, key: Any = None
+) -> tuple[Any, Any, Any]:
+    """Entry of the choice, place along its edge and probability, stratified over count.
+
+    Args:
+        choice: Of edges.
+        index: Number of the sample.
+        count: Of samples.
+        seed: Of the numbers.
+        key: What the numbers belong to, if not the index.
+    """
+    jitter, along = uniform_pair(index if key is None else key, seed)
+    place, rest, chance = choice.draw((mi.Float(index) + jitter) / count)
+    return place, dr.select(chance > _RESOLVED, rest, along), chance
