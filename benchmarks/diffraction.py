@@ -63,7 +63,7 @@ from invertwin.channel.field.edged import EdgedScene
 from invertwin.channel.field.images import Walls
 from invertwin.channel.field.sequences import Powers
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.scene import visible
+from invertwin.channel.rays.ray_scene import visible
 from invertwin.channel.rays.topology import topology_of
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.scene import box

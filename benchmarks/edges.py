@@ -38,8 +38,8 @@ from invertwin.channel.power.interior_silhouettes import InteriorEdgeSampler
 from invertwin.channel.power.random_walk import Walk
 from invertwin.channel.rays.arrays import from_points
 from invertwin.channel.rays.backend import mi, torch_threads
-from invertwin.channel.rays.geometry import flatten
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.ray_scene import RayScene
+from invertwin.channel.rays.scene_tables import flatten
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import AntennaArray, Isotropic, Mesh, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import linear_array

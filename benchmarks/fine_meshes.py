@@ -30,7 +30,7 @@ from rich.table import Table
 
 from invertwin.channel import Grid, Link, Sampling, backend, deposit_power
 from invertwin.channel.coherent.radar_equation import Place, radar_equation
-from invertwin.channel.rays.geometry import flatten
+from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Isotropic, Mesh, Object, RoughDielectric, Scene, plate, rigid, sphere
 
 SUBDIVISIONS = (4, 6, 7)

@@ -73,7 +73,7 @@ from trimesh.remesh import subdivide
 
 from invertwin.channel import Sampling, backend, deposit_power
 from invertwin.channel.rays.backend import mi
-from invertwin.channel.rays.scene import Occluders
+from invertwin.channel.rays.ray_scene import Occluders
 from invertwin.channel.rays.topology import Topology
 from invertwin.memory import peak_memory
 from invertwin.radar import Radar

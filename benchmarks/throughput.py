@@ -28,8 +28,8 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Sampling, backend, deposit_power, trace_power
 from invertwin.channel.rays.backend import mi
-from invertwin.channel.rays.geometry import flatten
-from invertwin.channel.rays.scene import RayScene, visible
+from invertwin.channel.rays.ray_scene import RayScene, visible
+from invertwin.channel.rays.scene_tables import flatten
 from invertwin.memory import peak_memory
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import AntennaArray, Isotropic, Mesh, Object, RoughDielectric, Scene

@@ -13,7 +13,7 @@ from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table
 from invertwin.channel.power.trace import Trace, tables_of
 from invertwin.channel.rays.arrays import to_float
 from invertwin.channel.rays.backend import mi
-from invertwin.channel.rays.geometry import flatten
+from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Scene
 
 

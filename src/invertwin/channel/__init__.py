@@ -32,7 +32,9 @@ from invertwin.channel.rays.backend import alone as alone
 from invertwin.channel.rays.backend import backend as backend
 from invertwin.channel.rays.backend import torch_threads as torch_threads
 from invertwin.channel.rays.backend import use_backend as use_backend
-from invertwin.channel.rays.scene import visible_points as visible_points
+from invertwin.channel.rays.ray_scene import visible_points as visible_points
+from invertwin.channel.rays.visibility import Curves as Curves
+from invertwin.channel.rays.visibility import Sight as Sight
 from invertwin.channel.reference.cross_sections import CrossSection as CrossSection
 from invertwin.channel.reference.cross_sections import DihedralByMoments as DihedralByMoments
 from invertwin.channel.reference.cross_sections import DihedralSection as DihedralSection
@@ -45,6 +47,4 @@ from invertwin.channel.reference.cross_sections import TrihedralSection as Trihe
 from invertwin.channel.sampling import REST as REST
 from invertwin.channel.sampling import Densities as Densities
 from invertwin.channel.sampling import Sampling as Sampling
-from invertwin.channel.sight import Curves as Curves
-from invertwin.channel.sight import Sight as Sight
 from invertwin.checks import differentiated as differentiated

@@ -12,7 +12,7 @@ from invertwin.channel.field.edged import EdgedScene
 from invertwin.channel.field.images import Walls
 from invertwin.channel.field.sequences import Powers
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.scene import visible
+from invertwin.channel.rays.ray_scene import visible
 from invertwin.channel.rays.topology import topology_of
 from invertwin.scene import Mesh, box, plate
 

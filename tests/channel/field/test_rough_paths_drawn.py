@@ -9,8 +9,8 @@ from torch import Tensor
 from invertwin.channel import Link
 from invertwin.channel.coherent.radar_equation import SurfacePaths, path_view, unblocked
 from invertwin.channel.coherent.rough_paths import draw_rough_paths
-from invertwin.channel.rays.geometry import Geometry, flatten
-from invertwin.channel.rays.scene import RayScene, face_areas
+from invertwin.channel.rays.ray_scene import RayScene, face_areas
+from invertwin.channel.rays.scene_tables import Geometry, flatten
 from invertwin.scene import RoughConductor, Scene, plate
 from scenes import link, thing
 

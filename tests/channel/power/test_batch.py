@@ -12,11 +12,11 @@ from invertwin.channel import Grid, Link, Sampling, deposit_batch, deposit_power
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.interior_silhouettes import InteriorEdgeSampler
 from invertwin.channel.power.silhouettes import EdgeSampler
-from invertwin.channel.rays.apart import stand_apart
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.geometry import flatten
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.batching import stand_apart
+from invertwin.channel.rays.ray_scene import RayScene
+from invertwin.channel.rays.scene_tables import flatten
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cloud,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_power
 from invertwin.channel.power import trace
-from invertwin.channel.rays.geometry import flatten
+from invertwin.channel.rays.scene_tables import flatten
 from invertwin.errors import InputError
 from invertwin.scene import (
     Cosine,

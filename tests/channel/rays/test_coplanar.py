@@ -10,8 +10,8 @@ import torch
 from invertwin.channel.rays import coplanar
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.coplanar import warn_of_coplanar
-from invertwin.channel.rays.geometry import flatten
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.ray_scene import RayScene
+from invertwin.channel.rays.scene_tables import flatten
 from invertwin.errors import PhysicsWarning
 from invertwin.scene import Mesh, Object, RoughConductor, RoughDielectric, Scene, box, plate, rigid
 from scenes import WAVELENGTH, float64, link, thing

@@ -12,12 +12,12 @@ from invertwin.channel import Sampling, deposit_power
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.interior_silhouettes import InteriorEdgeSampler
 from invertwin.channel.power.silhouettes import EdgeSampler
-from invertwin.channel.rays import scene as ray_scene
+from invertwin.channel.rays import ray_scene
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
-from invertwin.channel.rays.geometry import flatten
 from invertwin.channel.rays.movers import NO_PLACE
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.ray_scene import RayScene
+from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, rigid, sphere
 from scenes import GRID, WAVELENGTH, float64, link, thing
 

@@ -22,7 +22,7 @@ from invertwin.channel.em.antenna_fields import (
 )
 from invertwin.channel.em.plane_waves import area_vector, dot, polygon_integral
 from invertwin.channel.paths import Link, Paths, joined
-from invertwin.channel.rays.geometry import flatten
+from invertwin.channel.rays.scene_tables import flatten
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene

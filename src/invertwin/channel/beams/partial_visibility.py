@@ -16,7 +16,7 @@ from torch import Tensor
 
 from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.scene import Occluders, visible
+from invertwin.channel.rays.ray_scene import Occluders, visible
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.checks import plain
 from invertwin.errors import InputError

@@ -14,8 +14,8 @@ from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.silhouettes import EdgePoints, EdgeSampler
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.geometry import mixed
-from invertwin.channel.rays.scene import RayScene, visible
+from invertwin.channel.rays.ray_scene import RayScene, visible
+from invertwin.channel.rays.scene_tables import mixed
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from invertwin.channel.coherent.speckle import Speckle, draw_speckle
 from invertwin.channel.em.antenna_fields import combined
 from invertwin.channel.paths import Link, Paths, joined
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.geometry import flatten, require_edges, silhouettes_move
-from invertwin.channel.rays.scene import RayScene, face_areas
+from invertwin.channel.rays.ray_scene import RayScene, face_areas
+from invertwin.channel.rays.scene_tables import flatten, require_edges, silhouettes_move
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.progress import told

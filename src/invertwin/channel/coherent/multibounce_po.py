@@ -23,8 +23,8 @@ from invertwin.channel.em.antenna_fields import (
 )
 from invertwin.channel.em.plane_waves import dot, mirrored
 from invertwin.channel.paths import Paths
-from invertwin.channel.rays.geometry import silhouettes_move
-from invertwin.channel.rays.scene import NEAR, RayScene, face_areas, next_surface
+from invertwin.channel.rays.ray_scene import NEAR, RayScene, face_areas, next_surface
+from invertwin.channel.rays.scene_tables import silhouettes_move
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError

@@ -12,7 +12,7 @@ from invertwin.channel.power.random_walk import Records
 from invertwin.channel.power.trace import Trace
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.geometry import Geometry, flatten, require_edges, silhouettes_move
+from invertwin.channel.rays.scene_tables import Geometry, flatten, require_edges, silhouettes_move
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene

@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.paths import Link, Paths
-from invertwin.channel.rays.geometry import Geometry, mixed
-from invertwin.channel.rays.scene import RayScene, next_surface, visible
+from invertwin.channel.rays.ray_scene import RayScene, next_surface, visible
+from invertwin.channel.rays.scene_tables import Geometry, mixed
 from invertwin.constants import SPEED_OF_LIGHT
 
 _MOST_SHEETS = 8  # that a segment of an explicit path may pass

@@ -24,8 +24,8 @@ from invertwin.channel.rays.arrays import (
     uniform_pair,
 )
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.geometry import Geometry, flatten
-from invertwin.channel.rays.scene import RayScene, face_areas
+from invertwin.channel.rays.ray_scene import RayScene, face_areas
+from invertwin.channel.rays.scene_tables import Geometry, flatten
 from invertwin.progress import told
 from invertwin.scene.scene import Scene
 

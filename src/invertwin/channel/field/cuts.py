@@ -16,11 +16,9 @@ from torch.nn.functional import normalize
 from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.field.images import Walls
 from invertwin.channel.field.shadow_edges import Screen, spread_along
-from invertwin.channel.rays.contacts import common_segments
+from invertwin.channel.rays.intersections import close_pairs, common_segments
 from invertwin.channel.rays.topology import Topology
 from invertwin.checks import plain
-
-_PAIRS = 1 << 22  # triangles × triangles whose boxes are compared at a time
 
 
 @dataclass(frozen=True)
@@ -98,23 +96,3 @@ def cut_rates(
 def _normals(corners: Tensor) -> Tensor:
     a, b, c = corners.unbind(1)
     return normalize(cross(b - a, c - a), dim=1)
-
-
-def close_pairs(
-    first: Float64[Tensor, "n 3 3"], second: Float64[Tensor, "m 3 3"]
-) -> tuple[Int64[Tensor, " pair"], Int64[Tensor, " pair"]]:
-    """Pairs of triangles whose boxes overlap.
-
-    Args:
-        first, second: Corners of the triangles.
-    """
-    low, high = second.amin(1), second.amax(1)
-    rows = [torch.zeros(2, 0, dtype=torch.int64)]
-    block = max(1, _PAIRS // len(second))
-    for begin in range(0, len(first), block):
-        some = first[begin : begin + block, None]
-        met = ((some.amin(2) <= high) & (some.amax(2) >= low)).all(2)
-        here, there = torch.nonzero(met).unbind(1)
-        rows.append(torch.stack([here + begin, there]))
-    found = torch.cat(rows, 1)
-    return found[0], found[1]

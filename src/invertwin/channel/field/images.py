@@ -23,7 +23,7 @@ from invertwin.channel.em.plane_waves import cross, dot, mirrored, unit_across
 from invertwin.channel.field.planes import Planes, planes_of
 from invertwin.channel.rays.arrays import opaque, to_double, to_float, to_index, to_torch
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.scene import NEAR, Occluders
+from invertwin.channel.rays.ray_scene import NEAR, Occluders
 from invertwin.channel.rays.topology import Topology
 
 _LANES = 1 << 19

@@ -34,9 +34,9 @@ from invertwin.channel.field.specular import Stage, paths_of, powers_of, staged
 from invertwin.channel.paths import Link
 from invertwin.channel.ray_paths import REFLECTION, RayPaths, joined
 from invertwin.channel.rays.backend import torch_threads, tracing
-from invertwin.channel.rays.contacts import contacts_of
-from invertwin.channel.rays.geometry import Geometry, flatten
-from invertwin.channel.rays.scene import RayScene, face_areas
+from invertwin.channel.rays.intersections import contacts_of
+from invertwin.channel.rays.ray_scene import RayScene, face_areas
+from invertwin.channel.rays.scene_tables import Geometry, flatten
 from invertwin.channel.sampling import Sampling
 from invertwin.checks import ArrayLike, differentiated, plain
 from invertwin.constants import SPEED_OF_LIGHT

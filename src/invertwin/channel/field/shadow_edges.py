@@ -25,7 +25,7 @@ from invertwin.channel.field.images import Chains, Walls, chains_between, images
 from invertwin.channel.field.sequences import Powers
 from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.scene import NEAR, Occluders
+from invertwin.channel.rays.ray_scene import NEAR, Occluders
 from invertwin.channel.rays.topology import Topology
 from invertwin.checks import plain
 

@@ -45,7 +45,7 @@ from invertwin.channel.field.plates import plates_of, several_diffractions
 from invertwin.channel.field.solved import SolvedBodies
 from invertwin.channel.field.tubes import tubes
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.scene import Occluders, visible
+from invertwin.channel.rays.ray_scene import Occluders, visible
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.checks import differentiated
 from invertwin.constants import SPEED_OF_LIGHT

@@ -42,7 +42,7 @@ from invertwin.channel.field.sequences import (
 )
 from invertwin.channel.ray_paths import REFLECTION, TRANSMISSION, RayPaths, joined
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.geometry import vertex_velocities
+from invertwin.channel.rays.scene_tables import vertex_velocities
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.checks import (
     ArrayLike,

@@ -12,7 +12,7 @@ from torch import Tensor
 from invertwin.channel.beams.beam_tracing import Bounce, Facets, in_air
 from invertwin.channel.em.plane_waves import dot, mirrored
 from invertwin.channel.field.patches import above, divided
-from invertwin.channel.rays.scene import Occluders, next_surface
+from invertwin.channel.rays.ray_scene import Occluders, next_surface
 
 
 def tubes(

@@ -20,8 +20,8 @@ from invertwin.channel.power.silhouettes import Drawn, EdgePoints, EdgeSampler, 
 from invertwin.channel.power.transmission import Passage
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.contacts import Contacts
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.intersections import Contacts
+from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.sampling import Sampling
 
 

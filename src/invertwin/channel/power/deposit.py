@@ -19,9 +19,9 @@ from invertwin.channel.power import bins, replay
 from invertwin.channel.power.clouds import deposit_density
 from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table, to_table
 from invertwin.channel.power.trace import Trace, tables_of, without_derivatives
-from invertwin.channel.rays.apart import stand_apart
 from invertwin.channel.rays.backend import backend, dr, mi, torch_threads, tracing
-from invertwin.channel.rays.geometry import Geometry, flatten, require_edges
+from invertwin.channel.rays.batching import stand_apart
+from invertwin.channel.rays.scene_tables import Geometry, flatten, require_edges
 from invertwin.channel.sampling import Sampling
 from invertwin.checks import differentiated, plain
 from invertwin.errors import InputError

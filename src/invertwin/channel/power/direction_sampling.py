@@ -13,8 +13,8 @@ from invertwin.channel.power.integrand import Place
 from invertwin.channel.power.surface import Surfaces, gaussian, single_row
 from invertwin.channel.rays.arrays import to_float
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.scene import RayScene
-from invertwin.channel.rays.spheres import in_cap
+from invertwin.channel.rays.bounding_spheres import in_cap
+from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.scene import Surface
 
 _TOWARDS = 0.5  # share of the directions that aim at other objects, where there are some

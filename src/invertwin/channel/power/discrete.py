@@ -4,7 +4,7 @@ from typing import Any
 
 from invertwin.channel.rays.arrays import uniform_pair
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.ray_scene import RayScene
 
 _RESOLVED = 5e-5  # chance of an edge from which float32 resolves a sample's place within it
 _LAST_BELOW_ONE = 1 - 2.0**-24

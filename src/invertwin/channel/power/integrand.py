@@ -23,7 +23,7 @@ from invertwin.channel.rays.arrays import (
     to_torch,
 )
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.ray_scene import RayScene
 
 #: The differentiable inputs of the kernel, in the order in which torch passes them.
 DIFFERENTIABLE = ("vertices", "tx", "rx", "rotations", *SURFACE)

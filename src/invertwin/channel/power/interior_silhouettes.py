@@ -19,7 +19,7 @@ from invertwin.channel.power.silhouettes import (
 from invertwin.channel.rays.arrays import between, point_at, scrambled, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.movers import NO_PLACE, Movers
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.ray_scene import RayScene
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ from invertwin.channel.rays.arrays import (
     uniform_pair,
 )
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.contacts import Contacts
-from invertwin.channel.rays.scene import NEAR, RayScene
+from invertwin.channel.rays.intersections import Contacts
+from invertwin.channel.rays.ray_scene import NEAR, RayScene
 from invertwin.errors import InputError
 
 _LOOKED_AT = 65_536  # points that tell whether paths run between surfaces that meet

@@ -4,8 +4,8 @@ from typing import Any
 
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.contacts import IN_PLANE
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.intersections import IN_PLANE
+from invertwin.channel.rays.ray_scene import RayScene
 
 # Of a mesh, so many triangles are looked at from an edge on, and more until rays that pass beside
 # the edge clear them, up to so many.

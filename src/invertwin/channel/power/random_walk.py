@@ -16,7 +16,7 @@ from invertwin.channel.power.integrand import Inputs, Place
 from invertwin.channel.power.transmission import Passage, land, passage
 from invertwin.channel.rays.arrays import opaque, scrambled, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.scene import NEAR, RayScene
+from invertwin.channel.rays.ray_scene import NEAR, RayScene
 
 _LEAST_SURVIVAL = 0.1  # of Russian roulette
 _ROULETTE_FROM = 3  # vertices after which it begins; shorter paths have less noise without

@@ -17,7 +17,7 @@ from invertwin.channel.power.random_walk import Recorded, Records
 from invertwin.channel.power.transmission import Passage, crossed, passage
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.ray_scene import RayScene
 
 
 @dataclass(frozen=True)

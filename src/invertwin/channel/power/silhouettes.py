@@ -16,8 +16,8 @@ from invertwin.channel.power.mesh_folds import folded
 from invertwin.channel.power.transmission import Hit, land, passage
 from invertwin.channel.rays.arrays import between, point_at, scrambled
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.contacts import IN_PLANE
-from invertwin.channel.rays.scene import NEAR, RayScene
+from invertwin.channel.rays.intersections import IN_PLANE
+from invertwin.channel.rays.ray_scene import NEAR, RayScene
 
 _GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
 # Boundary rays start beside the edge, by this much (two roundings) of its distance from the origin

@@ -23,9 +23,9 @@ from invertwin.channel.rays.arrays import (
     uniform_pair,
 )
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.geometry import Geometry
-from invertwin.channel.rays.scene import RayScene, face_areas
-from invertwin.channel.rays.spheres import Spheres
+from invertwin.channel.rays.bounding_spheres import Spheres
+from invertwin.channel.rays.ray_scene import RayScene, face_areas
+from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.errors import InputError
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_float
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.scene import Surface
 
 #: Names of a surface's tables that kernels read; depolarisation scales others (``deposit_power``).

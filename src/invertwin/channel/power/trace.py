@@ -20,10 +20,10 @@ from invertwin.channel.power.surface import SURFACE
 from invertwin.channel.power.transmission import Passage
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.contacts import contacts_of
 from invertwin.channel.rays.coplanar import warn_of_coplanar
-from invertwin.channel.rays.geometry import Geometry
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.intersections import contacts_of
+from invertwin.channel.rays.ray_scene import RayScene
+from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.sampling import Sampling
 from invertwin.checks import plain
 

@@ -12,7 +12,7 @@ from invertwin.channel.power import integrand
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.rays.arrays import opaque, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.scene import NEAR, RayScene
+from invertwin.channel.rays.ray_scene import NEAR, RayScene
 
 _MOST = 32  # surfaces that a segment may pass
 # Probability of passing a sheet on which the ray may end. It is not the transmittance: a

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.rays.contacts import shared_boxes
-from invertwin.channel.rays.geometry import Geometry
-from invertwin.channel.rays.scene import NEAR, RayScene, visible
+from invertwin.channel.rays.intersections import shared_boxes
+from invertwin.channel.rays.ray_scene import NEAR, RayScene, visible
+from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.errors import PhysicsWarning
 
 _PAIRS = 20_000  # of triangles in one plane that are compared, evenly chosen of more

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_index
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.spheres import in_cap
+from invertwin.channel.rays.bounding_spheres import in_cap
 
 NO_PLACE = 0xFFFFFFFF  # no place in a table
 _SLACK = 1e-4  # of a distance: far more than rounding

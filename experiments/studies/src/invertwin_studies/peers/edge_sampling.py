@@ -20,8 +20,8 @@ from invertwin.channel import Grid, Link, differentiated
 from invertwin.channel.coherent.radar_equation import Place, radar_equation
 from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import mi
-from invertwin.channel.rays.geometry import Geometry, flatten
-from invertwin.channel.rays.scene import RayScene, visible
+from invertwin.channel.rays.ray_scene import RayScene, visible
+from invertwin.channel.rays.scene_tables import Geometry, flatten
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate

@@ -7,7 +7,7 @@ from torch import Tensor
 from invertwin.channel import Grid, Sampling, deposit_power
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
-from invertwin.channel.rays.few import MOST, Few
+from invertwin.channel.rays.brute_force import MOST, Few
 from invertwin.scene import Mesh, Scene, box, plate
 from scenes import link, relative, thing
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from invertwin.channel.rays.geometry import flatten
+from invertwin.channel.rays.scene_tables import flatten
 from invertwin.radar import PhysicsWarning
 from invertwin.scene import Mesh, Object, RoughConductor, RoughDielectric, Scene, rigid
 from invertwin.scene.shapes import box, plate, sphere

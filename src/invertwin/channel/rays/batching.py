@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.paths import Link
-from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.checks import plain
 
 _GAP = 0.02  # between scenes, of the largest side of any

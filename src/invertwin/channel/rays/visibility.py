@@ -16,11 +16,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import cross, dot
-from invertwin.channel.field.cuts import close_pairs
 from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
-from invertwin.channel.rays.contacts import common_segments
-from invertwin.channel.rays.scene import Occluders
+from invertwin.channel.rays.intersections import close_pairs, common_segments
+from invertwin.channel.rays.ray_scene import Occluders
 from invertwin.channel.rays.topology import topology_of
 from invertwin.checks import differentiated, plain
 from invertwin.errors import InputError

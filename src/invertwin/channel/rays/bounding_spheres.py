@@ -9,7 +9,7 @@ from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_float, to_index
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import side_by_side
 
 _TOGETHER = 8  # objects of a group

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from invertwin.channel.rays.arrays import point_at, to_index, to_torch
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.geometry import Geometry
-from invertwin.channel.rays.scene import NEAR, RayScene
+from invertwin.channel.rays.intersections import common_segments
+from invertwin.channel.rays.ray_scene import NEAR, RayScene
+from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import Topology
 
 IN_PLANE = 1e-9  # closer than this to a plane [m] is in it
@@ -246,3 +247,26 @@ def _span(
 
 def _unit(vectors: Tensor) -> Tensor:
     return vectors / vectors.norm(dim=1, keepdim=True).clamp_min(1e-300)
+
+
+_PAIRS = 1 << 22  # triangles × triangles whose boxes are compared at a time
+
+
+def close_pairs(
+    first: Float64[Tensor, "n 3 3"], second: Float64[Tensor, "m 3 3"]
+) -> tuple[Int64[Tensor, " pair"], Int64[Tensor, " pair"]]:
+    """Pairs of triangles whose boxes overlap.
+
+    Args:
+        first, second: Corners of the triangles.
+    """
+    low, high = second.amin(1), second.amax(1)
+    rows = [torch.zeros(2, 0, dtype=torch.int64)]
+    block = max(1, _PAIRS // len(second))
+    for begin in range(0, len(first), block):
+        some = first[begin : begin + block, None]
+        met = ((some.amin(2) <= high) & (some.amax(2) >= low)).all(2)
+        here, there = torch.nonzero(met).unbind(1)
+        rows.append(torch.stack([here + begin, there]))
+    found = torch.cat(rows, 1)
+    return found[0], found[1]

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from invertwin.channel.rays.contacts import Contacts, contacts_of, may_meet
-from invertwin.channel.rays.geometry import flatten
-from invertwin.channel.rays.scene import RayScene
+from invertwin.channel.rays.intersections import Contacts, contacts_of, may_meet
+from invertwin.channel.rays.ray_scene import RayScene
+from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Mesh, Object, Scene, box, plate, rigid, sphere
 from scenes import WAVELENGTH, link, thing
 

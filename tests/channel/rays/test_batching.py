@@ -2,8 +2,8 @@
 
 import torch
 
-from invertwin.channel.rays.apart import stand_apart
-from invertwin.channel.rays.geometry import flatten
+from invertwin.channel.rays.batching import stand_apart
+from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Scene, box
 from scenes import WAVELENGTH, float64, link, thing
 

@@ -20,10 +20,10 @@ from invertwin.channel.rays.arrays import (
     to_torch,
 )
 from invertwin.channel.rays.backend import backend, dr, mi, tracing
-from invertwin.channel.rays.few import Few
-from invertwin.channel.rays.geometry import Geometry
+from invertwin.channel.rays.bounding_spheres import Spheres
+from invertwin.channel.rays.brute_force import Few
 from invertwin.channel.rays.movers import Movers
-from invertwin.channel.rays.spheres import Spheres
+from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
