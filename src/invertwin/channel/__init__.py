@@ -11,10 +11,10 @@ from invertwin.channel.coherent.power_paths import trace_power as trace_power
 from invertwin.channel.coherent.speckle import Speckle as Speckle
 from invertwin.channel.coherent.speckle import densities_of as densities_of
 from invertwin.channel.coherent.speckle import draw_speckle as draw_speckle
+from invertwin.channel.coverage.coverage import trace_coverage as trace_coverage
+from invertwin.channel.coverage.single_scattering import trace_scattered as trace_scattered
 from invertwin.channel.em.plane_waves import polarisations as polarisations
-from invertwin.channel.field.coverage import trace_coverage as trace_coverage
 from invertwin.channel.field.echoes import trace_echoes as trace_echoes
-from invertwin.channel.field.scattered import trace_scattered as trace_scattered
 from invertwin.channel.field.signature import trace_signature as trace_signature
 from invertwin.channel.field.specular import trace_paths as trace_paths
 from invertwin.channel.paths import Grid as Grid

@@ -25,11 +25,11 @@ from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
 from invertwin.channel.coherent.radar_equation import Place, SurfacePaths, scattered
+from invertwin.channel.coverage.shadow_boundaries import OwnSurfaces, rim_points, rims
 from invertwin.channel.em.plane_waves import dot
 from invertwin.channel.field.images import Chains, Walls, chains_from
 from invertwin.channel.field.joint import joint
 from invertwin.channel.field.sequences import every_sequence, sequences_from_edges
-from invertwin.channel.field.shadow_edges import OwnSurfaces, rim_points, rims
 from invertwin.channel.field.specular import Stage, paths_of, powers_of, staged
 from invertwin.channel.paths import Link
 from invertwin.channel.ray_paths import REFLECTION, RayPaths, joined

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from invertwin.channel import RayPaths, Sampling, trace_scattered
-from invertwin.channel.field import scattered as module
+from invertwin.channel.coverage import single_scattering as module
 from invertwin.scene import Dielectric, PerfectConductor, RoughConductor, Scene, box, plate
 from scenes import float64, thing
 
