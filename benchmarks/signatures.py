@@ -32,7 +32,8 @@ from torch import Tensor
 
 from invertwin import Object, Scene, rcs
 from invertwin.channel import backend
-from invertwin.channel.field import signature, tubes
+from invertwin.channel.rcs import far_field as signature
+from invertwin.channel.rcs import shooting_bouncing_rays as tubes
 from invertwin.errors import PhysicsWarning
 from invertwin.scene import Mesh, PerfectConductor, load_mesh
 from invertwin.signatures import Signature, aspects

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from invertwin import Object, Scene, rcs
 from invertwin.channel import SphereSection
-from invertwin.channel.field import signature
+from invertwin.channel.rcs import far_field as signature
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.scene import (
     PerfectConductor,

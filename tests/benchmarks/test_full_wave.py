@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from rich.console import Console
 
-from invertwin.channel.field import solved
+from invertwin.channel.rcs.moments import mfie as solved
 
 
 @pytest.mark.parametrize(("name", "closed"), [("cube", True), ("open_box", False), ("ogive", True)])

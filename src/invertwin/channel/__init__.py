@@ -15,7 +15,6 @@ from invertwin.channel.coverage.coverage import trace_coverage as trace_coverage
 from invertwin.channel.coverage.single_scattering import trace_scattered as trace_scattered
 from invertwin.channel.em.plane_waves import polarisations as polarisations
 from invertwin.channel.field.echoes import trace_echoes as trace_echoes
-from invertwin.channel.field.signature import trace_signature as trace_signature
 from invertwin.channel.field.specular import trace_paths as trace_paths
 from invertwin.channel.paths import Grid as Grid
 from invertwin.channel.paths import Link as Link
@@ -35,15 +34,16 @@ from invertwin.channel.rays.backend import use_backend as use_backend
 from invertwin.channel.rays.ray_scene import visible_points as visible_points
 from invertwin.channel.rays.visibility import Curves as Curves
 from invertwin.channel.rays.visibility import Sight as Sight
-from invertwin.channel.reference.cross_sections import CrossSection as CrossSection
-from invertwin.channel.reference.cross_sections import DihedralByMoments as DihedralByMoments
-from invertwin.channel.reference.cross_sections import DihedralSection as DihedralSection
-from invertwin.channel.reference.cross_sections import PlateSection as PlateSection
-from invertwin.channel.reference.cross_sections import SphereSection as SphereSection
-from invertwin.channel.reference.cross_sections import (
+from invertwin.channel.rcs.closed_forms import CrossSection as CrossSection
+from invertwin.channel.rcs.closed_forms import DihedralByMoments as DihedralByMoments
+from invertwin.channel.rcs.closed_forms import DihedralSection as DihedralSection
+from invertwin.channel.rcs.closed_forms import PlateSection as PlateSection
+from invertwin.channel.rcs.closed_forms import SphereSection as SphereSection
+from invertwin.channel.rcs.closed_forms import (
     SquareTrihedralSection as SquareTrihedralSection,
 )
-from invertwin.channel.reference.cross_sections import TrihedralSection as TrihedralSection
+from invertwin.channel.rcs.closed_forms import TrihedralSection as TrihedralSection
+from invertwin.channel.rcs.far_field import trace_signature as trace_signature
 from invertwin.channel.sampling import REST as REST
 from invertwin.channel.sampling import Densities as Densities
 from invertwin.channel.sampling import Sampling as Sampling

@@ -11,9 +11,9 @@ import invertwin as iw
 from invertwin.channel.beams.beam_tracing import beams, facets_of
 from invertwin.channel.em.dielectric_solids import interiors
 from invertwin.channel.em.plane_waves import area_vector, dot
-from invertwin.channel.field import signature
-from invertwin.channel.field.passages import at_surface
 from invertwin.channel.rays.topology import topology_of
+from invertwin.channel.rcs import far_field as signature
+from invertwin.channel.rcs.dielectric_interfaces import at_surface
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import (

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from invertwin.channel.field.cells import cells_of
+from invertwin.channel.rcs.moments.mfie import cells_of
 from invertwin.scene import Mesh, box, cylinder, sphere
 from scenes import float64
 

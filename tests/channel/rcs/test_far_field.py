@@ -23,9 +23,10 @@ from invertwin.channel.em.plane_waves import (
     reflected,
 )
 from invertwin.channel.em.wedges import Wedges, find_wedges, fringe_field, run_on
-from invertwin.channel.field import meshed, signature
 from invertwin.channel.rays.topology import topology_of
-from invertwin.channel.reference.cross_sections import strip_across, strip_along
+from invertwin.channel.rcs import far_field as signature
+from invertwin.channel.rcs.closed_forms import strip_across, strip_along
+from invertwin.channel.rcs.moments import efie_solver as meshed
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import (

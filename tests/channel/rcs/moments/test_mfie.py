@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel import SphereSection, trace_signature
-from invertwin.channel.field import currents, solved
+from invertwin.channel.rcs.moments import mfie as solved
+from invertwin.channel.rcs.moments import solver as currents
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import PhysicsWarning
 from invertwin.scene import (

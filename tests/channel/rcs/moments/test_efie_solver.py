@@ -9,7 +9,7 @@ from torch import Tensor
 
 from invertwin import Object, Scene, rcs
 from invertwin.channel import SphereSection
-from invertwin.channel.field import meshed
+from invertwin.channel.rcs.moments import efie_solver as meshed
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import (

@@ -22,8 +22,8 @@ from torch.nn.functional import normalize
 from invertwin.channel.beams.beam_tracing import Bounce, Facets, joined, left, rows_of
 from invertwin.channel.em.dielectric_solids import Solids
 from invertwin.channel.em.plane_waves import cross, dot, mirrored, points_at, shares, unit_across
-from invertwin.channel.field.patches import above, divided, inner_points
 from invertwin.channel.rays.ray_scene import Occluders, next_surface
+from invertwin.channel.rcs.shooting_bouncing_rays import above, divided, inner_points
 from invertwin.errors import InputError
 from invertwin.scene.material.fresnel import refractive_index
 

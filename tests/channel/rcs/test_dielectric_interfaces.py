@@ -9,7 +9,7 @@ from torch import Tensor
 from invertwin.channel.beams.beam_tracing import Bounce
 from invertwin.channel.em.dielectric_solids import Solids, normal_part, refracted
 from invertwin.channel.em.plane_waves import Skins, dot, mirrored, reflected
-from invertwin.channel.field.passages import at_surface, passage
+from invertwin.channel.rcs.dielectric_interfaces import at_surface, passage
 from invertwin.scene.material.fresnel import fresnel_coefficients
 from scenes import complex128, float64
 

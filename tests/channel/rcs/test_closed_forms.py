@@ -15,7 +15,7 @@ from invertwin.channel import (
     SquareTrihedralSection,
     TrihedralSection,
 )
-from invertwin.channel.reference.cross_sections import strip_across, strip_along
+from invertwin.channel.rcs.closed_forms import strip_across, strip_along
 from invertwin.constants import SPEED_OF_LIGHT
 from scenes import float64
 

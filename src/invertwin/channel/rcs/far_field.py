@@ -37,16 +37,21 @@ from invertwin.channel.em.wedges import (
     outside,
     run_on,
 )
-from invertwin.channel.field.inner import SMOOTH, Curved, curved, require_apart, with_inner
-from invertwin.channel.field.meshed import SolvedMeshes
-from invertwin.channel.field.passages import at_surface
-from invertwin.channel.field.patches import lit_triangles
-from invertwin.channel.field.plates import plates_of, several_diffractions
-from invertwin.channel.field.solved import SolvedBodies
-from invertwin.channel.field.tubes import tubes
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.ray_scene import Occluders, visible
 from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.channel.rcs.dielectric_interfaces import at_surface
+from invertwin.channel.rcs.moments.efie_solver import SolvedMeshes
+from invertwin.channel.rcs.moments.mfie import SolvedBodies
+from invertwin.channel.rcs.plate_diffraction import plates_of, several_diffractions
+from invertwin.channel.rcs.rays_in_dielectrics import (
+    SMOOTH,
+    Curved,
+    curved,
+    require_apart,
+    with_inner,
+)
+from invertwin.channel.rcs.shooting_bouncing_rays import lit_triangles, tubes
 from invertwin.checks import differentiated
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning

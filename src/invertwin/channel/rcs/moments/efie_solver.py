@@ -12,9 +12,9 @@ from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.em.plane_waves import cross, dot, polarisations, turned
-from invertwin.channel.field.conforming import Conforming, conforming
-from invertwin.channel.field.currents import Currents, keeps_power
-from invertwin.channel.field.moments import Moments, functions_of
+from invertwin.channel.rcs.moments.efie_matrix import Moments, functions_of
+from invertwin.channel.rcs.moments.meshing import Conforming, conforming
+from invertwin.channel.rcs.moments.solver import Currents, keeps_power
 from invertwin.checks import differentiated
 from invertwin.errors import InputError
 from invertwin.scene import Mesh, signed_distance

@@ -9,9 +9,9 @@ from torch import Tensor
 import invertwin as iw
 from invertwin.channel import SphereSection
 from invertwin.channel.beams.beam_tracing import facets_of
-from invertwin.channel.field import signature
-from invertwin.channel.field.inner import _fitted, _spread, curved
 from invertwin.channel.rays.topology import topology_of
+from invertwin.channel.rcs import far_field as signature
+from invertwin.channel.rcs.rays_in_dielectrics import _fitted, _spread, curved
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import (
