@@ -56,15 +56,15 @@ from invertwin.channel.em.plane_waves import cross, dot, mirrored, plane_of_inci
 from invertwin.channel.em.transition_functions import transition
 from invertwin.channel.em.utd import Faces, Turn, conductor, diffraction_dyad
 from invertwin.channel.em.wedges import Wedges, azimuth_outside, edge_axis
-from invertwin.channel.field.bends import Bends, find_bends
-from invertwin.channel.field.diffracted import DiffractedPaths, diffracted_paths
-from invertwin.channel.field.edge_paths import Edge, over_edges
-from invertwin.channel.field.edged import EdgedScene
-from invertwin.channel.field.images import Walls
-from invertwin.channel.field.sequences import Powers
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.ray_scene import visible
 from invertwin.channel.rays.topology import topology_of
+from invertwin.channel.specular.candidates import Powers
+from invertwin.channel.specular.diffracted_paths import DiffractedPaths, diffracted_paths
+from invertwin.channel.specular.diffraction_candidates import Bends, find_bends
+from invertwin.channel.specular.edge_path_geometry import Edge, over_edges
+from invertwin.channel.specular.image_method import Walls
+from invertwin.channel.specular.wedge_scene import EdgedScene
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.scene import box
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients

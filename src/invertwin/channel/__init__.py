@@ -14,8 +14,6 @@ from invertwin.channel.coherent.speckle import draw_speckle as draw_speckle
 from invertwin.channel.coverage.coverage import trace_coverage as trace_coverage
 from invertwin.channel.coverage.single_scattering import trace_scattered as trace_scattered
 from invertwin.channel.em.plane_waves import polarisations as polarisations
-from invertwin.channel.field.echoes import trace_echoes as trace_echoes
-from invertwin.channel.field.specular import trace_paths as trace_paths
 from invertwin.channel.paths import Grid as Grid
 from invertwin.channel.paths import Link as Link
 from invertwin.channel.paths import Paths as Paths
@@ -24,9 +22,6 @@ from invertwin.channel.power.bins import deposit_paths as deposit_paths
 from invertwin.channel.power.clouds import deposit_density as deposit_density
 from invertwin.channel.power.deposit import deposit_batch as deposit_batch
 from invertwin.channel.power.deposit import deposit_power as deposit_power
-from invertwin.channel.ray_paths import KINDS as KINDS
-from invertwin.channel.ray_paths import METASURFACE as METASURFACE
-from invertwin.channel.ray_paths import RayPaths as RayPaths
 from invertwin.channel.rays.backend import alone as alone
 from invertwin.channel.rays.backend import backend as backend
 from invertwin.channel.rays.backend import torch_threads as torch_threads
@@ -47,4 +42,9 @@ from invertwin.channel.rcs.far_field import trace_signature as trace_signature
 from invertwin.channel.sampling import REST as REST
 from invertwin.channel.sampling import Densities as Densities
 from invertwin.channel.sampling import Sampling as Sampling
+from invertwin.channel.specular.point_targets import trace_echoes as trace_echoes
+from invertwin.channel.specular.ray_paths import KINDS as KINDS
+from invertwin.channel.specular.ray_paths import METASURFACE as METASURFACE
+from invertwin.channel.specular.ray_paths import RayPaths as RayPaths
+from invertwin.channel.specular.trace_paths import trace_paths as trace_paths
 from invertwin.checks import differentiated as differentiated

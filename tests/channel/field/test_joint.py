@@ -2,7 +2,7 @@
 
 import torch
 
-from invertwin.channel.field.joint import joint
+from invertwin.channel.specular.ray_paths import joint
 
 
 def test_pairs_are_those_of_all_equal_numbers_in_order():

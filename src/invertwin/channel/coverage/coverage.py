@@ -24,13 +24,13 @@ from invertwin.channel.coverage.shadow_boundaries import (
     spread_along,
 )
 from invertwin.channel.em.plane_waves import cross, dot
-from invertwin.channel.field.images import Chains, Walls, chains_between
-from invertwin.channel.field.sequences import every_sequence, shot_sequences
-from invertwin.channel.field.specular import Stage, paths_of, powers_of, staged
-from invertwin.channel.ray_paths import RayPaths, joined
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.intersections import close_pairs, common_segments
 from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.channel.specular.candidates import every_sequence, shot_sequences
+from invertwin.channel.specular.image_method import Chains, Walls, chains_between
+from invertwin.channel.specular.ray_paths import RayPaths, joined
+from invertwin.channel.specular.trace_paths import Stage, paths_of, powers_of, staged
 from invertwin.checks import ArrayLike, differentiated, plain
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene

@@ -21,12 +21,12 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from invertwin.channel.em.plane_waves import cross, dot, mirrored, points_at
-from invertwin.channel.field.images import Chains, Walls, chains_between, images
-from invertwin.channel.field.sequences import Powers
 from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import NEAR, Occluders
 from invertwin.channel.rays.topology import Topology
+from invertwin.channel.specular.candidates import Powers
+from invertwin.channel.specular.image_method import Chains, Walls, chains_between, images
 from invertwin.checks import plain
 
 ASIDE = 10.0  # margins between where power jumps and the two sides that are compared

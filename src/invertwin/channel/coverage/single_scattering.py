@@ -27,17 +27,16 @@ from torch.utils.checkpoint import checkpoint
 from invertwin.channel.coherent.radar_equation import Place, SurfacePaths, scattered
 from invertwin.channel.coverage.shadow_boundaries import OwnSurfaces, rim_points, rims
 from invertwin.channel.em.plane_waves import dot
-from invertwin.channel.field.images import Chains, Walls, chains_from
-from invertwin.channel.field.joint import joint
-from invertwin.channel.field.sequences import every_sequence, sequences_from_edges
-from invertwin.channel.field.specular import Stage, paths_of, powers_of, staged
 from invertwin.channel.paths import Link
-from invertwin.channel.ray_paths import REFLECTION, RayPaths, joined
 from invertwin.channel.rays.backend import torch_threads, tracing
 from invertwin.channel.rays.intersections import contacts_of
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry, flatten
 from invertwin.channel.sampling import Sampling
+from invertwin.channel.specular.candidates import every_sequence, sequences_from_edges
+from invertwin.channel.specular.image_method import Chains, Walls, chains_from
+from invertwin.channel.specular.ray_paths import REFLECTION, RayPaths, joined, joint
+from invertwin.channel.specular.trace_paths import Stage, paths_of, powers_of, staged
 from invertwin.checks import ArrayLike, differentiated, plain
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError

@@ -24,26 +24,26 @@ from invertwin.channel.em.plane_waves import (
     points_at,
     polarisations,
 )
-from invertwin.channel.field.bends import Bends, find_bends
-from invertwin.channel.field.diffracted import diffracted_paths
-from invertwin.channel.field.edged import EdgedScene
-from invertwin.channel.field.images import (
+from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.scene_tables import vertex_velocities
+from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.channel.specular.candidates import (
+    Powers,
+    Sequences,
+    every_sequence,
+    shot_sequences,
+)
+from invertwin.channel.specular.diffracted_paths import diffracted_paths
+from invertwin.channel.specular.diffraction_candidates import Bends, find_bends
+from invertwin.channel.specular.image_method import (
     Chains,
     Walls,
     chains_between,
     corners_of,
     images,
 )
-from invertwin.channel.field.sequences import (
-    Powers,
-    Sequences,
-    every_sequence,
-    shot_sequences,
-)
-from invertwin.channel.ray_paths import REFLECTION, TRANSMISSION, RayPaths, joined
-from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.scene_tables import vertex_velocities
-from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.channel.specular.ray_paths import REFLECTION, TRANSMISSION, RayPaths, joined
+from invertwin.channel.specular.wedge_scene import EdgedScene
 from invertwin.checks import (
     ArrayLike,
     checked_count,

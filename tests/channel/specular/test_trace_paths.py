@@ -460,7 +460,7 @@ def test_pieces_add_up(monkeypatch):
     rx = [[-1.4, 0.9, -0.6], [0.4, 1.2, -1.0], [2.0, -1.5, 1.0]]
     found = []
     for rows in (1 << 15, 7):
-        monkeypatch.setattr("invertwin.channel.field.specular._ROWS_AT_ONCE", rows)
+        monkeypatch.setattr("invertwin.channel.specular.trace_paths._ROWS_AT_ONCE", rows)
         walls = box((5.0, 4.0, 3.0))
         vertices = walls.vertices.clone().requires_grad_()
         scene = room(Dielectric(4.0, 0.1)).replace("room", mesh=Mesh(vertices, walls.faces))

@@ -16,12 +16,12 @@ from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import cross, dot, mirrored, plane_of_incidence
 from invertwin.channel.em.wedges import edge_axis
-from invertwin.channel.field.bends import Bends, Corner, Legs, along_faces
-from invertwin.channel.field.corners import round_corner
-from invertwin.channel.field.edge_paths import Edge, EdgePaths, over_edges
-from invertwin.channel.field.edged import EdgedScene, on_edge
-from invertwin.channel.field.images import corners_of, images
-from invertwin.channel.ray_paths import DIFFRACTION
+from invertwin.channel.specular.corner_diffraction import round_corner
+from invertwin.channel.specular.diffraction_candidates import Bends, Corner, Legs, along_faces
+from invertwin.channel.specular.edge_path_geometry import Edge, EdgePaths, over_edges
+from invertwin.channel.specular.image_method import corners_of, images
+from invertwin.channel.specular.ray_paths import DIFFRACTION
+from invertwin.channel.specular.wedge_scene import EdgedScene, on_edge
 
 
 @dataclass(frozen=True)

@@ -24,17 +24,16 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.em.plane_waves import dot
-from invertwin.channel.field.corners import face_share
-from invertwin.channel.field.edge_paths import several_turning_points, turning_points
-from invertwin.channel.field.edged import EdgedScene, exterior
-from invertwin.channel.field.images import clear_ways, images, reaching
-from invertwin.channel.field.joint import joint
-from invertwin.channel.field.sequences import (
+from invertwin.channel.specular.candidates import (
     Powers,
     every_sequence,
     sequences_from_edges,
 )
-from invertwin.channel.ray_paths import REFLECTION, TRANSMISSION
+from invertwin.channel.specular.corner_diffraction import face_share
+from invertwin.channel.specular.edge_path_geometry import several_turning_points, turning_points
+from invertwin.channel.specular.image_method import clear_ways, images, reaching
+from invertwin.channel.specular.ray_paths import REFLECTION, TRANSMISSION, joint
+from invertwin.channel.specular.wedge_scene import EdgedScene, exterior
 
 Corner = Literal["first", "last"] | None
 _ROWS_AT_ONCE = 1 << 16

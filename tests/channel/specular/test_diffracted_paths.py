@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from invertwin.channel.em.utd import conductor
-from invertwin.channel.field.bends import find_bends
-from invertwin.channel.field.diffracted import diffracted_paths
-from invertwin.channel.field.edged import EdgedScene
-from invertwin.channel.field.images import Walls
-from invertwin.channel.field.sequences import Powers
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.ray_scene import visible
 from invertwin.channel.rays.topology import topology_of
+from invertwin.channel.specular.candidates import Powers
+from invertwin.channel.specular.diffracted_paths import diffracted_paths
+from invertwin.channel.specular.diffraction_candidates import find_bends
+from invertwin.channel.specular.image_method import Walls
+from invertwin.channel.specular.wedge_scene import EdgedScene
 from invertwin.scene import Mesh, box, plate
 
 K = 2 * math.pi

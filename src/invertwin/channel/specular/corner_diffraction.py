@@ -20,7 +20,13 @@ from torch.nn.functional import normalize
 from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.em.utd import Order, Turn, diffraction_dyads
 from invertwin.channel.em.wedges import Wedges, azimuth_outside, edge_axis
-from invertwin.channel.field.edge_paths import Edge, EdgePaths, Route, find_route, transfers
+from invertwin.channel.specular.edge_path_geometry import (
+    Edge,
+    EdgePaths,
+    Route,
+    find_route,
+    transfers,
+)
 
 _LOW = 1e-18  # sin² of angles that count as none
 

@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.field.planes import Planes
 from invertwin.channel.rays.arrays import to_float, to_index, to_torch
 from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.specular.image_method import Planes
 from invertwin.errors import InputError
 
 if TYPE_CHECKING:  # walls know the planes that sequences are made of
-    from invertwin.channel.field.images import Walls
+    from invertwin.channel.specular.image_method import Walls
 
 _LANES = 1 << 20
 _MOST = 1_000_000  # sequences that are tried one by one

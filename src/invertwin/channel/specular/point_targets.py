@@ -13,9 +13,9 @@ from torch import Tensor
 
 from invertwin.channel.em.antenna_fields import antenna_fields, combined
 from invertwin.channel.em.plane_waves import polarisations
-from invertwin.channel.field.specular import trace_paths
 from invertwin.channel.paths import Link, Paths, joined
-from invertwin.channel.ray_paths import RayPaths
+from invertwin.channel.specular.ray_paths import RayPaths
+from invertwin.channel.specular.trace_paths import trace_paths
 from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError

@@ -9,7 +9,7 @@ import torch
 
 from invertwin.channel.em.utd import conductor
 from invertwin.channel.em.wedges import Wedges, joined_wedges
-from invertwin.channel.field.edge_paths import Edge, over_edges, several_turning_points
+from invertwin.channel.specular.edge_path_geometry import Edge, over_edges, several_turning_points
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
 
 K = 2 * math.pi

@@ -21,9 +21,9 @@ from invertwin.channel.em.wedges import (
     find_wedges,
     joined_wedges,
 )
-from invertwin.channel.field.edge_paths import Edge
-from invertwin.channel.field.images import Walls, clear_ways
 from invertwin.channel.rays.topology import Topology
+from invertwin.channel.specular.edge_path_geometry import Edge
+from invertwin.channel.specular.image_method import Walls, clear_ways
 from invertwin.checks import plain
 from invertwin.scene.material.fresnel import FieldCoefficients
 
