@@ -12,7 +12,6 @@ from torch import Tensor
 
 from invertwin.channel.rays.arrays import point_at, to_index, to_torch
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.intersections import common_segments
 from invertwin.channel.rays.ray_scene import NEAR, RayScene
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import Topology
