@@ -48,12 +48,11 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from invertwin.cli import build
 from invertwin.cli.fits.fitting import fit
 from invertwin.cli.fits.problem import FULL, problem_of
 from invertwin.cli.fits.spreading import Workers
-from invertwin.cli.run_file import load_run, stated, to_toml, validate
-from invertwin.cli.schema import RunFile
+from invertwin.cli.schema import RunFile, build
+from invertwin.cli.schema.run_file import load_run, stated, to_toml, validate
 from invertwin.engines import spread
 from invertwin.runs import open_run
 

@@ -35,7 +35,6 @@ import torch
 from report import MetricTable, Required, write
 from rich.console import Console
 
-from invertwin.cli import build
 from invertwin.cli.fits.problem import (
     Problem,
     observations_of,
@@ -43,7 +42,8 @@ from invertwin.cli.fits.problem import (
     schedule_of,
     unknowns_of,
 )
-from invertwin.cli.run_file import load_run
+from invertwin.cli.schema import build
+from invertwin.cli.schema.run_file import load_run
 from invertwin.inversion import Report, reconstruct
 
 RUN = Path(__file__).parents[1] / "experiments" / "demo.toml"

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from invertwin.cli.run_file import to_toml, validate
 from invertwin.cli.schema import RunFile
+from invertwin.cli.schema.run_file import to_toml, validate
 from invertwin.errors import InputError
 from invertwin.folders import LOCK, MANIFEST, UNFINISHED
 from invertwin.runs import open_run, plain

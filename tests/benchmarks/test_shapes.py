@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from invertwin.cli import build
 from invertwin.cli.fits.problem import varied_run
-from invertwin.cli.run_file import need
+from invertwin.cli.schema import build
+from invertwin.cli.schema.run_file import need
 from invertwin.scene import load_mesh
 from invertwin_studies.vehicles import Car, car_mesh
 

@@ -16,8 +16,9 @@ import pytest
 from rich.console import Console
 
 from cli.small import BEHIND, GRADCHECK, MATERIAL, RUN, STARTS, call, read_metrics
-from invertwin.cli import app, running
-from invertwin.cli.run_file import load_run
+from invertwin.cli import app
+from invertwin.cli import terminal as running
+from invertwin.cli.schema.run_file import load_run
 
 
 def test_help_names_the_commands(monkeypatch, capsys):
@@ -206,7 +207,7 @@ def test_ended_at_any_moment_then_resumed_gives_the_same_twin(run_file, monkeypa
 
 
 def test_interruption_says_how_to_go_on(run_file, monkeypatch, capsys):
-    from invertwin.cli import run_reconstruct
+    from invertwin.cli.commands import reconstruct as run_reconstruct
 
     def interrupted(run, folder, console, workers, view):
         folder.write_text("checkpoint.pt", "state")
@@ -221,7 +222,7 @@ def test_interruption_says_how_to_go_on(run_file, monkeypatch, capsys):
 
 
 def test_demo_reconstructs_the_run_file_that_comes_along(tmp_path, monkeypatch):
-    from invertwin.cli import run_reconstruct
+    from invertwin.cli.commands import reconstruct as run_reconstruct
 
     monkeypatch.chdir(tmp_path)
     seen = []
@@ -239,7 +240,7 @@ def test_demo_reconstructs_the_run_file_that_comes_along(tmp_path, monkeypatch):
 
 
 def test_demo_replaces_its_own_results_but_no_others(tmp_path, monkeypatch, capsys):
-    from invertwin.cli import run_reconstruct
+    from invertwin.cli.commands import reconstruct as run_reconstruct
 
     monkeypatch.chdir(tmp_path)
 
@@ -285,7 +286,7 @@ def test_backend_option_is_in_force(monkeypatch, run_file):
 
 
 def test_a_resumed_run_is_complete_and_only_then_complete_already(run_file, monkeypatch, capsys):
-    from invertwin.cli import run_reconstruct
+    from invertwin.cli.commands import reconstruct as run_reconstruct
 
     def interrupted(run, folder, console, workers, view):
         folder.write_text("checkpoint.pt", "state")

@@ -6,11 +6,10 @@ from typing import Any
 import pytest
 import torch
 
-from invertwin.cli import build
 from invertwin.cli.fits.problem import Problem, starts_of
 from invertwin.cli.fits.scores import joint_scores
-from invertwin.cli.run_file import validate
-from invertwin.cli.schema import RunFile
+from invertwin.cli.schema import RunFile, build
+from invertwin.cli.schema.run_file import validate
 from invertwin.errors import InputError
 from invertwin.inversion.lines import line_of
 from invertwin.scene import Scene

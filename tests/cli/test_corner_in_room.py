@@ -8,9 +8,9 @@ import torch
 
 from cli.small import RUN, call, read_metrics
 from invertwin.capture import Capture
-from invertwin.cli import build
 from invertwin.cli.fits.problem import Problem, Sight, annealed_until, models_of, sharp_models
-from invertwin.cli.run_file import validate
+from invertwin.cli.schema import build
+from invertwin.cli.schema.run_file import validate
 from invertwin.errors import InputError
 from invertwin.models import SurrogateMap
 

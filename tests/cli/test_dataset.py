@@ -15,11 +15,11 @@ import torch
 import invertwin
 from cli.small import call, read_metrics
 from invertwin.capture.readers import described_arrays
-from invertwin.cli import build
-from invertwin.cli.run_dataset import sample_run, shard_content
-from invertwin.cli.run_file import load_run, to_toml, validate
-from invertwin.cli.shape_tables import joint_places
-from invertwin.cli.variation import steps_of, with_values
+from invertwin.cli.commands.dataset import sample_run, shard_content
+from invertwin.cli.schema import build
+from invertwin.cli.schema.run_file import load_run, to_toml, validate
+from invertwin.cli.schema.shape_tables import joint_places
+from invertwin.cli.schema.variation import steps_of, with_values
 from invertwin.datasets import Samples, object_labels
 from invertwin.datasets.shards import members_of
 from invertwin.engines import spread

@@ -6,9 +6,8 @@ import pytest
 from rich.console import Console
 
 from cli.small import call, read_metrics
-from invertwin.cli.fits.initial import guessed
-from invertwin.cli.fits.problem import problem_of
-from invertwin.cli.run_file import validate
+from invertwin.cli.fits.problem import guessed, problem_of
+from invertwin.cli.schema.run_file import validate
 
 
 def smaller(repository, **changes: str) -> str:

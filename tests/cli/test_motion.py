@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from cli.small import call, read_metrics
-from invertwin.cli import build
-from invertwin.cli.motion_tables import at_start, in_motion, joints_at_start
-from invertwin.cli.run_dataset import sample_content
-from invertwin.cli.run_file import validate
+from invertwin.cli.commands.dataset import sample_content
+from invertwin.cli.schema import build
+from invertwin.cli.schema.motion_tables import at_start, in_motion, joints_at_start
+from invertwin.cli.schema.run_file import validate
 from invertwin.errors import InputError
 from invertwin.scene import InMotion, Scene, Waving
 

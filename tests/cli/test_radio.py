@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from cli.small import call, read_metrics
-from invertwin.cli import build
-from invertwin.cli.fits.certainty import certainty_table
 from invertwin.cli.fits.radio import Heard, spread_of_ends
-from invertwin.cli.run_file import to_toml, validate
+from invertwin.cli.fits.scores import certainty_table
+from invertwin.cli.schema import build
+from invertwin.cli.schema.run_file import to_toml, validate
 from invertwin.errors import InputError
 from invertwin.inversion import SpectrumLoss
 from invertwin.links import Points

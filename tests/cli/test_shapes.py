@@ -7,7 +7,6 @@ from PIL import Image
 from rich.console import Console
 
 from cli.small import RUN, call, read_metrics
-from invertwin.cli import build
 from invertwin.cli.fits.problem import (
     FULL,
     Problem,
@@ -19,8 +18,9 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.shape_scores import is_shape_key, shape_label, shape_scores
 from invertwin.cli.fits.writing import Fitted, tables_of
-from invertwin.cli.run_file import to_toml, validate
-from invertwin.cli.shape_tables import shape_terms
+from invertwin.cli.schema import build
+from invertwin.cli.schema.run_file import to_toml, validate
+from invertwin.cli.schema.shape_tables import shape_terms
 from invertwin.errors import InputError
 from invertwin.scene import Mesh, PriorShape
 from invertwin.scene.files import load_mesh

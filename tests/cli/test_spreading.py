@@ -7,7 +7,7 @@ import pytest
 from cli.small import RUN, STARTS, call, read_metrics
 from cli.test_radio import RUN as RADIO
 from cli.test_radio import STARTS as RADIO_STARTS
-from invertwin.cli import run_reconstruct
+from invertwin.cli.commands import reconstruct as run_reconstruct
 from invertwin.cli.fits import spreading
 from invertwin.cli.fits.spreading import part_name
 from invertwin.folders import PARTS

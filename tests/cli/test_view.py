@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from cli.small import RUN, call, read_metrics
+from invertwin.cli.commands.view import shown_of
 from invertwin.cli.fits.displays import VIEW, steps_in
-from invertwin.cli.run_file import load_run
-from invertwin.cli.run_view import shown_of
+from invertwin.cli.schema.run_file import load_run
 from invertwin.viewer import Display, Viewer, policy
 
 EVIL = "<script>alert(1)</script>"

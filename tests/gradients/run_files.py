@@ -4,8 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from invertwin.channel import Sampling
-from invertwin.cli import build
-from invertwin.cli.run_file import load_run
+from invertwin.cli.schema import build
+from invertwin.cli.schema.run_file import load_run
 from invertwin.inversion.gradcheck import Check, GradientReport, gradcheck
 from invertwin.models import SurrogateMap
 from invertwin.radar import Surrogate

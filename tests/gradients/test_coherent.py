@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from invertwin.cli import build
-from invertwin.cli.run_file import validate
+from invertwin.cli.schema import build
+from invertwin.cli.schema.run_file import validate
 from invertwin.inversion.gradcheck import Check, GradientReport, gradcheck
 from invertwin.models import SignatureMap
 from invertwin.scene import Object, PerfectConductor, Scale, Scene, dihedral

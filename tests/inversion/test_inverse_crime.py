@@ -10,11 +10,10 @@ import pytest
 
 from invertwin.capture import Capture
 from invertwin.channel import Sampling
-from invertwin.cli import build
 from invertwin.cli.fits.problem import stages_of
-from invertwin.cli.radio_tables import ReceivedData
-from invertwin.cli.run_file import load_run
-from invertwin.cli.schema import SimulatedData
+from invertwin.cli.schema import SimulatedData, build
+from invertwin.cli.schema.radio_tables import ReceivedData
+from invertwin.cli.schema.run_file import load_run
 from invertwin.errors import InputError
 from invertwin.models import SurrogateMap
 from scenes import occluder, radar
@@ -91,7 +90,7 @@ def check_data(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if not isinstance(run.data, SimulatedData):
         assert run.data.kind in ("capture", "rail_sar", "openradar", "dca1000", "arrays")
         return
-    from invertwin.cli import run_simulate
+    from invertwin.cli.commands import simulate as run_simulate
 
     class FieldsTracedError(Exception):
         """Stops before the work is done."""

@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from cli.test_shapes import check, learned
-from invertwin.cli import build
+from invertwin.cli.schema import build
 from invertwin.errors import InputError
 from invertwin.scene import LinearShape, box
 from invertwin_studies.vehicle_space import load_vehicle_space

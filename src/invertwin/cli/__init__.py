@@ -3,13 +3,13 @@
 from invertwin.registry.kinds import registry
 
 registry.built_in = (
-    "invertwin.cli.sensors",
-    "invertwin.cli.materials",
-    "invertwin.cli.shape_tables",
-    "invertwin.cli.recordings",
-    "invertwin.cli.fit_tables",
-    "invertwin.cli.cross_sections",
-    "invertwin.cli.radio_tables",
-    "invertwin.cli.camera_tables",
+    "invertwin.cli.schema.sensors",
+    "invertwin.cli.schema.materials",
+    "invertwin.cli.schema.shape_tables",
+    "invertwin.cli.schema.recordings",
+    "invertwin.cli.schema.fit_tables",
+    "invertwin.cli.schema.cross_sections",
+    "invertwin.cli.schema.radio_tables",
+    "invertwin.cli.schema.camera_tables",
     "invertwin.cli.schema.dataset",
 )

@@ -27,8 +27,8 @@ from invertwin.cli.options import (
     with_options,
 )
 from invertwin.cli.report import Table
-from invertwin.cli.run_file import about_file
-from invertwin.cli.running import load_runs, now_and_then, print_tables, progress, run_folder
+from invertwin.cli.schema.run_file import about_file
+from invertwin.cli.terminal import load_runs, now_and_then, print_tables, progress, run_folder
 from invertwin.errors import InputError, interruptible, one_line
 from invertwin.threads import available
 
@@ -97,7 +97,7 @@ def simulate(options: Options, file: FileArgument) -> None:
     """Simulate exact radar signals of a scene, and their spectra."""
     runs = load_runs([file], options, "simulate", ("radar", "grid", "data"))
     with run_folder(options, Path("out", file.stem), runs) as folder:
-        from invertwin.cli.run_simulate import run_simulate
+        from invertwin.cli.commands.simulate import run_simulate
 
         with about_file(file), progress(console):
             tables = run_simulate(runs[file.stem], folder)
@@ -108,7 +108,7 @@ def simulate(options: Options, file: FileArgument) -> None:
 @with_options(Dataset)
 def dataset(options: Dataset, file: FileArgument) -> None:
     """Simulate a data set: many samples of a run file with other values each, and their labels."""
-    from invertwin.cli.run_dataset import NEEDS, folder_of_part, part_of, run_dataset
+    from invertwin.cli.commands.dataset import NEEDS, folder_of_part, part_of, run_dataset
 
     part = part_of(options.shard)
     runs = load_runs([file], options, "dataset", NEEDS)
@@ -138,7 +138,7 @@ def plan(options: Resumable, file: FileArgument) -> None:
     with run_folder(options, Path("out", file.stem), runs) as folder:
         if folder.complete:
             return
-        from invertwin.cli.run_plan import run_plan
+        from invertwin.cli.commands.plan import run_plan
 
         with about_file(file):
             tables = run_plan(runs[file.stem], folder, console, now_and_then())
@@ -148,10 +148,10 @@ def plan(options: Resumable, file: FileArgument) -> None:
 @app.command()
 def check(file: FileArgument, backend: BackendOption = None) -> None:
     """Say what a run file needs, memory and time, and do nothing else."""
-    from invertwin.cli.run_file import load_run
+    from invertwin.cli.schema.run_file import load_run
 
     run = load_run(file)
-    from invertwin.cli.run_check import run_check
+    from invertwin.cli.commands.check import run_check
 
     with about_file(file):
         tables, line = run_check(run)
@@ -172,7 +172,7 @@ def demo(options: Resumable) -> None:
 @with_options(Look)
 def look(options: Look) -> None:
     """Show a recording: range, range rate, direction; and write it as a capture."""
-    from invertwin.cli.run_look import run_look
+    from invertwin.cli.commands.look import run_look
 
     default = Path("out") / options.recording.name.split(".")[0]
     with run_folder(options, default) as folder:
@@ -185,7 +185,7 @@ def look(options: Look) -> None:
 @with_options(Find)
 def twin(options: Find) -> None:
     """Find what stands in a recording, with no start: things, places, sizes, confidences."""
-    from invertwin.cli.run_twin import run_twin
+    from invertwin.cli.commands.twin import run_twin
 
     default = Path("out") / f"{options.recording.name.split('.')[0]}_twin"
     with run_folder(options, default) as folder:
@@ -212,7 +212,7 @@ def view(
     backend: BackendOption = None,
 ) -> None:
     """Show a run, a scene or a capture in the browser, in three dimensions."""
-    from invertwin.cli.run_view import run_view
+    from invertwin.cli.commands.view import run_view
 
     run_view(target, console, host=host, port=port, token=token, record=record)
 
@@ -223,7 +223,7 @@ def gradcheck(options: Resumable, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
 
     def work(*given: Any) -> list[Table]:
-        from invertwin.cli.run_gradcheck import run_gradcheck
+        from invertwin.cli.commands.gradcheck import run_gradcheck
 
         return run_gradcheck(*given)
 
@@ -245,7 +245,7 @@ def rcs(options: Resumable, files: FilesArgument) -> None:
     """Compute radar signatures: cross-sections, range profiles, images."""
 
     def work(*given: Any) -> list[Table]:
-        from invertwin.cli.run_rcs import run_rcs
+        from invertwin.cli.commands.rcs import run_rcs
 
         return run_rcs(*given)
 
@@ -265,7 +265,7 @@ def keys(
     ] = False,
 ) -> None:
     """Print the keys of a section of run files: units, defaults, meaning; or list the sections."""
-    from invertwin.cli.keys import json_schema, key_index, key_tables
+    from invertwin.cli.schema.keys import json_schema, key_index, key_tables
 
     if as_json:
         print(json.dumps(json_schema(), indent=2, ensure_ascii=False))
@@ -318,8 +318,8 @@ def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
     with run_folder(options, default, runs) as folder:
         if folder.complete:
             return
+        from invertwin.cli.commands.reconstruct import run_reconstruct
         from invertwin.cli.fits.spreading import Workers
-        from invertwin.cli.run_reconstruct import run_reconstruct
 
         fits = isinstance(options, Fits)
         workers = Workers.asked(options.engine, options.workers) if fits else None

@@ -11,8 +11,8 @@ from invertwin.cli.options import FileArgument, Options, Where, with_options
 @with_options(Options)
 def loss_scan(options: Options, file: FileArgument) -> None:
     """Show the losses of signals and of the surrogate along a line."""
-    from invertwin.cli.run_file import about_file
-    from invertwin.cli.running import load_runs, print_tables, run_folder
+    from invertwin.cli.schema.run_file import about_file
+    from invertwin.cli.terminal import load_runs, print_tables, run_folder
 
     runs = load_runs([file], options, "loss-scan", ("loss_scan", "radar", "grid", "data"))
     with run_folder(options, Path("out", file.stem), runs) as folder:
@@ -33,7 +33,7 @@ def train_prior(
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
 ) -> None:
     """Train a shape prior on cars of the generator; the packaged one by default."""
-    from invertwin.cli.running import now_and_then, print_tables, run_folder
+    from invertwin.cli.terminal import now_and_then, print_tables, run_folder
     from invertwin_studies import train_prior as training
     from invertwin_studies.prior_training import Training
 

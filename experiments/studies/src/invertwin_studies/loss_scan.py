@@ -10,13 +10,12 @@ from torch import Tensor
 
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
-from invertwin.cli import build
-from invertwin.cli.estimate import Sensor, require_room
-from invertwin.cli.landscape import exact_losses, line_through
+from invertwin.cli.commands.estimate import Sensor, require_room
+from invertwin.cli.commands.landscape import exact_losses, line_through
+from invertwin.cli.commands.simulate import exact
 from invertwin.cli.report import Table, finish, picture
-from invertwin.cli.run_file import need
-from invertwin.cli.run_simulate import exact
-from invertwin.cli.schema import RunFile
+from invertwin.cli.schema import RunFile, build
+from invertwin.cli.schema.run_file import need
 from invertwin.errors import InputError
 from invertwin.inversion import Observation
 from invertwin.inversion.lines import Line, losses_along

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from invertwin.channel import Sampling, draw_speckle
-from invertwin.cli import build
+from invertwin.cli.commands.gradcheck import Checked
 from invertwin.cli.report import Table
-from invertwin.cli.run_gradcheck import Checked
+from invertwin.cli.schema import build
 from invertwin_studies.figures import Derivative, derivatives
 from invertwin_studies.peers.edge_sampling import edge_sampling_derivative
 from invertwin_studies.peers.music import MusicMap

@@ -10,8 +10,8 @@ from invertwin.registry.section import Section
 if TYPE_CHECKING:  # run files are read in milliseconds, the rest takes seconds to import
     from matplotlib.figure import Figure
 
+    from invertwin.cli.commands.gradcheck import Checked
     from invertwin.cli.report import Table
-    from invertwin.cli.run_gradcheck import Checked
 
 Subarray = Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=2)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]

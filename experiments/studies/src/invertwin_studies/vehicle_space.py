@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from invertwin.cli.shape_tables import ObjectTable
+from invertwin.cli.schema.shape_tables import ObjectTable
 from invertwin.errors import InputError
 from invertwin.inversion.remeshing import remeshed
 from invertwin.limits import Count, Positive

@@ -12,7 +12,6 @@ from rich.console import Console
 from torch import nn
 
 from invertwin.capture import calibrate
-from invertwin.cli import build
 from invertwin.cli.fits.displays import KeptSteps, steps_file
 from invertwin.cli.fits.problem import (
     FULL,
@@ -30,6 +29,7 @@ from invertwin.cli.fits.problem import (
 from invertwin.cli.fits.scores import scores
 from invertwin.cli.fits.shape_scores import CURVE, watch_of
 from invertwin.cli.fits.spreading import part_name
+from invertwin.cli.schema import build
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
 from invertwin.inversion import (

@@ -13,15 +13,14 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
-from invertwin.cli import build
-from invertwin.cli.estimate import Sensor, require_room
-from invertwin.cli.motion_tables import at_start
-from invertwin.cli.recordings import chirp_capture
+from invertwin.cli.commands.estimate import Sensor, require_room
+from invertwin.cli.commands.simulate import chirp_train
 from invertwin.cli.report import Picture, Table, finish, picture, quantities, texts
-from invertwin.cli.run_file import about, need
-from invertwin.cli.run_simulate import chirp_train
-from invertwin.cli.schema import RunFile, SimulatedData
-from invertwin.cli.shape_tables import Mover
+from invertwin.cli.schema import RunFile, SimulatedData, build
+from invertwin.cli.schema.motion_tables import at_start
+from invertwin.cli.schema.recordings import chirp_capture
+from invertwin.cli.schema.run_file import about, need
+from invertwin.cli.schema.shape_tables import Mover
 from invertwin.errors import InputError
 from invertwin.inversion import (
     CorrelationLoss,

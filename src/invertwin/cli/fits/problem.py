@@ -1,6 +1,7 @@
 """What is to be fitted: scene, observations, unknowns and stages of a run file."""
 
 import math
+import time
 import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -14,23 +15,71 @@ from torch import nn
 
 from invertwin.capture import Capture
 from invertwin.channel import Densities, Grid, Sampling
-from invertwin.cli import build
-from invertwin.cli.estimate import Sensor, require_room
-from invertwin.cli.recordings import measured
-from invertwin.cli.run_file import about, need
-from invertwin.cli.run_simulate import exact
-from invertwin.cli.schema import SAMPLED, Measures, Reconstruct, RunFile, SimulatedData
+from invertwin.cli.commands.estimate import Sensor, require_room
+from invertwin.cli.commands.simulate import exact
+from invertwin.cli.schema import SAMPLED, Measures, Reconstruct, RunFile, SimulatedData, build
 from invertwin.cli.schema import Stage as StageTable
-from invertwin.cli.shape_tables import shape_terms
+from invertwin.cli.schema.recordings import measured
+from invertwin.cli.schema.run_file import about, need
+from invertwin.cli.schema.shape_tables import shape_terms
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion import Observation, Stage, Unknown, remeshed
+from invertwin.inversion.initial import guess_density
+from invertwin.inversion.metrics import residual
 from invertwin.models import ChainMap, ExactMap, SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import Object, Scene, rigid
 from invertwin.seeds import derived_seed
+
+
+def guessed(problem: Problem, console: Console) -> tuple[Problem, dict[str, Any]]:
+    """The problem with its object where `[initial]` finds it, and how that went.
+
+    Raises:
+        InputError: `[starts]` beside it, no echoes, or too few points.
+    """
+    run, table, sight = problem.run, problem.run.initial, problem.first
+    if table is None:
+        return problem, {}
+    if run.starts is not None:
+        raise InputError(
+            "initial: expected no [starts] beside [initial], got both; a fit starts from one"
+        )
+    console.print(f"looking for {table.object} with a conventional detector")
+    begin, name = time.perf_counter(), table.object
+    with about("initial"):
+        guess = table.build().find(
+            problem.scene,
+            name,
+            sight.capture,
+            sight.grid,
+            loss=build.made(run, "loss"),
+            seed=run.seed,
+        )
+        scene = _clouded(problem, guess.scene, name)
+    found: dict[str, Any] = {"initial_points": guess.points} if guess.points else {}
+    if guess.size is not None:
+        known = table.scale and name in problem.known
+        off = residual(guess.scene[name], problem.truth[name]) if known else None
+        found |= {"initial_scale_error": abs(off.scale - 1)} if off else {}
+        found |= {"initial_losses": guess.losses, "initial_size_m": list(guess.size)}
+    found["initial_seconds"] = time.perf_counter() - begin
+    return replace(problem, scene=scene), found
+
+
+def _clouded(problem: Problem, scene: Scene, name: str) -> Scene:
+    """The scene with a density from the backprojected echoes, where one is fitted."""
+    sight = problem.first
+    for table in problem.run.parameters:
+        if table.kind == "density" and table.object == name:
+            box = table.low, table.high, table.counts
+            grid = guess_density(sight.capture, sight.grid, scene[name], name, *box)
+            return scene.replace(name, cloud=grid.cloud)
+    return scene
+
 
 FULL, INTERIOR = "full", "interior_only"
 

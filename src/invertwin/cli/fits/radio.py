@@ -14,16 +14,15 @@ from torch import Tensor, nn
 
 from invertwin import plotting
 from invertwin.channel import trace_paths
-from invertwin.cli import build
-from invertwin.cli.fits.certainty import certainty_table
 from invertwin.cli.fits.problem import FULL, settings_of, stages_of, varied_run
+from invertwin.cli.fits.scores import certainty_table
 from invertwin.cli.fits.spreading import QUIET, Workers, fit_elsewhere, part_name
-from invertwin.cli.radio_tables import ReceivedData, ReceivedFile
 from invertwin.cli.report import Table, finish, picture, quantities, texts
-from invertwin.cli.run_file import about, need
-from invertwin.cli.running import progress
-from invertwin.cli.schema import RunFile
-from invertwin.cli.shape_tables import given_for
+from invertwin.cli.schema import RunFile, build
+from invertwin.cli.schema.radio_tables import ReceivedData, ReceivedFile
+from invertwin.cli.schema.run_file import about, need
+from invertwin.cli.schema.shape_tables import given_for
+from invertwin.cli.terminal import progress
 from invertwin.errors import InputError
 from invertwin.inversion import (
     Checkpoint,

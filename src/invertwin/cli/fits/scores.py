@@ -9,7 +9,6 @@ import torch
 
 from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
-from invertwin.cli import build
 from invertwin.cli.fits.problem import (
     Problem,
     fitted_of,
@@ -19,7 +18,8 @@ from invertwin.cli.fits.problem import (
     shown_models,
 )
 from invertwin.cli.fits.shape_scores import shape_scores
-from invertwin.cli.schema import SimulatedData
+from invertwin.cli.report import Table, texts
+from invertwin.cli.schema import SimulatedData, build
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Objective
 from invertwin.inversion.metrics import axis_error, residual, value_errors
@@ -28,6 +28,29 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene import Mesh, Scene, SkinnedBody
 from invertwin.scene.geometry.density import without_clouds
+
+
+def certainty_table(metrics: dict[str, Any]) -> Table:
+    """The error bars of the best fit."""
+    cells = []
+    for name, value in metrics.get("standard_deviations", {}).items():
+        unit, factor = metrics["units"][name], 1.0
+        if unit == "rad":
+            unit, factor = "°", math.degrees(1)
+        row = [f"{name} [{unit}]" if unit else name, factor * value]
+        row += [factor * metrics["within_95"][name]]
+        row += [metrics.get("coverage_95", {}).get(name.split(".")[-1])]
+        row += [metrics.get("predicted_over_observed", {}).get(name)]
+        cells.append([*row, metrics.get("spread_of_ends", {}).get(name)])
+    heads = ["parameter", "standard deviation", "95 % of errors within"]
+    heads += ["coverage", "over that of simulated fits", "spread of other ends"]
+    kept = [k for k in range(len(heads)) if k < 3 or any(row[k] is not None for row in cells)]
+    heads, cells = [heads[k] for k in kept], [[row[k] for k in kept] for row in cells]
+    told = ("verdict_reasons", "ambiguities", "unobserved")
+    said = [text for key in told for text in metrics.get(key, [])]
+    said += [metrics["spread_note"]] if "spread_note" in metrics else []
+    said.append(metrics.get("no_error_bars", texts("notes")["error_bars"]))
+    return Table("Error bars", heads, cells, "\n".join(said))
 
 
 def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import torch
 
 from invertwin.cli.fits.problem import Problem
 from invertwin.cli.report import texts
-from invertwin.cli.run_file import about
+from invertwin.cli.schema.run_file import about
 from invertwin.errors import InputError
 from invertwin.inversion.metrics import (
     ShapeMetrics,

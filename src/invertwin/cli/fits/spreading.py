@@ -14,9 +14,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from invertwin.cli.run_file import stated, validate
-from invertwin.cli.running import progress
 from invertwin.cli.schema import RunFile
+from invertwin.cli.schema.run_file import stated, validate
+from invertwin.cli.terminal import progress
 from invertwin.engines import Engine, spread
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.folders import PARTS, UNFINISHED

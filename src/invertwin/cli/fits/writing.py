@@ -8,7 +8,6 @@ from typing import Any
 import torch
 
 from invertwin import plotting
-from invertwin.cli.fits.certainty import certainty_table
 from invertwin.cli.fits.problem import (
     FULL,
     INTERIOR,
@@ -17,6 +16,7 @@ from invertwin.cli.fits.problem import (
     fitted_objects,
     settings_of,
 )
+from invertwin.cli.fits.scores import certainty_table
 from invertwin.cli.fits.shape_scores import CURVE, is_shape_key, shape_label, short_label
 from invertwin.cli.report import Picture, Table, picture, quantities, shown, texts
 from invertwin.cli.schema import RunFile, SimulatedData

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from annotated_types import MinLen
 from pydantic import GetCoreSchemaHandler, model_validator
 
-from invertwin.cli.variation import steps_of
+from invertwin.cli.schema.variation import steps_of
 from invertwin.datasets import Choice, Integer, LogUniform, Normal, Presence, Uniform
 from invertwin.limits import Count
 from invertwin.registry.kinds import Group, Registry, Table, number_or_list

@@ -7,7 +7,7 @@ from annotated_types import Ge, MinLen
 from pydantic import PlainSerializer, WrapValidator
 
 from invertwin.channel import Sampling
-from invertwin.cli.fit_tables import SurrogateTable
+from invertwin.cli.schema.fit_tables import SurrogateTable
 from invertwin.inversion.first_pose import FirstPose
 from invertwin.inversion.schedule import Schedule
 from invertwin.inversion.starts import nearby

@@ -7,7 +7,7 @@ from annotated_types import MinLen
 from torch import Tensor
 
 from invertwin.cli.schema.fits import SAMPLED
-from invertwin.cli.sensors import LookAt, Orientation, Polarised, Turned
+from invertwin.cli.schema.sensors import LookAt, Orientation, Polarised, Turned
 from invertwin.errors import InputError
 from invertwin.limits import Count, NonNegative
 from invertwin.links import Reception, Terminals, Transmitters

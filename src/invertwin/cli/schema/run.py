@@ -10,10 +10,9 @@ from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from invertwin.channel import REST
-from invertwin.cli.camera_tables import AnyCamera, AnyImage
-from invertwin.cli.fit_tables import SurrogateTable
-from invertwin.cli.recordings import SimulatedData
+from invertwin.cli.schema.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.schema.dataset import DatasetTable
+from invertwin.cli.schema.fit_tables import SurrogateTable
 from invertwin.cli.schema.fits import (
     AnyInitial,
     AnyStarts,
@@ -29,11 +28,12 @@ from invertwin.cli.schema.fits import (
 from invertwin.cli.schema.gradcheck import Gradcheck
 from invertwin.cli.schema.placement import Placement
 from invertwin.cli.schema.radio import AnyMap, TransmitterStarts, TransmitterTable
+from invertwin.cli.schema.recordings import SimulatedData
+from invertwin.cli.schema.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
+from invertwin.cli.schema.shape_tables import LearnedTable, RoomTable
 from invertwin.cli.schema.signature import Rcs
 from invertwin.cli.schema.twin import TwinTable
-from invertwin.cli.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
-from invertwin.cli.shape_tables import LearnedTable, RoomTable
-from invertwin.cli.variation import check_varied
+from invertwin.cli.schema.variation import check_varied
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck import Check
 from invertwin.limits import NonNegative, Positive

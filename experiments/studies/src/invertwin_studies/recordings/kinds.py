@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from invertwin.capture import Capture, ChirpCapture
-from invertwin.cli.recordings import recorded
+from invertwin.cli.schema.recordings import recorded
 from invertwin.errors import InputError
 from invertwin.radar.boards import Mounting
 from invertwin.registry.section import InputPath, about

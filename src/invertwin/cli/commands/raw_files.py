@@ -5,8 +5,8 @@ from jaxtyping import Complex
 from torch import Tensor
 
 from invertwin.capture import ChirpSettings, adc_counts, settings_of, ti
-from invertwin.cli.run_file import about
 from invertwin.cli.schema import Raw, RunFile
+from invertwin.cli.schema.run_file import about
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW

@@ -9,8 +9,8 @@ import torch
 
 from invertwin.capture import Capture
 from invertwin.channel import Grid, densities_of
-from invertwin.cli.run_file import about, need
 from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.schema.run_file import about, need
 from invertwin.cli.schema.signature import count_of
 from invertwin.errors import InputError
 from invertwin.inversion import require_edge

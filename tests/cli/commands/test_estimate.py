@@ -6,10 +6,13 @@ import tomllib
 import pytest
 
 from cli.small import GRADCHECK, RUN, STARTS, call
-from invertwin.cli import build, run_check, run_gradcheck, run_simulate
-from invertwin.cli import estimate as estimates
+from invertwin.cli.commands import check as run_check
+from invertwin.cli.commands import estimate as estimates
+from invertwin.cli.commands import gradcheck as run_gradcheck
+from invertwin.cli.commands import simulate as run_simulate
 from invertwin.cli.fits import problem
-from invertwin.cli.run_file import load_run, validate
+from invertwin.cli.schema import build
+from invertwin.cli.schema.run_file import load_run, validate
 from invertwin.errors import PhysicsWarning
 from invertwin.progress import time_left
 from invertwin.scene import Mesh, shapes

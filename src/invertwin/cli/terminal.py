@@ -16,7 +16,7 @@ from rich.text import Text
 
 from invertwin.cli.options import Options, Where, console
 from invertwin.cli.report import Table, is_number, shown
-from invertwin.cli.run_file import about_file, load_run, need, to_toml
+from invertwin.cli.schema.run_file import about_file, load_run, need, to_toml
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
 from invertwin.progress import listening, time_left

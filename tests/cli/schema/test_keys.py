@@ -3,7 +3,7 @@
 import pytest
 
 from cli.small import call
-from invertwin.cli.keys import json_schema, key_index, key_tables
+from invertwin.cli.schema.keys import json_schema, key_index, key_tables
 from invertwin.errors import InputError
 from invertwin.radar.boards import BOARDS
 

@@ -3,7 +3,7 @@
 import pytest
 from rich.console import Console
 
-from invertwin.cli import running
+from invertwin.cli import terminal as running
 from invertwin.cli.report import Table
 
 

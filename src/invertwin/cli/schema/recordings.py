@@ -9,7 +9,7 @@ from pydantic import GetCoreSchemaHandler, model_validator
 from invertwin.capture import Capture, ChannelCalibration, ChirpCapture, ChirpData, ti
 from invertwin.capture.readers import described_arrays, described_sweeps
 from invertwin.capture.readers.radar_fields import WAVEFORMS
-from invertwin.cli.sensors import Posed
+from invertwin.cli.schema.sensors import Posed
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.radar.boards import Mounting

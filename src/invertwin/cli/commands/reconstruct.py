@@ -14,6 +14,8 @@ from typing import Any
 import torch
 from rich.console import Console
 
+from invertwin.cli.commands.landscape import landscape
+from invertwin.cli.commands.placement import run_placement
 from invertwin.cli.fits.displays import (
     VIEW,
     display_of_fit,
@@ -23,11 +25,11 @@ from invertwin.cli.fits.displays import (
     steps_in,
 )
 from invertwin.cli.fits.fitting import calibrated, fit
-from invertwin.cli.fits.initial import guessed
 from invertwin.cli.fits.mover import run_mover
 from invertwin.cli.fits.problem import (
     FULL,
     Problem,
+    guessed,
     known_of,
     problem_of,
     recorded_anew,
@@ -48,13 +50,11 @@ from invertwin.cli.fits.scores import (
 from invertwin.cli.fits.shape_scores import check_measures, is_shape_key
 from invertwin.cli.fits.spreading import QUIET, Workers, fit_elsewhere, refused
 from invertwin.cli.fits.writing import COLUMNS, Fitted, pictures_of, status, tables_of
-from invertwin.cli.landscape import landscape
 from invertwin.cli.report import Table, View, finish, picture
-from invertwin.cli.run_file import stated, validate
-from invertwin.cli.run_placement import run_placement
-from invertwin.cli.running import progress
 from invertwin.cli.schema import RunFile, SimulatedData
-from invertwin.cli.shape_tables import Mover
+from invertwin.cli.schema.run_file import stated, validate
+from invertwin.cli.schema.shape_tables import Mover
+from invertwin.cli.terminal import progress
 from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
 from invertwin.inversion.certainty import certainty, coverage

@@ -8,11 +8,10 @@ from rich.console import Console
 
 from invertwin.capture import Capture, shown_ranges
 from invertwin.channel import Grid
-from invertwin.cli import build
 from invertwin.cli.fits.displays import VIEW
 from invertwin.cli.fits.problem import fitted_objects, sensors_of
-from invertwin.cli.run_file import about_file, load_run
-from invertwin.cli.schema import RunFile
+from invertwin.cli.schema import RunFile, build
+from invertwin.cli.schema.run_file import about_file, load_run
 from invertwin.errors import InputError
 from invertwin.radar import Radar
 from invertwin.viewer import (

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from invertwin.cli import build
 from invertwin.cli.fits.problem import Problem, starts_of
-from invertwin.cli.run_file import to_toml, validate
+from invertwin.cli.schema import build
+from invertwin.cli.schema.run_file import to_toml, validate
 from invertwin.errors import InputError
 from invertwin.inversion import displaced, residual
 from invertwin.inversion.loss import SpectrumLoss

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from invertwin.cli import build
-from invertwin.cli.keys import key_tables
-from invertwin.cli.run_file import load_run, to_toml, validate
+from invertwin.cli.schema import build
+from invertwin.cli.schema.keys import key_tables
+from invertwin.cli.schema.run_file import load_run, to_toml, validate
 from invertwin.errors import InputError
 from invertwin.inversion.metrics import value_errors
 from invertwin.scene import (

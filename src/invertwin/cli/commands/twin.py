@@ -9,13 +9,13 @@ import tomli_w
 import torch
 
 from invertwin.capture import Capture, ChirpCapture
-from invertwin.cli import build
+from invertwin.cli.commands.look import read_recording
+from invertwin.cli.commands.simulate import exact
 from invertwin.cli.options import Find
-from invertwin.cli.recordings import SimulatedData
 from invertwin.cli.report import Picture, Table, finish, picture, texts
-from invertwin.cli.run_file import about_file, is_run_file, load_run, need
-from invertwin.cli.run_look import read_recording
-from invertwin.cli.run_simulate import exact
+from invertwin.cli.schema import build
+from invertwin.cli.schema.recordings import SimulatedData
+from invertwin.cli.schema.run_file import about_file, is_run_file, load_run, need
 from invertwin.discovery import Twin, still_capture, twin
 from invertwin.inversion.initial import Ground
 from invertwin.inversion.metrics import compare_shapes

@@ -12,14 +12,13 @@ from torch import Tensor
 
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
-from invertwin.cli import build
-from invertwin.cli.estimate import Sensor, of_signature, require_room
+from invertwin.cli.commands.estimate import Sensor, of_signature, require_room
 from invertwin.cli.report import Picture, Table, finish, picture, texts
-from invertwin.cli.run_file import about, need
-from invertwin.cli.running import in_parts
-from invertwin.cli.schema import RunFile
+from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.gradcheck import Gradcheck
+from invertwin.cli.schema.run_file import about, need
 from invertwin.cli.schema.signature import swept
+from invertwin.cli.terminal import in_parts
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck

@@ -7,16 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from cli.test_build import RADAR, read
 
 from cli.small import RUN, call, read_metrics
-from cli.test_build import RADAR, read
 from invertwin.capture import Capture, ChannelCalibration, ChirpData
 from invertwin.capture.readers import described_arrays
 from invertwin.capture.ti import read_cfg, read_recording, read_settings
-from invertwin.cli import build, schema, sensors
-from invertwin.cli.raw_files import settings_of_run
-from invertwin.cli.recordings import measured
-from invertwin.cli.run_file import to_toml, validate
+from invertwin.cli import schema
+from invertwin.cli.commands.raw_files import settings_of_run
+from invertwin.cli.schema import build, sensors
+from invertwin.cli.schema.recordings import measured
+from invertwin.cli.schema.run_file import to_toml, validate
 from invertwin.errors import InputError
 from invertwin.radar import FMCW, OFDM, Impulse, SteppedFrequency
 from invertwin.radar.boards import board

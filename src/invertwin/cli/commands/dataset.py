@@ -17,14 +17,13 @@ import torch
 
 from invertwin import __version__
 from invertwin.channel import Paths
-from invertwin.cli import build
-from invertwin.cli.estimate import Sensor, require_room
-from invertwin.cli.motion_tables import at_start, joints_at_start
+from invertwin.cli.commands.estimate import Sensor, require_room
+from invertwin.cli.commands.simulate import chirp_train, exact
 from invertwin.cli.report import Table, finish, quantities
-from invertwin.cli.run_file import about_file, load_run, need, to_toml, validate
-from invertwin.cli.run_simulate import chirp_train, exact
-from invertwin.cli.schema import RunFile
-from invertwin.cli.variation import sample_of
+from invertwin.cli.schema import RunFile, build
+from invertwin.cli.schema.motion_tables import at_start, joints_at_start
+from invertwin.cli.schema.run_file import about_file, load_run, need, to_toml, validate
+from invertwin.cli.schema.variation import sample_of
 from invertwin.datasets import Samples, object_labels, radar_labels, seen_triangles
 from invertwin.datasets.shards import (
     FORMAT,

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from cli.small import RUN
-from invertwin.cli.run_file import load_run, stated, validate
 from invertwin.cli.schema import RunFile
+from invertwin.cli.schema.run_file import load_run, stated, validate
 from invertwin.errors import InputError
 
 REPOSITORY = Path(__file__).parents[2]

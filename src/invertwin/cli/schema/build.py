@@ -8,12 +8,12 @@ from typing import Any
 import torch
 from torch import nn
 
-from invertwin.cli.run_file import about as about
-from invertwin.cli.run_file import need, unknown_object
 from invertwin.cli.schema import RunFile, SceneFile
-from invertwin.cli.sensors import grid as grid
-from invertwin.cli.sensors import radar as radar
-from invertwin.cli.shape_tables import ObjectTable, Placement, given_for
+from invertwin.cli.schema.run_file import about as about
+from invertwin.cli.schema.run_file import need, unknown_object
+from invertwin.cli.schema.sensors import grid as grid
+from invertwin.cli.schema.sensors import radar as radar
+from invertwin.cli.schema.shape_tables import ObjectTable, Placement, given_for
 from invertwin.errors import InputError
 from invertwin.inversion.placement import Placing
 from invertwin.inversion.tangents import Change, changes_of

@@ -2,9 +2,9 @@
 
 from torch import Tensor
 
-from invertwin.cli.run_file import about
 from invertwin.cli.schema import RunFile
-from invertwin.cli.shape_tables import ObjectTable, joint_places, template_of
+from invertwin.cli.schema.run_file import about
+from invertwin.cli.schema.shape_tables import ObjectTable, joint_places, template_of
 from invertwin.errors import InputError
 from invertwin.scene import InMotion, Mover, Scene, Sitting, Walking, Waving
 from invertwin.scene.geometry.body import BodyTemplate

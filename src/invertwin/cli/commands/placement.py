@@ -12,12 +12,11 @@ from rich.console import Console
 from torch import Tensor
 
 from invertwin import plotting
-from invertwin.cli import build
 from invertwin.cli.report import Table, finish, picture, texts
-from invertwin.cli.run_file import need
-from invertwin.cli.running import progress
-from invertwin.cli.schema import RunFile
+from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.placement import Placement
+from invertwin.cli.schema.run_file import need
+from invertwin.cli.terminal import progress
 from invertwin.folders import PARTS
 from invertwin.inversion.placement import Coverage, Found, Placing, Trial, evaluations_until
 from invertwin.progress import told

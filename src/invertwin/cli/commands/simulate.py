@@ -13,13 +13,12 @@ from invertwin import plotting
 from invertwin.capture import Capture, ChirpData
 from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid, Sampling
-from invertwin.cli import build, sensors
-from invertwin.cli.estimate import Sensor, require_room
-from invertwin.cli.motion_tables import in_motion, refuse_motion
-from invertwin.cli.raw_files import settings_of_run, write_raw
+from invertwin.cli.commands.estimate import Sensor, require_room
+from invertwin.cli.commands.raw_files import settings_of_run, write_raw
 from invertwin.cli.report import Table, finish, picture, quantities
-from invertwin.cli.run_file import about, need
-from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.schema import RunFile, SimulatedData, build, sensors
+from invertwin.cli.schema.motion_tables import in_motion, refuse_motion
+from invertwin.cli.schema.run_file import about, need
 from invertwin.errors import InputError
 from invertwin.models import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, doppler_maps, velocity_span

@@ -11,13 +11,12 @@ from torch import Tensor
 
 from invertwin import plotting
 from invertwin.capture import load_section
-from invertwin.cli import build
-from invertwin.cli.estimate import of_signature
+from invertwin.cli.commands.estimate import of_signature
 from invertwin.cli.report import Picture, Table, finish, picture, texts
-from invertwin.cli.run_file import about, need
-from invertwin.cli.running import in_parts
-from invertwin.cli.schema import RunFile
+from invertwin.cli.schema import RunFile, build
+from invertwin.cli.schema.run_file import about, need
 from invertwin.cli.schema.signature import Measurement, Rcs
+from invertwin.cli.terminal import in_parts
 from invertwin.errors import InputError
 from invertwin.runs import RunFolder
 from invertwin.scene import Scene

@@ -10,11 +10,10 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from invertwin import plotting
-from invertwin.cli import build
 from invertwin.cli.fits.problem import Problem, models_of
-from invertwin.cli.run_file import need
-from invertwin.cli.running import counted
-from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.schema import RunFile, SimulatedData, build
+from invertwin.cli.schema.run_file import need
+from invertwin.cli.terminal import counted
 from invertwin.inversion import Observation
 from invertwin.inversion.lines import Line, line_of, losses_along
 from invertwin.inversion.loss import relative_error

@@ -7,15 +7,14 @@ from dataclasses import replace
 import torch
 
 from invertwin.channel import Sampling, densities_of
-from invertwin.cli import build
-from invertwin.cli.estimate import Estimate, Sensor, estimate_of, of_sensor, of_signature
+from invertwin.cli.commands.estimate import Estimate, Sensor, estimate_of, of_sensor, of_signature
+from invertwin.cli.commands.simulate import chirp_train, exact
 from invertwin.cli.fits.problem import FULL, sensors_of, settings_of, stages_of, varied_run
-from invertwin.cli.recordings import chirp_capture
 from invertwin.cli.report import Table, texts
-from invertwin.cli.run_file import about, need
-from invertwin.cli.run_simulate import chirp_train, exact
-from invertwin.cli.schema import RunFile, SimulatedData
-from invertwin.cli.shape_tables import Mover
+from invertwin.cli.schema import RunFile, SimulatedData, build
+from invertwin.cli.schema.recordings import chirp_capture
+from invertwin.cli.schema.run_file import about, need
+from invertwin.cli.schema.shape_tables import Mover
 from invertwin.memory import free_memory, gigabytes
 from invertwin.models import SurrogateMap
 from invertwin.progress import time_left

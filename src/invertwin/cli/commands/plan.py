@@ -8,8 +8,6 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from invertwin.cli import build
-from invertwin.cli.fits.certainty import certainty_table
 from invertwin.cli.fits.problem import (
     Problem,
     another,
@@ -18,10 +16,11 @@ from invertwin.cli.fits.problem import (
     stages_of,
     unknowns_of,
 )
+from invertwin.cli.fits.scores import certainty_table
 from invertwin.cli.report import Table, finish, texts
-from invertwin.cli.run_file import need
-from invertwin.cli.running import progress
-from invertwin.cli.schema import Plan, RunFile, SimulatedData
+from invertwin.cli.schema import Plan, RunFile, SimulatedData, build
+from invertwin.cli.schema.run_file import need
+from invertwin.cli.terminal import progress
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
 from invertwin.inversion import fit_at, planned
