@@ -8,7 +8,7 @@ import torch
 from discovery.test_recordings import around, thing
 from discovery.test_search import search_of
 from invertwin.discovery.certainty import Rival, kind_probabilities, rivals, widened
-from invertwin.discovery.primitives import Figure
+from invertwin.discovery.shapes.primitives import Figure
 from invertwin.scene import Scene, box
 
 

@@ -8,9 +8,9 @@ import torch
 import invertwin as iw
 from invertwin.capture import Capture, ChirpCapture
 from invertwin.discovery import Twin, still_capture, twin
-from invertwin.discovery.places import dense
-from invertwin.discovery.primitives import Figure
+from invertwin.discovery.imaging.point_detections import dense
 from invertwin.discovery.search import Search
+from invertwin.discovery.shapes.primitives import Figure
 from invertwin.errors import InputError
 from invertwin.inversion.initial import Ground
 from invertwin.radar import Chirps, add_noise

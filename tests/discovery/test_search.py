@@ -10,8 +10,8 @@ from scipy import sparse
 import invertwin as iw
 from discovery.test_recordings import CHAIN, HEIGHT, around, thing
 from invertwin.discovery.assembly import Assembly, sampling_of
-from invertwin.discovery.clutter import HeavyTailed, background, shared_bins
-from invertwin.discovery.primitives import Figure
+from invertwin.discovery.imaging.likelihood import HeavyTailed, background, shared_bins
+from invertwin.discovery.imaging.reflectivity import Response
 from invertwin.discovery.proposals import standing
 from invertwin.discovery.search import (
     Lattice,
@@ -22,7 +22,7 @@ from invertwin.discovery.search import (
     outline,
     section,
 )
-from invertwin.discovery.sharp_image import Response
+from invertwin.discovery.shapes.primitives import Figure
 from invertwin.inversion.initial import Ground
 from invertwin.models import SurrogateMap
 from invertwin.scene import Mesh, box, cylinder, person, standing_height

@@ -4,8 +4,8 @@ from invertwin.discovery.outcome import Picture as Picture
 from invertwin.discovery.outcome import Thing as Thing
 from invertwin.discovery.outcome import Track as Track
 from invertwin.discovery.outcome import Twin as Twin
-from invertwin.discovery.primitives import KINDS as KINDS
-from invertwin.discovery.primitives import Figure as Figure
-from invertwin.discovery.primitives import Primitive as Primitive
 from invertwin.discovery.recordings import still_capture as still_capture
 from invertwin.discovery.recordings import twin as twin
+from invertwin.discovery.shapes.primitives import KINDS as KINDS
+from invertwin.discovery.shapes.primitives import Figure as Figure
+from invertwin.discovery.shapes.primitives import Primitive as Primitive

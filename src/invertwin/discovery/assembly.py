@@ -9,10 +9,10 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.channel import Grid, Sampling
-from invertwin.discovery.clutter import HeavyTailed
-from invertwin.discovery.primitives import Figure, Primitive
-from invertwin.discovery.prisms import Outline, unknown
-from invertwin.discovery.sharp_image import thinned
+from invertwin.discovery.imaging.likelihood import HeavyTailed
+from invertwin.discovery.imaging.reflectivity import thinned
+from invertwin.discovery.shapes.primitives import Figure, Primitive
+from invertwin.discovery.shapes.prisms import Outline, unknown
 from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
 from invertwin.inversion.initial import Ground
 from invertwin.models import SurrogateMap

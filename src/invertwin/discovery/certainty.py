@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from invertwin.discovery.assembly import Assembly
-from invertwin.discovery.primitives import Figure, upright
 from invertwin.discovery.search import facing, other_kinds
+from invertwin.discovery.shapes.primitives import Figure, upright
 from invertwin.inversion import Reconstruction, speckle_weight
 from invertwin.inversion.uncertainty import coordinates, map_derivatives
 

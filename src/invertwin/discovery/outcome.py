@@ -9,8 +9,8 @@ from torch import Tensor
 
 from invertwin.capture import ChannelCalibration
 from invertwin.channel import Grid
-from invertwin.discovery.primitives import Figure
-from invertwin.discovery.prisms import unknown
+from invertwin.discovery.shapes.primitives import Figure
+from invertwin.discovery.shapes.prisms import unknown
 from invertwin.inversion.initial import Ground
 from invertwin.scene import Object, Scene
 

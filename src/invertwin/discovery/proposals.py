@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.discovery.primitives import SIZES, Figure
+from invertwin.discovery.shapes.primitives import SIZES, Figure
 from invertwin.inversion.initial import Ground, linked
 
 _TURNS = 45  # yaws that a rectangle is tried at, over a quarter turn

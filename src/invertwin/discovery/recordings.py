@@ -14,14 +14,14 @@ from invertwin.channel import Grid, Sight
 from invertwin.checks import checked_count, checked_number, checked_tensor
 from invertwin.discovery.assembly import Assembly, sampling_of
 from invertwin.discovery.certainty import deviations, kind_probabilities, presence, rivals, widened
-from invertwin.discovery.channels import apart, channels_of_scene
-from invertwin.discovery.clutter import HeavyTailed, background, shared_bins
-from invertwin.discovery.forms import outlined
+from invertwin.discovery.imaging.likelihood import HeavyTailed, background, shared_bins
+from invertwin.discovery.imaging.point_detections import dense, movers, own_velocities, points_along
+from invertwin.discovery.imaging.reflectivity import Response, responses
 from invertwin.discovery.outcome import Picture, Thing, Twin
-from invertwin.discovery.places import dense, movers, own_velocities, points_along
-from invertwin.discovery.primitives import upright
 from invertwin.discovery.search import Lattice, Search
-from invertwin.discovery.sharp_image import Response, responses
+from invertwin.discovery.self_calibration import apart, channels_of_scene
+from invertwin.discovery.shapes.outlines import outlined
+from invertwin.discovery.shapes.primitives import upright
 from invertwin.discovery.tracks import tracks
 from invertwin.errors import InputError
 from invertwin.inversion.initial import Ground

@@ -10,10 +10,10 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.discovery.assembly import Assembly
-from invertwin.discovery.primitives import Figure, opening, turned
-from invertwin.discovery.prisms import Prism, contour
+from invertwin.discovery.imaging.reflectivity import Response, sharpened
 from invertwin.discovery.proposals import CORNER, bright, figures, groups, headings, standing
-from invertwin.discovery.sharp_image import Response, sharpened
+from invertwin.discovery.shapes.primitives import Figure, opening, turned
+from invertwin.discovery.shapes.prisms import Prism, contour
 from invertwin.inversion.initial import Ground
 
 _MOST = 24  # objects

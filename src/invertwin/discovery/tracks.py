@@ -10,8 +10,8 @@ from torch import Tensor
 
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Grid
+from invertwin.discovery.imaging.point_detections import movers
 from invertwin.discovery.outcome import Thing, Track
-from invertwin.discovery.places import movers
 from invertwin.inversion.initial import Ground
 
 _GATE = 16.3  # squared distance in deviations of 0.1 % of three normal numbers

@@ -1,5 +1,11 @@
 """From observed maps to the scene: observations, loss, schedule, fit; and gradient checks."""
 
+from invertwin.discovery.movers import MoverMaps as MoverMaps
+from invertwin.discovery.movers import MoverTwin as MoverTwin
+from invertwin.discovery.movers import of_point as of_point
+from invertwin.discovery.movers import strongest_mover as strongest_mover
+from invertwin.discovery.moving_body import Echo as Echo
+from invertwin.discovery.moving_body import MovingBody as MovingBody
 from invertwin.inversion.averaging import mean_over_views as mean_over_views
 from invertwin.inversion.callbacks import Checkpoint as Checkpoint
 from invertwin.inversion.callbacks import Report as Report
@@ -27,12 +33,6 @@ from invertwin.inversion.metrics import volume_iou as volume_iou
 from invertwin.inversion.minima import Search as Search
 from invertwin.inversion.minima import pose_grid as pose_grid
 from invertwin.inversion.minima import search as search
-from invertwin.inversion.mover import Echo as Echo
-from invertwin.inversion.mover import MoverMaps as MoverMaps
-from invertwin.inversion.mover import MoverTwin as MoverTwin
-from invertwin.inversion.mover import MovingBody as MovingBody
-from invertwin.inversion.mover import of_point as of_point
-from invertwin.inversion.mover import strongest_mover as strongest_mover
 from invertwin.inversion.observation import Observation as Observation
 from invertwin.inversion.observation import Unknown as Unknown
 from invertwin.inversion.optimizer import Optimizer as Optimizer

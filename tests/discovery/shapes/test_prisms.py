@@ -6,8 +6,8 @@ from typing import Literal
 import pytest
 import torch
 
-from invertwin.discovery.primitives import Figure, Primitive
-from invertwin.discovery.prisms import Outline, Prism, contour, prism_of, unknown
+from invertwin.discovery.shapes.primitives import Figure, Primitive
+from invertwin.discovery.shapes.prisms import Outline, Prism, contour, prism_of, unknown
 from invertwin.inversion.initial import Ground
 from invertwin.scene import Mesh, Scene
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from invertwin.capture import Capture, ChirpCapture, backproject
 from invertwin.channel import Grid
+from invertwin.discovery.imaging.reflectivity import cell_of
 from invertwin.discovery.outcome import Thing
-from invertwin.discovery.sharp_image import cell_of
 from invertwin.inversion.initial import linked
 from invertwin.radar import noise_power, points_of, range_doppler, velocity_span
 from invertwin.radar.spectrum import aperture

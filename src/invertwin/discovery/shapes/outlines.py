@@ -6,9 +6,9 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from invertwin.discovery.assembly import Assembly
-from invertwin.discovery.primitives import Figure
-from invertwin.discovery.prisms import prism_of
 from invertwin.discovery.search import apart
+from invertwin.discovery.shapes.primitives import Figure
+from invertwin.discovery.shapes.prisms import prism_of
 
 _TOUCH = 2.0  # cells of range between shapes that may be one
 _LEAST = 6.0  # cells of range along the longer side of a shape whose outline can be told

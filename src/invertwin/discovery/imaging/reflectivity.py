@@ -9,7 +9,7 @@ from scipy import sparse
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.discovery.clutter import DEGREES, Axis, axes_of
+from invertwin.discovery.imaging.likelihood import DEGREES, Axis, axes_of
 from invertwin.errors import InputError
 from invertwin.inversion import speckle_weight
 from invertwin.progress import told

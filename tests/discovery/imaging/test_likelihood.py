@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import invertwin as iw
-from invertwin.discovery.clutter import HeavyTailed, background, shared_bins
+from invertwin.discovery.imaging.likelihood import HeavyTailed, background, shared_bins
 from invertwin.scene import AntennaArray, linear_array
 
 CHIRP = iw.FMCW(start_frequency=77e9, bandwidth=1e9, duration=50e-6, samples=64)

@@ -9,9 +9,10 @@ import torch
 
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
+from invertwin.discovery.movers import of_point, strongest_mover
+from invertwin.discovery.moving_body import MovingBody
 from invertwin.errors import InputError
 from invertwin.inversion import CorrelationLoss, Observation, Optimizer, Schedule, reconstruct
-from invertwin.inversion.mover import MovingBody, of_point, strongest_mover
 from invertwin.models import MotionMap
 from invertwin.radar.boards import board
 from invertwin.radar.motion import Chirps, moving_beat

@@ -8,7 +8,7 @@ import torch
 
 import invertwin as iw
 from invertwin.capture import ChannelCalibration
-from invertwin.discovery.channels import apart, channels_of_scene
+from invertwin.discovery.self_calibration import apart, channels_of_scene
 from invertwin.scene import RoughDielectric, box, linear_array, look_at, rigid
 
 CHIRP = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=128)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from invertwin.capture import Capture, ChannelCalibration
 from invertwin.channel import Grid
-from invertwin.discovery.clutter import DEGREES, background
-from invertwin.discovery.sharp_image import responses, sharpened, thinned
+from invertwin.discovery.imaging.likelihood import DEGREES, background
+from invertwin.discovery.imaging.reflectivity import responses, sharpened, thinned
 from invertwin.inversion import speckle_weight
 from invertwin.radar import Radar, range_profile
 from invertwin.radar.radar import sampled

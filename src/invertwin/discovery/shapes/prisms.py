@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from skimage.measure import find_contours
 from torch import Tensor, nn
 
-from invertwin.discovery.primitives import Figure, Primitive, Unknown
+from invertwin.discovery.shapes.primitives import Figure, Primitive, Unknown
 from invertwin.inversion.initial import Ground
 from invertwin.scene import DistanceGrid, Mesh, iso_surface, signed_distance
 from invertwin.scene.geometry.lattice import Lattice

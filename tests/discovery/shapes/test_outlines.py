@@ -9,10 +9,10 @@ import torch
 import invertwin as iw
 from discovery.test_recordings import around
 from discovery.test_search import search_of
-from invertwin.discovery.forms import outlined
-from invertwin.discovery.primitives import Figure
-from invertwin.discovery.prisms import Prism, contour
 from invertwin.discovery.search import Search
+from invertwin.discovery.shapes.outlines import outlined
+from invertwin.discovery.shapes.primitives import Figure
+from invertwin.discovery.shapes.prisms import Prism, contour
 from invertwin.scene import Mesh, RoughDielectric, box
 
 CORNERS = ((-0.4, -0.3), (0.5, -0.2), (-0.1, 0.5))

@@ -7,7 +7,14 @@ from typing import Any
 import pytest
 import torch
 
-from invertwin.discovery.primitives import NARROW, Figure, Primitive, opening, turned, upright
+from invertwin.discovery.shapes.primitives import (
+    NARROW,
+    Figure,
+    Primitive,
+    opening,
+    turned,
+    upright,
+)
 from invertwin.errors import InputError
 from invertwin.inversion.initial import Ground
 from invertwin.inversion.uncertainty import coordinates

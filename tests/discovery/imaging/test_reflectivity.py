@@ -6,8 +6,8 @@ import torch
 import invertwin as iw
 from invertwin.channel import Paths
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.discovery.clutter import background
-from invertwin.discovery.sharp_image import responses, sharpened, thinned
+from invertwin.discovery.imaging.likelihood import background
+from invertwin.discovery.imaging.reflectivity import responses, sharpened, thinned
 from invertwin.errors import InputError
 from invertwin.radar import beat_signal
 from invertwin.scene import Cosine, linear_array
