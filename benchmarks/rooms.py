@@ -45,7 +45,7 @@ import invertwin as iw
 from invertwin.channel import Sight
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import PhysicsWarning
-from invertwin.inversion.initial import linked, principal_rectangle
+from invertwin.inversion.initialisation.detections import linked, principal_rectangle
 from invertwin.radar import add_noise, ordered_statistics_cfar, peaks
 from invertwin.scene import (
     Cosine,

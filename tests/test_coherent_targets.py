@@ -11,7 +11,7 @@ from torch import Tensor
 
 from invertwin.channel import Sampling, trace_chains, trace_field, without_echoes
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
 from invertwin.models import ChainMap, SurrogateMap
 from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum
 from invertwin.scene import (

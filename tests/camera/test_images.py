@@ -11,7 +11,7 @@ from torch import Tensor
 from invertwin.camera import Camera, CameraPose, ImageSampling, depths, silhouettes
 from invertwin.channel import Sight
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
 from invertwin.models import DepthMap, SilhouetteMap
 from invertwin.scene import (
     Object,

@@ -11,7 +11,7 @@ from invertwin.cli.fits.scores import joint_scores
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.run_file import validate
 from invertwin.errors import InputError
-from invertwin.inversion.lines import line_of
+from invertwin.inversion.gradcheck.lines import line_of
 from invertwin.scene import Scene
 
 STUFF = {"kind": "rough_dielectric", "permittivity": 4.0}

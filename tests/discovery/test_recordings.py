@@ -12,7 +12,7 @@ from invertwin.discovery.imaging.point_detections import dense
 from invertwin.discovery.search import Search
 from invertwin.discovery.shapes.primitives import Figure
 from invertwin.errors import InputError
-from invertwin.inversion.initial import Ground
+from invertwin.inversion.initialisation.detections import Ground
 from invertwin.radar import Chirps, add_noise
 from invertwin.scene import (
     AntennaArray,

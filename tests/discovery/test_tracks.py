@@ -7,7 +7,7 @@ import invertwin as iw
 from invertwin.capture import ChirpCapture
 from invertwin.discovery import still_capture
 from invertwin.discovery.tracks import tracks
-from invertwin.inversion.initial import Ground
+from invertwin.inversion.initialisation.detections import Ground
 from invertwin.radar import Chirps, add_noise
 from invertwin.scene import AntennaArray, RoughDielectric, linear_array, rigid, sphere
 

@@ -32,8 +32,8 @@ from invertwin.channel import (
 )
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import Check, gradcheck
-from invertwin.inversion.lines import line_of
+from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.lines import line_of
 from invertwin.links import CellSampling, MapPlane, Reception, Transmitters
 from invertwin.links.metasurface import Metasurface, panel_response
 from invertwin.models import DepthMap, SilhouetteMap, SurrogateMap

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gradients.run_files import check_run
-from invertwin.inversion.gradcheck import Check
+from invertwin.inversion.gradcheck.gradcheck import Check
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "contact"
 NAMES = (

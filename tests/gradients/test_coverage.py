@@ -7,7 +7,7 @@ import pytest
 
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import load_run
-from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "waves"
 NAMES = ("coverage_occluder", "coverage_panel", "coverage_transmitter")

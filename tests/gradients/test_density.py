@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from invertwin.channel import Sampling
-from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
 from invertwin.models import SurrogateMap
 from invertwin.radar import Surrogate
 from invertwin.scene import DensityGrid, Scene, plate

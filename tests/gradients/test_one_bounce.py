@@ -6,7 +6,7 @@ import pytest
 
 from gradients.run_files import check_run
 from invertwin.channel import Sampling
-from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
 from invertwin.models import SurrogateMap
 from invertwin.radar import Surrogate
 from invertwin.scene import Scene, Translation, plate, sphere

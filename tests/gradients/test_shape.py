@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.channel import Sampling
-from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
 from invertwin.models import SurrogateMap
 from invertwin.radar import Surrogate
 from invertwin.scene import (

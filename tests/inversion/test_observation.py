@@ -19,7 +19,7 @@ from invertwin.inversion import (
     Stage,
     reconstruct,
 )
-from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
 from invertwin.models import SurrogateMap
 from invertwin.radar import Radar, RadarPose, RangeBias, Surrogate
 from invertwin.scene import Scene, Translation, look_at, sphere

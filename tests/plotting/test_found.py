@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from invertwin.discovery import Figure, Picture, Thing, Twin
-from invertwin.inversion.initial import Ground
+from invertwin.inversion.initialisation.detections import Ground
 from invertwin.plotting import found
 
 

@@ -5,7 +5,7 @@ import torch
 
 from invertwin.channel import Sampling, deposit_power, draw_speckle, trace_power
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
 from invertwin.models import SurrogateMap
 from invertwin.radar import FMCW, Radar
 from invertwin.radar.surrogate import Surrogate

@@ -14,7 +14,7 @@ from invertwin.discovery.imaging.reflectivity import thinned
 from invertwin.discovery.shapes.primitives import Figure, Primitive
 from invertwin.discovery.shapes.prisms import Outline, unknown
 from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
-from invertwin.inversion.initial import Ground
+from invertwin.inversion.initialisation.detections import Ground
 from invertwin.models import SurrogateMap
 from invertwin.radar import Radar
 from invertwin.scene import Scene

@@ -11,7 +11,7 @@ from invertwin.discovery.assembly import Assembly
 from invertwin.discovery.search import facing, other_kinds
 from invertwin.discovery.shapes.primitives import Figure, upright
 from invertwin.inversion import Reconstruction, speckle_weight
-from invertwin.inversion.uncertainty import coordinates, map_derivatives
+from invertwin.inversion.confidence.uncertainty import coordinates, map_derivatives
 
 
 def deviations(one: Assembly, found: Reconstruction) -> dict[str, float]:

@@ -11,7 +11,7 @@ from invertwin.capture import ChannelCalibration
 from invertwin.channel import Grid
 from invertwin.discovery.shapes.primitives import Figure
 from invertwin.discovery.shapes.prisms import unknown
-from invertwin.inversion.initial import Ground
+from invertwin.inversion.initialisation.detections import Ground
 from invertwin.scene import Object, Scene
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.discovery.shapes.primitives import SIZES, Figure
-from invertwin.inversion.initial import Ground, linked
+from invertwin.inversion.initialisation.detections import Ground, linked
 
 _TURNS = 45  # yaws that a rectangle is tried at, over a quarter turn
 _TRIM = 0.05  # share of the weight beyond each side of a rectangle

@@ -24,7 +24,7 @@ from invertwin.discovery.shapes.outlines import outlined
 from invertwin.discovery.shapes.primitives import upright
 from invertwin.discovery.tracks import tracks
 from invertwin.errors import InputError
-from invertwin.inversion.initial import Ground
+from invertwin.inversion.initialisation.detections import Ground
 from invertwin.models import SurrogateMap
 from invertwin.radar import Radar, SampledWaveform
 from invertwin.scene import Scene

@@ -14,7 +14,7 @@ from invertwin.discovery.imaging.reflectivity import Response, sharpened
 from invertwin.discovery.proposals import CORNER, bright, figures, groups, headings, standing
 from invertwin.discovery.shapes.primitives import Figure, opening, turned
 from invertwin.discovery.shapes.prisms import Prism, contour
-from invertwin.inversion.initial import Ground
+from invertwin.inversion.initialisation.detections import Ground
 
 _MOST = 24  # objects
 _ROUNDS = 3  # of births

@@ -12,7 +12,7 @@ from invertwin.capture import ChirpCapture
 from invertwin.channel import Grid
 from invertwin.discovery.imaging.point_detections import movers
 from invertwin.discovery.outcome import Thing, Track
-from invertwin.inversion.initial import Ground
+from invertwin.inversion.initialisation.detections import Ground
 
 _GATE = 16.3  # squared distance in deviations of 0.1 % of three normal numbers
 _AGILE = 1.0  # acceleration that a mover may have [m/s²]

@@ -10,15 +10,15 @@ from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.inversion.draws import End
+from invertwin.inversion.confidence.realisations import End
+from invertwin.inversion.confidence.uncertainty import Evidence, Uncertainty
+from invertwin.inversion.confidence.verdict import LEAST_SHARE, Verdict, shares_explained, verdict
 from invertwin.inversion.fit import Callback, Fit, Settings, Status
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.observation import Observation, Unknown, Unknowns, named_unknowns
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule, Stage, checked_stages
-from invertwin.inversion.uncertainty import Evidence, Uncertainty
-from invertwin.inversion.verdict import LEAST_SHARE, Verdict, shares_explained, verdict
 from invertwin.outward import shown_by
 from invertwin.scene.geometry.density import without_clouds
 from invertwin.scene.scene import Scene
@@ -68,7 +68,7 @@ class Reconstruction:
         """The error bars of the parameters, computed when they are first asked for.
 
         Raises:
-            InputError: See :class:`invertwin.inversion.uncertainty.Evidence`.
+            InputError: See :class:`invertwin.inversion.confidence.uncertainty.Evidence`.
         """
         return Evidence(self.end).bars()
 

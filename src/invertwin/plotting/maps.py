@@ -14,7 +14,7 @@ from torch import Tensor
 
 from invertwin.channel import Grid
 from invertwin.errors import InputError
-from invertwin.inversion.draws import coarse
+from invertwin.inversion.confidence.realisations import coarse
 from invertwin.plotting.figures import legible, numbers
 from invertwin.radar import DopplerMaps
 

@@ -16,8 +16,8 @@ from invertwin.discovery.shapes.primitives import (
     upright,
 )
 from invertwin.errors import InputError
-from invertwin.inversion.initial import Ground
-from invertwin.inversion.uncertainty import coordinates
+from invertwin.inversion.confidence.uncertainty import coordinates
+from invertwin.inversion.initialisation.detections import Ground
 from invertwin.scene import RoughConductor, RoughDielectric, rotation_from_vector
 
 BOX = Figure("box", (0.3, -0.4), 0.3, 0.8, 0.2, 1.1, 0.05)

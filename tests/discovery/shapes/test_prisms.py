@@ -8,7 +8,7 @@ import torch
 
 from invertwin.discovery.shapes.primitives import Figure, Primitive
 from invertwin.discovery.shapes.prisms import Outline, Prism, contour, prism_of, unknown
-from invertwin.inversion.initial import Ground
+from invertwin.inversion.initialisation.detections import Ground
 from invertwin.scene import Mesh, Scene
 
 BOX = Figure("box", (0.3, -0.4), 0.5, 0.8, 0.5, 1.1, 0.05)

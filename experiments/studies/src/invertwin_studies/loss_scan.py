@@ -18,7 +18,7 @@ from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.run_file import need
 from invertwin.errors import InputError
 from invertwin.inversion import Observation
-from invertwin.inversion.lines import Line, losses_along
+from invertwin.inversion.gradcheck.lines import Line, losses_along
 from invertwin.inversion.loss import relative_error
 from invertwin.models import BeatMap, SurrogateMap
 from invertwin.radar.direction import music

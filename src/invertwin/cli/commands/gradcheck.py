@@ -21,8 +21,8 @@ from invertwin.cli.schema.signature import swept
 from invertwin.cli.terminal import in_parts
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.inversion.gradcheck import Agreement, GradientReport, gradcheck
-from invertwin.inversion.lines import line_of
+from invertwin.inversion.gradcheck.gradcheck import Agreement, GradientReport, gradcheck
+from invertwin.inversion.gradcheck.lines import line_of
 from invertwin.links import MapPlane, Points
 from invertwin.models import PanelMap, SignatureMap, SurrogateMap
 from invertwin.radar.radar import Radar

@@ -15,7 +15,7 @@ from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.cli.schema.run_file import need
 from invertwin.cli.terminal import counted
 from invertwin.inversion import Observation
-from invertwin.inversion.lines import Line, line_of, losses_along
+from invertwin.inversion.gradcheck.lines import Line, line_of, losses_along
 from invertwin.inversion.loss import relative_error
 from invertwin.models import BeatMap
 from invertwin.scene import Scene, Translation

@@ -24,8 +24,8 @@ from invertwin.cli.terminal import progress
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
 from invertwin.inversion import fit_at, planned
-from invertwin.inversion.certainty import bars
-from invertwin.inversion.planning import missed
+from invertwin.inversion.confidence.planning import missed
+from invertwin.inversion.confidence.report import bars
 from invertwin.runs import RunFolder
 
 

@@ -57,7 +57,7 @@ from invertwin.cli.schema.shape_tables import Mover
 from invertwin.cli.terminal import progress
 from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
-from invertwin.inversion.certainty import certainty, coverage
+from invertwin.inversion.confidence.report import certainty, coverage
 from invertwin.inversion.fit import Fit
 from invertwin.memory import peak_memory
 from invertwin.runs import CHECKPOINT, RunFolder

@@ -17,7 +17,7 @@ from invertwin.cli.schema import build
 from invertwin.cli.schema.recordings import SimulatedData
 from invertwin.cli.schema.run_file import about_file, is_run_file, load_run, need
 from invertwin.discovery import Twin, still_capture, twin
-from invertwin.inversion.initial import Ground
+from invertwin.inversion.initialisation.detections import Ground
 from invertwin.inversion.metrics import compare_shapes
 from invertwin.plotting import found as pictures
 from invertwin.plotting import spectrum

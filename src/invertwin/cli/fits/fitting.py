@@ -45,7 +45,7 @@ from invertwin.inversion import (
     watched,
 )
 from invertwin.inversion.callbacks import stage_file
-from invertwin.inversion.certainty import certainty
+from invertwin.inversion.confidence.report import certainty
 from invertwin.inversion.fit import Fit
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.runs import RunFolder

@@ -25,7 +25,7 @@ from invertwin.cli.schema.shape_tables import shape_terms
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion import Observation, Stage, Unknown, remeshed
-from invertwin.inversion.initial import guess_density
+from invertwin.inversion.initialisation.detections import guess_density
 from invertwin.inversion.metrics import residual
 from invertwin.models import ChainMap, ExactMap, SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RangeBias

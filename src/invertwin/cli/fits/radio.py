@@ -33,8 +33,8 @@ from invertwin.inversion import (
     reconstruct,
     watched,
 )
-from invertwin.inversion.certainty import certainty
-from invertwin.inversion.rivals import REJECTED, score
+from invertwin.inversion.confidence.ambiguities import REJECTED, score
+from invertwin.inversion.confidence.report import certainty
 from invertwin.links import Points, Transmitters
 from invertwin.models import RadioMap
 from invertwin.runs import RunFolder

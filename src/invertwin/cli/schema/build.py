@@ -15,8 +15,8 @@ from invertwin.cli.schema.sensors import grid as grid
 from invertwin.cli.schema.sensors import radar as radar
 from invertwin.cli.schema.shape_tables import ObjectTable, Placement, given_for
 from invertwin.errors import InputError
+from invertwin.inversion.gradcheck.tangents import Change, changes_of
 from invertwin.inversion.placement import Placing
-from invertwin.inversion.tangents import Change, changes_of
 from invertwin.links.placement import PlacedPanel
 from invertwin.registry.kinds import Table
 from invertwin.scene import Mesh, Object, Scene, SkinnedBody, joined

@@ -7,10 +7,10 @@ from pydantic import model_validator
 
 from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
+from invertwin.inversion.initialisation.multi_start import pose_grid
+from invertwin.inversion.initialisation.starts import nearby, posed
 from invertwin.inversion.loss import SpectrumLoss
-from invertwin.inversion.minima import pose_grid
 from invertwin.inversion.optimizer import Optimizer
-from invertwin.inversion.starts import nearby, posed
 from invertwin.models import ChainField, ChainMap, SurrogateMap
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate
 from invertwin.registry.kinds import Group, Registry, Table

@@ -8,9 +8,9 @@ from pydantic import PlainSerializer, WrapValidator
 
 from invertwin.channel import Sampling
 from invertwin.cli.schema.fit_tables import SurrogateTable
-from invertwin.inversion.first_pose import FirstPose
+from invertwin.inversion.initialisation.initial_pose import FirstPose
+from invertwin.inversion.initialisation.starts import nearby
 from invertwin.inversion.schedule import Schedule
-from invertwin.inversion.starts import nearby
 from invertwin.limits import Count, NonNegative, Positive
 from invertwin.radar.surrogate import Surrogate
 from invertwin.registry.kinds import OneOf, Table, TableOf, registry

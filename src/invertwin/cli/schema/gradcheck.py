@@ -5,8 +5,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import GetCoreSchemaHandler, model_validator
 
-from invertwin.inversion.gradcheck import Check
-from invertwin.inversion.tangents import Bump
+from invertwin.inversion.gradcheck.gradcheck import Check
+from invertwin.inversion.gradcheck.tangents import Bump
 from invertwin.limits import Count, Positive
 from invertwin.registry.kinds import OneOf, Table, number_or_list, registry
 from invertwin.registry.section import Depth, check_presence, fail, key

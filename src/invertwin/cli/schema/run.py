@@ -35,7 +35,7 @@ from invertwin.cli.schema.signature import Rcs
 from invertwin.cli.schema.twin import TwinTable
 from invertwin.cli.schema.variation import check_varied
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import Check
+from invertwin.inversion.gradcheck.gradcheck import Check
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate import Surrogate
 from invertwin.registry.kinds import NameOf, OneOf, TableOf, load_plugins, registry

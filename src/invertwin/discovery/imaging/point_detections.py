@@ -11,7 +11,7 @@ from invertwin.capture import Capture, ChirpCapture, backproject
 from invertwin.channel import Grid
 from invertwin.discovery.imaging.reflectivity import cell_of
 from invertwin.discovery.outcome import Thing
-from invertwin.inversion.initial import linked
+from invertwin.inversion.initialisation.detections import linked
 from invertwin.radar import noise_power, points_of, range_doppler, velocity_span
 from invertwin.radar.spectrum import aperture
 

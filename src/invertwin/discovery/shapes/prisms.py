@@ -10,7 +10,7 @@ from skimage.measure import find_contours
 from torch import Tensor, nn
 
 from invertwin.discovery.shapes.primitives import Figure, Primitive, Unknown
-from invertwin.inversion.initial import Ground
+from invertwin.inversion.initialisation.detections import Ground
 from invertwin.scene import DistanceGrid, Mesh, iso_surface, signed_distance
 from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.parameters import Coordinate

@@ -7,8 +7,8 @@ import torch
 
 from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck import Check, gradcheck
-from invertwin.inversion.lines import line_of
+from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.lines import line_of
 from invertwin.models import ExactMap, SurrogateMap
 from invertwin.radar import Radar, Surrogate
 from invertwin.radar.parameters import RadarPose

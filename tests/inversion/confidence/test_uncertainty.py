@@ -16,7 +16,7 @@ from invertwin.inversion import (
     Schedule,
     reconstruct,
 )
-from invertwin.inversion.uncertainty import coordinates
+from invertwin.inversion.confidence.uncertainty import coordinates
 from invertwin.radar.parameters import RadarPose, RangeBias
 from invertwin.scene import Pose, Scale, Scene, Translation
 from invertwin.scene.parameters import Coordinate

@@ -12,7 +12,7 @@ from scipy import stats
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
-from invertwin.inversion.draws import End
+from invertwin.inversion.confidence.realisations import End
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import along, penalty_curvature
 from invertwin.inversion.loss import SpectrumLoss

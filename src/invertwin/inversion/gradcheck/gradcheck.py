@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from invertwin.channel import alone
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.inversion.lines import line_of
-from invertwin.inversion.tangents import Change
+from invertwin.inversion.gradcheck.lines import line_of
+from invertwin.inversion.gradcheck.tangents import Change
 from invertwin.limits import Count, NonNegative, Positive
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derived_seed
@@ -116,7 +116,7 @@ def gradcheck(
         model: What predicts the map; its ``sampling`` is that of one derivative.
         module: A module that could be fitted; θ = 0 is the module as it is.
         tangent: Changes of its values by name, such as ``{"rotation": [0, 1, 0]}``, or of its only
-            parameter; see ``invertwin.inversion.tangents.changes_of``.
+            parameter; see ``invertwin.inversion.gradcheck.tangents.changes_of``.
         scene: What the module is applied to, or sees.
         sensor: What sees the scene.
         of: Whether the module maps the scene or the sensor.

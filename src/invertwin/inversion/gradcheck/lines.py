@@ -8,9 +8,9 @@ from torch import Tensor, nn
 
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
+from invertwin.inversion.gradcheck.tangents import Change, changes_of
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.observation import Observation
-from invertwin.inversion.tangents import Change, changes_of
 from invertwin.scene.mesh import Mesh
 
 _NEWTON = 8  # steps along a normal, onto the zero of the changed field

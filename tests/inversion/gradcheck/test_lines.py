@@ -7,9 +7,9 @@ from invertwin.capture import Capture
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.inversion import Observation
-from invertwin.inversion.lines import FieldLine, line_of, losses_along
+from invertwin.inversion.gradcheck.lines import FieldLine, line_of, losses_along
+from invertwin.inversion.gradcheck.tangents import Bump, changes_of
 from invertwin.inversion.loss import relative_error
-from invertwin.inversion.tangents import Bump, changes_of
 from invertwin.models import BeatMap, SurrogateMap
 from invertwin.radar import Surrogate
 from invertwin.scene import (

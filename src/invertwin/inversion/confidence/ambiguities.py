@@ -10,12 +10,12 @@ from jaxtyping import Float64
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
-from invertwin.inversion.draws import End, zscore
+from invertwin.inversion.confidence.realisations import End, zscore
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import GaussNewton
+from invertwin.inversion.initialisation.starts import displaced
 from invertwin.inversion.metrics import residual, surface_points
 from invertwin.inversion.remeshing import closest_points
-from invertwin.inversion.starts import displaced
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import Pose
 from invertwin.scene.pose import quaternion_from_vector

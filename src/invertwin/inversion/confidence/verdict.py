@@ -11,8 +11,8 @@ from torch import Tensor
 
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
-from invertwin.inversion.draws import End, coarse, zscore
-from invertwin.inversion.rivals import Rival, rivals
+from invertwin.inversion.confidence.ambiguities import Rival, rivals
+from invertwin.inversion.confidence.realisations import End, coarse, zscore
 
 Word = Literal["consistent", "inconsistent", "ambiguous", "at a bound", "worse", "lost", "unknown"]
 

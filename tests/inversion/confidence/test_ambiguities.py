@@ -7,7 +7,7 @@ import torch
 
 from blobs import LAW, Blob, Needle
 from invertwin.inversion import Observation, Optimizer, Schedule, displaced, reconstruct
-from invertwin.inversion.rivals import Rival, rivals, same, turns
+from invertwin.inversion.confidence.ambiguities import Rival, rivals, same, turns
 from invertwin.scene import Mesh, Pose, Scene, Translation, box, sphere, text
 from scenes import float64, thing
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
-from invertwin.inversion.initial import (
+from invertwin.inversion.initialisation.detections import (
     Ground,
     best_pose,
     detected_points,

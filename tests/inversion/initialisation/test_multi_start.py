@@ -10,7 +10,7 @@ from torch import Tensor
 from blobs import BINS, LAW, Blob, Needle, scene
 from invertwin.errors import InputError
 from invertwin.inversion import Observation, Optimizer, Schedule, nearby, pose_grid
-from invertwin.inversion.minima import Search, search
+from invertwin.inversion.initialisation.multi_start import Search, search
 from invertwin.scene import Object, Pose, Scene, Translation, box
 from scenes import float64, thing
 

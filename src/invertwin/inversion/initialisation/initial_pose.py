@@ -11,7 +11,7 @@ from torch import Tensor
 from invertwin.capture import Capture
 from invertwin.channel import Grid
 from invertwin.errors import InputError
-from invertwin.inversion.initial import (
+from invertwin.inversion.initialisation.detections import (
     Ground,
     best_pose,
     detected_points,

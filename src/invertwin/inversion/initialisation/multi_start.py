@@ -14,16 +14,16 @@ from invertwin.channel import Sampling
 from invertwin.checks import Point
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
+from invertwin.inversion.confidence.ambiguities import REJECTED, same, score, turns, way
 from invertwin.inversion.fit import Callback
+from invertwin.inversion.initialisation.starts import displaced
 from invertwin.inversion.loss import Objective, SpectrumLoss
 from invertwin.inversion.metrics import residual
 from invertwin.inversion.observation import Observation, Unknowns
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.reconstruction import Reconstruction, reconstruct
 from invertwin.inversion.regularization import Regularizer
-from invertwin.inversion.rivals import REJECTED, same, score, turns, way
 from invertwin.inversion.schedule import Schedule
-from invertwin.inversion.starts import displaced
 from invertwin.limits import Count, Positive
 from invertwin.memory import require_at_most
 from invertwin.scene.scene import Object, Scene

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import torch
 
 from invertwin.errors import InputError
-from invertwin.inversion.draws import End
+from invertwin.inversion.confidence.realisations import End
+from invertwin.inversion.confidence.uncertainty import Evidence, Uncertainty, coordinates
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import GaussNewton
-from invertwin.inversion.uncertainty import Evidence, Uncertainty, coordinates
 from invertwin.progress import told
 
 _STEPS, _REACH = 5, 0.1  # of a fit that begins at the truth

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from invertwin.errors import InputError
+from invertwin.inversion.confidence.uncertainty import Uncertainty
 from invertwin.inversion.metrics import residual
 from invertwin.inversion.reconstruction import Reconstruction
-from invertwin.inversion.uncertainty import Uncertainty
 from invertwin.scene.scene import Object
 
 _COORDINATES = ("x", "y", "z", "pitch", "yaw", "roll")
