@@ -34,7 +34,7 @@ from invertwin.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.limits import Positive
-from invertwin.links.metasurface import Metasurface, panel_response
+from invertwin.links.metasurface.panel import Metasurface, panel_response
 from invertwin.links.places import Places
 from invertwin.links.received import Received, Reception
 from invertwin.links.transmitters import Transmitters

@@ -35,7 +35,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
 from invertwin.inversion.gradcheck.lines import line_of
 from invertwin.links import CellSampling, MapPlane, Reception, Transmitters
-from invertwin.links.metasurface import Metasurface, panel_response
+from invertwin.links.metasurface.panel import Metasurface, panel_response
 from invertwin.models import DepthMap, SilhouetteMap, SurrogateMap
 from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum, surrogate_spectrum
 from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias

@@ -5,11 +5,11 @@ from invertwin.links.cells import MapMesh as MapMesh
 from invertwin.links.cells import MapPlane as MapPlane
 from invertwin.links.conversion import ray_paths_of as ray_paths_of
 from invertwin.links.listing import path_table as path_table
-from invertwin.links.metasurface import Metasurface as Metasurface
-from invertwin.links.metasurface import panel_paths as panel_paths
-from invertwin.links.metasurface import panel_response as panel_response
-from invertwin.links.placement import PlacedPanel as PlacedPanel
-from invertwin.links.placement import WallPath as WallPath
+from invertwin.links.metasurface.panel import Metasurface as Metasurface
+from invertwin.links.metasurface.panel import panel_paths as panel_paths
+from invertwin.links.metasurface.panel import panel_response as panel_response
+from invertwin.links.metasurface.wall_path import PlacedPanel as PlacedPanel
+from invertwin.links.metasurface.wall_path import WallPath as WallPath
 from invertwin.links.places import Places as Places
 from invertwin.links.places import Points as Points
 from invertwin.links.received import Received as Received

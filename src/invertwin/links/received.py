@@ -24,7 +24,7 @@ from invertwin.channel import RayPaths, Sampling, trace_paths
 from invertwin.checks import checked_number
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.links.metasurface import Metasurface, panel_paths
+from invertwin.links.metasurface.panel import Metasurface, panel_paths
 from invertwin.links.responses import Terminals, frequency_response, path_amplitudes, phasors
 from invertwin.links.scattered import scattered_moments
 from invertwin.links.spreads import path_powers, root

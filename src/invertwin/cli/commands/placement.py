@@ -18,7 +18,7 @@ from invertwin.cli.schema.placement import Placement
 from invertwin.cli.schema.run_file import need
 from invertwin.cli.terminal import progress
 from invertwin.folders import PARTS
-from invertwin.inversion.placement import Coverage, Found, Placing, Trial, evaluations_until
+from invertwin.links.metasurface.placement import Coverage, Found, Placing, Trial, evaluations_until
 from invertwin.progress import told
 from invertwin.runs import RunFolder
 from invertwin.seeds import derived_seed

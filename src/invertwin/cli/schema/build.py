@@ -16,8 +16,8 @@ from invertwin.cli.schema.sensors import radar as radar
 from invertwin.cli.schema.shape_tables import ObjectTable, Placement, given_for
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.tangents import Change, changes_of
-from invertwin.inversion.placement import Placing
-from invertwin.links.placement import PlacedPanel
+from invertwin.links.metasurface.placement import Placing
+from invertwin.links.metasurface.wall_path import PlacedPanel
 from invertwin.registry.kinds import Table
 from invertwin.scene import Mesh, Object, Scene, SkinnedBody, joined
 from invertwin.scene.files import CONCRETE, load_scene_xml

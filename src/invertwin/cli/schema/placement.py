@@ -9,10 +9,10 @@ import torch
 from annotated_types import Ge, Gt, Len, Lt, MinLen
 from torch import Tensor
 
-from invertwin.inversion.placement import Coverage, Descent, Placing
 from invertwin.limits import Count, NonNegative, Positive, Several
-from invertwin.links.metasurface import Metasurface
-from invertwin.links.placement import PlacedPanel, WallPath
+from invertwin.links.metasurface.panel import Metasurface
+from invertwin.links.metasurface.placement import Coverage, Descent, Placing
+from invertwin.links.metasurface.wall_path import PlacedPanel, WallPath
 from invertwin.registry.kinds import OneOf, TableOf
 from invertwin.registry.section import Section, Seed, Vector, about, key
 from invertwin.scene import Scene

@@ -12,7 +12,7 @@ from invertwin.checks import ArrayLike, Point
 from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
-from invertwin.links.placement import PlacedPanel
+from invertwin.links.metasurface.wall_path import PlacedPanel
 from invertwin.radar.parameters import RadarPath, RadarPose
 from invertwin.radar.radar import Radar
 from invertwin.registry.kinds import Group, OneOf, Registry, Table

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from invertwin.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.links.metasurface import Metasurface
+from invertwin.links.metasurface.panel import Metasurface
 
 _DO = "give x, y of at least two corners, the room on the left"
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

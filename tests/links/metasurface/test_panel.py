@@ -22,7 +22,7 @@ from invertwin.links import (
     panel_paths,
     received_gain,
 )
-from invertwin.links.metasurface import panel_response
+from invertwin.links.metasurface.panel import panel_response
 from invertwin.links.places import Points
 from invertwin.models import RadioMap
 from invertwin.scene import Cosine, Object, PerfectConductor, Scene, plate, rigid

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.inversion.placement import (
+from invertwin.links import Metasurface, PlacedPanel, WallPath
+from invertwin.links.metasurface.placement import (
     Coverage,
     Descent,
     Placing,
     evaluations_until,
     soft_quantile,
 )
-from invertwin.links import Metasurface, PlacedPanel, WallPath
 from invertwin.scene import Object, PerfectConductor, Scene, plate, rigid, rotation_from_vector
 from scenes import float64
 

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from invertwin.channel import trace_paths
 from invertwin.limits import Angle, Count, NonNegative, Positive, Share
-from invertwin.links.metasurface import Metasurface, panel_response
-from invertwin.links.placement import PlacedPanel
+from invertwin.links.metasurface.panel import Metasurface, panel_response
+from invertwin.links.metasurface.wall_path import PlacedPanel
 from invertwin.links.responses import frequency_response
 from invertwin.progress import told
 from invertwin.scene import Scene
