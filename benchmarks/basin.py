@@ -52,7 +52,7 @@ from torch import Tensor, nn
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling, Speckle, draw_speckle
 from invertwin.inversion import Observation, Optimizer, Schedule, SpectrumLoss, reconstruct
-from invertwin.models import ExactMap, SurrogateMap
+from invertwin.models.radar import ExactMap, SurrogateMap
 from invertwin.radar import FMCW, Radar, Surrogate
 from invertwin.scene import AntennaArray, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import linear_array

@@ -17,7 +17,7 @@ from invertwin.inversion import (
     reconstruct,
 )
 from invertwin.inversion.fit import Callback
-from invertwin.models import ExactMap, SurrogateMap
+from invertwin.models.radar import ExactMap, SurrogateMap
 from invertwin.radar import Radar, Surrogate
 from invertwin.scene import Scene
 

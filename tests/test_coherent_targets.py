@@ -12,7 +12,8 @@ from torch import Tensor
 from invertwin.channel import Sampling, trace_chains, trace_field, without_echoes
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
-from invertwin.models import ChainMap, SurrogateMap
+from invertwin.models.facets import ChainMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum
 from invertwin.scene import (
     AntennaArray,

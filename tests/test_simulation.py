@@ -7,7 +7,7 @@ import torch
 
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
-from invertwin.models import ExactMap, SurrogateMap
+from invertwin.models.radar import ExactMap, SurrogateMap
 from invertwin.radar import Impairments
 from invertwin.scene import (
     AntennaArray,

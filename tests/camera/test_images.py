@@ -12,7 +12,7 @@ from invertwin.camera import Camera, CameraPose, ImageSampling, depths, silhouet
 from invertwin.channel import Sight
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
-from invertwin.models import DepthMap, SilhouetteMap
+from invertwin.models.camera import DepthMap, SilhouetteMap
 from invertwin.scene import (
     Object,
     PerfectConductor,

@@ -5,7 +5,7 @@ import torch
 
 from invertwin.camera import Camera, photograph
 from invertwin.errors import InputError
-from invertwin.models import DepthMap
+from invertwin.models.camera import DepthMap
 from invertwin.scene import Object, PerfectConductor, Scene, plate, rigid
 
 AHEAD = Camera(torch.zeros(3).double(), torch.eye(3).double(), 40, 30, 60.0)

@@ -12,7 +12,7 @@ from invertwin.cli.fits.problem import Problem, Sight, annealed_until, models_of
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import validate
 from invertwin.errors import InputError
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 
 MODEL = '\n[model]\nkind = "surrogate"\ncoherent = ["plate"]\nstretch = 2.0\n'
 

@@ -13,7 +13,7 @@ from invertwin.discovery.movers import of_point, strongest_mover
 from invertwin.discovery.moving_body import MovingBody
 from invertwin.errors import InputError
 from invertwin.inversion import CorrelationLoss, Observation, Optimizer, Schedule, reconstruct
-from invertwin.models import MotionMap
+from invertwin.models.doppler import MotionMap
 from invertwin.radar.boards import board
 from invertwin.radar.motion import Chirps, moving_beat
 from invertwin.radar.radar import Radar

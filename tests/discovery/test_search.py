@@ -24,7 +24,7 @@ from invertwin.discovery.search import (
 )
 from invertwin.discovery.shapes.primitives import Figure
 from invertwin.inversion.initialisation.detections import Ground
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.scene import Mesh, box, cylinder, person, standing_height
 from invertwin_studies.vehicles import car_mesh, sample_car
 

@@ -7,7 +7,7 @@ from invertwin.channel import Sampling
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import load_run
 from invertwin.inversion.gradcheck.gradcheck import Check, GradientReport, gradcheck
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Surrogate
 
 

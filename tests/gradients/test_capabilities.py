@@ -36,7 +36,8 @@ from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
 from invertwin.inversion.gradcheck.lines import line_of
 from invertwin.links import CellSampling, MapPlane, Reception, Transmitters
 from invertwin.links.metasurface.panel import Metasurface, panel_response
-from invertwin.models import DepthMap, SilhouetteMap, SurrogateMap
+from invertwin.models.camera import DepthMap, SilhouetteMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum, surrogate_spectrum
 from invertwin.radar.parameters import ClockOffset, RadarPose, RangeBias
 from invertwin.scene import (

@@ -11,7 +11,7 @@ import torch
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import validate
 from invertwin.inversion.gradcheck.gradcheck import Check, GradientReport, gradcheck
-from invertwin.models import SignatureMap
+from invertwin.models.rcs import SignatureMap
 from invertwin.scene import Object, PerfectConductor, Scale, Scene, dihedral
 from invertwin.signatures import aspects, rcs
 from scenes import relative

@@ -5,7 +5,7 @@ import torch
 
 from invertwin.channel import Sampling
 from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Surrogate
 from invertwin.scene import DensityGrid, Scene, plate
 from scenes import radar, thing

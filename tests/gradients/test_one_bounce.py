@@ -7,7 +7,7 @@ import pytest
 from gradients.run_files import check_run
 from invertwin.channel import Sampling
 from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Surrogate
 from invertwin.scene import Scene, Translation, plate, sphere
 from scenes import float64, radar, thing

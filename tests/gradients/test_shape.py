@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from invertwin.channel import Sampling
 from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Surrogate
 from invertwin.scene import (
     BodyTemplate,

@@ -26,7 +26,7 @@ from invertwin.inversion import (
 )
 from invertwin.inversion.fit import _restore
 from invertwin.inversion.regularization import Laplacian
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.scene import RoughDielectric
 from invertwin.scene.parameters import Vertices
 

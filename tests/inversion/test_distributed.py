@@ -8,7 +8,7 @@ from invertwin.channel import Sampling
 from invertwin.engines import spread
 from invertwin.errors import InputError
 from invertwin.inversion import mean_over_views
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.scene import Translation
 from invertwin.seeds import derived_seed
 from scenes import occluder, radar

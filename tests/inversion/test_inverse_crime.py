@@ -15,7 +15,7 @@ from invertwin.cli.schema import SimulatedData, build
 from invertwin.cli.schema.radio_tables import ReceivedData
 from invertwin.cli.schema.run_file import load_run
 from invertwin.errors import InputError
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from scenes import occluder, radar
 
 FEW = Sampling(depth=1, samples=1_000)

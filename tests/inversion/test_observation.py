@@ -20,7 +20,7 @@ from invertwin.inversion import (
     reconstruct,
 )
 from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar, RadarPose, RangeBias, Surrogate
 from invertwin.scene import Scene, Translation, look_at, sphere
 from invertwin.simulation import simulate

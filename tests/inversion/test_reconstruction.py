@@ -14,7 +14,6 @@ import torch
 from torch import nn
 
 from fits import fit
-from invertwin import models
 from invertwin.capture import Capture
 from invertwin.channel import Sampling, draw_speckle
 from invertwin.errors import InputError
@@ -27,7 +26,8 @@ from invertwin.inversion import (
     reconstruct,
 )
 from invertwin.inversion.regularization import Laplacian
-from invertwin.models import ExactMap
+from invertwin.models import radar as models
+from invertwin.models.radar import ExactMap
 from invertwin.radar import Surrogate
 from invertwin.radar.parameters import RadarPose, RangeBias
 from invertwin.scene import Scene

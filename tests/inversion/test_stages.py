@@ -14,7 +14,7 @@ from invertwin.inversion import Optimizer, Schedule, Stage, Unknown
 from invertwin.inversion.callbacks import stage_file
 from invertwin.inversion.regularization import Laplacian
 from invertwin.inversion.remeshing import remeshed
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.scene import Mesh, SmoothVertices, plate
 from invertwin.scene.parameters import Scale, Translation, Vertices
 

@@ -23,7 +23,7 @@ from invertwin.links import (
     Transmitters,
 )
 from invertwin.links.cells import Cells
-from invertwin.models import RadioMap
+from invertwin.models.radio import RadioMap
 from invertwin.scene import (
     AntennaArray,
     Cosine,

@@ -15,7 +15,7 @@ from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.links import CellSampling, MapPlane, Points, Reception, Terminals, Transmitters
 from invertwin.links import scattered as scattered_module
-from invertwin.models import RadioMap, ResponseMap
+from invertwin.models.radio import RadioMap, ResponseMap
 from invertwin.scene import (
     AntennaArray,
     Cosine,

@@ -6,7 +6,7 @@ import torch
 from invertwin.channel import Sampling, deposit_power, draw_speckle, trace_power
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar import FMCW, Radar
 from invertwin.radar.surrogate import Surrogate
 from invertwin.scene import AntennaArray, Isotropic, Object, RoughDielectric, Scene

@@ -28,7 +28,7 @@ import invertwin as iw
 from invertwin.camera import Camera, ImageSampling, Photograph, photograph
 from invertwin.folders import replacing
 from invertwin.inversion import Check, Unknown
-from invertwin.models import DepthMap, SilhouetteMap
+from invertwin.models.camera import DepthMap, SilhouetteMap
 from invertwin.plotting import PALETTE
 from invertwin.scene import (
     Cosine,

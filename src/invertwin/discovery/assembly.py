@@ -15,7 +15,7 @@ from invertwin.discovery.shapes.primitives import Figure, Primitive
 from invertwin.discovery.shapes.prisms import Outline, unknown
 from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
 from invertwin.inversion.initialisation.detections import Ground
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar
 from invertwin.scene import Scene
 

@@ -13,7 +13,7 @@ from invertwin.discovery.moving_body import Echo, MovingBody
 from invertwin.errors import InputError
 from invertwin.inversion.loss import CorrelationLoss, Scale
 from invertwin.inversion.reconstruction import Reconstruction
-from invertwin.models import MotionMap
+from invertwin.models.doppler import MotionMap
 from invertwin.radar.detection import ordered_statistics_cfar, point_cloud
 from invertwin.radar.doppler import compensate_tdm, range_doppler, velocity_axis
 from invertwin.radar.radar import Radar

@@ -25,7 +25,7 @@ from invertwin.discovery.shapes.primitives import upright
 from invertwin.discovery.tracks import tracks
 from invertwin.errors import InputError
 from invertwin.inversion.initialisation.detections import Ground
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar, SampledWaveform
 from invertwin.scene import Scene
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Paths, Sampling, torch_threads, trace_power
 from invertwin.errors import InputError
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar
 from invertwin.scene import Mesh, Scene, compose
 from invertwin.scene.geometry.density import without_clouds

@@ -9,7 +9,7 @@ from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
 from invertwin.inversion.gradcheck.lines import line_of
-from invertwin.models import ExactMap, SurrogateMap
+from invertwin.models.radar import ExactMap, SurrogateMap
 from invertwin.radar import Radar, Surrogate
 from invertwin.radar.parameters import RadarPose
 from invertwin.scene import Scene

@@ -10,7 +10,7 @@ from invertwin.inversion import Observation
 from invertwin.inversion.gradcheck.lines import FieldLine, line_of, losses_along
 from invertwin.inversion.gradcheck.tangents import Bump, changes_of
 from invertwin.inversion.loss import relative_error
-from invertwin.models import BeatMap, SurrogateMap
+from invertwin.models.radar import BeatMap, SurrogateMap
 from invertwin.radar import Surrogate
 from invertwin.scene import (
     DensityGrid,

@@ -24,7 +24,7 @@ from invertwin.links import (
 )
 from invertwin.links.metasurface.panel import panel_response
 from invertwin.links.places import Points
-from invertwin.models import RadioMap
+from invertwin.models.radio import RadioMap
 from invertwin.scene import Cosine, Object, PerfectConductor, Scene, plate, rigid
 from scenes import float64
 

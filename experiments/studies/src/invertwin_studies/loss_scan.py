@@ -20,7 +20,7 @@ from invertwin.errors import InputError
 from invertwin.inversion import Observation
 from invertwin.inversion.gradcheck.lines import Line, losses_along
 from invertwin.inversion.loss import relative_error
-from invertwin.models import BeatMap, SurrogateMap
+from invertwin.models.radar import BeatMap, SurrogateMap
 from invertwin.radar.direction import music
 from invertwin.radar.radar import Radar
 from invertwin.radar.range_profile import range_profile

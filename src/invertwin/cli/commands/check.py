@@ -16,7 +16,7 @@ from invertwin.cli.schema.recordings import chirp_capture
 from invertwin.cli.schema.run_file import about, need
 from invertwin.cli.schema.shape_tables import Mover
 from invertwin.memory import free_memory, gigabytes
-from invertwin.models import SurrogateMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.progress import time_left
 from invertwin.scene import Scene, Translation
 

@@ -24,7 +24,9 @@ from invertwin.forward_model import ForwardModel
 from invertwin.inversion.gradcheck.gradcheck import Agreement, GradientReport, gradcheck
 from invertwin.inversion.gradcheck.lines import line_of
 from invertwin.links import MapPlane, Points
-from invertwin.models import PanelMap, SignatureMap, SurrogateMap
+from invertwin.models.radar import SurrogateMap
+from invertwin.models.radio import PanelMap
+from invertwin.models.rcs import SignatureMap
 from invertwin.radar.radar import Radar
 from invertwin.runs import RunFolder
 from invertwin.scene import Scene

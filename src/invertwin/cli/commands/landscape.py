@@ -17,7 +17,7 @@ from invertwin.cli.terminal import counted
 from invertwin.inversion import Observation
 from invertwin.inversion.gradcheck.lines import Line, line_of, losses_along
 from invertwin.inversion.loss import relative_error
-from invertwin.models import BeatMap
+from invertwin.models.radar import BeatMap
 from invertwin.scene import Scene, Translation
 
 

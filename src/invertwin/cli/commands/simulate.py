@@ -20,7 +20,7 @@ from invertwin.cli.schema import RunFile, SimulatedData, build, sensors
 from invertwin.cli.schema.motion_tables import in_motion, refuse_motion
 from invertwin.cli.schema.run_file import about, need
 from invertwin.errors import InputError
-from invertwin.models import SurrogateMap, surrogate_correlation
+from invertwin.models.radar import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, doppler_maps, velocity_span
 from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar

@@ -33,7 +33,7 @@ from invertwin.inversion import (
     strongest_mover,
     watched,
 )
-from invertwin.models import MotionMap
+from invertwin.models.doppler import MotionMap
 from invertwin.plotting import RATE_LABEL, U_LABEL, Panel
 from invertwin.radar import doppler_maps
 from invertwin.runs import RunFolder

@@ -27,7 +27,8 @@ from invertwin.forward_model import ForwardModel
 from invertwin.inversion import Observation, Stage, Unknown, remeshed
 from invertwin.inversion.initialisation.detections import guess_density
 from invertwin.inversion.metrics import residual
-from invertwin.models import ChainMap, ExactMap, SurrogateMap
+from invertwin.models.facets import ChainMap
+from invertwin.models.radar import ExactMap, SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import Surrogate

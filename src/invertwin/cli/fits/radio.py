@@ -36,7 +36,7 @@ from invertwin.inversion import (
 from invertwin.inversion.confidence.ambiguities import REJECTED, score
 from invertwin.inversion.confidence.report import certainty
 from invertwin.links import Points, Transmitters
-from invertwin.models import RadioMap
+from invertwin.models.radio import RadioMap
 from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.seeds import derived_seed

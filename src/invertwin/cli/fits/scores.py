@@ -23,7 +23,7 @@ from invertwin.cli.schema import SimulatedData, build
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Objective
 from invertwin.inversion.metrics import axis_error, residual, value_errors
-from invertwin.models import surrogate_correlation
+from invertwin.models.radar import surrogate_correlation
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene import Mesh, Scene, SkinnedBody

@@ -8,7 +8,7 @@ from annotated_types import Len, MinLen
 from invertwin.camera import Camera, CameraPose, ImageSampling
 from invertwin.forward_model import ForwardModel
 from invertwin.limits import RADIANS, Count, Positive
-from invertwin.models import DepthMap, SilhouetteMap
+from invertwin.models.camera import DepthMap, SilhouetteMap
 from invertwin.registry.kinds import Group, OneOf, Registry, TableOf
 
 Place = Annotated[Sequence[float], Len(3, 3)]

@@ -11,7 +11,8 @@ from invertwin.inversion.initialisation.multi_start import pose_grid
 from invertwin.inversion.initialisation.starts import nearby, posed
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.optimizer import Optimizer
-from invertwin.models import ChainField, ChainMap, SurrogateMap
+from invertwin.models.facets import ChainField, ChainMap
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar.surrogate import Surrogate, chosen_surrogate
 from invertwin.registry.kinds import Group, Registry, Table
 from invertwin.registry.section import fail, key

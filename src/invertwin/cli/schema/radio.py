@@ -11,7 +11,7 @@ from invertwin.cli.schema.sensors import LookAt, Orientation, Polarised, Turned
 from invertwin.errors import InputError
 from invertwin.limits import Count, NonNegative
 from invertwin.links import Reception, Terminals, Transmitters
-from invertwin.models import RadioMap
+from invertwin.models.radio import RadioMap
 from invertwin.registry.kinds import OneOf, TableOf, registry
 from invertwin.registry.section import Section, Seed, Vector, about, key
 from invertwin.scene import AntennaArray, Mesh, Scene, look_at, rotation_from_vector

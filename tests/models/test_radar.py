@@ -12,16 +12,10 @@ from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.channel import Sampling, trace_paths
 from invertwin.errors import InputError
 from invertwin.links import Points, Reception, Transmitters, frequency_response
-from invertwin.models import (
-    ChainField,
-    ChainMap,
-    ExactMap,
-    MotionMap,
-    RadioMap,
-    ResponseMap,
-    SurrogateMap,
-    surrogate_correlation,
-)
+from invertwin.models.doppler import MotionMap
+from invertwin.models.facets import ChainField, ChainMap
+from invertwin.models.radar import ExactMap, SurrogateMap, surrogate_correlation
+from invertwin.models.radio import RadioMap, ResponseMap
 from invertwin.radar import Chirps, Radar, Surrogate, velocity_axis
 from invertwin.scene import (
     Dielectric,

@@ -1,0 +1,131 @@
+"""TODO."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.camera import Camera, ImageSampling, depths, silhouettes
+from invertwin.checks import ArrayLike, checked_tensor
+from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
+from invertwin.limits import Positive
+from invertwin.models.noise import _scattered
+from invertwin.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class SilhouetteMap(ForwardModel):
+    """Masks of some objects as a camera sees them: 1 inside, 0 outside, between at their outlines.
+
+    Compare them by ``SpectrumLoss(gain="one")``. Masks of several objects are several observations.
+
+    Attributes:
+        objects: Names of the objects that the mask shows; others may hide them.
+        sampling: Of pixels and outlines.
+        scatter: Standard deviation of measured masks about the map; None = as large as what a fit
+            leaves unexplained.
+    """
+
+    objects: tuple[str, ...]
+    sampling: ImageSampling = field(default_factory=ImageSampling)
+    scatter: float | None = None
+
+    fields: ClassVar[bool] = True
+
+    def predict(
+        self, scene: Scene, sensor: Camera, seed: int
+    ) -> Float64[Tensor, "frame row column"]:
+        """The masks. See ``ForwardModel.predict``."""
+        return silhouettes(scene, sensor, self.objects, self.sampling, seed)
+
+    def observe(self, recording: ArrayLike) -> Float64[Tensor, "frame row column"]:
+        """Measured masks, [frame, row, column] or [row, column], from 0 to 1.
+
+        Raises:
+            InputError: Another shape, NaN, or values outside of 0 to 1.
+        """
+        found = _images(recording, "masks")
+        if len(found.flatten()) and not 0 <= float(found.min()) <= float(found.max()) <= 1:
+            raise InputError(
+                f"expected masks from 0 to 1, got {float(found.min()):g} to "
+                f"{float(found.max()):g}; divide bytes by 255"
+            )
+        return found
+
+    def looks(self, scene: Scene, sensor: Camera, seed: int) -> Callable[[int, float], Tensor]:
+        """The masks with other errors each time."""
+        return _scattered(self.predict(scene, sensor, seed), self.scatter)
+
+    def for_differences(
+        self, scene: Scene, sensor: Camera, samples: int, scheme: Literal["rays", "area"]
+    ) -> "SilhouetteMap":
+        """More rays in every pixel. See ``ForwardModel.for_differences``."""
+        return replace(self, sampling=_finer(self.sampling, sensor, samples))
+
+    def ablations(self) -> dict[str, ForwardModel]:
+        """The model with outlines at rest. See ``ForwardModel.ablations``."""
+        return {"boundary": self.sampled_by(boundary=False)} if self.sampling.boundary else {}
+
+
+@dataclass(frozen=True)
+class DepthMap(ForwardModel):
+    """Depth images of a camera: the mean over each pixel of z in camera axes [m].
+
+    Compare them by ``SpectrumLoss(gain="one")``.
+
+    Attributes:
+        far: Depth where nothing is seen, or what is further away [m].
+        sampling: Of pixels and outlines.
+        scatter: Standard deviation of measured depths about the map [m]; None = as large as what a
+            fit leaves unexplained.
+    """
+
+    far: Positive
+    sampling: ImageSampling = field(default_factory=ImageSampling)
+    scatter: float | None = None
+
+    fields: ClassVar[bool] = True
+
+    def predict(
+        self, scene: Scene, sensor: Camera, seed: int
+    ) -> Float64[Tensor, "frame row column"]:
+        """The depths. See ``ForwardModel.predict``."""
+        return depths(scene, sensor, self.far, self.sampling, seed)
+
+    def observe(self, recording: ArrayLike) -> Float64[Tensor, "frame row column"]:
+        """Measured depths, [frame, row, column] or [row, column] [m], at most ``far``.
+
+        Raises:
+            InputError: Another shape, or NaN.
+        """
+        given = torch.as_tensor(recording, dtype=torch.float64)
+        return _images(given.clamp_max(self.far), "depths [m]")
+
+    def looks(self, scene: Scene, sensor: Camera, seed: int) -> Callable[[int, float], Tensor]:
+        """The depths with other errors each time."""
+        return _scattered(self.predict(scene, sensor, seed), self.scatter)
+
+    def for_differences(
+        self, scene: Scene, sensor: Camera, samples: int, scheme: Literal["rays", "area"]
+    ) -> "DepthMap":
+        """More rays in every pixel. See ``ForwardModel.for_differences``."""
+        return replace(self, sampling=_finer(self.sampling, sensor, samples))
+
+    def ablations(self) -> dict[str, ForwardModel]:
+        """The model with outlines at rest. See ``ForwardModel.ablations``."""
+        return {"boundary": self.sampled_by(boundary=False)} if self.sampling.boundary else {}
+
+
+def _images(recording: ArrayLike, what: str) -> Tensor:
+    given = torch.as_tensor(recording, dtype=torch.float64)
+    given = given[None] if given.ndim == 2 else given
+    return checked_tensor(given, (None, None, None), what, "give [frame, row, column]")
+
+
+def _finer(sampling: ImageSampling, camera: Camera, samples: int) -> ImageSampling:
+    pixels = len(camera.positions) * camera.width * camera.height
+    return replace(sampling, samples=max(sampling.samples, samples // pixels))

@@ -1,0 +1,139 @@
+"""TODO."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from invertwin.capture.chirp_capture import ChirpCapture
+from invertwin.channel import (
+    Grid,
+    Paths,
+    Sampling,
+    trace_power,
+)
+from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
+from invertwin.radar.doppler import range_doppler_angle, velocity_axis
+from invertwin.radar.motion import Chirps
+from invertwin.radar.moving_power import moving_power
+from invertwin.radar.radar import Radar
+from invertwin.scene.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class MotionMap(ForwardModel):
+    """Power over range rate, range and direction of what moves.
+
+    What stands still is taken out of a recording as the mean over the chirps; so a prediction
+    holds the objects with a velocity alone. Other objects hide them. A silhouette has no boundary
+    term: a rough convex body goes dark towards its edge.
+
+    Attributes:
+        grid: Ranges and directions.
+        chirps: Timing of the ramps.
+        rates: Range rates to show, positive moves away [m/s]; some of those of ``bins``.
+        bins: Bins of range rate over the whole unambiguous span.
+        sampling: How paths are sampled; one bounce, fixed visibility.
+    """
+
+    grid: Grid
+    chirps: Chirps
+    rates: Float64[Tensor, " velocity"]
+    bins: int
+    sampling: Sampling = Sampling(depth=1, boundary=False)
+
+    @classmethod
+    def of(
+        cls,
+        radar: Radar,
+        grid: Grid,
+        chirps: Chirps,
+        oversample: int = 2,
+        sampling: Sampling | None = None,
+    ) -> "MotionMap":
+        """All range rates that the chirps tell apart.
+
+        Args:
+            radar: What records.
+            grid: Ranges and directions.
+            chirps: Timing of the ramps.
+            oversample: Bins of range rate per cell.
+            sampling: How paths are sampled.
+        """
+        bins = oversample * chirps.count
+        rates = velocity_axis(radar, chirps, bins)
+        return cls(grid, chirps, rates, bins, sampling or cls.sampling)
+
+    def __post_init__(self) -> None:
+        if self.sampling.depth != 1 or self.sampling.boundary:
+            raise InputError(
+                "expected Sampling(depth=1, boundary=False) for a MotionMap, got depth "
+                f"{self.sampling.depth} and boundary {self.sampling.boundary}; moving paths have "
+                "one bounce and fixed visibility"
+            )
+
+    def predict(
+        self, scene: Scene, sensor: Radar, seed: int
+    ) -> Float[Tensor, "frame velocity range u v"]:
+        """The expected power of what moves. See ``ForwardModel.predict``.
+
+        Raises:
+            InputError: No object has a velocity.
+        """
+        if all(item.velocity is None for item in scene.objects.values()):
+            raise InputError(
+                "expected an object with a velocity for a MotionMap, got none; give one a "
+                "velocity, or fit a MovingBody"
+            )
+        paths = trace_power(scene, sensor.link(), sampling=self.sampling, seed=seed)
+        assert paths.velocity is not None
+        moves = (paths.velocity.detach() != 0).any(1)
+        return self.expected(paths.chosen(moves), sensor)
+
+    def expected(self, paths: Paths, radar: Radar) -> Float[Tensor, "frame velocity range u v"]:
+        """What moving paths look like in this map. See ``moving_power``.
+
+        Args:
+            paths: With velocities.
+            radar: What records them.
+        """
+        assert paths.velocity is not None
+        return moving_power(paths, paths.velocity, radar, self.grid, self.chirps, self.rates)
+
+    def observe(self, recording: ChirpCapture) -> Float[Tensor, "frame velocity range u v"]:
+        """The measured power of what moves.
+
+        Raises:
+            InputError: A recording of another number of chirps.
+        """
+        beat, radar = recording.beat, recording.radar()
+        moving = (beat - beat.mean(1, keepdim=True)).to(torch.complex128)
+        power = range_doppler_angle(moving, radar, self.grid, self.chirps, bins=self.bins)
+        every = velocity_axis(radar, self.chirps, self.bins)
+        rows = (every - self.rates[:, None]).abs().argmin(1)
+        return power[:, rows]
+
+    def around(self, range_: float, rate: float, cells: int, radar: Radar) -> "MotionMap":
+        """The cells at most so many range and Doppler cells from an echo, in all directions.
+
+        Args:
+            range_: Of the echo [m].
+            rate: Range rate of the echo [m/s].
+            cells: To either side.
+            radar: What records.
+        """
+        doppler = velocity_axis(radar, self.chirps).diff()[0] if self.chirps.count > 1 else math.inf
+        near = (self.grid.ranges - range_).abs() / radar.waveform.range_resolution
+        slow = (self.rates - rate).abs() / doppler
+        ranges, rates = (torch.nonzero(d <= cells)[:, 0] for d in (near, slow))
+        if not len(ranges) or not len(rates):
+            raise InputError(
+                f"expected an echo within the map, got one at {range_:.3g} m and {rate:.3g} m/s; "
+                "widen the grid"
+            )
+        start, count = float(self.grid.ranges[ranges[0]]), len(ranges)
+        grid = replace(self.grid, range_start=start, range_count=count)
+        return replace(self, grid=grid, rates=self.rates[rates])

@@ -1,0 +1,127 @@
+"""TODO."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invertwin.capture.capture import Capture
+from invertwin.channel import (
+    Grid,
+    Sampling,
+    trace_chains,
+)
+from invertwin.forward_model import ForwardModel
+from invertwin.models.noise import _noisy
+from invertwin.radar.radar import Radar
+from invertwin.radar.range_profile import beat_signal, range_profile
+from invertwin.radar.spectrum import exact_spectrum
+from invertwin.radar.surrogate import (
+    Surrogate,
+)
+from invertwin.radar.waveform import SampledWaveform
+from invertwin.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class ChainMap(ForwardModel):
+    """The power spectrum of a few flat conductors that mirror one another: |sum of fields|².
+
+    Chains of a corner reflector add in phase, as in a ``SurrogateMap`` that names it ``coherent``,
+    which serves scenes with rough things, too. There are no samples and no speckle: the map is
+    smooth in the pose, corners and beams' edges included, as long as one chain or one corner
+    dominates each cell; echoes of several targets in one cell interfere, with a minimum every half
+    wavelength.
+
+    Attributes:
+        grid: Bins, see ``Radar.grid``.
+        surrogate: Extra widths, which are zero at the end of a fit; its kernels do not count.
+        sampling: Most bounces; nothing else counts.
+    """
+
+    grid: Grid
+    surrogate: Surrogate = field(default_factory=Surrogate)
+    sampling: Sampling = Sampling()
+
+    redraws: ClassVar[bool] = False
+
+    def _beat(self, scene: Scene, sensor: Radar) -> Tensor:
+        return beat_signal(trace_chains(scene, sensor.link(), self.sampling.depth), sensor)
+
+    def _shown(self, beat: Tensor, sensor: Radar) -> Tensor:
+        return exact_spectrum(beat, sensor, self.grid).to(torch.float32)
+
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
+        """The spectrum of the chains. See ``ForwardModel.predict`` and ``trace_chains``."""
+        return self.blurred(self._shown(self._beat(scene, sensor), sensor), sensor)
+
+    def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
+        """The measured power spectrum of a capture."""
+        return recording.spectrum(self.grid).to(torch.float32)
+
+    def looks(
+        self, scene: Scene, sensor: Radar, seed: int
+    ) -> Callable[[int, float], Tensor] | None:
+        """The map with other noise each time; None for waveforms without samples."""
+        if not isinstance(sensor.waveform, SampledWaveform):
+            return None
+        beat = self._beat(scene, sensor)
+        return _noisy(
+            lambda _: beat,
+            lambda signal: self._shown(signal, sensor),
+            sensor,
+            seed,
+            fields=self.fields,
+        )
+
+    @property
+    def widened(self) -> bool:
+        """Whether there are extra widths."""
+        return self.surrogate.widened
+
+    def narrowed(self, share: float) -> "ChainMap":
+        """The model with this share of its extra widths."""
+        return replace(self, surrogate=self.surrogate.narrowed(share))
+
+    def blurred(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
+        """A map with the extra widths."""
+        return self.surrogate.blur(observed, sensor, self.grid)
+
+
+@dataclass(frozen=True)
+class ChainField(ChainMap):
+    """The complex range profiles of a few flat conductors that mirror one another.
+
+    The phase tells the range to parts of a wavelength. So its loss has a minimum every half
+    wavelength: it refines what a ``ChainMap`` has found to a tenth of a wavelength in range, in a
+    later stage of a fit. Maps hold real and imaginary parts; compare them by a ``SpectrumLoss`` of
+    kind ``mse`` with one level. The radar's phase is calibrated.
+    """
+
+    fields: ClassVar[bool] = True
+
+    def _shown(self, beat: Tensor, sensor: Radar) -> Tensor:
+        profile = range_profile(beat.to(torch.complex128), sensor, self.grid)
+        return torch.view_as_real(profile.flatten(1, 2).mT).contiguous()
+
+    def predict(
+        self, scene: Scene, sensor: Radar, seed: int
+    ) -> Float[Tensor, "frame range channel part"]:
+        """The range profiles of the chains. See ``ForwardModel.predict`` and ``trace_chains``."""
+        return super().predict(scene, sensor, seed)
+
+    def observe(self, recording: Capture) -> Float[Tensor, "frame range channel part"]:
+        """The measured range profiles of a capture."""
+        return self._shown(recording.beat, recording.radar())
+
+    @property
+    def widened(self) -> bool:
+        """Fields have no extra widths."""
+        return False
+
+    def blurred(self, observed: Tensor, sensor: Radar) -> Tensor:
+        """A map as it is."""
+        return observed

@@ -1,0 +1,309 @@
+"""Forward models: what a sensor would show of a scene, and a recording in the same form.
+
+A model is a frozen value. ``predict`` maps a scene and a sensor to a map, ``observe`` maps a
+recording to a map of the same shape; a loss compares the two. A model of one's own derives from
+:class:`ForwardModel` and has these two methods; ``reconstruct`` and ``gradcheck`` take it.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated, ClassVar, Literal
+
+import torch
+from annotated_types import Ge
+from jaxtyping import Float
+from torch import Tensor
+
+from invertwin.capture.capture import Capture
+from invertwin.channel import (
+    Grid,
+    Sampling,
+    Speckle,
+    draw_speckle,
+    trace_field,
+    trace_target,
+    without_echoes,
+)
+from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
+from invertwin.models.noise import _noisy
+from invertwin.radar.looks import Looks
+from invertwin.radar.radar import Radar
+from invertwin.radar.range_profile import beat_signal
+from invertwin.radar.spectrum import exact_spectrum
+from invertwin.radar.surrogate import (
+    Surrogate,
+    chosen_surrogate,
+    surrogate_spectra,
+    surrogate_spectrum,
+)
+from invertwin.radar.waveform import SampledWaveform
+from invertwin.scene.scene import Scene
+from invertwin.seeds import derived_seed
+from invertwin.simulation import simulate
+
+
+@dataclass(frozen=True)
+class SurrogateMap(ForwardModel):
+    """Expected power over range and direction, smooth in the scene's parameters.
+
+    Attributes:
+        grid: Bins, see ``Radar.grid``.
+        surrogate: Kernels and extra widths, or a name among ``SURROGATES``.
+        sampling: How paths are sampled.
+        coherent: Names of coherent targets: smooth conductors of at most 24 triangles each, such as
+            corner reflectors, whose bounces add in field. A smooth conductor that is not named
+            is a narrow lobe, whose bounces add in power: a corner is then some 10 dB too weak.
+        stretch: Wavelength of the targets' phases at the start of a fit, in wavelengths of the
+            radar. Lobes of plates and dihedrals are wider by it, with the same peaks.
+
+    Raises:
+        InputError: An unknown name, or "exact", which is ``ExactMap``; a stretch below 1, or one
+            without targets.
+    """
+
+    grid: Grid
+    surrogate: Surrogate | str = "response"
+    sampling: Sampling = Sampling()
+    coherent: Sequence[str] = ()
+    stretch: Annotated[float, Ge(1)] = 1.0
+    _reference: tuple[Scene, Radar, Literal["rays", "area"]] | None = field(
+        default=None, repr=False
+    )
+
+    def __post_init__(self) -> None:
+        chosen = chosen_surrogate(self.surrogate)
+        if chosen is None:
+            raise InputError(
+                'expected a surrogate for a SurrogateMap, got "exact"; use ExactMap(grid)'
+            )
+        object.__setattr__(self, "surrogate", chosen)
+        if isinstance(self.coherent, str):
+            raise InputError(
+                f"expected a list of names of coherent targets, got {self.coherent!r}; give "
+                f"coherent=[{self.coherent!r}]"
+            )
+        object.__setattr__(self, "coherent", tuple(self.coherent))
+        if not 1 <= self.stretch < math.inf or (self.stretch > 1 and not self.coherent):
+            raise InputError(
+                f"expected a stretch >= 1 of coherent targets, got {self.stretch} and "
+                f"{len(self.coherent)} targets; give coherent=[...], or stretch=1"
+            )
+
+    @property
+    def kernels(self) -> Surrogate:
+        """The surrogate as a value."""
+        assert isinstance(self.surrogate, Surrogate)
+        return self.surrogate
+
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
+        """The expected power spectrum. See ``ForwardModel.predict``."""
+        scheme: Literal["rays", "area"] = "rays"
+        reference = None
+        if self._reference is not None:
+            fixed, device, scheme = self._reference
+            reference = (fixed, device.link())
+        return surrogate_spectrum(
+            scene,
+            sensor,
+            self.grid,
+            self.kernels,
+            sampling=self.sampling,
+            seed=seed,
+            scheme=scheme,
+            reference=reference,
+            coherent=self.coherent,
+            stretch=self.stretch,
+        )
+
+    def predict_batch(
+        self, scenes: Sequence[Scene], sensor: Radar, seed: int
+    ) -> Float[Tensor, "scene frame range u v"]:
+        """``predict`` of many scenes at once, in one launch: fast where samples are few.
+
+        Gradients flow to every scene, and to the sensor. Scenes have nothing in common but the
+        sensor: they may share tensors, or have objects of their own. See ``deposit_batch``.
+
+        Args:
+            scenes: What is seen, such as the variants of one scene in a training step.
+            sensor: What sees each of them, with its poses.
+            seed: Same seed and scenes, same maps.
+
+        Raises:
+            InputError: No scenes, clouds, or a model made for differences.
+        """
+        if self._reference is not None:
+            raise InputError(
+                "expected a model for predictions, got one that was made for differences of one "
+                "scene; use predict, or the model that for_differences was called of"
+            )
+        return surrogate_spectra(
+            scenes,
+            sensor,
+            self.grid,
+            self.kernels,
+            sampling=self.sampling,
+            seed=seed,
+            coherent=self.coherent,
+            stretch=self.stretch,
+        )
+
+    def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
+        """The measured power spectrum of a capture."""
+        return recording.spectrum(self.grid).to(torch.float32)
+
+    def for_differences(
+        self, scene: Scene, sensor: Radar, samples: int, scheme: Literal["rays", "area"]
+    ) -> "SurrogateMap":
+        """The model with sampling probabilities that belong to this scene."""
+        sampling = replace(self.sampling, samples=samples, boundary_samples=0)
+        return replace(self, sampling=sampling, _reference=(scene, sensor, scheme))
+
+    def looks(
+        self, scene: Scene, sensor: Radar, seed: int
+    ) -> Callable[[int, float], Tensor] | None:
+        """Spectra of one scene with other speckle, and another phase of every coherent target.
+
+        None for clouds and for smooth conductors that are no targets.
+        """
+        rest = without_echoes(scene, self.coherent)
+        if not isinstance(sensor.waveform, SampledWaveform) or any(
+            item.cloud is not None or item.material.coherent for item in rest.objects.values()
+        ):
+            return None
+        fields, link = replace(self.sampling, boundary=False), sensor.link()
+        looks = Looks(trace_field(rest, link, sampling=fields, seed=seed), sensor)
+        targets = [
+            beat_signal(trace_target(scene, name, link, sampling=fields), sensor)
+            for name in self.coherent
+        ]
+
+        def beat(number: int) -> Tensor:
+            generator = torch.Generator().manual_seed(derived_seed(number, 2))
+            turns = 2 * math.pi * torch.rand(len(targets), generator=generator)
+            total = looks.beat(derived_seed(number, 0))
+            for turn, target in zip(
+                torch.polar(torch.ones_like(turns), turns), targets, strict=True
+            ):
+                total = total + turn * target.to(total)
+            return total
+
+        return _noisy(
+            beat,
+            lambda beat: exact_spectrum(beat, sensor, self.grid).to(torch.float32),
+            sensor,
+            seed,
+        )
+
+    @property
+    def widened(self) -> bool:
+        """Whether the surrogate has extra widths, or targets a longer wavelength."""
+        return self.kernels.widened or self.stretch > 1
+
+    def narrowed(self, share: float) -> "SurrogateMap":
+        """The surrogate with this share of its extra widths and of its stretch beyond 1."""
+        stretch = 1 + (self.stretch - 1) * share
+        return replace(self, surrogate=self.kernels.narrowed(share), stretch=stretch)
+
+    def blurred(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
+        """A measured spectrum with the extra widths."""
+        return self.kernels.blur(observed, sensor, self.grid)
+
+
+@dataclass(frozen=True)
+class ExactMap(ForwardModel):
+    """The power spectrum of one realisation, as the radar itself computes it.
+
+    Its loss has a minimum every half wavelength, and rough surfaces need
+    ``Sampling(boundary=False)``. It serves comparisons and data.
+
+    Attributes:
+        grid: Bins, see ``Radar.grid``.
+        sampling: How paths are sampled.
+        speckle: Rough points and paths with their phases, which are unknown for real data; None =
+            drawn from the seed.
+    """
+
+    grid: Grid
+    sampling: Sampling = Sampling()
+    speckle: Speckle | None = None
+
+    redraws: ClassVar[bool] = False
+    smooth: ClassVar[bool] = False
+
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
+        """The spectrum of the exact beat signals. See ``ForwardModel.predict``."""
+        found = simulate(
+            scene, sensor, self.grid, seed=seed, sampling=self.sampling, speckle=self.speckle
+        )
+        return found.spectrum.to(torch.float32)
+
+    def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
+        """The measured power spectrum of a capture."""
+        return recording.spectrum(self.grid).to(torch.float32)
+
+    def prepared(self, scene: Scene, sensor: Radar, seed: int) -> "ExactMap":
+        """The model with rough points that stay while the scene moves."""
+        if self.speckle is not None:
+            return self
+        return replace(self, speckle=draw_speckle(scene, sensor.link(), self.sampling, seed))
+
+
+@dataclass(frozen=True)
+class BeatMap(ExactMap):
+    """The exact beat signals themselves, before any spectrum. They are complex.
+
+    Attributes:
+        channels: Transmitters and receivers whose signals are shown.
+    """
+
+    channels: tuple[slice, slice] = (slice(None), slice(None))
+
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Tensor:
+        """The beat signals [frame, tx, rx, sample]. See ``ForwardModel.predict``."""
+        paths = trace_field(
+            scene, sensor.link(), sampling=self.sampling, seed=seed, speckle=self.speckle
+        )
+        return beat_signal(paths, sensor, channels=self.channels)
+
+    def observe(self, recording: Capture) -> Tensor:
+        """The recorded beat signals of these channels."""
+        return recording.beat[(slice(None), *self.channels)]
+
+
+def surrogate_correlation(
+    scene: Scene, radar: Radar, model: SurrogateMap, *, seed: int, looks: int = 16
+) -> float:
+    """Correlation of a surrogate's map with the mean exact spectrum over several looks.
+
+    A look has its own phases of the rough surfaces. One look has speckle as strong as the map
+    itself. A scene of conductors has no speckle: all its looks are equal.
+
+    Args:
+        scene: What is seen.
+        radar: Arrays, waveform and poses.
+        model: The surrogate; its ``sampling`` serves the exact spectra too.
+        seed: Of the first look, and of the surrogate's samples.
+        looks: Exact spectra that are averaged.
+
+    Returns:
+        Pearson's correlation over all bins and frames; 0 where a map is constant.
+
+    Raises:
+        InputError: No looks.
+    """
+    if looks < 1:
+        raise InputError(
+            f"expected looks >= 1, got {looks}; 16 looks leave a quarter of the speckle"
+        )
+    if all(item.material.coherent for item in scene.objects.values()):
+        looks = 1
+    exact = ExactMap(model.grid, model.sampling)
+    with torch.no_grad():
+        mean = torch.zeros(radar.frame_count, *model.grid.shape, dtype=torch.float64)
+        for look in range(looks):
+            mean += exact.predict(scene, radar, seed + look) / looks
+        a, b = (p.double() - p.double().mean() for p in (mean, model.predict(scene, radar, seed)))
+        norms = a.norm() * b.norm()
+    return float((a * b).sum() / norms) if norms > 0 else 0.0

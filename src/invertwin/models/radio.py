@@ -1,0 +1,278 @@
+"""TODO."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from invertwin.checks import ArrayLike, checked_number, checked_tensor
+from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
+from invertwin.links.metasurface.panel import Metasurface, panel_response
+from invertwin.links.places import Places
+from invertwin.links.received import Received, Reception
+from invertwin.links.transmitters import Transmitters
+from invertwin.models.noise import _scattered
+from invertwin.scene.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class PanelMap(ForwardModel):
+    """The path gain of receivers over a metasurface alone; the sensor is the metasurface.
+
+    Attributes:
+        tx: The transmitter [m].
+        receivers: [rx, 3] [m].
+        frequency: [Hz].
+        boundary: False leaves out of derivatives that shadows move over the panel.
+    """
+
+    tx: Float64[Tensor, "3"]
+    receivers: Float64[Tensor, "rx 3"]
+    frequency: float
+    boundary: bool = True
+
+    redraws: ClassVar[bool] = False
+    random: ClassVar[bool] = False
+
+    def predict(self, scene: Scene, sensor: Metasurface, seed: int) -> Float64[Tensor, "1 rx"]:
+        """|Σ|² of the elements. See ``panel_response``."""
+        found = panel_response(
+            scene, sensor, self.tx[None], self.receivers, self.frequency, boundary=self.boundary
+        )
+        return found.real.square() + found.imag.square()
+
+    def observe(self, recording: Tensor) -> Float64[Tensor, "1 rx"]:
+        """Measured path gains, over the panel alone."""
+        return recording.reshape(1, -1)
+
+    def ablations(self) -> dict[str, ForwardModel]:
+        """The model at fixed shadows. See ``ForwardModel.ablations``."""
+        return {"boundary": replace(self, boundary=False)} if self.boundary else {}
+
+
+QUANTITIES = ("received_power", "path_gain", "gain", "sinr", "delay_spread")
+"""What a ``RadioMap`` may show."""
+
+
+@dataclass(frozen=True, eq=False)
+class RadioMap(ForwardModel):
+    """What receivers at known places get of transmitters: a map for each of these.
+
+    Levels are in decibels; compare them by ``SpectrumLoss(levels=1, gain="one")``, with
+    ``background="level"`` where the sent power is not known. A floor is added to every gain, so
+    that levels and derivatives are finite where no path leads.
+
+    Attributes:
+        places: Where receivers are.
+        reception: How paths are found, and how they add up.
+        quantity: ``received_power`` [dBm], ``path_gain`` [dB], ``gain``: the same as a ratio
+            without a floor, ``sinr`` [dB]: received power of a transmitter over that of all others
+            and noise, or ``delay_spread`` [s].
+        floor_db: Path gain that is added to every one [dB].
+        noise_dbm: Of a receiver, for ``sinr`` [dBm].
+        scatter: Standard deviation of data about the map, in its unit, where it is known. Error
+            bars and verdicts draw from it; None = as large as what a fit leaves unexplained.
+        without: Names of objects that the model leaves out. In a first, coarse stage of a fit, what
+            hides a transmitter would keep it from where it belongs.
+
+    Raises:
+        InputError: An unknown quantity, or a number out of range.
+    """
+
+    places: Places
+    reception: Reception
+    quantity: Literal["received_power", "path_gain", "gain", "sinr", "delay_spread"] = (
+        "received_power"
+    )
+    floor_db: float = -200.0
+    noise_dbm: float = -100.0
+    scatter: float | None = None
+    without: Sequence[str] = ()
+
+    redraws: ClassVar[bool] = False
+    fields: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if self.quantity not in QUANTITIES:
+            raise InputError(
+                f"expected a quantity among {', '.join(QUANTITIES)}, got {self.quantity!r}; "
+                "choose one"
+            )
+        checked_number(self.floor_db, "floor [dB]", -math.inf)
+        checked_number(self.noise_dbm, "noise [dBm]", -math.inf)
+        if self.scatter is not None:
+            checked_number(self.scatter, "scatter of data", 0.0)
+
+    def received(self, scene: Scene, sensor: Transmitters, seed: int) -> Received:
+        """Gain and delay spread, before any decibels.
+
+        Args:
+            scene: What is in the way.
+            sensor: What sends.
+            seed: Of the rays that find paths.
+
+        Raises:
+            InputError: No object of a name that is left out.
+        """
+        if self.without:
+            unknown = sorted(set(self.without) - set(scene.names))
+            if unknown:
+                raise InputError(
+                    f"expected names of objects in without ({', '.join(scene.names)}), got "
+                    f"{unknown[0]}; correct it",
+                    "without",
+                )
+            kept = {n: o for n, o in scene.objects.items() if n not in self.without}
+            scene = replace(scene, objects=kept)
+        return self.places.received(scene, sensor, self.reception, seed)
+
+    def predict(self, scene: Scene, sensor: Transmitters, seed: int) -> Float64[Tensor, "tx *map"]:
+        """The quantity of every transmitter. See ``ForwardModel.predict``."""
+        found = self.received(scene, sensor, seed)
+        if self.quantity == "delay_spread":
+            return found.delay_spread
+        if self.quantity == "gain":
+            return found.gain
+        gain = found.gain + 10 ** (self.floor_db / 10)
+        if self.quantity == "path_gain":
+            return 10 * gain.log10()
+        power = gain * sensor.powers.reshape(-1, *[1] * (gain.ndim - 1))
+        if self.quantity == "sinr":
+            power = power / (power.sum(0) - power + 10 ** (self.noise_dbm / 10))
+        return 10 * power.log10()
+
+    def observe(self, recording: ArrayLike) -> Float64[Tensor, "tx *map"]:
+        """Measured values [tx, …], or those of a single transmitter […].
+
+        Raises:
+            InputError: Another shape, or NaN.
+        """
+        shape, given = self.places.shape, torch.as_tensor(recording, dtype=torch.float64)
+        given = given[None] if given.ndim == len(shape) else given
+        what = f"measured {self.quantity.replace('_', ' ')}"
+        return checked_tensor(given, (None, *shape), what, "give a map for each transmitter")
+
+    def looks(
+        self, scene: Scene, sensor: Transmitters, seed: int
+    ) -> Callable[[int, float], Tensor]:
+        """The map with other errors of measurement each time."""
+        return self.looks_about(self.predict(scene, sensor, seed))
+
+    def looks_about(self, mean: Float64[Tensor, "tx *map"]) -> Callable[[int, float], Tensor]:
+        """A map with other errors of measurement each time, see ``ForwardModel.looks``.
+
+        Args:
+            mean: The map without errors.
+        """
+        return _scattered(mean, self.scatter)
+
+    def best_server(self, scene: Scene, sensor: Transmitters, seed: int) -> Int64[Tensor, "*map"]:
+        """Number of the transmitter of which most power arrives; −1 where none arrives.
+
+        Args:
+            scene: What is in the way.
+            sensor: What sends.
+            seed: As for ``predict``.
+        """
+        gain = self.received(scene, sensor, seed).gain
+        most, number = (gain * sensor.powers.reshape(-1, *[1] * (gain.ndim - 1))).max(0)
+        return torch.where(most > 0, number, -1)
+
+    @property
+    def random(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether points are drawn, as those of cells are, or scattered paths."""
+        return self.places.random or self.reception.rough is not None
+
+    def for_differences(
+        self, scene: Scene, sensor: Transmitters, samples: int, scheme: Literal["rays", "area"]
+    ) -> "RadioMap":
+        """The model with so many points on the cells, and so many scattered paths."""
+        reception, rough = self.reception, self.reception.rough
+        if rough is not None:
+            finer = replace(rough, samples=samples, boundary=False)
+            reception = replace(reception, rough=finer)
+        return replace(self, places=self.places.finer(samples), reception=reception)
+
+    def ablations(self) -> dict[str, ForwardModel]:
+        """The model at fixed visibility: without diffraction, or without boundary paths of cells.
+
+        See ``ForwardModel.ablations``.
+        """
+        fixed = self.places.fixed_visibility()
+        rough = self.reception.rough
+        moves = rough is not None and rough.boundary
+        if fixed is None and not self.reception.edges and not moves:
+            return {}
+        if rough is not None:
+            rough = replace(rough, boundary=False)
+        # In cells without diffraction, powers add.
+        bandwidth = self.reception.bandwidth if fixed is None else None
+        reception = replace(self.reception, edges=0, bandwidth=bandwidth, rough=rough)
+        return {"boundary": replace(self, places=fixed or self.places, reception=reception)}
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseMap(ForwardModel):
+    """Complex responses H(f) between transmitters and receivers at known places.
+
+    Their phase tells the length of paths to parts of a wavelength, so that the loss has a minimum
+    every half wavelength of a place. Materials, which hardly turn phases, are found from anywhere.
+    Maps hold real and imaginary parts; compare them by ``SpectrumLoss(levels=1, gain="one")``.
+
+    Attributes:
+        positions: Of the receivers, [place, 3] [m].
+        frequencies: Of the responses [Hz].
+        reception: How paths are found; its bandwidth does not count.
+        scatter: Standard deviation of data about the map, of each part; None = as large as what a
+            fit leaves unexplained.
+    """
+
+    positions: Float64[Tensor, "place 3"]
+    frequencies: Float64[Tensor, " frequency"]
+    reception: Reception
+    scatter: float | None = None
+
+    redraws: ClassVar[bool] = False
+    random: ClassVar[bool] = False
+    fields: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        do = "give a row of x, y, z for each"
+        places = checked_tensor(self.positions, (None, 3), "positions of receivers [m]", do)
+        swept = checked_tensor(
+            torch.atleast_1d(torch.as_tensor(self.frequencies, dtype=torch.float64)),
+            (None,),
+            "frequencies [Hz]",
+            "give one or several",
+        )
+        object.__setattr__(self, "positions", places)
+        object.__setattr__(self, "frequencies", swept)
+
+    def predict(
+        self, scene: Scene, sensor: Transmitters, seed: int
+    ) -> Float64[Tensor, "tx place frequency part"]:
+        """The responses of the first elements. See ``ForwardModel.predict``."""
+        found = self.reception.responses(scene, sensor, self.positions, self.frequencies, seed)
+        return torch.view_as_real(found)
+
+    def observe(self, recording: Tensor) -> Float64[Tensor, "tx place frequency part"]:
+        """Measured complex responses [tx, place, frequency].
+
+        Raises:
+            InputError: Another shape, or NaN.
+        """
+        given = torch.as_tensor(recording, dtype=torch.complex128)
+        shape = (None, len(self.positions), len(self.frequencies), 2)
+        do = "give complex numbers [tx, place, frequency]"
+        return checked_tensor(torch.view_as_real(given), shape, "measured responses", do)
+
+    def looks(
+        self, scene: Scene, sensor: Transmitters, seed: int
+    ) -> Callable[[int, float], Tensor]:
+        """The responses with other noise each time."""
+        return _scattered(self.predict(scene, sensor, seed), self.scatter)
