@@ -23,7 +23,7 @@ import torch
 from report import MetricTable, Required, write
 
 import invertwin as iw
-from invertwin.radar.motion import Chirps
+from invertwin.radar.signal.chirps import Chirps
 from invertwin.scene import (
     InMotion,
     RoughDielectric,

@@ -18,12 +18,12 @@ from invertwin.channel import (
 )
 from invertwin.checks import checked_count, checked_type
 from invertwin.errors import InputError
-from invertwin.radar.blocks import Blocks, displacements
-from invertwin.radar.impairments import Impairments
-from invertwin.radar.motion import Chirps, Places, Train, every_ramp, sample_interval
+from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar, sampled
-from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
-from invertwin.radar.spectrum import exact_spectrum
+from invertwin.radar.signal.chirps import Chirps, Places, Train, every_ramp, sample_interval
+from invertwin.radar.signal.impairments import Impairments
+from invertwin.radar.signal.keyframes import Blocks, displacements
+from invertwin.radar.signal.range_profile import add_noise, beat_signal, check_paths
 from invertwin.scene.scene import Scene, warn_of_mirrors
 
 # Motion over half a ramp is straight where it bends by less than this, in wavelengths.

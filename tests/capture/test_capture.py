@@ -9,8 +9,8 @@ import xarray as xr
 from invertwin.capture import Capture, Track, read
 from invertwin.channel import Grid
 from invertwin.errors import InputError
+from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
-from invertwin.radar.spectrum import exact_spectrum
 from invertwin.radar.waveform import FMCW, Impulse
 from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Table, linear_array
 from invertwin.scene.pose import rotation_from_vector

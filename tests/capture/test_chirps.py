@@ -9,7 +9,7 @@ from invertwin.capture import ChirpData, ChirpSettings, adc_counts, settings_of
 from invertwin.capture.chirps import shortest_loop
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
-from invertwin.radar.motion import Chirps
+from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.waveform import FMCW, PhysicsWarning
 
 SETTINGS = ChirpSettings(

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from radar.test_moving_power import paths_of
 
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
@@ -15,13 +16,12 @@ from invertwin.errors import InputError
 from invertwin.inversion import CorrelationLoss, Observation, Optimizer, Schedule, reconstruct
 from invertwin.models.doppler import MotionMap
 from invertwin.radar.boards import board
-from invertwin.radar.motion import Chirps, moving_beat
 from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import beat_signal
+from invertwin.radar.signal.chirps import Chirps, moving_beat
+from invertwin.radar.signal.range_profile import beat_signal
 from invertwin.radar.waveform import FMCW
 from invertwin.scene import Object, PerfectConductor, RoughDielectric, Scene, rigid, shapes
 from invertwin.simulation import simulate_chirps
-from radar.test_moving_power import paths_of
 
 CHIRPS = Chirps(32, 60e-6)
 RADAR = Radar(

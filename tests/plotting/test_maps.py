@@ -9,7 +9,7 @@ from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.plotting import Panel
 from invertwin.radar import DopplerMaps
-from invertwin.radar.doppler_maps import Peak
+from invertwin.radar.processing.doppler_maps import Peak
 
 GRID = Grid(1.0, 0.5, 3, -0.4, 0.2, 5, -0.1, 0.1, 3)
 ROW = Grid(1.0, 0.5, 3, -0.4, 0.2, 5)

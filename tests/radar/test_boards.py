@@ -7,8 +7,8 @@ import torch
 
 from invertwin.errors import InputError
 from invertwin.radar.boards import BOARDS, Board, board
+from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
-from invertwin.radar.spectrum import exact_spectrum
 from invertwin.radar.waveform import FMCW, PhysicsWarning
 
 ISK_0 = [0, -1, -2, -3, -2, -3, -4, -5, -4, -5, -6, -7]

@@ -24,11 +24,11 @@ from invertwin.radar import (
     exact_spectrum,
     moving_beat,
     peaks,
-    range_profile,
     surrogate_spectrum,
 )
-from invertwin.radar.looks import Looks
-from invertwin.radar.range_profile import fft_bins
+from invertwin.radar.signal import range_profile
+from invertwin.radar.signal.range_profile import fft_bins
+from invertwin.radar.signal.realisations import Looks
 from invertwin.scene import Scene, plate
 from invertwin.scene.antenna import linear_array
 from scenes import float64, thing

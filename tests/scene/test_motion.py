@@ -8,7 +8,7 @@ import torch
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.radar import FMCW, Radar
-from invertwin.radar.motion import Chirps
+from invertwin.radar.signal.chirps import Chirps
 from invertwin.scene import (
     Along,
     AntennaArray,

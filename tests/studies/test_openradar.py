@@ -9,7 +9,7 @@ import torch
 
 from invertwin.errors import InputError
 from invertwin.radar.boards import Mounting, board
-from invertwin.radar.doppler import compensate_tdm, range_doppler
+from invertwin.radar.processing.doppler import compensate_tdm, range_doppler
 from invertwin_studies.recordings.kinds import openradar_data
 from invertwin_studies.recordings.openradar import FILE, read_chirps
 

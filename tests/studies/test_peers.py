@@ -8,7 +8,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import FMCW, Radar
-from invertwin.radar.surrogate import Surrogate
+from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.scene import AntennaArray, Isotropic, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import planar_array
 from invertwin.scene.parameters import Translation

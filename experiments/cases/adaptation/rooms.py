@@ -14,7 +14,7 @@ from torch import Tensor
 import invertwin as iw
 from invertwin.channel import trace_echoes
 from invertwin.radar import beat_signal
-from invertwin.radar.spectrum import exact_spectrum
+from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.scene import (
     Cosine,
     Dielectric,

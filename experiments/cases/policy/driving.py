@@ -16,8 +16,8 @@ from torch import Tensor
 
 import invertwin as iw
 from invertwin.channel import Speckle, draw_speckle
-from invertwin.radar.range_profile import range_profile
-from invertwin.radar.spectrum import aperture
+from invertwin.radar.processing.beamforming import aperture
+from invertwin.radar.signal.range_profile import range_profile
 from invertwin.scene import Cosine, Mesh, RoughDielectric, box, linear_array
 from invertwin.seeds import derived_seed
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from invertwin.capture.capture import Capture
 from invertwin.errors import InputError
-from invertwin.radar.backprojection import backproject_beat, distances
+from invertwin.radar.processing.backprojection import backproject_beat, distances
 
 # Half widths and steps of the first search: wide against what clocks and cables are off by after
 # alignment by hand, dense against a range cell and the time in which a radar moves one beamwidth.

@@ -17,8 +17,8 @@ from invertwin.capture.track import Track
 from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.outward import shown_by
+from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
-from invertwin.radar.spectrum import exact_spectrum
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.untrusted import reading
 

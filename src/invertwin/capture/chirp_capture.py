@@ -10,8 +10,8 @@ from torch import Tensor
 from invertwin.capture.capture import Capture
 from invertwin.checks import check_shape
 from invertwin.errors import InputError
-from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
+from invertwin.radar.signal.chirps import Chirps
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,8 @@ from invertwin.checks import check_fields, check_shape, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Among, Count, Frequency, NonNegative, Positive, Several, Usual
 from invertwin.radar.boards import Elements, Mounting
-from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
+from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.waveform import FMCW, PhysicsWarning
 
 CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")

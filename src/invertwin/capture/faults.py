@@ -15,8 +15,8 @@ from torch import Tensor
 from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.prediction import covariances, predictor, residuals
+from invertwin.radar.processing.reflectors import noise_power
 from invertwin.radar.radar import sampled
-from invertwin.radar.reflectors import noise_power
 from invertwin.radar.waveform import SampledWaveform, unit_window
 
 _NEAR_CELLS = 3  # from range zero, in which leakage outshines everything

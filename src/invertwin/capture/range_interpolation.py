@@ -8,7 +8,7 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar.backprojection import UPSAMPLING, between_samples
+from invertwin.radar.processing.backprojection import UPSAMPLING, between_samples
 
 
 class RangeInterpolator:

@@ -14,10 +14,10 @@ from invertwin.errors import InputError
 from invertwin.inversion.loss import CorrelationLoss, Scale
 from invertwin.inversion.reconstruction import Reconstruction
 from invertwin.models.doppler import MotionMap
-from invertwin.radar.detection import ordered_statistics_cfar, point_cloud
-from invertwin.radar.doppler import compensate_tdm, range_doppler, velocity_axis
+from invertwin.radar.processing.beamforming import aperture
+from invertwin.radar.processing.detection import ordered_statistics_cfar, point_cloud
+from invertwin.radar.processing.doppler import compensate_tdm, range_doppler, velocity_axis
 from invertwin.radar.radar import Radar
-from invertwin.radar.spectrum import aperture
 from invertwin.scene.scene import Scene
 
 # Cells of a map that an echo and its neighbours fill; and those that the noise is taken from.

@@ -16,10 +16,10 @@ from invertwin.channel import (
 )
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.radar.doppler import range_doppler_angle, velocity_axis
-from invertwin.radar.motion import Chirps
-from invertwin.radar.moving_power import moving_power
+from invertwin.radar.processing.doppler import range_doppler_angle, velocity_axis
 from invertwin.radar.radar import Radar
+from invertwin.radar.signal.chirps import Chirps
+from invertwin.radar.surrogate.range_doppler import moving_power
 from invertwin.scene.scene import Scene
 
 

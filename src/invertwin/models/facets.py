@@ -16,10 +16,10 @@ from invertwin.channel import (
 )
 from invertwin.forward_model import ForwardModel
 from invertwin.models.noise import _noisy
+from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import beat_signal, range_profile
-from invertwin.radar.spectrum import exact_spectrum
-from invertwin.radar.surrogate import (
+from invertwin.radar.signal.range_profile import beat_signal, range_profile
+from invertwin.radar.surrogate.surrogate import (
     Surrogate,
 )
 from invertwin.radar.waveform import SampledWaveform

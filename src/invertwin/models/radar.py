@@ -28,11 +28,11 @@ from invertwin.channel import (
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.models.noise import _noisy
-from invertwin.radar.looks import Looks
+from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import beat_signal
-from invertwin.radar.spectrum import exact_spectrum
-from invertwin.radar.surrogate import (
+from invertwin.radar.signal.range_profile import beat_signal
+from invertwin.radar.signal.realisations import Looks
+from invertwin.radar.surrogate.surrogate import (
     Surrogate,
     chosen_surrogate,
     surrogate_spectra,

@@ -21,9 +21,9 @@ from invertwin.inversion import Observation
 from invertwin.inversion.gradcheck.lines import Line, losses_along
 from invertwin.inversion.loss import relative_error
 from invertwin.models.radar import BeatMap, SurrogateMap
-from invertwin.radar.direction import music
+from invertwin.radar.processing.direction import music
 from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import range_profile
+from invertwin.radar.signal.range_profile import range_profile
 from invertwin.runs import RunFolder
 from invertwin_studies.figures import Curve, deep_minima, scan
 from invertwin_studies.sections import LossScan

@@ -11,9 +11,9 @@ from invertwin.capture import Capture
 from invertwin.channel import Grid, Paths, Sampling, trace_power
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.radar.point_spread import airy_field, airy_radii, normalized_gaussian
 from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate import Surrogate
+from invertwin.radar.surrogate.point_spread import airy_field, airy_radii, normalized_gaussian
+from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.radar.waveform import SIGMA_PER_FWHM
 from invertwin.scene import Scene
 

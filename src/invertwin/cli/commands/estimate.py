@@ -17,7 +17,7 @@ from invertwin.inversion import require_edge
 from invertwin.memory import free_memory, gigabytes
 from invertwin.radar import SampledWaveform
 from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import fft_bins
+from invertwin.radar.signal.range_profile import fft_bins
 from invertwin.scene import Mesh, Object, Scene
 from invertwin.scene.scene import warn_of_mirrors
 

@@ -21,9 +21,10 @@ from invertwin.cli.schema.motion_tables import in_motion, refuse_motion
 from invertwin.cli.schema.run_file import about, need
 from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap, surrogate_correlation
-from invertwin.radar import FMCW, doppler_maps, velocity_span
-from invertwin.radar.motion import Chirps
+from invertwin.radar import FMCW, velocity_span
+from invertwin.radar.processing import doppler_maps
 from invertwin.radar.radar import Radar
+from invertwin.radar.signal.chirps import Chirps
 from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh

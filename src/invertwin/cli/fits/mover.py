@@ -35,7 +35,7 @@ from invertwin.inversion import (
 )
 from invertwin.models.doppler import MotionMap
 from invertwin.plotting import RATE_LABEL, U_LABEL, Panel
-from invertwin.radar import doppler_maps
+from invertwin.radar.processing import doppler_maps
 from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh

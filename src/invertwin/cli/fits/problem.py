@@ -31,7 +31,7 @@ from invertwin.models.facets import ChainMap
 from invertwin.models.radar import ExactMap, SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate import Surrogate
+from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.scene import Object, Scene, rigid
 from invertwin.seeds import derived_seed
 

@@ -13,7 +13,7 @@ from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.models.facets import ChainField, ChainMap
 from invertwin.models.radar import SurrogateMap
-from invertwin.radar.surrogate import Surrogate, chosen_surrogate
+from invertwin.radar.surrogate.surrogate import Surrogate, chosen_surrogate
 from invertwin.registry.kinds import Group, Registry, Table
 from invertwin.registry.section import fail, key
 from invertwin.scene.scene import Object

@@ -12,7 +12,7 @@ from invertwin.inversion.initialisation.initial_pose import FirstPose
 from invertwin.inversion.initialisation.starts import nearby
 from invertwin.inversion.schedule import Schedule
 from invertwin.limits import Count, NonNegative, Positive
-from invertwin.radar.surrogate import Surrogate
+from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.registry.kinds import OneOf, Table, TableOf, registry
 from invertwin.registry.section import Section, Seed, Vector, key
 

@@ -37,7 +37,7 @@ from invertwin.cli.schema.variation import check_varied
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.gradcheck import Check
 from invertwin.limits import NonNegative, Positive
-from invertwin.radar.surrogate import Surrogate
+from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.registry.kinds import NameOf, OneOf, TableOf, load_plugins, registry
 from invertwin.registry.section import InputPath, Section, Seed, Vector, Words, fail, key
 from invertwin.scene.room import room

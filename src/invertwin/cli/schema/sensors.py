@@ -12,9 +12,9 @@ from invertwin.capture.readers.radar_fields import WAVEFORMS
 from invertwin.channel import Grid
 from invertwin.limits import Count, Positive
 from invertwin.radar import boards, tracks
-from invertwin.radar.impairments import Impairments
-from invertwin.radar.motion import Chirps
 from invertwin.radar.radar import Radar
+from invertwin.radar.signal.chirps import Chirps
+from invertwin.radar.signal.impairments import Impairments
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
 from invertwin.registry.kinds import Group, OneOf, Registry, Table, TableOf, number_or_list
 from invertwin.registry.section import TAG_MARK, Section, Vector, about, check_presence, key, tag_by

@@ -10,8 +10,8 @@ from torch import Tensor
 from invertwin.channel import Grid
 from invertwin.inversion import speckle_divergence
 from invertwin.radar import Radar
+from invertwin.radar.processing.beamforming import aperture
 from invertwin.radar.radar import sampled
-from invertwin.radar.spectrum import aperture
 from invertwin.radar.waveform import unit_window
 
 DEGREES = 4.0

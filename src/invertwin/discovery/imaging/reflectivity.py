@@ -14,7 +14,7 @@ from invertwin.errors import InputError
 from invertwin.inversion import speckle_weight
 from invertwin.progress import told
 from invertwin.radar import Radar
-from invertwin.radar.spectrum import aperture
+from invertwin.radar.processing.beamforming import aperture
 
 _LEAST = 1e-3  # of a response, relative to its peak: less is left out
 _NONE = 1e-30  # of a response: the place is out of sight [1/m²]

@@ -24,7 +24,7 @@ from invertwin.inversion.initialisation.detections import (
     principal_rectangle,
 )
 from invertwin.limits import Positive
-from invertwin.radar.surrogate import Surrogate
+from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import rigid
 from invertwin.scene.scene import Scene

@@ -24,7 +24,7 @@ from invertwin.channel.rays.ray_scene import RayScene, visible
 from invertwin.channel.rays.scene_tables import Geometry, flatten
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate import Surrogate
+from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.scene.scene import Scene
 from invertwin_studies.peers.binning import binned
 

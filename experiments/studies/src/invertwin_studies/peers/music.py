@@ -13,9 +13,9 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import Grid, Sampling, Speckle, trace_field
-from invertwin.radar.direction import music
+from invertwin.radar.processing.direction import music
 from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import beat_signal, range_profile
+from invertwin.radar.signal.range_profile import beat_signal, range_profile
 from invertwin.scene.scene import Scene
 
 _SAMPLES = 200_000  # on coherent objects

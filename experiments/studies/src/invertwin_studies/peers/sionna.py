@@ -21,7 +21,7 @@ from invertwin.channel.rays.arrays import to_float, to_index, to_torch
 from invertwin.channel.rays.backend import mi
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate import Surrogate
+from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.scene.scene import Scene
 from invertwin_studies.peers.binning import binned
 

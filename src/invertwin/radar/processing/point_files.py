@@ -6,7 +6,7 @@ import numpy as np
 
 from invertwin.errors import InputError
 from invertwin.folders import replacing
-from invertwin.radar.detection import PointCloud
+from invertwin.radar.processing.detection import PointCloud
 
 
 def save_points(path: str | Path, points: PointCloud) -> None:

@@ -11,17 +11,22 @@ from torch import Tensor
 
 from invertwin.channel import Grid
 from invertwin.progress import told
-from invertwin.radar.detection import (
+from invertwin.radar.processing.beamforming import beamform
+from invertwin.radar.processing.detection import (
     PointCloud,
     cell_averaging_cfar,
     ordered_statistics_cfar,
     world_positions,
 )
-from invertwin.radar.doppler import compensate_tdm, range_doppler, velocity_axis, velocity_span
-from invertwin.radar.motion import Chirps
+from invertwin.radar.processing.doppler import (
+    compensate_tdm,
+    range_doppler,
+    velocity_axis,
+    velocity_span,
+)
 from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import range_profile
-from invertwin.radar.spectrum import beamform
+from invertwin.radar.signal.chirps import Chirps
+from invertwin.radar.signal.range_profile import range_profile
 from invertwin.radar.waveform import unit_window
 
 # With fewer range rates the cells that train a threshold lie along range alone. Half of them may

@@ -12,7 +12,7 @@ from invertwin.channel import Grid
 from invertwin.checks import check_shape
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import range_profile
+from invertwin.radar.signal.range_profile import range_profile
 from invertwin.radar.waveform import taper
 
 # Depth of an array along boresight, in wavelengths, that (u, v) steering may leave out.

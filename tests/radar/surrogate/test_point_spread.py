@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from invertwin.radar import FMCW, airy, dirichlet, normalized_gaussian
-from invertwin.radar.point_spread import (
+from invertwin.radar.processing.beamforming import aperture
+from invertwin.radar.surrogate.point_spread import (
     airy_field,
     array_point_spread,
     bessel_j1,
     range_point_spread,
 )
-from invertwin.radar.spectrum import aperture
 
 
 def test_point_spreads_peak_at_one(planar):

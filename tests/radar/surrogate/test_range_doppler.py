@@ -9,10 +9,10 @@ from invertwin.channel import Paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
-from invertwin.radar.doppler import range_doppler_angle, velocity_axis
-from invertwin.radar.motion import Chirps, moving_beat
-from invertwin.radar.moving_power import moving_power
+from invertwin.radar.processing.doppler import range_doppler_angle, velocity_axis
 from invertwin.radar.radar import Radar
+from invertwin.radar.signal.chirps import Chirps, moving_beat
+from invertwin.radar.surrogate.range_doppler import moving_power
 from invertwin.radar.waveform import FMCW
 from invertwin.scene.pose import look_at
 

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from invertwin.channel import Paths
 from invertwin.errors import InputError
-from invertwin.radar.motion import Chirps, Train, sample_interval
 from invertwin.radar.radar import Radar, sampled
-from invertwin.radar.range_profile import beat_signal, check_paths
+from invertwin.radar.signal.chirps import Chirps, Train, sample_interval
+from invertwin.radar.signal.range_profile import beat_signal, check_paths
 from invertwin.scene.scene import Scene
 
 _OFF = 1e-7  # m: a polynomial of time is the place

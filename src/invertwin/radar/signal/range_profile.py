@@ -11,8 +11,8 @@ from invertwin.channel import Grid, Paths
 from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.progress import told
-from invertwin.radar.nonuniform import beat_of_delays
 from invertwin.radar.radar import Radar, checked_beat, sampled
+from invertwin.radar.signal.nufft import beat_of_delays
 from invertwin.radar.waveform import PhysicsWarning, SampledWaveform, unit_window
 
 _STANDARD_TEMPERATURE = 290.0  # K, at which noise figures are defined

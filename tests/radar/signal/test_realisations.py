@@ -4,7 +4,7 @@ import torch
 
 from invertwin.channel import Sampling, trace_field
 from invertwin.radar import exact_spectrum
-from invertwin.radar.looks import Looks
+from invertwin.radar.signal.realisations import Looks
 from invertwin.scene import Scene, plate
 from invertwin.simulation import simulate
 from scenes import float64, radar, relative, thing

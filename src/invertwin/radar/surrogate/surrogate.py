@@ -27,7 +27,9 @@ from invertwin.channel import (
 from invertwin.checks import check_fields
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
-from invertwin.radar.point_spread import (
+from invertwin.radar.processing.beamforming import Aperture, aperture
+from invertwin.radar.radar import Radar
+from invertwin.radar.surrogate.point_spread import (
     airy,
     airy_radii,
     array_point_spread,
@@ -35,8 +37,6 @@ from invertwin.radar.point_spread import (
     interpolated,
     range_point_spread,
 )
-from invertwin.radar.radar import Radar
-from invertwin.radar.spectrum import Aperture, aperture
 from invertwin.radar.waveform import PhysicsWarning, Waveform
 from invertwin.scene.scene import Scene
 

@@ -14,14 +14,14 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.progress import told
-from invertwin.radar.nonuniform import (
+from invertwin.radar.radar import Radar, sampled
+from invertwin.radar.signal.nufft import (
     beat_of_delays,
     instants_derivative,
     phase_cycles,
     ramp_instants,
 )
-from invertwin.radar.radar import Radar, sampled
-from invertwin.radar.range_profile import beat_signal, check_paths
+from invertwin.radar.signal.range_profile import beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, SampledWaveform, SteppedFrequency
 
 # Largest error of interpolating a path's phase factor between the instants of a ramp.

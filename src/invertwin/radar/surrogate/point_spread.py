@@ -9,8 +9,8 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.radar.processing.beamforming import Aperture
 from invertwin.radar.radar import Radar
-from invertwin.radar.spectrum import Aperture
 from invertwin.radar.waveform import SampledWaveform, Waveform, gaussian_response
 
 _TABLE = 32  # entries per cell of a tabulated response

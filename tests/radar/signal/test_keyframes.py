@@ -10,7 +10,7 @@ from invertwin import simulation
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.radar import FMCW, Radar
-from invertwin.radar.motion import Chirps
+from invertwin.radar.signal.chirps import Chirps
 from invertwin.scene import (
     Object,
     PerfectConductor,

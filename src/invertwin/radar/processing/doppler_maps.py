@@ -12,16 +12,16 @@ from torch import Tensor
 
 from invertwin.channel import Grid
 from invertwin.progress import told
-from invertwin.radar.direction import capon, music
-from invertwin.radar.doppler import (
+from invertwin.radar.processing.beamforming import beamform
+from invertwin.radar.processing.direction import capon, music
+from invertwin.radar.processing.doppler import (
     compensate_tdm,
     range_doppler,
     velocity_axis,
 )
-from invertwin.radar.motion import Chirps
+from invertwin.radar.processing.reflectors import noise_power
 from invertwin.radar.radar import Radar
-from invertwin.radar.reflectors import noise_power
-from invertwin.radar.spectrum import beamform
+from invertwin.radar.signal.chirps import Chirps
 
 # Bins of range rate on either side of zero where slow drift of what stands still is seen, and how
 # far below the still echo of its range such drift stays.

@@ -11,8 +11,8 @@ from torch import Tensor
 from invertwin.channel import Grid
 from invertwin.checks import check_shape, checked_number
 from invertwin.errors import InputError
+from invertwin.radar.processing.beamforming import Aperture, aperture
 from invertwin.radar.radar import Radar
-from invertwin.radar.spectrum import Aperture, aperture
 
 # Gaps between signal and noise eigenvalues below this part of the largest one count as noise of
 # the arithmetic: there the derivative of the subspace is damped instead of unbounded.

@@ -23,9 +23,9 @@ from invertwin.channel import Paths
 from invertwin.checks import check_fields, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, NonNegative, Positive, Usual
-from invertwin.radar.motion import Chirps, moving_beat
 from invertwin.radar.radar import Radar, sampled
-from invertwin.radar.range_profile import add_noise, beat_signal, check_paths
+from invertwin.radar.signal.chirps import Chirps, moving_beat
+from invertwin.radar.signal.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, PhysicsWarning, SteppedFrequency
 
 # Phase of the highest offset between delays at which the residual is computed; linear between

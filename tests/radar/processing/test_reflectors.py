@@ -5,7 +5,7 @@ import torch
 
 from invertwin.radar import FMCW, Chirps, Radar, points_csv, points_of
 from invertwin.radar.boards import board
-from invertwin.radar.reflectors import noise_power
+from invertwin.radar.processing.reflectors import noise_power
 from oracles.moving_point import moving_point
 
 ARRAYS = board("IWR6843ISK").arrays(elevation=1)

@@ -25,7 +25,7 @@ from invertwin.radar import (
     normalized_gaussian,
     surrogate_spectrum,
 )
-from invertwin.radar.point_spread import range_point_spread
+from invertwin.radar.surrogate.point_spread import range_point_spread
 from invertwin.scene import Object, RoughDielectric, Scene, plate, rigid, rotation_from_vector
 from invertwin.scene.antenna import AntennaArray, linear_array
 from oracles.bspline import deposit

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Paths
 from invertwin.checks import check_shape
-from invertwin.radar.doppler import velocity_span
-from invertwin.radar.motion import Chirps
-from invertwin.radar.point_spread import interpolated
+from invertwin.radar.processing.beamforming import aperture
+from invertwin.radar.processing.doppler import velocity_span
 from invertwin.radar.radar import Radar
-from invertwin.radar.spectrum import aperture
+from invertwin.radar.signal.chirps import Chirps
+from invertwin.radar.surrogate.point_spread import interpolated
 from invertwin.radar.waveform import FMCW, SteppedFrequency, Waveform, unit_window
 
 

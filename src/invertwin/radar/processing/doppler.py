@@ -11,10 +11,10 @@ from torch import Tensor
 from invertwin.channel import Grid
 from invertwin.checks import check_shape
 from invertwin.errors import InputError
-from invertwin.radar.motion import Chirps
+from invertwin.radar.processing.beamforming import beamform
 from invertwin.radar.radar import Radar
-from invertwin.radar.range_profile import range_profile
-from invertwin.radar.spectrum import beamform
+from invertwin.radar.signal.chirps import Chirps
+from invertwin.radar.signal.range_profile import range_profile
 from invertwin.radar.waveform import unit_window
 
 

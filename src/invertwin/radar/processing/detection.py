@@ -16,9 +16,9 @@ from torch import Tensor
 from invertwin.channel import Grid, differentiated
 from invertwin.checks import check_shape
 from invertwin.errors import InputError
-from invertwin.radar.doppler import velocity_axis, velocity_span
-from invertwin.radar.motion import Chirps
+from invertwin.radar.processing.doppler import velocity_axis, velocity_span
 from invertwin.radar.radar import Radar
+from invertwin.radar.signal.chirps import Chirps
 
 _QUADRATURE = 4096  # nodes over the distribution of an order statistic
 

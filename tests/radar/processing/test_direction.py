@@ -19,7 +19,7 @@ from invertwin.radar import (
     range_doppler,
     source_count,
 )
-from invertwin.radar.direction import _SignalProjector
+from invertwin.radar.processing.direction import _SignalProjector
 from invertwin.scene.antenna import AntennaArray, linear_array
 from oracles.moving_point import moving_point
 
