@@ -75,8 +75,8 @@ from invertwin.channel import Sampling, backend, deposit_power
 from invertwin.channel.rays.backend import mi
 from invertwin.channel.rays.ray_scene import Occluders
 from invertwin.channel.rays.topology import Topology
-from invertwin.memory import peak_memory
 from invertwin.radar import Radar
+from invertwin.runtime.memory import peak_memory
 from invertwin.scene import Mesh, Object, RoughConductor, Scene
 from invertwin.scene.antenna import linear_array
 from invertwin.scene.shapes import box

@@ -30,8 +30,8 @@ from invertwin.channel import Grid, Sampling, backend, deposit_power, trace_powe
 from invertwin.channel.rays.backend import mi
 from invertwin.channel.rays.ray_scene import RayScene, visible
 from invertwin.channel.rays.scene_tables import flatten
-from invertwin.memory import peak_memory
 from invertwin.radar import FMCW, Radar
+from invertwin.runtime.memory import peak_memory
 from invertwin.scene import AntennaArray, Isotropic, Mesh, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import linear_array
 from invertwin.scene.shapes import box, plate, sphere

@@ -67,7 +67,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     marked = [item for item in items if item.get_closest_marker("gpu")]
     if not marked:
         return
-    from invertwin import doctor
+    from invertwin.runtime import doctor
 
     if doctor.gpu_name() is None:
         for item in marked:

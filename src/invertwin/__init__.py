@@ -15,7 +15,7 @@ is quick, and ``invertwin doctor`` runs where no ray tracer can.
 from importlib import import_module
 from typing import Any
 
-from invertwin import doctor, threads
+from invertwin.runtime import doctor, threads
 
 __version__ = "0.3.0"
 

@@ -270,7 +270,7 @@ def test_wheels_carry_the_demo(repository):
 
 @pytest.mark.parametrize("ok", [True, False])
 def test_doctor_prints_and_returns_the_verdict(monkeypatch, capsys, ok):
-    from invertwin import doctor
+    from invertwin.runtime import doctor
 
     monkeypatch.setattr(doctor, "report", lambda: {"ok": ok})
     monkeypatch.setattr(doctor, "render", lambda report: "[not markup] " + "x" * 100)

@@ -22,8 +22,8 @@ from invertwin.cli.schema.shape_tables import joint_places
 from invertwin.cli.schema.variation import steps_of, with_values
 from invertwin.datasets import Samples, object_labels
 from invertwin.datasets.shards import members_of
-from invertwin.engines import spread
 from invertwin.errors import InputError
+from invertwin.runtime.engines import spread
 
 ANYWHERE = Path("rooms.toml")
 RUN = """

@@ -5,10 +5,10 @@ import torch
 from torch import distributed
 
 from invertwin.channel import Sampling
-from invertwin.engines import spread
 from invertwin.errors import InputError
 from invertwin.inversion import mean_over_views
 from invertwin.models.radar import SurrogateMap
+from invertwin.runtime.engines import spread
 from invertwin.scene import Translation
 from invertwin.seeds import derived_seed
 from scenes import occluder, radar

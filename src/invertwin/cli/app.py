@@ -30,7 +30,7 @@ from invertwin.cli.report import Table
 from invertwin.cli.schema.run_file import about_file
 from invertwin.cli.terminal import load_runs, now_and_then, print_tables, progress, run_folder
 from invertwin.errors import InputError, interruptible, one_line
-from invertwin.threads import available
+from invertwin.runtime.threads import available
 
 
 class _Commands(TyperGroup):
@@ -276,7 +276,7 @@ def keys(
 @app.command()
 def doctor(backend: BackendOption = None) -> None:
     """Check that this machine can trace rays, and say how to fix it if not."""
-    from invertwin import doctor as machine
+    from invertwin.runtime import doctor as machine
 
     report = machine.report()
     console.print(machine.render(report), markup=False, soft_wrap=True)

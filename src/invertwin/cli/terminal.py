@@ -19,8 +19,8 @@ from invertwin.cli.report import Table, is_number, shown
 from invertwin.cli.schema.run_file import about_file, load_run, need, to_toml
 from invertwin.errors import InputError
 from invertwin.folders import PARTS
-from invertwin.progress import listening, time_left
 from invertwin.runs import RunFolder, open_run
+from invertwin.runtime.progress import listening, time_left
 
 _LOG_SECONDS = 10.0  # between lines of progress in a log
 

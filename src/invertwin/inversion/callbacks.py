@@ -19,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from invertwin.errors import InputError
 from invertwin.folders import replacing
 from invertwin.inversion.fit import Callback, Fit
-from invertwin.progress import time_left
+from invertwin.runtime.progress import time_left
 from invertwin.scene.scene import Scene
 from invertwin.untrusted import reading
 

@@ -15,7 +15,7 @@ import torch
 
 from invertwin.checks import checked_number
 from invertwin.errors import InputError
-from invertwin.memory import require_at_most
+from invertwin.runtime.memory import require_at_most
 from invertwin.scene.mesh import Mesh
 
 _MOST_TRIANGLES = 1e6  # each is moved by itself

@@ -16,7 +16,7 @@ from invertwin.channel import RayPaths, polarisations
 from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.memory import require_memory
+from invertwin.runtime.memory import require_memory
 from invertwin.scene import AntennaArray
 
 _VALUES_AT_ONCE = 1 << 21

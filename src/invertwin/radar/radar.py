@@ -17,9 +17,9 @@ from invertwin.checks import ArrayLike, check_fields, check_shape, checked_tenso
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import MOST, Among
-from invertwin.memory import require_at_most
 from invertwin.outward import shown_by
 from invertwin.radar.waveform import WINDOWS, PhysicsWarning, SampledWaveform, Waveform
+from invertwin.runtime.memory import require_at_most
 from invertwin.scene.antenna import AntennaArray
 
 Window = Annotated[str, Among(WINDOWS)]

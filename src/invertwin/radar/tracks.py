@@ -6,7 +6,7 @@ from torch import Tensor
 
 from invertwin.checks import Point, checked_tensor
 from invertwin.limits import Angle, Count, NonNegative, Positive
-from invertwin.memory import require_at_most
+from invertwin.runtime.memory import require_at_most
 
 _MOST_POSITIONS = 1e6
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Count, NonNegative, Positive
-from invertwin.memory import require_at_most
+from invertwin.runtime.memory import require_at_most
 from invertwin.scene.polarisation import JonesTable, Polarisation
 
 Polarised = str | ArrayLike | JonesTable

@@ -14,7 +14,7 @@ from annotated_types import Ge, Le, MinLen
 from invertwin.checks import checked_count, checked_number, checked_tensor
 from invertwin.errors import InputError
 from invertwin.limits import Angle, Count, Positive
-from invertwin.memory import require_at_most
+from invertwin.runtime.memory import require_at_most
 from invertwin.scene.mesh import Mesh
 
 _MOST_TRIANGLES = 1e7  # of one shape

@@ -14,7 +14,7 @@ from invertwin.cli.fits import problem
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import load_run, validate
 from invertwin.errors import PhysicsWarning
-from invertwin.progress import time_left
+from invertwin.runtime.progress import time_left
 from invertwin.scene import Mesh, shapes
 from invertwin.scene.files import save_mesh
 

@@ -24,7 +24,7 @@ from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import flatten, require_edges, silhouettes_move
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
-from invertwin.progress import told
+from invertwin.runtime.progress import told
 from invertwin.scene.scene import Scene
 
 _ROWS_AT_ONCE = 1 << 18  # frames × paths

@@ -28,7 +28,7 @@ from invertwin.channel.rays.scene_tables import silhouettes_move
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.progress import told
+from invertwin.runtime.progress import told
 
 _GOLDEN = (0.754_877_666_246_692_7, 0.569_840_290_998_053_2)  # the R2 low-discrepancy sequence
 _ROWS_AT_ONCE = 1 << 18  # frames × rays

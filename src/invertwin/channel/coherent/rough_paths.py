@@ -26,7 +26,7 @@ from invertwin.channel.rays.arrays import (
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry, flatten
-from invertwin.progress import told
+from invertwin.runtime.progress import told
 from invertwin.scene.scene import Scene
 
 _LANES = 1 << 18  # walked at a time

@@ -14,8 +14,8 @@ from typing import Any
 
 import torch
 
-from invertwin import doctor, threads
 from invertwin.errors import InputError
+from invertwin.runtime import doctor, threads
 
 VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
 alone = threading.RLock()

@@ -55,7 +55,7 @@ from invertwin.channel.rcs.shooting_bouncing_rays import lit_triangles, tubes
 from invertwin.checks import differentiated
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.progress import told
+from invertwin.runtime.progress import told
 from invertwin.scene.material.fresnel import refractive_index
 from invertwin.scene.scene import Scene
 

@@ -15,9 +15,9 @@ from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.cli.schema.recordings import chirp_capture
 from invertwin.cli.schema.run_file import about, need
 from invertwin.cli.schema.shape_tables import Mover
-from invertwin.memory import free_memory, gigabytes
 from invertwin.models.radar import SurrogateMap
-from invertwin.progress import time_left
+from invertwin.runtime.memory import free_memory, gigabytes
+from invertwin.runtime.progress import time_left
 from invertwin.scene import Scene, Translation
 
 _FRAMES = 4  # of the radar, or aspects, in the probe

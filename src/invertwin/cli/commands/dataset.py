@@ -37,13 +37,13 @@ from invertwin.datasets.shards import (
     ranges,
     shard_name,
 )
-from invertwin.engines import Engine, spread
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.folders import PARTS, UNFINISHED
-from invertwin.progress import told
 from invertwin.radar import range_doppler_angle
 from invertwin.radar.radar import Radar
 from invertwin.runs import RunFolder, open_run
+from invertwin.runtime.engines import Engine, spread
+from invertwin.runtime.progress import told
 from invertwin.scene import Scene
 
 NEEDS = ("dataset", "radar", "grid", "data")

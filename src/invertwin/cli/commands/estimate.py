@@ -14,10 +14,10 @@ from invertwin.cli.schema.run_file import about, need
 from invertwin.cli.schema.signature import count_of
 from invertwin.errors import InputError
 from invertwin.inversion import require_edge
-from invertwin.memory import free_memory, gigabytes
 from invertwin.radar import SampledWaveform
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import fft_bins
+from invertwin.runtime.memory import free_memory, gigabytes
 from invertwin.scene import Mesh, Object, Scene
 from invertwin.scene.scene import warn_of_mirrors
 

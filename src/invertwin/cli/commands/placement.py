@@ -19,8 +19,8 @@ from invertwin.cli.schema.run_file import need
 from invertwin.cli.terminal import progress
 from invertwin.folders import PARTS
 from invertwin.links.metasurface.placement import Coverage, Found, Placing, Trial, evaluations_until
-from invertwin.progress import told
 from invertwin.runs import RunFolder
+from invertwin.runtime.progress import told
 from invertwin.seeds import derived_seed
 
 _AS_GOOD = 0.95

@@ -59,8 +59,8 @@ from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
 from invertwin.inversion.confidence.report import certainty, coverage
 from invertwin.inversion.fit import Fit
-from invertwin.memory import peak_memory
 from invertwin.runs import CHECKPOINT, RunFolder
+from invertwin.runtime.memory import peak_memory
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 from invertwin.scene.geometry.density import without_clouds

@@ -17,11 +17,11 @@ from rich.console import Console
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.run_file import stated, validate
 from invertwin.cli.terminal import progress
-from invertwin.engines import Engine, spread
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.folders import PARTS, UNFINISHED
-from invertwin.progress import told
 from invertwin.runs import RunFolder, open_run
+from invertwin.runtime.engines import Engine, spread
+from invertwin.runtime.progress import told
 
 QUIET = Console(quiet=True)
 FitOne = Callable[[RunFile, str, int, RunFolder], object]

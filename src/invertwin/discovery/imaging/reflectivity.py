@@ -12,9 +12,9 @@ from invertwin.channel import Grid
 from invertwin.discovery.imaging.likelihood import DEGREES, Axis, axes_of
 from invertwin.errors import InputError
 from invertwin.inversion import speckle_weight
-from invertwin.progress import told
 from invertwin.radar import Radar
 from invertwin.radar.processing.beamforming import aperture
+from invertwin.runtime.progress import told
 
 _LEAST = 1e-3  # of a response, relative to its peak: less is left out
 _NONE = 1e-30  # of a response: the place is out of sight [1/m²]

@@ -10,7 +10,7 @@ from invertwin.inversion.confidence.realisations import End
 from invertwin.inversion.confidence.uncertainty import Evidence, Uncertainty, coordinates
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import GaussNewton
-from invertwin.progress import told
+from invertwin.runtime.progress import told
 
 _STEPS, _REACH = 5, 0.1  # of a fit that begins at the truth
 

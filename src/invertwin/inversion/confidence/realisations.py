@@ -11,7 +11,7 @@ from torch import Tensor
 
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.loss import Maps, SpectrumLoss, pooled
-from invertwin.progress import told
+from invertwin.runtime.progress import told
 from invertwin.seeds import derived_seed
 
 _LOOKS = 64  # they tell a standard deviation to 9 %

@@ -16,7 +16,7 @@ from invertwin.inversion.confidence.realisations import End
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import along, penalty_curvature
 from invertwin.inversion.loss import SpectrumLoss
-from invertwin.progress import told
+from invertwin.runtime.progress import told
 from invertwin.scene.parameters import Coordinate, Entries
 
 _MOST = 64  # coordinates; each costs derivatives of the map

@@ -21,10 +21,10 @@ from invertwin.capture.capture import Capture
 from invertwin.channel import Grid, Sampling
 from invertwin.checks import ArrayLike, check_fields, checked_number
 from invertwin.errors import InputError
-from invertwin.memory import require_at_most
 from invertwin.radar.processing.detection import ordered_statistics_cfar, peaks
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate.surrogate import Surrogate, surrogate_spectrum
+from invertwin.runtime.memory import require_at_most
 from invertwin.scene import DensityGrid, Object, Scene, rigid, rotation_from_vector
 from invertwin.scene.geometry.lattice import Lattice
 

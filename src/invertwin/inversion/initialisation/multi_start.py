@@ -25,7 +25,7 @@ from invertwin.inversion.reconstruction import Reconstruction, reconstruct
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule
 from invertwin.limits import Count, Positive
-from invertwin.memory import require_at_most
+from invertwin.runtime.memory import require_at_most
 from invertwin.scene.scene import Object, Scene
 from invertwin.seeds import derived_seed
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from invertwin.checks import Point
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Axes, Count, NonNegative
-from invertwin.memory import require_at_most
+from invertwin.runtime.memory import require_at_most
 from invertwin.scene.pose import rigid, rotation_from_vector
 from invertwin.scene.scene import Object
 

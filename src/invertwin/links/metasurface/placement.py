@@ -16,7 +16,7 @@ from invertwin.limits import Angle, Count, NonNegative, Positive, Share
 from invertwin.links.metasurface.panel import Metasurface, panel_response
 from invertwin.links.metasurface.wall_path import PlacedPanel
 from invertwin.links.responses import frequency_response
-from invertwin.progress import told
+from invertwin.runtime.progress import told
 from invertwin.scene import Scene
 
 Trial = tuple[float, float, tuple[float, float]]

@@ -11,7 +11,6 @@ from scipy.special import gammainccinv
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.progress import told
 from invertwin.radar.processing.beamforming import beamform
 from invertwin.radar.processing.direction import capon, music
 from invertwin.radar.processing.doppler import (
@@ -22,6 +21,7 @@ from invertwin.radar.processing.doppler import (
 from invertwin.radar.processing.reflectors import noise_power
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
+from invertwin.runtime.progress import told
 
 # Bins of range rate on either side of zero where slow drift of what stands still is seen, and how
 # far below the still echo of its range such drift stays.

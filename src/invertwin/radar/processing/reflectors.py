@@ -10,7 +10,6 @@ from scipy.special import gammaincinv
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.progress import told
 from invertwin.radar.processing.beamforming import beamform
 from invertwin.radar.processing.detection import (
     PointCloud,
@@ -28,6 +27,7 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.signal.range_profile import range_profile
 from invertwin.radar.waveform import unit_window
+from invertwin.runtime.progress import told
 
 # With fewer range rates the cells that train a threshold lie along range alone. Half of them may
 # then hold other reflectors.

@@ -13,7 +13,6 @@ from invertwin.checks import check_fields
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
-from invertwin.progress import told
 from invertwin.radar.radar import Radar, sampled
 from invertwin.radar.signal.nufft import (
     beat_of_delays,
@@ -23,6 +22,7 @@ from invertwin.radar.signal.nufft import (
 )
 from invertwin.radar.signal.range_profile import beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, SampledWaveform, SteppedFrequency
+from invertwin.runtime.progress import told
 
 # Largest error of interpolating a path's phase factor between the instants of a ramp.
 _INTERPOLATION_ERROR = 1e-6

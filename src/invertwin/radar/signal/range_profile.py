@@ -10,10 +10,10 @@ from torch import Tensor
 from invertwin.channel import Grid, Paths
 from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.progress import told
 from invertwin.radar.radar import Radar, checked_beat, sampled
 from invertwin.radar.signal.nufft import beat_of_delays
 from invertwin.radar.waveform import PhysicsWarning, SampledWaveform, unit_window
+from invertwin.runtime.progress import told
 
 _STANDARD_TEMPERATURE = 290.0  # K, at which noise figures are defined
 

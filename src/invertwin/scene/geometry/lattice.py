@@ -9,7 +9,7 @@ from torch import Tensor
 
 from invertwin.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.errors import InputError
-from invertwin.memory import require_at_most
+from invertwin.runtime.memory import require_at_most
 
 _MOST_NODES, _MOST_ALONG = 2e7, 2000
 _DO = "give x, y, z of the box's corners"

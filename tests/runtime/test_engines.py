@@ -8,9 +8,9 @@ import time
 
 import pytest
 
-from invertwin.engines import spread
 from invertwin.errors import InputError
 from invertwin.registry.section import KeyInputError
+from invertwin.runtime.engines import spread
 
 
 def squared(number: int) -> tuple[int, str, int]:
@@ -69,7 +69,7 @@ def test_ray_that_is_not_installed_is_told(monkeypatch):
 
 SLEEPER = """
 import time
-from invertwin.engines import spread
+from invertwin.runtime.engines import spread
 if __name__ == "__main__":
     print("begun", flush=True)
     list(spread(time.sleep, [60, 60], workers=2))

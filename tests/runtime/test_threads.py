@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from invertwin.threads import available, quota
+from invertwin.runtime.threads import available, quota
 
 
 def counted(code, **environment):

@@ -1,7 +1,7 @@
 """Progress of loops."""
 
-from invertwin import progress
-from invertwin.progress import listening, told
+from invertwin.runtime import progress
+from invertwin.runtime.progress import listening, told
 
 
 def test_a_listener_hears_of_the_outer_loop_with_the_time_left(monkeypatch):

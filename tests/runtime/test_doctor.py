@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from invertwin import doctor
 from invertwin.errors import InputError
+from invertwin.runtime import doctor
 
 VERSIONS = (14, 15, 19)
 SUBSETS = [subset for size in range(4) for subset in itertools.combinations(VERSIONS, size)]

@@ -174,7 +174,7 @@ def _cluster() -> Iterator[tuple[int, Any, Any]]:
 
 def _alone(work: Callable[[Any], Any], job: Any) -> Any:
     """A piece of work on a node of a cluster."""
-    from invertwin import threads
+    from invertwin.runtime import threads
 
     # Asked for with the task; a worker with more threads would give other bits.
     if threads.available() != 1:

@@ -7,8 +7,8 @@ import textwrap
 
 import pytest
 
-from invertwin import memory
 from invertwin.errors import InputError
+from invertwin.runtime import memory
 
 
 def test_limits_of_groups_and_processes_count(monkeypatch, tmp_path):
@@ -50,7 +50,7 @@ def test_the_most_that_was_held_is_this_process_alone_and_never_falls():
     script = """
         import subprocess, sys
         child = (
-            "from invertwin.memory import peak_memory; before = peak_memory();"
+            "from invertwin.runtime.memory import peak_memory; before = peak_memory();"
             "block = b'1' * 100_000_000; held = peak_memory(); del block;"
             "print(before, held, peak_memory())"
         )
