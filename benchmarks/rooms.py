@@ -61,7 +61,7 @@ from invertwin.scene import (
     sphere,
     trihedral,
 )
-from invertwin.scene.geometry.gait import hanging
+from invertwin.scene.people.gait import hanging
 
 REQUIRED: Required = {
     "recall": (">=", 0.9),

@@ -26,10 +26,10 @@ from invertwin.radar.waveform import FMCW
 from invertwin.runs import open_run
 from invertwin.scene import linear_array, plate
 from invertwin.scene.files import load_mesh, load_scene_xml, save_mesh
-from invertwin.scene.geometry.body import load_smpl
-from invertwin.scene.geometry.lattice import Lattice
-from invertwin.scene.geometry.prior import Decoder, ShapePrior, load_prior
 from invertwin.scene.parameters import Translation
+from invertwin.scene.people.body import load_smpl
+from invertwin.scene.shape_models.lattice import Lattice
+from invertwin.scene.shape_models.prior import Decoder, ShapePrior, load_prior
 
 ALL = ("bytes", "words", "values")
 

@@ -32,7 +32,7 @@ from invertwin.scene import (
     rotation_from_vector,
     sphere,
 )
-from invertwin.scene.geometry.lattice import Lattice
+from invertwin.scene.shape_models.lattice import Lattice
 from scenes import float64, radar, thing
 
 Line = tuple[Scene, nn.Module, dict[str, Tensor]]

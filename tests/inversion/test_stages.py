@@ -13,10 +13,10 @@ from invertwin.errors import InputError
 from invertwin.inversion import Optimizer, Schedule, Stage, Unknown
 from invertwin.inversion.callbacks import stage_file
 from invertwin.inversion.regularization import Laplacian
-from invertwin.inversion.remeshing import remeshed
 from invertwin.models.radar import SurrogateMap
 from invertwin.scene import Mesh, SmoothVertices, plate
 from invertwin.scene.parameters import Scale, Translation, Vertices
+from invertwin.scene.remeshing import remeshed
 
 BUILDERS = {"place": lambda _: Translation("plate"), "size": lambda _: Scale("plate")}
 

@@ -26,7 +26,7 @@ from invertwin.scene import (
     plate,
     rigid,
 )
-from invertwin.scene.geometry.gait import hanging
+from invertwin.scene.people.gait import hanging
 from invertwin.seeds import derived_seed
 
 HEIGHT = 1.2  # of the radar above the floor [m]

@@ -50,7 +50,7 @@ from invertwin.inversion.reconstruction import reconstruct as reconstruct
 from invertwin.inversion.regularization import Laplacian as Laplacian
 from invertwin.inversion.regularization import LatentNorm as LatentNorm
 from invertwin.inversion.regularization import Regularizer as Regularizer
-from invertwin.inversion.remeshing import remeshed as remeshed
-from invertwin.inversion.remeshing import require_edge as require_edge
 from invertwin.inversion.schedule import Schedule as Schedule
 from invertwin.inversion.schedule import Stage as Stage
+from invertwin.scene.remeshing import remeshed as remeshed
+from invertwin.scene.remeshing import require_edge as require_edge

@@ -20,8 +20,8 @@ from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule, Stage, checked_stages
 from invertwin.outward import shown_by
-from invertwin.scene.geometry.density import without_clouds
 from invertwin.scene.scene import Scene
+from invertwin.scene.shape_models.density import without_clouds
 
 
 @dataclass(frozen=True)

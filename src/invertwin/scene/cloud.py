@@ -7,7 +7,7 @@ from torch import Tensor
 
 from invertwin.checks import checked_number, checked_tensor
 from invertwin.errors import InputError
-from invertwin.scene.geometry.lattice import Lattice
+from invertwin.scene.shape_models.lattice import Lattice
 
 
 @dataclass(frozen=True, eq=False)

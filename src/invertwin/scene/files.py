@@ -25,9 +25,9 @@ from invertwin.scene.material.materials import (
     RoughConductor,
     RoughDielectric,
 )
+from invertwin.scene.material.radio_materials import radio_bsdf, stated_material
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.radio_materials import radio_bsdf, stated_material
 from invertwin.scene.scene import Object, Scene
 from invertwin.untrusted import existing_file, reader, reading
 

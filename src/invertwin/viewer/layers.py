@@ -12,7 +12,7 @@ from invertwin.capture import Capture
 from invertwin.channel import Grid
 from invertwin.radar import Radar
 from invertwin.scene import Object, Scene
-from invertwin.scene.geometry.density import without_clouds
+from invertwin.scene.shape_models.density import without_clouds
 from invertwin.viewer.display import Body, Display, Layer
 
 _GREY, _RADAR = (185, 190, 199), (110, 120, 140)

@@ -12,7 +12,7 @@ from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar
 from invertwin.scene import Mesh, Scene, compose
-from invertwin.scene.geometry.density import without_clouds
+from invertwin.scene.shape_models.density import without_clouds
 from invertwin.viewer.display import Body
 
 _SAMPLES = 20_000  # rays of a map: quick, and smooth enough for the eye

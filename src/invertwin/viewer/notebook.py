@@ -14,7 +14,7 @@ from invertwin.channel import Grid
 from invertwin.inversion import Reconstruction
 from invertwin.radar import Radar, SampledWaveform
 from invertwin.scene import Scene
-from invertwin.scene.geometry.density import without_clouds
+from invertwin.scene.shape_models.density import without_clouds
 from invertwin.viewer.display import Display
 from invertwin.viewer.layers import display_of
 from invertwin.viewer.link import Link

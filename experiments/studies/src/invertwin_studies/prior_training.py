@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from invertwin.checks import checked_count, checked_number
 from invertwin.errors import InputError
-from invertwin.scene.geometry.lattice import Lattice
-from invertwin.scene.geometry.prior import Decoder, ShapePrior
+from invertwin.scene.shape_models.lattice import Lattice
+from invertwin.scene.shape_models.prior import Decoder, ShapePrior
 from invertwin_studies.vehicles import car_distance, sample_car
 
 _LOW, _HIGH = (-3.4, -1.2, -0.08), (3.2, 1.2, 2.24)  # holds every car of the generator [m]

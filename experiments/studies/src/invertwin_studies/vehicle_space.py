@@ -10,11 +10,11 @@ from torch import Tensor
 
 from invertwin.cli.schema.shape_tables import ObjectTable
 from invertwin.errors import InputError
-from invertwin.inversion.remeshing import remeshed
 from invertwin.limits import Count, Positive
 from invertwin.registry.section import InputPath
 from invertwin.scene import LinearShape, Mesh, ShapeSpace
 from invertwin.scene.files import load_mesh
+from invertwin.scene.remeshing import remeshed
 from invertwin.untrusted import read_arrays
 
 Level = Literal["coarse", "fine"]

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from invertwin.checks import checked_count, checked_number
 from invertwin.errors import InputError
-from invertwin.scene.geometry.iso_surface import iso_surface
-from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.shape_models.iso_surface import iso_surface
+from invertwin.scene.shape_models.lattice import Lattice
 
 _MARGIN = 0.12  # of the lattice around a car [m]
 _UP = (0.0, 0.03)  # how the underbody rises from the sills to the bumpers [m]

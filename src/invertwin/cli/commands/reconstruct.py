@@ -63,7 +63,7 @@ from invertwin.runs import CHECKPOINT, RunFolder
 from invertwin.runtime.memory import peak_memory
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
-from invertwin.scene.geometry.density import without_clouds
+from invertwin.scene.shape_models.density import without_clouds
 from invertwin.viewer import MEASURED, SIMULATED, Display, Link, Step, Viewer, view_html
 
 _VALUES_OF_STEPS = 200_000  # of the maps of a step that is shown while the fit goes on

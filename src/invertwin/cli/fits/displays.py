@@ -16,7 +16,7 @@ from invertwin.folders import PARTS
 from invertwin.inversion import Callback
 from invertwin.inversion.fit import Fit
 from invertwin.scene import Scene
-from invertwin.scene.geometry.density import without_clouds
+from invertwin.scene.shape_models.density import without_clouds
 from invertwin.viewer import (
     MEASURED,
     SIMULATED,

@@ -27,7 +27,7 @@ from invertwin.models.radar import surrogate_correlation
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene import Mesh, Scene, SkinnedBody
-from invertwin.scene.geometry.density import without_clouds
+from invertwin.scene.shape_models.density import without_clouds
 
 
 def certainty_table(metrics: dict[str, Any]) -> Table:

@@ -17,7 +17,7 @@ from invertwin.inversion.metrics import (
     volume_iou,
 )
 from invertwin.scene import Mesh, Scene
-from invertwin.scene.geometry.density import without_clouds
+from invertwin.scene.shape_models.density import without_clouds
 
 CURVE = "chamfer_m"
 """What the curves show."""

@@ -7,7 +7,7 @@ from invertwin.cli.schema.run_file import about
 from invertwin.cli.schema.shape_tables import ObjectTable, joint_places, template_of
 from invertwin.errors import InputError
 from invertwin.scene import InMotion, Mover, Scene, Sitting, Walking, Waving
-from invertwin.scene.geometry.body import BodyTemplate
+from invertwin.scene.people.body import BodyTemplate
 
 _PEOPLE = (Walking, Sitting, Waving)
 

@@ -15,7 +15,7 @@ from invertwin.models.radio import RadioMap
 from invertwin.registry.kinds import OneOf, TableOf, registry
 from invertwin.registry.section import Section, Seed, Vector, about, key
 from invertwin.scene import AntennaArray, Mesh, Scene, look_at, rotation_from_vector
-from invertwin.scene.geometry.distance import signed_distance
+from invertwin.scene.shape_models.distance import signed_distance
 
 _TRIES = 10_000  # places that are drawn, before that is given up
 

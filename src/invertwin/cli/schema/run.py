@@ -40,7 +40,7 @@ from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.registry.kinds import NameOf, OneOf, TableOf, load_plugins, registry
 from invertwin.registry.section import InputPath, Section, Seed, Vector, Words, fail, key
-from invertwin.scene.room import room
+from invertwin.scene.rooms import room
 from invertwin.signatures import rcs
 
 # How a run calls its own fits, and how names of its metrics end.

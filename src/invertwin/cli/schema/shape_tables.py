@@ -42,9 +42,9 @@ from invertwin.scene import (
     shapes,
 )
 from invertwin.scene.files import load_mesh
-from invertwin.scene.geometry.body import BodyTemplate
-from invertwin.scene.geometry.body_models import body, body_template
 from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation, Vertices
+from invertwin.scene.people.body import BodyTemplate
+from invertwin.scene.people.body_models import body, body_template
 
 
 class Placement(Table):

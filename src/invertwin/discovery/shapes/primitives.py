@@ -22,8 +22,8 @@ from invertwin.scene import (
     Surface,
     person,
 )
-from invertwin.scene.geometry.gait import hanging
 from invertwin.scene.parameters import Coordinate
+from invertwin.scene.people.gait import hanging
 from invertwin.scene.shapes import box, cylinder, sphere
 
 Kind = Literal["wall", "box", "cylinder", "sphere", "point", "person", "vehicle", "corner", "prism"]

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from invertwin.discovery.shapes.primitives import Figure, Primitive, Unknown
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.scene import DistanceGrid, Mesh, iso_surface, signed_distance
-from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.parameters import Coordinate
+from invertwin.scene.shape_models.lattice import Lattice
 
 _SMOOTH = 20.0  # of signed distances, see ``DistanceGrid``
 _MARGIN = 6  # nodes around what a prism starts from

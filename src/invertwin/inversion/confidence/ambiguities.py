@@ -15,10 +15,10 @@ from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.initialisation.starts import displaced
 from invertwin.inversion.metrics import residual, surface_points
-from invertwin.inversion.remeshing import closest_points
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import Pose
 from invertwin.scene.pose import quaternion_from_vector
+from invertwin.scene.remeshing import closest_points
 from invertwin.scene.scene import Object, Scene
 
 REJECTED = 2.33  # standard deviations: one right rival in a hundred is rejected

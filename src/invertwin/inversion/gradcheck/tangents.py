@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from invertwin.checks import ArrayLike, Point
 from invertwin.errors import InputError
 from invertwin.limits import Positive
-from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.parameters import Entries
+from invertwin.scene.shape_models.lattice import Lattice
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate.surrogate import Surrogate, surrogate_spectrum
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene import DensityGrid, Object, Scene, rigid, rotation_from_vector
-from invertwin.scene.geometry.lattice import Lattice
+from invertwin.scene.shape_models.lattice import Lattice
 
 _TURNS = 91  # yaws that a rectangle is tried at, over a quarter turn
 _EDGE = 0.02  # share of the points beyond a side of a rectangle

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 
 from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
-from invertwin.scene.geometry.iso_surface import follow, surface_of
-from invertwin.scene.geometry.lattice import Lattice, cubic, cubic_slices
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
+from invertwin.scene.shape_models.iso_surface import follow, surface_of
+from invertwin.scene.shape_models.lattice import Lattice, cubic, cubic_slices
 from invertwin.untrusted import read_arrays, reader
 
 _MODEL = "vehicle_prior.npz"

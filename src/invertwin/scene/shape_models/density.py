@@ -12,11 +12,11 @@ from invertwin.checks import ArrayLike, Counts, Point, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Positive
 from invertwin.scene.cloud import Cloud
-from invertwin.scene.geometry.distance import signed_distance
-from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import Entries, ObjectModule
 from invertwin.scene.scene import Object, Scene
+from invertwin.scene.shape_models.distance import signed_distance
+from invertwin.scene.shape_models.lattice import Lattice
 
 # Starts are kept this far above zero, in units of one over a node spacing: below, softplus is so
 # flat that a density could not come back.

@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 
 from invertwin.checks import Point
 from invertwin.limits import RADIANS, Positive
-from invertwin.scene.geometry.anny_body import load_anny
-from invertwin.scene.geometry.body import BodyTemplate, load_smpl
-from invertwin.scene.geometry.person import person
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.people.anny_body import load_anny
+from invertwin.scene.people.body import BodyTemplate, load_smpl
+from invertwin.scene.people.person import person
 
 Model = Literal["person", "anny"]
 _AT_REST: dict[str, Point] = {}

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.scene import Mesh, PriorShape, Scene, ShapePrior, box, load_prior
-from invertwin.scene.geometry.lattice import Lattice
-from invertwin.scene.geometry.prior import Decoder
+from invertwin.scene.shape_models.lattice import Lattice
+from invertwin.scene.shape_models.prior import Decoder
 from scenes import float64, thing
 
 PRIOR = load_prior()

@@ -15,7 +15,7 @@ from invertwin.scene import (
     rigid,
     standing_height,
 )
-from invertwin.scene.geometry.gait import leg_length
+from invertwin.scene.people.gait import leg_length
 from scenes import float64
 
 BODY = person(spacing=0.05)

@@ -8,8 +8,8 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.scene.geometry.lattice import Lattice
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.shape_models.lattice import Lattice
 
 Field = Callable[[Float64[Tensor, "p 3"]], Float64[Tensor, " p"]]
 

@@ -7,8 +7,8 @@ from torch import Tensor
 from invertwin.errors import InputError
 from invertwin.inversion.metrics import volume_iou
 from invertwin.scene import DensityGrid, Object, RoughDielectric, Scene, plate, sphere
-from invertwin.scene.geometry.density import without_clouds
 from invertwin.scene.parameters import Scale, Translation
+from invertwin.scene.shape_models.density import without_clouds
 
 BOX = [-0.5] * 3, [0.5] * 3
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.scene.geometry.body import BodyTemplate
+from invertwin.scene.people.body import BodyTemplate
 
 _STEP = 0.05  # of a phenotype, either side, for its direction
 # Anny's people face −y, z up; ours face −z, y up.

@@ -9,8 +9,8 @@ from torch.autograd import gradcheck
 
 from invertwin.errors import InputError
 from invertwin.scene import Scene, SmoothVertices, box, sphere
-from invertwin.scene.geometry.smooth_vertices import Smoother, laplacian
 from invertwin.scene.parameters import Vertices
+from invertwin.scene.shape_models.smooth_vertices import Smoother, laplacian
 from scenes import thing
 
 BALL = sphere(0.2, subdivisions=2)

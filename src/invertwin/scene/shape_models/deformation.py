@@ -6,9 +6,9 @@ from torch import Tensor, nn
 
 from invertwin.checks import Counts, Point
 from invertwin.errors import InputError
-from invertwin.scene.geometry.lattice import Lattice, tensor_product
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
+from invertwin.scene.shape_models.lattice import Lattice, tensor_product
 
 
 class LatticeDeformation(ObjectModule):

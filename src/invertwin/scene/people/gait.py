@@ -25,8 +25,8 @@ from torch import Tensor
 from invertwin.checks import checked_number, checked_type
 from invertwin.errors import InputError
 from invertwin.limits import Positive
-from invertwin.scene.geometry.body import BodyTemplate
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.people.body import BodyTemplate
 from invertwin.scene.pose import compose, rigid, rotation_from_vector
 from invertwin.scene.scene import Object
 

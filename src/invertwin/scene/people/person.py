@@ -5,9 +5,9 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.checks import checked_number
-from invertwin.scene.geometry.body import BodyTemplate
-from invertwin.scene.geometry.iso_surface import iso_surface
-from invertwin.scene.geometry.lattice import Lattice
+from invertwin.scene.people.body import BodyTemplate
+from invertwin.scene.shape_models.iso_surface import iso_surface
+from invertwin.scene.shape_models.lattice import Lattice
 
 # Joints of a person 1.75 m tall who stands with the arms held out, as [m] from the pelvis.
 _JOINTS: dict[str, tuple[str | None, tuple[float, float, float]]] = {

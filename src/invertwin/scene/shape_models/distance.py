@@ -22,10 +22,10 @@ from invertwin.checks import (
     checked_tensor,
 )
 from invertwin.limits import NonNegative, Positive
-from invertwin.scene.geometry.iso_surface import iso_surface
-from invertwin.scene.geometry.lattice import Lattice, cubic
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
+from invertwin.scene.shape_models.iso_surface import iso_surface
+from invertwin.scene.shape_models.lattice import Lattice, cubic
 
 
 def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:

@@ -20,7 +20,7 @@ from invertwin.scene import (
     iso_surface,
     sphere,
 )
-from invertwin.scene.geometry.lattice import Lattice
+from invertwin.scene.shape_models.lattice import Lattice
 from scenes import float64, thing
 
 SCENE = Scene({"ball": thing(sphere(0.2, 1), (0.1, 0.2, 2.0), (0.3, 0.0, 0.5))})

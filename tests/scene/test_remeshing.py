@@ -6,8 +6,8 @@ import torch
 from invertwin.errors import InputError
 from invertwin.inversion import compare_shapes
 from invertwin.inversion.metrics import is_watertight
-from invertwin.inversion.remeshing import closest_points, remeshed
 from invertwin.scene import Mesh, box, plate, signed_distance, sphere, text
+from invertwin.scene.remeshing import closest_points, remeshed
 from scenes import float64
 
 

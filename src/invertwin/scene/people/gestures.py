@@ -20,8 +20,8 @@ from torch import Tensor
 from invertwin.checks import checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Positive
-from invertwin.scene.geometry.body import BodyTemplate
-from invertwin.scene.geometry.gait import (
+from invertwin.scene.people.body import BodyTemplate
+from invertwin.scene.people.gait import (
     Posture,
     Walking,
     about,
