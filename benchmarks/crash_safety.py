@@ -35,7 +35,7 @@ import numpy as np
 from report import MetricTable, Required, write
 
 from invertwin.capture import Capture
-from invertwin.folders import UNFINISHED
+from invertwin.storage.folders import UNFINISHED
 
 KILLS, PAIRS, SECONDS = 100, 20, 900.0
 SAME = 1e-6  # a difference of numbers of one run [m, or relative]

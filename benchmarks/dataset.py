@@ -34,7 +34,7 @@ from typing import Any
 from report import MetricTable, Required, write
 
 import invertwin
-from invertwin.folders import UNFINISHED
+from invertwin.storage.folders import UNFINISHED
 
 ROOMS = Path(__file__).resolve().parents[1] / "experiments" / "dataset_rooms.toml"
 SAMPLES, KILLS, REPEATS, SECONDS = 200, 10, 2, 3600.0

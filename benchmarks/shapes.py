@@ -53,8 +53,8 @@ from invertwin.cli.fits.problem import FULL, problem_of
 from invertwin.cli.fits.spreading import Workers
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.run_file import load_run, stated, to_toml, validate
-from invertwin.runs import open_run
 from invertwin.runtime.engines import spread
+from invertwin.storage.run_folder import open_run
 
 RUN = Path(__file__).parents[1] / "experiments" / "shape_car_prior_public.toml"
 CARS = 20

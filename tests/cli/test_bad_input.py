@@ -9,10 +9,10 @@ from invertwin.capture import Capture
 from invertwin.capture.readers.netcdf import write_dataset
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import load_run
-from invertwin.folders import MANIFEST
-from invertwin.runs import open_run
 from invertwin.scene import Mesh, plate
 from invertwin.scene.files import save_mesh
+from invertwin.storage.folders import MANIFEST
+from invertwin.storage.run_folder import open_run
 
 NAN_VERTEX = """ply
 format ascii 1.0

@@ -174,7 +174,7 @@ def test_a_run_that_is_killed_goes_on_to_the_same_bytes(whole, monkeypatch):
     # Dies as kill -9 does, once the first shard is written.
     script = f"""
 import os, sys
-from invertwin.runs import RunFolder
+from invertwin.storage.run_folder import RunFolder
 from invertwin.cli import app
 write = RunFolder.write_json
 def last(self, name, value):

@@ -10,7 +10,7 @@ from cli.test_radio import STARTS as RADIO_STARTS
 from invertwin.cli.commands import reconstruct as run_reconstruct
 from invertwin.cli.fits import spreading
 from invertwin.cli.fits.spreading import part_name
-from invertwin.folders import PARTS
+from invertwin.storage.folders import PARTS
 
 SHORT = RUN.replace("steps = 8", "steps = 3")
 VARIANT = "\n[variants.fixed]\nreconstruct = { boundary = false }\n"

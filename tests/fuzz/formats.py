@@ -23,13 +23,13 @@ from invertwin.inversion.fit import Fit, Progress
 from invertwin.radar.boards import Mounting
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW
-from invertwin.runs import open_run
 from invertwin.scene import linear_array, plate
 from invertwin.scene.files import load_mesh, load_scene_xml, save_mesh
 from invertwin.scene.parameters import Translation
 from invertwin.scene.people.body import load_smpl
 from invertwin.scene.shape_models.lattice import Lattice
 from invertwin.scene.shape_models.prior import Decoder, ShapePrior, load_prior
+from invertwin.storage.run_folder import open_run
 
 ALL = ("bytes", "words", "values")
 

@@ -31,7 +31,7 @@ from invertwin.scene import (
     sphere,
     text,
 )
-from invertwin.untrusted import read_arrays
+from invertwin.storage.untrusted import read_arrays
 
 
 def triangles(mesh: Mesh) -> np.ndarray:

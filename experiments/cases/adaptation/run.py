@@ -26,9 +26,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rooms import Room, Samples
 
-from invertwin.folders import replacing
 from invertwin.plotting import PALETTE
 from invertwin.seeds import derived_seed
+from invertwin.storage.folders import replacing
 
 WEAK, STRONG = (1.5, 4.0), (60.0, 200.0)  # permittivity of walls: generic and unseen rooms
 GENERIC, UNSEEN, TRUE, SITE, SEEN, TESTED = range(1, 7)  # keys of seeds

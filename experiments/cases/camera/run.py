@@ -26,7 +26,6 @@ from matplotlib.figure import Figure
 
 import invertwin as iw
 from invertwin.camera import Camera, ImageSampling, Photograph, photograph
-from invertwin.folders import replacing
 from invertwin.inversion import Check, Unknown
 from invertwin.models.camera import DepthMap, SilhouetteMap
 from invertwin.plotting import PALETTE
@@ -41,6 +40,7 @@ from invertwin.scene import (
     rigid,
     rotation_from_vector,
 )
+from invertwin.storage.folders import replacing
 
 PAINT = RoughDielectric(permittivity=4.0)
 MASK_WEIGHT = 3.0

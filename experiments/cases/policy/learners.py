@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
 
-from invertwin.folders import replacing
 from invertwin.seeds import derived_seed
+from invertwin.storage.folders import replacing
 
 RATE = 1e-2
 CHUNK = 10  # updates between two looks at the success

@@ -28,9 +28,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from torch import Tensor
 
-from invertwin.folders import replacing
 from invertwin.plotting import PALETTE
 from invertwin.seeds import derived_seed
+from invertwin.storage.folders import replacing
 
 TARGET = 0.8  # success to which steps are counted
 WATCHED, UNSEEN, CHECKED = 1, 2, 3  # keys of the seeds of worlds that no training draws

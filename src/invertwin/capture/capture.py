@@ -20,7 +20,7 @@ from invertwin.outward import shown_by
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
-from invertwin.untrusted import reading
+from invertwin.storage.untrusted import reading
 
 BEAT_DIMS = ("frame", "tx", "rx", "sample")
 PROFILE_DIMS = ("frame", "range")

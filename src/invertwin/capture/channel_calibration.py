@@ -15,10 +15,10 @@ from invertwin.capture.readers.radar_fields import labelled
 from invertwin.checks import checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.folders import replacing
 from invertwin.radar.radar import sampled
 from invertwin.radar.waveform import unit_window
-from invertwin.untrusted import existing_file, reading
+from invertwin.storage.folders import replacing
+from invertwin.storage.untrusted import existing_file, reading
 
 Recorded = TypeVar("Recorded", bound=Capture | ChirpCapture)
 _DEAD = 1e-3

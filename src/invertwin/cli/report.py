@@ -15,7 +15,7 @@ from invertwin import __version__
 if TYPE_CHECKING:  # Matplotlib takes half a second, and most errors come before any figure
     from matplotlib.figure import Figure
 
-    from invertwin.runs import RunFolder
+    from invertwin.storage.run_folder import RunFolder
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from invertwin.cli.options import Options, Where, console
 from invertwin.cli.report import Table, is_number, shown
 from invertwin.cli.schema.run_file import about_file, load_run, need, to_toml
 from invertwin.errors import InputError
-from invertwin.folders import PARTS
-from invertwin.runs import RunFolder, open_run
 from invertwin.runtime.progress import listening, time_left
+from invertwin.storage.folders import PARTS
+from invertwin.storage.run_folder import RunFolder, open_run
 
 _LOG_SECONDS = 10.0  # between lines of progress in a log
 

@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 
 from invertwin.datasets.shards import Manifest, members_of, read_manifests
 from invertwin.errors import InputError
-from invertwin.untrusted import reading
+from invertwin.storage.untrusted import reading
 
 
 class Samples(Dataset[Any]):

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from invertwin.errors import InputError
-from invertwin.untrusted import reading
+from invertwin.storage.untrusted import reading
 
 MANIFEST = "manifest.json"
 FORMAT = "invertwin data set 1"

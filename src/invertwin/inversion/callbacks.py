@@ -17,11 +17,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from invertwin.errors import InputError
-from invertwin.folders import replacing
 from invertwin.inversion.fit import Callback, Fit
 from invertwin.runtime.progress import time_left
 from invertwin.scene.scene import Scene
-from invertwin.untrusted import reading
+from invertwin.storage.folders import replacing
+from invertwin.storage.untrusted import reading
 
 
 @contextmanager

@@ -18,7 +18,6 @@ from trimesh.visual.texture import TextureVisuals
 
 from invertwin.checks import checked_tensor
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.folders import replacing
 from invertwin.scene import shapes
 from invertwin.scene.material.materials import (
     PerfectConductor,
@@ -29,7 +28,8 @@ from invertwin.scene.material.radio_materials import radio_bsdf, stated_material
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Object, Scene
-from invertwin.untrusted import existing_file, reader, reading
+from invertwin.storage.folders import replacing
+from invertwin.storage.untrusted import existing_file, reader, reading
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".inp")
 _CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # of shell elements, by the digit in their type

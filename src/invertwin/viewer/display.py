@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.folders import replacing
-from invertwin.untrusted import read_arrays, reading
+from invertwin.storage.folders import replacing
+from invertwin.storage.untrusted import read_arrays, reading
 
 _FORMAT = 2
 _DO = "repeat the run with --overwrite"

@@ -24,7 +24,7 @@ from invertwin.models.radar import BeatMap, SurrogateMap
 from invertwin.radar.processing.direction import music
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import range_profile
-from invertwin.runs import RunFolder
+from invertwin.storage.run_folder import RunFolder
 from invertwin_studies.figures import Curve, deep_minima, scan
 from invertwin_studies.sections import LossScan
 

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from invertwin.cli.report import Picture, Table, report_html
 from invertwin.plotting import PALETTE, png_bytes
-from invertwin.runs import RunFolder
 from invertwin.scene import Mesh, ShapePrior, load_prior
+from invertwin.storage.run_folder import RunFolder
 from invertwin_studies.prior_training import Trained, Training, train_prior
 
 _SHOWN = 4  # coordinates of the picture

@@ -15,7 +15,7 @@ from invertwin.registry.section import InputPath
 from invertwin.scene import LinearShape, Mesh, ShapeSpace
 from invertwin.scene.files import load_mesh
 from invertwin.scene.remeshing import remeshed
-from invertwin.untrusted import read_arrays
+from invertwin.storage.untrusted import read_arrays
 
 Level = Literal["coarse", "fine"]
 _TRAINED = 79  # vehicles behind the public space: σ of mode k is its singular value over √79

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from invertwin.capture.track import Track
 from invertwin.errors import InputError
-from invertwin.untrusted import reader
+from invertwin.storage.untrusted import reader
 
 # Where messages with poses keep the place, by the names of their fields.
 _PLACES = ("pose.pose.position", "pose.position", "transform.translation", "point", "position")

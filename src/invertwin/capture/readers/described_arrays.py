@@ -12,14 +12,14 @@ import scipy.io
 import tomli_w
 import torch
 
-from invertwin.apart import read_apart
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
 from invertwin.checks import checked_tensor
 from invertwin.errors import InputError
-from invertwin.folders import replacing
 from invertwin.radar.boards import Elements, Mounting
 from invertwin.scene.antenna import AntennaArray
-from invertwin.untrusted import (
+from invertwin.storage.folders import replacing
+from invertwin.storage.isolated_reader import read_apart
+from invertwin.storage.untrusted import (
     existing_file,
     read_arrays,
     read_npy,

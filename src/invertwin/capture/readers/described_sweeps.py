@@ -24,7 +24,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SteppedFrequency
 from invertwin.scene import look_at
-from invertwin.untrusted import read_npy, read_text, reader, reading
+from invertwin.storage.untrusted import read_npy, read_text, reader, reading
 
 TOUCHSTONE = re.compile(r"\.s\d+p", re.IGNORECASE)
 """Ending of a Touchstone file."""

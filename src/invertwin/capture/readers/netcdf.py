@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from invertwin.apart import read_apart
 from invertwin.errors import InputError
-from invertwin.folders import replacing
-from invertwin.untrusted import existing_file, reading
+from invertwin.storage.folders import replacing
+from invertwin.storage.isolated_reader import read_apart
+from invertwin.storage.untrusted import existing_file, reading
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:

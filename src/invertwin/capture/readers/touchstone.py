@@ -11,7 +11,7 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.untrusted import read_text, reading
+from invertwin.storage.untrusted import read_text, reading
 
 _UNITS = {"HZ": 1.0, "KHZ": 1e3, "MHZ": 1e6, "GHZ": 1e9}
 _FORMATS = ("MA", "DB", "RI")

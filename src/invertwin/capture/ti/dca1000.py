@@ -31,9 +31,9 @@ from invertwin.capture.ti.layouts import (
 from invertwin.capture.ti.mmwave_studio import read_studio, setup_files
 from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.errors import InputError
-from invertwin.folders import replacing
 from invertwin.radar.waveform import PhysicsWarning
-from invertwin.untrusted import existing_file, reader
+from invertwin.storage.folders import replacing
+from invertwin.storage.untrusted import existing_file, reader
 
 _WORD = np.dtype("<i2")
 

@@ -18,8 +18,8 @@ from invertwin.capture.ti.chirp_table import (
     text,
 )
 from invertwin.errors import InputError
-from invertwin.folders import replacing
-from invertwin.untrusted import existing_file, read_text, reader, reading
+from invertwin.storage.folders import replacing
+from invertwin.storage.untrusted import existing_file, read_text, reader, reading
 
 # Names of the numbers of a profile, and of the frame.
 _PROFILE = (

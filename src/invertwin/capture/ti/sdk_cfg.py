@@ -15,8 +15,8 @@ from invertwin.capture.ti.chirp_table import (
     text,
 )
 from invertwin.errors import InputError
-from invertwin.folders import replacing
-from invertwin.untrusted import read_text, reader
+from invertwin.storage.folders import replacing
+from invertwin.storage.untrusted import read_text, reader
 
 # Fewest arguments of the commands that are read.
 _ARGUMENTS = {

@@ -38,13 +38,13 @@ from invertwin.datasets.shards import (
     shard_name,
 )
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.folders import PARTS, UNFINISHED
 from invertwin.radar import range_doppler_angle
 from invertwin.radar.radar import Radar
-from invertwin.runs import RunFolder, open_run
 from invertwin.runtime.engines import Engine, spread
 from invertwin.runtime.progress import told
 from invertwin.scene import Scene
+from invertwin.storage.folders import PARTS, UNFINISHED
+from invertwin.storage.run_folder import RunFolder, open_run
 
 NEEDS = ("dataset", "radar", "grid", "data")
 _COMPUTE = ("drjit", "finufft", "mitsuba", "numpy", "torch")

@@ -28,9 +28,9 @@ from invertwin.models.radar import SurrogateMap
 from invertwin.models.radio import PanelMap
 from invertwin.models.rcs import SignatureMap
 from invertwin.radar.radar import Radar
-from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.signatures import Signature
+from invertwin.storage.run_folder import RunFolder
 
 _COLUMNS = (
     *("scene", "L1 full", "L1 interior", "L1 no interior edges", "L1 no contact", "ratio"),

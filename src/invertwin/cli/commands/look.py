@@ -41,7 +41,7 @@ from invertwin.radar.boards import Mounting
 from invertwin.radar.processing import doppler_maps
 from invertwin.radar.signal import range_profile
 from invertwin.registry.kinds import load_plugins, registry
-from invertwin.runs import RunFolder
+from invertwin.storage.run_folder import RunFolder
 
 Recording = Capture | ChirpCapture
 _ENDINGS = ".bin, .setup.json, .toml, .s1p, .s2p, .nc or .npz"

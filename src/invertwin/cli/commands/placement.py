@@ -17,11 +17,11 @@ from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.placement import Placement
 from invertwin.cli.schema.run_file import need
 from invertwin.cli.terminal import progress
-from invertwin.folders import PARTS
 from invertwin.links.metasurface.placement import Coverage, Found, Placing, Trial, evaluations_until
-from invertwin.runs import RunFolder
 from invertwin.runtime.progress import told
 from invertwin.seeds import derived_seed
+from invertwin.storage.folders import PARTS
+from invertwin.storage.run_folder import RunFolder
 
 _AS_GOOD = 0.95
 _CELLS = 2500  # of a drawn map

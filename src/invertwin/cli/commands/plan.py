@@ -22,11 +22,11 @@ from invertwin.cli.schema import Plan, RunFile, SimulatedData, build
 from invertwin.cli.schema.run_file import need
 from invertwin.cli.terminal import progress
 from invertwin.errors import InputError
-from invertwin.folders import PARTS
 from invertwin.inversion import fit_at, planned
 from invertwin.inversion.confidence.planning import missed
 from invertwin.inversion.confidence.report import bars
-from invertwin.runs import RunFolder
+from invertwin.storage.folders import PARTS
+from invertwin.storage.run_folder import RunFolder
 
 
 def run_plan(

@@ -10,7 +10,7 @@ from invertwin.cli.schema.run_file import about
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW
-from invertwin.runs import RunFolder
+from invertwin.storage.run_folder import RunFolder
 
 # A largest sample at this part of the full scale leaves room for those of other seeds.
 _HEADROOM = 1.25

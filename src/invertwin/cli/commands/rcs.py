@@ -18,9 +18,9 @@ from invertwin.cli.schema.run_file import about, need
 from invertwin.cli.schema.signature import Measurement, Rcs
 from invertwin.cli.terminal import in_parts
 from invertwin.errors import InputError
-from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.signatures import Signature, decibels
+from invertwin.storage.run_folder import RunFolder
 
 _NOTHING = -200.0  # dBsm that rounding leaves where there is no field
 _SAME = 1e-6  # rad or share of the frequency by which a measured row may be off a swept one

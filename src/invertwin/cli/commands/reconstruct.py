@@ -59,11 +59,11 @@ from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
 from invertwin.inversion.confidence.report import certainty, coverage
 from invertwin.inversion.fit import Fit
-from invertwin.runs import CHECKPOINT, RunFolder
 from invertwin.runtime.memory import peak_memory
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 from invertwin.scene.shape_models.density import without_clouds
+from invertwin.storage.run_folder import CHECKPOINT, RunFolder
 from invertwin.viewer import MEASURED, SIMULATED, Display, Link, Step, Viewer, view_html
 
 _VALUES_OF_STEPS = 200_000  # of the maps of a step that is shown while the fit goes on

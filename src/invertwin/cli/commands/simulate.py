@@ -25,10 +25,10 @@ from invertwin.radar import FMCW, velocity_span
 from invertwin.radar.processing import doppler_maps
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
-from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 from invertwin.simulation import Simulation, simulate, simulate_chirps
+from invertwin.storage.run_folder import RunFolder
 
 _SURROGATE_SAMPLES = 2_000_000
 _Outcome = tuple[torch.Tensor, dict[str, Any], Figure, str]  # signals, metrics, picture, its note

@@ -21,8 +21,8 @@ from invertwin.inversion.initialisation.detections import Ground
 from invertwin.inversion.metrics import compare_shapes
 from invertwin.plotting import found as pictures
 from invertwin.plotting import spectrum
-from invertwin.runs import RunFolder
 from invertwin.scene import RoughDielectric, Scene, joined, save_mesh
+from invertwin.storage.run_folder import RunFolder
 
 _SURE = 0.5  # confidence of things that are counted
 # Of the command line; they win over those of a run file.

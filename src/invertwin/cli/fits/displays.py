@@ -12,11 +12,11 @@ from torch import Tensor
 
 from invertwin.cli.fits.problem import Problem, fitted_objects
 from invertwin.errors import InputError
-from invertwin.folders import PARTS
 from invertwin.inversion import Callback
 from invertwin.inversion.fit import Fit
 from invertwin.scene import Scene
 from invertwin.scene.shape_models.density import without_clouds
+from invertwin.storage.folders import PARTS
 from invertwin.viewer import (
     MEASURED,
     SIMULATED,

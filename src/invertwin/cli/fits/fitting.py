@@ -31,7 +31,6 @@ from invertwin.cli.fits.shape_scores import CURVE, watch_of
 from invertwin.cli.fits.spreading import part_name
 from invertwin.cli.schema import build
 from invertwin.errors import InputError
-from invertwin.folders import PARTS
 from invertwin.inversion import (
     Callback,
     Checkpoint,
@@ -48,9 +47,10 @@ from invertwin.inversion.callbacks import stage_file
 from invertwin.inversion.confidence.report import certainty
 from invertwin.inversion.fit import Fit
 from invertwin.radar.parameters import ClockOffset, RangeBias
-from invertwin.runs import RunFolder
 from invertwin.scene import Object, Scene
 from invertwin.seeds import derived_seed
+from invertwin.storage.folders import PARTS
+from invertwin.storage.run_folder import RunFolder
 from invertwin.viewer import Step
 
 

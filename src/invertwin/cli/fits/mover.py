@@ -36,9 +36,9 @@ from invertwin.inversion import (
 from invertwin.models.doppler import MotionMap
 from invertwin.plotting import RATE_LABEL, U_LABEL, Panel
 from invertwin.radar.processing import doppler_maps
-from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
+from invertwin.storage.run_folder import RunFolder
 
 _CELLS = 4  # about the mover, that twin and point are scored on
 _DRAWN_CELLS = 8

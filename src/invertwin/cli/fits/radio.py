@@ -37,9 +37,9 @@ from invertwin.inversion.confidence.ambiguities import REJECTED, score
 from invertwin.inversion.confidence.report import certainty
 from invertwin.links import Points, Transmitters
 from invertwin.models.radio import RadioMap
-from invertwin.runs import RunFolder
 from invertwin.scene import Scene
 from invertwin.seeds import derived_seed
+from invertwin.storage.run_folder import RunFolder
 
 _TRANSMITTER = "transmitter"  # kind of its parameter
 _FEW_ENDS = 2  # of other starts: fewer say nothing about how ends scatter

@@ -18,10 +18,10 @@ from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.run_file import stated, validate
 from invertwin.cli.terminal import progress
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.folders import PARTS, UNFINISHED
-from invertwin.runs import RunFolder, open_run
 from invertwin.runtime.engines import Engine, spread
 from invertwin.runtime.progress import told
+from invertwin.storage.folders import PARTS, UNFINISHED
+from invertwin.storage.run_folder import RunFolder, open_run
 
 QUIET = Console(quiet=True)
 FitOne = Callable[[RunFile, str, int, RunFolder], object]

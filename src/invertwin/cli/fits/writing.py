@@ -21,9 +21,9 @@ from invertwin.cli.fits.shape_scores import CURVE, is_shape_key, shape_label, sh
 from invertwin.cli.report import Picture, Table, picture, quantities, shown, texts
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.inversion.metrics import residual
-from invertwin.runs import RunFolder
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.material.values import RANGES
+from invertwin.storage.run_folder import RunFolder
 
 _MATERIAL = {f"{name}_error": name for name in RANGES}
 _UNITS = {"translation": " [m]", "rotation": " [rad, rotation vector]", "scale": " [factor]"}

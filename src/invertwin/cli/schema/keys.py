@@ -13,9 +13,9 @@ from typing import Any
 
 from invertwin.cli.report import Table
 from invertwin.errors import InputError
-from invertwin.folders import replacing
 from invertwin.registry.kinds import PLUGINS
 from invertwin.runtime.doctor import cache_folder
+from invertwin.storage.folders import replacing
 
 COLUMNS = ("key", "value", "default", "unit or meaning")
 _WORDS = {"number": "number", "integer": "integer", "boolean": "true or false", "string": "text"}

@@ -27,7 +27,7 @@ from invertwin.scene import (
 )
 from invertwin.scene.material.materials import Medium
 from invertwin.scene.material.values import RANGES, Value
-from invertwin.untrusted import read_npy
+from invertwin.storage.untrusted import read_npy
 
 _KINDS: Mapping[str, type[Material]] = {
     "rough_dielectric": RoughDielectric,

@@ -19,7 +19,7 @@ from pydantic_core import ErrorDetails
 from invertwin.errors import InputError
 from invertwin.registry.section import TAG_MARK
 from invertwin.registry.section import about as about
-from invertwin.untrusted import reading
+from invertwin.storage.untrusted import reading
 
 _MOST_ERRORS = 20  # in one line
 # Sections and kinds of the package in experiments/studies.

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from invertwin.errors import InputError
-from invertwin.folders import replacing
 from invertwin.radar.processing.detection import PointCloud
+from invertwin.storage.folders import replacing
 
 
 def save_points(path: str | Path, points: PointCloud) -> None:

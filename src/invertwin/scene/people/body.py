@@ -15,7 +15,7 @@ from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh, joined
 from invertwin.scene.parameters import Entries, ObjectModule, axes_mask, free_part
 from invertwin.scene.pose import rotation_angle, rotation_from_vector
-from invertwin.untrusted import read_arrays, reader
+from invertwin.storage.untrusted import read_arrays, reader
 
 _DO = "give arrays of one template"
 _ALONE = 0.95  # share of a vertex that a joint moves nearly alone

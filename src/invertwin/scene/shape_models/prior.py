@@ -16,7 +16,7 @@ from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
 from invertwin.scene.shape_models.iso_surface import follow, surface_of
 from invertwin.scene.shape_models.lattice import Lattice, cubic, cubic_slices
-from invertwin.untrusted import read_arrays, reader
+from invertwin.storage.untrusted import read_arrays, reader
 
 _MODEL = "vehicle_prior.npz"
 _FORMAT = "invertwin shape prior 1"

@@ -11,7 +11,7 @@ import torch
 
 from invertwin.capture.chirps import ChirpData, ChirpSettings
 from invertwin.errors import InputError
-from invertwin.untrusted import read_arrays
+from invertwin.storage.untrusted import read_arrays
 
 FILE = "openradar.npz"
 _TX, _RX = 2, 4

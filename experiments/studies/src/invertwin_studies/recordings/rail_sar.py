@@ -18,7 +18,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import Impulse
 from invertwin.scene.antenna import AntennaArray
-from invertwin.untrusted import read_arrays
+from invertwin.storage.untrusted import read_arrays
 
 FILE = "bwsi_rail_trial6.npz"
 

@@ -26,7 +26,9 @@ _MEMORY = 2 << 30  # beside four times the size of the file
 _LARGE, _REFUSED, _MISSING = 77, 76, 75  # exit codes of the child
 _SLOW = -getattr(signal, "SIGXCPU", 0) or 78
 _NAMES = {"netcdf": "NetCDF", "hdf5": "HDF5", "matlab": "MATLAB"}
-_CHILD = "import sys; from invertwin.apart import hand_over; hand_over(*sys.argv[1:])"
+_CHILD = (
+    "import sys; from invertwin.storage.isolated_reader import hand_over; hand_over(*sys.argv[1:])"
+)
 
 
 class StoredArray(NamedTuple):

@@ -12,8 +12,8 @@ import pytest
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.run_file import to_toml, validate
 from invertwin.errors import InputError
-from invertwin.folders import LOCK, MANIFEST, UNFINISHED
-from invertwin.runs import open_run, plain
+from invertwin.storage.folders import LOCK, MANIFEST, UNFINISHED
+from invertwin.storage.run_folder import open_run, plain
 
 
 def make_run(**changes) -> RunFile:

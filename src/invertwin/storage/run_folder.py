@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from invertwin.errors import InputError
-from invertwin.folders import (
+from invertwin.storage.folders import (
     PARTS,
     UNFINISHED,
     Manifest,

@@ -10,10 +10,10 @@ import pytest
 import scipy.io
 import xarray as xr
 
-from invertwin.apart import read_apart
 from invertwin.capture import Capture
 from invertwin.capture.readers import described_arrays
 from invertwin.errors import InputError
+from invertwin.storage.isolated_reader import read_apart
 
 DESCRIPTION = """
 [data]

@@ -14,7 +14,7 @@ from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import load_run
 from invertwin.errors import InputError
 from invertwin.scene.files import load_mesh, load_scene_xml
-from invertwin.untrusted import read_arrays, read_npy, reader, reading
+from invertwin.storage.untrusted import read_arrays, read_npy, reader, reading
 
 DESCRIPTION = """
 [data]
