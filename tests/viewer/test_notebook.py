@@ -32,7 +32,7 @@ def cells(text: str) -> list[str]:
 
 
 def test_a_scene_shows_its_objects_and_runs_no_name():
-    shown = scene()._repr_html_()
+    shown = shown_html(scene())
     assert shown.startswith('<img alt="three views of the scene" src="data:image/png;base64,')
     name, count, material, size, middle = cells(shown)
     assert name == "&lt;script&gt;alert(1)&lt;/script&gt;"
@@ -41,7 +41,7 @@ def test_a_scene_shows_its_objects_and_runs_no_name():
 
 
 def test_a_radar_shows_what_it_resolves():
-    rows = cells(radar()._repr_html_())
+    rows = cells(shown_html(radar()))
     found = dict(zip(rows[::2], rows[1::2], strict=True))
     assert found["transmitters × receivers"] == "1 × 8"
     assert float(found["range cell [m]"]) == pytest.approx(299792458 / 2 / 1.5e9, rel=1e-3)
@@ -65,15 +65,15 @@ def fit(folder, callbacks=(), steps=6):
 
 def test_a_capture_and_a_fit_show_themselves(tmp_path):
     capture, found = fit(tmp_path)
-    assert 'alt="map of the first frame"' in capture._repr_html_()
-    shown = found._repr_html_()
+    assert 'alt="map of the first frame"' in shown_html(capture)
+    shown = shown_html(found)
     assert 'alt="loss over the steps"' in shown
     assert "<script" not in shown
     rows = cells(shown)
     assert rows[rows.index("steps") + 1] == "6"
     assert "verdict" not in rows
     assert vars(found).get("verdict") is None  # looking computes nothing
-    assert found.verdict.word in cells(found._repr_html_())
+    assert found.verdict.word in cells(shown_html(found))
 
 
 @pytest.fixture
@@ -115,6 +115,6 @@ def test_a_fit_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, capsys):
 )
 def test_a_scene_opens_its_viewer(capsys):
     grid = radar().grid(1.0, 3.0, 0.5, 0.5)
-    with scene().show(radar=radar(), grid=grid, port=0) as viewer:
+    with show(scene(), radar=radar(), grid=grid, port=0) as viewer:
         assert viewer.address in capsys.readouterr().out
         assert viewer.address.startswith("http://127.0.0.1:")

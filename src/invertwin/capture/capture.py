@@ -16,7 +16,6 @@ from invertwin.capture.readers.radar_fields import labelled, radar_fields, radar
 from invertwin.capture.track import Track
 from invertwin.channel import Grid
 from invertwin.errors import InputError
-from invertwin.outward import shown_by
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
@@ -150,10 +149,6 @@ class Capture:
             InputError: the folder does not exist.
         """
         write_dataset(self.dataset, Path(path))
-
-    def _repr_html_(self) -> str:
-        """What a notebook shows."""
-        return shown_by("capture_html", self)
 
     @property
     def frame_count(self) -> int:

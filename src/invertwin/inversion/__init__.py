@@ -1,11 +1,5 @@
 """From observed maps to the scene: observations, loss, schedule, fit; and gradient checks."""
 
-from invertwin.discovery.movers import MoverMaps as MoverMaps
-from invertwin.discovery.movers import MoverTwin as MoverTwin
-from invertwin.discovery.movers import of_point as of_point
-from invertwin.discovery.movers import strongest_mover as strongest_mover
-from invertwin.discovery.moving_body import Echo as Echo
-from invertwin.discovery.moving_body import MovingBody as MovingBody
 from invertwin.inversion.callbacks import Checkpoint as Checkpoint
 from invertwin.inversion.callbacks import Report as Report
 from invertwin.inversion.callbacks import Watch as Watch

@@ -19,7 +19,6 @@ from invertwin.inversion.observation import Observation, Unknown, Unknowns, name
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule, Stage, checked_stages
-from invertwin.outward import shown_by
 from invertwin.scene.scene import Scene
 from invertwin.scene.shape_models.density import without_clouds
 
@@ -50,10 +49,6 @@ class Reconstruction:
     steps: int
     loss: float
     end: End = field(repr=False)
-
-    def _repr_html_(self) -> str:
-        """What a notebook shows."""
-        return shown_by("reconstruction_html", self)
 
     @cached_property
     def lost(self) -> bool:

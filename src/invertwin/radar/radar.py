@@ -17,7 +17,6 @@ from invertwin.checks import ArrayLike, check_fields, check_shape, checked_tenso
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import MOST, Among
-from invertwin.outward import shown_by
 from invertwin.radar.waveform import WINDOWS, PhysicsWarning, SampledWaveform, Waveform
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.antenna import AntennaArray
@@ -98,10 +97,6 @@ class Radar:
             "receivers",
         )
         self._warn_about_spacing()
-
-    def _repr_html_(self) -> str:
-        """What a notebook shows."""
-        return shown_by("radar_html", self)
 
     @property
     def frame_count(self) -> int:

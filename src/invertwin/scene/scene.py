@@ -12,7 +12,6 @@ from torch import Tensor
 
 from invertwin.checks import checked_number, checked_tensor
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.outward import shown_by
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.material.roughness import ROUGH_LOBE_WIDTH, lobe_exponent
 from invertwin.scene.material.surface import Material
@@ -171,25 +170,6 @@ class Scene:
                 f"got {name!r}; use one of these names"
             )
         return self.objects[name]
-
-    def _repr_html_(self) -> str:
-        """What a notebook shows."""
-        return shown_by("scene_html", self)
-
-    def show(self, **options: Any) -> Any:
-        """Show the scene in a browser that opens its address; needs the extra ``view``.
-
-        Args:
-            options: ``radar`` and ``grid`` for beams, paths and a map that follows what is moved;
-                ``host``, ``port`` and ``token`` as of ``invertwin.viewer.Viewer``.
-
-        Returns:
-            The viewer, which has an ``address``; ``close()`` ends it.
-
-        Raises:
-            InputError: No viser, or a host without a token.
-        """
-        return shown_by("show_scene", self, **options)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,8 +1,8 @@
-"""What notebooks show of values: a picture and a table; and the way from a scene to its viewer."""
+"""Pictures and tables of values in notebooks, and the viewer of a scene."""
 
 import base64
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -21,7 +21,7 @@ from invertwin.viewer.link import Link
 from invertwin.viewer.server import Viewer
 
 
-def show_scene(
+def show(
     scene: Scene, *, radar: Radar | None = None, grid: Grid | None = None, **options: Any
 ) -> Viewer:
     """A viewer of a scene; with a radar and its grid, one whose map follows what is moved.
@@ -40,6 +40,21 @@ def show_scene(
     viewer = Viewer(display, links, **options)
     print(f"open {viewer.address}")
     return viewer
+
+
+def register_formatters() -> None:
+    """Register with a running IPython the pictures of scenes, radars, captures and fits.
+
+    The package's menu calls it. The values themselves know nothing of notebooks.
+    """
+    from IPython import get_ipython  # the caller found it loaded
+
+    shell = get_ipython()
+    if shell is None:
+        return
+    formatter = shell.display_formatter.formatters["text/html"]
+    for kind, page in PAGES.items():
+        formatter.for_type(kind, page)
 
 
 def scene_html(scene: Scene) -> str:
@@ -154,3 +169,12 @@ def _shown(figure: Figure, alt: str, heads: Sequence[str], rows: Iterable[Sequen
         f'<img alt="{alt}" src="data:image/png;base64,{png}" style="max-width: 100%">'
         f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
     )
+
+
+PAGES: dict[type, Callable[[Any], str]] = {
+    Scene: scene_html,
+    Radar: radar_html,
+    Capture: capture_html,
+    Reconstruction: reconstruction_html,
+}
+"""Type of a value → the function that returns its picture and table as HTML."""

@@ -3,10 +3,8 @@
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-
 import numpy as np
 import torch
-
 from invertwin.channel.coherent.radar_equation import SurfacePaths
 from invertwin.channel.coherent.rough_paths import draw_rough_paths
 from invertwin.channel.paths import Link
@@ -14,38 +12,6 @@ from invertwin.channel.rays.backend import tracing
 from invertwin.channel.sampling import REST, Densities, Sampling
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
-
-
-@dataclass(frozen=True)
-class Speckle:
-    """The fixed random parts of fields: they stay while radar and scene move.
-
-    Attributes:
-        points: Points of rough surfaces: paths of one bounce.
-        paths: Rough paths of two points, of three points, and so on.
-    """
-
-    points: SurfacePaths
-    paths: tuple[SurfacePaths, ...] = ()
-
-
-def draw_speckle(scene: Scene, link: Link, sampling: Sampling, seed: int) -> Speckle:
-    """Draw the fixed points and paths that give rough surfaces their speckle.
-
-    Args:
-        scene: Surfaces.
-        link: Antennas, which suggest what rough paths are worth drawing.
-        sampling: Points per m², number and depth of rough paths.
-        seed: Seed of places and phases.
-
-    Raises:
-        InputError: Points per m² of what is not in the scene, or not of all its rough objects.
-    """
-    with tracing(sampling.backend):
-        paths = draw_rough_paths(
-            scene, link, count=sampling.rough_paths, depth=sampling.depth, seed=seed
-        )
-    return Speckle(draw_rough_points(scene, sampling.points_per_m2, seed), paths)
 
 
 def densities_of(scene: Scene, points_per_m2: Densities) -> dict[str, float]:
@@ -127,3 +93,35 @@ def _hash(key: np.uint64, first: np.ndarray, second: np.ndarray, stream: int) ->
             state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
             state = state ^ (state >> np.uint64(31))
     return (state >> np.uint64(11)).astype(np.float64) * 2.0**-53
+
+
+@dataclass(frozen=True)
+class Speckle:
+    """The fixed random parts of fields: they stay while radar and scene move.
+
+    Attributes:
+        points: Points of rough surfaces: paths of one bounce.
+        paths: Rough paths of two points, of three points, and so on.
+    """
+
+    points: SurfacePaths
+    paths: tuple[SurfacePaths, ...] = ()
+
+
+def draw_speckle(scene: Scene, link: Link, sampling: Sampling, seed: int) -> Speckle:
+    """Draw the fixed points and paths that give rough surfaces their speckle.
+
+    Args:
+        scene: Surfaces.
+        link: Antennas, which suggest what rough paths are worth drawing.
+        sampling: Points per m², number and depth of rough paths.
+        seed: Seed of places and phases.
+
+    Raises:
+        InputError: Points per m² of what is not in the scene, or not of all its rough objects.
+    """
+    with tracing(sampling.backend):
+        paths = draw_rough_paths(
+            scene, link, count=sampling.rough_paths, depth=sampling.depth, seed=seed
+        )
+    return Speckle(draw_rough_points(scene, sampling.points_per_m2, seed), paths)

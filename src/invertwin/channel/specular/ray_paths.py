@@ -2,31 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-
 import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
-
 from invertwin.constants import SPEED_OF_LIGHT
-
-
-def joint(
-    first: Int64[Tensor, " n"], second: Int64[Tensor, " m"], count: int
-) -> tuple[Int64[Tensor, " pair"], Int64[Tensor, " pair"]]:
-    """Rows of all pairs with the same number, in the order of the first table's rows.
-
-    Args:
-        first, second: the numbers, below ``count``.
-        count: how many numbers there are.
-    """
-    order = second.argsort(stable=True)
-    many = torch.bincount(second, minlength=count)
-    begin = many.cumsum(0) - many
-    times = many[first]
-    row = torch.arange(len(first)).repeat_interleave(times)
-    within = torch.arange(len(row)) - (times.cumsum(0) - times)[row]
-    return row, order[begin[first[row]] + within]
-
 
 KINDS = ("", "reflection", "transmission", "diffraction", "metasurface")
 """What happens where a path meets a surface or an edge, by its number in ``RayPaths.kinds``."""
@@ -204,3 +183,21 @@ def _widened(value: Tensor, width: int, fill: float) -> Tensor:
     value = value[:, :width]
     more = value.new_full((len(value), width - value.shape[1], *value.shape[2:]), fill)
     return torch.cat([value, more], 1)
+
+
+def joint(
+    first: Int64[Tensor, " n"], second: Int64[Tensor, " m"], count: int
+) -> tuple[Int64[Tensor, " pair"], Int64[Tensor, " pair"]]:
+    """Rows of all pairs with the same number, in the order of the first table's rows.
+
+    Args:
+        first, second: the numbers, below ``count``.
+        count: how many numbers there are.
+    """
+    order = second.argsort(stable=True)
+    many = torch.bincount(second, minlength=count)
+    begin = many.cumsum(0) - many
+    times = many[first]
+    row = torch.arange(len(first)).repeat_interleave(times)
+    within = torch.arange(len(row)) - (times.cumsum(0) - times)[row]
+    return row, order[begin[first[row]] + within]

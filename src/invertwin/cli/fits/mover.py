@@ -22,17 +22,8 @@ from invertwin.cli.schema.recordings import chirp_capture
 from invertwin.cli.schema.run_file import about, need
 from invertwin.cli.schema.shape_tables import Mover
 from invertwin.errors import InputError
-from invertwin.inversion import (
-    CorrelationLoss,
-    MoverMaps,
-    MoverTwin,
-    MovingBody,
-    Observation,
-    Schedule,
-    reconstruct,
-    strongest_mover,
-    watched,
-)
+from invertwin.discovery import MoverMaps, MoverTwin, MovingBody, strongest_mover
+from invertwin.inversion import CorrelationLoss, Observation, Schedule, reconstruct, watched
 from invertwin.models.doppler import MotionMap
 from invertwin.plotting import RATE_LABEL, U_LABEL, Panel
 from invertwin.radar.processing import doppler_maps

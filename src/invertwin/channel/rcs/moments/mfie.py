@@ -15,28 +15,39 @@ left out where cells do not resolve the gap.
 import math
 from dataclasses import dataclass
 from functools import cached_property
-
 import numpy as np
 import torch
 from jaxtyping import Complex64, Complex128, Float64
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
-
 from invertwin.channel.em.plane_waves import cross, dot, polarisations, turned
 from invertwin.channel.rcs.moments.solver import Currents, keeps_power
 
 _PIECES = 4.0  # of a side of a cell over the longest side of its pieces
 _MANY = 40  # pieces of a cell with which centres are spread first
-_SPREAD, _SETTLED = 20, 5  # rounds with some pieces, then with all
 _LEAN = 0.7  # cells' sides that normals at right angles are apart
 _NEIGHBOURS = 9
 _TURNED = 0.6  # cosine of neighbours' normals, below which an edge lies between
 _ASIDE = 1e-3  # of the size: nearer to the tangent plane, nothing faces a cell from within
+
+Array = NDArray[np.float64]
+_ROWS_AT_ONCE = 1 << 20
+_SPREAD, _SETTLED = 20, 5  # rounds with some pieces, then with all
 _CURVATURE_ROWS = 1 << 21
 _BURIED, _SOME = 0.35, 0.02  # off half a solid angle, and share of the surface where it may be
 
-Array = NDArray[np.float64]
+
+MOST = 6000
+"""Cells up to which currents are solved: twice as many unknowns."""
+_INSIDE = 0.25  # wavelengths to the second surface,
+_OF_BALL = 0.8  # but less of the ball that fits in,
+_RESOLVED = 0.7  # and at least so many cells' sides
+_SHARE = 1j  # of the second equation
+_WIDTHS = ((0.25, 1.0), (0.05, 0.3))  # of how many cells the balls may be how many sides less
+_WORTH = 75  # cells per wave, below which the matrix is factorised
+_ROUNDS = 80
+_RESIDUAL = 3e-5  # of the right-hand side
 
 
 @dataclass(frozen=True)
@@ -175,19 +186,6 @@ def _surroundings(point: Array, normal: Array, area: Array) -> tuple[Array, bool
         angle[rows] = (seen / np.maximum(square, least**2) ** 1.5).sum(1) / (4 * math.pi)
     wrong = np.abs(angle - 0.5) > _BURIED
     return ball, bool(area[wrong].sum() < _SOME * area.sum())
-
-
-MOST = 6000
-"""Cells up to which currents are solved: twice as many unknowns."""
-_INSIDE = 0.25  # wavelengths to the second surface,
-_OF_BALL = 0.8  # but less of the ball that fits in,
-_RESOLVED = 0.7  # and at least so many cells' sides
-_SHARE = 1j  # of the second equation
-_WIDTHS = ((0.25, 1.0), (0.05, 0.3))  # of how many cells the balls may be how many sides less
-_WORTH = 75  # cells per wave, below which the matrix is factorised
-_ROUNDS = 80
-_RESIDUAL = 3e-5  # of the right-hand side
-_ROWS_AT_ONCE = 1 << 20
 
 
 class SolvedBodies(Currents[Cells]):
