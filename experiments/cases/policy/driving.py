@@ -16,7 +16,7 @@ from torch import Tensor
 
 import invertwin as iw
 from invertwin.channel import Speckle, draw_speckle
-from invertwin.radar.processing.beamforming import aperture
+from invertwin.radar.aperture import aperture
 from invertwin.radar.signal.range_profile import range_profile
 from invertwin.scene import Cosine, Mesh, RoughDielectric, box, linear_array
 from invertwin.seeds import derived_seed

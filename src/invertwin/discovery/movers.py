@@ -14,7 +14,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.loss import CorrelationLoss, Scale
 from invertwin.inversion.reconstruction import Reconstruction
 from invertwin.models.doppler import MotionMap
-from invertwin.radar.processing.beamforming import aperture
+from invertwin.radar.aperture import aperture
 from invertwin.radar.processing.detection import ordered_statistics_cfar, point_cloud
 from invertwin.radar.processing.doppler import compensate_tdm, range_doppler, velocity_axis
 from invertwin.radar.radar import Radar

@@ -14,8 +14,8 @@ from invertwin.viewer.layers import scene_layers as scene_layers
 from invertwin.viewer.link import Link as Link
 from invertwin.viewer.notebook import capture_html as capture_html
 from invertwin.viewer.notebook import radar_html as radar_html
-from invertwin.viewer.notebook import register_formatters as register_formatters
 from invertwin.viewer.notebook import reconstruction_html as reconstruction_html
+from invertwin.viewer.notebook import register_formatters as register_formatters
 from invertwin.viewer.notebook import scene_html as scene_html
 from invertwin.viewer.notebook import show as show
 from invertwin.viewer.page import page_html as page_html

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from invertwin.radar import FMCW, airy, dirichlet, normalized_gaussian
-from invertwin.radar.processing.beamforming import aperture
+from invertwin.radar.aperture import aperture
 from invertwin.radar.surrogate.point_spread import (
     airy_field,
     array_point_spread,

@@ -3,8 +3,10 @@
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+
 import numpy as np
 import torch
+
 from invertwin.channel.coherent.radar_equation import SurfacePaths
 from invertwin.channel.coherent.rough_paths import draw_rough_paths
 from invertwin.channel.paths import Link

@@ -8,12 +8,14 @@ Source: derivations §10 and §11.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
+
 from invertwin.channel.coverage.shadow_boundaries import (
     ASIDE,
     Screen,

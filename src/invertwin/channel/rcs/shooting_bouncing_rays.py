@@ -5,9 +5,11 @@ pieces are as small as asked for; these are cut where light ends.
 """
 
 from collections.abc import Callable, Iterator
+
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
+
 from invertwin.channel.beams.beam_tracing import Bounce, Facets, in_air
 from invertwin.channel.em.plane_waves import dot, mirrored
 from invertwin.channel.rays.ray_scene import Occluders, next_surface

@@ -13,11 +13,13 @@ Source: derivations §10.
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
+
 from invertwin.channel.em.plane_waves import cross, dot, mirrored, unit_across
 from invertwin.channel.rays.arrays import opaque, to_double, to_float, to_index, to_torch
 from invertwin.channel.rays.backend import dr, mi

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+
 import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
+
 from invertwin.constants import SPEED_OF_LIGHT
 
 KINDS = ("", "reflection", "transmission", "diffraction", "metasurface")

@@ -21,8 +21,8 @@ from invertwin.cli.schema.motion_tables import at_start
 from invertwin.cli.schema.recordings import chirp_capture
 from invertwin.cli.schema.run_file import about, need
 from invertwin.cli.schema.shape_tables import Mover
-from invertwin.errors import InputError
 from invertwin.discovery import MoverMaps, MoverTwin, MovingBody, strongest_mover
+from invertwin.errors import InputError
 from invertwin.inversion import CorrelationLoss, Observation, Schedule, reconstruct, watched
 from invertwin.models.doppler import MotionMap
 from invertwin.plotting import RATE_LABEL, U_LABEL, Panel

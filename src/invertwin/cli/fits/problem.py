@@ -8,9 +8,11 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
+
 import torch
 from rich.console import Console
 from torch import nn
+
 from invertwin.capture import Capture
 from invertwin.channel import Densities, Grid, Sampling
 from invertwin.cli.commands.estimate import Sensor, require_room

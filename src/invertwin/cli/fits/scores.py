@@ -4,7 +4,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
+
 import torch
+
 from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
 from invertwin.cli.fits.problem import (

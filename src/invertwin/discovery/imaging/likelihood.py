@@ -10,7 +10,7 @@ from torch import Tensor
 from invertwin.channel import Grid
 from invertwin.inversion import speckle_divergence
 from invertwin.radar import Radar
-from invertwin.radar.processing.beamforming import aperture
+from invertwin.radar.aperture import aperture
 from invertwin.radar.radar import sampled
 from invertwin.radar.waveform import unit_window
 

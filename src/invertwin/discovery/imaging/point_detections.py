@@ -13,7 +13,7 @@ from invertwin.discovery.imaging.reflectivity import cell_of
 from invertwin.discovery.outcome import Thing
 from invertwin.inversion.initialisation.detections import linked
 from invertwin.radar import noise_power, points_of, range_doppler, velocity_span
-from invertwin.radar.processing.beamforming import aperture
+from invertwin.radar.aperture import aperture
 
 _CELLS = 3.0  # of range and rate between echoes of one mover
 _STRONG = 0.1  # of the strongest: dimmer peaks may be sidelobes

@@ -13,7 +13,7 @@ from invertwin.discovery.imaging.likelihood import DEGREES, Axis, axes_of
 from invertwin.errors import InputError
 from invertwin.inversion import speckle_weight
 from invertwin.radar import Radar
-from invertwin.radar.processing.beamforming import aperture
+from invertwin.radar.aperture import aperture
 from invertwin.runtime.progress import told
 
 _LEAST = 1e-3  # of a response, relative to its peak: less is left out

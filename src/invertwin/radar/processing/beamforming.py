@@ -1,124 +1,18 @@
 """Beamforming: range profiles of the virtual channels to power over range × direction."""
 
-import math
-from dataclasses import dataclass
-from functools import lru_cache
-
 import torch
 from jaxtyping import Complex, Float, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import Grid
 from invertwin.checks import check_shape
-from invertwin.errors import InputError
+from invertwin.radar.aperture import Aperture, aperture
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import range_profile
 from invertwin.radar.waveform import taper
 
 # Depth of an array along boresight, in wavelengths, that (u, v) steering may leave out.
 _FLATNESS = 0.05
-
-
-@dataclass(frozen=True, eq=False)
-class Aperture:
-    """The virtual array on the grid of its distinct x and y positions.
-
-    Attributes:
-        x: Distinct x positions [m].
-        y: Distinct y positions [m].
-        column: Index into ``x`` of each virtual element, TX-major.
-        row: Index into ``y`` of each virtual element.
-        x_taper: Window along x.
-        y_taper: Window along y.
-        counts: Number of virtual elements at each place of the grid.
-        wavelength: [m].
-    """
-
-    x: Float64[Tensor, " x"]
-    y: Float64[Tensor, " y"]
-    column: Int64[Tensor, " virtual"]
-    row: Int64[Tensor, " virtual"]
-    x_taper: Float64[Tensor, " x"]
-    y_taper: Float64[Tensor, " y"]
-    counts: Float64[Tensor, "x y"]
-    wavelength: float
-
-    @property
-    def separable(self) -> bool:
-        """Whether the array is the product of a row and a column, so its response is too."""
-        counts = self.counts
-        return torch.equal(counts * counts.sum(), counts.sum(1)[:, None] * counts.sum(0)[None])
-
-    def check_resolved(self, grid: Grid) -> None:
-        """Raise if the grid resolves only one axis of an array that is not separable."""
-        if not self.separable and (grid.u_count == 1 or grid.v_count == 1):
-            raise InputError(
-                f"expected a grid that resolves u and v, got {grid.u_count} × {grid.v_count} bins; "
-                "this array is not the product of a row and a column, so resolve both axes"
-            )
-
-    def check_directions(self, grid: Grid) -> None:
-        """Raise if the grid does not resolve an axis along which the array extends."""
-        for name, places, bins in (("u", self.x, grid.u_count), ("v", self.y, grid.v_count)):
-            if len(places) > 1 and bins == 1:
-                raise InputError(
-                    f"expected a grid that resolves {name}, got 1 bin; the array extends along "
-                    "that axis, so give the grid its directions"
-                )
-
-    @property
-    def weight(self) -> Float64[Tensor, " virtual"]:
-        """Taper of the virtual elements, with a sum of 1."""
-        weight = self.x_taper[self.column] * self.y_taper[self.row]
-        return weight / weight.sum()
-
-    def plane(self, channels: Complex[Tensor, "*batch virtual"]) -> Complex[Tensor, "*batch x y"]:
-        """Channels on the grid of places; those at one place are averaged, empty places are 0."""
-        index = (self.column * len(self.y) + self.row).to(channels.device)
-        plane = channels.new_zeros(*channels.shape[:-1], self.counts.numel())
-        plane = plane.index_add(-1, index, channels).unflatten(-1, self.counts.shape)
-        return plane / self.counts.clamp_min(1).to(plane.device, plane.real.dtype)
-
-    def steering(
-        self, cosines: Float64[Tensor, " node"], places: Float64[Tensor, " place"]
-    ) -> Complex[Tensor, "node place"]:
-        """Phasors exp(+jk u x), which undo the beat phase of an element at x for a source at u.
-
-        Args:
-            cosines: Direction cosines u.
-            places: Positions x of the elements [m].
-        """
-        phase = 2 * math.pi / self.wavelength * cosines[:, None] * places[None]
-        return torch.polar(torch.ones_like(phase), phase)
-
-    def beams(
-        self,
-        u: Float64[Tensor, " u"],
-        v: Float64[Tensor, " v"],
-        x: Float64[Tensor, " element"],
-        y: Float64[Tensor, " element"],
-    ) -> Complex[Tensor, "direction element"]:
-        """``steering`` of elements in a plane towards all pairs of direction cosines, u slowest.
-
-        Args:
-            u: Direction cosines along x.
-            v: Direction cosines along y.
-            x: Positions of the elements along x [m].
-            y: Positions of the elements along y [m].
-        """
-        return (self.steering(u, x)[:, None] * self.steering(v, y)).flatten(0, 1)
-
-
-def aperture(radar: Radar) -> Aperture:
-    """The radar's virtual array, sorted onto its distinct positions.
-
-    Raises:
-        InputError: The array is not flat in the radar's x-y plane, so that u and v alone do not
-            describe its response.
-    """
-    places = radar.virtual_positions.cpu()
-    key = tuple(tuple(place) for place in places.tolist())
-    return _aperture(key, radar.waveform.wavelength, radar.array_window)
 
 
 def beamform(
@@ -187,22 +81,6 @@ def _separable_power(
     if grid.v_count == 1:
         power = power.mean(3, keepdim=True)
     return power
-
-
-@lru_cache(maxsize=8)
-def _aperture(key: tuple[tuple[float, ...], ...], wavelength: float, window: str) -> Aperture:
-    places = torch.tensor(key, dtype=torch.float64)
-    depth = float(places[:, 2].max() - places[:, 2].min()) / wavelength
-    if depth > _FLATNESS:
-        raise InputError(
-            f"expected a virtual array in the radar's x-y plane, got one {depth:.2g} wavelengths "
-            "deep along z; turn the radar's rotation instead of its elements"
-        )
-    x, column = _distinct(places[:, 0], wavelength)
-    y, row = _distinct(places[:, 1], wavelength)
-    counts = torch.zeros(len(x), len(y), dtype=torch.float64)
-    counts.index_put_((column, row), torch.ones(len(places), dtype=torch.float64), accumulate=True)
-    return Aperture(x, y, column, row, _taper(window, x), _taper(window, y), counts, wavelength)
 
 
 def _distinct(

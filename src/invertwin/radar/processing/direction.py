@@ -11,7 +11,7 @@ from torch import Tensor
 from invertwin.channel import Grid
 from invertwin.checks import check_shape, checked_number
 from invertwin.errors import InputError
-from invertwin.radar.processing.beamforming import Aperture, aperture
+from invertwin.radar.aperture import Aperture, aperture
 from invertwin.radar.radar import Radar
 
 # Gaps between signal and noise eigenvalues below this part of the largest one count as noise of

@@ -7,7 +7,7 @@ from jaxtyping import Complex64, Float, Float64
 from torch import Tensor
 
 from invertwin.channel import Paths
-from invertwin.radar.processing.beamforming import aperture
+from invertwin.radar.aperture import aperture
 from invertwin.radar.radar import Radar, sampled
 
 _CELLS = 4  # per resolution cell and axis: less than a tenth of a percent of the power is lost

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.radar.processing.beamforming import Aperture
+from invertwin.radar.aperture import Aperture
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform, Waveform, gaussian_response
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Paths
 from invertwin.checks import check_shape
-from invertwin.radar.processing.beamforming import aperture
+from invertwin.radar.aperture import aperture
 from invertwin.radar.processing.doppler import velocity_span
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps

@@ -27,7 +27,7 @@ from invertwin.channel import (
 from invertwin.checks import check_fields
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
-from invertwin.radar.processing.beamforming import Aperture, aperture
+from invertwin.radar.aperture import Aperture, aperture
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate.point_spread import (
     airy,

@@ -15,12 +15,14 @@ left out where cells do not resolve the gap.
 import math
 from dataclasses import dataclass
 from functools import cached_property
+
 import numpy as np
 import torch
 from jaxtyping import Complex64, Complex128, Float64
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
+
 from invertwin.channel.em.plane_waves import cross, dot, polarisations, turned
 from invertwin.channel.rcs.moments.solver import Currents, keeps_power
 
