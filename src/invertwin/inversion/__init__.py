@@ -21,7 +21,6 @@ from invertwin.inversion.initialisation.initial_pose import Guess as Guess
 from invertwin.inversion.initialisation.multi_start import Search as Search
 from invertwin.inversion.initialisation.multi_start import pose_grid as pose_grid
 from invertwin.inversion.initialisation.multi_start import search as search
-from invertwin.inversion.initialisation.starts import displaced as displaced
 from invertwin.inversion.initialisation.starts import nearby as nearby
 from invertwin.inversion.initialisation.starts import posed as posed
 from invertwin.inversion.loss import CorrelationLoss as CorrelationLoss
@@ -48,3 +47,4 @@ from invertwin.inversion.schedule import Schedule as Schedule
 from invertwin.inversion.schedule import Stage as Stage
 from invertwin.scene.remeshing import remeshed as remeshed
 from invertwin.scene.remeshing import require_edge as require_edge
+from invertwin.scene.scene import displaced as displaced

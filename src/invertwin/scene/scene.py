@@ -16,7 +16,8 @@ from invertwin.scene.cloud import Cloud
 from invertwin.scene.material.roughness import ROUGH_LOBE_WIDTH, lobe_exponent
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.pose import compose, rigid
+from invertwin.scene.pose import compose, rigid, rotation_from_vector
+from invertwin.scene.scene import Object
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,3 +254,18 @@ def _checked_pose(pose: object) -> Tensor:
             "and scale the mesh instead"
         )
     return matrix
+
+
+def displaced(
+    item: Object, offset: Float64[Tensor, "3"], rotation: Float64[Tensor, "3"] | None = None
+) -> Object:
+    """An object that is turned about its centre and moved.
+
+    Args:
+        item: The object.
+        offset: Of its centre [m].
+        rotation: Rotation vector [rad]; None = no turn.
+    """
+    turn = rotation_from_vector(torch.zeros_like(offset) if rotation is None else rotation)
+    motion = rigid(turn, offset + item.center - turn @ item.center)
+    return replace(item, pose=motion @ item.transform)

@@ -13,13 +13,12 @@ from invertwin.errors import InputError
 from invertwin.inversion.confidence.realisations import End, zscore
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import GaussNewton
-from invertwin.inversion.initialisation.starts import displaced
 from invertwin.inversion.metrics import residual, surface_points
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import Pose
 from invertwin.scene.pose import quaternion_from_vector
 from invertwin.scene.remeshing import closest_points
-from invertwin.scene.scene import Object, Scene
+from invertwin.scene.scene import Object, Scene, displaced
 
 REJECTED = 2.33  # standard deviations: one right rival in a hundred is rejected
 SAME_PLACE, SAME_TURN = 0.03, 0.1  # m and rad: ends as near are one

@@ -16,7 +16,6 @@ from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.confidence.ambiguities import REJECTED, same, score, turns, way
 from invertwin.inversion.fit import Callback
-from invertwin.inversion.initialisation.starts import displaced
 from invertwin.inversion.loss import Objective, SpectrumLoss
 from invertwin.inversion.metrics import residual
 from invertwin.inversion.observation import Observation, Unknowns
@@ -26,7 +25,7 @@ from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule
 from invertwin.limits import Count, Positive
 from invertwin.runtime.memory import require_at_most
-from invertwin.scene.scene import Object, Scene
+from invertwin.scene.scene import Object, Scene, displaced
 from invertwin.seeds import derived_seed
 
 _MOST_POSES = 1e4

@@ -14,7 +14,7 @@ from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Axes, Count, NonNegative
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.pose import rigid, rotation_from_vector
-from invertwin.scene.scene import Object
+from invertwin.scene.scene import Object, displaced
 
 _MOST_COPIES = 1e4
 Interval = tuple[NonNegative, NonNegative]
@@ -84,18 +84,3 @@ def posed(
     turns = turns or [item.transform[:3, :3]] * len(positions)
     for turn, place in zip(turns, positions, strict=True):
         yield replace(item, pose=rigid(turn, torch.as_tensor(place, dtype=torch.float64)))
-
-
-def displaced(
-    item: Object, offset: Float64[Tensor, "3"], rotation: Float64[Tensor, "3"] | None = None
-) -> Object:
-    """An object that is turned about its centre and moved.
-
-    Args:
-        item: The object.
-        offset: Of its centre [m].
-        rotation: Rotation vector [rad]; None = no turn.
-    """
-    turn = rotation_from_vector(torch.zeros_like(offset) if rotation is None else rotation)
-    motion = rigid(turn, offset + item.center - turn @ item.center)
-    return replace(item, pose=motion @ item.transform)
