@@ -1,4 +1,4 @@
-"""TODO."""
+"""The virtual array of a radar, sorted onto the distinct positions along its axes."""
 
 import math
 from dataclasses import dataclass
@@ -10,8 +10,11 @@ from torch import Tensor
 
 from invertwin.channel import Grid
 from invertwin.errors import InputError
-from invertwin.radar.processing.beamforming import _FLATNESS, _distinct, _taper
+from invertwin.radar.aperture import Aperture, aperture
 from invertwin.radar.radar import Radar
+from invertwin.radar.waveform import taper
+
+_FLATNESS = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,3 +133,24 @@ def _aperture(key: tuple[tuple[float, ...], ...], wavelength: float, window: str
     counts = torch.zeros(len(x), len(y), dtype=torch.float64)
     counts.index_put_((column, row), torch.ones(len(places), dtype=torch.float64), accumulate=True)
     return Aperture(x, y, column, row, _taper(window, x), _taper(window, y), counts, wavelength)
+
+
+# Depth of an array along boresight, in wavelengths, that (u, v) steering may leave out.
+
+
+def _distinct(
+    places: Float64[Tensor, " virtual"], wavelength: float
+) -> tuple[Float64[Tensor, " place"], Int64[Tensor, " virtual"]]:
+    """Distinct positions to a thousandth of a wavelength, and which one each element has."""
+    ordered, order = places.sort()
+    groups = torch.cat([torch.zeros(1), (ordered.diff() > 1e-3 * wavelength)]).cumsum(0).long()
+    index = torch.empty_like(groups)
+    index[order] = groups
+    sums = torch.zeros(int(groups[-1]) + 1, dtype=torch.float64).index_add_(0, index, places)
+    return sums / torch.bincount(index), index
+
+
+def _taper(window: str, places: Float64[Tensor, " place"]) -> Float64[Tensor, " place"]:
+    extent = places[-1] - places[0]
+    position = (places - places[0]) / extent if len(places) > 1 else torch.zeros_like(places)
+    return taper(window, position, len(places))

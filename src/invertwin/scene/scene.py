@@ -17,7 +17,6 @@ from invertwin.scene.material.roughness import ROUGH_LOBE_WIDTH, lobe_exponent
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import compose, rigid, rotation_from_vector
-from invertwin.scene.scene import Object
 
 
 @dataclass(frozen=True, eq=False)

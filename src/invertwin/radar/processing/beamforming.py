@@ -1,7 +1,7 @@
 """Beamforming: range profiles of the virtual channels to power over range × direction."""
 
 import torch
-from jaxtyping import Complex, Float, Float64, Int64
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from invertwin.channel import Grid
@@ -9,10 +9,6 @@ from invertwin.checks import check_shape
 from invertwin.radar.aperture import Aperture, aperture
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import range_profile
-from invertwin.radar.waveform import taper
-
-# Depth of an array along boresight, in wavelengths, that (u, v) steering may leave out.
-_FLATNESS = 0.05
 
 
 def beamform(
@@ -81,21 +77,3 @@ def _separable_power(
     if grid.v_count == 1:
         power = power.mean(3, keepdim=True)
     return power
-
-
-def _distinct(
-    places: Float64[Tensor, " virtual"], wavelength: float
-) -> tuple[Float64[Tensor, " place"], Int64[Tensor, " virtual"]]:
-    """Distinct positions to a thousandth of a wavelength, and which one each element has."""
-    ordered, order = places.sort()
-    groups = torch.cat([torch.zeros(1), (ordered.diff() > 1e-3 * wavelength)]).cumsum(0).long()
-    index = torch.empty_like(groups)
-    index[order] = groups
-    sums = torch.zeros(int(groups[-1]) + 1, dtype=torch.float64).index_add_(0, index, places)
-    return sums / torch.bincount(index), index
-
-
-def _taper(window: str, places: Float64[Tensor, " place"]) -> Float64[Tensor, " place"]:
-    extent = places[-1] - places[0]
-    position = (places - places[0]) / extent if len(places) > 1 else torch.zeros_like(places)
-    return taper(window, position, len(places))
