@@ -1,4 +1,4 @@
-"""TODO."""
+"""Rigid bodies that move along a straight line, as unknowns of a fit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

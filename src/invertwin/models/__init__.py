@@ -1,0 +1,1 @@
+"""Forward models, one file a kind of sensor."""

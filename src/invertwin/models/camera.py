@@ -1,4 +1,4 @@
-"""TODO."""
+"""Forward models of cameras: silhouettes and depth."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

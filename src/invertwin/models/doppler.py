@@ -1,4 +1,4 @@
-"""TODO."""
+"""Forward model of chirp trains: power over range, Doppler and direction."""
 
 import math
 from dataclasses import dataclass, replace

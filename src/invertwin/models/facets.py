@@ -1,4 +1,4 @@
-"""TODO."""
+"""Forward models of a few flat conductors: coherent beam tracing."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

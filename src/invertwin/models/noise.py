@@ -1,4 +1,4 @@
-"""TODO."""
+"""Simulated realisations of maps: receiver noise and scatter."""
 
 from collections.abc import Callable
 

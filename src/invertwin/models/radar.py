@@ -1,9 +1,4 @@
-"""Forward models: what a sensor would show of a scene, and a recording in the same form.
-
-A model is a frozen value. ``predict`` maps a scene and a sensor to a map, ``observe`` maps a
-recording to a map of the same shape; a loss compares the two. A model of one's own derives from
-:class:`ForwardModel` and has these two methods; ``reconstruct`` and ``gradcheck`` take it.
-"""
+"""Forward models of radar spectra: the smooth surrogate and the exact signal."""
 
 import math
 from collections.abc import Callable, Sequence

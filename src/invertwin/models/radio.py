@@ -1,4 +1,4 @@
-"""TODO."""
+"""Forward models of links: received power, frequency responses, power of panels."""
 
 import math
 from collections.abc import Callable, Sequence

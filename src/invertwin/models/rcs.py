@@ -1,4 +1,4 @@
-"""TODO."""
+"""Forward model of radar cross-sections over aspect angles and frequencies."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from invertwin.channel import Grid
 from invertwin.errors import InputError
-from invertwin.radar.aperture import Aperture, aperture
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import taper
 

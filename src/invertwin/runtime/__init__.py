@@ -1,0 +1,1 @@
+"""The machine: libLLVM, threads, memory, engines, progress."""

@@ -1,0 +1,1 @@
+"""Beam tracing of few flat facets, with exact derivatives."""

@@ -1,1 +1,1 @@
-"""Slow, readable implementations of the kernels' laws. Tests compare the kernels with them."""
+"""One realisation of the field: speckle, rough paths, physical optics, the radar equation."""

@@ -1,0 +1,1 @@
+"""Receiving surfaces: shadow boundaries and single scattering."""

@@ -1,1 +1,1 @@
-"""Fields: conductors, rough points, rough paths of several bounces."""
+"""Laws of plane waves and edges, without scene or rays."""

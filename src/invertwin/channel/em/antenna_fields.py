@@ -1,4 +1,4 @@
-"""TODO."""
+"""Fields of antennas at a surface, and of currents on conductors at an antenna."""
 
 import torch
 from jaxtyping import Complex128, Float64

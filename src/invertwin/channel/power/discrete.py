@@ -1,4 +1,4 @@
-"""TODO."""
+"""Discrete distributions on the GPU or CPU, sampled in proportion to tabulated weights."""
 
 from typing import Any
 

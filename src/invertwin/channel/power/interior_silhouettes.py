@@ -1,4 +1,4 @@
-"""TODO."""
+"""Silhouette sampling between surfaces: edges that shadow one surface point from another."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +18,7 @@ from invertwin.channel.power.silhouettes import (
 )
 from invertwin.channel.rays.arrays import between, point_at, scrambled, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.movers import NO_PLACE, Movers
+from invertwin.channel.rays.differentiated_objects import NO_PLACE, Movers
 from invertwin.channel.rays.ray_scene import RayScene
 
 
@@ -147,8 +147,10 @@ class InteriorEdgeSampler:
         y0, y1 = rays.exact_ends(edge)
         place = y0 + (y1 - y0) * mi.Float64(along)
         omega, density = self._direction(index, edge, y0, y1)
-        if self.weighted and rays.movers is not None and rays.scenes == 1:
-            omega, density = self._aimed(rays.movers, index, edge, place, omega, density)
+        if self.weighted and rays.differentiated_objects is not None and rays.scenes == 1:
+            omega, density = self._aimed(
+                rays.differentiated_objects, index, edge, place, omega, density
+            )
         exact = mi.Vector3d(omega)
         sides = _sides(rays, self.inputs, edge, exact)
         aside = _BESIDE * (dr.norm(place) + dr.norm(y1 - y0))
@@ -163,10 +165,10 @@ class InteriorEdgeSampler:
             valid &= hit.valid & _not_grazing(rays, hit.face, omega, hit.valid)
             valid &= rays.in_scene(frame, hit.face, hit.valid)
             hits.append(hit)
-        if rays.movers is not None:
-            moves = rays.movers.has_edge(edge)
+        if rays.differentiated_objects is not None:
+            moves = rays.differentiated_objects.has_edge(edge)
             for hit in hits:
-                moves |= rays.movers.has_face(hit.face, hit.valid)
+                moves |= rays.differentiated_objects.has_face(hit.face, hit.valid)
             valid &= moves
         near = _MISSED * dr.norm(place)
         valid &= ~folded(rays, edge, place, exact, sides.outwards, aside, near, valid)

@@ -142,8 +142,10 @@ class EdgeSampler:
         if self.size:
             seen = mi.Float(dr.atan2(dr.norm(dr.cross(*ends)), dr.dot(*ends)))
             counts = sides.unlike
-            if rays.movers is not None:
-                counts &= rays.movers.has_edge(edge) | rays.movers.beyond(edge, origin, y0, y1)
+            if rays.differentiated_objects is not None:
+                counts &= rays.differentiated_objects.has_edge(
+                    edge
+                ) | rays.differentiated_objects.beyond(edge, origin, y0, y1)
             weight = dr.select(counts, seen * sides.step, 0.0)
             self.choice = Proportional(by_object(rays, edge, weight, receiver, len(centres)))
         self.seed, self.dice = scrambled(seed, 3), scrambled(seed, 9)
@@ -183,8 +185,10 @@ class EdgeSampler:
         )  # fmt: skip
         valid &= hit.valid & _not_grazing(rays, hit.face, away, hit.valid)
         valid &= rays.in_scene(frame, hit.face, hit.valid)
-        if rays.movers is not None:
-            valid &= rays.movers.has_edge(edge) | rays.movers.has_face(hit.face, hit.valid)
+        if rays.differentiated_objects is not None:
+            valid &= rays.differentiated_objects.has_edge(
+                edge
+            ) | rays.differentiated_objects.has_face(hit.face, hit.valid)
         # Last, since it takes longest: packets without a shadow spare it.
         near = _MISSED * dr.norm(exact)
         valid &= ~folded(rays, edge, y, exact, sides.outwards, aside, near, valid)

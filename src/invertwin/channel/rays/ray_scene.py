@@ -22,7 +22,7 @@ from invertwin.channel.rays.arrays import (
 from invertwin.channel.rays.backend import backend, dr, mi, tracing
 from invertwin.channel.rays.bounding_spheres import Spheres
 from invertwin.channel.rays.brute_force import Few
-from invertwin.channel.rays.movers import Movers
+from invertwin.channel.rays.differentiated_objects import Movers
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.checks import ArrayLike, checked_tensor

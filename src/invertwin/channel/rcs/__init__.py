@@ -1,0 +1,1 @@
+"""Radar cross-sections in the far field."""

@@ -1,0 +1,1 @@
+"""Paths between antennas by the image method and the uniform theory of diffraction."""

@@ -1,0 +1,1 @@
+"""Outline models and shape proposals."""

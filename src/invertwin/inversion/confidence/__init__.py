@@ -1,0 +1,1 @@
+"""Error bars, goodness of fit, ambiguities, planning."""

@@ -1,0 +1,1 @@
+"""Automatic derivatives against central differences."""

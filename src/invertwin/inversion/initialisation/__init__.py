@@ -1,0 +1,1 @@
+"""Initial estimates and multi-start fits."""

@@ -1,0 +1,1 @@
+"""Reconfigurable surfaces on walls."""

@@ -1,0 +1,1 @@
+"""Beamforming, direction finding, Doppler processing, detection, backprojection."""

@@ -1,0 +1,1 @@
+"""Beat signals and range profiles."""

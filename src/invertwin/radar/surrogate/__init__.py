@@ -1,0 +1,1 @@
+"""The smooth radar model: point spreads and expected power."""

@@ -1,0 +1,1 @@
+"""Shapes as unknowns: distances, densities, lattices, learned priors."""

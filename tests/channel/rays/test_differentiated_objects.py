@@ -15,7 +15,7 @@ from invertwin.channel.power.silhouettes import EdgeSampler
 from invertwin.channel.rays import ray_scene
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
-from invertwin.channel.rays.movers import NO_PLACE
+from invertwin.channel.rays.differentiated_objects import NO_PLACE
 from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, rigid, sphere
@@ -108,10 +108,12 @@ def reach(offset: Callable[[float], list[float]]) -> list[bool]:
         scene = Scene({"edge": thing(plate(0.5, 0.5), (0.25, 0.0, 1.0)), "ball": ball})
         with tracing():
             rays = RayScene(flatten(scene, WAVELENGTH), link(), antennas_move=False)
-            assert rays.movers is not None
+            assert rays.differentiated_objects is not None
             edge = dr.arange(mi.UInt32, 5)  # those of the plate
             y0, y1 = rays.exact_ends(edge)
-            asked = to_torch(rays.movers.beyond(edge, mi.Point3f(0.0), y0, y1)).bool()
+            asked = to_torch(
+                rays.differentiated_objects.beyond(edge, mi.Point3f(0.0), y0, y1)
+            ).bool()
             ends = rays.geometry.vertices.detach()[rays.topology.edges[:5]]
             upright = (ends[..., 0].abs() < 1e-9).all(1)
             assert int(upright.sum()) == 1
@@ -151,7 +153,7 @@ def test_a_scene_of_which_nothing_or_all_moves_asks_nobody():
     with tracing():
         for flags in ((False,) * 4, (True,) * 4):
             rays = RayScene(replace(still, moving=flags), link(), antennas_move=False)
-            assert rays.movers is None
+            assert rays.differentiated_objects is None
 
 
 @pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (0.5, 0.0, 2.05)])
