@@ -8,32 +8,23 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "invertwin"
 
-FOUNDATION = {
-    *(
-        "constants",
-        "errors",
-        "limits",
-        "seeds",
-        "folders",
-        "memory",
-        "untrusted",
-        "apart",
-        "progress",
-        "outward",
-    ),
-}
+FOUNDATION = {"constants", "errors", "limits", "seeds", "checks", "runtime", "storage"}
 SCENE = FOUNDATION | {"scene"}
-CHANNEL = SCENE | {"doctor", "threads", "channel"}
-RADAR = CHANNEL - {"doctor", "threads"} | {"radar"}
-LINKS = CHANNEL - {"doctor", "threads"} | {"links"}
+CHANNEL = SCENE | {"channel"}
+RADAR = CHANNEL | {"radar"}
+LINKS = CHANNEL | {"links"}
+CAMERA = CHANNEL | {"camera"}
 SIMULATION = RADAR | {"simulation"}
 CAPTURE = RADAR | {"capture"}
 SIGNATURES = CHANNEL | {"signatures"}
-CAMERA = CHANNEL - {"doctor", "threads"} | {"camera"}
 DATASETS = RADAR | {"datasets"}
-MODELS = SIMULATION | CAPTURE | LINKS | CAMERA | {"signatures", "models"}
-INVERSION = MODELS | {"inversion"}
-DISCOVERY = INVERSION | {"discovery"}
+CONTRACT = SCENE | {"forward_model"}
+MODELS = SIMULATION | CAPTURE | LINKS | CAMERA | SIGNATURES | CONTRACT | {"models"}
+# A fit knows the contract of models, and initial estimates know captures; no fit knows a model.
+INVERSION = CAPTURE | CONTRACT | {"inversion"}
+DISCOVERY = INVERSION | MODELS | {"discovery"}
+PLOTTING = DISCOVERY | {"plotting"}
+VIEWER = PLOTTING | {"viewer"}
 
 # Which rooms each room may import: only those before it. `__init__` is the package's own menu.
 ALLOWED = {
@@ -41,15 +32,9 @@ ALLOWED = {
     "errors": set(),
     "limits": set(),
     "seeds": set(),
-    "folders": {"errors"},
-    "memory": {"errors"},
-    "untrusted": {"errors"},
-    "apart": {"errors"},
-    "progress": set(),
-    "outward": set(),
-    "threads": set(),
-    "engines": {"errors", "threads"},
-    "doctor": FOUNDATION,
+    "checks": {"errors", "limits"},
+    "runtime": {"errors", "runtime"},
+    "storage": {"errors", "storage"},
     "scene": SCENE,
     "channel": CHANNEL,
     "radar": RADAR,
@@ -59,19 +44,36 @@ ALLOWED = {
     "signatures": SIGNATURES,
     "capture": CAPTURE,
     "datasets": DATASETS,
+    "forward_model": CONTRACT,
     "models": MODELS,
     "inversion": INVERSION,
     "discovery": DISCOVERY,
-    "runs": FOUNDATION | {"runs"},
-    "plotting": DISCOVERY | {"plotting"},
-    "viewer": DISCOVERY | {"plotting", "viewer"},
+    "plotting": PLOTTING,
+    "viewer": VIEWER,
     "registry": FOUNDATION | {"registry"},
-    "cli": DISCOVERY
-    | SIGNATURES
-    | DATASETS
-    | {"doctor", "threads", "engines", "runs", "plotting", "viewer", "registry", "cli", "__init__"},
+    "cli": VIEWER | DATASETS | {"registry", "cli", "__init__"},
     "__main__": {"errors", "cli"},
-    "__init__": DISCOVERY | SIGNATURES | {"doctor", "threads"},
+    "__init__": {"runtime", "viewer"},
+}
+# Inside a room: which of its folders each folder may import. Files beside the folders are either
+# what all of them share, or the room's own top and menu; file cycles are forbidden anyway.
+INSIDE = {
+    "capture": {"ti": set(), "readers": {"ti"}},
+    "channel": {
+        "em": set(),
+        "rays": {"em"},
+        "power": {"em", "rays"},
+        "coherent": {"em", "rays", "power"},
+        "beams": {"em", "rays"},
+        "specular": {"em", "rays"},
+        "coverage": {"em", "rays", "coherent", "specular"},
+        "rcs": {"em", "rays", "beams"},
+    },
+    "cli": {"schema": set(), "fits": {"schema"}, "commands": {"schema", "fits"}},
+    "discovery": {"imaging": set(), "shapes": set()},
+    "inversion": {"confidence": set(), "initialisation": {"confidence"}, "gradcheck": set()},
+    "radar": {"signal": set(), "processing": {"signal"}, "surrogate": {"signal", "processing"}},
+    "scene": {"material": set(), "shape_models": set(), "people": {"shape_models"}},
 }
 RAY_TRACER = {"mitsuba", "drjit"}
 KNOW_THE_RAY_TRACER = {"channel"}
@@ -113,6 +115,27 @@ def room_of(file: Path, package: Path) -> str:
     return first.removesuffix(".py")
 
 
+def imports_by_string(file: Path, package: Path) -> Iterator[int]:
+    """Lines that import a module of the package by a string, which no import statement shows."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if not (isinstance(node, ast.Call) and node.args):
+            continue
+        if ast.unparse(node.func).rpartition(".")[2] not in ("import_module", "__import__"):
+            continue
+        first = node.args[0]
+        if isinstance(first, ast.JoinedStr) and first.values:
+            first = first.values[0]
+        # A name that begins with a dot is one of the package's own, too.
+        if isinstance(first, ast.Constant) and str(first.value).split(".")[0] in ("", package.name):
+            yield node.lineno
+
+
+def folder_of(file: Path, package: Path) -> str:
+    """The folder inside its room in which a file lies; empty for files of the room itself."""
+    parts = file.relative_to(package).parts
+    return parts[1] if len(parts) > 2 else ""
+
+
 def cycles(graph: dict[Path, set[Path]]) -> list[list[Path]]:
     found: list[list[Path]] = []
     finished: set[Path] = set()
@@ -143,6 +166,10 @@ def violations(package: Path) -> list[str]:
             problems.append(f"{where}: '{room}' is no room of the house")
             continue
         graph[file] = set()
+        problems += [
+            f"{where}:{line}: an import by a string; write an import statement"
+            for line in imports_by_string(file, package)
+        ]
         for line, name in imports(file, package):
             if name.split(".")[0] in RAY_TRACER and room not in KNOW_THE_RAY_TRACER:
                 problems.append(f"{where}:{line}: {name} belongs in channel/")
@@ -156,6 +183,10 @@ def violations(package: Path) -> list[str]:
             to = room_of(target, package)
             if to not in ALLOWED[room]:
                 problems.append(f"{where}:{line}: {room} must not import {to}")
+            here, there = folder_of(file, package), folder_of(target, package)
+            if to == room and here and there and here != there:
+                if there not in INSIDE.get(room, {}).get(here, set()):
+                    problems.append(f"{where}:{line}: {here} must not import {there} in {room}/")
             inside = target != package / "channel" / "__init__.py"
             if to == "channel" and inside and room not in KNOW_THE_RAY_TRACER:
                 problems.append(f"{where}:{line}: {name} is not in the menu of channel/")
@@ -199,12 +230,21 @@ def test_every_room_is_known():
         ("misc/thing.py", "", "says nothing"),
         ("garage/car.py", "", "no room of the house"),
         ("scene/mesh.py", "from invertwin.scene.scene import Scene", "cycle: "),
+        ("channel/rays/tables.py", "import invertwin.channel.power.bins", "must not import power"),
+        ("channel/em/utd.py", "from ..rays.scene import x", "em must not import rays in channel/"),
+        ("radar/signal/nufft.py", "from ..processing import music", "must not import processing"),
+        ("inversion/fit.py", "from invertwin.models.radar import M", "must not import models"),
+        ("scene/mesh.py", 'importlib.import_module("invertwin.viewer")', "import by a string"),
+        ("scene/mesh.py", 'import_module(f"invertwin.{name}")', "import by a string"),
+        ("scene/mesh.py", '__import__(".viewer")', "import by a string"),
     ],
 )
 def test_a_planted_violation_is_caught(tmp_path, file, source, complaint):
     package = tmp_path / "invertwin"
     rooms = ("scene/scene.py", "channel/paths.py", "radar/waveform.py", "capture/readers/netcdf.py")
-    for name in (*rooms, "plotting/scenes.py"):
+    rooms += ("channel/rays/scene.py", "channel/power/bins.py", "channel/em/utd.py")
+    rooms += ("radar/signal/nufft.py", "radar/processing/music.py", "models/radar.py")
+    for name in (*rooms, "inversion/fit.py", "plotting/scenes.py"):
         (package / name).parent.mkdir(parents=True, exist_ok=True)
         (package / name).write_text("")
         (package / name).with_name("__init__.py").write_text("")
