@@ -10,9 +10,9 @@ from torch import Tensor
 
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
-from invertwin.cli.commands.estimate import Sensor, require_room
 from invertwin.cli.commands.landscape import exact_losses, line_through
-from invertwin.cli.commands.simulate import exact
+from invertwin.cli.estimate import Sensor, require_room
+from invertwin.cli.exact_signals import exact
 from invertwin.cli.report import Table, finish, picture
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.run_file import need

@@ -7,8 +7,8 @@ from dataclasses import replace
 import torch
 
 from invertwin.channel import Sampling, densities_of
-from invertwin.cli.commands.estimate import Estimate, Sensor, estimate_of, of_sensor, of_signature
-from invertwin.cli.commands.simulate import chirp_train, exact
+from invertwin.cli.estimate import Estimate, Sensor, estimate_of, of_sensor, of_signature
+from invertwin.cli.exact_signals import chirp_train, exact
 from invertwin.cli.fits.problem import FULL, sensors_of, settings_of, stages_of, varied_run
 from invertwin.cli.report import Table, texts
 from invertwin.cli.schema import RunFile, SimulatedData, build

@@ -17,8 +17,8 @@ import torch
 
 from invertwin import __version__
 from invertwin.channel import Paths
-from invertwin.cli.commands.estimate import Sensor, require_room
-from invertwin.cli.commands.simulate import chirp_train, exact
+from invertwin.cli.estimate import Sensor, require_room
+from invertwin.cli.exact_signals import chirp_train, exact
 from invertwin.cli.report import Table, finish, quantities
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.motion_tables import at_start, joints_at_start

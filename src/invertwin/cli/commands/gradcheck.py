@@ -12,7 +12,7 @@ from torch import Tensor
 
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
-from invertwin.cli.commands.estimate import Sensor, of_signature, require_room
+from invertwin.cli.estimate import Sensor, of_signature, require_room
 from invertwin.cli.report import Picture, Table, finish, picture, texts
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.gradcheck import Gradcheck

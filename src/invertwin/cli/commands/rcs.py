@@ -11,7 +11,7 @@ from torch import Tensor
 
 from invertwin import plotting
 from invertwin.capture import load_section
-from invertwin.cli.commands.estimate import of_signature
+from invertwin.cli.estimate import of_signature
 from invertwin.cli.report import Picture, Table, finish, picture, texts
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.run_file import about, need

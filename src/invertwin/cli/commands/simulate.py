@@ -13,65 +13,23 @@ from invertwin import plotting
 from invertwin.capture import Capture, ChirpData
 from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid, Sampling
-from invertwin.cli.commands.estimate import Sensor, require_room
 from invertwin.cli.commands.raw_files import settings_of_run, write_raw
+from invertwin.cli.estimate import Sensor, require_room
+from invertwin.cli.exact_signals import chirp_train, exact
 from invertwin.cli.report import Table, finish, picture, quantities
-from invertwin.cli.schema import RunFile, SimulatedData, build, sensors
-from invertwin.cli.schema.motion_tables import in_motion, refuse_motion
+from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.cli.schema.run_file import about, need
 from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, velocity_span
 from invertwin.radar.processing import doppler_maps
 from invertwin.radar.radar import Radar
-from invertwin.radar.signal.chirps import Chirps
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
-from invertwin.simulation import Simulation, simulate, simulate_chirps
 from invertwin.storage.run_folder import RunFolder
 
 _SURROGATE_SAMPLES = 2_000_000
 _Outcome = tuple[torch.Tensor, dict[str, Any], Figure, str]  # signals, metrics, picture, its note
-
-
-def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
-    """Exact signals with the settings of the `[data]` table.
-
-    Raises:
-        InputError: The run file's data are measured, not simulated.
-    """
-    data = _simulated(run)
-    refuse_motion(run)
-    front = None if run.impairments is None else sensors.impairments(run.impairments, data)
-    with torch.no_grad():
-        return simulate(
-            scene,
-            radar,
-            grid,
-            seed=run.seed if data.seed is None else data.seed,
-            sampling=_sampling(data, data.depth),
-            snr_db=None if front else data.snr_db,
-            noise_figure_db=None if front else data.noise_figure_db,
-            impairments=front,
-        )
-
-
-def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> torch.Tensor:
-    """Exact beat signals of every chirp with the settings of `[data]` and `[chirps]`."""
-    data = _simulated(run)
-    front = sensors.impairments(run.impairments, data)
-    table = need(run, "chirps", "several ramps a frame")
-    with about("chirps"), torch.no_grad():
-        return simulate_chirps(
-            in_motion(run, scene),
-            radar,
-            chirps,
-            seed=run.seed if data.seed is None else data.seed,
-            sampling=_sampling(data, 1),
-            retrace=table.retrace,
-            visibility_every=table.visibility_every,
-            impairments=front,
-        )
 
 
 def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:

@@ -10,7 +10,7 @@ import torch
 
 from invertwin.capture import Capture, ChirpCapture
 from invertwin.cli.commands.look import read_recording
-from invertwin.cli.commands.simulate import exact
+from invertwin.cli.exact_signals import exact
 from invertwin.cli.options import Find
 from invertwin.cli.report import Picture, Table, finish, picture, texts
 from invertwin.cli.schema import build

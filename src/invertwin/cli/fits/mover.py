@@ -13,8 +13,8 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
-from invertwin.cli.commands.estimate import Sensor, require_room
-from invertwin.cli.commands.simulate import chirp_train
+from invertwin.cli.estimate import Sensor, require_room
+from invertwin.cli.exact_signals import chirp_train
 from invertwin.cli.report import Picture, Table, finish, picture, quantities, texts
 from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.cli.schema.motion_tables import at_start

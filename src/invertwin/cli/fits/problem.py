@@ -15,8 +15,8 @@ from torch import nn
 
 from invertwin.capture import Capture
 from invertwin.channel import Densities, Grid, Sampling
-from invertwin.cli.commands.estimate import Sensor, require_room
-from invertwin.cli.commands.simulate import exact
+from invertwin.cli.estimate import Sensor, require_room
+from invertwin.cli.exact_signals import exact
 from invertwin.cli.schema import SAMPLED, Measures, Reconstruct, RunFile, SimulatedData, build
 from invertwin.cli.schema import Stage as StageTable
 from invertwin.cli.schema.recordings import measured

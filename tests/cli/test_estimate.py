@@ -6,8 +6,8 @@ import tomllib
 import pytest
 
 from cli.small import GRADCHECK, RUN, STARTS, call
+from invertwin.cli import estimate as estimates
 from invertwin.cli.commands import check as run_check
-from invertwin.cli.commands import estimate as estimates
 from invertwin.cli.commands import gradcheck as run_gradcheck
 from invertwin.cli.commands import simulate as run_simulate
 from invertwin.cli.fits import problem

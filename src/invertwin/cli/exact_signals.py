@@ -1,0 +1,53 @@
+"""TODO."""
+
+import torch
+
+from invertwin.channel import Grid
+from invertwin.cli.commands.simulate import _sampling, _simulated
+from invertwin.cli.schema import RunFile, sensors
+from invertwin.cli.schema.motion_tables import in_motion, refuse_motion
+from invertwin.cli.schema.run_file import about, need
+from invertwin.radar.radar import Radar
+from invertwin.radar.signal.chirps import Chirps
+from invertwin.scene import Scene
+from invertwin.simulation import Simulation, simulate, simulate_chirps
+
+
+def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
+    """Exact signals with the settings of the `[data]` table.
+
+    Raises:
+        InputError: The run file's data are measured, not simulated.
+    """
+    data = _simulated(run)
+    refuse_motion(run)
+    front = None if run.impairments is None else sensors.impairments(run.impairments, data)
+    with torch.no_grad():
+        return simulate(
+            scene,
+            radar,
+            grid,
+            seed=run.seed if data.seed is None else data.seed,
+            sampling=_sampling(data, data.depth),
+            snr_db=None if front else data.snr_db,
+            noise_figure_db=None if front else data.noise_figure_db,
+            impairments=front,
+        )
+
+
+def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> torch.Tensor:
+    """Exact beat signals of every chirp with the settings of `[data]` and `[chirps]`."""
+    data = _simulated(run)
+    front = sensors.impairments(run.impairments, data)
+    table = need(run, "chirps", "several ramps a frame")
+    with about("chirps"), torch.no_grad():
+        return simulate_chirps(
+            in_motion(run, scene),
+            radar,
+            chirps,
+            seed=run.seed if data.seed is None else data.seed,
+            sampling=_sampling(data, 1),
+            retrace=table.retrace,
+            visibility_every=table.visibility_every,
+            impairments=front,
+        )
