@@ -184,9 +184,9 @@ def violations(package: Path) -> list[str]:
             if to not in ALLOWED[room]:
                 problems.append(f"{where}:{line}: {room} must not import {to}")
             here, there = folder_of(file, package), folder_of(target, package)
-            if to == room and here and there and here != there:
-                if there not in INSIDE.get(room, {}).get(here, set()):
-                    problems.append(f"{where}:{line}: {here} must not import {there} in {room}/")
+            inner = to == room and "" not in (here, there) and here != there
+            if inner and there not in INSIDE.get(room, {}).get(here, set()):
+                problems.append(f"{where}:{line}: {here} must not import {there} in {room}/")
             inside = target != package / "channel" / "__init__.py"
             if to == "channel" and inside and room not in KNOW_THE_RAY_TRACER:
                 problems.append(f"{where}:{line}: {name} is not in the menu of channel/")

@@ -1,4 +1,4 @@
-"""The contract of forward models: ``predict`` a map of a scene, ``observe`` a recording as such a map.
+"""The contract of forward models: ``predict`` a map of a scene, ``observe`` a recording.
 
 A model is a frozen value. ``predict`` maps a scene and a sensor to a map; ``observe`` maps a
 recording to a map of the same shape; a loss compares the two. A model of one's own derives from

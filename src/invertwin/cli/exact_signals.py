@@ -1,12 +1,12 @@
-"""TODO."""
+"""Exact signals with the settings of a run file: data of simulations and of fits of them."""
 
 import torch
 
-from invertwin.channel import Grid
-from invertwin.cli.commands.simulate import _sampling, _simulated
-from invertwin.cli.schema import RunFile, sensors
+from invertwin.channel import Grid, Sampling
+from invertwin.cli.schema import RunFile, SimulatedData, sensors
 from invertwin.cli.schema.motion_tables import in_motion, refuse_motion
 from invertwin.cli.schema.run_file import about, need
+from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.scene import Scene
@@ -51,3 +51,24 @@ def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> tor
             visibility_every=table.visibility_every,
             impairments=front,
         )
+
+
+def _simulated(run: RunFile) -> SimulatedData:
+    data = need(run, "data", "a simulation")
+    if not isinstance(data, SimulatedData):
+        raise InputError(
+            f'data.kind: expected "simulated" to simulate a scene, got "{data.kind}"; '
+            "give density and snr_db instead of a capture"
+        )
+    return data
+
+
+def _sampling(data: SimulatedData, depth: int) -> Sampling:
+    return Sampling(
+        depth=depth,
+        samples=data.samples,
+        boundary_samples=0,
+        boundary=False,
+        points_per_m2=data.points_per_m2,
+        rough_paths=data.rough_paths,
+    )

@@ -15,11 +15,10 @@ from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid, Sampling
 from invertwin.cli.commands.raw_files import settings_of_run, write_raw
 from invertwin.cli.estimate import Sensor, require_room
-from invertwin.cli.exact_signals import chirp_train, exact
+from invertwin.cli.exact_signals import _simulated, chirp_train, exact
 from invertwin.cli.report import Table, finish, picture, quantities
-from invertwin.cli.schema import RunFile, SimulatedData, build
+from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.run_file import about, need
-from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, velocity_span
 from invertwin.radar.processing import doppler_maps
@@ -111,27 +110,6 @@ def _chirps(run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: G
         "wall_seconds": seconds,
     }
     return beat, metrics, plotting.range_doppler(maps), "doppler"
-
-
-def _simulated(run: RunFile) -> SimulatedData:
-    data = need(run, "data", "a simulation")
-    if not isinstance(data, SimulatedData):
-        raise InputError(
-            f'data.kind: expected "simulated" to simulate a scene, got "{data.kind}"; '
-            "give density and snr_db instead of a capture"
-        )
-    return data
-
-
-def _sampling(data: SimulatedData, depth: int) -> Sampling:
-    return Sampling(
-        depth=depth,
-        samples=data.samples,
-        boundary_samples=0,
-        boundary=False,
-        points_per_m2=data.points_per_m2,
-        rough_paths=data.rough_paths,
-    )
 
 
 def _peak(spectrum: torch.Tensor, grid: Grid) -> dict[str, float | None]:
