@@ -1,19 +1,27 @@
-"""The shape of the code: arguments, lines, relayed options, copies of a law, import arrows.
+"""The shape of the code: import arrows, sizes, names, words, relayed options, copies of a law.
 
     python benchmarks/house.py [-o DIR]
 
 Prints a table and writes `metrics.json` into DIR (default `out/house`). Everything is read from
-`src/invertwin`, most of it from its syntax trees:
+`src/invertwin`, most of it from its syntax trees, and from README.md and docs/limitations.md. What
+must hold is tested by `tests/test_house.py`, which `make check` runs.
 
+- `circles`: cycles of imports between files; menus (`__init__.py`) count as files. `arrows_up`:
+  imports against the order of rooms, and of folders inside rooms. `own_imports_by_string`: calls of
+  `import_module` with a name of the package. All three as `tests/test_architecture.py` finds them.
+- `files_reached_by_reconstruct`: files that `inversion/reconstruction.py` imports, directly or by
+  way of others; a name taken from a menu leads to the file that defines it.
+- `code_lines`: lines of the package without blank lines, comments and docstrings.
+- `fit_pipelines`, `any_in_kernels`, `longest_function_lines`, `question_docstrings` (a share of all
+  docstrings), `duplicate_class_names`, `participle_functions`, `readme_words`, `limitations_words`:
+  see `house_counts.py`.
 - `reconstruct_arguments`: parameters of `invertwin.reconstruct`.
 - `longest_argument_list`: most parameters of a public function, or of a public method or
   constructor that is a function. Public means that no name on the way begins with an underscore,
   `__init__`, `__new__` and `__call__` excepted. `self` and `cls` do not count; `*args` and
   `**kwargs` count one each. The fields of dataclasses and of pydantic tables do not count: they are
   values with names, and nobody writes their constructors.
-- `cli_lines`, `package_lines`: lines of all `.py` files below `cli/`, and of the whole package. At
-  0.2.0, when the same things took the fewest lines, they were 4 985 and 28 950 (limits 5 000 and
-  29 000). What came later adds lines of its own, so there is no limit any more.
+- `cli_lines`, `package_lines`: lines of all `.py` files below `cli/`, and of the whole package.
 - `hops_boundary_samples`: functions that merely pass the option on. Such a function reads a name or
   an attribute `boundary_samples` only to make it an argument of the same name: by keyword, by its
   position in a call of a function or class of the package, or as an entry of a dictionary.
@@ -34,6 +42,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import house_counts as counts
 from report import MetricTable, Required, write
 
 import invertwin
@@ -45,6 +54,19 @@ CONSTRUCTORS = ("__init__", "__new__", "__call__")
 POWERS = ("pow", "power", "float_power")
 LOGARITHMS = ("log", "log1p", "log_less")  # the last is log(1 - x), of our own
 REQUIRED: Required = {
+    "circles": ("<=", 0),
+    "arrows_up": ("<=", 0),
+    "own_imports_by_string": ("<=", 0),
+    "files_reached_by_reconstruct": ("<=", 60),
+    "code_lines": ("<=", 39_000),
+    "fit_pipelines": ("<=", 1),
+    "longest_function_lines": ("<=", 80),
+    "any_in_kernels": ("<=", 60),
+    "question_docstrings": ("<=", 0.01),
+    "duplicate_class_names": ("<=", 0),
+    "participle_functions": ("<=", 0),
+    "readme_words": ("<=", 1_000),
+    "limitations_words": ("<=", 2_500),
     "reconstruct_arguments": ("<=", 9),
     "longest_argument_list": ("<=", 10),
     "hops_boundary_samples": ("<=", 3),
@@ -86,7 +108,7 @@ def functions(package: Path) -> Iterator[Function]:
     for file in sorted(package.rglob("*.py")):
         where = file.relative_to(package)
         public = not any(_hidden(part.removesuffix(".py")) for part in where.parts)
-        yield from _below(_tree(file), str(where), public, in_class=False)
+        yield from _below(counts.tree(file), str(where), public, in_class=False)
 
 
 def _below(node: ast.AST, name: str, public: bool, in_class: bool) -> Iterator[Function]:
@@ -106,10 +128,6 @@ def _below(node: ast.AST, name: str, public: bool, in_class: bool) -> Iterator[F
 
 def _hidden(name: str) -> bool:
     return name.startswith("_") and name not in (*CONSTRUCTORS, "__init__")
-
-
-def _tree(file: Path) -> ast.Module:
-    return ast.parse(file.read_text(encoding="utf-8"))
 
 
 def longest_argument_list(package: Path) -> tuple[int, str]:
@@ -138,7 +156,7 @@ def _places(package: Path, option: str) -> dict[str, int]:
             callee = owner.rpartition(".")[2] if name in CONSTRUCTORS else name
             places[callee] = one.parameters.index(option)
     for file in package.rglob("*.py"):
-        for node in ast.walk(_tree(file)):
+        for node in ast.walk(counts.tree(file)):
             if isinstance(node, ast.ClassDef):
                 fields = [ast.unparse(f.target) for f in node.body if isinstance(f, ast.AnnAssign)]
                 if option in fields:
@@ -216,8 +234,8 @@ def _is_logarithm(value: ast.AST) -> bool:
     return any(ast.unparse(call.func).rpartition(".")[2] in LOGARITHMS for call in calls)
 
 
-def broken_arrows(package: Path) -> list[str]:
-    """What the checker of the tests says about the imports."""
+def checker_of_tests() -> Any:
+    """Return the module that checks the imports for the tests."""
     spec = importlib.util.spec_from_file_location(
         "test_architecture", ROOT / "tests" / "test_architecture.py"
     )
@@ -225,38 +243,88 @@ def broken_arrows(package: Path) -> list[str]:
     assert spec.loader is not None
     checker = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(checker)
-    return checker.violations(package)
+    return checker
+
+
+def broken_arrows(package: Path) -> list[str]:
+    """List what the checker of the tests says about the imports."""
+    return checker_of_tests().violations(package)
+
+
+def files_reached(package: Path, start: str) -> list[str]:
+    """List the files that a file of the package imports, by way of others too."""
+    checker = checker_of_tests()
+
+    def defining(name: str) -> Path | None:
+        """Return the file that defines a name, through menus."""
+        file = checker.module_of(name, package)
+        while file is not None and file.name == "__init__.py":
+            wanted = name.rpartition(".")[2]
+            offered = {full.rpartition(".")[2]: full for _, full in checker.imports(file, package)}
+            if wanted not in offered:
+                return file
+            name = offered[wanted]
+            file = checker.module_of(name, package)
+        return file
+
+    def imported(file: Path) -> set[Path]:
+        found = {defining(name) for _, name in checker.imports(file, package)}
+        return {target for target in found if target is not None} - {file}
+
+    return counts.reached(package, package / start, imported)
 
 
 def measure(package: Path = PACKAGE) -> dict[str, Any]:
-    """All metrics, and by name what was counted."""
-    longest, where = longest_argument_list(package)
-    hops, laws, broken = relays(package), lobe_laws(package), broken_arrows(package)
+    """Measure all metrics, and list by name what was counted."""
+    broken = broken_arrows(package)
+    laws = lobe_laws(package)
+    asked = counts.question_docstrings(package)
+    listed = {
+        "circles": [line for line in broken if line.startswith("cycle: ")],
+        "arrows_up": [line for line in broken if "must not import" in line],
+        "own_imports_by_string": [line for line in broken if "import by a string" in line],
+        "files_reached_by_reconstruct": files_reached(package, "inversion/reconstruction.py"),
+        "fit_pipelines": counts.fit_pipelines(package),
+        "any_in_kernels": counts.any_annotations(package),
+        "duplicate_class_names": counts.duplicate_class_names(package),
+        "participle_functions": counts.participle_functions(package),
+        "hops_boundary_samples": relays(package),
+        "import_arrow_exceptions": broken,
+    }
+    arguments, wide = longest_argument_list(package)
+    length, long = counts.longest_function(package)
     return {
+        **{key: len(names) for key, names in listed.items()},
         "reconstruct_arguments": len(inspect.signature(invertwin.reconstruct).parameters),
-        "longest_argument_list": longest,
+        "longest_argument_list": arguments,
+        "longest_function_lines": length,
+        "question_docstrings": len(asked) / len(counts.docstrings(package)),
+        "code_lines": counts.code_lines(package),
         "cli_lines": lines(package / "cli"),
         "package_lines": lines(package),
-        "hops_boundary_samples": len(hops),
+        "readme_words": counts.words(ROOT / "README.md"),
+        "limitations_words": counts.words(ROOT / "docs" / "limitations.md"),
         "lobe_law_copies": {language: len(names) for language, names in laws.items()},
-        "import_arrow_exceptions": len(broken),
         "counted": {
-            "longest_argument_list": [where],
-            "hops_boundary_samples": hops,
+            **listed,
+            "question_docstrings": asked,
+            "longest_argument_list": [wide],
+            "longest_function_lines": [long],
             "lobe_law_copies.torch": laws["torch"],
             "lobe_law_copies.drjit": laws["drjit"],
-            "import_arrow_exceptions": broken,
         },
     }
 
 
 def table(metrics: dict[str, Any]) -> MetricTable:
-    """A row a metric."""
+    """Return a table with a row a metric."""
     shown = MetricTable("The shape of the code", REQUIRED)
     for key in ("cli_lines", "package_lines", *REQUIRED):
         first, _, last = key.partition(".")
         value = metrics[first][last] if last else metrics[first]
-        shown.row(key, value, "d", ", ".join(metrics["counted"].get(key, [])))
+        names = metrics["counted"].get(key, [])
+        text = ", ".join(names[:3]) + (f", and {len(names) - 3} more" if len(names) > 3 else "")
+        shown.row(key, value, ".4f" if isinstance(value, float) else "d", text)
     return shown
 
 

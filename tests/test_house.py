@@ -1,0 +1,37 @@
+"""The shape of the code stays: every limit of `benchmarks/house.py` holds. Part of `make check`."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def house():
+    """The benchmark as a module, with its measured metrics."""
+    folder = str(ROOT / "benchmarks")
+    sys.path.insert(0, folder)
+    try:
+        spec = importlib.util.spec_from_file_location("house_of_checks", f"{folder}/house.py")
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[spec.name] = module
+        spec.loader.exec_module(module)
+        return module, module.measure()
+    finally:
+        sys.path.remove(folder)
+        sys.modules.pop("house_of_checks", None)
+
+
+def test_every_limit_of_the_house_holds(house):
+    module, metrics = house
+    broken = {}
+    for key, (sign, limit) in module.REQUIRED.items():
+        first, _, last = key.partition(".")
+        value = metrics[first][last] if last else metrics[first]
+        assert sign == "<="
+        if value > limit:
+            broken[key] = (value, limit, metrics["counted"].get(key, [])[:20])
+    assert broken == {}
