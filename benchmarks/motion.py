@@ -31,9 +31,9 @@ from invertwin.scene import (
     linear_array,
     person,
     rigid,
+    room,
     standing_height,
 )
-from invertwin.scene import rooms as room
 
 LOOPS, SLOW, INTERVAL = 64, 8, 50e-6
 SPEED = 1.4  # m/s

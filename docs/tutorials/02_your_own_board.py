@@ -13,8 +13,7 @@ import numpy as np
 
 import invertwin as iw
 from invertwin.capture import ChirpCapture, read
-from invertwin.radar import Chirps, board, points_of
-from invertwin.radar.processing import doppler_maps
+from invertwin.radar import Chirps, board, doppler_maps, points_of
 from invertwin.scene import RoughDielectric, rigid, sphere
 
 # %% [markdown]

@@ -8,8 +8,7 @@
 # %matplotlib inline
 import invertwin as iw
 from invertwin.plotting import Panel
-from invertwin.radar import Chirps, micro_doppler
-from invertwin.radar.signal import range_profile
+from invertwin.radar import Chirps, micro_doppler, range_profile
 from invertwin.scene import (
     InMotion,
     RoughDielectric,

@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from radar.test_moving_power import paths_of
 
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
@@ -22,6 +21,7 @@ from invertwin.radar.signal.range_profile import beat_signal
 from invertwin.radar.waveform import FMCW
 from invertwin.scene import Object, PerfectConductor, RoughDielectric, Scene, rigid, shapes
 from invertwin.simulation import simulate_chirps
+from radar.surrogate.test_range_doppler import paths_of
 
 CHIRPS = Chirps(32, 60e-6)
 RADAR = Radar(

@@ -24,9 +24,9 @@ from invertwin.radar import (
     exact_spectrum,
     moving_beat,
     peaks,
+    range_profile,
     surrogate_spectrum,
 )
-from invertwin.radar.signal import range_profile
 from invertwin.radar.signal.range_profile import fft_bins
 from invertwin.radar.signal.realisations import Looks
 from invertwin.scene import Scene, plate

@@ -8,8 +8,7 @@ import torch
 from invertwin.channel import Sampling, trace_field
 from invertwin.errors import InputError
 from invertwin.radar import FMCW, Radar
-from invertwin.scene import AntennaArray, RoughDielectric, Scene
-from invertwin.scene import rooms as room
+from invertwin.scene import AntennaArray, RoughDielectric, Scene, room
 from scenes import float64
 
 SIDES = ("floor", "ceiling", "wall_front", "wall_back", "wall_left", "wall_right")

@@ -3,6 +3,8 @@
 import importlib.util
 import re
 import signal
+import sys
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
@@ -13,8 +15,14 @@ from invertwin.channel import Sampling
 from invertwin.inversion import Checkpoint, Report, watched
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import Object, RoughDielectric, Scene, Translation, box, planar_array, rigid
+from invertwin.viewer.notebook import PAGES, register_formatters, show
 
 EVIL = "<script>alert(1)</script>"
+
+
+def shown_html(value: object) -> str:
+    """The page that is registered for the type of a value."""
+    return PAGES[type(value)](value)
 
 
 def scene() -> Scene:
@@ -38,6 +46,21 @@ def test_a_scene_shows_its_objects_and_runs_no_name():
     assert name == "&lt;script&gt;alert(1)&lt;/script&gt;"
     assert (count, material, size) == ("12", "RoughDielectric", "0.4 × 0.3 × 0.2")
     assert middle == "0, 0, 2"
+
+
+def test_a_running_ipython_gets_the_pages(monkeypatch):
+    registered = {}
+    formatter = SimpleNamespace(for_type=registered.__setitem__)
+    display = SimpleNamespace(formatters={"text/html": formatter})
+    module = ModuleType("IPython")
+    shells = [SimpleNamespace(display_formatter=display)]
+    module.get_ipython = lambda: shells[0]
+    monkeypatch.setitem(sys.modules, "IPython", module)
+    register_formatters()
+    assert registered == PAGES
+    assert "<table>" in registered[type(radar())](radar())
+    shells[0] = None
+    register_formatters()
 
 
 def test_a_radar_shows_what_it_resolves():

@@ -13,9 +13,8 @@ from invertwin.channel import Grid
 from invertwin.discovery.imaging.likelihood import DEGREES, background
 from invertwin.discovery.imaging.reflectivity import responses, sharpened, thinned
 from invertwin.inversion import speckle_weight
-from invertwin.radar import Radar
+from invertwin.radar import Radar, range_profile
 from invertwin.radar.radar import sampled
-from invertwin.radar.signal import range_profile
 
 _ROUNDS = 2  # an image, then the channels that it tells
 _SWEEPS = 100  # over the channels, at most

@@ -2,6 +2,7 @@
 
 import base64
 import html
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -47,9 +48,7 @@ def register_formatters() -> None:
 
     The package's menu calls it. The values themselves know nothing of notebooks.
     """
-    from IPython import get_ipython  # the caller found it loaded
-
-    shell = get_ipython()
+    shell = sys.modules["IPython"].get_ipython()
     if shell is None:
         return
     formatter = shell.display_formatter.formatters["text/html"]

@@ -14,8 +14,7 @@ from invertwin.capture import Capture, backproject, is_sweeps, read
 from invertwin.capture.readers.described_sweeps import read_sweeps
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar import SteppedFrequency
-from invertwin.radar.signal import range_profile
+from invertwin.radar import SteppedFrequency, range_profile
 
 FREQUENCIES = 4e9 + 10e6 * np.arange(101)  # 15 m unambiguous, 0.15 m cells
 TARGET, WALL = np.array([0.3, 0.0, 3.0]), np.array([-1.0, 0.5, 6.0])

@@ -14,8 +14,13 @@ from invertwin.errors import InputError
 from invertwin.inversion import displaced, residual
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer
-from invertwin.scene import PerfectConductor, RoughDielectric, rotation_angle, rotation_from_vector
-from invertwin.scene import rooms as room
+from invertwin.scene import (
+    PerfectConductor,
+    RoughDielectric,
+    room,
+    rotation_angle,
+    rotation_from_vector,
+)
 
 ROUGH = {"kind": "rough_dielectric", "permittivity": 4.0, "lobe_width_deg": 30.0}
 ELEMENT = {"kind": "positions", "positions": [[0, 0, 0]]}

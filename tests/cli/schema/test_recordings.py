@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from cli.test_build import RADAR, read
 
+from cli.schema.test_build import RADAR, read
 from cli.small import RUN, call, read_metrics
 from invertwin.capture import Capture, ChannelCalibration, ChirpData
 from invertwin.capture.readers import described_arrays

@@ -17,8 +17,8 @@ from invertwin.radar import (
     backproject_beat,
     beamform,
     beat_signal,
+    range_profile,
 )
-from invertwin.radar.signal import range_profile
 from invertwin.radar.waveform import unit_window
 from invertwin.scene.antenna import linear_array
 from invertwin.scene.pose import rotation_from_vector

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from invertwin.errors import InputError
-from invertwin.radar import FMCW, Radar, beamform, beat_signal, exact_spectrum
+from invertwin.radar import FMCW, Radar, beamform, beat_signal, exact_spectrum, range_profile
 from invertwin.radar.aperture import aperture
-from invertwin.radar.signal import range_profile
 from invertwin.radar.signal.range_profile import fft_bins
 from invertwin.scene.antenna import AntennaArray, linear_array
 from invertwin.scene.pose import rotation_from_vector

@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 
-from invertwin.radar import FMCW, Chirps, Radar, velocity_span
+from invertwin.radar import FMCW, Chirps, Radar, doppler_maps, velocity_span
 from invertwin.radar.boards import board
-from invertwin.radar.processing import doppler_maps
 from oracles.moving_point import moving_point
 
 ARRAYS = board("IWR6843ISK").arrays(elevation=1)

@@ -27,9 +27,9 @@ from invertwin.radar import (
     moving_beat,
     noisy_oscillator_beat,
     quantize,
+    range_profile,
     residual_phase,
 )
-from invertwin.radar.signal import range_profile
 from invertwin.radar.waveform import unit_window
 from invertwin.scene.antenna import linear_array
 

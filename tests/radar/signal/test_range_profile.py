@@ -21,8 +21,8 @@ from invertwin.radar import (
     add_noise,
     beat_signal,
     exact_spectrum,
+    range_profile,
 )
-from invertwin.radar.signal import range_profile
 from invertwin.scene.antenna import linear_array
 from invertwin.scene.pose import rotation_from_vector
 from oracles.beat import beat as direct_beat

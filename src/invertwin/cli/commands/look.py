@@ -29,17 +29,17 @@ from invertwin.errors import InputError, PhysicsWarning
 from invertwin.plotting import Panel, direction_panels, doppler_panels, panels
 from invertwin.radar import (
     SampledWaveform,
+    doppler_maps,
     peak_of,
     points_csv,
     points_of,
+    range_profile,
     save_points,
     sharp_map,
     snapshots_of,
     velocity_span,
 )
 from invertwin.radar.boards import Mounting
-from invertwin.radar.processing import doppler_maps
-from invertwin.radar.signal import range_profile
 from invertwin.registry.kinds import load_plugins, registry
 from invertwin.storage.run_folder import RunFolder
 

@@ -20,8 +20,7 @@ from invertwin.cli.report import Table, finish, picture, quantities
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.run_file import about, need
 from invertwin.models.radar import SurrogateMap, surrogate_correlation
-from invertwin.radar import FMCW, velocity_span
-from invertwin.radar.processing import doppler_maps
+from invertwin.radar import FMCW, doppler_maps, velocity_span
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh

@@ -26,7 +26,7 @@ from invertwin.errors import InputError
 from invertwin.inversion import CorrelationLoss, Observation, Schedule, reconstruct, watched
 from invertwin.models.doppler import MotionMap
 from invertwin.plotting import RATE_LABEL, U_LABEL, Panel
-from invertwin.radar.processing import doppler_maps
+from invertwin.radar import doppler_maps
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 from invertwin.storage.run_folder import RunFolder
