@@ -1,10 +1,9 @@
-"""The capability table of docs/limitations.md, cell by cell."""
+"""The capability table, cell by cell."""
 
 import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import pytest
@@ -13,6 +12,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from gradients.capability_table import CELLS, MECHANISMS
 from invertwin.camera import Camera, ImageSampling
 from invertwin.capture import Capture
 from invertwin.capture.track import Track
@@ -65,47 +65,10 @@ from invertwin.scene.parameters import (
 from invertwin.signatures import rcs
 from scenes import float64, occluder, relative, thing
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "limitations.md"
-MECHANISMS = {
-    "power paths, interior": "interior",
-    "power paths, boundary": "boundary",
-    "2+ bounces, interior": "bounces interior",
-    "2+ bounces, boundary": "bounces boundary",
-    "coherent field": "coherent",
-    "rough field": "rough",
-    "signature": "signature",
-    "paths between antennas": "antennas",
-    "coverage maps": "coverage",
-    "mirrored scattering": "mirrored",
-    "chains": "chains",
-    "coherent targets": "targets",
-    "metasurfaces": "panels",
-    "images": "images",
-}
 ROUGH = RoughDielectric(4.0, 0.5, 0.6, 0.5)
 METAL = PerfectConductor()
 COATED = Dielectric(4.0, 0.5, scattering=0.6, rms_slope=0.4)
 BOARD = Slab(2.7, 0.05, thickness=3e-3, scattering=0.8, rms_slope=0.4)
-
-
-def table() -> dict[tuple[str, str], str]:
-    """(parameter, mechanism) → what the page says."""
-    rows = [
-        [cell.strip() for cell in line.strip("| \n").split("|")]
-        for line in PAGE.read_text(encoding="utf-8").splitlines()
-        if line.startswith("|")
-    ]
-    start = next(i for i, row in enumerate(rows) if row[0] == "parameter")
-    header = [MECHANISMS[name] for name in rows[start][1:]]
-    cells = {}
-    for row in rows[start + 2 :]:
-        if len(row) != len(header) + 1:
-            break
-        cells |= {(row[0], name): cell for name, cell in zip(header, row[1:], strict=True)}
-    return cells
-
-
-CELLS = table()
 
 
 def power_radar(positions: object = ((0.0, 0.0, 0.0),)) -> Radar:
