@@ -58,8 +58,8 @@ def recording(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_the_command_of_the_readme(recording, monkeypatch, repository):
-    page = (repository / "README.md").read_text()
+def test_the_command_of_the_start_page(recording, monkeypatch, repository):
+    page = (repository / "docs" / "start.md").read_text()
     (line,) = re.findall(r"^    \.venv/bin/invertwin (look .*)$", page, re.MULTILINE)
     assert call(monkeypatch, *line.split()) == 0
     assert read_metrics(recording / "out" / "adc")["mover_range_m"] == pytest.approx(3.0, abs=0.06)
