@@ -6,11 +6,12 @@
 
 Every benchmark, experiment and group of tests has one file `benchmarks/stored/<name>.json`:
 
-- `section`, `title`, `command`, `note`: the place on the page, and how to measure again.
+- `section`, `rank`, `title`, `command`, `note`: the place on the page, and how to measure again.
 - `stated`: figures that a page of the documentation stated at a commit, before metrics were stored.
   Its rows are [quantity, measured value, required value or a peer's].
 - `measured`: the `metrics` of a run with `machine`, `commit` and `date`. Its rows are as above, and
-  the measured value is a format string over the metrics: `{scenes.letter_x.full.relative_l1:.4f}`.
+  the measured value is a format string over the metrics: `{scenes.letter_x.full.relative_l1:.4f}`,
+  `{max scenes.*.full.relative_l1:.4f}`.
 
 `--store FOLDER` writes `measured` of the file that `--name` states, by default the folder's name.
 Rows are kept; where there are none, every number of `metrics.json` gets one.
@@ -20,6 +21,7 @@ test checks.
 """
 
 import argparse
+import fnmatch
 import json
 import os
 import platform
@@ -77,6 +79,7 @@ COLUMNS = "| quantity | measured | required, or a peer |\n|---|---|---|\n"
 def results_page(stored: Path = STORED) -> str:
     """Compose the page of all stored figures."""
     entries = [json.loads(file.read_text("utf-8")) for file in sorted(stored.glob("*.json"))]
+    entries.sort(key=lambda entry: entry.get("rank", 1000))
     unknown = {entry["section"] for entry in entries} - set(SECTIONS)
     if unknown:
         raise ValueError(f"expected sections {list(SECTIONS)}, got {sorted(unknown)}")
@@ -114,8 +117,18 @@ class Metrics:
     def fill(self, text: str) -> str:
         """Put numbers into the fields of a format string."""
         return re.sub(
-            r"\{([^{}:]+):([^{}]*)\}", lambda field: format(self.numbers[field[1]], field[2]), text
+            r"\{([^{}:]+):([^{}]*)\}",
+            lambda field: format(self.find(field[1]), field[2]).replace("e-0", "e-"),
+            text,
         )
+
+    def find(self, key: str) -> float:
+        """Return the number of a key, or the least or greatest of a pattern: `max a.*.error`."""
+        choice, _, pattern = key.rpartition(" ")
+        if not choice:
+            return self.numbers[key]
+        found = [self.numbers[one] for one in fnmatch.filter(self.numbers, pattern)]
+        return {"min": min, "max": max}[choice](found)
 
 
 def _numbers(metrics: Any, key: str = "") -> Iterator[tuple[str, float]]:

@@ -92,10 +92,10 @@ def test_metrics_are_stored_with_machine_and_commit(results, tmp_path):
 def test_rows_survive_the_next_run(results, tmp_path):
     (tmp_path / "metrics.json").write_text('{"speed": 2.0}')
     (tmp_path / "stored").mkdir()
-    rows = [["how fast", "{speed:.2f} times", "1 time"]]
+    rows = [["how fast", "{speed:.2f} times", "1 time"], ["least", "{min sp*:.1f}", ""]]
     folder = stored(tmp_path / "stored", measured={"rows": rows})
     results.store(tmp_path, "run", folder)
-    assert "| how fast | 2.00 times | 1 time |" in results.results_page(folder)
+    assert "| how fast | 2.00 times | 1 time |\n| least | 2.0 |" in results.results_page(folder)
     (tmp_path / "metrics.json").write_text('{"other": 2.0}')
     with pytest.raises(KeyError, match="speed"):
         results.store(tmp_path, "run", folder)
