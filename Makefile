@@ -8,8 +8,9 @@ SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo -n)
 MAY_APT := command -v apt-get >/dev/null && $(SUDO) true 2>/dev/null
 APT := $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get -q
 LLVM_USABLE := $(BIN)/python -c 'from invertwin.runtime import doctor; doctor.require()' 2>/dev/null
-# Two processes, a file at a time: files share what is slow to make.
-PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile
+# Two processes, a file at a time: files share what is slow to make. What each test took goes to
+# out/tests; benchmarks/test_time.py reads it.
+PYTEST = $(BIN)/python -m pytest -n 2 --dist loadfile --junitxml=out/tests/$@.xml
 NEW_ENOUGH := -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null
 
 # Of `make fuzz`.
@@ -18,12 +19,14 @@ MINUTES ?= 30
 LOWEST := .venv-lowest
 WHEEL := .venv-wheel
 
-.PHONY: help demo test test-fast test-gpu test-browser fuzz lowest wheel docs check format bench clean
+.PHONY: help demo test test-fast test-all test-docs test-gpu test-browser fuzz lowest wheel docs check format bench clean
 
 help:
 	@echo 'make demo       find a hidden letter from its radar echoes (under 5 minutes)'
-	@echo 'make test       all tests but those that need a GPU'
+	@echo 'make test       the quick tests and one slow test for each claim (under 10 minutes)'
 	@echo 'make test-fast  the quick ones'
+	@echo 'make test-docs  pages, tutorials, examples, plugins'
+	@echo 'make test-all   all tests but those that need a GPU, with run-time type checks'
 	@echo 'make test-gpu   those that need a GPU'
 	@echo 'make test-browser  viewer and report in Chromium; screenshots in out/browser'
 	@echo 'make fuzz       read damaged files of every format for MINUTES=30'
@@ -39,10 +42,17 @@ demo: .venv/.run .venv/.llvm
 	$(BIN)/invertwin demo
 
 test: .venv/.dev .venv/.llvm
-	$(PYTEST) -m 'not gpu'
+	$(PYTEST) -m 'not gpu and (claim or not slow)'
 
 test-fast: .venv/.dev .venv/.llvm
 	$(PYTEST) -m 'not gpu and not slow'
+
+# Many short tests of one file: whoever is idle takes some.
+test-docs: .venv/.dev .venv/.llvm
+	$(PYTEST) --dist worksteal -m 'docs and not gpu'
+
+test-all: .venv/.dev .venv/.llvm
+	INVERTWIN_CHECK_TYPES=1 $(PYTEST) -m 'not gpu'
 
 test-gpu: .venv/.dev .venv/.llvm
 	$(BIN)/python -m pytest -m gpu

@@ -1,7 +1,7 @@
 """What every test shares: run-time shape checks, the data folder, the markers."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,12 +19,13 @@ if "PYTEST_XDIST_WORKER" in os.environ and hasattr(os, "sched_setaffinity"):
     number = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw"))
     os.sched_setaffinity(0, cores[number % len(cores) :: workers])
 
-# Shape annotations are executed in tests only; users pay nothing for them. The numeric tower of
-# PEP 484: an int is welcome where a float is asked for.
-install_import_hook(
-    ["invertwin", "invertwin_studies"],
-    "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
-)
+# Shape annotations are executed by `make test-all` only; users pay nothing for them. The numeric
+# tower of PEP 484: an int is welcome where a float is expected.
+if os.environ.get("INVERTWIN_CHECK_TYPES"):
+    install_import_hook(
+        ["invertwin", "invertwin_studies"],
+        "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
+    )
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 # What pytest-xdist starts inherits the environment as it is changed below.
@@ -56,6 +57,30 @@ def unchecked() -> Iterator[None]:
     config.update("jaxtyping_disable", True)
     yield
     config.update("jaxtyping_disable", False)
+
+
+def processor_seconds() -> float:
+    """Seconds that processors have worked for this process and its children that have ended."""
+    return sum(os.times()[:4])
+
+
+STARTED = pytest.StashKey[float]()
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> Generator[None]:
+    item.stash[STARTED] = processor_seconds()
+    yield
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Generator[None]:
+    """State the processor time of a test, fixtures included, in the JUnit file."""
+    try:
+        yield
+    finally:
+        used = processor_seconds() - item.stash[STARTED]
+        item.user_properties.append(("processor_seconds", f"{used:.3f}"))
 
 
 # Before the items are selected by their marks.
