@@ -7,7 +7,8 @@
 Every benchmark, experiment and group of tests has one file `benchmarks/stored/<name>.json`:
 
 - `section`, `rank`, `title`, `command`, `note`: the place on the page, and how to measure again.
-- `stated`: figures that a page of the documentation stated at a commit, before metrics were stored.
+- `stated`: figures that a page of the documentation stated at a commit, before metrics were stored,
+  and `since` which commit.
   Its rows are [quantity, measured value, required value or a peer's].
 - `measured`: the `metrics` of a run with `machine`, `commit` and `date`. Its rows are as above, and
   the measured value is a format string over the metrics: `{scenes.letter_x.full.relative_l1:.4f}`,
@@ -64,9 +65,9 @@ HEAD = """\
 
 `python benchmarks/results.py` generates this page from `benchmarks/stored`: do not edit it. Every
 table has its command, machine and commit. *Stated* figures were transcribed from the page that
-stated them at that commit; the others are the `metrics.json` of a run. `invertwin` and `python`
-stand for `.venv/bin/invertwin` and `.venv/bin/python`, and the figures of a run file are those of
-the seed in it.
+stated them at that commit; *since* is the commit that wrote the newest of them there. The others
+are the `metrics.json` of a run. `invertwin` and `python` stand for `.venv/bin/invertwin` and
+`.venv/bin/python`, and the figures of a run file are those of the seed in it.
 
 **The rule for other pages.** A measured value stands here first. A test reads README.md and the
 pages of docs/: every number with a unit of a measurement (%, dB, °, ms, s, min, mm, cm, *times*),
@@ -99,7 +100,8 @@ def _entry(entry: dict[str, Any]) -> str:
         text += f"\nMeasured {run['date']} at {run['commit']}: {run['machine']}.\n\n{COLUMNS}"
         text += "".join(_row(what, numbers.fill(value), peer) for what, value, peer in run["rows"])
     if stated := entry.get("stated"):
-        text += f"\nStated by {stated['page']} at {stated['commit']}: {stated['machine']}.\n"
+        text += f"\nStated by {stated['page']} at {stated['commit']}, since {stated['since']}: "
+        text += f"{stated['machine']}.\n"
         text += f"\n{COLUMNS}" + "".join(_row(*row) for row in stated["rows"])
     return text
 

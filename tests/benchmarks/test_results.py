@@ -66,6 +66,8 @@ def test_stored_figures_say_where_they_come_from(file):
         assert re.match(r"[0-9a-f]{7}", part["commit"])
         assert part["machine"]
         assert all(len(row) == 3 and row[0] and row[1] for row in part["rows"])
+        when = part["date"] if "metrics" in part else part["since"]
+        assert re.search(r"\d{4}-\d\d-\d\d", when)
     for path in re.findall(r"\b(?:experiments|benchmarks|tests)/[\w/*.]*\w", entry["command"]):
         assert list(ROOT.glob(path)), f"no file {path}"
 
