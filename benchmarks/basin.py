@@ -13,7 +13,8 @@ realisation of speckle and noise, and converges at an offset if the fits from bo
 basin is the largest offset up to which 19 of 20 seeds converge; no larger one is tried once a
 second seed has failed.
 
-- `exact`: the model is the exact signals (visibility fixed, derivations §4). It is given the phases
+- `simulate_exact`: the model is the exact signals (visibility fixed, derivations §4). It is given
+the phases
   of the data's scatterers, which a user never has. The loss compares power spectra.
 - `gaussian`: the paper's kernels (Gaussian pulse, Airy lobe) on powers, no extra width.
 - `dirichlet`: the response without a window, no extra width; the data have no window either, and
@@ -23,7 +24,8 @@ second seed has failed.
 
 `final_error_cells` and `final_error_beamwidths` are what 19 of 20 seeds stay within after the last
 stage, from the required offsets. All fits are `invertwin.reconstruct` with one loss.
-All surrogates take equally many steps, `exact` takes fewer. Only the rate of `exact` was compared
+All surrogates take equally many steps, `simulate_exact` takes fewer. Only the rate of
+`simulate_exact` was compared
 with others (0.1 and 1 on two seeds); surrogates of fixed width may do better at rates of their own.
 """
 

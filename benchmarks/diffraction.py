@@ -52,27 +52,35 @@ from report import MetricTable, Required, write
 from rich.table import Table
 from torch import Tensor
 
-from invertwin.channel.em.plane_waves import cross, dot, mirrored, plane_of_incidence
+from invertwin.channel.em.plane_waves import cross, dot, plane_of_incidence, reflect_vectors
 from invertwin.channel.em.transition_functions import transition
-from invertwin.channel.em.utd import Faces, Turn, conductor, diffraction_dyad
-from invertwin.channel.em.wedges import Wedges, azimuth_outside, edge_axis
+from invertwin.channel.em.utd import (
+    EdgeDiffraction,
+    FaceCoefficients,
+    conductor_coefficients,
+    diffraction_dyad,
+)
+from invertwin.channel.em.wedges import Wedges, edge_axis, exterior_azimuth
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.ray_scene import visible
+from invertwin.channel.rays.ray_scene import is_visible
 from invertwin.channel.rays.topology import topology_of
-from invertwin.channel.specular.candidates import Powers
-from invertwin.channel.specular.diffracted_paths import DiffractedPaths, diffracted_paths
-from invertwin.channel.specular.diffraction_candidates import Bends, find_bends
-from invertwin.channel.specular.edge_path_geometry import Edge, over_edges
-from invertwin.channel.specular.image_method import Walls
-from invertwin.channel.specular.wedge_scene import EdgedScene
+from invertwin.channel.specular.candidates import FaceInteractions
+from invertwin.channel.specular.diffracted_paths import DiffractedPaths, evaluate_diffracted_paths
+from invertwin.channel.specular.diffraction_candidates import (
+    DiffractionCandidates,
+    find_diffraction_candidates,
+)
+from invertwin.channel.specular.edge_path_geometry import PathEdge, diffract_over_edges
+from invertwin.channel.specular.image_method import CandidateSurfaces
+from invertwin.channel.specular.wedge_scene import WedgeScene
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.scene import box
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
-from invertwin.scene.material.slab import Sheet, slab_coefficients
+from invertwin.scene.material.slab import SlabLayer, slab_coefficients
 from oracles.exact_wedge import (
-    half_plane_of_plane_wave,
-    half_plane_of_point_source,
-    wedge_of_plane_wave,
+    half_plane_plane_wave,
+    half_plane_point_source,
+    wedge_plane_wave,
 )
 
 WAVE_NUMBER = 2 * math.pi  # a wavelength is a metre
@@ -110,7 +118,7 @@ class Bend:
     """
 
     opening: float
-    faces: Faces = conductor
+    faces: FaceCoefficients = conductor_coefficients
     axes: Float64[Tensor, "3 3"] | None = None
 
     def wedges(self, count: int) -> Wedges:
@@ -134,7 +142,7 @@ class Bend:
         wedges = self.wedges(len(rx))
         across = edge_axis(wedges)
         azimuth_in, azimuth = (
-            azimuth_outside(wedges, _unit(p - dot(p, across)[:, None] * across), 0)
+            exterior_azimuth(wedges, _unit(p - dot(p, across)[:, None] * across), 0)
             for p in (tx, rx)
         )
         length, way = _leg(tx, rx)
@@ -149,8 +157,8 @@ class Bend:
         sees = ((0, azimuth + azimuth_in < math.pi), (1, azimuth + azimuth_in > last))
         for face, bright in sees:
             normal = wedges.normals[:, face]
-            length, way = _leg(mirrored(tx, normal), rx)
-            before = mirrored(way, normal)
+            length, way = _leg(reflect_vectors(tx, normal), rx)
+            before = reflect_vectors(way, normal)
             law = self.faces(face, dot(normal, way).abs())
             s, p, after = (v[:, 0] for v in plane_of_incidence(normal, before))
             sent = _outer(law.reflection_s, s, s) + _outer(law.reflection_p, after, p)
@@ -159,7 +167,9 @@ class Bend:
 
     def diffracted(self, tx: Tensor, rx: Tensor, k: float) -> Tensor:
         """What the edge sends, with phase."""
-        found = over_edges([Edge(self.wedges(len(rx)), self.faces, endless=True)], tx, rx, k)
+        found = diffract_over_edges(
+            [PathEdge(self.wedges(len(rx)), self.faces, infinite=True)], tx, rx, k
+        )
         turn = torch.polar(torch.ones_like(found.length), -k * found.length)
         return found.transfer * turn[:, None, None]
 
@@ -202,7 +212,7 @@ def lossy(face: int, cosine: Tensor) -> FieldCoefficients:
 def sheet(face: int, cosine: Tensor) -> FieldCoefficients:
     """Both sides of a sheet, about its middle."""
     frequency = 299_792_458.0 * WAVE_NUMBER / (2 * math.pi)
-    layer = Sheet(torch.tensor(PERMITTIVITY), torch.tensor(0j), torch.tensor(THICKNESS))
+    layer = SlabLayer(torch.tensor(PERMITTIVITY), torch.tensor(0j), torch.tensor(THICKNESS))
     found = slab_coefficients([layer], cosine, frequency)
     turn = torch.polar(torch.ones_like(cosine), WAVE_NUMBER * THICKNESS * cosine)
     return FieldCoefficients(*(turn * value for value in found))
@@ -229,7 +239,7 @@ def plane_wave_error(opening: float, distance: float, truth: Callable[..., Any])
     wedges = bend.wedges(len(azimuth))
     towards = bend.place(1.0, azimuth, 0.0)
     direction = -bend.place(1.0, torch.full_like(azimuth, azimuth_in), 0.0)
-    turn = Turn(
+    turn = EdgeDiffraction(
         wedges,
         direction,
         towards,
@@ -266,13 +276,13 @@ def plane_wave_error(opening: float, distance: float, truth: Callable[..., Any])
 def sommerfeld(k: float, azimuth_in: float, distance: float, angle: Any, polarisation: Any) -> Any:
     """The half plane for many azimuths."""
     return np.array(
-        [half_plane_of_plane_wave(k, azimuth_in, distance, a, polarisation) for a in angle]
+        [half_plane_plane_wave(k, azimuth_in, distance, a, polarisation) for a in angle]
     )
 
 
 def series(k: float, azimuth_in: float, distance: float, angle: Any, polarisation: Any) -> Any:
     """The wedge of 3π/2."""
-    return wedge_of_plane_wave(k, 1.5, azimuth_in, distance, angle, polarisation)
+    return wedge_plane_wave(k, 1.5, azimuth_in, distance, angle, polarisation)
 
 
 def point_source_error(distance: float) -> float:
@@ -309,7 +319,7 @@ def point_source_error(distance: float) -> float:
             lit = (beta.abs() < math.pi).numpy()
             total = total + strength * lit * np.exp(-1j * WAVE_NUMBER * length) / length
         exact = [
-            half_plane_of_point_source(
+            half_plane_point_source(
                 WAVE_NUMBER, (distance, azimuth_in), (distance, a, height), polarisation
             )
             for a in azimuth.tolist()
@@ -325,7 +335,7 @@ def bends() -> dict[str, list[Bend]]:
     axes = axes * torch.linalg.det(axes)
     openings = (2.0, 1.5, 1.25)
     return {
-        "conductor": [Bend(n, conductor, axes) for n in openings],
+        "conductor": [Bend(n, conductor_coefficients, axes) for n in openings],
         "lossy": [Bend(n, lossy, axes) for n in openings],
         "sheet": [Bend(2.0, sheet, axes)],
     }
@@ -371,7 +381,7 @@ def slope_jump(*, corrected: bool = True) -> float:
     tx = bend.place(11.0, torch.full((2,), azimuth_in, dtype=torch.float64), 8.0)
     rx = bend.place(9.0, azimuth, -5.0)
     wedges = bend.wedges(2)
-    found = over_edges([Edge(wedges, endless=True)], tx, rx, WAVE_NUMBER, slopes=True)
+    found = diffract_over_edges([PathEdge(wedges, infinite=True)], tx, rx, WAVE_NUMBER, slopes=True)
     direction = _unit(found.points[:, 0] - tx).detach()
     turned = _unit(cross(direction, edge_axis(wedges)))  # −e × d
     vector = edge_axis(wedges) + 0j
@@ -405,17 +415,19 @@ class Cube:
     def __init__(self, side: float) -> None:
         mesh = box((side, side, side))
         topology = topology_of([mesh])
-        walls = Walls(mesh.vertices, topology, torch.tensor(PLACES, dtype=torch.float64))
+        walls = CandidateSurfaces(
+            mesh.vertices, topology, torch.tensor(PLACES, dtype=torch.float64)
+        )
         self.half = side / 2
-        self.around = EdgedScene(
-            mesh.vertices, topology, walls, lambda _, cosine: conductor(0, cosine)
+        self.around = WedgeScene(
+            mesh.vertices, topology, walls, lambda _, cosine: conductor_coefficients(0, cosine)
         )
 
     def optics(self, tx: Tensor, rx: Tensor) -> tuple[Tensor, Tensor]:
         """Straight and mirrored waves [row, 3, 3], and which of the seven there are [row, 7]."""
         length, way = _leg(tx, rx)
         eye = torch.eye(3, dtype=torch.float64)
-        lit = [visible(self.around.walls, tx, rx)]
+        lit = [is_visible(self.around.surfaces, tx, rx)]
         total = lit[0][:, None, None] * _across_dyad(way) * _wave(WAVE_NUMBER, length)
         for axis in range(3):
             others = [other for other in range(3) if other != axis]
@@ -428,19 +440,23 @@ class Cube:
                 bright = (dot(tx, normal) > self.half) & (dot(rx, normal) > self.half)
                 lit.append(bright & (met[:, others].abs() <= self.half).all(1))
                 turned = 2 * normal[:, :, None] * normal[:, None] - eye
-                sent = turned.to(torch.complex128) @ _across_dyad(mirrored(way, normal))
+                sent = turned.to(torch.complex128) @ _across_dyad(reflect_vectors(way, normal))
                 total = total + lit[-1][:, None, None] * sent * _wave(WAVE_NUMBER, length)
         return total, torch.stack(lit, 1)
 
-    def bends(self, tx: Tensor, rx: Tensor, order: int) -> list[Bends]:
+    def bends(self, tx: Tensor, rx: Tensor, order: int) -> list[DiffractionCandidates]:
         """Paths round its edges."""
         none = torch.zeros(len(self.around.topology.faces), dtype=torch.bool)
-        return list(find_bends(self.around, Powers(none, none), tx, rx, order, 0, None, 0))
+        return list(
+            find_diffraction_candidates(
+                self.around, FaceInteractions(none, none), tx, rx, order, 0, None, 0
+            )
+        )
 
     def diffracted(self, tx: Tensor, rx: Tensor, order: int) -> list[DiffractedPaths]:
         """What they are worth."""
         found = self.bends(tx, rx, order)
-        return [diffracted_paths(self.around, some, tx, rx, WAVE_NUMBER) for some in found]
+        return [evaluate_diffracted_paths(self.around, some, tx, rx, WAVE_NUMBER) for some in found]
 
     def of_dipole(self, tx: Tensor, rx: Tensor, vectors: Tensor, order: int) -> Tensor:
         """The field of Hertzian dipoles in one place [row, 3, dipole], also along the waves' ways.
@@ -462,11 +478,15 @@ class Cube:
         for some in found:
             alone = replace(some, rx=torch.arange(len(some.rx)))
 
-            def sent(aside: Tensor, bends: Bends = alone, at: Tensor = rx[some.rx]) -> Any:
-                part = diffracted_paths(self.around, bends, tx[None], at + aside, WAVE_NUMBER)
+            def sent(
+                aside: Tensor, bends: DiffractionCandidates = alone, at: Tensor = rx[some.rx]
+            ) -> Any:
+                part = evaluate_diffracted_paths(
+                    self.around, bends, tx[None], at + aside, WAVE_NUMBER
+                )
                 turn = torch.polar(torch.ones_like(part.length), -WAVE_NUMBER * part.length)
                 turn = turn * (1 + 1 / (1j * WAVE_NUMBER * part.length))
-                return (part.transfer * turn[:, None, None]) @ vectors, part.ways[:, -1]
+                return (part.transfer * turn[:, None, None]) @ vectors, part.directions[:, -1]
 
             with tracing():
                 across, way = sent(0 * eye[0])

@@ -34,8 +34,8 @@ from torch import Tensor
 from invertwin.channel import Grid, Sampling, backend
 from invertwin.channel.power import boundary
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.interior_silhouettes import InteriorEdgeSampler
-from invertwin.channel.power.random_walk import Walk
+from invertwin.channel.power.interior_silhouettes import InteriorSilhouetteSampler
+from invertwin.channel.power.random_walk import RandomWalk
 from invertwin.channel.rays.arrays import from_points
 from invertwin.channel.rays.backend import mi, torch_threads
 from invertwin.channel.rays.ray_scene import RayScene
@@ -125,7 +125,7 @@ class Estimator:
         owners[geometry.faces.ravel()] = geometry.face_object.repeat_interleave(3)
         self.moving = owners == list(names).index(task.moving)
         self.rays = RayScene(geometry, link)
-        self.inputs = Inputs.of(self.rays)
+        self.inputs = Inputs.from_rays(self.rays)
 
     def __call__(
         self, samples: int, seed: int, *, weighted: bool
@@ -139,23 +139,23 @@ class Estimator:
         start = perf_counter()
         # The samplers of the first family find nothing, so that all samples are of the second.
         with (
-            patch.object(boundary, "EdgeSampler", lambda *_, **__: NOTHING),
+            patch.object(boundary, "SilhouetteSampler", lambda *_, **__: NOTHING),
             patch.object(
                 boundary,
-                "InteriorEdgeSampler",
-                partial(InteriorEdgeSampler, weighted=weighted),
+                "InteriorSilhouetteSampler",
+                partial(InteriorSilhouetteSampler, importance_sampling=weighted),
             ),
         ):
-            points = boundary.BoundaryPoints(
+            points = boundary.BoundarySamples(
                 self.rays,
                 self.inputs,
                 Sampling(depth=DEPTH, boundary_samples=FAMILIES * samples),
                 seed,
                 chunks=lambda size: iter([dr.arange(mi.UInt32, size)] if size else []),
             )
-            walk = Walk(self.rays, self.inputs, seed)
-            for paths in boundary.boundary_paths(self.rays, attached, walk, points):
-                total = paths.weighted(lambda _, exists: dr.select(exists, 1.0, 0.0))
+            walk = RandomWalk(self.rays, self.inputs, seed)
+            for paths in boundary.trace_boundary_paths(self.rays, attached, walk, points):
+                total = paths.sum_weighted(lambda _, exists: dr.select(exists, 1.0, 0.0))
                 dr.backward_from(paths.speed * total)
         gradient = from_points(dr.grad(vertices)).numpy()
         seconds = perf_counter() - start
@@ -170,7 +170,7 @@ def compare(body: Mesh, samples: int, seeds: int) -> dict[str, Any]:
     with torch_threads(1):
         for seed in range(WARM_UP + seeds):
             for name, weighted in WAYS.items():
-                value, seconds = estimate(samples, seed, weighted=weighted)
+                value, seconds = estimate(samples, seed, importance_sampling=weighted)
                 values[name].append(value)
                 times[name].append(seconds)
     found: dict[str, Any] = {}

@@ -29,7 +29,7 @@ from report import MetricTable, write
 from rich.table import Table
 
 from invertwin.channel import Grid, Link, Sampling, backend, deposit_power
-from invertwin.channel.coherent.radar_equation import Place, radar_equation
+from invertwin.channel.coherent.radar_equation import MaterialPoints, radar_equation
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Isotropic, Mesh, Object, RoughDielectric, Scene, plate, rigid, sphere
 
@@ -93,7 +93,9 @@ class Task:
         geometry = flatten(Scene({"wall": self.wall}), self.link.wavelength)
         still = torch.zeros(len(position), dtype=torch.int64)
         normal = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(len(position), 3)
-        place = Place(position, normal, torch.ones(len(position), dtype=torch.float64), still)
+        place = MaterialPoints(
+            position, normal, torch.ones(len(position), dtype=torch.float64), still
+        )
         power = radar_equation(geometry, self.link, still, [place]).power
         return float(power @ torch.from_numpy(area.ravel()))
 

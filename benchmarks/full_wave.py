@@ -39,7 +39,7 @@ from invertwin.channel.em.plane_waves import polarisations
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import PhysicsWarning
 from invertwin.scene import Mesh, PerfectConductor
-from invertwin.signatures import aspects
+from invertwin.signatures import aspect_directions
 
 STORED = Path(__file__).parent / "full_wave_data"
 SIDE = 3.12  # of the cube: between the resonances inside, where its integral equation is sick
@@ -73,7 +73,7 @@ class Body:
     def directions(self, cut: str) -> Float64[Tensor, "aspect 3"]:
         """Towards the radar."""
         theta, phi = (torch.from_numpy(np.radians(angle)) for angle in self.cuts[cut])
-        return aspects(theta, phi)
+        return aspect_directions(theta, phi)
 
 
 def _seven_points() -> list[tuple[float, ...]]:

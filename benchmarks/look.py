@@ -43,15 +43,22 @@ from report import MetricTable, Required, write
 from torch import Tensor
 
 import invertwin as iw
-from invertwin.capture import Capture, ChirpCapture, ChirpData, ChirpSettings, adc_counts, faults_of
-from invertwin.capture.ti import changed, read_recording, write_samples
-from invertwin.capture.ti.layouts import fits_layout, frame_words, layout
+from invertwin.capture import (
+    Capture,
+    ChirpCapture,
+    ChirpData,
+    ChirpSettings,
+    adc_counts,
+    find_faults,
+)
+from invertwin.capture.ti import change_settings, read_recording, write_samples
+from invertwin.capture.ti.layouts import block_layout, frame_words, layout_error
 from invertwin.channel import Paths, trace_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar import BOARDS, Impairments, Leakage, Radar
-from invertwin.radar.boards import Elements
-from invertwin.radar.radar import sampled
+from invertwin.radar.boards import TxRxArrays
+from invertwin.radar.radar import require_sampled_waveform
 from invertwin.scene import RoughDielectric, box, plate, rigid
 
 REQUIRED: Required = {"detected": (">=", 0.95), "false_alarms": ("<=", 0.02)}
@@ -87,13 +94,13 @@ class Drawn:
 
     scene: str
     settings: ChirpSettings
-    elements: Elements
+    elements: TxRxArrays
     beat: Tensor
     snr: float
     headroom: float
 
 
-def drawn_settings(chance: Chance) -> tuple[ChirpSettings, Elements]:
+def drawn_settings(chance: Chance) -> tuple[ChirpSettings, TxRxArrays]:
     """Settings of a random board, and its elements."""
     board = BOARDS[str(chance.choice(DEVICES))]
     order = chance.permutation(len(board.transmitters))[: chance.integers(2, 5)] + 1
@@ -125,7 +132,7 @@ def reflectors(
     scene: str, radar: Radar, farthest: float, most_clutter_db: float, chance: Chance
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Ranges and directions [point, (R, u, v)], amplitudes and range rates of a scene's points."""
-    cell, unambiguous = radar.waveform.range_resolution, sampled(radar).max_range
+    cell, unambiguous = radar.waveform.range_resolution, require_sampled_waveform(radar).max_range
     nearest = max(5 * cell, 0.5)
     count = {"one": 1, "pair": 2, "mirrored": 2, "clutter": 300}.get(scene) or chance.integers(2, 7)
     last = min(0.9 * farthest, farthest - 5 * cell)
@@ -189,7 +196,7 @@ def objects(radar: Radar, farthest: float, chance: Chance) -> Paths:
     sampling = iw.Sampling(depth=1, points_per_m2=400)
     paths = trace_field(scene, radar.link(), sampling=sampling, seed=int(chance.integers(2**31)))
     strength = float(paths.coefficient.abs().square().sum().sqrt()) / radar.frame_count**0.5
-    return paths.weighted(1e-3 / strength)
+    return paths.scale_fields(1e-3 / strength)
 
 
 def drawn(scene: str, chance: Chance, *, sound: bool, leak: bool = False) -> Drawn:
@@ -370,9 +377,9 @@ def seen(case: Drawn, chance: Chance) -> Capture | ChirpCapture:
     scaled = ChirpData(data.samples * float(10 ** chance.uniform(-6, 0)), data.settings)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PhysicsWarning)
-        recording = scaled.recorded(case.elements)
+        recording = scaled.to_chirp_capture(case.elements)
         alone = case.settings.loops == 1 and not case.settings.real
-        return recording.capture() if alone else recording
+        return recording.to_capture() if alone else recording
 
 
 def stated(case: Drawn, chance: Chance) -> tuple[ChirpSettings, dict[str, Any]] | None:
@@ -403,13 +410,13 @@ def stated(case: Drawn, chance: Chance) -> tuple[ChirpSettings, dict[str, Any]] 
     wrong = {str(name): choices[name][int(chance.integers(len(choices[name])))] for name in names}
     wrong = {name: value for name, value in wrong.items() if value != numbers[name]}
     try:
-        other = changed(replace(right, ramp_end_time=2 * right.ramp_time), wrong)
+        other = change_settings(replace(right, ramp_end_time=2 * right.ramp_time), wrong)
         other = replace(other, ramp_end_time=right.ramp_time)
     except InputError:
         return None
-    same = layout(other) == layout(right)
+    same = block_layout(other) == block_layout(right)
     sizes = [frame_words(one) * (one.frames or 1) for one in (other, right)]
-    if not wrong or fits_layout(other) is not None or (same and sizes[0] >= sizes[1]):
+    if not wrong or layout_error(other) is not None or (same and sizes[0] >= sizes[1]):
         return None
     return other, {name: numbers[name] for name in numbers if name in wrong}
 
@@ -444,7 +451,7 @@ def judged_sound(number: int, seed: int) -> dict[str, Any]:
     scene = SCENES[number % len(SCENES)]
     case = drawn(scene, chance, sound=True)
     refused = refusal(case, case.settings) if number % 3 == 0 else None
-    said = [fault.name for fault in faults_of(seen(case, chance))]
+    said = [fault.name for fault in find_faults(seen(case, chance))]
     return {"scene": scene, "said": said + (["settings"] if refused else [])}
 
 
@@ -465,7 +472,7 @@ def judged_faulty(number: int, seed: int) -> dict[str, Any]:
             first = said is not None and f"what fits: {right} " in said
             return {"fault": fault, "found": said is not None, "named": named, "first": first}
         if fault == "leakage" or APPLIED[fault](case, chance):
-            names = [found.name for found in faults_of(seen(case, chance))]
+            names = [found.name for found in find_faults(seen(case, chance))]
             right = ALSO.get(fault, {fault})
             found, first = bool(right & set(names)), bool(right & set(names[:1]))
             return {"fault": fault, "found": found, "named": found, "first": first}

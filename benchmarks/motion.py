@@ -25,7 +25,7 @@ from report import MetricTable, Required, write
 import invertwin as iw
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.scene import (
-    InMotion,
+    MovingScene,
     RoughDielectric,
     Walking,
     linear_array,
@@ -46,7 +46,7 @@ BODY = person()
 SKIN = RoughDielectric(permittivity=4.0)
 PLACE = [0.2, standing_height(BODY), 4.0]
 STANDING = iw.Object(BODY.mesh({}), SKIN, rigid(translation=PLACE))
-walking = InMotion(
+walking = MovingScene(
     iw.Scene({**room(), "person": STANDING}), {"person": Walking(BODY, SPEED, phase=0.8)}
 )
 

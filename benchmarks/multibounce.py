@@ -10,7 +10,8 @@ time over ours (> 1: we are faster).
 - We (`deposit_power`) join every vertex of a path to the receiver and sum the paths into a map of
   range × angle. The step adds the derivative with respect to all vertices, which move from step to
   step, so that the tree is rebuilt. Shadow edges are sampled, though a convex room has none.
-- They (`PathSolver`, loop mode `evaluated`) list paths that end with a diffuse reflection; the step
+- They (`PathSolver`, loop mode `evaluate_value`) list paths that end with a diffuse reflection;
+the step
   adds the derivative of the total power with respect to the scattering coefficient: their diffuse
   paths have no other. With specular reflection on, as in our room, a vertex is diffuse with
   probability 1/4;

@@ -42,10 +42,10 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 import invertwin as iw
-from invertwin.channel import Sight
+from invertwin.channel import ViewpointScene
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import PhysicsWarning
-from invertwin.inversion.initialisation.detections import linked, principal_rectangle
+from invertwin.inversion.initialisation.detections import label_groups, principal_rectangle
 from invertwin.radar import add_noise, ordered_statistics_cfar, peaks
 from invertwin.scene import (
     Cosine,
@@ -61,7 +61,7 @@ from invertwin.scene import (
     sphere,
     trihedral,
 )
-from invertwin.scene.people.gait import hanging
+from invertwin.scene.people.gait import hanging_arm_rotation
 
 REQUIRED: Required = {
     "recall": (">=", 0.9),
@@ -155,10 +155,10 @@ class Thing:
         beat = torch.zeros(*radar.shape, CHIRP.samples, dtype=torch.complex128)
         tx, rx = radar.elements()
         for frame, place in enumerate(radar.positions):
-            sight, way = Sight(scene, place), -away[frame : frame + 1]
-            face = sight.first(way)
+            sight, way = ViewpointScene(scene, place), -away[frame : frame + 1]
+            face = sight.find_first_faces(way)
             length = way.norm(dim=1)
-            if int(face) >= 0 and float(sight.along(face, way / length)) < float(length):
+            if int(face) >= 0 and float(sight.plane_distances(face, way / length)) < float(length):
                 continue
             local = way / length @ link.rotations[frame]
             gain = (link.tx_pattern.gain(local) * link.rx_pattern.gain(local)).sqrt()
@@ -174,8 +174,8 @@ def _standing() -> Mesh:
     """A person with hanging arms, about the middle of its box."""
     turns = torch.eye(3, dtype=torch.float64).repeat(len(BODY.names), 1, 1)
     for side in ("left", "right"):
-        turns[BODY.joint(f"{side}_shoulder")] = hanging(side)
-    skin, _ = BODY.posed(turns)
+        turns[BODY.joint(f"{side}_shoulder")] = hanging_arm_rotation(side)
+    skin, _ = BODY.apply_pose(turns)
     return Mesh(skin - 0.5 * (skin.amax(0) + skin.amin(0)), BODY.faces)
 
 
@@ -291,7 +291,7 @@ class Room:
         begin = perf_counter()
         twin = iw.twin(capture, low=(-HALF, -HALF), high=(HALF, HALF), level=0.0, seed=self.number)
         seconds = perf_counter() - begin
-        sure = [thing for thing in twin.things if thing.confidence > 0.5]
+        sure = [thing for thing in twin.objects if thing.existence_probability > 0.5]
         places = [(float(t.position[0]), float(t.position[2])) for t in sure]
         pairs = matched([thing.place for thing in self.things], places)
         rows = [
@@ -306,7 +306,7 @@ class Room:
             "kinds": [thing.kind for thing in self.things],
             "frames": len(self.turns),
             "found": len(sure),
-            "unsure": len(twin.things) - len(sure),
+            "unsure": len(twin.objects) - len(sure),
             "matched": rows,
             "missed": [
                 thing.kind for k, thing in enumerate(self.things) if k not in [a for a, _ in pairs]
@@ -392,7 +392,7 @@ def conventional(
     core = points[counts >= least]
     if not len(core):
         return []
-    labels = linked(core, gap)
+    labels = label_groups(core, gap)
     found: list[tuple[float, float]] = []
     for number in range(int(labels.max()) + 1):
         own: Tensor = core[labels == number]

@@ -16,17 +16,18 @@ turned by 10° to some side. From the same data and start are fitted:
 
 - `pose_only`: place and heading of the mean car, by Adam.
 - `free`: these, and its vertices, which move in smooth steps, by Adam: too many for Gauss–Newton.
-- `prior`: these, and the coordinates of the prior, 27 numbers, by Gauss–Newton, whose steps cost
+- `prior_shape`: these, and the coordinates of the prior, 27 numbers, by Gauss–Newton, whose steps
+cost
   more: `seconds_ratio` compares times.
 
 Distances and volumes are those of the whole car, the side that no position sees included; `_seen`
 are restricted to the surface that some position sees. Medians over the cars:
 
-- `chamfer_ratio`: Chamfer distance of `prior` over that of `pose_only`.
-- `iou_gain`: volume IoU of `prior` minus that of `pose_only`.
-- `iteration_ratio`: the iteration at which `prior` is first as near as `free` ends, over the
+- `chamfer_ratio`: Chamfer distance of `prior_shape` over that of `pose_only`.
+- `iou_gain`: volume IoU of `prior_shape` minus that of `pose_only`.
+- `iteration_ratio`: the iteration at which `prior_shape` is first as near as `free` ends, over the
   iterations of `free`; infinite where it never is.
-- `seconds_ratio`: the time until `prior` is as near as `free` ends, over the time of `free`.
+- `seconds_ratio`: the time until `prior_shape` is as near as `free` ends, over the time of `free`.
 """
 
 import argparse
@@ -48,17 +49,17 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from invertwin.cli.fits.fitting import fit
-from invertwin.cli.fits.problem import FULL, problem_of
-from invertwin.cli.fits.spreading import Workers
+from invertwin.cli.fits.fitting import run_fit
+from invertwin.cli.fits.problem import OWN_METHOD, build_problem
+from invertwin.cli.fits.spreading import FitWorkers
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import load_run, stated, to_toml, validate
-from invertwin.runtime.engines import spread
+from invertwin.cli.schema.run_file import load_run, to_minimal_toml, to_toml, validate_run
+from invertwin.runtime.engines import run_jobs
 from invertwin.storage.run_folder import open_run
 
 RUN = Path(__file__).parents[1] / "experiments" / "shape_car_prior_public.toml"
 CARS = 20
-MODES = {"pose_only": "pose_only", "free": "free", "prior": FULL}
+MODES = {"pose_only": "pose_only", "free": "free", "prior": OWN_METHOD}
 MODES_OF_SPACE = 78
 CUT = 2.0  # standard deviations
 DISTANCE, ANGLE_DEG = 0.3, 10.0  # of a start
@@ -100,12 +101,12 @@ def _turned(rotation_deg: Sequence[float] | None, heading_deg: float) -> list[fl
 def fitted(run: RunFile) -> Car:
     """All fits of a car."""
     console = Console(quiet=True)
-    problem = problem_of(run, console)
+    problem = build_problem(run, console)
     found: Car = {}
     with tempfile.TemporaryDirectory() as scratch:
         folder = open_run(Path(scratch) / "car", {"car": to_toml(run)})
         for name, mode in MODES.items():
-            row, _ = fit(problem, problem.scene, 0, mode, folder, console, None)
+            row, _ = run_fit(problem, problem.scene, 0, mode, folder, console, None)
             kept = {key: row[key] for key in KEPT if key in row}
             found[name] = kept | {key: row[key] for key in ("steps", "loss", "seconds", "curve")}
     return found
@@ -119,11 +120,11 @@ def key_of(run: RunFile) -> str:
 
 def fitted_text(text: str) -> Car:
     """All fits of a car by its run file: what a worker does."""
-    return fitted(validate(tomllib.loads(text), RUN))
+    return fitted(validate_run(tomllib.loads(text), RUN))
 
 
 def all_cars(
-    out: Path, numbers: Sequence[int], run: RunFile, workers: Workers | None = None
+    out: Path, numbers: Sequence[int], run: RunFile, workers: FitWorkers | None = None
 ) -> dict[int, Car]:
     """The fits of the cars; those that are in the folder are read."""
     (out / "cars").mkdir(parents=True, exist_ok=True)
@@ -141,8 +142,8 @@ def all_cars(
     if workers is None:
         done = enumerate(map(fitted, runs))
     else:
-        texts = [stated(own) for own in runs]
-        done = spread(fitted_text, texts, engine=workers.engine, workers=workers.count)
+        texts = [to_minimal_toml(own) for own in runs]
+        done = run_jobs(fitted_text, texts, engine=workers.engine, workers=workers.count)
     for at, fits in done:
         number = list(missing)[at]
         kept = {"key": key_of(runs[at]), "fits": fits}
@@ -234,7 +235,7 @@ def picture(cars: dict[int, Car], worst: int, path: Path) -> None:
 
 
 def measure(
-    out: Path, count: int = CARS, run: RunFile | None = None, workers: Workers | None = None
+    out: Path, count: int = CARS, run: RunFile | None = None, workers: FitWorkers | None = None
 ) -> dict[str, Any]:
     """All metrics and the picture; fewer cars and shorter fits in tests only."""
     start = perf_counter()
@@ -272,7 +273,9 @@ def main() -> None:
     parser.add_argument("--workers", type=int)
     parser.add_argument("--engine", choices=("processes", "ray"), default="processes")
     given = parser.parse_args()
-    metrics = measure(given.out, given.cars, workers=Workers.asked(given.engine, given.workers))
+    metrics = measure(
+        given.out, given.cars, workers=FitWorkers.from_options(given.engine, given.workers)
+    )
     for key in SHOWN:
         print(f"{key} = {metrics[key]:.3g} (worst car {metrics['worst'][key]:.3g})")
     for line in verdicts(metrics):

@@ -69,7 +69,7 @@ class Case:
     def signal(self) -> Tensor:
         """What the library computes."""
         paths = point_paths(self.radar, self._at(0.0), self.coefficient)
-        return moving_beat(paths, self.radar, self.chirps, places=self._at)
+        return moving_beat(paths, self.radar, self.chirps, trajectory=self._at)
 
     def oracle(self) -> Tensor:
         """Every sample by itself, [1, chirp, tx, rx, sample]."""

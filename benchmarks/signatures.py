@@ -36,7 +36,7 @@ from invertwin.channel.rcs import far_field as signature
 from invertwin.channel.rcs import shooting_bouncing_rays as tubes
 from invertwin.errors import PhysicsWarning
 from invertwin.scene import Mesh, PerfectConductor, load_mesh
-from invertwin.signatures import Signature, aspects
+from invertwin.signatures import Signature, aspect_directions
 
 CAR = Path(__file__).parents[1] / "experiments" / "car.ply"
 ASPECT = (85.0, 20.0)  # θ, φ [°]; the car points along x
@@ -104,7 +104,7 @@ def signed(scene: Scene, density: float, frequencies: tuple[float, float, int]) 
         warnings.simplefilter("ignore", PhysicsWarning)
         return rcs(
             scene,
-            aspects(theta, phi),
+            aspect_directions(theta, phi),
             swept,
             depth=DEPTH,
             edges=0,
@@ -129,9 +129,9 @@ def measure(
     signed(scene, 0.25, (*frequencies[:2], 2))
     rays = Rays()
     with (
-        patch.object(tubes, "next_surface", rays.traced(tubes.next_surface)),
-        patch.object(signature, "visible", rays.traced(signature.visible)),
-        patch.object(signature, "tubes", rays.bounced(signature.tubes)),
+        patch.object(tubes, "next_surface", rays.traced(tubes.find_next_surface)),
+        patch.object(signature, "visible", rays.traced(signature.is_visible)),
+        patch.object(signature, "tubes", rays.bounced(signature.trace_tubes)),
     ):
         start = perf_counter()
         found = signed(scene, DENSITY, frequencies)

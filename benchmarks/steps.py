@@ -37,10 +37,10 @@ from rich.console import Console
 
 from invertwin.cli.fits.problem import (
     Problem,
-    observations_of,
-    problem_of,
-    schedule_of,
-    unknowns_of,
+    build_problem,
+    make_observations,
+    make_schedule,
+    make_unknowns,
 )
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import load_run
@@ -65,13 +65,13 @@ COUNTED = {
 def fit(problem: Problem, steps: int, after_step: Callable[[dict[str, Any]], None]) -> None:
     """The first steps of the demo's fit."""
     run = problem.run
-    (stage,) = schedule_of(problem)
+    (stage,) = make_schedule(problem)
     reconstruct(
         problem.scene,
-        observations_of(problem),
-        unknowns_of(run),
-        loss=build.made(run, "loss"),
-        optimizer=build.made(run, "optimizer"),
+        make_observations(problem),
+        make_unknowns(run),
+        loss=build.build_section(run, "loss"),
+        optimizer=build.build_section(run, "optimizer"),
         schedule=replace(stage, steps=steps),
         callbacks=[Report(after_step)],
         seed=run.seed,
@@ -126,7 +126,7 @@ def torch_operations(problem: Problem, steps: int) -> list[dict[str, float]]:
 
 def measure(steps: int = STEPS, skipped: int = SKIPPED) -> dict[str, Any]:
     """Medians over the steps; fewer steps in tests only."""
-    problem = problem_of(load_run(RUN), Console(quiet=True))
+    problem = build_problem(load_run(RUN), Console(quiet=True))
     first, second = wall_and_kernels(problem, steps), torch_operations(problem, steps)
     rows = [one | other for one, other in zip(first, second, strict=True)][skipped:]
     found: dict[str, Any] = {key: statistics.median(row[key] for row in rows) for key in rows[0]}

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Sampling, backend, deposit_power, trace_power
 from invertwin.channel.rays.backend import mi
-from invertwin.channel.rays.ray_scene import RayScene, visible
+from invertwin.channel.rays.ray_scene import RayScene, is_visible
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.radar import FMCW, Radar
 from invertwin.runtime.memory import peak_memory
@@ -84,7 +84,7 @@ class Task:
         center = torch.stack(corners).mean(dim=0)
         normal = torch.linalg.cross(corners[1] - corners[0], corners[2] - corners[0])
         facing = center[(normal * (link.tx - center)).sum(dim=1) > 0]
-        seen = visible(RayScene(geometry, link), link.tx.expand(len(facing), 3), facing)
+        seen = is_visible(RayScene(geometry, link), link.tx.expand(len(facing), 3), facing)
         return 1 - float(seen.double().mean())
 
     def step(self, number: int, samples: int, boundary_samples: int) -> tuple[float, float]:

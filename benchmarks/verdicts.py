@@ -28,7 +28,7 @@ import torch
 from report import MetricTable, Required, write
 
 import invertwin as iw
-from invertwin.inversion import Optimizer, displaced, nearby, pose_grid, residual
+from invertwin.inversion import Optimizer, displace, pose_error, pose_grid, sample_nearby_poses
 from invertwin.scene import (
     AntennaArray,
     Mesh,
@@ -114,7 +114,7 @@ class Trial:
         item = iw.Object(mesh, PAINT, rigid(turn, place - turn @ mesh.center))
         wall = iw.Object(plate(3.6, 1.6), PAINT, rigid(translation=[0.0, 0.0, 3.9]))
         limits: dict[str, Any] = {"distance": (0.0, FAR), "angle": (0.0, math.pi), "axes": "xz"}
-        (start,) = nearby(item, rotation_axis=UP, generator=chance, **limits)
+        (start,) = sample_nearby_poses(item, rotation_axis=UP, generator=chance, **limits)
         parts = 1 if kind in ("L", "car") else 2
         return Trial(number, kind, iw.Scene({"object": item, "wall": wall}), start, parts)
 
@@ -122,8 +122,8 @@ class Trial:
         """How far an end is from the truth [m, rad]."""
         none, errors = torch.zeros(3, dtype=torch.float64), []
         for k in range(self.parts):
-            alike = displaced(self.truth["object"], none, 2 * math.pi * k / self.parts * UP)
-            off = residual(found["object"], alike)
+            alike = displace(self.truth["object"], none, 2 * math.pi * k / self.parts * UP)
+            off = pose_error(found["object"], alike)
             assert off is not None
             errors.append((off.angle, off.distance))
         angle, distance = min(errors)
@@ -149,7 +149,7 @@ class Trial:
         found = iw.search(known, seen, pose, {"object": starts}, seed=self.number, **FIT)
         row |= {"search": self._judged(found.best), "ambiguities": found.ambiguities}
         row["ends"] = [
-            [*self.error(end.scene), z] for end, z in zip(found.ends, found.rivals, strict=True)
+            [*self.error(end.scene), z] for end, z in zip(found.minima, found.scores, strict=True)
         ]
         return row | {"seconds": perf_counter() - begin, "settings": SETTINGS}
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 import invertwin as iw
-from invertwin.inversion import Check
+from invertwin.inversion import GradcheckSettings
 from invertwin.scene import (
     RoughDielectric,
     Translation,
@@ -41,7 +41,7 @@ model = iw.SurrogateMap(grid, sampling=sampling)
 # θ moves the letter to the right. The differences are the truth: two maps, 8 mm apart.
 report = iw.gradcheck(
     model, Translation("letter"), {"translation": [1.0, 0.0, 0.0]}, scene=scene, sensor=radar,
-    check=Check(repeats=2, difference_samples=2_000_000, max_pairs=4),
+    settings=GradcheckSettings(repeats=2, difference_samples=2_000_000, max_pairs=4),
 )  # fmt: skip
 
 peak = report.value.max()

@@ -10,7 +10,7 @@ import torch
 from torch.func import jvp
 
 import invertwin as iw
-from invertwin.links import CellSampling, MapPlane, Reception, Transmitters
+from invertwin.links import CellSampling, MapPlane, PropagationSettings, Transmitters
 from invertwin.scene import PerfectConductor, Slab, box, rigid, rotation_from_vector
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples")
@@ -31,7 +31,10 @@ scene = iw.Scene(
         "table": iw.Object(box([1.6, 0.8, 0.04]), board, at(1.6, 4.6, 0.75)),
     }
 )
-mast, reception = Transmitters(torch.tensor([[0.7, 0.6, 2.4]]).double()), Reception(3.5e9, depth=2)
+mast, reception = (
+    Transmitters(torch.tensor([[0.7, 0.6, 2.4]]).double()),
+    PropagationSettings(3.5e9, depth=2),
+)
 zero, one, step = torch.tensor([0.0, 1.0, 0.02]).double()
 
 

@@ -43,7 +43,9 @@ class Blob(ForwardModel):
     def observe(self, recording: Tensor) -> Tensor:
         return recording
 
-    def looks(self, scene: Scene, sensor: Any, seed: int) -> Callable[[int, float], Tensor] | None:
+    def realisations(
+        self, scene: Scene, sensor: Any, seed: int
+    ) -> Callable[[int, float], Tensor] | None:
         if not self.known:
             return None
         mean = self.predict(scene, sensor, seed)

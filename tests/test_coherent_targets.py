@@ -9,10 +9,10 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
-from invertwin.channel import Sampling, trace_chains, trace_field, without_echoes
+from invertwin.channel import Sampling, as_absorbers, trace_facet_paths, trace_field
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
-from invertwin.models.facets import ChainMap
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
+from invertwin.models.facets import FacetMap
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import FMCW, Radar, Surrogate, beat_signal, exact_spectrum
 from invertwin.scene import (
@@ -65,9 +65,9 @@ def test_peak_and_lobe_are_those_of_the_field(name):
     tops, worst = [], 0.0
     for degrees in (-10, -5, -2, -1, 0, 1, 2, 5, 10):
         scene = alone(mesh, (0.0, math.radians(degrees) + TOWARDS, 0.0))
-        field = ChainMap(GRID, sampling=drawn).predict(scene, DEVICE, 0)
+        field = FacetMap(GRID, sampling=drawn).predict(scene, DEVICE, 0)
         rough = replace(model, coherent=()).predict(
-            without_echoes(walled(scene), ["target"]), DEVICE, 1
+            as_absorbers(walled(scene), ["target"]), DEVICE, 1
         )
         found = model.predict(walled(scene), DEVICE, 1)
         truth = field + rough
@@ -108,7 +108,7 @@ def test_two_targets_in_one_cell_are_the_mean_over_wavelengths():
         scene = Scene({**scene.objects, "other": other})
         # Each by itself: beams of both together would see one another.
         beats = [
-            beat_signal(trace_chains(Scene({n: o}), DEVICE.link(), 3), DEVICE)
+            beat_signal(trace_facet_paths(Scene({n: o}), DEVICE.link(), 3), DEVICE)
             for n, o in scene.objects.items()
         ]
         fields.append(exact_spectrum(beats[0] + beats[1], DEVICE, GRID))
@@ -133,8 +133,8 @@ def test_on_a_rough_wall_a_target_is_the_mean_over_speckle():
     drawn = Sampling(depth=1, samples=200_000, boundary_samples=0, points_per_m2=4000.0)
     deep = replace(drawn, depth=3)
     found = SurrogateMap(GRID, sampling=deep, coherent=["target"]).predict(scene, DEVICE, 1)
-    target = trace_chains(Scene({"target": scene["target"]}), DEVICE.link(), 3)
-    dark = without_echoes(scene, ["target"])
+    target = trace_facet_paths(Scene({"target": scene["target"]}), DEVICE.link(), 3)
+    dark = as_absorbers(scene, ["target"])
     looks = []
     for seed in range(64):
         rough = trace_field(dark, DEVICE.link(), sampling=replace(drawn, boundary=False), seed=seed)
@@ -154,7 +154,7 @@ def test_the_loss_of_a_place_falls_steadily_where_fields_fringe():
     drawn = Sampling(depth=3, samples=20_000, boundary_samples=0)
     wide = Surrogate(range_width=2.0)
     smooth = SurrogateMap(GRID, wide, drawn, coherent=["target", "still"])
-    fringed = ChainMap(GRID, wide, drawn)
+    fringed = FacetMap(GRID, wide, drawn)
     still = thing(trihedral(0.05), (0.06, 0.0, 3.0), material=METAL)
 
     def at(z: float) -> Scene:
@@ -226,7 +226,7 @@ def test_gradient_checks_hold_before_a_rough_wall():
         {"rotation": float64([0.6, 0.7, 0.2])},
         scene=walled(alone(trihedral(0.05), (0.1, 0.12, 0.0))),
         sensor=DEVICE,
-        check=Check(repeats=1, difference_samples=30_000, noise=0.01, max_pairs=4),
+        settings=GradcheckSettings(repeats=1, difference_samples=30_000, noise=0.01, max_pairs=4),
     )
     error = relative(report.gradient, report.difference)
     assert error < 0.02
@@ -247,12 +247,12 @@ def test_batches_and_references_have_the_targets_of_single_maps():
 
 def test_a_fit_narrows_the_stretch_with_the_widths():
     model = SurrogateMap(GRID, Surrogate(range_width=2.0), coherent=("target",), stretch=3.0)
-    half = model.narrowed(0.5)
+    half = model.scale_blur(0.5)
     assert (half.kernels.range_width, half.stretch) == (1.0, 2.0)
-    end = model.narrowed(0.0)
+    end = model.scale_blur(0.0)
     assert end.stretch == 1.0
-    assert not end.widened
-    assert SurrogateMap(GRID, coherent=["target"], stretch=1.5).widened
+    assert not end.has_blur
+    assert SurrogateMap(GRID, coherent=["target"], stretch=1.5).has_blur
 
 
 def test_looks_have_other_phases_of_targets():
@@ -260,7 +260,7 @@ def test_looks_have_other_phases_of_targets():
     few = Sampling(depth=3, samples=50_000, boundary_samples=0, points_per_m2=2000.0)
     model = SurrogateMap(GRID, sampling=few, coherent=["target"])
     scene = walled(alone(trihedral(0.02), at=(0.1, 0.0, 3.3)))
-    look = model.looks(scene, DEVICE, 0)
+    look = model.realisations(scene, DEVICE, 0)
     assert look is not None
     found = torch.stack([look(number, 0.0) for number in range(48)])
     expected = model.predict(scene, DEVICE, 0).flatten()
@@ -268,7 +268,7 @@ def test_looks_have_other_phases_of_targets():
     values, mean = found.flatten(1)[:, cell], expected[cell]
     assert float(values.mean() / mean) == pytest.approx(1, abs=0.2)
     assert float(values.std() / values.mean()) > 0.1
-    assert replace(model, coherent=()).looks(scene, DEVICE, 0) is None
+    assert replace(model, coherent=()).realisations(scene, DEVICE, 0) is None
 
 
 def test_targets_are_given_by_names_and_the_stretch_needs_some():
@@ -290,7 +290,7 @@ def test_echoes_of_one_target_in_different_cells_add_in_power():
     pair = Scene({"target": thing(both, (0.0, 0.0, 2.7), material=METAL)})
     drawn = Sampling(depth=1)
     found = SurrogateMap(GRID, sampling=drawn, coherent=["target"]).predict(pair, DEVICE, 0)
-    truth = ChainMap(GRID, sampling=drawn).predict(pair, DEVICE, 0)
+    truth = FacetMap(GRID, sampling=drawn).predict(pair, DEVICE, 0)
     assert relative(found, truth) < 0.05
 
 
@@ -310,6 +310,6 @@ def test_arrays_that_are_no_product_and_other_kernels_serve_too():
         device = Radar(*arrays, waveform, float64([[0.0, 0.0, 0.0]]), array_window="rectangular")
         grid = device.grid(2.4, 3.6, 0.3)
         model = SurrogateMap(grid, kernels, Sampling(3), coherent=["target"])
-        truth = ChainMap(grid, sampling=Sampling(3)).predict(scene, device, 0)
+        truth = FacetMap(grid, sampling=Sampling(3)).predict(scene, device, 0)
         found = model.predict(scene, device, 0)
         assert float(found.max() / truth.max()) == pytest.approx(1, abs=0.05)

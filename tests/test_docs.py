@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.run_file import load_run, validate
+from invertwin.cli.schema.run_file import load_run, validate_run
 from invertwin.registry.kinds import PLUGINS
 from invertwin_studies.recordings import rail_sar
 from public_names import ROOMS, cells, documented, menu, shown
@@ -179,7 +179,7 @@ def test_run_files_on_the_page_fit_the_schema(tmp_path):
     examples = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert examples
     for text in examples:
-        found = validate(tomllib.loads(text), tmp_path / "run.toml")
+        found = validate_run(tomllib.loads(text), tmp_path / "run.toml")
         (tmp_path / "run.toml").write_text(text)
         assert load_run(tmp_path / "run.toml") == found
 

@@ -14,13 +14,13 @@ from invertwin.scene import (
     PerfectConductor,
     Slab,
     dihedral,
-    joined,
+    merge_meshes,
     plate,
     rigid,
     sphere,
     trihedral,
 )
-from invertwin.signatures import aspects, decibels
+from invertwin.signatures import aspect_directions, to_dbsm
 from scenes import float64
 
 METAL = PerfectConductor()
@@ -43,7 +43,7 @@ def test_sigma_of_a_plate():
 
 def test_a_target_that_is_moved_returns_no_more_and_no_less():
     """Sides of its beams lie in the planes of its mirrors; rounding there has no derivative."""
-    directions = aspects(torch.deg2rad(float64([172.0, 180.0, 186.0])), math.pi / 2)
+    directions = aspect_directions(torch.deg2rad(float64([172.0, 180.0, 186.0])), math.pi / 2)
 
     def power(place: Tensor) -> Tensor:
         moved = iw.Object(trihedral(0.05), METAL, rigid(translation=place))
@@ -64,7 +64,7 @@ def test_one_bounce_turns_circular_polarisation_over_and_two_keep_it(mesh, kept)
 
 
 def test_polarisation_names_the_first_row():
-    direction = aspects(math.pi - 0.4, 0.3)
+    direction = aspect_directions(math.pi - 0.4, 0.3)
     linear = iw.rcs(target(dihedral(0.05)), direction, 30e9, edges=0)
     turned = iw.rcs(target(dihedral(0.05)), direction, 30e9, edges=0, polarisation="H")
     slanted = iw.rcs(target(dihedral(0.05)), direction, 30e9, edges=0, polarisation=(1, 1))
@@ -73,7 +73,9 @@ def test_polarisation_names_the_first_row():
 
 
 def test_aspects_are_those_of_a_sphere():
-    found = aspects(float64([0.0, math.pi / 2, math.pi / 2]), float64([0.7, 0.0, math.pi / 2]))
+    found = aspect_directions(
+        float64([0.0, math.pi / 2, math.pi / 2]), float64([0.7, 0.0, math.pi / 2])
+    )
     assert torch.allclose(found, float64([[0, 0, 1], [1, 0, 0], [0, 1, 0]]), atol=1e-12)
 
 
@@ -100,7 +102,11 @@ def test_an_image_is_sharp_where_the_target_is():
     place = (0.12, 0.05, 0.0)
     angles = torch.linspace(-0.1, 0.1, 41, dtype=torch.float64)
     found = iw.rcs(
-        target(sphere(0.04, 5), place), aspects(math.pi / 2, angles), BAND, edges=0, depth=1
+        target(sphere(0.04, 5), place),
+        aspect_directions(math.pi / 2, angles),
+        BAND,
+        edges=0,
+        depth=1,
     )
     steps = torch.linspace(-0.2, 0.2, 81, dtype=torch.float64)
     x, y = torch.meshgrid(steps, steps, indexing="ij")
@@ -122,7 +128,7 @@ def test_bistatic_directions_are_apart():
 
 
 def test_decibels_of_nothing_are_finite():
-    assert torch.isfinite(decibels(torch.zeros(2, dtype=torch.complex128))).all()
+    assert torch.isfinite(to_dbsm(torch.zeros(2, dtype=torch.complex128))).all()
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -147,7 +153,7 @@ def test_bad_arguments_are_named(change, text):
 
 
 def test_uneven_frequencies_have_no_range_profile():
-    found = iw.rcs(target(joined([plate(0.1, 0.1)])), AHEAD, [28e9, 29e9, 31e9])
+    found = iw.rcs(target(merge_meshes([plate(0.1, 0.1)])), AHEAD, [28e9, 29e9, 31e9])
     with pytest.raises(InputError, match="evenly spaced"):
         found.range_profile()
 

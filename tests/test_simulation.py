@@ -84,7 +84,7 @@ def test_motion_is_refused_until_it_is_frozen():
     moving = occluder().replace("occluder", velocity=float64([0.5, 0.0, 0.0]))
     with pytest.raises(InputError, match="expected objects at rest, got velocities on occluder"):
         simulate(moving, device, grid, seed=0, sampling=few)
-    frozen = moving.at(0.2).replace("occluder", velocity=None)
+    frozen = moving.advance(0.2).replace("occluder", velocity=None)
     assert simulate(frozen, device, grid, seed=0, sampling=few).spectrum.any()
     assert SurrogateMap(grid, sampling=few).predict(frozen, device, 0).any()
 

@@ -13,7 +13,7 @@ import numpy as np
 
 import invertwin as iw
 from invertwin.capture import ChirpCapture, read
-from invertwin.radar import Chirps, board, doppler_maps, points_of
+from invertwin.radar import Chirps, board, detect_points, doppler_maps
 from invertwin.scene import RoughDielectric, rigid, sphere
 
 # %% [markdown]
@@ -81,7 +81,7 @@ iw.plotting.range_doppler(maps)
 # A list of points: range, range rate, direction and place.
 
 # %%
-points = points_of(recording.beat, seen, grid, recording.chirps, frame=0)
+points = detect_points(recording.beat, seen, grid, recording.chirps, frame=0)
 for number in points.power.argsort(descending=True)[:4].tolist():
     x, _, z = points.position[number].tolist()
     print(f"{points.velocity[number]:+.1f} m/s at x = {x:+.2f} m, z = {z:.2f} m")

@@ -7,10 +7,10 @@
 # %%
 # %matplotlib inline
 import invertwin as iw
-from invertwin.plotting import Panel
+from invertwin.plotting import MapPanel
 from invertwin.radar import Chirps, micro_doppler, range_profile
 from invertwin.scene import (
-    InMotion,
+    MovingScene,
     RoughDielectric,
     Walking,
     linear_array,
@@ -21,7 +21,7 @@ from invertwin.scene import (
 
 # %% [markdown]
 # ## A body that walks
-# `person` is a body with joints. `Walking` turns the joints as people do at a given speed. `InMotion` makes a scene
+# `person` is a body with joints. `Walking` turns the joints as people do at a given speed. `MovingScene` makes a scene
 # that is a function of time.
 
 # %%
@@ -29,7 +29,7 @@ body = person(spacing=0.05)
 skin = RoughDielectric(permittivity=8.0)
 place = rigid(translation=[0.0, standing_height(body), 5.0])
 scene = iw.Scene({"person": iw.Object(body.mesh({}), skin, place)})
-walk = InMotion(scene, {"person": Walking(body, speed=1.0)})
+walk = MovingScene(scene, {"person": Walking(body, speed=1.0)})
 step = walk(1.0)["person"].center - walk(0.0)["person"].center
 print(f"after a second: {-float(step[2]):.2f} m nearer")
 assert abs(float(step[2]) + 1.0) < 0.1
@@ -66,7 +66,7 @@ profile = range_profile(beat[0], every, grid)[:, 0, 0]  # chirp, range
 shown = micro_doppler(profile.T, radar, train, length=256, step=24)
 power = shown.power.sum(0)
 near = (shown.velocities > -5.0) & (shown.velocities < 2.0)
-rates = Panel(power[:, near].T, shown.velocities[near], shown.times, "time [s]")
+rates = MapPanel(power[:, near].T, shown.velocities[near], shown.times, "time [s]")
 figure = iw.plotting.panels({"a person who walks": rates})
 figure.axes[0].set_ylabel("range rate [m/s]")
 figure

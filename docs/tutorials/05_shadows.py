@@ -10,7 +10,7 @@
 import torch
 
 import invertwin as iw
-from invertwin.inversion import Check, line_of, losses_along
+from invertwin.inversion import GradcheckSettings, evaluate_losses, make_line
 from invertwin.scene import RoughDielectric, Translation, linear_array, plate, rigid
 
 # %% [markdown]
@@ -41,7 +41,7 @@ report = iw.gradcheck(
     {"translation": [1.0, 0.0, 0.0]},
     scene=scene,
     sensor=radar,
-    check=Check(repeats=1, difference_samples=1_000_000, max_pairs=3, noise=0.05),
+    settings=GradcheckSettings(repeats=1, difference_samples=1_000_000, max_pairs=3, noise=0.05),
 )
 shown = {
     "by differences": report.difference,
@@ -75,9 +75,9 @@ data = iw.simulate(scene, radar, grid, seed=1, sampling=few)
 capture = iw.Capture.from_beat(data.beat, radar)
 model = iw.SurrogateMap(grid, iw.Surrogate(range_width=2.0, angle_width=1.0), rays)
 seen = iw.Observation(model, radar, capture, loss=iw.SpectrumLoss(kind="likelihood"))
-line = line_of(Translation("plate"), {"translation": [1.0, 0.0, 0.0]}, scene)
+line = make_line(Translation("plate"), {"translation": [1.0, 0.0, 0.0]}, scene)
 shifts = torch.linspace(-0.4, 0.4, 9)
-losses = losses_along(line, shifts.tolist(), seen, seed=1)
+losses = evaluate_losses(line, shifts.tolist(), seen, seed=1)
 iw.plotting.convergence(losses.tolist())
 
 # %%

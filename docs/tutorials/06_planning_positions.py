@@ -9,7 +9,7 @@
 from matplotlib.figure import Figure
 
 import invertwin as iw
-from invertwin.inversion import fit_at, planned
+from invertwin.inversion import plan_error_bars, prepare_fit
 from invertwin.scene import RoughDielectric, Translation, box, linear_array, rigid
 
 # %% [markdown]
@@ -34,7 +34,7 @@ grid = radar.grid(range_min=1.0, range_max=3.6, u_max=0.6)
 
 # %% [markdown]
 # ## Error bars before the recording
-# One simulated recording tells gain and noise. The fit stands at the truth, and `planned` computes how far speckle and
+# One simulated recording tells gain and noise. The fit stands at the truth, and `plan_error_bars` computes how far speckle and
 # noise would move it. The last four frames are candidates: each is tried by itself.
 
 # %%
@@ -43,11 +43,11 @@ recorded = iw.simulate(truth, radar, grid, seed=1, sampling=few, snr_db=20.0)
 model = iw.SurrogateMap(grid, sampling=iw.Sampling(depth=1, samples=40_000, boundary_samples=8_000))
 seen = iw.Observation(model, radar, iw.Capture.from_beat(recorded.beat, radar))
 likely = iw.SpectrumLoss(kind="likelihood")
-at_truth = fit_at(truth, [seen], Translation("box", axes="xz"), loss=likely, seed=1)
-now, added = planned(at_truth, candidates=len(possible))
+at_truth = prepare_fit(truth, [seen], Translation("box", axes="xz"), loss=likely, seed=1)
+now, added = plan_error_bars(at_truth, candidates=len(possible))
 print("two positions:", {name: f"{100 * value:.1f} cm" for name, value in now.deviations.items()})
 for one in added:
-    print(f"with {possible[one.frame - len(here)]}: deviations times {one.share:.2f}")
+    print(f"with {possible[one.frame - len(here)]}: deviations times {one.deviation_ratio:.2f}")
 
 # %% [markdown]
 # Which position helps most is hard to guess: here it is not the farthest one. So it pays to compute it.
@@ -58,7 +58,10 @@ axes = figure.subplots()
 axes.plot(*zip(*[(x, z) for x, _, z in here], strict=True), "k^", label="there already")
 places = [possible[one.frame - len(here)] for one in added]
 dots = axes.scatter(
-    [x for x, _, _ in places], [z for _, _, z in places], c=[one.share for one in added], s=80
+    [x for x, _, _ in places],
+    [z for _, _, z in places],
+    c=[one.deviation_ratio for one in added],
+    s=80,
 )
 axes.plot(0.1, 2.5, "s", markersize=14, color="0.6", label="box")
 axes.set(xlabel="x [m]", ylabel="z [m]", aspect="equal")
@@ -67,9 +70,9 @@ figure.colorbar(dots, label="deviations, times")
 figure
 
 # %%
-assert all(one.share < 1.0 for one in added)
-assert added[0].share < 0.85
-assert all(one.bars.deviations["box.x"] < 1.02 * now.deviations["box.x"] for one in added)
+assert all(one.deviation_ratio < 1.0 for one in added)
+assert added[0].deviation_ratio < 0.85
+assert all(one.error_bars.deviations["box.x"] < 1.02 * now.deviations["box.x"] for one in added)
 
 # %% [markdown]
 # `invertwin plan run.toml` does this from a run file, and with `fits` compares the plan with fits of as many simulated

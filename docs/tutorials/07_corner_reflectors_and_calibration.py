@@ -14,7 +14,7 @@ import invertwin as iw
 from invertwin.capture import estimate_channels
 from invertwin.radar import channel_errors
 from invertwin.scene import PerfectConductor, linear_array, rigid, sphere, trihedral
-from invertwin.signatures import aspects, decibels
+from invertwin.signatures import aspect_directions, to_dbsm
 
 # %% [markdown]
 # ## Strength
@@ -24,12 +24,12 @@ from invertwin.signatures import aspects, decibels
 # %%
 corner = iw.Scene({"corner": iw.Object(trihedral(0.1), PerfectConductor())})
 degrees = torch.linspace(160.0, 200.0, 41, dtype=torch.float64)
-found = iw.rcs(corner, aspects(torch.deg2rad(degrees), math.pi / 2), [77e9])
+found = iw.rcs(corner, aspect_directions(torch.deg2rad(degrees), math.pi / 2), [77e9])
 curves = {
     "all": found.dbsm[0, :, 0, 0],
-    "three bounces": decibels(found.parts["order 3"])[0, :, 0, 0],
+    "three bounces": to_dbsm(found.parts["order 3"])[0, :, 0, 0],
 }
-iw.plotting.sections(
+iw.plotting.rcs_curves(
     {"trihedral of 10 cm at 77 GHz": curves}, degrees - 180, "angle from the axis [°]"
 )
 
@@ -94,5 +94,5 @@ sharp = mended.spectrum(grid) / mended.spectrum(grid).max()
 assert float((sharp - clean.spectrum / clean.spectrum.max()).abs().max()) < 0.02
 
 # %% [markdown]
-# On the command line: `invertwin look adc.bin … --reflector 0.5 0 2.2` writes `channels.json`, and `--channels
+# On the command line: `invertwin look adc.bin … --reflector 0.5 0 2.2` writes `count_channels.json`, and `--channels
 # channels.json` divides the gains out of another recording.

@@ -12,9 +12,9 @@ import invertwin as iw
 from invertwin.links import (
     MapPlane,
     Metasurface,
-    PlacedPanel,
-    Points,
-    Reception,
+    PanelPlacement,
+    PropagationSettings,
+    ReceiverPoints,
     Transmitters,
     WallPath,
 )
@@ -38,7 +38,7 @@ sender = Transmitters(torch.tensor([[0.6, 0.8, 1.2]]).double())
 
 # %%
 plane = MapPlane.horizontal([0.05, 0.05], [5.9, 3.9], 1.2, 0.25)
-model = iw.RadioMap(plane, Reception(5.0e9, depth=1), "gain")
+model = iw.RadioMap(plane, PropagationSettings(5.0e9, depth=1), "gain")
 gain = model.predict(scene, sender, seed=0)[0].clamp_min(1e-12)
 levels = {"path gain": 10 * gain.log10()}
 iw.plotting.coverage(levels, plane, scene=scene, transmitters=sender)
@@ -49,12 +49,14 @@ iw.plotting.coverage(levels, plane, scene=scene, transmitters=sender)
 
 # %%
 receiver = torch.tensor([[5.2, 0.6, 1.2]]).double()
-spot = Points(receiver)
-before = iw.RadioMap(spot, Reception(5.0e9, depth=1), "gain").predict(scene, sender, seed=0)
+spot = ReceiverPoints(receiver)
+before = iw.RadioMap(spot, PropagationSettings(5.0e9, depth=1), "gain").predict(
+    scene, sender, seed=0
+)
 
 # %% [markdown]
 # ## A panel on the wall
-# The panel hangs on the far wall, at y = 4 m, somewhere along a line. `PlacedPanel` focuses it from the transmitter on
+# The panel hangs on the far wall, at y = 4 m, somewhere along a line. `PanelPlacement` focuses it from the transmitter on
 # the receiver. It is a torch module: its place on the wall, its yaw and all its phases can be fitted.
 
 # %%
@@ -65,8 +67,8 @@ plain = Metasurface(here, torch.eye(3, dtype=torch.float64), flat, spacing=0.03)
 
 
 def with_panel(along: float) -> torch.Tensor:
-    placed = PlacedPanel(wall, sender.positions[0], receiver[0], 5.0e9, (32, 32), along=along)
-    reception = Reception(5.0e9, depth=1, panels=[placed(plain)])
+    placed = PanelPlacement(wall, sender.positions[0], receiver[0], 5.0e9, (32, 32), along=along)
+    reception = PropagationSettings(5.0e9, depth=1, panels=[placed(plain)])
     return iw.RadioMap(spot, reception, "gain").predict(scene, sender, seed=0)
 
 
@@ -83,11 +85,11 @@ for along, value in zip(places, after, strict=True):
 best = places[int(after.argmax())]
 xs, ys = torch.linspace(3.3, 5.9, 14).double(), torch.linspace(0.1, 3.7, 19).double()
 grid = torch.stack(torch.meshgrid(xs, ys, indexing="ij"), -1)
-points = Points(torch.cat([grid, torch.full_like(grid[..., :1], 1.2)], -1).reshape(-1, 3))
-focus = PlacedPanel(wall, sender.positions[0], receiver[0], 5.0e9, (32, 32), along=best)
-lit = iw.RadioMap(points, Reception(5.0e9, depth=1, panels=[focus(plain)]), "gain").predict(
-    scene, sender, seed=0
-)
+points = ReceiverPoints(torch.cat([grid, torch.full_like(grid[..., :1], 1.2)], -1).reshape(-1, 3))
+focus = PanelPlacement(wall, sender.positions[0], receiver[0], 5.0e9, (32, 32), along=best)
+lit = iw.RadioMap(
+    points, PropagationSettings(5.0e9, depth=1, panels=[focus(plain)]), "gain"
+).predict(scene, sender, seed=0)
 window = MapPlane.horizontal([3.2, 0.0], [6.0, 3.8], 1.2, 0.2)
 iw.plotting.coverage(
     {"with the panel": 10 * lit.detach().clamp_min(1e-12).log10().reshape(14, 19)},

@@ -22,7 +22,7 @@ truth = iw.Scene(
 )
 start = truth.replace("crate", pose=rigid(translation=[0.1, 0.0, 3.15]))
 
-camera = Camera.looking(
+camera = Camera.look_at(
     [[0.0, 0.0, 0.0]], [0.0, 0.0, 3.0], width=48, height=36, field_of_view=0.7, up=[0.0, 1.0, 0.0]
 )
 picture = photograph(truth, camera, seed=1, wrong_labels=0.1)

@@ -73,7 +73,9 @@ with tempfile.TemporaryDirectory() as folder:
     run_file = Path(folder, "crates.toml")
     run_file.write_text(RUN)
     iw.dataset(run_file, Path(folder, "crates"), workers=1)
-    samples = iw.datasets.Samples(Path(folder, "crates"), keep=["map", "labels"], transform=example)
+    samples = iw.datasets.SampleDataset(
+        Path(folder, "crates"), entries=["map", "labels"], transform=example
+    )
     levels, places = next(iter(DataLoader(samples, batch_size=len(samples))))
 print(tuple(levels.shape), "samples, ranges, directions")
 

@@ -23,9 +23,9 @@ __version__ = "0.4.0"
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 # Libraries read how many threads to start while they are being loaded.
-threads.prepare()
+threads.set_thread_environment()
 # Dr.Jit picks its libLLVM while it is being imported: before any module can do that.
-doctor.prepare()
+doctor.select_libllvm()
 
 if "IPython" in sys.modules:
     from invertwin.viewer.notebook import register_formatters

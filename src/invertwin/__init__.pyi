@@ -21,7 +21,7 @@ from .inversion.loss import SpectrumLoss as SpectrumLoss
 from .inversion.observation import Observation as Observation
 from .inversion.reconstruction import reconstruct as reconstruct
 from .inversion.schedule import Schedule as Schedule
-from .models.doppler import MotionMap as MotionMap
+from .models.doppler import RangeDopplerMap as RangeDopplerMap
 from .models.radar import ExactMap as ExactMap
 from .models.radar import SurrogateMap as SurrogateMap
 from .models.radio import RadioMap as RadioMap

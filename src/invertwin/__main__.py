@@ -1,11 +1,11 @@
 """Where the command line begins: an interruption is one line, also while modules are imported."""
 
-from invertwin.errors import interruptible
+from invertwin.errors import exit_on_interrupt
 
 
 def main() -> None:
     """Run the command line."""
-    with interruptible():
+    with exit_on_interrupt():
         from invertwin.cli import app
 
         app.main()

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wrapped_tensor
 
 from invertwin.errors import InputError
-from invertwin.limits import Among, Usual, marks
+from invertwin.limits import AllowedValues, UsualValue, annotation_parts
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 Point = Annotated[ArrayLike, Len(3, 3)]
@@ -42,7 +42,7 @@ def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: 
     try:
         tensor = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError):
-        expected = f"expected {what} as numbers of shape {_listed(shape)}"
+        expected = f"expected {what} as numbers of shape {_format_shape(shape)}"
         raise InputError(f"{expected}, got {type(value).__name__}; {do}") from None
     check_shape(refuse_batch(tensor), shape, f"{what} as numbers", do)
     bad = int((~torch.isfinite(tensor)).sum())
@@ -87,7 +87,7 @@ def refuse_batch(value: Tensor) -> Tensor:
     return value
 
 
-def plain(value: Tensor) -> Tensor:
+def strip_derivatives(value: Tensor) -> Tensor:
     """The numbers of a tensor, without derivatives and without the wrappers of `torch.func`.
 
     Args:
@@ -113,11 +113,11 @@ def check_shape(value: Tensor, shape: Sequence[int | None], what: str, do: str) 
     pairs = zip(shape, value.shape, strict=False)
     if value.ndim != len(shape) or any(size not in (None, actual) for size, actual in pairs):
         raise InputError(
-            f"expected {what} of shape {_listed(shape)}, got shape {list(value.shape)}; {do}"
+            f"expected {what} of shape {_format_shape(shape)}, got shape {list(value.shape)}; {do}"
         )
 
 
-def _listed(shape: Sequence[int | None]) -> str:
+def _format_shape(shape: Sequence[int | None]) -> str:
     return f"[{', '.join('any' if size is None else str(size) for size in shape)}]"
 
 
@@ -139,7 +139,7 @@ def checked_number(
     opening = "(" if open_low else "["
     closing = ")" if math.isinf(high) else "]"
     expected = f"expected {what} in {opening}{low:g}, {high:g}{closing}"
-    bare = plain(value) if isinstance(value, Tensor) else value
+    bare = strip_derivatives(value) if isinstance(value, Tensor) else value
     if isinstance(bare, bool) or not (
         isinstance(bare, int | float | np.number)
         or (isinstance(bare, Tensor) and bare.ndim == 0 and not bare.is_complex())
@@ -177,11 +177,11 @@ def check_fields(holder: object) -> None:
         InputError: a word that is not one of those allowed; a number that is beyond a limit, not
             finite, not whole where a count is expected, or evidently in another unit.
     """
-    for name, found in _marks_of_fields(type(holder)).items():
+    for name, found in _field_limits(type(holder)).items():
         value = getattr(holder, name)
         if value is None and type(None) in found:
             continue
-        allowed = [word for mark in found for word in _words(mark)]
+        allowed = [word for mark in found for word in _describe_limit(mark)]
         if not allowed:
             for number in value if isinstance(value, tuple) else (value,):
                 _check_number(holder, name, number, found)
@@ -193,23 +193,25 @@ def check_fields(holder: object) -> None:
 
 
 @cache
-def _marks_of_fields(kind: type) -> dict[str, tuple[Any, ...]]:
-    found = {n: tuple(marks(h)) for n, h in get_type_hints(kind, include_extras=True).items()}
+def _field_limits(kind: type) -> dict[str, tuple[Any, ...]]:
+    found = {
+        n: tuple(annotation_parts(h)) for n, h in get_type_hints(kind, include_extras=True).items()
+    }
     return {
         name: of
         for name, of in found.items()
-        if any(type(mark) in _LIMITS or _words(mark) for mark in of)
+        if any(type(mark) in _LIMITS or _describe_limit(mark) for mark in of)
     }
 
 
-def _words(mark: Any) -> tuple[str | int, ...]:
-    if isinstance(mark, Among):
-        return mark.names
+def _describe_limit(mark: Any) -> tuple[str | int, ...]:
+    if isinstance(mark, AllowedValues):
+        return mark.values
     return get_args(mark) if get_origin(mark) is Literal else ()
 
 
 def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]) -> None:
-    usual = next((mark for mark in found if isinstance(mark, Usual)), None)
+    usual = next((mark for mark in found if isinstance(mark, UsualValue)), None)
     do = f"correct {type(holder).__name__}({name}=...)"
     if usual is not None:
         do = f"give it in {usual.unit}, such as {usual.value:g}"
@@ -225,11 +227,11 @@ def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]
             if not (finite and holds(number, limit)):
                 raise InputError(f"expected {name} {words} {limit:g}, got {number}; {do}")
     if usual and not usual.low <= number <= usual.high:
-        meant = usual.meant(float(number))
+        meant = usual.suggest_value(float(number))
         raise InputError(f"expected {name} in {usual.unit}, got {number:g}; did you mean {meant}?")
 
 
-def differentiated(value: Tensor | None) -> bool:
+def is_differentiated(value: Tensor | None) -> bool:
     """Whether derivatives flow through a tensor, in reverse or in forward mode."""
     if value is None:
         return False

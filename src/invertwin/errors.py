@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-_LONGEST = 8_000  # characters of a line
+_MAX_LENGTH = 8_000  # characters of a line
 
 
 class InputError(ValueError):
@@ -23,7 +23,7 @@ class InputError(ValueError):
             text: The line.
             at: The argument that it is about: the key of a run file.
         """
-        super().__init__(one_line(text))
+        super().__init__(to_one_line(text))
         self.at = at
 
 
@@ -31,7 +31,7 @@ class PhysicsWarning(UserWarning):
     """The input is valid, but its result will not mean what one may expect."""
 
 
-def one_line(text: str) -> str:
+def to_one_line(text: str) -> str:
     """A text that a terminal shows as it is: one line, no control characters, not endless.
 
     Args:
@@ -40,13 +40,13 @@ def one_line(text: str) -> str:
     if not text.isprintable():
         plain = (c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(text.split()))
         text = "".join(plain)
-    if len(text) > _LONGEST:
-        text = f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 2 :]}"
+    if len(text) > _MAX_LENGTH:
+        text = f"{text[: _MAX_LENGTH // 2]} … {text[-_MAX_LENGTH // 2 :]}"
     return text
 
 
 @contextmanager
-def interruptible() -> Iterator[None]:
+def exit_on_interrupt() -> Iterator[None]:
     """End the program with one line and exit code 130 on Ctrl-C."""
     try:
         yield

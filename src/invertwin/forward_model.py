@@ -22,17 +22,18 @@ class ForwardModel(ABC):
     Attributes:
         redraws: Whether a fit gives the model another seed at every step. False for a model
             whose random numbers belong to the scene.
-        smooth: Whether the derivative of the mean is the mean of derivatives, visibility
+        is_smooth: Whether the derivative of the mean is the mean of derivatives, visibility
             included. Gauss–Newton and gradient checks need that.
-        random: Whether maps depend on the seed. Of a model whose maps do not, gradient checks take
+        is_random: Whether maps depend on the seed. Of a model whose maps do not, gradient checks
+            take
             one derivative and one pair of differences.
-        fields: Whether maps hold parts of fields, of either sign, not power.
+        holds_fields: Whether maps hold parts of fields, of either sign, not power.
     """
 
     redraws: ClassVar[bool] = True
-    smooth: ClassVar[bool] = True
-    random: ClassVar[bool] = True
-    fields: ClassVar[bool] = False
+    is_smooth: ClassVar[bool] = True
+    is_random: ClassVar[bool] = True
+    holds_fields: ClassVar[bool] = False
 
     @abstractmethod
     def predict(self, scene: Scene, sensor: Any, seed: int) -> Float[Tensor, "frame *map"]:
@@ -48,7 +49,7 @@ class ForwardModel(ABC):
     def observe(self, recording: Any) -> Float[Tensor, "frame *map"]:
         """A recording as a map of the same form."""
 
-    def prepared(self, scene: Scene, sensor: Any, seed: int) -> "ForwardModel":
+    def prepare(self, scene: Scene, sensor: Any, seed: int) -> "ForwardModel":
         """The model with everything drawn that stays the same during a fit.
 
         Args:
@@ -71,7 +72,9 @@ class ForwardModel(ABC):
         """
         return self
 
-    def looks(self, scene: Scene, sensor: Any, seed: int) -> Callable[[int, float], Tensor] | None:
+    def realisations(
+        self, scene: Scene, sensor: Any, seed: int
+    ) -> Callable[[int, float], Tensor] | None:
         """What the sensor might have recorded of a scene: other speckle and noise each time.
 
         The error bars of a fit and the test of its goodness draw from it.
@@ -87,7 +90,7 @@ class ForwardModel(ABC):
         """
         return None
 
-    def sampled_by(self, **changes: Any) -> "ForwardModel":
+    def with_sampling(self, **changes: Any) -> "ForwardModel":
         """The model with other fields of its ``sampling``, where it has one."""
         return replace(self, sampling=replace(self.sampling, **changes))  # type: ignore
 
@@ -102,18 +105,18 @@ class ForwardModel(ABC):
         fields = ["boundary"]
         fields += ["interior_edges"] if sampling.depth > 1 else []
         fields += ["contacts"] if sampling.contacts else []
-        return {name: self.sampled_by(**{name: False}) for name in fields}
+        return {name: self.with_sampling(**{name: False}) for name in fields}
 
     @property
-    def widened(self) -> bool:
+    def has_blur(self) -> bool:
         """Whether the model has extra widths."""
         return False
 
-    def narrowed(self, share: float) -> "ForwardModel":
+    def scale_blur(self, fraction: float) -> "ForwardModel":
         """The model with this share of its extra widths; 0 takes them away."""
         return self
 
-    def blurred(self, observed: Tensor, sensor: Any) -> Tensor:
+    def blur_observed(self, observed: Tensor, sensor: Any) -> Tensor:
         """An observed map with the model's extra widths, of plain torch: no rays are traced here.
 
         A fit calls it in a thread of its own, while it predicts.

@@ -12,11 +12,11 @@ from annotated_types import Ge, Gt, Le
 
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
-Share = Annotated[float, Ge(0), Le(1)]
-MOST = 2**31 - 1
+UnitFraction = Annotated[float, Ge(0), Le(1)]
+MAX_COUNT = 2**31 - 1
 """Larger counts are a mistake; the ray tracer numbers its rays by 32 bits."""
-Count = Annotated[int, Ge(1), Le(MOST)]
-Several = Annotated[int, Ge(2), Le(MOST)]
+Count = Annotated[int, Ge(1), Le(MAX_COUNT)]
+CountOfTwo = Annotated[int, Ge(2), Le(MAX_COUNT)]
 
 RADIANS = "rad"
 """Marks a value in radians. Its key in a run file ends in `_deg` and is in degrees."""
@@ -24,27 +24,27 @@ Angle = Annotated[float, RADIANS]
 
 
 @dataclass(frozen=True)
-class Letters:
+class AllowedLetters:
     """Marks a text that is made of some letters. In a run file it is a list of them."""
 
-    allowed: str
+    letters: str
 
 
 @dataclass(frozen=True)
-class Among:
+class AllowedValues:
     """Marks a text or a number that is one of these."""
 
-    names: tuple[str | int, ...]
+    values: tuple[str | int, ...]
 
     def __get_pydantic_core_schema__(self, _: Any, handler: Any) -> Any:
-        return handler.generate_schema(Literal[self.names])
+        return handler.generate_schema(Literal[self.values])
 
 
-Axes = Annotated[str, Letters("xyz")]
+Axes = Annotated[str, AllowedLetters("xyz")]
 
 
 @dataclass(frozen=True)
-class Usual:
+class UsualValue:
     """Marks a number with its SI unit and a usual value, so that another unit is noticed.
 
     Attributes:
@@ -59,19 +59,19 @@ class Usual:
     low: float = 0.0
     high: float = math.inf
 
-    def meant(self, number: float) -> str:
+    def suggest_value(self, number: float) -> str:
         """The number times the power of ten that brings it nearest to the usual value."""
         decades = math.log10(self.value / number)
         return f"{number:g}e{min((9, 6, 3, -3, -6, -9, -12), key=lambda e: abs(e - decades))}"
 
 
-Frequency = Annotated[Positive, Usual("Hz", 77e9, low=1e6)]
-Bandwidth = Annotated[Positive, Usual("Hz", 1e9, low=1e6)]
-Step = Annotated[Positive, Usual("Hz", 1e6, low=1e3)]
-Duration = Annotated[Positive, Usual("seconds", 4e-5, high=1.0)]
+Frequency = Annotated[Positive, UsualValue("Hz", 77e9, low=1e6)]
+Bandwidth = Annotated[Positive, UsualValue("Hz", 1e9, low=1e6)]
+FrequencyStep = Annotated[Positive, UsualValue("Hz", 1e6, low=1e3)]
+Duration = Annotated[Positive, UsualValue("seconds", 4e-5, high=1.0)]
 
 
-def marks(hint: Any) -> Iterator[Any]:
+def annotation_parts(hint: Any) -> Iterator[Any]:
     """The types and the marks that an annotation is made of, also of its items and members."""
     yield from getattr(hint, "__metadata__", ())
     parts = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
@@ -79,4 +79,4 @@ def marks(hint: Any) -> Iterator[Any]:
         yield hint
         return
     for part in parts:
-        yield from marks(part)
+        yield from annotation_parts(part)

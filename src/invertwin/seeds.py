@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def derived_seed(seed: int, *key: int) -> int:
+def derive_seed(seed: int, *key: int) -> int:
     """A seed of its own for every key, independent of the seeds of all other keys.
 
     Args:

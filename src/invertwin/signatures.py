@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel import differentiated, trace_signature
+from invertwin.channel import is_differentiated, trace_far_field
 from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -21,8 +21,10 @@ from invertwin.limits import Count, Positive
 from invertwin.scene import Scene
 from invertwin.scene.polarisation import jones_basis
 
-_AT_ONCE = 1 << 22  # frequencies × aspects × points
-_EVEN = 1e-3  # of a step, by which steps of frequencies may differ: those of float32 do
+_VALUES_PER_CHUNK = 1 << 22  # frequencies × aspects × points
+_SPACING_TOLERANCE = (
+    1e-3  # of a step, by which steps of frequencies may differ: those of float32 do
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +55,14 @@ class Signature:
         return torch.stack([*self.parts.values()]).sum(0)
 
     @property
-    def section(self) -> Float64[Tensor, "frequency aspect 2 2"]:
+    def cross_section(self) -> Float64[Tensor, "frequency aspect 2 2"]:
         """σ = 4π|S|² [m²]."""
         return 4 * math.pi * torch.view_as_real(self.matrix).square().sum(-1)
 
     @property
     def dbsm(self) -> Float64[Tensor, "frequency aspect 2 2"]:
         """σ = 4π|S|² over 1 m², in decibels."""
-        return decibels(self.matrix)
+        return to_dbsm(self.matrix)
 
     def range_profile(
         self, padding: Count = 4
@@ -78,12 +80,14 @@ class Signature:
         """
         count = len(self.frequencies)
         steps = self.frequencies.diff()
-        if count < 2 or not bool((steps > 0).all() & ((steps / steps[0] - 1).abs() < _EVEN).all()):
+        if count < 2 or not bool(
+            (steps > 0).all() & ((steps / steps[0] - 1).abs() < _SPACING_TOLERANCE).all()
+        ):
             raise InputError(
                 f"expected evenly spaced, ascending frequencies for a range profile, got {count}; "
                 "give them as start, stop and count"
             )
-        window = _hann(count)[:, None, None, None]
+        window = _hann_window(count)[:, None, None, None]
         length = count * checked_count(padding, "padding", 1)
         profile = torch.fft.ifft(self.matrix * window, n=length, dim=0) * length / count
         spread = SPEED_OF_LIGHT / 2 / float(steps.mean())
@@ -105,14 +109,14 @@ class Signature:
         flat = places.reshape(-1, 3)
         both = self.directions + self.receivers
         weight = (
-            _hann(len(self.frequencies))[:, None]
-            * _hann(len(both))
+            _hann_window(len(self.frequencies))[:, None]
+            * _hann_window(len(both))
             / (len(self.frequencies) * len(both))
         )
         weighted = (self.matrix * weight[..., None, None]).reshape(-1, 4)
         k = 2 * math.pi * self.frequencies / SPEED_OF_LIGHT
         found = []
-        for some in flat.split(max(1, _AT_ONCE // len(weighted))):
+        for some in flat.split(max(1, _VALUES_PER_CHUNK // len(weighted))):
             phase = -(k[:, None, None] * (both @ some.T)).reshape(len(weighted), -1)
             found.append(torch.polar(torch.ones_like(phase), phase).T @ weighted)
         return torch.cat(found).reshape(*places.shape[:-1], 2, 2)
@@ -162,8 +166,8 @@ def rcs(
 
     Source: derivations §4, §13, §14.
     """
-    sent = _directions(directions, "directions")
-    received = None if receivers is None else _directions(receivers, "receivers")
+    sent = _check_directions(directions, "directions")
+    received = None if receivers is None else _check_directions(receivers, "receivers")
     if received is not None and len(received) != len(sent):
         raise InputError(
             f"expected {len(sent)} receivers, one for each direction, got {len(received)}"
@@ -177,13 +181,13 @@ def rcs(
     for frequency in swept.tolist():
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
     for value, what in ((sent, "directions"), (received, "receivers"), (swept, "frequencies")):
-        if differentiated(value):
+        if is_differentiated(value):
             raise InputError(
                 f"expected {what} without derivatives, got some that require grad; turn the scene "
                 "instead, or detach them"
             )
     axis = checked_tensor(up, (3,), "up", "give a vector such as 0, 0, 1")
-    parts = trace_signature(
+    parts = trace_far_field(
         scene,
         sent,
         received,
@@ -201,7 +205,7 @@ def rcs(
     return Signature(turned, swept, sent, sent if received is None else received)
 
 
-def aspects(
+def aspect_directions(
     theta: float | Sequence[float] | Tensor, phi: float | Sequence[float] | Tensor
 ) -> Float64[Tensor, "aspect 3"]:
     """Unit vectors at angles θ to z and φ from x towards y [rad]; one may be a single number.
@@ -216,7 +220,7 @@ def aspects(
     return torch.stack([t.sin() * p.cos(), t.sin() * p.sin(), t.cos()], 1)
 
 
-def decibels(amplitude: Complex128[Tensor, "*any"]) -> Float64[Tensor, "*any"]:
+def to_dbsm(amplitude: Complex128[Tensor, "*any"]) -> Float64[Tensor, "*any"]:
     """σ = 4π|S|² in dBsm.
 
     Args:
@@ -225,7 +229,7 @@ def decibels(amplitude: Complex128[Tensor, "*any"]) -> Float64[Tensor, "*any"]:
     return 10 * torch.log10((4 * math.pi * amplitude.abs() ** 2).clamp_min(1e-300))
 
 
-def _directions(values: ArrayLike, what: str) -> Tensor:
+def _check_directions(values: ArrayLike, what: str) -> Tensor:
     found = checked_tensor(values, (None, 3), what, "give x, y, z of each, towards the radar")
     length = found.norm(dim=1, keepdim=True)
     if not len(found) or not bool((length > 0).all()):
@@ -233,7 +237,7 @@ def _directions(values: ArrayLike, what: str) -> Tensor:
     return found / length
 
 
-def _hann(count: int) -> Tensor:
+def _hann_window(count: int) -> Tensor:
     """A Hann window of mean one; without zeros at its ends, so that short sweeps keep theirs."""
     window = torch.hann_window(count + 2, periodic=False, dtype=torch.float64)[1:-1]
     return window / window.mean()

@@ -19,15 +19,21 @@ from invertwin.channel import (
 from invertwin.checks import checked_count, checked_type
 from invertwin.errors import InputError
 from invertwin.radar.processing.beamforming import exact_spectrum
-from invertwin.radar.radar import Radar, sampled
-from invertwin.radar.signal.chirps import Chirps, Places, Train, every_ramp, sample_interval
+from invertwin.radar.radar import Radar, require_sampled_waveform
+from invertwin.radar.signal.chirps import (
+    Chirps,
+    ChirpTrain,
+    PointTrajectory,
+    sample_interval,
+    simulate_chirp_train,
+)
 from invertwin.radar.signal.impairments import Impairments
-from invertwin.radar.signal.keyframes import Blocks, displacements
+from invertwin.radar.signal.keyframes import VisibilityKeyframes, vertex_displacements
 from invertwin.radar.signal.range_profile import add_noise, beat_signal, check_paths
-from invertwin.scene.scene import Scene, warn_of_mirrors
+from invertwin.scene.scene import Scene, warn_if_purely_specular
 
 # Motion over half a ramp is straight where it bends by less than this, in wavelengths.
-_STRAIGHT = 1e-6
+_STRAIGHT_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -84,7 +90,7 @@ def simulate(
             f"expected objects at rest, got velocities on {', '.join(moving)}; a frame is one "
             "instant: use scene.at(time), or simulate_chirps for motion within a frame"
         )
-    warn_of_mirrors(scene, radar.waveform.center_frequency)
+    warn_if_purely_specular(scene, radar.waveform.center_frequency)
     noisy = snr_db is not None or noise_figure_db is not None
     if noisy and impairments is not None:
         raise InputError(
@@ -149,7 +155,7 @@ def simulate_chirps(
     again = retrace or not isinstance(scene, Scene)
     if again and impairments is not None:
         impairments.check_applicable()
-    motion = scene.at if isinstance(scene, Scene) else scene
+    motion = scene.advance if isinstance(scene, Scene) else scene
     plan = sampling or Sampling(depth=1)
     if checked_count(visibility_every, "visibility_every", 1) > 1 and (plan.depth > 1 or not again):
         raise InputError(
@@ -158,43 +164,47 @@ def simulate_chirps(
         )
     fixed = speckle or draw_speckle(motion(0.0), radar.link(), plan, seed)
 
-    def traced(instant: Scene) -> Paths:
+    def trace_instant(instant: Scene) -> Paths:
         return trace_field(instant, radar.link(), sampling=plan, seed=seed, speckle=fixed)
 
     if isinstance(scene, Scene) and not again:
         front = impairments or Impairments()
-        return front.record(traced(scene), radar, seed=seed, chirps=chirps)
+        return front.record(trace_instant(scene), radar, seed=seed, chirps=chirps)
     if visibility_every > 1:
         plan = replace(plan, boundary=False)
         # Ramps of what moves are small work, which several threads on a busy machine slow tenfold.
         with torch.no_grad(), torch_threads(1):
-            blocks = Blocks(motion, traced, radar, chirps, visibility_every)
-            beat = every_ramp(chirps, radar.shape[1], blocks.ramp)
+            blocks = VisibilityKeyframes(motion, trace_instant, radar, chirps, visibility_every)
+            beat = simulate_chirp_train(chirps, radar.shape[1], blocks.simulate_ramp)
         return beat if impairments is None else impairments.apply(beat, radar, seed=seed)
-    half = 0.5 * (sampled(radar).samples - 1) * sample_interval(sampled(radar))
+    half = (
+        0.5
+        * (require_sampled_waveform(radar).samples - 1)
+        * sample_interval(require_sampled_waveform(radar))
+    )
 
-    def ramp(start: float, senders: list[int]) -> Tensor:
-        paths, places = _over_a_ramp(motion, start + half, half, traced, radar)
-        check_paths(paths, radar, sampled(radar))
-        return Train(paths, radar, places).ramp(start, senders)
+    def simulate_ramp(start: float, senders: list[int]) -> Tensor:
+        paths, places = _trace_ramp(motion, start + half, half, trace_instant, radar)
+        check_paths(paths, radar, require_sampled_waveform(radar))
+        return ChirpTrain(paths, radar, places).simulate_ramp(start, senders)
 
-    beat = every_ramp(chirps, radar.shape[1], ramp)
+    beat = simulate_chirp_train(chirps, radar.shape[1], simulate_ramp)
     return beat if impairments is None else impairments.apply(beat, radar, seed=seed)
 
 
-def _over_a_ramp(
+def _trace_ramp(
     motion: Callable[[float], Scene],
     middle: float,
-    half: float,
-    traced: Callable[[Scene], Paths],
+    half_duration: float,
+    trace: Callable[[Scene], Paths],
     radar: Radar,
-) -> tuple[Paths, Places]:
+) -> tuple[Paths, PointTrajectory]:
     """Paths in the middle of a ramp, and where their points are half a ramp before and after."""
     scene = motion(middle)
-    ahead = displacements(scene, motion(middle + half))
-    behind = displacements(scene, motion(middle - half))
+    ahead = vertex_displacements(scene, motion(middle + half_duration))
+    behind = vertex_displacements(scene, motion(middle - half_duration))
     # A trace interpolates the velocities of vertices at its points; so it does displacements.
-    paths = traced(_with_velocities(scene, ahead))
+    paths = trace(_set_velocities(scene, ahead))
     if paths.velocity is None:
         return paths, lambda time: paths.first
     # Paths of several bounces stand still within a ramp.
@@ -202,21 +212,21 @@ def _over_a_ramp(
     forward = paths.velocity * alone
     bend = max(float((ahead[n] + behind[n]).norm(dim=1).max()) for n in scene.names)
     backward = -forward
-    if bend > _STRAIGHT * radar.waveform.wavelength:
-        again = traced(_with_velocities(scene, behind)).velocity
+    if bend > _STRAIGHT_TOLERANCE * radar.waveform.wavelength:
+        again = trace(_set_velocities(scene, behind)).velocity
         assert again is not None
         assert again.shape == forward.shape  # The same scene and seed, so the same points.
         backward = again * alone
     slope, curve = 0.5 * (forward - backward), 0.5 * (forward + backward)
 
-    def places(time: float) -> Tensor:
-        part = (time - middle) / half
+    def point_positions(time: float) -> Tensor:
+        part = (time - middle) / half_duration
         return paths.first + slope * part + curve * part**2
 
-    return paths, places
+    return paths, point_positions
 
 
-def _with_velocities(scene: Scene, values: dict[str, Tensor]) -> Scene:
+def _set_velocities(scene: Scene, values: dict[str, Tensor]) -> Scene:
     for name, value in values.items():
         scene = scene.replace(name, velocity=value if value.any() else None)
     return scene

@@ -56,6 +56,6 @@ def test_an_ogive_whose_currents_are_solved(full_wave):
 
 def test_facets_about_a_tip_are_no_edges(full_wave, monkeypatch):
     """Without solved currents, as of larger bodies."""
-    monkeypatch.setattr(solved, "MOST", 0)
+    monkeypatch.setattr(solved, "MAX_CELLS", 0)
     metrics = full_wave.measure(["ogive"])
     assert max(metrics["phase_deg"].values()) < 20.0

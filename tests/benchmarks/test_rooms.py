@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import invertwin as iw
-from invertwin.discovery import Figure
+from invertwin.discovery import ShapeParameters
 
 
 def test_rooms_hold_one_to_six_things_that_do_not_touch(rooms):
@@ -62,7 +62,7 @@ def test_pairs_are_one_to_one_and_near(rooms):
 )
 def test_yaw_is_that_of_the_longer_side(rooms, length, width, yaw, off):
     true = rooms.Thing("box", (0.0, 0.0), 0.5, (0.8, 1.0, 0.3), 0.5, 4.0)
-    found = Figure("box", (0.0, 0.0), yaw, length, width, 1.0)
+    found = ShapeParameters("box", (0.0, 0.0), yaw, length, width, 1.0)
     assert rooms.yaw_error(true, found) == pytest.approx(off, abs=1e-9)
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from invertwin.cli.fits.problem import varied_run
+from invertwin.cli.fits.problem import method_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import need
+from invertwin.cli.schema.run_file import require_section
 from invertwin.scene import load_mesh
 from invertwin_studies.vehicles import Car, car_mesh
 
@@ -154,8 +154,8 @@ def test_every_method_is_a_fit_of_the_run_file(shapes):
     run = shapes.load_run(shapes.RUN)
     assert set(shapes.MODES.values()) == {shapes.FULL, *run.variants}
     for mode in shapes.MODES.values():
-        settings = need(varied_run(run, mode), "reconstruct", "reconstruct")
-        assert settings.steps % need(run, "measures", "reconstruct").every == 0
+        settings = require_section(method_run(run, mode), "reconstruct", "reconstruct")
+        assert settings.steps % require_section(run, "measures", "reconstruct").every == 0
 
 
 def test_both_run_files_are_one_experiment(shapes):
@@ -164,7 +164,7 @@ def test_both_run_files_are_one_experiment(shapes):
     same = {name: getattr(one, name) for name in ("title", "reconstruct", "optimizer", "variants")}
     assert other.model_copy(update=same) == one
     for mine, theirs in ((shapes.FULL, "prior"), ("free", shapes.FULL), ("pose_only",) * 2):
-        fits = varied_run(one, mine), varied_run(other, theirs)
+        fits = method_run(one, mine), method_run(other, theirs)
         first, second = (
             found.model_copy(
                 update={

@@ -14,7 +14,7 @@ def test_the_parts_of_a_step_add_up(steps, tmp_path, monkeypatch):
         data = run.data.model_copy(update={"points_per_m2": 200.0})
         return problem(run.model_copy(update={"reconstruct": table, "data": data}), console)
 
-    monkeypatch.setattr(steps, "problem_of", small)
+    monkeypatch.setattr(steps, "build_problem", small)
     metrics = steps.measure(steps=4, skipped=2)
     assert metrics["steps"] == 2
     assert metrics["kernel_count"] >= 2

@@ -6,14 +6,14 @@ import math
 import pytest
 import torch
 
-from invertwin.inversion import displaced
+from invertwin.inversion import displace
 
 
 def test_a_turn_that_brings_an_object_back_is_no_error(verdicts):
     none = torch.zeros(3, dtype=torch.float64)
     for number, wrong in ((0, math.pi), (1, 0.0), (2, 0.0), (3, math.pi)):
         trial = verdicts.Trial.draw(number)
-        item = displaced(trial.truth["object"], none, math.pi * verdicts.UP)
+        item = displace(trial.truth["object"], none, math.pi * verdicts.UP)
         distance, angle = trial.error(trial.truth.replace("object", pose=item.pose))
         assert distance == pytest.approx(0.0, abs=1e-9)
         assert angle == pytest.approx(wrong, abs=1e-6), trial.kind

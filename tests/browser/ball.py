@@ -17,21 +17,31 @@ from invertwin.scene import (
     rotation_from_vector,
     sphere,
 )
-from invertwin.viewer import MEASURED, Body, Display, Link, Maps, Step, body_of, display_of
+from invertwin.viewer import (
+    MEASURED,
+    Display,
+    DisplayMaps,
+    DisplayMesh,
+    DisplayStep,
+    InteractiveSensor,
+    build_display,
+    display_mesh,
+)
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
 
 
 @cache
-def shown() -> tuple[Display, dict[str, Link]]:
+def shown() -> tuple[Display, dict[str, InteractiveSensor]]:
     """At step k the ball is at x = 0.2 k m, z = 2 m; measured at x = 0.5 m. One sensor is aside."""
     material = RoughDielectric(4.0)
     ball = Object(sphere(0.3, 4), material, rigid(translation=[0.0, 0.0, 2.0]))
     wall = Object(plate(3.0, 2.4), material, rigid(translation=[0.0, 0.0, 3.3]))
     scene = Scene({EVIL: ball, "wall": wall})
-    body, away = body_of(ball), np.array([0.2, 0.0, 0.0], np.float32)
+    body, away = display_mesh(ball), np.array([0.2, 0.0, 0.0], np.float32)
     steps = [
-        Step(k, f"{EVIL} {k}", {EVIL: Body(body.vertices + k * away, body.faces)}) for k in range(5)
+        DisplayStep(k, f"{EVIL} {k}", {EVIL: DisplayMesh(body.vertices + k * away, body.faces)})
+        for k in range(5)
     ]
     one, array = planar_array((1, 1), (1.9e-3, 1.9e-3)), planar_array((16, 4), (1.9e-3, 1.9e-3))
     waveform = FMCW(77e9, 2e9, 50e-6, 128)
@@ -43,13 +53,13 @@ def shown() -> tuple[Display, dict[str, Link]]:
         EVIL: Radar(one, array, waveform, beside, turned[None]),
     }
     grids = {name: radar.grid(1.0, 4.5, 0.6, 0.5) for name, radar in radars.items()}
-    links = {name: Link(scene, radar, grids[name]) for name, radar in radars.items()}
-    truth = links["front"].moved(EVIL, rigid(translation=[0.5, 0.0, 0.0]))
+    links = {name: InteractiveSensor(scene, radar, grids[name]) for name, radar in radars.items()}
+    truth = links["front"].move_object(EVIL, rigid(translation=[0.5, 0.0, 0.0]))
     maps = {
-        name: Maps.of(
+        name: DisplayMaps.from_spectra(
             {
                 MEASURED: torch.stack(
-                    [link.map(truth, k)[..., None] for k in range(link.radar.frame_count)]
+                    [link.predict_map(truth, k)[..., None] for k in range(link.radar.frame_count)]
                 )
             },
             grids[name],
@@ -57,5 +67,5 @@ def shown() -> tuple[Display, dict[str, Link]]:
         for name, link in links.items()
     }
     sights = {name: (radar, grids[name]) for name, radar in radars.items()}
-    made = display_of(scene, sights, EVIL, fitted=[EVIL])
+    made = build_display(scene, sights, EVIL, fitted=[EVIL])
     return replace(made, steps=steps, maps=maps), links

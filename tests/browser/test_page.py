@@ -13,8 +13,8 @@ from PIL import Image, ImageChops, ImageFilter
 
 from browser.ball import EVIL, shown
 from browser.references import APART, apart, blocks, difference
-from invertwin.cli.report import Table, View, report_html
-from invertwin.viewer import Display, Link, page_html, view_html
+from invertwin.cli.report import ReportTable, ReportView, report_html
+from invertwin.viewer import Display, InteractiveSensor, page_html, view_html
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -29,7 +29,7 @@ def display() -> Display:
 
 
 @pytest.fixture(scope="module")
-def links() -> dict[str, Link]:
+def links() -> dict[str, InteractiveSensor]:
     """What simulates the maps."""
     return shown()[1]
 
@@ -54,7 +54,7 @@ def test_the_slider_moves_mesh_and_map_and_no_name_acts(
 ):
     text = page_html(display, links)
     if kind == "report":
-        parts = [Table(EVIL, ["name"], [[EVIL]]), View(view_html(display, links))]
+        parts = [ReportTable(EVIL, ["name"], [[EVIL]]), ReportView(view_html(display, links))]
         text = report_html(EVIL, EVIL, EVIL, parts, "reconstruct", {"run.toml": EVIL})
     begin = time.monotonic()
     slider = opened(watched, text, tmp_path / "page.html")
@@ -176,8 +176,8 @@ def test_a_report_is_legible_in_the_dark_and_on_paper(
     watched, pictures, tmp_path: Any, display, links
 ):
     parts = [
-        Table("Result", ["quantity", "value"], [["loss", 0.5]]),
-        View(view_html(display, links)),
+        ReportTable("Result", ["quantity", "value"], [["loss", 0.5]]),
+        ReportView(view_html(display, links)),
     ]
     file = tmp_path / "report.html"
     file.write_text(report_html("Title", "Status.", "", parts, "reconstruct", {}), encoding="utf-8")

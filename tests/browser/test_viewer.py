@@ -16,7 +16,15 @@ from browser.ball import EVIL, shown
 from browser.references import APART, apart
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import Object, RoughDielectric, Scene, planar_array, plate, rigid, sphere
-from invertwin.viewer import Body, Link, Maps, Step, Viewer, body_of, display_of
+from invertwin.viewer import (
+    DisplayMaps,
+    DisplayMesh,
+    DisplayStep,
+    InteractiveSensor,
+    Viewer,
+    build_display,
+    display_mesh,
+)
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -36,20 +44,24 @@ def viewer(chromium: Any):
     wall = Object(plate(3.0, 2.4), material, rigid(translation=[0.0, 0.0, 3.3]))
     scene = Scene({"ball": ball, "wall": wall})
     assert len(ball.mesh.faces) >= 20_000
-    link = Link(scene, radar, grid)
+    link = InteractiveSensor(scene, radar, grid)
     truth = scene.replace("ball", pose=rigid(translation=[0.1, 0.0, 2.1]))
-    measured = torch.stack([link.map(truth, k)[..., None] for k in range(2)])
-    begun, away = body_of(ball), np.array([0.1, 0.0, 0.0], np.float32)
+    measured = torch.stack([link.predict_map(truth, k)[..., None] for k in range(2)])
+    begun, away = display_mesh(ball), np.array([0.1, 0.0, 0.0], np.float32)
     steps = [
-        Step(
+        DisplayStep(
             k,
             f"step {k}",
-            {"ball": Body(begun.vertices - k * away, begun.faces)},
+            {"ball": DisplayMesh(begun.vertices - k * away, begun.faces)},
         )
         for k in range(6)
     ]
-    display = display_of(scene, {"": (radar, grid)}, "<script>alert(1)</script>", fitted=["ball"])
-    display = replace(display, steps=steps, maps={"": Maps.of({"measured": measured}, grid)})
+    display = build_display(
+        scene, {"": (radar, grid)}, "<script>alert(1)</script>", fitted=["ball"]
+    )
+    display = replace(
+        display, steps=steps, maps={"": DisplayMaps.from_spectra({"measured": measured}, grid)}
+    )
     with Viewer(display, {"": link}, port=0) as found:
         yield found
 
@@ -200,7 +212,7 @@ def test_each_sensor_has_its_maps_and_its_points(watched, pictures, chromium):
         assert np.abs(now / now.max() - before / before.max()).max() > 0.5
         # From x = -2.5 m, along x, the ball at x = 0.8 m is straight ahead.
         row = round((3.3 - 0.3 - other.grid.range_start) / other.grid.range_step)
-        viewer._choose(bin=(row, other.grid.u_count // 2))
+        viewer._update_state(bin=(row, other.grid.u_count // 2))
         page.wait_for_timeout(2500)
         fed = viewer._nodes["chosen bin"].points
         assert len(fed) > 3

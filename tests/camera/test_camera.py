@@ -9,7 +9,7 @@ from invertwin.camera import Camera, CameraPose
 from invertwin.errors import InputError
 from scenes import float64
 
-CAMERA = Camera.looking(
+CAMERA = Camera.look_at(
     [[2.0, 1.0, 1.5], [-1.0, 2.0, 0.5]], [0.2, 0.1, 0.3], width=64, height=48, field_of_view=0.9
 )
 
@@ -18,7 +18,7 @@ def test_a_point_is_seen_along_the_direction_of_its_pixel():
     points = float64([[0.3, -0.2, 0.1], [0.0, 0.4, 0.6]])
     for frame in (0, 1):
         pixels = CAMERA.project(points, frame)
-        depth = CAMERA.local(points, frame)[:, 2:]
+        depth = CAMERA.to_camera_axes(points, frame)[:, 2:]
         back = CAMERA.positions[frame] + depth * CAMERA.directions(pixels, frame)
         torch.testing.assert_close(back, points)
 
@@ -71,4 +71,4 @@ def test_wrong_cameras_are_refused(changes, words):
 
 def test_a_camera_that_looks_along_up_is_refused():
     with pytest.raises(InputError, match="along up"):
-        Camera.looking([0, 0, 1], [0, 0, 0], width=8, height=6, field_of_view=math.pi / 3)
+        Camera.look_at([0, 0, 1], [0, 0, 0], width=8, height=6, field_of_view=math.pi / 3)

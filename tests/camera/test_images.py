@@ -9,9 +9,9 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from invertwin.camera import Camera, CameraPose, ImageSampling, depths, silhouettes
-from invertwin.channel import Sight
+from invertwin.channel import ViewpointScene
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
 from invertwin.models.camera import DepthMap, SilhouetteMap
 from invertwin.scene import (
     Object,
@@ -31,7 +31,7 @@ RADIUS = 0.4
 BALL = sphere(RADIUS, 4)
 AHEAD = Camera(torch.zeros(3).double(), torch.eye(3).double(), 40, 30, 60.0)
 FINE = ImageSampling(samples=64)
-NEAR_BOX = Camera.looking([2.5, 1.0, 1.4], [0.0, 0.0, 0.1], width=12, height=9, field_of_view=0.5)
+NEAR_BOX = Camera.look_at([2.5, 1.0, 1.4], [0.0, 0.0, 0.1], width=12, height=9, field_of_view=0.5)
 CROWD = Scene(
     {
         "box": Object(
@@ -122,7 +122,7 @@ def test_seeds_move_rays_and_nothing_else():
     assert float((first - other).abs().max()) < 0.5
 
 
-CHECK = Check(step=2e-3, difference_samples=2_000_000, max_pairs=24, noise=0.01)
+CHECK = GradcheckSettings(step=2e-3, difference_samples=2_000_000, max_pairs=24, noise=0.01)
 
 
 @pytest.mark.slow
@@ -137,7 +137,7 @@ CHECK = Check(step=2e-3, difference_samples=2_000_000, max_pairs=24, noise=0.01)
 )
 def test_images_of_a_box_behind_a_post(model, tangent, still):
     report = gradcheck(
-        model, Pose("box"), tangent, scene=CROWD, sensor=NEAR_BOX, check=CHECK, seed=1
+        model, Pose("box"), tangent, scene=CROWD, sensor=NEAR_BOX, settings=CHECK, seed=1
     )
     assert report.full.relative_l1 <= 0.02 + report.difference_noise
     assert report.interior.relative_l1 >= still
@@ -152,8 +152,8 @@ def test_images_of_a_camera_that_moves():
         tangent,
         scene=CROWD,
         sensor=NEAR_BOX,
-        of="sensor",
-        check=CHECK,
+        acts_on="sensor",
+        settings=CHECK,
         seed=1,
     )
     assert report.full.relative_l1 <= 0.02 + report.difference_noise
@@ -162,7 +162,7 @@ def test_images_of_a_camera_that_moves():
 
 def test_a_mask_ends_where_objects_cross(monkeypatch):
     """A ball that rises out of a floor: what is seen of it grows also where the floor cuts it."""
-    camera = Camera.looking(
+    camera = Camera.look_at(
         [2.5, 0.0, 1.2], [0.0, 0.0, 0.0], width=16, height=12, field_of_view=0.5
     )
 
@@ -177,7 +177,7 @@ def test_a_mask_ends_where_objects_cross(monkeypatch):
         ends = [float(area(float64(0.1 + step), 4096)) for step in (-0.02, 0.02)]
     assert found == pytest.approx((ends[1] - ends[0]) / 0.04, rel=0.02)
     # The outline alone, without the curve in which the floor cuts the ball, says something else.
-    monkeypatch.setattr(Sight, "crossings", Sight.outlines)
+    monkeypatch.setattr(ViewpointScene, "crossings", ViewpointScene.find_silhouettes)
     assert float(forward(area, 0.1)) != pytest.approx(found, rel=0.2)
 
 

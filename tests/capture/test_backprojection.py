@@ -23,7 +23,7 @@ def capture(*targets: torch.Tensor, clock_error: float = 0.0, bias_error: float 
     along = 0.8 * (track_times - 6) + 0.15 * torch.sin(track_times)
     track = Track(track_times, torch.nn.functional.pad(along[:, None], (1, 1)))
     times = torch.linspace(1, 5, 81, dtype=torch.float64)
-    positions = track.at(times + CLOCK)
+    positions = track.interpolate(times + CLOCK)
     ranges = 5 + 0.02 * torch.arange(250, dtype=torch.float64)
     waveform = Impulse(4e9, 1.5e9)
     profile = torch.zeros(81, 250, dtype=torch.complex128)
@@ -35,7 +35,7 @@ def capture(*targets: torch.Tensor, clock_error: float = 0.0, bias_error: float 
     return Capture.from_range_profile(
         profile,
         ranges + BIAS - (BIAS + bias_error),
-        Radar(antenna, antenna, waveform, track.at(times + CLOCK + clock_error)),
+        Radar(antenna, antenna, waveform, track.interpolate(times + CLOCK + clock_error)),
         times,
         track=track,
         clock_offset=CLOCK + clock_error,

@@ -12,7 +12,7 @@ from invertwin.errors import InputError
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, Impulse
-from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Table, linear_array
+from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, TabulatedPattern, linear_array
 from invertwin.scene.pose import rotation_from_vector
 
 FRAMES = 3
@@ -69,7 +69,7 @@ def assert_same_radar(one: Radar, other: Radar) -> None:
     [
         Isotropic(),
         Cosine(2.0),
-        Table(
+        TabulatedPattern(
             torch.linspace(0, 3, 9).double(), torch.arange(4.0).double(), torch.rand(9, 4).double()
         ),
     ],
@@ -173,7 +173,7 @@ def test_recalibration_moves_ranges_and_positions():
     times = torch.linspace(-1, 5, 13, dtype=torch.float64)
     line = torch.stack([times * 0.5, times * 0, times * 0 + 1], dim=1)
     capture = profile_capture(track=Track(times, line), clock_offset=0.1, range_bias=0.4)
-    moved = capture.recalibrated(clock_offset=0.3, range_bias=0.5)
+    moved = capture.recalibrate(clock_offset=0.3, range_bias=0.5)
     torch.testing.assert_close(moved.ranges, capture.ranges - 0.1)
     assert torch.equal(moved.range_profile, capture.range_profile)
     torch.testing.assert_close(moved.radar().positions[:, 0], 0.5 * (capture.times + 0.3))

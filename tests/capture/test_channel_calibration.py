@@ -5,7 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invertwin.capture import Capture, ChannelCalibration, ChirpData, estimate_channels, settings_of
+from invertwin.capture import (
+    Capture,
+    ChannelCalibration,
+    ChirpData,
+    estimate_channels,
+    make_settings,
+)
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
 from invertwin.radar.radar import Radar
@@ -78,14 +84,14 @@ def test_common_power_and_phase_are_left_alone():
 
 def test_chirps_are_calibrated_alike():
     beat = recorded().beat
-    settings = settings_of(CHIRP, 3, 4, loops=2)
+    settings = make_settings(CHIRP, 3, 4, loops=2)
     data = ChirpData(beat[:, None].expand(-1, 2, -1, -1, -1), settings)
     calibration = ChannelCalibration(errors())
     device = recorded().radar()
     arrays = (device.transmitters, device.receivers)
-    corrected = calibration.apply(data.recorded(arrays))
+    corrected = calibration.apply(data.to_chirp_capture(arrays))
     torch.testing.assert_close(corrected.beat[:, 1], calibration.apply(recorded()).beat)
-    real = ChirpData(data.samples.real + 0j, replace(settings, real=True)).recorded(arrays)
+    real = ChirpData(data.samples.real + 0j, replace(settings, real=True)).to_chirp_capture(arrays)
     clean = calibration.apply(real)
     torch.testing.assert_close(clean.beat * calibration.gains[..., None], real.beat)
     assert clean.max_range == CHIRP.max_range / 2

@@ -20,7 +20,7 @@ def beat() -> torch.Tensor:
 
 def test_a_part_of_the_chirps_keeps_radar_and_timing():
     whole = ChirpCapture(beat(), DEVICE, CHIRPS)
-    part = whole.loops(2, 3)
+    part = whole.select_chirps(2, 3)
     assert torch.equal(part.beat, whole.beat[:, 2:5])
     assert (part.chirps.count, part.chirps.interval) == (3, 60e-6)
     assert part.radar() is DEVICE
@@ -43,4 +43,4 @@ def test_what_does_not_belong_together_is_refused(wrong, unchecked):
 
 def test_more_chirps_than_there_are_is_refused():
     with pytest.raises(InputError, match=r"shape \(2, 4, 1, 16\)"):
-        ChirpCapture(beat(), DEVICE, CHIRPS).loops(4, 4)
+        ChirpCapture(beat(), DEVICE, CHIRPS).select_chirps(4, 4)

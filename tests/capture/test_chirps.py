@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invertwin.capture import ChirpData, ChirpSettings, adc_counts, settings_of
+from invertwin.capture import ChirpData, ChirpSettings, adc_counts, make_settings
 from invertwin.capture.chirps import shortest_loop
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
@@ -47,7 +47,7 @@ def test_the_waveform_is_the_sampled_part_of_the_ramp():
 
 def test_settings_of_a_waveform_record_it():
     chirp = FMCW(77e9, 1.2e9, 40e-6, 200)
-    settings = settings_of(chirp, 2, 4, loops=8, frames=3)
+    settings = make_settings(chirp, 2, 4, loops=8, frames=3)
     assert settings.waveform.start_frequency == chirp.start_frequency
     assert settings.waveform.bandwidth == pytest.approx(chirp.bandwidth, rel=1e-12)
     assert settings.sample_rate == 5e6
@@ -58,7 +58,7 @@ def test_turns_of_a_simulation_become_the_order_of_sending():
     """Elements in the board's order, sent as TX3, TX1, TX2: files have them as they were sent."""
     turns = Chirps(4, 50e-6, order=(2, 0, 1))
     chirp = FMCW(77e9, 1.2e9, 40e-6, 16)
-    settings = settings_of(chirp, 3, 2, loops=4, idle_time=10e-6, order=turns.order)
+    settings = make_settings(chirp, 3, 2, loops=4, idle_time=10e-6, order=turns.order)
     assert settings.transmit_order == (3, 1, 2)
     beat = torch.randn(1, 4, 3, 2, 16, dtype=torch.complex128)
     data = adc_counts(beat, settings, full_scale=10.0, order=turns.order)
@@ -71,7 +71,7 @@ def test_turns_of_a_simulation_become_the_order_of_sending():
         with pytest.raises(InputError, match="transmitters 0 to 2, each once"):
             adc_counts(beat, settings, 10.0, order)
         with pytest.raises(InputError, match="transmitters 0 to 2, each once"):
-            settings_of(chirp, 3, 2, order=order)
+            make_settings(chirp, 3, 2, order=order)
 
 
 def test_repeated_orders_are_loops():
@@ -82,10 +82,10 @@ def test_repeated_orders_are_loops():
 
 def test_a_capture_is_the_mean_or_one_chirp():
     data = ChirpData(samples(), SETTINGS)
-    mean = data.recorded(ARRAYS).capture("mean")
+    mean = data.to_chirp_capture(ARRAYS).to_capture("mean")
     torch.testing.assert_close(mean.beat, data.samples.mean(1))
     assert mean.times.tolist() == [0.0, 0.05]
-    one = data.recorded(ARRAYS, torch.ones(2, 3, dtype=torch.float64)).capture(2)
+    one = data.to_chirp_capture(ARRAYS, torch.ones(2, 3, dtype=torch.float64)).to_capture(2)
     assert torch.equal(one.beat, data.samples[:, 2])
     assert float(one.radar().positions.sum()) == 6
     assert one.radar().waveform == SETTINGS.waveform
@@ -97,8 +97,8 @@ def test_real_samples_become_analytic():
     echo = torch.exp(2j * torch.pi * (8 * time + 0.2))
     recorded = torch.zeros(2, 4, 3, 4, 64, dtype=torch.complex64) + echo.real
     data = ChirpData(recorded, settings)
-    torch.testing.assert_close(data.beat[:, 0], data.recorded(ARRAYS).capture(0).beat)
-    beat = data.recorded(ARRAYS).capture("mean").beat
+    torch.testing.assert_close(data.beat[:, 0], data.to_chirp_capture(ARRAYS).to_capture(0).beat)
+    beat = data.to_chirp_capture(ARRAYS).to_capture("mean").beat
     torch.testing.assert_close(beat[1, 2, 3].to(torch.complex128), echo, atol=1e-6, rtol=0)
 
 
@@ -163,9 +163,9 @@ def test_a_capture_needs_a_choice_and_its_elements():
     data = ChirpData(samples(), SETTINGS)
     for chirps in (4, -1, "all", True):
         with pytest.raises(InputError, match='"mean" or a number from 0 to 3'):
-            data.recorded(ARRAYS).capture(chirps)
+            data.to_chirp_capture(ARRAYS).to_capture(chirps)
     two = board("xWR1642").arrays()
     with pytest.raises(InputError, match="expected 3 TX elements"):
-        data.recorded(two)
+        data.to_chirp_capture(two)
     with pytest.raises(InputError, match="expected 4 RX elements"):
-        data.recorded((ARRAYS[0], two[0]))
+        data.to_chirp_capture((ARRAYS[0], two[0]))

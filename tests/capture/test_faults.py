@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from invertwin.capture import Capture, ChirpCapture, faults_of, shown_ranges
+from invertwin.capture import Capture, ChirpCapture, find_faults, search_ranges
 from invertwin.radar import FMCW, Chirps, Leakage, Radar, leakage_signal
 from invertwin.scene.antenna import linear_array
 from oracles.moving_point import moving_point
@@ -32,7 +32,7 @@ def beat(*echoes: tuple[float, float, float], rate: float = 0.0, noise: float = 
 
 
 def names(samples: Tensor, **options: float) -> list[str]:
-    return [fault.name for fault in faults_of(ChirpCapture(samples, RADAR, CHIRPS), **options)]
+    return [fault.name for fault in find_faults(ChirpCapture(samples, RADAR, CHIRPS), **options)]
 
 
 ECHOES = beat((11.3, 0.2, 1.0), (23.7, -0.4, 0.5))
@@ -55,7 +55,7 @@ ECHOES = beat((11.3, 0.2, 1.0), (23.7, -0.4, 0.5))
 )
 def test_sound_recordings_are_not_faulty(samples):
     assert names(samples) == []
-    assert faults_of(Capture.from_beat(samples[:, 0], RADAR)) == []
+    assert find_faults(Capture.from_beat(samples[:, 0], RADAR)) == []
 
 
 def test_real_samples_done_rightly_are_sound():
@@ -63,15 +63,15 @@ def test_real_samples_done_rightly_are_sound():
     positive[..., 33:] = 0
     positive[..., 1:32] *= 2
     analytic = torch.fft.ifft(positive)
-    assert faults_of(ChirpCapture(analytic, RADAR, CHIRPS, real=True)) == []
-    assert faults_of(Capture.from_beat(analytic[:, 0], RADAR)) == []
+    assert find_faults(ChirpCapture(analytic, RADAR, CHIRPS, real=True)) == []
+    assert find_faults(Capture.from_beat(analytic[:, 0], RADAR)) == []
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.7])
 def test_complex_by_type(turn):
     """Also on a turned line, as after a calibration."""
     samples = ECHOES.real * torch.polar(torch.tensor(1.0).double(), torch.tensor(turn).double())
-    (found,) = faults_of(ChirpCapture(samples, RADAR, CHIRPS))
+    (found,) = find_faults(ChirpCapture(samples, RADAR, CHIRPS))
     assert found.name == "complex only by type"
     assert "agree to 1 (coherence" in found.evidence
     assert names(ECHOES.real + 0.5j * ECHOES.imag) == []
@@ -80,7 +80,7 @@ def test_complex_by_type(turn):
 def test_odd_samples_with_another_gain():
     """A copy 26 dB below each echo, at the first echo's range plus half of the unambiguous one."""
     odd = torch.arange(64) % 2 == 1
-    (found,) = faults_of(ChirpCapture(ECHOES * torch.where(odd, 0.95, 1.05), RADAR, CHIRPS))
+    (found,) = find_faults(ChirpCapture(ECHOES * torch.where(odd, 0.95, 1.05), RADAR, CHIRPS))
     assert found.name == "ghosts"
     first, copy = 11.25 * CELL, 43.25 * CELL
     assert f"{first:.3g} m has a copy at {copy:.3g} m, 26 dB weaker" in found.evidence
@@ -91,7 +91,7 @@ def test_odd_samples_with_another_gain():
 def test_lost_packets():
     samples = ECHOES.clone()
     samples[0, 3, 1, :, 20:36] = 0
-    (found,) = faults_of(ChirpCapture(samples, RADAR, CHIRPS))
+    (found,) = find_faults(ChirpCapture(samples, RADAR, CHIRPS))
     assert str(found).startswith(
         "dropped samples: 64 of 4096 samples are zeros in runs of up to 16"
     )
@@ -104,7 +104,7 @@ def test_lost_packets():
 def test_a_phase_that_jumps(chirp):
     samples = ECHOES.clone()
     samples[:, chirp, ..., 40:] *= 1j
-    (found,) = faults_of(ChirpCapture(samples, RADAR, CHIRPS))
+    (found,) = find_faults(ChirpCapture(samples, RADAR, CHIRPS))
     assert found.name == "phase break"
     where = int(found.evidence.split()[1])
     assert abs(where - 40) <= 4
@@ -120,10 +120,10 @@ def test_leakage_is_the_strongest():
     """2 cells wide, so that its sidelobes outshine the echoes; and within 0.3 m, where shown."""
     over_board = leakage_signal(Leakage(0.4e-9, -0.1), RADAR)
     weak = 2e-3 * beat((11.3, 0.2, 1.0), noise=0.003)
-    (found,) = faults_of(ChirpCapture(weak + over_board, RADAR, CHIRPS))
+    (found,) = find_faults(ChirpCapture(weak + over_board, RADAR, CHIRPS))
     assert found.name == "leakage"
     assert names(0.05 * ECHOES + over_board) == []
-    (found,) = faults_of(ChirpCapture(0.1 * ECHOES + over_board, RADAR, CHIRPS), range_min=0.0)
+    (found,) = find_faults(ChirpCapture(0.1 * ECHOES + over_board, RADAR, CHIRPS), range_min=0.0)
     assert f"strongest echo beyond is at {11.25 * CELL:.3g} m" in found.evidence
     assert names(0.1 * ECHOES + over_board, range_min=1.0) == []
 
@@ -139,8 +139,8 @@ def test_clipped_samples_pile_up():
 
 def test_ranges_that_are_shown():
     recording = ChirpCapture(ECHOES, RADAR, CHIRPS)
-    assert shown_ranges(recording, None, None) == pytest.approx((3 * CELL, 61 * CELL))
+    assert search_ranges(recording, None, None) == pytest.approx((3 * CELL, 61 * CELL))
     real = replace(recording, real=True)
-    assert shown_ranges(real, 0.2, None) == pytest.approx((0.2, 29 * CELL))
-    assert shown_ranges(real, None, 3.0) == pytest.approx((3 * CELL, 3.0))
+    assert search_ranges(real, 0.2, None) == pytest.approx((0.2, 29 * CELL))
+    assert search_ranges(real, None, 3.0) == pytest.approx((3 * CELL, 3.0))
     assert math.isclose(CHIRP.max_range, 64 * CELL)

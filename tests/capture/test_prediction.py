@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from invertwin.capture.prediction import covariances, predictor, residuals
+from invertwin.capture.prediction import covariances, prediction_coefficients, prediction_residuals
 
 PLACES = torch.arange(200, dtype=torch.float64)
 TONES = torch.exp(2j * math.pi * 0.11 * PLACES) + 0.5 * torch.exp(-2j * math.pi * 0.23 * PLACES)
@@ -13,7 +13,9 @@ TONES = torch.exp(2j * math.pi * 0.11 * PLACES) + 0.5 * torch.exp(-2j * math.pi 
 
 def left(rows: torch.Tensor, order: int) -> torch.Tensor:
     products = covariances(rows, order)
-    return residuals(products, predictor(products, torch.ones(len(products)) > 0))
+    return prediction_residuals(
+        products, prediction_coefficients(products, torch.ones(len(products)) > 0)
+    )
 
 
 def test_tones_follow_from_as_many_samples():
@@ -32,6 +34,6 @@ def test_a_break_stands_out_where_it_is():
     broken[120:] *= 1j
     products = covariances(broken[None], 1)
     kept = torch.arange(199) != 119
-    found = residuals(products, predictor(products, kept))
+    found = prediction_residuals(products, prediction_coefficients(products, kept))
     assert float(found[119]) == pytest.approx(2.0)
     assert float(found[kept].max()) < 1e-12

@@ -264,7 +264,7 @@ def test_wheels_carry_the_demo(repository):
     project = tomllib.loads((repository / "pyproject.toml").read_text())
     wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
     ((source, target),) = wheel["force-include"].items()
-    assert (repository / source).read_text() == app._demo_file().read_text()
+    assert (repository / source).read_text() == app._find_demo_file().read_text()
     assert f"src/{target}" == str(Path(app.__file__).with_name("demo.toml").relative_to(repository))
 
 
@@ -272,8 +272,8 @@ def test_wheels_carry_the_demo(repository):
 def test_doctor_prints_and_returns_the_verdict(monkeypatch, capsys, ok):
     from invertwin.runtime import doctor
 
-    monkeypatch.setattr(doctor, "report", lambda: {"ok": ok})
-    monkeypatch.setattr(doctor, "render", lambda report: "[not markup] " + "x" * 100)
+    monkeypatch.setattr(doctor, "collect_report", lambda: {"ok": ok})
+    monkeypatch.setattr(doctor, "render_report", lambda report: "[not markup] " + "x" * 100)
     assert call(monkeypatch, "doctor") == (0 if ok else 1)
     assert "[not markup] " + "x" * 100 in capsys.readouterr().out
 
@@ -306,7 +306,7 @@ def test_a_resumed_run_is_complete_and_only_then_complete_already(run_file, monk
     assert capsys.readouterr().out.startswith("was complete already: ")
 
 
-@pytest.mark.parametrize("place", ["load_runs", "_demo_file"])
+@pytest.mark.parametrize("place", ["load_runs", "_find_demo_file"])
 def test_an_interruption_before_a_run_has_a_folder_is_one_line(
     run_file, monkeypatch, capsys, place
 ):
@@ -315,7 +315,8 @@ def test_an_interruption_before_a_run_has_a_folder_is_one_line(
 
     monkeypatch.setattr(app, place, stopped)
     assert (
-        call(monkeypatch, *(["demo"] if place == "_demo_file" else ["simulate", run_file])) == 130
+        call(monkeypatch, *(["demo"] if place == "_find_demo_file" else ["simulate", run_file]))
+        == 130
     )
     assert capsys.readouterr().err == "invertwin: interrupted\n"
 
@@ -339,7 +340,7 @@ def test_a_log_tells_the_time_that_is_left(monkeypatch):
     monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=lambda: float(next(now))))
     written = io.StringIO()
     log = Console(file=written, width=100)
-    with running.counted(log, "landscape", 10) as advance:
+    with running.count_progress(log, "landscape", 10) as advance:
         for _ in range(10):
             advance()
     lines = written.getvalue().splitlines()

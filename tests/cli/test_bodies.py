@@ -6,12 +6,12 @@ from typing import Any
 import pytest
 import torch
 
-from invertwin.cli.fits.problem import Problem, starts_of
-from invertwin.cli.fits.scores import joint_scores
+from invertwin.cli.fits.problem import Problem, make_starts
+from invertwin.cli.fits.scores import score_joints
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import validate
+from invertwin.cli.schema.run_file import validate_run
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck.lines import line_of
+from invertwin.inversion.gradcheck.lines import make_line
 from invertwin.scene import Scene
 
 STUFF = {"kind": "rough_dielectric", "permittivity": 4.0}
@@ -33,26 +33,26 @@ def run_file(joints: Any = LEFT, scale: float = 1.0, **tables: Any) -> RunFile:
         "starts": {"object": "person", "count": 2, "distance": [0.0, 0.0], "joint_deg": 20.0},
         **tables,
     }
-    return validate(run, Path("run.toml"))
+    return validate_run(run, Path("run.toml"))
 
 
 def test_every_free_joint_starts_that_far_off_and_only_these():
     run = run_file(scale=1.2)
     assert run.starts is not None
     scene = build.scene(run)
-    body = build.body_of(run, scene, "person")
+    body = build.fitted_body(run, scene, "person")
     assert body is not None
     problem = Problem(run, scene, scene, frozenset())
-    starts, again = starts_of(problem), starts_of(problem)
+    starts, again = make_starts(problem), make_starts(problem)
     truth = scene["person"].mesh
-    true = body.template.rotations_of(truth.vertices)
+    true = body.template.estimate_rotations(truth.vertices)
     for start, same in zip(starts, again, strict=True):
         mesh = start["person"].mesh
         assert torch.equal(mesh.vertices, same["person"].mesh.vertices)
-        angles = joint_scores(body, mesh, truth, truth)
+        angles = score_joints(body, mesh, truth, truth)
         assert angles["joint_error_before_deg"] == pytest.approx(20.0, abs=1e-4)
         assert angles["joint_error_after_deg"] == pytest.approx(0.0, abs=1e-4)
-        found = body.template.rotations_of(mesh.vertices)
+        found = body.template.estimate_rotations(mesh.vertices)
         hinge = body.template.joint("left_elbow")
         assert torch.allclose(found[hinge, [0, 2]], torch.zeros(2).double(), atol=1e-6)
         moved = (found - true).abs().amax(1) > 1e-6
@@ -66,9 +66,9 @@ def test_every_free_joint_starts_that_far_off_and_only_these():
 def test_a_truth_may_have_other_angles():
     run = run_file(truth={"person": {"angles_deg": {"neck": [10.0, 0.0, 0.0]}}})
     scene, truth = build.scene(run), build.true_scene(run)
-    body, mesh = build.body_of(run, scene, "person"), scene["person"].mesh
+    body, mesh = build.fitted_body(run, scene, "person"), scene["person"].mesh
     assert body is not None
-    angles = joint_scores(body, mesh, mesh, truth["person"].mesh)
+    angles = score_joints(body, mesh, mesh, truth["person"].mesh)
     assert angles["joint_error_left_elbow_deg"] == pytest.approx(50.0, abs=1e-4)
     assert angles["joint_error_left_hip_deg"] == pytest.approx(0.0, abs=1e-4)
 
@@ -97,8 +97,8 @@ def checked(
     key = "step_deg" if given["kind"] == "body" else "step"
     run = run_file(gradcheck={"parameter": given, "tangent": tangent, key: 0.1})
     scene = build.scene(run)
-    line = line_of(*build.tangent(run, scene), scene)
-    return line.at(torch.zeros((), dtype=torch.float64)), line.end(0.01)
+    line = make_line(*build.tangent(run, scene), scene)
+    return line.evaluate(torch.zeros((), dtype=torch.float64)), line.evaluate_end(0.01)
 
 
 BUMP = {"center": [0.5, 0.0, 0.0], "width": 0.1}
@@ -109,10 +109,10 @@ ELBOW = {"kind": "body", "joints": {"left_elbow": ["y"]}}
 def test_theta_turns_a_joint():
     start, moved = checked(ELBOW, {"left_elbow": [0.0, 1.0, 0.0]})
     run = run_file()
-    found = build.body_of(run, build.scene(run), "person")
+    found = build.fitted_body(run, build.scene(run), "person")
     assert found is not None
     body = found.template
-    before, after = (body.rotations_of(s["person"].mesh.vertices) for s in (start, moved))
+    before, after = (body.estimate_rotations(s["person"].mesh.vertices) for s in (start, moved))
     assert float((after - before)[body.joint("left_elbow"), 1]) == pytest.approx(0.01, abs=1e-9)
     assert float((after - before).abs().sum()) == pytest.approx(0.01, abs=1e-7)
 

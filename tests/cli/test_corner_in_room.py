@@ -8,9 +8,15 @@ import torch
 
 from cli.small import RUN, call, read_metrics
 from invertwin.capture import Capture
-from invertwin.cli.fits.problem import Problem, Sight, annealed_until, models_of, sharp_models
+from invertwin.cli.fits.problem import (
+    Problem,
+    SensorData,
+    blur_end_step,
+    make_models,
+    make_unblurred_models,
+)
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import validate
+from invertwin.cli.schema.run_file import validate_run
 from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap
 
@@ -18,27 +24,27 @@ MODEL = '\n[model]\nkind = "surrogate"\ncoherent = ["plate"]\nstretch = 2.0\n'
 
 
 def run_of(text: str, tmp_path):
-    return validate(tomllib.loads(text), tmp_path / "run.toml")
+    return validate_run(tomllib.loads(text), tmp_path / "run.toml")
 
 
 def test_run_files_name_targets_and_their_stretch(tmp_path):
     run = run_of(RUN + MODEL, tmp_path)
     scene, radar = build.scene(run), build.radar(run.radar)
     capture = Capture.from_beat(torch.zeros(*radar.shape, 64, dtype=torch.complex64), radar)
-    sight = Sight(capture, radar, build.grid(run.grid, radar))
+    sight = SensorData(capture, radar, build.grid(run.grid, radar))
     problem = Problem(run, scene, scene, frozenset(), {"": sight})
-    (model,) = models_of(problem)
+    (model,) = make_models(problem)
     assert isinstance(model, SurrogateMap)
     assert (model.coherent, model.stretch) == (("plate",), 2.0)
     assert model.kernels.range_width == 2.0
-    (sharp,) = sharp_models(problem)
+    (sharp,) = make_unblurred_models(problem)
     assert sharp == replace(model, surrogate="response", stretch=1.0)
 
 
 def test_the_stretch_is_annealed_like_widths(tmp_path):
     sharp = RUN.replace("range_width = 2.0\nangle_width = 1.0\n", "range_width = 0.0\n")
-    assert annealed_until(run_of(sharp, tmp_path)) is None
-    assert annealed_until(run_of(sharp + MODEL, tmp_path)) == pytest.approx(0.7 * 8)
+    assert blur_end_step(run_of(sharp, tmp_path)) is None
+    assert blur_end_step(run_of(sharp + MODEL, tmp_path)) == pytest.approx(0.7 * 8)
 
 
 def test_a_stretch_below_one_is_refused(tmp_path):

@@ -15,15 +15,15 @@ import torch
 import invertwin
 from cli.small import call, read_metrics
 from invertwin.capture.readers import described_arrays
-from invertwin.cli.commands.dataset import sample_run, shard_content
+from invertwin.cli.commands.dataset import make_sample_run, make_shard
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import load_run, to_toml, validate
-from invertwin.cli.schema.shape_tables import joint_places
-from invertwin.cli.schema.variation import steps_of, with_values
-from invertwin.datasets import Samples, object_labels
-from invertwin.datasets.shards import members_of
+from invertwin.cli.schema.run_file import load_run, to_toml, validate_run
+from invertwin.cli.schema.shape_tables import joint_positions
+from invertwin.cli.schema.variation import parse_key_path, set_values
+from invertwin.datasets import SampleDataset, object_labels
+from invertwin.datasets.shards import locate_members
 from invertwin.errors import InputError
-from invertwin.runtime.engines import spread
+from invertwin.runtime.engines import run_jobs
 
 ANYWHERE = Path("rooms.toml")
 RUN = """
@@ -125,7 +125,7 @@ def test_two_workers_make_the_same_bytes(whole, monkeypatch, capsys):
 def test_a_shard_does_not_depend_on_what_was_made_before(whole):
     _, folder = whole
     text = to_toml(load_run(folder / "rooms.toml"))
-    assert shard_content((text, 4, 1)) == shards(folder / "whole")["shard-000002.tar"]
+    assert make_shard((text, 4, 1)) == shards(folder / "whole")["shard-000002.tar"]
 
 
 @pytest.mark.slow
@@ -141,7 +141,7 @@ def test_two_nodes_of_a_ray_cluster_make_the_same_bytes(whole, monkeypatch):
         cluster.add_node(num_cpus=1)
         ray.init(address=cluster.address, log_to_driver=False)
         invertwin.dataset(folder / "rooms.toml", folder / "ray", engine="ray")
-        nodes = {node for _, node in spread(node_of, [0, 1], engine="ray")}
+        nodes = {node for _, node in run_jobs(node_of, [0, 1], engine="ray")}
     finally:
         ray.shutdown()
         cluster.shutdown()
@@ -164,7 +164,7 @@ def test_parts_are_parts_of_the_whole(whole, monkeypatch):
     assert call(monkeypatch, *arguments) == 0
     made = shards(folder / "parts" / "part_2_of_2")
     assert made == {"shard-000001.tar": shards(folder / "whole")["shard-000001.tar"]}
-    assert [sample["index"] for sample in Samples(folder / "parts")] == [2, 3]
+    assert [sample["index"] for sample in SampleDataset(folder / "parts")] == [2, 3]
 
 
 @pytest.mark.slow
@@ -232,7 +232,7 @@ def test_samples_hold_signals_and_true_labels(whole):
         assert sample["masks"].shape == (1, count)
         # Label and map agree: the strongest echo is that of the front half of the ball.
         if len(labels["objects"]) == 1:
-            run = validate(own, ANYWHERE)
+            run = validate_run(own, ANYWHERE)
             ranges = build.grid(run.grid, build.radar(run.radar)).ranges
             peak = float(ranges[sample["map"].amax((0, 1, 3, 4)).argmax()])
             middle = (x * x + y * y + z * z) ** 0.5
@@ -265,21 +265,24 @@ def test_check_counts_all_samples(whole, monkeypatch, capsys):
 
 
 def test_draws_depend_on_seed_and_index_only():
-    run = validate(tomllib.loads(RUN), ANYWHERE)
-    longer = validate(tomllib.loads(RUN.replace("samples = 5", "samples = 500")), ANYWHERE)
-    assert to_toml(sample_run(run, 4)) == to_toml(sample_run(longer, 4))
-    places = [sample_run(longer, k).scene["ball"].position for k in range(40)]
+    run = validate_run(tomllib.loads(RUN), ANYWHERE)
+    longer = validate_run(tomllib.loads(RUN.replace("samples = 5", "samples = 500")), ANYWHERE)
+    assert to_toml(make_sample_run(run, 4)) == to_toml(make_sample_run(longer, 4))
+    places = [make_sample_run(longer, k).scene["ball"].position for k in range(40)]
     assert len({tuple(place) for place in places}) == 40
     other = run.model_copy(update={"seed": 6})
-    assert sample_run(other, 4).scene["ball"].position != sample_run(run, 4).scene["ball"].position
-    assert sample_run(run, 4).seed not in (run.seed, sample_run(run, 3).seed)
+    assert (
+        make_sample_run(other, 4).scene["ball"].position
+        != make_sample_run(run, 4).scene["ball"].position
+    )
+    assert make_sample_run(run, 4).seed not in (run.seed, make_sample_run(run, 3).seed)
     # One more table at the end changes nothing of those before it.
     more = (
         RUN
         + '[[vary]]\nkey = "data.points_per_m2"\nkind = "normal"\nmean = 200.0\ndeviation = 1.0\n'
     )
-    assert sample_run(validate(tomllib.loads(more), ANYWHERE), 4).scene == (
-        sample_run(run, 4).scene
+    assert make_sample_run(validate_run(tomllib.loads(more), ANYWHERE), 4).scene == (
+        make_sample_run(run, 4).scene
     )
 
 
@@ -296,9 +299,9 @@ def test_joints_of_a_body_are_where_its_skin_is():
         }
     }
     del raw["vary"], raw["dataset"]["classes"]
-    run = validate(raw, ANYWHERE)
+    run = validate_run(raw, ANYWHERE)
     scene = build.true_scene(run)
-    joints = joint_places(run.scene["anna"], scene["anna"])
+    joints = joint_positions(run.scene["anna"], scene["anna"])
     assert joints["pelvis"].tolist() == pytest.approx([0.5, 0.0, 3.0])
     # Turned by 90° about y, what was at +x is now at −z.
     assert joints["right_elbow"].tolist() == pytest.approx([0.5, 0.45, 3.0 - 0.47], abs=1e-6)
@@ -380,7 +383,7 @@ def varied(**table):
 )
 def test_what_is_wrong_is_told_before_any_work(raw, said):
     with pytest.raises(InputError) as found:
-        validate(raw, ANYWHERE)
+        validate_run(raw, ANYWHERE)
     message = str(found.value).removeprefix("rooms.toml: ")
     assert "\n" not in message
     assert re.search(said, message), message
@@ -396,12 +399,12 @@ def test_shards_that_are_none_are_told(whole, monkeypatch, capsys, text):
 
 
 def test_names_with_dots_stand_in_quotes():
-    assert steps_of('scene."a.b".position[0]') == ("scene", "a.b", "position", 0)
-    assert steps_of("a[0][1]") == ("a", 0, 1)
+    assert parse_key_path('scene."a.b".position[0]') == ("scene", "a.b", "position", 0)
+    assert parse_key_path("a[0][1]") == ("a", 0, 1)
     for path in ("", "a.", ".a", "a b", "a[x]", "a..b", "a[0]b"):
-        assert steps_of(path) == (), path
+        assert parse_key_path(path) == (), path
     raw = {"a": [1, 2, 3], "b": {"c": 4}}
-    gone = with_values(raw, [("a[0]", None), ("a[2]", None), ("b.c", None), ("b.d", 5)])
+    gone = set_values(raw, [("a[0]", None), ("a[2]", None), ("b.c", None), ("b.d", 5)])
     assert gone == {"a": [2], "b": {"d": 5}}
     assert raw == {"a": [1, 2, 3], "b": {"c": 4}}
 
@@ -410,9 +413,9 @@ def test_paths_are_written_where_they_are_asked_for(tmp_path):
     text = RUN.replace("[chirps]\ncount = 4\ninterval = 6e-5\n", "")
     text = text.replace("velocity = [0.0, 0.0, 1.0]\n", "")
     text = text.replace("masks = true", "paths = true").replace("samples = 5", "samples = 1")
-    run = validate(tomllib.loads(text), tmp_path / "run.toml")
-    (tmp_path / "a.tar").write_bytes(shard_content((to_toml(run), 0, 1)))
-    members = members_of(tmp_path / "a.tar")[0]
+    run = validate_run(tomllib.loads(text), tmp_path / "run.toml")
+    (tmp_path / "a.tar").write_bytes(make_shard((to_toml(run), 0, 1)))
+    members = locate_members(tmp_path / "a.tar")[0]
     assert {name for name in members if name.startswith("paths")} == {
         f"paths_{name}.npy" for name in ("frame", "delay", "coefficient", "first", "last")
     }
@@ -450,10 +453,10 @@ high = 3.0
 
 
 def test_rooms_are_drawn_and_their_furniture_is_labelled():
-    run = validate(tomllib.loads(RUN + ROOM), ANYWHERE)
+    run = validate_run(tomllib.loads(RUN + ROOM), ANYWHERE)
     floors, counts = set(), set()
     for index in range(12):
-        item: Any = sample_run(run, index)
+        item: Any = make_sample_run(run, index)
         objects, made = labels_of(item), item.room
         floors.add(made.materials["floor"].kind)
         counts.add(len(made.furniture))

@@ -12,9 +12,9 @@ from invertwin.cli.commands import gradcheck as run_gradcheck
 from invertwin.cli.commands import simulate as run_simulate
 from invertwin.cli.fits import problem
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import load_run, validate
+from invertwin.cli.schema.run_file import load_run, validate_run
 from invertwin.errors import PhysicsWarning
-from invertwin.runtime.progress import time_left
+from invertwin.runtime.progress import format_duration
 from invertwin.scene import Mesh, shapes
 from invertwin.scene.files import save_mesh
 
@@ -68,7 +68,11 @@ CASES = {
 @pytest.fixture
 def idle(monkeypatch):
     """No work begins."""
-    work = (problem, "exact"), (run_simulate, "exact"), (run_check, "exact")
+    work = (
+        (problem, "simulate_exact"),
+        (run_simulate, "simulate_exact"),
+        (run_check, "simulate_exact"),
+    )
     for module, name in (*work, (run_gradcheck, "gradcheck")):
         monkeypatch.setattr(module, name, None)
 
@@ -144,8 +148,10 @@ def test_points_of_every_object_are_counted(run_file, monkeypatch, capsys):
         name: Mesh(item.vertices, item.mesh.faces).area for name, item in scene.objects.items()
     }
     radar = build.radar(run.radar)
-    sensor = estimates.Sensor(run, radar, build.grid(run.grid, radar))
-    counts = {part.key: part.count for part in estimates.of_sensor(sensor, scene)[0]}
+    sensor = estimates.SensorSetup(run, radar, build.grid(run.grid, radar))
+    counts = {
+        part.key: part.count for part in estimates.estimate_sensor_resources(sensor, scene)[0]
+    }
     expected = 3e3 * areas["plate"] + 1e3 * areas["wall"]
     assert counts["data.points_per_m2"] == pytest.approx(expected)
     assert call(monkeypatch, "check", run_file) == 0
@@ -155,13 +161,13 @@ def test_points_of_every_object_are_counted(run_file, monkeypatch, capsys):
 
 
 def test_times_as_people_say_them():
-    said = [time_left(seconds) for seconds in (3.2, 90.0, 150.0, 3 * 3600.0, 1e6)]
+    said = [format_duration(seconds) for seconds in (3.2, 90.0, 150.0, 3 * 3600.0, 1e6)]
     assert said == ["3 s", "90 s", "2 min", "3 h", "12 days"]
 
 
 @pytest.mark.usefixtures("idle")
 def test_a_fit_of_another_depth_than_its_data_gets_a_warning(tmp_path):
     text = RUN.replace("depth = 1", "depth = 2", 1)  # of the data
-    run = validate(tomllib.loads(text), tmp_path / "run.toml")
+    run = validate_run(tomllib.loads(text), tmp_path / "run.toml")
     with pytest.warns(PhysicsWarning, match=r"reconstruct.depth is 1, data.depth is 2"):
-        problem._warn_of_depths(run, problem.sensors_of(run))
+        problem._warn_if_depths_differ(run, problem.build_sensors(run))

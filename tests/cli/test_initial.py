@@ -6,8 +6,8 @@ import pytest
 from rich.console import Console
 
 from cli.small import call, read_metrics
-from invertwin.cli.fits.problem import guessed, problem_of
-from invertwin.cli.schema.run_file import validate
+from invertwin.cli.fits.problem import build_problem, estimate_initial_scene
+from invertwin.cli.schema.run_file import validate_run
 
 
 def smaller(repository, **changes: str) -> str:
@@ -62,8 +62,8 @@ def test_a_size_is_guessed_also_of_an_object_whose_true_shape_is_another(reposit
     text = smaller(repository, **{"[initial]": "[initial]\nscale = true"})
     parts = '\n\n[[truth.truck.parts]]\nshape = "box"\nsize = [4.4, 1.0, 1.6]\n\n[radar]'
     text = text.replace("\n\n[radar]", parts)
-    run = validate(tomllib.loads(text), tmp_path / "run.toml")
+    run = validate_run(tomllib.loads(text), tmp_path / "run.toml")
     console = Console(quiet=True)
-    _, found = guessed(problem_of(run, console), console)
+    _, found = estimate_initial_scene(build_problem(run, console), console)
     assert found["initial_points"] > 20
     assert "initial_scale_error" not in found

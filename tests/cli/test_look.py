@@ -13,7 +13,7 @@ from cli.small import call, read_metrics
 from invertwin.capture import Capture, ChannelCalibration, ChirpData, ChirpSettings, adc_counts
 from invertwin.capture.readers import described_arrays
 from invertwin.capture.ti import write_cfg, write_samples, write_setup, write_studio
-from invertwin.radar import Chirps, Radar, sharp_map, snapshots_of, velocity_span
+from invertwin.radar import Chirps, Radar, doppler_snapshots, high_resolution_map, velocity_span
 from invertwin.radar.boards import board
 from oracles.moving_point import moving_point
 
@@ -140,9 +140,9 @@ def test_finer_directions_and_points(recording, monkeypatch, method):
 
 def test_sharp_maps_peak_at_the_mover():
     beat, grid = mover().samples, RADAR.grid(2.8, 3.2)
-    snapshots = snapshots_of(beat, RADAR, grid, CHIRPS, 0)
+    snapshots = doppler_snapshots(beat, RADAR, grid, CHIRPS, 0)
     for method, sources in (("capon", None), ("music", None), ("music", 1)):
-        power = sharp_map(snapshots, RADAR, grid, method, sources)
+        power = high_resolution_map(snapshots, RADAR, grid, method, sources)
         _, u, v = np.unravel_index(int(power.argmax()), power.shape)
         assert grid.u[int(u)] == pytest.approx(0.3, abs=0.07)
         assert abs(grid.v[int(v)]) < 0.3

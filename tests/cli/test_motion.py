@@ -8,12 +8,16 @@ import pytest
 import torch
 
 from cli.small import call, read_metrics
-from invertwin.cli.commands.dataset import sample_content
+from invertwin.cli.commands.dataset import make_sample
 from invertwin.cli.schema import build
-from invertwin.cli.schema.motion_tables import at_start, in_motion, joints_at_start
-from invertwin.cli.schema.run_file import validate
+from invertwin.cli.schema.motion_tables import (
+    build_moving_scene,
+    joint_positions_at_start,
+    scene_at_start,
+)
+from invertwin.cli.schema.run_file import validate_run
 from invertwin.errors import InputError
-from invertwin.scene import InMotion, Scene, Waving
+from invertwin.scene import MovingScene, Scene, Waving
 
 RUN = """
 task = "simulate"
@@ -78,14 +82,14 @@ def read(text: str = RUN, **scene: dict):
     raw = tomllib.loads(text)
     for name, changes in scene.items():
         raw["scene"][name] |= changes
-    return validate(raw, Path("run.toml"))
+    return validate_run(raw, Path("run.toml"))
 
 
 def test_objects_do_what_their_tables_say():
     run = read()
     scene = build.true_scene(run)
-    motion = in_motion(run, scene)
-    assert isinstance(motion, InMotion)
+    motion = build_moving_scene(run, scene)
+    assert isinstance(motion, MovingScene)
     ahead = motion(1.0)["person"].center - motion(0.0)["person"].center
     assert float(ahead[2]) == pytest.approx(-1.4, abs=0.1)
     fan = motion(0.05)["fan"]
@@ -115,9 +119,9 @@ def test_simulate_shows_who_comes_nearer(tmp_path, monkeypatch):
 def test_a_person_can_wave_while_walking():
     both = [{"kind": "walking", "speed": 1.2}, {"kind": "waving", "side": "left"}]
     run = read(person={"motion": both})
-    motion = in_motion(run, build.true_scene(run))
-    assert isinstance(motion, InMotion)
-    found = motion.movers["person"]
+    motion = build_moving_scene(run, build.true_scene(run))
+    assert isinstance(motion, MovingScene)
+    found = motion.motions["person"]
     assert isinstance(found, list)
     (mover,) = found
     assert isinstance(mover, Waving)
@@ -128,13 +132,13 @@ def test_a_person_can_wave_while_walking():
 
 def test_labels_are_those_of_the_start_with_the_mean_velocity():
     run = read()
-    begun = at_start(run, build.true_scene(run), DURATION)
+    begun = scene_at_start(run, build.true_scene(run), DURATION)
     velocity = begun["fan"].velocity
     assert velocity is not None
     assert torch.allclose(
         velocity.reshape(-1, 3).mean(0), torch.tensor([0.0, 0.0, 1.0]).double(), atol=1e-6
     )
-    joints = joints_at_start(run, begun)["person"]
+    joints = joint_positions_at_start(run, begun)["person"]
     assert set(joints) > {"left_knee", "right_elbow"}
     # The right foot lands: that leg is ahead.
     assert float(joints["right_knee"][2]) < float(joints["left_knee"][2]) - 0.2
@@ -146,7 +150,7 @@ def test_a_data_set_has_these_labels():
     text = RUN.replace('task = "simulate"', 'task = "dataset"') + (
         '[dataset]\nsamples = 1\nshard = 1\nsignals = ["raw"]\n'
     )
-    files = sample_content(read(text), 0)
+    files = make_sample(read(text), 0)
     labels = {row["name"]: row for row in json.loads(files["labels.json"])["objects"]}
     assert labels["fan"]["velocity"] == pytest.approx([0.0, 0.0, 1.0], abs=1e-6)
     assert labels["person"]["velocity"][2] < -0.5
@@ -169,7 +173,7 @@ def test_a_data_set_has_these_labels():
 def test_what_cannot_move_so_is_refused(changes, message):
     run = read(**changes)
     with pytest.raises(InputError, match=message):
-        in_motion(run, build.true_scene(run))
+        build_moving_scene(run, build.true_scene(run))
 
 
 def test_motion_needs_chirps(tmp_path, monkeypatch, capsys):
@@ -184,5 +188,5 @@ def test_motion_needs_chirps(tmp_path, monkeypatch, capsys):
 def test_without_motion_the_scene_is_left_alone():
     run = read(person={"motion": []}, fan={"motion": []})
     scene = build.true_scene(run)
-    assert in_motion(run, scene) is scene
+    assert build_moving_scene(run, scene) is scene
     assert isinstance(scene, Scene)

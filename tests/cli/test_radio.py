@@ -8,12 +8,12 @@ import torch
 
 from cli.small import call, read_metrics
 from invertwin.cli.fits.radio import Heard, spread_of_ends
-from invertwin.cli.fits.scores import certainty_table
+from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import to_toml, validate
+from invertwin.cli.schema.run_file import to_toml, validate_run
 from invertwin.errors import InputError
 from invertwin.inversion import SpectrumLoss
-from invertwin.links import Points
+from invertwin.links import ReceiverPoints
 
 RUN = """
 task = "reconstruct"
@@ -78,7 +78,7 @@ def file_of(folder, text):
 
 
 def loaded(folder, text):
-    return validate(tomllib.loads(text), folder / "small.toml")
+    return validate_run(tomllib.loads(text), folder / "small.toml")
 
 
 def test_a_transmitter_is_located(tmp_path, monkeypatch):
@@ -101,7 +101,7 @@ def test_levels_of_a_file(tmp_path, monkeypatch):
     run = loaded(tmp_path, RUN)
     model, scene = run.map.build(), build.scene(run)
     sensor = run.transmitter.build()
-    assert isinstance(model.places, Points)
+    assert isinstance(model.places, ReceiverPoints)
     level = model.predict(scene, sensor, 0)
     rows = torch.cat([model.places.positions, level.T], 1)
     lines = ["x,y,z,dBm", *(",".join(str(x) for x in row) for row in rows.tolist())]
@@ -122,7 +122,9 @@ def test_a_run_file_as_used_compares_levels_as_the_first_one_did(tmp_path):
     run = loaded(tmp_path, RUN)
     again = loaded(tmp_path, to_toml(run))
     assert (
-        build.made(again, "loss") == build.made(run, "loss") == SpectrumLoss(levels=1, gain="one")
+        build.build_section(again, "loss")
+        == build.build_section(run, "loss")
+        == SpectrumLoss(levels=1, gain="one")
     )
 
 
@@ -216,7 +218,7 @@ def test_ends_that_scatter_beyond_the_bars_are_told(tmp_path, ends, near, inside
     assert found["spread_of_ends"]["transmitter.x"] == pytest.approx(expected)
     assert found["spread_of_ends"]["transmitter.z"] == 0.0
     assert ("spread_note" in found) == (inside == 0)
-    shown = certainty_table(
+    shown = error_bar_table(
         found | {"standard_deviations": bars, "within_95": bars, "units": dict.fromkeys(bars, "m")}
     )
     assert "spread of other ends" in shown.columns

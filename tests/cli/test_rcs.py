@@ -6,7 +6,7 @@ import tomllib
 import pytest
 
 from invertwin.cli.app import app
-from invertwin.cli.schema.run_file import load_run, validate
+from invertwin.cli.schema.run_file import load_run, validate_run
 from invertwin.errors import InputError
 
 PLATE = """
@@ -133,7 +133,7 @@ def test_measurements_of_other_angles_are_refused(tmp_path):
 def test_mistakes_are_named(tmp_path, old, new, text):
     assert old in PLATE
     with pytest.raises(InputError, match=text):
-        validate(tomllib.loads(PLATE.replace(old, new)), tmp_path / "plate.toml")
+        validate_run(tomllib.loads(PLATE.replace(old, new)), tmp_path / "plate.toml")
 
 
 def test_an_unknown_part_is_named(tmp_path):
@@ -190,4 +190,4 @@ def test_derivatives_of_a_signature_are_checked(tmp_path, across):
 )
 def test_what_a_derivative_of_a_signature_does_not_take(tmp_path, old, new, message):
     with pytest.raises(InputError, match=message):
-        validate(tomllib.loads(SLOPES.replace(old, new)), tmp_path / "run.toml")
+        validate_run(tomllib.loads(SLOPES.replace(old, new)), tmp_path / "run.toml")

@@ -2,7 +2,7 @@
 
 import re
 
-from invertwin.cli.report import Picture, Table, report_html
+from invertwin.cli.report import ReportPicture, ReportTable, report_html
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -13,10 +13,10 @@ def test_report_is_self_contained_and_escaped():
         "converged",
         "first\n\nsecond",
         [
-            Table(
+            ReportTable(
                 "Poses", ["name", "x", "ok"], [["<letter>", 0.123456, True], ["wall", None, False]]
             ),
-            Picture("Loss & steps", PNG + b"data", note="one & two"),
+            ReportPicture("Loss & steps", PNG + b"data", note="one & two"),
         ],
         "reconstruct run.toml",
         {"run.toml": 'task = "demo"'},

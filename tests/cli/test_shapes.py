@@ -8,19 +8,19 @@ from rich.console import Console
 
 from cli.small import RUN, call, read_metrics
 from invertwin.cli.fits.problem import (
-    FULL,
+    OWN_METHOD,
     Problem,
-    annealed_until,
-    problem_of,
-    schedule_of,
-    stages_of,
-    varied_run,
+    blur_end_step,
+    build_problem,
+    make_schedule,
+    method_run,
+    stage_runs,
 )
-from invertwin.cli.fits.shape_scores import is_shape_key, shape_label, shape_scores
-from invertwin.cli.fits.writing import Fitted, tables_of
+from invertwin.cli.fits.shape_scores import is_shape_key, score_shape, shape_label
+from invertwin.cli.fits.writing import BestFit, make_tables
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import to_toml, validate
-from invertwin.cli.schema.shape_tables import shape_terms
+from invertwin.cli.schema.run_file import to_toml, validate_run
+from invertwin.cli.schema.shape_tables import shape_regularizers
 from invertwin.errors import InputError
 from invertwin.scene import Mesh, PriorShape
 from invertwin.scene.files import load_mesh
@@ -85,7 +85,7 @@ def shapes(text: str = SHAPES) -> str:
 
 
 def check(text: str, tmp_path):
-    return validate(tomllib.loads(text), tmp_path / "run.toml")
+    return validate_run(tomllib.loads(text), tmp_path / "run.toml")
 
 
 @pytest.mark.slow
@@ -109,7 +109,7 @@ def test_a_shape_is_fitted_in_stages_and_compared(tmp_path, monkeypatch, capsys)
     said = " ".join(capsys.readouterr().out.split())
     assert "Ways to fit" in said
     assert "Chamfer distance from" in said
-    again = validate(tomllib.loads((out / "run.toml").read_text()), tmp_path / "run.toml")
+    again = validate_run(tomllib.loads((out / "run.toml").read_text()), tmp_path / "run.toml")
     assert again == check(shapes(), tmp_path)
 
 
@@ -174,27 +174,27 @@ def test_voxels_of_a_wrong_size_are_refused_before_the_fit(
 
 
 def test_a_twin_that_has_collapsed_has_no_measures(tmp_path):
-    problem = problem_of(check(letters(), tmp_path), Console(quiet=True))
+    problem = build_problem(check(letters(), tmp_path), Console(quiet=True))
     start = problem.scene
     mesh = start["plate"].mesh
     twin = start.replace("plate", mesh=Mesh(0 * mesh.vertices, mesh.faces))
-    found = shape_scores(problem, start, twin)
+    found = score_shape(problem, start, twin)
     assert found["start_chamfer_m"] > 0
     assert not {"chamfer_m", "chamfer_seen_m", "iou"} & set(found)
     metrics = {"steps": 1, "status": "budget", "verdict": "worse", "parameters": {}, **found}
-    result = tables_of(Fitted(problem, metrics, {FULL: [found]}, start, twin, {}, []))[0]
+    result = make_tables(BestFit(problem, metrics, {OWN_METHOD: [found]}, start, twin, {}, []))[0]
     assert ["Chamfer distance, mean of both directions [m]", None] in result.rows
 
 
 def test_a_start_that_is_lost_says_so_in_the_table(tmp_path):
-    problem = problem_of(check(letters(), tmp_path), Console(quiet=True))
+    problem = build_problem(check(letters(), tmp_path), Console(quiet=True))
     rows = [
         {"start": k, "loss": loss, "status": "converged", "lost": lost, "steps": 9, "seconds": 1.0}
         for k, (loss, lost) in enumerate([(0.7, False), (1.0, True)])
     ]
     metrics = {"steps": 9, "status": "converged", "verdict": "unknown", "parameters": {}}
-    fitted = Fitted(problem, metrics, {FULL: rows}, problem.scene, problem.scene, {}, [])
-    starts = tables_of(fitted)[1]
+    fitted = BestFit(problem, metrics, {OWN_METHOD: rows}, problem.scene, problem.scene, {}, [])
+    starts = make_tables(fitted)[1]
     ended = starts.columns.index("ended as")
     assert [row[ended] for row in starts.rows] == [
         "the loss no longer falls",
@@ -224,11 +224,11 @@ def test_a_run_with_stages_survives_the_way_to_toml(tmp_path):
 def test_extra_widths_end_where_the_only_stage_says(tmp_path):
     settings = "reconstruct = { steps = 2, annealing = 0.5 }\nsurrogate = { range_width = 3.0 }\n"
     one = LETTERS.replace("[measures]", f"[[stages]]\n{settings}\n[measures]")
-    assert annealed_until(check(shapes(LETTERS), tmp_path)) is None
-    assert annealed_until(check(shapes(one), tmp_path)) == 1.0
+    assert blur_end_step(check(shapes(LETTERS), tmp_path)) is None
+    assert blur_end_step(check(shapes(one), tmp_path)) == 1.0
     wide = f"{shapes(LETTERS)}\n[surrogate]\nrange_width = 2.0\n"
-    assert annealed_until(check(wide, tmp_path)) == pytest.approx(0.7)
-    assert annealed_until(check(wide + "exact = true\n", tmp_path)) is None
+    assert blur_end_step(check(wide, tmp_path)) == pytest.approx(0.7)
+    assert blur_end_step(check(wide + "exact = true\n", tmp_path)) is None
 
 
 def test_variants_and_stages_have_an_optimizer_of_their_own(tmp_path):
@@ -242,14 +242,14 @@ def test_variants_and_stages_have_an_optimizer_of_their_own(tmp_path):
         'reconstruct = { steps = 2, annealing = 0.5 }\noptimizer = { kind = "sgd" }\n',
     )
     run = check(text, tmp_path)
-    own = varied_run(run, "no_boundary")
+    own = method_run(run, "no_boundary")
     assert (own.optimizer.kind, own.optimizer.rate) == ("sgd", 0.5)
     assert own.reconstruct is not None
     assert own.reconstruct.annealing == 0.25
-    assert varied_run(run, FULL).optimizer.kind == "adam"
+    assert method_run(run, OWN_METHOD).optimizer.kind == "adam"
     scene = build.scene(run)
-    first, second = schedule_of(Problem(run, scene, scene, frozenset()))
-    assert first.optimizer == build.made(run, "optimizer")
+    first, second = make_schedule(Problem(run, scene, scene, frozenset()))
+    assert first.optimizer == build.build_section(run, "optimizer")
     assert (first.steps, first.annealing) == (3, 0.7)
     assert second.optimizer is not None
     assert second.optimizer.kind == "sgd"
@@ -268,9 +268,9 @@ def test_learned_shapes_are_objects_and_parameters(tmp_path):
     run = check(learned('shape = "prior"'), tmp_path)
     scene = build.scene(run)
     assert len(scene["plate"].mesh.faces) > 200
-    tables = build.named(run.parameters)
-    module = build.builders(run.parameters)["vertices"](scene)
-    assert len(shape_terms(tables["vertices"], module, scene)) == 1
+    tables = build.tables_by_name(run.parameters)
+    module = build.module_builders(run.parameters)["vertices"](scene)
+    assert len(shape_regularizers(tables["vertices"], module, scene)) == 1
 
 
 def test_learned_shapes_start_as_their_object(tmp_path):
@@ -367,9 +367,9 @@ def test_parts_are_merged_key_by_key_and_kinds_replace(tmp_path):
     )
     text += '\n[loss]\nkind = "likelihood"\nfloor = 0.5\n[surrogate]\nangle_kernel = "airy"\n'
     run = check(text + "[optimizer]\nrate = 0.2\n", tmp_path)
-    own = varied_run(run, "no_boundary")
+    own = method_run(run, "no_boundary")
     assert (own.loss.kind, own.loss.floor, own.loss.levels) == ("likelihood", 0.5, 1)
     assert (own.optimizer.kind, own.optimizer.rate) == ("gauss_newton", 0.03)
     assert (own.surrogate.range_kernel, own.surrogate.angle_kernel) == ("response", "response")
-    first, second = (found.optimizer.rate for _, found in stages_of(run))
+    first, second = (found.optimizer.rate for _, found in stage_runs(run))
     assert (first, second) == (0.2, 0.01)

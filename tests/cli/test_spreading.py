@@ -9,7 +9,7 @@ from cli.test_radio import RUN as RADIO
 from cli.test_radio import STARTS as RADIO_STARTS
 from invertwin.cli.commands import reconstruct as run_reconstruct
 from invertwin.cli.fits import spreading
-from invertwin.cli.fits.spreading import part_name
+from invertwin.cli.fits.spreading import fit_file_stem
 from invertwin.storage.folders import PARTS
 
 SHORT = RUN.replace("steps = 8", "steps = 3")
@@ -76,12 +76,12 @@ def test_fits_that_are_in_the_folder_are_left_to_it(run_file, monkeypatch, here)
             raise KeyboardInterrupt
         run_reconstruct._fit_one(run, mode, number, folder)
 
-    whole = spreading.fit_elsewhere
-    monkeypatch.setattr(run_reconstruct, "fit_elsewhere", lambda _, *given: whole(broken, *given))
+    whole = spreading.distribute_fits
+    monkeypatch.setattr(run_reconstruct, "distribute_fits", lambda _, *given: whole(broken, *given))
     command = ("reconstruct", run_file, "-o", "cut", "--workers", "2")
     assert call(monkeypatch, *command) == 130
     assert here == [("full", 0), ("full", 1), ("fixed", 0)]
-    monkeypatch.setattr(run_reconstruct, "fit_elsewhere", whole)
+    monkeypatch.setattr(run_reconstruct, "distribute_fits", whole)
     here.clear()
     assert call(monkeypatch, *command, "--resume") == 0
     assert here == [("fixed", 0), ("fixed", 1)]
@@ -90,12 +90,12 @@ def test_fits_that_are_in_the_folder_are_left_to_it(run_file, monkeypatch, here)
 def goes_on(run, mode, start, folder):
     """A fit that makes something of the calibration."""
     begun = folder.file(CALIBRATED).read_bytes()
-    folder.write_bytes(f"{part_name(mode, start)}.json", begun + str(run.seed).encode())
+    folder.write_bytes(f"{fit_file_stem(mode, start)}.json", begun + str(run.seed).encode())
 
 
 def test_a_worker_goes_on_from_the_calibration():
-    job = spreading.Job(goes_on, SHORT, "full", 1, {CALIBRATED: b"seed "})
-    assert spreading.fitted_files(job) == {f"{PARTS}/full_01.json": b"seed 3"}
+    job = spreading.FitJob(goes_on, SHORT, "full", 1, {CALIBRATED: b"seed "})
+    assert spreading.run_fit_job(job) == {f"{PARTS}/full_01.json": b"seed 3"}
 
 
 @pytest.mark.parametrize("options", [("--workers", "2"), ("--engine", "ray")])

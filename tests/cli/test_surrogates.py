@@ -5,7 +5,7 @@ import tomllib
 import pytest
 
 from cli.small import RUN, call, read_metrics
-from invertwin.cli.schema.run_file import to_toml, validate
+from invertwin.cli.schema.run_file import to_toml, validate_run
 from invertwin.errors import InputError
 from invertwin.radar import SURROGATES
 
@@ -18,13 +18,13 @@ def named(line: str) -> str:
 
 @pytest.mark.parametrize("name", SURROGATES)
 def test_a_name_stands_for_the_table(name, tmp_path):
-    run = validate(tomllib.loads(named(f'surrogate = "{name}"')), tmp_path / "run.toml")
+    run = validate_run(tomllib.loads(named(f'surrogate = "{name}"')), tmp_path / "run.toml")
     chosen = SURROGATES[name]
     assert run.surrogate.exact == (chosen is None)
     if chosen is not None:
         table = run.surrogate.model_dump(exclude={"exact"})
         assert table == {key: vars(chosen)[key] for key in table}
-    assert validate(tomllib.loads(to_toml(run)), tmp_path / "run.toml") == run
+    assert validate_run(tomllib.loads(to_toml(run)), tmp_path / "run.toml") == run
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,7 @@ def test_a_name_stands_for_the_table(name, tmp_path):
 )
 def test_a_wrong_one_is_named(line, message, tmp_path):
     with pytest.raises(InputError, match=message):
-        validate(tomllib.loads(named(line)), tmp_path / "run.toml")
+        validate_run(tomllib.loads(named(line)), tmp_path / "run.toml")
 
 
 @pytest.mark.slow

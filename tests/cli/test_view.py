@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from cli.small import RUN, call, read_metrics
-from invertwin.cli.commands.view import shown_of
-from invertwin.cli.fits.displays import VIEW, steps_in
+from invertwin.cli.commands.view import load_display
+from invertwin.cli.fits.displays import VIEW_FILE, load_steps
 from invertwin.cli.schema.run_file import load_run
-from invertwin.viewer import Display, Viewer, policy
+from invertwin.viewer import Display, Viewer, content_security_policy
 
 EVIL = "<script>alert(1)</script>"
 NEEDS_VISER = pytest.mark.skipif(
@@ -22,7 +22,7 @@ NEEDS_VISER = pytest.mark.skipif(
 
 
 def test_a_run_file_shows_the_truth_and_can_be_moved(run_file):
-    display, links = shown_of(run_file)
+    display, links = load_display(run_file)
     run = load_run(run_file)
     layers = {layer.name: layer for layer in display.layers}
     name = next(iter(run.truth))
@@ -37,7 +37,7 @@ def test_a_fit_leaves_its_steps_and_a_report_in_which_no_name_acts(run_file, mon
     assert call(monkeypatch, "reconstruct", run_file) == 0
     folder = Path("out/small")
     metrics = read_metrics(folder)
-    display, links = shown_of(folder)
+    display, links = load_display(folder)
     assert [step.number for step in display.steps] == list(range(metrics["steps"] + 1))
     assert display.steps[0].label == "start"
     assert f"{metrics['loss']:.4g}" in display.steps[-1].label
@@ -52,24 +52,24 @@ def test_a_fit_leaves_its_steps_and_a_report_in_which_no_name_acts(run_file, mon
     report = (folder / "report.html").read_text()
     assert "<script>alert" not in report
     assert 'id="view-data"' in report
-    assert policy() in html.unescape(report)
+    assert content_security_policy() in html.unescape(report)
     assert call(monkeypatch, "view", folder, "--record", "page.html") == 0
     assert "<script>alert" not in Path("page.html").read_text()
 
 
 def test_a_capture_shows_its_maps(run_file, monkeypatch):
     assert call(monkeypatch, "simulate", run_file) == 0
-    display, links = shown_of(Path("out/small/capture.nc"))
+    display, links = load_display(Path("out/small/capture.nc"))
     assert links == {}
     assert len(display.maps[""].frames) == len(display.layers[0].points)
-    assert set(shown_of(Path("out/small"))[0].maps) == {""}
+    assert set(load_display(Path("out/small"))[0].maps) == {""}
 
 
 def test_a_folder_of_a_twin_shows_what_was_found(run_file):
     folder = Path("found")
     folder.mkdir()
     (folder / "twin.toml").write_text(RUN)
-    display, links = shown_of(folder)
+    display, links = load_display(folder)
     assert set(links) == {""}
     assert "twin/plate" in {layer.name for layer in display.layers}
 
@@ -104,7 +104,7 @@ def test_a_damaged_view_is_refused(run_file, monkeypatch, capsys):
     folder = Path("out/small")
     folder.mkdir(parents=True)
     (folder / "run.toml").write_text(RUN)
-    (folder / VIEW).write_bytes(b"damaged")
+    (folder / VIEW_FILE).write_bytes(b"damaged")
     assert call(monkeypatch, "view", folder) == 2
     assert "repeat the run with --overwrite" in capsys.readouterr().err
 
@@ -121,7 +121,7 @@ def test_a_fit_is_seen_while_it_goes_on(run_file, monkeypatch, capsys):
             seen.append(step.number)
         (own,) = found.values()
         (known,) = self._display.maps.values()
-        begun.append(known.at(0)["simulated"])
+        begun.append(known.maps_of_frame(0)["simulated"])
         maps.append(own.at(0)["simulated"])
 
     monkeypatch.setattr(Viewer, "add_step", noted)
@@ -129,8 +129,8 @@ def test_a_fit_is_seen_while_it_goes_on(run_file, monkeypatch, capsys):
     assert "open http://127.0.0.1:" in capsys.readouterr().out
     assert seen == list(range(read_metrics(Path("watched"))["steps"] + 1))
     # At first what the start has for it, at last what the twin has.
-    (kept,) = Display.load(Path("watched") / VIEW).maps.values()
-    ended = kept.at(0)["simulated"]
+    (kept,) = Display.load(Path("watched") / VIEW_FILE).maps.values()
+    ended = kept.maps_of_frame(0)["simulated"]
     peak = float(ended.max())
     assert maps[0] == pytest.approx(begun[0], abs=1e-5 * peak)
     assert maps[-1] == pytest.approx(ended, abs=1e-5 * peak)
@@ -147,6 +147,6 @@ def test_workers_cannot_be_viewed(run_file, monkeypatch, capsys):
 
 
 def test_no_file_has_no_steps(tmp_path):
-    assert steps_in(tmp_path / "none.npz") == []
+    assert load_steps(tmp_path / "none.npz") == []
     Display("", []).save(tmp_path / "empty.npz")
-    assert steps_in(tmp_path / "empty.npz") == []
+    assert load_steps(tmp_path / "empty.npz") == []

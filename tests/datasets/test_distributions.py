@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from invertwin.datasets import KEPT, Choice, Integer, LogUniform, Normal, Presence, Uniform
+from invertwin.datasets import UNCHANGED, Choice, Integer, LogUniform, Normal, Presence, Uniform
 from invertwin.errors import InputError
 
 
@@ -48,17 +48,17 @@ def test_choice_goes_by_its_weights():
 
 def test_presence_keeps_a_key_or_takes_it_away():
     values = draws(Presence(0.25))
-    assert values.count(KEPT) == pytest.approx(1000, rel=0.1)
-    assert values.count(None) == 4000 - values.count(KEPT)
+    assert values.count(UNCHANGED) == pytest.approx(1000, rel=0.1)
+    assert values.count(None) == 4000 - values.count(UNCHANGED)
 
 
 def test_ends_are_those_that_draws_stay_between():
-    assert Uniform([0.0], [1.0]).ends() == [[0.0], [1.0]]
-    assert LogUniform(1.0, 2.0).ends() == [1.0, 2.0]
-    assert Integer(1, 3).ends() == [1, 3]
-    assert Normal(1.0, 2.0).ends() == [1.0]
-    assert Choice([1, "a"]).ends() == [1, "a"]
-    assert Presence().ends() == [None]
+    assert Uniform([0.0], [1.0]).extreme_values() == [[0.0], [1.0]]
+    assert LogUniform(1.0, 2.0).extreme_values() == [1.0, 2.0]
+    assert Integer(1, 3).extreme_values() == [1, 3]
+    assert Normal(1.0, 2.0).extreme_values() == [1.0]
+    assert Choice([1, "a"]).extreme_values() == [1, "a"]
+    assert Presence().extreme_values() == [None]
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from invertwin.datasets import object_labels, radar_labels, seen_triangles
+from invertwin.datasets import object_labels, radar_labels, triangle_visibility
 from invertwin.radar.radar import Radar
 from invertwin.scene import Object, RoughDielectric, Scene, box, plate, rigid
 from scenes import radar as any_radar
@@ -34,7 +34,7 @@ def scene() -> Scene:
 
 def test_boxes_poses_and_velocities():
     device = looks_from([0.0, 0.0, 0.0])
-    crate, wall = object_labels(scene(), seen_triangles(scene(), device), {"crate": "box"}, {})
+    crate, wall = object_labels(scene(), triangle_visibility(scene(), device), {"crate": "box"}, {})
     assert (crate["name"], crate["class"], wall["class"]) == ("crate", "box", "wall")
     half = (0.2 + 0.3) * math.sqrt(0.5)
     assert crate["box"]["low"] == pytest.approx([0.5 - half, -0.1, 3.0 - half])
@@ -60,7 +60,7 @@ def test_a_box_hides_its_back_and_a_part_of_the_wall():
     wall = Object(plate(2.0, 2.0, 4), PAINT, turned(0.0, [0.0, 0.0, 5.0]))
     pair = Scene({"crate": facing, "wall": wall})
     device = looks_from([0.0, 0.0, 0.0], [10.0, 0.0, 3.0])
-    crate, screen = object_labels(pair, seen_triangles(pair, device), {}, {})
+    crate, screen = object_labels(pair, triangle_visibility(pair, device), {}, {})
     areas = {"front": 0.4 * 0.2, "side": 0.6 * 0.2, "top": 0.4 * 0.6}
     whole = 2 * sum(areas.values())
     assert crate["seen"] == pytest.approx([areas["front"] / whole, areas["side"] / whole], abs=0.01)
@@ -73,7 +73,7 @@ def test_a_box_hides_its_back_and_a_part_of_the_wall():
 
 def test_masks_say_which_triangles():
     facing = Scene({"crate": Object(box(1.0), PAINT, turned(0.0, [0.0, 0.0, 3.0]))})
-    masks = seen_triangles(facing, looks_from([0.0, 0.0, 0.0]))["crate"]
+    masks = triangle_visibility(facing, looks_from([0.0, 0.0, 0.0]))["crate"]
     mesh = facing["crate"].mesh
     a, b, c = mesh.vertices[mesh.faces].unbind(1)
     normals = torch.linalg.cross(b - a, c - a)

@@ -7,8 +7,16 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from invertwin.datasets import Samples
-from invertwin.datasets.shards import FORMAT, Array, Manifest, described, npy, packed, shard_name
+from invertwin.datasets import SampleDataset
+from invertwin.datasets.shards import (
+    FORMAT,
+    ArrayInfo,
+    DatasetManifest,
+    describe_shard,
+    npy_bytes,
+    pack_shard,
+    shard_name,
+)
 from invertwin.errors import InputError
 
 
@@ -17,11 +25,11 @@ def written(folder, ranges, part=(1, 1)):
     folder.mkdir(parents=True, exist_ok=True)
     shards = []
     for first, count in ranges:
-        content = packed(
+        content = pack_shard(
             (
                 k,
                 {
-                    "map.npy": npy(np.full((2, 3), k, dtype=np.float32)),
+                    "map.npy": npy_bytes(np.full((2, 3), k, dtype=np.float32)),
                     "labels.json": json.dumps({"index": k}).encode(),
                     "run.toml": b'task = "simulate"',
                 },
@@ -30,14 +38,14 @@ def written(folder, ranges, part=(1, 1)):
         )
         name = shard_name(first)
         (folder / name).write_bytes(content)
-        shards.append(described(name, first, count, content))
-    manifest = Manifest(
+        shards.append(describe_shard(name, first, count, content))
+    manifest = DatasetManifest(
         format=FORMAT,
         samples=10,
         part=part,
         fingerprint="ab",
         versions={},
-        arrays={"map": Array(dims=["frame", "range"], unit="")},
+        arrays={"map": ArrayInfo(dims=["frame", "range"], unit="")},
         shards=shards,
     )
     (folder / "manifest.json").write_text(manifest.model_dump_json())
@@ -49,7 +57,7 @@ def map_of(sample):
 
 
 def test_every_sample_is_found_by_its_number(tmp_path):
-    found = Samples(written(tmp_path, [(0, 4), (4, 4), (8, 2)]))
+    found = SampleDataset(written(tmp_path, [(0, 4), (4, 4), (8, 2)]))
     assert len(found) == 10
     for k in (0, 3, 4, 7, 9, -1):
         sample = found[k]
@@ -64,21 +72,23 @@ def test_every_sample_is_found_by_its_number(tmp_path):
 def test_parts_are_read_as_one_set_in_order(tmp_path):
     written(tmp_path / "part_1_of_2", [(0, 4), (8, 2)], (1, 2))
     written(tmp_path / "part_2_of_2", [(4, 4)], (2, 2))
-    assert [sample["index"] for sample in Samples(tmp_path, keep=["index"])] == list(range(10))
+    assert [sample["index"] for sample in SampleDataset(tmp_path, entries=["index"])] == list(
+        range(10)
+    )
     # A part alone says which samples it has.
-    assert [s["index"] for s in Samples(tmp_path / "part_2_of_2")] == [4, 5, 6, 7]
+    assert [s["index"] for s in SampleDataset(tmp_path / "part_2_of_2")] == [4, 5, 6, 7]
 
 
 def test_only_what_is_kept_is_read(tmp_path):
-    found = Samples(written(tmp_path, [(0, 10)]), keep=["map"])
+    found = SampleDataset(written(tmp_path, [(0, 10)]), entries=["map"])
     assert set(found[2]) == {"map"}
     with pytest.raises(InputError, match="index, map, labels, run, got mask"):
-        Samples(tmp_path, keep=["mask"])
+        SampleDataset(tmp_path, entries=["mask"])
 
 
 @pytest.mark.parametrize("context", [None, "spawn"])
 def test_a_data_loader_reads_it(tmp_path, context):
-    found = Samples(written(tmp_path, [(0, 4), (4, 6)]), transform=map_of)
+    found = SampleDataset(written(tmp_path, [(0, 4), (4, 6)]), transform=map_of)
     loader = DataLoader(
         found,
         batch_size=4,
@@ -93,7 +103,7 @@ def test_a_data_loader_reads_it(tmp_path, context):
 
 
 def test_a_damaged_shard_is_told(tmp_path):
-    found = Samples(written(tmp_path, [(0, 10)]))
+    found = SampleDataset(written(tmp_path, [(0, 10)]))
     found.check()
     shard = tmp_path / shard_name(0)
     whole = shard.read_bytes()

@@ -7,18 +7,25 @@ import tarfile
 import numpy as np
 import pytest
 
-from invertwin.datasets.shards import described, members_of, npy, packed, ranges, read_manifests
+from invertwin.datasets.shards import (
+    describe_shard,
+    locate_members,
+    npy_bytes,
+    pack_shard,
+    read_manifests,
+    shard_ranges,
+)
 from invertwin.errors import InputError
 
 
 def samples(first, count):
     for k in range(first, first + count):
-        yield k, {"map.npy": npy(np.full((2, 3), k)), "labels.json": b'{"a": 1}'}
+        yield k, {"map.npy": npy_bytes(np.full((2, 3), k)), "labels.json": b'{"a": 1}'}
 
 
 def test_a_shard_is_a_tar_that_names_no_owner_and_no_time(tmp_path):
-    content = packed(samples(5, 2))
-    assert content == packed(samples(5, 2))
+    content = pack_shard(samples(5, 2))
+    assert content == pack_shard(samples(5, 2))
     with tarfile.open(fileobj=io.BytesIO(content)) as tar:
         entries = tar.getmembers()
         names = [entry.name for entry in entries]
@@ -28,15 +35,15 @@ def test_a_shard_is_a_tar_that_names_no_owner_and_no_time(tmp_path):
     assert names == [f"0000000{k}.{end}" for k in (5, 6) for end in ("map.npy", "labels.json")]
     assert {(e.mtime, e.uid, e.gid, e.uname, e.mode) for e in entries} == {(0, 0, 0, "", 0o644)}
     (tmp_path / "a.tar").write_bytes(content)
-    places = members_of(tmp_path / "a.tar")
+    places = locate_members(tmp_path / "a.tar")
     start, size = places[6]["labels.json"]
     assert content[start : start + size] == b'{"a": 1}'
 
 
 def test_parts_share_all_shards_among_themselves():
-    whole = ranges(23, 5, (1, 1))
+    whole = shard_ranges(23, 5, (1, 1))
     assert whole == [(0, 0, 5), (1, 5, 5), (2, 10, 5), (3, 15, 5), (4, 20, 3)]
-    assert sorted(row for part in (1, 2, 3) for row in ranges(23, 5, (part, 3))) == whole
+    assert sorted(row for part in (1, 2, 3) for row in shard_ranges(23, 5, (part, 3))) == whole
 
 
 @pytest.mark.parametrize(
@@ -44,11 +51,11 @@ def test_parts_share_all_shards_among_themselves():
 )
 def test_parts_that_are_none_are_refused(part, said):
     with pytest.raises(InputError, match=said):
-        ranges(23, 5, part)
+        shard_ranges(23, 5, part)
 
 
 def manifest(**changes) -> str:
-    shard = described("shard-000000.tar", 0, 2, packed(samples(0, 2))).model_dump()
+    shard = describe_shard("shard-000000.tar", 0, 2, pack_shard(samples(0, 2))).model_dump()
     whole = {
         "format": "invertwin data set 1",
         "samples": 2,

@@ -9,11 +9,11 @@ import torch
 
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
-from invertwin.discovery.movers import of_point, strongest_mover
+from invertwin.discovery.movers import detect_strongest_target, point_response
 from invertwin.discovery.moving_body import MovingBody
 from invertwin.errors import InputError
 from invertwin.inversion import CorrelationLoss, Observation, Optimizer, Schedule, reconstruct
-from invertwin.models.doppler import MotionMap
+from invertwin.models.doppler import RangeDopplerMap
 from invertwin.radar.boards import board
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps, moving_beat
@@ -68,33 +68,33 @@ def correlation(one, other, scale: Any = "magnitude"):
     return 1 - float(CorrelationLoss(scale)(one, other))
 
 
-WHOLE = MotionMap.of(RADAR, GRID, CHIRPS)
+WHOLE = RangeDopplerMap.from_chirps(RADAR, GRID, CHIRPS)
 
 
 def test_the_strongest_mover_is_found_beside_what_stands_still(frame):
-    echo = strongest_mover(frame, WHOLE)
+    echo = detect_strongest_target(frame, WHOLE)
     away = math.hypot(0.5, 2.8)
     assert echo.range == pytest.approx(away, abs=0.02)
-    assert echo.rate == pytest.approx(2.0 * 2.8 / away, abs=0.1)
+    assert echo.range_rate == pytest.approx(2.0 * 2.8 / away, abs=0.1)
     assert echo.u == pytest.approx(-0.5 / away, abs=0.03)
     assert echo.coherence > 0.99
     torch.testing.assert_close(
         echo.position, echo.range * float64(echo.u, 0.0, math.sqrt(1 - echo.u**2))
     )
-    near = WHOLE.around(echo.range, echo.rate, 4, RADAR)
+    near = WHOLE.crop_around(echo.range, echo.range_rate, 4, RADAR)
     power = near.observe(frame)
     assert power.shape[1] in (16, 17)
     assert power.shape[2] in (16, 17)
     assert float(power.max()) == pytest.approx(float(WHOLE.observe(frame).max()), rel=1e-9)
-    assert correlation(of_point(near, RADAR, echo), power, "power") > 0.97
+    assert correlation(point_response(near, RADAR, echo), power, "power") > 0.97
 
 
 def test_a_point_that_moves_on_is_where_its_rate_takes_it(frame):
-    echo = strongest_mover(frame, WHOLE)
-    later = WHOLE.around(echo.range + 0.1 * echo.rate, echo.rate, 4, RADAR)
+    echo = detect_strongest_target(frame, WHOLE)
+    later = WHOLE.crop_around(echo.range + 0.1 * echo.range_rate, echo.range_rate, 4, RADAR)
     middle = later.grid.ranges.mean()
-    assert float(middle) == pytest.approx(echo.range + 0.1 * echo.rate, abs=0.03)
-    ranges = of_point(later, RADAR, echo, time=0.1).amax((0, 1, 3, 4))
+    assert float(middle) == pytest.approx(echo.range + 0.1 * echo.range_rate, abs=0.03)
+    ranges = point_response(later, RADAR, echo, time=0.1).amax((0, 1, 3, 4))
     assert float(later.grid.ranges[ranges.argmax()]) == pytest.approx(float(middle), abs=0.06)
 
 
@@ -102,7 +102,7 @@ def test_without_a_mover_there_is_nothing_to_fit():
     beat = beat_signal(paths_of(RADAR, float64(0.0, 0.0, 2.0)[None], float64(1.0)), RADAR)
     still = noisy(beat[:, None].repeat(1, CHIRPS.count, 1, 1, 1))
     with pytest.raises(InputError, match="no echo above the noise"):
-        strongest_mover(still, WHOLE)
+        detect_strongest_target(still, WHOLE)
 
 
 def test_correlation_ignores_gain_and_knows_three_scales(unchecked):
@@ -125,7 +125,7 @@ def start(echo, **changes):
 
 
 def test_the_body_starts_with_its_front_at_the_echo_and_moves_rigidly(frame):
-    echo = strongest_mover(frame, WHOLE)
+    echo = detect_strongest_target(frame, WHOLE)
     scene, body = start(echo)
     vertices = body(scene)["ball"].vertices.detach()
     assert float(vertices.norm(dim=1).min()) == pytest.approx(echo.range, abs=1e-3)
@@ -149,7 +149,7 @@ def test_the_body_starts_with_its_front_at_the_echo_and_moves_rigidly(frame):
 
 
 def test_materials_without_a_diffuse_share_are_refused(frame):
-    echo = strongest_mover(frame, WHOLE)
+    echo = detect_strongest_target(frame, WHOLE)
     for material, message in (
         (PerfectConductor(), "rough_dielectric"),
         (replace(GLOSSY, diffuse=1.0), "between 0 and 1"),
@@ -166,10 +166,10 @@ def test_a_twin_finds_place_and_motion_in_exact_signals():
     place, velocity, radius = (-0.4, 0.0, 2.6), (0.0, 0.0, 1.6), 0.3
     frames = [recorded(place, velocity, radius, seed) for seed in range(12)]
     records = [ChirpCapture(beat, RADAR, CHIRPS) for beat in frames]
-    echo = strongest_mover(records[0], WHOLE)
+    echo = detect_strongest_target(records[0], WHOLE)
     scene, body = start(echo)
     near = replace(
-        WHOLE.around(echo.range, echo.rate, 6, RADAR),
+        WHOLE.crop_around(echo.range, echo.range_rate, 6, RADAR),
         sampling=Sampling(depth=1, boundary=False, samples=1500),
     )
     mean = torch.stack([near.observe(record) for record in records]).mean(0)
@@ -195,16 +195,16 @@ def test_a_twin_finds_place_and_motion_in_exact_signals():
     many = replace(near, sampling=replace(near.sampling, samples=20_000))
     with torch.no_grad():
         shown = many.predict(body(scene), RADAR, 5)
-    twin, point = (correlation(p, mean) for p in (shown, of_point(near, RADAR, echo)))
+    twin, point = (correlation(p, mean) for p in (shown, point_response(near, RADAR, echo)))
     assert twin > 0.97
     assert twin > point + 0.02
 
 
 def test_a_body_that_leaves_the_view_is_an_error(frame):
-    echo = strongest_mover(frame, WHOLE)
+    echo = detect_strongest_target(frame, WHOLE)
     scene, body = start(echo)
     with torch.no_grad():
         body.size.add_(float64(math.nan, 0.0, 0.0))
-    near = WHOLE.around(echo.range, echo.rate, 4, RADAR)
+    near = WHOLE.crop_around(echo.range, echo.range_rate, 4, RADAR)
     with pytest.raises(InputError):
         reconstruct(scene, Observation(near, RADAR, frame), body, schedule=Schedule(1))

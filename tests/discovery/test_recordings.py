@@ -7,10 +7,10 @@ import torch
 
 import invertwin as iw
 from invertwin.capture import Capture, ChirpCapture
-from invertwin.discovery import Twin, still_capture, twin
-from invertwin.discovery.imaging.point_detections import dense
-from invertwin.discovery.search import Search
-from invertwin.discovery.shapes.primitives import Figure
+from invertwin.discovery import Twin, average_chirps, twin
+from invertwin.discovery.imaging.point_detections import is_dense_track
+from invertwin.discovery.search import ShapeSearch
+from invertwin.discovery.shapes.primitives import ShapeParameters
 from invertwin.errors import InputError
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.radar import Chirps, add_noise
@@ -73,17 +73,17 @@ def room() -> Twin:
 
 @pytest.mark.slow
 def test_what_stands_in_a_room_is_found(room: Twin):
-    assert len(room.things) == 2
-    by_kind = {one.kind: one for one in room.things}
+    assert len(room.objects) == 2
+    by_kind = {one.kind: one for one in room.objects}
     assert set(by_kind) == {"box", "cylinder"}
     for kind, place in (("box", (-0.35, 0.2)), ("cylinder", (0.5, -0.3))):
         one = by_kind[kind]
         assert math.dist(one.position[[0, 2]].tolist(), place) < 0.03
-        assert one.confidence > 0.95
+        assert one.existence_probability > 0.95
         for axis, value in ((0, place[0]), (2, place[1])):
             assert abs(float(one.position[axis]) - value) < 4 * one.deviations["xz"[axis // 2]]
         assert sum(one.probabilities.values()) == pytest.approx(1.0)
-    figure = by_kind["box"].figure
+    figure = by_kind["box"].shape
     assert figure is not None
     sides = sorted((figure.length, figure.width))
     assert sides == pytest.approx([0.3, 0.5], abs=0.05)
@@ -94,7 +94,9 @@ def test_what_stands_in_a_room_is_found(room: Twin):
 def test_what_is_likelier_something_else_becomes_that(monkeypatch):
     """The search ends with a box where a post stands."""
     monkeypatch.setattr(
-        Search, "run", lambda _: [Figure("box", (0.1, 0.2), 0.3, 0.3, 0.25, 1.0, 0.05)]
+        ShapeSearch,
+        "run",
+        lambda _: [ShapeParameters("box", (0.1, 0.2), 0.3, 0.3, 0.25, 1.0, 0.05)],
     )
     radar = around(8)
     scene = iw.Scene({"post": thing(cylinder(0.2, 1.0), (0.1, 0.2), 0.5)})
@@ -102,21 +104,21 @@ def test_what_is_likelier_something_else_becomes_that(monkeypatch):
     beat = iw.simulate(scene, radar, grid, seed=3, sampling=CHAIN, snr_db=10.0).beat
     (one,) = twin(
         Capture.from_beat(beat, radar), low=(-0.6, -0.6), high=(0.6, 0.6), level=0.0
-    ).things
-    assert one.figure is not None
-    assert (one.kind, one.figure.kind) == ("cylinder", "cylinder")
+    ).objects
+    assert one.shape is not None
+    assert (one.kind, one.shape.kind) == ("cylinder", "cylinder")
     assert one.probabilities["cylinder"] > 0.5
-    assert one.figure.length == pytest.approx(0.4, abs=0.04)
+    assert one.shape.length == pytest.approx(0.4, abs=0.04)
     assert {"x", "z", "length", "height", "brightness"} == set(one.deviations)
 
 
 @pytest.mark.slow
 def test_the_inside_of_a_box_is_never_seen(room: Twin):
-    assert room.picture is not None
-    inside = (room.picture.places - torch.tensor([-0.35, 0.2])).norm(dim=1) < 0.1
+    assert room.image is not None
+    inside = (room.image.places - torch.tensor([-0.35, 0.2])).norm(dim=1) < 0.1
     assert int(inside.sum()) > 5
-    assert int(room.picture.views[inside].max()) == 0
-    assert int(room.picture.views.max()) > 4
+    assert int(room.image.view_counts[inside].max()) == 0
+    assert int(room.image.view_counts.max()) > 4
 
 
 @pytest.mark.slow
@@ -127,14 +129,14 @@ def test_maps_of_the_twin_explain_the_recording(room: Twin):
     spread = (room.observed.double() / room.predicted.double()).log().std()
     assert float(spread) == pytest.approx(math.pi / math.sqrt(6), rel=0.06)
     assert room.scene is not None
-    assert room.scene.names == tuple(one.name for one in room.things)
+    assert room.scene.names == tuple(one.name for one in room.objects)
 
 
 def test_noise_is_nothing():
     radar = around(4)
     noise = torch.randn(4, 2, 4, 128, dtype=torch.complex128, generator=torch.manual_seed(0))
     found = twin(Capture.from_beat(1e-6 * noise, radar))
-    assert found.things == ()
+    assert found.objects == ()
     assert found.notes == ("nothing is above the noise",)
     assert found.scene is None
 
@@ -146,7 +148,7 @@ def test_one_small_ball_is_one_thing():
     sampling = iw.Sampling(depth=1, points_per_m2=2e4, boundary=False)
     found = iw.simulate(scene, radar, radar.grid(0.5, 3.0), seed=1, sampling=sampling, snr_db=10.0)
     seen = twin(Capture.from_beat(found.beat, radar), low=(-1.0, -1.0), high=(1.0, 1.0), level=0.0)
-    (one,) = seen.things
+    (one,) = seen.objects
     assert math.dist(one.position[[0, 2]].tolist(), (0.3, 0.1)) < 0.03
 
 
@@ -162,8 +164,8 @@ def test_two_in_one_cell_are_not_more_than_two():
     sampling = iw.Sampling(depth=1, points_per_m2=2e4, boundary=False)
     found = iw.simulate(scene, radar, radar.grid(0.5, 3.0), seed=1, sampling=sampling, snr_db=10.0)
     seen = twin(Capture.from_beat(found.beat, radar), low=(-1.0, -1.0), high=(1.0, 1.0), level=0.0)
-    assert 1 <= len(seen.things) <= 2
-    for one in seen.things:
+    assert 1 <= len(seen.objects) <= 2
+    for one in seen.objects:
         assert math.dist(one.position[[0, 2]].tolist(), (0.3, 0.1125)) < 0.04
 
 
@@ -186,14 +188,16 @@ def test_what_moves_and_what_stands_at_one_range_are_two():
     beat = add_noise(beat, snr_db=20.0, seed=1)
     recording = ChirpCapture(beat, radar, chirps)
     found = twin(recording, level=-0.6, rays=1000)
-    movers = [one for one in found.things if one.velocity is not None]
-    (mover,) = [one for one in movers if one.confidence > 0.5]
+    movers = [one for one in found.objects if one.velocity is not None]
+    (mover,) = [one for one in movers if one.existence_probability > 0.5]
     assert mover.velocity is not None
     way = math.hypot(0.8, 1.6)
     assert float(mover.position.norm()) == pytest.approx(way - 0.08, abs=0.1)
     assert float(mover.velocity.norm()) == pytest.approx(1.5 * 1.6 / way, abs=0.3)
     assert float(mover.position[0]) > 0.3
-    assert min(one.confidence for one in movers) > 0.05  # no line for what is not believed
+    assert (
+        min(one.existence_probability for one in movers) > 0.05
+    )  # no line for what is not believed
     # The echo comes from the front of the ball, three quarters of its radius before the middle.
     truth = (1 - 0.075 / way) * torch.tensor([0.8, 0.0, 1.6], dtype=torch.float64)
     sight = torch.nn.functional.normalize(truth, dim=0)
@@ -201,7 +205,9 @@ def test_what_moves_and_what_stands_at_one_range_are_two():
     across = float((mover.position - truth - along * sight).norm())
     assert abs(along) < 3 * mover.deviations["range"] < 0.15
     assert across < 3 * mover.deviations["across"] < 0.6
-    (rest,) = [one for one in found.things if one.velocity is None and one.confidence > 0.5]
+    (rest,) = [
+        one for one in found.objects if one.velocity is None and one.existence_probability > 0.5
+    ]
     assert math.dist(rest.position[[0, 2]].tolist(), (-0.8, 1.6)) < 0.2
 
 
@@ -210,10 +216,10 @@ def test_both_reflectors_on_the_rail_are_found(data_folder):
     from invertwin_studies.recordings import rail_sar
 
     capture = rail_sar.read(data_folder / "rail_sar")
-    assert dense(capture)
+    assert is_dense_track(capture)
     found = twin(capture, ground=Ground("z"), level=0.0, height=0.0)
     survey = torch.tensor([[2.203936, -3.873749], [2.32899, 1.037974]], dtype=torch.float64)
-    sure = [one.position[:2] for one in found.things if one.confidence > 0.5]
+    sure = [one.position[:2] for one in found.objects if one.existence_probability > 0.5]
     assert len(sure) == 2
     away = torch.cdist(survey, torch.stack(sure)).amin(1)
     assert float(away.max()) < 0.2
@@ -225,13 +231,13 @@ def test_the_strongest_mover_of_the_board_is_found(data_folder):
     from invertwin.registry.kinds import load_plugins, registry
 
     load_plugins()
-    table = registry.table("data", "openradar")
+    table = registry.kind_table("data", "openradar")
     recording = table.made_by(str(data_folder / "openradar"), board=Mounting("xWR1642", None, 1))
     found = twin(recording)
-    strongest = max(found.things, key=lambda one: one.name == "mover_1")
+    strongest = max(found.objects, key=lambda one: one.name == "mover_1")
     assert strongest.velocity is not None
     assert float(strongest.position.norm()) == pytest.approx(2.93, abs=0.05)
-    assert strongest.confidence > 0.9
+    assert strongest.existence_probability > 0.9
     assert float(strongest.velocity.norm()) > 0.2
 
 
@@ -241,7 +247,7 @@ def test_what_rests_keeps_its_signal_and_what_moves_fades():
     mover = torch.exp(2j * torch.pi * turns)[:, None, None, None]
     for signal, least, most in ((torch.ones_like(mover), 1 - 1e-12, 1 + 1e-12), (mover, 0, 6e-4)):
         beat = signal.expand(1, 32, 2, 4, 128).contiguous()
-        power = still_capture(ChirpCapture(beat, radar, chirps)).beat.abs().square()
+        power = average_chirps(ChirpCapture(beat, radar, chirps)).beat.abs().square()
         assert least <= float(power.min()) <= float(power.max()) <= most
 
 
@@ -250,7 +256,7 @@ def test_a_region_that_nothing_sees_is_refused():
     beat = torch.randn(4, 2, 4, 128, dtype=torch.complex128, generator=torch.manual_seed(0))
     beat[..., :] += 50 * torch.exp(2j * torch.pi * 0.3 * torch.arange(128))
     capture = Capture.from_beat(beat, radar)
-    assert still_capture(capture) is capture
+    assert average_chirps(capture) is capture
     with pytest.raises(InputError, match="some radar sees"):
         twin(capture, low=(50.0, 50.0), high=(51.0, 51.0))
     with pytest.raises(InputError, match="low below high"):

@@ -9,29 +9,35 @@ from scipy import sparse
 
 import invertwin as iw
 from discovery.test_recordings import CHAIN, HEIGHT, around, thing
-from invertwin.discovery.assembly import Assembly, sampling_of
-from invertwin.discovery.imaging.likelihood import HeavyTailed, background, shared_bins
-from invertwin.discovery.imaging.reflectivity import Response
-from invertwin.discovery.proposals import standing
-from invertwin.discovery.search import (
-    Lattice,
-    Search,
-    facing,
-    halves,
-    other_kinds,
-    outline,
-    section,
+from invertwin.discovery.assembly import ShapeLikelihood, make_sampling
+from invertwin.discovery.imaging.likelihood import (
+    HeavyTailedLoss,
+    count_bins_per_draw,
+    estimate_background,
 )
-from invertwin.discovery.shapes.primitives import Figure
+from invertwin.discovery.imaging.reflectivity import ImageResponse
+from invertwin.discovery.proposals import propose_people_and_vehicles
+from invertwin.discovery.search import (
+    ImageGrid,
+    ShapeSearch,
+    mean_rcs,
+    outline_corners,
+    propose_kinds,
+    propose_splits,
+    rotate_headed_shapes,
+)
+from invertwin.discovery.shapes.primitives import ShapeParameters
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.models.radar import SurrogateMap
 from invertwin.scene import Mesh, box, cylinder, person, standing_height
 from invertwin_studies.vehicles import car_mesh, sample_car
 
-BOX = Figure("box", (0.3, -0.4), 0.3, 0.8, 0.2, 1.1, 0.05)
+BOX = ShapeParameters("box", (0.3, -0.4), 0.3, 0.8, 0.2, 1.1, 0.05)
 
 
-def search_of(scene: iw.Scene, radar: iw.Radar | None = None, density: float = 500.0) -> Search:
+def search_of(
+    scene: iw.Scene, radar: iw.Radar | None = None, density: float = 500.0
+) -> ShapeSearch:
     """A search of a simulated scene; it has no image."""
     board: iw.Radar = around(12) if radar is None else radar
     count, farthest = board.frame_count, 1.7 * float(board.positions[0].norm())
@@ -39,33 +45,33 @@ def search_of(scene: iw.Scene, radar: iw.Radar | None = None, density: float = 5
     sampling = replace(CHAIN, points_per_m2=density)
     beat = iw.simulate(scene, board, grid, seed=3, sampling=sampling, snr_db=10.0).beat
     power = iw.Capture.from_beat(beat, board).spectrum(grid).float()
-    one = Assembly(
-        SurrogateMap(grid, sampling=sampling_of(count, 1500)),
+    one = ShapeLikelihood(
+        SurrogateMap(grid, sampling=make_sampling(count, 1500)),
         board,
         power,
-        HeavyTailed(background(power)),
-        shared_bins(board, grid),
+        HeavyTailedLoss(estimate_background(power)),
+        count_bins_per_draw(board, grid),
         Ground(),
         0.0,
         0,
     )
     nowhere = torch.zeros(1, 2, dtype=torch.float64)
-    empty = Response(sparse.csr_matrix((power.numel(), 1)), tuple(power.shape))
+    empty = ImageResponse(sparse.csr_matrix((power.numel(), 1)), tuple(power.shape))
     held = list(range(3, count, 4))
-    fitted = one.frames([frame for frame in range(count) if frame not in held])
-    return Search(fitted, one.frames(held), Lattice(nowhere, 0.04, empty, 0.6))
+    fitted = one.select_frames([frame for frame in range(count) if frame not in held])
+    return ShapeSearch(fitted, one.select_frames(held), ImageGrid(nowhere, 0.04, empty, 0.6))
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_halves_fill_the_whole(up):
     ground = Ground(up)
-    pairs = halves(BOX, ground)
+    pairs = propose_splits(BOX, ground)
     assert len(pairs) == 42
-    middle = torch.tensor(BOX.place, dtype=torch.float64)
-    whole = outline(BOX, ground)
+    middle = torch.tensor(BOX.position, dtype=torch.float64)
+    whole = outline_corners(BOX, ground)
     for number, pair in enumerate(pairs):
         area = sum(one.length * one.width for one in pair) / (0.8 * 0.2)
-        parts = torch.cat([outline(one, ground) for one in pair])
+        parts = torch.cat([outline_corners(one, ground) for one in pair])
         # No part reaches beyond the whole.
         assert float((parts - middle).norm(dim=1).max()) < 0.5 * math.hypot(0.8, 0.2) + 1e-9
         if number % 7:
@@ -73,13 +79,18 @@ def test_halves_fill_the_whole(up):
         else:
             assert area == pytest.approx(1.0)
             assert float(torch.cdist(whole, parts).amin(1).max()) < 1e-9
-    post = Figure("cylinder", (0.0, 0.0), 0.0, 0.4, 0.4, 1.0)
-    assert {one.kind for pair in halves(post, ground) for one in pair} == {"box"}
+    post = ShapeParameters("cylinder", (0.0, 0.0), 0.0, 0.4, 0.4, 1.0)
+    assert {one.kind for pair in propose_splits(post, ground) for one in pair} == {"box"}
 
 
 def test_only_what_is_as_large_as_a_person_or_a_vehicle_may_be_one():
     def kinds(length: float, width: float) -> set[str]:
-        return {one.kind for one in standing(Figure("box", (0.0, 0.0), 0.0, length, width, 1.0))}
+        return {
+            one.kind
+            for one in propose_people_and_vehicles(
+                ShapeParameters("box", (0.0, 0.0), 0.0, length, width, 1.0)
+            )
+        }
 
     assert kinds(0.5, 0.3) == {"person"}
     assert kinds(1.8, 0.1) == set()
@@ -88,9 +99,11 @@ def test_only_what_is_as_large_as_a_person_or_a_vehicle_may_be_one():
 
 
 def test_a_section_grows_with_the_surface():
-    assert section(Figure("box", (0.0, 0.0), 0.0, 1.0, 1.0, 2.0)) == pytest.approx(2 * math.pi)
-    ball = Figure("sphere", (0.0, 0.0), 0.0, 0.5, 0.5, 1.0)
-    assert section(ball) == pytest.approx(math.pi / 8)
+    assert mean_rcs(ShapeParameters("box", (0.0, 0.0), 0.0, 1.0, 1.0, 2.0)) == pytest.approx(
+        2 * math.pi
+    )
+    ball = ShapeParameters("sphere", (0.0, 0.0), 0.0, 0.5, 0.5, 1.0)
+    assert mean_rcs(ball) == pytest.approx(math.pi / 8)
 
 
 @pytest.mark.slow
@@ -102,18 +115,25 @@ def test_one_shape_about_two_things_is_split():
         }
     )
     search = search_of(scene)
-    whole = search.settled([Figure("box", (-0.05, 0.1), 0.0, 1.1, 0.4, 0.9, 0.1)])
-    found = search.alive(search.kinds(search.split(whole)))
+    whole = search.refine([ShapeParameters("box", (-0.05, 0.1), 0.0, 1.1, 0.4, 0.9, 0.1)])
+    found = search.prune(search.select_kinds(search.split_shapes(whole)))
     assert len(found) == 2
     assert search.evidence(found) > search.evidence(whole)
     away = torch.cdist(
         torch.tensor([[-0.25, 0.1], [0.3, 0.1]], dtype=torch.float64),
-        torch.tensor([one.place for one in found], dtype=torch.float64),
+        torch.tensor([one.position for one in found], dtype=torch.float64),
     )
     assert float(away.amin(1).max()) < 0.1
     # One thing stays one.
     alone = search_of(iw.Scene({"wall": thing(box((0.7, 0.9, 0.1)), (-0.25, 0.1), 0.45)}))
-    assert len(alone.split(alone.settled([Figure("box", (-0.25, 0.1), 0.0, 0.7, 0.1, 0.9)]))) == 1
+    assert (
+        len(
+            alone.split_shapes(
+                alone.refine([ShapeParameters("box", (-0.25, 0.1), 0.0, 0.7, 0.1, 0.9)])
+            )
+        )
+        == 1
+    )
 
 
 @pytest.mark.slow
@@ -121,14 +141,14 @@ def test_a_person_is_no_box():
     body = person(height=1.65, spacing=0.05)
     scene = iw.Scene({"person": thing(body.mesh({}), (0.1, -0.2), standing_height(body), 0.6)})
     search = search_of(scene)
-    start = Figure("box", (0.12, -0.18), 0.7, 0.5, 0.25, 1.2, 0.1)
-    before = search.settled([start])
-    (found,) = search.turns(search.kinds(before))
+    start = ShapeParameters("box", (0.12, -0.18), 0.7, 0.5, 0.25, 1.2, 0.1)
+    before = search.refine([start])
+    (found,) = search.select_headings(search.select_kinds(before))
     assert found.kind == "person"
-    assert math.dist(found.place, (0.1, -0.2)) < 0.06
-    lists = other_kinds(search.fitted, before)
+    assert math.dist(found.position, (0.1, -0.2)) < 0.06
+    lists = propose_kinds(search.fitted_frames, before)
     assert {rows[0].kind for rows in lists} == {"cylinder", "sphere", "person"}
-    assert facing(before, math.pi, Ground()) == []
+    assert rotate_headed_shapes(before, math.pi, Ground()) == []
 
 
 @pytest.mark.slow
@@ -147,10 +167,10 @@ def test_a_car_is_a_vehicle():
     places = (near.positions - up) * 4 + up
     radar = iw.Radar(near.transmitters, near.receivers, chirp, places, near.rotations)
     search = search_of(scene, radar, 50.0)
-    start = Figure("box", (0.2, -0.4), 0.6, 3.8, 1.7, 1.5, 0.1)
-    (found,) = search.turns(search.kinds(search.settled([start])))
+    start = ShapeParameters("box", (0.2, -0.4), 0.6, 3.8, 1.7, 1.5, 0.1)
+    (found,) = search.select_headings(search.select_kinds(search.refine([start])))
     assert found.kind == "vehicle"
-    assert math.dist(found.place, (0.3, -0.5)) < 0.15
+    assert math.dist(found.position, (0.3, -0.5)) < 0.15
     assert found.length == pytest.approx(long, abs=0.3)
     assert found.width == pytest.approx(wide, abs=0.2)
     assert abs(math.remainder(found.yaw - 0.6, 2 * math.pi)) < math.radians(4)

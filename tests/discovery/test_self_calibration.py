@@ -8,7 +8,7 @@ import torch
 
 import invertwin as iw
 from invertwin.capture import ChannelCalibration
-from invertwin.discovery.self_calibration import apart, channels_of_scene
+from invertwin.discovery.self_calibration import calibrate_on_scene, phase_spread
 from invertwin.scene import RoughDielectric, box, linear_array, look_at, rigid
 
 CHIRP = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=128)
@@ -50,7 +50,7 @@ def found(capture: iw.Capture) -> ChannelCalibration | None:
     ends = torch.arange(-1.5, 1.5, 0.06, dtype=torch.float64)
     flat = torch.cartesian_prod(ends, ends)
     places = torch.stack([flat[:, 0], torch.zeros(len(flat)), flat[:, 1]], dim=1).double()
-    return channels_of_scene(capture, radar.grid(0.5, 5.0), places)
+    return calibrate_on_scene(capture, radar.grid(0.5, 5.0), places)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -63,7 +63,7 @@ def test_any_phases_and_levels_are_found(seed):
     left = left / left[0, 0]
     assert float(left.angle().abs().max()) < math.radians(6)
     assert float(20 * left.abs().log10().abs().max()) < 1.5
-    assert apart(told, spoilt.radar()) > 30
+    assert phase_spread(told, spoilt.radar()) > 30
 
 
 def test_channels_that_agree_are_left_alone():
@@ -74,9 +74,9 @@ def test_a_ramp_of_phases_is_a_turn_of_the_radar():
     radar = recording().radar()
     x = radar.virtual_positions[:, 0].reshape(2, 4) / CHIRP.wavelength
     ramp = ChannelCalibration(torch.polar(torch.ones(2, 4).double(), 2 * math.pi * 0.23 * x))
-    assert apart(ramp, radar) < 2
+    assert phase_spread(ramp, radar) < 2
     bent = ChannelCalibration(torch.polar(torch.ones(2, 4).double(), 2 * x**2))
-    assert apart(bent, radar) > 30
+    assert phase_spread(bent, radar) > 30
 
 
 @pytest.mark.parametrize("frames", [range(4), [0] * 12], ids=["few", "one, often"])

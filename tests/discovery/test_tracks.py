@@ -5,8 +5,8 @@ import torch
 
 import invertwin as iw
 from invertwin.capture import ChirpCapture
-from invertwin.discovery import still_capture
-from invertwin.discovery.tracks import tracks
+from invertwin.discovery import average_chirps
+from invertwin.discovery.tracks import track_moving_targets
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.radar import Chirps, add_noise
 from invertwin.scene import AntennaArray, RoughDielectric, linear_array, rigid, sphere
@@ -45,7 +45,7 @@ def recorded(rates: torch.Tensor, own: torch.Tensor) -> ChirpCapture:
 
 def test_two_movers_are_followed():
     recording = recorded(RATES, torch.zeros(3, dtype=torch.float64))
-    found = tracks(recording, recording.radar().grid(0.3, 6.0), Ground())
+    found = track_moving_targets(recording, recording.radar().grid(0.3, 6.0), Ground())
     assert len(found) == 2
     for one in found:
         assert one.track is not None
@@ -64,7 +64,7 @@ def test_two_movers_are_followed():
                 off = float(one.track.positions[k, "xyz".index(axis)] - true["xyz".index(axis)])
                 assert abs(off) < 3 * float(one.track.deviations[axis][k])
         assert torch.equal(one.position, one.track.positions[-1])
-        assert one.row()["track"]["times_s"][0] == 0.0
+        assert one.to_metrics()["track"]["times_s"][0] == 0.0
 
 
 def test_what_only_the_radar_moves_past_is_at_rest():
@@ -73,11 +73,11 @@ def test_what_only_the_radar_moves_past_is_at_rest():
     rates[1] = 0.0
     own = torch.tensor([0.0, 0.0, 1.2], dtype=torch.float64)
     recording = recorded(rates, own)
-    (found,) = tracks(recording, recording.radar().grid(0.3, 6.0), Ground())
+    (found,) = track_moving_targets(recording, recording.radar().grid(0.3, 6.0), Ground())
     assert found.velocity is not None
     assert (found.velocity - rates[0]).norm() < 0.4
     end = STARTS[0] + PERIOD * (FRAMES - 1) * rates[0]
     assert (found.position - end).norm() < 0.2
     # The mean of its chirps would lose what rests.
-    still = still_capture(recording)
+    still = average_chirps(recording)
     assert torch.equal(still.beat, recording.beat[:, 16])

@@ -19,7 +19,7 @@ from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import load_run, to_toml
 from invertwin.inversion.callbacks import Checkpoint
 from invertwin.inversion.fingerprint import Fingerprint
-from invertwin.inversion.fit import Fit, Progress
+from invertwin.inversion.fit import Fit, FitProgress
 from invertwin.radar.boards import Mounting
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW
@@ -328,7 +328,7 @@ def _npz() -> list[Files]:
     def prior(folder: Path) -> str:
         torch.manual_seed(1)
         decoder = Decoder(2, 3, 4, 5 * 3 * 5).double()
-        lattice = Lattice.between([-1.0, -1, -1], [1.0, 1, 1], [5, 5, 5])
+        lattice = Lattice.from_bounds([-1.0, -1, -1], [1.0, 1, 1], [5, 5, 5])
         ShapePrior(decoder, lattice).save(folder / "prior.npz")
         return "prior.npz"
 
@@ -385,14 +385,14 @@ def _channels() -> list[Files]:
 def _fit() -> Fit:
     """What of a fit a checkpoint knows, without rays."""
     fit = object.__new__(Fit)
-    fit.modules, fit.number, fit.last = nn.ModuleList([Translation("ball")]), 0, True
+    fit.modules, fit.number, fit.is_last = nn.ModuleList([Translation("ball")]), 0, True
     fit.fingerprint = Fingerprint("a fit", torch.arange(3.0))
     fit.optimizer = optimizer = torch.optim.Adam(fit.modules.parameters(), lr=0.1)
     fit.modules[0].translation.grad = torch.ones(3, dtype=torch.float64)  # type: ignore[union-attr]
     optimizer.step()
     first = {name: value.clone() for name, value in fit.modules.state_dict().items()}
     row = {"step": 0, "stage": 0, "loss": 1.5, "values": {"ball.translation": [0.0, 0.0, 0.0]}}
-    fit.progress = Progress(first, 1, [row], (0, 1.5, first))
+    fit.progress = FitProgress(first, 1, [row], (0, 1.5, first))
     return fit
 
 

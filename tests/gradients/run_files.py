@@ -6,7 +6,7 @@ from pathlib import Path
 from invertwin.channel import Sampling
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import load_run
-from invertwin.inversion.gradcheck.gradcheck import Check, GradientReport, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, GradientReport, gradcheck
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Surrogate
 
@@ -16,7 +16,7 @@ def check_run(
     *,
     samples: int,
     boundary_samples: int,
-    check: Check,
+    check: GradcheckSettings,
     surrogate: Surrogate | None = None,
     oversample: int | None = None,
 ) -> GradientReport:
@@ -43,12 +43,12 @@ def check_run(
     told = settings.build()
     module, tangent = build.tangent(run, scene)
     return gradcheck(
-        SurrogateMap(grid, surrogate or build.made(run, "surrogate"), drawn),
+        SurrogateMap(grid, surrogate or build.build_section(run, "surrogate"), drawn),
         module,
         tangent,
         scene=scene,
         sensor=radar,
-        of=settings.of,
-        check=replace(check, step=told.step, scheme=told.scheme),
+        acts_on=settings.of,
+        settings=replace(check, step=told.step, scheme=told.scheme),
         seed=1,
     )

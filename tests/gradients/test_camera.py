@@ -7,7 +7,7 @@ import pytest
 
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import load_run
-from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "camera"
 
@@ -16,17 +16,19 @@ FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "ca
 def test_outlines_that_sweep_over_pixels(file):
     run = load_run(file)
     assert run.gradcheck is not None
-    scene, camera = build.scene(run), build.made(run, "camera")
+    scene, camera = build.scene(run), build.build_section(run, "camera")
     module, tangent = build.tangent(run, scene)
     coarse = replace(camera, width=6, height=5, focal=camera.focal / 2, centre=None)
     report = gradcheck(
-        build.made(run, "image"),
+        build.build_section(run, "image"),
         module,
         tangent,
         scene=scene,
         sensor=coarse,
-        of=run.gradcheck.of,
-        check=Check(repeats=1, step=6e-3, difference_samples=300_000, noise=0.02, max_pairs=8),
+        acts_on=run.gradcheck.of,
+        settings=GradcheckSettings(
+            repeats=1, step=6e-3, difference_samples=300_000, noise=0.02, max_pairs=8
+        ),
     )
     assert report.full.relative_l1 < 0.06
     assert report.interior.relative_l1 > 0.5

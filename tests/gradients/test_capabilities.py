@@ -21,20 +21,20 @@ from invertwin.channel import (
     Paths,
     RayPaths,
     Sampling,
+    combine_coherently,
     deposit_paths,
     deposit_power,
-    interference,
-    trace_chains,
+    trace_facet_paths,
     trace_field,
     trace_paths,
-    trace_scattered,
+    trace_single_scattering,
     trace_target,
 )
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
-from invertwin.inversion.gradcheck.lines import line_of
-from invertwin.links import CellSampling, MapPlane, Reception, Transmitters
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
+from invertwin.inversion.gradcheck.lines import make_line
+from invertwin.links import CellSampling, MapPlane, PropagationSettings, Transmitters
 from invertwin.links.metasurface.panel import Metasurface, panel_response
 from invertwin.models.camera import DepthMap, SilhouetteMap
 from invertwin.models.radar import SurrogateMap
@@ -50,7 +50,7 @@ from invertwin.scene import (
     RoughDielectric,
     Scene,
     Slab,
-    Table,
+    TabulatedPattern,
     linear_array,
     plate,
     rotation_from_vector,
@@ -105,8 +105,8 @@ class Move:
     def __call__(self, scene: Scene, radar: Radar, theta: Tensor) -> tuple[Scene, Radar]:
         scene = self.start(scene)
         if self.of == "scene":
-            return line_of(self.module, self.tangent, scene).at(theta), radar
-        return scene, line_of(self.module, self.tangent, radar).at(theta)
+            return make_line(self.module, self.tangent, scene).evaluate(theta), radar
+        return scene, make_line(self.module, self.tangent, radar).evaluate(theta)
 
 
 def material(name: str, start: float, wall: Material | None = None) -> Move:
@@ -119,7 +119,9 @@ def material(name: str, start: float, wall: Material | None = None) -> Move:
 def soft() -> Move:
     """The occluder as a soft ball, whose densities change at random."""
     reach = [0.3, 0.3, 0.3]
-    nodes = DensityGrid.even("occluder", [-x for x in reach], reach, (9, 9, 9)).lattice.nodes
+    nodes = DensityGrid.from_optical_depth(
+        "occluder", [-x for x in reach], reach, (9, 9, 9)
+    ).lattice.nodes
     ball = 15 * torch.sigmoid((0.2 - nodes.norm(dim=-1)) / 0.03)
     change = torch.randn(ball.shape, generator=torch.Generator().manual_seed(2)).double()
     return Move(DensityGrid("occluder", [-x for x in reach], reach, ball), {"value": change})
@@ -153,7 +155,7 @@ def clock() -> tuple[Radar, Move]:
     times = torch.linspace(0, 1, 3, dtype=torch.float64)
     path = float64([[-0.5, 0.0, 0.0], [0.5, 0.1, 0.1]])
     track = Track(float64([-0.5, 1.5]), path)
-    radar = power_radar(track.at(times).tolist())
+    radar = power_radar(track.interpolate(times).tolist())
     single = replace(radar, receivers=radar.transmitters)
     profile = torch.ones(3, 8, dtype=torch.complex128)
     capture = Capture.from_range_profile(
@@ -184,7 +186,7 @@ def power_case(parameter: str) -> Found:
             boundary_samples=50_000 * radar.frame_count,
         ),
     )
-    check = Check(
+    check = GradcheckSettings(
         repeats=2,
         difference_samples=300_000 * radar.frame_count,
         noise=0.01,
@@ -196,8 +198,8 @@ def power_case(parameter: str) -> Found:
         move.tangent,
         scene=move.start(scene),
         sensor=radar,
-        of=move.of,
-        check=check,
+        acts_on=move.of,
+        settings=check,
     )
     return Found(
         report.gradient, report.interior_gradient, report.difference, report.difference_noise
@@ -291,7 +293,7 @@ def rough_case(parameter: str) -> Found:
 def section(scene: Scene) -> Tensor:
     """Radar cross-sections from in front, a little to the side."""
     sides = float64([[0.3, 0.1, -1.0], [0.05, -0.2, -1.0]])
-    return rcs(scene, sides, [1e9], edges=0).section
+    return rcs(scene, sides, [1e9], edges=0).cross_section
 
 
 def signature_case(parameter: str) -> Found:
@@ -344,7 +346,9 @@ def covered(scene: Scene, place: Tensor, sampling: CellSampling, seed: int = 0) 
     """Mean power in cells, seen directly and by the mirror of the wall."""
     cells = replace(CELLS_BEHIND, sampling=sampling)
     mast = Transmitters(place + float64([-0.07, 0.04, 0.19]))
-    return cells.received(scene, mast, Reception(1e9, depth=1, rays=None), seed).gain
+    return cells.link_statistics(
+        scene, mast, PropagationSettings(1e9, depth=1, rays=None), seed
+    ).gain
 
 
 def coverage_case(parameter: str) -> Found:
@@ -395,7 +399,7 @@ def by_mirrors(scene: Scene, place: Tensor, sampling: Sampling, seed: int) -> Te
     if rough["occluder"].cloud is None:
         rough = rough.replace("occluder", material=AIR)
     tx = place + float64([-0.07, 0.04, 0.19])
-    return trace_scattered(
+    return trace_single_scattering(
         scene,
         rough,
         tx,
@@ -440,7 +444,7 @@ def chain_case(parameter: str) -> Found:
 
     def value(theta: Tensor) -> Tensor:
         moved, device = moves(scene, radar, theta)
-        return at_carrier(trace_chains(moved, device.link(), 2), device.link())
+        return at_carrier(trace_facet_paths(moved, device.link(), 2), device.link())
 
     up, down = (value(torch.tensor(sign * 1e-6).double()) for sign in (1, -1))
     found = pushed(value)
@@ -455,7 +459,7 @@ def target_map(scene: Scene, radar: Radar) -> Tensor:
         return Surrogate().spread(radar, grid, *(0.5 * gap for gap in gaps))
 
     fields = trace_target(scene, "wall", link, sampling=Sampling(depth=1))
-    return deposit_paths(interference(fields, link, overlap), link, grid).double()
+    return deposit_paths(combine_coherently(fields, link, overlap), link, grid).double()
 
 
 def target_case(parameter: str) -> Found:
@@ -642,7 +646,9 @@ def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
         return
     if mechanism == "chains":
         exact_spectrum(
-            beat_signal(trace_chains(scene, radar.link(), 2), radar), radar, radar.grid(0.4, 2.8)
+            beat_signal(trace_facet_paths(scene, radar.link(), 2), radar),
+            radar,
+            radar.grid(0.4, 2.8),
         )
         return
     if mechanism.endswith(("interior", "boundary")):
@@ -672,7 +678,7 @@ def velocity(scene: Scene, radar: Radar) -> tuple[Scene, Radar]:
 
 def patterns(scene: Scene, radar: Radar) -> tuple[Scene, Radar]:
     gains = torch.ones(2, 1, dtype=torch.float64, requires_grad=True)
-    pattern = Table(float64([0.0, 1.5]), float64([0.0]), gains)
+    pattern = TabulatedPattern(float64([0.0, 1.5]), float64([0.0]), gains)
     return scene, replace(radar, receivers=replace(radar.receivers, pattern=pattern))
 
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import validate
-from invertwin.inversion.gradcheck.gradcheck import Check, GradientReport, gradcheck
-from invertwin.models.rcs import SignatureMap
+from invertwin.cli.schema.run_file import validate_run
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, GradientReport, gradcheck
+from invertwin.models.rcs import RcsMap
 from invertwin.scene import Object, PerfectConductor, Scale, Scene, dihedral
-from invertwin.signatures import aspects, rcs
+from invertwin.signatures import aspect_directions, rcs
 from scenes import relative
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "coherent"
@@ -29,13 +29,15 @@ def check_run(name: str, count: int) -> GradientReport:
     raw = tomllib.loads(file.read_text(encoding="utf-8"))
     swept = next(value for value in raw["rcs"].values() if isinstance(value, dict))
     swept["count"] = count
-    run = validate(raw, file)
+    run = validate_run(raw, file)
     assert run.gradcheck is not None
     assert run.rcs is not None
     table, scene = run.rcs, build.scene(run)
     module, tangent = build.tangent(run, scene)
-    model = SignatureMap(lambda seen, **more: table.build({Scene: seen}, **more))
-    return gradcheck(model, module, tangent, scene=scene, sensor=None, check=run.gradcheck.build())
+    model = RcsMap(lambda seen, **more: table.build({Scene: seen}, **more))
+    return gradcheck(
+        model, module, tangent, scene=scene, sensor=None, settings=run.gradcheck.build()
+    )
 
 
 def test_all_run_files_are_here():
@@ -61,8 +63,10 @@ def test_a_plate_through_broadside_has_no_beams_that_end_on_it():
 
 def test_fixed_visibility_changes_no_value():
     corner = Scene({"corner": Object(dihedral(0.1, 1.5), PerfectConductor())})
-    seen = partial(rcs, directions=aspects([2.9, 3.1, 3.4], 0.2), frequencies=30e9, edges=0)
-    model = SignatureMap(seen)
+    seen = partial(
+        rcs, directions=aspect_directions([2.9, 3.1, 3.4], 0.2), frequencies=30e9, edges=0
+    )
+    model = RcsMap(seen)
     value = model.predict(corner, None, 0)
     fixed = replace(model, boundary=False)
     assert torch.allclose(fixed.predict(corner, None, 1), value, rtol=1e-9)
@@ -75,17 +79,17 @@ def test_fixed_visibility_changes_no_value():
 def test_both_modes_agree(boundary):
     """Reverse mode through the clipped polygons, against the forward mode of the check."""
     corner = Scene({"corner": Object(dihedral(0.1, 1.5), PerfectConductor())})
-    seen = partial(rcs, directions=aspects([2.9, 3.4], 0.2), frequencies=30e9, edges=0)
+    seen = partial(rcs, directions=aspect_directions([2.9, 3.4], 0.2), frequencies=30e9, edges=0)
     module = Scale("corner")
     report = gradcheck(
-        SignatureMap(seen),
+        RcsMap(seen),
         module,
         {"log_scale": 1.0},
         scene=corner,
         sensor=None,
-        check=Check(step=1e-5),
+        settings=GradcheckSettings(step=1e-5),
     )
     forward = report.gradient if boundary else report.interior_gradient
-    total = SignatureMap(seen, boundary).predict(module(corner), None, 0).sum()
+    total = RcsMap(seen, boundary).predict(module(corner), None, 0).sum()
     (backward,) = torch.autograd.grad(total, [*module.parameters()])
     assert float(backward.sum()) == pytest.approx(float(forward.sum()), rel=1e-9)

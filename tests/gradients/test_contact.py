@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gradients.run_files import check_run
-from invertwin.inversion.gradcheck.gradcheck import Check
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "contact"
 NAMES = (
@@ -26,7 +26,7 @@ def test_a_contact_that_moves(name):
         FOLDER / f"{name}.toml",
         samples=400_000,
         boundary_samples=100_000,
-        check=Check(repeats=2, difference_samples=1_000_000, noise=0.01, max_pairs=8),
+        check=GradcheckSettings(repeats=2, difference_samples=1_000_000, noise=0.01, max_pairs=8),
     )
     assert report.difference_noise < 0.015
     assert report.full.relative_l1 < 0.02
@@ -40,7 +40,7 @@ def test_a_contact_lit_by_way_of_a_screen():
         FOLDER / "past_a_contact_two_bounces.toml",
         samples=2_000_000,
         boundary_samples=500_000,
-        check=Check(repeats=3, difference_samples=8_000_000, noise=0.02, max_pairs=40),
+        check=GradcheckSettings(repeats=3, difference_samples=8_000_000, noise=0.02, max_pairs=40),
     )
     assert report.difference_noise < 0.025
     assert report.full.relative_l1 < 0.04

@@ -7,7 +7,7 @@ import pytest
 
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import load_run
-from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "waves"
 NAMES = ("coverage_occluder", "coverage_panel", "coverage_transmitter")
@@ -34,8 +34,10 @@ def test_shadows_and_beams_that_sweep_over_cells(name):
         tangent,
         scene=scene,
         sensor=run.transmitter.build(),
-        of=run.gradcheck.of,
-        check=Check(repeats=1, step=0.03, difference_samples=100_000, noise=0.05, max_pairs=4),
+        acts_on=run.gradcheck.of,
+        settings=GradcheckSettings(
+            repeats=1, step=0.03, difference_samples=100_000, noise=0.05, max_pairs=4
+        ),
     )
     assert report.full.relative_l1 < 0.08
     assert report.interior.relative_l1 > 0.3

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from invertwin.channel import Sampling
-from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Surrogate
 from invertwin.scene import DensityGrid, Scene, plate
@@ -18,7 +18,7 @@ def test_gradient_by_densities_is_that_of_converged_differences():
     """A soft ball in front of a wall; its densities change at random."""
     start = thing(plate(0.1, 0.1), (0.05, 0.02, 1.1), (0.1, 0.2, 0.05))
     scene = Scene({"wall": thing(plate(2.4, 2.4, divisions=2), (0, 0, 2)), "object": start})
-    module = DensityGrid.even("object", LOW, HIGH, (10, 9, 8))
+    module = DensityGrid.from_optical_depth("object", LOW, HIGH, (10, 9, 8))
     distance = module.lattice.nodes.norm(dim=-1)
     module = DensityGrid("object", LOW, HIGH, 15 * torch.sigmoid((0.22 - distance) / 0.03))
     change = torch.randn(module.value.shape, generator=torch.Generator().manual_seed(2)).double()
@@ -34,7 +34,9 @@ def test_gradient_by_densities_is_that_of_converged_differences():
         change,
         scene=scene,
         sensor=device,
-        check=Check(repeats=2, step=0.02, difference_samples=300_000, noise=0.008, max_pairs=8),
+        settings=GradcheckSettings(
+            repeats=2, step=0.02, difference_samples=300_000, noise=0.008, max_pairs=8
+        ),
         seed=1,
     )
     print(f"L1 {report.full.relative_l1:.4f}, noise {report.difference_noise:.4f}")

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gradients.run_files import check_run
-from invertwin.inversion.gradcheck.gradcheck import Check, GradientReport
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, GradientReport
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "multi_bounce"
 
@@ -20,7 +20,9 @@ def checked(name: str, samples: int, boundary_samples: int, pairs: int) -> Gradi
         FOLDER / f"{name}.toml",
         samples=samples,
         boundary_samples=boundary_samples,
-        check=Check(repeats=2, difference_samples=2 * samples, noise=0.0, max_pairs=pairs),
+        check=GradcheckSettings(
+            repeats=2, difference_samples=2 * samples, noise=0.0, max_pairs=pairs
+        ),
     )
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from gradients.run_files import check_run
 from invertwin.channel import Sampling
-from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Surrogate
 from invertwin.scene import Scene, Translation, plate, sphere
@@ -34,7 +34,7 @@ def test_gradient_is_that_of_converged_differences(file):
         file,
         samples=400_000,
         boundary_samples=100_000,
-        check=Check(repeats=3, difference_samples=500_000, noise=0.01, max_pairs=16),
+        check=GradcheckSettings(repeats=3, difference_samples=500_000, noise=0.01, max_pairs=16),
         surrogate=Surrogate("gaussian", range_width=1.5, angle_width=1.0),
         oversample=1,
     )
@@ -65,7 +65,9 @@ def test_a_fine_mesh_keeps_its_silhouette(axis):
         float64(axis),
         scene=scene,
         sensor=seen,
-        check=Check(repeats=2, difference_samples=1_500_000, noise=0.015, max_pairs=8),
+        settings=GradcheckSettings(
+            repeats=2, difference_samples=1_500_000, noise=0.015, max_pairs=8
+        ),
     )
     assert report.difference_noise < 0.02
     assert report.full.relative_l1 < 0.03

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.channel import Sampling
-from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Surrogate
 from invertwin.scene import (
@@ -86,7 +86,7 @@ def distance_grid() -> Line:
     def ellipsoid(points: Tensor) -> Tensor:
         return 0.2 * ((points / float64([0.3, 0.2, 0.2])).norm(dim=1) - 1)
 
-    module = DistanceGrid.sampled("object", LOW, HIGH, (13, 12, 11), ellipsoid)
+    module = DistanceGrid.from_function("object", LOW, HIGH, (13, 12, 11), ellipsoid)
     scene = before_a_wall(sphere(0.2, 1))
     # Values on one side fall: the surface moves outwards there.
     change = -(module.lattice.nodes[..., 0] > 0.1).double()
@@ -111,7 +111,7 @@ def small_prior(size: float = 0.13) -> ShapePrior:
     decoder = copy.deepcopy(cars.decoder)
     decoder.basis.weight.data *= size
     decoder.basis.bias.data *= size
-    lattice = Lattice.between(size * cars.low, size * cars.high, cars.lattice.counts)
+    lattice = Lattice.from_bounds(size * cars.low, size * cars.high, cars.lattice.counts)
     return ShapePrior(decoder, lattice)
 
 
@@ -177,14 +177,14 @@ def test_gradient_is_that_of_converged_differences(case):
         Surrogate("gaussian", range_width=2.0, angle_width=1.0),
         Sampling(depth=1, samples=400_000, boundary_samples=200_000),
     )
-    check = Check(
+    check = GradcheckSettings(
         repeats=3,
         step=2e-3 if "distance" in case.__name__ else 6e-3,
         difference_samples=1_000_000,
         noise=0.008,
         max_pairs=24,
     )
-    report = gradcheck(model, module, tangent, scene=scene, sensor=device, check=check, seed=1)
+    report = gradcheck(model, module, tangent, scene=scene, sensor=device, settings=check, seed=1)
     print(
         f"L1 {report.full.relative_l1:.4f}, interior {report.interior.relative_l1:.3f}, "
         f"noise {report.difference_noise:.4f}, {report.pairs} pairs"

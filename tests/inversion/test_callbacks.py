@@ -24,7 +24,7 @@ from invertwin.inversion import (
     Watch,
     reconstruct,
 )
-from invertwin.inversion.fit import _restore
+from invertwin.inversion.fit import _restore_optimizer
 from invertwin.inversion.regularization import Laplacian
 from invertwin.models.radar import SurrogateMap
 from invertwin.scene import RoughDielectric
@@ -251,7 +251,7 @@ def test_what_no_optimizer_has_left_is_not_taken_for_its_state(name, value):
     parameter.grad = torch.ones(3, dtype=torch.float64)
     optimizer.step()
     state = optimizer.state_dict()
-    _restore(torch.optim.Adam([parameter]), state)
+    _restore_optimizer(torch.optim.Adam([parameter]), state)
     state["state"][0][name] = value
     with pytest.raises(ValueError, match="optimiser of another fit"):
-        _restore(torch.optim.Adam([parameter]), state)
+        _restore_optimizer(torch.optim.Adam([parameter]), state)

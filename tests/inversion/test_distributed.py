@@ -8,9 +8,9 @@ from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.inversion import mean_over_views
 from invertwin.models.radar import SurrogateMap
-from invertwin.runtime.engines import spread
+from invertwin.runtime.engines import run_jobs
 from invertwin.scene import Translation
-from invertwin.seeds import derived_seed
+from invertwin.seeds import derive_seed
 from scenes import occluder, radar
 
 VIEWS = range(3)
@@ -25,7 +25,7 @@ def of_views() -> tuple[float, list[float]]:
     module = Translation(scene.names[0])
 
     def loss(view: int) -> torch.Tensor:
-        return model.predict(module(scene), device, derived_seed(7, view)).sum().log()
+        return model.predict(module(scene), device, derive_seed(7, view)).sum().log()
 
     value = mean_over_views(loss, VIEWS, module)
     (parameter,) = module.parameters()
@@ -46,7 +46,7 @@ def one_of_two(job: tuple[int, str]) -> tuple[float, list[float]]:
 def test_two_processes_give_what_one_gives(tmp_path, monkeypatch):
     monkeypatch.setenv("GLOO_SOCKET_IFNAME", "lo")
     jobs = [(rank, str(tmp_path / "meeting")) for rank in (0, 1)]
-    first, second = (found for _, found in sorted(spread(one_of_two, jobs, workers=2)))
+    first, second = (found for _, found in sorted(run_jobs(one_of_two, jobs, workers=2)))
     assert first == second
     value, slope = of_views()
     assert first[0] == pytest.approx(value, rel=1e-6)

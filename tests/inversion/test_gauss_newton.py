@@ -14,7 +14,7 @@ from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.inversion import Optimizer, SpectrumLoss
 from invertwin.inversion.gauss_newton import GaussNewton
-from invertwin.inversion.loss import Maps, Objective
+from invertwin.inversion.loss import MapPairs, Objective
 from invertwin.radar import surrogate_spectrum
 from invertwin.scene.parameters import Pose, Translation
 from scenes import float64
@@ -81,7 +81,7 @@ def test_curvature_is_the_second_derivative_at_the_truth(kind, background):
 
 def test_reaches_of_parameters_are_their_own():
     model, measured = Mixture([0.0, 0.0, 0.0]), Mixture(TRUTH)().detach()
-    solver = GaussNewton(model, alone(SpectrumLoss(gain="one")), reaches={model.share: 0.1})
+    solver = GaussNewton(model, alone(SpectrumLoss(gain="one")), trust_radii={model.share: 0.1})
     solver.step(lambda: [(model(), measured)])
     assert float(model.share.detach().abs().max()) == pytest.approx(0.1)
     rates, first = Optimizer("gauss_newton", rate=0.3), Translation("a")
@@ -112,7 +112,7 @@ def test_a_fixed_coordinate_stays_to_the_last_bit():
 def test_no_step_is_longer_than_its_reach_and_none_makes_it_worse():
     measured = Mixture(TRUTH)().detach()
     model = Mixture([0.0, 0.0, 0.0])
-    GaussNewton(model, alone(SpectrumLoss()), reach=0.01).step(lambda: [(model(), measured)])
+    GaussNewton(model, alone(SpectrumLoss()), trust_radius=0.01).step(lambda: [(model(), measured)])
     assert float(model.share.detach().abs().max()) == pytest.approx(0.01, rel=1e-6)
 
     class Wrong(Mixture):
@@ -137,9 +137,11 @@ def test_a_curvature_serves_several_steps():
 
     def asked(every: int) -> tuple[int, Tensor]:
         model, count = Mixture([0.0, 0.0, 0.0]), 0
-        solver = GaussNewton(model, alone(SpectrumLoss(gain="one")), damping=1e-4, every=every)
+        solver = GaussNewton(
+            model, alone(SpectrumLoss(gain="one")), damping=1e-4, curvature_every=every
+        )
 
-        def maps() -> Maps:
+        def maps() -> MapPairs:
             nonlocal count
             count += forward_ad.unpack_dual(model.share).tangent is not None
             return [(model(), measured)]
@@ -160,7 +162,7 @@ def test_a_kept_curvature_goes_on_from_a_checkpoint():
 
     def steps(count: int, state: Any = None) -> tuple[Tensor, dict[str, Any]]:
         model = Mixture([0.0, 0.0, 0.0])
-        solver = GaussNewton(model, alone(SpectrumLoss()), reach=0.1, every=4)
+        solver = GaussNewton(model, alone(SpectrumLoss()), trust_radius=0.1, curvature_every=4)
         if state is not None:
             solver.load_state_dict(state[1])
             model.share.data.copy_(state[0])
@@ -188,12 +190,12 @@ def test_a_displaced_plate_is_found_in_eight_steps(case):
     """The same plate takes Adam 60 steps (test_reconstruction). The array tells nothing of y."""
     module = Translation("plate", axes="xz")
     surrogate = case.settings()["surrogate"]
-    solver = GaussNewton(module, alone(SpectrumLoss()), reach=0.1)
+    solver = GaussNewton(module, alone(SpectrumLoss()), trust_radius=0.1)
     for step in range(8):
         left = max(0.0, 1 - step / 5)
         kernels = replace(surrogate, range_width=2 * left, angle_width=left)
 
-        def maps(step: int = step, kernels: Any = kernels) -> Maps:
+        def maps(step: int = step, kernels: Any = kernels) -> MapPairs:
             simulated = surrogate_spectrum(
                 module(case.scene),
                 case.radar,
@@ -216,7 +218,7 @@ def test_bad_input(unchecked):
     with pytest.raises(InputError, match="expected a SpectrumLoss for Gauss–Newton, got function"):
         GaussNewton(model, alone(lambda a, b: a))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="reach > 0"):
-        GaussNewton(model, alone(SpectrumLoss()), reach=0.0)
+        GaussNewton(model, alone(SpectrumLoss()), trust_radius=0.0)
     with pytest.raises(InputError, match="got 0,"):
         GaussNewton(nn.ReLU(), alone(SpectrumLoss()))
     solver = GaussNewton(many, alone(SpectrumLoss()))
@@ -236,7 +238,7 @@ def test_a_turned_pose_has_free_quaternion_numbers_only(case):
     module = Pose("plate", axes="z", rotation_axes="y")
     measured = case.capture.spectrum(case.grid).float()
 
-    def maps() -> Maps:
+    def maps() -> MapPairs:
         simulated = surrogate_spectrum(
             module(case.scene),
             case.radar,

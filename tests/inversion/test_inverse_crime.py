@@ -10,7 +10,7 @@ import pytest
 
 from invertwin.capture import Capture
 from invertwin.channel import Sampling
-from invertwin.cli.fits.problem import stages_of
+from invertwin.cli.fits.problem import stage_runs
 from invertwin.cli.schema import SimulatedData, build
 from invertwin.cli.schema.radio_tables import ReceivedData
 from invertwin.cli.schema.run_file import load_run
@@ -106,10 +106,12 @@ def check_data(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         device = build.radar(table)
         scene = build.true_scene(run)
         if run.chirps is None:
-            simulated = partial(run_simulate.exact, run, scene, device, build.grid(bins, device))
+            simulated = partial(
+                run_simulate.simulate_exact, run, scene, device, build.grid(bins, device)
+            )
         else:
             chirps = run.chirps.build()
-            simulated = partial(run_simulate.chirp_train, run, scene, device, chirps)
+            simulated = partial(run_simulate.simulate_chirp_beats, run, scene, device, chirps)
         with pytest.raises(FieldsTracedError):
             simulated()
 
@@ -117,7 +119,7 @@ def check_data(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def check_levels(run: Any) -> None:
     """Simulated levels know paths that no stage of any fit knows, and other rays."""
     ways = [run, *(run.varied(variant) for variant in run.variants.values())]
-    fitted: list[Any] = [own.map for way in ways for _, own in stages_of(way)]
+    fitted: list[Any] = [own.map for way in ways for _, own in stage_runs(way)]
     assert run.data.depth > max(table.depth for table in fitted)
     assert (run.data.edges or 0) > max(table.edges for table in fitted) or not run.data.edges
     assert run.data.rays > max(table.rays for table in fitted)

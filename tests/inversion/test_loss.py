@@ -142,7 +142,7 @@ def test_the_gain_of_the_likelihood_is_that_of_a_long_iteration():
         up = sum(float((x * (y + 0.01) / (gain * x + 0.01) ** 2).mean()) for x, y in pairs)
         down = sum(float((x / (gain * x + 0.01)).mean()) for x, _ in pairs)
         gain *= up / down
-    assert float(loss._gain(pairs)) == pytest.approx(gain, rel=1e-5)
+    assert float(loss._optimal_gain(pairs)) == pytest.approx(gain, rel=1e-5)
 
 
 def test_the_heavy_tail_is_the_likelihood_for_many_degrees():

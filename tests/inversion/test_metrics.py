@@ -10,12 +10,12 @@ from invertwin.channel import visible_points
 from invertwin.errors import InputError
 from invertwin.inversion.metrics import (
     ShapeMetrics,
-    Topology,
+    TopologyCounts,
     axis_error,
     compare_shapes,
+    count_topology,
     is_watertight,
-    surface_points,
-    topology,
+    sample_surface,
     volume_iou,
 )
 from invertwin.scene import Mesh, box, plate, rigid, rotation_from_vector, sphere, text
@@ -35,15 +35,15 @@ def joined(*parts: Mesh) -> Mesh:
 
 
 def test_points_are_even_and_on_the_surface():
-    points, normals = surface_points(box([1.0, 2.0, 3.0]), 40_000, seed=1)
+    points, normals = sample_surface(box([1.0, 2.0, 3.0]), 40_000, seed=1)
     faces = (points.abs() / float64([0.5, 1.0, 1.5]) - 1).abs() < 1e-12
     assert bool(faces.any(1).all())
     shares = [float(faces[:, k].double().mean()) for k in range(3)]
     assert shares == pytest.approx([12 / 22, 6 / 22, 4 / 22], abs=0.01)
     assert bool(((normals * points).sum(1) > 0).all())
     assert torch.allclose(normals.norm(dim=1), float64(1.0))
-    again, _ = surface_points(box([1.0, 2.0, 3.0]), 40_000, seed=1)
-    other, _ = surface_points(box([1.0, 2.0, 3.0]), 40_000, seed=1, stream=1)
+    again, _ = sample_surface(box([1.0, 2.0, 3.0]), 40_000, seed=1)
+    other, _ = sample_surface(box([1.0, 2.0, 3.0]), 40_000, seed=1, stream=1)
     assert torch.equal(points, again)
     assert not torch.equal(points, other)
 
@@ -135,7 +135,7 @@ def test_open_meshes_are_told_apart():
 
 
 def test_half_of_a_ball_is_seen_from_afar():
-    points, _ = surface_points(sphere(0.5, 5), 5_000, seed=0)
+    points, _ = sample_surface(sphere(0.5, 5), 5_000, seed=0)
     seen = visible_points(sphere(0.5, 5), points, [[0, 0, -50.0]])
     assert float(seen.double().mean()) == pytest.approx(0.5, abs=0.03)
     assert bool((points[seen][:, 2] < 0.02).all())
@@ -185,7 +185,7 @@ def test_bad_input():
         volume_iou(shifted(ball, 0.25, 0.25, 0.25), shifted(ball, 0.25, 0.25, 0.25), voxel=1.0)
     with pytest.raises(InputError, match="radar positions"):
         compare_shapes(ball, ball, seen_from=[[0.0, 1.0]])
-    (normal,) = surface_points(ball, 1, seed=0)[1]
+    (normal,) = sample_surface(ball, 1, seed=0)[1]
     with pytest.raises(InputError, match="expected a found surface that some position sees"):
         compare_shapes(ball, ball, seen_from=-10 * normal[None], count=1)
 
@@ -199,18 +199,18 @@ def test_the_volume_may_be_left_out():
 
 
 def test_parts_and_holes_are_counted():
-    assert topology(sphere(0.2, 1)) == Topology(components=1, euler_number=2)
-    assert topology(text("A", 0.6, 0.2)) == Topology(components=1, euler_number=0)
-    assert topology(text("B", 0.6, 0.2)) == Topology(components=1, euler_number=-2)
+    assert count_topology(sphere(0.2, 1)) == TopologyCounts(components=1, euler_number=2)
+    assert count_topology(text("A", 0.6, 0.2)) == TopologyCounts(components=1, euler_number=0)
+    assert count_topology(text("B", 0.6, 0.2)) == TopologyCounts(components=1, euler_number=-2)
     two = joined(sphere(0.2), shifted(text("A", 0.6, 0.2), 2, 0, 0))
-    assert topology(two) == Topology(components=2, euler_number=2)
+    assert count_topology(two) == TopologyCounts(components=2, euler_number=2)
     # Triangles without area, and vertices that no triangle has, are no part of the surface.
     ball = sphere(0.2, 1)
     corners = torch.cat([float64([[9.0, 9.0, 9.0]]), ball.vertices])
     thin = torch.tensor([[1, 1, 2], [3, 3, 3]])
-    assert topology(Mesh(corners, torch.cat([ball.faces + 1, thin]))) == topology(ball)
+    assert count_topology(Mesh(corners, torch.cat([ball.faces + 1, thin]))) == count_topology(ball)
     with pytest.raises(InputError, match="expected a watertight mesh"):
-        topology(plate(1.0, 1.0))
+        count_topology(plate(1.0, 1.0))
 
 
 def test_an_axis_knows_no_turns_about_itself():

@@ -19,7 +19,7 @@ from invertwin.inversion import (
     Stage,
     reconstruct,
 )
-from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar, RadarPose, RangeBias, Surrogate
 from invertwin.scene import Scene, Translation, look_at, sphere
@@ -227,7 +227,7 @@ def test_gradients_of_a_module_and_a_model_of_ones_own_are_checked():
         float64(1.0),
         scene=scene(),
         sensor=float64(2.0),
-        check=Check(repeats=1, max_pairs=4),
+        settings=GradcheckSettings(repeats=1, max_pairs=4),
     )
     assert report.gradient[0].tolist() == pytest.approx([2.0, 0.0, 0.6])
     assert report.difference[0].tolist() == pytest.approx([2.0, 0.0, 0.6], abs=1e-9)
@@ -256,8 +256,8 @@ def test_gradients_of_sensor_unknowns_are_checked(module, tangent):
         tangent,
         scene=occluder(),
         sensor=device,
-        of="sensor",
-        check=Check(repeats=2, difference_samples=300_000, noise=0.01, max_pairs=8),
+        acts_on="sensor",
+        settings=GradcheckSettings(repeats=2, difference_samples=300_000, noise=0.01, max_pairs=8),
     )
     assert report.full.relative_l1 < 0.03
 
@@ -296,7 +296,7 @@ def test_an_observed_map_is_compared_as_it_is(case):
     few = Sampling(depth=1, samples=1_000, boundary_samples=100)
     model = SurrogateMap(case.grid, sampling=few)
     first, second = (
-        Observation(model, case.radar, data).observed()
+        Observation(model, case.radar, data).observed_map()
         for data in (case.capture, model.observe(case.capture))
     )
     assert relative(second, first) == 0

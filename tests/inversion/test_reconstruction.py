@@ -32,7 +32,7 @@ from invertwin.radar import Surrogate
 from invertwin.radar.parameters import RadarPose, RangeBias
 from invertwin.scene import Scene
 from invertwin.scene.parameters import Translation, Vertices
-from invertwin.seeds import derived_seed
+from invertwin.seeds import derive_seed
 from invertwin.simulation import simulate
 from scenes import float64
 
@@ -474,7 +474,7 @@ def test_exact_signals_as_the_model(case):
     drawn = Sampling(
         depth=1, samples=2_000, boundary_samples=500, points_per_m2=300.0, boundary=False
     )
-    speckle = draw_speckle(case.scene, case.radar.link(), drawn, derived_seed(3, 0))
+    speckle = draw_speckle(case.scene, case.radar.link(), drawn, derive_seed(3, 0))
     second = reconstruct(
         case.scene,
         Observation(ExactMap(case.grid, drawn, speckle), case.radar, case.capture),

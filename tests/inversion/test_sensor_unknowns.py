@@ -9,7 +9,7 @@ from fits import fit
 from invertwin.capture import Capture
 from invertwin.channel import Sampling
 from invertwin.inversion import LatentNorm, Optimizer, Unknown
-from invertwin.radar import RadarPath, RangeBias, Surrogate
+from invertwin.radar import RadarTrajectory, RangeBias, Surrogate
 from invertwin.scene.parameters import Translation
 from invertwin.simulation import simulate
 from scenes import float64
@@ -56,7 +56,7 @@ def test_a_drifting_path_is_found_and_held_by_its_odometry(case):
     """Known surfaces show where the radar was; a heavy prior leaves it where odometry says."""
     start = torch.linspace(-0.3, 0.3, 5).double()[:, None] * float64([1, 0, 0])
     said = replace(case.radar, positions=start, rotations=None)
-    drifted = RadarPath(2, drift=0.04, axes="z")
+    drifted = RadarTrajectory(2, drift=0.04, axes="z")
     with torch.no_grad():
         drifted.latent[:, 2] = float64([1.5, 1.0])
         drawn = Sampling(depth=1, points_per_m2=3_000.0)
@@ -65,7 +65,7 @@ def test_a_drifting_path_is_found_and_held_by_its_odometry(case):
     capture = Capture.from_beat(beat, said)
 
     def refined(weight: float) -> torch.Tensor:
-        path = RadarPath(2, drift=0.04, axes="z")
+        path = RadarTrajectory(2, drift=0.04, axes="z")
         own = Unknown(path, regularize=lambda module, _: [LatentNorm(module, weight)])
         settings = case.settings(steps=80, optimizer=Optimizer(rate=0.1))
         found = fit(case.scene, said, capture, [], of_radar={"path": own}, **settings)

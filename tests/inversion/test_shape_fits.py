@@ -107,7 +107,7 @@ LEFT, RIGHT = (
     Mesh(box([0.2, 0.1, 0.1]).vertices + float64([x, 0, 0]), box(1.0).faces) for x in (-0.15, 0.15)
 )
 SHAPES = {
-    "grid": lambda: DistanceGrid.sampled("object", LOW, HIGH, (13, 11, 11), ellipsoid),
+    "grid": lambda: DistanceGrid.from_function("object", LOW, HIGH, (13, 11, 11), ellipsoid),
     "network": lambda: NeuralDistance("object", LOW, HIGH, (13, 11, 11), radius=0.15, width=8),
     "lattice": lambda: LatticeDeformation("object", LOW, HIGH),
     "smooth": lambda: SmoothVertices("object", BALL),

@@ -11,12 +11,12 @@ import fits
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.inversion import Optimizer, Schedule, Stage, Unknown
-from invertwin.inversion.callbacks import stage_file
+from invertwin.inversion.callbacks import stage_checkpoint_path
 from invertwin.inversion.regularization import Laplacian
 from invertwin.models.radar import SurrogateMap
 from invertwin.scene import Mesh, SmoothVertices, plate
 from invertwin.scene.parameters import Scale, Translation, Vertices
-from invertwin.scene.remeshing import remeshed
+from invertwin.scene.remeshing import remesh
 
 BUILDERS = {"place": lambda _: Translation("plate"), "size": lambda _: Scale("plate")}
 
@@ -89,7 +89,7 @@ def test_a_rebuilt_stage_begins_on_the_twin_so_far(case):
 
 def test_meshes_are_made_finer_between_stages(case):
     builders = {"shape": lambda scene: SmoothVertices("plate", scene["plate"].mesh, 5.0)}
-    change = {"plate": partial(remeshed, edge=0.05)}
+    change = {"plate": partial(remesh, edge_length=0.05)}
     found = fit(case, [Stage(2), Stage(2, remesh=change)], builders)
     mesh = found.scene["plate"].mesh
     assert len(mesh.faces) > 2 * len(case.scene["plate"].mesh.faces)
@@ -112,7 +112,7 @@ def test_interrupted_in_the_second_stage_it_ends_the_same(case, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         fit(case, stages, checkpoint=file, checkpoint_every=2, progress=stop)
-    assert stage_file(file, 0).exists()
+    assert stage_checkpoint_path(file, 0).exists()
     again = []
     resumed = fit(case, stages, checkpoint=file, resume=True, progress=again.append)
     assert [row["step"] for row in again] == [6, 7, 8, 9]  # from the last checkpoint on

@@ -14,12 +14,12 @@ from torch import Tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links import (
+    AntennaMount,
     CellSampling,
     MapMesh,
     MapPlane,
-    Points,
-    Reception,
-    Terminals,
+    PropagationSettings,
+    ReceiverPoints,
     Transmitters,
 )
 from invertwin.links.cells import Cells
@@ -44,7 +44,7 @@ FREQUENCY = 3.5e9
 SCALE = (SPEED_OF_LIGHT / FREQUENCY / (4 * math.pi)) ** 2
 METAL = PerfectConductor()
 GLASS = Slab.itu("glass", thickness=0.01)
-DIRECT = Reception(FREQUENCY, depth=0)
+DIRECT = PropagationSettings(FREQUENCY, depth=0)
 TX = float64([-2.0, 0.0, 3.0])
 
 
@@ -70,15 +70,20 @@ def slope(gain: Callable[[Tensor], Tensor]) -> Tensor:
 
 
 def gains(
-    cells: Cells, scene: Callable[[Tensor], Scene], reception: Reception = DIRECT, seed: int = 1
+    cells: Cells,
+    scene: Callable[[Tensor], Scene],
+    reception: PropagationSettings = DIRECT,
+    seed: int = 1,
 ) -> Callable[[Tensor], Tensor]:
     """The gain of one transmitter as a function of what changes the scene."""
-    return lambda theta: cells.received(scene(theta), Transmitters(TX), reception, seed).gain[0]
+    return lambda theta: cells.link_statistics(
+        scene(theta), Transmitters(TX), reception, seed
+    ).gain[0]
 
 
 def bare(cells: Cells) -> Cells:
     """The cells without boundary paths."""
-    return cells.sampled(replace(cells.sampling, boundary=False))
+    return cells.with_sampling(replace(cells.sampling, boundary=False))
 
 
 def integral(f: Callable[[float, float], float], *bounds: float) -> float:
@@ -94,7 +99,7 @@ def test_the_mean_over_cells_of_free_space():
     cells = MapPlane.horizontal([-1.0, -1.0], [2.0, 1.0], 0.5, 1.0, CellSampling(points=900))
     assert cells.shape == (3, 2)
     torch.testing.assert_close(cells.centres[2, 0], float64([1.5, -0.5, 0.5]))
-    found = cells.received(FAR, Transmitters(TX), DIRECT, 0)
+    found = cells.link_statistics(FAR, Transmitters(TX), DIRECT, 0)
     assert found.gain.shape == (1, 3, 2)
     for i in range(3):
         for j in range(2):
@@ -106,10 +111,10 @@ def test_the_mean_over_cells_of_free_space():
 
 
 def test_a_pattern_and_the_power_of_several_transmitters():
-    beam = Terminals(AntennaArray(torch.zeros(1, 3).double(), Cosine(2.0)))  # looks along x
+    beam = AntennaMount(AntennaArray(torch.zeros(1, 3).double(), Cosine(2.0)))  # looks along x
     sides = float64([[0.0, 0.2, 0.0], [0.0, 0.0, 0.2]])
     cells = MapPlane(float64([1.0, -0.1, 2.9]), sides[0], sides[1], (1, 1))
-    one = cells.received(FAR, Transmitters(TX, beam), DIRECT, 0).gain
+    one = cells.link_statistics(FAR, Transmitters(TX, beam), DIRECT, 0).gain
     assert float(one) == pytest.approx(6 * SCALE / 9, rel=3e-3)
     places = torch.stack([TX, TX + float64([0.0, 3.0, 0.0])])
     two = Transmitters(places, power_dbm=float64([0.0, 30.0]))
@@ -126,7 +131,7 @@ def test_a_pattern_and_the_power_of_several_transmitters():
 def test_two_rays_over_a_ground():
     ground = Scene({"ground": Object(plate(400.0, 400.0), METAL)})
     cells = MapPlane.horizontal([3.0, -1.0], [5.0, 1.0], 1.0, 2.0, CellSampling(points=900))
-    found = cells.received(ground, Transmitters(TX), replace(DIRECT, depth=1), 0)
+    found = cells.link_statistics(ground, Transmitters(TX), replace(DIRECT, depth=1), 0)
 
     def rays(y: float, x: float) -> float:
         flat = (x + 2) ** 2 + y**2
@@ -134,10 +139,10 @@ def test_two_rays_over_a_ground():
 
     truth = integral(rays, 3, 5, -1, 1)
     assert float(found.gain) == pytest.approx(truth / 4, rel=1e-4)
-    middle = Points(float64([[4.0, 0.0, 1.0]]))
-    point = middle.received(ground, Transmitters(TX), replace(DIRECT, depth=1), 0)
+    middle = ReceiverPoints(float64([[4.0, 0.0, 1.0]]))
+    point = middle.link_statistics(ground, Transmitters(TX), replace(DIRECT, depth=1), 0)
     small = MapPlane.horizontal([3.99, -0.01], [4.01, 0.01], 1.0, 0.02)
-    cell = small.received(ground, Transmitters(TX), replace(DIRECT, depth=1), 0)
+    cell = small.link_statistics(ground, Transmitters(TX), replace(DIRECT, depth=1), 0)
     assert float(cell.gain) == pytest.approx(float(point.gain), rel=1e-4)
     assert float(cell.delay_spread) == pytest.approx(float(point.delay_spread), rel=1e-3)
 
@@ -174,7 +179,7 @@ def test_a_transmitter_that_moves_takes_shadows_along():
     wall = Scene({"wall": upright(8.0, 17.0, float64([0.0, 0.0, 10.5]))})
     cells = MapPlane.horizontal([-1.03, -1.0], [6.97, 1.0], 1.0, 4.0, CellSampling(points=400))
     place = TX.clone().requires_grad_()
-    gain = cells.received(wall, Transmitters(place), DIRECT, 1).gain.sum()
+    gain = cells.link_statistics(wall, Transmitters(place), DIRECT, 1).gain.sum()
     found = torch.autograd.grad(gain, place)[0]
     # Higher, the rim is at 2·(z − 1)/(z − 2) − 2: it comes closer by 2 m a metre.
     inside = integral(lambda y, x: SCALE * -4 / ((x + 2) ** 2 + y**2 + 4) ** 2, -1.03, 2, -1, 1)
@@ -202,10 +207,10 @@ def test_beams_of_mirrors_and_sheets_against_differences(
     material: Material, blocker: bool, depth: int
 ):
     cells = MapPlane.horizontal([-1.1, -2.3], [4.9, 1.7], 0.4, 2.0, CellSampling(points=900))
-    reception = Reception(FREQUENCY, depth=depth, rays=None)
+    reception = PropagationSettings(FREQUENCY, depth=depth, rays=None)
     scene = panel_scene(material, blocker)
     found = slope(gains(cells, scene, reception))
-    fine = gains(cells.finer(6 * 120**2), scene, reception)
+    fine = gains(cells.with_sample_count(6 * 120**2), scene, reception)
     step = 0.03
     truth = (fine(torch.tensor(step).double()) - fine(torch.tensor(-step).double())) / (2 * step)
     fixed = slope(gains(bare(cells), scene, reception))
@@ -218,7 +223,7 @@ def test_a_mesh_of_cells_is_a_plane_of_cells():
     halves = MapMesh(Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]])), CellSampling(400))
     whole = MapPlane.horizontal([-1.1, -2.3], [0.9, -0.3], 0.4, 2.0, CellSampling(800))
     assert halves.shape == (2,)
-    reception = Reception(FREQUENCY, depth=1, rays=None)
+    reception = PropagationSettings(FREQUENCY, depth=1, rays=None)
     scene = panel_scene(METAL, True)
     ways = [gains(cells, scene, reception) for cells in (halves, whole)]
     values = [float(way(torch.zeros(()).double()).mean()) for way in ways]
@@ -236,11 +241,11 @@ def test_a_box_that_stands_through_the_map_moves():
         at = float64([1.0, 0.2, 1.0]) + theta * float64([1.0, 0.4, 0.0])
         return Scene({"box": Object(box([0.8, 0.5, 1.9]), METAL, rigid(turn, at))})
 
-    reception = Reception(FREQUENCY, depth=1, rays=None)
+    reception = PropagationSettings(FREQUENCY, depth=1, rays=None)
     found = slope(gains(cells, scene, reception))
     step, parts = torch.tensor(0.04).double(), []
     for seed in range(3):
-        fine = gains(cells.finer(9 * 120**2), scene, reception, seed)
+        fine = gains(cells.with_sample_count(9 * 120**2), scene, reception, seed)
         parts.append((fine(step) - fine(-step)) / (2 * step))
     assert error(found, torch.stack(parts).mean(0)) < 0.02
 
@@ -256,7 +261,7 @@ def test_rims_on_the_border_of_a_map_count_in_its_cells():
 
     found = slope(gains(cells, scene))
     assert float(found.sum()) == pytest.approx(2 * line(2.0) / 8, rel=3e-3)
-    corner = cells.cell_of(float64([[-2.0, -1.0, 1.0], [6.0, 1.0, 1.0]]), torch.tensor([0, 0]))
+    corner = cells.find_cells(float64([[-2.0, -1.0, 1.0], [6.0, 1.0, 1.0]]), torch.tensor([0, 0]))
     assert corner.tolist() == [0, 1]
 
 
@@ -264,7 +269,8 @@ def test_where_no_path_has_so_many_steps():
     cells = MapPlane.horizontal([-1.1, -2.3], [4.9, 1.7], 0.4, 2.0, CellSampling(points=10))
     scene = panel_scene(METAL, False)
     found = [
-        slope(gains(cells, scene, Reception(FREQUENCY, depth=depth, rays=1000))) for depth in (1, 3)
+        slope(gains(cells, scene, PropagationSettings(FREQUENCY, depth=depth, rays=1000)))
+        for depth in (1, 3)
     ]
     torch.testing.assert_close(found[0], found[1])
 
@@ -273,7 +279,7 @@ def test_the_same_seed_gives_the_same_map():
     cells = MapPlane.horizontal([-1.1, -2.3], [4.9, 1.7], 0.4, 2.0, CellSampling(points=10))
     scene = panel_scene(METAL, True)(torch.zeros(()).double())
     first, again, other = (
-        cells.received(scene, Transmitters(TX), DIRECT, seed).gain for seed in (1, 1, 2)
+        cells.link_statistics(scene, Transmitters(TX), DIRECT, seed).gain for seed in (1, 1, 2)
     )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
@@ -287,7 +293,7 @@ def test_ten_thousand_cells_take_bounded_memory():
     def pulled(size: float) -> Tensor:
         place = float64([-2.0, 0.3, 1.0]).requires_grad_()
         cells = MapPlane.horizontal([-9.0, -9.0], [9.0, 9.0], 0.2, size, CellSampling(1, 2000))
-        gain = cells.received(scene, Transmitters(place), replace(DIRECT, depth=1), 0).gain
+        gain = cells.link_statistics(scene, Transmitters(place), replace(DIRECT, depth=1), 0).gain
         return torch.autograd.grad(gain.sum(), place)[0]
 
     pulled(1.8)
@@ -311,7 +317,7 @@ def test_what_is_no_map_is_refused():
         CellSampling(points=0)
     cells = MapPlane.horizontal([0.0, 0.0], [1.0, 1.0], 1.0, 0.5)
     with pytest.raises(InputError, match="with bandwidth None, or with edges, got bandwidth"):
-        cells.received(FAR, Transmitters(TX), Reception(FREQUENCY, 1e8), 0)
+        cells.link_statistics(FAR, Transmitters(TX), PropagationSettings(FREQUENCY, 1e8), 0)
 
 
 def walled(shift: Tensor) -> Scene:
@@ -325,15 +331,15 @@ def test_cells_in_a_shadow_hold_what_the_edges_of_it_diffract():
     cells = MapPlane.horizontal([0.8, -0.2], [1.6, 0.6], 0.6, 0.4, CellSampling(points=100))
     round_edges = replace(DIRECT, bandwidth=1e8, edges=1)
     still = walled(torch.zeros(()).double())
-    found = cells.received(still, Transmitters(TX), round_edges, 3)
+    found = cells.link_statistics(still, Transmitters(TX), round_edges, 3)
     line = float64([(k + 0.5) / 14 * 0.4 for k in range(14)])
     for i in range(2):
         for j in range(2):
             x, y = torch.meshgrid(0.8 + 0.4 * i + line, -0.2 + 0.4 * j + line, indexing="ij")
             flat = torch.stack([x.flatten(), y.flatten(), torch.full((196,), 0.6).double()], 1)
-            points = Points(flat).received(still, Transmitters(TX), round_edges, 3)
+            points = ReceiverPoints(flat).link_statistics(still, Transmitters(TX), round_edges, 3)
             assert float(found.gain[0, i, j]) == pytest.approx(float(points.gain.mean()), rel=0.03)
-    dark = cells.received(still, Transmitters(TX), DIRECT, 3).gain
+    dark = cells.link_statistics(still, Transmitters(TX), DIRECT, 3).gain
     assert float(dark.min()) == 0.0
     assert float(found.gain.min()) > 1e-4 * SCALE / 9
     assert float(found.delay_spread.max()) < 5e-9
@@ -350,6 +356,6 @@ def test_a_shadow_with_diffraction_sweeps_over_cells_as_differences_do():
     model = RadioMap(cells, replace(DIRECT, bandwidth=1e8, edges=1), "gain")
     fixed = model.ablations()["boundary"]
     assert isinstance(fixed, RadioMap)
-    assert fixed.reception.bandwidth is None
+    assert fixed.propagation.bandwidth is None
     still = slope(lambda shift: fixed.predict(walled(shift), Transmitters(TX), 1)[0])
     assert error(still, truth) > 0.5

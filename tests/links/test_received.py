@@ -12,9 +12,9 @@ from invertwin.channel import trace_paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links import (
-    Points,
-    Reception,
-    Terminals,
+    AntennaMount,
+    PropagationSettings,
+    ReceiverPoints,
     Transmitters,
     frequency_response,
     received_gain,
@@ -42,8 +42,8 @@ SCREEN = Scene({"screen": Object(plate(2.0, 3.0), METAL, rigid(translation=[1.0,
 
 
 def received(scene: Scene, tx: object, rx: Tensor, **how: object) -> Tensor:
-    reception = Reception(FREQUENCY, **how)  # type: ignore[arg-type]
-    return Points(rx).received(scene, Transmitters(float64(tx)), reception, 0).gain
+    reception = PropagationSettings(FREQUENCY, **how)  # type: ignore[arg-type]
+    return ReceiverPoints(rx).link_statistics(scene, Transmitters(float64(tx)), reception, 0).gain
 
 
 def test_fields_or_powers_of_two_rays_add():
@@ -95,15 +95,17 @@ def test_edges_leave_no_jump_at_a_shadow(bandwidth):
 
 def test_edges_need_a_bandwidth():
     with pytest.raises(InputError, match="expected a bandwidth with edges, got none"):
-        Reception(FREQUENCY, edges=1)
+        PropagationSettings(FREQUENCY, edges=1)
 
 
 @pytest.mark.parametrize("bandwidth", [None, 0.0, 1e8])
 def test_where_no_path_leads_there_is_no_power(bandwidth):
     sealed = ROOM.replace("room", material=METAL)
     tx = torch.tensor([9.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
-    reception = Reception(FREQUENCY, bandwidth)
-    found = Points(float64([[0.0, 0.0, 0.0]])).received(sealed, Transmitters(tx), reception, 0)
+    reception = PropagationSettings(FREQUENCY, bandwidth)
+    found = ReceiverPoints(float64([[0.0, 0.0, 0.0]])).link_statistics(
+        sealed, Transmitters(tx), reception, 0
+    )
     assert found.gain.tolist() == [[0.0]]
     assert found.delay_spread.tolist() == [[0.0]]
 
@@ -111,14 +113,14 @@ def test_where_no_path_leads_there_is_no_power(bandwidth):
 def test_batches_change_nothing(monkeypatch):
     rx = torch.rand(23, 3, generator=torch.Generator().manual_seed(1)).double() * 2 - 1
     tx = torch.tensor([[0.3, -1.5, 0.9], [-1.3, 1.5, 0.2]], dtype=torch.float64, requires_grad=True)
-    reception = Reception(FREQUENCY, 1e8, edges=1, depth=2)
+    reception = PropagationSettings(FREQUENCY, 1e8, edges=1, depth=2)
 
     def gains() -> tuple[Tensor, Tensor]:
-        found = Points(rx).received(ROOM, Transmitters(tx), reception, 0).gain
+        found = ReceiverPoints(rx).link_statistics(ROOM, Transmitters(tx), reception, 0).gain
         return found.detach(), torch.autograd.grad(found.log().sum(), tx)[0]
 
     whole = gains()
-    monkeypatch.setattr(received_module, "_RECEIVERS_AT_ONCE", 5)
+    monkeypatch.setattr(received_module, "_RECEIVERS_PER_BATCH", 5)
     for one, other in zip(whole, gains(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
 
@@ -128,10 +130,10 @@ def test_ten_thousand_receivers_in_bounded_memory():
     rx = torch.rand(10_000, 3, generator=torch.Generator().manual_seed(1)).double()
     rx = rx * float64([5.8, 4.8, 2.8]) - float64([2.9, 2.4, 1.4])
     tx = torch.tensor([0.3, -1.5, 0.9], dtype=torch.float64, requires_grad=True)
-    reception = Reception(FREQUENCY, 1e8, depth=2)
+    reception = PropagationSettings(FREQUENCY, 1e8, depth=2)
 
     def slope(count: int) -> Tensor:
-        gain = Points(rx[:count]).received(ROOM, Transmitters(tx), reception, 0).gain
+        gain = ReceiverPoints(rx[:count]).link_statistics(ROOM, Transmitters(tx), reception, 0).gain
         return torch.autograd.grad(gain.sum(), tx)[0]
 
     slope(1_000)
@@ -141,10 +143,10 @@ def test_ten_thousand_receivers_in_bounded_memory():
 
 
 def test_terminals_weigh_paths():
-    beam = Terminals(AntennaArray(torch.zeros(1, 3).double(), Cosine(2.0)))  # looks along x
+    beam = AntennaMount(AntennaArray(torch.zeros(1, 3).double(), Cosine(2.0)))  # looks along x
     tx = Transmitters(float64([0.0, 0.0, 1.0]), beam, 20.0)
-    rx = Points(float64([[3.0, 0.0, 1.0], [-3.0, 0.0, 1.0]]))
-    found = rx.received(GROUND, tx, Reception(FREQUENCY, depth=0), 0).gain[0]
+    rx = ReceiverPoints(float64([[3.0, 0.0, 1.0], [-3.0, 0.0, 1.0]]))
+    found = rx.link_statistics(GROUND, tx, PropagationSettings(FREQUENCY, depth=0), 0).gain[0]
     free = (WAVELENGTH / (4 * math.pi * 3)) ** 2
     torch.testing.assert_close(found, float64([6 * free, 0.0]))
     assert replace(tx, power_dbm=30.0).powers.tolist() == [1000.0]

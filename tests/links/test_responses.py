@@ -11,7 +11,7 @@ from invertwin.channel import RayPaths, trace_paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links import (
-    Terminals,
+    AntennaMount,
     frequency_response,
     impulse_response,
     ofdm_channel,
@@ -62,7 +62,7 @@ def test_links_are_summed_apart():
     assert both.shape == (2, 1, 2, 1, 1)
     for tx in range(2):
         for rx in range(2):
-            some = paths.between(tx, rx)
+            some = paths.select_link(tx, rx)
             one = some.coefficient[:, 0, 0] * torch.polar(
                 torch.ones(len(some)).double(), -2 * math.pi * FREQUENCY * some.delay
             )
@@ -84,13 +84,13 @@ def test_elements_are_antennas_of_their_own():
     turn = rotation_from_vector(float64([0.3, 0.5, -0.2]))
     ground = Scene({"ground": Object(plate(9e3, 9e3), METAL)})
     tx, rx = float64([0.0, 0.0, 900.0]), float64([1200.0, 500.0, 700.0])
-    terminals = Terminals(array, turn)
+    terminals = AntennaMount(array, turn)
     paths = trace(ground, tx, rx)
     together = frequency_response(paths, [FREQUENCY, 1.01 * FREQUENCY], tx=terminals, rx=terminals)
     places = array.positions @ turn.T
     apart = trace(ground, tx + places, rx + places)
     # Each path of an element with its own vertical: the same element, turned.
-    single = Terminals(AntennaArray(torch.zeros(1, 3, dtype=torch.float64)), turn)
+    single = AntennaMount(AntennaArray(torch.zeros(1, 3, dtype=torch.float64)), turn)
     each = frequency_response(apart, [FREQUENCY, 1.01 * FREQUENCY], tx=single, rx=single)
     expected = each.permute(1, 0, 3, 2, 4)
     error = float((together - expected).abs().max() / expected.abs().max())
@@ -100,9 +100,9 @@ def test_elements_are_antennas_of_their_own():
 def test_dipoles_that_are_crossed_do_not_talk():
     ground = Scene({"far": Object(plate(1.0, 1.0), METAL, rigid(translation=[0.0, 0.0, -50.0]))})
     paths = trace(ground, [0, 0, 0], [5.0, 0, 0], depth=0)
-    upright = Terminals()
+    upright = AntennaMount()
     axes = upright.rotations
-    lying = Terminals(rotations=torch.stack([-axes[:, 1], axes[:, 0], axes[:, 2]], 1))
+    lying = AntennaMount(rotations=torch.stack([-axes[:, 1], axes[:, 0], axes[:, 2]], 1))
     amplitude = [
         path_amplitudes(paths, tx, rx)[0].abs().max().item()
         for tx, rx in ((upright, upright), (lying, lying), (upright, lying))
@@ -122,20 +122,21 @@ def test_polarisations_of_elements_count():
     one = torch.zeros(1, 3, dtype=torch.float64)
     axes = torch.eye(3, dtype=torch.float64)
     right, left = (
-        Terminals(AntennaArray(one, polarisation=jones), axes) for jones in ("circular", [1, -1j])
+        AntennaMount(AntennaArray(one, polarisation=jones), axes)
+        for jones in ("circular", [1, -1j])
     )
     same, other = (path_amplitudes(paths, right, rx)[0].abs().flatten() for rx in (right, left))
     ratio = (same / other).log10()
     assert ratio[0].item() > 2
     assert ratio[1].item() < -2
-    both = Terminals(AntennaArray(float64([[0, 0, 0]] * 2), polarisation=[[1, 0], [0, 1]]), axes)
+    both = AntennaMount(AntennaArray(float64([[0, 0, 0]] * 2), polarisation=[[1, 0], [0, 1]]), axes)
     assert path_amplitudes(paths, both, both)[0].shape == (2, 2, 2)
 
 
 def test_patterns_weigh_directions():
     ground = Scene({"far": Object(plate(1.0, 1.0), METAL, rigid(translation=[0.0, 0.0, -50.0]))})
     paths = trace(ground, [0, 0, 0], [[5.0, 0, 0], [-5.0, 0, 0], [3.0, 4.0, 0]], depth=0)
-    ahead = Terminals(AntennaArray(torch.zeros(1, 3, dtype=torch.float64), Cosine(2.0)))
+    ahead = AntennaMount(AntennaArray(torch.zeros(1, 3, dtype=torch.float64), Cosine(2.0)))
     gains = path_amplitudes(paths, tx=ahead)[0].abs()[:, 0, 0]
     free = path_amplitudes(paths)[0].abs()[:, 0, 0]
     torch.testing.assert_close(gains / free, float64([6.0, 0.0, 6 * 0.36]).sqrt())
@@ -171,7 +172,9 @@ def test_ofdm_is_the_response_of_moved_geometry():
     grid = FREQUENCY + (torch.arange(count).double() - count // 2) * spacing
     for symbol in range(4):
         time = symbol * (1 / spacing + prefix)
-        later = trace(scene.at(time), *(e + v * time for e, v in zip(ends, moves, strict=True)))
+        later = trace(
+            scene.advance(time), *(e + v * time for e, v in zip(ends, moves, strict=True))
+        )
         expected = frequency_response(later, grid)
         found = channel[:, :, :, :, symbol]
         assert float((found - expected).abs().max() / expected.abs().max()) < 1e-3
@@ -183,7 +186,7 @@ def test_many_frequencies_come_in_pieces(monkeypatch):
     paths = trace(ROOM, TX, RX)
     grid = torch.linspace(3.4e9, 3.6e9, 50, dtype=torch.float64)
     whole = frequency_response(paths, grid)
-    monkeypatch.setattr("invertwin.links.responses._VALUES_AT_ONCE", 300)
+    monkeypatch.setattr("invertwin.links.responses._VALUES_PER_CHUNK", 300)
     torch.testing.assert_close(frequency_response(paths, grid), whole)
 
 
@@ -194,7 +197,7 @@ def test_gradients_are_differences():
         paths = trace(ROOM, float64(TX) + change[:3], float64(RX[0]) + change[3:6])
         turn = rotation_from_vector(float64([0.3, 0.5, -0.2]) + change[6:])
         found = ofdm_channel(
-            paths, subcarriers=3, spacing=1e6, tx=Terminals(array, turn), rx=Terminals()
+            paths, subcarriers=3, spacing=1e6, tx=AntennaMount(array, turn), rx=AntennaMount()
         )
         return torch.view_as_real(found).flatten()
 
@@ -225,8 +228,8 @@ def test_bad_ofdm_is_told(options, message):
 def test_bad_terminals_are_told():
     paths = trace(ROOM, [TX, TX, TX], RX, depth=0)
     with pytest.raises(InputError, match="orthonormal"):
-        Terminals(rotations=2 * torch.eye(3, dtype=torch.float64))
-    two = Terminals(rotations=torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
+        AntennaMount(rotations=2 * torch.eye(3, dtype=torch.float64))
+    two = AntennaMount(rotations=torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
     with pytest.raises(InputError, match="a rotation for each of 3 places"):
         frequency_response(paths, [1e9], tx=two)
     with pytest.raises(InputError, match="at least one frequency"):

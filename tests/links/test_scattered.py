@@ -13,7 +13,14 @@ from invertwin.channel import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.links import CellSampling, MapPlane, Points, Reception, Terminals, Transmitters
+from invertwin.links import (
+    AntennaMount,
+    CellSampling,
+    MapPlane,
+    PropagationSettings,
+    ReceiverPoints,
+    Transmitters,
+)
 from invertwin.links import scattered as scattered_module
 from invertwin.models.radio import RadioMap, ResponseMap
 from invertwin.scene import (
@@ -69,9 +76,9 @@ def summed(
 
 
 def test_power_and_delays_are_those_of_the_integral():
-    mirrored = Points(SPOTS).received(WALL, MAST, Reception(FREQUENCY), 0)
-    reception = Reception(FREQUENCY, rough=ONE_BOUNCE)
-    found = Points(SPOTS).received(WALL, MAST, reception, 0)
+    mirrored = ReceiverPoints(SPOTS).link_statistics(WALL, MAST, PropagationSettings(FREQUENCY), 0)
+    reception = PropagationSettings(FREQUENCY, rough=ONE_BOUNCE)
+    found = ReceiverPoints(SPOTS).link_statistics(WALL, MAST, reception, 0)
     for number, place in enumerate(SPOTS):
         power, spread = summed(place)
         more = float(found.gain[0, number] - mirrored.gain[0, number])
@@ -81,17 +88,17 @@ def test_power_and_delays_are_those_of_the_integral():
 
 def test_pattern_of_receivers_has_axes_of_its_own():
     turn = rotation_from_vector(float64([0.3, 2.8, 0.1]))  # looks at the wall, aslant
-    horn = Terminals(AntennaArray(float64([[0.0, 0.0, 0.0]]), Cosine(2.0)), turn)
+    horn = AntennaMount(AntennaArray(float64([[0.0, 0.0, 0.0]]), Cosine(2.0)), turn)
     place = SPOTS[:1]
 
     def gain(points: Tensor, way: Tensor) -> Tensor:
         cosine = ((points - place[0]) @ turn[:, 2]) / way
         return torch.where(cosine > 0, 6 * cosine.clamp_min(0) ** 2, 0.0)
 
-    reception = Reception(FREQUENCY, receivers=horn, rough=ONE_BOUNCE)
+    reception = PropagationSettings(FREQUENCY, receivers=horn, rough=ONE_BOUNCE)
     isotropic = replace(horn, array=AntennaArray(float64([[0.0, 0.0, 0.0]])))
-    plain = Reception(FREQUENCY, receivers=isotropic, rough=ONE_BOUNCE)
-    powers = [float(how.scattered(WALL, MAST, place, 0)[0, 0, 0]) for how in (plain, reception)]
+    plain = PropagationSettings(FREQUENCY, receivers=isotropic, rough=ONE_BOUNCE)
+    powers = [float(how.rough_moments(WALL, MAST, place, 0)[0, 0, 0]) for how in (plain, reception)]
     whole, seen = summed(place[0])[0], summed(place[0], gain)[0]
     # The polarisation is the same for both, so the ratio is that of the pattern alone.
     assert powers[1] / powers[0] == pytest.approx(seen / whole, rel=5e-3)
@@ -101,9 +108,9 @@ def test_pattern_of_receivers_has_axes_of_its_own():
 def test_smooth_share_mirrors_and_the_rest_scatters():
     half = Scene({"wall": Object(plate(4.0, 4.0), RoughConductor(scattering=0.6, rms_slope=0.2))})
     metal = Scene({"wall": Object(plate(4.0, 4.0), PerfectConductor())})
-    reception = Reception(FREQUENCY, rough=ONE_BOUNCE)
+    reception = PropagationSettings(FREQUENCY, rough=ONE_BOUNCE)
     gains = {
-        name: float(reception.scattered(scene, MAST, SPOTS, 0)[0, 0, 0])
+        name: float(reception.rough_moments(scene, MAST, SPOTS, 0)[0, 0, 0])
         for name, scene in {"all": WALL, "half": half, "none": metal}.items()
     }
     assert gains["half"] == pytest.approx(0.36 * gains["all"], rel=1e-5)
@@ -120,10 +127,10 @@ def shaded(offset: Tensor) -> Scene:
 @pytest.mark.parametrize("places", ["points", "cells"])
 def test_derivative_holds_shadows_that_move(places):
     sampling = Sampling(depth=1, samples=1_000_000, boundary_samples=100_000)
-    where = Points(float64([[-1.0, 0.3, 1.8]]))
+    where = ReceiverPoints(float64([[-1.0, 0.3, 1.8]]))
     if places == "cells":
         where = MapPlane.horizontal([-1.2, 0.1], [-0.8, 0.5], 1.8, 0.4, CellSampling(points=9))
-    reception = Reception(FREQUENCY, depth=0, rough=sampling)
+    reception = PropagationSettings(FREQUENCY, depth=0, rough=sampling)
     model = RadioMap(where, reception, "gain")
     at = float64(0.1)
 
@@ -134,7 +141,7 @@ def test_derivative_holds_shadows_that_move(places):
         return float(jvp(total, (at,), (torch.ones_like(at),))[1])
 
     many = replace(sampling, samples=8_000_000, boundary=False)
-    fine = replace(model, reception=replace(reception, rough=many))
+    fine = replace(model, propagation=replace(reception, rough=many))
     ends = [fine.predict(shaded(at + way), MAST, 0).sum() for way in (-0.02, 0.02)]
     truth = float(ends[1] - ends[0]) / 0.04
     fixed = model.ablations()["boundary"]
@@ -143,29 +150,33 @@ def test_derivative_holds_shadows_that_move(places):
 
 
 def test_a_map_with_scattered_power_is_random():
-    model = RadioMap(Points(SPOTS), Reception(FREQUENCY, rough=ONE_BOUNCE))
-    assert model.random
-    assert not RadioMap(Points(SPOTS), Reception(FREQUENCY)).random
+    model = RadioMap(ReceiverPoints(SPOTS), PropagationSettings(FREQUENCY, rough=ONE_BOUNCE))
+    assert model.is_random
+    assert not RadioMap(ReceiverPoints(SPOTS), PropagationSettings(FREQUENCY)).is_random
 
 
 def test_batches_of_places_add_up_to_the_same(monkeypatch):
-    reception = Reception(FREQUENCY, rough=ONE_BOUNCE)
-    whole = reception.scattered(WALL, MAST, SPOTS, 0)
-    monkeypatch.setattr(scattered_module, "_PLACES_AT_ONCE", 1)
-    torch.testing.assert_close(reception.scattered(WALL, MAST, SPOTS, 0), whole, rtol=5e-3, atol=0)
+    reception = PropagationSettings(FREQUENCY, rough=ONE_BOUNCE)
+    whole = reception.rough_moments(WALL, MAST, SPOTS, 0)
+    monkeypatch.setattr(scattered_module, "_POSITIONS_PER_BATCH", 1)
+    torch.testing.assert_close(
+        reception.rough_moments(WALL, MAST, SPOTS, 0), whole, rtol=5e-3, atol=0
+    )
 
 
 def test_refusals_name_what_is_wrong():
-    reception = Reception(FREQUENCY, rough=ONE_BOUNCE)
+    reception = PropagationSettings(FREQUENCY, rough=ONE_BOUNCE)
     with pytest.raises(InputError, match=r"got Sampling.*no phase"):
         ResponseMap(SPOTS, float64([FREQUENCY]), reception).predict(WALL, MAST, 0)
     horn = AntennaArray(float64([[0.0, 0.0, 0.0]]), Cosine(2.0))
     turns = torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
     with pytest.raises(InputError, match="one orientation of all receivers"):
-        replace(reception, receivers=Terminals(horn, turns)).at(WALL, MAST, SPOTS, 0)
-    turned = replace(MAST, terminals=Terminals(rotations=turns[0].clone().requires_grad_()))
+        replace(reception, receivers=AntennaMount(horn, turns)).link_statistics(
+            WALL, MAST, SPOTS, 0
+        )
+    turned = replace(MAST, mount=AntennaMount(rotations=turns[0].clone().requires_grad_()))
     with pytest.raises(InputError, match="detach them"):
-        reception.at(WALL, turned, SPOTS, 0)
+        reception.link_statistics(WALL, turned, SPOTS, 0)
 
 
 MIRROR = Object(
@@ -187,7 +198,7 @@ def mixed(
     """Power of paths that scatter once and are mirrored too, and its moments over excess delay."""
     sampling = replace(ONE_BOUNCE, **how)
     found = [
-        Reception(FREQUENCY, depth=d, rays=None, rough=sampling).scattered(
+        PropagationSettings(FREQUENCY, depth=d, rays=None, rough=sampling).rough_moments(
             scene, Transmitters(tx), places, seed
         )[0]
         for d in (depth, 1)
@@ -227,10 +238,10 @@ def test_energy_that_meets_a_rough_plate_leaves_it_again():
     turn = math.pi * (1 + math.sqrt(5)) * torch.arange(count, dtype=torch.float64)
     ring = (1 - z**2).sqrt()
     sphere = radius * torch.stack([ring * turn.cos(), ring * turn.sin(), z], 1)
-    reception = Reception(
+    reception = PropagationSettings(
         FREQUENCY, depth=3, rays=None, rough=replace(ONE_BOUNCE, samples=1_600_000)
     )
-    gain = reception.scattered(scene, Transmitters(tx), sphere, 0)[0, :, 0]
+    gain = reception.rough_moments(scene, Transmitters(tx), sphere, 0)[0, :, 0]
     left = float(gain.mean()) * 4 * math.pi / WAVELENGTH**2 * 4 * math.pi * radius**2
     assert left == pytest.approx(arrived, rel=0.01)
 
@@ -255,10 +266,10 @@ def test_what_heights_take_off_the_mirror_is_scattered():
         return Scene({**BESIDE_MIRROR.objects, "wall": Object(plate(4.0, 4.0), gritty)})
 
     def total(height: Tensor, depth: int) -> Tensor:
-        how = Reception(FREQUENCY, depth=depth, rays=None, rough=ONE_BOUNCE)
-        return how.scattered(scene(height), MAST, place, 0).sum((0, 1))[0]
+        how = PropagationSettings(FREQUENCY, depth=depth, rays=None, rough=ONE_BOUNCE)
+        return how.rough_moments(scene(height), MAST, place, 0).sum((0, 1))[0]
 
-    surface = RoughConductor(scattering=0.0, rms_slope=0.3).surface(FREQUENCY)
+    surface = RoughConductor(scattering=0.0, rms_slope=0.3).scattering_law(FREQUENCY)
 
     def fall(cosine: Tensor) -> Tensor:
         """What the lobe sends back over what it does straight back."""
@@ -302,8 +313,8 @@ def test_derivative_by_the_size_of_a_mirror():
         glass = replace(glass, vertices=glass.vertices * size)
         mirror = Object(glass, PerfectConductor(), rigid(tilted, float64([3.0, 0.0, 1.2])))
         scene = Scene({"wall": WALL.objects["wall"], "mirror": mirror})
-        reception = Reception(FREQUENCY, depth=3, rays=None, rough=sampling)
-        return reception.scattered(scene, MAST, float64([[-1.0, -0.5, 1.5]]), 0)[0, 0, 0]
+        reception = PropagationSettings(FREQUENCY, depth=3, rays=None, rough=sampling)
+        return reception.rough_moments(scene, MAST, float64([[-1.0, -0.5, 1.5]]), 0)[0, 0, 0]
 
     def rate(sampling: Sampling) -> float:
         return float(jvp(lambda x: total(x, sampling), (at,), (torch.ones_like(at),))[1])
@@ -320,10 +331,10 @@ def test_surfaces_that_meet_and_move_are_refused_by_name():
     pose = rigid(translation=torch.stack([*float64([0.1, 0.2]), at]))
     scene = Scene({**BESIDE_MIRROR.objects, "box": Object(CRATE, PerfectConductor(), pose)})
     sampling = Sampling(depth=1, samples=1000, boundary_samples=1000)
-    reception = Reception(FREQUENCY, depth=2, rays=None, rough=sampling)
+    reception = PropagationSettings(FREQUENCY, depth=2, rays=None, rough=sampling)
     with pytest.raises(InputError, match="wall and box that meet; leave a gap"):
-        reception.scattered(scene, MAST, SPOTS, 0)
+        reception.rough_moments(scene, MAST, SPOTS, 0)
     reception = replace(reception, rough=replace(sampling, contacts=False))
-    reception.scattered(scene, MAST, SPOTS, 0).sum().backward()
+    reception.rough_moments(scene, MAST, SPOTS, 0).sum().backward()
     assert at.grad is not None
     assert bool(at.grad.isfinite())

@@ -10,14 +10,14 @@ from torch import Tensor
 
 from invertwin.channel import RayPaths, trace_paths
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.links import Terminals, frequency_response, path_amplitudes
+from invertwin.links import AntennaMount, frequency_response, path_amplitudes
 from invertwin.scene import (
     AntennaArray,
     Cosine,
     Object,
     PerfectConductor,
     Scene,
-    Table,
+    TabulatedPattern,
     linear_array,
     plate,
     rigid,
@@ -41,11 +41,11 @@ def upright(normal: float) -> Object:
 BEFORE_A_WALL = Scene({"screen": EDGE, "wall": upright(-2.0)})
 
 
-def looking(way: list[float], array: AntennaArray) -> Terminals:
+def looking(way: list[float], array: AntennaArray) -> AntennaMount:
     """An array whose boresight is about along ``way``, its x axis about along the world's x."""
     z = torch.nn.functional.normalize(float64(way), dim=0)
     y = torch.nn.functional.normalize(torch.linalg.cross(z, float64([1.0, 0.2, 0.0])), dim=0)
-    return Terminals(array, torch.stack([torch.linalg.cross(y, z), y, z], 1))
+    return AntennaMount(array, torch.stack([torch.linalg.cross(y, z), y, z], 1))
 
 
 def beam() -> AntennaArray:
@@ -65,7 +65,9 @@ def shadow(source: tuple[float, float, float]) -> Tensor:
     return float64([-0.8 * x / z, -0.5, -0.8])
 
 
-def step_of_slope(scene: Scene, tx: Terminals, rx: Terminals, sloped: bool, source=TX) -> float:
+def step_of_slope(
+    scene: Scene, tx: AntennaMount, rx: AntennaMount, sloped: bool, source=TX
+) -> float:
     """How much the derivative of the received fields by the place steps at the shadow."""
     bound, way = shadow(source), float64([1.0, 0.0, 0.0])
     slopes = []
@@ -80,15 +82,15 @@ def step_of_slope(scene: Scene, tx: Terminals, rx: Terminals, sloped: bool, sour
     return float((slopes[1] - slopes[0]).norm() / slopes[0].norm())
 
 
-ONE = Terminals().array
+ONE = AntennaMount().array
 
 
 @pytest.mark.parametrize("array", [beam(), row(), ONE], ids=["beam", "row", "single"])
 @pytest.mark.parametrize("at_tx", [True, False], ids=["tx", "rx"])
 def test_derivatives_do_not_step_at_the_shadow(array, at_tx):
-    ends = (looking([0.5, -0.3, -1.0], array), Terminals())
+    ends = (looking([0.5, -0.3, -1.0], array), AntennaMount())
     if not at_tx:
-        ends = (Terminals(), looking([-0.4, 0.5, 1.0], array))
+        ends = (AntennaMount(), looking([-0.4, 0.5, 1.0], array))
     plain = step_of_slope(SCREEN, *ends, sloped=False)
     assert plain > 0.01
     # The places are 2e-6 m apart.
@@ -97,7 +99,7 @@ def test_derivatives_do_not_step_at_the_shadow(array, at_tx):
 
 def test_over_a_wall_the_antenna_turns_as_its_image():
     image = (-4.0 - TX[0], TX[1], TX[2])
-    ends = (looking([-1.0, -0.3, 0.2], beam()), Terminals())
+    ends = (looking([-1.0, -0.3, 0.2], beam()), AntennaMount())
     plain = step_of_slope(BEFORE_A_WALL, *ends, sloped=False, source=image)
     assert plain > 0.01
     assert step_of_slope(BEFORE_A_WALL, *ends, sloped=True, source=image) < 0.05 * plain
@@ -111,7 +113,7 @@ def test_the_way_back_is_the_same():
     paths = one_link(float64([0.7, -0.3, -0.8]), float64(TX))
     ends = looking([0.5, -0.3, -1.0], beam()), looking([-0.4, 0.5, 1.0], row())
     there, delay = path_amplitudes(paths, *ends)
-    back, late = path_amplitudes(paths.reversed(), *ends[::-1])
+    back, late = path_amplitudes(paths.reverse(), *ends[::-1])
 
     # Rows are in the order of delays, of which some are equal.
     def turned(amplitude: Tensor, delay: Tensor) -> Tensor:
@@ -126,7 +128,7 @@ def table_beam() -> AntennaArray:
     theta = torch.linspace(0, math.pi, 181, dtype=torch.float64)
     gain = (6 * theta.cos() - 4).exp()[:, None]
     origin = torch.zeros(1, 3, dtype=torch.float64)
-    return AntennaArray(origin, pattern=Table(theta, float64([0.0]), gain))
+    return AntennaArray(origin, pattern=TabulatedPattern(theta, float64([0.0]), gain))
 
 
 @pytest.mark.parametrize("array", [beam(), row(), table_beam()], ids=["beam", "row", "table"])

@@ -16,7 +16,7 @@ from invertwin.links import (
     angle_spread,
     delay_spread,
     path_table,
-    ray_paths_of,
+    ray_paths_from_sionna,
     rician_factor,
 )
 from invertwin.scene import Object, PerfectConductor, Scene, Slab, plate, rigid
@@ -112,7 +112,7 @@ def sionna_like(**changes: object) -> Any:
 
 def test_paths_of_sionna_are_ours():
     theirs = sionna_like()
-    found = ray_paths_of(theirs, 3.5e9)
+    found = ray_paths_from_sionna(theirs, 3.5e9)
     assert found.counts == (1, 2)
     assert found.rx.tolist() == [0, 0, 1]
     torch.testing.assert_close(found.delay, float64([1e-8, 2e-8, 3e-8]))
@@ -131,7 +131,7 @@ def test_paths_of_sionna_are_ours():
 def test_other_paths_of_sionna_are_refused():
     single = np.zeros((2, 1, 1, 1, 2))
     with pytest.raises(InputError, match="polarization 'VH'"):
-        ray_paths_of(sionna_like(a=(single, single)), 3.5e9)
+        ray_paths_from_sionna(sionna_like(a=(single, single)), 3.5e9)
     diffuse = np.full((2, 2, 1, 2), 2)
     with pytest.raises(InputError, match="diffuse_reflection=False"):
-        ray_paths_of(sionna_like(interactions=diffuse), 3.5e9)
+        ray_paths_from_sionna(sionna_like(interactions=diffuse), 3.5e9)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from invertwin.errors import InputError
-from invertwin.links import Terminals, TransmitterPosition, Transmitters
+from invertwin.links import AntennaMount, TransmitterPosition, Transmitters
 from scenes import float64
 
 TWO = Transmitters(float64([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]), power_dbm=float64([0.0, 10.0]))
@@ -19,9 +19,9 @@ def test_frames_are_transmitters():
     some = TWO.frames([1])
     assert some.positions.tolist() == [[1.0, 2.0, 3.0]]
     assert some.powers.tolist() == [10.0]
-    turns = Terminals().rotations.expand(2, 3, 3) * float64([1.0, 1.0])[:, None, None]
-    turned = Transmitters(TWO.positions, Terminals(rotations=turns))
-    assert turned.frames([0]).terminals.rotations.shape == (1, 3, 3)
+    turns = AntennaMount().rotations.expand(2, 3, 3) * float64([1.0, 1.0])[:, None, None]
+    turned = Transmitters(TWO.positions, AntennaMount(rotations=turns))
+    assert turned.frames([0]).mount.rotations.shape == (1, 3, 3)
 
 
 @pytest.mark.parametrize(
@@ -44,8 +44,8 @@ def test_a_module_places_one_of_them():
     found = module(TWO)
     assert found.positions.tolist() == [[0.0, 0.0, 0.0], [5.0, 6.0, 7.0]]
     found.positions.sum().backward()
-    assert module.place.grad is not None
-    assert module.place.grad.tolist() == [1.0, 1.0, 0.0]
+    assert module.raw_position.grad is not None
+    assert module.raw_position.grad.tolist() == [1.0, 1.0, 0.0]
     assert [c.name for c in module.coordinates()] == ["transmitter.x", "transmitter.y"]
     assert module.at_bounds() == []
 
@@ -55,9 +55,9 @@ def test_a_box_holds_it():
     module = TransmitterPosition([1.0, 1.0, 1.0], low, high)
     torch.testing.assert_close(module.position.detach(), float64([1.0, 1.0, 1.0]))
     with torch.no_grad():
-        module.place[1] = 40.0
+        module.raw_position[1] = 40.0
     torch.testing.assert_close(module.position.detach(), float64([1.0, 2.0, 1.0]))
-    (slope,) = torch.autograd.grad(module.position[1], module.place)
+    (slope,) = torch.autograd.grad(module.position[1], module.raw_position)
     assert slope.tolist() == [0.0, 1.0, 0.0]  # it may come back
     assert module.at_bounds() == ["transmitter.y"]
 

@@ -11,9 +11,9 @@ from invertwin.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.channel import Sampling, trace_paths
 from invertwin.errors import InputError
-from invertwin.links import Points, Reception, Transmitters, frequency_response
-from invertwin.models.doppler import MotionMap
-from invertwin.models.facets import ChainField, ChainMap
+from invertwin.links import PropagationSettings, ReceiverPoints, Transmitters, frequency_response
+from invertwin.models.doppler import RangeDopplerMap
+from invertwin.models.facets import FacetField, FacetMap
 from invertwin.models.radar import ExactMap, SurrogateMap, surrogate_correlation
 from invertwin.models.radio import RadioMap, ResponseMap
 from invertwin.radar import Chirps, Radar, Surrogate, velocity_axis
@@ -42,7 +42,7 @@ def test_the_surrogate_correlates_with_the_mean_over_looks():
 
     def found(surrogate: str = "response", looks: int = 24) -> float:
         model = SurrogateMap(grid, surrogate, drawn)
-        return surrogate_correlation(scene, device, model, seed=0, looks=looks)
+        return surrogate_correlation(scene, device, model, seed=0, realisations=looks)
 
     assert found() >= 0.9
     assert found(looks=1) < found()
@@ -58,7 +58,7 @@ def test_looks_of_conductors_are_all_the_same():
     scene = Scene({"plate": thing(plate(0.2, 0.2), (0, 0, 1.2), material=PerfectConductor())})
     model = SurrogateMap(device.grid(0.7, 1.7, 0.7), sampling=Sampling(samples=5_000))
     few, many = (
-        surrogate_correlation(scene, device, model, seed=0, looks=looks) for looks in (1, 4)
+        surrogate_correlation(scene, device, model, seed=0, realisations=looks) for looks in (1, 4)
     )
     assert few == pytest.approx(many, rel=1e-5)
 
@@ -67,7 +67,7 @@ def test_a_correlation_needs_looks():
     device = radar()
     model = SurrogateMap(device.grid(0.5, 2.5))
     with pytest.raises(InputError, match="expected looks >= 1, got 0"):
-        surrogate_correlation(occluder(), device, model, seed=0, looks=0)
+        surrogate_correlation(occluder(), device, model, seed=0, realisations=0)
 
 
 def test_a_surrogate_goes_by_its_name():
@@ -87,15 +87,15 @@ def test_a_surrogate_goes_by_its_name():
 def test_extra_widths_are_taken_away_by_shares():
     device = radar()
     model = SurrogateMap(device.grid(0.5, 2.5), Surrogate(range_width=3.0, angle_width=1.5))
-    assert model.widened
-    half = model.narrowed(0.5).kernels
+    assert model.has_blur
+    half = model.scale_blur(0.5).kernels
     assert (half.range_width, half.angle_width) == (1.5, 0.75)
-    assert not model.narrowed(0).widened
-    assert not ExactMap(model.grid).widened
+    assert not model.scale_blur(0).has_blur
+    assert not ExactMap(model.grid).has_blur
     observed = torch.rand(1, *model.grid.shape)
     blurred = model.kernels.blur(observed, device, model.grid)
-    assert torch.equal(model.blurred(observed, device), blurred)
-    assert torch.equal(ExactMap(model.grid).blurred(observed, device), observed)
+    assert torch.equal(model.blur_observed(observed, device), blurred)
+    assert torch.equal(ExactMap(model.grid).blur_observed(observed, device), observed)
 
 
 def test_an_exact_map_is_the_spectrum_of_its_recording():
@@ -111,8 +111,8 @@ def test_prepared_speckle_stays_while_the_scene_moves():
     """A step of a micrometre is a new look with new points, and the same one with prepared ones."""
     device = radar()
     model, scene = ExactMap(device.grid(0.5, 2.5), FEW), occluder()
-    kept = model.prepared(scene, device, 7)
-    assert kept.prepared(scene, device, 8) is kept
+    kept = model.prepare(scene, device, 7)
+    assert kept.prepare(scene, device, 8) is kept
     first, other = (kept.predict(scene, device, seed) for seed in (1, 2))
     assert relative(other, first) < 1e-5
     assert relative(model.predict(scene, device, 2), model.predict(scene, device, 1)) > 0.1
@@ -120,7 +120,7 @@ def test_prepared_speckle_stays_while_the_scene_moves():
 
 def test_sampling_is_changed_by_name():
     model = SurrogateMap(radar().grid(0.5, 2.5), sampling=FEW)
-    changed = model.sampled_by(depth=1, boundary=False).sampling
+    changed = model.with_sampling(depth=1, boundary=False).sampling
     assert changed == replace(FEW, depth=1, boundary=False)
 
 
@@ -136,9 +136,9 @@ def moving(speed: float = 8.0) -> Scene:
     return moves.replace("mover", velocity=float64([0.0, 0.0, speed]))
 
 
-def motion(device: Radar, **changes: Any) -> MotionMap:
+def motion(device: Radar, **changes: Any) -> RangeDopplerMap:
     grid = device.grid(1.0, 2.4, 0.6)
-    return replace(MotionMap.of(device, grid, CHIRPS, sampling=MOVES), **changes)
+    return replace(RangeDopplerMap.from_chirps(device, grid, CHIRPS, sampling=MOVES), **changes)
 
 
 def recorded(scene: Scene, device: Radar, looks: int) -> torch.Tensor:
@@ -147,7 +147,7 @@ def recorded(scene: Scene, device: Radar, looks: int) -> torch.Tensor:
     model, maps = motion(device), []
     middle = 0.5 * float(CHIRPS.times(1)[-1, 0])
     # A recording begins half a frame before the middle, to which a prediction belongs.
-    earlier = scene.replace("mover", pose=scene.at(-middle)["mover"].pose)
+    earlier = scene.replace("mover", pose=scene.advance(-middle)["mover"].pose)
     for seed in range(looks):
         beat = simulate_chirps(earlier, device, CHIRPS, seed=seed, sampling=drawn)
         maps.append(model.observe(ChirpCapture(beat, device, CHIRPS)))
@@ -201,7 +201,7 @@ def test_what_stands_still_has_no_map_of_motion():
 def test_a_part_of_a_map_is_cut_around_an_echo():
     device = radar()
     model = motion(device)
-    part = model.around(1.6, 1.2, 3, device)
+    part = model.crop_around(1.6, 1.2, 3, device)
     cell, doppler = device.waveform.range_resolution, float(velocity_axis(device, CHIRPS).diff()[0])
     assert float((part.grid.ranges - 1.6).abs().max()) <= 3 * cell
     assert float((part.rates - 1.2).abs().max()) <= 3 * doppler
@@ -210,7 +210,7 @@ def test_a_part_of_a_map_is_cut_around_an_echo():
     columns = [int((model.grid.ranges - r).abs().argmin()) for r in part.grid.ranges]
     assert torch.allclose(cut, whole[:, rows][:, :, columns], rtol=1e-6, atol=1e-12)
     with pytest.raises(InputError, match="expected an echo within the map"):
-        model.around(9.0, 1.2, 3, device)
+        model.crop_around(9.0, 1.2, 3, device)
 
 
 def corner() -> Scene:
@@ -224,7 +224,7 @@ def test_chains_have_the_strength_of_a_corner_reflector():
     grid = device.grid(0.7, 1.3)
     drawn = Sampling(depth=3, samples=60_000, boundary=False)
     truth = simulate(corner(), device, grid, seed=1, sampling=drawn).spectrum
-    found = ChainMap(grid, sampling=Sampling(depth=3)).predict(corner(), device, 0)
+    found = FacetMap(grid, sampling=Sampling(depth=3)).predict(corner(), device, 0)
     assert float(found.max()) == pytest.approx(float(truth.max()), rel=0.15)
     assert relative(found, truth.float()) < 0.1
 
@@ -232,13 +232,13 @@ def test_chains_have_the_strength_of_a_corner_reflector():
 def test_chains_blur_both_maps_alike_and_have_looks():
     device = radar()
     grid = device.grid(0.7, 1.3)
-    model = ChainMap(grid, Surrogate(range_width=2.0), Sampling(depth=3))
-    sharp = model.narrowed(0.0)
-    assert model.widened
-    assert not sharp.widened
+    model = FacetMap(grid, Surrogate(range_width=2.0), Sampling(depth=3))
+    sharp = model.scale_blur(0.0)
+    assert model.has_blur
+    assert not sharp.has_blur
     flat = sharp.predict(corner(), device, 0)
-    assert torch.allclose(model.predict(corner(), device, 0), model.blurred(flat, device))
-    look = sharp.looks(corner(), device, 0)
+    assert torch.allclose(model.predict(corner(), device, 0), model.blur_observed(flat, device))
+    look = sharp.realisations(corner(), device, 0)
     assert look is not None
     assert torch.allclose(look(0, 0.0), flat, rtol=1e-3, atol=float(flat.max()) * 1e-5)
     noise = 1e-3 * float(flat.max())
@@ -250,7 +250,7 @@ def test_chain_fields_are_the_range_profiles_of_a_recording():
     grid = device.grid(0.7, 1.3)
     drawn = Sampling(depth=3, samples=60_000, boundary=False)
     beat = simulate(corner(), device, grid, seed=1, sampling=drawn).beat
-    model = ChainField(grid, sampling=Sampling(depth=3))
+    model = FacetField(grid, sampling=Sampling(depth=3))
     truth = model.observe(Capture.from_beat(beat, device))
     found = model.predict(corner(), device, 0)
     assert found.shape == truth.shape == (*found.shape[:3], 2)
@@ -261,9 +261,9 @@ def test_chain_fields_are_the_range_profiles_of_a_recording():
 
 def test_looks_at_chain_fields_have_the_noise_that_is_asked_for():
     device = radar()
-    model = ChainField(device.grid(0.7, 1.3), sampling=Sampling(depth=3))
+    model = FacetField(device.grid(0.7, 1.3), sampling=Sampling(depth=3))
     flat = model.predict(corner(), device, 0)
-    look = model.looks(corner(), device, 0)
+    look = model.realisations(corner(), device, 0)
     assert look is not None
     assert torch.allclose(look(0, 0.0), flat)
     noise = 0.01 * float(flat.square().max())
@@ -274,18 +274,18 @@ def test_looks_at_chain_fields_have_the_noise_that_is_asked_for():
 
 
 HALL = Scene({"hall": Object(box((6.0, 5.0, 3.0)), Dielectric(5.0, 0.1, scattering=0.0))})
-SPOTS = Points(float64([[2.0, 1.0, 0.3], [-1.0, 1.5, -0.4], [0.3, -2.0, 0.8]]))
+SPOTS = ReceiverPoints(float64([[2.0, 1.0, 0.3], [-1.0, 1.5, -0.4], [0.3, -2.0, 0.8]]))
 MAST = Transmitters(float64([[-2.0, -1.0, 0.5], [1.5, 2.0, 0.2]]), power_dbm=float64([10.0, 13.0]))
 
 
 def test_levels_of_a_radio_map():
-    reception = Reception(2.4e9, 1e8, depth=2)
+    reception = PropagationSettings(2.4e9, 1e8, depth=2)
     shown = {
         name: RadioMap(SPOTS, reception, name).predict(HALL, MAST, 0)  # type: ignore[arg-type]
         for name in ("path_gain", "received_power", "sinr", "delay_spread")
     }
     assert all(power.shape == (2, 3) for power in shown.values())
-    found = RadioMap(SPOTS, reception).received(HALL, MAST, 0)
+    found = RadioMap(SPOTS, reception).link_statistics(HALL, MAST, 0)
     torch.testing.assert_close(shown["path_gain"], 10 * found.gain.log10(), rtol=1e-9, atol=0)
     torch.testing.assert_close(
         shown["received_power"] - shown["path_gain"], float64([[10.0] * 3, [13.0] * 3])
@@ -297,7 +297,7 @@ def test_levels_of_a_radio_map():
 
 
 def test_derivatives_of_a_radio_map_are_differences():
-    model = RadioMap(SPOTS, Reception(2.4e9, 1e8, depth=2, edges=1))
+    model = RadioMap(SPOTS, PropagationSettings(2.4e9, 1e8, depth=2, edges=1))
     scene = Scene(
         {**HALL.objects, "cup": Object(box((0.5, 0.9, 1.7)), Dielectric(3.0, 0.02), rigid())}
     )
@@ -325,7 +325,7 @@ def test_derivatives_of_a_radio_map_are_differences():
 def test_unreached_points_have_finite_levels_and_derivatives():
     sealed = HALL.replace("hall", material=PerfectConductor())
     place = torch.tensor([9.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
-    model = RadioMap(SPOTS, Reception(2.4e9, 0.0), floor_db=-150.0)
+    model = RadioMap(SPOTS, PropagationSettings(2.4e9, 0.0), floor_db=-150.0)
     level = model.predict(sealed, Transmitters(place), 0)
     torch.testing.assert_close(level.detach(), torch.full((1, 3), -150.0).double())
     mixed = (level + place.sum()).sum()
@@ -334,21 +334,21 @@ def test_unreached_points_have_finite_levels_and_derivatives():
 
 @pytest.mark.usefixtures("unchecked")
 def test_measured_levels_have_the_shape_of_the_map():
-    model = RadioMap(SPOTS, Reception(2.4e9))
+    model = RadioMap(SPOTS, PropagationSettings(2.4e9))
     assert model.observe([-50.0, -60.0, -70.0]).shape == (1, 3)
     assert model.observe([[-50.0, -60.0, -70.0]] * 2).shape == (2, 3)
     with pytest.raises(InputError, match="measured received power"):
         model.observe([-50.0, -60.0])
     with pytest.raises(InputError, match="quantity among received_power"):
-        RadioMap(SPOTS, Reception(2.4e9), "rssi")  # type: ignore[arg-type]
+        RadioMap(SPOTS, PropagationSettings(2.4e9), "rssi")  # type: ignore[arg-type]
 
 
 def test_looks_of_a_radio_map_scatter_as_told():
-    known = RadioMap(SPOTS, Reception(2.4e9), scatter=2.0)
+    known = RadioMap(SPOTS, PropagationSettings(2.4e9), scatter=2.0)
     open_ = replace(known, scatter=None)
     mean = known.predict(HALL, MAST, 0)
     for model, deviation in ((known, 2.0), (open_, 0.5)):
-        look = model.looks(HALL, MAST, 0)
+        look = model.realisations(HALL, MAST, 0)
         drawn = torch.stack([look(number, 0.25) for number in range(200)]) - mean
         assert float(drawn.std()) == pytest.approx(deviation, rel=0.1)
         assert torch.equal(look(3, 0.25), look(3, 0.25))
@@ -356,7 +356,7 @@ def test_looks_of_a_radio_map_scatter_as_told():
 
 def test_responses_are_those_of_the_paths():
     swept = float64([2.39e9, 2.4e9, 2.41e9])
-    model = ResponseMap(SPOTS.positions, swept, Reception(2.4e9, depth=2))
+    model = ResponseMap(SPOTS.positions, swept, PropagationSettings(2.4e9, depth=2))
     found = model.predict(HALL, MAST, 0)
     assert found.shape == (2, 3, 3, 2)
     paths = trace_paths(HALL, MAST.positions, SPOTS.positions, 2.4e9, depth=2, rays=100_000)

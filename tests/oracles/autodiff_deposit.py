@@ -8,9 +8,9 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling
 from invertwin.channel.power import replay
-from invertwin.channel.power.bins import Contribution
+from invertwin.channel.power.bins import PathContribution
 from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table
-from invertwin.channel.power.trace import Trace, tables_of
+from invertwin.channel.power.trace import PowerTracer, differentiable_tables
 from invertwin.channel.rays.arrays import to_float
 from invertwin.channel.rays.backend import mi
 from invertwin.channel.rays.scene_tables import flatten
@@ -22,21 +22,21 @@ def gradients(
 ) -> dict[str, Tensor]:
     """∂ Σ weights · map / ∂ every table of the kernel."""
     sampling = Sampling(depth=1, samples=samples, boundary_samples=edges, memory_budget=1e12)
-    trace = Trace(flatten(scene, link.wavelength), link, sampling, seed)
+    trace = PowerTracer(flatten(scene, link.wavelength), link, sampling, seed)
     tables = {name: mi.Float(trace.fixed.table(name)) for name in DIFFERENTIABLE}
     dr.enable_grad(list(tables.values()))
     inputs, out = trace.inputs(tables), mi.Float(0)
-    for records in trace.records():
-        number, antennas = mi.UInt32(0), replay._Antennas.of(inputs, records.frame)
-        near = replay._Near.of(inputs, records, number, records.depth)
-        vertex = replay._vertex(trace.rays, inputs, records, antennas, number, near)
-        path, arriving = vertex.path(), vertex.arriving
-        power = dr.select(vertex.seen, path.power * (arriving / dr.detach(arriving)), 0)
-        length = 0.5 * (vertex.segment + vertex.connection.distance)
+    for records in trace.iterate_records():
+        number, antennas = mi.UInt32(0), replay._AntennaPoses.look_up(inputs, records.frame)
+        near = replay._VertexNeighbours.read(inputs, records, number, records.depth)
+        vertex = replay._evaluate_vertex(trace.rays, inputs, records, antennas, number, near)
+        path, arriving = vertex.to_contribution(), vertex.incident_factor
+        power = dr.select(vertex.is_visible, path.power * (arriving / dr.detach(arriving)), 0)
+        length = 0.5 * (vertex.optical_length + vertex.connection.distance)
         out += _weighted(grid, weights, replace(path, power=power, range=length))
-    for paths in trace.boundary(inputs):
+    for paths in trace.trace_boundary(inputs):
 
-        def visit(_: Any, path: Contribution, exists: Any, speed: Any = paths.speed) -> None:
+        def visit(_: Any, path: PathContribution, exists: Any, speed: Any = paths.speed) -> None:
             nonlocal out
             amount = dr.select(exists, path.power, 0) * speed
             zero = dr.zeros(mi.Float, dr.width(amount))
@@ -45,12 +45,12 @@ def gradients(
 
         paths.run(dict(paths.state), visit)
     dr.backward(out)
-    likes = tables_of(trace.rays.geometry, trace.rays.link)
+    likes = differentiable_tables(trace.rays.geometry, trace.rays.link)
     by_name: dict[str, Tensor] = dict(zip(DIFFERENTIABLE, likes, strict=True))
     return {name: from_table(name, dr.grad(tables[name]), by_name[name]) for name in tables}
 
 
-def _weighted(grid: Grid, weights: Tensor, found: Contribution) -> Any:
+def _weighted(grid: Grid, weights: Tensor, found: PathContribution) -> Any:
     """Σ weights · map of these paths, with B-spline weights that carry derivatives."""
     flat, total = to_float(weights), mi.Float(0)
     axes = [

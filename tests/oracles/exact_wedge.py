@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Complex128, Float64
 from scipy.special import hankel2, hankel2e, jv, wofz
 
-Polarisation = Literal["soft", "hard"]
+WedgePolarisation = Literal["soft", "hard"]
 _SIGNS = {"soft": -1.0, "hard": 1.0}
 _PANELS, _POINTS = 24, 20  # of the quadrature of Macdonald's integral
 
 
-def half_plane_of_plane_wave(
-    k: float, azimuth_in: float, distance: float, azimuth: float, polarisation: Polarisation
+def half_plane_plane_wave(
+    k: float, azimuth_in: float, distance: float, azimuth: float, polarisation: WedgePolarisation
 ) -> complex:
     """Sommerfeld: a plane wave of amplitude 1 at the edge meets a half plane.
 
@@ -47,13 +47,13 @@ def _half_plane_wave(distance: float, angle: float) -> complex:
     return complex(np.exp(1j * distance * math.cos(angle)) * share)
 
 
-def wedge_of_plane_wave(
+def wedge_plane_wave(
     k: float,
     opening: float,
     azimuth_in: float,
     distance: float,
     azimuth: Float64[np.ndarray, " angle"],
-    polarisation: Polarisation,
+    polarisation: WedgePolarisation,
 ) -> Complex128[np.ndarray, " angle"]:
     """The series of a wedge in a plane wave of amplitude 1 at the edge.
 
@@ -69,16 +69,16 @@ def wedge_of_plane_wave(
     order = np.arange(int(opening * (reach + 12 * np.cbrt(reach) + 25)))
     weight = np.where(order == 0, 1, 2) * np.exp(0.5j * math.pi * order / opening)
     weight = weight * jv(order / opening, reach) / opening
-    return _angular(order, weight, opening, azimuth_in, azimuth, polarisation)
+    return _angular_factors(order, weight, opening, azimuth_in, azimuth, polarisation)
 
 
-def wedge_of_line_source(
+def wedge_line_source(
     k: float,
     opening: float,
     source: tuple[float, float],
     distance: float,
     azimuth: Float64[np.ndarray, " angle"],
-    polarisation: Polarisation,
+    polarisation: WedgePolarisation,
 ) -> Complex128[np.ndarray, " angle"]:
     """The series of a wedge beside a line source, whose own field is H₀⁽²⁾(kR).
 
@@ -98,37 +98,37 @@ def wedge_of_line_source(
     sound = (np.abs(small) > 1e-280) & np.isfinite(large)
     weight = np.where(sound, small * np.where(sound, large, 0), 0)
     weight = weight * np.where(order == 0, 1, 2) / opening
-    return _angular(order, weight, opening, source[1], azimuth, polarisation)
+    return _angular_factors(order, weight, opening, source[1], azimuth, polarisation)
 
 
-def _angular(
+def _angular_factors(
     order: np.ndarray,
     weight: np.ndarray,
     opening: float,
     azimuth_in: float,
     azimuth: np.ndarray,
-    polarisation: Polarisation,
+    polarisation: WedgePolarisation,
 ) -> np.ndarray:
     direct = np.cos(np.outer(azimuth - azimuth_in, order) / opening)
     mirrored = np.cos(np.outer(azimuth + azimuth_in, order) / opening)
     return (direct + _SIGNS[polarisation] * mirrored) @ weight
 
 
-def half_plane_of_point_source(
+def half_plane_point_source(
     k: float,
     source: tuple[float, float],
-    place: tuple[float, float, float],
-    polarisation: Polarisation,
+    point: tuple[float, float, float],
+    polarisation: WedgePolarisation,
 ) -> complex:
     """Macdonald: a half plane beside a point source, whose own field is exp(−jkR)/R.
 
     Args:
         k: wave number [1/m].
         source: ρ′ [m] and φ′ [rad].
-        place: ρ [m], φ [rad], and z along the edge from the source [m].
+        point: ρ [m], φ [rad], and z along the edge from the source [m].
         polarisation: soft or hard.
     """
-    (apart_in, azimuth_in), (apart, azimuth, along) = source, place
+    (apart_in, azimuth_in), (apart, azimuth, along) = source, point
     total = 0j
     for angle, sign in ((azimuth - azimuth_in, 1.0), (azimuth + azimuth_in, _SIGNS[polarisation])):
         square = apart**2 + apart_in**2 - 2 * apart * apart_in * math.cos(angle) + along**2

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from invertwin.discovery import Figure, Picture, Thing, Twin
+from invertwin.discovery import DetectedObject, GroundImage, ShapeParameters, Twin
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.plotting import found
 
@@ -11,13 +11,15 @@ from invertwin.plotting import found
 def test_the_ground_shows_things_movers_and_blind_places():
     places = torch.cartesian_prod(*[torch.arange(3, dtype=torch.float64)] * 2)
     views = torch.tensor([0, 1, 2, 3, 0, 1, 2, 3, 4])
-    picture = Picture(places, torch.arange(9, dtype=torch.float64), views)
+    picture = GroundImage(places, torch.arange(9, dtype=torch.float64), views)
     still = torch.tensor([0.5, 0.4, 1.5], dtype=torch.float64)
-    figure = Figure("box", (0.5, 1.5), 0.2, 0.6, 0.3, 0.8, 0.1)
+    figure = ShapeParameters("box", (0.5, 1.5), 0.2, 0.6, 0.3, 0.8, 0.1)
     spread = {"x": 0.1, "z": 0.2}
-    box = Thing("object_1", "box", {"box": 1.0}, still, figure, spread, 0.99)
+    box = DetectedObject("object_1", "box", {"box": 1.0}, still, figure, spread, 0.99)
     moved = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    mover = Thing("mover_1", "point", {"point": 1.0}, 2 * moved, None, {"range": 0.1}, 0.4, moved)
+    mover = DetectedObject(
+        "mover_1", "point", {"point": 1.0}, 2 * moved, None, {"range": 0.1}, 0.4, moved
+    )
     drawn = found.ground(Twin((box, mover), Ground(), 0.0, picture))
     axes = drawn.axes[0]
     texts = [text.get_text() for text in axes.texts]

@@ -7,7 +7,7 @@ import torch
 from invertwin import plotting
 from invertwin.channel import Grid
 from invertwin.errors import InputError
-from invertwin.plotting import Panel
+from invertwin.plotting import MapPanel
 from invertwin.radar import DopplerMaps
 from invertwin.radar.processing.doppler_maps import Peak
 
@@ -78,7 +78,7 @@ def test_maps_on_one_scale_keep_their_level():
 def test_panels_have_their_own_axes_and_peaks():
     values = torch.tensor([[1.0, 10.0], [100.0, 1.0], [1.0, 1.0]])
     rates = torch.tensor([-2.0, 2.0])
-    panel = Panel(values, ALONE.ranges, rates, plotting.RATE_LABEL)
+    panel = MapPanel(values, ALONE.ranges, rates, plotting.RATE_LABEL)
     first, second = cells(plotting.panels({"a": panel, "b": panel}, dynamic_range=30.0))
     np.testing.assert_allclose(shown(first), [[-20, -10], [0, -20], [-20, -20]], atol=1e-6)
     assert first.images[0].get_clim() == (-30, 0)

@@ -15,7 +15,7 @@ def test_fits_of_a_transmitter_begin_and_end_on_the_plan():
         [[[0.0, 0.0, 1.0], [3.0, 4.0, 1.5]], [[1.0, 5.0, 1.0], [3.1, 4.1, 1.5]]]
     ).double()
     places = {"truth": torch.tensor([[3.0, 4.1, 1.5]]).double(), "found": fits[:1, 1]}
-    (axes,) = plotting.located(scene, 1.2, places, fits).axes
+    (axes,) = plotting.transmitter_fits(scene, 1.2, places, fits).axes
     shown = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
     assert shown["starts"] == [[0.0, 0.0], [1.0, 5.0]]
     assert [round(x, 3) for x in shown["truth"][0]] == [3.0, 4.1]

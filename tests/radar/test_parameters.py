@@ -12,8 +12,8 @@ from invertwin.radar import (
     FMCW,
     ClockOffset,
     Radar,
-    RadarPath,
     RadarPose,
+    RadarTrajectory,
     RangeBias,
     SteppedFrequency,
     backproject_beat,
@@ -43,7 +43,7 @@ def test_radar_pose_turns_the_radar_about_its_mean_position_and_moves_it():
 
 
 def test_a_path_is_a_walk_from_the_first_frame():
-    module = RadarPath(2, drift=0.1, axes="xz")
+    module = RadarTrajectory(2, drift=0.1, axes="xz")
     with torch.no_grad():
         module.latent[:] = float64([[1.0, 5.0, 0.0], [-3.0, 5.0, 2.0]])
     moved = module.displacements(5)
@@ -66,15 +66,15 @@ def test_a_path_is_refined_until_the_image_is_sharp():
     turn = torch.linspace(-0.06, 0.06, 61, dtype=torch.float64)
     places = 1000 * torch.stack([turn.sin(), 0 * turn, -turn.cos()], dim=1)
     one = AntennaArray(torch.zeros(1, 3, dtype=torch.float64))
-    said = Radar(one, one, sweep, places).centered([0.0, 0.0, 0.0])
-    truth = RadarPath(6, drift=0.03, axes="z")
+    said = Radar(one, one, sweep, places).center_on([0.0, 0.0, 0.0])
+    truth = RadarTrajectory(6, drift=0.03, axes="z")
     with torch.no_grad():
         truth.latent[:, 2] = float64([1.0, -1.5, -1.0, 1.2, 1.4, -1.0])
     points = float64([[0.0, 0.0, 0.0], [13.0, 0.0, -9.0], [-8.0, 0.0, 15.0]])
     real = truth(said).positions.detach()
     shown = (real[:, None] - points).norm(dim=-1) - said.origins[:, None]
     beat = torch.exp(4j * math.pi * shown[..., None] * sweep.frequencies / SPEED_OF_LIGHT).sum(1)
-    found = RadarPath(6, drift=0.03, axes="z")
+    found = RadarTrajectory(6, drift=0.03, axes="z")
 
     def loss():
         image = backproject_beat(beat[:, None, None], found(said), points)
@@ -116,7 +116,7 @@ def recording() -> tuple[Capture, Radar]:
     one = AntennaArray(torch.zeros(1, 3, dtype=torch.float64))
     times = torch.linspace(0, 1, 5, dtype=torch.float64)
     track = Track(float64([-1.0, 0.45, 2.0]), float64([[-1.0, 0, 0], [0.0, 0.2, 0], [1.5, 0, 0.1]]))
-    radar = Radar(one, one, FMCW(76e9, 2e9, 50e-6, 64), track.at(times + 0.1))
+    radar = Radar(one, one, FMCW(76e9, 2e9, 50e-6, 64), track.interpolate(times + 0.1))
     profile = torch.ones(5, 4, dtype=torch.complex128)
     capture = Capture.from_range_profile(
         profile, 1 + torch.arange(4).double(), radar, times, track=track, clock_offset=0.1
@@ -132,7 +132,7 @@ def test_clock_offset_moves_the_radar_along_its_track():
     )
     assert torch.allclose(still.positions, radar.positions)
     assert capture.track is not None
-    assert torch.allclose(shifted.positions, capture.track.at(capture.times + 0.25))
+    assert torch.allclose(shifted.positions, capture.track.interpolate(capture.times + 0.25))
 
 
 def test_clock_offset_has_the_gradient_of_the_track():

@@ -28,7 +28,7 @@ from invertwin.radar import (
     surrogate_spectrum,
 )
 from invertwin.radar.signal.range_profile import fft_bins
-from invertwin.radar.signal.realisations import Looks
+from invertwin.radar.signal.realisations import SpeckleRealisations
 from invertwin.scene import Scene, plate
 from invertwin.scene.antenna import linear_array
 from scenes import float64, thing
@@ -55,13 +55,13 @@ def test_an_origin_takes_its_delay_off(waveform, point_paths):
     """What is 104 m away looks as if it were 4 m away: on a ramp, too, whose reference waits."""
     away, near = far([[0.0, 0.0, 0.0]], waveform), far([[0.0, 0.0, 100.0]], waveform)
     point = [0.0, 0.0, 104.0]
-    found = beat_signal(echo(point_paths, away, point), away.centered(CENTER))
+    found = beat_signal(echo(point_paths, away, point), away.center_on(CENTER))
     expected = beat_signal(echo(point_paths, near, point), near)
     assert (found - expected).abs().max() < 1e-8
 
 
 def test_the_origins_are_those_of_the_phase_centres():
-    radar = replace(far(), receivers=linear_array(2, 0.01)).centered(CENTER)
+    radar = replace(far(), receivers=linear_array(2, 0.01)).center_on(CENTER)
     expected = [100.0, math.hypot(3.0, 102.0)]
     assert radar.origins.tolist() == pytest.approx(expected, rel=1e-12)
     assert radar.frames([1]).origins.tolist() == pytest.approx(expected[1:])
@@ -77,7 +77,7 @@ def test_ranges_around_a_far_scene_are_no_error(point_paths):
         beat_signal(paths, radar)
     with pytest.raises(InputError, match="range origin for data that are centred"):
         radar.grid(60.0, 140.0)
-    centered = radar.centered(CENTER)
+    centered = radar.center_on(CENTER)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         beat = beat_signal(paths, centered)
@@ -91,19 +91,19 @@ def test_ranges_around_a_far_scene_are_no_error(point_paths):
 def test_the_window_begins_half_of_it_before_the_origin_but_not_behind_the_radar(point_paths):
     span = SWEEP.max_range
     assert far().range_limits == (0.0, span)
-    assert far().centered(CENTER).range_limits == (-span / 2, span / 2)
+    assert far().center_on(CENTER).range_limits == (-span / 2, span / 2)
     near = replace(far(), range_origin=float64([10.0, 12.0]))
     assert near.range_limits == (-10.0, span - 10.0)
     # A cable of 0.4 m shows everything so much later.
     assert replace(far(), range_origin=float64([-0.4, -0.4])).range_limits == (0.4, span + 0.4)
-    pulse = replace(far(), waveform=Impulse(9.7e9, 1e8)).centered(CENTER)
+    pulse = replace(far(), waveform=Impulse(9.7e9, 1e8)).center_on(CENTER)
     assert pulse.range_limits == (-100.0, math.inf)
     with pytest.warns(PhysicsWarning, match=r"from -49\.97 to 49\.97 m of the origin"):
-        beat_signal(echo(point_paths, far(), [0, 0, 160.0]), far().centered(CENTER))
+        beat_signal(echo(point_paths, far(), [0, 0, 160.0]), far().center_on(CENTER))
 
 
 def test_negative_ranges_are_bins_of_the_fft(point_paths):
-    radar = far().centered(CENTER)
+    radar = far().center_on(CENTER)
     beat = beat_signal(echo(point_paths, far(), [4.0, 0.0, 80.0]), radar)
     grid = radar.grid(-30.0, 20.0)
     assert fft_bins(SWEEP, grid) is not None
@@ -114,13 +114,13 @@ def test_negative_ranges_are_bins_of_the_fft(point_paths):
 
 
 def test_movers_and_looks_count_from_the_origin(point_paths):
-    radar = far().centered(CENTER)
+    radar = far().center_on(CENTER)
     paths = echo(point_paths, far(), [0.0, 0.0, 110.0])
     still = beat_signal(paths, radar)
     moving = replace(paths, velocity=torch.zeros(2, 3, dtype=torch.float64))
     train = moving_beat(moving, radar, Chirps(count=2, interval=1e-3))
     assert (train - still[:, None]).abs().max() < 1e-6
-    look = Looks(paths, radar).beat(seed=1)
+    look = SpeckleRealisations(paths, radar).beat(seed=1)
     # The same random amplitude in both frames; cells are a quarter of a resolution cell.
     first, second = (look / still).mean((1, 2, 3))
     assert abs(second / first - 1) < 0.1
@@ -129,7 +129,7 @@ def test_movers_and_looks_count_from_the_origin(point_paths):
 
 def test_detections_are_placed_in_the_world(point_paths):
     row = linear_array(16, 0.5 * SWEEP.wavelength)
-    radar = replace(far([[0.0, 0.0, 0.0]]), receivers=row).centered(CENTER)
+    radar = replace(far([[0.0, 0.0, 0.0]]), receivers=row).center_on(CENTER)
     point = float64([10.0, 0.0, 95.0])
     beat = beat_signal(point_paths(radar, point, torch.ones(1)), radar)
     grid = radar.grid(-20.0, 20.0, 0.5)
@@ -152,7 +152,7 @@ def test_the_surrogate_counts_from_the_origin_of_every_frame():
         return surrogate_spectrum(SCENE, moved, grid, Surrogate(), sampling=sampling, seed=3)
 
     plain = shown(radar, 92.0)
-    found = shown(radar.centered(CENTER), -8.0)
+    found = shown(radar.center_on(CENTER), -8.0)
     assert plain.detach().sum() > 0
     assert (found - plain).abs().max() < 1e-4 * plain.detach().max()
     weight = torch.linspace(0, 1, 24)[None, :, None, None]
@@ -162,18 +162,18 @@ def test_the_surrogate_counts_from_the_origin_of_every_frame():
 
 def test_every_frame_has_an_origin_of_its_own():
     radar, sampling = far(), Sampling(depth=1, samples=20_000)
-    centered, grid = radar.centered(CENTER), Grid(-8.0, 0.78, 24)
+    centered, grid = radar.center_on(CENTER), Grid(-8.0, 0.78, 24)
     both = surrogate_spectrum(SCENE, centered, grid, Surrogate(), sampling=sampling, seed=3)
     places = (both.sum((2, 3)) * grid.ranges).sum(1) / both.sum((1, 2, 3))
     middle = float64([1.0, 0.5, 103.0])
     truth = (middle - radar.positions).norm(dim=1) - centered.origins
     assert (places - truth).abs().max() < 0.3
-    assert float(radar.frames([1]).centered(CENTER).origins) == float(centered.origins[1])
+    assert float(radar.frames([1]).center_on(CENTER).origins) == float(centered.origins[1])
 
 
 def test_the_origin_stays_where_the_radar_is_moved(point_paths):
     """It is what the recording was compensated with: phases turn by the whole shift of the path."""
-    radar = far().centered(CENTER)
+    radar = far().center_on(CENTER)
     pose = RadarPose([0.0, 0.0, 0.5])
     assert torch.equal(pose(radar).origins, radar.origins)
     moved = echo(point_paths, pose(radar), [0.0, 0.0, 104.0])
@@ -195,5 +195,5 @@ def test_wrong_origins():
         replace(far(), range_origin=float64([1.0, 2.0]).requires_grad_())
     with pytest.raises(InputError, match="no leakage with a range_origin"):
         Impairments(leakage=Leakage(1e-9, -30.0)).apply(
-            torch.zeros(2, 1, 1, 64, dtype=torch.complex128), far().centered(CENTER), seed=0
+            torch.zeros(2, 1, 1, 64, dtype=torch.complex128), far().center_on(CENTER), seed=0
         )

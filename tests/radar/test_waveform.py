@@ -171,7 +171,7 @@ def test_moved_turns_about_the_mean_position():
     radar = small(positions=torch.tensor([[0, 0, 0], [2, 0, 0]], dtype=torch.float64))
     turn = rotation_from_vector(torch.tensor([0, 0, math.pi / 2], dtype=torch.float64))
     shift = torch.tensor([0.0, 0, 5], dtype=torch.float64, requires_grad=True)
-    moved = radar.moved(turn, shift)
+    moved = radar.transform_rigidly(turn, shift)
     expected = torch.tensor([[1.0, -1, 5], [1, 1, 5]], dtype=torch.float64)
     assert torch.allclose(moved.positions, expected)
     assert torch.allclose(moved.link().rotations, turn.expand(2, 3, 3))

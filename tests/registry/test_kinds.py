@@ -15,8 +15,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.cli.schema.keys import json_schema
-from invertwin.cli.schema.recordings import chirp_capture
-from invertwin.cli.schema.run_file import need, to_toml, validate
+from invertwin.cli.schema.recordings import build_chirp_capture
+from invertwin.cli.schema.run_file import require_section, to_toml, validate_run
 from invertwin.errors import InputError
 from invertwin.limits import Angle, Axes, Positive
 from invertwin.registry.kinds import registry
@@ -56,7 +56,7 @@ def made(
     return dict(locals())
 
 
-TABLE = registry.table_of(made, "Made")
+TABLE = registry.constructor_table(made, "Made")
 
 
 def test_keys_defaults_and_meanings_come_from_the_signature_and_the_docstring():
@@ -133,18 +133,18 @@ def test_observations_have_sections_of_their_own_and_survive_the_way_to_toml(tmp
     raw = tomllib.loads(text)
     sensor = {name: raw.pop(name) for name in ("radar", "grid", "data")}
     raw["observations"] = {"door": sensor, "corner": {**sensor, "weight": 2.0}}
-    run = validate(raw, tmp_path / "run.toml")
+    run = validate_run(raw, tmp_path / "run.toml")
     assert [table.weight for table in run.observations.values()] == [1.0, 2.0]
     assert run.observations["door"].surrogate is None
-    assert need(run, "grid", "reconstruct") is None
-    assert validate(tomllib.loads(to_toml(run)), tmp_path / "run.toml") == run
+    assert require_section(run, "grid", "reconstruct") is None
+    assert validate_run(tomllib.loads(to_toml(run)), tmp_path / "run.toml") == run
     del raw["observations"]["corner"]["grid"]
     with pytest.raises(InputError, match=r"expected a section \[grid\]"):
-        need(validate(raw, tmp_path / "run.toml"), "grid", "reconstruct")
+        require_section(validate_run(raw, tmp_path / "run.toml"), "grid", "reconstruct")
 
 
 def test_data_without_chirps_are_none_for_movers(tmp_path):
     raw: dict = {"task": "reconstruct", "data": {"kind": "simulated", "points_per_m2": 1.0}}
     raw["scene"] = {"box": {"shape": "box", "size": 1.0, "material": {"kind": "rough_conductor"}}}
     with pytest.raises(InputError, match=r"data\.kind: expected data with chirps, got \"simulated"):
-        chirp_capture(validate(raw, tmp_path / "run.toml").data)
+        build_chirp_capture(validate_run(raw, tmp_path / "run.toml").data)

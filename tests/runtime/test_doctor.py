@@ -26,8 +26,8 @@ class FakeProbe:
     def __call__(self, path):
         self.asked.append(path)
         if any(str(version) in Path(path).name for version in self.working):
-            return doctor.Verdict(True, "works")
-        return doctor.Verdict(False, "aborts the process")
+            return doctor.LlvmProbeResult(True, "works")
+        return doctor.LlvmProbeResult(False, "aborts the process")
 
 
 @pytest.fixture(autouse=True)
@@ -35,8 +35,10 @@ def fresh_doctor(monkeypatch, tmp_path):
     """A process that has not chosen yet, with an empty cache."""
     monkeypatch.setattr(doctor, "_choice", None)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setenv(doctor.VARIABLE, "")  # so that what a test leaves there is taken back
-    monkeypatch.delenv(doctor.VARIABLE)
+    monkeypatch.setenv(
+        doctor.LIBLLVM_VARIABLE, ""
+    )  # so that what a test leaves there is taken back
+    monkeypatch.delenv(doctor.LIBLLVM_VARIABLE)
     monkeypatch.delenv(doctor.BACKEND_VARIABLE, raising=False)
     monkeypatch.setattr(doctor, "gpu_name", lambda: None)
     # Dr.Jit may be loaded in this process by other tests; here it is not.
@@ -62,12 +64,12 @@ def machine(root: Path, versions) -> list[Path]:
 
 
 def library(folders, version):
-    return next(c.path for c in doctor.candidates(folders) if c.version[0] == version)
+    return next(c.path for c in doctor.find_libraries(folders) if c.version[0] == version)
 
 
 @pytest.mark.parametrize("present", SUBSETS)
 def test_every_library_is_found_once_newest_first(tmp_path, present):
-    found = doctor.candidates(machine(tmp_path, present))
+    found = doctor.find_libraries(machine(tmp_path, present))
     assert [c.version[0] for c in found] == sorted(present, reverse=True)
 
 
@@ -79,10 +81,10 @@ def test_the_newest_that_passes_is_chosen(tmp_path, monkeypatch, caplog, present
     if explicit:
         own.parent.mkdir()
         own.write_text("LLVM of the user's own")
-        monkeypatch.setenv(doctor.VARIABLE, str(own))
-    doctor.prepare(folders, FakeProbe())
+        monkeypatch.setenv(doctor.LIBLLVM_VARIABLE, str(own))
+    doctor.select_libllvm(folders, FakeProbe())
 
-    set_to = os.environ[doctor.VARIABLE]
+    set_to = os.environ[doctor.LIBLLVM_VARIABLE]
     if explicit == 19:
         assert set_to == str(own)
     elif 19 in present:
@@ -90,7 +92,7 @@ def test_the_newest_that_passes_is_chosen(tmp_path, monkeypatch, caplog, present
     else:
         assert not os.path.exists(set_to)
         with pytest.raises(InputError, match=r"libllvm19|llvm@19|llvm-libs"):
-            doctor.require()
+            doctor.require_backend()
     warned = explicit in (14, 15)
     assert len(caplog.messages) == warned
     assert all("\n" not in message and str(own) in message for message in caplog.messages)
@@ -98,8 +100,8 @@ def test_the_newest_that_passes_is_chosen(tmp_path, monkeypatch, caplog, present
 
 def test_older_but_working_is_chosen_when_the_newest_fails(tmp_path):
     folders = machine(tmp_path, VERSIONS)
-    doctor.prepare(folders, FakeProbe(working=(14,)))
-    assert os.environ[doctor.VARIABLE] == library(folders, 14)
+    doctor.select_libllvm(folders, FakeProbe(working=(14,)))
+    assert os.environ[doctor.LIBLLVM_VARIABLE] == library(folders, 14)
 
 
 @pytest.mark.parametrize(
@@ -117,26 +119,26 @@ def test_older_but_working_is_chosen_when_the_newest_fails(tmp_path):
     ],
 )
 def test_version_of_a_file(file, version):
-    assert doctor._version(file) == version
+    assert doctor._library_version(file) == version
 
 
 def test_no_library_at_all_raises_one_line_only_when_rays_are_needed(tmp_path, monkeypatch):
-    doctor.prepare([tmp_path], FakeProbe())
+    doctor.select_libllvm([tmp_path], FakeProbe())
     with pytest.raises(InputError, match="got none on this machine; type: ") as error:
-        doctor.require()
+        doctor.require_backend()
     assert "\n" not in str(error.value)
     monkeypatch.setattr(doctor, "gpu_name", lambda: "A GPU")
-    doctor.require()
-    doctor.require("cuda")
+    doctor.require_backend()
+    doctor.require_backend("cuda")
     with pytest.raises(InputError, match="type: "):
-        doctor.require("cpu")
+        doctor.require_backend("cpu")
 
 
 def test_a_child_process_does_not_take_our_mark_for_the_users_choice(tmp_path, monkeypatch, caplog):
-    doctor.prepare([tmp_path], FakeProbe())
+    doctor.select_libllvm([tmp_path], FakeProbe())
     monkeypatch.setattr(doctor, "_choice", None)
     probe = FakeProbe()
-    doctor.prepare([tmp_path], probe)
+    doctor.select_libllvm([tmp_path], probe)
     assert probe.asked == []
     assert caplog.messages == []
 
@@ -144,12 +146,12 @@ def test_a_child_process_does_not_take_our_mark_for_the_users_choice(tmp_path, m
 def test_the_cuda_backend_costs_no_probe(tmp_path, monkeypatch):
     monkeypatch.setenv(doctor.BACKEND_VARIABLE, "cuda")
     probe = FakeProbe()
-    doctor.prepare(machine(tmp_path, VERSIONS), probe)
+    doctor.select_libllvm(machine(tmp_path, VERSIONS), probe)
     assert probe.asked == []
-    assert doctor.VARIABLE not in os.environ
-    doctor.require()
+    assert doctor.LIBLLVM_VARIABLE not in os.environ
+    doctor.require_backend()
     with pytest.raises(InputError, match="unset INVERTWIN_BACKEND"):
-        doctor.require("cpu")
+        doctor.require_backend("cpu")
 
 
 def test_dr_jit_imported_first_with_a_bad_library_is_noticed(tmp_path, monkeypatch):
@@ -160,17 +162,17 @@ def test_dr_jit_imported_first_with_a_bad_library_is_noticed(tmp_path, monkeypat
                 return (15, 0, 6)
 
     monkeypatch.setitem(sys.modules, "drjit", Loaded)
-    doctor.prepare(machine(tmp_path, VERSIONS), FakeProbe())
+    doctor.select_libllvm(machine(tmp_path, VERSIONS), FakeProbe())
     with pytest.raises(InputError, match=r"libLLVM 15\.0\.6, as Dr\.Jit was imported first"):
-        doctor.require("cpu")
+        doctor.require_backend("cpu")
 
 
 class TestCache:
     def choose(self, monkeypatch, folders, probe):
         monkeypatch.setattr(doctor, "_choice", None)
-        monkeypatch.delenv(doctor.VARIABLE, raising=False)
-        doctor.prepare(folders, probe)
-        return os.environ[doctor.VARIABLE]
+        monkeypatch.delenv(doctor.LIBLLVM_VARIABLE, raising=False)
+        doctor.select_libllvm(folders, probe)
+        return os.environ[doctor.LIBLLVM_VARIABLE]
 
     def test_a_second_import_asks_nothing(self, tmp_path, monkeypatch):
         folders = machine(tmp_path, VERSIONS)
@@ -216,7 +218,9 @@ class TestCache:
 
     def test_a_passing_trouble_is_not_remembered(self, tmp_path, monkeypatch):
         folders = machine(tmp_path, VERSIONS)
-        self.choose(monkeypatch, folders, lambda path: doctor.Verdict(False, "busy", final=False))
+        self.choose(
+            monkeypatch, folders, lambda path: doctor.LlvmProbeResult(False, "busy", final=False)
+        )
         assert self.choose(monkeypatch, folders, FakeProbe()) == library(folders, 19)
 
 
@@ -224,7 +228,7 @@ class TestRealLibraries:
     """The libraries of this machine, in subprocesses."""
 
     def real(self, version):
-        found = [c.path for c in doctor.candidates() if c.version[:1] == (version,)]
+        found = [c.path for c in doctor.find_libraries() if c.version[:1] == (version,)]
         if not found:
             pytest.skip(f"no libLLVM {version} on this machine")
         return found[0]
@@ -241,7 +245,7 @@ class TestRealLibraries:
         assert "aborts the process" in verdict.reason
 
     def test_llvm_19_works(self):
-        assert doctor.probe_library(self.real(19)) == doctor.Verdict(True, "works")
+        assert doctor.probe_library(self.real(19)) == doctor.LlvmProbeResult(True, "works")
 
     def test_a_file_that_is_no_library_is_refused(self, tmp_path):
         file = tmp_path / "libLLVM-19.so"
@@ -259,7 +263,7 @@ class TestRealLibraries:
         )
         monkeypatch.setattr(doctor, "_run", lambda *_, **__: ended)
         verdict = doctor.probe_library("libLLVM-19.so")
-        assert verdict == doctor.Verdict(
+        assert verdict == doctor.LlvmProbeResult(
             False, "could not be tried: Dr.Jit needs libatomic.so.1", final=False
         )
 
@@ -274,7 +278,7 @@ class TestRealLibraries:
         )
         ended = subprocess.run(
             [sys.executable, "-c", kernel],
-            env=os.environ | {doctor.VARIABLE: self.real(asked)},
+            env=os.environ | {doctor.LIBLLVM_VARIABLE: self.real(asked)},
             capture_output=True,
             text=True,
             check=True,
@@ -286,23 +290,23 @@ class TestRealLibraries:
     def test_report(self, monkeypatch):
         self.real(19)
         monkeypatch.setenv(doctor.BACKEND_VARIABLE, "cpu")
-        report = doctor.report()
+        report = doctor.collect_report()
         assert report["ok"]
         assert report["fix"] is None
         assert report["backend"] == {"requested": "cpu", "in_force": "cpu", "gpu": None}
         assert report["self_test"]["rays_per_second"] > 1e5
         assert json.loads(json.dumps(report)) == report
-        text = doctor.render(report)
+        text = doctor.render_report(report)
         assert f"{report['llvm']['chosen']}  ← chosen" in text
         assert "million rays/s" in text
 
 
 def test_report_without_any_library_names_the_cure(tmp_path):
-    doctor.prepare([tmp_path], FakeProbe())
-    report = doctor.report()
+    doctor.select_libllvm([tmp_path], FakeProbe())
+    report = doctor.collect_report()
     assert not report["ok"]
     assert report["fix"] == doctor.install_command()
-    assert f"To fix it, type:  {report['fix']}" in doctor.render(report)
+    assert f"To fix it, type:  {report['fix']}" in doctor.render_report(report)
 
 
 @pytest.mark.parametrize(

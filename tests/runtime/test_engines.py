@@ -10,7 +10,7 @@ import pytest
 
 from invertwin.errors import InputError
 from invertwin.registry.section import KeyInputError
-from invertwin.runtime.engines import spread
+from invertwin.runtime.engines import run_jobs
 
 
 def squared(number: int) -> tuple[int, str, int]:
@@ -31,7 +31,7 @@ def dies(number: int) -> int:
 
 def test_every_piece_is_done_once_by_workers_of_one_thread(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    found = dict(spread(squared, [3, 4, 5, 6, 7], workers=2))
+    found = dict(run_jobs(squared, [3, 4, 5, 6, 7], workers=2))
     assert {number: row[0] for number, row in found.items()} == {0: 9, 1: 16, 2: 25, 3: 36, 4: 49}
     assert {row[1] for row in found.values()} == {"1"}
     assert os.getpid() not in {row[2] for row in found.values()}
@@ -39,17 +39,17 @@ def test_every_piece_is_done_once_by_workers_of_one_thread(monkeypatch):
 
 
 def test_no_work_starts_nobody():
-    assert list(spread(dies, [])) == []
+    assert list(run_jobs(dies, [])) == []
 
 
 def test_what_a_worker_refuses_is_told_here():
     with pytest.raises(InputError, match=r"^scene\.box: expected a box, got none$"):
-        list(spread(refused, [1, 2, 3]))
+        list(run_jobs(refused, [1, 2, 3]))
 
 
 def test_a_worker_that_dies_is_told():
     with pytest.raises(InputError, match="got one that has died"):
-        list(spread(dies, [0, 1]))
+        list(run_jobs(dies, [0, 1]))
 
 
 @pytest.mark.parametrize(
@@ -58,13 +58,13 @@ def test_a_worker_that_dies_is_told():
 )
 def test_bad_arguments_are_told(unchecked, options, said):
     with pytest.raises(InputError, match=said):
-        list(spread(squared, [1], **options))
+        list(run_jobs(squared, [1], **options))
 
 
 def test_ray_that_is_not_installed_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"pip install 'invertwin\[ray\]'"):
-        list(spread(squared, [1], engine="ray"))
+        list(run_jobs(squared, [1], engine="ray"))
 
 
 SLEEPER = """

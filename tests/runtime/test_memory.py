@@ -20,11 +20,11 @@ def test_limits_of_groups_and_processes_count(monkeypatch, tmp_path):
     (group / "memory.current").write_text("2500000000\n")
     (group / "memory.stat").write_text("anon 5\ninactive_file 400000000\n")
     names = "memory.max", "memory.current", "inactive_file"
-    assert list(memory._of_group(inner, *names)) == []
-    assert list(memory._of_group(group, *names)) == [0.9e9]
-    monkeypatch.setattr(memory, "_of_groups", lambda: iter([0.9e9]))
+    assert list(memory._group_memory(inner, *names)) == []
+    assert list(memory._group_memory(group, *names)) == [0.9e9]
+    monkeypatch.setattr(memory, "_control_group_memory", lambda: iter([0.9e9]))
     assert memory.free_memory() <= 0.9e9
-    monkeypatch.setattr(memory, "_of_process", lambda: iter([-5.0]))
+    monkeypatch.setattr(memory, "_process_memory", lambda: iter([-5.0]))
     assert memory.free_memory() == 0.0
 
 

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from invertwin.runtime.threads import available, quota
+from invertwin.runtime.threads import available_threads, cgroup_quota
 
 
 def counted(code, **environment):
@@ -21,9 +21,9 @@ def counted(code, **environment):
 
 def test_the_users_own_number_wins(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "3,2")
-    assert available() == 3
+    assert available_threads() == 3
     monkeypatch.setenv("OMP_NUM_THREADS", "many")
-    assert 1 <= available() <= (os.cpu_count() or 1)
+    assert 1 <= available_threads() <= (os.cpu_count() or 1)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_the_quota_of_control_groups_counts(tmp_path, listing, files, expected):
     for name, text in files.items():
         (tmp_path / "groups" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "groups" / name).write_text(text)
-    assert quota(tmp_path / "listing", tmp_path / "groups") == expected
+    assert cgroup_quota(tmp_path / "listing", tmp_path / "groups") == expected
 
 
 @pytest.mark.slow

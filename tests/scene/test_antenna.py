@@ -13,7 +13,7 @@ from invertwin.scene import (
     Cosine,
     Isotropic,
     Pattern,
-    Table,
+    TabulatedPattern,
     linear_array,
     planar_array,
 )
@@ -31,7 +31,7 @@ def direction(theta: float, phi: float) -> Tensor:
 
 
 def read_table(table: Tensor, directions: Tensor) -> np.ndarray:
-    """A plain reading of the grid that `Pattern.table` documents."""
+    """A plain reading of the grid that `GainPattern.table` documents."""
     rows, columns = table.shape
     values = []
     for x, y, z in directions.tolist():
@@ -47,11 +47,11 @@ def read_table(table: Tensor, directions: Tensor) -> np.ndarray:
     return np.array(values)
 
 
-def lopsided() -> Table:
+def lopsided() -> TabulatedPattern:
     """A pattern that depends on both angles, one node every 2 degrees of θ and 10 of φ."""
     theta = torch.linspace(0, math.pi / 2, 46, dtype=torch.float64)
     phi = torch.arange(36, dtype=torch.float64) * math.radians(10) - math.pi
-    return Table(theta, phi, smooth_gain(theta[:, None], phi))
+    return TabulatedPattern(theta, phi, smooth_gain(theta[:, None], phi))
 
 
 def smooth_gain(theta: Tensor, phi: Tensor) -> Tensor:
@@ -84,7 +84,9 @@ def test_table_sizes():
     assert Cosine(2.0).table().shape == (2049, 1)
     assert lopsided().table().shape == (2049, 360)
     theta = torch.tensor([0.0, 1.0], dtype=torch.float64)
-    symmetric = Table(theta, torch.zeros(1, dtype=torch.float64), torch.ones(2, 1).double())
+    symmetric = TabulatedPattern(
+        theta, torch.zeros(1, dtype=torch.float64), torch.ones(2, 1).double()
+    )
     assert symmetric.table().shape == (2049, 1)
 
 
@@ -124,7 +126,7 @@ def test_measured_pattern_follows_its_samples():
 def test_measured_pattern_given_from_zero_to_two_pi():
     pattern = lopsided()
     phi = pattern.phi + math.pi
-    shifted = Table(pattern.theta, phi, smooth_gain(pattern.theta[:, None], phi))
+    shifted = TabulatedPattern(pattern.theta, phi, smooth_gain(pattern.theta[:, None], phi))
     directions = random_directions(200)
     assert torch.allclose(shifted.gain(directions), pattern.gain(directions), atol=1e-9)
 
@@ -190,14 +192,29 @@ def one(*numbers: float) -> Tensor:
     ("make", "message"),
     [
         (lambda: Cosine(-1.0), "pattern exponent"),
-        (lambda: Table(one(0, 1), one(0), torch.ones(1, 2)), r"gains as numbers of shape \[2, 1\]"),
-        (lambda: Table(one(0, 1), one(0), -torch.ones(2, 1)), "linear power gains >= 0"),
-        (lambda: Table(one(0, 90), one(0), torch.ones(2, 1)), "theta from 0 to at most pi"),
-        (lambda: Table(one(0.1, 1), one(0), torch.ones(2, 1)), "theta from 0 to at most pi"),
-        (lambda: Table(one(1, 0), one(0), torch.ones(2, 1)), "ascending"),
-        (lambda: Table(one(0), one(0), torch.ones(1, 1)), "at least 2 ascending theta"),
-        (lambda: Table(one(0, 1), one(0, 180), torch.ones(2, 2)), "spanning less than 2 pi"),
-        (lambda: Table(one(0, 1), one(0), torch.full((2, 1), math.nan)), "finite pattern gains"),
+        (
+            lambda: TabulatedPattern(one(0, 1), one(0), torch.ones(1, 2)),
+            r"gains as numbers of shape \[2, 1\]",
+        ),
+        (lambda: TabulatedPattern(one(0, 1), one(0), -torch.ones(2, 1)), "linear power gains >= 0"),
+        (
+            lambda: TabulatedPattern(one(0, 90), one(0), torch.ones(2, 1)),
+            "theta from 0 to at most pi",
+        ),
+        (
+            lambda: TabulatedPattern(one(0.1, 1), one(0), torch.ones(2, 1)),
+            "theta from 0 to at most pi",
+        ),
+        (lambda: TabulatedPattern(one(1, 0), one(0), torch.ones(2, 1)), "ascending"),
+        (lambda: TabulatedPattern(one(0), one(0), torch.ones(1, 1)), "at least 2 ascending theta"),
+        (
+            lambda: TabulatedPattern(one(0, 1), one(0, 180), torch.ones(2, 2)),
+            "spanning less than 2 pi",
+        ),
+        (
+            lambda: TabulatedPattern(one(0, 1), one(0), torch.full((2, 1), math.nan)),
+            "finite pattern gains",
+        ),
         (lambda: AntennaArray(torch.zeros(0, 3)), "at least one antenna element"),
         (lambda: AntennaArray(torch.zeros(4, 2)), r"element positions as numbers of shape"),
         (lambda: AntennaArray(one(0, 0, 0)[None] / 0), "finite element positions"),

@@ -206,7 +206,7 @@ def test_material_values_cannot_leave_their_range():
         for name in ("permittivity", "conductivity", "diffuse", "lobe_width"):
             value = float(torch.as_tensor(getattr(material, name)).detach())
             assert RANGES[name].low <= value <= RANGES[name].high
-        amplitude = material.surface(77e9).amplitude
+        amplitude = material.scattering_law(77e9).amplitude
         assert bool(((amplitude >= 0) & (amplitude <= 1)).all())
         gradients = torch.autograd.grad(amplitude.sum(), [*module.parameters()], allow_unused=True)
         assert all(g is None or bool(g.isfinite()) for g in gradients)
@@ -257,7 +257,7 @@ def test_every_value_of_a_slab_can_be_fitted():
     assert isinstance(material, Slab)
     for name, value in SLAB.items():
         assert float(getattr(material, name).detach()) == pytest.approx(value, rel=1e-12)
-    surface = material.surface(77e9)
+    surface = material.scattering_law(77e9)
     # The exponent of a lobe tells about the slope, the weights about the rest.
     parts = (surface.amplitude, surface.transmittance, surface.extra_length, surface.lobes.square())
     torch.stack([part[1:].sum() for part in parts]).sum().backward()
@@ -281,7 +281,7 @@ def test_values_per_triangle_and_textures_can_be_fitted():
     assert torch.allclose(material.diffuse.image, pixels)
     assert torch.allclose(module.values()["wall.permittivity"], start)
     assert torch.allclose(module.values()["wall.diffuse"], pixels)
-    surface = material.surface(77e9)
+    surface = material.scattering_law(77e9)
     (surface.amplitude.sum() + surface.diffuse.square().sum()).backward()
     for name, shape in (("permittivity", (2,)), ("diffuse", (2, 2))):
         gradient = module.raw[name].grad
@@ -299,7 +299,7 @@ def test_values_of_one_layer_can_be_fitted():
     assert material.layers[0] == stack.layers[0]
     assert material.layers[1].permittivity == Itu("glass")
     assert float(module.values()["wall.layers[1].thickness"]) == pytest.approx(5e-3)
-    material.surface(77e9).transmittance.sum().backward()
+    material.scattering_law(77e9).transmittance.sum().backward()
     assert float(module.raw["thickness"].grad) != 0
     with pytest.raises(InputError, match="a layer below 2 of 'wall', got 2"):
         MaterialValues("wall", layer=2, thickness=5e-3)(board)

@@ -8,7 +8,7 @@ import torch
 from invertwin.errors import InputError
 from invertwin.radar.boards import Mounting, board
 from invertwin.scene import JonesTable, linear_array
-from invertwin.scene.polarisation import Polarisation, jones_basis, orthogonal
+from invertwin.scene.polarisation import Polarisation, jones_basis, orthogonal_vectors
 from scenes import float64
 
 RIGHT = torch.tensor([1, 1j], dtype=torch.complex128) / math.sqrt(2)
@@ -54,8 +54,8 @@ def test_a_table_is_bilinear_and_periodic():
     half = math.sqrt(0.5)
     expected = torch.tensor([[1, 0], [0, 1], [half, half], [half, half]])
     assert torch.allclose(table.vector(directions).real, expected.double())
-    both = Polarisation.of(table, 0.5, 1).towards(directions)
-    assert torch.allclose(both[:, 1], orthogonal(both[:, 0]))
+    both = Polarisation.from_jones(table, 0.5, 1).evaluate(directions)
+    assert torch.allclose(both[:, 1], orthogonal_vectors(both[:, 0]))
     up = float64([[0.0, 0.0, 1.0], [0.1, 0.2, 0.9]]).requires_grad_()
     (slope,) = torch.autograd.grad(table.vector(up).real.sum(), up)
     assert bool(torch.isfinite(slope).all())

@@ -7,7 +7,7 @@ from invertwin.errors import InputError
 from invertwin.inversion import compare_shapes
 from invertwin.inversion.metrics import is_watertight
 from invertwin.scene import Mesh, box, plate, signed_distance, sphere, text
-from invertwin.scene.remeshing import closest_points, remeshed
+from invertwin.scene.remeshing import closest_points, remesh
 from scenes import float64
 
 
@@ -42,7 +42,7 @@ def area(mesh: Mesh) -> float:
     ids=["finer", "coarser", "letter", "letter with a hole", "box"],
 )
 def test_edges_are_even_and_the_surface_stays(mesh, edge):
-    found = remeshed(mesh, edge)
+    found = remesh(mesh, edge)
     assert is_watertight(found)
     assert euler(found) == euler(mesh)
     assert float(lengths(found).mean()) == pytest.approx(edge, rel=0.1)
@@ -55,14 +55,14 @@ def test_edges_are_even_and_the_surface_stays(mesh, edge):
 def test_a_stretched_mesh_gets_even_again():
     ball = sphere(0.2, 3)
     long = Mesh(ball.vertices * float64([3.0, 1.0, 0.5]), ball.faces)
-    found = remeshed(long, 0.03)
+    found = remesh(long, 0.03)
     assert float(lengths(long).max() / lengths(long).min()) > 4
     assert float(lengths(found).std() / lengths(found).mean()) < 0.2
     assert volume(found) == pytest.approx(volume(long), rel=0.02)
 
 
 def test_borders_stay():
-    found = remeshed(plate(0.5, 0.4, divisions=2), 0.04)
+    found = remesh(plate(0.5, 0.4, divisions=2), 0.04)
     assert area(found) == pytest.approx(0.2, rel=1e-9)
     assert float(lengths(found).max()) < 0.07
     assert float(found.vertices[:, 2].abs().max()) < 1e-12
@@ -71,7 +71,7 @@ def test_borders_stay():
 def test_derivatives_end_and_the_mesh_given_is_not_touched():
     ball = sphere(0.2, 2)
     places = ball.vertices.clone().requires_grad_()
-    found = remeshed(Mesh(places, ball.faces), 0.05)
+    found = remesh(Mesh(places, ball.faces), 0.05)
     assert not found.vertices.requires_grad
     assert torch.equal(places.detach(), ball.vertices)
 
@@ -79,14 +79,14 @@ def test_derivatives_end_and_the_mesh_given_is_not_touched():
 @pytest.mark.parametrize("edge", [0.0, -1.0, float("nan")])
 def test_a_length_that_is_none(edge):
     with pytest.raises(InputError, match="edge length"):
-        remeshed(sphere(0.2, 1), edge)
+        remesh(sphere(0.2, 1), edge)
 
 
 @pytest.mark.parametrize("face", [[0, 0, 1], [0, 1, 2]])
 def test_a_surface_without_area(face):
     line = Mesh(float64([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]), torch.tensor([face]))
     with pytest.raises(InputError, match="expected a surface with area"):
-        remeshed(line, 0.05)
+        remesh(line, 0.05)
 
 
 def test_no_points_have_no_distances():

@@ -60,29 +60,29 @@ def test_vertices_are_differentiable_in_mesh_and_pose():
 
 def test_rigid_motion_is_in_world_axes():
     item = Object(PLATE, METAL, pose=placed(), velocity=vector(0.0, 0.0, -10.0))
-    moved = item.at(0.1)
+    moved = item.advance(0.1)
     assert torch.allclose(moved.vertices, item.vertices + vector(0.0, 0.0, -1.0))
     assert torch.equal(moved.mesh.vertices, PLATE.vertices)
-    assert torch.equal(item.at(0.0).vertices, item.vertices)
+    assert torch.equal(item.advance(0.0).vertices, item.vertices)
 
 
 def test_vertex_motion_is_in_world_axes():
     velocity = torch.arange(12, dtype=torch.float64).reshape(4, 3)
     item = Object(PLATE, METAL, pose=placed(), velocity=velocity)
-    assert torch.allclose(item.at(0.5).vertices, item.vertices + 0.5 * velocity)
-    assert item.at(0.5).velocity is None
+    assert torch.allclose(item.advance(0.5).vertices, item.vertices + 0.5 * velocity)
+    assert item.advance(0.5).velocity is None
 
 
 def test_motion_is_differentiable():
     velocity = vector(1.0, 0.0, 0.0).requires_grad_()
-    Object(PLATE, METAL, velocity=velocity).at(2.0).vertices.sum().backward()
+    Object(PLATE, METAL, velocity=velocity).advance(2.0).vertices.sum().backward()
     assert velocity.grad is not None
     assert velocity.grad.tolist() == [8.0, 8.0, 8.0]
 
 
 def test_resting_object_stays_itself():
     item = Object(PLATE, METAL)
-    assert item.at(7.0) is item
+    assert item.advance(7.0) is item
 
 
 def scene() -> Scene:
@@ -100,7 +100,7 @@ def test_scene_keeps_names_in_order():
 
 
 def test_scene_moves_what_moves():
-    before, after = scene(), scene().at(1.5)
+    before, after = scene(), scene().advance(1.5)
     assert torch.equal(after["wall"].vertices, before["wall"].vertices)
     assert torch.allclose(after["door"].vertices, before["door"].vertices + vector(1.5, 0.0, 0.0))
 
@@ -151,7 +151,7 @@ def test_scene_can_be_copied_and_pickled():
         (lambda: Object(PLATE, METAL, velocity=vector(1, 2)), r"velocity \[m/s\] as numbers"),
         (lambda: Object(PLATE, METAL, velocity=torch.zeros(3, 3)), r"shape \[4, 3\], got shape"),
         (lambda: Object(PLATE, METAL, velocity="fast"), "velocity"),  # pyright: ignore[reportArgumentType]
-        (lambda: Object(PLATE, METAL).at(math.nan), "time"),
+        (lambda: Object(PLATE, METAL).advance(math.nan), "time"),
         (lambda: Scene({}), "at least one named object, got none"),
         (lambda: Scene([Object(PLATE, METAL)]), "at least one named object, got list"),  # pyright: ignore[reportArgumentType]
         (lambda: Scene({"": Object(PLATE, METAL)}), "names that are not empty.*, got ''"),
@@ -169,7 +169,7 @@ def test_bad_scenes_are_refused_in_one_line(make, message):
 
 
 def test_many_objects_are_placed_as_each_by_itself():
-    from invertwin.scene.scene import placed
+    from invertwin.scene.scene import transform_vertices
 
     turn = rotation_from_vector(vector(0.1, 0.2, 0.3)).requires_grad_()
     poses = [rigid(turn, vector(k, 1.0, 2.0)) for k in range(3)]
@@ -180,7 +180,7 @@ def test_many_objects_are_placed_as_each_by_itself():
         Object(plate(1.0, 1.0, divisions=3), METAL, poses[1]),
         Object(bent, METAL, poses[2]),
     ]
-    found = placed(objects)
+    found = transform_vertices(objects)
     slopes = []
     for vertices in (found, [item.vertices for item in objects]):
         total = sum((k + 1) * v.square().sum() for k, v in enumerate(vertices))
@@ -192,7 +192,7 @@ def test_many_objects_are_placed_as_each_by_itself():
 
 def test_scenes_of_mirrors_get_a_warning():
     from invertwin.scene import Dielectric, RoughConductor, Slab
-    from invertwin.scene.scene import warn_of_mirrors
+    from invertwin.scene.scene import warn_if_purely_specular
 
     wall = plate(1.0, 1.0)
     for material in (
@@ -200,11 +200,11 @@ def test_scenes_of_mirrors_get_a_warning():
         RoughDielectric(4.0, diffuse=0.0, lobe_width=0.1),
     ):
         with pytest.warns(PhysicsWarning, match="no surface scatters"):
-            warn_of_mirrors(Scene({"wall": Object(wall, material)}), 77e9)
+            warn_if_purely_specular(Scene({"wall": Object(wall, material)}), 77e9)
     for material in (RoughConductor(), Dielectric(4.0), RoughDielectric(4.0), PerfectConductor()):
-        warn_of_mirrors(Scene({"wall": Object(wall, material)}), 77e9)
+        warn_if_purely_specular(Scene({"wall": Object(wall, material)}), 77e9)
     pair = {
         "glass": Object(wall, Slab(6.0, thickness=0.01)),
         "wall": Object(wall, RoughConductor()),
     }
-    warn_of_mirrors(Scene(pair), 77e9)
+    warn_if_purely_specular(Scene(pair), 77e9)

@@ -13,7 +13,7 @@ import xarray as xr
 from invertwin.capture import Capture
 from invertwin.capture.readers import described_arrays
 from invertwin.errors import InputError
-from invertwin.storage.isolated_reader import read_apart
+from invertwin.storage.isolated_reader import read_isolated
 
 DESCRIPTION = """
 [data]
@@ -60,7 +60,7 @@ FILES: list[tuple[str, Literal["netcdf", "hdf5", "matlab"]]] = [
 def test_a_child_process_hands_over_every_bit(tmp_path, name, kind):
     stored(tmp_path)
     apart, here = (
-        read_apart(tmp_path / name, kind, "adc", trusted=trusted) for trusted in (False, True)
+        read_isolated(tmp_path / name, kind, "adc", trusted=trusted) for trusted in (False, True)
     )
     assert list(apart.arrays) == list(here.arrays)
     assert repr(apart.attributes) == repr(here.attributes)
@@ -80,13 +80,13 @@ def test_a_variable_that_is_missing_is_a_key_error(tmp_path):
     for name, kind in FILES[1:]:
         for trusted in (False, True):
             with pytest.raises(KeyError, match="power"):
-                read_apart(tmp_path / name, kind, "power", trusted=trusted)
+                read_isolated(tmp_path / name, kind, "power", trusted=trusted)
 
 
 def test_objects_are_not_handed_over(tmp_path):
     scipy.io.savemat(tmp_path / "a.mat", {"adc": np.array([1, "a"], dtype=object)})
     with pytest.raises(InputError, match=r"refuses .*adc holds objects"):
-        read_apart(tmp_path / "a.mat", "matlab", "adc")
+        read_isolated(tmp_path / "a.mat", "matlab", "adc")
 
 
 def test_modules_beside_the_file_are_not_imported(tmp_path, monkeypatch):
@@ -94,7 +94,7 @@ def test_modules_beside_the_file_are_not_imported(tmp_path, monkeypatch):
     stored(tmp_path)
     (tmp_path / "h5py.py").write_text("open('imported', 'w')")
     monkeypatch.chdir(tmp_path)
-    assert read_apart(tmp_path / "a.h5", "hdf5", "adc").arrays["adc"].values.shape == (2, 3)
+    assert read_isolated(tmp_path / "a.h5", "hdf5", "adc").arrays["adc"].values.shape == (2, 3)
     assert not (tmp_path / "imported").exists()
 
 

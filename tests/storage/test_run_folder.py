@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.run_file import to_toml, validate
+from invertwin.cli.schema.run_file import to_toml, validate_run
 from invertwin.errors import InputError
 from invertwin.storage.folders import LOCK, MANIFEST, UNFINISHED
-from invertwin.storage.run_folder import open_run, plain
+from invertwin.storage.run_folder import open_run, to_json_value
 
 
 def make_run(**changes) -> RunFile:
@@ -38,7 +38,7 @@ def make_run(**changes) -> RunFile:
             "orientation": {"look_at": [0, 0, 2.5]},
         },
     }
-    return validate(raw | changes, Path("run.toml"))
+    return validate_run(raw | changes, Path("run.toml"))
 
 
 def broken_run(path, error, files, **flags):
@@ -59,7 +59,7 @@ def whole_run(path, files, at_the_end=lambda: None, **flags):
 
 def test_run_file_as_used_reads_back_equal():
     run = make_run(seed=7)
-    assert validate(tomllib.loads(to_toml(run)), Path("elsewhere/run.toml")) == run
+    assert validate_run(tomllib.loads(to_toml(run)), Path("elsewhere/run.toml")) == run
 
 
 def test_a_complete_folder_is_refused_without_a_flag(tmp_path):
@@ -299,7 +299,7 @@ def test_several_run_files_are_kept_by_stem(tmp_path):
 
 def test_metrics_are_plain_json(tmp_path):
     value = {"a": np.float64(1.5), "b": [np.int64(2), float("nan")], "c": np.eye(2), "d": tmp_path}
-    assert plain(value) == {
+    assert to_json_value(value) == {
         "a": 1.5,
         "b": [2, None],
         "c": [[1.0, 0.0], [0.0, 1.0]],

@@ -14,7 +14,7 @@ from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import load_run
 from invertwin.errors import InputError
 from invertwin.scene.files import load_mesh, load_scene_xml
-from invertwin.storage.untrusted import read_arrays, read_npy, reader, reading
+from invertwin.storage.untrusted import convert_read_errors, read_arrays, read_npy, safe_reader
 
 DESCRIPTION = """
 [data]
@@ -92,7 +92,7 @@ def test_headers_that_lie_are_refused_before_memory_is_asked_for(tmp_path):
 
 
 def test_all_of_a_reader_is_wrapped():
-    @reader("a mesh", "export it")
+    @safe_reader("a mesh", "export it")
     def read(path, number=0):
         return 1 / number
 
@@ -103,7 +103,7 @@ def test_all_of_a_reader_is_wrapped():
 
 
 def test_warnings_that_are_errors_stay_warnings():
-    with pytest.raises(UserWarning, match="as it was"), reading("a.ply", "a mesh"):
+    with pytest.raises(UserWarning, match="as it was"), convert_read_errors("a.ply", "a mesh"):
         raise UserWarning("as it was")
 
 
@@ -131,7 +131,7 @@ def test_values_of_another_kind_are_one_line(tmp_path, name, text, read):
 
 def test_errors_of_readers_name_the_file_and_pass_input_errors_on():
     told = r"expected a mesh, got a\.ply \(ValueError: x y\)"
-    with pytest.raises(InputError, match=told), reading("a.ply", "a mesh"):
+    with pytest.raises(InputError, match=told), convert_read_errors("a.ply", "a mesh"):
         raise ValueError("x\ny")
-    with pytest.raises(InputError, match=r"^as it was$"), reading("a.ply", "a mesh"):
+    with pytest.raises(InputError, match=r"^as it was$"), convert_read_errors("a.ply", "a mesh"):
         raise InputError("as it was")

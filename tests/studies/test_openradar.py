@@ -88,13 +88,13 @@ def test_the_recording_has_movers_near_three_metres(data_folder):
     nearest = data.settings.waveform.range_resolution
     ranges = torch.arange(128) * nearest
     assert 2.8 < float(ranges[profile.argmax()]) < 3.2
-    capture = data.recorded(Mounting("xWR1642")).capture(0)
+    capture = data.to_chirp_capture(Mounting("xWR1642")).to_capture(0)
     assert capture.radar().waveform.center_frequency == pytest.approx(78.956e9, rel=1e-4)
 
 
 def test_the_channels_of_the_mover_are_a_plane_wave(data_folder):
     data = read_chirps(data_folder / "openradar")
-    radar = data.recorded(Mounting("xWR1642")).radar()
+    radar = data.to_chirp_capture(Mounting("xWR1642")).radar()
     moving = (data.beat - data.beat.mean(1, keepdim=True)).to(torch.complex128)
     spectrum = range_doppler(moving, radar, radar.grid(2.5, 3.5), data.settings.chirps)
     spectrum = compensate_tdm(spectrum, radar, data.settings.chirps)[0]

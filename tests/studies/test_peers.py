@@ -5,7 +5,7 @@ import torch
 
 from invertwin.channel import Sampling, deposit_power, draw_speckle, trace_power
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import FMCW, Radar
 from invertwin.radar.surrogate.surrogate import Surrogate
@@ -93,7 +93,7 @@ def test_edge_sampling_lacks_the_delay_and_nothing_else(radar, grid, turn, least
         ALONG,
         scene=given,
         sensor=radar,
-        check=Check(repeats=1, difference_samples=400_000, max_pairs=4),
+        settings=GradcheckSettings(repeats=1, difference_samples=400_000, max_pairs=4),
     )
     found = edge_sampling_derivative(
         given, radar, grid, slide, surrogate=SURROGATE, samples=50_000, edge_samples=100_000, seed=1

@@ -134,7 +134,7 @@ def test_a_measured_pass_is_centred_beyond_its_unambiguous_range(data_folder):
         step = SPEED_OF_LIGHT / 2 / max_range
         sweep = SteppedFrequency(3.1e9, step, int(1.7e9 / step), 1e-6)
         radar = replace(capture.radar(), waveform=sweep)
-        radar = radar.centered(center) if centered else radar
+        radar = radar.center_on(center) if centered else radar
         shown = capture.ranges[:, None] * sweep.frequencies
         response = capture.range_profile.to(torch.complex128) @ torch.exp(
             -4j * torch.pi * shown / SPEED_OF_LIGHT

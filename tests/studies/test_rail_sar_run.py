@@ -5,7 +5,7 @@ import torch
 
 from cli.small import call, read_metrics
 from invertwin.capture import Capture, calibrate, locate
-from invertwin.capture.readers.radar_fields import labelled
+from invertwin.capture.readers.radar_fields import to_data_array
 from invertwin_studies.recordings import rail_sar
 
 
@@ -42,8 +42,10 @@ def test_an_offset_across_the_rail_is_what_calibration_cannot_see(data_folder):
     out = torch.tensor([0.25, 0.0, 0.0], dtype=torch.float64)
     moved = Capture(
         capture.dataset.assign(
-            position=labelled(("frame", "axis"), capture.radar().positions + out, "m"),
-            track_position=labelled(("track_time", "axis"), capture.track.positions + out, "m"),
+            position=to_data_array(("frame", "axis"), capture.radar().positions + out, "m"),
+            track_position=to_data_array(
+                ("track_time", "axis"), capture.track.positions + out, "m"
+            ),
         )
     )
     for _ in range(3):  # the search reaches 0.1 m at a time

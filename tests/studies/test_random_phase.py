@@ -157,7 +157,7 @@ def test_of_a_scene():
     assert first.shape == (1, *grid.shape)
     assert torch.allclose(first, again, rtol=1e-5)
     assert (first - other).norm() > 0.3 * first.norm()
-    interior = model.sampled_by(boundary_samples=0, boundary=False)
+    interior = model.with_sampling(boundary_samples=0, boundary=False)
     still = interior.predict(move(occluder()), radar, 2)
     assert torch.allclose(first, still, rtol=1e-5)
     slopes = [torch.autograd.grad(m.sum(), move.translation)[0] for m in (first, still)]
@@ -167,13 +167,13 @@ def test_of_a_scene():
 def test_its_width_is_taken_away(view):
     radar, grid = view
     model = RandomPhaseMap(grid, Surrogate("gaussian", "airy", range_width=2.0), Sampling(depth=1))
-    assert model.widened
-    assert model.narrowed(0.5).surrogate.range_width == 1.0
-    assert not model.narrowed(0.0).widened
+    assert model.has_blur
+    assert model.scale_blur(0.5).surrogate.range_width == 1.0
+    assert not model.scale_blur(0.0).has_blur
     one = torch.zeros(1, *grid.shape)
     one[:, grid.range_count // 2] = 1.0
     torch.testing.assert_close(
-        model.blurred(one, radar), Surrogate(range_width=2.0).blur(one, radar, grid)
+        model.blur_observed(one, radar), Surrogate(range_width=2.0).blur(one, radar, grid)
     )
 
 

@@ -11,7 +11,16 @@ from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import Object, RoughDielectric, Scene, box, planar_array, plate, rigid
-from invertwin.viewer import Body, Display, Link, Maps, Step, body_of, display_of, ellipsoid_layers
+from invertwin.viewer import (
+    Display,
+    DisplayMaps,
+    DisplayMesh,
+    DisplayStep,
+    InteractiveSensor,
+    build_display,
+    display_mesh,
+    ellipsoid_layers,
+)
 
 GRID = Grid(1.0, 0.05, 60, -0.5, 0.05, 21)
 
@@ -31,14 +40,18 @@ def radar() -> Radar:
 
 
 def display() -> Display:
-    made = display_of(scene(), {"": (radar(), GRID)}, "title", truth=scene(), fitted=["a/cube"])
-    body = body_of(scene()["a/cube"])
+    made = build_display(scene(), {"": (radar(), GRID)}, "title", truth=scene(), fitted=["a/cube"])
+    body = display_mesh(scene()["a/cube"])
     steps = [
-        Step(k, f"step {k}", {"a/cube": Body(body.vertices + np.float32(k), body.faces)})
+        DisplayStep(
+            k, f"step {k}", {"a/cube": DisplayMesh(body.vertices + np.float32(k), body.faces)}
+        )
         for k in range(3)
     ]
     power = torch.rand(2, 60, 21, 1, generator=torch.Generator().manual_seed(1))
-    return replace(made, steps=steps, maps={"": Maps.of({"measured": power}, GRID)})
+    return replace(
+        made, steps=steps, maps={"": DisplayMaps.from_spectra({"measured": power}, GRID)}
+    )
 
 
 def test_layers_are_where_things_are():
@@ -55,7 +68,7 @@ def test_layers_are_where_things_are():
 def test_a_step_moves_its_layer_alone():
     made = display()
     before = {layer.name: layer.points for layer in made.layers}
-    after = {layer.name: layer.points for layer in made.at_step(made.steps[2]).layers}
+    after = {layer.name: layer.points for layer in made.show_step(made.steps[2]).layers}
     moved = [name for name in before if not np.array_equal(before[name], after[name])]
     assert moved == ["twin/a/cube"]
     assert after["twin/a/cube"] - before["twin/a/cube"] == pytest.approx(2.0, abs=1e-6)
@@ -72,7 +85,9 @@ def test_a_file_holds_everything_and_triangles_once(tmp_path):
     assert [step.label for step in read.steps] == ["step 0", "step 1", "step 2"]
     one, other = (x.steps[1].bodies["a/cube"].vertices for x in (read, made))
     assert np.array_equal(one, other)
-    assert np.array_equal(read.maps[""].at(1)["measured"], made.maps[""].at(1)["measured"])
+    assert np.array_equal(
+        read.maps[""].maps_of_frame(1)["measured"], made.maps[""].maps_of_frame(1)["measured"]
+    )
     assert (read.title, read.up, read.ahead) == (made.title, made.up, made.ahead)
     names = np.load(tmp_path / "view.npz").files
     assert len(names) < 1 + 2 * len(made.layers) + 2 * len(made.steps)
@@ -105,11 +120,11 @@ def test_damaged_files_are_refused(tmp_path):
 
 def test_many_frames_are_thinned_out_evenly():
     power = torch.zeros(300, 200, 101, 1)
-    maps = Maps.of({"measured": power}, Grid(0.0, 0.1, 200, -1.0, 0.02, 101))
+    maps = DisplayMaps.from_spectra({"measured": power}, Grid(0.0, 0.1, 200, -1.0, 0.02, 101))
     assert maps.frames[0] == 0
     assert maps.frames[-1] == 299
     assert len(maps.frames) == 2_000_000 // (200 * 101)
-    assert maps.at(1) == {} or 1 in maps.frames
+    assert maps.maps_of_frame(1) == {} or 1 in maps.frames
 
 
 def test_ellipsoids_hold_95_percent():
@@ -130,19 +145,21 @@ def test_ellipsoids_hold_95_percent():
 
 
 def test_a_link_says_what_feeds_a_bin_and_follows():
-    link = Link(scene(), radar(), GRID)
-    before = link.map(link.scene, 0)
-    moved = link.moved("a/cube", rigid(translation=torch.tensor([0.0, 0.0, 0.25]).double()))
-    after = link.map(moved, 0)
+    link = InteractiveSensor(scene(), radar(), GRID)
+    before = link.predict_map(link.scene, 0)
+    moved = link.move_object("a/cube", rigid(translation=torch.tensor([0.0, 0.0, 0.25]).double()))
+    after = link.predict_map(moved, 0)
     near = 1.0 + 0.05 * int(before.amax(1)[:28].argmax())
     assert near == pytest.approx(1.8, abs=0.06)
     assert 1.0 + 0.05 * int(after.amax(1)[:32].argmax()) == pytest.approx(2.05, abs=0.06)
-    seen = link.seen(link.scene, 0)
+    seen = link.sample_paths(link.scene, 0)
     row, column = 17, round((0.1 / math.hypot(0.1, 1.8) + 0.5) / 0.05)
-    fed = seen.feeding(row, column)
+    fed = seen.points_in_bin(row, column)
     assert len(fed) > 5
     assert float((fed.norm(dim=1) - GRID.ranges[row]).abs().max()) <= 0.051
     assert len(seen.edges) > 50
-    body = body_of(moved["a/cube"])
-    link.take({"a/cube": body})
-    assert link.map(link.scene, 0) == pytest.approx(after, rel=0.05, abs=float(after.max()) * 0.05)
+    body = display_mesh(moved["a/cube"])
+    link.replace_meshes({"a/cube": body})
+    assert link.predict_map(link.scene, 0) == pytest.approx(
+        after, rel=0.05, abs=float(after.max()) * 0.05
+    )

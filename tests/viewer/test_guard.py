@@ -11,7 +11,7 @@ import torch
 
 from invertwin.errors import InputError
 from invertwin.scene import Object, RoughDielectric, Scene, box, rigid
-from invertwin.viewer import Guard, Viewer, display_of
+from invertwin.viewer import AccessGuard, Viewer, build_display
 
 TOKEN = "a-token_of-16-and-more"
 NEEDS_VISER = pytest.mark.skipif(
@@ -50,23 +50,23 @@ def cube() -> Scene:
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
 def test_a_host_that_others_reach_needs_a_token(host):
     with pytest.raises(InputError, match="expected a token for the host"):
-        Guard(host)
-    Guard(host, TOKEN)
+        AccessGuard(host)
+    AccessGuard(host, TOKEN)
 
 
 @pytest.mark.parametrize("token", ["short", "with a space in it, and long"])
 def test_a_token_that_can_be_guessed_or_breaks_the_address_is_refused(token):
     with pytest.raises(InputError, match="at least 16 letters, digits"):
-        Guard("127.0.0.1", token)
+        AccessGuard("127.0.0.1", token)
 
 
 def test_a_host_of_another_machine_is_refused():
     with pytest.raises(InputError, match="address of this machine"):
-        Guard("192.0.2.1", TOKEN)
+        AccessGuard("192.0.2.1", TOKEN)
 
 
 def test_loopback_admits_its_own_names_and_pages_alone():
-    guard = Guard("127.0.0.1")
+    guard = AccessGuard("127.0.0.1")
     assert guard.admits("/", headers(Host="127.0.0.1:8080"), 8080)
     assert guard.admits("/", headers(Host="localhost:8080", Origin="http://localhost:8080"), 8080)
     assert not guard.admits("/", headers(Host="rebound.example:8080"), 8080)
@@ -76,7 +76,7 @@ def test_loopback_admits_its_own_names_and_pages_alone():
 
 
 def test_the_token_is_asked_for_in_address_or_cookie():
-    guard = Guard("0.0.0.0", TOKEN)
+    guard = AccessGuard("0.0.0.0", TOKEN)
     host = {"Host": "192.0.2.1:8080"}
     assert guard.admits(f"/?token={TOKEN}", headers(**host), 8080)
     assert guard.admits("/", headers(**host, Cookie=f"invertwin_8080={TOKEN}"), 8080)
@@ -88,7 +88,7 @@ def test_the_token_is_asked_for_in_address_or_cookie():
 
 @NEEDS_VISER
 def test_a_wrong_token_gets_403_and_the_right_one_a_cookie():
-    with Viewer(display_of(cube(), {}, "cube"), port=0, token=TOKEN) as viewer:
+    with Viewer(build_display(cube(), {}, "cube"), port=0, token=TOKEN) as viewer:
         assert viewer.address.endswith(f"/?token={TOKEN}")
         assert answered(viewer).status == 403
         assert answered(viewer, "/?token=another-token-of-16").status == 403
@@ -105,13 +105,13 @@ def test_a_wrong_token_gets_403_and_the_right_one_a_cookie():
 
 @NEEDS_VISER
 def test_the_address_for_others_names_this_machine():
-    with Viewer(display_of(cube(), {}, "cube"), host="0.0.0.0", port=0, token=TOKEN) as viewer:
+    with Viewer(build_display(cube(), {}, "cube"), host="0.0.0.0", port=0, token=TOKEN) as viewer:
         assert viewer.address.startswith(f"http://{socket.gethostname()}:")
 
 
 @NEEDS_VISER
 def test_two_viewers_at_once():
-    first, second = (display_of(cube(), {}, name) for name in ("one", "two"))
+    first, second = (build_display(cube(), {}, name) for name in ("one", "two"))
     with Viewer(first, port=0) as one, Viewer(second, port=0) as two:
         assert one.address != two.address
         assert [answered(one).status, answered(two).status] == [200, 200]
@@ -121,6 +121,6 @@ def test_two_viewers_at_once():
 
 @NEEDS_VISER
 def test_files_beside_the_page_are_not_served():
-    with Viewer(display_of(cube(), {}, "cube"), port=0) as viewer:
+    with Viewer(build_display(cube(), {}, "cube"), port=0) as viewer:
         assert answered(viewer, "/../../__init__.py").status == 404
         assert answered(viewer, "/%2e%2e/%2e%2e/__init__.py").status == 404

@@ -12,7 +12,7 @@ import torch
 from invertwin import Observation, Schedule, SurrogateMap, reconstruct, simulate
 from invertwin.capture import Capture
 from invertwin.channel import Sampling
-from invertwin.inversion import Checkpoint, Report, watched
+from invertwin.inversion import Checkpoint, Report, report_progress
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import Object, RoughDielectric, Scene, Translation, box, planar_array, rigid
 from invertwin.viewer.notebook import PAGES, register_formatters, show
@@ -124,7 +124,7 @@ def test_a_fit_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, capsys):
             if self.count == 3:
                 signal.raise_signal(signal.SIGINT)
 
-    with pytest.raises(KeyboardInterrupt), watched("fit", 6) as shown:
+    with pytest.raises(KeyboardInterrupt), report_progress("fit", 6) as shown:
         fit(tmp_path / "b", [Report(Stop()), *shown])
     assert "fit: step 3 of 6" in capsys.readouterr().out
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -11,7 +11,16 @@ import pytest
 import torch
 
 from invertwin.channel import Grid
-from invertwin.viewer import Body, Display, Layer, Maps, Step, page_html, policy, view_html
+from invertwin.viewer import (
+    Display,
+    DisplayLayer,
+    DisplayMaps,
+    DisplayMesh,
+    DisplayStep,
+    content_security_policy,
+    page_html,
+    view_html,
+)
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
 
@@ -22,12 +31,14 @@ def display() -> Display:
     power[0, 2, 3], power[0, 0, 1] = 1.0, 0.01
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     faces = np.array([[0, 1, 2]], np.int32)
-    steps = [Step(k, f"{EVIL} {k}", {EVIL: Body(points + k, faces)}) for k in range(5)]
+    steps = [
+        DisplayStep(k, f"{EVIL} {k}", {EVIL: DisplayMesh(points + k, faces)}) for k in range(5)
+    ]
     return Display(
         EVIL,
-        [Layer(f"twin/{EVIL}", "surface", points, faces)],
+        [DisplayLayer(f"twin/{EVIL}", "surface", points, faces)],
         steps,
-        maps={EVIL: Maps.of({"measured": power}, grid)},
+        maps={EVIL: DisplayMaps.from_spectra({"measured": power}, grid)},
     )
 
 
@@ -45,8 +56,8 @@ def test_the_policy_admits_our_script_alone():
     page = page_html(display())
     script = re.findall(r"<script>(.*?)</script>", page, re.S)[-1]
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    assert f"script-src 'sha256-{digest}'" in policy()
-    assert policy() in page
+    assert f"script-src 'sha256-{digest}'" in content_security_policy()
+    assert content_security_policy() in page
     assert "default-src 'none'" in page
     assert "http://" not in page
     assert "https://" not in page
@@ -78,7 +89,9 @@ def test_maps_are_bytes_of_decibels_below_the_peak():
 def test_large_steps_are_thinned_out():
     made = display()
     points = np.random.default_rng(1).random((60_000, 3), np.float32)
-    steps = [Step(k, str(k), {EVIL: Body(points, made.layers[0].faces)}) for k in range(20)]
+    steps = [
+        DisplayStep(k, str(k), {EVIL: DisplayMesh(points, made.layers[0].faces)}) for k in range(20)
+    ]
     large = view_html(replace(made, steps=steps))
     labels = re.findall(r'"label": "(\d+)"', large)
     assert labels == ["0", "19"]

@@ -9,14 +9,21 @@ import torch
 from invertwin.channel import Grid
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import Object, RoughDielectric, Scene, planar_array, rigid, sphere
-from invertwin.viewer import Body, Link, Maps, Step, body_of, display_of
-from invertwin.viewer.sensor_maps import SensorMaps, sensor_maps
+from invertwin.viewer import (
+    DisplayMaps,
+    DisplayMesh,
+    DisplayStep,
+    InteractiveSensor,
+    build_display,
+    display_mesh,
+)
+from invertwin.viewer.sensor_maps import SensorMaps, collect_sensor_maps
 
 GRID = Grid(1.0, 0.05, 40, -0.5, 0.05, 21)
 FINE = Grid(1.0, 0.01, 200, -0.5, 0.05, 21)
 
 
-def links() -> dict[str, Link]:
+def links() -> dict[str, InteractiveSensor]:
     """One sensor at the origin, and one of a single position 0.4 m to the right."""
     ball = Object(sphere(0.2, 3), RoughDielectric(4.0), rigid(translation=[0.0, 0.0, 1.8]))
     array = planar_array((16, 1), (1.9e-3, 1.9e-3))
@@ -26,7 +33,7 @@ def links() -> dict[str, Link]:
     for name, grid, x in (("a", GRID, 0.0), ("b", FINE, 0.4)):
         places = torch.tensor([[x, 0.0, 0.0]], dtype=torch.float64).expand(1 if x else 30, 3)
         radar = Radar(one, array, FMCW(77e9, 1.5e9, 5e-5, 128), places)
-        found[name] = Link(scene, radar, grid)
+        found[name] = InteractiveSensor(scene, radar, grid)
     return found
 
 
@@ -41,11 +48,14 @@ def peak(own: SensorMaps, step: int) -> tuple[float, float]:
 
 def test_maps_follow_the_steps_of_every_sensor():
     made = links()
-    body = body_of(made["a"].scene["ball"])
+    body = display_mesh(made["a"].scene["ball"])
     away = np.array([0.0, 0.0, 0.4], np.float32)
-    steps = [Step(k, str(k), {"ball": Body(body.vertices + k * away, body.faces)}) for k in (0, 1)]
-    display = replace(display_of(made["a"].scene, {}, ""), steps=steps)
-    found = sensor_maps(display, made)
+    steps = [
+        DisplayStep(k, str(k), {"ball": DisplayMesh(body.vertices + k * away, body.faces)})
+        for k in (0, 1)
+    ]
+    display = replace(build_display(made["a"].scene, {}, ""), steps=steps)
+    found = collect_sensor_maps(display, made)
     assert list(found) == ["a", "b"]
     # Eight positions of thirty, evenly; the first and the last among them.
     assert found["a"].frames == [0, 4, 8, 12, 16, 20, 24, 29]
@@ -62,16 +72,18 @@ def test_maps_follow_the_steps_of_every_sensor():
     assert found["b"].simulated is not None
     assert found["b"].simulated.shape == (2, 1, 67, 21)
     assert found["b"].grid == pytest.approx((1.01, 0.03, -0.5, 0.05))
-    assert found["b"].places == pytest.approx(np.array([[0.4, 0.0, 0.0]]))
+    assert found["b"].positions == pytest.approx(np.array([[0.4, 0.0, 0.0]]))
 
 
 def test_what_was_measured_stands_beside_it_and_needs_no_model():
     power = torch.zeros(30, 40, 21, 1)
     power[29, 7, 3] = 2.0
-    display = replace(display_of(None, {}, ""), maps={"a": Maps.of({"measured": power}, GRID)})
-    found = sensor_maps(display, {})["a"]
+    display = replace(
+        build_display(None, {}, ""), maps={"a": DisplayMaps.from_spectra({"measured": power}, GRID)}
+    )
+    found = collect_sensor_maps(display, {})["a"]
     assert found.simulated is None
-    assert found.places.shape == (0, 3)
+    assert found.positions.shape == (0, 3)
     assert found.frames[-1] == 29
     assert found.measured is not None
     assert np.argwhere(found.measured).tolist() == [[len(found.frames) - 1, 7, 3]]
@@ -79,9 +91,11 @@ def test_what_was_measured_stands_beside_it_and_needs_no_model():
 
 def test_many_steps_leave_fewer_positions():
     made = {"a": links()["a"]}
-    bodies = {"ball": body_of(made["a"].scene["ball"])}
-    steps = [Step(k, str(k), bodies) for k in range(72)]
-    found = sensor_maps(replace(display_of(made["a"].scene, {}, ""), steps=steps), made)["a"]
+    bodies = {"ball": display_mesh(made["a"].scene["ball"])}
+    steps = [DisplayStep(k, str(k), bodies) for k in range(72)]
+    found = collect_sensor_maps(replace(build_display(made["a"].scene, {}, ""), steps=steps), made)[
+        "a"
+    ]
     assert found.frames == [0, 29]
     assert found.simulated is not None
     assert len(found.simulated) == 72

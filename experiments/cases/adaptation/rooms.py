@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 import invertwin as iw
-from invertwin.channel import trace_echoes
+from invertwin.channel import trace_point_targets
 from invertwin.radar import beat_signal
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.scene import (
@@ -26,8 +26,8 @@ from invertwin.scene import (
     plate,
     rigid,
 )
-from invertwin.scene.people.gait import hanging
-from invertwin.seeds import derived_seed
+from invertwin.scene.people.gait import hanging_arm_rotation
+from invertwin.seeds import derive_seed
 
 HEIGHT = 1.2  # of the radar above the floor [m]
 CABINET = (0.5, 0.9, 2.0)  # along x, y, z [m]
@@ -125,12 +125,12 @@ def _shapes() -> list[Tensor]:
     still = torch.eye(3, dtype=torch.float64).repeat(len(BODY.names), 1, 1)
     standing = still.clone()
     for side in ("left", "right"):
-        standing[BODY.joint(f"{side}_shoulder")] = hanging(side)
+        standing[BODY.joint(f"{side}_shoulder")] = hanging_arm_rotation(side)
     sat, shift = Sitting(BODY, 0.45).posture(2.0)
     low = BODY.vertices[:, 1].min()
     found = []
     for turns, away in ((standing, 0 * shift), (sat, shift), (still, 0 * shift)):
-        skin, joints = BODY.posed(turns)
+        skin, joints = BODY.apply_pose(turns)
         tips = skin[[int(BODY.vertices[:, 0].argmin()), int(BODY.vertices[:, 0].argmax())]]
         x, y, z = (torch.cat([joints, tips]) + away).unbind(-1)
         found.append(torch.stack([z, x, y - low - HEIGHT], dim=-1))
@@ -181,7 +181,7 @@ def recorded(room: Room, count: int, seed: int) -> Samples:
     """
     scene, maps, rows = scene_of(room), [], []
     for number in range(count):
-        random = torch.Generator().manual_seed(derived_seed(seed, number))
+        random = torch.Generator().manual_seed(derive_seed(seed, number))
         tried = torch.rand((400, 2), generator=random, dtype=torch.float64)
         corner = torch.stack([torch.zeros_like(room.left), room.left])
         far = torch.stack([room.back, room.right])
@@ -194,7 +194,7 @@ def recorded(room: Room, count: int, seed: int) -> Samples:
         points = SHAPES[posture] @ turn.T
         points[:, :2] += place
         drawn = torch.rand(len(points), generator=random, dtype=torch.float64)
-        echoes = trace_echoes(scene, RADAR.link(), points, -SIZE * drawn.log(), rays=None)
+        echoes = trace_point_targets(scene, RADAR.link(), points, -SIZE * drawn.log(), rays=None)
         beat = beat_signal(echoes, RADAR)
         noise = torch.randn((2, *beat.shape), generator=random, dtype=torch.float64)
         beat = beat + NOISE * torch.complex(noise[0], noise[1])

@@ -27,8 +27,8 @@ from matplotlib.figure import Figure
 from rooms import Room, Samples
 
 from invertwin.plotting import PALETTE
-from invertwin.seeds import derived_seed
-from invertwin.storage.folders import replacing
+from invertwin.seeds import derive_seed
+from invertwin.storage.folders import replace_file
 
 WEAK, STRONG = (1.5, 4.0), (60.0, 200.0)  # permittivity of walls: generic and unseen rooms
 GENERIC, UNSEEN, TRUE, SITE, SEEN, TESTED = range(1, 7)  # keys of seeds
@@ -67,7 +67,7 @@ def kept(file: Path, make: Callable[[], Any]) -> Any:
         make: Makes it.
     """
     if not file.exists():
-        with replacing(file) as part:
+        with replace_file(file) as part:
             torch.save(make(), part)
     return torch.load(file)
 
@@ -96,10 +96,10 @@ def generic_network(plan: Plan, folder: Path) -> network.Finder:
     def samples() -> Samples:
         parts = []
         for number in range(count):
-            seed = derived_seed(GENERIC, number)
+            seed = derive_seed(GENERIC, number)
             room = rooms.random_room(seed, *WEAK)
             parts.append(
-                recordings(folder / f"generic_{number}.pt", room, each, derived_seed(seed, 1))
+                recordings(folder / f"generic_{number}.pt", room, each, derive_seed(seed, 1))
             )
             print(f"generic rooms: {number + 1} of {count}", flush=True)
         return network.joined(parts)
@@ -123,11 +123,11 @@ def in_room(number: int, net: network.Finder, plan: Plan, folder: Path) -> dict[
         plan: How much.
         folder: Of the output.
     """
-    true = rooms.random_room(derived_seed(UNSEEN, number), *STRONG)
+    true = rooms.random_room(derive_seed(UNSEEN, number), *STRONG)
 
     def of(name: str, room: Room, count: int, key: int) -> Samples:
         file = folder / f"room_{number}_{name}.pt"
-        return recordings(file, room, count, derived_seed(key, number))
+        return recordings(file, room, count, derive_seed(key, number))
 
     tested = of("tested", true, plan.tested, TESTED)
     maps = of("seen", true, plan.seen, SEEN).maps  # without labels
@@ -246,7 +246,7 @@ def main() -> None:
         print(f"room {number}: {told}; gap recovered {rows[-1]['gap_recovered']:.2f}", flush=True)
     figure(rows).savefig(folder / "adaptation.png", dpi=110)
     metrics = summary(rows)
-    with replacing(folder / "metrics.json") as part:
+    with replace_file(folder / "metrics.json") as part:
         part.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
     print(json.dumps({key: value for key, value in metrics.items() if key != "rooms"}, indent=2))
 

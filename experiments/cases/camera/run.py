@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 
 import invertwin as iw
 from invertwin.camera import Camera, ImageSampling, Photograph, photograph
-from invertwin.inversion import Check, Unknown
+from invertwin.inversion import GradcheckSettings, Unknown
 from invertwin.models.camera import DepthMap, SilhouetteMap
 from invertwin.plotting import PALETTE
 from invertwin.scene import (
@@ -40,7 +40,7 @@ from invertwin.scene import (
     rigid,
     rotation_from_vector,
 )
-from invertwin.storage.folders import replacing
+from invertwin.storage.folders import replace_file
 
 PAINT = RoughDielectric(permittivity=4.0)
 MASK_WEIGHT = 3.0
@@ -63,7 +63,7 @@ class View:
 
 def robot() -> tuple[Camera, iw.Radar]:
     """Camera and radar of the robot, side by side; z is up, and it looks along x."""
-    camera = Camera.looking(
+    camera = Camera.look_at(
         EYE, [3.0, 0.0, 1.0], width=96, height=72, field_of_view=math.radians(60)
     )
     # Columns of a camera are right, down, ahead; those of a radar are x, up, ahead.
@@ -195,7 +195,7 @@ def trials(count: int, file: Path) -> list[dict[str, Any]]:
     begin, done = time.perf_counter(), len(rows)
     for seed in range(done, count):
         rows.append(trial(seed))
-        with replacing(file) as part:
+        with replace_file(file) as part:
             part.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
         left = (count - seed - 1) * (time.perf_counter() - begin) / (seed + 1 - done)
         print(f"scene {seed + 1} of {count}, about {left / 60:.0f} min left", flush=True)
@@ -218,7 +218,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def checks() -> dict[str, dict[str, float]]:
     """Derivatives of masks and depths of scene 0 against differences, with and without outlines."""
     seen = view(0)
-    camera = Camera.looking(
+    camera = Camera.look_at(
         EYE, [3.0, 0.0, 1.0], width=20, height=15, field_of_view=math.radians(60)
     )
     fine = ImageSampling(outline_samples=1000)
@@ -233,7 +233,9 @@ def checks() -> dict[str, dict[str, float]]:
             {"translation": [0.3, 0.8, -0.5], "rotation": [0.4, -0.3, 0.7]},
             scene=seen.truth,
             sensor=camera,
-            check=Check(step=2e-3, difference_samples=4_000_000, noise=0.005, max_pairs=32),
+            settings=GradcheckSettings(
+                step=2e-3, difference_samples=4_000_000, noise=0.005, max_pairs=32
+            ),
             seed=0,
         )
         full, interior = report.full.relative_l1, report.interior.relative_l1
@@ -286,7 +288,7 @@ def main() -> None:
         "gradcheck": checks(),
         "rows": rows,
     }
-    with replacing(given.output / "metrics.json") as part:
+    with replace_file(given.output / "metrics.json") as part:
         part.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
     for sensors in ("start", *SENSORS):
         found = metrics[sensors]

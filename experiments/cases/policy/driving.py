@@ -19,7 +19,7 @@ from invertwin.channel import Speckle, draw_speckle
 from invertwin.radar.aperture import aperture
 from invertwin.radar.signal.range_profile import range_profile
 from invertwin.scene import Cosine, Mesh, RoughDielectric, box, linear_array
-from invertwin.seeds import derived_seed
+from invertwin.seeds import derive_seed
 
 STEPS = 24
 INTERVAL = 0.3  # [s] of one step
@@ -431,7 +431,7 @@ def final_distance(
     """
     state = worlds.start
     for number in range(steps):
-        command = net(inputs(worlds, state, shown(state, derived_seed(seed, 0, number))))
+        command = net(inputs(worlds, state, shown(state, derive_seed(seed, 0, number))))
         state = moved(state, command + first if number == 0 else command)
     return (state[:, :2] - worlds.goal).norm(dim=-1)
 
@@ -479,12 +479,12 @@ def drive(
     cost = torch.zeros(worlds.count, dtype=torch.float64)
     driving = torch.ones(worlds.count, dtype=torch.bool)
     success, clean = ~driving, driving
-    random = torch.Generator().manual_seed(derived_seed(seed, 1)) if speckle else None
+    random = torch.Generator().manual_seed(derive_seed(seed, 1)) if speckle else None
     number = 0
     while number < steps and driving.any():
         if most is not None and state.requires_grad:
             state.register_hook(functools.partial(_limited, most))
-        power = shown(state, derived_seed(seed, 0, number))
+        power = shown(state, derive_seed(seed, 0, number))
         command = net(inputs(worlds, state, power, random))
         done = step(worlds, state, command)
         cost = cost + torch.where(driving, done.cost, 0.0)

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
 
-from invertwin.seeds import derived_seed
-from invertwin.storage.folders import replacing
+from invertwin.seeds import derive_seed
+from invertwin.storage.folders import replace_file
 
 RATE = 1e-2
 CHUNK = 10  # updates between two looks at the success
@@ -82,7 +82,7 @@ class _Updated(Learner):
             for group in self.adam.param_groups:
                 group["lr"] = RATE * max(0.01, min(1.0, 2 * (1 - self.number / self.updates)))
             self.adam.zero_grad()
-            self.steps += self.gradient(derived_seed(self.seed, 2, self.number))
+            self.steps += self.gradient(derive_seed(self.seed, 2, self.number))
             torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
             self.adam.step()
             self.mean.update_parameters(self.net)
@@ -103,7 +103,7 @@ class _Updated(Learner):
             "number": self.number,
             "steps": self.steps,
         }
-        with replacing(file) as part:
+        with replace_file(file) as part:
             torch.save(kept, part)
 
     def load(self, file: Path) -> None:
@@ -128,11 +128,9 @@ class ByGradient(_Updated):
 
     def gradient(self, seed: int) -> int:
         count = self.few if self.number < self.first else self.worlds
-        worlds = driving.random_worlds(count, derived_seed(seed, 0))
+        worlds = driving.random_worlds(count, derive_seed(seed, 0))
         shown = driving.smooth_radar(worlds)
-        found = driving.drive(
-            worlds, shown, self.net, derived_seed(seed, 1), speckle=True, most=1.0
-        )
+        found = driving.drive(worlds, shown, self.net, derive_seed(seed, 1), speckle=True, most=1.0)
         found.cost.sum().backward()  # of the sum, so that the bound counts for each world
         for weight in self.net.parameters():
             assert weight.grad is not None
@@ -153,7 +151,7 @@ class ByEvolution(_Updated):
     def gradient(self, seed: int) -> int:
         names = [name for name, _ in self.net.named_parameters()]
         pairs = self.worlds // 2
-        random = torch.Generator().manual_seed(derived_seed(seed, 2))
+        random = torch.Generator().manual_seed(derive_seed(seed, 2))
         noise = {
             name: torch.randn((pairs, *p.shape), generator=random, dtype=p.dtype)
             for name, p in self.net.named_parameters()
@@ -166,14 +164,14 @@ class ByEvolution(_Updated):
         def one(weights: dict[str, Tensor], given: Tensor) -> Tensor:
             return torch.func.functional_call(self.net, weights, (given[None],))[0]
 
-        worlds = driving.random_worlds(pairs, derived_seed(seed, 0))
+        worlds = driving.random_worlds(pairs, derive_seed(seed, 0))
         worlds = worlds.chosen([*range(pairs), *range(pairs)])  # both of a pair drive in one
         with torch.no_grad():
             found = driving.drive(
                 worlds,
                 driving.smooth_radar(worlds),
                 lambda given: torch.func.vmap(one)(changed, given),
-                derived_seed(seed, 1),
+                derive_seed(seed, 1),
                 speckle=True,
             )
         ranks = found.cost.argsort().argsort().double() / (self.worlds - 1) - 0.5
@@ -207,7 +205,7 @@ class ByPPO(Learner):
             return self.model.policy.get_distribution(given.float()).mode().double()
 
     def save(self, file: Path) -> None:
-        with replacing(file) as part:
+        with replace_file(file) as part:
             kept = {
                 "policy": self.model.policy.state_dict(),
                 "adam": self.model.policy.optimizer.state_dict(),

@@ -15,7 +15,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 
-from invertwin.seeds import derived_seed
+from invertwin.seeds import derive_seed
 
 ROBOTS = 64
 FARTHEST = 10.0  # command; tanh has long saturated
@@ -44,22 +44,22 @@ class Robots(VecEnv):
         Args:
             number: Tells one restart from another.
         """
-        self.root, self.clock, self.drawn = derived_seed(self.origin, 4, number), 0, 0
-        self.random = torch.Generator().manual_seed(derived_seed(self.root, 0))
+        self.root, self.clock, self.drawn = derive_seed(self.origin, 4, number), 0, 0
+        self.random = torch.Generator().manual_seed(derive_seed(self.root, 0))
         self._place(self._new(ROBOTS))
         self.state = self.worlds.start.clone()
         self.ages = torch.zeros(ROBOTS, dtype=torch.int64)
 
     def _new(self, count: int) -> driving.Worlds:
         self.drawn += 1
-        return driving.random_worlds(count, derived_seed(self.root, 1, self.drawn))
+        return driving.random_worlds(count, derive_seed(self.root, 1, self.drawn))
 
     def _place(self, worlds: driving.Worlds) -> None:
         self.worlds, self.shown = worlds, driving.smooth_radar(worlds, boundary=False)
 
     def _seen(self) -> np.ndarray:
         self.clock += 1
-        power = self.shown(self.state, derived_seed(self.root, 2, self.clock))
+        power = self.shown(self.state, derive_seed(self.root, 2, self.clock))
         return driving.inputs(self.worlds, self.state, power, self.random).float().numpy()
 
     def reset(self) -> np.ndarray:

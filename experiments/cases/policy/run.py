@@ -6,7 +6,8 @@ stable-baselines3 and an evolution strategy learn the same on the same simulator
 
     .venv/bin/python experiments/cases/policy/run.py [--quick] [-o out/policy]
 
-Writes `metrics.json` and `policy.png`. Every training goes on where it was interrupted. PPO needs
+Writes `metrics.json` and `content_security_policy.png`. Every training goes on where it was
+interrupted. PPO needs
 the optional extra `cases`; without it, `--without-ppo` leaves it out.
 """
 
@@ -29,8 +30,8 @@ from matplotlib.patches import Polygon
 from torch import Tensor
 
 from invertwin.plotting import PALETTE
-from invertwin.seeds import derived_seed
-from invertwin.storage.folders import replacing
+from invertwin.seeds import derive_seed
+from invertwin.storage.folders import replace_file
 
 TARGET = 0.8  # success to which steps are counted
 WATCHED, UNSEEN, CHECKED = 1, 2, 3  # keys of the seeds of worlds that no training draws
@@ -69,7 +70,7 @@ def written(file: Path, value: Any) -> None:
         file: Where.
         value: What.
     """
-    with replacing(file) as part:
+    with replace_file(file) as part:
         part.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
 
 
@@ -96,7 +97,7 @@ def watched(plan: Plan, learner: Learner) -> float:
         plan: How many worlds.
         learner: The policy.
     """
-    worlds = driving.random_worlds(plan.watched, derived_seed(0, WATCHED))
+    worlds = driving.random_worlds(plan.watched, derive_seed(0, WATCHED))
     shown = driving.smooth_radar(worlds, boundary=False)
     found = driving.drive(worlds, shown, learner.command, 0, speckle=True)
     return float(found.success.double().mean())
@@ -169,7 +170,7 @@ def exact_rows(name: str, learner: Learner, plan: Plan, folder: Path) -> list[Ro
     worlds = unseen(plan)
     for number in range(len(rows), plan.unseen):
         world = worlds.chosen([number])
-        seed = derived_seed(0, UNSEEN, 1, number)
+        seed = derive_seed(0, UNSEEN, 1, number)
         found = driving.drive(world, driving.exact_radar(world, seed), learner.command, seed)
         way = found.states[:, 0, :2]
         rows.append({"success": bool(found.success[0]), "way": way.tolist()})
@@ -185,7 +186,7 @@ def unseen(plan: Plan) -> driving.Worlds:
     Args:
         plan: How many.
     """
-    return driving.random_worlds(plan.unseen, derived_seed(0, UNSEEN))
+    return driving.random_worlds(plan.unseen, derive_seed(0, UNSEEN))
 
 
 @torch.no_grad()
@@ -223,7 +224,7 @@ def checks(plan: Plan, count: int = 12, step: float = 0.01) -> dict[str, float]:
         step: Of differences.
     """
     seed, net = 0, steering.policy(CHECKED, share=3.0)
-    drawn = driving.random_worlds(8 * count, derived_seed(0, CHECKED))
+    drawn = driving.random_worlds(8 * count, derive_seed(0, CHECKED))
     with torch.no_grad():
         shown = driving.smooth_radar(drawn, boundary=False)
         ways = driving.drive(drawn, shown, net, seed, steps=driving.STEPS // 2).states

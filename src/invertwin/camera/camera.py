@@ -8,12 +8,18 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.channel import differentiated
-from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor, plain
+from invertwin.channel import is_differentiated
+from invertwin.checks import (
+    ArrayLike,
+    checked_count,
+    checked_number,
+    checked_tensor,
+    strip_derivatives,
+)
 from invertwin.errors import InputError
 from invertwin.scene.parameters import Coordinate, RigidMotion
 
-_MOST_PIXELS = 1 << 26
+_MAX_PIXELS = 1 << 26
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +62,8 @@ class Camera:
         if float((axes.detach().mT @ axes.detach() - unit).abs().max()) > 1e-5:
             raise InputError(f"expected rotations of a camera with orthonormal columns; {do}")
         pixels = checked_count(self.width, "width", 1) * checked_count(self.height, "height", 1)
-        if pixels > _MOST_PIXELS:
-            raise InputError(f"expected at most {_MOST_PIXELS:,} pixels, got {pixels:,}; bin them")
+        if pixels > _MAX_PIXELS:
+            raise InputError(f"expected at most {_MAX_PIXELS:,} pixels, got {pixels:,}; bin them")
         focal = torch.as_tensor(self.focal, dtype=torch.float64)
         checked_number(float(focal.detach()), "focal length [pixel]", 0.0, open_low=True)
         middle = torch.tensor([self.width / 2, self.height / 2], dtype=torch.float64)
@@ -72,7 +78,7 @@ class Camera:
             object.__setattr__(self, name, value)
 
     @staticmethod
-    def looking(
+    def look_at(
         positions: ArrayLike,
         target: ArrayLike,
         *,
@@ -107,16 +113,16 @@ class Camera:
         angle = checked_number(field_of_view, "field of view [rad]", 0.0, math.pi, open_low=True)
         return Camera(places, rotations, width, height, width / (2 * math.tan(angle / 2)))
 
-    def frames(self, chosen: Sequence[int]) -> "Camera":
+    def frames(self, indices: Sequence[int]) -> "Camera":
         """Only some of the frames.
 
         Args:
-            chosen: Their numbers.
+            indices: Their numbers.
         """
-        rows = torch.as_tensor(chosen)
+        rows = torch.as_tensor(indices)
         return replace(self, positions=self.positions[rows], rotations=self.rotations[rows])
 
-    def moved(
+    def transform_rigidly(
         self, rotation: Float64[Tensor, "3 3"], translation: Float64[Tensor, "3"]
     ) -> "Camera":
         """All poses moved rigidly: turned about the mean position, then translated.
@@ -132,24 +138,24 @@ class Camera:
             rotations=rotation @ self.rotations,
         )
 
-    def detached(self) -> "Camera":
+    def detach(self) -> "Camera":
         """The same camera without derivatives."""
         values = {
-            name: plain(getattr(self, name))
+            name: strip_derivatives(getattr(self, name))
             for name in ("positions", "rotations", "focal", "centre")
         }
         return replace(self, **values)
 
     @property
-    def middle(self) -> Float64[Tensor, "2"]:
+    def principal_point(self) -> Float64[Tensor, "2"]:
         """c_u, c_v [pixel]."""
         return torch.as_tensor(self.centre)
 
     @property
-    def moves(self) -> bool:
+    def is_differentiated(self) -> bool:
         """Whether derivatives flow to any of its values."""
         values = (self.positions, self.rotations, self.focal, self.centre)
-        return any(differentiated(torch.as_tensor(value)) for value in values)
+        return any(is_differentiated(torch.as_tensor(value)) for value in values)
 
     def directions(self, pixels: Float64[Tensor, "n 2"], frame: int) -> Float64[Tensor, "n 3"]:
         """What pixels see: ways in the world, one unit forward.
@@ -158,11 +164,11 @@ class Camera:
             pixels: u, v.
             frame: Number of the pose.
         """
-        aside = (pixels - self.middle) / self.focal
+        aside = (pixels - self.principal_point) / self.focal
         local = torch.cat([aside, torch.ones_like(aside[:, :1])], 1)
         return local @ self.rotations[frame].mT
 
-    def local(self, points: Float64[Tensor, "n 3"], frame: int) -> Float64[Tensor, "n 3"]:
+    def to_camera_axes(self, points: Float64[Tensor, "n 3"], frame: int) -> Float64[Tensor, "n 3"]:
         """World points in camera axes [m].
 
         Args:
@@ -178,8 +184,8 @@ class Camera:
             points: [m].
             frame: Number of the pose.
         """
-        local = self.local(points, frame)
-        return self.middle + self.focal * local[:, :2] / local[:, 2:]
+        local = self.to_camera_axes(points, frame)
+        return self.principal_point + self.focal * local[:, :2] / local[:, 2:]
 
 
 class CameraPose(RigidMotion):
@@ -187,7 +193,7 @@ class CameraPose(RigidMotion):
 
     def forward(self, camera: Camera) -> Camera:
         """The moved camera."""
-        return camera.moved(self.rotation_matrix, self.shift)
+        return camera.transform_rigidly(self.rotation_matrix, self.shift)
 
     def values(self) -> dict[str, Tensor]:
         """Translation [m] and rotation vector [rad] by name, for progress and reports."""

@@ -18,20 +18,20 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.camera.camera import Camera
-from invertwin.channel import Curves, Sight
-from invertwin.checks import plain
+from invertwin.channel import DiscontinuityCurves, ViewpointScene
+from invertwin.checks import strip_derivatives
 from invertwin.errors import InputError
 from invertwin.limits import Count
 from invertwin.scene.scene import Scene
 
-_ASIDE = 0.01  # pixel between an outline and the rays at its sides
-_LEAST_ASIDE = 2e-5  # rad: rays are float32
-_NEAR = 1e-3  # m in front of the camera, where outlines begin
+_OUTLINE_OFFSET = 0.01  # pixel between an outline and the rays at its sides
+_MIN_OUTLINE_OFFSET = 2e-5  # rad: rays are float32
+_NEAR_PLANE = 1e-3  # m in front of the camera, where outlines begin
 _ROWS_AT_ONCE = 1 << 20
-_EVEN = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
+_R2_STEPS = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
 """Steps of the sequence R2, which fills a square evenly: powers of the root of x³ = x + 1."""
 
-Shown = Callable[[Sight, Tensor, Tensor], Tensor]
+RayValue = Callable[[ViewpointScene, Tensor, Tensor], Tensor]
 """What single rays show, by scene, the triangles that they meet first (−1: none), and depths."""
 
 
@@ -73,11 +73,11 @@ def silhouettes(
         )
     numbers = torch.tensor([list(scene.objects).index(name) for name in objects])
 
-    def shown(sight: Sight, face: Tensor, depth: Tensor) -> Tensor:
+    def evaluate_mask(sight: ViewpointScene, face: Tensor, depth: Tensor) -> Tensor:
         owner = torch.where(face >= 0, sight.face_object[face.clamp_min(0)], -1)
         return torch.isin(owner, numbers).double()
 
-    return _images(scene, camera, shown, sampling, seed, crossings=True)
+    return _render_images(scene, camera, evaluate_mask, sampling, seed, crossings=True)
 
 
 def depths(
@@ -96,28 +96,31 @@ def depths(
         InputError: A cloud in the scene.
     """
 
-    def shown(sight: Sight, face: Tensor, depth: Tensor) -> Tensor:
+    def evaluate_depth(sight: ViewpointScene, face: Tensor, depth: Tensor) -> Tensor:
         return depth.clamp_max(far)
 
     # Where objects cross, depth has no jump.
-    return _images(scene, camera, shown, sampling, seed, crossings=False)
+    return _render_images(scene, camera, evaluate_depth, sampling, seed, crossings=False)
 
 
-def _images(
+def _render_images(
     scene: Scene,
     camera: Camera,
-    shown: Shown,
+    ray_value: RayValue,
     sampling: ImageSampling,
     seed: int,
     *,
     crossings: bool,
 ) -> Tensor:
     frames = range(len(camera.positions))
-    every = [_Frame(scene, camera, n, shown, sampling, seed).image(crossings) for n in frames]
+    every = [
+        _ImageRenderer(scene, camera, n, ray_value, sampling, seed).render(crossings)
+        for n in frames
+    ]
     return torch.stack(every)
 
 
-class _Frame:
+class _ImageRenderer:
     """One image."""
 
     def __init__(
@@ -125,16 +128,21 @@ class _Frame:
         scene: Scene,
         camera: Camera,
         number: int,
-        shown: Shown,
+        ray_value: RayValue,
         sampling: ImageSampling,
         seed: int,
     ) -> None:
-        self.camera, self.number, self.shown, self.sampling = camera, number, shown, sampling
-        self.sight = Sight(scene, camera.positions[number])
+        self.camera, self.number, self.ray_value, self.sampling = (
+            camera,
+            number,
+            ray_value,
+            sampling,
+        )
+        self.sight = ViewpointScene(scene, camera.positions[number])
         self.random = np.random.default_rng(np.random.SeedSequence([seed, number]))
-        self.fixed = camera.detached()
+        self.fixed = camera.detach()
 
-    def image(self, crossings: bool) -> Float64[Tensor, "row column"]:
+    def render(self, crossings: bool) -> Float64[Tensor, "row column"]:
         """The mean over each pixel, with the derivative of outlines."""
         camera, count = self.camera, self.sampling.samples
         pixels = camera.width * camera.height
@@ -144,37 +152,43 @@ class _Frame:
             pixel = some // count
             corner = torch.stack([pixel % camera.width, pixel // camera.width], 1)
             # Even over the pixel, at a shift of its own.
-            inside = (shift[pixel] + (some % count)[:, None] * _EVEN) % 1.0
-            total = total.index_add(0, pixel, self.seen(corner + inside, camera) / count)
-        if self.sampling.boundary and (self.sight.moves or camera.moves):
-            total = total + self._swept(self.sight.outlines())
+            inside = (shift[pixel] + (some % count)[:, None] * _R2_STEPS) % 1.0
+            total = total.index_add(0, pixel, self.sample_image(corner + inside, camera) / count)
+        if self.sampling.boundary and (self.sight.is_differentiated or camera.is_differentiated):
+            total = total + self._outline_derivative(self.sight.find_silhouettes())
             if crossings:
-                total = total + self._swept(self.sight.crossings())
+                total = total + self._outline_derivative(self.sight.find_intersections())
         return total.unflatten(0, (camera.height, camera.width))
 
-    def seen(self, places: Float64[Tensor, "n 2"], camera: Camera) -> Float64[Tensor, " n"]:
+    def sample_image(
+        self, positions: Float64[Tensor, "n 2"], camera: Camera
+    ) -> Float64[Tensor, " n"]:
         """What single places of the image show.
 
         Args:
-            places: u, v.
+            positions: u, v.
             camera: With derivatives, or without.
         """
-        face = self.sight.first(self.fixed.directions(places, self.number))
+        face = self.sight.find_first_faces(self.fixed.directions(positions, self.number))
         rows = torch.nonzero(face >= 0)[:, 0]
-        depth = self.sight.along(face[rows], camera.directions(places[rows], self.number))
+        depth = self.sight.plane_distances(
+            face[rows], camera.directions(positions[rows], self.number)
+        )
         none = torch.full((len(face),), math.inf, dtype=torch.float64)
-        return self.shown(self.sight, face, none.index_put((rows,), depth))
+        return self.ray_value(self.sight, face, none.index_put((rows,), depth))
 
-    def _swept(self, curves: Curves) -> Float64[Tensor, " pixel"]:
+    def _outline_derivative(self, curves: DiscontinuityCurves) -> Float64[Tensor, " pixel"]:
         """What outlines add to derivatives; zero in value."""
         camera, fixed, number = self.camera, self.fixed, self.number
         size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-        ends = torch.stack([fixed.local(end, number) for end in (curves.start, curves.end)])
-        low, high = _within(ends, fixed, size)
+        ends = torch.stack(
+            [fixed.to_camera_axes(end, number) for end in (curves.start, curves.end)]
+        )
+        low, high = _clip_segments(ends, fixed, size)
         piece = torch.nonzero(high > low)[:, 0]
         ends = ends[:, piece]
         cut = [torch.lerp(ends[0], ends[1], share[piece, None]) for share in (low, high)]
-        marks = torch.stack([_projected(fixed, point) for point in cut])
+        marks = torch.stack([_project_points(fixed, point) for point in cut])
         length = (marks[1] - marks[0]).norm(dim=1)
         count = int(np.ceil(float(length.sum()) * self.sampling.outline_samples))
         if not count:
@@ -188,13 +202,14 @@ class _Frame:
         share = share * depth[0] / torch.lerp(depth[1], depth[0], share)
         share = torch.lerp(low[piece][row], high[piece][row], share)
 
-        place = camera.project(self.sight.points(curves, piece[row], share), number)
-        here = plain(place)
+        place = camera.project(self.sight.points_on_curves(curves, piece[row], share), number)
+        here = strip_derivatives(place)
         along = (marks[1] - marks[0])[row] / length[row, None]
         across = torch.stack([-along[:, 1], along[:, 0]], 1)
-        aside = max(_ASIDE, _LEAST_ASIDE * float(torch.as_tensor(fixed.focal)))
+        aside = max(_OUTLINE_OFFSET, _MIN_OUTLINE_OFFSET * float(torch.as_tensor(fixed.focal)))
         low_side, high_side = (
-            plain(self.seen(here + sign * aside * across, fixed)) for sign in (-1.0, 1.0)
+            strip_derivatives(self.sample_image(here + sign * aside * across, fixed))
+            for sign in (-1.0, 1.0)
         )
         sweep = ((place - here) * across).sum(1) * (float(until[-1]) / count)
         inside = ((here >= 0) & (here < size)).all(1)
@@ -205,19 +220,19 @@ class _Frame:
         return flat.index_add(0, line * camera.width + column, added)
 
 
-def _projected(camera: Camera, local: Tensor) -> Tensor:
+def _project_points(camera: Camera, local: Tensor) -> Tensor:
     """u, v of points in camera axes."""
-    return camera.middle + camera.focal * local[:, :2] / local[:, 2:]
+    return camera.principal_point + camera.focal * local[:, :2] / local[:, 2:]
 
 
-def _within(
+def _clip_segments(
     ends: Float64[Tensor, "2 piece 3"], camera: Camera, size: Tensor
 ) -> tuple[Float64[Tensor, " piece"], Float64[Tensor, " piece"]]:
     """From where to where pieces are in front of the camera and inside its image, 0 to 1."""
     x, y, z = ends.unbind(2)
-    u, v = camera.middle
+    u, v = camera.principal_point
     planes = [
-        z - _NEAR,
+        z - _NEAR_PLANE,
         camera.focal * x + u * z,
         camera.focal * y + v * z,
         (size[0] - u) * z - camera.focal * x,

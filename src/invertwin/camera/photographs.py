@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.camera.camera import Camera
-from invertwin.channel import Sight
+from invertwin.channel import ViewpointScene
 from invertwin.checks import checked_number
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
@@ -75,34 +75,35 @@ def photograph(
     share = checked_number(wrong_labels, "share of wrong labels", 0.0, 1.0)
     deviation = checked_number(depth_noise, "noise of depths at 1 m [m]", 0.0)
     random = torch.Generator().manual_seed(seed)
-    fixed = camera.detached()
-    frames = [_seen(scene, fixed, number) for number in range(len(fixed.positions))]
+    fixed = camera.detach()
+    frames = [_render_labels(scene, fixed, number) for number in range(len(fixed.positions))]
     labels = torch.stack([label for label, _ in frames])
     depth = torch.stack([depth for _, depth in frames])
     return Photograph(
         tuple(scene.objects),
-        _mislabelled(labels, share, random),
-        depth + _normal(depth, random) * torch.where(depth.isfinite(), depth**2 * deviation, 0.0),
+        _corrupt_labels(labels, share, random),
+        depth
+        + _draw_normal(depth, random) * torch.where(depth.isfinite(), depth**2 * deviation, 0.0),
     )
 
 
-def _seen(scene: Scene, camera: Camera, number: int) -> tuple[Tensor, Tensor]:
+def _render_labels(scene: Scene, camera: Camera, number: int) -> tuple[Tensor, Tensor]:
     with torch.no_grad():
-        sight = Sight(scene, camera.positions[number])
+        sight = ViewpointScene(scene, camera.positions[number])
         row, column = torch.meshgrid(
             torch.arange(camera.height), torch.arange(camera.width), indexing="ij"
         )
         middles = torch.stack([column, row], 2).reshape(-1, 2).double() + 0.5
         directions = camera.directions(middles, number)
-        face = sight.first(directions)
+        face = sight.find_first_faces(directions)
         found = face >= 0
         depth = torch.full((len(face),), torch.inf, dtype=torch.float64)
-        depth[found] = sight.along(face[found], directions[found])
+        depth[found] = sight.plane_distances(face[found], directions[found])
         label = torch.where(found, sight.face_object[face.clamp_min(0)], -1).long()
     return label.reshape(row.shape), depth.reshape(row.shape)
 
 
-def _mislabelled(labels: Tensor, share: float, random: torch.Generator) -> Tensor:
+def _corrupt_labels(labels: Tensor, share: float, random: torch.Generator) -> Tensor:
     """Labels of which some at outlines are a neighbour's."""
     way = torch.randint(0, 4, labels.shape, generator=random)
     neighbour = torch.stack([labels.roll(by, axis) for axis in (1, 2) for by in (1, -1)])
@@ -116,5 +117,5 @@ def _mislabelled(labels: Tensor, share: float, random: torch.Generator) -> Tenso
     return torch.where(wrong & at_outline, other, labels)
 
 
-def _normal(like: Tensor, random: torch.Generator) -> Tensor:
+def _draw_normal(like: Tensor, random: torch.Generator) -> Tensor:
     return torch.randn(like.shape, generator=random, dtype=like.dtype)

@@ -9,14 +9,14 @@ from torch import Tensor
 
 from invertwin.capture.capture import Capture
 from invertwin.errors import InputError
-from invertwin.radar.processing.backprojection import backproject_beat, distances
+from invertwin.radar.processing.backprojection import backproject_beat, pairwise_distances
 
 # Half widths and steps of the first search: wide against what clocks and cables are off by after
 # alignment by hand, dense against a range cell and the time in which a radar moves one beamwidth.
 _CLOCK_SEARCH = (0.1, 0.01)
 _BIAS_SEARCH = (0.1, 0.01)
 
-Measure = Callable[[Tensor], Tensor]
+FocusMeasure = Callable[[Tensor], Tensor]
 
 
 def backproject(
@@ -39,7 +39,7 @@ def backproject(
         return backproject_beat(capture.beat, capture.radar(), points)
     flat = points.reshape(-1, 3)
     radar = capture.radar()
-    ranges = distances(radar.positions, flat) - radar.origins[:, None]
+    ranges = pairwise_distances(radar.positions, flat) - radar.origins[:, None]
     return capture.interpolator()(ranges).mean(0).reshape(points.shape[:-1])
 
 
@@ -66,11 +66,11 @@ def locate(
 
     def brightness(offset: Float64[Tensor, "point 2"]) -> Float64[Tensor, " point"]:
         points = center + torch.nn.functional.pad(offset, (0, 1))
-        ranges = distances(radar.positions, points) - radar.origins[:, None]
+        ranges = pairwise_distances(radar.positions, points) - radar.origins[:, None]
         return interpolator(ranges).mean(0).abs()
 
     spans = (radius, step), (radius, step)
-    found = torch.tensor(_brightest(brightness, spans), dtype=torch.float64)
+    found = torch.tensor(_maximise_measure(brightness, spans), dtype=torch.float64)
     return center + torch.nn.functional.pad(found, (0, 1))
 
 
@@ -97,11 +97,11 @@ def calibrate(capture: Capture, target: Float64[Tensor, "3"]) -> Capture:
         shown = torch.stack(ranges, dim=1) - origins + trial[:, 1]
         return interpolator(shown).mean(0).abs()
 
-    clock, bias = _brightest(focus, (_CLOCK_SEARCH, _BIAS_SEARCH))
-    return capture.recalibrated(capture.clock_offset + clock, capture.range_bias + bias)
+    clock, bias = _maximise_measure(focus, (_CLOCK_SEARCH, _BIAS_SEARCH))
+    return capture.recalibrate(capture.clock_offset + clock, capture.range_bias + bias)
 
 
-def _brightest(measure: Measure, spans: Sequence[tuple[float, float]]) -> list[float]:
+def _maximise_measure(measure: FocusMeasure, spans: Sequence[tuple[float, float]]) -> list[float]:
     """The maximum of a measure of rows of two numbers: on a grid, then from there by a simplex.
 
     The spans are half the width and the step of the grid along each axis.

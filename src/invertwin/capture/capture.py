@@ -12,14 +12,19 @@ from torch import Tensor
 
 from invertwin.capture.range_interpolation import RangeInterpolator
 from invertwin.capture.readers.netcdf import read_dataset, write_dataset
-from invertwin.capture.readers.radar_fields import labelled, radar_fields, radar_from_fields, tensor
+from invertwin.capture.readers.radar_fields import (
+    radar_fields,
+    radar_from_fields,
+    read_tensor,
+    to_data_array,
+)
 from invertwin.capture.track import Track
 from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
-from invertwin.storage.untrusted import reading
+from invertwin.storage.untrusted import convert_read_errors
 
 BEAT_DIMS = ("frame", "tx", "rx", "sample")
 PROFILE_DIMS = ("frame", "range")
@@ -47,7 +52,7 @@ class Capture:
     _radar: Radar = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_radar", _checked(self.dataset))
+        object.__setattr__(self, "_radar", _check_dataset(self.dataset))
 
     @classmethod
     def from_beat(
@@ -73,8 +78,8 @@ class Capture:
                 f"expected complex (I/Q) beat samples, got {got}; of real ADC samples take the "
                 "analytic signal (scipy.signal.hilbert) along the last axis first"
             )
-        variables = {"beat": labelled(BEAT_DIMS, samples, "1")}
-        return cls._assembled(variables, radar, times)
+        variables = {"beat": to_data_array(BEAT_DIMS, samples, "1")}
+        return cls._assemble(variables, radar, times)
 
     @classmethod
     def from_range_profile(
@@ -102,26 +107,28 @@ class Capture:
             survey: known positions of targets [m].
         """
         variables = {
-            "range_profile": labelled(PROFILE_DIMS, profile, "1"),
-            "range": labelled(("range",), ranges, "m"),
+            "range_profile": to_data_array(PROFILE_DIMS, profile, "1"),
+            "range": to_data_array(("range",), ranges, "m"),
         }
         if track is not None:
-            variables["track_time"] = labelled(("track_time",), track.times, "s")
-            variables["track_position"] = labelled(("track_time", "axis"), track.positions, "m")
+            variables["track_time"] = to_data_array(("track_time",), track.times, "s")
+            variables["track_position"] = to_data_array(
+                ("track_time", "axis"), track.positions, "m"
+            )
         if survey is not None:
-            variables["survey"] = labelled(("target", "axis"), survey, "m")
-        capture = cls._assembled(variables, radar, times)
+            variables["survey"] = to_data_array(("target", "axis"), survey, "m")
+        capture = cls._assemble(variables, radar, times)
         named = {"clock_offset": clock_offset, "range_bias": range_bias}
         return cls(capture.dataset.assign_attrs(named))
 
     @classmethod
-    def _assembled(
+    def _assemble(
         cls, variables: dict[str, xr.DataArray], radar: Radar, times: Tensor | None
     ) -> "Capture":
         described, attributes = radar_fields(radar)
         variables |= described
         if times is not None:
-            variables["time"] = labelled(("frame",), times, "s")
+            variables["time"] = to_data_array(("frame",), times, "s")
         _check_sizes(variables)
         return cls(xr.Dataset(variables, attrs=attributes))
 
@@ -139,7 +146,7 @@ class Capture:
         Raises:
             InputError: no such file, a truncated file, or one that holds no capture.
         """
-        with reading(path, "a capture", "record or save it again"):
+        with convert_read_errors(path, "a capture", "record or save it again"):
             return cls(read_dataset(Path(path), trusted=trusted))
 
     def save(self, path: str | Path) -> None:
@@ -162,7 +169,7 @@ class Capture:
         Raises:
             InputError: the capture holds range profiles.
         """
-        return self._data("beat")
+        return self._read_data("beat")
 
     @property
     def range_profile(self) -> Complex[Tensor, "frame range"]:
@@ -171,13 +178,13 @@ class Capture:
         Raises:
             InputError: the capture holds beat samples.
         """
-        return self._data("range_profile")
+        return self._read_data("range_profile")
 
     @property
     def ranges(self) -> Float64[Tensor, " range"]:
         """R = L/2 of the samples of the range profile [m]."""
-        self._data("range_profile")
-        return tensor(self.dataset, "range")
+        self._read_data("range_profile")
+        return read_tensor(self.dataset, "range")
 
     @property
     def times(self) -> Float64[Tensor, " frame"]:
@@ -186,14 +193,16 @@ class Capture:
         Raises:
             InputError: the capture has no times.
         """
-        return tensor(self.dataset, "time")
+        return read_tensor(self.dataset, "time")
 
     @property
     def track(self) -> Track | None:
         """The track that the positions were read from; None where it is not known."""
         if "track_time" not in self.dataset.variables:
             return None
-        return Track(tensor(self.dataset, "track_time"), tensor(self.dataset, "track_position"))
+        return Track(
+            read_tensor(self.dataset, "track_time"), read_tensor(self.dataset, "track_position")
+        )
 
     @property
     def clock_offset(self) -> float:
@@ -208,7 +217,7 @@ class Capture:
     @property
     def survey(self) -> Float64[Tensor, "target 3"] | None:
         """Known positions of targets [m]."""
-        return tensor(self.dataset, "survey") if "survey" in self.dataset.variables else None
+        return read_tensor(self.dataset, "survey") if "survey" in self.dataset.variables else None
 
     @property
     def max_range(self) -> float:
@@ -235,9 +244,9 @@ class Capture:
                 "expected a capture with the track of the radar, got none; "
                 "a clock offset can be fitted only where the track is known"
             )
-        return track.at(self.times + (self.clock_offset + clock_shift))
+        return track.interpolate(self.times + (self.clock_offset + clock_shift))
 
-    def recalibrated(self, clock_offset: float, range_bias: float) -> "Capture":
+    def recalibrate(self, clock_offset: float, range_bias: float) -> "Capture":
         """A capture of the same data with another clock offset and range bias.
 
         Args:
@@ -250,8 +259,8 @@ class Capture:
         shift = torch.tensor(clock_offset - self.clock_offset, dtype=torch.float64)
         ranges = self.ranges + (self.range_bias - range_bias)
         dataset = self.dataset.assign(
-            position=labelled(("frame", "axis"), self.positions(shift), "m"),
-            range=labelled(("range",), ranges, "m"),
+            position=to_data_array(("frame", "axis"), self.positions(shift), "m"),
+            range=to_data_array(("range",), ranges, "m"),
         )
         named = {"clock_offset": clock_offset, "range_bias": range_bias}
         return Capture(dataset.assign_attrs(named))
@@ -285,14 +294,14 @@ class Capture:
         frequency = self._radar.waveform.center_frequency
         return RangeInterpolator(self.range_profile, self.ranges, frequency)
 
-    def _data(self, name: str) -> Tensor:
+    def _read_data(self, name: str) -> Tensor:
         if name not in self.dataset:
             held = "beat" if "beat" in self.dataset else "range_profile"
             raise InputError(
                 f"expected a capture of {name}, got one of {held}; "
                 "captures hold raw samples or range profiles, not both"
             )
-        return tensor(self.dataset, name)
+        return read_tensor(self.dataset, name)
 
 
 def _check_sizes(variables: dict[str, xr.DataArray]) -> None:
@@ -308,7 +317,7 @@ def _check_sizes(variables: dict[str, xr.DataArray]) -> None:
                 )
 
 
-def _checked(dataset: xr.Dataset) -> Radar:
+def _check_dataset(dataset: xr.Dataset) -> Radar:
     """Check a dataset, and return its radar."""
     held = [name for name in ("beat", "range_profile") if name in dataset]
     if len(held) != 1:
@@ -348,7 +357,7 @@ def _check_beat(dataset: xr.Dataset, radar: Radar) -> None:
 
 
 def _check_profile(dataset: xr.Dataset) -> None:
-    steps = tensor(dataset, "range").diff()
+    steps = read_tensor(dataset, "range").diff()
     if not len(steps) or not ((steps / steps.mean() - 1).abs() <= 1e-3).all() or steps[0] <= 0:
         raise InputError(
             "expected at least 2 uniform, ascending ranges, got others; "

@@ -11,17 +11,17 @@ from torch import Tensor
 
 from invertwin.capture.capture import BEAT_DIMS, Capture
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.capture.readers.radar_fields import labelled
+from invertwin.capture.readers.radar_fields import to_data_array
 from invertwin.checks import checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar.radar import sampled
+from invertwin.radar.radar import require_sampled_waveform
 from invertwin.radar.waveform import unit_window
-from invertwin.storage.folders import replacing
-from invertwin.storage.untrusted import existing_file, reading
+from invertwin.storage.folders import replace_file
+from invertwin.storage.untrusted import convert_read_errors, existing_file
 
-Recorded = TypeVar("Recorded", bound=Capture | ChirpCapture)
-_DEAD = 1e-3
+RecordingT = TypeVar("Recorded", bound=Capture | ChirpCapture)
+_MIN_RELATIVE_GAIN = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +47,12 @@ class ChannelCalibration:
                 f"expected finite gains [tx, rx], got shape {tuple(gains.shape)}; "
                 "give one complex number per virtual channel"
             )
-        weak = gains.abs() < _DEAD * gains.abs().max()
+        weak = gains.abs() < _MIN_RELATIVE_GAIN * gains.abs().max()
         if bool(weak.any()):
             tx, rx = (int(index) for index in weak.nonzero()[0])
             raise InputError(
-                f"expected signal in every channel, got less than {_DEAD:g} of the strongest from "
+                f"expected signal in every channel, got less than {_MIN_RELATIVE_GAIN:g} of the "
+                f"strongest from "
                 f"TX element {tx} to RX element {rx} (from 0); leave out the dead element"
             )
         gains = gains / gains.abs().square().mean().sqrt()
@@ -69,7 +70,7 @@ class ChannelCalibration:
             InputError: no such file, or one that holds no calibration.
         """
         path = existing_file(path, "a calibration")
-        with reading(path, "a calibration, gains [tx][rx][real, imaginary]"):
+        with convert_read_errors(path, "a calibration, gains [tx][rx][real, imaginary]"):
             parts = torch.tensor(json.loads(path.read_text())["gains"], dtype=torch.float64)
             if parts.ndim != 3 or parts.shape[2] != 2:
                 raise ValueError(f"shape {tuple(parts.shape)}")
@@ -84,10 +85,10 @@ class ChannelCalibration:
         Raises:
             InputError: the folder does not exist.
         """
-        with replacing(path) as part:
+        with replace_file(path) as part:
             part.write_text(json.dumps({"gains": torch.view_as_real(self.gains).tolist()}) + "\n")
 
-    def apply(self, capture: Recorded) -> Recorded:
+    def apply(self, capture: RecordingT) -> RecordingT:
         """The recording with every channel divided by its gain.
 
         Raises:
@@ -102,7 +103,7 @@ class ChannelCalibration:
         beat = (beat / self.gains[:, :, None]).to(beat.dtype)
         if isinstance(capture, ChirpCapture):
             return replace(capture, beat=beat)
-        return type(capture)(capture.dataset.assign(beat=labelled(BEAT_DIMS, beat, "1")))
+        return type(capture)(capture.dataset.assign(beat=to_data_array(BEAT_DIMS, beat, "1")))
 
 
 def estimate_channels(
@@ -128,7 +129,7 @@ def estimate_channels(
     do = "give the world position of the reflector in metres"
     place = checked_tensor(reflector, (3,), "reflector", do)
     radar = capture.radar()
-    waveform = sampled(radar)
+    waveform = require_sampled_waveform(radar)
     tx, rx = radar.elements()
     to_tx, to_rx = (tx - place).norm(dim=-1), (rx - place).norm(dim=-1)
     delay = (to_tx[:, :, None] + to_rx[:, None]) / SPEED_OF_LIGHT

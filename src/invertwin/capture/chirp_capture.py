@@ -61,7 +61,7 @@ class ChirpCapture:
         """Range up to which the samples mean something [m]."""
         return self.device.range_limits[1] / (2 if self.real else 1)
 
-    def loops(self, first: int, count: int) -> "ChirpCapture":
+    def select_chirps(self, first: int, count: int) -> "ChirpCapture":
         """A part of the chirps of every frame.
 
         Args:
@@ -84,7 +84,7 @@ class ChirpCapture:
             )
         return replace(self, beat=self.beat[list(numbers)], device=self.device.frames(numbers))
 
-    def placed(
+    def with_poses(
         self,
         positions: Float64[Tensor, "frame 3"],
         rotations: Float64[Tensor, "frame 3 3"] | None = None,
@@ -101,7 +101,7 @@ class ChirpCapture:
         check_shape(positions, (self.frame_count, 3), "positions along frame", "give one each")
         return replace(self, device=replace(self.device, positions=positions, rotations=rotations))
 
-    def capture(self, chirp: int | str = "mean") -> Capture:
+    def to_capture(self, chirp: int | str = "mean") -> Capture:
         """One beat signal per frame and channel, for a scene that stands still within a frame.
 
         A static scene is the same in every chirp, so the mean over the chirps is the recording with

@@ -15,14 +15,22 @@ from torch import Tensor
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.checks import check_fields, check_shape, checked_number
 from invertwin.errors import InputError
-from invertwin.limits import Among, Count, Frequency, NonNegative, Positive, Several, Usual
-from invertwin.radar.boards import Elements, Mounting
+from invertwin.limits import (
+    AllowedValues,
+    Count,
+    CountOfTwo,
+    Frequency,
+    NonNegative,
+    Positive,
+    UsualValue,
+)
+from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.waveform import FMCW, PhysicsWarning
 
 CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")
-Pause = Annotated[NonNegative, Usual("seconds", 5e-6, high=1.0)]
+IdleTime = Annotated[NonNegative, UsualValue("seconds", 5e-6, high=1.0)]
 
 
 @dataclass(frozen=True)
@@ -53,21 +61,21 @@ class ChirpSettings:
     """
 
     start_frequency: Frequency
-    slope: Annotated[Positive, Usual("Hz/s", 60e12, low=1.0)]
-    sample_rate: Annotated[Positive, Usual("Hz", 5e6, low=1.0)]
-    samples: Several
+    slope: Annotated[Positive, UsualValue("Hz/s", 60e12, low=1.0)]
+    sample_rate: Annotated[Positive, UsualValue("Hz", 5e6, low=1.0)]
+    samples: CountOfTwo
     transmit_order: tuple[int, ...]
     receivers: tuple[int, ...]
     loops: Count
     frames: Count | None = None
     frame_period: float | None = None
-    idle_time: Pause = 0.0
-    adc_start_time: Pause = 0.0
+    idle_time: IdleTime = 0.0
+    adc_start_time: IdleTime = 0.0
     ramp_end_time: float | None = None
     real: bool = False
     swap_iq: bool = False
-    bits: Annotated[int, Among((12, 14, 16))] = 16
-    lanes: Annotated[int, Among((2, 4))] | None = None
+    bits: Annotated[int, AllowedValues((12, 14, 16))] = 16
+    lanes: Annotated[int, AllowedValues((2, 4))] | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -169,9 +177,9 @@ class ChirpData:
         analytic = np.asarray(hilbert(self.samples.real.numpy().astype(np.float64), axis=-1))
         return torch.from_numpy(analytic)
 
-    def recorded(
+    def to_chirp_capture(
         self,
-        board: Mounting | Elements,
+        board: Mounting | TxRxArrays,
         positions: Float64[Tensor, "frame 3"] | None = None,
         rotations: Float64[Tensor, "frame 3 3"] | None = None,
     ) -> ChirpCapture:
@@ -227,7 +235,7 @@ def adc_counts(
     if beat.ndim == 4:
         beat = beat[:, None].expand(-1, settings.loops, -1, -1, -1)
     if order is not None:
-        beat = beat[:, :, _checked_order(order, beat.shape[2])]
+        beat = beat[:, :, _check_order(order, beat.shape[2])]
     top = 2 ** (settings.bits - 1) - 1
     parts = torch.view_as_real(beat.to(torch.complex128).resolve_conj()) * (top / full_scale)
     parts = parts.round().clamp(-top - 1, top)
@@ -253,7 +261,7 @@ def shortest_loop(order: Sequence[int], loops: int) -> tuple[tuple[int, ...], in
     return whole, loops
 
 
-def settings_of(
+def make_settings(
     waveform: FMCW,
     transmitters: int | Sequence[int],
     receivers: int | Sequence[int],
@@ -280,7 +288,7 @@ def settings_of(
         for given in (transmitters, receivers)
     )
     if order is not None:
-        senders = [senders[turn] for turn in _checked_order(order, len(senders))]
+        senders = [senders[turn] for turn in _check_order(order, len(senders))]
     others.setdefault("loops", 1)
     rate = waveform.samples / waveform.duration
     nearest = round(rate)
@@ -296,7 +304,7 @@ def settings_of(
     )
 
 
-def _checked_order(order: Sequence[int], transmitters: int) -> list[int]:
+def _check_order(order: Sequence[int], transmitters: int) -> list[int]:
     if sorted(order) != list(range(transmitters)):
         raise InputError(
             f"expected an order of the transmitters 0 to {transmitters - 1}, each once, got "

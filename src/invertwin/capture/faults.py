@@ -14,14 +14,14 @@ from torch import Tensor
 
 from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.capture.prediction import covariances, predictor, residuals
+from invertwin.capture.prediction import covariances, prediction_coefficients, prediction_residuals
 from invertwin.radar.processing.reflectors import noise_power
-from invertwin.radar.radar import sampled
+from invertwin.radar.radar import require_sampled_waveform
 from invertwin.radar.waveform import SampledWaveform, unit_window
 
-_NEAR_CELLS = 3  # from range zero, in which leakage outshines everything
-_MOST_SAMPLES, _MOST_CHANNELS = 2**20, 64  # that are looked at
-_RATES = 3  # strongest range rates of a frame in which a pattern is looked for
+_LEAKAGE_CELLS = 3  # from range zero, in which leakage outshines everything
+_MAX_SAMPLES, _MAX_CHANNELS = 2**20, 64  # that are looked at
+_STRONGEST_RATES = 3  # strongest range rates of a frame in which a pattern is looked for
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class Fault:
     """What is wrong with a recording.
 
     Attributes:
-        name: ``complex only by type``, ``ghosts``, ``dropped samples``, ``phase break``,
-            ``leakage`` or ``saturation``.
+        name: ``complex only by type``, ``detect_ghosts``, ``dropped samples``, ``phase break``,
+            ``detect_leakage`` or ``detect_saturation``.
         evidence: What in the samples says so, and what to do.
     """
 
@@ -41,7 +41,7 @@ class Fault:
         return f"{self.name}: {self.evidence}"
 
 
-def faults_of(
+def find_faults(
     recording: Capture | ChirpCapture,
     range_min: float | None = None,
     range_max: float | None = None,
@@ -50,30 +50,33 @@ def faults_of(
 
     Args:
         recording: Samples as they were recorded, before a calibration.
-        range_min: From where the strongest echo is looked for [m]; None = as ``shown_ranges``.
+        range_min: From where the strongest echo is looked for [m]; None = as ``search_ranges``.
         range_max: Up to where.
     """
     if isinstance(recording, Capture):
         if "beat" not in recording.dataset:
             return []
         beat = recording.beat[:, None]
-        real = _analytic(beat)
+        real = _is_analytic(beat)
     else:
         beat, real = recording.beat, recording.real
     radar = recording.radar()
-    waveform = sampled(radar)
-    found = [saturation(beat, real=real), lost_samples(beat, real=real)]
-    beat = _few(beat)
+    waveform = require_sampled_waveform(radar)
+    found = [detect_saturation(beat, real=real), detect_lost_samples(beat, real=real)]
+    beat = _limit_samples(beat)
     if not any(found):
         # Both of them break phases and make ghosts, too.
-        found += [phase_break(beat, real=real), ghosts(_by_rate(beat), waveform, real=real)]
-    found.append(mirror_images(beat))
-    shown = shown_ranges(recording, range_min, range_max)
-    found.append(leakage(beat, waveform, radar.window, shown, real=real))
+        found += [
+            detect_phase_break(beat, real=real),
+            detect_ghosts(_strongest_range_rates(beat), waveform, real=real),
+        ]
+    found.append(detect_iq_images(beat))
+    shown = search_ranges(recording, range_min, range_max)
+    found.append(detect_leakage(beat, waveform, radar.window, shown, real=real))
     return [fault for fault in found if fault is not None]
 
 
-def shown_ranges(
+def search_ranges(
     recording: Capture | ChirpCapture, range_min: float | None, range_max: float | None
 ) -> tuple[float, float]:
     """Ranges in which echoes are looked for [m].
@@ -87,8 +90,8 @@ def shown_ranges(
         range_max: What the user has chosen.
     """
     radar = recording.radar()
-    waveform = sampled(radar)
-    leaking = _NEAR_CELLS * waveform.range_resolution
+    waveform = require_sampled_waveform(radar)
+    leaking = _LEAKAGE_CELLS * waveform.range_resolution
     # Ranges that count from a scene begin before it.
     near = max(leaking - float(radar.origins.min()), radar.range_limits[0])
     real = isinstance(recording, ChirpCapture) and recording.real
@@ -101,13 +104,15 @@ def shown_ranges(
 # Shares of the range between the ends of the values. Where values are smooth, the outermost code
 # holds few of those in the band beside it; clipped ones pile up in it.
 _BAND = 0.1
-_PILE = 0.5
-_LEAST_CLIPPED = 1e-3
-_LEAST_HITS = 8
-_FEW_CODES = 200  # of the largest value, below which a pure tone piles up too
+_MIN_END_FRACTION = 0.5
+_MIN_CLIPPED_FRACTION = 1e-3
+_MIN_CLIPPED_COUNT = 8
+_MIN_CODES = 200  # of the largest value, below which a pure tone piles up too
 
 
-def saturation(beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: bool) -> Fault | None:
+def detect_saturation(
+    beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: bool
+) -> Fault | None:
     """Values that pile up at the ends of their range, whatever the converter's full scale is.
 
     A tone of amplitude A that is clipped at A/s has ``acos(1/s)/π`` of its values at either end
@@ -122,7 +127,7 @@ def saturation(beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: bool)
     picked = beat[:4, :: max(1, beat.shape[1] // 2)][:, :2]
     values = picked.real if real else torch.view_as_real(picked.resolve_conj())
     codes = values.unique()
-    if len(codes) < 4 * _LEAST_HITS:
+    if len(codes) < 4 * _MIN_CLIPPED_COUNT:
         return None
     for end in (values, -values):
         top, size = end.max(), float(values.abs().max())
@@ -130,8 +135,8 @@ def saturation(beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: bool)
         hits = int((end >= top - 1e-6 * size).sum())
         beside = int((end >= top - _BAND * size).sum()) - hits
         least = 3 * math.sqrt(step / (_BAND * size))
-        many = hits >= max(_LEAST_HITS, _LEAST_CLIPPED * values.numel())
-        if step * _FEW_CODES <= size and many and hits > max(_PILE, least) * beside:
+        many = hits >= max(_MIN_CLIPPED_COUNT, _MIN_CLIPPED_FRACTION * values.numel())
+        if step * _MIN_CODES <= size and many and hits > max(_MIN_END_FRACTION, least) * beside:
             return Fault(
                 "saturation",
                 f"{hits / values.numel():.2g} of the values are at one end of their range, "
@@ -141,11 +146,13 @@ def saturation(beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: bool)
     return None
 
 
-_FALSE = 1e-4  # probability that a sound recording in noise is called faulty
-_LEAST_RUN = 8
+_FALSE_ALARM_PROBABILITY = 1e-4  # probability that a sound recording in noise is called faulty
+_MIN_RUN_LENGTH = 8
 
 
-def lost_samples(beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: bool) -> Fault | None:
+def detect_lost_samples(
+    beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: bool
+) -> Fault | None:
     """Runs of zeros within chirps that are too long to be rounded noise.
 
     With a share z of zeros elsewhere, one of n samples begins L zeros with a probability below
@@ -161,12 +168,12 @@ def lost_samples(beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: boo
     if not zero.numel() or not bool(zero.any()):
         return None
     # Of the run that each sample is in: how far it has come, and how far it goes.
-    before, after = _run_so_far(zero), _run_so_far(zero.flip(1)).flip(1)
+    before, after = _zero_run_lengths(zero), _zero_run_lengths(zero.flip(1)).flip(1)
     length = torch.where(zero, before + after - 1, 0)
-    longest, long = int(length.max()), length >= _LEAST_RUN
+    longest, long = int(length.max()), length >= _MIN_RUN_LENGTH
     rest = int((zero & ~long).sum())
     share = max(rest, 1) / max(int((~long).sum()), 1)
-    if longest < _LEAST_RUN or zero.numel() * share**longest > _FALSE:
+    if longest < _MIN_RUN_LENGTH or zero.numel() * share**longest > _FALSE_ALARM_PROBABILITY:
         return None
     return Fault(
         "dropped samples",
@@ -175,19 +182,19 @@ def lost_samples(beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: boo
     )
 
 
-def _run_so_far(zero: Bool[Tensor, "row sample"]) -> Int64[Tensor, "row sample"]:
+def _zero_run_lengths(zero: Bool[Tensor, "row sample"]) -> Int64[Tensor, "row sample"]:
     """How many zeros in a row end at each sample."""
     place = torch.arange(1, zero.shape[1] + 1)
     return place - torch.where(zero, 0, place).cummax(1).values
 
 
 # Bins beside range zero, and beside half of the unambiguous range, where a tone is its own image.
-_OWN_IMAGE = 6
-_ON_ONE_LINE = 0.97
-_EVERYWHERE = 0.5
+_SELF_IMAGE_BINS = 6
+_MIN_TOTAL_COHERENCE = 0.97
+_MIN_BIN_COHERENCE = 0.5
 
 
-def mirror_images(beat: Complex128[Tensor, "frame chirp tx rx sample"]) -> Fault | None:
+def detect_iq_images(beat: Complex128[Tensor, "frame chirp tx rx sample"]) -> Fault | None:
     """Complex by type only: every frequency has its mirror image at the negative one.
 
     ``X(−f) = e^{2jα} conj X(f)`` where I and Q lie on one line. Coherence
@@ -200,11 +207,11 @@ def mirror_images(beat: Complex128[Tensor, "frame chirp tx rx sample"]) -> Fault
         beat: Samples.
     """
     tx, rx, count = beat.shape[2:]
-    edge = min(_OWN_IMAGE, count // 8)
+    edge = min(_SELF_IMAGE_BINS, count // 8)
     if edge < 2:
         return None
     chosen = beat[:, :64].permute(2, 3, 0, 1, 4).reshape(tx * rx, -1, count)
-    spectrum = torch.fft.fft(chosen * _low_sidelobes(count))
+    spectrum = torch.fft.fft(chosen * _blackman_harris_window(count))
     near = torch.arange(edge, count // 2)
     one, other = spectrum[..., near], spectrum[..., -near]
     level = 0.5 * (one.abs().square() + other.abs().square()).sum(1)
@@ -218,7 +225,7 @@ def mirror_images(beat: Complex128[Tensor, "frame chirp tx rx sample"]) -> Fault
     weighted = float(turned[:, ~own].sum() / level[:, ~own].sum())
     tiny = torch.finfo(torch.float64).tiny
     least = float((turned.sum(0) / level.sum(0).clamp_min(tiny)).min())
-    if weighted < _ON_ONE_LINE or least < _EVERYWHERE:
+    if weighted < _MIN_TOTAL_COHERENCE or least < _MIN_BIN_COHERENCE:
         return None
     return Fault(
         "complex only by type",
@@ -230,14 +237,17 @@ def mirror_images(beat: Complex128[Tensor, "frame chirp tx rx sample"]) -> Fault
 
 # The ghost's energy over the power of noise in one cell: below, a ghost is none that counts. What
 # else may differ from the echo: noise, and a part of the ghost.
-_GHOST_OVER_NOISE = 100.0
-_UNLIKE = 0.03
-_ISOLATED = 10.0
-_EMPTY, _FLOOR = 0.2, 1e-10  # share of a spectrum without echoes; what its window leaves
-_WEAKEST_ECHO = 1e-4  # of the strongest one's power, that is searched for ghosts
+_MIN_GHOST_TO_NOISE = 100.0
+_MAX_RESIDUAL_FRACTION = 0.03
+_MIN_PEAK_TO_SURROUNDINGS = 10.0
+_NOISE_ONLY_FRACTION, _WINDOW_FLOOR = (
+    0.2,
+    1e-10,
+)  # share of a spectrum without echoes; what its window leaves
+_MIN_RELATIVE_ECHO = 1e-4  # of the strongest one's power, that is searched for ghosts
 
 
-def ghosts(
+def detect_ghosts(
     rates: Complex128[Tensor, "rate channel sample"], waveform: SampledWaveform, *, real: bool
 ) -> Fault | None:
     """Echoes whose copies lie half the unambiguous range away: odd samples unlike even ones.
@@ -250,37 +260,40 @@ def ghosts(
     it, below which chance agreement is frequent.
 
     Args:
-        rates: Of ``_by_rate``.
+        rates: Of ``_strongest_range_rates``.
         waveform: Its unambiguous range.
         real: Whether the samples were real.
     """
     count = rates.shape[-1]
-    tapered = rates * _low_sidelobes(count)
+    tapered = rates * _blackman_harris_window(count)
     power = torch.fft.fft(tapered, 4 * count).abs().square().flatten(0, 1).mean(0)
     looks, top = rates.shape[0] * rates.shape[1], float(power.max())
-    noise = max(noise_power(power[: 2 * count] if real else power, looks, _EMPTY), _FLOOR * top)
+    noise = max(
+        noise_power(power[: 2 * count] if real else power, looks, _NOISE_ONLY_FRACTION),
+        _WINDOW_FLOOR * top,
+    )
     highest = (power >= power.roll(1)) & (power > power.roll(-1))
-    strong = highest & (power > _WEAKEST_ECHO * top) & (power > _GHOST_OVER_NOISE * noise)
+    strong = highest & (power > _MIN_RELATIVE_ECHO * top) & (power > _MIN_GHOST_TO_NOISE * noise)
     kinds = ((0.5, 1.0, False), (0.5, -1.0, True)) if not real else ((0.5, -1.0, True),)
     for place in torch.nonzero(strong)[:, 0].tolist():
         echo = place / (4 * count)
-        own = _lines(tapered, echo)
+        own = _adjacent_lines(tapered, echo)
         for offset, sign, conjugate in kinds:
             at = (offset + sign * echo) % 1
-            if abs((at - echo + 0.5) % 1 - 0.5) * count < _OWN_IMAGE:
+            if abs((at - echo + 0.5) % 1 - 0.5) * count < _SELF_IMAGE_BINS:
                 continue
-            around = max(noise, _beside(power, at))
-            if _at(power, at) < _ISOLATED * around:
+            around = max(noise, _power_beside(power, at))
+            if _power_at(power, at) < _MIN_PEAK_TO_SURROUNDINGS * around:
                 continue
-            copy = _lines(tapered, at)
+            copy = _adjacent_lines(tapered, at)
             like = own.flip(-1).conj() if conjugate else own
             factor = torch.vdot(like.flatten(), copy.flatten()) / like.abs().square().sum()
             explained = float(factor.abs().square() * like.abs().square().sum())
             left = float((copy - factor * like).abs().square().sum())
             chance = around * copy.numel() * (1 + 4 / math.sqrt(looks))
             if (
-                explained > _GHOST_OVER_NOISE * around
-                and left < chance + _UNLIKE * explained
+                explained > _MIN_GHOST_TO_NOISE * around
+                and left < chance + _MAX_RESIDUAL_FRACTION * explained
                 and float(factor.abs()) < 1.05
             ):
                 level = 20 * math.log10(float(factor.abs()))
@@ -295,13 +308,13 @@ def ghosts(
     return None
 
 
-_ORDER = 8  # of the prediction
-_SETTLING = 8  # part of a ramp
-_LEAST_RATIO = 4.0
-_FEW_CHIRPS = 4
+_PREDICTION_ORDER = 8  # of the prediction
+_SETTLING_PART = 8  # part of a ramp
+_MIN_RESIDUAL_RATIO = 4.0
+_MIN_CHIRPS = 4
 
 
-def phase_break(
+def detect_phase_break(
     beat: Complex128[Tensor, "frame chirp tx rx sample"], *, real: bool
 ) -> Fault | None:
     """A sample that does not follow from the ones before it, in all chirps or in one.
@@ -317,58 +330,62 @@ def phase_break(
         real: Whether they were real: the ends of an analytic signal follow from nothing.
     """
     count = beat.shape[-1]
-    order = min(_ORDER, count // 6)
+    order = min(_PREDICTION_ORDER, count // 6)
     if order < 2:
         return None
     if real:
         beat = beat.real.to(beat.dtype)
-    rates = _by_rate(beat)
-    settled = count // _SETTLING
+    rates = _strongest_range_rates(beat)
+    settled = count // _SETTLING_PART
     first, rows = settled + order, rates.flatten(0, 1)[:, settled:]
     products = covariances(rows, order)
     kept = torch.ones(len(products), dtype=torch.bool)
     left, place = torch.zeros(0), 0
     for _ in range(3):
-        left = _over(residuals(products, predictor(products, kept)), order)
+        left = _window_means(
+            prediction_residuals(products, prediction_coefficients(products, kept)), order
+        )
         place = int(left.argmax())
         kept[:] = True
         kept[place : place + order] = False
     away = torch.ones(len(left), dtype=torch.bool)
     away[max(place - order + 1, 0) : place + order] = False
-    found = _stands_out(left, left[away], len(rows)) if bool(away.any()) else None
+    found = _outlier_ratio(left, left[away], len(rows)) if bool(away.any()) else None
     if found is not None:
-        return _broken(place + first, found, "chirps")
+        return _phase_break_fault(place + first, found, "chirps")
     chirps = beat.flatten(0, 1).flatten(1, 2)[..., settled:]
-    if len(chirps) < _FEW_CHIRPS:
+    if len(chirps) < _MIN_CHIRPS:
         return None
-    coefficients = predictor(covariances(chirps.flatten(0, 1), order), torch.ones_like(kept))
+    coefficients = prediction_coefficients(
+        covariances(chirps.flatten(0, 1), order), torch.ones_like(kept)
+    )
     past = chirps.unfold(-1, order + 1, 1).flip(-1)
     both = [(past @ part).abs().square() for part in (coefficients, coefficients.conj().flip(0))]
-    each = _over(0.5 * (both[0] + both[1]).mean(1), order)
-    found = _stands_out(each, each.flatten(), chirps.shape[1])
+    each = _window_means(0.5 * (both[0] + both[1]).mean(1), order)
+    found = _outlier_ratio(each, each.flatten(), chirps.shape[1])
     if found is None:
         return None
     chirp, place = divmod(int(each.argmax()), each.shape[1])
-    return _broken(place + first, found, f"chirp {chirp % beat.shape[1]}")
+    return _phase_break_fault(place + first, found, f"chirp {chirp % beat.shape[1]}")
 
 
-def _at(power: Float64[Tensor, " bin"], frequency: float) -> float:
+def _power_at(power: Float64[Tensor, " bin"], frequency: float) -> float:
     return float(power[round(frequency * len(power)) % len(power)])
 
 
-def _beside(power: Float64[Tensor, " bin"], frequency: float) -> float:
+def _power_beside(power: Float64[Tensor, " bin"], frequency: float) -> float:
     """Power on the quieter side of a line: as much as on it where a break has spread an echo."""
     count = len(power) // 4
-    reach = min(_OWN_IMAGE, count // 6) / count
-    return min(_at(power, frequency - reach), _at(power, frequency + reach))
+    reach = min(_SELF_IMAGE_BINS, count // 6) / count
+    return min(_power_at(power, frequency - reach), _power_at(power, frequency + reach))
 
 
-def _over(values: Tensor, count: int) -> Tensor:
+def _window_means(values: Tensor, count: int) -> Tensor:
     """Means over the windows of prediction that a break at each place cuts."""
     return values.unfold(-1, count, 1).mean(-1)
 
 
-def _broken(sample: int, ratio: float, where: str) -> Fault:
+def _phase_break_fault(sample: int, ratio: float, where: str) -> Fault:
     return Fault(
         "phase break",
         f"sample {sample} of {where} does not follow from the samples before it (residual "
@@ -377,39 +394,43 @@ def _broken(sample: int, ratio: float, where: str) -> Fault:
     )
 
 
-def _stands_out(values: Tensor, usual: Tensor, looks: int) -> float | None:
+def _outlier_ratio(values: Tensor, reference: Tensor, averages: int) -> float | None:
     """The largest over the median, if chance does not explain it."""
-    low, middle, high = (float(usual.quantile(q)) for q in (0.25, 0.5, 0.75))
+    low, middle, high = (float(reference.quantile(q)) for q in (0.25, 0.5, 0.75))
     if middle <= 0:
         return None
-    shape = _gamma_shape(high / max(low, 1e-300), looks)
-    limit = float(gammainccinv(shape, _FALSE / values.numel()) / gammaincinv(shape, 0.5))
+    shape = _gamma_shape(high / max(low, 1e-300), averages)
+    limit = float(
+        gammainccinv(shape, _FALSE_ALARM_PROBABILITY / values.numel()) / gammaincinv(shape, 0.5)
+    )
     ratio = float(values.max()) / middle
-    return ratio if ratio > max(limit, _LEAST_RATIO) else None
+    return ratio if ratio > max(limit, _MIN_RESIDUAL_RATIO) else None
 
 
-def _gamma_shape(quartiles: float, most: float) -> float:
+def _gamma_shape(quartile_ratio: float, maximum: float) -> float:
     """Shape of the gamma distribution whose upper quartile is so many times the lower one."""
-    low, high = 0.2, float(most)
+    low, high = 0.2, float(maximum)
     for _ in range(40):
         shape = math.sqrt(low * high)
-        if float(gammaincinv(shape, 0.75) / gammaincinv(shape, 0.25)) > quartiles:
+        if float(gammaincinv(shape, 0.75) / gammaincinv(shape, 0.25)) > quartile_ratio:
             low = shape
         else:
             high = shape
     return low
 
 
-_BOARD = 0.3  # m, half the length of ways from transmitters to receivers over a board and its cover
+_BOARD_RANGE = (
+    0.3  # m, half the length of ways from transmitters to receivers over a board and its cover
+)
 # Over the window's sidelobes; ends of a chirp, which do not meet, raise those of analytic signals.
-_SKIRT, _REAL_SKIRT = 4.0, 16.0
+_SIDELOBE_FACTOR, _REAL_SIDELOBE_FACTOR = 4.0, 16.0
 
 
-def leakage(
+def detect_leakage(
     beat: Complex128[Tensor, "frame chirp tx rx sample"],
     waveform: SampledWaveform,
     window: str,
-    shown: tuple[float, float],
+    search_range: tuple[float, float],
     *,
     real: bool,
 ) -> Fault | None:
@@ -424,7 +445,7 @@ def leakage(
         beat: Samples.
         waveform: Its ranges.
         window: Over the samples.
-        shown: First and last range where echoes are looked for [m].
+        search_range: First and last range where echoes are looked for [m].
         real: Whether the samples were real.
     """
     cell, farthest, count = waveform.range_resolution, waveform.max_range, waveform.samples
@@ -433,18 +454,18 @@ def leakage(
     power = spectrum.abs().square().flatten(0, 3).mean(0)
     ranges = torch.arange(finer * count) * (cell / finer)
     near = ranges if real else torch.minimum(ranges, farthest - ranges)
-    around = _NEAR_CELLS * cell
-    seen = (ranges >= shown[0]) & (ranges <= shown[1])
-    zone = (ranges <= max(_BOARD, around)) | (near <= around)
+    around = _LEAKAGE_CELLS * cell
+    seen = (ranges >= search_range[0]) & (ranges <= search_range[1])
+    zone = (ranges <= max(_BOARD_RANGE, around)) | (near <= around)
     highest = (power >= power.roll(1)) & (power >= power.roll(-1))
     source = int(torch.where(zone & highest, power, 0.0).argmax())
     strongest = int(torch.where(seen, power, 0.0).argmax())
     apart = (ranges - ranges[source])[:, None] + cell * torch.tensor([-0.5, 0.0, 0.5])
     response = waveform.range_response(apart.flatten().double(), window).reshape(apart.shape)
-    skirt = (_REAL_SKIRT if real else _SKIRT) * power[source] * response.amax(1)
-    over_board = float(ranges[strongest]) <= _BOARD
+    skirt = (_REAL_SIDELOBE_FACTOR if real else _SIDELOBE_FACTOR) * power[source] * response.amax(1)
+    over_board = float(ranges[strongest]) <= _BOARD_RANGE
     # At the first range that is shown, falling from one that is not.
-    first = float(ranges[strongest]) < shown[0] + cell and not bool(highest[strongest])
+    first = float(ranges[strongest]) < search_range[0] + cell and not bool(highest[strongest])
     flank = first and bool(power[source] > power[strongest])
     above = bool(power[strongest] > skirt[strongest])
     if not over_board and not flank and above:
@@ -456,7 +477,8 @@ def leakage(
         level = 10 * math.log10(float(power[strongest] / power[best]))
         advice = (
             f"the strongest echo beyond is at {float(ranges[best]):.3g} m, {level:.0f} dB weaker: "
-            f"give --range-min {0.5 * (float(ranges[best]) + max(_BOARD, shown[0])):.2g}"
+            f"give --range-min "
+            f"{0.5 * (float(ranges[best]) + max(_BOARD_RANGE, search_range[0])):.2g}"
         )
     return Fault(
         "leakage",
@@ -465,43 +487,43 @@ def leakage(
     )
 
 
-def _few(
+def _limit_samples(
     beat: Complex[Tensor, "frame chirp tx rx sample"],
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
     """As many transmitters, chirps and frames, the latter in equal steps, as are looked at."""
     _, chirps, tx, rx, count = beat.shape
-    senders = max(1, min(tx, _MOST_CHANNELS // rx))
-    loops = max(1, min(chirps, _MOST_SAMPLES // (senders * rx * count)))
-    frames = max(1, min(len(beat), _MOST_SAMPLES // (loops * senders * rx * count)))
+    senders = max(1, min(tx, _MAX_CHANNELS // rx))
+    loops = max(1, min(chirps, _MAX_SAMPLES // (senders * rx * count)))
+    frames = max(1, min(len(beat), _MAX_SAMPLES // (loops * senders * rx * count)))
     chosen = torch.linspace(0, len(beat) - 1, frames).long()
     return beat[chosen][:, :loops, :senders].to(torch.complex128)
 
 
-def _analytic(beat: Complex[Tensor, "frame chirp tx rx sample"]) -> bool:
+def _is_analytic(beat: Complex[Tensor, "frame chirp tx rx sample"]) -> bool:
     """Whether samples were real ones: no power in the farther half of the unambiguous range."""
     count = beat.shape[-1]
     power = torch.fft.fft(beat[:1]).abs().square().flatten(0, 3).sum(0)
-    return bool(power[count // 2 + 1 :].sum() < _FLOOR * power.sum())
+    return bool(power[count // 2 + 1 :].sum() < _WINDOW_FLOOR * power.sum())
 
 
-def _by_rate(
+def _strongest_range_rates(
     beat: Complex128[Tensor, "frame chirp tx rx sample"],
 ) -> Complex128[Tensor, "rate channel sample"]:
     """The strongest range rates of every frame, in which noise of many chirps is averaged."""
     rates = torch.fft.fft(beat.flatten(2, 3), dim=1) / math.sqrt(beat.shape[1])
     energy = rates.abs().square().sum((2, 3))
-    best = energy.topk(min(_RATES, beat.shape[1]), dim=1).indices
+    best = energy.topk(min(_STRONGEST_RATES, beat.shape[1]), dim=1).indices
     return torch.cat([frame[chosen] for frame, chosen in zip(rates, best, strict=True)])
 
 
-def _low_sidelobes(count: int) -> Float64[Tensor, " sample"]:
+def _blackman_harris_window(count: int) -> Float64[Tensor, " sample"]:
     """The four-term window of Blackman and Harris: sidelobes of −92 dB."""
     turn = 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
     terms = (0.35875, -0.48829, 0.14128, -0.01168)
     return sum((a * torch.cos(k * turn) for k, a in enumerate(terms)), torch.zeros(count)) / count
 
 
-def _lines(
+def _adjacent_lines(
     tapered: Complex128[Tensor, "rate channel sample"], frequency: float
 ) -> Complex128[Tensor, "rate channel line"]:
     """Spectra a bin below, at, and a bin above a frequency in cycles per sample."""

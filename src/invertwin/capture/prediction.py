@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Complex128, Float64
 from torch import Tensor
 
-_LOADING = 1e-9  # of the mean power: exact tones have singular equations
+_DIAGONAL_LOADING = 1e-9  # of the mean power: exact tones have singular equations
 
 
 def covariances(
@@ -24,23 +24,23 @@ def covariances(
     return torch.einsum("rnk,rnl->nkl", past.conj(), past) / len(rows)
 
 
-def predictor(
-    products: Complex128[Tensor, "place lag lag"], kept: Bool[Tensor, " place"]
+def prediction_coefficients(
+    products: Complex128[Tensor, "place lag lag"], mask: Bool[Tensor, " place"]
 ) -> Complex128[Tensor, " lag"]:
     """Coefficients with the least mean residual at the places that are kept, the first one 1.
 
     Args:
         products: Of ``covariances``.
-        kept: Places that count.
+        mask: Places that count.
     """
-    mean = products[kept].sum(0)
+    mean = products[mask].sum(0)
     level = mean.diagonal().real.mean().clamp_min(torch.finfo(torch.float64).tiny)
-    inner = mean[1:, 1:] + _LOADING * level * torch.eye(len(mean) - 1, dtype=mean.dtype)
+    inner = mean[1:, 1:] + _DIAGONAL_LOADING * level * torch.eye(len(mean) - 1, dtype=mean.dtype)
     past = -torch.linalg.solve(inner, mean[1:, 0])
     return torch.cat([torch.ones(1, dtype=mean.dtype), past])
 
 
-def residuals(
+def prediction_residuals(
     products: Complex128[Tensor, "place lag lag"], coefficients: Complex128[Tensor, " lag"]
 ) -> Float64[Tensor, " place"]:
     """Mean power of what prediction leaves at each place, forwards and backwards in time.
@@ -49,7 +49,7 @@ def residuals(
 
     Args:
         products: Of ``covariances``.
-        coefficients: Of ``predictor``.
+        coefficients: Of ``prediction_coefficients``.
     """
     both = torch.stack([coefficients, coefficients.conj().flip(0)])
     form = torch.einsum("dk,nkl,dl->n", both.conj(), products, both)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar.processing.backprojection import UPSAMPLING, between_samples
+from invertwin.radar.processing.backprojection import UPSAMPLING, interpolate_samples
 
 
 class RangeInterpolator:
@@ -58,5 +58,5 @@ class RangeInterpolator:
                 f"{low:g} to {high:g} m; choose a smaller grid or nearer points"
             )
         offset = ranges - self._first
-        value = between_samples(self._samples, offset / self._step)
+        value = interpolate_samples(self._samples, offset / self._step)
         return value * torch.polar(torch.ones_like(offset), self._wavenumber * offset)

@@ -34,7 +34,7 @@ class Track:
                 "expected at least 2 ascending track times, got others; sort the track by time"
             )
 
-    def at(self, times: Float64[Tensor, " frame"]) -> Float64[Tensor, "frame 3"]:
+    def interpolate(self, times: Float64[Tensor, " frame"]) -> Float64[Tensor, "frame 3"]:
         """Interpolate positions linearly at these times; differentiable with respect to the times.
 
         Raises:

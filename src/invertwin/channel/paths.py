@@ -16,7 +16,7 @@ from invertwin.scene.polarisation import VERTICAL, Polarisation
 
 
 @runtime_checkable
-class Pattern(Protocol):
+class GainPattern(Protocol):
     """What the channel asks of an antenna pattern (see ``invertwin.scene.antenna``)."""
 
     def gain(self, direction: Float[Tensor, "*point 3"]) -> Float[Tensor, "*point"]:
@@ -99,8 +99,8 @@ class Link:
     tx: Float64[Tensor, "frame 3"]
     rx: Float64[Tensor, "frame 3"]
     rotations: Float64[Tensor, "frame 3 3"]
-    tx_pattern: Pattern
-    rx_pattern: Pattern
+    tx_pattern: GainPattern
+    rx_pattern: GainPattern
     wavelength: float
     shared_visibility: bool
     tx_jones: Polarisation = VERTICAL
@@ -148,7 +148,8 @@ class Paths:
             mean elements.
         face: Triangle of the scattering point, counted through all objects of the scene in order;
             −1 of paths of several bounces. None where paths are not bound to a surface.
-        share: Its barycentric coordinates, the second's and the third's corner; with ``face``.
+        barycentric: Its barycentric coordinates, the second's and the third's corner; with
+            ``face``.
     """
 
     frame: Int64[Tensor, " path"]
@@ -162,7 +163,7 @@ class Paths:
     velocity: Float64[Tensor, "path 3"] | None = None
     matrix: Complex128[Tensor, "path r t"] | None = None
     face: Int64[Tensor, " path"] | None = None
-    share: Float64[Tensor, "path 2"] | None = None
+    barycentric: Float64[Tensor, "path 2"] | None = None
 
     def __len__(self) -> int:
         return self.delay.shape[0]
@@ -172,7 +173,7 @@ class Paths:
         """Half the path length [m]."""
         return 0.5 * SPEED_OF_LIGHT * self.delay
 
-    def cosines(self, link: "Link") -> Float64[Tensor, "path 2"]:
+    def direction_cosines(self, link: "Link") -> Float64[Tensor, "path 2"]:
         """Direction cosines u and v in which the receiver sees the last points.
 
         Args:
@@ -182,18 +183,18 @@ class Paths:
         local = torch.einsum("nij,ni->nj", link.rotations[self.frame], way)
         return local[:, :2] / way.norm(dim=1, keepdim=True)
 
-    def chosen(self, mask: Bool[Tensor, " path"] | Int64[Tensor, " chosen"]) -> "Paths":
+    def select(self, mask: Bool[Tensor, " path"] | Int64[Tensor, " select"]) -> "Paths":
         """Only the paths of a mask, or of indices."""
         rows = {n: value[mask] for n, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(self, **rows)
 
     @property
-    def carries(self) -> Bool[Tensor, " path"]:
+    def has_field(self) -> Bool[Tensor, " path"]:
         """Which paths have a field, between any of the elements."""
         own = self.coefficient != 0
         return own if self.matrix is None else own | (self.matrix != 0).flatten(1).any(1)
 
-    def weighted(self, weight: float | Float64[Tensor, " path"]) -> "Paths":
+    def scale_fields(self, weight: float | Float64[Tensor, " path"]) -> "Paths":
         """The paths with fields of other strength.
 
         Args:
@@ -204,12 +205,12 @@ class Paths:
         return replace(self, coefficient=self.coefficient * factor, matrix=matrix)
 
     def __add__(self, other: "Paths") -> "Paths":
-        return joined([self, other])
+        return concatenate_paths([self, other])
 
 
-def joined(parts: Sequence[Paths]) -> Paths:
+def concatenate_paths(parts: Sequence[Paths]) -> Paths:
     """All paths in order."""
-    own = ("kind", "velocity", "matrix", "face", "share")
+    own = ("kind", "velocity", "matrix", "face", "barycentric")
     names = [f.name for f in fields(Paths) if f.name not in own]
     columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
     velocity = None
@@ -225,5 +226,7 @@ def joined(parts: Sequence[Paths]) -> Paths:
         velocity=velocity,
         matrix=torch.cat(matrices) if len(matrices) == len(parts) else None,
         face=torch.cat([part.face for part in parts if part.face is not None]) if bound else None,
-        share=torch.cat([p.share for p in parts if p.share is not None]) if bound else None,
+        barycentric=torch.cat([p.barycentric for p in parts if p.barycentric is not None])
+        if bound
+        else None,
     )

@@ -7,11 +7,11 @@ from typing import Annotated
 from annotated_types import Ge, Le
 
 from invertwin.errors import InputError
-from invertwin.limits import MOST, Count
+from invertwin.limits import MAX_COUNT, Count
 
-_DEEPEST = 16
+_MAX_DEPTH = 16
 
-REST = "*"
+ALL_OTHERS = "*"
 """In densities by object: all objects that are not named."""
 
 Densities = float | Mapping[str, float]
@@ -45,9 +45,9 @@ class Sampling:
         InputError: A number out of range.
     """
 
-    depth: Annotated[int, Ge(1), Le(_DEEPEST)] = 3
+    depth: Annotated[int, Ge(1), Le(_MAX_DEPTH)] = 3
     samples: Count = 400_000
-    boundary_samples: Annotated[int, Ge(0), Le(MOST)] = 50_000
+    boundary_samples: Annotated[int, Ge(0), Le(MAX_COUNT)] = 50_000
     boundary: bool = True
     interior_edges: bool = True
     contacts: bool = True
@@ -57,14 +57,14 @@ class Sampling:
     backend: str | None = None
 
     def __post_init__(self) -> None:
-        if not 1 <= self.depth <= _DEEPEST:
+        if not 1 <= self.depth <= _MAX_DEPTH:
             raise InputError(
-                f"expected a depth from 1 to {_DEEPEST}, got {self.depth}; give the most bounces "
+                f"expected a depth from 1 to {_MAX_DEPTH}, got {self.depth}; give the most bounces "
                 "of a path"
             )
-        if not (1 <= self.samples <= MOST and 0 <= self.boundary_samples <= MOST):
+        if not (1 <= self.samples <= MAX_COUNT and 0 <= self.boundary_samples <= MAX_COUNT):
             raise InputError(
-                f"expected samples from 1 and boundary_samples from 0 to {MOST}, got "
+                f"expected samples from 1 and boundary_samples from 0 to {MAX_COUNT}, got "
                 f"{self.samples} and {self.boundary_samples}; give the number of rays over all "
                 "frames"
             )

@@ -15,34 +15,34 @@ from typer.core import TyperGroup
 from invertwin import __version__
 from invertwin.cli.options import (
     BackendOption,
-    Dataset,
+    DatasetOptions,
     FileArgument,
     FilesArgument,
-    Find,
-    Fits,
-    Look,
-    Options,
-    Resumable,
+    FitOptions,
+    LookOptions,
+    ResumableOptions,
+    RunOptions,
+    TwinOptions,
     console,
     with_options,
 )
-from invertwin.cli.report import Table
-from invertwin.cli.schema.run_file import about_file
-from invertwin.cli.terminal import load_runs, now_and_then, print_tables, progress, run_folder
-from invertwin.errors import InputError, interruptible, one_line
-from invertwin.runtime.threads import available
+from invertwin.cli.report import ReportTable
+from invertwin.cli.schema.run_file import prefix_file_errors
+from invertwin.cli.terminal import limit_rate, load_runs, print_tables, run_folder, show_progress
+from invertwin.errors import InputError, exit_on_interrupt, to_one_line
+from invertwin.runtime.threads import available_threads
 
 
-class _Commands(TyperGroup):
+class _CommandGroup(TyperGroup):
     """Our commands, and those of plugins, which are imported when ours do not answer."""
 
     def make_context(self, *args: Any, **given: Any) -> Any:
-        with interruptible():
+        with exit_on_interrupt():
             return super().make_context(*args, **given)
 
-    def invoke(self, ctx: Any) -> Any:
-        with interruptible():
-            return super().invoke(ctx)
+    def invoke(self, context: Any) -> Any:
+        with exit_on_interrupt():
+            return super().invoke(context)
 
     def list_commands(self, ctx: Any) -> list[str]:
         self._add_plugins()
@@ -65,7 +65,7 @@ class _Commands(TyperGroup):
 
 app = typer.Typer(
     name="invertwin",
-    cls=_Commands,
+    cls=_CommandGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -92,47 +92,56 @@ def invertwin(
 
 
 @app.command()
-@with_options(Options)
-def simulate(options: Options, file: FileArgument) -> None:
+@with_options(RunOptions)
+def simulate(options: RunOptions, file: FileArgument) -> None:
     """Simulate exact radar signals of a scene, and their spectra."""
     runs = load_runs([file], options, "simulate", ("radar", "grid", "data"))
     with run_folder(options, Path("out", file.stem), runs) as folder:
         from invertwin.cli.commands.simulate import run_simulate
 
-        with about_file(file), progress(console):
+        with prefix_file_errors(file), show_progress(console):
             tables = run_simulate(runs[file.stem], folder)
         print_tables(tables)
 
 
 @app.command()
-@with_options(Dataset)
-def dataset(options: Dataset, file: FileArgument) -> None:
+@with_options(DatasetOptions)
+def dataset(options: DatasetOptions, file: FileArgument) -> None:
     """Simulate a data set: many samples of a run file with other values each, and their labels."""
-    from invertwin.cli.commands.dataset import NEEDS, folder_of_part, part_of, run_dataset
+    from invertwin.cli.commands.dataset import (
+        DATASET_SECTIONS,
+        parse_part,
+        part_folder,
+        run_dataset,
+    )
 
-    part = part_of(options.shard)
-    runs = load_runs([file], options, "dataset", NEEDS)
-    chosen = replace(options, out=folder_of_part(options.out or Path("out", file.stem), part))
+    part = parse_part(options.shard)
+    runs = load_runs([file], options, "dataset", DATASET_SECTIONS)
+    chosen = replace(options, out=part_folder(options.out or Path("out", file.stem), part))
     with run_folder(chosen, Path("out"), runs) as folder:
         if folder.complete:
             return
-        with about_file(file), progress(console):
+        with prefix_file_errors(file), show_progress(console):
             tables = run_dataset(
-                runs[file.stem], folder, part, options.engine, options.workers or available()
+                runs[file.stem],
+                folder,
+                part,
+                options.engine,
+                options.workers or available_threads(),
             )
         print_tables(tables)
 
 
 @app.command()
-@with_options(Fits)
-def reconstruct(options: Fits, file: FileArgument) -> None:
+@with_options(FitOptions)
+def reconstruct(options: FitOptions, file: FileArgument) -> None:
     """Fit the parameters of a scene to radar data."""
-    _reconstruct(file, options, Path("out", file.stem))
+    _run_one_reconstruction(file, options, Path("out", file.stem))
 
 
 @app.command()
-@with_options(Resumable)
-def plan(options: Resumable, file: FileArgument) -> None:
+@with_options(ResumableOptions)
+def plan(options: ResumableOptions, file: FileArgument) -> None:
     """State the error bars of a fit before anything is recorded, and rank positions to add."""
     runs = load_runs([file], options, "plan", ("radar", "data", "grid", "parameters"))
     with run_folder(options, Path("out", file.stem), runs) as folder:
@@ -140,8 +149,8 @@ def plan(options: Resumable, file: FileArgument) -> None:
             return
         from invertwin.cli.commands.plan import run_plan
 
-        with about_file(file):
-            tables = run_plan(runs[file.stem], folder, console, now_and_then())
+        with prefix_file_errors(file):
+            tables = run_plan(runs[file.stem], folder, console, limit_rate())
         print_tables(tables)
 
 
@@ -153,43 +162,43 @@ def check(file: FileArgument, backend: BackendOption = None) -> None:
     run = load_run(file)
     from invertwin.cli.commands.check import run_check
 
-    with about_file(file):
+    with prefix_file_errors(file):
         tables, line = run_check(run)
     print_tables(tables)
     console.print(line, markup=False, soft_wrap=True)
 
 
 @app.command()
-@with_options(Resumable)
-def demo(options: Resumable) -> None:
+@with_options(ResumableOptions)
+def demo(options: ResumableOptions) -> None:
     """Find a hidden letter from its radar echoes."""
     # In its own folder the demo replaces what it left there before.
     again = options.overwrite or (options.out is None and not options.resume)
-    _reconstruct(_demo_file(), replace(options, overwrite=again), Path("out/demo"))
+    _run_one_reconstruction(_find_demo_file(), replace(options, overwrite=again), Path("out/demo"))
 
 
 @app.command()
-@with_options(Look)
-def look(options: Look) -> None:
+@with_options(LookOptions)
+def look(options: LookOptions) -> None:
     """Show a recording: range, range rate, direction; and write it as a capture."""
     from invertwin.cli.commands.look import run_look
 
     default = Path("out") / options.recording.name.split(".")[0]
     with run_folder(options, default) as folder:
-        with progress(console):
+        with show_progress(console):
             tables = run_look(options, folder)
         print_tables(tables)
 
 
 @app.command()
-@with_options(Find)
-def twin(options: Find) -> None:
+@with_options(TwinOptions)
+def twin(options: TwinOptions) -> None:
     """Find what stands in a recording, with no start: things, places, sizes, confidences."""
     from invertwin.cli.commands.twin import run_twin
 
     default = Path("out") / f"{options.recording.name.split('.')[0]}_twin"
     with run_folder(options, default) as folder:
-        with progress(console):
+        with show_progress(console):
             tables = run_twin(options, folder)
         print_tables(tables)
 
@@ -218,19 +227,19 @@ def view(
 
 
 @app.command()
-@with_options(Resumable)
-def gradcheck(options: Resumable, files: FilesArgument) -> None:
+@with_options(ResumableOptions)
+def gradcheck(options: ResumableOptions, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
 
-    def work(*given: Any) -> list[Table]:
+    def run_command(*given: Any) -> list[ReportTable]:
         from invertwin.cli.commands.gradcheck import run_gradcheck
 
         return run_gradcheck(*given)
 
-    _each(options, files, "gradcheck", _needs_of_gradcheck, work)
+    _run_each(options, files, "gradcheck", _gradcheck_sections, run_command)
 
 
-def _needs_of_gradcheck(run: Any) -> tuple[str, ...]:
+def _gradcheck_sections(run: Any) -> tuple[str, ...]:
     if run.map is not None:
         return ("gradcheck", "map", "transmitter")
     if run.image is not None:
@@ -240,16 +249,16 @@ def _needs_of_gradcheck(run: Any) -> tuple[str, ...]:
 
 
 @app.command()
-@with_options(Resumable)
-def rcs(options: Resumable, files: FilesArgument) -> None:
+@with_options(ResumableOptions)
+def rcs(options: ResumableOptions, files: FilesArgument) -> None:
     """Compute radar signatures: cross-sections, range profiles, images."""
 
-    def work(*given: Any) -> list[Table]:
+    def run_command(*given: Any) -> list[ReportTable]:
         from invertwin.cli.commands.rcs import run_rcs
 
         return run_rcs(*given)
 
-    _each(options, files, "rcs", ("rcs",), work)
+    _run_each(options, files, "rcs", ("rcs",), run_command)
 
 
 @app.command()
@@ -278,15 +287,15 @@ def doctor(backend: BackendOption = None) -> None:
     """Check that this machine can trace rays, and say how to fix it if not."""
     from invertwin.runtime import doctor as machine
 
-    report = machine.report()
-    console.print(machine.render(report), markup=False, soft_wrap=True)
+    report = machine.collect_report()
+    console.print(machine.render_report(report), markup=False, soft_wrap=True)
     if not report["ok"]:
         raise typer.Exit(1)
 
 
 def main() -> None:
     """Entry point: bad input is one line and exit code 2, an interruption 130."""
-    warnings.showwarning = _shown_once()
+    warnings.showwarning = _warn_once()
     try:
         app(standalone_mode=True)
     except InputError as error:
@@ -294,12 +303,12 @@ def main() -> None:
         sys.exit(2)
 
 
-def _each(
-    options: Resumable,
+def _run_each(
+    options: ResumableOptions,
     files: Sequence[Path],
     command: str,
     sections: Sequence[str] | Callable[[Any], Sequence[str]],
-    work: Callable[..., list[Table]],
+    work: Callable[..., list[ReportTable]],
 ) -> None:
     """Several run files with one report."""
     runs = load_runs(files, options, command, sections)
@@ -308,48 +317,48 @@ def _each(
         if folder.complete:
             return
         with console.status("tracing") as status:
-            say = status.update if console.is_terminal else now_and_then()
+            say = status.update if console.is_terminal else limit_rate()
             tables = work(runs, {file.stem: file for file in files}, folder, say)
         print_tables(tables)
 
 
-def _reconstruct(file: Path, options: Resumable, default: Path) -> None:
-    runs = load_runs([file], options, "reconstruct", _needs_of_reconstruct)
+def _run_one_reconstruction(file: Path, options: ResumableOptions, default: Path) -> None:
+    runs = load_runs([file], options, "reconstruct", _reconstruct_sections)
     with run_folder(options, default, runs) as folder:
         if folder.complete:
             return
         from invertwin.cli.commands.reconstruct import run_reconstruct
-        from invertwin.cli.fits.spreading import Workers
+        from invertwin.cli.fits.spreading import FitWorkers
 
-        fits = isinstance(options, Fits)
-        workers = Workers.asked(options.engine, options.workers) if fits else None
-        view = isinstance(options, Fits) and options.view
-        with about_file(file):
+        fits = isinstance(options, FitOptions)
+        workers = FitWorkers.from_options(options.engine, options.workers) if fits else None
+        view = isinstance(options, FitOptions) and options.view
+        with prefix_file_errors(file):
             tables, outcome = run_reconstruct(runs[file.stem], folder, console, workers, view=view)
         print_tables(tables)
         console.print(outcome, markup=False, soft_wrap=True)
 
 
-def _needs_of_reconstruct(run: Any) -> tuple[str, ...]:
+def _reconstruct_sections(run: Any) -> tuple[str, ...]:
     if run.placement is not None:
         return ()
     return ("reconstruct", "data", "grid" if run.map is None else "transmitter", "parameters")
 
 
-def _demo_file() -> Path:
+def _find_demo_file() -> Path:
     """In a wheel the run file lies beside this module, in a checkout in experiments."""
     beside = Path(__file__).with_name("demo.toml")
     return beside if beside.exists() else Path(__file__).parents[3] / "experiments" / "demo.toml"
 
 
-def _shown_once() -> Callable[..., None]:
+def _warn_once() -> Callable[..., None]:
     """Print every warning on one line, the same text once."""
     said: set[str] = set()
 
-    def show(message: Warning | str, *_: Any) -> None:
-        line = one_line(f"invertwin: warning: {message}")
+    def show_warning(message: Warning | str, *_: Any) -> None:
+        line = to_one_line(f"invertwin: warning: {message}")
         if line not in said:
             said.add(line)
             print(line, file=sys.stderr)
 
-    return show
+    return show_warning

@@ -8,35 +8,35 @@ from typing import Any
 import torch
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid, densities_of
+from invertwin.channel import Grid, resolve_densities
 from invertwin.cli.schema import RunFile, SimulatedData
-from invertwin.cli.schema.run_file import about, need
-from invertwin.cli.schema.signature import count_of
+from invertwin.cli.schema.run_file import prefix_errors, require_section
+from invertwin.cli.schema.signature import count_values
 from invertwin.errors import InputError
-from invertwin.inversion import require_edge
+from invertwin.inversion import require_edge_length
 from invertwin.radar import SampledWaveform
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import fft_bins
-from invertwin.runtime.memory import free_memory, gigabytes
+from invertwin.runtime.memory import format_gigabytes, free_memory
 from invertwin.scene import Mesh, Object, Scene
-from invertwin.scene.scene import warn_of_mirrors
+from invertwin.scene.scene import warn_if_purely_specular
 
 # Bytes, measured as peaks of whole runs (benchmarks are in docs/limitations.md).
-_PROGRAM = 0.8e9  # the library, compiled kernels and the rays that are alive at a time
-_TRIANGLE = 700
-_POINT, _ROW = 250, 300  # of a rough surface; of a path in one frame
-_SAMPLE = 64  # of a beat signal
-_BIN, _FITTED_BIN = 60, 100  # of a recorded spectrum; of a map with its derivative
-_PHASOR = 32
-_MATRIX = 200  # of 2 × 2 amplitudes, with what is made of them
-_COPY = 10_000  # of an object at another place
+_PROGRAM_BYTES = 0.8e9  # the library, compiled kernels and the rays that are alive at a time
+_TRIANGLE_BYTES = 700
+_POINT_BYTES, _PATH_BYTES = 250, 300  # of a rough surface; of a path in one frame
+_SAMPLE_BYTES = 64  # of a beat signal
+_BIN_BYTES, _FITTED_BIN_BYTES = 60, 100  # of a recorded spectrum; of a map with its derivative
+_PHASOR_BYTES = 32
+_MATRIX_BYTES = 200  # of 2 × 2 amplitudes, with what is made of them
+_START_BYTES = 10_000  # of an object at another place
 _SIMULATED_RAYS = 2e6  # of the smooth map beside a simulation
-_MOST_RAYS = 1e13  # twelve days at 10⁷ a second
-_SIZES = ("max_edge", "divisions", "subdivisions", "spacing", "file", "parts", "shape")
+_MAX_RAYS = 1e13  # twelve days at 10⁷ a second
+_SIZE_KEYS = ("max_edge", "divisions", "subdivisions", "spacing", "file", "parts", "shape")
 
 
 @dataclass(frozen=True)
-class Part:
+class MemoryItem:
     """One thing that a run needs memory for.
 
     Attributes:
@@ -53,31 +53,31 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ResourceEstimate:
     """What a run needs.
 
     Attributes:
-        parts: What takes memory, the largest first.
-        maps: Smooth maps that are predicted.
-        rays: Samples of all of them.
+        memory_items: What takes memory, the largest first.
+        map_count: Smooth maps that are predicted.
+        ray_count: Samples of all of them.
         rays_key: Key of the run file that has most to do with their number.
-        recordings: Exact signals that are simulated.
-        rows: Paths of all of them, times frames.
+        recording_count: Exact signals that are simulated.
+        path_count: Paths of all of them, times frames.
     """
 
-    parts: tuple[Part, ...]
-    maps: float
-    rays: float
+    memory_items: tuple[MemoryItem, ...]
+    map_count: float
+    ray_count: float
     rays_key: str
-    recordings: float
-    rows: float
+    recording_count: float
+    path_count: float
 
     @property
     def memory(self) -> float:
         """Bytes at the peak."""
-        return _PROGRAM + sum(part.memory for part in self.parts)
+        return _PROGRAM_BYTES + sum(part.memory for part in self.memory_items)
 
-    def require(self) -> None:
+    def require_available(self) -> None:
         """Refuse a run that this machine cannot do.
 
         Raises:
@@ -85,22 +85,23 @@ class Estimate:
         """
         free = free_memory()
         if not self.memory <= free:
-            most = self.parts[0]
+            most = self.memory_items[0]
             raise InputError(
-                f"{most.key}: expected a run within the {gigabytes(free)} of memory that are free, "
-                f"got an estimate of {gigabytes(self.memory)}, most of it for "
+                f"{most.key}: expected a run within the {format_gigabytes(free)} of memory that "
+                f"are free, "
+                f"got an estimate of {format_gigabytes(self.memory)}, most of it for "
                 f"{min(most.count, 1e300):.3g} {most.name}; lower {most.key}, or give metres if "
                 "these are millimetres"
             )
-        if not self.rays <= _MOST_RAYS:
+        if not self.ray_count <= _MAX_RAYS:
             raise InputError(
-                f"{self.rays_key}: expected at most {_MOST_RAYS:g} rays in all, got "
-                f"{min(self.rays, 1e300):.3g}; lower {self.rays_key}"
+                f"{self.rays_key}: expected at most {_MAX_RAYS:g} rays in all, got "
+                f"{min(self.ray_count, 1e300):.3g}; lower {self.rays_key}"
             )
 
 
 @dataclass(frozen=True)
-class Sensor:
+class SensorSetup:
     """What measures.
 
     Attributes:
@@ -115,7 +116,9 @@ class Sensor:
     capture: Capture | None = None
 
 
-def estimate_of(run: RunFile, truth: Scene, sensors: Mapping[str, Sensor]) -> Estimate:
+def estimate_resources(
+    run: RunFile, truth: Scene, sensors: Mapping[str, SensorSetup]
+) -> ResourceEstimate:
     """What a run needs, from its tables and what they make: nothing is traced.
 
     Args:
@@ -126,68 +129,75 @@ def estimate_of(run: RunFile, truth: Scene, sensors: Mapping[str, Sensor]) -> Es
     Raises:
         InputError: Too many starts, or a stage that makes too many triangles.
     """
-    _require_stated(run, truth)
-    parts, rows, one_channel = [_triangles(run, truth)], 0.0, 0.0
+    _check_starts_and_stages(run, truth)
+    parts, rows, one_channel = [_triangle_item(run, truth)], 0.0, 0.0
     for name, sensor in sensors.items():
-        found, traced = of_sensor(sensor, truth)
-        parts += [_at(f"observations.{name}.", part) if name else part for part in found]
+        found, traced = estimate_sensor_resources(sensor, truth)
+        parts += [
+            _prefix_item_key(f"observations.{name}.", part) if name else part for part in found
+        ]
         rows += traced
         one_channel += traced / math.prod(sensor.radar.shape)
-    parts += _of_fits(run, sensors)
-    again = _recordings(run)
+    parts += _fit_items(run, sensors)
+    again = _count_recordings(run)
     recordings, rows = again * len(sensors), rows * again
     if run.landscape is not None:
         rows += run.landscape.exact_points * one_channel
     ordered = sorted(parts, key=lambda part: -part.memory)
     kept = tuple(part for part in ordered if part.memory)
-    return Estimate(kept, *_rays(run), recordings, rows)
+    return ResourceEstimate(kept, *_count_rays(run), recordings, rows)
 
 
-def of_signature(run: RunFile, scene: Scene) -> Estimate:
+def estimate_rcs_resources(run: RunFile, scene: Scene) -> ResourceEstimate:
     """What `[rcs]` needs.
 
     Args:
         run: The run file.
         scene: Its scene.
     """
-    table = need(run, "rcs", run.task)
-    sizes = {n: count_of(getattr(table, n)) for n in ("frequencies", "theta_deg", "phi_deg")}
+    table = require_section(run, "rcs", run.task)
+    sizes = {n: count_values(getattr(table, n)) for n in ("frequencies", "theta_deg", "phi_deg")}
     values = sizes["frequencies"] * table.aspect_count
     largest = max(sizes, key=lambda name: sizes[name])
     parts = [
-        _triangles(run, scene),
-        Part("values of the field", values, values * _MATRIX * (table.depth + 2), f"rcs.{largest}"),
+        _triangle_item(run, scene),
+        MemoryItem(
+            "values of the field",
+            values,
+            values * _MATRIX_BYTES * (table.depth + 2),
+            f"rcs.{largest}",
+        ),
     ]
     if table.image is not None:
         pixels = table.image.pixels**2
-        parts.append(Part("pixels", pixels, pixels * _MATRIX, "rcs.image.pixels"))
+        parts.append(MemoryItem("pixels", pixels, pixels * _MATRIX_BYTES, "rcs.image.pixels"))
     ordered = tuple(sorted(parts, key=lambda part: -part.memory))
-    return Estimate(ordered, 0, 0, "rcs.frequencies", 0, 0)
+    return ResourceEstimate(ordered, 0, 0, "rcs.frequencies", 0, 0)
 
 
-def require_room(run: RunFile, truth: Scene, sensors: Mapping[str, Sensor]) -> None:
-    """Refuse a run that this machine cannot do; arguments and errors as of `estimate_of`."""
+def require_resources(run: RunFile, truth: Scene, sensors: Mapping[str, SensorSetup]) -> None:
+    """Refuse a run that this machine cannot do; arguments and errors as of `estimate_resources`."""
     for sensor in sensors.values():
-        warn_of_mirrors(truth, sensor.radar.waveform.center_frequency)
-    estimate_of(run, truth, sensors).require()
+        warn_if_purely_specular(truth, sensor.radar.waveform.center_frequency)
+    estimate_resources(run, truth, sensors).require_available()
 
 
-def _at(path: str, part: Part) -> Part:
-    return replace(part, key=f"{path}{part.key}")
+def _prefix_item_key(path: str, item: MemoryItem) -> MemoryItem:
+    return replace(item, key=f"{path}{item.key}")
 
 
-def _triangles(run: RunFile, scene: Scene) -> Part:
+def _triangle_item(run: RunFile, scene: Scene) -> MemoryItem:
     counts = {name: len(item.mesh.faces) for name, item in scene.objects.items()}
     name = max(counts, key=lambda name: counts[name])
     total = sum(counts.values())
     key = "room.furniture" if run.scene_file is None else "scene_file.file"
     if name in run.scene:
-        size = next(size for size in _SIZES if hasattr(run.scene[name], size))
+        size = next(size for size in _SIZE_KEYS if hasattr(run.scene[name], size))
         key = f"scene.{name}.{size}"
-    return Part("triangles", total, total * _TRIANGLE, key)
+    return MemoryItem("triangles", total, total * _TRIANGLE_BYTES, key)
 
 
-def of_sensor(sensor: Sensor, scene: Scene) -> tuple[list[Part], float]:
+def estimate_sensor_resources(sensor: SensorSetup, scene: Scene) -> tuple[list[MemoryItem], float]:
     """What the data of one sensor need, and how many paths they have over all frames.
 
     Args:
@@ -198,16 +208,18 @@ def of_sensor(sensor: Sensor, scene: Scene) -> tuple[list[Part], float]:
     frames, senders, receivers = radar.shape
     channels, chirps = senders * receivers, run.chirps.count if run.chirps else 1
     across, bins = grid.u_count + grid.v_count, math.prod(grid.shape)
-    beams = bins // grid.range_count if not _separable(radar) else across
+    beams = bins // grid.range_count if not _is_separable(radar) else across
     counts = {"radar.positions": frames, "grid.range_max": grid.range_count}
     counts |= {"grid.u_max": grid.u_count, "grid.v_max": grid.v_count}
     largest = max(counts, key=lambda name: counts[name])
     parts = [
-        Part("bins of a map over all frames", bins * frames, bins * frames * _BIN, largest),
-        Part(
+        MemoryItem(
+            "bins of a map over all frames", bins * frames, bins * frames * _BIN_BYTES, largest
+        ),
+        MemoryItem(
             "phases of beams and antennas",
             beams * channels,
-            beams * channels * _PHASOR,
+            beams * channels * _PHASOR_BYTES,
             "grid.u_max",
         ),
     ]
@@ -218,14 +230,16 @@ def of_sensor(sensor: Sensor, scene: Scene) -> tuple[list[Part], float]:
         taken["radar.waveform"] = samples
         beat = math.prod(taken.values())
         most = max(taken, key=lambda name: taken[name])
-        parts.append(Part("samples of beat signals", beat, beat * _SAMPLE, most))
+        parts.append(MemoryItem("samples of beat signals", beat, beat * _SAMPLE_BYTES, most))
         if fft_bins(radar.waveform, grid) is None:
             count = samples * grid.range_count
             parts.append(
-                Part("phases of samples and ranges", count, count * _PHASOR, "grid.range_max")
+                MemoryItem(
+                    "phases of samples and ranges", count, count * _PHASOR_BYTES, "grid.range_max"
+                )
             )
     if isinstance(run.data, SimulatedData):
-        for part, traced in _of_simulation(run.data, scene, frames):
+        for part, traced in _simulation_items(run.data, scene, frames):
             parts.append(part)
             table = run.chirps
             moves = any(item.motion for item in run.scene.values())
@@ -235,34 +249,42 @@ def of_sensor(sensor: Sensor, scene: Scene) -> tuple[list[Part], float]:
     return parts, rows
 
 
-def _of_simulation(data: SimulatedData, scene: Scene, frames: int) -> Iterator[tuple[Part, float]]:
+def _simulation_items(
+    data: SimulatedData, scene: Scene, frames: int
+) -> Iterator[tuple[MemoryItem, float]]:
     """Paths of exact signals, and how many there are over all frames."""
-    with about("data.points_per_m2"):
-        rough = densities_of(scene, data.points_per_m2)
+    with prefix_errors("data.points_per_m2"):
+        rough = resolve_densities(scene, data.points_per_m2)
     areas = {name: Mesh(scene[name].vertices, scene[name].mesh.faces).area for name in rough}
     area = sum(areas.values())
     points = sum(areas[name] * density for name, density in rough.items())
-    each = _POINT + frames * _ROW
+    each = _POINT_BYTES + frames * _PATH_BYTES
     name = f"points on {area:.3g} m² of rough surfaces"
-    yield Part(name, points, points * each, "data.points_per_m2"), points * frames
+    yield MemoryItem(name, points, points * each, "data.points_per_m2"), points * frames
     if len(rough) < len(scene.objects):
         rows = data.samples * frames
-        yield Part("points on conductors", data.samples, rows * _ROW, "data.samples"), rows
+        yield (
+            MemoryItem("points on conductors", data.samples, rows * _PATH_BYTES, "data.samples"),
+            rows,
+        )
     if data.depth > 1:
         drawn = data.rough_paths * (data.depth - 1)
         kept = drawn / 4 * frames
-        memory = drawn * _POINT + kept * _ROW
-        yield Part("paths of several bounces", drawn, memory, "data.rough_paths"), drawn + kept
+        memory = drawn * _POINT_BYTES + kept * _PATH_BYTES
+        yield (
+            MemoryItem("paths of several bounces", drawn, memory, "data.rough_paths"),
+            drawn + kept,
+        )
 
 
-def _of_fits(run: RunFile, sensors: Mapping[str, Sensor]) -> Iterator[Part]:
+def _fit_items(run: RunFile, sensors: Mapping[str, SensorSetup]) -> Iterator[MemoryItem]:
     """What fits and checks of derivatives keep, beside the data."""
     copies = (run.starts.count if run.starts else 1) * (1 + len(run.variants))
     key = "starts.count" if run.starts else "variants"
-    yield Part("starts", copies, copies * _COPY, key)
+    yield MemoryItem("starts", copies, copies * _START_BYTES, key)
     if run.landscape is not None:
         points = run.landscape.points + run.landscape.exact_points
-        yield Part("points of a landscape", points, points * 100, "landscape.exact_points")
+        yield MemoryItem("points of a landscape", points, points * 100, "landscape.exact_points")
     for name, sensor in sensors.items():
         bins, frames = math.prod(sensor.grid.shape), sensor.radar.frame_count
         path = f"observations.{name}." if name else ""
@@ -270,14 +292,16 @@ def _of_fits(run: RunFile, sensors: Mapping[str, Sensor]) -> Iterator[Part]:
             maps = 4 * run.gradcheck.repeats + run.gradcheck.max_pairs
             count = maps * bins * frames
             most = max(("repeats", "max_pairs"), key=lambda key: getattr(run.gradcheck, key))
-            yield Part("bins of maps to compare", count, count * 8, f"gradcheck.{most}")
+            yield MemoryItem("bins of maps to compare", count, count * 8, f"gradcheck.{most}")
         if run.reconstruct is not None:
-            used = max(min(own.frames_per_step or frames, frames) for own in _budgets(run))
+            used = max(min(own.frames_per_step or frames, frames) for own in _fit_budgets(run))
             count = bins * used
-            yield Part("bins of a fitted map", count, count * _FITTED_BIN, f"{path}grid.range_max")
+            yield MemoryItem(
+                "bins of a fitted map", count, count * _FITTED_BIN_BYTES, f"{path}grid.range_max"
+            )
 
 
-def _rays(run: RunFile) -> tuple[float, float, str]:
+def _count_rays(run: RunFile) -> tuple[float, float, str]:
     """Smooth maps, samples of all of them, and the key that says most of these."""
     if run.task == "gradcheck" and run.gradcheck is not None:
         table = run.gradcheck
@@ -290,8 +314,10 @@ def _rays(run: RunFile) -> tuple[float, float, str]:
     if run.task == "simulate" or own is None:
         return 1, _SIMULATED_RAYS, "data.samples"
     each = (run.starts.count if run.starts else 1) * max(1, len(run.observations))
-    maps = each * sum(part.steps for part in _budgets(run))
-    rays = each * sum(part.steps * (part.samples + part.boundary_samples) for part in _budgets(run))
+    maps = each * sum(part.steps for part in _fit_budgets(run))
+    rays = each * sum(
+        part.steps * (part.samples + part.boundary_samples) for part in _fit_budgets(run)
+    )
     if run.landscape is not None:
         maps += 2 * run.landscape.points
         rays += 2 * run.landscape.points * own.samples
@@ -300,14 +326,16 @@ def _rays(run: RunFile) -> tuple[float, float, str]:
     return maps, rays, max(counts, key=lambda name: counts[name])
 
 
-def _budgets(run: RunFile) -> list[Any]:
+def _fit_budgets(run: RunFile) -> list[Any]:
     """The `[reconstruct]` of every stage of every way to fit."""
-    ways = [run, *(run.varied(variant) for variant in run.variants.values())]
-    runs = [own for way in ways for own in [run.varied(stage) for stage in way.stages] or [way]]
+    ways = [run, *(run.apply_overrides(variant) for variant in run.variants.values())]
+    runs = [
+        own for way in ways for own in [run.apply_overrides(stage) for stage in way.stages] or [way]
+    ]
     return [own.reconstruct for own in runs if own.reconstruct is not None]
 
 
-def _recordings(run: RunFile) -> int:
+def _count_recordings(run: RunFile) -> int:
     """How often data are simulated."""
     if not isinstance(run.data, SimulatedData):
         return 1
@@ -317,23 +345,23 @@ def _recordings(run: RunFile) -> int:
     return anew + (run.plan.fits if run.plan is not None else 0)
 
 
-def _require_stated(run: RunFile, scene: Scene) -> None:
+def _check_starts_and_stages(run: RunFile, scene: Scene) -> None:
     """Refuse starts and stages beyond the limits of what makes them, before any of them begins."""
     chance = torch.Generator()
     for section, more in (("starts", {"generator": chance}), ("search", {})):
         table = getattr(run, section)
         if table is not None:
             given = {Object: scene[table.object], torch.Generator: chance}
-            with about(section):
+            with prefix_errors(section):
                 next(iter(table.build(given, **more)), None)
     free = [table.object for table in run.parameters if table.kind == "vertices"]
     for i, stage in enumerate(run.stages):
         for name in free if stage.remesh else ():
-            with about(f"stages[{i}].remesh"):
-                require_edge(scene[name].mesh, stage.remesh or 0.0)
+            with prefix_errors(f"stages[{i}].remesh"):
+                require_edge_length(scene[name].mesh, stage.remesh or 0.0)
 
 
-def _separable(radar: Radar) -> bool:
+def _is_separable(radar: Radar) -> bool:
     """Whether the virtual array is a product of a row and a column."""
     places = radar.virtual_positions / (1e-3 * radar.waveform.wavelength)
     x, y, both = (

@@ -4,8 +4,8 @@ import torch
 
 from invertwin.channel import Grid, Sampling
 from invertwin.cli.schema import RunFile, SimulatedData, sensors
-from invertwin.cli.schema.motion_tables import in_motion, refuse_motion
-from invertwin.cli.schema.run_file import about, need
+from invertwin.cli.schema.motion_tables import build_moving_scene, refuse_motion
+from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
@@ -13,13 +13,13 @@ from invertwin.scene import Scene
 from invertwin.simulation import Simulation, simulate, simulate_chirps
 
 
-def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
+def simulate_exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
     """Exact signals with the settings of the `[data]` table.
 
     Raises:
         InputError: The run file's data are measured, not simulated.
     """
-    data = _simulated(run)
+    data = _require_simulated_data(run)
     refuse_motion(run)
     front = None if run.impairments is None else sensors.impairments(run.impairments, data)
     with torch.no_grad():
@@ -28,33 +28,33 @@ def exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
             radar,
             grid,
             seed=run.seed if data.seed is None else data.seed,
-            sampling=_sampling(data, data.depth),
+            sampling=_make_sampling(data, data.depth),
             snr_db=None if front else data.snr_db,
             noise_figure_db=None if front else data.noise_figure_db,
             impairments=front,
         )
 
 
-def chirp_train(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> torch.Tensor:
+def simulate_chirp_beats(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> torch.Tensor:
     """Exact beat signals of every chirp with the settings of `[data]` and `[chirps]`."""
-    data = _simulated(run)
+    data = _require_simulated_data(run)
     front = sensors.impairments(run.impairments, data)
-    table = need(run, "chirps", "several ramps a frame")
-    with about("chirps"), torch.no_grad():
+    table = require_section(run, "chirps", "several ramps a frame")
+    with prefix_errors("chirps"), torch.no_grad():
         return simulate_chirps(
-            in_motion(run, scene),
+            build_moving_scene(run, scene),
             radar,
             chirps,
             seed=run.seed if data.seed is None else data.seed,
-            sampling=_sampling(data, 1),
+            sampling=_make_sampling(data, 1),
             retrace=table.retrace,
             visibility_every=table.visibility_every,
             impairments=front,
         )
 
 
-def _simulated(run: RunFile) -> SimulatedData:
-    data = need(run, "data", "a simulation")
+def _require_simulated_data(run: RunFile) -> SimulatedData:
+    data = require_section(run, "data", "a simulation")
     if not isinstance(data, SimulatedData):
         raise InputError(
             f'data.kind: expected "simulated" to simulate a scene, got "{data.kind}"; '
@@ -63,7 +63,7 @@ def _simulated(run: RunFile) -> SimulatedData:
     return data
 
 
-def _sampling(data: SimulatedData, depth: int) -> Sampling:
+def _make_sampling(data: SimulatedData, depth: int) -> Sampling:
     return Sampling(
         depth=depth,
         samples=data.samples,

@@ -35,7 +35,7 @@ FilesArgument = Annotated[list[Path], typer.Argument(help="Run files (TOML).", s
 
 
 @dataclass(frozen=True, kw_only=True)
-class Where:
+class OutputOptions:
     """Where the results of a command go."""
 
     out: Annotated[
@@ -48,7 +48,7 @@ class Where:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Where):
+class RunOptions(OutputOptions):
     """What commands with run files have in common."""
 
     seed: Annotated[
@@ -59,7 +59,7 @@ class Options(Where):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Resumable(Options):
+class ResumableOptions(RunOptions):
     """What commands have whose work is kept when it is interrupted."""
 
     resume: Annotated[
@@ -74,7 +74,7 @@ EngineOption = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dataset(Resumable):
+class DatasetOptions(ResumableOptions):
     """Who simulates a data set, and which part of it."""
 
     workers: Annotated[
@@ -91,7 +91,7 @@ class Dataset(Resumable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fits(Resumable):
+class FitOptions(ResumableOptions):
     """Who makes the fits of a run."""
 
     workers: Annotated[
@@ -110,7 +110,7 @@ class Fits(Resumable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recorded(Where):
+class RecordingOptions(OutputOptions):
     """A recording, and what it takes to read it."""
 
     recording: Annotated[
@@ -148,7 +148,7 @@ class Recorded(Where):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Look(Recorded):
+class LookOptions(RecordingOptions):
     """What to look at, as the options of `invertwin look` say it."""
 
     chirp: Annotated[
@@ -174,7 +174,7 @@ class Look(Recorded):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Find(Recorded):
+class TwinOptions(RecordingOptions):
     """What to make a twin of, as the options of `invertwin twin` say it."""
 
     low: Annotated[

@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # Matplotlib takes half a second, and most errors come before
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """A table of the report; cells are text or numbers."""
 
     title: str
@@ -29,7 +29,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Picture:
+class ReportPicture:
     """A picture of the report, as PNG bytes."""
 
     title: str
@@ -38,7 +38,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class View:
+class ReportView:
     """A display in three dimensions; a report holds one at most.
 
     Attributes:
@@ -54,7 +54,7 @@ def report_html(
     title: str,
     status: str,
     note: str,
-    parts: Sequence[Table | Picture | View],
+    parts: Sequence[ReportTable | ReportPicture | ReportView],
     again: str,
     files: Mapping[str, str],
 ) -> str:
@@ -70,12 +70,12 @@ def report_html(
     """
     from jinja2 import Environment
 
-    from invertwin.viewer import policy
+    from invertwin.viewer import content_security_policy
 
     pages = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    pages.filters |= {"shown": shown, "base64": _base64}
+    pages.filters |= {"shown": format_cell, "base64": _encode_base64}
     backend = os.environ.get("INVERTWIN_BACKEND")
-    return pages.from_string(_resource("report.html.jinja")).render(
+    return pages.from_string(_read_resource("report.html.jinja")).render(
         title=title,
         status=status,
         note=note,
@@ -83,20 +83,20 @@ def report_html(
         version=__version__,
         command=f"invertwin {again} -o again" + (f" --backend {backend}" if backend else ""),
         files=files,
-        policy=policy(),
+        policy=content_security_policy(),
     )
 
 
-def finish(
+def write_report(
     folder: "RunFolder",
     metrics: Mapping[str, Any],
     title: str,
     status: str,
-    parts: Sequence[Table | Picture | View],
+    parts: Sequence[ReportTable | ReportPicture | ReportView],
     *,
     again: str,
     note: str = "",
-) -> list[Table]:
+) -> list[ReportTable]:
     """Write metrics.json and report.html; return the tables, to be printed.
 
     Args:
@@ -114,12 +114,12 @@ def finish(
         again += " run.toml" if len(files) == 1 else " runs/*.toml"
     html = report_html(title, status, note, parts, again, files)
     folder.write_text("report.html", html)
-    return [part for part in parts if isinstance(part, Table)]
+    return [part for part in parts if isinstance(part, ReportTable)]
 
 
-def picture(
+def save_picture(
     folder: "RunFolder", name: str, figure: "Figure", title: str = "", note: str = ""
-) -> Picture:
+) -> ReportPicture:
     """Write a figure as a PNG file, and return it for the report.
 
     Args:
@@ -134,45 +134,53 @@ def picture(
     png = png_bytes(figure)
     folder.write_bytes(f"{name}.png", png)
     title = title or name.capitalize().replace("_", ", ")
-    return Picture(title, png, texts("notes").get(note, note))
+    return ReportPicture(title, png, load_texts("notes").get(note, note))
 
 
-def quantities(
-    title: str, values: Mapping[str, Any], *, skip: Collection[str] = (), of: str = "quantities"
-) -> Table:
+def quantity_table(
+    title: str,
+    values: Mapping[str, Any],
+    *,
+    skip: Collection[str] = (),
+    label_table: str = "quantities",
+) -> ReportTable:
     """A table of the values that texts.toml has a label for, in its order.
 
     Args:
         title: Of the table.
         values: By the keys of metrics.json.
         skip: Keys to leave out.
-        of: The table of labels.
+        label_table: The table of labels.
     """
-    labels = {key: label for key, label in texts(of).items() if key in values and key not in skip}
+    labels = {
+        key: label
+        for key, label in load_texts(label_table).items()
+        if key in values and key not in skip
+    }
     rows = [[label, values[key]] for key, label in labels.items()]
-    return Table(title, ["quantity", "value"], rows)
+    return ReportTable(title, ["quantity", "value"], rows)
 
 
 @cache
-def texts(name: str) -> dict[str, str]:
+def load_texts(name: str) -> dict[str, str]:
     """A table of texts.toml."""
-    return tomllib.loads(_resource("texts.toml"))[name]
+    return tomllib.loads(_read_resource("texts.toml"))[name]
 
 
-def _resource(name: str) -> str:
+def _read_resource(name: str) -> str:
     return (resources.files("invertwin.cli") / name).read_text(encoding="utf-8")
 
 
-def _base64(png: bytes) -> str:
+def _encode_base64(png: bytes) -> str:
     return base64.b64encode(png).decode("ascii")
 
 
-def is_number(value: Any) -> bool:
+def is_numeric_cell(value: Any) -> bool:
     """Whether a cell is right-aligned."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def shown(value: Any) -> str:
+def format_cell(value: Any) -> str:
     """A cell as people read it: four significant digits, yes and no, a dash for nothing."""
     if value is None:
         return "–"
@@ -181,5 +189,5 @@ def shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}" if math.isfinite(value) else "–"
     if isinstance(value, list | tuple):
-        return ", ".join(shown(item) for item in value)
+        return ", ".join(format_cell(item) for item in value)
     return str(value)

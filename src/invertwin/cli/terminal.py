@@ -14,20 +14,20 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from invertwin.cli.options import Options, Where, console
-from invertwin.cli.report import Table, is_number, shown
-from invertwin.cli.schema.run_file import about_file, load_run, need, to_toml
+from invertwin.cli.options import OutputOptions, RunOptions, console
+from invertwin.cli.report import ReportTable, format_cell, is_numeric_cell
+from invertwin.cli.schema.run_file import load_run, prefix_file_errors, require_section, to_toml
 from invertwin.errors import InputError
-from invertwin.runtime.progress import listening, time_left
+from invertwin.runtime.progress import format_duration, progress_callback
 from invertwin.storage.folders import PARTS
 from invertwin.storage.run_folder import RunFolder, open_run
 
-_LOG_SECONDS = 10.0  # between lines of progress in a log
+_LOG_INTERVAL = 10.0  # between lines of progress in a log
 
 
 @contextmanager
 def run_folder(
-    options: Where, default: Path, runs: Mapping[str, Any] | None = None
+    options: OutputOptions, default: Path, runs: Mapping[str, Any] | None = None
 ) -> Iterator[RunFolder]:
     """The run's folder, as of `open_run`; says where the results are, or how to resume.
 
@@ -54,7 +54,7 @@ def run_folder(
 
 def load_runs(
     files: Sequence[Path],
-    options: Options,
+    options: RunOptions,
     command: str,
     sections: Sequence[str] | Callable[[Any], Sequence[str]],
 ) -> dict[str, Any]:
@@ -79,15 +79,15 @@ def load_runs(
         cure = "add it"
         if other != command:
             cure = f"its task is {run.task}: use `invertwin {other} {file}`"
-        with about_file(file):
+        with prefix_file_errors(file):
             for section in sections(run) if callable(sections) else sections:
-                need(run, section, command, cure)
+                require_section(run, section, command, cure)
         seeded = {} if options.seed is None else {"seed": options.seed}
         runs[file.stem] = run.model_copy(update=seeded)
     return runs
 
 
-def in_parts(
+def compute_in_parts(
     runs: Mapping[str, Any],
     files: Mapping[str, Path],
     folder: RunFolder,
@@ -108,60 +108,60 @@ def in_parts(
         part = f"{PARTS}/{name}.json"
         found = folder.read_json(part)
         if found is None:
-            with about_file(files[name]):
+            with prefix_file_errors(files[name]):
                 found = compute(name, run)
             folder.write_json(part, found)
         yield name, run, found
 
 
 @contextmanager
-def counted(shown: Console, name: str, total: int) -> Iterator[Callable[[], None]]:
+def count_progress(console: Console, name: str, total: int) -> Iterator[Callable[[], None]]:
     """Progress with the time that is left: a bar, or a line now and then where no terminal is.
 
     Args:
-        shown: Where.
+        console: Where.
         name: Of what is counted.
         total: How many there are.
 
     Yields:
         A function to be called after each of them.
     """
-    if not shown.is_terminal:
+    if not console.is_terminal:
         begin, done = time.monotonic(), 0
-        say = now_and_then(shown, begin)
+        say = limit_rate(console, begin)
 
-        def tell() -> None:
+        def advance() -> None:
             nonlocal done
             done += 1
-            left = time_left((time.monotonic() - begin) / done * (total - done))
+            left = format_duration((time.monotonic() - begin) / done * (total - done))
             say(f"{name}: {done} of {total}, {left} left")
 
-        yield tell
+        yield advance
         return
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=shown) as bar:
+    with Progress(*columns, console=console) as bar:
         task = bar.add_task("", total=total)
         yield partial(bar.advance, task)
 
 
 @contextmanager
-def progress(shown: Console) -> Iterator[None]:
+def show_progress(console: Console) -> Iterator[None]:
     """Show how far long loops have come: on one line, or a line now and then in a log.
 
     Args:
-        shown: Where.
+        console: Where.
     """
-    with shown.status("working") as status:
-        say = status.update if shown.is_terminal else now_and_then(shown, time.monotonic())
+    with console.status("working") as status:
+        say = status.update if console.is_terminal else limit_rate(console, time.monotonic())
 
-        def hear(name: str, done: int, total: int, left: float) -> None:
-            say(f"{name}: {done} of {total}, {time_left(left)} left")
+        def show_line(name: str, done: int, total: int, left: float) -> None:
+            say(f"{name}: {done} of {total}, {format_duration(left)} left")
 
-        with listening(hear):
+        with progress_callback(show_line):
             yield
 
 
-def now_and_then(shown: Console = console, last: float = -math.inf) -> Callable[[str], None]:
+def limit_rate(shown: Console = console, last: float = -math.inf) -> Callable[[str], None]:
     """A function that prints a line of progress, unless one was printed just now.
 
     Args:
@@ -171,19 +171,19 @@ def now_and_then(shown: Console = console, last: float = -math.inf) -> Callable[
 
     def say(line: str) -> None:
         nonlocal last
-        if time.monotonic() - last >= _LOG_SECONDS:
+        if time.monotonic() - last >= _LOG_INTERVAL:
             last = time.monotonic()
             shown.print(line, markup=False, soft_wrap=True)
 
     return say
 
 
-def print_tables(tables: Sequence[Table]) -> None:
+def print_tables(tables: Sequence[ReportTable]) -> None:
     """Print tables with their notes; a narrow terminal wraps headings and words, never a number."""
     for table in tables:
         grid = RichTable(title=Text(table.title), title_justify="left")
         for i, column in enumerate(table.columns):
-            numbers = [len(shown(row[i])) for row in table.rows if is_number(row[i])]
+            numbers = [len(format_cell(row[i])) for row in table.rows if is_numeric_cell(row[i])]
             grid.add_column(
                 Text(column),
                 justify="right" if numbers else "left",
@@ -192,7 +192,7 @@ def print_tables(tables: Sequence[Table]) -> None:
                 overflow="fold",
             )
         for row in table.rows:
-            grid.add_row(*(Text(shown(cell)) for cell in row))
+            grid.add_row(*(Text(format_cell(cell)) for cell in row))
         least = grid.__rich_measure__(console, console.options).minimum
         grid.width = least if least > console.width else None
         console.print(grid, crop=False)

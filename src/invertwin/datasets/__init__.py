@@ -1,6 +1,6 @@
 """Data sets of simulated recordings: what is drawn, labels, shards, and their reader."""
 
-from invertwin.datasets.distributions import KEPT as KEPT
+from invertwin.datasets.distributions import UNCHANGED as UNCHANGED
 from invertwin.datasets.distributions import Choice as Choice
 from invertwin.datasets.distributions import Distribution as Distribution
 from invertwin.datasets.distributions import Integer as Integer
@@ -10,6 +10,6 @@ from invertwin.datasets.distributions import Presence as Presence
 from invertwin.datasets.distributions import Uniform as Uniform
 from invertwin.datasets.labels import object_labels as object_labels
 from invertwin.datasets.labels import radar_labels as radar_labels
-from invertwin.datasets.labels import seen_triangles as seen_triangles
-from invertwin.datasets.reader import Samples as Samples
-from invertwin.datasets.shards import Manifest as Manifest
+from invertwin.datasets.labels import triangle_visibility as triangle_visibility
+from invertwin.datasets.reader import SampleDataset as SampleDataset
+from invertwin.datasets.shards import DatasetManifest as DatasetManifest

@@ -8,22 +8,22 @@ from typing import Any, Final
 import numpy as np
 
 from invertwin.errors import InputError
-from invertwin.limits import NonNegative, Positive, Share
+from invertwin.limits import NonNegative, Positive, UnitFraction
 
-Numbers = float | Sequence[float]
-KEPT: Final = object()
+NumberOrList = float | Sequence[float]
+UNCHANGED: Final = object()
 """Drawn where a key stays as it is, with what others have drawn in it."""
 
 
 class Distribution(ABC):
-    """Draws values for a key. None takes the key away, and ``KEPT`` leaves it as it is."""
+    """Draws values for a key. None takes the key away, and ``UNCHANGED`` leaves it as it is."""
 
     @abstractmethod
     def draw(self, generator: np.random.Generator) -> Any:
-        """A value, ``KEPT``, or None."""
+        """A value, ``UNCHANGED``, or None."""
 
     @abstractmethod
-    def ends(self) -> list[Any]:
+    def extreme_values(self) -> list[Any]:
         """Values that are as bad as any other: if these are right, all are."""
 
 
@@ -39,19 +39,19 @@ class Uniform(Distribution):
         InputError: Limits of different lengths, or in the wrong order.
     """
 
-    low: Numbers
-    high: Numbers
+    low: NumberOrList
+    high: NumberOrList
 
     def __post_init__(self) -> None:
         _check_order(self.low, self.high)
 
     def draw(self, generator: np.random.Generator) -> Any:
         """A number, or a list of independent ones."""
-        return np.asarray(generator.uniform(self.low, self.high, _size(self.low))).tolist()
+        return np.asarray(generator.uniform(self.low, self.high, _shape_of(self.low))).tolist()
 
-    def ends(self) -> list[Any]:
+    def extreme_values(self) -> list[Any]:
         """Both limits."""
-        return [_plain(self.low), _plain(self.high)]
+        return [_to_python(self.low), _to_python(self.high)]
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,14 @@ class LogUniform(Distribution):
 
     def draw(self, generator: np.random.Generator) -> Any:
         """A number, or a list of independent ones."""
-        share = generator.random(_size(self.low))
+        share = generator.random(_shape_of(self.low))
         low, high = np.asarray(self.low, dtype=float), np.asarray(self.high, dtype=float)
         # The last bit of a power may lie beyond a limit.
         return np.clip(low * (high / low) ** share, low, high).tolist()
 
-    def ends(self) -> list[Any]:
+    def extreme_values(self) -> list[Any]:
         """Both limits."""
-        return [_plain(self.low), _plain(self.high)]
+        return [_to_python(self.low), _to_python(self.high)]
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Normal(Distribution):
         InputError: Lists of different lengths, or a negative deviation.
     """
 
-    mean: Numbers
+    mean: NumberOrList
     deviation: NonNegative | Sequence[NonNegative]
 
     def __post_init__(self) -> None:
@@ -112,12 +112,12 @@ class Normal(Distribution):
 
     def draw(self, generator: np.random.Generator) -> Any:
         """A number, or a list of independent ones."""
-        drawn = generator.normal(self.mean, self.deviation, _size(self.mean))
+        drawn = generator.normal(self.mean, self.deviation, _shape_of(self.mean))
         return np.asarray(drawn).tolist()
 
-    def ends(self) -> list[Any]:
+    def extreme_values(self) -> list[Any]:
         """The mean: the numbers themselves have no limits."""
-        return [_plain(self.mean)]
+        return [_to_python(self.mean)]
 
 
 @dataclass(frozen=True)
@@ -140,12 +140,12 @@ class Integer(Distribution):
 
     def draw(self, generator: np.random.Generator) -> Any:
         """A whole number, or a list of independent ones."""
-        drawn = generator.integers(self.low, self.high, _size(self.low), endpoint=True)
+        drawn = generator.integers(self.low, self.high, _shape_of(self.low), endpoint=True)
         return np.asarray(drawn).tolist()
 
-    def ends(self) -> list[Any]:
+    def extreme_values(self) -> list[Any]:
         """Both limits."""
-        return [_plain(self.low), _plain(self.high)]
+        return [_to_python(self.low), _to_python(self.high)]
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class Choice(Distribution):
         weights = None if self.weights is None else np.asarray(self.weights) / sum(self.weights)
         return self.values[int(generator.choice(len(self.values), p=weights))]
 
-    def ends(self) -> list[Any]:
+    def extreme_values(self) -> list[Any]:
         """All values."""
         return list(self.values)
 
@@ -194,18 +194,18 @@ class Presence(Distribution):
         probability: That it is.
     """
 
-    probability: Share = 0.5
+    probability: UnitFraction = 0.5
 
     def draw(self, generator: np.random.Generator) -> Any:
         """Kept, or None."""
-        return KEPT if generator.random() < self.probability else None
+        return UNCHANGED if generator.random() < self.probability else None
 
-    def ends(self) -> list[Any]:
+    def extreme_values(self) -> list[Any]:
         """None: what is stated has been checked."""
         return [None]
 
 
-def _check_order(low: Numbers, high: Numbers) -> None:
+def _check_order(low: NumberOrList, high: NumberOrList) -> None:
     if np.shape(low) != np.shape(high):
         raise InputError(
             f"expected limits of one length, got {np.size(low)} and {np.size(high)} numbers; give "
@@ -215,9 +215,9 @@ def _check_order(low: Numbers, high: Numbers) -> None:
         raise InputError(f"expected low <= high, got {low} and {high}; swap them")
 
 
-def _size(value: Numbers) -> tuple[int, ...] | None:
+def _shape_of(value: NumberOrList) -> tuple[int, ...] | None:
     return np.shape(value) or None
 
 
-def _plain(value: Any) -> Any:
+def _to_python(value: Any) -> Any:
     return list(value) if isinstance(value, Sequence) else value

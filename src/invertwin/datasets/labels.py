@@ -10,15 +10,15 @@ from torch import Tensor
 
 from invertwin.channel import visible_points
 from invertwin.radar.radar import Radar
-from invertwin.scene import Mesh, Scene, joined
+from invertwin.scene import Mesh, Scene, merge_meshes
 
 _POINTS = 256  # at least so many on every object
-_STEPS = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
+_R2_STEPS = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
 
 
 def object_labels(
     scene: Scene,
-    seen: Mapping[str, Float[Tensor, "frame face"]],
+    visibility: Mapping[str, Float[Tensor, "frame face"]],
     classes: Mapping[str, str],
     joints: Mapping[str, Mapping[str, Tensor]],
 ) -> list[dict[str, Any]]:
@@ -27,12 +27,13 @@ def object_labels(
     A row has ``name``, ``class``, ``pose`` (4 × 4, from the object's frame to the world), ``box``
     (``low`` and ``high`` corner along the world's axes), ``oriented_box`` (``center``, ``size`` and
     ``rotation``: along the object's own axes, the columns of ``rotation``), ``velocity`` (the mean
-    over its vertices), ``triangles`` (number of the first one in the scene, and how many), ``seen``
+    over its vertices), ``triangles`` (number of the first one in the scene, and how many),
+    ``visibility``
     (share of the surface that each position of the radar sees), and ``joints`` where it has some.
 
     Args:
         scene: At the time of the recording.
-        seen: Of ``seen_triangles``.
+        visibility: Of ``triangle_visibility``.
         classes: By name; an object without one is a class of its own name.
         joints: Places of joints in the world [m], by object and name.
     """
@@ -42,7 +43,7 @@ def object_labels(
         low, high = own.amin(0), own.amax(0)
         still = torch.zeros(1, 3, dtype=torch.float64)
         velocity = still if item.velocity is None else item.velocity.reshape(-1, 3)
-        areas = _areas(item.mesh)
+        areas = _triangle_areas(item.mesh)
         found: dict[str, Any] = {
             "name": name,
             "class": classes.get(name, name),
@@ -55,7 +56,7 @@ def object_labels(
             },
             "velocity": velocity.mean(0).tolist(),
             "triangles": {"first": first, "count": len(areas)},
-            "seen": (seen[name].double() @ (areas / areas.sum())).tolist(),
+            "seen": (visibility[name].double() @ (areas / areas.sum())).tolist(),
         }
         if name in joints:
             found["joints"] = {joint: place.tolist() for joint, place in joints[name].items()}
@@ -75,7 +76,7 @@ def radar_labels(radar: Radar) -> dict[str, Any]:
     return {"positions": radar.positions.tolist(), "rotations": axes.tolist()}
 
 
-def seen_triangles(scene: Scene, radar: Radar) -> dict[str, Float[Tensor, "frame face"]]:
+def triangle_visibility(scene: Scene, radar: Radar) -> dict[str, Float[Tensor, "frame face"]]:
     """Share of every triangle that each position of the radar sees, by object.
 
     Whatever lies between hides it, sheets too. Counted are points that are spread evenly over a
@@ -87,8 +88,8 @@ def seen_triangles(scene: Scene, radar: Radar) -> dict[str, Float[Tensor, "frame
         radar: Its positions, one a frame; antennas are not told apart.
     """
     meshes = [Mesh(item.vertices.detach(), item.mesh.faces) for item in scene.objects.values()]
-    points = [_spread(mesh) for mesh in meshes]
-    flat, whole = torch.cat([part.reshape(-1, 3) for part in points]), joined(meshes)
+    points = [_sample_triangles(mesh) for mesh in meshes]
+    flat, whole = torch.cat([part.reshape(-1, 3) for part in points]), merge_meshes(meshes)
     frames = [visible_points(whole, flat, place[None]) for place in radar.positions.detach()]
     parts = torch.stack(frames).split([part.shape[0] * part.shape[1] for part in points], dim=1)
     return {
@@ -97,20 +98,20 @@ def seen_triangles(scene: Scene, radar: Radar) -> dict[str, Float[Tensor, "frame
     }
 
 
-def _spread(mesh: Mesh) -> Float64[Tensor, "face point 3"]:
+def _sample_triangles(mesh: Mesh) -> Float64[Tensor, "face point 3"]:
     """Points in every triangle, the same shares of its sides in each.
 
     Source: M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018 (R₂).
     """
     count = math.ceil(_POINTS / len(mesh.faces))
     numbers = torch.arange(1, count + 1, dtype=torch.float64)
-    u, v = ((0.5 + numbers[:, None] * _STEPS) % 1.0).unbind(1)
+    u, v = ((0.5 + numbers[:, None] * _R2_STEPS) % 1.0).unbind(1)
     over = u + v > 1
     u, v = torch.where(over, 1 - u, u), torch.where(over, 1 - v, v)
     shares = torch.stack([1 - u - v, u, v], dim=1)
     return torch.einsum("pk,fkx->fpx", shares, mesh.vertices[mesh.faces])
 
 
-def _areas(mesh: Mesh) -> Float64[Tensor, " face"]:
+def _triangle_areas(mesh: Mesh) -> Float64[Tensor, " face"]:
     a, b, c = mesh.vertices.detach()[mesh.faces].unbind(1)
     return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from invertwin.datasets.shards import Manifest, members_of, read_manifests
+from invertwin.datasets.shards import DatasetManifest, locate_members, read_manifests
 from invertwin.errors import InputError
-from invertwin.storage.untrusted import reading
+from invertwin.storage.untrusted import convert_read_errors
 
 
-class Samples(Dataset[Any]):
+class SampleDataset(Dataset[Any]):
     """The samples of a folder that ``invertwin dataset`` made, by number; map-style.
 
     A sample is a dict: ``index``, its arrays as tensors by name (``beat``, ``map``, …), ``labels``
@@ -26,7 +26,7 @@ class Samples(Dataset[Any]):
 
     Args:
         folder: Of the data set, or of all of its parts.
-        keep: Which entries are read; the rest costs nothing. None = all.
+        entries: Which entries are read; the rest costs nothing. None = all.
         transform: Makes of a sample what a network takes. Workers that are spawned need a function
             of a module, not a lambda.
 
@@ -41,18 +41,18 @@ class Samples(Dataset[Any]):
         self,
         folder: str | Path,
         *,
-        keep: Sequence[str] | None = None,
+        entries: Sequence[str] | None = None,
         transform: Callable[[dict[str, Any]], Any] | None = None,
     ) -> None:
         parts = read_manifests(Path(folder))
-        self.manifest: Manifest = parts[0][1]
+        self.manifest: DatasetManifest = parts[0][1]
         known = ["index", *self.manifest.arrays, "labels", "run"]
-        unknown = [name for name in keep or () if name not in known]
+        unknown = [name for name in entries or () if name not in known]
         if unknown:
             raise InputError(
                 f"expected entries among {', '.join(known)}, got {', '.join(unknown)}; choose some"
             )
-        self._keep = set(known if keep is None else keep)
+        self._keep = set(known if entries is None else entries)
         self._transform = transform
         found = [(shard.first, shard, place) for place, m in parts for shard in m.shards]
         self._shards = [
@@ -71,9 +71,11 @@ class Samples(Dataset[Any]):
         number = int(np.searchsorted(self._starts, index, side="right")) - 1
         path, shard = self._shards[number]
         if number not in self._places:
-            self._places[number] = members_of(path)
+            self._places[number] = locate_members(path)
         sample = shard.first + index - int(self._starts[number])
-        with reading(path, "a whole shard of a data set", "check() says which are damaged"):
+        with convert_read_errors(
+            path, "a whole shard of a data set", "check() says which are damaged"
+        ):
             found = self._read(path, sample, self._places[number][sample])
         return found if self._transform is None else self._transform(found)
 
@@ -84,7 +86,7 @@ class Samples(Dataset[Any]):
             InputError: One that is damaged or missing.
         """
         for path, shard in self._shards:
-            with reading(path, "a shard of a data set"), path.open("rb") as opened:
+            with convert_read_errors(path, "a shard of a data set"), path.open("rb") as opened:
                 digest = hashlib.file_digest(opened, "sha256").hexdigest()
             if digest != shard.sha256:
                 raise InputError(
@@ -92,18 +94,18 @@ class Samples(Dataset[Any]):
                     "content; copy it again, or make the data set again"
                 )
 
-    def _read(self, path: Path, sample: int, places: dict[str, tuple[int, int]]) -> dict[str, Any]:
+    def _read(self, path: Path, sample: int, members: dict[str, tuple[int, int]]) -> dict[str, Any]:
         found: dict[str, Any] = {"index": sample} if "index" in self._keep else {}
         with path.open("rb") as opened:
-            for end, (start, size) in places.items():
+            for end, (start, size) in members.items():
                 name, _, kind = end.rpartition(".")
                 if name in self._keep:
                     opened.seek(start)
-                    found[name] = _decoded(opened.read(size), kind)
+                    found[name] = _decode(opened.read(size), kind)
         return found
 
 
-def _decoded(content: bytes, kind: str) -> Any:
+def _decode(content: bytes, kind: str) -> Any:
     if kind == "npy":
         return torch.from_numpy(np.load(io.BytesIO(content), allow_pickle=False))
     return json.loads(content) if kind == "json" else content.decode("utf-8")

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from invertwin.errors import InputError
-from invertwin.storage.untrusted import reading
+from invertwin.storage.untrusted import convert_read_errors
 
 MANIFEST = "manifest.json"
 FORMAT = "invertwin data set 1"
@@ -35,14 +35,14 @@ class Shard(BaseModel):
     sha256: str
 
 
-class Array(BaseModel):
+class ArrayInfo(BaseModel):
     """What an array of every sample is."""
 
     dims: list[str]
     unit: str
 
 
-class Manifest(BaseModel):
+class DatasetManifest(BaseModel):
     """What a folder of shards holds."""
 
     format: str
@@ -50,7 +50,7 @@ class Manifest(BaseModel):
     part: tuple[int, int]  # which of how many parts of the data set this folder holds
     fingerprint: str  # SHA-256 of the run file as used
     versions: dict[str, str]  # of what computed the samples
-    arrays: dict[str, Array]
+    arrays: dict[str, ArrayInfo]
     shards: list[Shard]
 
 
@@ -59,7 +59,7 @@ def shard_name(number: int) -> str:
     return f"shard-{number:06d}.tar"
 
 
-def packed(samples: Iterable[tuple[int, Mapping[str, bytes]]]) -> bytes:
+def pack_shard(samples: Iterable[tuple[int, Mapping[str, bytes]]]) -> bytes:
     """A tar file.
 
     Args:
@@ -76,14 +76,14 @@ def packed(samples: Iterable[tuple[int, Mapping[str, bytes]]]) -> bytes:
     return made.getvalue()
 
 
-def npy(array: np.ndarray) -> bytes:
+def npy_bytes(array: np.ndarray) -> bytes:
     """An array as the content of an ``.npy`` file."""
     made = io.BytesIO()
     np.save(made, array, allow_pickle=False)
     return made.getvalue()
 
 
-def described(name: str, first: int, samples: int, content: bytes) -> Shard:
+def describe_shard(name: str, first: int, samples: int, content: bytes) -> Shard:
     """The manifest's row of a shard.
 
     Args:
@@ -96,7 +96,7 @@ def described(name: str, first: int, samples: int, content: bytes) -> Shard:
     return Shard(name=name, first=first, samples=samples, size=len(content), sha256=digest)
 
 
-def ranges(samples: int, size: int, part: tuple[int, int]) -> list[tuple[int, int, int]]:
+def shard_ranges(samples: int, size: int, part: tuple[int, int]) -> list[tuple[int, int, int]]:
     """Number, first sample and length of every shard of a part: part i of n has every n-th one.
 
     Args:
@@ -121,7 +121,7 @@ def ranges(samples: int, size: int, part: tuple[int, int]) -> list[tuple[int, in
     return [(k, first, min(size, samples - first)) for k, first in starts]
 
 
-def members_of(path: Path) -> dict[int, dict[str, tuple[int, int]]]:
+def locate_members(path: Path) -> dict[int, dict[str, tuple[int, int]]]:
     """Where the files of every sample of a shard lie: first byte and size, by number and name.
 
     Args:
@@ -131,14 +131,14 @@ def members_of(path: Path) -> dict[int, dict[str, tuple[int, int]]]:
         InputError: No tar file, or one that is no shard.
     """
     found: dict[int, dict[str, tuple[int, int]]] = {}
-    with reading(path, "a shard of a data set"), tarfile.open(path, mode="r:") as tar:
+    with convert_read_errors(path, "a shard of a data set"), tarfile.open(path, mode="r:") as tar:
         for entry in tar:
             number, _, end = entry.name.partition(".")
             found.setdefault(int(number), {})[end] = (entry.offset_data, entry.size)
     return found
 
 
-def read_manifests(folder: Path) -> list[tuple[Path, Manifest]]:
+def read_manifests(folder: Path) -> list[tuple[Path, DatasetManifest]]:
     """The manifest of a folder, or those of its parts, each with its folder.
 
     Args:
@@ -151,8 +151,8 @@ def read_manifests(folder: Path) -> list[tuple[Path, Manifest]]:
     files = [whole] if whole.is_file() else sorted(folder.glob(f"part_*/{MANIFEST}"))
     found = []
     for file in files:
-        with reading(file, "the manifest of a data set"):
-            manifest = Manifest.model_validate_json(file.read_bytes())
+        with convert_read_errors(file, "the manifest of a data set"):
+            manifest = DatasetManifest.model_validate_json(file.read_bytes())
         if manifest.format != FORMAT or any(Path(s.name).name != s.name for s in manifest.shards):
             raise InputError(f"expected {FORMAT!r}, got {file} of another format; make it again")
         found.append((file.parent, manifest))
@@ -165,7 +165,7 @@ def read_manifests(folder: Path) -> list[tuple[Path, Manifest]]:
     return found
 
 
-def _require_one_set(folder: Path, manifests: Sequence[Manifest]) -> None:
+def _require_one_set(folder: Path, manifests: Sequence[DatasetManifest]) -> None:
     if len({(m.fingerprint, m.samples, m.part[1]) for m in manifests}) > 1:
         raise InputError(
             f"expected parts of one data set, got those of several in {folder}; make them with "

@@ -1,17 +1,17 @@
 """From a recording to a twin, with no start: which things there are, and how sure that is."""
 
-from invertwin.discovery.movers import MoverMaps as MoverMaps
-from invertwin.discovery.movers import MoverTwin as MoverTwin
-from invertwin.discovery.movers import of_point as of_point
-from invertwin.discovery.movers import strongest_mover as strongest_mover
-from invertwin.discovery.moving_body import Echo as Echo
+from invertwin.discovery.movers import MovingTargetFit as MovingTargetFit
+from invertwin.discovery.movers import MovingTargetMaps as MovingTargetMaps
+from invertwin.discovery.movers import detect_strongest_target as detect_strongest_target
+from invertwin.discovery.movers import point_response as point_response
+from invertwin.discovery.moving_body import DetectedEcho as DetectedEcho
 from invertwin.discovery.moving_body import MovingBody as MovingBody
-from invertwin.discovery.outcome import Picture as Picture
-from invertwin.discovery.outcome import Thing as Thing
-from invertwin.discovery.outcome import Track as Track
+from invertwin.discovery.outcome import DetectedObject as DetectedObject
+from invertwin.discovery.outcome import GroundImage as GroundImage
+from invertwin.discovery.outcome import ObjectTrack as ObjectTrack
 from invertwin.discovery.outcome import Twin as Twin
-from invertwin.discovery.recordings import still_capture as still_capture
+from invertwin.discovery.recordings import average_chirps as average_chirps
 from invertwin.discovery.recordings import twin as twin
-from invertwin.discovery.shapes.primitives import KINDS as KINDS
-from invertwin.discovery.shapes.primitives import Figure as Figure
-from invertwin.discovery.shapes.primitives import Primitive as Primitive
+from invertwin.discovery.shapes.primitives import SHAPE_KINDS as SHAPE_KINDS
+from invertwin.discovery.shapes.primitives import PrimitiveModel as PrimitiveModel
+from invertwin.discovery.shapes.primitives import ShapeParameters as ShapeParameters

@@ -9,21 +9,21 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.channel import Grid, Sampling
-from invertwin.discovery.imaging.likelihood import HeavyTailed
-from invertwin.discovery.imaging.reflectivity import thinned
-from invertwin.discovery.shapes.primitives import Figure, Primitive
-from invertwin.discovery.shapes.prisms import Outline, unknown
+from invertwin.discovery.imaging.likelihood import HeavyTailedLoss
+from invertwin.discovery.imaging.reflectivity import thin_map
+from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters
+from invertwin.discovery.shapes.prisms import OutlineModel, make_shape_model
 from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar
 from invertwin.scene import Scene
 
-_RATE = 0.01  # of the optimiser, see the scales of ``Primitive``
+_LEARNING_RATE = 0.01  # of the optimiser, see the scales of ``PrimitiveModel``
 
 
 @dataclass(frozen=True, eq=False)
-class Coarse:
+class CoarseMaps:
     """Maps of nearly independent bins.
 
     Attributes:
@@ -34,11 +34,11 @@ class Coarse:
 
     power: Float64[Tensor, "frame some_range some_u some_v"]
     grid: Grid
-    loss: HeavyTailed
+    loss: HeavyTailedLoss
 
 
 @dataclass(frozen=True, eq=False)
-class Assembly:
+class ShapeLikelihood:
     """Maps, and what it takes to judge shapes by them.
 
     Attributes:
@@ -46,7 +46,7 @@ class Assembly:
         radar: Recorded them.
         power: The maps.
         loss: How unlikely maps are.
-        shared: How many bins are worth one.
+        bins_per_draw: How many bins are worth one.
         ground: The plane on which things stand.
         level: Its height [m].
         seed: Of rays.
@@ -55,91 +55,95 @@ class Assembly:
     model: SurrogateMap
     radar: Radar
     power: Float[Tensor, "frame range u v"]
-    loss: HeavyTailed
-    shared: float
+    loss: HeavyTailedLoss
+    bins_per_draw: float
     ground: Ground
     level: float
     seed: int
 
-    def unknowns(self, figures: Sequence[Figure]) -> dict[str, Primitive | Outline]:
+    def unknowns(
+        self, shapes: Sequence[ShapeParameters]
+    ) -> dict[str, PrimitiveModel | OutlineModel]:
         """Shapes as unknowns, by name.
 
         Args:
-            figures: The shapes.
+            shapes: The shapes.
         """
         return {
-            f"object_{number}": unknown(f"object_{number}", figure, self.ground, self.level)
-            for number, figure in enumerate(figures, 1)
+            f"object_{number}": make_shape_model(
+                f"object_{number}", figure, self.ground, self.level
+            )
+            for number, figure in enumerate(shapes, 1)
         }
 
     @cached_property
-    def coarse(self) -> "Coarse":
+    def coarse_maps(self) -> "CoarseMaps":
         """The maps with one bin for each cell of range and direction."""
-        power, grid = thinned(self.power, self.radar, self.model.grid)
+        power, grid = thin_map(self.power, self.radar, self.model.grid)
         stride = round(grid.range_step / self.model.grid.range_step)
-        return Coarse(power, grid, replace(self.loss, level=self.loss.level[::stride]))
+        return CoarseMaps(power, grid, replace(self.loss, level=self.loss.level[::stride]))
 
-    def coarse_predicted(
-        self, figures: Sequence[Figure]
+    def predict_coarse(
+        self, shapes: Sequence[ShapeParameters]
     ) -> Float64[Tensor, "frame some_range some_u some_v"]:
-        """``predicted`` in the bins of ``coarse``.
+        """``predicted`` in the bins of ``coarsen_map``.
 
         Args:
-            figures: The shapes.
+            shapes: The shapes.
         """
-        return thinned(self.predicted(figures).double(), self.radar, self.model.grid)[0]
+        return thin_map(self.predict(shapes).double(), self.radar, self.model.grid)[0]
 
-    def scene(self, figures: Sequence[Figure]) -> Scene:
+    def build_scene(self, shapes: Sequence[ShapeParameters]) -> Scene:
         """Shapes as a scene.
 
         Args:
-            figures: The shapes.
+            shapes: The shapes.
         """
-        return Scene({name: one.item for name, one in self.unknowns(figures).items()})
+        return Scene({name: one.item for name, one in self.unknowns(shapes).items()})
 
     @torch.no_grad()
-    def predicted(self, figures: Sequence[Figure]) -> Float[Tensor, "frame range u v"]:
+    def predict(self, shapes: Sequence[ShapeParameters]) -> Float[Tensor, "frame range u v"]:
         """The maps of shapes, without background.
 
         Args:
-            figures: The shapes.
+            shapes: The shapes.
         """
-        if not figures:
+        if not shapes:
             return torch.zeros_like(self.power)
         model = replace(self.model, sampling=replace(self.model.sampling, boundary=False))
-        return model.predict(self.scene(figures), self.radar, self.seed)
+        return model.predict(self.build_scene(shapes), self.radar, self.seed)
 
-    def gains(self, figures: Sequence[Figure]) -> Float64[Tensor, " frame"]:
+    def log_likelihood_gains(self, shapes: Sequence[ShapeParameters]) -> Float64[Tensor, " frame"]:
         """By how much shapes are likelier than the background alone, of every frame.
 
         Args:
-            figures: The shapes.
+            shapes: The shapes.
 
         Returns:
             Logarithms of likelihood ratios, for as many draws as are independent.
         """
-        rows = self._nothing - self.loss.rows(self.predicted(figures), self.power)
-        return rows.flatten(1).double().sum(1) / self.shared
+        rows = self._background_loss - self.loss.bin_losses(self.predict(shapes), self.power)
+        return rows.flatten(1).double().sum(1) / self.bins_per_draw
 
     @cached_property
-    def _nothing(self) -> Tensor:
-        return self.loss.rows(torch.zeros_like(self.power), self.power)
+    def _background_loss(self) -> Tensor:
+        return self.loss.bin_losses(torch.zeros_like(self.power), self.power)
 
     @property
-    def draws(self) -> float:
+    def independent_draws(self) -> float:
         """How many independent draws the maps hold."""
-        return self.power.numel() / self.shared
+        return self.power.numel() / self.bins_per_draw
 
-    def frames(self, numbers: Sequence[int]) -> "Assembly":
+    def select_frames(self, indices: Sequence[int]) -> "ShapeLikelihood":
         """Some frames.
 
         Args:
-            numbers: Of the frames.
+            indices: Of the frames.
         """
-        chosen = list(numbers)
+        chosen = list(indices)
         sampling = self.model.sampling
         share = len(chosen) / self.radar.frame_count
-        fewer = sampling_of(1, max(1, round(sampling.samples * share)))
+        fewer = make_sampling(1, max(1, round(sampling.samples * share)))
         return replace(
             self,
             model=replace(self.model, sampling=fewer),
@@ -147,27 +151,29 @@ class Assembly:
             power=self.power[chosen],
         )
 
-    def fitted(self, figures: Sequence[Figure], steps: int) -> tuple[list[Figure], Reconstruction]:
+    def fit(
+        self, shapes: Sequence[ShapeParameters], steps: int
+    ) -> tuple[list[ShapeParameters], Reconstruction]:
         """Shapes after a joint fit of all their numbers.
 
         Args:
-            figures: At the start.
+            shapes: At the start.
             steps: Of the fit.
         """
-        unknowns = self.unknowns(figures)
+        unknowns = self.unknowns(shapes)
         found = reconstruct(
-            self.scene(figures),
+            self.build_scene(shapes),
             Observation(self.model, self.radar, self.power),
             unknowns,
             loss=self.loss,
-            optimizer=Optimizer("adam", rate=_RATE),
+            optimizer=Optimizer("adam", rate=_LEARNING_RATE),
             schedule=Schedule(steps, annealing=0.5),
             seed=self.seed,
         )
-        return [one.figure for one in unknowns.values()], found
+        return [one.shape for one in unknowns.values()], found
 
 
-def sampling_of(frames: int, rays: int) -> Sampling:
+def make_sampling(frames: int, rays: int) -> Sampling:
     """Rays of a fit, an eighth as many on silhouettes.
 
     Args:

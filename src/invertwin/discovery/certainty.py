@@ -7,14 +7,16 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from invertwin.discovery.assembly import Assembly
-from invertwin.discovery.search import facing, other_kinds
-from invertwin.discovery.shapes.primitives import Figure, upright
+from invertwin.discovery.assembly import ShapeLikelihood
+from invertwin.discovery.search import propose_kinds, rotate_headed_shapes
+from invertwin.discovery.shapes.primitives import ShapeParameters, shape_center
 from invertwin.inversion import Reconstruction, speckle_weight
-from invertwin.inversion.confidence.uncertainty import coordinates, map_derivatives
+from invertwin.inversion.confidence.uncertainty import iterate_coordinates, map_derivatives
 
 
-def deviations(one: Assembly, found: Reconstruction) -> dict[str, float]:
+def standard_deviations(
+    likelihood: ShapeLikelihood, reconstruction: Reconstruction
+) -> dict[str, float]:
     """Standard deviations of all numbers of a joint fit, by name.
 
     The larger of two: H⁻¹, H the information of heavy-tailed speckle, and H⁻¹ S H⁻¹, S the scatter
@@ -23,15 +25,15 @@ def deviations(one: Assembly, found: Reconstruction) -> dict[str, float]:
     beforehand, ten times an error that matters.
 
     Args:
-        one: Maps.
-        found: The fit.
+        likelihood: Maps.
+        reconstruction: The fit.
     """
-    fit = found.end.fit
-    rows = list(coordinates(fit.modules))
-    mean, power = found.end.maps[0]
-    level = one.loss.level.to(mean)[:, None, None]
+    fit = reconstruction.result.fit
+    rows = list(iterate_coordinates(fit.modules))
+    mean, power = reconstruction.result.maps[0]
+    level = likelihood.loss.level.to(mean)[:, None, None]
     mean = (mean.detach().clamp_min(0.0) + level).double()
-    ratio, nu = power.double() / mean, one.loss.degrees
+    ratio, nu = power.double() / mean, likelihood.loss.degrees
     score = 1 - ratio * speckle_weight(ratio, nu)
     first, second = (
         map_derivatives(fit, rows, number)[0].detach().double() / mean for number in (0, 1)
@@ -39,8 +41,11 @@ def deviations(one: Assembly, found: Reconstruction) -> dict[str, float]:
     flat = [part.flatten(2) for part in (first, second)]
     # The product of two draws is free of the information that their noise feigns.
     mixed = torch.einsum("pfn,qfn->pq", *flat)
-    information = nu / (nu + 2) * 0.5 * (mixed + mixed.T) / one.shared
-    slopes = torch.einsum("pfn,fn->pf", 0.5 * (flat[0] + flat[1]), score.flatten(1)) / one.shared
+    information = nu / (nu + 2) * 0.5 * (mixed + mixed.T) / likelihood.bins_per_draw
+    slopes = (
+        torch.einsum("pfn,fn->pf", 0.5 * (flat[0] + flat[1]), score.flatten(1))
+        / likelihood.bins_per_draw
+    )
     scatter = slopes @ slopes.T
     spans = torch.tensor([10 * row.span for row in rows], dtype=torch.float64)
     # In units of the spans, with one unit known beforehand; noise must not make it negative.
@@ -52,14 +57,14 @@ def deviations(one: Assembly, found: Reconstruction) -> dict[str, float]:
     return {row.name: float(value) for row, value in zip(rows, error, strict=True)}
 
 
-def surer(with_it: Tensor, without: Tensor) -> float:
+def acceptance_probability(gains_with: Tensor, gains_without: Tensor) -> float:
     """The probability that a change that frames speak for is right.
 
     Args:
-        with_it: Gains of all frames.
-        without: Those without the change.
+        gains_with: Gains of all frames.
+        gains_without: Those without the change.
     """
-    gain = with_it - without
+    gain = gains_with - gains_without
     total = float(gain.sum())
     if len(gain) < 4:
         return 1 - min(1.0, math.exp(-max(total, 0.0)))
@@ -67,96 +72,118 @@ def surer(with_it: Tensor, without: Tensor) -> float:
     return float(torch.special.ndtr(torch.tensor(total / max(spread, 1e-9)).double()))
 
 
-def presence(one: Assembly, shapes: Sequence[Figure]) -> list[float]:
+def existence_probabilities(
+    likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters]
+) -> list[float]:
     """The probability of every shape that it is there.
 
     Args:
-        one: Maps.
+        likelihood: Maps.
         shapes: All of them.
     """
-    together = one.gains(shapes)
-    return [surer(together, one.gains([*shapes[:k], *shapes[k + 1 :]])) for k in range(len(shapes))]
+    together = likelihood.log_likelihood_gains(shapes)
+    return [
+        acceptance_probability(
+            together, likelihood.log_likelihood_gains([*shapes[:k], *shapes[k + 1 :]])
+        )
+        for k in range(len(shapes))
+    ]
 
 
 @dataclass(frozen=True)
-class Rival:
+class ShapeHypothesis:
     """What a shape may be.
 
     Attributes:
-        figure: After a fit.
-        weight: Its probability.
+        shape: After a fit.
+        probability: Its probability.
     """
 
-    figure: Figure
-    weight: float
+    shape: ShapeParameters
+    probability: float
 
 
-def rivals(one: Assembly, shapes: Sequence[Figure]) -> list[list[Rival]]:
+def find_hypotheses(
+    likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters]
+) -> list[list[ShapeHypothesis]]:
     """What every shape may be, all others as they are; itself first.
 
     Other kinds, and others that look the other way, are fitted for a short while first, all shapes
     together.
 
     Args:
-        one: Maps.
+        likelihood: Maps.
         shapes: After their fit.
     """
-    together = one.gains(shapes)
-    found = [[Rival(shape, 1.0)] for shape in shapes]
-    for changed in (*other_kinds(one, shapes), facing(shapes, math.pi, one.ground)):
+    together = likelihood.log_likelihood_gains(shapes)
+    found = [[ShapeHypothesis(shape, 1.0)] for shape in shapes]
+    for changed in (
+        *propose_kinds(likelihood, shapes),
+        rotate_headed_shapes(shapes, math.pi, likelihood.ground),
+    ):
         if not changed:
             continue
-        fitted, _ = one.fitted(changed, _SHORT)
+        fitted, _ = likelihood.fit(changed, _SHORT_FIT_STEPS)
         for number, (start, new, old) in enumerate(zip(changed, fitted, shapes, strict=True)):
             if start is old:
                 continue
             # A short fit stirs a shape up before it mends it.
             options = [
-                (one.gains([*shapes[:number], r, *shapes[number + 1 :]]), r) for r in (start, new)
+                (likelihood.log_likelihood_gains([*shapes[:number], r, *shapes[number + 1 :]]), r)
+                for r in (start, new)
             ]
             swapped, rival = max(options, key=lambda option: float(option[0].sum()))
-            right = min(max(surer(together, swapped), 1e-6), 1 - 1e-6)
-            found[number].append(Rival(rival, (1 - right) / right))
-    totals = [sum(rival.weight for rival in row) for row in found]
+            right = min(max(acceptance_probability(together, swapped), 1e-6), 1 - 1e-6)
+            found[number].append(ShapeHypothesis(rival, (1 - right) / right))
+    totals = [sum(rival.probability for rival in row) for row in found]
     return [
-        [replace(rival, weight=rival.weight / total) for rival in row]
+        [replace(rival, probability=rival.probability / total) for rival in row]
         for row, total in zip(found, totals, strict=True)
     ]
 
 
-def kind_probabilities(among: Sequence[Rival]) -> dict[str, float]:
+def kind_probabilities(hypotheses: Sequence[ShapeHypothesis]) -> dict[str, float]:
     """The probability of every kind.
 
     Args:
-        among: What a shape may be.
+        hypotheses: What a shape may be.
     """
     found = dict[str, float]()
-    for rival in among:
-        found[rival.figure.named] = found.get(rival.figure.named, 0.0) + rival.weight
+    for rival in hypotheses:
+        found[rival.shape.effective_kind] = (
+            found.get(rival.shape.effective_kind, 0.0) + rival.probability
+        )
     return found
 
 
-def widened(one: Assembly, own: Mapping[str, float], among: Sequence[Rival]) -> dict[str, float]:
+def widen_deviations(
+    likelihood: ShapeLikelihood,
+    deviations: Mapping[str, float],
+    hypotheses: Sequence[ShapeHypothesis],
+) -> dict[str, float]:
     """Standard deviations of a shape's place, with what its derivatives do not tell.
 
     They do not tell where it would be if it were a rival; nor, of what may hang at any height near
     the radar's, how its range grows with the square of its way up or down.
 
     Args:
-        one: Maps.
-        own: Its deviations if it is what it is called.
-        among: What it may be, itself first.
+        likelihood: Maps.
+        deviations: Its deviations if it is what it is called.
+        hypotheses: What it may be, itself first.
     """
-    found, figure = dict(own), among[0].figure
-    middle = upright(figure, one.ground, one.level)
+    found, figure = dict(deviations), hypotheses[0].shape
+    middle = shape_center(figure, likelihood.ground, likelihood.level)
     farther = 0.0
-    if figure.ball:
-        distance = float((one.radar.positions.detach() - middle).norm(dim=1).mean())
-        farther = own["height"] ** 2 / (2 * distance)
-    for number, axis in enumerate(one.ground.level):
-        away = sum(r.weight * (r.figure.place[number] - figure.place[number]) ** 2 for r in among)
-        found["xyz"[axis]] = math.hypot(own["xyz"[axis]], math.sqrt(away), farther)
+    if figure.has_free_height:
+        distance = float((likelihood.radar.positions.detach() - middle).norm(dim=1).mean())
+        farther = deviations["height"] ** 2 / (2 * distance)
+    for number, axis in enumerate(likelihood.ground.plane_axes):
+        away = sum(
+            r.probability * (r.shape.position[number] - figure.position[number]) ** 2
+            for r in hypotheses
+        )
+        found["xyz"[axis]] = math.hypot(deviations["xyz"[axis]], math.sqrt(away), farther)
     return found
 
 
-_SHORT = 20  # steps
+_SHORT_FIT_STEPS = 20  # steps

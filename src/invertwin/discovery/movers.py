@@ -9,11 +9,11 @@ from torch import Tensor
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.channel import Grid, Paths
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.discovery.moving_body import Echo, MovingBody
+from invertwin.discovery.moving_body import DetectedEcho, MovingBody
 from invertwin.errors import InputError
-from invertwin.inversion.loss import CorrelationLoss, Scale
+from invertwin.inversion.loss import CorrelationLoss, CorrelationScale
 from invertwin.inversion.reconstruction import Reconstruction
-from invertwin.models.doppler import MotionMap
+from invertwin.models.doppler import RangeDopplerMap
 from invertwin.radar.aperture import aperture
 from invertwin.radar.processing.detection import ordered_statistics_cfar, point_cloud
 from invertwin.radar.processing.doppler import compensate_tdm, range_doppler, velocity_axis
@@ -21,12 +21,14 @@ from invertwin.radar.radar import Radar
 from invertwin.scene.scene import Scene
 
 # Cells of a map that an echo and its neighbours fill; and those that the noise is taken from.
-_GUARD, _TRAINING = 2, 2
-_FALSE_ALARM = 1e-6
-_RAYS = 10_000  # of a map that is compared or drawn
+_GUARD_CELLS, _TRAINING_CELLS = 2, 2
+_FALSE_ALARM_RATE = 1e-6
+_RAY_COUNT = 10_000  # of a map that is compared or drawn
 
 
-def of_point(model: MotionMap, radar: Radar, echo: Echo, time: float = 0.0) -> Tensor:
+def point_response(
+    model: RangeDopplerMap, radar: Radar, echo: DetectedEcho, time: float = 0.0
+) -> Tensor:
     """What a point at an echo looks like in a map: the bare response of the radar.
 
     Args:
@@ -42,7 +44,7 @@ def of_point(model: MotionMap, radar: Radar, echo: Echo, time: float = 0.0) -> T
     origin = 0.5 * (link.tx + link.rx)[0]
     distance = (echo.position - origin).norm()
     away = (echo.position - origin) / distance
-    place = (origin + (distance + echo.rate * time) * away)[None]
+    place = (origin + (distance + echo.range_rate * time) * away)[None]
     length = (place - link.tx).norm(dim=1) + (place - link.rx).norm(dim=1)
     point = Paths(
         frame=torch.zeros(1, dtype=torch.int64),
@@ -53,12 +55,12 @@ def of_point(model: MotionMap, radar: Radar, echo: Echo, time: float = 0.0) -> T
         last=place,
         kind="power",
         boundary=torch.zeros(1, dtype=torch.bool),
-        velocity=echo.rate * away[None],
+        velocity=echo.range_rate * away[None],
     )
-    return model.expected(point, radar)
+    return model.predict_paths(point, radar)
 
 
-def strongest_mover(recording: ChirpCapture, model: MotionMap) -> Echo:
+def detect_strongest_target(recording: ChirpCapture, model: RangeDopplerMap) -> DetectedEcho:
     """The strongest detected echo of a recording: CFAR over range rate and range, then its peak.
 
     Args:
@@ -71,11 +73,12 @@ def strongest_mover(recording: ChirpCapture, model: MotionMap) -> Echo:
     radar, chirps, grid = recording.radar(), model.chirps, model.grid
     bins = model.bins / chirps.count, radar.waveform.range_resolution / grid.range_step
     guard, training = (
-        (max(1, round(n * bins[0])), max(1, round(n * bins[1]))) for n in (_GUARD, _TRAINING)
+        (max(1, round(n * bins[0])), max(1, round(n * bins[1])))
+        for n in (_GUARD_CELLS, _TRAINING_CELLS)
     )
     power = model.observe(recording).detach()
     seen = ordered_statistics_cfar(
-        power.amax((-2, -1)), guard=guard, training=training, false_alarm=_FALSE_ALARM
+        power.amax((-2, -1)), guard=guard, training=training, false_alarm=_FALSE_ALARM_RATE
     )
     points = point_cloud(power, seen, radar, grid, chirps)
     if not len(points.power):
@@ -87,14 +90,16 @@ def strongest_mover(recording: ChirpCapture, model: MotionMap) -> Echo:
     range_, rate, u, v = (
         float(x[best]) for x in (points.range, points.velocity, points.u, points.v)
     )
-    coherence = _coherence(recording, grid, rate, range_)
-    return Echo(range_, rate, u, v, points.position[best], coherence)
+    coherence = _channel_coherence(recording, grid, rate, range_)
+    return DetectedEcho(range_, rate, u, v, points.position[best], coherence)
 
 
-def _coherence(recording: ChirpCapture, grid: Grid, rate: float, range_: float) -> float:
+def _channel_coherence(
+    recording: ChirpCapture, grid: Grid, range_rate: float, range_: float
+) -> float:
     """|mean of the channels' phases| against the best plane wave, at the cell nearest a place."""
     radar, chirps = recording.radar(), recording.chirps
-    row = int((velocity_axis(radar, chirps) - rate).abs().argmin())
+    row = int((velocity_axis(radar, chirps) - range_rate).abs().argmin())
     column = int((grid.ranges - range_).abs().argmin())
     moving = recording.beat - recording.beat.mean(1, keepdim=True)
     slow = range_doppler(moving.to(torch.complex128), radar, grid, chirps)
@@ -108,47 +113,49 @@ def _coherence(recording: ChirpCapture, grid: Grid, rate: float, range_: float) 
 
 
 @dataclass(frozen=True, eq=False)
-class MoverMaps:
+class MovingTargetMaps:
     """Maps about an echo that moves: of its twin, and of a bare point in its place.
 
     Attributes:
         model: What the maps show.
-        twin: Power [velocity, range, u, v].
-        point: The same of the point.
+        twin_map: Power [velocity, range, u, v].
+        point_map: The same of the point.
     """
 
-    model: MotionMap
-    twin: Tensor
-    point: Tensor
+    model: RangeDopplerMap
+    twin_map: Tensor
+    point_map: Tensor
 
     def correlations(self, recording: ChirpCapture) -> dict[str, dict[str, float]]:
         """Correlations of ``twin`` and ``bare_psf`` with a frame of chirps, by scale."""
         seen = self.model.observe(recording)[0]
         found = {}
-        for scale in get_args(Scale):
+        for scale in get_args(CorrelationScale):
             loss = CorrelationLoss(scale)
-            pair = ("twin", self.twin), ("bare_psf", self.point)
+            pair = ("twin", self.twin_map), ("bare_psf", self.point_map)
             found[scale] = {name: 1 - float(loss(power, seen)) for name, power in pair}
         return found
 
 
 @dataclass(frozen=True, eq=False)
-class MoverTwin:
+class MovingTargetFit:
     """A body that was fitted to the strongest mover of a recording.
 
     Attributes:
         recording: One frame of chirps.
         model: Map of the whole recording.
         body: As fitted.
-        outcome: Of the fit.
+        reconstruction: Of the fit.
     """
 
     recording: ChirpCapture
-    model: MotionMap
+    model: RangeDopplerMap
     body: MovingBody
-    outcome: Reconstruction
+    reconstruction: Reconstruction
 
-    def maps(self, scene: Scene, cells: int, *, time: float = 0.0, seed: int = 0) -> MoverMaps:
+    def predict_maps(
+        self, scene: Scene, cells: int, *, time: float = 0.0, seed: int = 0
+    ) -> MovingTargetMaps:
         """Maps about the place that the echo has moved to.
 
         Args:
@@ -158,7 +165,11 @@ class MoverTwin:
             seed: Of the rays.
         """
         radar, echo = self.recording.radar(), self.body.echo
-        near = self.model.around(echo.range + echo.rate * time, echo.rate, cells, radar)
+        near = self.model.crop_around(
+            echo.range + echo.range_rate * time, echo.range_rate, cells, radar
+        )
         with torch.no_grad():
-            twin = near.sampled_by(samples=_RAYS).predict(self.body(scene, time), radar, seed)[0]
-        return MoverMaps(near, twin, of_point(near, radar, echo, time)[0])
+            twin = near.with_sampling(samples=_RAY_COUNT).predict(
+                self.body(scene, time), radar, seed
+            )[0]
+        return MovingTargetMaps(near, twin, point_response(near, radar, echo, time)[0])

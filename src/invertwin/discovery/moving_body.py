@@ -16,19 +16,19 @@ from invertwin.scene.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
-class Echo:
+class DetectedEcho:
     """A detected echo, its place refined between the bins.
 
     Attributes:
         range: [m].
-        rate: Range rate, positive moves away [m/s].
+        range_rate: Range rate, positive moves away [m/s].
         u, v: Direction cosines.
         position: In the world [m].
         coherence: 1 where the channels are a plane wave.
     """
 
     range: float
-    rate: float
+    range_rate: float
     u: float
     v: float
     position: Float64[Tensor, "3"]
@@ -59,7 +59,7 @@ class MovingBody(nn.Module):
         object: str,
         scene: Scene,
         radar: Radar,
-        echo: Echo,
+        echo: DetectedEcho,
         free: Sequence[str] = ("place", "velocity", "spin", "size", "diffuse"),
     ) -> None:
         """Start at an echo with the object's own size.
@@ -76,7 +76,7 @@ class MovingBody(nn.Module):
         """
         super().__init__()
         self.object, self.echo = object, echo
-        material = _rough(scene, object)
+        material = _require_rough_dielectric(scene, object)
         share = material.diffuse
         if not isinstance(share, float | int) or not 0 < share < 1:
             raise InputError(
@@ -95,7 +95,7 @@ class MovingBody(nn.Module):
         zeros = torch.zeros(2, dtype=torch.float64)
         self.place = nn.Parameter(zeros.clone())
         self.height = nn.Parameter(zeros[0].clone())
-        self.velocity = nn.Parameter(torch.tensor([0.0, echo.rate], dtype=torch.float64))
+        self.velocity = nn.Parameter(torch.tensor([0.0, echo.range_rate], dtype=torch.float64))
         self.spin = nn.Parameter(zeros[0].clone())
         self.size = nn.Parameter(torch.zeros(3, dtype=torch.float64))
         self.diffuse = nn.Parameter(torch.tensor(share, dtype=torch.float64).logit())
@@ -119,35 +119,37 @@ class MovingBody(nn.Module):
         """
         item = scene[self.object]
         mesh = Mesh((item.mesh.vertices - item.mesh.center) * self.size.exp(), item.mesh.faces)
-        center = self._center(time)
+        center = self._center_at(time)
         placed = scene.replace(
             self.object,
             mesh=mesh,
             pose=rigid(self._axes, center),
-            material=replace(_rough(scene, self.object), diffuse=self.diffuse.sigmoid()),
+            material=replace(
+                _require_rough_dielectric(scene, self.object), diffuse=self.diffuse.sigmoid()
+            ),
         )
         lever = placed[self.object].vertices - center
         turn = torch.linalg.cross((self.spin * self._axes[:, 1]).expand_as(lever), lever)
-        return placed.replace(self.object, velocity=self._axes @ self._translation + turn)
+        return placed.replace(self.object, velocity=self._axes @ self._velocity_vector + turn)
 
     def values(self) -> dict[str, Tensor]:
         """What was found, by name, in SI units; velocity and position in the world."""
         with torch.no_grad():
             return {
-                "position_m": self._center(),
-                "velocity_m_s": self._axes @ self._translation,
+                "position_m": self._center_at(),
+                "velocity_m_s": self._axes @ self._velocity_vector,
                 "spin_rad_s": self.spin.clone(),
                 "extent_m": self._extent,
                 "diffuse": self.diffuse.sigmoid(),
             }
 
-    def _center(self, time: float = 0.0) -> Float64[Tensor, "3"]:
+    def _center_at(self, time: float = 0.0) -> Float64[Tensor, "3"]:
         depth = 0.5 * self._extent[2]
         offset = torch.stack([self.place[0], self.height, self.place[1] + depth])
-        return self._start + self._axes @ (offset + self._translation * time)
+        return self._start + self._axes @ (offset + self._velocity_vector * time)
 
     @property
-    def _translation(self) -> Tensor:
+    def _velocity_vector(self) -> Tensor:
         return torch.stack([self.velocity[0], torch.zeros_like(self.spin), self.velocity[1]])
 
     @property
@@ -156,7 +158,7 @@ class MovingBody(nn.Module):
         return self._first_extent * self.size.exp()
 
 
-def _rough(scene: Scene, name: str) -> RoughDielectric:
+def _require_rough_dielectric(scene: Scene, name: str) -> RoughDielectric:
     material = scene[name].material
     if isinstance(material, RoughDielectric):
         return material

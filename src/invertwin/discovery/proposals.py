@@ -8,18 +8,20 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.discovery.shapes.primitives import SIZES, Figure
-from invertwin.inversion.initialisation.detections import Ground, linked
+from invertwin.discovery.shapes.primitives import SIZE_LIMITS, ShapeParameters
+from invertwin.inversion.initialisation.detections import Ground, label_groups
 
-_TURNS = 45  # yaws that a rectangle is tried at, over a quarter turn
-_TRIM = 0.05  # share of the weight beyond each side of a rectangle
-_PERSON = 0.66, 0.32, 1.75  # usual length, width and height [m]
-_LEAST_PERSON, _SPARE = 0.12, 0.25  # of an extent, and beyond the usual one [m]
-CORNER = 0.15
+_YAW_COUNT = 45  # yaws that a rectangle is tried at, over a quarter turn
+_TRIMMED_FRACTION = 0.05  # share of the weight beyond each side of a rectangle
+_PERSON_SIZE = 0.66, 0.32, 1.75  # usual length, width and height [m]
+_MIN_PERSON_EXTENT, _PERSON_MARGIN = 0.12, 0.25  # of an extent, and beyond the usual one [m]
+MAX_CORNER_EXTENT = 0.15
 """Side of the largest group that may be a corner reflector [m]."""
 
 
-def bright(strength: Float64[Tensor, " place"], share: float = 0.02) -> Float64[Tensor, " chosen"]:
+def bright_weights(
+    strength: Float64[Tensor, " place"], fraction: float = 0.02
+) -> Float64[Tensor, " chosen"]:
     """Weights of places of an image; those that are too dim have none.
 
     Sizes of echoes differ by orders of magnitude, but even a dim object is brighter than the grain
@@ -27,29 +29,29 @@ def bright(strength: Float64[Tensor, " place"], share: float = 0.02) -> Float64[
 
     Args:
         strength: The image.
-        share: Of the reference, below which a place is dark.
+        fraction: Of the reference, below which a place is dark.
     """
     order = strength.sort(descending=True).values
     total = order.cumsum(0)
     # Half of all strength is in places brighter than this.
     typical = order[int((total < 0.5 * total[-1]).sum())]
-    return torch.where(strength > share * typical, strength, 0.0)
+    return torch.where(strength > fraction * typical, strength, 0.0)
 
 
-def groups(
-    places: Float64[Tensor, "place 2"], weight: Float64[Tensor, " place"], gap: float
+def group_bright_points(
+    positions: Float64[Tensor, "place 2"], weight: Float64[Tensor, " place"], max_gap: float
 ) -> list[Float64[Tensor, " place"]]:
     """Sets of bright places that are linked by steps of at most a gap, as weights of all places.
 
     Args:
-        places: On the ground [m].
+        positions: On the ground [m].
         weight: Of every place; zero is dark.
-        gap: Longest step [m].
+        max_gap: Longest step [m].
     """
     lit = weight.nonzero()[:, 0]
     if not len(lit):
         return []
-    labels = linked(places[lit], gap)
+    labels = label_groups(positions[lit], max_gap)
     found = []
     for number in range(int(labels.max()) + 1):
         own = torch.zeros_like(weight)
@@ -59,22 +61,24 @@ def groups(
     return sorted(found, key=lambda own: -float(own.sum()))
 
 
-def rectangle(
-    places: Float64[Tensor, "place 2"], weight: Float64[Tensor, " place"], turn: float
+def enclosing_rectangle(
+    positions: Float64[Tensor, "place 2"], weight: Float64[Tensor, " place"], yaw: float
 ) -> tuple[Float64[Tensor, "2"], Float64[Tensor, "2"], float]:
     """Middle [m], sides [m] and tightness of the rectangle of one turn about bright places.
 
     Args:
-        places: On the ground [m].
+        positions: On the ground [m].
         weight: Of every place.
-        turn: Of the first side, from the first axis towards the second [rad].
+        yaw: Of the first side, from the first axis towards the second [rad].
 
     Returns:
         The tightness is the mean over the weight of 1/(d + 3 cm), d the way to the nearest side.
     """
-    c, s = math.cos(turn), math.sin(turn)
-    own = torch.stack([c * places[:, 0] + s * places[:, 1], c * places[:, 1] - s * places[:, 0]], 1)
-    ends = torch.stack([_quantiles(own[:, axis], weight) for axis in range(2)])
+    c, s = math.cos(yaw), math.sin(yaw)
+    own = torch.stack(
+        [c * positions[:, 0] + s * positions[:, 1], c * positions[:, 1] - s * positions[:, 0]], 1
+    )
+    ends = torch.stack([_trimmed_ends(own[:, axis], weight) for axis in range(2)])
     middle, sides = ends.mean(1), ends[:, 1] - ends[:, 0]
     away = (0.5 * sides - (own - middle).abs()).abs().amin(1)
     tight = float((weight / (away + 0.03)).sum() / weight.sum())
@@ -82,83 +86,92 @@ def rectangle(
     return torch.tensor([c * x - s * y, s * x + c * y], dtype=torch.float64), sides, tight
 
 
-def _quantiles(along: Tensor, weight: Tensor) -> Tensor:
-    order = along.argsort()
+def _trimmed_ends(coordinates: Tensor, weight: Tensor) -> Tensor:
+    order = coordinates.argsort()
     share = weight[order].cumsum(0) / weight.sum()
-    low = int((share < _TRIM).sum())
-    high = int((share < 1 - _TRIM).sum())
-    return along[order][[low, min(high, len(along) - 1)]]
+    low = int((share < _TRIMMED_FRACTION).sum())
+    high = int((share < 1 - _TRIMMED_FRACTION).sum())
+    return coordinates[order][[low, min(high, len(coordinates) - 1)]]
 
 
-def figures(
-    places: Float64[Tensor, "place 2"],
+def propose_shapes(
+    positions: Float64[Tensor, "place 2"],
     weight: Float64[Tensor, " place"],
     ground: Ground,
     *,
     step: float,
     height: float,
-) -> list[Figure]:
+) -> list[ShapeParameters]:
     """What could stand where places are bright: boxes of two turns, round shapes, and what its
     extent allows of people, vehicles and corner reflectors.
 
     Args:
-        places: On the ground [m].
+        positions: On the ground [m].
         weight: Of every place; zero is dark.
         ground: The plane.
         step: Of the image [m].
         height: Of the radars above the ground, near which things are seen [m].
     """
     lit = weight > 0
-    places, weight = places[lit], weight[lit].sqrt()  # less of glints
-    turns = [k * 0.5 * math.pi / _TURNS for k in range(_TURNS)]
-    tried = [(rectangle(places, weight, turn), turn) for turn in turns]
+    positions, weight = positions[lit], weight[lit].sqrt()  # less of glints
+    turns = [k * 0.5 * math.pi / _YAW_COUNT for k in range(_YAW_COUNT)]
+    tried = [(enclosing_rectangle(positions, weight, turn), turn) for turn in turns]
     # The tightest, and the smallest: half a box is best enclosed, a whole one best outlined.
     tightest = max(tried, key=lambda one: one[0][2])
     smallest = min(tried, key=lambda one: float((one[0][1] + step).prod()))
-    rows: list[Figure] = []
+    rows: list[ShapeParameters] = []
     chosen: Sequence[tuple[tuple[Tensor, Tensor, float], float]] = [tightest, smallest]
     for (middle, sides, _), turn in chosen:
         # The image is about a step wider than what is there.
         length, width = (max(float(side), 0.02) for side in sides)
         x, y = middle.tolist()
-        rows.append(Figure("box", (x, y), ground.sense * turn, length, width, 1.5 * height))
+        rows.append(
+            ShapeParameters("box", (x, y), ground.yaw_sign * turn, length, width, 1.5 * height)
+        )
     spread = max(float(smallest[0][1].mean()), 0.02)
     x, y = smallest[0][0].tolist()
-    rows.append(Figure("cylinder", (x, y), 0.0, spread, spread, 1.5 * height))
-    rows.append(Figure("sphere", (x, y), 0.0, spread, spread, height))
+    rows.append(ShapeParameters("cylinder", (x, y), 0.0, spread, spread, 1.5 * height))
+    rows.append(ShapeParameters("sphere", (x, y), 0.0, spread, spread, height))
     middle, sides, _ = smallest[0]
-    if float(sides.max()) < CORNER:
-        rows += headings(Figure("corner", (x, y), height=height))
-    around = Figure("box", (x, y), ground.sense * smallest[1], *sides.clamp_min(0.02).tolist())
-    return rows + standing(around)
+    if float(sides.max()) < MAX_CORNER_EXTENT:
+        rows += propose_headings(ShapeParameters("corner", (x, y), height=height))
+    around = ShapeParameters(
+        "box", (x, y), ground.yaw_sign * smallest[1], *sides.clamp_min(0.02).tolist()
+    )
+    return rows + propose_people_and_vehicles(around)
 
 
-def headings(figure: Figure) -> list[Figure]:
+def propose_headings(shape: ShapeParameters) -> list[ShapeParameters]:
     """A shape that looks eight ways.
 
     Args:
-        figure: The shape.
+        shape: The shape.
     """
-    return [replace(figure, yaw=k * math.pi / 4) for k in range(8)]
+    return [replace(shape, yaw=k * math.pi / 4) for k in range(8)]
 
 
-def standing(around: Figure) -> list[Figure]:
+def propose_people_and_vehicles(box: ShapeParameters) -> list[ShapeParameters]:
     """People and vehicles of usual sizes that could be what a box surrounds.
 
     Args:
-        around: The box.
+        box: The box.
     """
-    long, short = max(around.length, around.width), min(around.length, around.width)
-    rows: list[Figure] = []
-    if _LEAST_PERSON < long < _PERSON[0] + _SPARE and short < _PERSON[1] + _SPARE:
-        length, width, height = _PERSON
-        rows += headings(replace(around, kind="person", length=length, width=width, height=height))
-    (low, _, _), (high, wide, height) = SIZES["vehicle"]
+    long, short = max(box.length, box.width), min(box.length, box.width)
+    rows: list[ShapeParameters] = []
+    if (
+        _MIN_PERSON_EXTENT < long < _PERSON_SIZE[0] + _PERSON_MARGIN
+        and short < _PERSON_SIZE[1] + _PERSON_MARGIN
+    ):
+        length, width, height = _PERSON_SIZE
+        rows += propose_headings(
+            replace(box, kind="person", length=length, width=width, height=height)
+        )
+    (low, _, _), (high, wide, height) = SIZE_LIMITS["vehicle"]
     if 0.8 * low < long < high and short < wide:
-        ahead = around.yaw if around.length >= around.width else around.yaw + 0.5 * math.pi
+        ahead = box.yaw if box.length >= box.width else box.yaw + 0.5 * math.pi
         rows += [
             replace(
-                around,
+                box,
                 kind="vehicle",
                 yaw=ahead + turn,
                 length=max(long, low),

@@ -10,31 +10,46 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.capture import Capture, ChirpCapture
-from invertwin.channel import Grid, Sight
+from invertwin.channel import Grid, ViewpointScene
 from invertwin.checks import checked_count, checked_number, checked_tensor
-from invertwin.discovery.assembly import Assembly, sampling_of
-from invertwin.discovery.certainty import deviations, kind_probabilities, presence, rivals, widened
-from invertwin.discovery.imaging.likelihood import HeavyTailed, background, shared_bins
-from invertwin.discovery.imaging.point_detections import dense, movers, own_velocities, points_along
-from invertwin.discovery.imaging.reflectivity import Response, responses
-from invertwin.discovery.outcome import Picture, Thing, Twin
-from invertwin.discovery.search import Lattice, Search
-from invertwin.discovery.self_calibration import apart, channels_of_scene
-from invertwin.discovery.shapes.outlines import outlined
-from invertwin.discovery.shapes.primitives import upright
-from invertwin.discovery.tracks import tracks
+from invertwin.discovery.assembly import ShapeLikelihood, make_sampling
+from invertwin.discovery.certainty import (
+    existence_probabilities,
+    find_hypotheses,
+    kind_probabilities,
+    standard_deviations,
+    widen_deviations,
+)
+from invertwin.discovery.imaging.likelihood import (
+    HeavyTailedLoss,
+    count_bins_per_draw,
+    estimate_background,
+)
+from invertwin.discovery.imaging.point_detections import (
+    detect_moving_targets,
+    is_dense_track,
+    locate_coherent_points,
+    platform_velocities,
+)
+from invertwin.discovery.imaging.reflectivity import ImageResponse, compute_response
+from invertwin.discovery.outcome import DetectedObject, GroundImage, Twin
+from invertwin.discovery.search import ImageGrid, ShapeSearch
+from invertwin.discovery.self_calibration import calibrate_on_scene, phase_spread
+from invertwin.discovery.shapes.outlines import fit_outlines
+from invertwin.discovery.shapes.primitives import shape_center
+from invertwin.discovery.tracks import track_moving_targets
 from invertwin.errors import InputError
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar, SampledWaveform
 from invertwin.scene import Scene
 
-_NEAREST = 4  # range cells, in which transmitters leak into receivers
-_HEIGHT = 0.6  # of radars above a ground of which nothing is said [m]
-_STEPS = 50  # of the last fit
-_PLACES = 40_000  # of an image at most
-_FAINT = 0.05  # confidence of movers that are not worth a line
-_HOLD = 4  # every fourth frame is held out, where there are twice as many
+_LEAKAGE_CELLS = 4  # range cells, in which transmitters leak into receivers
+_DEFAULT_RADAR_HEIGHT = 0.6  # of radars above a ground of which nothing is said [m]
+_FINAL_FIT_STEPS = 50  # of the last fit
+_MAX_IMAGE_POINTS = 40_000  # of an image at most
+_MIN_EXISTENCE_PROBABILITY = 0.05  # confidence of movers that are not worth a line
+_HELD_OUT_EVERY = 4  # every fourth frame is held out, where there are twice as many
 
 
 def twin(
@@ -76,42 +91,46 @@ def twin(
     """
     plane = ground or Ground()
     checked_count(rays, "rays", 100)
-    capture = still_capture(recording)
+    capture = average_chirps(recording)
     if isinstance(recording, ChirpCapture) and recording.real:
         range_max = min(range_max or math.inf, recording.max_range)
     radar = capture.radar()
-    base = float(radar.positions.detach()[:, plane.vertical].mean())
+    base = float(radar.positions.detach()[:, plane.up_axis].mean())
     floor = (
-        base - _HEIGHT
+        base - _DEFAULT_RADAR_HEIGHT
         if level is None
         else checked_number(level, "level of the ground [m]", -math.inf)
     )
     plane_at = base if height is None else floor + checked_number(height, "height [m]", 0.0)
-    reach = _reach(capture, range_max)
+    reach = _search_range(capture, range_max)
     if reach is None:
-        moving = _moving(recording, range_max, plane)
-        said = "nothing that stands still is above the noise" if moving else _NOTHING
-        return Twin(_surest_first(moving), plane, floor, notes=(said,))
-    places, step = _places(radar, plane, plane_at, reach, low, high)
-    told = channels_of_scene(capture, radar.grid(*reach), places)
+        moving = _find_moving_targets(recording, range_max, plane)
+        said = "nothing that stands still is above the noise" if moving else _NO_SIGNAL_NOTE
+        return Twin(_sort_objects(moving), plane, floor, notes=(said,))
+    places, step = _image_points(radar, plane, plane_at, reach, low, high)
+    told = calibrate_on_scene(capture, radar.grid(*reach), places)
     if told is not None:
         recording, capture = told.apply(recording), told.apply(capture)
-    moving = _moving(recording, range_max, plane)
-    if dense(capture):
+    moving = _find_moving_targets(recording, range_max, plane)
+    if is_dense_track(capture):
         # Frames add up only where all of them have an echo.
         far = torch.cdist(places, radar.positions.detach())
         places = places[(far.amin(1) > reach[0]) & (far.amax(1) < reach[1])]
-        found, image = points_along(capture, places, 4 * max(step, radar.waveform.wavelength))
-        picture = Picture(places[:, list(plane.level)], image, _views(radar, places, None))
-        return Twin(_surest_first([*found, *moving]), plane, floor, picture)
+        found, image = locate_coherent_points(
+            capture, places, 4 * max(step, radar.waveform.wavelength)
+        )
+        picture = GroundImage(
+            places[:, list(plane.plane_axes)], image, _count_views(radar, places, None)
+        )
+        return Twin(_sort_objects([*found, *moving]), plane, floor, picture)
     grid = radar.grid(*reach)
-    still = _standing(capture, radar, grid, plane, floor, places, step, rays, seed)
-    notes = () if told is None else (_CALIBRATED.format(apart(told, radar)),)
-    things = _surest_first([*still.things, *moving])
-    return replace(still, things=things, notes=(*notes, *still.notes), calibration=told)
+    still = _find_static_objects(capture, radar, grid, plane, floor, places, step, rays, seed)
+    notes = () if told is None else (_CALIBRATION_NOTE.format(phase_spread(told, radar)),)
+    things = _sort_objects([*still.objects, *moving])
+    return replace(still, objects=things, notes=(*notes, *still.notes), calibration=told)
 
 
-def still_capture(recording: Capture | ChirpCapture) -> Capture:
+def average_chirps(recording: Capture | ChirpCapture) -> Capture:
     """A recording with one signal a frame, in which what moves fades.
 
     It is the mean over the chirps, by Hann's window. Of a radar that itself moves by a quarter of a
@@ -124,48 +143,52 @@ def still_capture(recording: Capture | ChirpCapture) -> Capture:
         return recording
     chirps, radar = recording.chirps, recording.radar()
     lasts = float(chirps.times(radar.shape[1])[-1].max())
-    way = float(own_velocities(recording).norm(dim=1).max()) * lasts
+    way = float(platform_velocities(recording).norm(dim=1).max()) * lasts
     if way > 0.25 * radar.waveform.wavelength:
-        return recording.capture(chirps.count // 2)
+        return recording.to_capture(chirps.count // 2)
     # Of what moves by 2.5 bins of range rate a plain mean passes 1.7 % of the power, this 0.05 %.
     window = torch.hann_window(chirps.count + 2, periodic=False, dtype=recording.beat.real.dtype)
     window = window[1:-1]
     weights = (window / window.mean())[:, None, None, None]
-    return replace(recording, beat=recording.beat * weights, moving=False).capture()
+    return replace(recording, beat=recording.beat * weights, moving=False).to_capture()
 
 
-def _moving(
+def _find_moving_targets(
     recording: Capture | ChirpCapture, range_max: float | None, ground: Ground
-) -> list[Thing]:
+) -> list[DetectedObject]:
     """What moves in trains of chirps; it is followed where the time between frames is known."""
     if isinstance(recording, Capture) or recording.chirps.count == 1:
         return []
     radar = recording.radar()
-    near = _NEAREST * radar.waveform.range_resolution
+    near = _LEAKAGE_CELLS * radar.waveform.range_resolution
     grid = radar.grid(near, min(range_max or math.inf, recording.max_range))
     if recording.frame_period is not None and recording.frame_count > 2:
-        return tracks(recording, grid, ground)
-    return [one for one in movers(recording, grid) if one.confidence > _FAINT]
+        return track_moving_targets(recording, grid, ground)
+    return [
+        one
+        for one in detect_moving_targets(recording, grid)
+        if one.existence_probability > _MIN_EXISTENCE_PROBABILITY
+    ]
 
 
-_CALIBRATED = (
+_CALIBRATION_NOTE = (
     "the phases of the channels were {:.0f}° apart (root mean square, but for a ramp): they were "
     "calibrated on the scene itself"
 )
-_NOTHING = "nothing is above the noise"
-_IMAGE_BETTER = (
+_NO_SIGNAL_NOTE = "nothing is above the noise"
+_IMAGE_BETTER_NOTE = (
     "the image explains frames that were held out better than the things do: shapes may be wrong, "
     "trust the image"
 )
 
 
-def _standing(
+def _find_static_objects(
     capture: Capture,
     radar: Radar,
     grid: Grid,
     ground: Ground,
     level: float,
-    places: Tensor,
+    positions: Tensor,
     step: float,
     rays: int,
     seed: int,
@@ -173,101 +196,119 @@ def _standing(
     """Shapes that explain the maps of a recording."""
     power = capture.spectrum(grid).detach().float()
     frames = radar.frame_count
-    one = Assembly(
-        SurrogateMap(grid, sampling=sampling_of(frames, rays)),
+    one = ShapeLikelihood(
+        SurrogateMap(grid, sampling=make_sampling(frames, rays)),
         radar,
         power,
-        HeavyTailed(background(power)),
-        shared_bins(radar, grid),
+        HeavyTailedLoss(estimate_background(power)),
+        count_bins_per_draw(radar, grid),
         ground,
         level,
         seed,
     )
-    held = list(range(_HOLD - 1, frames, _HOLD)) if frames >= 2 * _HOLD else []
-    fitted = one.frames([k for k in range(frames) if k not in held]) if held else one
-    coarse = fitted.coarse.grid
-    flat = places[:, list(ground.level)]
-    height = float(places[:, ground.vertical].mean()) - level
-    lattice = Lattice(flat, step, responses(fitted.radar, coarse, places), max(height, 0.1))
-    aside = one.frames(held) if held else None
-    search = Search(fitted, aside, lattice)
+    held = (
+        list(range(_HELD_OUT_EVERY - 1, frames, _HELD_OUT_EVERY))
+        if frames >= 2 * _HELD_OUT_EVERY
+        else []
+    )
+    fitted = one.select_frames([k for k in range(frames) if k not in held]) if held else one
+    coarse = fitted.coarse_maps.grid
+    flat = positions[:, list(ground.plane_axes)]
+    height = float(positions[:, ground.up_axis].mean()) - level
+    lattice = ImageGrid(
+        flat, step, compute_response(fitted.radar, coarse, positions), max(height, 0.1)
+    )
+    aside = one.select_frames(held) if held else None
+    search = ShapeSearch(fitted, aside, lattice)
     picture = search.first_image
     shapes = search.run()
     level_map = one.loss.level[:, None, None].to(power)
     if not shapes:
-        seen = Picture(flat, picture, _views(radar, places, None))
+        seen = GroundImage(flat, picture, _count_views(radar, positions, None))
         nothing = level_map.expand_as(power)
-        return Twin((), ground, level, seen, nothing, power, grid, (_NOTHING,))
+        return Twin((), ground, level, seen, nothing, power, grid, (_NO_SIGNAL_NOTE,))
     notes: tuple[str, ...] = ()
     if aside is not None:
-        shapes = outlined(fitted, aside, shapes)
-        seen_there = responses(aside.radar, coarse, places)
-        if _explained(aside, seen_there, picture) > float(aside.gains(shapes).sum()):
-            notes = (_IMAGE_BETTER,)
-    shapes, found = one.fitted(shapes, _STEPS)
-    among = rivals(one, shapes)
-    likelier = [max(row, key=lambda rival: rival.weight).figure for row in among]
+        shapes = fit_outlines(fitted, aside, shapes)
+        seen_there = compute_response(aside.radar, coarse, positions)
+        if _image_likelihood_gain(aside, seen_there, picture) > float(
+            aside.log_likelihood_gains(shapes).sum()
+        ):
+            notes = (_IMAGE_BETTER_NOTE,)
+    shapes, found = one.fit(shapes, _FINAL_FIT_STEPS)
+    among = find_hypotheses(one, shapes)
+    likelier = [max(row, key=lambda rival: rival.probability).shape for row in among]
     if any(new is not old for new, old in zip(likelier, shapes, strict=True)):
-        shapes, found = one.fitted(likelier, _STEPS)
-        among = rivals(one, shapes)
-    errors, sure = deviations(one, found), presence(one, shapes)
+        shapes, found = one.fit(likelier, _FINAL_FIT_STEPS)
+        among = find_hypotheses(one, shapes)
+    errors, sure = standard_deviations(one, found), existence_probabilities(one, shapes)
     things = [
-        Thing(
+        DetectedObject(
             f"object_{k}",
-            shape.named,
+            shape.effective_kind,
             kind_probabilities(among[k - 1]),
-            upright(shape, ground, level),
+            shape_center(shape, ground, level),
             shape,
-            widened(one, _own(errors, f"object_{k}."), among[k - 1]),
+            widen_deviations(one, _select_prefix(errors, f"object_{k}."), among[k - 1]),
             sure[k - 1],
         )
         for k, shape in enumerate(shapes, 1)
     ]
-    views = _views(radar, places, one.scene(shapes))
+    views = _count_views(radar, positions, one.build_scene(shapes))
     return Twin(
         tuple(things),
         ground,
         level,
-        Picture(flat, picture, views),
-        one.predicted(shapes) + level_map,
+        GroundImage(flat, picture, views),
+        one.predict(shapes) + level_map,
         power,
         grid,
         notes,
     )
 
 
-def _explained(one: Assembly, response: Response, strength: Tensor) -> float:
+def _image_likelihood_gain(
+    likelihood: ShapeLikelihood, response: ImageResponse, strength: Tensor
+) -> float:
     """By how much an image makes maps likelier than the background alone.
 
     Args:
-        one: Maps.
+        likelihood: Maps.
         response: Of the image's places, to thinned maps.
         strength: The image.
     """
-    power, coarse, loss = one.coarse.power, one.coarse.grid, one.coarse.loss
-    rows = loss.rows(torch.zeros_like(power), power) - loss.rows(response.maps(strength), power)
-    return float(rows.sum()) / shared_bins(one.radar, coarse)
+    power, coarse, loss = (
+        likelihood.coarse_maps.power,
+        likelihood.coarse_maps.grid,
+        likelihood.coarse_maps.loss,
+    )
+    rows = loss.bin_losses(torch.zeros_like(power), power) - loss.bin_losses(
+        response.predict_maps(strength), power
+    )
+    return float(rows.sum()) / count_bins_per_draw(likelihood.radar, coarse)
 
 
-def _surest_first(things: list[Thing]) -> tuple[Thing, ...]:
+def _sort_objects(things: list[DetectedObject]) -> tuple[DetectedObject, ...]:
     """Things by confidence, those that move last."""
-    return tuple(sorted(things, key=lambda one: (one.velocity is not None, -one.confidence)))
+    return tuple(
+        sorted(things, key=lambda one: (one.velocity is not None, -one.existence_probability))
+    )
 
 
-def _own(errors: dict[str, float], prefix: str) -> dict[str, float]:
+def _select_prefix(errors: dict[str, float], prefix: str) -> dict[str, float]:
     return {n.removeprefix(prefix): v for n, v in errors.items() if n.startswith(prefix)}
 
 
-def _reach(capture: Capture, last: float | None) -> tuple[float, float] | None:
+def _search_range(capture: Capture, range_max: float | None) -> tuple[float, float] | None:
     """Ranges from the end of the leakage to the last echo and a little more; None without one [m].
 
     Args:
         capture: The recording.
-        last: Farthest range that is looked at [m]; None = all of them.
+        range_max: Farthest range that is looked at [m]; None = all of them.
     """
     radar = capture.radar()
     waveform, cell = radar.waveform, radar.waveform.range_resolution
-    first = _NEAREST * cell
+    first = _LEAKAGE_CELLS * cell
     if isinstance(waveform, SampledWaveform):
         # The last cells of a period hold what leaks from its first.
         longest = 0.98 * waveform.max_range
@@ -276,7 +317,7 @@ def _reach(capture: Capture, last: float | None) -> tuple[float, float] | None:
             max(first, float(capture.ranges[0]) + cell),
             float(capture.ranges[-1]) - cell,
         )
-    limit = longest if last is None else min(last, longest)
+    limit = longest if range_max is None else min(range_max, longest)
     if not first < limit:
         raise InputError(
             f"expected range_max beyond the leakage, which ends at {first:.3g} m, got {limit:.3g}; "
@@ -285,7 +326,7 @@ def _reach(capture: Capture, last: float | None) -> tuple[float, float] | None:
     grid = radar.grid(first, limit)
     power = capture.spectrum(grid).detach().double()
     # The level of pure noise: no quieter range is ever louder.
-    noise = float(background(power).min())
+    noise = float(estimate_background(power).min())
     strongest = power.amax((0, 2, 3)) / noise
     loud = (strongest > 2 * math.log(power.numel()) + 5).nonzero()[:, 0]
     if not len(loud):
@@ -293,7 +334,7 @@ def _reach(capture: Capture, last: float | None) -> tuple[float, float] | None:
     return first, min(limit, float(grid.ranges[loud[-1]]) + 10 * cell)
 
 
-def _places(
+def _image_points(
     radar: Radar,
     ground: Ground,
     height: float,
@@ -302,7 +343,7 @@ def _places(
     high: Sequence[float] | None,
 ) -> tuple[Float64[Tensor, "place 3"], float]:
     """Places of an image on the ground that some radar sees [m], and their distance."""
-    axes = list(ground.level)
+    axes = list(ground.plane_axes)
     at = radar.positions.detach()[:, axes]
     corners = [at.amin(0) - ranges[1], at.amax(0) + ranges[1]]
     for k, given in enumerate((low, high)):
@@ -322,14 +363,14 @@ def _places(
         ]
         flat = torch.cartesian_prod(*lines)
         places = torch.zeros(len(flat), 3, dtype=torch.float64)
-        places[:, axes], places[:, ground.vertical] = flat, height
+        places[:, axes], places[:, ground.up_axis] = flat, height
         near = torch.zeros(len(flat), dtype=torch.bool)
         for place, axis in _boresights(radar):
             way = places - place
             distance = way.norm(dim=1)
             ahead = way @ axis > 0.05 * distance
             near |= ahead & (distance > ranges[0]) & (distance < ranges[1])
-        if int(near.sum()) <= _PLACES:
+        if int(near.sum()) <= _MAX_IMAGE_POINTS:
             break
         cell *= 1.25
     if not bool(near.any()):
@@ -337,20 +378,20 @@ def _places(
     return places[near], cell
 
 
-def _views(
-    radar: Radar, places: Float64[Tensor, "place 3"], scene: Scene | None
+def _count_views(
+    radar: Radar, positions: Float64[Tensor, "place 3"], scene: Scene | None
 ) -> Int64[Tensor, " place"]:
     """How many positions of the radar see each place, past all things."""
-    total = torch.zeros(len(places), dtype=torch.int64)
+    total = torch.zeros(len(positions), dtype=torch.int64)
     for place, axis in _boresights(radar):
-        way = places - place
+        way = positions - place
         seen = way @ axis > 0
         if scene is not None:
-            sight = Sight(scene, place)
-            face = sight.first(way)
+            sight = ViewpointScene(scene, place)
+            face = sight.find_first_faces(way)
             hit = face >= 0
             length = torch.full((len(way),), math.inf, dtype=torch.float64)
-            length[hit] = sight.along(face[hit], normalize(way, dim=1)[hit]).detach()
+            length[hit] = sight.plane_distances(face[hit], normalize(way, dim=1)[hit]).detach()
             seen &= length > way.norm(dim=1)
         total += seen
     return total

@@ -10,20 +10,24 @@ from torch import Tensor
 
 from invertwin.capture import Capture, ChannelCalibration
 from invertwin.channel import Grid
-from invertwin.discovery.imaging.likelihood import DEGREES, background
-from invertwin.discovery.imaging.reflectivity import responses, sharpened, thinned
+from invertwin.discovery.imaging.likelihood import TAIL_DEGREES, estimate_background
+from invertwin.discovery.imaging.reflectivity import (
+    compute_response,
+    reconstruct_reflectivity,
+    thin_map,
+)
 from invertwin.inversion import speckle_weight
 from invertwin.radar import Radar, range_profile
-from invertwin.radar.radar import sampled
+from invertwin.radar.radar import require_sampled_waveform
 
-_ROUNDS = 2  # an image, then the channels that it tells
-_SWEEPS = 100  # over the channels, at most
-_WORTH = 10.0  # degrees of phase, root mean square: less is left as it is
-_APART = 8  # positions at least that are a range cell apart: they tell directions by ranges
+_CALIBRATION_ROUNDS = 2  # an image, then the channels that it tells
+_MAX_SWEEPS = 100  # over the channels, at most
+_MIN_PHASE_SPREAD = 10.0  # degrees of phase, root mean square: less is left as it is
+_MIN_POSITIONS = 8  # positions at least that are a range cell apart: they tell directions by ranges
 
 
-def channels_of_scene(
-    capture: Capture, grid: Grid, places: Float64[Tensor, "place 3"]
+def calibrate_on_scene(
+    capture: Capture, grid: Grid, positions: Float64[Tensor, "place 3"]
 ) -> ChannelCalibration | None:
     """The gains of the channels under which a recording fits its own image best.
 
@@ -34,7 +38,7 @@ def channels_of_scene(
     Args:
         capture: Of several positions.
         grid: Bins.
-        places: Of the image [m].
+        positions: Of the image [m].
 
     Returns:
         None where the channels agree, or where too few positions tell a wrong phase from another
@@ -42,25 +46,25 @@ def channels_of_scene(
     """
     radar = capture.radar()
     cells = (radar.positions.detach() / radar.waveform.range_resolution).round().unique(dim=0)
-    if len(radar.virtual_positions) == 1 or len(cells) < _APART:
+    if len(radar.virtual_positions) == 1 or len(cells) < _MIN_POSITIONS:
         return None
     flat = replace(grid, u_start=0.0, u_step=1.0, u_count=1, v_start=0.0, v_step=1.0, v_count=1)
     shape = tuple(capture.beat.shape[1:3])
     found = ChannelCalibration(torch.ones(shape, dtype=torch.complex128))
-    for number in range(_ROUNDS):
+    for number in range(_CALIBRATION_ROUNDS):
         now = found.apply(capture)
         bins = flat if number == 0 else grid
         power = now.spectrum(bins).detach().double()
-        power, coarse = thinned(power, radar, bins)
-        level = background(power)[:, None, None].expand_as(power)
-        image = sharpened(responses(radar, coarse, places), power, level)
-        found = _likeliest(capture, flat, places, image)
-        if number == 0 and apart(found, radar) < _WORTH:
+        power, coarse = thin_map(power, radar, bins)
+        level = estimate_background(power)[:, None, None].expand_as(power)
+        image = reconstruct_reflectivity(compute_response(radar, coarse, positions), power, level)
+        found = _estimate_gains(capture, flat, positions, image)
+        if number == 0 and phase_spread(found, radar) < _MIN_PHASE_SPREAD:
             return None
     return found
 
 
-def apart(calibration: ChannelCalibration, radar: Radar) -> float:
+def phase_spread(calibration: ChannelCalibration, radar: Radar) -> float:
     """How far the phases of channels are apart, root mean square [°], but for a ramp.
 
     A ramp along the array is a turn of the radar, and may come of an image that is a little off.
@@ -69,7 +73,7 @@ def apart(calibration: ChannelCalibration, radar: Radar) -> float:
         calibration: Of the channels.
         radar: Its array and wavelength.
     """
-    places = radar.virtual_positions[:, :2] / sampled(radar).wavelength
+    places = radar.virtual_positions[:, :2] / require_sampled_waveform(radar).wavelength
     extent = places.amax(0) - places.amin(0)
     steps = [
         torch.arange(-1.0, 1.0, 1 / (16 * float(e)) if e > 0 else 2.0).double() for e in extent
@@ -85,8 +89,8 @@ def apart(calibration: ChannelCalibration, radar: Radar) -> float:
     return math.degrees(float(best.angle().square().mean().sqrt()))
 
 
-def _likeliest(
-    capture: Capture, flat: Grid, places: Float64[Tensor, "place 3"], image: Tensor
+def _estimate_gains(
+    capture: Capture, range_grid: Grid, positions: Float64[Tensor, "place 3"], image: Tensor
 ) -> ChannelCalibration:
     """Gains of the channels, of a known image.
 
@@ -97,22 +101,22 @@ def _likeliest(
 
     Args:
         capture: Signals.
-        flat: Bins of range.
-        places: Of the image [m].
+        range_grid: Bins of range.
+        positions: Of the image [m].
         image: Radar cross-section of every place [m²].
     """
     radar = capture.radar()
-    profile = range_profile(capture.beat.to(torch.complex128), radar, flat)
+    profile = range_profile(capture.beat.to(torch.complex128), radar, range_grid)
     power = profile.abs().square().mean((1, 2))
-    power, coarse = thinned(power[:, :, None, None], radar, flat)
-    stride = round(coarse.range_step / flat.range_step)
+    power, coarse = thin_map(power[:, :, None, None], radar, range_grid)
+    stride = round(coarse.range_step / range_grid.range_step)
     cells = profile[..., ::stride].flatten(1, 2).movedim(1, -1)  # frame, range, channel
-    level = background(power)
-    predicted = responses(radar, coarse, places).matrix
+    level = estimate_background(power)
+    predicted = compute_response(radar, coarse, positions).matrix
     count, ranges = cells.shape[-1], cells.shape[1]
     eye = torch.eye(count, dtype=torch.complex128)
     total, draws = torch.zeros(count, count, dtype=torch.complex128), 0.0
-    for frame, waves in enumerate(_waves(radar, places)):
+    for frame, waves in enumerate(_channel_phasors(radar, positions)):
         model = level[:, None, None] * eye
         for k in range(ranges):
             row = predicted[frame * ranges + k]
@@ -123,24 +127,26 @@ def _likeliest(
         inverse = torch.linalg.inv(model)
         x = cells[frame]
         misfit = torch.einsum("ri,rij,rj->r", x.conj(), inverse, x).real / count
-        weight = speckle_weight(misfit, DEGREES)
+        weight = speckle_weight(misfit, TAIL_DEGREES)
         total += torch.einsum("r,ri,rij,rj->ij", weight.to(x), x.conj(), inverse, x)
         draws += float(weight.sum())
-    return ChannelCalibration((1 / _minimum(total, draws)).reshape(capture.beat.shape[1:3]))
+    return ChannelCalibration((1 / _minimise_gains(total, draws)).reshape(capture.beat.shape[1:3]))
 
 
-def _waves(radar: Radar, places: Float64[Tensor, "place 3"]) -> list[Complex128[Tensor, "p c"]]:
+def _channel_phasors(
+    radar: Radar, positions: Float64[Tensor, "place 3"]
+) -> list[Complex128[Tensor, "p c"]]:
     """What the channels of every frame get from echoes at places."""
     found = []
     for place, axes in zip(radar.positions.detach(), radar.link().rotations.detach(), strict=True):
-        seen = torch.nn.functional.normalize(places - place, dim=1) @ axes
+        seen = torch.nn.functional.normalize(positions - place, dim=1) @ axes
         path = seen[:, :2] @ radar.virtual_positions[:, :2].T
-        phase = -2 * math.pi / sampled(radar).wavelength * path
+        phase = -2 * math.pi / require_sampled_waveform(radar).wavelength * path
         found.append(torch.polar(torch.ones_like(phase), phase))
     return found
 
 
-def _minimum(matrix: Complex128[Tensor, "c c"], draws: float) -> Complex128[Tensor, " c"]:
+def _minimise_gains(matrix: Complex128[Tensor, "c c"], draws: float) -> Complex128[Tensor, " c"]:
     """The h that minimises hᴴ Q h − 2 N Σ log|h|.
 
     Args:
@@ -149,7 +155,7 @@ def _minimum(matrix: Complex128[Tensor, "c c"], draws: float) -> Complex128[Tens
     """
     vectors = torch.linalg.eigh(matrix).eigenvectors
     h = vectors[:, 0] / vectors[:, 0].abs().clamp_min(1e-3)
-    for _ in range(_SWEEPS):
+    for _ in range(_MAX_SWEEPS):
         before = h.clone()
         for c in range(len(h)):
             own = float(matrix[c, c].real)

@@ -18,10 +18,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from invertwin.errors import InputError
 from invertwin.inversion.fit import Callback, Fit
-from invertwin.runtime.progress import time_left
+from invertwin.runtime.progress import format_duration
 from invertwin.scene.scene import Scene
-from invertwin.storage.folders import replacing
-from invertwin.storage.untrusted import reading
+from invertwin.storage.folders import replace_file
+from invertwin.storage.untrusted import convert_read_errors
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Watch(Callback):
             return {}
         try:
             with torch.no_grad():
-                return self.function(fit.applied()[0])
+                return self.function(fit.apply_modules()[0])
         except InputError:  # parameters out of bounds, as the next step will find
             return {}
 
@@ -91,7 +91,7 @@ class Checkpoint(Callback):
         path = self._path(fit)
         if not (self.resume and path.exists()):
             return
-        with reading(path, "a whole checkpoint", "delete it or start without resume"):
+        with convert_read_errors(path, "a whole checkpoint", "delete it or start without resume"):
             state = torch.load(path, weights_only=True)
             restored = isinstance(state, dict) and fit.restore(state)
         if not restored:
@@ -110,15 +110,15 @@ class Checkpoint(Callback):
         """Write the file. If the process is killed, the last whole file is left."""
         data = io.BytesIO()  # torch would tell of a full disk in its own words
         torch.save(fit.state(), data)
-        with replacing(self._path(fit)) as part:
+        with replace_file(self._path(fit)) as part:
             part.write_bytes(data.getbuffer())
 
     def _path(self, fit: Fit) -> Path:
         path = Path(self.file)
-        return path if fit.last else stage_file(path, fit.number)
+        return path if fit.is_last else stage_checkpoint_path(path, fit.number)
 
 
-def stage_file(file: Path, stage: int) -> Path:
+def stage_checkpoint_path(file: Path, stage: int) -> Path:
     """The checkpoint of a stage that is not the last.
 
     Args:
@@ -129,37 +129,39 @@ def stage_file(file: Path, stage: int) -> Path:
 
 
 @contextmanager
-def interrupted_between_steps() -> Generator[Callable[[], None]]:
+def defer_interrupt() -> Generator[Callable[[], None]]:
     """Ctrl-C waits for the end of the step, when nothing is half done; a second one does not.
 
     Gives a function that raises KeyboardInterrupt if one is due.
     """
     due = False
 
-    def heed() -> None:
+    def raise_if_interrupted() -> None:
         if due:
             raise KeyboardInterrupt
 
-    def note(_signal: int, _frame: FrameType | None) -> None:
+    def record_interrupt(_signal: int, _frame: FrameType | None) -> None:
         nonlocal due
-        heed()
+        raise_if_interrupted()
         due = True
 
     # Another handler, or another thread than the main one, is not ours to change.
     ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not ours or threading.current_thread() is not threading.main_thread():
-        yield heed
+        yield raise_if_interrupted
         return
-    signal.signal(signal.SIGINT, note)
+    signal.signal(signal.SIGINT, record_interrupt)
     try:
-        yield heed
-        heed()
+        yield raise_if_interrupted
+        raise_if_interrupted()
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @contextmanager
-def watched(name: str, steps: int, console: Console | None = None) -> Generator[list[Report]]:
+def report_progress(
+    name: str, steps: int, console: Console | None = None
+) -> Generator[list[Report]]:
     """Progress with the loss and the first parameters: a bar, or lines where nothing can draw one.
 
     Give ``reconstruct`` the callbacks that the block gets. Ctrl-C, or a notebook's stop, waits for
@@ -176,9 +178,9 @@ def watched(name: str, steps: int, console: Console | None = None) -> Generator[
     bar = Progress(*columns, TextColumn("{task.description}"), console=console, disable=lines)
     task = bar.add_task("", total=steps)
     begin = time.monotonic()
-    with bar, interrupted_between_steps() as heed:
+    with bar, defer_interrupt() as heed:
 
-        def show(row: dict[str, Any]) -> None:
+        def show_row(row: dict[str, Any]) -> None:
             values = " ".join(
                 np.array2string(np.atleast_1d(value), precision=3, suppress_small=True)
                 for value in list(row["values"].values())[:2]
@@ -187,9 +189,9 @@ def watched(name: str, steps: int, console: Console | None = None) -> Generator[
             text, done = f"loss {row['loss']:.4f} {values}", row["step"] + 1
             bar.update(task, completed=done, description=text)
             if lines and done * 10 // steps > row["step"] * 10 // steps:
-                left = time_left((time.monotonic() - begin) / done * (steps - done))
+                left = format_duration((time.monotonic() - begin) / done * (steps - done))
                 line = f"{name}: step {done} of {steps}, {left} left, {text}"
                 console.print(line, markup=False, soft_wrap=True)
             heed()
 
-        yield [Report(show)]
+        yield [Report(show_row)]

@@ -8,11 +8,11 @@ from torch import Tensor, distributed, nn
 
 from invertwin.errors import InputError
 
-_View = TypeVar("_View")
+_ViewItem = TypeVar("_View")
 
 
 def mean_over_views(
-    loss: Callable[[_View], Tensor], views: Sequence[_View], module: nn.Module
+    loss: Callable[[_ViewItem], Tensor], views: Sequence[_ViewItem], module: nn.Module
 ) -> float:
     """The mean of a loss over views; its derivative is added to the parameters' ``grad``.
 
@@ -51,12 +51,12 @@ def mean_over_views(
         for own, part in zip(sums, parts, strict=True):
             own += part
     if count > 1:
-        sums, total = _summed(sums, total)
+        sums, total = _sum_over_processes(sums, total)
     torch.autograd.backward(free, sums)  # of parameters themselves: adds the sums
     return float(total)
 
 
-def _summed(parts: list[Tensor], total: Tensor) -> tuple[list[Tensor], Tensor]:
+def _sum_over_processes(parts: list[Tensor], total: Tensor) -> tuple[list[Tensor], Tensor]:
     """Both, summed over all processes."""
     flat = torch.cat([total.reshape(1), *(part.double().flatten() for part in parts)])
     distributed.all_reduce(flat)

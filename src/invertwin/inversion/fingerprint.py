@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 _PROJECTIONS = 6  # of a tensor onto fixed waves: one changed number changes them
-_ROUNDING = 1e-5  # of a tensor's norm: what another order of additions may change
-_OWN_TO_TORCH = frozenset(vars(nn.Module()))
+_ROUNDING_TOLERANCE = 1e-5  # of a tensor's norm: what another order of additions may change
+_MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
 # Code of classes from here belongs to a version, not to a fit.
 _LIBRARIES = ("builtins", "collections", "functools", "invertwin", "numpy", "torch", "typing")
 
@@ -40,25 +40,28 @@ class Fingerprint:
         """Plain values for a checkpoint."""
         return {"digest": self._hash.hexdigest(), "numbers": list(self._numbers)}
 
-    def matches(self, kept: Any) -> bool:
+    def matches(self, stored: Any) -> bool:
         """Whether kept content is of equal values, but for rounding."""
-        if not isinstance(kept, dict) or kept.get("digest") != self._hash.hexdigest():
+        if not isinstance(stored, dict) or stored.get("digest") != self._hash.hexdigest():
             return False
-        pairs = zip(kept["numbers"], self._numbers, strict=True)
-        return all(math.isclose(a, b, rel_tol=_ROUNDING, abs_tol=_ROUNDING) for a, b in pairs)
+        pairs = zip(stored["numbers"], self._numbers, strict=True)
+        return all(
+            math.isclose(a, b, rel_tol=_ROUNDING_TOLERANCE, abs_tol=_ROUNDING_TOLERANCE)
+            for a, b in pairs
+        )
 
-    def _note(self, *words: object) -> None:
+    def _update_digest(self, *words: object) -> None:
         self._hash.update(("|".join(map(str, words)) + ";").encode())
 
     def _add(self, value: Any) -> None:
         if value is None or isinstance(value, bool | int | str | bytes):
-            self._note(type(value).__name__, value)
+            self._update_digest(type(value).__name__, value)
         elif isinstance(value, float):
-            self._note("float", repr(value))
+            self._update_digest("float", repr(value))
         elif isinstance(value, Tensor | np.ndarray):
             self._add_tensor(torch.as_tensor(value).detach())
         elif id(value) in self._open:
-            self._note("again")
+            self._update_digest("again")
         else:
             self._open.add(id(value))
             self._add_compound(value)
@@ -66,40 +69,42 @@ class Fingerprint:
 
     def _add_compound(self, value: Any) -> None:
         if isinstance(value, Mapping):
-            self._note("mapping", len(value))
+            self._update_digest("mapping", len(value))
             for key, item in value.items():
                 self._add(key)
                 self._add(item)
         elif isinstance(value, Sequence | Set):
             items = sorted(value, key=repr) if isinstance(value, Set) else value
-            self._note("sequence", len(items))
+            self._update_digest("sequence", len(items))
             for item in items:
                 self._add(item)
         elif isinstance(value, partial):
-            self._note("partial")
+            self._update_digest("partial")
             self._add([value.func, list(value.args), dict(value.keywords)])
         elif isinstance(value, types.MethodType):
-            self._note("method", value.__func__.__qualname__)
+            self._update_digest("method", value.__func__.__qualname__)
             self._add([value.__func__, value.__self__])
         elif isinstance(value, types.FunctionType):
             self._add_function(value)
         elif isinstance(value, types.CodeType):
-            self._note("code", value.co_code.hex(), *value.co_names)
+            self._update_digest("code", value.co_code.hex(), *value.co_names)
             self._add(value.co_consts)
         elif isinstance(value, type | types.BuiltinFunctionType | types.ModuleType):
-            self._note(getattr(value, "__module__", ""), getattr(value, "__qualname__", value))
+            self._update_digest(
+                getattr(value, "__module__", ""), getattr(value, "__qualname__", value)
+            )
         else:
             self._add_object(value)
 
     def _add_function(self, value: types.FunctionType) -> None:
-        self._note("function", value.__module__, value.__qualname__)
+        self._update_digest("function", value.__module__, value.__qualname__)
         used = inspect.getclosurevars(value)
-        around = {n: v for n, v in sorted(used.globals.items()) if not _foreign(v, value)}
+        around = {n: v for n, v in sorted(used.globals.items()) if not _is_foreign(v, value)}
         enclosed = dict(used.nonlocals)
         self._add([value.__code__, value.__defaults__, value.__kwdefaults__, enclosed, around])
 
     def _add_object(self, value: Any) -> None:
-        self._note("object", type(value).__module__, type(value).__qualname__)
+        self._update_digest("object", type(value).__module__, type(value).__qualname__)
         if isinstance(value, nn.Module):
             self._add(dict(value.named_parameters(recurse=False)))
             self._add({n: p.requires_grad for n, p in value.named_parameters(recurse=False)})
@@ -112,10 +117,10 @@ class Fingerprint:
         kept = getattr(value, "__dict__", {})
         slots = [n for c in type(value).__mro__ for n in getattr(c, "__slots__", ())]
         fields = {n: getattr(value, n) for n in slots if hasattr(value, n) and n != "__weakref__"}
-        self._add({n: v for n, v in (fields | kept).items() if n not in _OWN_TO_TORCH})
+        self._add({n: v for n, v in (fields | kept).items() if n not in _MODULE_ATTRIBUTES})
 
     def _add_tensor(self, value: Tensor) -> None:
-        self._note("tensor", value.dtype, tuple(value.shape))
+        self._update_digest("tensor", value.dtype, tuple(value.shape))
         flat = value.cpu().reshape(-1)
         if not (flat.is_floating_point() or flat.is_complex()):
             self._hash.update(flat.contiguous().numpy().tobytes())
@@ -131,7 +136,7 @@ class Fingerprint:
         self._numbers += [math.log(norm) if norm > 0 else -1e9, *(w / (norm or 1.0) for w in waves)]
 
 
-def _foreign(value: Any, function: types.FunctionType) -> bool:
+def _is_foreign(value: Any, function: types.FunctionType) -> bool:
     """Whether a global name stands for something that is not the function's own."""
     if isinstance(value, types.FunctionType):
         return value.__module__ != function.__module__

@@ -16,31 +16,36 @@ from torch import Tensor, nn
 from invertwin.channel import torch_threads
 from invertwin.errors import InputError
 from invertwin.inversion.fingerprint import Fingerprint
-from invertwin.inversion.gauss_newton import GaussNewton, without_effect
-from invertwin.inversion.loss import Maps, Objective
+from invertwin.inversion.gauss_newton import GaussNewton, no_effect_error
+from invertwin.inversion.loss import MapPairs, Objective
 from invertwin.inversion.observation import Observation
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Stage
 from invertwin.scene.scene import Scene
-from invertwin.seeds import derived_seed
+from invertwin.seeds import derive_seed
 
 Status = Literal["converged", "budget", "diverged"]
 
-_DIVERGED = 1e3  # times the first loss
-_WORSE = 1.1  # times the loss of the first parameters, all widths at their end: more than noise
-_WINDOW = 20  # steps over which convergence is judged
-_SUBSETS = 2**16  # keys of the seeds that choose frames, beyond those of observations
+_MAX_RELATIVE_LOSS = 1e3  # times the first loss
+_MAX_LOSS_INCREASE = (
+    1.1  # times the loss of the first parameters, all widths at their end: more than noise
+)
+_CONVERGENCE_WINDOW = 20  # steps over which convergence is judged
+_FRAME_SEED_KEY = 2**16  # keys of the seeds that choose frames, beyond those of observations
 # What optimisers remember of a parameter.
-_REMEMBERED: dict[type[torch.optim.Optimizer], set[str]] = {
+_OPTIMIZER_STATE_KEYS: dict[type[torch.optim.Optimizer], set[str]] = {
     torch.optim.Adam: {"step", "exp_avg", "exp_avg_sq"},
     torch.optim.SGD: {"momentum_buffer"},
 }
-_SHARP, _LOOKS = 2**17, 2**17 + 1  # keys of seeds, beyond those of stages
+_UNBLURRED_SEED_KEY, _REALISATION_SEED_KEY = (
+    2**17,
+    2**17 + 1,
+)  # keys of seeds, beyond those of stages
 
 
 @dataclass(frozen=True)
-class Progress:
+class FitProgress:
     """How far a fit has come: all that a checkpoint holds besides parameters and optimiser.
 
     Attributes:
@@ -60,7 +65,7 @@ class Progress:
     ended: Status | None = None
 
 
-_PROGRESS = TypeAdapter(Progress)
+_PROGRESS_ADAPTER = TypeAdapter(FitProgress)
 
 
 class Callback:
@@ -95,7 +100,7 @@ class Fit:
         sensor_unknowns: Modules of the sensor of every observation.
         stage: Its schedule.
         number: Number of the stage, from 0.
-        last: Whether it is the last stage.
+        is_last: Whether it is the last stage.
         progress: How far it has come.
     """
 
@@ -107,9 +112,9 @@ class Fit:
         sensor_unknowns: Sequence[Sequence[nn.Module]],
         *,
         stage: Stage,
-        settings: "Settings",
+        settings: "FitSettings",
         rates: Mapping[nn.Parameter, float],
-        position: tuple[int, int, bool],
+        stage_position: tuple[int, int, bool],
     ) -> None:
         """Prepare a stage.
 
@@ -117,16 +122,16 @@ class Fit:
             scene, observations, unknowns, sensor_unknowns, stage: As the attributes.
             settings: What all stages have in common.
             rates: Learning rates of single parameters.
-            position: Number of the stage, steps before it, whether it is the last one.
+            stage_position: Number of the stage, steps before it, whether it is the last one.
         """
         self.scene, self.stage = scene, stage
-        self.number, self._before, self.last = position
+        self.number, self._before, self.is_last = stage_position
         self.unknowns, self.sensor_unknowns = list(unknowns), [list(m) for m in sensor_unknowns]
         listed = [*self.unknowns, *(m for modules in self.sensor_unknowns for m in modules)]
         self.modules = nn.ModuleList(dict.fromkeys(listed))
         self._settings = settings
         self.observations = list(observations)
-        self._observed = [observation.observed().detach() for observation in observations]
+        self._observed = [observation.observed_map().detach() for observation in observations]
         losses = tuple(o.loss or settings.loss for o in observations)
         self.objective = Objective(losses, tuple(o.weight for o in observations))
         free = [p for p in self.modules.parameters() if p.requires_grad]
@@ -142,7 +147,7 @@ class Fit:
                 f"{stage.held_out}, got {few}; hold out none, or a larger share"
             )
         rules = stage.optimizer or settings.optimizer
-        rough = [o.model for o in observations if not o.model.smooth]
+        rough = [o.model for o in observations if not o.model.is_smooth]
         if rough and rules.kind == "gauss_newton":
             raise InputError(
                 "expected smooth models such as SurrogateMap with kind 'gauss_newton', got "
@@ -150,18 +155,18 @@ class Fit:
             )
         # Before the models draw anything: what is drawn follows from the rest.
         self.fingerprint = Fingerprint(
-            (position, stage, settings, self.modules, scene),
+            (stage_position, stage, settings, self.modules, scene),
             [
                 (o.model, o.sensor, o.weight, o.loss, observed)
                 for o, observed in zip(observations, self._observed, strict=True)
             ],
         )
         self._models = [
-            o.model.prepared(scene, o.sensor, derived_seed(settings.seed, k))
+            o.model.prepare(scene, o.sensor, derive_seed(settings.seed, k))
             for k, o in enumerate(observations)
         ]
         self.rules, self.optimizer = rules, rules.build(self.modules, self.objective, rates)
-        self.progress = Progress(self.parameters())
+        self.progress = FitProgress(self.parameters())
 
     def run(self, callbacks: Sequence[Callback]) -> Status:
         """Take all steps, watched by the callbacks, and return how the fit has ended."""
@@ -169,14 +174,14 @@ class Fit:
             callback.begin(self)
         if self.progress.ended is None:
             with torch_threads(max(1, torch.get_num_threads() // 2)):
-                status = self._descend(callbacks)
-            self._note(ended=self._judged(status))
+                status = self._run_steps(callbacks)
+            self._update_progress(ended=self._select_best(status))
         for callback in callbacks:
             callback.end(self)
         assert self.progress.ended is not None
         return self.progress.ended
 
-    def applied(self) -> tuple[Scene, list[Any]]:
+    def apply_modules(self) -> tuple[Scene, list[Any]]:
         """The scene and all sensors under the present parameters."""
         scene = self.scene
         for module in self.unknowns:
@@ -192,42 +197,42 @@ class Fit:
     def twin(self) -> Scene:
         """The scene under the present parameters, without derivatives."""
         with torch.no_grad():
-            return self.applied()[0]
+            return self.apply_modules()[0]
 
-    def maps(self, step: int) -> Maps:
+    def maps(self, step: int) -> MapPairs:
         """The predicted and the observed map of every observation, blurred alike.
 
         The same number of a step gives the same random numbers.
         """
-        scene, sensors = self.applied()
-        share = max(0.0, 1 - step / self.stage.widths_end)
+        scene, sensors = self.apply_modules()
+        share = max(0.0, 1 - step / self.stage.blur_end)
         pairs = []
         for k, (model, sensor, observed) in enumerate(
             zip(self._models, sensors, self._observed, strict=True)
         ):
-            sensor, observed = self._subset(k, step, sensor, observed)
-            model = model.narrowed(share)
+            sensor, observed = self._select_frames(k, step, sensor, observed)
+            model = model.scale_blur(share)
             key = (self.number, step, k) if model.redraws else (k,)
-            seed = derived_seed(self._settings.seed, *key)
+            seed = derive_seed(self._settings.seed, *key)
             # On a core that is idle while the prediction's kernels are prepared.
             with ThreadPoolExecutor(1) as beside:
-                blurred = beside.submit(model.blurred, observed, sensor)
+                blurred = beside.submit(model.blur_observed, observed, sensor)
                 pairs.append((model.predict(scene, sensor, seed), blurred.result()))
         return pairs
 
-    def sharp_maps(self, number: int, **sampled: Any) -> Maps:
+    def unblurred_maps(self, seed_number: int, **sampling_changes: Any) -> MapPairs:
         """The predicted and the observed map of every observation, with all frames, not blurred.
 
         Args:
-            number: Other numbers have other random numbers.
-            sampled: Fields of the models' ``sampling`` in place of their own.
+            seed_number: Other numbers have other random numbers.
+            sampling_changes: Fields of the models' ``sampling`` in place of their own.
         """
-        scene, sensors = self.applied()
+        scene, sensors = self.apply_modules()
         pairs = []
         for k, (model, sensor) in enumerate(zip(self._models, sensors, strict=True)):
-            key = derived_seed(self._settings.seed, _SHARP, number, k)
-            model = model.sampled_by(**sampled) if sampled else model
-            predicted = model.narrowed(0.0).predict(scene, sensor, key)
+            key = derive_seed(self._settings.seed, _UNBLURRED_SEED_KEY, seed_number, k)
+            model = model.with_sampling(**sampling_changes) if sampling_changes else model
+            predicted = model.scale_blur(0.0).predict(scene, sensor, key)
             pairs.append((predicted, self._observed[k]))
         return pairs
 
@@ -237,28 +242,32 @@ class Fit:
         self.modules.load_state_dict(self.progress.first)
         try:
             with torch.no_grad():
-                return float(self.objective(self.sharp_maps(0)))
+                return float(self.objective(self.unblurred_maps(0)))
         except InputError:  # out of bounds
             return math.inf
         finally:
             self.modules.load_state_dict(present)
 
-    def looks(self, number: int) -> list[Callable[[int, float], Tensor] | None]:
+    def realisations(self, seed_number: int) -> list[Callable[[int, float], Tensor] | None]:
         """What every sensor might have recorded of the twin, see ``ForwardModel.looks``.
 
         Args:
-            number: Other numbers have other points on surfaces.
+            seed_number: Other numbers have other points on surfaces.
         """
         with torch.no_grad():
-            scene, sensors = self.applied()
+            scene, sensors = self.apply_modules()
             return [
-                model.looks(scene, sensor, derived_seed(self._settings.seed, _LOOKS, number, k))
+                model.realisations(
+                    scene,
+                    sensor,
+                    derive_seed(self._settings.seed, _REALISATION_SEED_KEY, seed_number, k),
+                )
                 for k, (model, sensor) in enumerate(zip(self._models, sensors, strict=True))
             ]
 
     def penalty(self) -> Tensor:
         """What the regularisers add to the loss."""
-        scene, total = self.applied()[0], torch.zeros((), dtype=torch.float64)
+        scene, total = self.apply_modules()[0], torch.zeros((), dtype=torch.float64)
         for term in self._settings.regularizers:
             total = total + term(scene)
         return total
@@ -272,22 +281,22 @@ class Fit:
         """A copy of the present parameters."""
         return {k: v.detach().clone() for k, v in self.modules.state_dict().items()}
 
-    def copied(self) -> "Fit":
+    def copy(self) -> "Fit":
         """The same fit with parameters of its own, which are as they are now."""
         other = copy.copy(self)
         own = (self.unknowns, self.sensor_unknowns, self.modules)
         other.unknowns, other.sensor_unknowns, other.modules = copy.deepcopy(own)
         return other
 
-    def descended(self, descent: GaussNewton, step: int) -> float:
+    def gauss_newton_step(self, optimizer: GaussNewton, step: int) -> float:
         """The loss before a Gauss–Newton step with the random numbers of a step.
 
         Args:
-            descent: Of the modules of this fit.
+            optimizer: Of the modules of this fit.
             step: Its number.
         """
         penalty = self.penalty if self._settings.regularizers else None
-        return descent.step(partial(self.maps, step), penalty)
+        return optimizer.step(partial(self.maps, step), penalty)
 
     def state(self) -> dict[str, Any]:
         """All that is needed to go on later."""
@@ -305,7 +314,7 @@ class Fit:
         """
         if not self.fingerprint.matches(state.get("fingerprint")):
             return False
-        progress = _PROGRESS.validate_python(state["progress"])
+        progress = _PROGRESS_ADAPTER.validate_python(state["progress"])
         kept = [state["modules"], progress.first, *(progress.best or ())[2:]]
         own = {name: value.shape for name, value in self.parameters().items()}
         if any({name: v.shape for name, v in values.items()} != own for values in kept):
@@ -313,53 +322,57 @@ class Fit:
         if not all({"step", "stage", "loss", "values"} <= row.keys() for row in progress.history):
             raise ValueError("rows of another fit")
         self.modules.load_state_dict(state["modules"])
-        _restore(self.optimizer, state["optimizer"])
+        _restore_optimizer(self.optimizer, state["optimizer"])
         self.progress = progress
         return True
 
-    def annealed(self, step: int) -> bool:
+    def is_unblurred(self, step: int) -> bool:
         """Whether the extra widths are zero from the step of this number on."""
-        return step >= self.stage.widths_end or not any(m.widened for m in self._models)
+        return step >= self.stage.blur_end or not any(m.has_blur for m in self._models)
 
-    def _note(self, **changes: Any) -> None:
-        self.progress = Progress(**{**vars(self.progress), **changes})
+    def _update_progress(self, **changes: Any) -> None:
+        self.progress = FitProgress(**{**vars(self.progress), **changes})
 
-    def _subset(self, k: int, step: int, sensor: Any, observed: Tensor) -> tuple[Any, Tensor]:
+    def _select_frames(
+        self, number: int, step: int, sensor: Any, observed: Tensor
+    ) -> tuple[Any, Tensor]:
         """The frames of one observation that a step compares."""
-        fitted = np.array([n for n in range(len(observed)) if n not in self._held(len(observed))])
+        fitted = np.array(
+            [n for n in range(len(observed)) if n not in self._held_out_frames(len(observed))]
+        )
         count = min(self.stage.frames_per_step or len(fitted), len(fitted))
         if count == len(observed):
             return sensor, observed
         rng = np.random.default_rng(
-            derived_seed(self._settings.seed, self.number, step, _SUBSETS + k)
+            derive_seed(self._settings.seed, self.number, step, _FRAME_SEED_KEY + number)
         )
         chosen = np.sort(rng.choice(fitted, count, replace=False))
         return sensor.frames(chosen.tolist()), observed.index_select(0, torch.from_numpy(chosen))
 
-    def _held(self, count: int) -> range:
+    def _held_out_frames(self, count: int) -> range:
         """Numbers of the frames that are held out, of so many."""
         every = self.stage.held_out
         return range(0) if every is None else range(every - 1, count, every)
 
-    def _judging(self) -> float:
+    def _selection_loss(self) -> float:
         """The loss that tells whether the fit is better than its start."""
         if self.stage.held_out is None:
             return float(self.evaluate(self.stage.steps))
-        held = [(self._held(len(b)), a, b) for a, b in self.sharp_maps(0)]
+        held = [(self._held_out_frames(len(b)), a, b) for a, b in self.unblurred_maps(0)]
         return float(self.objective([(a[list(k)], b[list(k)]) for k, a, b in held]))
 
-    def _descend(self, callbacks: Sequence[Callback]) -> Status:
+    def _run_steps(self, callbacks: Sequence[Callback]) -> Status:
         stage = self.stage
         while (step := self.progress.step) < stage.steps:
-            self.rules.apply(self.optimizer, step / stage.steps)
+            self.rules.set_rates(self.optimizer, step / stage.steps)
             before = self.parameters()
             try:
-                number = self._stepped(step)
+                number = self._take_step(step)
             except InputError:
                 if self.progress.best is None:  # not lost on the way, but wrong from the start
                     raise
                 number = math.nan
-            if _lost(number, self.progress.history):
+            if _has_diverged(number, self.progress.history):
                 if self.progress.best is None:
                     raise InputError(
                         f"expected a finite loss at the start, got {number}; check the data and "
@@ -369,25 +382,25 @@ class Fit:
                 return "diverged"
             self._keep_if_better(number, before)
             row: dict[str, Any] = {"step": self._before + step, "stage": self.number}
-            row |= {"loss": number, "values": _values(self.modules)}
-            self._note(step=step + 1)
+            row |= {"loss": number, "values": _parameter_values(self.modules)}
+            self._update_progress(step=step + 1)
             for callback in callbacks:
                 row |= callback.annotate(self)
             self.progress.history.append(row)
             for callback in callbacks:
                 callback.step(self, row)
-            if stage.tolerance > 0 and self._settled(stage.tolerance):
+            if stage.tolerance > 0 and self._has_converged(stage.tolerance):
                 return "converged"
-        return "converged" if self._settled(max(stage.tolerance, 1e-3)) else "budget"
+        return "converged" if self._has_converged(max(stage.tolerance, 1e-3)) else "budget"
 
-    def _stepped(self, step: int) -> float:
+    def _take_step(self, step: int) -> float:
         """The loss of the present parameters, which then take a step down."""
         if isinstance(self.optimizer, GaussNewton):
-            return self.descended(self.optimizer, step)
+            return self.gauss_newton_step(self.optimizer, step)
         self.optimizer.zero_grad()
         value = self.evaluate(step)
         number = float(value.detach())
-        if not _lost(number, self.progress.history):
+        if not _has_diverged(number, self.progress.history):
             if value.requires_grad:
                 value.backward()
             _require_all_used(self.modules)
@@ -398,12 +411,12 @@ class Fit:
         """Remember the best parameters; a loss without extra widths beats any with them."""
         best, step = self.progress.best, self.progress.step
         if best is not None:
-            first = self.annealed(step) and not self.annealed(best[0])
+            first = self.is_unblurred(step) and not self.is_unblurred(best[0])
             if not first and loss >= best[1]:
                 return
-        self._note(best=(step, loss, parameters))
+        self._update_progress(best=(step, loss, parameters))
 
-    def _judged(self, status: Status) -> Status:
+    def _select_best(self, status: Status) -> Status:
         """The status: ``diverged`` if the fit ends worse than it began; the best is kept."""
         best = self.progress.best
         if best is None:
@@ -416,30 +429,32 @@ class Fit:
             for name, parameters in ends.items():
                 self.modules.load_state_dict(parameters)
                 try:
-                    losses[name] = self._judging()
+                    losses[name] = self._selection_loss()
                 except InputError:  # out of bounds
                     losses[name] = math.inf
         last = losses.get("last", math.inf)
-        if math.isfinite(last) and last <= _WORSE * losses["first"]:
+        if math.isfinite(last) and last <= _MAX_LOSS_INCREASE * losses["first"]:
             self.modules.load_state_dict(ends["last"])
             return status
         # A loss on the way was that of frames that are fitted, which says nothing of the others.
         kept = min(("first", "best"), key=lambda name: losses[name])
         self.modules.load_state_dict(ends[kept])
-        self._note(best=(self.progress.step, losses[kept], ends[kept]))
+        self._update_progress(best=(self.progress.step, losses[kept], ends[kept]))
         return "diverged"
 
-    def _settled(self, tolerance: float) -> bool:
+    def _has_converged(self, tolerance: float) -> bool:
         """Whether the loss, averaged over two windows without extra widths, no longer falls."""
-        rows = [row["loss"] for row in self.progress.history[-2 * _WINDOW :]]
-        if len(rows) < 2 * _WINDOW or not self.annealed(self.progress.step - 2 * _WINDOW):
+        rows = [row["loss"] for row in self.progress.history[-2 * _CONVERGENCE_WINDOW :]]
+        if len(rows) < 2 * _CONVERGENCE_WINDOW or not self.is_unblurred(
+            self.progress.step - 2 * _CONVERGENCE_WINDOW
+        ):
             return False
-        before, after = np.mean(rows[:_WINDOW]), np.mean(rows[_WINDOW:])
+        before, after = np.mean(rows[:_CONVERGENCE_WINDOW]), np.mean(rows[_CONVERGENCE_WINDOW:])
         return bool(before - after < tolerance * before)
 
 
 @dataclass(frozen=True)
-class Settings:
+class FitSettings:
     """What all stages of a fit have in common. See :func:`invertwin.reconstruct`."""
 
     loss: Callable[[Tensor, Tensor], Tensor]  # of a predicted and an observed map
@@ -448,7 +463,9 @@ class Settings:
     seed: int  # of all random numbers
 
 
-def _restore(optimizer: torch.optim.Optimizer | GaussNewton, state: dict[str, Any]) -> None:
+def _restore_optimizer(
+    optimizer: torch.optim.Optimizer | GaussNewton, state: dict[str, Any]
+) -> None:
     """Give an optimiser back what it knew of every parameter; its settings are those of the fit."""
     if isinstance(optimizer, GaussNewton):
         optimizer.load_state_dict(state)
@@ -456,7 +473,7 @@ def _restore(optimizer: torch.optim.Optimizer | GaussNewton, state: dict[str, An
     if any(value.is_complex() for known in state["state"].values() for value in known.values()):
         raise ValueError("an optimiser of another fit")
     optimizer.load_state_dict({**optimizer.state_dict(), "state": state["state"]})
-    names = _REMEMBERED[type(optimizer)]
+    names = _OPTIMIZER_STATE_KEYS[type(optimizer)]
     for parameter, known in optimizer.state.items():
         step = known.get("step", torch.zeros(()))
         counted = step.shape == () and step.is_floating_point() and 0 <= float(step) < math.inf
@@ -473,14 +490,16 @@ def _require_all_used(modules: nn.ModuleList) -> None:
     for module in modules:
         for name, parameter in module.named_parameters():
             if parameter.requires_grad and parameter.grad is None:
-                raise without_effect(module, name)
+                raise no_effect_error(module, name)
 
 
-def _lost(loss: float, history: list[dict[str, Any]]) -> bool:
-    return not math.isfinite(loss) or bool(history and loss > _DIVERGED * history[0]["loss"])
+def _has_diverged(loss: float, history: list[dict[str, Any]]) -> bool:
+    return not math.isfinite(loss) or bool(
+        history and loss > _MAX_RELATIVE_LOSS * history[0]["loss"]
+    )
 
 
-def _values(modules: nn.ModuleList) -> dict[str, Any]:
+def _parameter_values(modules: nn.ModuleList) -> dict[str, Any]:
     """Parameters by name as plain numbers; long ones (vertices) are left to the checkpoint."""
     rows: dict[str, Any] = {}
     for module in modules:

@@ -11,16 +11,19 @@ from jaxtyping import Bool, Float64
 from torch import Tensor, nn
 from torch.autograd import grad
 
-from invertwin.channel import alone
+from invertwin.channel import tracer_lock
 from invertwin.checks import checked_count
 from invertwin.errors import InputError
-from invertwin.inversion.loss import Maps, Objective, SpectrumLoss
+from invertwin.inversion.loss import MapPairs, Objective, SpectrumLoss
 
-_MOST = 64  # parameters; each costs a derivative of the map per step
-_TRIES = 4  # dampings of one step
-_EASE, _STRAIN = 0.3, 4.0  # of the damping after a step that helped, and after one that did not
-_LEAST, _LARGEST = 1e-3, 1e3  # of the damping
-_SLACK = 1e-3  # of the loss: the noise of two evaluations on the same samples
+_MAX_PARAMETERS = 64  # parameters; each costs a derivative of the map per step
+_MAX_DAMPING_TRIALS = 4  # dampings of one step
+_DAMPING_DECREASE, _DAMPING_INCREASE = (
+    0.3,
+    4.0,
+)  # of the damping after a step that helped, and after one that did not
+_MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e3  # of the damping
+_LOSS_TOLERANCE = 1e-3  # of the loss: the noise of two evaluations on the same samples
 
 
 class GaussNewton:
@@ -40,7 +43,7 @@ class GaussNewton:
         modules: what is fitted.
         objective: how maps are compared, of `SpectrumLoss` only.
         reach: the longest change of one parameter in a step, in its unit.
-        reaches: the reach of single parameters, in place of `reach`.
+        trust_radii: the reach of single parameters, in place of `reach`.
         damping: μ at the first step.
         every: steps from one H to the next; those between take the last one.
 
@@ -57,10 +60,10 @@ class GaussNewton:
         modules: nn.Module,
         objective: Objective,
         *,
-        reach: float = 0.3,
-        reaches: Mapping[nn.Parameter, float] | None = None,
+        trust_radius: float = 0.3,
+        trust_radii: Mapping[nn.Parameter, float] | None = None,
         damping: float = 0.01,
-        every: int = 1,
+        curvature_every: int = 1,
     ) -> None:
         self._slots = [
             (module, name, parameter)
@@ -74,24 +77,26 @@ class GaussNewton:
                     f"expected a SpectrumLoss for Gauss–Newton, got {type(loss).__name__}; "
                     "give one, or another kind of optimiser"
                 )
-        if not self._slots or not (reach > 0 and damping > 0):
+        if not self._slots or not (trust_radius > 0 and damping > 0):
             raise InputError(
                 f"expected parameters to fit, reach > 0 and damping > 0, got {len(self._slots)}, "
-                f"{reach} and {damping}; a reach of 0.3 suits metres and radians"
+                f"{trust_radius} and {damping}; a reach of 0.3 suits metres and radians"
             )
         self.objective, self.damping = objective, damping
-        own = dict(reaches or {})
+        own = dict(trust_radii or {})
         self.reach = torch.cat(
             [
-                torch.full((p.numel(),), own.get(p, reach), dtype=torch.float64)
+                torch.full((p.numel(),), own.get(p, trust_radius), dtype=torch.float64)
                 for _, _, p in self._slots
             ]
         )
-        self.every = checked_count(every, "steps from one curvature to the next", 1)
+        self.every = checked_count(curvature_every, "steps from one curvature to the next", 1)
         self._known: tuple[Tensor, Tensor] | None = None  # H, and of which parameters
         self._age = 0  # steps that H has served
 
-    def step(self, maps: Callable[[], Maps], penalty: Callable[[], Tensor] | None = None) -> float:
+    def step(
+        self, maps: Callable[[], MapPairs], penalty: Callable[[], Tensor] | None = None
+    ) -> float:
         """Do one step, and return the loss before it.
 
         Args:
@@ -113,22 +118,23 @@ class GaussNewton:
             found = grad(value, parameters, allow_unused=True)
         for (module, name, _), slopes in zip(self._slots, found, strict=True):
             if slopes is None:
-                raise without_effect(module, name)
-        slope = _row([part for part in found if part is not None])
+                raise no_effect_error(module, name)
+        slope = _flatten([part for part in found if part is not None])
         before = float(value.detach())
         if not bool(torch.isfinite(slope).all()) or before != before:
             return float("nan")
         # Along a parameter that the module holds fixed, the derivative is zero to the last bit.
         free = slope != 0
-        if int(free.sum()) > _MOST:
+        if int(free.sum()) > _MAX_PARAMETERS:
             raise InputError(
-                f"expected at most {_MOST} parameters for Gauss–Newton, got {int(free.sum())}; "
+                f"expected at most {_MAX_PARAMETERS} parameters for Gauss–Newton, got "
+                f"{int(free.sum())}; "
                 "use adam for many"
             )
         if not bool(free.any()):
             return before
         if self._known is None or self._age >= self.every or not torch.equal(free, self._known[1]):
-            self._known = self._curvature(maps, pairs, free), free
+            self._known = self._compute_curvature(maps, pairs, free), free
             self._age = 0
         self._age += 1
         curvature = self._known[0]
@@ -136,18 +142,20 @@ class GaussNewton:
             curvature = curvature + penalty_curvature(penalty, parameters, free)
         start = [parameter.detach().clone() for parameter in parameters]
         given = self.damping
-        for _ in range(_TRIES):
-            self._move(start, self._solved(curvature, slope[free], self.reach[free]), free)
-            after = _value(self.objective, maps, penalty)
-            if after < before + _SLACK * abs(before):
-                self.damping = max(self.damping * _EASE, _LEAST)
+        for _ in range(_MAX_DAMPING_TRIALS):
+            self._set_parameters(
+                start, self._solve_step(curvature, slope[free], self.reach[free]), free
+            )
+            after = _evaluate_loss(self.objective, maps, penalty)
+            if after < before + _LOSS_TOLERANCE * abs(before):
+                self.damping = max(self.damping * _DAMPING_DECREASE, _MIN_DAMPING)
                 return before
-            self.damping *= _STRAIN
+            self.damping *= _DAMPING_INCREASE
         # Samples are others in the next step: what failed on these may be right on those, with a
         # curvature of theirs.
         self._known = None
-        self.damping = min(given * _STRAIN, _LARGEST)
-        self._move(start, torch.zeros(int(free.sum()), dtype=torch.float64), free)
+        self.damping = min(given * _DAMPING_INCREASE, _MAX_DAMPING)
+        self._set_parameters(start, torch.zeros(int(free.sum()), dtype=torch.float64), free)
         return before
 
     def state_dict(self) -> dict[str, Any]:
@@ -171,26 +179,28 @@ class GaussNewton:
     def zero_grad(self) -> None:
         """Do nothing: gradients are not kept in the parameters."""
 
-    def _solved(self, curvature: Tensor, slope: Tensor, reach: Tensor) -> Float64[Tensor, " p"]:
+    def _solve_step(
+        self, curvature: Tensor, gradient: Tensor, trust_radius: Tensor
+    ) -> Float64[Tensor, " p"]:
         """The minimum of the damped quadratic model within the reach of every parameter."""
         own = curvature.diagonal()
         # What the data hardly tell is damped as much as what they tell on average: noise would
         # carry it away otherwise.
         scale = own.clamp_min(float(own.mean()))
         model = curvature + torch.diag(self.damping * scale)
-        change, free = torch.zeros_like(slope), torch.ones_like(slope, dtype=torch.bool)
+        change, free = torch.zeros_like(gradient), torch.ones_like(gradient, dtype=torch.bool)
         while bool(free.any()):
             # What is at its limit stays there, the others make the best of it.
-            rest = slope[free] + model[free][:, ~free] @ change[~free]
+            rest = gradient[free] + model[free][:, ~free] @ change[~free]
             change[free] = -torch.linalg.solve(model[free][:, free], rest)
-            beyond = free & (change.abs() > reach)
+            beyond = free & (change.abs() > trust_radius)
             if not bool(beyond.any()):
                 break
-            change = change.clamp(-reach, reach)
+            change = change.clamp(-trust_radius, trust_radius)
             free = free & ~beyond
         return change
 
-    def _move(self, start: list[Tensor], change: Tensor, free: Tensor) -> None:
+    def _set_parameters(self, start: list[Tensor], change: Tensor, free: Tensor) -> None:
         """Set the parameters to where they were, plus a change of the free ones."""
         whole = torch.zeros(free.shape, dtype=torch.float64)
         whole[free] = change
@@ -199,30 +209,32 @@ class GaussNewton:
             for (_, _, parameter), value, part in zip(self._slots, start, parts, strict=True):
                 parameter.copy_(value + part.reshape(value.shape).to(value))
 
-    def _curvature(
-        self, maps: Callable[[], Maps], pairs: Maps, free: Bool[Tensor, " q"]
+    def _compute_curvature(
+        self, maps: Callable[[], MapPairs], pairs: MapPairs, free: Bool[Tensor, " q"]
     ) -> Float64[Tensor, "p p"]:
         fixed = [(predicted.detach(), observed) for predicted, observed in pairs]
         tangents: list[list[Tensor]] = [[] for _ in fixed]
         for index in free.nonzero()[:, 0].tolist():
-            with alone, forward_ad.dual_level(), self._along(index):
+            with tracer_lock, forward_ad.dual_level(), self._dual_coordinate(index):
                 found = [forward_ad.unpack_dual(predicted).tangent for predicted, _ in maps()]
             for rows, tangent, (predicted, _) in zip(tangents, found, fixed, strict=True):
                 rows.append(torch.zeros_like(predicted) if tangent is None else tangent)
         return self.objective.curvature(fixed, [torch.stack(rows) for rows in tangents])
 
-    def _along(self, index: int) -> AbstractContextManager[None]:
+    def _dual_coordinate(self, index: int) -> AbstractContextManager[None]:
         """Parameters as dual numbers whose tangent is one along a single coordinate."""
         sizes = [parameter.numel() for _, _, parameter in self._slots]
         slot = next(k for k in range(len(sizes)) if index < sum(sizes[: k + 1]))
         module, name, parameter = self._slots[slot]
         tangent = torch.zeros_like(parameter.detach())
         tangent.view(-1)[index - sum(sizes[:slot])] = 1.0
-        return along(module, {name: tangent})
+        return dual_parameters(module, {name: tangent})
 
 
 @contextmanager
-def along(module: nn.Module, tangents: Mapping[str, Tensor]) -> Generator[None, None, None]:
+def dual_parameters(
+    module: nn.Module, tangents: Mapping[str, Tensor]
+) -> Generator[None, None, None]:
     """Parameters of a module as dual numbers, with these tangents by name.
 
     Args:
@@ -249,8 +261,8 @@ def along(module: nn.Module, tangents: Mapping[str, Tensor]) -> Generator[None, 
                 setattr(part, key, parameter)
 
 
-def _value(
-    objective: Objective, maps: Callable[[], Maps], penalty: Callable[[], Tensor] | None
+def _evaluate_loss(
+    objective: Objective, maps: Callable[[], MapPairs], penalty: Callable[[], Tensor] | None
 ) -> float:
     """The loss with its term; infinite for parameters that the scene refuses."""
     with torch.no_grad():
@@ -260,7 +272,7 @@ def _value(
             return math.inf
 
 
-def without_effect(module: nn.Module, name: str) -> InputError:
+def no_effect_error(module: nn.Module, name: str) -> InputError:
     """Make the error for a parameter that the loss does not depend on.
 
     Args:
@@ -274,7 +286,7 @@ def without_effect(module: nn.Module, name: str) -> InputError:
     )
 
 
-def _row(parts: Sequence[Tensor]) -> Float64[Tensor, " q"]:
+def _flatten(parts: Sequence[Tensor]) -> Float64[Tensor, " q"]:
     """All numbers of some tensors one after the other."""
     return torch.cat([part.flatten().double() for part in parts])
 
@@ -292,10 +304,10 @@ def penalty_curvature(
     count, value = int(free.sum()), penalty()
     total = torch.zeros(count, count, dtype=torch.float64)
     if value.requires_grad:
-        slopes = _row(grad(value, parameters, create_graph=True, materialize_grads=True))[free]
+        slopes = _flatten(grad(value, parameters, create_graph=True, materialize_grads=True))[free]
         for row, slope in zip(total, slopes, strict=True):
             if slope.requires_grad:
                 second = grad(slope, parameters, retain_graph=True, materialize_grads=True)
-                row.copy_(_row(second)[free])
+                row.copy_(_flatten(second)[free])
     values, vectors = torch.linalg.eigh((total + total.T) / 2)
     return vectors @ torch.diag(values.clamp_min(0.0)) @ vectors.T

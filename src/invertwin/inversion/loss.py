@@ -14,16 +14,18 @@ from torch import Tensor
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 
-_LEAST = 1e-38  # keeps logarithms finite
+_MIN_POSITIVE = 1e-38  # keeps logarithms finite
 _GAIN_STEPS = 8  # at most; three or four do
-_SETTLED = 1e-3  # of the gain: a step this small is the last, and leaves less than 1e-5
-_BLOCK = 2**16  # bins that are worked on at a time: what they need stays in a core's cache
+_GAIN_TOLERANCE = 1e-3  # of the gain: a step this small is the last, and leaves less than 1e-5
+_BINS_PER_BLOCK = 2**16  # bins that are worked on at a time: what they need stays in a core's cache
 
-KINDS = ("mse", "likelihood", "heavy_tailed")
+LOSS_KINDS = ("mse", "likelihood", "heavy_tailed")
 BACKGROUNDS = ("none", "level", "static")
-Power = TypeVar("Power", Tensor, NDArray[np.float32])
-_Block = tuple[Tensor, Tensor, Tensor]  # of a simulated map, what it holds of power, the measured
-Maps = Sequence[tuple[Tensor, Tensor]]
+PowerArray = TypeVar("Power", Tensor, NDArray[np.float32])
+_PowerBlock = tuple[
+    Tensor, Tensor, Tensor
+]  # of a simulated map, what it holds of power, the measured
+MapPairs = Sequence[tuple[Tensor, Tensor]]
 """The predicted and the observed map of every observation."""
 
 
@@ -63,7 +65,7 @@ def speckle_divergence(ratio: Tensor, degrees: float = math.inf) -> Tensor:
     return (degrees + 1) * tail - ratio.log()
 
 
-def speckle_weight(ratio: Power, degrees: float) -> Power:
+def speckle_weight(ratio: PowerArray, degrees: float) -> PowerArray:
     """By how much less a bin counts in slopes than under plain speckle: (ν + 1) / (ν + q).
 
     Args:
@@ -116,9 +118,9 @@ class SpectrumLoss:
     degrees: Positive = 4.0
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
+        if self.kind not in LOSS_KINDS:
             raise InputError(
-                f"expected kind among {', '.join(KINDS)}, got {self.kind!r}; choose one"
+                f"expected kind among {', '.join(LOSS_KINDS)}, got {self.kind!r}; choose one"
             )
         if self.levels < 1 or self.gain not in ("fitted", "one"):
             raise InputError(
@@ -141,11 +143,11 @@ class SpectrumLoss:
             )
 
     @property
-    def _tail(self) -> float:
+    def _tail_degrees(self) -> float:
         """ν of the speckle."""
         return self.degrees if self.kind == "heavy_tailed" else math.inf
 
-    def _heeded(self, power: Tensor, inverse: Tensor | float = 1.0) -> Tensor:
+    def _weight_power(self, power: Tensor, inverse: Tensor | float = 1.0) -> Tensor:
         """Power as it counts in slopes, see ``speckle_weight``; all of it under plain speckle.
 
         Args:
@@ -174,7 +176,9 @@ class SpectrumLoss:
         if self.kind != "mse":
             return self._divergence(simulated, measured)
         pairs = self._pyramid(simulated, measured)
-        return self._error([(self._cleared(a), self._cleared(b)) for a, b in pairs])
+        return self._squared_error(
+            [(self._subtract_background(a), self._subtract_background(b)) for a, b in pairs]
+        )
 
     def curvature(
         self,
@@ -195,19 +199,19 @@ class SpectrumLoss:
         pairs = self._pyramid(simulated.detach(), measured)
         # The derivative of a map with respect to the logarithm of its gain is the map.
         rows = torch.cat([tangents, simulated.detach()[None].to(tangents)])
-        rows = rows / self._units(simulated, measured)[0]
+        rows = rows / self._normalisations(simulated, measured)[0]
         if self.kind == "mse":
-            pairs = [(self._cleared(a), self._cleared(b)) for a, b in pairs]
-        gain = self._gain(pairs)
+            pairs = [(self._subtract_background(a), self._subtract_background(b)) for a, b in pairs]
+        gain = self._optimal_gain(pairs)
         total = rows.new_zeros(len(rows), len(rows), dtype=torch.float64)
         for level, (a, b) in enumerate(pairs):
             if level > 0:
-                rows = pooled(rows.flatten(0, 1)).unflatten(0, (len(rows), -1))
+                rows = halve_resolution(rows.flatten(0, 1)).unflatten(0, (len(rows), -1))
             if self.kind == "mse":
                 weight = 2 * gain**2 / b.square().mean().clamp_min(1e-30)
-                weighed = torch.stack([self._cleared(row) for row in rows]).flatten(1)
+                weighed = torch.stack([self._subtract_background(row) for row in rows]).flatten(1)
             else:
-                weight = 1.0 / (1.0 + 2.0 / self._tail)
+                weight = 1.0 / (1.0 + 2.0 / self._tail_degrees)
                 weighed = (
                     rows * ((a > 0) * gain / (gain * a.clamp_min(0.0) + self.floor))
                 ).flatten(1)
@@ -225,37 +229,37 @@ class SpectrumLoss:
             simulated: Power.
             measured: Power.
         """
-        unit, scale = self._units(simulated, measured)
+        unit, scale = self._normalisations(simulated, measured)
         pairs = self._pyramid(simulated.detach(), measured)
         if self.kind == "mse":
-            pairs = [(self._cleared(a), self._cleared(b)) for a, b in pairs]
-        return float(self._gain(pairs) * scale / unit)
+            pairs = [(self._subtract_background(a), self._subtract_background(b)) for a, b in pairs]
+        return float(self._optimal_gain(pairs) * scale / unit)
 
-    def _units(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
+    def _normalisations(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
         """What the simulated and the measured map are divided by."""
-        scale = _mean_size(measured)
+        scale = _mean_magnitude(measured)
         if not scale > 0:
             raise InputError("expected a measured map with power in it, got zeros; check the grid")
-        unit = _mean_size(simulated) if self.gain == "fitted" else scale
+        unit = _mean_magnitude(simulated) if self.gain == "fitted" else scale
         return torch.where(unit > 0, unit, 1.0), scale
 
     def _resolutions(self, power: Tensor) -> list[Tensor]:
         """A map at all resolutions."""
         found = [power]
         while len(found) < self.levels:
-            found.append(pooled(found[-1]))
+            found.append(halve_resolution(found[-1]))
         return found
 
     def _pyramid(self, simulated: Tensor, measured: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Both maps at all resolutions, in units near one."""
-        unit, scale = self._units(simulated, measured)
+        unit, scale = self._normalisations(simulated, measured)
         both = (
             self._resolutions(simulated / unit),
             self._resolutions(measured.to(simulated) / scale),
         )
         return list(zip(*both, strict=True))
 
-    def _gain(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
+    def _optimal_gain(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
         """The gain that minimises the loss."""
         gain = torch.ones(())
         if self.gain == "one":
@@ -267,17 +271,17 @@ class SpectrumLoss:
                 mixed = torch.stack([(a * b).mean() / n for (a, b), n in both]).sum()
                 power = torch.stack([(a * a).mean() / n for (a, _), n in both]).sum()
                 return (mixed / power.clamp_min(1e-30)).clamp_min(0.0)
-            return gain * self._likeliest([self._blocks(*pair) for pair in pairs])
+            return gain * self._likelihood_gain([self._split_blocks(*pair) for pair in pairs])
 
-    def _blocks(self, a: Tensor, b: Tensor, scale: Any = 1.0) -> list[_Block]:
+    def _split_blocks(self, a: Tensor, b: Tensor, scale: Any = 1.0) -> list[_PowerBlock]:
         """What both maps hold of power, the measured one in its unit with the floor added."""
-        columns = (x.detach().flatten().split(_BLOCK) for x in (a, b))
+        columns = (x.detach().flatten().split(_BINS_PER_BLOCK) for x in (a, b))
         return [
             (x, x.clamp_min(0.0), (y.to(x) / scale).clamp_min_(0.0).add_(self.floor))
             for x, y in zip(*columns, strict=True)
         ]
 
-    def _likeliest(self, levels: list[list[_Block]], unit: float = 1.0) -> float:
+    def _likelihood_gain(self, levels: list[list[_PowerBlock]], unit: float = 1.0) -> float:
         """The gain of a likelihood over the unit, by a secant on its logarithm."""
         if self.gain == "one":
             return 1.0 / unit
@@ -293,18 +297,21 @@ class SpectrumLoss:
                     for _, a, b in blocks:
                         inverse = torch.add(floor, a, alpha=math.exp(place)).reciprocal_()
                         down += float(a @ inverse) / count
-                        up += float(self._heeded(b, inverse) @ inverse.square_().mul_(a)) / count
-                move = math.log(max(up, _LEAST) / max(down, _LEAST))
+                        up += (
+                            float(self._weight_power(b, inverse) @ inverse.square_().mul_(a))
+                            / count
+                        )
+                move = math.log(max(up, _MIN_POSITIVE) / max(down, _MIN_POSITIVE))
                 if step != 0:
                     slope = min(max((before - move) / step, 0.1), 1.0)
                 before, step = move, move / slope
                 place += step
-                if abs(step) < _SETTLED:
+                if abs(step) < _GAIN_TOLERANCE:
                     break
         return math.exp(place)
 
-    def _error(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
-        gain = self._gain(pairs)
+    def _squared_error(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
+        gain = self._optimal_gain(pairs)
         norms = [b.detach().square().mean().clamp_min(1e-30) for _, b in pairs]
         terms = [(gain * a - b).square().mean() / n for (a, b), n in zip(pairs, norms, strict=True)]
         return torch.stack(terms).mean()
@@ -313,44 +320,50 @@ class SpectrumLoss:
         # torch has no public name for this question.
         transformed = torch._C._are_functorch_transforms_active()  # pyright: ignore[reportPrivateUsage]
         if not transformed:
-            return _Known.apply(simulated, *self._divergence_and_slope(simulated, measured))
+            return _ScalarWithGradient.apply(
+                simulated, *self._divergence_and_gradient(simulated, measured)
+            )
         # Such as a second derivative.
         pairs = self._pyramid(simulated, measured)
-        gain = self._gain(pairs)
+        gain = self._optimal_gain(pairs)
         ratios = [
             (b.clamp_min(0.0) + self.floor) / (gain * a.clamp_min(0.0) + self.floor)
             for a, b in pairs
         ]
-        return torch.stack([speckle_divergence(q, self._tail).mean() for q in ratios]).mean()
+        return torch.stack(
+            [speckle_divergence(q, self._tail_degrees).mean() for q in ratios]
+        ).mean()
 
     @torch.no_grad()
-    def _divergence_and_slope(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
+    def _divergence_and_gradient(
+        self, simulated: Tensor, measured: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """The divergence, and its derivative with respect to the simulated map.
 
         The maps are large, and torch's own derivative keeps and reads each of them several times.
         """
-        unit, scale = self._units(simulated, measured)
+        unit, scale = self._normalisations(simulated, measured)
         maps = [self._resolutions(power) for power in (simulated.detach(), measured)]
-        levels = [self._blocks(a, b, scale) for a, b in zip(*maps, strict=True)]
-        gain = self._likeliest(levels, float(unit))
+        levels = [self._split_blocks(a, b, scale) for a, b in zip(*maps, strict=True)]
+        gain = self._likelihood_gain(levels, float(unit))
         value, slope = 0.0, None
         for power, blocks in zip(reversed(maps[0]), reversed(levels), strict=True):
             factor = gain / (power.numel() * self.levels)
             own = torch.empty_like(power, memory_format=torch.contiguous_format)
-            slopes = own.flatten().split(_BLOCK)
+            slopes = own.flatten().split(_BINS_PER_BLOCK)
             for (a, lit, data), out in zip(blocks, slopes, strict=True):
                 inverse = lit.mul_(gain).add_(self.floor).reciprocal_()
                 ratio = data.mul_(inverse)
-                value += float(speckle_divergence(ratio, self._tail).sum()) / power.numel()
-                inverse.addcmul_(inverse, self._heeded(ratio), value=-1).mul_(factor)
+                value += float(speckle_divergence(ratio, self._tail_degrees).sum()) / power.numel()
+                inverse.addcmul_(inverse, self._weight_power(ratio), value=-1).mul_(factor)
                 # What is below zero counts as zero, and has no derivative; a dark bin has one.
                 least = -torch.finfo(a.dtype).tiny
                 torch.ops.aten.threshold_backward(inverse, a, least, grad_input=out)
-            slope = own if slope is None else _spread(slope, own)
+            slope = own if slope is None else _add_pooling_adjoint(slope, own)
         assert slope is not None
         return slope.new_tensor(value / self.levels), slope
 
-    def _cleared(self, power: Tensor) -> Tensor:
+    def _subtract_background(self, power: Tensor) -> Tensor:
         if self.background == "level":
             return power - power.mean()
         if self.background == "static":
@@ -358,14 +371,14 @@ class SpectrumLoss:
         return power
 
 
-class _Known(torch.autograd.Function):
+class _ScalarWithGradient(torch.autograd.Function):
     """A number whose derivative with respect to a map is known."""
 
     @staticmethod
-    def forward(ctx: Any, power: Tensor, value: Tensor, slope: Tensor) -> Tensor:
+    def forward(ctx: Any, power: Tensor, value: Tensor, gradient: Tensor) -> Tensor:
         """The number, of a map."""
-        ctx.save_for_backward(slope)
-        ctx.save_for_forward(slope)
+        ctx.save_for_backward(gradient)
+        ctx.save_for_forward(gradient)
         return value.clone()
 
     @staticmethod
@@ -380,7 +393,7 @@ class _Known(torch.autograd.Function):
         return (slope * tangents[0]).sum()
 
 
-Scale = Literal["magnitude", "power", "level"]
+CorrelationScale = Literal["magnitude", "power", "level"]
 
 
 @dataclass(frozen=True)
@@ -395,12 +408,13 @@ class CorrelationLoss:
         InputError: An unknown scale.
     """
 
-    scale: Scale = "magnitude"
+    scale: CorrelationScale = "magnitude"
 
     def __post_init__(self) -> None:
-        if self.scale not in _SCALES:
+        if self.scale not in _SCALE_TRANSFORMS:
             raise InputError(
-                f"expected a scale of {', '.join(_SCALES)}, got {self.scale!r}; choose one"
+                f"expected a scale of {', '.join(_SCALE_TRANSFORMS)}, got {self.scale!r}; choose "
+                f"one"
             )
 
     def __call__(
@@ -421,19 +435,21 @@ class CorrelationLoss:
             )
         rows = []
         for power in (simulated, measured):
-            row = _SCALES[self.scale](power.to(torch.float64) / power.detach().max()).flatten()
+            row = _SCALE_TRANSFORMS[self.scale](
+                power.to(torch.float64) / power.detach().max()
+            ).flatten()
             row = row - row.mean()
             rows.append(row / row.norm())
         return 1 - rows[0] @ rows[1]
 
 
-_FLOOR = 1e-4  # of the peak: below it levels are noise
-_TINY = 1e-12  # of the peak: keeps the derivative of a magnitude finite
-_SCALES: dict[str, Callable[[Tensor], Tensor]] = {
+_MIN_RELATIVE_POWER = 1e-4  # of the peak: below it levels are noise
+_SQRT_OFFSET = 1e-12  # of the peak: keeps the derivative of a magnitude finite
+_SCALE_TRANSFORMS: dict[str, Callable[[Tensor], Tensor]] = {
     # An interpolated response may fall a little below zero.
-    "magnitude": lambda share: (share.clamp(min=0) + _TINY).sqrt(),
+    "magnitude": lambda share: (share.clamp(min=0) + _SQRT_OFFSET).sqrt(),
     "power": lambda share: share,
-    "level": lambda share: share.clamp(min=_FLOOR).log(),
+    "level": lambda share: share.clamp(min=_MIN_RELATIVE_POWER).log(),
 }
 
 
@@ -448,7 +464,7 @@ class Objective:
     losses: tuple[Callable[[Tensor, Tensor], Tensor], ...]
     weights: tuple[float, ...]
 
-    def __call__(self, maps: Maps) -> Float[Tensor, ""]:
+    def __call__(self, maps: MapPairs) -> Float[Tensor, ""]:
         """The loss of the maps of all observations."""
         terms = [
             weight * loss(*pair)
@@ -457,7 +473,7 @@ class Objective:
         return torch.stack(terms).sum() / sum(self.weights)
 
     def curvature(
-        self, maps: Maps, tangents: Sequence[Float[Tensor, "p *map"]]
+        self, maps: MapPairs, tangents: Sequence[Float[Tensor, "p *map"]]
     ) -> Float[Tensor, "p p"]:
         """The Gauss–Newton matrix of the mean.
 
@@ -473,12 +489,12 @@ class Objective:
         return total / sum(self.weights)
 
 
-def _mean_size(power: Tensor) -> Tensor:
+def _mean_magnitude(power: Tensor) -> Tensor:
     """The mean of the absolute values, detached."""
     return power.detach().abs().mean()
 
 
-def pooled(power: Tensor) -> Tensor:
+def halve_resolution(power: Tensor) -> Tensor:
     """Half the resolution along every axis that has two bins or more.
 
     Args:
@@ -493,7 +509,7 @@ def pooled(power: Tensor) -> Tensor:
     return share * power
 
 
-def _spread(coarse: Tensor, power: Tensor) -> Tensor:
+def _add_pooling_adjoint(coarse: Tensor, power: Tensor) -> Tensor:
     """The adjoint of pooling, added to a map of twice the resolution."""
     for dim in reversed(range(2, power.ndim)):
         if power.shape[dim] > 1:

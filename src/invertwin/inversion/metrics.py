@@ -17,15 +17,15 @@ from invertwin.channel import visible_points
 from invertwin.checks import ArrayLike, checked_count, checked_number
 from invertwin.errors import InputError
 from invertwin.scene import Itu, Material
-from invertwin.scene.material.materials import held_by
-from invertwin.scene.material.values import Value, evaluated
+from invertwin.scene.material.materials import select_layer
+from invertwin.scene.material.values import Value, evaluate_value
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Object
 
-POINTS = 20_000  # of each surface
-VOXEL = 0.02  # [m]
-_MOST_VOXELS = 200_000_000
-_CHUNK = 4_000_000  # voxels at a time
+SURFACE_POINT_COUNT = 20_000  # of each surface
+VOXEL_EDGE = 0.02  # [m]
+_MAX_VOXELS = 200_000_000
+_VOXELS_PER_CHUNK = 4_000_000  # voxels at a time
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class ShapeMetrics:
 
 
 @dataclass(frozen=True)
-class Topology:
+class TopologyCounts:
     """Number of parts and holes of a closed surface.
 
     Attributes:
@@ -64,23 +64,23 @@ class Topology:
 
 
 @dataclass(frozen=True)
-class Residual:
+class PoseError:
     """How one object differs from where it really is.
 
     Attributes:
         offset: of its centre [m].
-        turn: rotation vector that remains, in the world [rad].
+        rotation: rotation vector that remains, in the world [rad].
         scale: size over the true one.
     """
 
     offset: Float64[Tensor, "3"]
-    turn: Float64[Tensor, "3"]
+    rotation: Float64[Tensor, "3"]
     scale: float
 
     @property
     def angle(self) -> float:
         """Of the turn [rad]."""
-        return float(self.turn.norm())
+        return float(self.rotation.norm())
 
     @property
     def distance(self) -> float:
@@ -88,7 +88,7 @@ class Residual:
         return float(self.offset.norm())
 
 
-def residual(found: Object, truth: Object) -> Residual | None:
+def pose_error(found: Object, truth: Object) -> PoseError | None:
     """The similarity transform that remains between two copies of an object.
 
     Least squares over the vertices (Umeyama), so it does not depend on how the pose is
@@ -109,7 +109,7 @@ def residual(found: Object, truth: Object) -> Residual | None:
     scale = float(b0.square().sum() / (values * sign).sum())
     offset = found.center.detach() - truth.center.detach()
     vector = torch.from_numpy(Rotation.from_matrix(turn.T.numpy()).as_rotvec())
-    return Residual(offset, vector, 1 / scale if scale else math.nan)
+    return PoseError(offset, vector, 1 / scale if scale else math.nan)
 
 
 def axis_error(found: Object, truth: Object, axis: ArrayLike) -> tuple[float, float]:
@@ -138,8 +138,8 @@ def compare_shapes(
     *,
     seen_from: ArrayLike | None = None,
     thresholds: Sequence[float] = (0.02,),
-    count: int = POINTS,
-    voxel: float | None = VOXEL,
+    count: int = SURFACE_POINT_COUNT,
+    voxel: float | None = VOXEL_EDGE,
     seed: int = 0,
 ) -> ShapeMetrics:
     """Compare two meshes in one frame.
@@ -161,7 +161,7 @@ def compare_shapes(
     """
     if not thresholds or any(not t > 0 for t in thresholds):
         raise InputError(f"expected thresholds > 0 [m], got {list(thresholds)}; give e.g. 0.02")
-    clouds = [surface_points(mesh, count, seed, k) for k, mesh in enumerate((found, truth))]
+    clouds = [sample_surface(mesh, count, seed, k) for k, mesh in enumerate((found, truth))]
     masks = [np.ones(count, dtype=bool)] * 2
     if seen_from is not None:
         masks = [
@@ -195,7 +195,7 @@ def compare_shapes(
     )
 
 
-def volume_iou(found: Mesh, truth: Mesh, voxel: float = VOXEL) -> float:
+def volume_iou(found: Mesh, truth: Mesh, voxel: float = VOXEL_EDGE) -> float:
     """Volume of the intersection of two closed meshes over that of their union, in voxels.
 
     A voxel is inside if the mesh winds around its centre, so overlapping closed parts count once
@@ -215,23 +215,23 @@ def volume_iou(found: Mesh, truth: Mesh, voxel: float = VOXEL) -> float:
 
 def is_watertight(mesh: Mesh) -> bool:
     """Whether every edge has two triangles, which run along it in opposite directions."""
-    solid = _solid(mesh)
+    solid = _to_trimesh(mesh)
     return bool(solid.is_watertight and solid.is_winding_consistent)
 
 
-def topology(mesh: Mesh) -> Topology:
+def count_topology(mesh: Mesh) -> TopologyCounts:
     """Number of parts and holes of a closed surface, whose triangles meet in shared vertices.
 
     Raises:
         InputError: a mesh that is not watertight.
     """
     _check_watertight(mesh, "mesh")
-    solid = _solid(mesh)
+    solid = _to_trimesh(mesh)
     parts = trimesh.graph.connected_components(solid.edges_unique)
-    return Topology(len(parts), int(solid.euler_number))
+    return TopologyCounts(len(parts), int(solid.euler_number))
 
 
-def value_errors(
+def material_errors(
     values: Sequence[str],
     found: Material,
     truth: Material,
@@ -249,21 +249,21 @@ def value_errors(
     Raises:
         InputError: no such layer.
     """
-    ends = [held_by(end, layer, type(end).__name__) for end in (found, truth)]
+    ends = [select_layer(end, layer, type(end).__name__) for end in (found, truth)]
     errors = {}
     for name in values:
         if all(hasattr(end, name) for end in ends):
-            value, true = (_at(getattr(end, name), name, frequency) for end in ends)
+            value, true = (_evaluate_value(getattr(end, name), name, frequency) for end in ends)
             errors[f"{name}_error"] = float((value - true).abs().mean() / true.abs().mean())
     return errors
 
 
-def _at(value: Value | Itu, name: str, frequency: float) -> Tensor:
+def _evaluate_value(value: Value | Itu, name: str, frequency: float) -> Tensor:
     found = getattr(value, name)(frequency) if isinstance(value, Itu) else value
-    return evaluated(found).detach()
+    return evaluate_value(found).detach()
 
 
-def surface_points(
+def sample_surface(
     mesh: Mesh, count: int, seed: int, stream: int = 0
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
     """Points drawn uniformly over a surface [m], and the unit normals of their triangles.
@@ -277,7 +277,7 @@ def surface_points(
     Raises:
         InputError: a surface without area.
     """
-    solid = _solid(mesh)
+    solid = _to_trimesh(mesh)
     if not solid.area > 0:
         raise InputError("expected a surface with area, got none; check the mesh")
     number = checked_count(count, "points", 1)
@@ -305,12 +305,12 @@ def _shared_volume(
     # Centres on a lattice of the frame, so that both meshes are cut alike wherever they are.
     first = np.floor(both.min(0) / edge).astype(np.int64)
     shape = np.ceil(both.max(0) / edge).astype(np.int64) - first
-    if math.prod(map(int, shape)) > _MOST_VOXELS:
+    if math.prod(map(int, shape)) > _MAX_VOXELS:
         raise InputError(
-            f"expected at most {_MOST_VOXELS} voxels, got {' × '.join(map(str, shape))}; "
+            f"expected at most {_MAX_VOXELS} voxels, got {' × '.join(map(str, shape))}; "
             "give a larger voxel"
         )
-    inside = [_inside(mesh, first, shape, edge) for mesh in (found, truth)]
+    inside = [_mark_inside_voxels(mesh, first, shape, edge) for mesh in (found, truth)]
     joint, shared = inside[0] | inside[1], inside[0] & inside[1]
     if keep is not None:
         clouds, masks = keep
@@ -325,15 +325,17 @@ def _shared_volume(
     return float(shared.sum() / total)
 
 
-def _inside(mesh: Mesh, first: np.ndarray, shape: np.ndarray, edge: float) -> np.ndarray:
+def _mark_inside_voxels(
+    mesh: Mesh, first: np.ndarray, shape: np.ndarray, edge: float
+) -> np.ndarray:
     """Whether a closed mesh winds around the centres of voxels [x, y, z].
 
     Source: Barill et al. 2018, "Fast winding numbers for soups and clouds".
     """
-    solid, size = _solid(mesh), tuple(map(int, shape))
+    solid, size = _to_trimesh(mesh), tuple(map(int, shape))
     vertices, faces = np.array(solid.vertices), np.array(solid.faces)
     inside = np.zeros(size, dtype=bool)
-    step = max(1, _CHUNK // max(size[1] * size[2], 1))
+    step = max(1, _VOXELS_PER_CHUNK // max(size[1] * size[2], 1))
     for start in range(0, size[0], step):
         part = inside[start : start + step]
         index = np.indices(part.shape).reshape(3, -1).T + np.array([start, 0, 0])
@@ -342,7 +344,7 @@ def _inside(mesh: Mesh, first: np.ndarray, shape: np.ndarray, edge: float) -> np
     return inside
 
 
-def _solid(mesh: Mesh) -> trimesh.Trimesh:
+def _to_trimesh(mesh: Mesh) -> trimesh.Trimesh:
     """The mesh for trimesh, without triangles that have shrunk to an edge."""
     faces = mesh.faces.numpy()
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]

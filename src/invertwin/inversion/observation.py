@@ -30,11 +30,11 @@ class Unknown:
     regularize: Callable[[nn.Module, Any], Sequence[Regularizer]] | None = None
 
     @property
-    def depends(self) -> bool:
+    def depends_on_target(self) -> bool:
         """Whether it must know what the unknowns before it make of the scene (or sensor)."""
         return not isinstance(self.module, nn.Module) or self.regularize is not None
 
-    def made(self, target: Any) -> nn.Module:
+    def build_module(self, target: Any) -> nn.Module:
         """The module, for a scene or a sensor."""
         return self.module if isinstance(self.module, nn.Module) else self.module(target)
 
@@ -42,7 +42,7 @@ class Unknown:
 Unknowns = nn.Module | Unknown | Sequence[nn.Module | Unknown] | Mapping[str, nn.Module | Unknown]
 
 
-def named_unknowns(unknowns: Unknowns, prefix: str = "") -> dict[str, Unknown]:
+def name_unknowns(unknowns: Unknowns, prefix: str = "") -> dict[str, Unknown]:
     """All unknowns by name, in order.
 
     Args:
@@ -93,6 +93,6 @@ class Observation:
                 "SurrogateMap(grid), or derive a class from ForwardModel"
             )
 
-    def observed(self) -> Tensor:
+    def observed_map(self) -> Tensor:
         """The data in the form of the model's maps."""
         return self.data if isinstance(self.data, Tensor) else self.model.observe(self.data)

@@ -66,7 +66,11 @@ class Optimizer:
                 )
         if self.kind == "gauss_newton":
             return GaussNewton(
-                modules, objective, reach=self.rate, reaches=found, every=self.curvature_every
+                modules,
+                objective,
+                trust_radius=self.rate,
+                trust_radii=found,
+                curvature_every=self.curvature_every,
             )
         groups: dict[float, list[nn.Parameter]] = {}
         for parameter, rate in found.items():
@@ -76,7 +80,7 @@ class Optimizer:
             return torch.optim.Adam(listed, lr=self.rate)
         return torch.optim.SGD(listed, lr=self.rate, momentum=self.momentum)
 
-    def apply(self, optimizer: torch.optim.Optimizer | GaussNewton, progress: float) -> None:
+    def set_rates(self, optimizer: torch.optim.Optimizer | GaussNewton, progress: float) -> None:
         """Set the learning rates.
 
         Args:

@@ -10,17 +10,22 @@ from torch import Tensor, nn
 
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.inversion.confidence.realisations import End
-from invertwin.inversion.confidence.uncertainty import Evidence, Uncertainty
-from invertwin.inversion.confidence.verdict import LEAST_SHARE, Verdict, shares_explained, verdict
-from invertwin.inversion.fit import Callback, Fit, Settings, Status
+from invertwin.inversion.confidence.realisations import FitResult
+from invertwin.inversion.confidence.uncertainty import CovarianceEstimator, Uncertainty
+from invertwin.inversion.confidence.verdict import (
+    MIN_EXPLAINED_FRACTION,
+    Verdict,
+    explained_fractions,
+    judge_fit,
+)
+from invertwin.inversion.fit import Callback, Fit, FitSettings, Status
 from invertwin.inversion.loss import SpectrumLoss
-from invertwin.inversion.observation import Observation, Unknown, Unknowns, named_unknowns
+from invertwin.inversion.observation import Observation, Unknown, Unknowns, name_unknowns
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
-from invertwin.inversion.schedule import Schedule, Stage, checked_stages
+from invertwin.inversion.schedule import Schedule, Stage, make_stages
 from invertwin.scene.scene import Scene
-from invertwin.scene.shape_models.density import without_clouds
+from invertwin.scene.shape_models.density import replace_clouds
 
 
 @dataclass(frozen=True)
@@ -35,10 +40,10 @@ class Reconstruction:
         status: ``converged`` (the loss no longer falls), ``budget`` (all steps done), or
             ``diverged`` (not finite, or worse than the start; then the better of the best state
             and the start is kept).
-            Why the fit stopped: whether it is right is the matter of ``verdict``.
+            Why the fit stopped: whether it is right is the matter of ``judge_fit``.
         steps: Steps done.
         loss: Final loss; if the fit diverged, that of the best state, without extra widths.
-        end: Maps at the end, and looks at the twin.
+        result: Maps at the end, and looks at the twin.
     """
 
     scene: Scene
@@ -48,15 +53,15 @@ class Reconstruction:
     status: Status
     steps: int
     loss: float
-    end: End = field(repr=False)
+    result: FitResult = field(repr=False)
 
     @cached_property
-    def lost(self) -> bool:
-        """Whether the twin shows next to nothing of what was observed, as in ``verdict``.
+    def is_uninformative(self) -> bool:
+        """Whether the twin shows next to nothing of what was observed, as in ``judge_fit``.
 
         A fitted gain of zero has no gradient, so such a fit stays where it began.
         """
-        return min(shares_explained(self.end)) < LEAST_SHARE
+        return min(explained_fractions(self.result)) < MIN_EXPLAINED_FRACTION
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
@@ -65,12 +70,12 @@ class Reconstruction:
         Raises:
             InputError: See :class:`invertwin.inversion.confidence.uncertainty.Evidence`.
         """
-        return Evidence(self.end).bars()
+        return CovarianceEstimator(self.result).error_bars()
 
     @cached_property
     def verdict(self) -> Verdict:
         """Whether the twin is to be believed, computed when it is first asked for."""
-        return verdict(self.end)
+        return judge_fit(self.result)
 
 
 def reconstruct(
@@ -94,7 +99,7 @@ def reconstruct(
     Args:
         scene: Starting scene.
         observations: What was observed, by one or several sensors.
-        parameters: Modules Scene → Scene, applied in order; an :class:`Unknown` has a rate and
+        parameters: Modules Scene → Scene, applied in order; an :class:`UnknownShape` has a rate and
             regularisers of its own. Give them by name if stages choose among them.
         loss: How maps are compared: (predicted, observed) → a number. None = ``SpectrumLoss()``.
         optimizer: Kind and rates.
@@ -113,24 +118,26 @@ def reconstruct(
     watched = [observations] if isinstance(observations, Observation) else list(observations)
     if not watched:
         raise InputError("expected at least one observation, got none; give Observation(...)")
-    unknowns = named_unknowns(parameters)
-    own = [named_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(watched)]
+    unknowns = name_unknowns(parameters)
+    own = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(watched)]
     names = [*unknowns, *(name for found in own for name in found)]
-    settings = Settings(loss or SpectrumLoss(), optimizer or Optimizer(), tuple(regularizers), seed)
-    stages = checked_stages(schedule, names)
-    made = [_made(o.sensor, found) for o, found in zip(watched, own, strict=True)]
+    settings = FitSettings(
+        loss or SpectrumLoss(), optimizer or Optimizer(), tuple(regularizers), seed
+    )
+    stages = make_stages(schedule, names)
+    made = [_build_modules(o.sensor, found) for o, found in zip(watched, own, strict=True)]
     sensor_modules = [found for found, _ in made]
     settings = replace(
         settings, regularizers=(*settings.regularizers, *(t for _, found in made for t in found))
     )
     begun, current, fit, status = scene, unknowns, None, "budget"
     history: list[dict[str, Any]] = []
-    modules, terms = _made(begun, current)
-    free = _Free([modules, *sensor_modules])
+    modules, terms = _build_modules(begun, current)
+    free = _FreeParameters([modules, *sensor_modules])
     for number, stage in enumerate(stages):
-        if fit is not None and stage.renews:
+        if fit is not None and stage.rebuilds_modules:
             # What was a cloud goes on as a mesh.
-            begun = without_clouds(fit.twin())
+            begun = replace_clouds(fit.twin())
             for name, change in stage.remesh.items():
                 begun = begun.replace(name, mesh=change(begun[name].mesh))
             current = {
@@ -142,33 +149,38 @@ def reconstruct(
                     f"expected functions that make the modules of a stage that rebuilds, got a "
                     f"module for {fixed[0]!r}; give Unknown(lambda scene: ...)"
                 )
-            modules, terms = _made(begun, current)
-            free = _Free([modules, *sensor_modules])
+            modules, terms = _build_modules(begun, current)
+            free = _FreeParameters([modules, *sensor_modules])
         free.apply(stage)
         fit = Fit(
             begun,
-            [replace(o, model=m) for o, m in zip(watched, _models(stage, watched), strict=True)],
+            [
+                replace(o, model=m)
+                for o, m in zip(watched, _stage_models(stage, watched), strict=True)
+            ],
             list(modules.values()),
             [list(named.values()) for named in sensor_modules],
             stage=stage,
             settings=replace(settings, regularizers=(*settings.regularizers, *terms)),
-            rates=free.rates({**unknowns, **{n: u for named in own for n, u in named.items()}}),
-            position=(number, len(history), number == len(stages) - 1),
+            rates=free.learning_rates(
+                {**unknowns, **{n: u for named in own for n, u in named.items()}}
+            ),
+            stage_position=(number, len(history), number == len(stages) - 1),
         )
         status = fit.run(callbacks)
         history += fit.progress.history
     assert fit is not None
     with torch.no_grad():
-        twin, sensors = fit.applied()
+        twin, sensors = fit.apply_modules()
     final = history[-1]["loss"]
     if status == "diverged" and fit.progress.best is not None:
         final = fit.progress.best[1]
     return Reconstruction(
-        twin, sensors, fit.modules, history, status, len(history), final, End(fit)
+        twin, sensors, fit.modules, history, status, len(history), final, FitResult(fit)
     )
 
 
-def fit_at(
+def prepare_fit(
     scene: Scene,
     observations: Sequence[Observation],
     parameters: Unknowns,
@@ -187,8 +199,8 @@ def fit_at(
         regularizers: Added to the loss.
         seed: Of all random numbers.
     """
-    modules, terms = _made(scene, named_unknowns(parameters))
-    of_sensors = [_made(o.sensor, named_unknowns(o.parameters)) for o in observations]
+    modules, terms = _build_modules(scene, name_unknowns(parameters))
+    of_sensors = [_build_modules(o.sensor, name_unknowns(o.parameters)) for o in observations]
     terms += [term for _, found in of_sensors for term in found]
     return Fit(
         scene,
@@ -196,13 +208,13 @@ def fit_at(
         list(modules.values()),
         [list(found.values()) for found, _ in of_sensors],
         stage=Stage(),
-        settings=Settings(loss or SpectrumLoss(), Optimizer(), (*regularizers, *terms), seed),
+        settings=FitSettings(loss or SpectrumLoss(), Optimizer(), (*regularizers, *terms), seed),
         rates={},
-        position=(0, 0, True),
+        stage_position=(0, 0, True),
     )
 
 
-def _models(stage: Stage, observations: Sequence[Observation]) -> Sequence[ForwardModel]:
+def _stage_models(stage: Stage, observations: Sequence[Observation]) -> Sequence[ForwardModel]:
     """The forward model of every observation in a stage."""
     if stage.models and len(stage.models) != len(observations):
         raise InputError(
@@ -212,13 +224,15 @@ def _models(stage: Stage, observations: Sequence[Observation]) -> Sequence[Forwa
     return stage.models or [o.model for o in observations]
 
 
-def _made(target: Any, unknowns: Mapping[str, Unknown]) -> tuple[dict[str, nn.Module], list[Any]]:
+def _build_modules(
+    target: Any, unknowns: Mapping[str, Unknown]
+) -> tuple[dict[str, nn.Module], list[Any]]:
     """Modules of a scene or a sensor by name, each for what those before leave, and their terms."""
     modules: dict[str, nn.Module] = {}
     terms: list[Regularizer] = []
-    last = max((k for k, item in enumerate(unknowns.values()) if item.depends), default=0)
+    last = max((k for k, item in enumerate(unknowns.values()) if item.depends_on_target), default=0)
     for number, (name, unknown) in enumerate(unknowns.items()):
-        modules[name] = unknown.made(target)
+        modules[name] = unknown.build_module(target)
         if unknown.regularize is not None:
             terms += unknown.regularize(modules[name], target)
         if number < last:
@@ -227,7 +241,7 @@ def _made(target: Any, unknowns: Mapping[str, Unknown]) -> tuple[dict[str, nn.Mo
     return modules, terms
 
 
-class _Free:
+class _FreeParameters:
     """Which parameters are free: those that were so at first, of the unknowns of a stage."""
 
     def __init__(self, groups: Sequence[Mapping[str, nn.Module]]) -> None:
@@ -243,7 +257,7 @@ class _Free:
                 wanted = not stage.unknowns or name in stage.unknowns
                 parameter.requires_grad_(self._first[parameter] and wanted)
 
-    def rates(self, unknowns: Mapping[str, Unknown]) -> dict[nn.Parameter, float]:
+    def learning_rates(self, unknowns: Mapping[str, Unknown]) -> dict[nn.Parameter, float]:
         """Learning rates of single parameters."""
         found = {}
         for name, module in self._modules.items():

@@ -36,7 +36,7 @@ class Schedule:
     tolerance: NonNegative = 0.0
 
     @property
-    def widths_end(self) -> float:
+    def blur_end(self) -> float:
         """The step from which there are no extra widths: the last one at the latest."""
         return max(1.0, min(self.annealing * self.steps, self.steps - 1))
 
@@ -62,12 +62,12 @@ class Stage(Schedule):
     models: Sequence[ForwardModel] = ()
 
     @property
-    def renews(self) -> bool:
+    def rebuilds_modules(self) -> bool:
         """Whether modules are made anew."""
         return self.rebuild or bool(self.remesh)
 
 
-def checked_stages(
+def make_stages(
     schedule: Schedule | Sequence[Schedule] | None, names: Sequence[str]
 ) -> list[Stage]:
     """The schedule as stages.
@@ -91,7 +91,7 @@ def checked_stages(
                     f"expected names of parameters in stage {number + 1} ({', '.join(names)}), "
                     f"got {name!r}; correct it"
                 )
-        if number and stage.renews:
+        if number and stage.rebuilds_modules:
             kept = set(stage.unknowns or names)
         gone = [name for name in stage.unknowns if name not in kept]
         if gone:

@@ -20,11 +20,17 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import RayPaths, trace_coverage
-from invertwin.checks import ArrayLike, check_fields, checked_number, checked_tensor, plain
+from invertwin.checks import (
+    ArrayLike,
+    check_fields,
+    checked_number,
+    checked_tensor,
+    strip_derivatives,
+)
 from invertwin.errors import InputError
 from invertwin.limits import Count
-from invertwin.links.places import Places
-from invertwin.links.received import Received, Reception, spread_of
+from invertwin.links.places import ReceiverLocations
+from invertwin.links.received import LinkStatistics, PropagationSettings, delay_spread_from_moments
 from invertwin.links.transmitters import Transmitters
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
@@ -51,12 +57,12 @@ class CellSampling:
         check_fields(self)
 
     @property
-    def side(self) -> int:
+    def points_per_side(self) -> int:
         """Points along each side of a cell."""
         return math.isqrt(self.points - 1) + 1
 
 
-class Cells(Places):
+class Cells(ReceiverLocations):
     """Cells of a surface, which hides nothing and is at rest.
 
     Attributes:
@@ -64,48 +70,48 @@ class Cells(Places):
     """
 
     sampling: CellSampling
-    random: ClassVar[bool] = True
+    is_random: ClassVar[bool] = True
 
     @abstractmethod
-    def sampled(self, sampling: CellSampling) -> "Cells":
+    def with_sampling(self, sampling: CellSampling) -> "Cells":
         """The same cells with other numbers of points.
 
         Args:
             sampling: How many points.
         """
 
-    def finer(self, samples: int) -> "Cells":
+    def with_sample_count(self, samples: int) -> "Cells":
         """The same cells with so many points in all. See ``Places.finer``."""
         points = max(1, samples // len(self.areas))
-        return self.sampled(replace(self.sampling, points=points))
+        return self.with_sampling(replace(self.sampling, points=points))
 
     def fixed_visibility(self) -> "Cells | None":
         """The same cells without boundary paths. See ``Places.fixed_visibility``."""
         if not self.sampling.boundary:
             return None
-        return self.sampled(replace(self.sampling, boundary=False))
+        return self.with_sampling(replace(self.sampling, boundary=False))
 
     @abstractmethod
     def surface(self) -> Mesh:
         """The surface, in the world [m]."""
 
     @abstractmethod
-    def drawn(self, numbers: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
+    def sample_points(self, rng: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
         """Points spread evenly over every cell [m].
 
         Args:
-            numbers: What draws them.
+            rng: What draws them.
         """
 
     @abstractmethod
-    def cell_of(
-        self, place: Float64[Tensor, "row 3"], face: Int64[Tensor, " row"]
+    def find_cells(
+        self, points: Float64[Tensor, "row 3"], faces: Int64[Tensor, " row"]
     ) -> Int64[Tensor, " row"]:
         """Cells that hold points of the surface.
 
         Args:
-            place: The points [m].
-            face: Their triangles.
+            points: The points [m].
+            faces: Their triangles.
         """
 
     @property
@@ -113,9 +119,9 @@ class Cells(Places):
     def areas(self) -> Float64[Tensor, " cell"]:
         """Of the cells [m²]."""
 
-    def received(
-        self, scene: Scene, sensor: Transmitters, reception: Reception, seed: int
-    ) -> Received:
+    def link_statistics(
+        self, scene: Scene, sensor: Transmitters, propagation: PropagationSettings, seed: int
+    ) -> LinkStatistics:
         """Means over the cells. See ``Places.received``.
 
         The delay spread of a cell is that of the powers over excess delays: those of paths less
@@ -124,47 +130,51 @@ class Cells(Places):
         Raises:
             InputError: A reception whose fields add and jump at shadows, since no edge diffracts.
         """
-        if reception.bandwidth is not None and not reception.edges:
+        if propagation.bandwidth is not None and not propagation.edges:
             raise InputError(
                 "expected a reception for cells with bandwidth None, or with edges, got bandwidth "
-                f"{reception.bandwidth} and edges 0; such fields jump at shadows: give edges=1, "
+                f"{propagation.bandwidth} and edges 0; such fields jump at shadows: give edges=1, "
                 "or leave out the bandwidth"
             )
         numbers = np.random.default_rng(np.random.SeedSequence([seed, 1]))
-        points = self.drawn(numbers)
-        if reception.edges:
-            gain, moments = reception.added(scene, sensor, points.flatten(0, 1), seed)
+        points = self.sample_points(numbers)
+        if propagation.edges:
+            gain, moments = propagation.gains_and_moments(scene, sensor, points.flatten(0, 1), seed)
             shape = (len(gain), *self.shape)
             mean = moments.unflatten(1, points.shape[:2]).mean(2)
             gain = gain.unflatten(1, points.shape[:2]).mean(2)
-            return Received(gain.reshape(shape), spread_of(mean).reshape(shape))
+            return LinkStatistics(
+                gain.reshape(shape), delay_spread_from_moments(mean).reshape(shape)
+            )
 
         def measure(paths: RayPaths, tx: Tensor, rx: Tensor) -> Tensor:
-            return reception.moments(paths, tx, rx, sensor.terminals)
+            return propagation.path_moments(paths, tx, rx, sensor.mount)
 
         lit = trace_coverage(
             scene,
             sensor.positions,
             self.surface(),
             points.flatten(0, 1),
-            reception.frequency,
+            propagation.frequency,
             measure,
             3,
-            depth=reception.depth,
-            rays=reception.rays,
+            depth=propagation.depth,
+            rays=propagation.rays,
             boundary_samples=self.sampling.edge_points if self.sampling.boundary else 0,
             seed=seed,
         )
         mean = lit.amount.unflatten(1, points.shape[:2]).mean(2)
-        for part in lit.crossings:
-            cell = self.cell_of(part.place, part.face)
+        for part in lit.boundary_paths:
+            cell = self.find_cells(part.point, part.face)
             row = part.tx * mean.shape[1] + cell
             density = part.amount / self.areas[cell, None]
             mean = mean.flatten(0, 1).index_add(0, row, density).view(mean.shape)
-        aside = reception.aside(scene, sensor, points.flatten(0, 1), seed)
+        aside = propagation.panel_and_rough_moments(scene, sensor, points.flatten(0, 1), seed)
         mean = mean + aside.unflatten(1, points.shape[:2]).mean(2)
         shape = (len(mean), *self.shape)
-        return Received(mean[..., 0].reshape(shape), spread_of(mean).reshape(shape))
+        return LinkStatistics(
+            mean[..., 0].reshape(shape), delay_spread_from_moments(mean).reshape(shape)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +202,7 @@ class MapPlane(Cells):
             value = checked_tensor(
                 getattr(self, name), (3,), f"{name} of a map [m]", "give x, y, z"
             )
-            object.__setattr__(self, name, plain(value))
+            object.__setattr__(self, name, strip_derivatives(value))
         if not float(self._normal.norm()) > 0:
             raise InputError(
                 "expected sides of a map that span an area, got parallel ones or none; give two "
@@ -209,7 +219,7 @@ class MapPlane(Cells):
         low: ArrayLike,
         high: ArrayLike,
         height: float,
-        cell: float,
+        cell_size: float,
         sampling: CellSampling = CellSampling(),
     ) -> "MapPlane":
         """Cells over x and y at one height z.
@@ -218,7 +228,7 @@ class MapPlane(Cells):
             low: Least x and y [m].
             high: Greatest x and y [m].
             height: z [m].
-            cell: Length of a cell's sides; the nearest that divides the sides of the map [m].
+            cell_size: Length of a cell's sides; the nearest that divides the sides of the map [m].
             sampling: How many points.
 
         Raises:
@@ -230,7 +240,7 @@ class MapPlane(Cells):
             for n, v in (("low", low), ("high", high))
         ]
         z = checked_number(height, "height of a map [m]", -math.inf)
-        size = checked_number(cell, "size of cells [m]", 0.0, open_low=True)
+        size = checked_number(cell_size, "size of cells [m]", 0.0, open_low=True)
         x, y = (ends[1] - ends[0]).tolist()
         if not (x > 0 and y > 0):
             raise InputError("expected high beyond low in x and y; exchange them")
@@ -239,7 +249,7 @@ class MapPlane(Cells):
         sides = torch.tensor([[x, 0.0, 0.0], [0.0, y, 0.0]], dtype=torch.float64)
         return cls(corner, sides[0], sides[1], count, sampling)
 
-    def sampled(self, sampling: CellSampling) -> "MapPlane":
+    def with_sampling(self, sampling: CellSampling) -> "MapPlane":
         """The same cells with other numbers of points. See ``Cells.sampled``."""
         return replace(self, sampling=sampling)
 
@@ -252,7 +262,7 @@ class MapPlane(Cells):
     def centres(self) -> Float64[Tensor, "first second 3"]:
         """Middles of the cells [m]."""
         at = [(torch.arange(n, dtype=torch.float64) + 0.5) / n for n in self.count]
-        return self._at(at[0][:, None], at[1][None])
+        return self._point_at(at[0][:, None], at[1][None])
 
     @property
     def areas(self) -> Float64[Tensor, " cell"]:
@@ -263,23 +273,23 @@ class MapPlane(Cells):
     def surface(self) -> Mesh:
         """Two triangles. See ``Cells.surface``."""
         a, u, v = self.corner, self.first, self.second
-        return Mesh(torch.stack([a, a + u, a + u + v, a + v]), _HALVES)
+        return Mesh(torch.stack([a, a + u, a + u + v, a + v]), _TRIANGLES)
 
-    def drawn(self, numbers: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
+    def sample_points(self, rng: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
         """One point at random in each square of a finer grid. See ``Cells.drawn``."""
-        side = self.sampling.side
+        side = self.sampling.points_per_side
         lattice = [side * n for n in self.count]
-        jitter = torch.from_numpy(numbers.random((2, *lattice)))
+        jitter = torch.from_numpy(rng.random((2, *lattice)))
         s = (torch.arange(lattice[0])[:, None] + jitter[0]) / lattice[0]
         t = (torch.arange(lattice[1]) + jitter[1]) / lattice[1]
-        points = self._at(s, t).view(self.count[0], side, self.count[1], side, 3)
+        points = self._point_at(s, t).view(self.count[0], side, self.count[1], side, 3)
         return points.transpose(1, 2).reshape(-1, side * side, 3)
 
-    def cell_of(
-        self, place: Float64[Tensor, "row 3"], face: Int64[Tensor, " row"]
+    def find_cells(
+        self, points: Float64[Tensor, "row 3"], faces: Int64[Tensor, " row"]
     ) -> Int64[Tensor, " row"]:
         """Cells that hold points of the plane. See ``Cells.cell_of``."""
-        offset, n = place - self.corner, self._normal
+        offset, n = points - self.corner, self._normal
         n = n / n.square().sum()
         i = (torch.linalg.cross(offset, self.second.expand_as(offset)) @ n * self.count[0]).floor()
         j = (torch.linalg.cross(self.first.expand_as(offset), offset) @ n * self.count[1]).floor()
@@ -290,11 +300,11 @@ class MapPlane(Cells):
     def _normal(self) -> Tensor:
         return torch.linalg.cross(self.first, self.second)
 
-    def _at(self, s: Tensor, t: Tensor) -> Tensor:
+    def _point_at(self, s: Tensor, t: Tensor) -> Tensor:
         return self.corner + s[..., None] * self.first + t[..., None] * self.second
 
 
-_HALVES = torch.tensor([[0, 1, 2], [0, 2, 3]])
+_TRIANGLES = torch.tensor([[0, 1, 2], [0, 2, 3]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,14 +323,14 @@ class MapMesh(Cells):
     sampling: CellSampling = CellSampling()
 
     def __post_init__(self) -> None:
-        mesh = replace(self.mesh, vertices=plain(self.mesh.vertices))
+        mesh = replace(self.mesh, vertices=strip_derivatives(self.mesh.vertices))
         object.__setattr__(self, "mesh", mesh)
         if not bool((self.areas > 0).all()):
             raise InputError(
                 "expected triangles with an area for the cells of a map, got one without; remove it"
             )
 
-    def sampled(self, sampling: CellSampling) -> "MapMesh":
+    def with_sampling(self, sampling: CellSampling) -> "MapMesh":
         """The same cells with other numbers of points. See ``Cells.sampled``."""
         return replace(self, sampling=sampling)
 
@@ -339,10 +349,10 @@ class MapMesh(Cells):
         """The mesh. See ``Cells.surface``."""
         return self.mesh
 
-    def drawn(self, numbers: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
+    def sample_points(self, rng: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
         """One point at random in each of equal parts of the triangles. See ``Cells.drawn``."""
-        side, cells = self.sampling.side, len(self.mesh.faces)
-        jitter = torch.from_numpy(numbers.random((2, cells, side, side)))
+        side, cells = self.sampling.points_per_side, len(self.mesh.faces)
+        jitter = torch.from_numpy(rng.random((2, cells, side, side)))
         steps = torch.arange(side, dtype=torch.float64)
         # A square, of which the root of one side makes a triangle of even density.
         far = ((steps[:, None] + jitter[0]) / side).sqrt().flatten(1)[..., None]
@@ -350,8 +360,8 @@ class MapMesh(Cells):
         a, b, c = (corner[:, None] for corner in self.mesh.vertices[self.mesh.faces].unbind(1))
         return a + far * (b - a + across * (c - b))
 
-    def cell_of(
-        self, place: Float64[Tensor, "row 3"], face: Int64[Tensor, " row"]
+    def find_cells(
+        self, points: Float64[Tensor, "row 3"], faces: Int64[Tensor, " row"]
     ) -> Int64[Tensor, " row"]:
         """The triangles. See ``Cells.cell_of``."""
-        return face
+        return faces

@@ -18,7 +18,7 @@ _KINDS = {
 }
 
 
-def ray_paths_of(paths: Any, frequency: float) -> RayPaths:
+def ray_paths_from_sionna(paths: Any, frequency: float) -> RayPaths:
     """The `Paths` of Sionna RT 2.2 as ``RayPaths``.
 
     Its arrays must have one element with ``pattern="iso"`` and ``polarization="VH"``, so that its
@@ -60,8 +60,8 @@ def ray_paths_of(paths: Any, frequency: float) -> RayPaths:
         torch.from_numpy(rx),
         _rows(paths.tau, valid),
         torch.from_numpy(np.ascontiguousarray(matrix)),
-        _directions(paths.theta_t, paths.phi_t, valid),
-        _directions(paths.theta_r, paths.phi_r, valid),
+        _unit_vectors(paths.theta_t, paths.phi_t, valid),
+        _unit_vectors(paths.theta_r, paths.phi_r, valid),
         torch.from_numpy(np.where((known > 0)[..., None], places, 0.0)),
         torch.from_numpy(known),
         torch.full(known.shape, -1, dtype=torch.int64),
@@ -69,14 +69,14 @@ def ray_paths_of(paths: Any, frequency: float) -> RayPaths:
         (),
         _rows(paths.doppler, valid),
     )
-    return found.sorted()
+    return found.sort_rows()
 
 
 def _rows(values: Any, valid: np.ndarray) -> Tensor:
     return torch.from_numpy(np.asarray(values, dtype=np.float64)[valid])
 
 
-def _directions(theta: Any, phi: Any, valid: np.ndarray) -> Tensor:
+def _unit_vectors(theta: Any, phi: Any, valid: np.ndarray) -> Tensor:
     polar, around = _rows(theta, valid), _rows(phi, valid)
     ring = polar.sin()
     return torch.stack([ring * around.cos(), ring * around.sin(), polar.cos()], 1)

@@ -5,9 +5,9 @@ import math
 import torch
 
 from invertwin.channel import KINDS, RayPaths
-from invertwin.links.responses import Terminals, path_amplitudes
+from invertwin.links.responses import AntennaMount, path_amplitudes
 
-_DEFAULT = Terminals()
+_DEFAULT = AntennaMount()
 _HEADER = (
     f"{'path':>4} {'delay ns':>10} {'length m':>10} {'power dB':>9} {'departs az, el':>16} "
     f"{'arrives az, el':>16} {'Doppler Hz':>11}  what it meets"
@@ -17,8 +17,8 @@ _HEADER = (
 def path_table(
     paths: RayPaths,
     link: tuple[int, int] = (0, 0),
-    tx: Terminals = _DEFAULT,
-    rx: Terminals = _DEFAULT,
+    tx: AntennaMount = _DEFAULT,
+    rx: AntennaMount = _DEFAULT,
 ) -> str:
     """The paths of one link as text, the shortest first.
 
@@ -31,7 +31,7 @@ def path_table(
         tx: At the transmitters.
         rx: At the receivers.
     """
-    some = paths.between(*link)
+    some = paths.select_link(*link)
     amplitude, _ = path_amplitudes(some, tx, rx)
     power = 20 * torch.log10(amplitude.detach()[:, 0, 0].abs().clamp_min(1e-30))
     lines = [_HEADER]
@@ -43,14 +43,14 @@ def path_table(
         ]
         lines.append(
             f"{row:>4} {1e9 * some.delay[row].item():>10.3f} {some.length[row].item():>10.3f} "
-            f"{power[row].item():>9.2f} {_angles(some.departure[row].tolist()):>16} "
-            f"{_angles(some.arrival[row].tolist()):>16} {some.doppler[row].item():>11.2f}  "
+            f"{power[row].item():>9.2f} {_format_angles(some.departure[row].tolist()):>16} "
+            f"{_format_angles(some.arrival[row].tolist()):>16} {some.doppler[row].item():>11.2f}  "
             f"{', '.join(met) or 'line of sight'}"
         )
     return "\n".join(lines)
 
 
-def _angles(direction: list[float]) -> str:
+def _format_angles(direction: list[float]) -> str:
     x, y, z = direction
     azimuth = math.degrees(math.atan2(y, x))
     return f"{azimuth:.2f}, {math.degrees(math.atan2(z, math.hypot(x, y))):.2f}"

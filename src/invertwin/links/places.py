@@ -9,19 +9,19 @@ from torch import Tensor
 
 from invertwin.checks import checked_tensor
 from invertwin.errors import InputError
-from invertwin.links.received import Received, Reception
+from invertwin.links.received import LinkStatistics, PropagationSettings
 from invertwin.links.transmitters import Transmitters
 from invertwin.scene.scene import Scene
 
 
-class Places(ABC):
+class ReceiverLocations(ABC):
     """Where a ``RadioMap`` is asked for.
 
     Attributes:
-        random: Whether a seed draws points.
+        is_random: Whether a seed draws points.
     """
 
-    random: ClassVar[bool] = False
+    is_random: ClassVar[bool] = False
 
     @property
     @abstractmethod
@@ -29,19 +29,19 @@ class Places(ABC):
         """Of a map of one transmitter."""
 
     @abstractmethod
-    def received(
-        self, scene: Scene, sensor: Transmitters, reception: Reception, seed: int
-    ) -> Received:
+    def link_statistics(
+        self, scene: Scene, sensor: Transmitters, propagation: PropagationSettings, seed: int
+    ) -> LinkStatistics:
         """What arrives there.
 
         Args:
             scene: What is in the way.
             sensor: What sends.
-            reception: How paths are found, and how they add up.
+            propagation: How paths are found, and how they add up.
             seed: Of all that is drawn.
         """
 
-    def finer(self, samples: int) -> "Places":
+    def with_sample_count(self, samples: int) -> "ReceiverLocations":
         """The same places with so many points in all, where points are drawn.
 
         Args:
@@ -49,13 +49,13 @@ class Places(ABC):
         """
         return self
 
-    def fixed_visibility(self) -> "Places | None":
+    def fixed_visibility(self) -> "ReceiverLocations | None":
         """The same places without boundary paths, for ablation; None where there are none."""
         return None
 
 
 @dataclass(frozen=True, eq=False)
-class Points(Places):
+class ReceiverPoints(ReceiverLocations):
     """Single points.
 
     Attributes:
@@ -79,8 +79,8 @@ class Points(Places):
         """(number of points,)."""
         return (len(self.positions),)
 
-    def received(
-        self, scene: Scene, sensor: Transmitters, reception: Reception, seed: int
-    ) -> Received:
+    def link_statistics(
+        self, scene: Scene, sensor: Transmitters, propagation: PropagationSettings, seed: int
+    ) -> LinkStatistics:
         """What arrives at the points. See ``Places.received``."""
-        return reception.at(scene, sensor, self.positions, seed)
+        return propagation.link_statistics(scene, sensor, self.positions, seed)

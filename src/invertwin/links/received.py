@@ -25,20 +25,20 @@ from invertwin.checks import checked_number
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links.metasurface.panel import Metasurface, panel_paths
-from invertwin.links.responses import Terminals, frequency_response, path_amplitudes, phasors
+from invertwin.links.responses import AntennaMount, frequency_response, path_amplitudes, phasor
 from invertwin.links.scattered import scattered_moments
-from invertwin.links.spreads import path_powers, root
+from invertwin.links.spreads import path_powers, safe_sqrt
 from invertwin.links.transmitters import Transmitters
 from invertwin.scene.scene import Scene
 
-_RECEIVERS_AT_ONCE = 512
-_VALUES_AT_ONCE = 1 << 21
-_MOST_NODES = 1000  # Gauss's rule of more takes long to find
-_DEFAULT = Terminals()
+_RECEIVERS_PER_BATCH = 512
+_VALUES_PER_CHUNK = 1 << 21
+_MAX_NODES = 1000  # Gauss's rule of more takes long to find
+_DEFAULT = AntennaMount()
 
 
 @dataclass(frozen=True, eq=False)
-class Received:
+class LinkStatistics:
     """What arrives at places, for every transmitter.
 
     Attributes:
@@ -51,7 +51,7 @@ class Received:
 
 
 @dataclass(frozen=True, eq=False)
-class Reception:
+class PropagationSettings:
     """How paths between transmitters and receivers are found, and how they add up.
 
     Attributes:
@@ -75,7 +75,7 @@ class Reception:
     depth: int = 3
     edges: int = 0
     rays: int | None = 100_000
-    receivers: Terminals = field(default_factory=Terminals)
+    receivers: AntennaMount = field(default_factory=AntennaMount)
     panels: Sequence[Metasurface] = ()
     rough: Sampling | None = None
 
@@ -90,21 +90,21 @@ class Reception:
                 "the carrier alone"
             )
 
-    def paths(
-        self, scene: Scene, sensor: Transmitters, places: Float64[Tensor, "place 3"], seed: int
+    def trace_links(
+        self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
     ) -> RayPaths:
         """The paths from all transmitters to some receivers.
 
         Args:
             scene: What is in the way.
             sensor: What sends.
-            places: Of the receivers [m].
+            positions: Of the receivers [m].
             seed: Of the rays that find them.
         """
         found = trace_paths(
             scene,
             sensor.positions,
-            places,
+            positions,
             self.frequency,
             depth=self.depth,
             edges=self.edges,
@@ -113,50 +113,50 @@ class Reception:
         )
         if not self.panels:
             return found
-        over = panel_paths(scene, self.panels, sensor.positions, places, self.frequency)
+        over = panel_paths(scene, self.panels, sensor.positions, positions, self.frequency)
         return found + over
 
-    def at(
-        self, scene: Scene, sensor: Transmitters, places: Float64[Tensor, "place 3"], seed: int
-    ) -> Received:
+    def link_statistics(
+        self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
+    ) -> LinkStatistics:
         """What receivers get at points. Memory does not grow with their number, but for results.
 
         Args:
             scene: What is in the way.
             sensor: What sends.
-            places: Of the receivers [m].
+            positions: Of the receivers [m].
             seed: Of the rays that find paths.
         """
-        gain, moments = self.added(scene, sensor, places, seed)
-        return Received(gain, spread_of(moments))
+        gain, moments = self.gains_and_moments(scene, sensor, positions, seed)
+        return LinkStatistics(gain, delay_spread_from_moments(moments))
 
-    def added(
-        self, scene: Scene, sensor: Transmitters, places: Float64[Tensor, "place 3"], seed: int
+    def gains_and_moments(
+        self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
     ) -> tuple[Float64[Tensor, "tx place"], Float64[Tensor, "tx place 3"]]:
         """Gains at points, as paths add up, and sums of ``moments``. Arguments as in ``at``.
 
         Args:
             scene: What is in the way.
             sensor: What sends.
-            places: Of the receivers [m].
+            positions: Of the receivers [m].
             seed: Of the rays that find paths.
         """
 
-        def found(some: Tensor) -> tuple[Tensor, Tensor]:
-            paths = self.paths(scene, sensor, some, seed)
-            gain = received_gain(paths, self.bandwidth, sensor.terminals, self.receivers)
-            return gain.T, self.summed(paths, sensor, some)
+        def evaluate_batch(batch: Tensor) -> tuple[Tensor, Tensor]:
+            paths = self.trace_links(scene, sensor, batch, seed)
+            gain = received_gain(paths, self.bandwidth, sensor.mount, self.receivers)
+            return gain.T, self.sum_moments(paths, sensor, batch)
 
-        gain, moments = in_batches(found, places)
-        more = self.scattered(scene, sensor, places, seed)
+        gain, moments = evaluate_in_batches(evaluate_batch, positions)
+        more = self.rough_moments(scene, sensor, positions, seed)
         return gain + more[..., 0], moments + more
 
-    def moments(
+    def path_moments(
         self,
         paths: RayPaths,
         tx: Float64[Tensor, "tx 3"],
         rx: Float64[Tensor, "rx 3"],
-        terminals: Terminals,
+        tx_mount: AntennaMount,
     ) -> Float64[Tensor, "path 3"]:
         """Power of each path, and that times its excess delay [s] and the square of it [s²].
 
@@ -166,62 +166,62 @@ class Reception:
             paths: From ``trace_paths``.
             tx: Where the transmitters are [m].
             rx: Where the receivers are [m].
-            terminals: At the transmitters.
+            tx_mount: At the transmitters.
         """
-        power = path_powers(paths, terminals, self.receivers)
+        power = path_powers(paths, tx_mount, self.receivers)
         excess = paths.delay - (rx[paths.rx] - tx[paths.tx]).norm(dim=1) / SPEED_OF_LIGHT
         return torch.stack([power, power * excess, power * excess**2], 1)
 
-    def summed(
-        self, paths: RayPaths, sensor: Transmitters, places: Float64[Tensor, "place 3"]
+    def sum_moments(
+        self, paths: RayPaths, sensor: Transmitters, positions: Float64[Tensor, "place 3"]
     ) -> Float64[Tensor, "tx place 3"]:
         """Sums of ``moments`` over the paths of each link.
 
         Args:
             paths: From the sensor to the places.
             sensor: What sends.
-            places: Of the receivers [m].
+            positions: Of the receivers [m].
         """
-        each = self.moments(paths, sensor.positions, places, sensor.terminals)
-        return _added(paths, each).view(*paths.counts, 3)
+        each = self.path_moments(paths, sensor.positions, positions, sensor.mount)
+        return _sum_over_paths(paths, each).view(*paths.counts, 3)
 
-    def aside(
-        self, scene: Scene, sensor: Transmitters, places: Float64[Tensor, "place 3"], seed: int
+    def panel_and_rough_moments(
+        self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
     ) -> Float64[Tensor, "tx place 3"]:
         """Sums of ``moments`` of what ``trace_coverage`` does not trace: panels, rough surfaces.
 
         Args:
             scene: What is in the way.
             sensor: What sends.
-            places: Of the receivers [m].
+            positions: Of the receivers [m].
             seed: Of the paths that are drawn.
         """
 
-        def found(some: Tensor) -> tuple[Tensor]:
-            over = panel_paths(scene, self.panels, sensor.positions, some, self.frequency)
-            return (self.summed(over, sensor, some),)
+        def evaluate_batch(batch: Tensor) -> tuple[Tensor]:
+            over = panel_paths(scene, self.panels, sensor.positions, batch, self.frequency)
+            return (self.sum_moments(over, sensor, batch),)
 
-        total = self.scattered(scene, sensor, places, seed)
-        return total + in_batches(found, places)[0] if self.panels else total
+        total = self.rough_moments(scene, sensor, positions, seed)
+        return total + evaluate_in_batches(evaluate_batch, positions)[0] if self.panels else total
 
-    def scattered(
-        self, scene: Scene, sensor: Transmitters, places: Float64[Tensor, "place 3"], seed: int
+    def rough_moments(
+        self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
     ) -> Float64[Tensor, "tx place 3"]:
         """What rough surfaces scatter to receivers: sums of ``moments``, 0 where it is left out.
 
         Args:
             scene: What scatters.
             sensor: What sends.
-            places: Of the receivers [m].
+            positions: Of the receivers [m].
             seed: Of the paths that are drawn.
         """
         if self.rough is None:
-            return places.new_zeros(len(sensor.positions), len(places), 3)
+            return positions.new_zeros(len(sensor.positions), len(positions), 3)
         return scattered_moments(
             scene,
             sensor,
             self.receivers,
-            places,
+            positions,
             self.frequency,
             self.rough,
             seed,
@@ -229,11 +229,11 @@ class Reception:
             rays=self.rays,
         )
 
-    def responses(
+    def frequency_responses(
         self,
         scene: Scene,
         sensor: Transmitters,
-        places: Float64[Tensor, "place 3"],
+        positions: Float64[Tensor, "place 3"],
         frequencies: Float64[Tensor, " frequency"],
         seed: int,
     ) -> Complex128[Tensor, "tx place frequency"]:
@@ -242,7 +242,7 @@ class Reception:
         Args:
             scene: What is in the way.
             sensor: What sends.
-            places: Of the receivers [m].
+            positions: Of the receivers [m].
             frequencies: [Hz].
             seed: Of the rays that find paths.
 
@@ -255,40 +255,41 @@ class Reception:
                 f"{self.rough}; scattered power has no phase: leave it out"
             )
 
-        def found(some: Tensor) -> tuple[Tensor]:
-            paths = self.paths(scene, sensor, some, seed)
-            ends = {"tx": sensor.terminals, "rx": self.receivers}
+        def evaluate_batch(batch: Tensor) -> tuple[Tensor]:
+            paths = self.trace_links(scene, sensor, batch, seed)
+            ends = {"tx": sensor.mount, "rx": self.receivers}
             return (frequency_response(paths, frequencies, **ends)[:, 0, :, 0].transpose(0, 1),)
 
-        return in_batches(found, places)[0]
+        return evaluate_in_batches(evaluate_batch, positions)[0]
 
 
-def spread_of(moments: Float64[Tensor, "*link 3"]) -> Float64[Tensor, "*link"]:
-    """Root mean square spread of delays [s], of sums of ``Reception.moments``.
+def delay_spread_from_moments(moments: Float64[Tensor, "*link 3"]) -> Float64[Tensor, "*link"]:
+    """Root mean square spread of delays [s], of sums of ``PropagationSettings.moments``.
 
     Args:
         moments: Power, and its first and second moment over excess delay.
     """
     power, first, second = moments.unbind(-1)
     safe = torch.where(power > 0, power, 1.0)
-    return root(second / safe - (first / safe) ** 2)
+    return safe_sqrt(second / safe - (first / safe) ** 2)
 
 
-def in_batches(
-    found: Callable[[Tensor], tuple[Tensor, ...]], places: Float64[Tensor, "place 3"]
+def evaluate_in_batches(
+    evaluate: Callable[[Tensor], tuple[Tensor, ...]], positions: Float64[Tensor, "place 3"]
 ) -> list[Tensor]:
     """Tables [tx, place, …] of many places, some at a time.
 
     What derivatives need is not kept, but computed again for each batch.
 
     Args:
-        found: Tables of some places; the same each time it is called.
-        places: All of them.
+        evaluate: Tables of some places; the same each time it is called.
+        positions: All of them.
     """
-    parts = places.split(_RECEIVERS_AT_ONCE)
+    parts = positions.split(_RECEIVERS_PER_BATCH)
     again = len(parts) > 1 and torch.is_grad_enabled()
     tables = [
-        checkpoint(found, some, use_reentrant=False) if again else found(some) for some in parts
+        checkpoint(evaluate, some, use_reentrant=False) if again else evaluate(some)
+        for some in parts
     ]
     return [torch.cat(column, 1) for column in zip(*tables, strict=True)]
 
@@ -296,8 +297,8 @@ def in_batches(
 def received_gain(
     paths: RayPaths,
     bandwidth: float | None = None,
-    tx: Terminals = _DEFAULT,
-    rx: Terminals = _DEFAULT,
+    tx: AntennaMount = _DEFAULT,
+    rx: AntennaMount = _DEFAULT,
 ) -> Float64[Tensor, "rx tx"]:
     """Received over sent power of every link; 0 where no path leads.
 
@@ -310,16 +311,16 @@ def received_gain(
     """
     amplitude, delay = path_amplitudes(paths, tx, rx)
     if bandwidth is None:
-        total = _added(paths, torch.view_as_real(amplitude).square().sum(-1))
+        total = _sum_over_paths(paths, torch.view_as_real(amplitude).square().sum(-1))
     elif not bandwidth:
-        field = _added(paths, amplitude * phasors(-paths.frequency * delay))
+        field = _sum_over_paths(paths, amplitude * phasor(-paths.frequency * delay))
         total = torch.view_as_real(field).square().sum(-1)
     else:
-        total = _band_mean(paths, amplitude * phasors(-paths.frequency * delay), delay, bandwidth)
+        total = _band_mean(paths, amplitude * phasor(-paths.frequency * delay), delay, bandwidth)
     return total.mean((1, 2)).view(paths.counts).T
 
 
-def _added(paths: RayPaths, values: Tensor) -> Tensor:
+def _sum_over_paths(paths: RayPaths, values: Tensor) -> Tensor:
     """Sums over the paths of each link, [link, …]."""
     total = values.new_zeros(paths.counts[0] * paths.counts[1], *values.shape[1:])
     return total.index_add(0, paths.link, values)
@@ -327,7 +328,7 @@ def _added(paths: RayPaths, values: Tensor) -> Tensor:
 
 def _band_mean(paths: RayPaths, field: Tensor, delay: Tensor, bandwidth: float) -> Tensor:
     """⟨|H|²⟩ over the band, of each link: by pairs of few paths, over frequencies of many."""
-    row, there = (table.flatten(0, 1) for table in paths.padded())
+    row, there = (table.flatten(0, 1) for table in paths.pad_links())
     if not row.shape[1]:
         return delay.new_zeros(len(row), *delay.shape[1:])
     filled = there[..., None, None]
@@ -338,29 +339,31 @@ def _band_mean(paths: RayPaths, field: Tensor, delay: Tensor, bandwidth: float) 
         middle = torch.where(there.any(1), 0.5 * (ends[0] - ends[1]), 0.0)
         widest = float((ends[0] + ends[1]).clamp_min(0.0).max())
     nodes = _node_count(math.pi * bandwidth * widest)
-    pairs = nodes > min(row.shape[1], _MOST_NODES)
+    pairs = nodes > min(row.shape[1], _MAX_NODES)
     cost = row.shape[1] * (row.shape[1] if pairs else nodes) * field.shape[1] * field.shape[2]
     found = []
-    for some in torch.arange(len(row)).split(max(1, _VALUES_AT_ONCE // cost)):
+    for some in torch.arange(len(row)).split(max(1, _VALUES_PER_CHUNK // cost)):
         parts = torch.where(filled[some], field[row[some]], 0.0)
         late = torch.where(filled[some], delay[row[some]] - middle[some, None, None, None], 0.0)
         late = bandwidth * late
-        found.append(_over_pairs(parts, late) if pairs else _over_nodes(parts, late, nodes))
+        found.append(
+            _sum_over_pairs(parts, late) if pairs else _mean_over_nodes(parts, late, nodes)
+        )
     return torch.cat(found)
 
 
-def _over_pairs(field: Tensor, late: Tensor) -> Tensor:
+def _sum_over_pairs(field: Tensor, delay_cycles: Tensor) -> Tensor:
     """Σᵢ Σⱼ fᵢ fⱼ* sinc(B(τᵢ − τⱼ)) of each link."""
     parts = torch.view_as_real(field)
-    apart = late[:, :, None] - late[:, None]
+    apart = delay_cycles[:, :, None] - delay_cycles[:, None]
     found = torch.einsum("lirtc,lijrt,ljrtc->lrt", parts, torch.sinc(apart), parts)
     return found.clamp_min(0.0)  # rounding may leave a little less than nothing
 
 
-def _over_nodes(field: Tensor, late: Tensor, count: int) -> Tensor:
+def _mean_over_nodes(field: Tensor, delay_cycles: Tensor, count: int) -> Tensor:
     """The same as a mean of |H|² over frequencies in the band, those of Gauss's rule."""
-    places, weights = _nodes(count)
-    total = torch.einsum("lirt,lirtn->lrtn", field, phasors(-0.5 * late[..., None] * places))
+    places, weights = _gauss_nodes(count)
+    total = torch.einsum("lirt,lirtn->lrtn", field, phasor(-0.5 * delay_cycles[..., None] * places))
     return 0.5 * torch.view_as_real(total).square().sum(-1) @ weights
 
 
@@ -370,5 +373,5 @@ def _node_count(phase: float) -> int:
 
 
 @cache
-def _nodes(count: int) -> tuple[Tensor, Tensor]:
+def _gauss_nodes(count: int) -> tuple[Tensor, Tensor]:
     return tuple(torch.from_numpy(values) for values in leggauss(count))  # type: ignore[return-value]

@@ -19,23 +19,23 @@ from invertwin.errors import InputError
 from invertwin.runtime.memory import require_memory
 from invertwin.scene import AntennaArray
 
-_VALUES_AT_ONCE = 1 << 21
+_VALUES_PER_CHUNK = 1 << 21
 _VERTICAL = (0.0, 0.0, 1.0)  # of V in ``RayPaths``
 _UP = (0.0, 1.0, 0.0)  # of V in the frame of an array
-_TURN = 1e-4  # rad: half the step over which fields of antennas are compared
+_ROTATION_STEP = 1e-4  # rad: half the step over which fields of antennas are compared
 
 
-def _upright() -> Tensor:
+def _default_axes() -> Tensor:
     """Axes of an array whose y axis is the world's z, and whose boresight is the world's x."""
     return torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
 
 
-def _single() -> AntennaArray:
+def _isotropic_element() -> AntennaArray:
     return AntennaArray(torch.zeros(1, 3, dtype=torch.float64))
 
 
 @dataclass(frozen=True, eq=False)
-class Terminals:
+class AntennaMount:
     """What stands at the places of transmitters, or of receivers: the same array at each.
 
     V and H of the array's polarisation are about its y axis. By default a terminal is one isotropic
@@ -50,8 +50,8 @@ class Terminals:
         InputError: Rotations of another shape, or that are not orthonormal.
     """
 
-    array: AntennaArray = field(default_factory=_single)
-    rotations: Float64[Tensor, "*place 3 3"] = field(default_factory=_upright)
+    array: AntennaArray = field(default_factory=_isotropic_element)
+    rotations: Float64[Tensor, "*place 3 3"] = field(default_factory=_default_axes)
 
     def __post_init__(self) -> None:
         do = "give the axes as columns, for all or for each place"
@@ -63,16 +63,16 @@ class Terminals:
             raise InputError(f"expected rotations of terminals with orthonormal columns; {do}")
         object.__setattr__(self, "rotations", turns)
 
-    def weights(
-        self, direction: Float64[Tensor, "path 3"], place: Int64[Tensor, " path"]
+    def element_weights(
+        self, direction: Float64[Tensor, "path 3"], index: Int64[Tensor, " path"]
     ) -> Complex128[Tensor, "path element 2"]:
         """Field of each element along directions, over V and H of ``RayPaths``.
 
         Args:
             direction: Unit vectors in the world, away from the terminal.
-            place: Its number.
+            index: Its number.
         """
-        turn = self._turns(place)
+        turn = self._rotations_of(index)
         local = torch.einsum("pij,pi->pj", turn, direction)
         gain = self.array.pattern.gain(local)
         lit = gain > 0  # a root of zero has no derivative
@@ -81,14 +81,14 @@ class Terminals:
         basis = polarisations(direction, torch.tensor(_VERTICAL, dtype=torch.float64))
         change = torch.einsum("pwi,pij,pbj->pwb", basis, turn, own).to(torch.complex128)
         jones = self.array.jones
-        mixed = jones.towards(local).expand(len(local), -1, -1)
+        mixed = jones.evaluate(local).expand(len(local), -1, -1)
         weights = torch.einsum("pwb,ek,pkb->pew", change, jones.mixtures, mixed)
         return strength[:, None, None] * weights
 
-    def slopes(
+    def element_slopes(
         self,
         direction: Float64[Tensor, "path 3"],
-        place: Int64[Tensor, " path"],
+        index: Int64[Tensor, " path"],
         axis: Float64[Tensor, "path 3"],
         wave_number: float,
     ) -> Complex128[Tensor, "path element 2"]:
@@ -99,7 +99,7 @@ class Terminals:
 
         Args:
             direction: Unit vectors in the world, away from the terminal.
-            place: Its number.
+            index: Its number.
             axis: Unit vectors in the world.
             wave_number: k [1/m].
         """
@@ -110,7 +110,7 @@ class Terminals:
         basis = polarisations(direction, up)
         # A difference works in every mode of differentiation, and for patterns that are tables.
         sides = []
-        for sine in (_TURN, -_TURN):
+        for sine in (_ROTATION_STEP, -_ROTATION_STEP):
             cosine = math.sqrt(1 - sine**2)
             way = direction * cosine + moved * sine + kept * (1 - cosine)
             # What the basis there is over the one here, turned with the direction.
@@ -118,39 +118,39 @@ class Terminals:
             along = axis[:, None] * (basis @ axis[..., None])
             turned = basis * cosine + across * sine + along * (1 - cosine)
             change = turned @ polarisations(way, up).mT
-            sides.append(self.weights(way, place) @ change.to(torch.complex128).mT)
-        slope = (sides[0] - sides[1]) / (2 * _TURN)
-        ahead = 1j * wave_number * self.advances(moved, place)[..., None]
-        return slope + ahead * self.weights(direction, place)
+            sides.append(self.element_weights(way, index) @ change.to(torch.complex128).mT)
+        slope = (sides[0] - sides[1]) / (2 * _ROTATION_STEP)
+        ahead = 1j * wave_number * self.element_advances(moved, index)[..., None]
+        return slope + ahead * self.element_weights(direction, index)
 
-    def advances(
-        self, direction: Float64[Tensor, "path 3"], place: Int64[Tensor, " path"]
+    def element_advances(
+        self, direction: Float64[Tensor, "path 3"], index: Int64[Tensor, " path"]
     ) -> Float64[Tensor, "path element"]:
         """How much shorter the path is for each element than for the place itself [m].
 
         Args:
             direction: Unit vectors in the world, away from the terminal.
-            place: Its number.
+            index: Its number.
         """
-        offsets = torch.einsum("pij,ej->pei", self._turns(place), self.array.positions)
+        offsets = torch.einsum("pij,ej->pei", self._rotations_of(index), self.array.positions)
         return torch.einsum("pei,pi->pe", offsets, direction)
 
-    def _turns(self, place: Tensor) -> Tensor:
+    def _rotations_of(self, index: Tensor) -> Tensor:
         if self.rotations.ndim == 2:
-            return self.rotations.expand(len(place), 3, 3)
-        if len(place) and int(place.max()) >= len(self.rotations):
+            return self.rotations.expand(len(index), 3, 3)
+        if len(index) and int(index.max()) >= len(self.rotations):
             raise InputError(
-                f"expected a rotation for each of {int(place.max()) + 1} places or more, got "
+                f"expected a rotation for each of {int(index.max()) + 1} places or more, got "
                 f"{len(self.rotations)}; give one for all, or one for each"
             )
-        return self.rotations[place]
+        return self.rotations[index]
 
 
-_DEFAULT = Terminals()
+_DEFAULT = AntennaMount()
 
 
 def path_amplitudes(
-    paths: RayPaths, tx: Terminals = _DEFAULT, rx: Terminals = _DEFAULT
+    paths: RayPaths, tx: AntennaMount = _DEFAULT, rx: AntennaMount = _DEFAULT
 ) -> tuple[Complex128[Tensor, "path rx_ant tx_ant"], Float64[Tensor, "path rx_ant tx_ant"]]:
     """Coefficient and delay [s] of every path between every two elements.
 
@@ -159,26 +159,26 @@ def path_amplitudes(
         tx: At the transmitters.
         rx: At the receivers.
     """
-    sent = tx.weights(paths.departure, paths.tx)
-    received = rx.weights(paths.arrival, paths.rx)
+    sent = tx.element_weights(paths.departure, paths.tx)
+    received = rx.element_weights(paths.arrival, paths.rx)
     amplitude = torch.einsum("pri,pij,ptj->prt", received, paths.coefficient, sent)
     if paths.slopes is not None and paths.axes is not None:
-        amplitude = amplitude + _by_slopes(paths, paths.slopes, paths.axes, tx, rx)
-    ahead = rx.advances(paths.arrival, paths.rx)[:, :, None]
-    ahead = ahead + tx.advances(paths.departure, paths.tx)[:, None]
+        amplitude = amplitude + _slope_diffraction(paths, paths.slopes, paths.axes, tx, rx)
+    ahead = rx.element_advances(paths.arrival, paths.rx)[:, :, None]
+    ahead = ahead + tx.element_advances(paths.departure, paths.tx)[:, None]
     return amplitude, paths.delay[:, None, None] - ahead / SPEED_OF_LIGHT
 
 
-def _by_slopes(
-    paths: RayPaths, slopes: Tensor, axes: Tensor, tx: Terminals, rx: Terminals
+def _slope_diffraction(
+    paths: RayPaths, slopes: Tensor, axes: Tensor, tx: AntennaMount, rx: AntennaMount
 ) -> Tensor:
     """What edges add where the antennas' fields are uneven across the rays."""
     rows = torch.nonzero(axes.detach().flatten(1).abs().amax(1) > 0)[:, 0]
     k = 2 * math.pi * paths.frequency / SPEED_OF_LIGHT
     ways, places = (paths.departure[rows], paths.arrival[rows]), (paths.tx[rows], paths.rx[rows])
     ends = list(zip((tx, rx), ways, places, axes[rows].unbind(1), strict=True))
-    even = [end.weights(way, place) for end, way, place, _ in ends]
-    uneven = [end.slopes(way, place, axis, k) for end, way, place, axis in ends]
+    even = [end.element_weights(way, place) for end, way, place, _ in ends]
+    uneven = [end.element_slopes(way, place, axis, k) for end, way, place, axis in ends]
     by_tx, by_rx = slopes[rows].unbind(1)
     added = torch.einsum("pri,pij,ptj->prt", even[1], by_tx, uneven[0])
     added = added + torch.einsum("pri,pij,ptj->prt", uneven[1], by_rx, even[0])
@@ -189,8 +189,8 @@ def frequency_response(
     paths: RayPaths,
     frequencies: ArrayLike,
     *,
-    tx: Terminals = _DEFAULT,
-    rx: Terminals = _DEFAULT,
+    tx: AntennaMount = _DEFAULT,
+    rx: AntennaMount = _DEFAULT,
 ) -> Complex128[Tensor, "rx rx_ant tx tx_ant frequency"]:
     """H(f) = Σ a exp(−j2πfτ) between all elements; zero where no path leads.
 
@@ -208,7 +208,7 @@ def frequency_response(
     """
     swept = torch.atleast_1d(torch.as_tensor(frequencies, dtype=torch.float64))
     swept = checked_tensor(swept, (None,), "frequencies [Hz]", "give one or several")
-    return _responses(paths, swept, torch.zeros(1, dtype=torch.float64), tx, rx)[..., 0, :]
+    return _evaluate_responses(paths, swept, torch.zeros(1, dtype=torch.float64), tx, rx)[..., 0, :]
 
 
 def ofdm_channel(
@@ -218,8 +218,8 @@ def ofdm_channel(
     spacing: float,
     symbols: int = 1,
     cyclic_prefix: float = 0.0,
-    tx: Terminals = _DEFAULT,
-    rx: Terminals = _DEFAULT,
+    tx: AntennaMount = _DEFAULT,
+    rx: AntennaMount = _DEFAULT,
 ) -> Complex128[Tensor, "rx rx_ant tx tx_ant symbol subcarrier"]:
     """The channel of every symbol and subcarrier of OFDM.
 
@@ -244,10 +244,12 @@ def ofdm_channel(
     step = checked_number(spacing, "subcarrier spacing [Hz]", 0.0, open_low=True)
     prefix = checked_number(cyclic_prefix, "cyclic prefix [s]", 0.0)
     instants = checked_count(symbols, "symbols", 1)
-    _require(paths, count * instants, tx, rx)
+    _require_channel_memory(paths, count * instants, tx, rx)
     number = torch.arange(instants, dtype=torch.float64)
     grid = torch.arange(count, dtype=torch.float64) - count // 2
-    return _responses(paths, paths.frequency + grid * step, number * (1 / step + prefix), tx, rx)
+    return _evaluate_responses(
+        paths, paths.frequency + grid * step, number * (1 / step + prefix), tx, rx
+    )
 
 
 def impulse_response(
@@ -256,8 +258,8 @@ def impulse_response(
     bandwidth: float,
     taps: int,
     start: float = 0.0,
-    tx: Terminals = _DEFAULT,
-    rx: Terminals = _DEFAULT,
+    tx: AntennaMount = _DEFAULT,
+    rx: AntennaMount = _DEFAULT,
 ) -> Complex128[Tensor, "rx rx_ant tx tx_ant tap"]:
     """The impulse response in a band about the carrier: h_n = Σ a exp(−j2πf₀τ) sinc(B(τ − t_n)).
 
@@ -279,36 +281,38 @@ def impulse_response(
     count = checked_count(taps, "taps", 1)
     first = checked_number(start, "start [s]", -math.inf)
     amplitude, delay = path_amplitudes(paths, tx, rx)
-    turned = amplitude * phasors(-paths.frequency * delay)
+    turned = amplitude * phasor(-paths.frequency * delay)
     shape = (len(paths), *amplitude.shape[1:], count)
     require_memory(16.0 * math.prod(shape), "an impulse response", "ask for fewer taps", "taps")
     times = first + torch.arange(count, dtype=torch.float64) / band
     values = turned[..., None] * torch.sinc(band * (delay[..., None] - times))
-    return _by_link(paths, values)
+    return _sum_by_link(paths, values)
 
 
-def _responses(
-    paths: RayPaths, frequencies: Tensor, times: Tensor, tx: Terminals, rx: Terminals
+def _evaluate_responses(
+    paths: RayPaths, frequencies: Tensor, times: Tensor, tx: AntennaMount, rx: AntennaMount
 ) -> Tensor:
     """H over [rx, rx_ant, tx, tx_ant, time, frequency]."""
     if not len(frequencies):
         raise InputError("expected at least one frequency, got none; give one or several [Hz]")
     amplitude, delay = path_amplitudes(paths, tx, rx)
-    _require(paths, len(times) * len(frequencies), tx, rx)
+    _require_channel_memory(paths, len(times) * len(frequencies), tx, rx)
     pairs = amplitude.shape[1] * amplitude.shape[2]
     # Delays change with time: a Doppler shift ν of the carrier f₀ is dτ/dt = −ν/f₀.
     rate = -paths.doppler / paths.frequency
     parts = []
     for some in frequencies.split(
-        max(1, _VALUES_AT_ONCE // max(1, len(paths) * pairs * len(times)))
+        max(1, _VALUES_PER_CHUNK // max(1, len(paths) * pairs * len(times)))
     ):
         moved = times[:, None] * rate[:, None, None, None, None]
-        turn = phasors(-some * (delay[..., None, None] + moved))
-        parts.append(_by_link(paths, amplitude[..., None, None] * turn))
+        turn = phasor(-some * (delay[..., None, None] + moved))
+        parts.append(_sum_by_link(paths, amplitude[..., None, None] * turn))
     return torch.cat(parts, -1)
 
 
-def _require(paths: RayPaths, count: int, tx: Terminals, rx: Terminals) -> None:
+def _require_channel_memory(
+    paths: RayPaths, count: int, tx: AntennaMount, rx: AntennaMount
+) -> None:
     """Refuse a channel that does not fit into the memory."""
     elements = len(tx.array.positions) * len(rx.array.positions)
     values = float(paths.counts[0] * paths.counts[1] * elements) * count
@@ -316,7 +320,7 @@ def _require(paths: RayPaths, count: int, tx: Terminals, rx: Terminals) -> None:
     require_memory(32 * values, "a channel", "ask for fewer frequencies, symbols or elements")
 
 
-def _by_link(paths: RayPaths, values: Tensor) -> Tensor:
+def _sum_by_link(paths: RayPaths, values: Tensor) -> Tensor:
     """Sums over the paths of each link: [rx, rx_ant, tx, tx_ant, ...]."""
     sent, received = paths.counts
     total = torch.zeros(sent * received, *values.shape[1:], dtype=values.dtype)
@@ -324,7 +328,7 @@ def _by_link(paths: RayPaths, values: Tensor) -> Tensor:
     return total.movedim((1, 2, 0, 3), (0, 1, 2, 3))
 
 
-def phasors(cycles: Float64[Tensor, "*any"]) -> Complex128[Tensor, "*any"]:
+def phasor(cycles: Float64[Tensor, "*any"]) -> Complex128[Tensor, "*any"]:
     """exp(j2π cycles), of whole cycles less.
 
     Args:

@@ -5,7 +5,8 @@ roughness goes everywhere, by ``Material.incoherent``: the lobes of ``EffectiveR
 the one about the mirror direction has what heights take off the mirror.
 
 Two kinds of paths add up: those that scatter at each of their bounces (``deposit_power``), and
-those that scatter once, with mirrors before or after (``trace_scattered``). Paths that scatter
+those that scatter once, with mirrors before or after (``trace_single_scattering``). Paths that
+scatter
 twice and are mirrored as well are left out.
 """
 
@@ -17,15 +18,15 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, RayPaths, Sampling, deposit_power, trace_scattered
+from invertwin.channel import Grid, Link, RayPaths, Sampling, deposit_power, trace_single_scattering
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.links.responses import Terminals
+from invertwin.links.responses import AntennaMount
 from invertwin.links.transmitters import Transmitters
-from invertwin.scene import Isotropic, Material, Pattern, Scene, Surface
+from invertwin.scene import Isotropic, Material, Pattern, ScatteringLaw, Scene
 from invertwin.scene.antenna import COSINE_COUNT
 
-_PLACES_AT_ONCE = 8192
+_POSITIONS_PER_BATCH = 8192
 _BINS = 64  # of length; moments are exact whatever their number
 _ANGLES = 360  # of a turned pattern about its axis
 
@@ -33,8 +34,8 @@ _ANGLES = 360  # of a turned pattern about its axis
 def scattered_moments(
     scene: Scene,
     sensor: Transmitters,
-    receivers: Terminals,
-    places: Float64[Tensor, "place 3"],
+    receivers: AntennaMount,
+    positions: Float64[Tensor, "place 3"],
     frequency: float,
     sampling: Sampling,
     seed: int,
@@ -51,7 +52,7 @@ def scattered_moments(
         scene: What scatters; surfaces, no clouds.
         sensor: What sends.
         receivers: Antenna and axes of every receiver.
-        places: Of the receivers [m].
+        positions: Of the receivers [m].
         frequency: [Hz].
         sampling: How many paths are drawn, over all receivers; most bounces of a path that
             scatters at each.
@@ -63,41 +64,43 @@ def scattered_moments(
         InputError: Axes of antennas that carry derivatives, or axes of its own for each receiver
             with a pattern.
     """
-    rough = _scattering(scene, frequency)
+    rough = _incoherent_scene(scene, frequency)
     if rough is None:
-        return places.new_zeros(len(sensor.positions), len(places), 3)
-    if sensor.terminals.rotations.requires_grad or receivers.rotations.requires_grad:
+        return positions.new_zeros(len(sensor.positions), len(positions), 3)
+    if sensor.mount.rotations.requires_grad or receivers.rotations.requires_grad:
         raise InputError(
             "expected axes of antennas without derivatives where rough surfaces scatter, got some "
             "that carry them; scattered power has none by axes: detach them"
         )
-    grid = _lengths(rough, (sensor.positions.detach(), places.detach()), sampling.depth)
-    parts = places.split(_PLACES_AT_ONCE)
+    grid = _length_grid(rough, (sensor.positions.detach(), positions.detach()), sampling.depth)
+    parts = positions.split(_POSITIONS_PER_BATCH)
     rows: list[Tensor] = []
     for number in range(len(sensor.positions)):
         one = sensor.frames([number])
         found: list[Tensor] = []
         for batch, some in enumerate(parts):
-            link = _link(one, receivers, some, frequency)
-            drawn = _share(sampling, len(some) / len(places))
+            link = _build_link(one, receivers, some, frequency)
+            drawn = _scale_sampling(sampling, len(some) / len(positions))
             power = deposit_power(rough, link, grid, sampling=drawn, seed=seed + batch)
-            found.append(_moments(power[..., 0, 0].double(), grid, link))
+            found.append(_delay_moments(power[..., 0, 0].double(), grid, link))
         rows.append(torch.cat(found))
     total = torch.stack(rows)
     if depth < 2:
         return total
 
-    def measure(out: RayPaths, home: RayPaths, turned: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
-        power = _taken(sensor.terminals, out, receivers, home, turned)
-        straight = (rx[home.tx] - tx[out.tx]).norm(dim=1)
-        excess = out.delay + home.delay - straight / SPEED_OF_LIGHT
+    def measure(
+        tx_paths: RayPaths, rx_paths: RayPaths, cross_polar: Tensor, tx: Tensor, rx: Tensor
+    ) -> Tensor:
+        power = _received_power(sensor.mount, tx_paths, receivers, rx_paths, cross_polar)
+        straight = (rx[rx_paths.tx] - tx[tx_paths.tx]).norm(dim=1)
+        excess = tx_paths.delay + rx_paths.delay - straight / SPEED_OF_LIGHT
         return torch.stack([power, power * excess, power * excess**2], 1)
 
-    return total + trace_scattered(
+    return total + trace_single_scattering(
         scene,
         rough,
         sensor.positions,
-        places,
+        positions,
         frequency,
         measure,
         3,
@@ -107,18 +110,22 @@ def scattered_moments(
     )
 
 
-def _taken(
-    tx: Terminals, out: RayPaths, rx: Terminals, home: RayPaths, turned: Float64[Tensor, " pair"]
+def _received_power(
+    tx: AntennaMount,
+    tx_paths: RayPaths,
+    rx: AntennaMount,
+    rx_paths: RayPaths,
+    cross_polar: Float64[Tensor, " pair"],
 ) -> Float64[Tensor, " pair"]:
     """What antennas take of the power that points scatter, V and H about the world's z axis.
 
     In Stokes parameters, as ``channel.coupling`` has it for one bounce: ``½(I I' + (1 − 2χ)(q q' +
     u u') − (1 − 4χ) v v')``, here of the fields that ways bring to the points.
     """
-    sent = _stokes(out, tx.weights(out.departure, out.tx))
-    taken = _stokes(home, rx.weights(home.departure, home.tx))
+    sent = _stokes(tx_paths, tx.element_weights(tx_paths.departure, tx_paths.tx))
+    taken = _stokes(rx_paths, rx.element_weights(rx_paths.departure, rx_paths.tx))
     whole, q, u, v = (0.5 * sent * taken).unbind(1)
-    return whole + (1 - 2 * turned) * (q + u) - (1 - 4 * turned) * v
+    return whole + (1 - 2 * cross_polar) * (q + u) - (1 - 4 * cross_polar) * v
 
 
 def _stokes(
@@ -133,29 +140,33 @@ def _stokes(
     return rows.mean(1)
 
 
-def _link(sensor: Transmitters, receivers: Terminals, places: Tensor, frequency: float) -> Link:
+def _build_link(
+    sensor: Transmitters, receivers: AntennaMount, positions: Tensor, frequency: float
+) -> Link:
     """From one transmitter to receivers, in its axes."""
-    count, turn = len(places), sensor.terminals.rotations.reshape(3, 3)
+    count, turn = len(positions), sensor.mount.rotations.reshape(3, 3)
     return Link(
         tx=sensor.positions.expand(count, 3),
-        rx=places,
+        rx=positions,
         rotations=turn.expand(count, 3, 3),
-        tx_pattern=sensor.terminals.array.pattern,
-        rx_pattern=_turned(receivers, turn),
+        tx_pattern=sensor.mount.array.pattern,
+        rx_pattern=_rotate_pattern(receivers, turn),
         wavelength=SPEED_OF_LIGHT / frequency,
         shared_visibility=False,
-        tx_jones=sensor.terminals.array.jones,
+        tx_jones=sensor.mount.array.jones,
         rx_jones=receivers.array.jones,
     )
 
 
-def _share(sampling: Sampling, share: float) -> Sampling:
+def _scale_sampling(sampling: Sampling, fraction: float) -> Sampling:
     """So much of all that is drawn."""
-    samples, edges = (math.ceil(n * share) for n in (sampling.samples, sampling.boundary_samples))
+    samples, edges = (
+        math.ceil(n * fraction) for n in (sampling.samples, sampling.boundary_samples)
+    )
     return replace(sampling, samples=samples, boundary_samples=edges)
 
 
-def _moments(power: Float64[Tensor, "place bin"], grid: Grid, link: Link) -> Tensor:
+def _delay_moments(power: Float64[Tensor, "place bin"], grid: Grid, link: Link) -> Tensor:
     """Sums of power, of power × excess delay and of power × its square."""
     straight = (link.rx - link.tx).norm(dim=1, keepdim=True)
     excess = (2 * grid.ranges - straight) / SPEED_OF_LIGHT
@@ -166,33 +177,33 @@ def _moments(power: Float64[Tensor, "place bin"], grid: Grid, link: Link) -> Ten
 
 
 @dataclass(frozen=True)
-class _Scattering(Material):
+class _IncoherentMaterial(Material):
     """What a material scatters, without what ``trace_paths`` mirrors at it."""
 
-    of: Material
+    base: Material
 
     @property
     def faces(self) -> int | None:
-        return self.of.faces
+        return self.base.faces
 
-    def surface(self, frequency: float) -> Surface:
+    def surface(self, frequency: float) -> ScatteringLaw:
         """See ``Material.incoherent``."""
-        return self.of.incoherent(frequency)
+        return self.base.incoherent_law(frequency)
 
 
-def _scattering(scene: Scene, frequency: float) -> Scene | None:
+def _incoherent_scene(scene: Scene, frequency: float) -> Scene | None:
     """The scene as it scatters; None if it does not."""
     objects = {
-        name: replace(item, material=_Scattering(item.material))
+        name: replace(item, material=_IncoherentMaterial(item.material))
         for name, item in scene.objects.items()
     }
     with torch.no_grad():
-        surfaces = [item.material.surface(frequency) for item in objects.values()]
+        surfaces = [item.material.scattering_law(frequency) for item in objects.values()]
         rough = any(bool((s.diffuse > 0).any() or (s.lobes > 0).any()) for s in surfaces)
     return replace(scene, objects=objects) if rough else None
 
 
-def _lengths(scene: Scene, ends: Sequence[Tensor], depth: int) -> Grid:
+def _length_grid(scene: Scene, ends: Sequence[Tensor], depth: int) -> Grid:
     """Bins that hold every path of so many bounces, with room for what sheets add."""
     points = torch.cat([item.vertices.detach() for item in scene.objects.values()] + [*ends])
     across = float((points.amax(0) - points.amin(0)).norm())
@@ -200,7 +211,7 @@ def _lengths(scene: Scene, ends: Sequence[Tensor], depth: int) -> Grid:
     return Grid(range_start=-step, range_step=step, range_count=_BINS)
 
 
-def _turned(receivers: Terminals, turn: Float64[Tensor, "3 3"]) -> Pattern:
+def _rotate_pattern(receivers: AntennaMount, rotation: Float64[Tensor, "3 3"]) -> Pattern:
     """The receivers' pattern about the axes of the transmitter."""
     pattern = receivers.array.pattern
     if isinstance(pattern, Isotropic):
@@ -210,21 +221,21 @@ def _turned(receivers: Terminals, turn: Float64[Tensor, "3 3"]) -> Pattern:
             "expected one orientation of all receivers with a pattern where rough surfaces "
             f"scatter, got {len(receivers.rotations)}; give one, or isotropic receivers"
         )
-    between = receivers.rotations.mT @ turn
+    between = receivers.rotations.mT @ rotation
     if torch.equal(between, torch.eye(3, dtype=torch.float64)):
         return pattern
-    return _Turned(pattern, between)
+    return _RotatedPattern(pattern, between)
 
 
 @dataclass(frozen=True, eq=False)
-class _Turned(Pattern):
+class _RotatedPattern(Pattern):
     """A pattern about other axes."""
 
-    of: Pattern
-    turn: Float64[Tensor, "3 3"]  # from these axes into those of the pattern
+    base: Pattern
+    rotation: Float64[Tensor, "3 3"]  # from these axes into those of the pattern
 
     def gain(self, direction: Tensor) -> Tensor:
-        return self.of.gain(direction @ self.turn.to(direction).mT)
+        return self.base.gain(direction @ self.rotation.to(direction).mT)
 
     def table(self) -> Float64[Tensor, "n_cos n_phi"]:
         cosine = torch.linspace(-1, 1, COSINE_COUNT, dtype=torch.float64)[:, None]

@@ -8,13 +8,13 @@ from torch import Tensor
 
 from invertwin.channel import KINDS, RayPaths
 from invertwin.errors import InputError
-from invertwin.links.responses import Terminals, path_amplitudes
+from invertwin.links.responses import AntennaMount, path_amplitudes
 
-_DEFAULT = Terminals()
+_DEFAULT = AntennaMount()
 
 
 def delay_spread(
-    paths: RayPaths, tx: Terminals = _DEFAULT, rx: Terminals = _DEFAULT
+    paths: RayPaths, tx: AntennaMount = _DEFAULT, rx: AntennaMount = _DEFAULT
 ) -> Float64[Tensor, "rx tx"]:
     """Root mean square spread of the delays by power [s]; 0 of links of one path or none.
 
@@ -24,17 +24,17 @@ def delay_spread(
         rx: At the receivers.
     """
     power = path_powers(paths, tx, rx)
-    total = _sums(paths, power)
-    mean = _sums(paths, power * paths.delay) / _safe(total)
+    total = _sum_links(paths, power)
+    mean = _sum_links(paths, power * paths.delay) / _nonzero(total)
     offset = paths.delay - mean[paths.rx, paths.tx]
-    return root(_sums(paths, power * offset**2) / _safe(total))
+    return safe_sqrt(_sum_links(paths, power * offset**2) / _nonzero(total))
 
 
 def angle_spread(
     paths: RayPaths,
     end: Literal["departure", "arrival"] = "arrival",
-    tx: Terminals = _DEFAULT,
-    rx: Terminals = _DEFAULT,
+    tx: AntennaMount = _DEFAULT,
+    rx: AntennaMount = _DEFAULT,
 ) -> Float64[Tensor, "rx tx"]:
     """Spread of the directions by power, √(1 − |u|²) with u the mean unit vector.
 
@@ -56,17 +56,17 @@ def angle_spread(
     if end not in ("departure", "arrival"):
         raise InputError(f"expected end as departure or arrival, got {end!r}; choose one of them")
     power = path_powers(paths, tx, rx)
-    total = _safe(_sums(paths, power))
+    total = _nonzero(_sum_links(paths, power))
     direction: Tensor = getattr(paths, end)
-    mean = torch.stack([_sums(paths, power * x) for x in direction.unbind(1)], -1)
+    mean = torch.stack([_sum_links(paths, power * x) for x in direction.unbind(1)], -1)
     mean = mean / total[..., None]
     # The mean square distance from the mean, which does not cancel as 1 − |u|² does.
     offset = (direction - mean[paths.rx, paths.tx]).square().sum(1)
-    return root(_sums(paths, power * offset) / total)
+    return safe_sqrt(_sum_links(paths, power * offset) / total)
 
 
 def rician_factor(
-    paths: RayPaths, tx: Terminals = _DEFAULT, rx: Terminals = _DEFAULT
+    paths: RayPaths, tx: AntennaMount = _DEFAULT, rx: AntennaMount = _DEFAULT
 ) -> Float64[Tensor, "rx tx"]:
     """Power of the straight path over that of all others; also where it passes through sheets.
 
@@ -80,14 +80,14 @@ def rician_factor(
     power = path_powers(paths, tx, rx)
     passing = (paths.kinds == 0) | (paths.kinds == KINDS.index("transmission"))
     straight = passing.all(1)
-    direct = _sums(paths, torch.where(straight, power, 0.0))
-    others = _sums(paths, torch.where(straight, 0.0, power))
-    ratio = direct / _safe(others)
+    direct = _sum_links(paths, torch.where(straight, power, 0.0))
+    others = _sum_links(paths, torch.where(straight, 0.0, power))
+    ratio = direct / _nonzero(others)
     alone = torch.where(direct > 0, torch.inf, 0.0)
     return torch.where(others > 0, ratio, alone)
 
 
-def path_powers(paths: RayPaths, tx: Terminals, rx: Terminals) -> Float64[Tensor, " path"]:
+def path_powers(paths: RayPaths, tx: AntennaMount, rx: AntennaMount) -> Float64[Tensor, " path"]:
     """Received over sent power of each path, mean of all pairs of elements.
 
     Args:
@@ -99,17 +99,17 @@ def path_powers(paths: RayPaths, tx: Terminals, rx: Terminals) -> Float64[Tensor
     return torch.view_as_real(amplitude).square().sum(-1).mean((1, 2))
 
 
-def _sums(paths: RayPaths, values: Tensor) -> Tensor:
+def _sum_links(paths: RayPaths, values: Tensor) -> Tensor:
     """Sums over the paths of each link, [rx, tx]."""
     total = torch.zeros(paths.counts[0] * paths.counts[1], dtype=torch.float64)
     return total.index_add(0, paths.link, values).view(paths.counts).T
 
 
-def _safe(total: Tensor) -> Tensor:
+def _nonzero(total: Tensor) -> Tensor:
     return torch.where(total > 0, total, 1.0)
 
 
-def root(square: Tensor) -> Tensor:
+def safe_sqrt(square: Tensor) -> Tensor:
     """A root without the infinite derivative at zero.
 
     Args:

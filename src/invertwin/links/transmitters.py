@@ -10,10 +10,10 @@ from torch import Tensor, nn
 from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
 from invertwin.limits import Axes
-from invertwin.links.responses import Terminals
+from invertwin.links.responses import AntennaMount
 from invertwin.scene.parameters import Coordinate, axes_mask, free_part
 
-_PLACE = 0.1  # m: an error that matters
+_POSITION_ERROR = 0.1  # m: an error that matters
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class Transmitters:
 
     Attributes:
         positions: [tx, 3] in the world [m]; one may be given as [3]. Differentiable.
-        terminals: Antenna and axes at each place; of several elements the mean power counts.
+        mount: Antenna and axes at each place; of several elements the mean power counts.
         power_dbm: Sent by each [dBm], one for all or one each.
 
     Raises:
@@ -30,7 +30,7 @@ class Transmitters:
     """
 
     positions: Float64[Tensor, "*tx 3"]
-    terminals: Terminals = field(default_factory=Terminals)
+    mount: AntennaMount = field(default_factory=AntennaMount)
     power_dbm: float | Float64[Tensor, " tx"] = 0.0
 
     def __post_init__(self) -> None:
@@ -60,7 +60,7 @@ class Transmitters:
             chosen: Their numbers.
         """
         rows = torch.as_tensor(chosen)
-        terminals = self.terminals
+        terminals = self.mount
         if terminals.rotations.ndim == 3:
             terminals = replace(terminals, rotations=terminals.rotations[rows])
         power = torch.as_tensor(self.power_dbm)[rows]
@@ -114,15 +114,15 @@ class TransmitterPosition(nn.Module):
                     "expected an initial place inside the box, got one outside or on its border; "
                     "choose another start or a larger box"
                 )
-        self.place = nn.Parameter(begun)
+        self.raw_position = nn.Parameter(begun)
 
     @property
     def position(self) -> Float64[Tensor, "3"]:
         """Where the transmitter is [m]."""
         if self._box is not None:
             with torch.no_grad():
-                self.place.data.clamp_(*self._box)
-        return free_part(self.place, self._axes)
+                self.raw_position.data.clamp_(*self._box)
+        return free_part(self.raw_position, self._axes)
 
     def forward(self, sensor: Transmitters) -> Transmitters:
         """The transmitters with this one placed."""
@@ -136,7 +136,7 @@ class TransmitterPosition(nn.Module):
     def coordinates(self) -> list[Coordinate]:
         """x, y and z of the transmitter, as far as they are free."""
         return [
-            Coordinate(f"transmitter.{axis}", "m", {"place": along}, _PLACE)
+            Coordinate(f"transmitter.{axis}", "m", {"raw_position": along}, _POSITION_ERROR)
             for axis, along, free in zip("xyz", torch.eye(3).double(), self._axes, strict=True)
             if free
         ]
@@ -145,6 +145,6 @@ class TransmitterPosition(nn.Module):
         """Names of coordinates on the border of the box."""
         if self._box is None:
             return []
-        place = self.place.detach()
+        place = self.raw_position.detach()
         near = ((place <= self._box[0]) | (place >= self._box[1])).tolist()
         return [f"transmitter.{axis}" for axis, at in zip("xyz", near, strict=True) if at]

@@ -13,7 +13,7 @@ from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.limits import Positive
-from invertwin.models.noise import _scattered
+from invertwin.models.noise import _add_white_errors
 from invertwin.scene.scene import Scene
 
 
@@ -34,7 +34,7 @@ class SilhouetteMap(ForwardModel):
     sampling: ImageSampling = field(default_factory=ImageSampling)
     scatter: float | None = None
 
-    fields: ClassVar[bool] = True
+    holds_fields: ClassVar[bool] = True
 
     def predict(
         self, scene: Scene, sensor: Camera, seed: int
@@ -48,7 +48,7 @@ class SilhouetteMap(ForwardModel):
         Raises:
             InputError: Another shape, NaN, or values outside of 0 to 1.
         """
-        found = _images(recording, "masks")
+        found = _check_images(recording, "masks")
         if len(found.flatten()) and not 0 <= float(found.min()) <= float(found.max()) <= 1:
             raise InputError(
                 f"expected masks from 0 to 1, got {float(found.min()):g} to "
@@ -56,19 +56,21 @@ class SilhouetteMap(ForwardModel):
             )
         return found
 
-    def looks(self, scene: Scene, sensor: Camera, seed: int) -> Callable[[int, float], Tensor]:
+    def realisations(
+        self, scene: Scene, sensor: Camera, seed: int
+    ) -> Callable[[int, float], Tensor]:
         """The masks with other errors each time."""
-        return _scattered(self.predict(scene, sensor, seed), self.scatter)
+        return _add_white_errors(self.predict(scene, sensor, seed), self.scatter)
 
     def for_differences(
         self, scene: Scene, sensor: Camera, samples: int, scheme: Literal["rays", "area"]
     ) -> "SilhouetteMap":
         """More rays in every pixel. See ``ForwardModel.for_differences``."""
-        return replace(self, sampling=_finer(self.sampling, sensor, samples))
+        return replace(self, sampling=_refine_sampling(self.sampling, sensor, samples))
 
     def ablations(self) -> dict[str, ForwardModel]:
         """The model with outlines at rest. See ``ForwardModel.ablations``."""
-        return {"boundary": self.sampled_by(boundary=False)} if self.sampling.boundary else {}
+        return {"boundary": self.with_sampling(boundary=False)} if self.sampling.boundary else {}
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class DepthMap(ForwardModel):
     sampling: ImageSampling = field(default_factory=ImageSampling)
     scatter: float | None = None
 
-    fields: ClassVar[bool] = True
+    holds_fields: ClassVar[bool] = True
 
     def predict(
         self, scene: Scene, sensor: Camera, seed: int
@@ -103,29 +105,31 @@ class DepthMap(ForwardModel):
             InputError: Another shape, or NaN.
         """
         given = torch.as_tensor(recording, dtype=torch.float64)
-        return _images(given.clamp_max(self.far), "depths [m]")
+        return _check_images(given.clamp_max(self.far), "depths [m]")
 
-    def looks(self, scene: Scene, sensor: Camera, seed: int) -> Callable[[int, float], Tensor]:
+    def realisations(
+        self, scene: Scene, sensor: Camera, seed: int
+    ) -> Callable[[int, float], Tensor]:
         """The depths with other errors each time."""
-        return _scattered(self.predict(scene, sensor, seed), self.scatter)
+        return _add_white_errors(self.predict(scene, sensor, seed), self.scatter)
 
     def for_differences(
         self, scene: Scene, sensor: Camera, samples: int, scheme: Literal["rays", "area"]
     ) -> "DepthMap":
         """More rays in every pixel. See ``ForwardModel.for_differences``."""
-        return replace(self, sampling=_finer(self.sampling, sensor, samples))
+        return replace(self, sampling=_refine_sampling(self.sampling, sensor, samples))
 
     def ablations(self) -> dict[str, ForwardModel]:
         """The model with outlines at rest. See ``ForwardModel.ablations``."""
-        return {"boundary": self.sampled_by(boundary=False)} if self.sampling.boundary else {}
+        return {"boundary": self.with_sampling(boundary=False)} if self.sampling.boundary else {}
 
 
-def _images(recording: ArrayLike, what: str) -> Tensor:
+def _check_images(recording: ArrayLike, what: str) -> Tensor:
     given = torch.as_tensor(recording, dtype=torch.float64)
     given = given[None] if given.ndim == 2 else given
     return checked_tensor(given, (None, None, None), what, "give [frame, row, column]")
 
 
-def _finer(sampling: ImageSampling, camera: Camera, samples: int) -> ImageSampling:
+def _refine_sampling(sampling: ImageSampling, camera: Camera, samples: int) -> ImageSampling:
     pixels = len(camera.positions) * camera.width * camera.height
     return replace(sampling, samples=max(sampling.samples, samples // pixels))

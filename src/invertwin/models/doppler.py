@@ -19,12 +19,12 @@ from invertwin.forward_model import ForwardModel
 from invertwin.radar.processing.doppler import range_doppler_angle, velocity_axis
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
-from invertwin.radar.surrogate.range_doppler import moving_power
+from invertwin.radar.surrogate.range_doppler import range_doppler_power
 from invertwin.scene.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
-class MotionMap(ForwardModel):
+class RangeDopplerMap(ForwardModel):
     """Power over range rate, range and direction of what moves.
 
     What stands still is taken out of a recording as the mean over the chirps; so a prediction
@@ -46,14 +46,14 @@ class MotionMap(ForwardModel):
     sampling: Sampling = Sampling(depth=1, boundary=False)
 
     @classmethod
-    def of(
+    def from_chirps(
         cls,
         radar: Radar,
         grid: Grid,
         chirps: Chirps,
         oversample: int = 2,
         sampling: Sampling | None = None,
-    ) -> "MotionMap":
+    ) -> "RangeDopplerMap":
         """All range rates that the chirps tell apart.
 
         Args:
@@ -91,17 +91,19 @@ class MotionMap(ForwardModel):
         paths = trace_power(scene, sensor.link(), sampling=self.sampling, seed=seed)
         assert paths.velocity is not None
         moves = (paths.velocity.detach() != 0).any(1)
-        return self.expected(paths.chosen(moves), sensor)
+        return self.predict_paths(paths.select(moves), sensor)
 
-    def expected(self, paths: Paths, radar: Radar) -> Float[Tensor, "frame velocity range u v"]:
-        """What moving paths look like in this map. See ``moving_power``.
+    def predict_paths(
+        self, paths: Paths, radar: Radar
+    ) -> Float[Tensor, "frame velocity range u v"]:
+        """What moving paths look like in this map. See ``range_doppler_power``.
 
         Args:
             paths: With velocities.
             radar: What records them.
         """
         assert paths.velocity is not None
-        return moving_power(paths, paths.velocity, radar, self.grid, self.chirps, self.rates)
+        return range_doppler_power(paths, paths.velocity, radar, self.grid, self.chirps, self.rates)
 
     def observe(self, recording: ChirpCapture) -> Float[Tensor, "frame velocity range u v"]:
         """The measured power of what moves.
@@ -116,7 +118,9 @@ class MotionMap(ForwardModel):
         rows = (every - self.rates[:, None]).abs().argmin(1)
         return power[:, rows]
 
-    def around(self, range_: float, rate: float, cells: int, radar: Radar) -> "MotionMap":
+    def crop_around(
+        self, range_: float, rate: float, cells: int, radar: Radar
+    ) -> "RangeDopplerMap":
         """The cells at most so many range and Doppler cells from an echo, in all directions.
 
         Args:

@@ -12,10 +12,10 @@ from invertwin.capture.capture import Capture
 from invertwin.channel import (
     Grid,
     Sampling,
-    trace_chains,
+    trace_facet_paths,
 )
 from invertwin.forward_model import ForwardModel
-from invertwin.models.noise import _noisy
+from invertwin.models.noise import _noisy_realisations
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import beat_signal, range_profile
@@ -27,7 +27,7 @@ from invertwin.scene.scene import Scene
 
 
 @dataclass(frozen=True)
-class ChainMap(ForwardModel):
+class FacetMap(ForwardModel):
     """The power spectrum of a few flat conductors that mirror one another: |sum of fields|².
 
     Chains of a corner reflector add in phase, as in a ``SurrogateMap`` that names it ``coherent``,
@@ -49,79 +49,81 @@ class ChainMap(ForwardModel):
     redraws: ClassVar[bool] = False
 
     def _beat(self, scene: Scene, sensor: Radar) -> Tensor:
-        return beat_signal(trace_chains(scene, sensor.link(), self.sampling.depth), sensor)
+        return beat_signal(trace_facet_paths(scene, sensor.link(), self.sampling.depth), sensor)
 
-    def _shown(self, beat: Tensor, sensor: Radar) -> Tensor:
+    def _to_map(self, beat: Tensor, sensor: Radar) -> Tensor:
         return exact_spectrum(beat, sensor, self.grid).to(torch.float32)
 
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
-        """The spectrum of the chains. See ``ForwardModel.predict`` and ``trace_chains``."""
-        return self.blurred(self._shown(self._beat(scene, sensor), sensor), sensor)
+        """The spectrum of the chains. See ``ForwardModel.predict`` and ``trace_facet_paths``."""
+        return self.blur_observed(self._to_map(self._beat(scene, sensor), sensor), sensor)
 
     def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
         """The measured power spectrum of a capture."""
         return recording.spectrum(self.grid).to(torch.float32)
 
-    def looks(
+    def realisations(
         self, scene: Scene, sensor: Radar, seed: int
     ) -> Callable[[int, float], Tensor] | None:
         """The map with other noise each time; None for waveforms without samples."""
         if not isinstance(sensor.waveform, SampledWaveform):
             return None
         beat = self._beat(scene, sensor)
-        return _noisy(
+        return _noisy_realisations(
             lambda _: beat,
-            lambda signal: self._shown(signal, sensor),
+            lambda signal: self._to_map(signal, sensor),
             sensor,
             seed,
-            fields=self.fields,
+            holds_fields=self.holds_fields,
         )
 
     @property
-    def widened(self) -> bool:
+    def has_blur(self) -> bool:
         """Whether there are extra widths."""
-        return self.surrogate.widened
+        return self.surrogate.has_blur
 
-    def narrowed(self, share: float) -> "ChainMap":
+    def scale_blur(self, fraction: float) -> "FacetMap":
         """The model with this share of its extra widths."""
-        return replace(self, surrogate=self.surrogate.narrowed(share))
+        return replace(self, surrogate=self.surrogate.scale_blur(fraction))
 
-    def blurred(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
+    def blur_observed(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
         """A map with the extra widths."""
         return self.surrogate.blur(observed, sensor, self.grid)
 
 
 @dataclass(frozen=True)
-class ChainField(ChainMap):
+class FacetField(FacetMap):
     """The complex range profiles of a few flat conductors that mirror one another.
 
     The phase tells the range to parts of a wavelength. So its loss has a minimum every half
-    wavelength: it refines what a ``ChainMap`` has found to a tenth of a wavelength in range, in a
+    wavelength: it refines what a ``FacetMap`` has found to a tenth of a wavelength in range, in a
     later stage of a fit. Maps hold real and imaginary parts; compare them by a ``SpectrumLoss`` of
     kind ``mse`` with one level. The radar's phase is calibrated.
     """
 
-    fields: ClassVar[bool] = True
+    holds_fields: ClassVar[bool] = True
 
-    def _shown(self, beat: Tensor, sensor: Radar) -> Tensor:
+    def _to_map(self, beat: Tensor, sensor: Radar) -> Tensor:
         profile = range_profile(beat.to(torch.complex128), sensor, self.grid)
         return torch.view_as_real(profile.flatten(1, 2).mT).contiguous()
 
     def predict(
         self, scene: Scene, sensor: Radar, seed: int
     ) -> Float[Tensor, "frame range channel part"]:
-        """The range profiles of the chains. See ``ForwardModel.predict`` and ``trace_chains``."""
+        """The range profiles of the chains. See ``ForwardModel.predict`` and
+        ``trace_facet_paths``.
+        """
         return super().predict(scene, sensor, seed)
 
     def observe(self, recording: Capture) -> Float[Tensor, "frame range channel part"]:
         """The measured range profiles of a capture."""
-        return self._shown(recording.beat, recording.radar())
+        return self._to_map(recording.beat, recording.radar())
 
     @property
-    def widened(self) -> bool:
+    def has_blur(self) -> bool:
         """Fields have no extra widths."""
         return False
 
-    def blurred(self, observed: Tensor, sensor: Radar) -> Tensor:
+    def blur_observed(self, observed: Tensor, sensor: Radar) -> Tensor:
         """A map as it is."""
         return observed

@@ -7,41 +7,43 @@ from torch import Tensor
 
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
-from invertwin.seeds import derived_seed
+from invertwin.seeds import derive_seed
 
 
-def _noisy(
-    beat_of: Callable[[int], Tensor],
-    shown: Callable[[Tensor], Tensor],
+def _noisy_realisations(
+    simulate_beat: Callable[[int], Tensor],
+    to_map: Callable[[Tensor], Tensor],
     sensor: Radar,
     seed: int,
     *,
-    fields: bool = False,
+    holds_fields: bool = False,
 ) -> Callable[[int, float], Tensor]:
     """Looks with noise: a function of their number gives beat signals, another shows them."""
     assert isinstance(sensor.waveform, SampledWaveform)
     shape = (*sensor.shape, sensor.waveform.samples)
 
-    def white(key: int) -> Tensor:
+    def white_noise(key: int) -> Tensor:
         generator = torch.Generator().manual_seed(key)
         return torch.randn(shape, dtype=torch.complex64, generator=generator)
 
-    whole = shown(white(seed))
-    share = float((whole.square() if fields else whole).mean())
+    whole = to_map(white_noise(seed))
+    share = float((whole.square() if holds_fields else whole).mean())
 
-    def look(number: int, noise: float) -> Tensor:
-        return shown(beat_of(number) + (noise / share) ** 0.5 * white(derived_seed(number, 1)))
+    def realise(number: int, noise: float) -> Tensor:
+        return to_map(
+            simulate_beat(number) + (noise / share) ** 0.5 * white_noise(derive_seed(number, 1))
+        )
 
-    return look
+    return realise
 
 
-def _scattered(mean: Tensor, scatter: float | None) -> Callable[[int, float], Tensor]:
+def _add_white_errors(mean: Tensor, scatter: float | None) -> Callable[[int, float], Tensor]:
     """Looks at a map with white errors: of a known deviation, or of the mean square asked for."""
     mean = mean.detach()
 
-    def look(number: int, noise: float) -> Tensor:
+    def realise(number: int, noise: float) -> Tensor:
         generator = torch.Generator().manual_seed(number)
         errors = torch.randn(mean.shape, dtype=mean.dtype, generator=generator)
         return mean + (noise**0.5 if scatter is None else scatter) * errors
 
-    return look
+    return realise

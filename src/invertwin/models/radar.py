@@ -15,27 +15,27 @@ from invertwin.channel import (
     Grid,
     Sampling,
     Speckle,
+    as_absorbers,
     draw_speckle,
     trace_field,
     trace_target,
-    without_echoes,
 )
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.models.noise import _noisy
+from invertwin.models.noise import _noisy_realisations
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import beat_signal
-from invertwin.radar.signal.realisations import Looks
+from invertwin.radar.signal.realisations import SpeckleRealisations
 from invertwin.radar.surrogate.surrogate import (
     Surrogate,
-    chosen_surrogate,
+    resolve_surrogate,
     surrogate_spectra,
     surrogate_spectrum,
 )
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene.scene import Scene
-from invertwin.seeds import derived_seed
+from invertwin.seeds import derive_seed
 from invertwin.simulation import simulate
 
 
@@ -68,7 +68,7 @@ class SurrogateMap(ForwardModel):
     )
 
     def __post_init__(self) -> None:
-        chosen = chosen_surrogate(self.surrogate)
+        chosen = resolve_surrogate(self.surrogate)
         if chosen is None:
             raise InputError(
                 'expected a surrogate for a SurrogateMap, got "exact"; use ExactMap(grid)'
@@ -155,53 +155,53 @@ class SurrogateMap(ForwardModel):
         sampling = replace(self.sampling, samples=samples, boundary_samples=0)
         return replace(self, sampling=sampling, _reference=(scene, sensor, scheme))
 
-    def looks(
+    def realisations(
         self, scene: Scene, sensor: Radar, seed: int
     ) -> Callable[[int, float], Tensor] | None:
         """Spectra of one scene with other speckle, and another phase of every coherent target.
 
         None for clouds and for smooth conductors that are no targets.
         """
-        rest = without_echoes(scene, self.coherent)
+        rest = as_absorbers(scene, self.coherent)
         if not isinstance(sensor.waveform, SampledWaveform) or any(
             item.cloud is not None or item.material.coherent for item in rest.objects.values()
         ):
             return None
         fields, link = replace(self.sampling, boundary=False), sensor.link()
-        looks = Looks(trace_field(rest, link, sampling=fields, seed=seed), sensor)
+        looks = SpeckleRealisations(trace_field(rest, link, sampling=fields, seed=seed), sensor)
         targets = [
             beat_signal(trace_target(scene, name, link, sampling=fields), sensor)
             for name in self.coherent
         ]
 
-        def beat(number: int) -> Tensor:
-            generator = torch.Generator().manual_seed(derived_seed(number, 2))
+        def simulate_beat(number: int) -> Tensor:
+            generator = torch.Generator().manual_seed(derive_seed(number, 2))
             turns = 2 * math.pi * torch.rand(len(targets), generator=generator)
-            total = looks.beat(derived_seed(number, 0))
+            total = looks.beat(derive_seed(number, 0))
             for turn, target in zip(
                 torch.polar(torch.ones_like(turns), turns), targets, strict=True
             ):
                 total = total + turn * target.to(total)
             return total
 
-        return _noisy(
-            beat,
+        return _noisy_realisations(
+            simulate_beat,
             lambda beat: exact_spectrum(beat, sensor, self.grid).to(torch.float32),
             sensor,
             seed,
         )
 
     @property
-    def widened(self) -> bool:
+    def has_blur(self) -> bool:
         """Whether the surrogate has extra widths, or targets a longer wavelength."""
-        return self.kernels.widened or self.stretch > 1
+        return self.kernels.has_blur or self.stretch > 1
 
-    def narrowed(self, share: float) -> "SurrogateMap":
+    def scale_blur(self, fraction: float) -> "SurrogateMap":
         """The surrogate with this share of its extra widths and of its stretch beyond 1."""
-        stretch = 1 + (self.stretch - 1) * share
-        return replace(self, surrogate=self.kernels.narrowed(share), stretch=stretch)
+        stretch = 1 + (self.stretch - 1) * fraction
+        return replace(self, surrogate=self.kernels.scale_blur(fraction), stretch=stretch)
 
-    def blurred(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
+    def blur_observed(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
         """A measured spectrum with the extra widths."""
         return self.kernels.blur(observed, sensor, self.grid)
 
@@ -225,7 +225,7 @@ class ExactMap(ForwardModel):
     speckle: Speckle | None = None
 
     redraws: ClassVar[bool] = False
-    smooth: ClassVar[bool] = False
+    is_smooth: ClassVar[bool] = False
 
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
         """The spectrum of the exact beat signals. See ``ForwardModel.predict``."""
@@ -238,7 +238,7 @@ class ExactMap(ForwardModel):
         """The measured power spectrum of a capture."""
         return recording.spectrum(self.grid).to(torch.float32)
 
-    def prepared(self, scene: Scene, sensor: Radar, seed: int) -> "ExactMap":
+    def prepare(self, scene: Scene, sensor: Radar, seed: int) -> "ExactMap":
         """The model with rough points that stay while the scene moves."""
         if self.speckle is not None:
             return self
@@ -268,7 +268,7 @@ class BeatMap(ExactMap):
 
 
 def surrogate_correlation(
-    scene: Scene, radar: Radar, model: SurrogateMap, *, seed: int, looks: int = 16
+    scene: Scene, radar: Radar, model: SurrogateMap, *, seed: int, realisations: int = 16
 ) -> float:
     """Correlation of a surrogate's map with the mean exact spectrum over several looks.
 
@@ -280,7 +280,7 @@ def surrogate_correlation(
         radar: Arrays, waveform and poses.
         model: The surrogate; its ``sampling`` serves the exact spectra too.
         seed: Of the first look, and of the surrogate's samples.
-        looks: Exact spectra that are averaged.
+        realisations: Exact spectra that are averaged.
 
     Returns:
         Pearson's correlation over all bins and frames; 0 where a map is constant.
@@ -288,17 +288,17 @@ def surrogate_correlation(
     Raises:
         InputError: No looks.
     """
-    if looks < 1:
+    if realisations < 1:
         raise InputError(
-            f"expected looks >= 1, got {looks}; 16 looks leave a quarter of the speckle"
+            f"expected looks >= 1, got {realisations}; 16 looks leave a quarter of the speckle"
         )
     if all(item.material.coherent for item in scene.objects.values()):
-        looks = 1
+        realisations = 1
     exact = ExactMap(model.grid, model.sampling)
     with torch.no_grad():
         mean = torch.zeros(radar.frame_count, *model.grid.shape, dtype=torch.float64)
-        for look in range(looks):
-            mean += exact.predict(scene, radar, seed + look) / looks
+        for look in range(realisations):
+            mean += exact.predict(scene, radar, seed + look) / realisations
         a, b = (p.double() - p.double().mean() for p in (mean, model.predict(scene, radar, seed)))
         norms = a.norm() * b.norm()
     return float((a * b).sum() / norms) if norms > 0 else 0.0

@@ -13,10 +13,10 @@ from invertwin.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.links.metasurface.panel import Metasurface, panel_response
-from invertwin.links.places import Places
-from invertwin.links.received import Received, Reception
+from invertwin.links.places import ReceiverLocations
+from invertwin.links.received import LinkStatistics, PropagationSettings
 from invertwin.links.transmitters import Transmitters
-from invertwin.models.noise import _scattered
+from invertwin.models.noise import _add_white_errors
 from invertwin.scene.scene import Scene
 
 
@@ -37,7 +37,7 @@ class PanelMap(ForwardModel):
     boundary: bool = True
 
     redraws: ClassVar[bool] = False
-    random: ClassVar[bool] = False
+    is_random: ClassVar[bool] = False
 
     def predict(self, scene: Scene, sensor: Metasurface, seed: int) -> Float64[Tensor, "1 rx"]:
         """|Σ|² of the elements. See ``panel_response``."""
@@ -69,7 +69,7 @@ class RadioMap(ForwardModel):
 
     Attributes:
         places: Where receivers are.
-        reception: How paths are found, and how they add up.
+        propagation: How paths are found, and how they add up.
         quantity: ``received_power`` [dBm], ``path_gain`` [dB], ``gain``: the same as a ratio
             without a floor, ``sinr`` [dB]: received power of a transmitter over that of all others
             and noise, or ``delay_spread`` [s].
@@ -84,8 +84,8 @@ class RadioMap(ForwardModel):
         InputError: An unknown quantity, or a number out of range.
     """
 
-    places: Places
-    reception: Reception
+    places: ReceiverLocations
+    propagation: PropagationSettings
     quantity: Literal["received_power", "path_gain", "gain", "sinr", "delay_spread"] = (
         "received_power"
     )
@@ -95,7 +95,7 @@ class RadioMap(ForwardModel):
     without: Sequence[str] = ()
 
     redraws: ClassVar[bool] = False
-    fields: ClassVar[bool] = True
+    holds_fields: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.quantity not in QUANTITIES:
@@ -108,7 +108,7 @@ class RadioMap(ForwardModel):
         if self.scatter is not None:
             checked_number(self.scatter, "scatter of data", 0.0)
 
-    def received(self, scene: Scene, sensor: Transmitters, seed: int) -> Received:
+    def link_statistics(self, scene: Scene, sensor: Transmitters, seed: int) -> LinkStatistics:
         """Gain and delay spread, before any decibels.
 
         Args:
@@ -129,11 +129,11 @@ class RadioMap(ForwardModel):
                 )
             kept = {n: o for n, o in scene.objects.items() if n not in self.without}
             scene = replace(scene, objects=kept)
-        return self.places.received(scene, sensor, self.reception, seed)
+        return self.places.link_statistics(scene, sensor, self.propagation, seed)
 
     def predict(self, scene: Scene, sensor: Transmitters, seed: int) -> Float64[Tensor, "tx *map"]:
         """The quantity of every transmitter. See ``ForwardModel.predict``."""
-        found = self.received(scene, sensor, seed)
+        found = self.link_statistics(scene, sensor, seed)
         if self.quantity == "delay_spread":
             return found.delay_spread
         if self.quantity == "gain":
@@ -157,19 +157,21 @@ class RadioMap(ForwardModel):
         what = f"measured {self.quantity.replace('_', ' ')}"
         return checked_tensor(given, (None, *shape), what, "give a map for each transmitter")
 
-    def looks(
+    def realisations(
         self, scene: Scene, sensor: Transmitters, seed: int
     ) -> Callable[[int, float], Tensor]:
         """The map with other errors of measurement each time."""
-        return self.looks_about(self.predict(scene, sensor, seed))
+        return self.realisations_about(self.predict(scene, sensor, seed))
 
-    def looks_about(self, mean: Float64[Tensor, "tx *map"]) -> Callable[[int, float], Tensor]:
+    def realisations_about(
+        self, mean: Float64[Tensor, "tx *map"]
+    ) -> Callable[[int, float], Tensor]:
         """A map with other errors of measurement each time, see ``ForwardModel.looks``.
 
         Args:
             mean: The map without errors.
         """
-        return _scattered(mean, self.scatter)
+        return _add_white_errors(mean, self.scatter)
 
     def best_server(self, scene: Scene, sensor: Transmitters, seed: int) -> Int64[Tensor, "*map"]:
         """Number of the transmitter of which most power arrives; −1 where none arrives.
@@ -179,24 +181,24 @@ class RadioMap(ForwardModel):
             sensor: What sends.
             seed: As for ``predict``.
         """
-        gain = self.received(scene, sensor, seed).gain
+        gain = self.link_statistics(scene, sensor, seed).gain
         most, number = (gain * sensor.powers.reshape(-1, *[1] * (gain.ndim - 1))).max(0)
         return torch.where(most > 0, number, -1)
 
     @property
-    def random(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def is_random(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether points are drawn, as those of cells are, or scattered paths."""
-        return self.places.random or self.reception.rough is not None
+        return self.places.is_random or self.propagation.rough is not None
 
     def for_differences(
         self, scene: Scene, sensor: Transmitters, samples: int, scheme: Literal["rays", "area"]
     ) -> "RadioMap":
         """The model with so many points on the cells, and so many scattered paths."""
-        reception, rough = self.reception, self.reception.rough
+        reception, rough = self.propagation, self.propagation.rough
         if rough is not None:
             finer = replace(rough, samples=samples, boundary=False)
             reception = replace(reception, rough=finer)
-        return replace(self, places=self.places.finer(samples), reception=reception)
+        return replace(self, places=self.places.with_sample_count(samples), propagation=reception)
 
     def ablations(self) -> dict[str, ForwardModel]:
         """The model at fixed visibility: without diffraction, or without boundary paths of cells.
@@ -204,16 +206,16 @@ class RadioMap(ForwardModel):
         See ``ForwardModel.ablations``.
         """
         fixed = self.places.fixed_visibility()
-        rough = self.reception.rough
+        rough = self.propagation.rough
         moves = rough is not None and rough.boundary
-        if fixed is None and not self.reception.edges and not moves:
+        if fixed is None and not self.propagation.edges and not moves:
             return {}
         if rough is not None:
             rough = replace(rough, boundary=False)
         # In cells without diffraction, powers add.
-        bandwidth = self.reception.bandwidth if fixed is None else None
-        reception = replace(self.reception, edges=0, bandwidth=bandwidth, rough=rough)
-        return {"boundary": replace(self, places=fixed or self.places, reception=reception)}
+        bandwidth = self.propagation.bandwidth if fixed is None else None
+        reception = replace(self.propagation, edges=0, bandwidth=bandwidth, rough=rough)
+        return {"boundary": replace(self, places=fixed or self.places, propagation=reception)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,19 +229,19 @@ class ResponseMap(ForwardModel):
     Attributes:
         positions: Of the receivers, [place, 3] [m].
         frequencies: Of the responses [Hz].
-        reception: How paths are found; its bandwidth does not count.
+        propagation: How paths are found; its bandwidth does not count.
         scatter: Standard deviation of data about the map, of each part; None = as large as what a
             fit leaves unexplained.
     """
 
     positions: Float64[Tensor, "place 3"]
     frequencies: Float64[Tensor, " frequency"]
-    reception: Reception
+    propagation: PropagationSettings
     scatter: float | None = None
 
     redraws: ClassVar[bool] = False
-    random: ClassVar[bool] = False
-    fields: ClassVar[bool] = True
+    is_random: ClassVar[bool] = False
+    holds_fields: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         do = "give a row of x, y, z for each"
@@ -257,7 +259,9 @@ class ResponseMap(ForwardModel):
         self, scene: Scene, sensor: Transmitters, seed: int
     ) -> Float64[Tensor, "tx place frequency part"]:
         """The responses of the first elements. See ``ForwardModel.predict``."""
-        found = self.reception.responses(scene, sensor, self.positions, self.frequencies, seed)
+        found = self.propagation.frequency_responses(
+            scene, sensor, self.positions, self.frequencies, seed
+        )
         return torch.view_as_real(found)
 
     def observe(self, recording: Tensor) -> Float64[Tensor, "tx place frequency part"]:
@@ -271,8 +275,8 @@ class ResponseMap(ForwardModel):
         do = "give complex numbers [tx, place, frequency]"
         return checked_tensor(torch.view_as_real(given), shape, "measured responses", do)
 
-    def looks(
+    def realisations(
         self, scene: Scene, sensor: Transmitters, seed: int
     ) -> Callable[[int, float], Tensor]:
         """The responses with other noise each time."""
-        return _scattered(self.predict(scene, sensor, seed), self.scatter)
+        return _add_white_errors(self.predict(scene, sensor, seed), self.scatter)

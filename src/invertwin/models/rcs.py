@@ -13,7 +13,7 @@ from invertwin.signatures import Signature
 
 
 @dataclass(frozen=True)
-class SignatureMap(ForwardModel):
+class RcsMap(ForwardModel):
     """Radar cross-sections σ = 4π|S|² [m²] of a scene, over frequency, aspect and polarisations.
 
     No sensor is needed: give None.
@@ -29,17 +29,17 @@ class SignatureMap(ForwardModel):
     boundary: bool = True
 
     redraws: ClassVar[bool] = False
-    random: ClassVar[bool] = False
+    is_random: ClassVar[bool] = False
 
     def predict(
         self, scene: Scene, sensor: Any, seed: int
     ) -> Float64[Tensor, "frequency aspect 2 2"]:
         """σ [m²], receive × transmit. See ``ForwardModel.predict``."""
-        return self.signature(scene, boundary=self.boundary).section
+        return self.signature(scene, boundary=self.boundary).cross_section
 
     def observe(self, recording: Signature) -> Float64[Tensor, "frequency aspect 2 2"]:
         """σ of a signature [m²]."""
-        return recording.section
+        return recording.cross_section
 
     def ablations(self) -> dict[str, ForwardModel]:
         """The model at fixed visibility. See ``ForwardModel.ablations``."""

@@ -15,7 +15,7 @@ from invertwin.plotting.images import images as images
 from invertwin.plotting.maps import RATE_LABEL as RATE_LABEL
 from invertwin.plotting.maps import U_LABEL as U_LABEL
 from invertwin.plotting.maps import V_LABEL as V_LABEL
-from invertwin.plotting.maps import Panel as Panel
+from invertwin.plotting.maps import MapPanel as MapPanel
 from invertwin.plotting.maps import direction_panels as direction_panels
 from invertwin.plotting.maps import doppler_panels as doppler_panels
 from invertwin.plotting.maps import gradient as gradient
@@ -24,11 +24,11 @@ from invertwin.plotting.maps import range_doppler as range_doppler
 from invertwin.plotting.maps import residuals as residuals
 from invertwin.plotting.maps import spectrum as spectrum
 from invertwin.plotting.rooms import floor_plan as floor_plan
-from invertwin.plotting.rooms import located as located
 from invertwin.plotting.rooms import placements as placements
+from invertwin.plotting.rooms import transmitter_fits as transmitter_fits
 from invertwin.plotting.scenes import scene as scene
-from invertwin.plotting.signatures import focused as focused
-from invertwin.plotting.signatures import profile as profile
-from invertwin.plotting.signatures import sections as sections
-from invertwin.plotting.signatures import slopes as slopes
+from invertwin.plotting.signatures import rcs_curves as rcs_curves
+from invertwin.plotting.signatures import rcs_derivatives as rcs_derivatives
+from invertwin.plotting.signatures import rcs_image as rcs_image
+from invertwin.plotting.signatures import rcs_profile as rcs_profile
 from invertwin.plotting.turntable import turntable as turntable

@@ -60,13 +60,13 @@ def coverage(
                 f"{list(values.shape)}; give one of a single transmitter"
             )
     count = len(levels) + len(rates)
-    grid = _flat(plane, _corners(plane))
+    grid = _project_to_plane(plane, _corners(plane))
     width, height = np.ptp(grid[..., 0]), np.ptp(grid[..., 1])
     tall = min(max(3.4 * height / width, 1.6), 5.0)
     figure = Figure(figsize=(1.4 + 3.4 * count, tall + 0.9), layout="constrained")
     cells = figure.subplots(1, count, squeeze=False, sharey=True)[0]
-    lines = [] if scene is None else _plan(scene, plane)
-    marks = None if transmitters is None else _flat(plane, transmitters.positions)
+    lines = [] if scene is None else _project_edges(scene, plane)
+    marks = None if transmitters is None else _project_to_plane(plane, transmitters.positions)
     split = len(levels)
     top = max((float(v.detach().amax()) for v in levels.values()), default=0.0)
     known = [numbers(v) for v in rates.values()]
@@ -78,7 +78,7 @@ def coverage(
         image = None
         for axes, (title, values) in zip(part, maps.items(), strict=True):
             image = axes.pcolormesh(grid[..., 0], grid[..., 1], numbers(values), **style)
-            _dress(axes, title, plane, lines, marks)
+            _format_axes(axes, title, plane, lines, marks)
         if image is not None:
             bar = figure.colorbar(image, ax=[*part], shrink=0.85)
             bar.set_label(name, fontsize=8)
@@ -100,7 +100,7 @@ def _axes(plane: MapPlane) -> Tensor:
     return torch.stack([right, up / up.norm()])
 
 
-def _flat(plane: MapPlane, points: Tensor) -> NDArray[Any]:
+def _project_to_plane(plane: MapPlane, points: Tensor) -> NDArray[Any]:
     """World points in the plane, about the world's origin [m]."""
     return numbers(points.detach() @ _axes(plane).T)
 
@@ -116,16 +116,16 @@ def _names(plane: MapPlane) -> list[str]:
     return found
 
 
-def _plan(scene: Scene, plane: MapPlane) -> list[NDArray[Any]]:
+def _project_edges(scene: Scene, plane: MapPlane) -> list[NDArray[Any]]:
     """Sharp edges of all objects, in the plane."""
     lines: list[NDArray[Any]] = []
     for item in scene.objects.values():
         edges = sharp_edges(numbers(item.vertices), numbers(item.mesh.faces))
-        lines += [*_flat(plane, item.vertices[torch.from_numpy(edges)])]
+        lines += [*_project_to_plane(plane, item.vertices[torch.from_numpy(edges)])]
     return lines
 
 
-def _dress(axes: Any, title: str, plane: MapPlane, lines: Any, marks: Any) -> None:
+def _format_axes(axes: Any, title: str, plane: MapPlane, lines: Any, marks: Any) -> None:
     axes.add_collection(LineCollection(lines, colors="black", linewidths=0.6))
     if marks is not None:
         axes.plot(marks[:, 0], marks[:, 1], "^", color="#c0143c", markeredgecolor="white")

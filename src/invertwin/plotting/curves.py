@@ -65,24 +65,28 @@ def _draw_errors(axes, losses, errors, label: str) -> None:
     axes.set(xlabel="step", ylabel=label, ylim=(0, 1.05 * highest))
 
 
-def landscape(exact: Curve, surrogates: Mapping[str, Curve], along: str) -> Figure:
+def landscape(exact: Curve, surrogates: Mapping[str, Curve], displacements: str) -> Figure:
     """The exact signal's loss beside the surrogate's, over the offset from the truth.
 
     Args:
         exact: Offsets [m] and losses of the exact signal.
         surrogates: Offsets [m] and losses of the surrogate, by name.
-        along: What is moved and in which direction, such as ``letter along z``.
+        displacements: What is moved and in which direction, such as ``letter along z``.
     """
     figure = Figure(figsize=(10, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.plot(exact[0] * 1e3, exact[1], color=color(0), linewidth=0.8)
     left.set_title(f"exact signal: {count_minima(exact[1])} local minima", fontsize=9)
-    left.set_xlabel(legible(f"offset of {along} from the truth, in millimetres [mm]"), fontsize=9)
+    left.set_xlabel(
+        legible(f"offset of {displacements} from the truth, in millimetres [mm]"), fontsize=9
+    )
     for i, (name, (offsets, losses)) in enumerate(surrogates.items()):
         label = legible(f"{name} ({count_minima(losses)})")
         right.plot(offsets, losses, color=color(i + 1), label=label)
     right.set_title("surrogate, and its number of local minima", fontsize=9)
-    right.set_xlabel(legible(f"offset of {along} from the truth, in metres [m]"), fontsize=9)
+    right.set_xlabel(
+        legible(f"offset of {displacements} from the truth, in metres [m]"), fontsize=9
+    )
     right.legend(fontsize=8)
     for axes in (left, right):
         axes.axvline(0, color="black", linewidth=0.6, linestyle=":")

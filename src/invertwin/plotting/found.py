@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from invertwin.discovery.outcome import Twin
-from invertwin.discovery.search import outline
+from invertwin.discovery.search import outline_corners
 from invertwin.plotting.figures import color, numbers
 
 
@@ -20,35 +20,35 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
     """
     figure = Figure(figsize=(7.5, 6.2), layout="constrained")
     axes = figure.subplots()
-    names = [f"{'xyz'[axis]} [m]" for axis in twin.ground.level]
+    names = [f"{'xyz'[axis]} [m]" for axis in twin.ground.plane_axes]
     axes.set(xlabel=names[0], ylabel=names[1], aspect="equal", facecolor="black")
-    if twin.picture is not None and len(twin.picture.places):
-        places, strength = numbers(twin.picture.places), numbers(twin.picture.strength)
+    if twin.image is not None and len(twin.image.places):
+        places, strength = numbers(twin.image.places), numbers(twin.image.strength)
         # A single glint would leave all else dark.
         top = max(float(np.quantile(strength, 0.998)), 1e-300)
         level = np.clip(10 * np.log10(np.maximum(strength, 1e-30) / top), -dynamic_range, 0)
-        blind = numbers(twin.picture.views) == 0
-        side = 72 * 5 / max(float(np.ptp(places, axis=0).max()), 1e-6) * _step(places)
+        blind = numbers(twin.image.view_counts) == 0
+        side = 72 * 5 / max(float(np.ptp(places, axis=0).max()), 1e-6) * _grid_step(places)
         style = {"s": max(1.3 * side, 1.0) ** 2, "marker": "s", "linewidths": 0}
         dots = axes.scatter(*places[~blind].T, c=level[~blind], cmap="magma", **style)
         axes.scatter(*places[blind].T, color="0.75", label="never seen", **style)
         figure.colorbar(dots, label="echoes, dB below bright ones", shrink=0.8)
-    for thing in twin.things:
-        x, y = (float(thing.position[axis]) for axis in twin.ground.level)
+    for thing in twin.objects:
+        x, y = (float(thing.position[axis]) for axis in twin.ground.plane_axes)
         at = (x, y)
-        tint = color(0) if thing.confidence > 0.5 else "0.5"
-        if thing.figure is not None:
-            corners = numbers(outline(thing.figure, twin.ground))
+        tint = color(0) if thing.existence_probability > 0.5 else "0.5"
+        if thing.shape is not None:
+            corners = numbers(outline_corners(thing.shape, twin.ground))
             axes.plot(*np.concatenate([corners, corners[:1]]).T, color=tint, linewidth=1.5)
-        spread = [thing.deviations.get("xyz"[axis]) for axis in twin.ground.level]
+        spread = [thing.deviations.get("xyz"[axis]) for axis in twin.ground.plane_axes]
         if None not in spread:
             sizes = [4 * float(value or 0.0) for value in spread]
             axes.add_patch(Ellipse(at, sizes[0], sizes[1], fill=False, color=tint))
         if thing.track is not None:
-            path = numbers(thing.track.positions)[:, list(twin.ground.level)]
+            path = numbers(thing.track.positions)[:, list(twin.ground.plane_axes)]
             axes.plot(*path.T, color=tint, linewidth=1.0, marker=".", markersize=3)
         if thing.velocity is not None:
-            speed = [float(thing.velocity[axis]) for axis in twin.ground.level]
+            speed = [float(thing.velocity[axis]) for axis in twin.ground.plane_axes]
             if math.hypot(*speed) > 0:
                 axes.annotate("", (x + speed[0], y + speed[1]), at, arrowprops={"arrowstyle": "->"})
         axes.annotate(
@@ -59,12 +59,12 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
             textcoords="offset points",
             bbox={"boxstyle": "round", "facecolor": "white", "alpha": 0.8, "linewidth": 0},
         )
-    if twin.picture is not None and bool((twin.picture.views == 0).any()):
+    if twin.image is not None and bool((twin.image.view_counts == 0).any()):
         axes.legend(fontsize=7, loc="upper right")
     return figure
 
 
-def _step(places: np.ndarray) -> float:
+def _grid_step(positions: np.ndarray) -> float:
     """The distance of neighbouring places along the second axis."""
-    gaps = np.diff(np.unique(places[:, 1]))
+    gaps = np.diff(np.unique(positions[:, 1]))
     return float(gaps.min()) if len(gaps) else 0.1

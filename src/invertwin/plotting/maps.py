@@ -14,20 +14,20 @@ from torch import Tensor
 
 from invertwin.channel import Grid
 from invertwin.errors import InputError
-from invertwin.inversion.confidence.realisations import coarse
+from invertwin.inversion.confidence.realisations import coarsen_map
 from invertwin.plotting.figures import legible, numbers
 from invertwin.radar import DopplerMaps
 
 U_LABEL, V_LABEL = "direction cosine u (to the right)", "direction cosine v (up)"
 RATE_LABEL = "range rate [m/s], away > 0"
-_FAINTEST = 1e-30  # power that stands for none in dB
+_MIN_POWER = 1e-30  # power that stands for none in dB
 
 Maps = Tensor | Mapping[str, Tensor]
 """Spectra [frame, range, u, v] by title, or a single one."""
 
 
 @dataclass(frozen=True, eq=False)
-class Panel:
+class MapPanel:
     """A map with its axes; rows are ranges.
 
     Attributes:
@@ -58,7 +58,7 @@ def spectrum(
             all maps on one scale.
         dynamic_range: Level of the brightest colour above the darkest [dB].
     """
-    columns = {title: _views(power, grid) for title, power in _titled(spectra).items()}
+    columns = {title: _views(power, grid) for title, power in _title_maps(spectra).items()}
     rows = len(next(iter(columns.values())))
     figure = Figure(figsize=(1.2 + 3.4 * len(columns), 3.3 * rows), layout="constrained")
     cells = figure.subplots(rows, len(columns), squeeze=False, sharey=True)
@@ -73,16 +73,16 @@ def spectrum(
     return figure
 
 
-def panels(shown: Mapping[str, Panel], *, dynamic_range: float = 40.0) -> Figure:
+def panels(maps: Mapping[str, MapPanel], *, dynamic_range: float = 40.0) -> Figure:
     """Power maps of different axes side by side, each in dB below its own peak.
 
     Args:
-        shown: The maps, by title.
+        maps: The maps, by title.
         dynamic_range: Level of the brightest colour above the darkest [dB].
     """
-    figure = Figure(figsize=(3.9 * len(shown), 3.6), layout="constrained")
-    cells = figure.subplots(1, len(shown), squeeze=False)[0]
-    drawn = [(cell, *item) for cell, item in zip(cells, shown.items(), strict=True)]
+    figure = Figure(figsize=(3.9 * len(maps), 3.6), layout="constrained")
+    cells = figure.subplots(1, len(maps), squeeze=False)[0]
+    drawn = [(cell, *item) for cell, item in zip(cells, maps.items(), strict=True)]
     _draw_decibels(figure, drawn, True, dynamic_range)
     cells[0].set_ylabel("range [m]", fontsize=8)
     return figure
@@ -93,17 +93,19 @@ def range_doppler(maps: DopplerMaps) -> Figure:
     return panels(doppler_panels(maps))
 
 
-def doppler_panels(maps: DopplerMaps) -> dict[str, Panel]:
+def doppler_panels(maps: DopplerMaps) -> dict[str, MapPanel]:
     """The panels of `range_doppler`, to be shown beside others."""
-    rates = Panel(maps.range_doppler.T, maps.grid.ranges, maps.velocities, RATE_LABEL)
+    rates = MapPanel(maps.range_doppler.T, maps.grid.ranges, maps.velocities, RATE_LABEL)
     found = {"range and range rate": rates}
-    found |= direction_panels("everything", maps.everything, maps.grid)
-    if maps.movers is not None:
-        found |= direction_panels("what moves", maps.movers, maps.grid)
+    found |= direction_panels("everything", maps.total_power, maps.grid)
+    if maps.moving_power is not None:
+        found |= direction_panels("what moves", maps.moving_power, maps.grid)
     return found
 
 
-def direction_panels(title: str, power: Float[Tensor, "range u v"], grid: Grid) -> dict[str, Panel]:
+def direction_panels(
+    title: str, power: Float[Tensor, "range u v"], grid: Grid
+) -> dict[str, MapPanel]:
     """Range × azimuth and range × elevation, the strongest over the other direction.
 
     Args:
@@ -113,10 +115,10 @@ def direction_panels(title: str, power: Float[Tensor, "range u v"], grid: Grid) 
     """
     found = {}
     if grid.u_count > 1:
-        found[title] = Panel(power.amax(2), grid.ranges, grid.u, U_LABEL)
+        found[title] = MapPanel(power.amax(2), grid.ranges, grid.u, U_LABEL)
     if grid.v_count > 1:
         name = f"{title}, elevation" if found else title
-        found[name] = Panel(power.amax(1), grid.ranges, grid.v, V_LABEL)
+        found[name] = MapPanel(power.amax(1), grid.ranges, grid.v, V_LABEL)
     return found
 
 
@@ -142,10 +144,10 @@ def gradient(
     """
     still = grid.u_count == grid.v_count == 1
 
-    def first(values: Tensor) -> Panel:
+    def first(values: Tensor) -> MapPanel:
         return _views(values if still else values[:1], grid)[0]
 
-    shared = {title: first(values) for title, values in _titled(derivatives).items()}
+    shared = {title: first(values) for title, values in _title_maps(derivatives).items()}
     others = {title: first(values) for title, values in (own_scale or {}).items()}
     count = len(shared) + len(others) + (power is not None)
     figure = Figure(figsize=(1.2 + 2.9 * count, 3.3), layout="constrained")
@@ -155,12 +157,12 @@ def gradient(
         _draw_decibels(figure, [(cells.pop(0), "power", first(power))], True, 30.0)
     limit = max(_limit(panel) for panel in shared.values())
     images = [
-        _signed(cell, title, panel, limit)
+        _draw_signed(cell, title, panel, limit)
         for cell, (title, panel) in zip(cells, shared.items(), strict=False)
     ]
     _colorbar(figure, images[-1], cells[: len(shared)], label)
     for cell, (title, panel) in zip(cells[len(shared) :], others.items(), strict=True):
-        image = _signed(cell, title, panel, _limit(panel))
+        image = _draw_signed(cell, title, panel, _limit(panel))
         _colorbar(figure, image, [cell], "own scale, same unit")
     return figure
 
@@ -172,11 +174,11 @@ def residuals(residual: Float[Tensor, "range u v"], grid: Grid, *, marked: float
     ones hold more power than the twin explains, blue ones less.
 
     Args:
-        residual: Of coarse bins, see ``Verdict.residuals``.
+        residual: Of coarse bins, see ``LlvmProbeResult.residuals``.
         grid: Bins of the fitted map.
         marked: Standard deviations.
     """
-    ranges, u, v = (coarse(axis[None]) for axis in (grid.ranges, grid.u, grid.v))
+    ranges, u, v = (coarsen_map(axis[None]) for axis in (grid.ranges, grid.u, grid.v))
     views = [(u, U_LABEL, 2), (v, V_LABEL, 1)]
     views = [view for view in views if len(view[0]) > 1] or [(u, U_LABEL, 2)]
     figure = Figure(figsize=(1.2 + 3.9 * len(views), 3.6), layout="constrained")
@@ -184,10 +186,10 @@ def residuals(residual: Float[Tensor, "range u v"], grid: Grid, *, marked: float
     image = None
     for cell, (across, label, dim) in zip(cells, views, strict=True):
         largest = residual.abs().argmax(dim, keepdim=True)
-        panel = Panel(residual.gather(dim, largest).squeeze(dim), ranges, across, label)
-        image = _signed(cell, "", panel, 2 * marked)
-        half = 0.5 * (_edges(ranges)[1] - _edges(ranges)[0]) / len(ranges)
-        wide = 0.5 * (_edges(across)[1] - _edges(across)[0]) / len(across)
+        panel = MapPanel(residual.gather(dim, largest).squeeze(dim), ranges, across, label)
+        image = _draw_signed(cell, "", panel, 2 * marked)
+        half = 0.5 * (_bin_edges(ranges)[1] - _bin_edges(ranges)[0]) / len(ranges)
+        wide = 0.5 * (_bin_edges(across)[1] - _bin_edges(across)[0]) / len(across)
         for row, column in (panel.values.abs() > marked).nonzero().tolist():
             corner = float(across[column]) - wide, float(ranges[row]) - half
             cell.add_patch(Rectangle(corner, 2 * wide, 2 * half, fill=False, linewidth=0.8))
@@ -196,14 +198,14 @@ def residuals(residual: Float[Tensor, "range u v"], grid: Grid, *, marked: float
     return figure
 
 
-def _titled(maps: Maps) -> Mapping[str, Tensor]:
+def _title_maps(maps: Maps) -> Mapping[str, Tensor]:
     titled = maps if isinstance(maps, Mapping) else {"": maps}
     if not titled:
         raise InputError("expected at least one map, got none; give a tensor or a dict of them")
     return titled
 
 
-def _views(power: Tensor, grid: Grid) -> list[Panel]:
+def _views(power: Tensor, grid: Grid) -> list[MapPanel]:
     """Range × azimuth and range × elevation where they are resolved, else range × frame."""
     if tuple(power.shape[1:]) != grid.shape:
         raise InputError(
@@ -212,44 +214,46 @@ def _views(power: Tensor, grid: Grid) -> list[Panel]:
         )
     views = []
     if grid.u_count > 1:
-        views.append(Panel(power.sum((0, 3)), grid.ranges, grid.u, U_LABEL))
+        views.append(MapPanel(power.sum((0, 3)), grid.ranges, grid.u, U_LABEL))
     if grid.v_count > 1:
-        views.append(Panel(power.sum((0, 2)), grid.ranges, grid.v, V_LABEL))
+        views.append(MapPanel(power.sum((0, 2)), grid.ranges, grid.v, V_LABEL))
     frames = torch.arange(len(power), dtype=torch.float64)
-    return views or [Panel(power.sum((2, 3)).T, grid.ranges, frames, "frame")]
+    return views or [MapPanel(power.sum((2, 3)).T, grid.ranges, frames, "frame")]
 
 
 def _draw_decibels(
-    figure: Figure, drawn: list[tuple[Any, str, Panel]], relative: bool, dynamic_range: float
+    figure: Figure, panels: list[tuple[Any, str, MapPanel]], relative: bool, dynamic_range: float
 ) -> None:
     """Power of all panels in dB, with one bar for their colours."""
-    powers = [numbers(panel.values) for _, _, panel in drawn]
-    top = 0.0 if relative else 10 * np.log10(max(max(p.max() for p in powers), _FAINTEST))
+    powers = [numbers(panel.values) for _, _, panel in panels]
+    top = 0.0 if relative else 10 * np.log10(max(max(p.max() for p in powers), _MIN_POWER))
     image = None
-    for (cell, title, panel), power in zip(drawn, powers, strict=True):
+    for (cell, title, panel), power in zip(panels, powers, strict=True):
         peak = power.max() if relative and power.max() > 0 else 1.0
-        level = 10 * np.log10(np.maximum(power / peak, _FAINTEST))
-        image = _image(cell, title, panel, level, vmin=top - dynamic_range, vmax=top)
+        level = 10 * np.log10(np.maximum(power / peak, _MIN_POWER))
+        image = _draw_image(cell, title, panel, level, vmin=top - dynamic_range, vmax=top)
     assert image is not None
     label = "power [dB below peak]" if relative else "received over transmitted power [dB]"
-    _colorbar(figure, image, [cell for cell, *_ in drawn], label)
+    _colorbar(figure, image, [cell for cell, *_ in panels], label)
 
 
-def _signed(cell: Any, title: str, panel: Panel, limit: float) -> Any:
-    return _image(cell, title, panel, numbers(panel.values), vmin=-limit, vmax=limit, cmap="RdBu_r")
+def _draw_signed(cell: Any, title: str, panel: MapPanel, limit: float) -> Any:
+    return _draw_image(
+        cell, title, panel, numbers(panel.values), vmin=-limit, vmax=limit, cmap="RdBu_r"
+    )
 
 
-def _limit(panel: Panel) -> float:
+def _limit(panel: MapPanel) -> float:
     """The largest colour: a few outliers may exceed it."""
     return float(np.quantile(np.abs(numbers(panel.values)), 0.998)) or 1.0
 
 
-def _image(cell: Any, title: str, panel: Panel, values: NDArray, **style: Any) -> Any:
+def _draw_image(cell: Any, title: str, panel: MapPanel, values: NDArray, **style: Any) -> Any:
     image = cell.imshow(
         values,
         origin="lower",
         aspect="auto",
-        extent=(*_edges(panel.across), *_edges(panel.ranges)),
+        extent=(*_bin_edges(panel.across), *_bin_edges(panel.ranges)),
         **style,
     )
     cell.set_title(legible(title), fontsize=9)
@@ -264,7 +268,7 @@ def _colorbar(figure: Figure, image: Any, cells: list[Any], label: str) -> None:
     bar.ax.tick_params(labelsize=7)
 
 
-def _edges(places: Tensor) -> tuple[float, float]:
+def _bin_edges(positions: Tensor) -> tuple[float, float]:
     """Outer edges of the first and the last bin."""
-    half = 0.5 * float(places[1] - places[0]) if len(places) > 1 else 0.5
-    return float(places[0]) - half, float(places[-1]) + half
+    half = 0.5 * float(positions[1] - positions[0]) if len(positions) > 1 else 0.5
+    return float(positions[0]) - half, float(positions[-1]) + half

@@ -48,7 +48,9 @@ def floor_plan(
             cmap="viridis",
             aspect="equal",
         )
-        axes.add_collection(LineCollection(_cut(scene, height), colors="black", linewidths=1.5))
+        axes.add_collection(
+            LineCollection(_cut_triangles(scene, height), colors="black", linewidths=1.5)
+        )
         axes.plot(*numbers(tx)[:2], "^", color="white", markeredgecolor="black", label="sender")
         if title != next(iter(levels)):
             axes.plot(*numbers(panel)[:2], "s", color=PALETTE[1], label="panel")
@@ -60,32 +62,34 @@ def floor_plan(
 
 
 def placements(
-    along: Float64[Tensor, " place"],
+    positions: Float64[Tensor, " place"],
     levels: Float64[Tensor, " place"],
-    ends: Float64[Tensor, "start 2"],
+    search_ends: Float64[Tensor, "start 2"],
 ) -> Figure:
     """The aim over the place of a panel, and where searches have ended.
 
     Args:
-        along: Places on the path [m].
+        positions: Places on the path [m].
         levels: The best of a grid at each [dB].
-        ends: Place [m] and level [dB] of every search.
+        search_ends: Place [m] and level [dB] of every search.
     """
     figure = Figure(figsize=(8, 3.3), layout="constrained")
     axes = figure.subplots()
     label = "best of the grid at this place"
-    axes.plot(numbers(along), numbers(levels), color=PALETTE[0], label=label)
-    axes.plot(*numbers(ends).T, "o", color=PALETTE[1], label="found by gradient, phases fitted")
+    axes.plot(numbers(positions), numbers(levels), color=PALETTE[0], label=label)
+    axes.plot(
+        *numbers(search_ends).T, "o", color=PALETTE[1], label="found by gradient, phases fitted"
+    )
     axes.set(xlabel="place along the walls [m]", ylabel="worst receivers [dB]")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure
 
 
-def located(
+def transmitter_fits(
     scene: Scene,
     height: float,
-    places: Mapping[str, Float64[Tensor, "place 3"]],
+    positions: Mapping[str, Float64[Tensor, "place 3"]],
     fits: Float64[Tensor, "fit 2 3"],
 ) -> Figure:
     """Where fits of a transmitter began and ended, on a floor plan.
@@ -93,24 +97,26 @@ def located(
     Args:
         scene: Its objects are cut at the height.
         height: [m].
-        places: Further places by title, such as the receivers, the truth and what was found [m].
+        positions: Further places by title, such as the receivers, the truth and what was found [m].
         fits: Start and end of each [m].
     """
     figure = Figure(figsize=(6.4, 4.6), layout="constrained")
     axes = figure.subplots()
-    axes.add_collection(LineCollection(_cut(scene, height), colors="black", linewidths=1.2))
+    axes.add_collection(
+        LineCollection(_cut_triangles(scene, height), colors="black", linewidths=1.2)
+    )
     ways = numbers(fits)[..., :2]
     axes.add_collection(LineCollection([*ways], colors="0.75", linewidths=0.8))
     axes.plot(*ways[:, 0].T, "o", color="0.6", markersize=4, label="starts")
     axes.plot(*ways[:, 1].T, "o", color=PALETTE[0], markersize=5, label="ends")
-    for (title, some), style in zip(places.items(), _MARKS, strict=False):
+    for (title, some), style in zip(positions.items(), _MARKS, strict=False):
         axes.plot(*numbers(some)[:, :2].T, style[0], color=style[1], label=legible(title))
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
-def _cut(scene: Scene, height: float) -> list[list[list[float]]]:
+def _cut_triangles(scene: Scene, height: float) -> list[list[list[float]]]:
     """Segments in which a level plane cuts the triangles of a scene, x and y of both ends."""
     found: list[list[list[float]]] = []
     for item in scene.objects.values():

@@ -20,7 +20,7 @@ _BACKGROUND = "#b9bec7"
 _OUTLINE = "#c0143c"
 _MARKED_SHARE = 0.015  # of a view: objects that look smaller get a mark
 _TRACK_COUNT = 24  # radar positions: more of them are drawn as dots
-_MIRRORED = "drawn with the radar's right to the right: mirrored against right-handed axes"
+_HANDEDNESS_NOTE = "drawn with the radar's right to the right: mirrored against right-handed axes"
 # What runs across, up, and in depth: 0, 1, 2 = the radar's right, up, boresight.
 _VIEWS = {"from the radar": (0, 1, 2), "from above": (0, 2, 1), "from the side": (2, 1, 0)}
 
@@ -77,7 +77,7 @@ def scene(
 
 
 @dataclass(frozen=True)
-class _View:
+class _OrthographicView:
     """A look along a world axis.
 
     Attributes:
@@ -95,7 +95,7 @@ class _View:
         return list(self.axes[:2])
 
 
-def _views(radar: Radar | None) -> list[_View]:
+def _views(radar: Radar | None) -> list[_OrthographicView]:
     """The views along the world axes nearest to the radar's right, up and boresight."""
     turned = radar is not None and radar.rotations is not None
     frame = numbers(radar.rotations.mean(0)) if turned else np.eye(3)  # type: ignore[union-attr]
@@ -107,14 +107,14 @@ def _views(radar: Radar | None) -> list[_View]:
         # The eye is in front of the radar, above, or on the right.
         towards = sign[depth] * (-1 if depth == 2 else 1)
         axes = nearest[across], nearest[up], nearest[depth]
-        views.append(_View(title, axes, (sign[across], sign[up], towards)))
+        views.append(_OrthographicView(title, axes, (sign[across], sign[up], towards)))
     return views
 
 
-def _shapes(shown: Scene) -> dict[str, Shape]:
+def _shapes(scene: Scene) -> dict[str, Shape]:
     return {
         name: (numbers(item.vertices), numbers(item.mesh.faces))
-        for name, item in shown.objects.items()
+        for name, item in scene.objects.items()
     }
 
 
@@ -126,12 +126,12 @@ def _colors(shapes: Mapping[str, Shape], highlight: Sequence[str] | None) -> dic
 
 
 def _window(
-    drawn: Sequence[Mapping[str, Shape]], places: NDArray | None, view: _View
+    scene_shapes: Sequence[Mapping[str, Shape]], positions: NDArray | None, view: _OrthographicView
 ) -> tuple[float, float, float, float]:
     """Centre and size of what a view shows, equal for all scenes."""
-    points = [vertices for shapes in drawn for vertices, _ in shapes.values()]
-    if places is not None:
-        points.append(places)
+    points = [vertices for shapes in scene_shapes for vertices, _ in shapes.values()]
+    if positions is not None:
+        points.append(positions)
     flat = np.concatenate(points)[:, view.plane]
     low, high = flat.min(axis=0), flat.max(axis=0)
     sides = (high - low) * 1.12
@@ -145,8 +145,8 @@ def _draw(
     shapes: Mapping[str, Shape],
     colors: Mapping[str, str],
     edges: Mapping[str, Shape],
-    places: NDArray | None,
-    view: _View,
+    positions: NDArray | None,
+    view: _OrthographicView,
     window: tuple[float, float, float, float],
 ) -> None:
     plane = view.plane
@@ -165,8 +165,10 @@ def _draw(
     for vertices, mark in small_marks:
         if np.ptp(vertices[:, plane], axis=0).max() < smallest:
             axes.plot(*vertices[:, plane].mean(axis=0), linestyle="", **mark)
-    if places is not None:
-        axes.plot(*places[:, plane].T, color="black", linestyle="", mew=0, **_mark(places))
+    if positions is not None:
+        axes.plot(
+            *positions[:, plane].T, color="black", linestyle="", mew=0, **_draw_marks(positions)
+        )
     for set_limits, c in ((axes.set_xlim, 0), (axes.set_ylim, 1)):
         ends = window[c] + window[c + 2] / 2 * np.array([-1, 1])
         set_limits(*ends[:: view.signs[c]])
@@ -176,13 +178,13 @@ def _draw(
     axes.tick_params(labelsize=7)
 
 
-def _mark(places: NDArray) -> dict[str, Any]:
-    many = len(places) > _TRACK_COUNT
+def _draw_marks(positions: NDArray) -> dict[str, Any]:
+    many = len(positions) > _TRACK_COUNT
     return {"marker": ".", "markersize": 5} if many else {"marker": "v", "markersize": 4}
 
 
 def _legend(
-    figure: Figure, names: Mapping[str, str], outlined: bool, places: NDArray | None
+    figure: Figure, names: Mapping[str, str], outlined: bool, positions: NDArray | None
 ) -> None:
     """Which colour is what, over all scenes."""
     labels = {("other objects" if c == _BACKGROUND else name): c for name, c in names.items()}
@@ -191,15 +193,15 @@ def _legend(
     ]
     if outlined:
         handles.append(Line2D([], [], color=_OUTLINE, linewidth=1, label="truth"))
-    if places is not None:
-        label = f"radar, {len(places)} positions" if len(places) > 1 else "radar"
-        handles.append(Line2D([], [], color="black", ls="", label=label, **_mark(places)))
+    if positions is not None:
+        label = f"radar, {len(positions)} positions" if len(positions) > 1 else "radar"
+        handles.append(Line2D([], [], color="black", ls="", label=label, **_draw_marks(positions)))
     figure.legend(
         handles=handles,
         loc="outside lower center",
         ncols=6,
         fontsize=8,
         frameon=False,
-        title=_MIRRORED,
+        title=_HANDEDNESS_NOTE,
         title_fontsize=7,
     )

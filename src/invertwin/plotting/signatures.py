@@ -12,7 +12,7 @@ from invertwin.plotting.figures import color, legible, numbers
 _SPAN = 60.0  # dB below the largest value that figures show
 
 
-def sections(
+def rcs_curves(
     panels: Mapping[str, Mapping[str, Tensor]], across: Tensor, label: str, least: float = _SPAN
 ) -> Figure:
     """Radar cross-sections in dBsm, a panel for each frequency or aspect.
@@ -35,7 +35,7 @@ def sections(
     return figure
 
 
-def slopes(curves: Mapping[str, Tensor], across: Tensor, label: str, unit: str) -> Figure:
+def rcs_derivatives(curves: Mapping[str, Tensor], across: Tensor, label: str, unit: str) -> Figure:
     """Derivatives of a radar cross-section.
 
     Args:
@@ -69,7 +69,7 @@ def _lines(
     axes.legend(fontsize=8)
 
 
-def profile(levels: Tensor, ranges: Tensor, across: Tensor, label: str) -> Figure:
+def rcs_profile(levels: Tensor, ranges: Tensor, across: Tensor, label: str) -> Figure:
     """Range profiles in dBsm: a curve of one aspect, a map of several.
 
     Args:
@@ -96,7 +96,7 @@ def profile(levels: Tensor, ranges: Tensor, across: Tensor, label: str) -> Figur
     return figure
 
 
-def focused(levels: Tensor, extent: float, labels: tuple[str, str]) -> Figure:
+def rcs_image(levels: Tensor, extent: float, labels: tuple[str, str]) -> Figure:
     """An image in dBsm.
 
     Args:

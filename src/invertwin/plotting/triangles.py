@@ -11,7 +11,9 @@ from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 MAX_TRIANGLES = 40_000  # of one object
-_LIGHT = np.array([0.35, 0.6, 0.72])  # towards the lamp: right, up, towards the eye
+_ILLUMINATION_DIRECTION = np.array(
+    [0.35, 0.6, 0.72]
+)  # towards the lamp: right, up, towards the eye
 
 Shape = tuple[NDArray, NDArray]
 """Vertices [v, 3] and faces [f, 3]."""
@@ -32,7 +34,7 @@ def paint(axes: Any, shapes: Sequence[tuple[Shape, str]], eye: NDArray, longest:
         triangles = triangles[:: math.ceil(len(triangles) / MAX_TRIANGLES)]
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         lengths = np.linalg.norm(normals, axis=1)
-        shade = np.abs(normals @ _LIGHT) / np.where(lengths > 0, lengths, 1)
+        shade = np.abs(normals @ _ILLUMINATION_DIRECTION) / np.where(lengths > 0, lengths, 1)
         polygons.append(triangles)
         colors.append(np.clip(np.array(to_rgb(color)) * (0.5 + 0.55 * shade[:, None]), 0, 1))
     triangles, color = np.concatenate(polygons), np.concatenate(colors)

@@ -4,8 +4,8 @@ from invertwin.radar.boards import BOARDS as BOARDS
 from invertwin.radar.boards import Board as Board
 from invertwin.radar.boards import board as board
 from invertwin.radar.parameters import ClockOffset as ClockOffset
-from invertwin.radar.parameters import RadarPath as RadarPath
 from invertwin.radar.parameters import RadarPose as RadarPose
+from invertwin.radar.parameters import RadarTrajectory as RadarTrajectory
 from invertwin.radar.parameters import RangeBias as RangeBias
 from invertwin.radar.processing.backprojection import backproject_beat as backproject_beat
 from invertwin.radar.processing.beamforming import beamform as beamform
@@ -29,13 +29,13 @@ from invertwin.radar.processing.doppler import velocity_span as velocity_span
 from invertwin.radar.processing.doppler_maps import DopplerMaps as DopplerMaps
 from invertwin.radar.processing.doppler_maps import Peak as Peak
 from invertwin.radar.processing.doppler_maps import doppler_maps as doppler_maps
-from invertwin.radar.processing.doppler_maps import peak_of as peak_of
-from invertwin.radar.processing.doppler_maps import sharp_map as sharp_map
-from invertwin.radar.processing.doppler_maps import snapshots_of as snapshots_of
+from invertwin.radar.processing.doppler_maps import doppler_snapshots as doppler_snapshots
+from invertwin.radar.processing.doppler_maps import find_peak as find_peak
+from invertwin.radar.processing.doppler_maps import high_resolution_map as high_resolution_map
 from invertwin.radar.processing.point_files import save_points as save_points
+from invertwin.radar.processing.reflectors import detect_points as detect_points
+from invertwin.radar.processing.reflectors import format_points_csv as format_points_csv
 from invertwin.radar.processing.reflectors import noise_power as noise_power
-from invertwin.radar.processing.reflectors import points_csv as points_csv
-from invertwin.radar.processing.reflectors import points_of as points_of
 from invertwin.radar.radar import Radar as Radar
 from invertwin.radar.signal.chirps import Chirps as Chirps
 from invertwin.radar.signal.chirps import moving_beat as moving_beat
@@ -57,7 +57,7 @@ from invertwin.radar.surrogate.point_spread import dirichlet as dirichlet
 from invertwin.radar.surrogate.point_spread import normalized_gaussian as normalized_gaussian
 from invertwin.radar.surrogate.surrogate import SURROGATES as SURROGATES
 from invertwin.radar.surrogate.surrogate import Surrogate as Surrogate
-from invertwin.radar.surrogate.surrogate import chosen_surrogate as chosen_surrogate
+from invertwin.radar.surrogate.surrogate import resolve_surrogate as resolve_surrogate
 from invertwin.radar.surrogate.surrogate import surrogate_spectrum as surrogate_spectrum
 from invertwin.radar.waveform import FMCW as FMCW
 from invertwin.radar.waveform import OFDM as OFDM

@@ -41,14 +41,14 @@ class Aperture:
     wavelength: float
 
     @property
-    def separable(self) -> bool:
+    def is_separable(self) -> bool:
         """Whether the array is the product of a row and a column, so its response is too."""
         counts = self.counts
         return torch.equal(counts * counts.sum(), counts.sum(1)[:, None] * counts.sum(0)[None])
 
     def check_resolved(self, grid: Grid) -> None:
         """Raise if the grid resolves only one axis of an array that is not separable."""
-        if not self.separable and (grid.u_count == 1 or grid.v_count == 1):
+        if not self.is_separable and (grid.u_count == 1 or grid.v_count == 1):
             raise InputError(
                 f"expected a grid that resolves u and v, got {grid.u_count} × {grid.v_count} bins; "
                 "this array is not the product of a row and a column, so resolve both axes"
@@ -77,15 +77,15 @@ class Aperture:
         return plane / self.counts.clamp_min(1).to(plane.device, plane.real.dtype)
 
     def steering(
-        self, cosines: Float64[Tensor, " node"], places: Float64[Tensor, " place"]
+        self, cosines: Float64[Tensor, " node"], positions: Float64[Tensor, " place"]
     ) -> Complex[Tensor, "node place"]:
         """Phasors exp(+jk u x), which undo the beat phase of an element at x for a source at u.
 
         Args:
             cosines: Direction cosines u.
-            places: Positions x of the elements [m].
+            positions: Positions x of the elements [m].
         """
-        phase = 2 * math.pi / self.wavelength * cosines[:, None] * places[None]
+        phase = 2 * math.pi / self.wavelength * cosines[:, None] * positions[None]
         return torch.polar(torch.ones_like(phase), phase)
 
     def beams(
@@ -127,29 +127,40 @@ def _aperture(key: tuple[tuple[float, ...], ...], wavelength: float, window: str
             f"expected a virtual array in the radar's x-y plane, got one {depth:.2g} wavelengths "
             "deep along z; turn the radar's rotation instead of its elements"
         )
-    x, column = _distinct(places[:, 0], wavelength)
-    y, row = _distinct(places[:, 1], wavelength)
+    x, column = _distinct_positions(places[:, 0], wavelength)
+    y, row = _distinct_positions(places[:, 1], wavelength)
     counts = torch.zeros(len(x), len(y), dtype=torch.float64)
     counts.index_put_((column, row), torch.ones(len(places), dtype=torch.float64), accumulate=True)
-    return Aperture(x, y, column, row, _taper(window, x), _taper(window, y), counts, wavelength)
+    return Aperture(
+        x,
+        y,
+        column,
+        row,
+        _position_taper(window, x),
+        _position_taper(window, y),
+        counts,
+        wavelength,
+    )
 
 
 # Depth of an array along boresight, in wavelengths, that (u, v) steering may leave out.
 
 
-def _distinct(
-    places: Float64[Tensor, " virtual"], wavelength: float
+def _distinct_positions(
+    positions: Float64[Tensor, " virtual"], wavelength: float
 ) -> tuple[Float64[Tensor, " place"], Int64[Tensor, " virtual"]]:
     """Distinct positions to a thousandth of a wavelength, and which one each element has."""
-    ordered, order = places.sort()
+    ordered, order = positions.sort()
     groups = torch.cat([torch.zeros(1), (ordered.diff() > 1e-3 * wavelength)]).cumsum(0).long()
     index = torch.empty_like(groups)
     index[order] = groups
-    sums = torch.zeros(int(groups[-1]) + 1, dtype=torch.float64).index_add_(0, index, places)
+    sums = torch.zeros(int(groups[-1]) + 1, dtype=torch.float64).index_add_(0, index, positions)
     return sums / torch.bincount(index), index
 
 
-def _taper(window: str, places: Float64[Tensor, " place"]) -> Float64[Tensor, " place"]:
-    extent = places[-1] - places[0]
-    position = (places - places[0]) / extent if len(places) > 1 else torch.zeros_like(places)
-    return taper(window, position, len(places))
+def _position_taper(window: str, positions: Float64[Tensor, " place"]) -> Float64[Tensor, " place"]:
+    extent = positions[-1] - positions[0]
+    position = (
+        (positions - positions[0]) / extent if len(positions) > 1 else torch.zeros_like(positions)
+    )
+    return taper(window, position, len(positions))

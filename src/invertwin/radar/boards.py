@@ -17,11 +17,11 @@ from torch import Tensor
 from invertwin.checks import ArrayLike, check_fields, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.limits import Among, Frequency, Positive
+from invertwin.limits import AllowedValues, Frequency, Positive
 from invertwin.scene.antenna import AntennaArray, Isotropic, Pattern, Polarised
 
-Elements = tuple[AntennaArray, AntennaArray]  # TX and RX
-Places = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]
+TxRxArrays = tuple[AntennaArray, AntennaArray]  # TX and RX
+ElementGrid = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class Board:
     """
 
     name: str
-    transmitters: Places
-    receivers: Places
+    transmitters: ElementGrid
+    receivers: ElementGrid
     design_frequency: Frequency
     source: str = "user"
     polarisation: Polarised = "V"
@@ -82,7 +82,7 @@ class Board:
         pattern: Pattern | None = None,
         polarisation: Polarised | None = None,
         leakage: float | ArrayLike = 0.0,
-    ) -> Elements:
+    ) -> TxRxArrays:
         """TX and RX elements in the radar frame (x right, y up, z boresight).
 
         Public sources disagree which way is up, for the xWR1843's middle transmitter for one, and
@@ -117,23 +117,25 @@ class Board:
         unit = SPEED_OF_LIGHT / self.design_frequency / 2
         pattern = Isotropic() if pattern is None else pattern
 
-        def array(places: Places, chosen: Sequence[int] | None, name: str) -> AntennaArray:
-            grid = torch.tensor(places, dtype=torch.float64)
+        def array(
+            grid_positions: ElementGrid, numbers: Sequence[int] | None, name: str
+        ) -> AntennaArray:
+            grid = torch.tensor(grid_positions, dtype=torch.float64)
             grid = (grid - grid.mean(dim=0)) * torch.tensor(signs, dtype=torch.float64) * unit
             positions = torch.cat([grid, torch.zeros_like(grid[:, :1])], dim=1)
             own = self.polarisation if polarisation is None else polarisation
             return AntennaArray(
-                positions[self._indices(places, chosen, name)], pattern, own, leakage
+                positions[self._indices(grid_positions, numbers, name)], pattern, own, leakage
             )
 
         return array(self.transmitters, transmitters, "TX"), array(self.receivers, receivers, "RX")
 
-    def _indices(self, places: Places, chosen: Sequence[int] | None, name: str) -> Tensor:
-        numbers = list(range(1, len(places) + 1)) if chosen is None else list(chosen)
-        wrong = [number for number in numbers if not 1 <= number <= len(places)]
+    def _indices(self, positions: ElementGrid, chosen: Sequence[int] | None, name: str) -> Tensor:
+        numbers = list(range(1, len(positions) + 1)) if chosen is None else list(chosen)
+        wrong = [number for number in numbers if not 1 <= number <= len(positions)]
         if wrong or not numbers or len(set(numbers)) < len(numbers):
             raise InputError(
-                f"expected different {name} numbers of {self.name} from 1 to {len(places)}, got "
+                f"expected different {name} numbers of {self.name} from 1 to {len(positions)}, got "
                 f"{numbers}; choose elements that it has"
             )
         return torch.tensor(numbers) - 1
@@ -164,7 +166,7 @@ class Mounting:
 
     def arrays(
         self, transmitters: Sequence[int] | None = None, receivers: Sequence[int] | None = None
-    ) -> Elements:
+    ) -> TxRxArrays:
         """TX (in the order of sending) and RX elements in use: its own, or those that recorded.
 
         Args:
@@ -278,7 +280,7 @@ BOARDS: Mapping[str, Board] = MappingProxyType({board.name: board for board in _
 
 
 def board(
-    name: Annotated[str, Among(tuple(BOARDS))], design_frequency: Positive | None = None
+    name: Annotated[str, AllowedValues(tuple(BOARDS))], design_frequency: Positive | None = None
 ) -> Board:
     """A board that the library knows: a preset of `BOARDS`.
 

@@ -19,7 +19,7 @@ class RadarPose(RigidMotion):
 
     def forward(self, radar: Radar) -> Radar:
         """The moved radar."""
-        return radar.moved(self.rotation_matrix, self.shift)
+        return radar.transform_rigidly(self.rotation_matrix, self.shift)
 
     def values(self) -> dict[str, Tensor]:
         """Translation [m] and rotation vector [rad] by name, for progress and reports."""
@@ -30,7 +30,7 @@ class RadarPose(RigidMotion):
         return self.named_coordinates("radar")
 
 
-class RadarPath(nn.Module):
+class RadarTrajectory(nn.Module):
     """Refines the path of a radar by what odometry piles up: a random walk from the first frame.
 
         d(0) = 0,   d(k) = d(k−1) + drift · z_k

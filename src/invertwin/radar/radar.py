@@ -12,22 +12,22 @@ from annotated_types import Ge, Gt, Le
 from jaxtyping import Complex, Complex128, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, Paths, differentiated
+from invertwin.channel import Grid, Link, Paths, is_differentiated
 from invertwin.checks import ArrayLike, check_fields, check_shape, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.limits import MOST, Among
+from invertwin.limits import MAX_COUNT, AllowedValues
 from invertwin.radar.waveform import WINDOWS, PhysicsWarning, SampledWaveform, Waveform
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.antenna import AntennaArray
 
-Window = Annotated[str, Among(WINDOWS)]
+Window = Annotated[str, AllowedValues(WINDOWS)]
 Cosine = Annotated[float, Gt(0), Le(1)]
 # Antennas closer than this see the same surfaces: one visibility test serves both.
 _SHARED_VISIBILITY_DISTANCE = 0.1
 # Arrays are built for λ/2 at some frequency of the band, not exactly at its centre.
 _SPACING_TOLERANCE = 1.05
-_MOST_CHANNELS = 1e6
+_MAX_CHANNELS = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class Radar:
             )
         require_at_most(
             self.shape[1] * self.shape[2],
-            _MOST_CHANNELS,
+            _MAX_CHANNELS,
             "pairs of a transmitter and a receiver",
             "use fewer elements",
             "receivers",
@@ -135,11 +135,11 @@ class Radar:
         return self._world(self.transmitters.positions), self._world(self.receivers.positions)
 
     @property
-    def biased(self) -> bool:
+    def has_range_bias(self) -> bool:
         """Whether ranges have a bias, or a derivative with respect to one."""
         bias = self.range_bias
         if isinstance(bias, Tensor):
-            return differentiated(bias) or bool(bias)
+            return is_differentiated(bias) or bool(bias)
         return bias != 0
 
     @property
@@ -167,7 +167,7 @@ class Radar:
         low = max(nearest, -0.5 * self.waveform.max_range)
         return low, low + self.waveform.max_range
 
-    def centered(self, point: ArrayLike) -> "Radar":
+    def center_on(self, point: ArrayLike) -> "Radar":
         """The radar of data that are motion compensated to a point, which has range 0 in them.
 
         The origins are those of the positions as they are now, without derivatives.
@@ -218,7 +218,9 @@ class Radar:
             )
         return torch.einsum("r,prt,t->p", received[receiver], paths.matrix, sent[transmitter])
 
-    def moved(self, rotation: Float64[Tensor, "3 3"], translation: Float64[Tensor, "3"]) -> "Radar":
+    def transform_rigidly(
+        self, rotation: Float64[Tensor, "3 3"], translation: Float64[Tensor, "3"]
+    ) -> "Radar":
         """All poses moved rigidly: turned about the mean position, then translated.
 
         Args:
@@ -296,7 +298,7 @@ class Radar:
             step = self.waveform.max_range / round(oversample * self.waveform.samples)
         do = "give metres, and direction cosines, or less oversampling"
         farthest = max(range_max, -range_min)
-        require_at_most(farthest / step, MOST, "bins of range", do, "range_max")
+        require_at_most(farthest / step, MAX_COUNT, "bins of range", do, "range_max")
         first = math.floor(range_min / step + 1e-9)
         last = math.ceil(range_max / step - 1e-9)
         axes = {}
@@ -305,7 +307,9 @@ class Radar:
             if size < 1.001 * half:
                 continue
             spacing = self.waveform.wavelength / (2 * oversample * size)
-            require_at_most(limit / spacing, MOST / 2 - 1, f"bins of {name}", do, f"{name}_max")
+            require_at_most(
+                limit / spacing, MAX_COUNT / 2 - 1, f"bins of {name}", do, f"{name}_max"
+            )
             side = min(math.ceil(limit / spacing - 1e-9), math.floor(1 / spacing + 1e-9))
             axes |= {
                 f"{name}_start": -side * spacing,
@@ -346,7 +350,7 @@ class Radar:
                 )
 
 
-def sampled(radar: Radar) -> SampledWaveform:
+def require_sampled_waveform(radar: Radar) -> SampledWaveform:
     """Return the radar's waveform, if it has a beat signal."""
     if isinstance(radar.waveform, SampledWaveform):
         return radar.waveform
@@ -368,7 +372,7 @@ def checked_beat(
     Raises:
         InputError: It has another shape.
     """
-    expected = (*radar.shape, sampled(radar).samples)
+    expected = (*radar.shape, require_sampled_waveform(radar).samples)
     what = "a beat signal (frame, tx, rx, sample)"
     check_shape(beat, expected, what, "use the radar that recorded it")
     return beat
@@ -377,7 +381,7 @@ def checked_beat(
 def _checked_origin(value: object, frames: int) -> Tensor:
     do = "give one range in metres per frame"
     origin = checked_tensor(value, (frames,), "range_origin", do)
-    if differentiated(origin):
+    if is_differentiated(origin):
         raise InputError(
             "expected range_origin without derivatives, got one that carries them; it is what the "
             "recording was compensated with: detach it"

@@ -8,7 +8,7 @@ from invertwin.checks import Point, checked_tensor
 from invertwin.limits import Angle, Count, NonNegative, Positive
 from invertwin.runtime.memory import require_at_most
 
-_MOST_POSITIONS = 1e6
+_MAX_POSITIONS = 1e6
 
 
 def line(start: Point, stop: Point, count: Count) -> Float64[Tensor, "frame 3"]:
@@ -62,7 +62,7 @@ def _point(value: Point) -> Tensor:
 
 
 def _require_positions(count: int) -> None:
-    require_at_most(count, _MOST_POSITIONS, "positions of a radar", "lower count", "count")
+    require_at_most(count, _MAX_POSITIONS, "positions of a radar", "lower count", "count")
 
 
 def _linspace(first: float, last: float, count: int) -> Tensor:

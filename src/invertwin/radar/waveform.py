@@ -15,7 +15,7 @@ from invertwin.checks import check_fields
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.errors import PhysicsWarning as PhysicsWarning
-from invertwin.limits import Bandwidth, Duration, Frequency, Several, Step
+from invertwin.limits import Bandwidth, CountOfTwo, Duration, Frequency, FrequencyStep
 
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
@@ -124,7 +124,7 @@ class FMCW(SampledWaveform):
     start_frequency: Frequency
     bandwidth: Bandwidth
     duration: Duration
-    samples: Several
+    samples: CountOfTwo
 
     @property
     def center_frequency(self) -> float:
@@ -169,8 +169,8 @@ class SteppedFrequency(SampledWaveform):
     """
 
     start_frequency: Frequency
-    step: Step
-    samples: Several
+    step: FrequencyStep
+    samples: CountOfTwo
     dwell: Duration
 
     @property
@@ -209,8 +209,8 @@ class OFDM(SampledWaveform):
     """
 
     start_frequency: Frequency
-    spacing: Step
-    subcarriers: Several
+    spacing: FrequencyStep
+    subcarriers: CountOfTwo
 
     @property
     def samples(self) -> int:
@@ -237,7 +237,7 @@ class OFDM(SampledWaveform):
         """N · spacing [Hz]: a subcarrier has 1/N of the noise, and 1/N of the transmit power."""
         return self.bandwidth
 
-    def received(
+    def receive_symbols(
         self, beat: Complex[Tensor, "*batch sample"], symbols: Complex[Tensor, "*#batch sample"]
     ) -> Complex[Tensor, "*batch sample"]:
         """Y = H X: what the receiver's FFT gives for these symbols.
@@ -249,29 +249,31 @@ class OFDM(SampledWaveform):
         Raises:
             InputError: Another number of symbols than subcarriers.
         """
-        return beat.conj() * self._checked(symbols)
+        return beat.conj() * self._check_symbols(symbols)
 
     def beat(
-        self, received: Complex[Tensor, "*batch sample"], symbols: Complex[Tensor, "*#batch sample"]
+        self,
+        received_symbols: Complex[Tensor, "*batch sample"],
+        symbols: Complex[Tensor, "*#batch sample"],
     ) -> Complex[Tensor, "*batch sample"]:
         """conj(Y / X), the samples that ``range_profile`` takes.
 
         Args:
-            received: Y, what the receiver's FFT gives.
+            received_symbols: Y, what the receiver's FFT gives.
             symbols: X, sent on each subcarrier.
 
         Raises:
             InputError: Another number of symbols than subcarriers, or one that is zero.
         """
-        silent = int((self._checked(symbols) == 0).sum())
+        silent = int((self._check_symbols(symbols) == 0).sum())
         if silent:
             raise InputError(
                 f"expected symbols other than zero, got {silent} zeros of {symbols.numel()}; "
                 "nothing can be measured on silent subcarriers: keep to those in use"
             )
-        return (received / symbols).conj()
+        return (received_symbols / symbols).conj()
 
-    def _checked(self, symbols: Tensor) -> Tensor:
+    def _check_symbols(self, symbols: Tensor) -> Tensor:
         if symbols.shape[-1] != self.subcarriers:
             raise InputError(
                 f"expected {self.subcarriers} symbols, got {symbols.shape[-1]}; "

@@ -33,20 +33,20 @@ from annotated_types import Len, MinLen
 from pydantic import Discriminator, GetCoreSchemaHandler, Tag, create_model, model_validator
 
 from invertwin.errors import InputError
-from invertwin.limits import RADIANS, Letters
+from invertwin.limits import RADIANS, AllowedLetters
 from invertwin.registry.section import (
     TAG_MARK,
     InputPath,
     KeyInputError,
     Section,
-    about,
-    fail,
     key,
+    prefix_errors,
+    raise_key_error,
     tag_by,
 )
 
 PLUGINS = "invertwin.plugins"
-_MEANINGS = {
+_ARGUMENT_DOCS = {
     "object": "name in the scene",
     "axis": "direction, or axis of the turn",
     "low": "corner of the box, in the object's frame [m]",
@@ -55,10 +55,10 @@ _MEANINGS = {
     "smooth": "λ of steps preconditioned by (I + λL)⁻²; 0 = none",
 }
 """What keys of many tables mean, where a constructor says nothing."""
-_PLAIN = (bool, int, float, str, list, tuple, dict)
+_PLAIN_TYPES = (bool, int, float, str, list, tuple, dict)
 
 
-class Table(Section):
+class ConstructorTable(Section):
     """A table that a constructor of the library makes something of."""
 
     made_by: ClassVar[Callable[..., Any]]
@@ -82,34 +82,34 @@ class Table(Section):
         found: dict[str, Any] = {}
         for name, (place, hint) in self.made_from.items():
             if place is None:
-                kind = next((kind for kind in _members(hint) if kind in given), None)
+                kind = next((kind for kind in _union_members(hint) if kind in given), None)
                 if kind is not None:
                     found[name] = given[kind]
             elif getattr(self, place) is not None:
-                with about(place):
-                    found[name] = registry.value(getattr(self, place), hint, name, given)
+                with prefix_errors(place):
+                    found[name] = registry.convert_value(getattr(self, place), hint, name, given)
         return found
 
 
-class _Checked(Table):
+class _CheckedTable(ConstructorTable):
     """A table whose constructor costs nothing, so that its own checks are made at once."""
 
     @model_validator(mode="after")
-    def _accepted(self) -> "_Checked":
+    def _check_constructor(self) -> "_CheckedTable":
         try:
             self.build()
         except KeyInputError as error:
-            fail(error.text, error.path)
+            raise_key_error(error.text, error.path)
         except InputError as error:
-            fail(str(error))
+            raise_key_error(str(error))
         return self
 
 
-class _NoKind(Section):
+class _EmptyGroupTable(Section):
     """No kind is known; plugins may add some."""
 
 
-class Form(NamedTuple):
+class ValueFormat(NamedTuple):
     """How a type of the library is written in a run file.
 
     Attributes:
@@ -122,7 +122,7 @@ class Form(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Kind:
+class _RegisteredKind:
     make: Any
     without: tuple[str, ...]
     untagged: bool
@@ -130,7 +130,7 @@ class _Kind:
 
 
 @dataclass
-class Group:
+class KindGroup:
     """The kinds of one thing, such as materials.
 
     Attributes:
@@ -144,12 +144,12 @@ class Group:
     """
 
     tag: str = "kind"
-    base: type[Table] = Table
+    base: type[ConstructorTable] = ConstructorTable
     product: Any = None
     default: str | None = None
     points: Any = None
     includes: str | None = None
-    kinds: dict[str, _Kind] = field(default_factory=dict)
+    kinds: dict[str, _RegisteredKind] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ class OneOf:
     """Annotates a key whose value is a table of a group."""
 
     group: str  # its name
-    base: type[Table] | None = None  # of these tables; None = the group's
+    base: type[ConstructorTable] | None = None  # of these tables; None = the group's
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
         return handler.generate_schema(registry.union(self.group, self.base))
@@ -168,12 +168,12 @@ class TableOf:
     """Annotates a key whose value is the table of one constructor."""
 
     make: Any  # the constructor
-    base: type[Table] = Table  # with keys beside its arguments
+    base: type[ConstructorTable] = ConstructorTable  # with keys beside its arguments
     without: tuple[str, ...] = ()  # arguments that are no keys
     checked: bool | None = None  # as in ``Registry.add``
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        found = _table_of_class(self.make, self.base, self.without, self.checked)
+        found = _class_table(self.make, self.base, self.without, self.checked)
         return handler.generate_schema(found)
 
 
@@ -208,11 +208,11 @@ class Registry:
         self.sections: dict[str, Any] = {}
         self.commands: dict[str, Callable[..., Any]] = {}
         self.recordings: dict[str, tuple[str, str | None]] = {}
-        self.groups: dict[str, Group] = {}
-        self.forms: dict[Any, Form] = {}
-        self.bases: dict[type, type[Table]] = {}
+        self.groups: dict[str, KindGroup] = {}
+        self.forms: dict[Any, ValueFormat] = {}
+        self.bases: dict[type, type[ConstructorTable]] = {}
         self.given: set[Any] = set()
-        self._waiting: list[tuple[str, str, _Kind]] | None = []
+        self._waiting: list[tuple[str, str, _RegisteredKind]] | None = []
 
     def add(
         self,
@@ -238,11 +238,11 @@ class Registry:
         Raises:
             InputError: The group is not known, or has this kind already.
         """
-        entry = _Kind(make, tuple(without), untagged, checked)
+        entry = _RegisteredKind(make, tuple(without), untagged, checked)
         if self._waiting is not None:
             self._waiting.append((group, kind, entry))
         else:
-            self._enter(group, kind, entry)
+            self._add_kind(group, kind, entry)
 
     def names(self, group: str) -> list[str]:
         """The kinds of a group, or of "task"."""
@@ -253,46 +253,52 @@ class Registry:
         return list(self._kinds(group))
 
     @cache  # noqa: B019 - the only registry lives as long as the program
-    def union(self, group: str, base: type[Table] | None = None) -> Any:
+    def union(self, group: str, base: type[ConstructorTable] | None = None) -> Any:
         """The type of a value that is a table of a group.
 
         Args:
             group: Its name.
             base: Of its tables; None = the group's.
         """
-        found, kinds = self._complete()[group], self._kinds(group)
+        found, kinds = self._load_kinds()[group], self._kinds(group)
         if not kinds:
-            return _NoKind
+            return _EmptyGroupTable
         keys = (found.tag, *(name for name, kind in kinds.items() if kind.untagged))
-        members = [Annotated[self.table(group, name, base), Tag(TAG_MARK + name)] for name in kinds]
+        members = [
+            Annotated[self.kind_table(group, name, base), Tag(TAG_MARK + name)] for name in kinds
+        ]
         if found.points is not None:
             members.append(Annotated[found.points, Tag(f"{TAG_MARK}points")])
         if all(kind.untagged for kind in kinds.values()):
             keys = keys[1:]
-        return Annotated[_any_of(members), tag_by(keys, found.default)]
+        return Annotated[_union_type(members), tag_by(keys, found.default)]
 
     @cache  # noqa: B019 - as above
-    def table(self, group: str, name: str, base: type[Table] | None = None) -> Any:
+    def kind_table(self, group: str, name: str, base: type[ConstructorTable] | None = None) -> Any:
         """The table of a kind.
 
         Args:
             group, name: Of the kind.
             base: Of the table; None = the group's.
         """
-        found = self._complete()[group]
+        found = self._load_kinds()[group]
         kind, base = self._kinds(group)[name], base or found.base
         fields: dict[str, Any] = {}
         if not kind.untagged:
             default = name if name == found.default else ...
             fields[found.tag] = (Literal[name], key("", default))
-        title = _title(name) + _title(base.__name__ if base is not Table else group)
-        return self.table_of(kind.make, title, base, fields, kind.without, checked=kind.checked)
+        title = _camel_case(name) + _camel_case(
+            base.__name__ if base is not ConstructorTable else group
+        )
+        return self.constructor_table(
+            kind.make, title, base, fields, kind.without, checked=kind.checked
+        )
 
-    def table_of(
+    def constructor_table(
         self,
         make: Any,
         title: str,
-        base: type[Table] = Table,
+        base: type[ConstructorTable] = ConstructorTable,
         fields: Mapping[str, Any] | None = None,
         without: Sequence[str] = (),
         *,
@@ -307,24 +313,24 @@ class Registry:
             fields: Further keys.
             without, checked: As in `add`.
         """
-        self._complete()
+        self._load_kinds()
         make = pkgutil.resolve_name(make) if isinstance(make, str) else make
         if isinstance(make, type) and issubclass(make, Section):
             return make
-        hints, documents = _hints(make), _documents(make)
+        hints, documents = _constructor_hints(make), _argument_docs(make)
         made: dict[str, Any] = dict(fields or {})
         arguments: dict[str, tuple[str | None, Any]] = {}
         product = make if isinstance(make, type) else hints.get("return")
         if isinstance(product, type):
             own = next((b for kind, b in self.bases.items() if issubclass(product, kind)), base)
-            base = base if issubclass(base, own) else _joined(own, base)
+            base = base if issubclass(base, own) else _combine_tables(own, base)
         for name, parameter in inspect.signature(make).parameters.items():
             if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
                 continue
             if name in without:
                 continue
             hint = hints[name]
-            if self.given & set(_members(hint)):
+            if self.given & set(_union_members(hint)):
                 arguments[name] = (None, hint)
                 continue
             place = f"{name}_deg" if _is_angle(hint) else name
@@ -333,8 +339,10 @@ class Registry:
                 default = None if name in base.optional else parameter.default
                 made[place] = self._field(hint, name, default, documents.get(name, ""))
         checked = is_dataclass(make) if checked is None else checked
-        if checked and not self.forms.keys() & {m for h in hints.values() for m in _members(h)}:
-            base = _joined(_Checked, base)
+        if checked and not self.forms.keys() & {
+            m for h in hints.values() for m in _union_members(h)
+        }:
+            base = _combine_tables(_CheckedTable, base)
         words = (inspect.getdoc(make) or "").split("\n\n")[0]
         # Fields of the constructor come first, those of the base after them, but for the tag.
         model = create_model(title, __base__=base, __doc__=words, **made)
@@ -343,25 +351,25 @@ class Registry:
         return model
 
     def _field(self, hint: Any, name: str, default: Any, words: str) -> Any:
-        kind = self.read_type(hint, name)
+        kind = self.run_file_type(hint, name)
         if default is inspect.Parameter.empty:
             return kind, key(words)
-        if not isinstance(default, _PLAIN):
-            return _any_of([kind, None]), key(words, None)
+        if not isinstance(default, _PLAIN_TYPES):
+            return _union_type([kind, None]), key(words, None)
         if isinstance(default, float) and _is_angle(hint):
             default = round(math.degrees(default), 9)
-        if isinstance(default, tuple) or _letters(hint):
+        if isinstance(default, tuple) or _allowed_letters(hint):
             default = [*default]  # type: ignore[misc]
         return kind, key(words, default, validate_default=isinstance(default, str))
 
-    def read_type(self, hint: Any, name: str) -> Any:
+    def run_file_type(self, hint: Any, name: str) -> Any:
         """What a run file may say for an argument.
 
         Args:
             hint: Annotation of the argument.
             name: Of the argument.
         """
-        origin, arguments, members = get_origin(hint), get_args(hint), _members(hint)
+        origin, arguments, members = get_origin(hint), get_args(hint), _union_members(hint)
         form = next((self.forms[member] for member in members if member in self.forms), None)
         products = {found.product: name for name, found in self.groups.items() if found.product}
         group = next((products[member] for member in members if member in products), None)
@@ -370,36 +378,36 @@ class Registry:
         if group is not None:
             return Annotated[Any, OneOf(group)]
         if origin is Annotated:
-            letters = _letters(hint)
+            letters = _allowed_letters(hint)
             if letters:
                 return Annotated[list[Literal[tuple(letters)]], MinLen(1)]  # type: ignore[valid-type]
             limits = [item for item in arguments[1:] if item != RADIANS]
             if float in members and any(_is_array(member) for member in members):
                 number = Annotated[(float, *limits)] if limits else float
                 return number_or_list(number, list[number])  # type: ignore[valid-type]
-            kind = self.read_type(arguments[0], name)
+            kind = self.run_file_type(arguments[0], name)
             return Annotated[(kind, *limits)] if limits else kind  # type: ignore[return-value]
         if Path in members:
             return InputPath
         if hasattr(hint, "dim_str"):
-            return _nested(hint.dim_str.split())
+            return _nested_list_type(hint.dim_str.split())
         if origin in (Union, UnionType):
             allowed = [part for part in arguments if part is not NoneType]
-            kinds = [self.read_type(part, name) for part in allowed if not _is_array(part)]
+            kinds = [self.run_file_type(part, name) for part in allowed if not _is_array(part)]
             lists = [list[float]] if any(_is_array(member) for member in members) else []
             return number_or_list(*kinds, *lists) if len(kinds + lists) > 1 else (kinds + lists)[0]
         if origin is tuple and arguments[-1] is not Ellipsis:
-            item = self.read_type(arguments[0], name)
+            item = self.run_file_type(arguments[0], name)
             return Annotated[list[item], Len(len(arguments), len(arguments))]
         if isinstance(origin, type) and issubclass(origin, Sequence):
-            return list[self.read_type(arguments[0], name)]  # type: ignore[misc]
+            return list[self.run_file_type(arguments[0], name)]  # type: ignore[misc]
         if isinstance(origin, type) and issubclass(origin, Mapping):
-            return dict[str, self.read_type(arguments[1], name)]  # type: ignore[misc]
+            return dict[str, self.run_file_type(arguments[1], name)]  # type: ignore[misc]
         if is_dataclass(hint) and isinstance(hint, type):
-            return _table_of_class(hint)
+            return _class_table(hint)
         return hint
 
-    def value(self, value: Any, hint: Any, name: str, given: Mapping[type, object]) -> Any:
+    def convert_value(self, value: Any, hint: Any, name: str, given: Mapping[type, object]) -> Any:
         """What the constructor gets for a value of the run file.
 
         Args:
@@ -408,16 +416,16 @@ class Registry:
             name: Of the argument.
             given: Values that no run file can hold, by their type.
         """
-        if isinstance(value, Table):
+        if isinstance(value, ConstructorTable):
             return value.build(given)
-        form = next((self.forms[m] for m in _members(hint) if m in self.forms), None)
+        form = next((self.forms[m] for m in _union_members(hint) if m in self.forms), None)
         if form is not None:
             return form.value(value, name, _is_angle(hint), given)
-        if _letters(hint):
+        if _allowed_letters(hint):
             return "".join(value)
         if _is_angle(hint):
-            value = _radians(value)
-        members = [member for member in _members(hint) if member is not NoneType]
+            value = _to_radians(value)
+        members = [member for member in _union_members(hint) if member is not NoneType]
         hint = members[0] if len(members) == 1 else hint
         arguments = get_args(hint)
         if hasattr(hint, "dim_str"):
@@ -425,15 +433,15 @@ class Registry:
 
             return torch.tensor(value, dtype=torch.float64)
         if isinstance(value, list) and arguments:
-            items = [self.value(item, arguments[0], name, given) for item in value]
+            items = [self.convert_value(item, arguments[0], name, given) for item in value]
             return tuple(items) if get_origin(hint) is tuple else items
         if isinstance(value, dict) and len(arguments) == 2:
-            return {k: self.value(v, arguments[1], name, given) for k, v in value.items()}
+            return {k: self.convert_value(v, arguments[1], name, given) for k, v in value.items()}
         return value
 
-    def _kinds(self, group: str) -> dict[str, _Kind]:
+    def _kinds(self, group: str) -> dict[str, _RegisteredKind]:
         """The kinds of a group, its own first where they are chosen by a key."""
-        groups = self._complete()
+        groups = self._load_kinds()
         own = groups[group].kinds
         if groups[group].includes is None:
             return own
@@ -441,7 +449,7 @@ class Registry:
         told = {name: kind for name, kind in included.items() if not kind.untagged}
         return told | own | included
 
-    def _enter(self, group: str, kind: str, entry: _Kind) -> None:
+    def _add_kind(self, group: str, kind: str, entry: _RegisteredKind) -> None:
         if group not in self.groups:
             known = ", ".join(self.groups)
             raise InputError(f"expected a group among {known}, got {group}; choose one")
@@ -449,14 +457,14 @@ class Registry:
             raise InputError(f"expected a new name of a {group}, got {kind}; choose another")
         self.groups[group].kinds[kind] = entry
 
-    def _complete(self) -> dict[str, Group]:
+    def _load_kinds(self) -> dict[str, KindGroup]:
         """The groups, the library's own kinds before those of plugins."""
         if self._waiting is not None:
             waiting, self._waiting = self._waiting, None
             for module in self.built_in:
                 pkgutil.resolve_name(f"{module}:register")(self)
             for entry in waiting:
-                self._enter(*entry)
+                self._add_kind(*entry)
         return self.groups
 
 
@@ -495,35 +503,37 @@ def number_or_list(*kinds: Any) -> Any:
     members = [
         Annotated[kind, Tag(TAG_MARK + name)] for kind, name in zip(kinds, tags, strict=True)
     ]
-    return Annotated[_any_of(members), Discriminator(form)]
+    return Annotated[_union_type(members), Discriminator(form)]
 
 
-def _any_of(kinds: Sequence[Any]) -> Any:
+def _union_type(kinds: Sequence[Any]) -> Any:
     return Union.__getitem__(tuple(kinds))  # type: ignore[attr-defined]
 
 
-def _members(hint: Any) -> tuple[Any, ...]:
+def _union_members(hint: Any) -> tuple[Any, ...]:
     """The types that an annotation allows, without its limits."""
     if get_origin(hint) is Annotated:
-        return _members(get_args(hint)[0])
+        return _union_members(get_args(hint)[0])
     if get_origin(hint) in (Union, UnionType):
-        return tuple(member for part in get_args(hint) for member in _members(part))
+        return tuple(member for part in get_args(hint) for member in _union_members(part))
     return (hint,)
 
 
-def _marks(hint: Any) -> tuple[Any, ...]:
+def _annotation_marks(hint: Any) -> tuple[Any, ...]:
     found = hint.__metadata__ if get_origin(hint) is Annotated else ()
     if get_origin(hint) in (Union, UnionType, Annotated):
-        found += tuple(mark for part in get_args(hint) for mark in _marks(part))
+        found += tuple(mark for part in get_args(hint) for mark in _annotation_marks(part))
     return found
 
 
 def _is_angle(hint: Any) -> bool:
-    return RADIANS in [mark for mark in _marks(hint) if isinstance(mark, str)]
+    return RADIANS in [mark for mark in _annotation_marks(hint) if isinstance(mark, str)]
 
 
-def _letters(hint: Any) -> str:
-    return next((mark.allowed for mark in _marks(hint) if isinstance(mark, Letters)), "")
+def _allowed_letters(hint: Any) -> str:
+    return next(
+        (mark.letters for mark in _annotation_marks(hint) if isinstance(mark, AllowedLetters)), ""
+    )
 
 
 def _is_array(kind: Any) -> bool:
@@ -531,25 +541,25 @@ def _is_array(kind: Any) -> bool:
     return kind is Sequence or getattr(kind, "__name__", "") in ("Tensor", "ndarray")
 
 
-def _nested(sizes: Sequence[str]) -> Any:
+def _nested_list_type(sizes: Sequence[str]) -> Any:
     if not sizes:
         return float
-    kind = list[_nested(sizes[1:])]  # type: ignore[misc]
+    kind = list[_nested_list_type(sizes[1:])]  # type: ignore[misc]
     return Annotated[kind, Len(int(sizes[0]), int(sizes[0]))] if sizes[0].isdigit() else kind
 
 
-def _radians(value: Any) -> Any:
+def _to_radians(value: Any) -> Any:
     if isinstance(value, dict):
-        return {name: _radians(item) for name, item in value.items()}
-    return [_radians(item) for item in value] if isinstance(value, list) else math.radians(value)
+        return {name: _to_radians(item) for name, item in value.items()}
+    return [_to_radians(item) for item in value] if isinstance(value, list) else math.radians(value)
 
 
-def _hints(make: Any) -> dict[str, Any]:
+def _constructor_hints(make: Any) -> dict[str, Any]:
     plain = isinstance(make, type) and not is_dataclass(make)
     return get_type_hints(make.__init__ if plain else make, include_extras=True)
 
 
-def _documents(make: Any) -> dict[str, str]:
+def _argument_docs(make: Any) -> dict[str, str]:
     """What `Attributes:` and `Args:` say of each name, bases first."""
     found: dict[str, str] = {}
     owners = reversed(make.__mro__[:-1]) if isinstance(make, type) else [make]
@@ -562,22 +572,29 @@ def _documents(make: Any) -> dict[str, str]:
                 ):
                     for name in names.split(", "):
                         found.setdefault(name, " ".join(words.split()).removesuffix("."))
-    return {**_MEANINGS, **found}
+    return {**_ARGUMENT_DOCS, **found}
 
 
-def _title(name: str) -> str:
+def _camel_case(name: str) -> str:
     return "".join(part[:1].upper() + part[1:] for part in re.split(r"\W|_", name))
 
 
 @cache
-def _joined(first: type[Table], second: type[Table]) -> type[Table]:
+def _combine_tables(
+    first: type[ConstructorTable], second: type[ConstructorTable]
+) -> type[ConstructorTable]:
     if issubclass(first, second):
         return first
     return type(f"{first.__name__}{second.__name__}", (first, second), {"__module__": __name__})
 
 
 @cache
-def _table_of_class(
-    kind: Any, base: type[Table] = Table, without: tuple[str, ...] = (), checked: bool | None = None
+def _class_table(
+    kind: Any,
+    base: type[ConstructorTable] = ConstructorTable,
+    without: tuple[str, ...] = (),
+    checked: bool | None = None,
 ) -> Any:
-    return registry.table_of(kind, _title(kind.__name__), base, without=without, checked=checked)
+    return registry.constructor_table(
+        kind, _camel_case(kind.__name__), base, without=without, checked=checked
+    )

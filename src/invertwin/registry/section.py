@@ -33,32 +33,32 @@ Counts = Annotated[list[Annotated[int, Ge(2)]], Len(3, 3)]
 Interval = Annotated[list[NonNegative], Len(2, 2)]
 WorldAxes = Annotated[list[Literal["x", "y", "z"]], MinLen(1)]
 
-_OWN = frozenset(get_args(ErrorType))  # kinds of errors that pydantic itself knows
+_PYDANTIC_ERRORS = frozenset(get_args(ErrorType))  # kinds of errors that pydantic itself knows
 # Pydantic puts the tag of a union into an error's location; the mark tells it from a key.
 TAG_MARK = "→"
 
 # Beside the checkout; for an installed package this is a folder that does not exist.
-_DATA_BESIDE_CHECKOUT = Path(__file__).resolve().parents[4] / "shared" / "data"
+_CHECKOUT_DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 
 
-def _beside_run_file(name: str, info: Any) -> str:
+def _resolve_input_path(name: str, info: Any) -> str:
     """Relative paths start at the run file's folder, then at the data folder."""
     folders = [
         (info.context or {}).get("folder", Path()),
-        os.environ.get("INVERTWIN_DATA", _DATA_BESIDE_CHECKOUT),
+        os.environ.get("INVERTWIN_DATA", _CHECKOUT_DATA),
     ]
     paths = [Path(folder, name).absolute() for folder in folders]
     return str(next(filter(os.path.exists, paths), paths[0]))
 
 
-def _without_control(text: str) -> str:
+def _reject_control_characters(text: str) -> str:
     if not text.isprintable():
         raise PydanticCustomError("words", "expected text without control characters")
     return text
 
 
-Words = Annotated[str, AfterValidator(_without_control)]
-InputPath = Annotated[str, MinLen(1), AfterValidator(_beside_run_file)]
+PrintableText = Annotated[str, AfterValidator(_reject_control_characters)]
+InputPath = Annotated[str, MinLen(1), AfterValidator(_resolve_input_path)]
 """Path of a file or folder, from the run file's folder, then from INVERTWIN_DATA."""
 
 
@@ -76,7 +76,7 @@ class KeyInputError(InputError):
 
 
 @contextmanager
-def about(path: str) -> Iterator[None]:
+def prefix_errors(path: str) -> Iterator[None]:
     """Add the key of the run file to errors of the library."""
     try:
         yield
@@ -107,7 +107,7 @@ class Section(BaseModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _known_keys_only(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
+    def _check_unknown_keys(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
         """Tell all unknown keys, beside what is wrong with the known ones."""
         names = list(cls.model_fields)
         unknown = [name for name in data if name not in names] if isinstance(data, dict) else []
@@ -132,14 +132,14 @@ class Section(BaseModel):
                 # A key that is misspelt is not missing, too.
                 if row["type"] == "missing" and row["loc"] and row["loc"][0] in meant:
                     continue
-                found.append(_again(row))
+                found.append(_to_init_error(row))
         raise ValidationError.from_exception_data(cls.__name__, found)
 
 
-def _again(row: ErrorDetails) -> InitErrorDetails:
+def _to_init_error(row: ErrorDetails) -> InitErrorDetails:
     """An error of pydantic as one that can be raised again."""
     kind, context = row["type"], row.get("ctx", {})
-    if kind not in _OWN:
+    if kind not in _PYDANTIC_ERRORS:
         return InitErrorDetails(
             type=PydanticCustomError(kind, "{text}", {**context, "text": row["msg"]}),  # type: ignore[arg-type]
             loc=row["loc"],
@@ -180,10 +180,10 @@ def check_presence(section: Section, wanted: dict[str, bool], when: str) -> None
     for name, needed in wanted.items():
         if needed != (getattr(section, name) is not None):
             verb, got, do = ("", "none", "add it") if needed else ("no ", "one", "remove it")
-            fail(f"expected {verb}`{name}` {when}, got {got}; {do}")
+            raise_key_error(f"expected {verb}`{name}` {when}, got {got}; {do}")
 
 
-def fail(text: str, path: str = "") -> NoReturn:
+def raise_key_error(text: str, path: str = "") -> NoReturn:
     """Raise an error of the run file.
 
     Args:

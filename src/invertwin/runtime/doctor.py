@@ -29,11 +29,11 @@ from typing import Any
 
 from invertwin.errors import InputError
 
-VARIABLE = "DRJIT_LIBLLVM_PATH"
+LIBLLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 BACKEND_VARIABLE = "INVERTWIN_BACKEND"
 
 # Dr.Jit must not go and find a library of its own when every one we know of fails.
-_NONE = "no-usable-libLLVM--run-invertwin-doctor"
+_NO_LIBRARY = "no-usable-libLLVM--run-invertwin-doctor"
 
 _FOLDERS = (
     "/usr/lib",
@@ -105,7 +105,7 @@ print(json.dumps({"backend": backend, "threads": dr.thread_count(),
 
 
 @dataclass(frozen=True)
-class Candidate:
+class LlvmLibrary:
     """A libLLVM on this machine.
 
     Attributes:
@@ -118,7 +118,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class LlvmProbeResult:
     """What came of running a kernel with a candidate.
 
     Attributes:
@@ -133,21 +133,22 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class _Choice:
+class _LlvmChoice:
     path: str | None
     problem: str = ""
-    asked: str | None = None
+    requested: str | None = None
 
 
-_choice: _Choice | None = None
+_choice: _LlvmChoice | None = None
 
 
-def prepare(
-    folders: Sequence[Path] | None = None, probe: Callable[[str], Verdict] | None = None
+def select_libllvm(
+    folders: Sequence[Path] | None = None, probe: Callable[[str], LlvmProbeResult] | None = None
 ) -> None:
     """Set ``DRJIT_LIBLLVM_PATH`` to the newest libLLVM that passes, before Dr.Jit is imported.
 
-    ``import invertwin`` calls it. It never raises: when nothing passes, :func:`require` raises as
+    ``import invertwin`` calls it. It never raises: when nothing passes, :func:`require_backend`
+    raises as
     soon as rays are needed. A path set by the user is kept if it passes, and replaced with a
     warning if not. Nothing is done when ``INVERTWIN_BACKEND=cuda``, nor on a second call.
 
@@ -158,11 +159,11 @@ def prepare(
     global _choice
     if _choice is not None or os.environ.get(BACKEND_VARIABLE) == "cuda":
         return
-    _choice = _choose(folders, probe or probe_library)
-    os.environ[VARIABLE] = _choice.path or _NONE
+    _choice = _choose_library(folders, probe or probe_library)
+    os.environ[LIBLLVM_VARIABLE] = _choice.path or _NO_LIBRARY
 
 
-def require(backend: str | None = None) -> None:
+def require_backend(backend: str | None = None) -> None:
     """Raise unless rays can be traced.
 
     Args:
@@ -175,7 +176,7 @@ def require(backend: str | None = None) -> None:
     backend = backend or os.environ.get(BACKEND_VARIABLE, "auto")
     if backend == "cuda":
         return
-    prepare()
+    select_libllvm()
     if _choice is None:
         raise InputError(
             f"expected a checked libLLVM for the CPU backend, got none as {BACKEND_VARIABLE}=cuda "
@@ -188,47 +189,51 @@ def require(backend: str | None = None) -> None:
         )
 
 
-def candidates(folders: Iterable[Path] | None = None) -> list[Candidate]:
+def find_libraries(folders: Iterable[Path] | None = None) -> list[LlvmLibrary]:
     """Every libLLVM in the given folders (default: system, conda, Homebrew), newest first."""
     found = {}
     for folder in _search_path() if folders is None else folders:
         for file in Path(folder).glob("libLLVM*"):
             if _LIBRARY.match(file.name) and file.is_file():
                 path = os.path.realpath(file)
-                found[path] = max(found.get(path, ()), _version(path) or _version(str(file)))
+                found[path] = max(
+                    found.get(path, ()), _library_version(path) or _library_version(str(file))
+                )
     newest = sorted(((version, path) for path, version in found.items()), reverse=True)
-    return [Candidate(path, version) for version, path in newest]
+    return [LlvmLibrary(path, version) for version, path in newest]
 
 
-def probe_library(path: str) -> Verdict:
+def probe_library(path: str) -> LlvmProbeResult:
     """Run a Dr.Jit kernel with this libLLVM in a subprocess, where an abort harms nobody."""
     with tempfile.TemporaryDirectory() as folder:
         # A kernel cached by another libLLVM would hide that this one cannot compile it.
-        environment = os.environ | {VARIABLE: path, "DRJIT_CACHE_DIR": folder}
+        environment = os.environ | {LIBLLVM_VARIABLE: path, "DRJIT_CACHE_DIR": folder}
         try:
             ended = _run(_PROBE, environment, folder, timeout=_PROBE_SECONDS)
         except subprocess.TimeoutExpired:
-            return Verdict(False, f"no answer within {_PROBE_SECONDS:.0f} s", final=False)
+            return LlvmProbeResult(False, f"no answer within {_PROBE_SECONDS:.0f} s", final=False)
         except OSError as error:
-            return Verdict(False, f"could not be tried: {error}", final=False)
+            return LlvmProbeResult(False, f"could not be tried: {error}", final=False)
     if ended.returncode == 0 and "passed" in ended.stdout:
-        return Verdict(True, "works")
+        return LlvmProbeResult(True, "works")
     lines = [line.strip() for line in ended.stderr.splitlines() if line.strip()] or ["no message"]
     if ended.returncode < 0:
         # Killed from outside (memory, a time limit) says nothing about the library.
         final = -ended.returncode in (signal.SIGABRT, signal.SIGSEGV, signal.SIGILL)
-        reason = f"aborts the process (signal {-ended.returncode}): {_brief(lines[0])}"
-        return Verdict(False, reason, final)
+        reason = f"aborts the process (signal {-ended.returncode}): {_shorten_message(lines[0])}"
+        return LlvmProbeResult(False, reason, final)
     missing = re.search(r"ImportError: (\S+): cannot open shared object", ended.stderr)
     if missing:
-        return Verdict(False, f"could not be tried: Dr.Jit needs {missing[1]}", final=False)
+        return LlvmProbeResult(False, f"could not be tried: Dr.Jit needs {missing[1]}", final=False)
     if lines[0].startswith("Traceback"):
-        return Verdict(False, f"could not be tried: {_brief(lines[-1])}", final=False)
+        return LlvmProbeResult(
+            False, f"could not be tried: {_shorten_message(lines[-1])}", final=False
+        )
     reason = lines[0].split("(): ")[-1].split(". ")[0].rstrip(".")
-    return Verdict(False, f"refused: {_brief(reason)}")
+    return LlvmProbeResult(False, f"refused: {_shorten_message(reason)}")
 
 
-def _brief(message: str) -> str:
+def _shorten_message(message: str) -> str:
     """A message without addresses of memory, cut between words."""
     plain = re.sub(r":? ?\b0x[0-9a-f]+\b,?", "", message)
     return textwrap.shorten(plain, 120, placeholder=" …")
@@ -262,7 +267,7 @@ def install_command() -> str:
     return "conda install -c conda-forge libllvm19"
 
 
-def report() -> dict[str, Any]:
+def collect_report() -> dict[str, Any]:
     """The state of this machine, for ``invertwin doctor``; takes a few seconds.
 
     Returns:
@@ -272,16 +277,16 @@ def report() -> dict[str, Any]:
         or None. Plain values that JSON can hold.
     """
     requested = os.environ.get(BACKEND_VARIABLE, "auto")
-    prepare()
+    select_libllvm()
     examined = []
-    for candidate in _with_explicit(candidates()):
-        verdict = _remembered(candidate.path, probe_library)
+    for candidate in _add_explicit(find_libraries()):
+        verdict = _probe_cached(candidate.path, probe_library)
         version = ".".join(map(str, candidate.version))
         told = {"usable": verdict.usable, "verdict": verdict.reason}
         examined.append({"path": candidate.path, "version": version, **told})
     gpu, fix = gpu_name(), None
     try:
-        require(requested)
+        require_backend(requested)
         measured = _self_test(requested)
     except InputError as error:
         measured, fix = {"error": str(error).split("; type: ")[0]}, install_command()
@@ -295,7 +300,7 @@ def report() -> dict[str, Any]:
             "python": platform.python_version(),
             **{name: _package_version(name) for name in ("torch", "drjit", "mitsuba")},
         },
-        "llvm": {"chosen": chosen and _resolved(chosen), "candidates": examined},
+        "llvm": {"chosen": chosen and _resolve_path(chosen), "candidates": examined},
         "backend": {"requested": requested, "in_force": measured.pop("backend", None), "gpu": gpu},
         "threads": measured.pop("threads", os.cpu_count()),
         "self_test": measured,
@@ -303,7 +308,7 @@ def report() -> dict[str, Any]:
     }
 
 
-def render(report: dict[str, Any]) -> str:
+def render_report(report: dict[str, Any]) -> str:
     """The report as text for a terminal."""
     llvm, backend, test = report["llvm"], report["backend"], report["self_test"]
     lines = [f"{name:<10} {version}" for name, version in report["versions"].items()]
@@ -329,56 +334,58 @@ def render(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _choose(folders: Sequence[Path] | None, probe: Callable[[str], Verdict]) -> _Choice:
-    explicit = _explicit()
+def _choose_library(
+    folders: Sequence[Path] | None, probe: Callable[[str], LlvmProbeResult]
+) -> _LlvmChoice:
+    explicit = _explicit_path()
     complaint = ""
     if explicit:
-        verdict = _remembered(explicit, probe)
+        verdict = _probe_cached(explicit, probe)
         if verdict.usable:
-            return _unless_loaded(_Choice(explicit, asked=explicit))
-        complaint = f"{VARIABLE}={explicit} does not work ({verdict.reason})"
+            return _reject_if_loaded(_LlvmChoice(explicit, requested=explicit))
+        complaint = f"{LIBLLVM_VARIABLE}={explicit} does not work ({verdict.reason})"
     seen = []
-    for candidate in candidates(folders):
-        verdict = _remembered(candidate.path, probe)
+    for candidate in find_libraries(folders):
+        verdict = _probe_cached(candidate.path, probe)
         if verdict.usable:
             if complaint:
                 _warn(f"{complaint}; using {candidate.path}")
-            return _unless_loaded(_Choice(candidate.path, asked=explicit))
+            return _reject_if_loaded(_LlvmChoice(candidate.path, requested=explicit))
         seen.append(f"{candidate.path} ({verdict.reason})")
     if complaint:
         _warn(f"{complaint}, and no other libLLVM does; 'invertwin doctor' says what to install")
         seen.insert(0, complaint)
-    return _Choice(None, ", ".join(seen) or "none on this machine", explicit)
+    return _LlvmChoice(None, ", ".join(seen) or "none on this machine", explicit)
 
 
-def _unless_loaded(choice: _Choice) -> _Choice:
+def _reject_if_loaded(choice: _LlvmChoice) -> _LlvmChoice:
     """The choice, unless Dr.Jit was imported earlier and has taken another libLLVM for itself."""
     drjit = sys.modules.get("drjit")
-    if drjit is None or os.environ.get(VARIABLE) == choice.path:
+    if drjit is None or os.environ.get(LIBLLVM_VARIABLE) == choice.path:
         return choice
     loaded = tuple(drjit.detail.llvm_version())
-    if loaded[:1] == _version(choice.path or "")[:1]:
+    if loaded[:1] == _library_version(choice.path or "")[:1]:
         return choice
     version = ".".join(map(str, loaded))
-    return _Choice(
+    return _LlvmChoice(
         None, f"libLLVM {version}, as Dr.Jit was imported first (import invertwin before it)"
     )
 
 
-def _explicit() -> str | None:
+def _explicit_path() -> str | None:
     """The user's own choice of libLLVM, if there is one."""
-    value = os.environ.get(VARIABLE)
-    return value if value and value != _NONE else None
+    value = os.environ.get(LIBLLVM_VARIABLE)
+    return value if value and value != _NO_LIBRARY else None
 
 
-def _with_explicit(found: list[Candidate]) -> list[Candidate]:
-    asked = _choice.asked if _choice else _explicit()
-    if asked is None or _resolved(asked) in {c.path for c in found}:
+def _add_explicit(found: list[LlvmLibrary]) -> list[LlvmLibrary]:
+    asked = _choice.requested if _choice else _explicit_path()
+    if asked is None or _resolve_path(asked) in {c.path for c in found}:
         return found
-    return [Candidate(_resolved(asked), _version(asked)), *found]
+    return [LlvmLibrary(_resolve_path(asked), _library_version(asked)), *found]
 
 
-def _resolved(path: str) -> str:
+def _resolve_path(path: str) -> str:
     # A bare name such as "libLLVM-19.so" is for the system's loader to find: leave it.
     return os.path.realpath(path) if os.path.exists(path) else path
 
@@ -394,7 +401,7 @@ def _search_path() -> list[Path]:
     return folders
 
 
-def _version(path: str) -> tuple[int, ...]:
+def _library_version(path: str) -> tuple[int, ...]:
     """(19, 1) of libLLVM.so.19.1, libLLVM-19.so or /usr/lib/llvm-19/lib/libLLVM.so."""
     match = _LIBRARY.match(os.path.basename(path))
     before, within, _, after = match.groups() if match else (None,) * 4
@@ -406,7 +413,7 @@ def _version(path: str) -> tuple[int, ...]:
     return ()
 
 
-def _remembered(path: str, probe: Callable[[str], Verdict]) -> Verdict:
+def _probe_cached(path: str, probe: Callable[[str], LlvmProbeResult]) -> LlvmProbeResult:
     """The verdict on a path from the disk, or from the probe, which is then remembered."""
     try:
         status = os.stat(path)
@@ -435,15 +442,15 @@ def _cache_file() -> Path:
     return cache_folder() / "llvm.json"
 
 
-def _read_cache() -> dict[str, Verdict]:
+def _read_cache() -> dict[str, LlvmProbeResult]:
     try:
         entries = json.loads(_cache_file().read_text(encoding="utf-8"))
-        return {key: Verdict(**entry) for key, entry in entries.items()}
+        return {key: LlvmProbeResult(**entry) for key, entry in entries.items()}
     except (OSError, ValueError, TypeError, AttributeError):
         return {}  # missing, or spoilt: the verdicts are simply found again
 
 
-def _write_cache(verdicts: dict[str, Verdict]) -> None:
+def _write_cache(verdicts: dict[str, LlvmProbeResult]) -> None:
     file = _cache_file()
     entries = {key: vars(verdict) for key, verdict in verdicts.items()}
     # Without a place to write, the next import probes again: slower, not wrong.

@@ -24,19 +24,19 @@ Engine = Literal["processes", "ray"]
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
 
-_AHEAD = 2  # pieces that wait for each worker, so that none is idle
+_QUEUED_PER_WORKER = 2  # pieces that wait for each worker, so that none is idle
 _ONE_THREAD: dict[str, str] = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
 )
 
 
-class _Refusal(NamedTuple):
+class _WorkerError(NamedTuple):
     """An InputError as text: not all of them can be pickled."""
 
     text: str
 
 
-def spread(
+def run_jobs(
     work: Callable[[_Job], _Result],
     jobs: Sequence[_Job],
     *,
@@ -66,30 +66,32 @@ def spread(
         raise InputError(f"expected at least one worker, got {workers}; give their number")
     if not jobs:
         return
-    started = _processes(min(workers, len(jobs))) if engine == "processes" else _cluster()
+    started = _processes(min(workers, len(jobs))) if engine == "processes" else _ray_cluster()
     with started as (count, submit, ended):
         waiting: dict[Any, int] = {}
         for number, job in enumerate(jobs):
-            if len(waiting) >= _AHEAD * count:
-                yield from _taken(ended(waiting), waiting)
+            if len(waiting) >= _QUEUED_PER_WORKER * count:
+                yield from _collect_results(ended(waiting), waiting)
             waiting[submit(work, job)] = number
         while waiting:
-            yield from _taken(ended(waiting), waiting)
+            yield from _collect_results(ended(waiting), waiting)
 
 
-def _taken(done: Sequence[tuple[Any, Any]], waiting: dict[Any, int]) -> Iterator[tuple[int, Any]]:
+def _collect_results(
+    done: Sequence[tuple[Any, Any]], pending: dict[Any, int]
+) -> Iterator[tuple[int, Any]]:
     for ticket, result in done:
-        number = waiting.pop(ticket)
-        if isinstance(result, _Refusal):
+        number = pending.pop(ticket)
+        if isinstance(result, _WorkerError):
             raise InputError(result.text)
         yield number, result
 
 
-def _guarded(work: Callable[[Any], Any], job: Any) -> Any:
+def _run_guarded(work: Callable[[Any], Any], job: Any) -> Any:
     try:
         return work(job)
     except InputError as error:
-        return _Refusal(str(error))
+        return _WorkerError(str(error))
 
 
 @contextmanager
@@ -97,18 +99,18 @@ def _processes(workers: int) -> Iterator[tuple[int, Any, Any]]:
     spawn = multiprocessing.get_context("spawn")
     alive, ours = spawn.Pipe(duplex=False)
     with (
-        _one_thread_each(),
-        ProcessPoolExecutor(workers, spawn, initializer=_begin, initargs=(alive,)) as pool,
+        _single_threaded_children(),
+        ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(alive,)) as pool,
     ):
 
         def submit(work: Any, job: Any) -> Any:
-            return pool.submit(_guarded, work, job)
+            return pool.submit(_run_guarded, work, job)
 
-        def ended(waiting: Any) -> list[tuple[Any, Any]]:
-            return [(f, f.result()) for f in wait(waiting, return_when=FIRST_COMPLETED).done]
+        def wait_for_results(pending: Any) -> list[tuple[Any, Any]]:
+            return [(f, f.result()) for f in wait(pending, return_when=FIRST_COMPLETED).done]
 
         try:
-            yield workers, submit, ended
+            yield workers, submit, wait_for_results
         except BaseException as error:
             ours.close()
             if not isinstance(error, BrokenProcessPool):
@@ -120,7 +122,7 @@ def _processes(workers: int) -> Iterator[tuple[int, Any, Any]]:
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
+def _single_threaded_children() -> Iterator[None]:
     """What is started in the block has one thread: libraries read that while they are loaded."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
@@ -133,20 +135,20 @@ def _one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _begin(alive: Connection) -> None:
+def _start_worker(alive: Connection) -> None:
     """A worker ends at once when its parent has ended, however that came, or wants no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(alive,), daemon=True).start()
+    threading.Thread(target=_exit_with_parent, args=(alive,), daemon=True).start()
 
 
-def _end_with(alive: Connection) -> None:
+def _exit_with_parent(alive: Connection) -> None:
     with suppress(EOFError, OSError):
         alive.recv()
     os._exit(0)
 
 
 @contextmanager
-def _cluster() -> Iterator[tuple[int, Any, Any]]:
+def _ray_cluster() -> Iterator[tuple[int, Any, Any]]:
     try:
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -159,27 +161,27 @@ def _cluster() -> Iterator[tuple[int, Any, Any]]:
         ray.init(include_dashboard=False, log_to_driver=False)
     try:
         one_thread = {"env_vars": _ONE_THREAD}
-        task = ray.remote(num_cpus=1, runtime_env=one_thread)(_alone)
+        task = ray.remote(num_cpus=1, runtime_env=one_thread)(_run_remote_job)
         count = max(1, int(ray.cluster_resources().get("CPU", 1)))
 
-        def ended(waiting: Any) -> list[tuple[Any, Any]]:
-            done, _ = ray.wait(list(waiting), num_returns=1)
+        def wait_for_results(pending: Any) -> list[tuple[Any, Any]]:
+            done, _ = ray.wait(list(pending), num_returns=1)
             return [(ticket, ray.get(ticket)) for ticket in done]
 
-        yield count, task.remote, ended
+        yield count, task.remote, wait_for_results
     finally:
         if ours:
             ray.shutdown()
 
 
-def _alone(work: Callable[[Any], Any], job: Any) -> Any:
+def _run_remote_job(work: Callable[[Any], Any], job: Any) -> Any:
     """A piece of work on a node of a cluster."""
     from invertwin.runtime import threads
 
     # Asked for with the task; a worker with more threads would give other bits.
-    if threads.available() != 1:
-        return _Refusal(
+    if threads.available_threads() != 1:
+        return _WorkerError(
             f"expected workers of Ray with one thread, got OMP_NUM_THREADS = "
             f"{os.environ.get('OMP_NUM_THREADS')}; start the cluster with OMP_NUM_THREADS=1"
         )
-    return _guarded(work, job)
+    return _run_guarded(work, job)

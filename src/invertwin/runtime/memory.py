@@ -8,20 +8,20 @@ from pathlib import Path, PurePosixPath
 
 from invertwin.errors import InputError
 
-_UNKNOWN = 16e9  # where the system does not say
+_DEFAULT_MEMORY = 16e9  # where the system does not say
 _UNLIMITED = 1 << 60  # larger limits are none
 _GROUPS = Path("/sys/fs/cgroup")
 
 
 def free_memory() -> float:
     """Bytes that this process may still take, of the machine, of its group, of its limit."""
-    return max(0.0, min((_of_machine(), *_of_groups(), *_of_process())))
+    return max(0.0, min((_machine_memory(), *_control_group_memory(), *_process_memory())))
 
 
 def peak_memory() -> float | None:
     """Most bytes that this process has held at a time; None where the system does not say."""
     # First, since Linux's getrusage counts the parent's size when this process was started.
-    if (held := _stated("/proc/self/status", "VmHWM")) is not None:
+    if (held := _read_stated_bytes("/proc/self/status", "VmHWM")) is not None:
         return held
     try:
         import resource
@@ -47,18 +47,18 @@ def require_memory(needed: float, what: str, do: str, at: str = "") -> None:
     free = free_memory()
     if not needed <= free:
         raise InputError(
-            f"expected {what} within the {gigabytes(free)} of memory that are free, got an "
-            f"estimate of {gigabytes(needed)}; {do}",
+            f"expected {what} within the {format_gigabytes(free)} of memory that are free, got an "
+            f"estimate of {format_gigabytes(needed)}; {do}",
             at,
         )
 
 
-def require_at_most(count: float, most: float, what: str, do: str, at: str = "") -> None:
+def require_at_most(count: float, maximum: float, what: str, do: str, at: str = "") -> None:
     """Refuse a count that only a wrong unit explains.
 
     Args:
         count: How many there would be; may be infinite.
-        most: Of them.
+        maximum: Of them.
         what: What they are.
         do: What the user can do.
         at: The argument to lower.
@@ -66,18 +66,18 @@ def require_at_most(count: float, most: float, what: str, do: str, at: str = "")
     Raises:
         InputError: More than that, or not a number.
     """
-    if not count <= most:
+    if not count <= maximum:
         raise InputError(
-            f"expected at most {most:,.0f} {what}, got {min(count, 1e300):.3g}; {do}", at
+            f"expected at most {maximum:,.0f} {what}, got {min(count, 1e300):.3g}; {do}", at
         )
 
 
-def gigabytes(count: float) -> str:
+def format_gigabytes(count: float) -> str:
     """Bytes as text."""
     return f"{min(count, 1e300) / 1e9:.3g} GB"
 
 
-def _stated(file: str, name: str) -> float | None:
+def _read_stated_bytes(file: str, name: str) -> float | None:
     """Bytes that Linux states in a line of a file; None where there is no such file or line."""
     try:
         for line in Path(file).read_text().splitlines():
@@ -88,16 +88,16 @@ def _stated(file: str, name: str) -> float | None:
     return None
 
 
-def _of_machine() -> float:
-    if (free := _stated("/proc/meminfo", "MemAvailable")) is not None:
+def _machine_memory() -> float:
+    if (free := _read_stated_bytes("/proc/meminfo", "MemAvailable")) is not None:
         return free
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):
-        return _UNKNOWN
+        return _DEFAULT_MEMORY
 
 
-def _of_groups() -> Iterator[float]:
+def _control_group_memory() -> Iterator[float]:
     """What the control groups of this process, which containers are made of, still allow."""
     try:
         lines = Path("/proc/self/cgroup").read_text().splitlines()
@@ -113,21 +113,23 @@ def _of_groups() -> Iterator[float]:
             names = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
         # In a container the name may be that of the host, whose group is then the root here.
         for path in (PurePosixPath(name), *PurePosixPath(name).parents):
-            yield from _of_group(root / str(path).strip("/"), *names)
+            yield from _group_memory(root / str(path).strip("/"), *names)
 
 
-def _of_group(folder: Path, most: str, used: str, cached: str) -> Iterator[float]:
+def _group_memory(
+    folder: Path, limit_name: str, usage_name: str, cache_name: str
+) -> Iterator[float]:
     try:
-        limit, taken = (int((folder / file).read_text()) for file in (most, used))
+        limit, taken = (int((folder / file).read_text()) for file in (limit_name, usage_name))
         rows = (line.split() for line in (folder / "memory.stat").read_text().splitlines())
-        files = next((int(row[1]) for row in rows if row[0] == cached), 0)
+        files = next((int(row[1]) for row in rows if row[0] == cache_name), 0)
     except (OSError, ValueError):  # no such group, or "max"
         return
     if limit < _UNLIMITED:
         yield float(limit - taken + files)
 
 
-def _of_process() -> Iterator[float]:
+def _process_memory() -> Iterator[float]:
     """What `ulimit -v` still allows."""
     try:
         import resource

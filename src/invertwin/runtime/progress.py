@@ -11,30 +11,31 @@ _T = TypeVar("_T")
 
 
 @dataclass
-class _Listener:
-    hear: Callable[[str, int, int, float], None]
+class _ProgressListener:
+    callback: Callable[[str, int, int, float], None]
     busy: bool = False
 
 
-_listener: ContextVar[_Listener | None] = ContextVar("listener", default=None)
+_listener: ContextVar[_ProgressListener | None] = ContextVar("listener", default=None)
 
 
 @contextmanager
-def listening(hear: Callable[[str, int, int, float], None]) -> Generator[None]:
+def progress_callback(callback: Callable[[str, int, int, float], None]) -> Generator[None]:
     """Hear how far long loops have come while the block is worked on.
 
     Args:
-        hear: Takes what is worked on, how many parts of it are done, how many there are, and the
+        callback: Takes what is worked on, how many parts of it are done, how many there are, and
+            the
             time that is left [s].
     """
-    token = _listener.set(_Listener(hear))
+    token = _listener.set(_ProgressListener(callback))
     try:
         yield
     finally:
         _listener.reset(token)
 
 
-def told(parts: Collection[_T], name: str) -> Generator[_T]:
+def track(parts: Collection[_T], name: str) -> Generator[_T]:
     """Go through parts of some work, and tell how many are done; loops inside keep silent.
 
     Args:
@@ -50,12 +51,12 @@ def told(parts: Collection[_T], name: str) -> Generator[_T]:
         for done, part in enumerate(parts, 1):
             yield part
             left = (time.monotonic() - begin) / done * (len(parts) - done)
-            listener.hear(name, done, len(parts), left)
+            listener.callback(name, done, len(parts), left)
     finally:
         listener.busy = False
 
 
-def time_left(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """A time as people say it.
 
     Args:

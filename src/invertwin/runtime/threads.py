@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 
 #: What tells libraries how their threads wait, read when they are loaded.
-_WAITING = {
+_WAIT_POLICY = {
     "OMP_WAIT_POLICY": "PASSIVE",
     "GOMP_SPINCOUNT": "0",  # GNU OpenMP: of torch and finufft
     "KMP_BLOCKTIME": "0",  # OpenMP of Intel and LLVM
@@ -21,17 +21,17 @@ _COUNTS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _GROUPS = Path("/sys/fs/cgroup")
 
 
-def prepare() -> None:
+def set_thread_environment() -> None:
     """Set the environment that libraries read while they are loaded; what is set already stays.
 
     ``import invertwin`` calls it. Libraries that were imported earlier keep their own ways.
     """
-    count = str(available())
-    for name, value in (_WAITING | dict.fromkeys(_COUNTS, count)).items():
+    count = str(available_threads())
+    for name, value in (_WAIT_POLICY | dict.fromkeys(_COUNTS, count)).items():
         os.environ.setdefault(name, value)
 
 
-def available() -> int:
+def available_threads() -> int:
     """Threads that work at once here: cores that the process may use, or ``OMP_NUM_THREADS``.
 
     Counted are the affinity mask and the quota of the control group.
@@ -41,10 +41,10 @@ def available() -> int:
         return int(asked)
     found = getattr(os, "sched_getaffinity", None)
     cores = len(found(0)) if found else os.cpu_count() or 1
-    return max(1, math.ceil(min(cores, quota())))
+    return max(1, math.ceil(min(cores, cgroup_quota())))
 
 
-def quota(listing: Path = Path("/proc/self/cgroup"), root: Path = _GROUPS) -> float:
+def cgroup_quota(listing: Path = Path("/proc/self/cgroup"), root: Path = _GROUPS) -> float:
     """Cores that the control groups of this process grant it, infinite where they do not say.
 
     Args:
@@ -52,7 +52,7 @@ def quota(listing: Path = Path("/proc/self/cgroup"), root: Path = _GROUPS) -> fl
         root: Where their files are.
     """
     least = math.inf
-    for line in _text(listing).splitlines():
+    for line in _read_text(listing).splitlines():
         _, kinds, name = line.split(":", 2)
         if kinds and "cpu" not in kinds.split(","):
             continue
@@ -61,20 +61,20 @@ def quota(listing: Path = Path("/proc/self/cgroup"), root: Path = _GROUPS) -> fl
         # A container sees its own group as the root, whatever name it has outside.
         for folder in (inside, *inside.parents, root / "cpu", root):
             if folder == root or root in folder.parents:
-                least = min(least, _granted(folder))
+                least = min(least, _read_quota(folder))
     return least
 
 
-def _granted(folder: Path) -> float:
-    words = _text(folder / "cpu.max").split()  # version 2
+def _read_quota(folder: Path) -> float:
+    words = _read_text(folder / "cpu.max").split()  # version 2
     if not words:
-        words = [_text(folder / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period")]
+        words = [_read_text(folder / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period")]
     if len(words) == 2 and all(word.isdecimal() for word in words) and int(words[1]) > 0:
         return int(words[0]) / int(words[1])
     return math.inf
 
 
-def _text(file: Path) -> str:
+def _read_text(file: Path) -> str:
     try:
         return file.read_text()
     except OSError:

@@ -22,7 +22,7 @@ from invertwin.runtime.memory import require_at_most
 from invertwin.scene.polarisation import JonesTable, Polarisation
 
 Polarised = str | ArrayLike | JonesTable
-_MOST_ELEMENTS = 1e5
+_MAX_ELEMENTS = 1e5
 COSINE_COUNT = 2049
 """Nodes of a pattern table over cosθ, at linspace(−1, 1, 2049)."""
 
@@ -76,13 +76,15 @@ class Cosine(Pattern):
 
     def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Linear power gain."""
-        return self._of_cosine(direction[..., 2])
+        return self._gain_of_cosine(direction[..., 2])
 
     def table(self) -> Float64[Tensor, "2049 1"]:
         """The gain over cosθ."""
-        return self._of_cosine(torch.linspace(-1, 1, COSINE_COUNT, dtype=torch.float64))[:, None]
+        return self._gain_of_cosine(torch.linspace(-1, 1, COSINE_COUNT, dtype=torch.float64))[
+            :, None
+        ]
 
-    def _of_cosine(self, cosine: Tensor) -> Tensor:
+    def _gain_of_cosine(self, cosine: Tensor) -> Tensor:
         front = cosine > 0
         # The power of a replaced value, since the gradient of 0ⁿ is infinite for n < 1.
         power = torch.where(front, cosine, 1.0) ** self.exponent
@@ -90,7 +92,7 @@ class Cosine(Pattern):
 
 
 @dataclass(frozen=True, eq=False)
-class Table(Pattern):
+class TabulatedPattern(Pattern):
     """A measured or simulated pattern.
 
     It is resampled once, linearly in the given angles, onto the grid of `table`; `gain`
@@ -130,15 +132,15 @@ class Table(Pattern):
             )
         for name, value in (("theta", theta), ("phi", phi), ("gains", gains)):
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "_grid", _resampled(theta, phi, gains))
+        object.__setattr__(self, "_grid", _resample_gains(theta, phi, gains))
 
     @classmethod
-    def of_decibels(
+    def from_decibels(
         cls,
         theta: Annotated[Sequence[float], MinLen(2), RADIANS],
         gain_db: Sequence[Sequence[float]],
         phi: Annotated[Sequence[float], MinLen(1), RADIANS] = (0.0,),
-    ) -> "Table":
+    ) -> "TabulatedPattern":
         """A measured power pattern in decibels.
 
         Args:
@@ -225,7 +227,7 @@ class AntennaArray:
                 "give Isotropic(), Cosine(exponent) or Table(theta, phi, gains)"
             )
         object.__setattr__(self, "positions", positions)
-        jones = Polarisation.of(self.polarisation, self.leakage, len(positions))
+        jones = Polarisation.from_jones(self.polarisation, self.leakage, len(positions))
         object.__setattr__(self, "jones", jones)
 
 
@@ -276,16 +278,16 @@ def planar_array(
         InputError: no elements, or a spacing that is not positive.
     """
     elements = count[0] * count[1]
-    require_at_most(elements, _MOST_ELEMENTS, "antenna elements", "lower count", "count")
-    x = _centred(count[0], spacing[0], "elements along x")
-    y = _centred(count[1], spacing[1], "elements along y")
+    require_at_most(elements, _MAX_ELEMENTS, "antenna elements", "lower count", "count")
+    x = _centre_positions(count[0], spacing[0], "elements along x")
+    y = _centre_positions(count[1], spacing[1], "elements along y")
     plane = torch.cartesian_prod(x, y)
     positions = torch.cat([plane, torch.zeros_like(plane[:, :1])], dim=1)
     gain = Isotropic() if pattern is None else pattern
     return AntennaArray(positions, gain, polarisation, leakage)
 
 
-def _centred(count: int, spacing: float, what: str) -> Tensor:
+def _centre_positions(count: int, spacing: float, what: str) -> Tensor:
     number = checked_count(count, what, 1)
     distance = checked_number(spacing, "element spacing [m]", 0.0, open_low=True)
     return (torch.arange(number, dtype=torch.float64) - (number - 1) / 2) * distance
@@ -310,7 +312,7 @@ def _check_angles(theta: Tensor, phi: Tensor) -> None:
         )
 
 
-def _resampled(theta: Tensor, phi: Tensor, gains: Tensor) -> Tensor:
+def _resample_gains(theta: Tensor, phi: Tensor, gains: Tensor) -> Tensor:
     cosine = np.linspace(-1, 1, COSINE_COUNT)
     given = gains.detach().numpy()
     if len(phi) > 1:

@@ -41,7 +41,7 @@ class Cloud:
         density = checked_tensor(
             self.density, (None, None, None), "densities [1/m]", "give one for each node"
         )
-        lattice = Lattice.between(self.low, self.high, density.shape)
+        lattice = Lattice.from_bounds(self.low, self.high, density.shape)
         least = float(density.detach().min())
         if least < 0:
             raise InputError(

@@ -24,12 +24,12 @@ from invertwin.scene.material.materials import (
     RoughConductor,
     RoughDielectric,
 )
-from invertwin.scene.material.radio_materials import radio_bsdf, stated_material
+from invertwin.scene.material.radio_materials import radio_bsdf, read_radio_material
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Object, Scene
-from invertwin.storage.folders import replacing
-from invertwin.storage.untrusted import existing_file, reader, reading
+from invertwin.storage.folders import replace_file
+from invertwin.storage.untrusted import convert_read_errors, existing_file, safe_reader
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".inp")
 _CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # of shell elements, by the digit in their type
@@ -57,7 +57,7 @@ def load_mesh(file: str | Path, unit: Unit = "m") -> Mesh:
         InputError: no such file, another format, a broken file, no triangles, NaN, or another
             unit.
     """
-    return _loaded(file, unit, lambda scene: {"": scene.to_mesh()})[""]
+    return _load_with(file, unit, lambda scene: {"": scene.to_mesh()})[""]
 
 
 def load_parts(file: str | Path, unit: Unit = "m") -> dict[str, Mesh]:
@@ -76,7 +76,7 @@ def load_parts(file: str | Path, unit: Unit = "m") -> dict[str, Mesh]:
 
     whole = Path(file).name  # how nodes without a name of their own are called
 
-    def apart(scene: trimesh.Scene) -> dict[str, trimesh.Trimesh]:
+    def split_parts(scene: trimesh.Scene) -> dict[str, trimesh.Trimesh]:
         found: dict[str, trimesh.Trimesh] = {}
         for node in scene.graph.nodes_geometry:
             transform, name = scene.graph[node]
@@ -90,11 +90,11 @@ def load_parts(file: str | Path, unit: Unit = "m") -> dict[str, Mesh]:
                 found[f"{label} {len(found)}" if label in found else label] = mesh
         return found
 
-    return _loaded(file, unit, apart)
+    return _load_with(file, unit, split_parts)
 
 
-@reader("a readable mesh")
-def _loaded(
+@safe_reader("a readable mesh")
+def _load_with(
     file: str | Path, unit: Unit, split: Callable[[trimesh.Scene], Mapping[str, trimesh.Trimesh]]
 ) -> dict[str, Mesh]:
     path = existing_file(file)
@@ -105,8 +105,8 @@ def _loaded(
             f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), got {path.name}; convert it first"
         )
     found = {}
-    with reading(path, f"a readable {path.suffix} mesh"):
-        for name, part in split(_scene_in(path)).items():
+    with convert_read_errors(path, f"a readable {path.suffix} mesh"):
+        for name, part in split(_load_trimesh_scene(path)).items():
             vertices = np.asarray(part.vertices, dtype=np.float64).reshape(-1, 3)
             faces = np.asarray(part.faces, dtype=np.int64).reshape(-1, 3)
             found[name] = vertices * _METRES[unit], faces
@@ -114,7 +114,7 @@ def _loaded(
         # The first check sees the file as it is: merging would hide what is wrong with it.
         for vertices, faces in found.values():
             Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
-        meshes = {name: _merged(*part) for name, part in found.items()}
+        meshes = {name: _merge_vertices(*part) for name, part in found.items()}
         if not meshes:
             raise InputError("expected triangles, got none; export the mesh again")
     except InputError as error:
@@ -158,19 +158,19 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
             for name, item in shape.objects.items()
         }
     )
-    looks = {id(material): _look(material) for *_, material in parts.values()}
+    looks = {id(material): _viewer_material(material) for *_, material in parts.values()}
     written = trimesh.Scene()
     for name, (vertices, faces, material) in parts.items():
         mesh = trimesh.Trimesh(vertices.detach().cpu().numpy(), faces.cpu().numpy(), process=False)
         if material is not None:
             mesh.visual = TextureVisuals(material=looks[id(material)])
         written.add_geometry(mesh, geom_name=name, node_name=name)
-    with replacing(file) as part:
+    with replace_file(file) as part:
         glb = file.suffix.lower() == ".glb"
         part.write_bytes(export_glb(written) if glb else _ply(written.to_mesh()))
 
 
-@reader("a readable scene")
+@safe_reader("a readable scene")
 def load_scene_xml(
     path: str | Path, materials: Mapping[str, Material] | None = None, default: Material = CONCRETE
 ) -> Scene:
@@ -191,10 +191,10 @@ def load_scene_xml(
             material id that no shape refers to.
     """
     file = existing_file(path)
-    with reading(file, "an XML scene"):
+    with convert_read_errors(file, "an XML scene"):
         root = ElementTree.parse(file).getroot()
     try:
-        return _scene_of(root, file.parent, dict(materials or {}), default)
+        return _build_scene(root, file.parent, dict(materials or {}), default)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
 
@@ -231,7 +231,7 @@ def save_scene_xml(path: str | Path, scene: Scene) -> None:
         shapes.append(shape)
     root.extend(shapes)
     ElementTree.indent(root)
-    with replacing(file) as part:
+    with replace_file(file) as part:
         (file.parent / "meshes").mkdir(exist_ok=True)
         for number, item in enumerate(scene.objects.values()):
             mesh = Mesh(item.vertices, item.mesh.faces)
@@ -239,7 +239,7 @@ def save_scene_xml(path: str | Path, scene: Scene) -> None:
         part.write_bytes(ElementTree.tostring(root))
 
 
-def _scene_in(path: Path) -> trimesh.Scene:
+def _load_trimesh_scene(path: Path) -> trimesh.Scene:
     if path.suffix.lower() != ".inp":
         return trimesh.load_scene(path, process=False)
     vertices, faces = _abaqus(path.read_text(encoding="utf-8-sig"))
@@ -260,7 +260,7 @@ def _abaqus(text: str) -> tuple[np.ndarray, np.ndarray]:
             if keyword == "PART":
                 nodes = {}  # every part numbers its own
             kind = next((o[5:] for o in options if o.startswith("TYPE=")), "")
-            corners, words = _corners_of(kind) if keyword == "ELEMENT" else 0, []
+            corners, words = _count_corners(kind) if keyword == "ELEMENT" else 0, []
         elif keyword == "NODE":
             number, *place = line.split(",")[:4]
             nodes[number.strip()] = len(places)
@@ -277,7 +277,7 @@ def _abaqus(text: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array(places, dtype=np.float64), np.array(faces, dtype=np.int64)
 
 
-def _corners_of(kind: str) -> int:
+def _count_corners(kind: str) -> int:
     """Corners of an element type such as S3, STRI65, S4R, R3D3; 0 of other than shells."""
     if not kind.startswith(("S", "R3D", "M3D", "CPS", "CPE", "DS", "SFM3D")):
         raise ValueError(f"elements of type {kind}, no shells")
@@ -285,7 +285,7 @@ def _corners_of(kind: str) -> int:
     return _CORNERS[digits[0]]
 
 
-def _merged(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     used = np.unique(faces)
     # Adding zero turns −0 into 0, which is the same place.
     _, first, group = np.unique(
@@ -299,7 +299,7 @@ def _merged(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     return Mesh(torch.from_numpy(merged), torch.from_numpy(renumbered[faces]))
 
 
-def _look(material: Material | None) -> PBRMaterial:
+def _viewer_material(material: Material | None) -> PBRMaterial:
     """What a viewer shows of a material: its name, and whether it is a metal."""
     metal = isinstance(material, PerfectConductor | RoughConductor)
     return PBRMaterial(
@@ -329,7 +329,7 @@ def _ply(mesh: trimesh.Trimesh) -> bytes:
     return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
 
 
-def _scene_of(
+def _build_scene(
     root: ElementTree.Element, folder: Path, materials: dict[str, Material], default: Material
 ) -> Scene:
     if root.tag != "scene" or root.find("include") is not None:
@@ -338,7 +338,7 @@ def _scene_of(
         )
     objects: dict[str, Object] = {}
     referred = set()
-    known = _stated_materials(root) | materials
+    known = _read_materials(root) | materials
     for number, element in enumerate(root.findall("shape")):
         name = element.get("id") or f"{element.get('type')}_{number}"
         if name in objects:
@@ -360,12 +360,12 @@ def _scene_of(
     return Scene(objects)
 
 
-def _stated_materials(root: ElementTree.Element) -> dict[str, Material]:
+def _read_materials(root: ElementTree.Element) -> dict[str, Material]:
     found: dict[str, Material] = {}
     for element in root.iter("bsdf"):
         name = element.get("id", "")
         try:
-            material = stated_material(element)
+            material = read_radio_material(element)
         except InputError as error:
             raise InputError(f"material {name!r}: {error}") from None
         if material is not None:

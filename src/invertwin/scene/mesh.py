@@ -82,7 +82,7 @@ class Mesh:
         return 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
 
 
-def joined(parts: Annotated[Sequence[Mesh], MinLen(1)]) -> Mesh:
+def merge_meshes(parts: Annotated[Sequence[Mesh], MinLen(1)]) -> Mesh:
     """Several shapes as one rigid object of one material.
 
     Args:

@@ -18,14 +18,14 @@ from invertwin.checks import ArrayLike, checked_count, checked_number, checked_t
 from invertwin.errors import InputError
 from invertwin.limits import Axes
 from invertwin.scene.material.itu import Itu
-from invertwin.scene.material.materials import held_by
+from invertwin.scene.material.materials import select_layer
 from invertwin.scene.material.values import (
     RANGES,
     MaterialValue,
     Texture,
     Value,
     checked_value,
-    evaluated,
+    evaluate_value,
 )
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import (
@@ -38,7 +38,7 @@ from invertwin.scene.pose import (
 from invertwin.scene.scene import Object, Scene
 
 ORIGIN = (0.0, 0.0, 0.0)
-_PLACE, _TURN = 0.1, 0.2  # m and rad: errors of a place and a turn that matter
+_POSITION_SCALE, _ROTATION_SCALE = 0.1, 0.2  # m and rad: errors of a place and a turn that matter
 _T = TypeVar("_T")
 
 
@@ -63,7 +63,7 @@ class Entries:
 class Coordinate:
     """One number that a fit finds, as people speak of it.
 
-    A module lists them in ``coordinates()``; for others every entry of a parameter is one.
+    A module lists them in ``iterate_coordinates()``; for others every entry of a parameter is one.
 
     Attributes:
         name: such as "letter.x".
@@ -92,13 +92,13 @@ class ObjectModule(nn.Module):
         super().__init__()
         self.object = object
 
-    def reshaped(self, mesh: Mesh) -> Mesh:
+    def update_mesh(self, mesh: Mesh) -> Mesh:
         """The object's new mesh, given the one that it has before."""
         raise NotImplementedError
 
     def forward(self, scene: Scene) -> Scene:
         """The scene with the object's mesh replaced."""
-        return scene.replace(self.object, mesh=self.reshaped(scene[self.object].mesh))
+        return scene.replace(self.object, mesh=self.update_mesh(scene[self.object].mesh))
 
     def values(self) -> dict[str, Tensor]:
         """What is fitted by name, in SI units, for progress and reports."""
@@ -134,7 +134,7 @@ class Translation(ObjectModule):
 
     def coordinates(self) -> list[Coordinate]:
         """x, y and z of the object, as far as they are free."""
-        return _places(self.object, self._axes)
+        return _translation_coordinates(self.object, self._axes)
 
 
 class RigidMotion(nn.Module):
@@ -196,7 +196,7 @@ class RigidMotion(nn.Module):
         Args:
             name: of what moves.
         """
-        found = _places(name, self._axes)
+        found = _translation_coordinates(name, self._axes)
         free = self._rotation_axes[1:]
         w, r = self.rotation.detach()[0], self.rotation.detach()[1:]
         for turn, axis in zip(("pitch", "yaw", "roll"), torch.eye(3, dtype=r.dtype), strict=True):
@@ -204,7 +204,7 @@ class RigidMotion(nn.Module):
                 # The product of the quaternion (1, axis/2) and the present one (w, r/2).
                 change = torch.cat([-axis @ r[:, None] / 4, w * axis + axis.cross(r, 0) / 2])
                 tangents = {"rotation": change * self._rotation_axes}
-                found.append(Coordinate(f"{name}.{turn}", "rad", tangents, _TURN))
+                found.append(Coordinate(f"{name}.{turn}", "rad", tangents, _ROTATION_SCALE))
         return found
 
     def named_values(self, name: str) -> dict[str, Tensor]:
@@ -275,7 +275,7 @@ class Scale(ObjectModule):
         """The factor."""
         return self.log_scale.exp()
 
-    def reshaped(self, mesh: Mesh) -> Mesh:
+    def update_mesh(self, mesh: Mesh) -> Mesh:
         """The mesh in its new size."""
         return Mesh(mesh.center + (mesh.vertices - mesh.center) * self.scale, mesh.faces)
 
@@ -306,7 +306,7 @@ class Vertices(ObjectModule):
         rows = checked_count(count, "number of vertices", 1)
         self.offsets = nn.Parameter(torch.zeros(rows, 3, dtype=torch.float64))
 
-    def reshaped(self, mesh: Mesh) -> Mesh:
+    def update_mesh(self, mesh: Mesh) -> Mesh:
         """The mesh with its vertices moved.
 
         Raises:
@@ -359,10 +359,10 @@ class MaterialValues(nn.Module):
             if isinstance(checked, Texture):
                 self._textures[name] = checked
                 checked = checked.image
-            self.raw[name] = nn.Parameter(_unbounded(name, evaluated(checked).detach()))
+            self.raw[name] = nn.Parameter(_to_unbounded(name, evaluate_value(checked).detach()))
 
     @classmethod
-    def of(
+    def from_object(
         cls,
         object: str,
         values: Annotated[Sequence[MaterialValue], MinLen(1)],
@@ -382,8 +382,10 @@ class MaterialValues(nn.Module):
                 or it starts at the end of its range.
         """
         try:
-            holder = held_by(item.material, layer, type(item.material).__name__)
-            return cls(object, layer=layer, **{name: _start(holder, name) for name in values})
+            holder = select_layer(item.material, layer, type(item.material).__name__)
+            return cls(
+                object, layer=layer, **{name: _initial_value(holder, name) for name in values}
+            )
         except InputError as error:
             raise InputError(str(error), f"values, material of {object}") from None
 
@@ -394,14 +396,14 @@ class MaterialValues(nn.Module):
             InputError: the object's material has no such value, or no such layer.
         """
         material: Any = scene[self.object].material
-        holder = held_by(material, self.layer, repr(self.object))
+        holder = select_layer(material, self.layer, repr(self.object))
         where = "material" if self.layer is None else "layer"
         if any(name not in getattr(holder, "__dataclass_fields__", {}) for name in self.raw):
             raise InputError(
                 f"expected a {where} with {', '.join(self.raw)} for {self.object!r}, got "
                 f"{type(holder).__name__}; give it another material"
             )
-        changed = replace(holder, **self._bounded())
+        changed = replace(holder, **self._bounded_values())
         if self.layer is not None:
             layers = [*material.layers]
             layers[self.layer] = changed
@@ -414,22 +416,24 @@ class MaterialValues(nn.Module):
         A texture is its image.
         """
         where = self.object if self.layer is None else f"{self.object}.layers[{self.layer}]"
-        return {f"{where}.{name}": _bounded(name, raw).detach() for name, raw in self.raw.items()}
+        return {
+            f"{where}.{name}": _to_bounded(name, raw).detach() for name, raw in self.raw.items()
+        }
 
     def entries(self) -> dict[str, Entries]:
         """The values in their own units."""
-        slopes = {name: _slope(name, raw.detach()) for name, raw in self.raw.items()}
+        slopes = {name: _bounded_slope(name, raw.detach()) for name, raw in self.raw.items()}
         return {name: Entries(f"raw.{name}", slope=slope) for name, slope in slopes.items()}
 
     def at_bounds(self) -> list[str]:
         """Names of values next to an end of their range."""
-        places = {name: _slope(name, raw.detach()) for name, raw in self.raw.items()}
+        places = {name: _bounded_slope(name, raw.detach()) for name, raw in self.raw.items()}
         spans = {name: RANGES[name].high - RANGES[name].low for name in places}
         near = {n: 1e-4 if math.isinf(span) else 0.01 * span for n, span in spans.items()}
         return [f"{self.object}.{n}" for n, p in places.items() if bool((p < near[n]).any())]
 
-    def _bounded(self) -> dict[str, Tensor | Texture]:
-        values = {name: _bounded(name, raw) for name, raw in self.raw.items()}
+    def _bounded_values(self) -> dict[str, Tensor | Texture]:
+        values = {name: _to_bounded(name, raw) for name, raw in self.raw.items()}
         textures = {n: replace(t, image=values[n]) for n, t in self._textures.items()}
         return {**values, **textures}
 
@@ -458,7 +462,7 @@ class Compose(nn.Module):
         return merged
 
 
-def _start(holder: Any, name: str) -> Value:
+def _initial_value(holder: Any, name: str) -> Value:
     """The value of a material, or of a layer, from which a fit starts."""
     if not hasattr(holder, name):
         raise InputError(f"expected values of {type(holder).__name__}, got {name}; remove it")
@@ -471,7 +475,7 @@ def _start(holder: Any, name: str) -> Value:
     return value
 
 
-def _bounded(name: str, raw: Tensor) -> Tensor:
+def _to_bounded(name: str, raw: Tensor) -> Tensor:
     """The value inside its range that an unbounded parameter stands for."""
     span = RANGES[name]
     if math.isinf(span.high):
@@ -479,7 +483,7 @@ def _bounded(name: str, raw: Tensor) -> Tensor:
     return span.low + (span.high - span.low) * torch.sigmoid(raw)
 
 
-def _slope(name: str, raw: Tensor) -> Tensor:
+def _bounded_slope(name: str, raw: Tensor) -> Tensor:
     """The derivative of `_bounded` with respect to the parameter."""
     span = RANGES[name]
     if math.isinf(span.high):
@@ -488,7 +492,7 @@ def _slope(name: str, raw: Tensor) -> Tensor:
     return (span.high - span.low) * place * (1 - place)
 
 
-def _unbounded(name: str, value: Tensor) -> Tensor:
+def _to_unbounded(name: str, value: Tensor) -> Tensor:
     """The parameter that `_bounded` maps to `value`."""
     span = RANGES[name]
     ends = (value == span.low) | (value == span.high)
@@ -502,11 +506,11 @@ def _unbounded(name: str, value: Tensor) -> Tensor:
     return above.log() if math.isinf(span.high) else torch.logit(above / (span.high - span.low))
 
 
-def _places(name: str, mask: Tensor) -> list[Coordinate]:
+def _translation_coordinates(name: str, mask: Tensor) -> list[Coordinate]:
     """The coordinates of a translation along the axes that are free."""
     axes = zip("xyz", torch.diag(mask), mask, strict=True)
     return [
-        Coordinate(f"{name}.{axis}", "m", {"translation": along}, _PLACE)
+        Coordinate(f"{name}.{axis}", "m", {"translation": along}, _POSITION_SCALE)
         for axis, along, free in axes
         if free
     ]

@@ -50,10 +50,10 @@ def jones_basis(
         raise InputError(f"expected {_LEVELS}, got {polarisation!r}; give two, not both zero")
     if first.requires_grad:
         raise InputError(f"expected a polarisation without derivatives, got some; {_DETACHED}")
-    return torch.stack([first / length, orthogonal(first / length)], 1)
+    return torch.stack([first / length, orthogonal_vectors(first / length)], 1)
 
 
-def orthogonal(vector: Complex128[Tensor, "*row 2"]) -> Complex128[Tensor, "*row 2"]:
+def orthogonal_vectors(vector: Complex128[Tensor, "*row 2"]) -> Complex128[Tensor, "*row 2"]:
     """The Jones vectors orthogonal to others, as long as they are.
 
     Args:
@@ -115,11 +115,11 @@ class JonesTable:
         # Neither the radius nor atan2 has a gradient on the axis itself; any φ serves there.
         on_axis = (x == 0) & (y == 0)
         radius = torch.where(on_axis, 0.0, torch.where(on_axis, 1.0, x**2 + y**2).sqrt())
-        row, up = _between(self.theta, torch.atan2(radius, z))
+        row, up = _locate_nodes(self.theta, torch.atan2(radius, z))
         azimuth = torch.atan2(y, torch.where(on_axis, 1.0, x))
         around = torch.cat([self.phi, self.phi[:1] + 2 * math.pi])
         azimuth = self.phi[0] + (azimuth - self.phi[0]) % (2 * math.pi)
-        column, across = _between(around, azimuth)
+        column, across = _locate_nodes(around, azimuth)
         after = (column + 1) % len(self.phi)
         found = torch.zeros(len(direction), 2, dtype=torch.complex128)
         for line, share in ((row, 1 - up), (row + 1, up)):
@@ -128,11 +128,11 @@ class JonesTable:
         return found / torch.view_as_real(found).flatten(-2).norm(dim=-1).clamp_min(1e-9)[:, None]
 
 
-def _between(nodes: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+def _locate_nodes(nodes: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
     """The node before each place, and how far on the way to the next it is."""
-    place = torch.minimum(place, nodes[-1])
-    low = torch.searchsorted(nodes, place.detach(), right=True).clamp(1, len(nodes) - 1) - 1
-    return low, (place - nodes[low]) / (nodes[low + 1] - nodes[low])
+    position = torch.minimum(position, nodes[-1])
+    low = torch.searchsorted(nodes, position.detach(), right=True).clamp(1, len(nodes) - 1) - 1
+    return low, (position - nodes[low]) / (nodes[low + 1] - nodes[low])
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +148,7 @@ class Polarisation:
     mixtures: Complex128[Tensor, "element k"]
 
     @staticmethod
-    def of(
+    def from_jones(
         polarisation: str | ArrayLike | JonesTable,
         leakage: complex | ArrayLike,
         elements: int,
@@ -169,14 +169,14 @@ class Polarisation:
         if isinstance(polarisation, JonesTable):
             if bool((share == share[0]).all()) and not share[0]:
                 return Polarisation(polarisation, share.new_ones(elements, 1))
-            return Polarisation(polarisation, _mixed(share))
+            return Polarisation(polarisation, _mixture_weights(share))
         vectors = _vectors(polarisation, elements)
         if vectors is None:
             basis = jones_basis(polarisation).T
-            mixtures = _mixed(share)
+            mixtures = _mixture_weights(share)
         else:
             basis = torch.eye(2, dtype=torch.complex128)
-            mixtures = (vectors + share[:, None] * orthogonal(vectors)) / _length(share)
+            mixtures = (vectors + share[:, None] * orthogonal_vectors(vectors)) / _length(share)
         if bool((mixtures == mixtures[0]).all()):
             return Polarisation(mixtures[:1] @ basis, share.new_ones(elements, 1))
         return Polarisation(basis, mixtures)
@@ -200,7 +200,7 @@ class Polarisation:
             )
         return self.mixtures @ self.base
 
-    def towards(self, direction: Float64[Tensor, "row 3"]) -> Complex128[Tensor, "#row k 2"]:
+    def evaluate(self, direction: Float64[Tensor, "row 3"]) -> Complex128[Tensor, "#row k 2"]:
         """The vectors that elements mix, one row where they are the same everywhere.
 
         Args:
@@ -209,7 +209,7 @@ class Polarisation:
         if not isinstance(self.base, JonesTable):
             return self.base[None]
         first = self.base.vector(direction)
-        return torch.stack([first, orthogonal(first)], 1)[:, : self.mixtures.shape[1]]
+        return torch.stack([first, orthogonal_vectors(first)], 1)[:, : self.mixtures.shape[1]]
 
     def equals(self, other: "Polarisation") -> bool:
         """Whether the mean elements of two arrays are alike, and all others like them.
@@ -257,7 +257,7 @@ def _vectors(polarisation: object, elements: int) -> Tensor | None:
     return torch.stack([jones_basis(vector)[:, 0] for vector in found])
 
 
-def _mixed(share: Tensor) -> Tensor:
+def _mixture_weights(share: Tensor) -> Tensor:
     return torch.stack([torch.ones_like(share), share], 1) / _length(share)
 
 
@@ -265,5 +265,5 @@ def _length(share: Tensor) -> Tensor:
     return (1 + share.abs() ** 2).sqrt()[:, None]
 
 
-VERTICAL = Polarisation.of("V", 0.0, 1)
+VERTICAL = Polarisation.from_jones("V", 0.0, 1)
 """Of one element with V."""

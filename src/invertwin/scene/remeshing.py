@@ -18,13 +18,16 @@ from invertwin.errors import InputError
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.mesh import Mesh
 
-_MOST_TRIANGLES = 1e6  # each is moved by itself
-_ROUNDS = 5  # of split, collapse, flip, relax; the lengths settle within these
-_LONG, _SHORT = 4 / 3, 4 / 5  # of the target: edges that are split, edges that are collapsed
-_FLAT = 0.5  # least cosine between two triangles whose edge is flipped: corners stay
+_MAX_TRIANGLES = 1e6  # each is moved by itself
+_REMESHING_ROUNDS = 5  # of split, collapse, flip, relax; the lengths settle within these
+_SPLIT_FACTOR, _COLLAPSE_FACTOR = (
+    4 / 3,
+    4 / 5,
+)  # of the target: edges that are split, edges that are collapsed
+_MIN_FLIP_COSINE = 0.5  # least cosine between two triangles whose edge is flipped: corners stay
 
 
-def remeshed(mesh: Mesh, edge: float) -> Mesh:
+def remesh(mesh: Mesh, edge_length: float) -> Mesh:
     """Remesh a surface with edges of about one length; topology and borders stay.
 
     Too long edges are split, too short ones collapsed, others flipped where vertices then have
@@ -36,37 +39,37 @@ def remeshed(mesh: Mesh, edge: float) -> Mesh:
 
     Args:
         mesh: the surface; derivatives end here.
-        edge: target length [m].
+        edge_length: target length [m].
 
     Raises:
         InputError: a length that is not positive or too small, or a surface without area.
     """
-    length = require_edge(mesh, edge)
-    surface = _Surface(mesh)
-    for _ in range(_ROUNDS):
-        surface.split(_LONG * length)
-        surface.collapse(_SHORT * length, _LONG * length)
+    length = require_edge_length(mesh, edge_length)
+    surface = _EditableMesh(mesh)
+    for _ in range(_REMESHING_ROUNDS):
+        surface.split(_SPLIT_FACTOR * length)
+        surface.collapse(_COLLAPSE_FACTOR * length, _SPLIT_FACTOR * length)
         surface.flip()
         surface.relax(mesh)
-    return surface.mesh()
+    return surface.to_mesh()
 
 
-def require_edge(mesh: Mesh, edge: float) -> float:
+def require_edge_length(mesh: Mesh, edge_length: float) -> float:
     """Return an edge length, if a surface can be remeshed with it.
 
     Args:
         mesh: the surface.
-        edge: target length [m].
+        edge_length: target length [m].
 
     Raises:
-        InputError: what `remeshed` refuses.
+        InputError: what `remesh` refuses.
     """
-    length = checked_number(edge, "edge length [m]", 0.0, open_low=True)
+    length = checked_number(edge_length, "edge length [m]", 0.0, open_low=True)
     area = mesh.area
     if not area > 0:
         raise InputError("expected a surface with area, got none; check the mesh")
     do = "give metres, or a longer edge"
-    require_at_most(2 * area / length / length, _MOST_TRIANGLES, "triangles", do)
+    require_at_most(2 * area / length / length, _MAX_TRIANGLES, "triangles", do)
     return length
 
 
@@ -77,14 +80,14 @@ def closest_points(mesh: Mesh, points: np.ndarray) -> np.ndarray:
         mesh: the surface.
         points: positions in the mesh's frame [p, 3], metres.
     """
-    return np.asarray(igl.point_mesh_squared_distance(points, *_arrays(mesh))[2])
+    return np.asarray(igl.point_mesh_squared_distance(points, *_mesh_arrays(mesh))[2])
 
 
-def _arrays(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+def _mesh_arrays(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     return mesh.vertices.detach().numpy(), mesh.faces.numpy()
 
 
-class _Surface:
+class _EditableMesh:
     """Triangles that change: which are around every vertex, and where the vertices are."""
 
     def __init__(self, mesh: Mesh) -> None:
@@ -99,7 +102,7 @@ class _Surface:
         edges, counts = self._edges()
         self.fixed = set(edges[counts != 2].ravel().tolist())
 
-    def mesh(self) -> Mesh:
+    def to_mesh(self) -> Mesh:
         """What there is now, without vertices that no triangle has."""
         used, faces = np.unique(np.array(list(self.faces.values())), return_inverse=True)
         return Mesh(
@@ -111,7 +114,7 @@ class _Surface:
         """Halve edges until none is longer."""
         while True:
             found = False
-            for a, b in self._sorted(lambda length: length > longest, -1):
+            for a, b in self._sorted_edges(lambda length: length > longest, -1):
                 found = True
                 middle = len(self.places)
                 self.places.append(0.5 * (self.places[a] + self.places[b]))
@@ -122,14 +125,14 @@ class _Surface:
                 for number in both:
                     face = self.faces[number]
                     self._remove(number)
-                    self._add(_with(face, a, middle))
-                    self._add(_with(face, b, middle))
+                    self._add(_replace_vertex(face, a, middle))
+                    self._add(_replace_vertex(face, b, middle))
             if not found:
                 return
 
     def collapse(self, shortest: float, longest: float) -> None:
         """Merge the ends of short edges, where the surface stays a surface."""
-        for a, b in self._sorted(lambda length: length < shortest, 1):
+        for a, b in self._sorted_edges(lambda length: length < shortest, 1):
             both = self.around[a] & self.around[b]
             if len(both) != 2 or a in self.fixed or b in self.fixed:
                 continue
@@ -142,14 +145,14 @@ class _Surface:
             if ((ring - middle) ** 2).sum(1).max() > longest**2:
                 continue
             rest = (self.around[a] | self.around[b]) - both
-            if self._folds(rest, (a, b), middle):
+            if self._would_fold(rest, (a, b), middle):
                 continue
             for number in both:
                 self._remove(number)
             for number in list(self.around[b]):
                 face = self.faces[number]
                 self._remove(number)
-                self._add(_with(face, b, a))
+                self._add(_replace_vertex(face, b, a))
             self.places[a] = middle
 
     def flip(self) -> None:
@@ -158,10 +161,10 @@ class _Surface:
             both = list(self.around[a] & self.around[b])
             if len(both) != 2:
                 continue
-            if _runs(self.faces[both[1]], a, b):
+            if _has_directed_edge(self.faces[both[1]], a, b):
                 both.reverse()
             first, second = (self.faces[number] for number in both)
-            if not _runs(first, a, b) or not _runs(second, b, a):
+            if not _has_directed_edge(first, a, b) or not _has_directed_edge(second, b, a):
                 continue
             c, d = sum(first) - a - b, sum(second) - a - b
             if c == d or self.around[c] & self.around[d]:
@@ -173,7 +176,7 @@ class _Surface:
             old = [self._normal(face) for face in (first, second)]
             new = [self._normal(face) for face in ((c, a, d), (d, b, c))]
             units = [n / max(float(np.linalg.norm(n)), 1e-300) for n in (*old, *new)]
-            if units[0] @ units[1] < _FLAT or units[2] @ units[3] < _FLAT:
+            if units[0] @ units[1] < _MIN_FLIP_COSINE or units[2] @ units[3] < _MIN_FLIP_COSINE:
                 continue
             if units[2] @ units[0] <= 0 or units[3] @ units[1] <= 0:
                 continue
@@ -207,14 +210,16 @@ class _Surface:
         pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
         return np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)
 
-    def _sorted(self, chosen: Callable[[Any], Any], order: int) -> Iterator[tuple[int, int]]:
+    def _sorted_edges(
+        self, is_selected: Callable[[Any], Any], order: int
+    ) -> Iterator[tuple[int, int]]:
         """Edges of chosen lengths, by length, that are still there when their turn comes."""
         edges, places = self._edges()[0], np.array(self.places)
         length = np.linalg.norm(places[edges[:, 0]] - places[edges[:, 1]], axis=1)
-        rows = np.nonzero(chosen(length))[0]
+        rows = np.nonzero(is_selected(length))[0]
         for row in rows[np.argsort(order * length[rows], kind="stable")]:
             a, b = edges[row].tolist()
-            if self.around[a] & self.around[b] and chosen(
+            if self.around[a] & self.around[b] and is_selected(
                 np.linalg.norm(self.places[a] - self.places[b])
             ):
                 yield a, b
@@ -222,12 +227,12 @@ class _Surface:
     def _neighbours(self, vertex: int) -> set[int]:
         return {v for number in self.around[vertex] for v in self.faces[number]} - {vertex}
 
-    def _folds(self, numbers: set[int], moved: tuple[int, int], place: np.ndarray) -> bool:
+    def _would_fold(self, numbers: set[int], moved: tuple[int, int], position: np.ndarray) -> bool:
         """Whether a triangle would turn over, or lose its area, with two vertices at a place."""
         rows = np.array([self.faces[number] for number in numbers])
         before = np.array([[self.places[v] for v in row] for row in rows.tolist()])
         after = before.copy()
-        after[np.isin(rows, moved)] = place
+        after[np.isin(rows, moved)] = position
         old, new = (np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]) for c in (before, after))
         sizes = np.linalg.norm(old, axis=1) * np.linalg.norm(new, axis=1)
         return bool(((old * new).sum(1) <= 0.2 * sizes).any())
@@ -247,11 +252,11 @@ class _Surface:
             self.around[vertex].discard(number)
 
 
-def _with(face: tuple[int, int, int], old: int, new: int) -> tuple[int, int, int]:
+def _replace_vertex(face: tuple[int, int, int], old: int, new: int) -> tuple[int, int, int]:
     a, b, c = (new if vertex == old else vertex for vertex in face)
     return a, b, c
 
 
-def _runs(face: tuple[int, int, int], a: int, b: int) -> bool:
+def _has_directed_edge(face: tuple[int, int, int], a: int, b: int) -> bool:
     """Whether a triangle runs from a to b."""
     return (a, b) in ((face[0], face[1]), (face[1], face[2]), (face[2], face[0]))

@@ -8,7 +8,7 @@ from invertwin.checks import checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Positive
 from invertwin.scene.material.materials import RoughDielectric
-from invertwin.scene.mesh import Mesh, joined
+from invertwin.scene.mesh import Mesh, merge_meshes
 from invertwin.scene.pose import rigid
 from invertwin.scene.scene import Object
 from invertwin.scene.shapes import box
@@ -82,7 +82,7 @@ def room(
     placed = {
         "table": (_table(0.8, 0.74, 1.4), [w / 2 - 0.85, d / 2]),
         "chair_1": (_chair(), [w / 2 - 0.85, d / 2 - 1.0]),
-        "chair_2": (_chair(turned=True), [w / 2 - 0.85, d / 2 + 1.0]),
+        "chair_2": (_chair(is_reversed=True), [w / 2 - 0.85, d / 2 + 1.0]),
         "shelf": (_shelf(0.9, 1.9, 0.35), [w / 2 - 0.6, d - 0.2]),
         "sofa": (_sofa(), [-w / 2 + 0.5, d / 2]),
     }
@@ -107,7 +107,7 @@ def _panel(middle: Sequence[float], first: Sequence[float], second: Sequence[flo
 def _boxes(*parts: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Mesh:
     """Boxes by size and middle."""
     meshes = [(box(size), torch.tensor(middle, dtype=torch.float64)) for size, middle in parts]
-    return joined([Mesh(mesh.vertices + middle, mesh.faces) for mesh, middle in meshes])
+    return merge_meshes([Mesh(mesh.vertices + middle, mesh.faces) for mesh, middle in meshes])
 
 
 def _legs(
@@ -124,9 +124,9 @@ def _table(x: float, y: float, z: float) -> Mesh:
     return _boxes(((x, _TOP, z), (0, y - _TOP / 2, 0)), *legs)
 
 
-def _chair(*, turned: bool = False) -> Mesh:
+def _chair(*, is_reversed: bool = False) -> Mesh:
     """A chair whose back is at −z, or at z."""
-    back = 0.19 if turned else -0.19
+    back = 0.19 if is_reversed else -0.19
     return _boxes(
         ((0.42, _TOP, 0.42), (0, 0.45, 0)),
         ((0.42, 0.45, _TOP), (0, 0.70, back)),

@@ -73,18 +73,22 @@ class Object:
     @property
     def vertices(self) -> Float64[Tensor, "v 3"]:
         """Vertex positions in the world [m], with the gradients of the mesh and the pose."""
-        return self.mesh.vertices if self.pose is None else _moved(self.mesh.vertices, self.pose)
+        return (
+            self.mesh.vertices
+            if self.pose is None
+            else _transform_points(self.mesh.vertices, self.pose)
+        )
 
     @property
     def center(self) -> Float64[Tensor, "3"]:
         """World position [m] of the middle of the mesh's bounding box in the object's frame.
 
-        Rotations and scalings act about it. Differentiable like `vertices`.
+        Rotations and scalings act about it. Differentiable like `free_vertices`.
         """
         center = self.mesh.center
-        return center if self.pose is None else _moved(center[None], self.pose)[0]
+        return center if self.pose is None else _transform_points(center[None], self.pose)[0]
 
-    def at(self, time: float) -> "Object":
+    def advance(self, time: float) -> "Object":
         """The object after it has moved with its velocity for `time` [s]; the result is at rest."""
         checked_number(time, "time [s]", -torch.inf)
         if self.velocity is None:
@@ -98,8 +102,8 @@ class Object:
         return replace(self, mesh=mesh, velocity=None)
 
 
-def placed(objects: Sequence[Object]) -> list[Float64[Tensor, "v 3"]]:
-    """The ``vertices`` of many objects; those of as many vertices are placed at once.
+def transform_vertices(objects: Sequence[Object]) -> list[Float64[Tensor, "v 3"]]:
+    """The ``free_vertices`` of many objects; those of as many vertices are placed at once.
 
     Args:
         objects: any number.
@@ -113,12 +117,12 @@ def placed(objects: Sequence[Object]) -> list[Float64[Tensor, "v 3"]]:
             alike.setdefault(len(item.mesh.vertices), []).append(number)
     for numbers in alike.values():
         points = torch.stack([objects[n].mesh.vertices for n in numbers])
-        moved = _moved(points, torch.stack([objects[n].transform for n in numbers]))
+        moved = _transform_points(points, torch.stack([objects[n].transform for n in numbers]))
         found |= zip(numbers, moved.unbind(), strict=True)
     return [found[number] for number in range(len(objects))]
 
 
-def _moved(points: Float64[Tensor, "*n v 3"], pose: Float64[Tensor, "*n 4 4"]) -> Tensor:
+def _transform_points(points: Float64[Tensor, "*n v 3"], pose: Float64[Tensor, "*n 4 4"]) -> Tensor:
     return points @ pose[..., :3, :3].mT + pose[..., None, :3, 3]
 
 
@@ -201,12 +205,12 @@ class Scene:
             )
         return Scene({**self.objects, name: changed})
 
-    def at(self, time: float) -> "Scene":
+    def advance(self, time: float) -> "Scene":
         """The scene after all objects moved with their velocities for `time` [s]."""
-        return Scene({name: value.at(time) for name, value in self.objects.items()})
+        return Scene({name: value.advance(time) for name, value in self.objects.items()})
 
 
-def warn_of_mirrors(scene: Scene, frequency: float) -> None:
+def warn_if_purely_specular(scene: Scene, frequency: float) -> None:
     """Warn where no surface scatters: a radar sees a mirror only where it stands upright to it.
 
     Scenes of perfect conductors and clouds alone are meant to be what they are.
@@ -218,7 +222,7 @@ def warn_of_mirrors(scene: Scene, frequency: float) -> None:
     bodies = [item for item in scene.objects.values() if item.cloud is None]
     rough = [item for item in bodies if not item.material.coherent]
     with torch.no_grad():
-        if rough and not any(_scatters(item.material, frequency) for item in rough):
+        if rough and not any(_has_diffuse_scattering(item.material, frequency) for item in rough):
             kinds = ", ".join(sorted({type(item.material).__name__ for item in rough}))
             warnings.warn(
                 f"no surface scatters ({kinds}): all are mirrors, which a radar sees only where "
@@ -228,8 +232,8 @@ def warn_of_mirrors(scene: Scene, frequency: float) -> None:
             )
 
 
-def _scatters(material: Material, frequency: float) -> bool:
-    surface = material.surface(frequency)
+def _has_diffuse_scattering(material: Material, frequency: float) -> bool:
+    surface = material.scattering_law(frequency)
     wide = surface.exponents[..., 0] <= 1.01 * lobe_exponent(ROUGH_LOBE_WIDTH)
     others = surface.lobes[..., 1:] > 0
     return bool(((surface.diffuse > 0) | wide | others.any(dim=-1)).any())
@@ -255,7 +259,7 @@ def _checked_pose(pose: object) -> Tensor:
     return matrix
 
 
-def displaced(
+def displace(
     item: Object, offset: Float64[Tensor, "3"], rotation: Float64[Tensor, "3"] | None = None
 ) -> Object:
     """An object that is turned about its centre and moved.

@@ -17,8 +17,8 @@ from invertwin.limits import Angle, Count, Positive
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.mesh import Mesh
 
-_MOST_TRIANGLES = 1e7  # of one shape
-_MOST_LETTERS = 100  # whose outlines are joined one by one
+_MAX_TRIANGLES = 1e7  # of one shape
+_MAX_LETTERS = 100  # whose outlines are joined one by one
 
 
 def plate(width: Positive, height: Positive, divisions: Count = 1) -> Mesh:
@@ -174,7 +174,7 @@ def text(
     height = _length(size, "text size [m]")
     thickness = _length(depth, "text depth [m]")
     longest = _length(max_edge, "longest edge [m]")
-    plane, cap = _triangulated_outline(text, height, thickness, longest)
+    plane, cap = _triangulate_outline(text, height, thickness, longest)
     count = len(plane)
     front = np.column_stack([plane, np.full(count, -thickness / 2)])
     back = np.column_stack([plane, np.full(count, thickness / 2)])
@@ -193,7 +193,7 @@ def _length(value: object, what: str) -> float:
 
 def _require_triangles(count: float, at: str, do: str = "") -> None:
     do = do or f"lower {at}"
-    require_at_most(count, _MOST_TRIANGLES, "triangles of a shape", do, at)
+    require_at_most(count, _MAX_TRIANGLES, "triangles of a shape", do, at)
 
 
 def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
@@ -216,11 +216,11 @@ def _lattice(n: int) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _triangulated_outline(
+def _triangulate_outline(
     string: str, height: float, thickness: float, longest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points [p, 2] and counter-clockwise triangles that fill the outline of a text."""
-    require_at_most(len(string), _MOST_LETTERS, "letters", "give a shorter text", "text")
+    require_at_most(len(string), _MAX_LETTERS, "letters", "give a shorter text", "text")
     # Imported here: only text needs these two, and matplotlib alone takes half a second.
     import matplotlib
     import shapely

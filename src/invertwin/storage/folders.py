@@ -22,7 +22,7 @@ UNFINISHED = "unfinished"
 PARTS = "parts"  # finished and unfinished parts of a run, until it ends
 
 
-class Work(BaseModel):
+class UnfinishedRun(BaseModel):
     """A run in progress: its files in `unfinished/`, and who writes them."""
 
     digest: str
@@ -36,11 +36,11 @@ class Manifest(BaseModel):
 
     digest: str = ""
     files: list[str] = []
-    unfinished: Work | None = None
+    unfinished: UnfinishedRun | None = None
 
 
 @contextmanager
-def replacing(path: str | Path) -> Generator[Path]:
+def replace_file(path: str | Path) -> Generator[Path]:
     """Write a new file beside a path; it takes its place when it is complete.
 
     A failure leaves an existing file as it was.
@@ -63,7 +63,7 @@ def replacing(path: str | Path) -> Generator[Path]:
 
 
 @contextmanager
-def in_one_line(do: str) -> Iterator[None]:
+def convert_os_errors(do: str) -> Iterator[None]:
     """Tell what the file system refuses as an InputError, with more that one can do."""
     try:
         yield
@@ -74,7 +74,7 @@ def in_one_line(do: str) -> Iterator[None]:
         ) from None
 
 
-def not_ours(path: Path, name: str) -> InputError:
+def foreign_file_error(path: Path, name: str) -> InputError:
     """The error of a file in the way that no run has written.
 
     Args:
@@ -87,16 +87,16 @@ def not_ours(path: Path, name: str) -> InputError:
     )
 
 
-def lock_folder(path: Path, held: ExitStack) -> None:
+def lock_folder(path: Path, stack: ExitStack) -> None:
     """Lock a folder until the stack is closed, or the process dies.
 
     Args:
         path: Of the folder.
-        held: Keeps the lock.
+        stack: Keeps the lock.
     """
     file = path / LOCK
     if file.is_symlink() or (file.exists() and (not file.is_file() or file.stat().st_size)):
-        raise not_ours(path, LOCK)
+        raise foreign_file_error(path, LOCK)
     lock = FileLock(file, timeout=0, thread_local=False)
     try:
         lock.acquire()
@@ -106,8 +106,8 @@ def lock_folder(path: Path, held: ExitStack) -> None:
             f"expected a folder that no other run uses, got {path}, in use by "
             f"{other.owner if other else 'another run'}; wait for it or choose another -o"
         ) from None
-    held.callback(lock.release)
-    held.callback(file.unlink, missing_ok=True)  # while it is held: nobody waits for it
+    stack.callback(lock.release)
+    stack.callback(file.unlink, missing_ok=True)  # while it is held: nobody waits for it
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -126,7 +126,7 @@ def read_manifest(path: Path) -> Manifest:
         ) from None
     inside = manifest.unfinished.files if manifest.unfinished else []
     for name in (*manifest.files, *(f"{UNFINISHED}/{name}" for name in inside)):
-        place_in(path, name)
+        path_in_folder(path, name)
     return manifest
 
 
@@ -137,11 +137,11 @@ def save_manifest(path: Path, manifest: Manifest) -> None:
         path: Of the folder.
         manifest: What it holds.
     """
-    with replacing(path / MANIFEST) as part:
+    with replace_file(path / MANIFEST) as part:
         part.write_text(manifest.model_dump_json(indent=1), encoding="utf-8")
 
 
-def place_in(path: Path, name: str) -> Path:
+def path_in_folder(path: Path, name: str) -> Path:
     """A file in the folder, if its name is plain: it does not lead elsewhere, nor do links.
 
     Args:
@@ -151,20 +151,20 @@ def place_in(path: Path, name: str) -> Path:
     parts = PurePosixPath(name).parts
     above = (path.joinpath(*parts[:k]) for k in range(1, len(parts)))
     outside = not parts or parts[0] == "/" or {"..", LOCK, MANIFEST} & {*parts} or "\0" in name
-    if outside or not _possible(path.joinpath(*parts)):
+    if outside or not _is_possible_name(path.joinpath(*parts)):
         raise InputError(
             f"expected names of files in {path} in its {MANIFEST}, got {name[:100]!r}; "
             "choose another -o"
         )
     if any(folder.is_symlink() for folder in above):
-        raise not_ours(path, name)
+        raise foreign_file_error(path, name)
     return path.joinpath(*parts)
 
 
-def _possible(place: Path) -> bool:
+def _is_possible_name(path: Path) -> bool:
     """Whether a file of this name can be, such as one that is not too long."""
     try:
-        place.lstat()
+        path.lstat()
     except (FileNotFoundError, NotADirectoryError):
         return True
     except (OSError, ValueError):  # too long, or letters that no name has
@@ -172,20 +172,20 @@ def _possible(place: Path) -> bool:
     return True
 
 
-def require_free(path: Path, name: str, own: Iterable[str]) -> None:
+def require_free(path: Path, name: str, replaceable: Iterable[str]) -> None:
     """Refuse a name at which something lies that is no file of our own.
 
     Args:
         path: Of the folder.
         name: Path in the folder.
-        own: Names of files that may be replaced.
+        replaceable: Names of files that may be replaced.
     """
-    place = place_in(path, name)
-    if os.path.lexists(place) and (name not in own or place.is_symlink() or place.is_dir()):
-        raise not_ours(path, name)
+    place = path_in_folder(path, name)
+    if os.path.lexists(place) and (name not in replaceable or place.is_symlink() or place.is_dir()):
+        raise foreign_file_error(path, name)
 
 
-def moved(path: Path, manifest: Manifest) -> Manifest:
+def move_results(path: Path, manifest: Manifest) -> Manifest:
     """Put the files of a complete run in their places; go on where a kill has cut it short.
 
     Args:
@@ -203,10 +203,10 @@ def moved(path: Path, manifest: Manifest) -> Manifest:
         os.replace(path / UNFINISHED / name, path / name)
     _remove(path, set(manifest.files).difference(results))
     manifest = Manifest(digest=work.digest, files=results, unfinished=work)
-    return without_unfinished(path, manifest)
+    return remove_unfinished(path, manifest)
 
 
-def without_unfinished(path: Path, manifest: Manifest) -> Manifest:
+def remove_unfinished(path: Path, manifest: Manifest) -> Manifest:
     """Remove what an unfinished run has left.
 
     Args:
@@ -228,7 +228,7 @@ def without_unfinished(path: Path, manifest: Manifest) -> Manifest:
 def _remove(path: Path, names: Iterable[str]) -> None:
     """Remove files, the drafts of them that a kill has left, and folders that are then empty."""
     for name in names:
-        place = place_in(path, name)
+        place = path_in_folder(path, name)
         drafts = place.parent.glob(f".{escape(place.stem)}.*.part{escape(place.suffix)}")
         for file in (place, *drafts):
             if file.is_file() and not file.is_symlink():

@@ -21,13 +21,14 @@ if TYPE_CHECKING:  # a child process starts without what it does not need
     import numpy as np
 
 _SECONDS, _BYTES_PER_SECOND = 8.0, 10e6  # of processor time, that of importing a reader with it
-_WAITING = 10.0  # times as long on a busy machine
+_TIMEOUT_FACTOR = 10.0  # times as long on a busy machine
 _MEMORY = 2 << 30  # beside four times the size of the file
-_LARGE, _REFUSED, _MISSING = 77, 76, 75  # exit codes of the child
-_SLOW = -getattr(signal, "SIGXCPU", 0) or 78
+_TOO_LARGE, _REFUSED, _MISSING = 77, 76, 75  # exit codes of the child
+_TIMED_OUT = -getattr(signal, "SIGXCPU", 0) or 78
 _NAMES = {"netcdf": "NetCDF", "hdf5": "HDF5", "matlab": "MATLAB"}
 _CHILD = (
-    "import sys; from invertwin.storage.isolated_reader import hand_over; hand_over(*sys.argv[1:])"
+    "import sys; from invertwin.storage.isolated_reader import run_child_reader; "
+    "run_child_reader(*sys.argv[1:])"
 )
 
 
@@ -57,7 +58,7 @@ class StoredArrays(NamedTuple):
     attributes: dict[str, Any]
 
 
-def read_apart(
+def read_isolated(
     path: Path,
     kind: Literal["netcdf", "hdf5", "matlab"],
     variable: str = "",
@@ -88,19 +89,19 @@ def read_apart(
         ended = subprocess.run(
             [*call, str(memory), str(int(seconds))],
             capture_output=True,
-            timeout=_WAITING * seconds,
+            timeout=_TIMEOUT_FACTOR * seconds,
             env=known,
         )
         code, said = ended.returncode, ended.stdout
     except subprocess.TimeoutExpired:
-        code, said = _SLOW, b""
+        code, said = _TIMED_OUT, b""
     if not code:
-        return _unpacked(said)
+        return _unpack_arrays(said)
     if code == _MISSING:
         raise KeyError(variable)
     told = {
-        _SLOW: f"one that takes its reader more than {seconds:.0f} s",
-        _LARGE: f"one that asks for more than {memory / 1e9:.1f} GB",
+        _TIMED_OUT: f"one that takes its reader more than {seconds:.0f} s",
+        _TOO_LARGE: f"one that asks for more than {memory / 1e9:.1f} GB",
         _REFUSED: f"one that its reader refuses ({said.decode(errors='replace').strip()})",
     }
     crash = f"one that crashes its reader ({signal.Signals(-code).name if code < 0 else code})"
@@ -110,7 +111,7 @@ def read_apart(
     )
 
 
-def hand_over(kind: str, path: str, variable: str, memory: str, seconds: str) -> None:
+def run_child_reader(kind: str, path: str, variable: str, memory: str, seconds: str) -> None:
     """What the child process does: read a file within limits, and write what it holds.
 
     Args:
@@ -134,9 +135,9 @@ def hand_over(kind: str, path: str, variable: str, memory: str, seconds: str) ->
         try:
             import numpy as np
 
-            np.savez(handed, *_packed(_READERS[kind](path, variable)))
+            np.savez(handed, *_pack_arrays(_READERS[kind](path, variable)))
         except MemoryError:
-            sys.exit(_LARGE)
+            sys.exit(_TOO_LARGE)
         # Whatever a library raises for a damaged file, the parent tells it in one line.
         except Exception as error:
             if isinstance(error, KeyError) and error.args == (variable,):
@@ -161,15 +162,15 @@ def _netcdf(path: str, _variable: str) -> StoredArrays:
     return StoredArrays(arrays, dict(whole.attrs))
 
 
-def _hdf5(path: str, place: str, name: str = "") -> StoredArrays:
+def _hdf5(path: str, location: str, name: str = "") -> StoredArrays:
     import h5py
     import numpy as np
 
-    name = name or place
+    name = name or location
     with h5py.File(path, "r") as opened:
-        if place not in opened:
+        if location not in opened:
             raise KeyError(name)
-        return StoredArrays({name: StoredArray((), np.asarray(opened[place]), {})}, {})
+        return StoredArrays({name: StoredArray((), np.asarray(opened[location]), {})}, {})
 
 
 def _matlab(path: str, variable: str) -> StoredArrays:
@@ -201,36 +202,36 @@ _READERS: dict[str, Callable[[str, str], StoredArrays]] = {
 }
 
 
-def _packed(stored: StoredArrays) -> "list[np.ndarray]":
+def _pack_arrays(stored: StoredArrays) -> "list[np.ndarray]":
     """Plain arrays; the last is text that names the others by their number."""
     import numpy as np
 
     arrays: list[np.ndarray] = []
 
-    def put(name: str, value: Any) -> int:
+    def add_array(name: str, value: Any) -> int:
         array = np.asarray(value)
         if array.dtype.hasobject:
             raise ValueError(f"{name} holds objects, not numbers or text")
         arrays.append(array)
         return len(arrays) - 1
 
-    def put_all(values: dict[str, Any]) -> dict[str, int]:
-        return {name: put(name, value) for name, value in values.items()}
+    def add_arrays(values: dict[str, Any]) -> dict[str, int]:
+        return {name: add_array(name, value) for name, value in values.items()}
 
     names = {
         "arrays": [
-            [name, array.dimensions, put(name, array.values), put_all(array.attributes)]
+            [name, array.dimensions, add_array(name, array.values), add_arrays(array.attributes)]
             for name, array in stored.arrays.items()
         ],
-        "attributes": put_all(stored.attributes),
+        "attributes": add_arrays(stored.attributes),
     }
     return [*arrays, np.asarray(json.dumps(names))]
 
 
-def _unpacked(handed: bytes) -> StoredArrays:
+def _unpack_arrays(content: bytes) -> StoredArrays:
     import numpy as np
 
-    with np.load(io.BytesIO(handed), allow_pickle=False) as archive:
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         *packed, text = archive.values()
     names = json.loads(text.item())
 

@@ -17,18 +17,18 @@ from invertwin.storage.folders import (
     PARTS,
     UNFINISHED,
     Manifest,
-    Work,
-    in_one_line,
+    UnfinishedRun,
+    convert_os_errors,
+    foreign_file_error,
     lock_folder,
-    moved,
-    not_ours,
-    place_in,
+    move_results,
+    path_in_folder,
     read_manifest,
     remove_empty,
-    replacing,
+    remove_unfinished,
+    replace_file,
     require_free,
     save_manifest,
-    without_unfinished,
 )
 
 CHECKPOINT = "checkpoint.pt"
@@ -55,25 +55,25 @@ class RunFolder:
     Args:
         path: Of the folder.
         manifest: What it holds.
-        held: Its lock.
+        stack: Its lock.
     """
 
-    def __init__(self, path: Path, manifest: Manifest, held: ExitStack):
+    def __init__(self, path: Path, manifest: Manifest, stack: ExitStack):
         self.path, self.complete = path, manifest.unfinished is None
-        self._manifest, self._held = manifest, held
+        self._manifest, self._held = manifest, stack
 
     def __enter__(self) -> "RunFolder":
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        with in_one_line("; then --resume goes on" if self.resumable else ""), self._held:
+        with convert_os_errors("; then --resume goes on" if self.resumable else ""), self._held:
             try:
                 if error is None and not self.complete:
                     self._finish()
             finally:
                 work = self._manifest.unfinished
                 if work is not None and not work.complete and not self.resumable:
-                    without_unfinished(self.path, self._manifest)
+                    remove_unfinished(self.path, self._manifest)
             if isinstance(error, OSError):
                 raise error
 
@@ -101,7 +101,7 @@ class RunFolder:
             require_free(self.path, name, self._manifest.files)
             work.files.append(name)
             save_manifest(self.path, self._manifest)
-        path = place_in(self.path, f"{UNFINISHED}/{name}")
+        path = path_in_folder(self.path, f"{UNFINISHED}/{name}")
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
@@ -112,7 +112,7 @@ class RunFolder:
             name: Its path in the folder.
             data: What it holds.
         """
-        with replacing(self.file(name)) as part:
+        with replace_file(self.file(name)) as part:
             part.write_bytes(data)
 
     def write_text(self, name: str, text: str) -> None:
@@ -131,7 +131,7 @@ class RunFolder:
             name: Its path in the folder.
             value: What it holds.
         """
-        text = json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False)
+        text = json.dumps(to_json_value(value), indent=2, ensure_ascii=False, allow_nan=False)
         self.write_text(name, text + "\n")
 
     def read_json(self, name: str) -> Any | None:
@@ -147,7 +147,7 @@ class RunFolder:
         manifest = self._manifest.model_copy(update={"unfinished": done})
         save_manifest(self.path, manifest)
         self._manifest = manifest
-        self._manifest = moved(self.path, manifest)
+        self._manifest = move_results(self.path, manifest)
 
 
 def open_run(
@@ -172,7 +172,7 @@ def open_run(
     if "\0" in str(path):
         raise InputError(f"expected a folder's name, got {str(path)!r}; take the NUL out")
     digest = hashlib.sha256(json.dumps(texts, sort_keys=True).encode()).hexdigest()
-    with in_one_line(" or choose another -o"), ExitStack() as held:
+    with convert_os_errors(" or choose another -o"), ExitStack() as held:
         missing = [folder for folder in (path, *path.parents) if not folder.exists()]
         if resume and missing:
             raise _nothing_to_resume(path)
@@ -182,11 +182,11 @@ def open_run(
         lock_folder(path, held)
         manifest = read_manifest(path)
         if manifest.unfinished is not None and manifest.unfinished.complete:
-            manifest = moved(path, manifest)
+            manifest = move_results(path, manifest)
         if not resume:
-            _require_room(path, manifest, texts, overwrite)
-            manifest = without_unfinished(path, manifest)
-            manifest.unfinished = Work(digest=digest, owner="")
+            _require_free_folder(path, manifest, texts, overwrite)
+            manifest = remove_unfinished(path, manifest)
+            manifest.unfinished = UnfinishedRun(digest=digest, owner="")
         work = manifest.unfinished
         if work is None and not manifest.files:
             raise _nothing_to_resume(path)
@@ -216,7 +216,9 @@ def _nothing_to_resume(path: Path) -> InputError:
     )
 
 
-def _require_room(path: Path, manifest: Manifest, stems: Iterable[str], overwrite: bool) -> None:
+def _require_free_folder(
+    path: Path, manifest: Manifest, stems: Iterable[str], overwrite: bool
+) -> None:
     """Refuse a folder with results that are not to be replaced, or not ours to replace."""
     found = [name for name in manifest.files if (path / name).exists()]
     if not overwrite and (found or _resumable(path, manifest)):
@@ -233,7 +235,7 @@ def _require_room(path: Path, manifest: Manifest, stems: Iterable[str], overwrit
     for name in sorted(os.listdir(path)):
         ours = not (path / name).is_symlink() and own.get(name) is (path / name).is_dir()
         if not ours and any(fnmatchcase(name, pattern) for pattern in wanted):
-            raise not_ours(path, name)
+            raise foreign_file_error(path, name)
 
 
 def _resumable(path: Path, manifest: Manifest) -> bool:
@@ -242,16 +244,16 @@ def _resumable(path: Path, manifest: Manifest) -> bool:
     return any((path / UNFINISHED / name).exists() for name in names)
 
 
-def plain(value: Any) -> Any:
+def to_json_value(value: Any) -> Any:
     """A value as JSON can hold it: tensors and arrays as lists, non-finite numbers as None."""
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_json_value(item) for item in value]
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return to_json_value(value.tolist())
     return str(value)

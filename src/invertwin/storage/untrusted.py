@@ -17,11 +17,13 @@ if TYPE_CHECKING:  # the command line starts without NumPy
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-_DAMAGED = "it is damaged or of another kind; copy or export it again"
+_DAMAGED_ADVICE = "it is damaged or of another kind; copy or export it again"
 
 
 @contextmanager
-def reading(path: str | Path, expected: str, do: str = _DAMAGED) -> Iterator[None]:
+def convert_read_errors(
+    path: str | Path, expected: str, do: str = _DAMAGED_ADVICE
+) -> Iterator[None]:
     """Tell whatever a reader raises as an InputError of one line; warnings stay warnings.
 
     Args:
@@ -42,8 +44,11 @@ def reading(path: str | Path, expected: str, do: str = _DAMAGED) -> Iterator[Non
         raise InputError(f"expected {expected}, got {path} ({reason}); {do}") from None
 
 
-def reader(expected: str, do: str = _DAMAGED) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
-    """Decorate a function that reads the file it is given first: all of it is `reading`.
+def safe_reader(
+    expected: str, do: str = _DAMAGED_ADVICE
+) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
+    """Decorate a function that reads the file it is given first: all of it is
+    `convert_read_errors`.
 
     Args:
         expected: What the file should be.
@@ -54,7 +59,7 @@ def reader(expected: str, do: str = _DAMAGED) -> Callable[[Callable[_P, _R]], Ca
         @wraps(function)
         def read(*args: _P.args, **kwargs: _P.kwargs) -> _R:
             path: Any = args[0] if args else next(iter(kwargs.values()))
-            with reading(path, expected, do):
+            with convert_read_errors(path, expected, do):
                 return function(*args, **kwargs)
 
         return read
@@ -93,7 +98,7 @@ def read_text(path: str | Path, what: str) -> str:
         InputError: No such file, or one that is no text.
     """
     file = existing_file(path, what)
-    with reading(file, what, "it is no text; name the settings, not the data"):
+    with convert_read_errors(file, what, "it is no text; name the settings, not the data"):
         return file.read_text(encoding="utf-8-sig")
 
 
@@ -110,20 +115,23 @@ def read_npy(path: str | Path) -> "np.ndarray":
 
     file = existing_file(path, "a NumPy file")
     # Opened here: numpy leaves a damaged file open.
-    with reading(file, "plain numbers in a NumPy file (.npy)"), file.open("rb") as opened:
+    with (
+        convert_read_errors(file, "plain numbers in a NumPy file (.npy)"),
+        file.open("rb") as opened,
+    ):
         _check_header(opened, file.stat().st_size)
         return np.load(opened, allow_pickle=False)
 
 
 def read_arrays(
-    path: str | Path, do: str, wanted: Collection[str] | None = None
+    path: str | Path, do: str, names: Collection[str] | None = None
 ) -> "dict[str, np.ndarray]":
     """Read the arrays of an ``.npz`` file by name. Wanted arrays that are missing are left out.
 
     Args:
         path: The file.
         do: What the user can do where it cannot be read, for the message.
-        wanted: Names; None = all.
+        names: Names; None = all.
 
     Raises:
         InputError: No such file, a damaged one, or pickled objects.
@@ -134,10 +142,10 @@ def read_arrays(
     if not file.is_file():
         raise InputError(f"expected {file.name} in {file.parent}, got no such file; {do}")
     found = {}
-    with reading(file, "plain arrays in an .npz file", do), ZipFile(file) as archive:
+    with convert_read_errors(file, "plain arrays in an .npz file", do), ZipFile(file) as archive:
         for entry in archive.infolist():
             name = entry.filename.removesuffix(".npy")
-            if wanted is None or name in wanted:
+            if names is None or name in names:
                 with archive.open(entry) as opened:
                     _check_header(opened, entry.file_size)
                     found[name] = np.load(opened, allow_pickle=False)

@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.storage.folders import replacing
-from invertwin.storage.untrusted import read_arrays, reading
+from invertwin.storage.folders import replace_file
+from invertwin.storage.untrusted import convert_read_errors, read_arrays
 
-_FORMAT = 2
-_DO = "repeat the run with --overwrite"
-_MOST_VALUES = 2_000_000  # of maps that are kept
+_FORMAT_VERSION = 2
+_RERUN_ADVICE = "repeat the run with --overwrite"
+_MAX_VALUES = 2_000_000  # of maps that are kept
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class DisplayMesh:
     """A surface in the world.
 
     Attributes:
@@ -33,7 +33,7 @@ class Body:
 
 
 @dataclass(frozen=True, eq=False)
-class Layer:
+class DisplayLayer:
     """One thing that can be shown and hidden.
 
     Attributes:
@@ -61,7 +61,7 @@ class Layer:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class DisplayStep:
     """Where a fit stood.
 
     Attributes:
@@ -72,11 +72,11 @@ class Step:
 
     number: int
     label: str
-    bodies: Mapping[str, Body]
+    bodies: Mapping[str, DisplayMesh]
 
 
 @dataclass(frozen=True, eq=False)
-class Maps:
+class DisplayMaps:
     """Power over range and direction, of some frames of a radar.
 
     Attributes:
@@ -92,16 +92,18 @@ class Maps:
     power: Mapping[str, NDArray[np.float32]]
 
     @classmethod
-    def of(cls, spectra: Mapping[str, Tensor], grid: Grid, most: int = _MOST_VALUES) -> "Maps":
+    def from_spectra(
+        cls, spectra: Mapping[str, Tensor], grid: Grid, max_values: int = _MAX_VALUES
+    ) -> "DisplayMaps":
         """Maps of spectra [frame, range, u, v]; of many frames, evenly chosen ones.
 
         Args:
             spectra: By what is shown, all of one shape.
             grid: Their bins.
-            most: Values that are kept, about.
+            max_values: Values that are kept, about.
         """
         frames, ranges, across, _ = next(iter(spectra.values())).shape
-        count = max(1, min(frames, most // (len(spectra) * ranges * across)))
+        count = max(1, min(frames, max_values // (len(spectra) * ranges * across)))
         chosen = np.unique(np.linspace(0, frames - 1, count).astype(int)).tolist()
         return cls(
             chosen,
@@ -113,7 +115,7 @@ class Maps:
             },
         )
 
-    def at(self, frame: int) -> dict[str, NDArray[np.float32]]:
+    def maps_of_frame(self, frame: int) -> dict[str, NDArray[np.float32]]:
         """The maps of a frame; none, where they were not kept.
 
         Args:
@@ -139,9 +141,9 @@ class Display:
     """
 
     title: str
-    layers: Sequence[Layer]
-    steps: Sequence[Step] = ()
-    maps: Mapping[str, Maps] = field(default_factory=dict)
+    layers: Sequence[DisplayLayer]
+    steps: Sequence[DisplayStep] = ()
+    maps: Mapping[str, DisplayMaps] = field(default_factory=dict)
     up: tuple[float, float, float] = (0.0, 1.0, 0.0)
     ahead: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
@@ -161,7 +163,7 @@ class Display:
             found.setdefault(layer.group, layer.shown)
         return found
 
-    def at_step(self, step: Step) -> "Display":
+    def show_step(self, step: DisplayStep) -> "Display":
         """The display with the bodies of a step in place of the twin's.
 
         Args:
@@ -184,20 +186,20 @@ class Display:
         """
         arrays: dict[int, NDArray[Any]] = {}  # by identity: faces of steps are mostly the same
 
-        def plain(value: Any) -> Any:
+        def to_json(value: Any) -> Any:
             if isinstance(value, np.ndarray):
                 arrays[id(value)] = value
                 return {"array": f"a{list(arrays).index(id(value))}"}
             if isinstance(value, Mapping):
-                return {name: plain(item) for name, item in value.items()}
+                return {name: to_json(item) for name, item in value.items()}
             if isinstance(value, list | tuple):
-                return [plain(item) for item in value]
-            return plain(vars(value)) if hasattr(value, "__dataclass_fields__") else value
+                return [to_json(item) for item in value]
+            return to_json(vars(value)) if hasattr(value, "__dataclass_fields__") else value
 
-        header = np.array(json.dumps(plain(self) | {"format": _FORMAT}))
+        header = np.array(json.dumps(to_json(self) | {"format": _FORMAT_VERSION}))
         named = {f"a{number}": array for number, array in enumerate(arrays.values())}
         # A run that is killed meanwhile goes on from the file before.
-        with replacing(path) as part:
+        with replace_file(path) as part:
             np.savez_compressed(part, allow_pickle=False, header=header, **named)
 
     @classmethod
@@ -210,36 +212,42 @@ class Display:
         Raises:
             InputError: A damaged file, or one of another version.
         """
-        with reading(path, "what a fit leaves to be viewed", _DO):
-            arrays = read_arrays(path, _DO)
+        with convert_read_errors(path, "what a fit leaves to be viewed", _RERUN_ADVICE):
+            arrays = read_arrays(path, _RERUN_ADVICE)
 
-            def whole(value: Any) -> Any:
+            def restore_arrays(value: Any) -> Any:
                 if isinstance(value, dict):
                     if set(value) == {"array"}:
                         return arrays[value["array"]]
-                    return {name: whole(item) for name, item in value.items()}
-                return [whole(item) for item in value] if isinstance(value, list) else value
+                    return {name: restore_arrays(item) for name, item in value.items()}
+                return (
+                    [restore_arrays(item) for item in value] if isinstance(value, list) else value
+                )
 
-            read = whole(json.loads(str(arrays["header"])))
-            if read.pop("format") != _FORMAT:
+            read = restore_arrays(json.loads(str(arrays["header"])))
+            if read.pop("format") != _FORMAT_VERSION:
                 raise ValueError("of another version")
-            maps = {name: Maps(**own) for name, own in read.pop("maps").items()}
+            maps = {name: DisplayMaps(**own) for name, own in read.pop("maps").items()}
             steps = [
-                Step(**step | {"bodies": {n: Body(**body) for n, body in step["bodies"].items()}})
+                DisplayStep(
+                    **step
+                    | {"bodies": {n: DisplayMesh(**body) for n, body in step["bodies"].items()}}
+                )
                 for step in read.pop("steps")
             ]
             layers = [
-                Layer(**layer | {"color": tuple(layer["color"])}) for layer in read.pop("layers")
+                DisplayLayer(**layer | {"color": tuple(layer["color"])})
+                for layer in read.pop("layers")
             ]
             read |= {key: tuple(read[key]) for key in ("up", "ahead")}
             for body in (*layers, *(body for step in steps for body in step.bodies.values())):
-                _check(body)
+                _check_triangles(body)
             return cls(**read, layers=layers, steps=steps, maps=maps)
 
 
-def _check(body: Layer | Body) -> None:
+def _check_triangles(mesh: DisplayLayer | DisplayMesh) -> None:
     """Refuse what would crash the graphics of a browser."""
-    points = body.points if isinstance(body, Layer) else body.vertices
-    inside = not body.faces.size or 0 <= body.faces.min() <= body.faces.max() < len(points)
-    if points.ndim != 2 or points.shape[1] != 3 or body.faces.shape[1:] != (3,) or not inside:
+    points = mesh.points if isinstance(mesh, DisplayLayer) else mesh.vertices
+    inside = not mesh.faces.size or 0 <= mesh.faces.min() <= mesh.faces.max() < len(points)
+    if points.ndim != 2 or points.shape[1] != 3 or mesh.faces.shape[1:] != (3,) or not inside:
         raise ValueError("triangles without corners")

@@ -14,11 +14,11 @@ from urllib.parse import parse_qs, urlsplit
 from invertwin.errors import InputError
 
 LOOPBACK = "127.0.0.1"
-_LEAST = 16  # characters of a token
-_replacing = threading.Lock()
+_MIN_TOKEN_LENGTH = 16  # characters of a token
+_patch_lock = threading.Lock()
 
 
-class Guard:
+class AccessGuard:
     """Answers 403 to whom nothing is to be shown.
 
     A browser that has come with the right token in the address gets a cookie, with which it opens
@@ -51,9 +51,9 @@ class Guard:
                 f"expected a token for the host {host}, which others can reach, got none; add "
                 f"one, such as {secrets.token_urlsafe(16)}, or use 127.0.0.1"
             )
-        if token is not None and (len(token) < _LEAST or not _plain(token)):
+        if token is not None and (len(token) < _MIN_TOKEN_LENGTH or not _is_plain_token(token)):
             raise InputError(
-                f"expected a token of at least {_LEAST} letters, digits, - or _, got "
+                f"expected a token of at least {_MIN_TOKEN_LENGTH} letters, digits, - or _, got "
                 f"{len(token)} characters; use one such as {secrets.token_urlsafe(16)}"
             )
         self._token = token
@@ -74,33 +74,33 @@ class Guard:
             return urlsplit(f"//{hosts[0]}").hostname in ("127.0.0.1", "localhost", "::1")
         given = parse_qs(urlsplit(path).query).get("token", [])
         cookies = SimpleCookie("; ".join(headers.get_all("Cookie")))
-        given += [cookies[_cookie(port)].value] if _cookie(port) in cookies else []
+        given += [cookies[_cookie_name(port)].value] if _cookie_name(port) in cookies else []
         return any(secrets.compare_digest(x.encode(), self._token.encode()) for x in given)
 
-    def before(self, answer: Callable[..., Any]) -> Callable[..., Any]:
+    def wrap_handler(self, handler: Callable[..., Any]) -> Callable[..., Any]:
         """The answers of a server, for those who are admitted.
 
         Args:
-            answer: What `websockets` takes as ``process_request``.
+            handler: What `websockets` takes as ``process_request``.
         """
 
-        def guarded(connection: Any, request: Any) -> Any:
+        def handle_request(connection: Any, request: Any) -> Any:
             port = connection.local_address[1]
             if not self.admits(request.path, request.headers, port):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "wrong or missing token\n")
-            response = answer(connection, request)
+            response = handler(connection, request)
             if response is not None and self._token is not None:
-                kept = f"{_cookie(port)}={self._token}; HttpOnly; SameSite=Strict; Path=/"
+                kept = f"{_cookie_name(port)}={self._token}; HttpOnly; SameSite=Strict; Path=/"
                 response.headers["Set-Cookie"] = kept
             if response is not None:
                 response.headers["Referrer-Policy"] = "no-referrer"
             return response
 
-        return guarded
+        return handle_request
 
 
 @contextmanager
-def guarding(guard: Guard) -> Iterator[None]:
+def install_guard(guard: AccessGuard) -> Iterator[None]:
     """Servers that are started in the block ask the guard before they answer.
 
     viser has no place for one: it hands its answers straight to `websockets`.
@@ -110,11 +110,11 @@ def guarding(guard: Guard) -> Iterator[None]:
     """
     import websockets.asyncio.server as server  # pyright: ignore[reportMissingImports]
 
-    with _replacing:
+    with _patch_lock:
         plain = server.serve
 
         def serve(*args: Any, process_request: Callable[..., Any], **given: Any) -> Any:
-            return plain(*args, process_request=guard.before(process_request), **given)
+            return plain(*args, process_request=guard.wrap_handler(process_request), **given)
 
         server.serve = serve
         try:
@@ -123,9 +123,9 @@ def guarding(guard: Guard) -> Iterator[None]:
             server.serve = plain
 
 
-def _plain(token: str) -> bool:
+def _is_plain_token(token: str) -> bool:
     return token.isascii() and token.replace("-", "").replace("_", "").isalnum()
 
 
-def _cookie(port: int) -> str:
+def _cookie_name(port: int) -> str:
     return f"invertwin_{port}"

@@ -12,27 +12,32 @@ from invertwin.capture import Capture
 from invertwin.channel import Grid
 from invertwin.radar import Radar
 from invertwin.scene import Object, Scene
-from invertwin.scene.shape_models.density import without_clouds
-from invertwin.viewer.display import Body, Display, Layer
+from invertwin.scene.shape_models.density import replace_clouds
+from invertwin.viewer.display import Display, DisplayLayer, DisplayMesh
 
 _GREY, _RADAR = (185, 190, 199), (110, 120, 140)
 _COLORS = {"truth": (192, 20, 60), "start": (224, 128, 60)}
 _TWIN = (76, 120, 168)
 # Layers of the present position: their names, their colours, and how large their points are.
-PATHS, SEEN, EDGES, FED = "sampled paths", "what is seen", "boundary paths", "chosen bin"
-OF_POSITION: dict[str, tuple[tuple[int, int, int], float]] = {
-    PATHS: ((120, 170, 220), 1.0),
-    SEEN: ((30, 140, 90), 0.4),
-    EDGES: ((200, 40, 160), 0.7),
-    FED: ((255, 220, 0), 1.5),
+SAMPLED_PATHS, VISIBLE_POINTS, BOUNDARY_POINTS, BIN_POINTS = (
+    "sampled paths",
+    "what is seen",
+    "boundary paths",
+    "chosen bin",
+)
+POSITION_LAYERS: dict[str, tuple[tuple[int, int, int], float]] = {
+    SAMPLED_PATHS: ((120, 170, 220), 1.0),
+    VISIBLE_POINTS: ((30, 140, 90), 0.4),
+    BOUNDARY_POINTS: ((200, 40, 160), 0.7),
+    BIN_POINTS: ((255, 220, 0), 1.5),
 }
 ELLIPSOID = "95 % ellipsoid"
-_MOST_BEAMS = 6  # positions whose beams are drawn
-_RINGS = 32  # corners of an ellipsoid's circles
-_LEVEL = 7.815  # squared radius of the ellipsoid that holds 95 % of a normal law in space
+_MAX_BEAMS = 6  # positions whose beams are drawn
+_CIRCLE_POINTS = 32  # corners of an ellipsoid's circles
+_CHI_SQUARED_95 = 7.815  # squared radius of the ellipsoid that holds 95 % of a normal law in space
 
 
-def floats(values: Any) -> NDArray[np.float32]:
+def to_float32(values: Any) -> NDArray[np.float32]:
     """Numbers as the graphics card takes them.
 
     Args:
@@ -41,42 +46,46 @@ def floats(values: Any) -> NDArray[np.float32]:
     return np.ascontiguousarray(torch.as_tensor(values).detach().cpu().numpy(), np.float32)
 
 
-def body_of(item: Object) -> Body:
+def display_mesh(item: Object) -> DisplayMesh:
     """The surface of an object in the world.
 
     Args:
         item: The object.
     """
     faces = np.ascontiguousarray(item.mesh.faces.cpu().numpy(), np.int32)
-    return Body(floats(item.vertices), faces)
+    return DisplayMesh(to_float32(item.vertices), faces)
 
 
 def scene_layers(
-    scene: Scene, group: str = "twin", *, fitted: Collection[str] = (), only: bool = False
-) -> list[Layer]:
+    scene: Scene, group: str = "twin", *, fitted: Collection[str] = (), fitted_only: bool = False
+) -> list[DisplayLayer]:
     """The surfaces of a scene.
 
     Args:
         scene: What is shown.
         group: Of the layers, such as "twin".
         fitted: Names of objects that are coloured.
-        only: Leave the others out.
+        fitted_only: Leave the others out.
     """
     layers = []
-    for name, item in without_clouds(scene).objects.items():
-        if only and name not in fitted:
+    for name, item in replace_clouds(scene).objects.items():
+        if fitted_only and name not in fitted:
             continue
-        body = body_of(item)
+        body = display_mesh(item)
         color = _COLORS.get(group, _TWIN if name in fitted else _GREY)
         opacity = 0.35 if group in _COLORS else 1.0
         shown = group != "start"
         layers.append(
-            Layer(f"{group}/{name}", "surface", body.vertices, body.faces, color, opacity, shown)
+            DisplayLayer(
+                f"{group}/{name}", "surface", body.vertices, body.faces, color, opacity, shown
+            )
         )
     return layers
 
 
-def radar_layers(radar: Radar, grid: Grid | None, length: float, name: str = "") -> list[Layer]:
+def radar_layers(
+    radar: Radar, grid: Grid | None, length: float, name: str = ""
+) -> list[DisplayLayer]:
     """Positions of a radar, and the pyramid that its map covers from some of them.
 
     Args:
@@ -86,8 +95,8 @@ def radar_layers(radar: Radar, grid: Grid | None, length: float, name: str = "")
         name: Of the radar, where there are several.
     """
     places, axes = radar.positions.detach(), radar.link().rotations.detach()
-    chosen = np.unique(np.linspace(0, len(places) - 1, _MOST_BEAMS).astype(int))
-    half = [_edge(grid and grid.u, 0.5), _edge(grid and grid.v, 0.5)]
+    chosen = np.unique(np.linspace(0, len(places) - 1, _MAX_BEAMS).astype(int))
+    half = [_largest_cosine(grid and grid.u, 0.5), _largest_cosine(grid and grid.v, 0.5)]
     u = torch.tensor([-1.0, 1.0, 1.0, -1.0]).double() * half[0]
     v = torch.tensor([-1.0, -1.0, 1.0, 1.0]).double() * half[1]
     w = (1 - u.square() - v.square()).clamp_min(0.0).sqrt()
@@ -98,21 +107,21 @@ def radar_layers(radar: Radar, grid: Grid | None, length: float, name: str = "")
         sides = torch.stack([places[k].expand(4, 3), ends], dim=1)
         lines += [sides.reshape(-1, 3), torch.stack([ends, ends.roll(-1, 0)], 1).reshape(-1, 3)]
     of = f"/{name}" if name else ""
-    beams = floats(torch.cat(lines))
+    beams = to_float32(torch.cat(lines))
     return [
-        Layer(f"radar{of}", "points", floats(places), color=_RADAR),
-        Layer(f"beams{of}", "lines", beams, color=(150, 150, 160), shown=False),
+        DisplayLayer(f"radar{of}", "points", to_float32(places), color=_RADAR),
+        DisplayLayer(f"beams{of}", "lines", beams, color=(150, 150, 160), shown=False),
     ]
 
 
-def _edge(cosines: torch.Tensor | None, default: float) -> float:
+def _largest_cosine(cosines: torch.Tensor | None, default: float) -> float:
     """The largest direction cosine that is covered, short of the side."""
     if cosines is None or len(cosines) < 2:
         return default
     return min(float(cosines.abs().max()), math.sqrt(0.45))
 
 
-def capture_layers(capture: Capture) -> list[Layer]:
+def capture_layers(capture: Capture) -> list[DisplayLayer]:
     """Surveyed targets of a capture, and the track of its radar.
 
     Args:
@@ -120,16 +129,16 @@ def capture_layers(capture: Capture) -> list[Layer]:
     """
     layers = []
     if capture.survey is not None:
-        points = floats(capture.survey)
-        layers.append(Layer("surveyed targets", "points", points, color=_COLORS["truth"]))
+        points = to_float32(capture.survey)
+        layers.append(DisplayLayer("surveyed targets", "points", points, color=_COLORS["truth"]))
     if capture.track is not None:
-        places = floats(capture.track.positions)
+        places = to_float32(capture.track.positions)
         pairs = np.stack([places[:-1], places[1:]], axis=1).reshape(-1, 3)
-        layers.append(Layer("track", "lines", pairs, color=_RADAR))
+        layers.append(DisplayLayer("track", "lines", pairs, color=_RADAR))
     return layers
 
 
-def ellipsoid_layers(scene: Scene, metrics: Mapping[str, Any]) -> list[Layer]:
+def ellipsoid_layers(scene: Scene, metrics: Mapping[str, Any]) -> list[DisplayLayer]:
     """Where the middles of fitted objects are with 95 %, as three circles each.
 
     A coordinate without an error bar has none here either: the ellipsoid is flat along it.
@@ -151,17 +160,17 @@ def ellipsoid_layers(scene: Scene, metrics: Mapping[str, Any]) -> list[Layer]:
                 scale = deviations[first] * deviations[second]
                 covariance[i, j] = scale * correlations[names.index(first), names.index(second)]
         sizes, axes = np.linalg.eigh(covariance)
-        radii = axes * np.sqrt(_LEVEL * sizes.clip(0))
-        turn = np.linspace(0, 2 * math.pi, _RINGS + 1)
+        radii = axes * np.sqrt(_CHI_SQUARED_95 * sizes.clip(0))
+        turn = np.linspace(0, 2 * math.pi, _CIRCLE_POINTS + 1)
         circle = np.stack([np.cos(turn), np.sin(turn)])
         rings = [(radii[:, [i, j]] @ circle).T for i, j in ((0, 1), (1, 2), (0, 2))]
         pairs = [np.stack([ring[:-1], ring[1:]], axis=1).reshape(-1, 3) for ring in rings]
-        points = floats(np.concatenate(pairs)) + floats(scene[name].center)
-        layers.append(Layer(f"{ELLIPSOID}/{name}", "lines", points, color=(230, 160, 0)))
+        points = to_float32(np.concatenate(pairs)) + to_float32(scene[name].center)
+        layers.append(DisplayLayer(f"{ELLIPSOID}/{name}", "lines", points, color=(230, 160, 0)))
     return layers
 
 
-def display_of(
+def build_display(
     scene: Scene | None,
     radars: Mapping[str, tuple[Radar, Grid | None]],
     title: str,
@@ -180,8 +189,8 @@ def display_of(
     """
     layers = [] if scene is None else scene_layers(scene, fitted=fitted)
     if truth is not None:
-        layers += scene_layers(truth, "truth", fitted=fitted, only=True)
-    places = [floats(radar.positions) for radar, _ in radars.values()]
+        layers += scene_layers(truth, "truth", fitted=fitted, fitted_only=True)
+    places = [to_float32(radar.positions) for radar, _ in radars.values()]
     length = 1.0
     if layers and places:
         middle = np.concatenate([x.points for x in layers]).mean(0)
@@ -191,11 +200,13 @@ def display_of(
         layers += radar_layers(radar, grid, length, name)
     for radar, _ in list(radars.values())[:1]:
         axes = radar.link().rotations.detach().mean(0)
-        up, ahead = _unit(axes[:, 1], up), _unit(axes[:, 2], ahead)
+        up, ahead = _unit_vector(axes[:, 1], up), _unit_vector(axes[:, 2], ahead)
     return Display(title, layers, up=up, ahead=ahead)
 
 
-def _unit(vector: torch.Tensor, default: tuple[float, float, float]) -> tuple[float, float, float]:
+def _unit_vector(
+    vector: torch.Tensor, default: tuple[float, float, float]
+) -> tuple[float, float, float]:
     """The direction of a mean axis; the default, where the axes cancel."""
     length = float(vector.norm())
     if length < 0.1:

@@ -12,8 +12,8 @@ from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar
 from invertwin.scene import Mesh, Scene, compose
-from invertwin.scene.shape_models.density import without_clouds
-from invertwin.viewer.display import Body
+from invertwin.scene.shape_models.density import replace_clouds
+from invertwin.viewer.display import DisplayMesh
 
 _SAMPLES = 20_000  # rays of a map: quick, and smooth enough for the eye
 _PATHS = 4_000  # rays of which single paths are shown
@@ -22,7 +22,7 @@ _SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class PositionSample:
     """What one position sees.
 
     Attributes:
@@ -33,13 +33,13 @@ class Seen:
         edges: Points of silhouettes, where what is seen jumps [m].
     """
 
-    place: Float[Tensor, "3"]
+    position: Float[Tensor, "3"]
     points: Float[Tensor, "path 2 3"]
     power: Float[Tensor, " path"]
     bins: Float[Tensor, "path 2"]
     edges: Float[Tensor, "edge 3"]
 
-    def feeding(self, range_bin: float, u_bin: float) -> Float[Tensor, "point 3"]:
+    def points_in_bin(self, range_bin: float, u_bin: float) -> Float[Tensor, "point 3"]:
         """Points whose echoes fall into a bin, or into its neighbours.
 
         Args:
@@ -50,7 +50,7 @@ class Seen:
         return self.points[(away <= 1.0).all(dim=1)][:, 1]
 
 
-class Link:
+class InteractiveSensor:
     """The forward model of one radar, for maps that follow what a person moves.
 
     Args:
@@ -61,7 +61,7 @@ class Link:
     """
 
     def __init__(self, scene: Scene, radar: Radar, grid: Grid, depth: int = 1) -> None:
-        self.scene = self._begun = without_clouds(scene)
+        self.scene = self._begun = replace_clouds(scene)
         self.radar, self.grid = radar, grid
         self._model = SurrogateMap(
             grid, sampling=Sampling(depth=depth, samples=_SAMPLES, boundary=False)
@@ -72,17 +72,17 @@ class Link:
         """Names of what can be moved."""
         return self.scene.names
 
-    def take(self, bodies: Mapping[str, Body]) -> None:
+    def replace_meshes(self, meshes: Mapping[str, DisplayMesh]) -> None:
         """Put other surfaces in place of those of some objects.
 
         Args:
-            bodies: By the name of the object.
+            meshes: By the name of the object.
 
         Raises:
             InputError: Other triangles than a material with values for each can have.
         """
         scene = self._begun
-        for name, body in bodies.items():
+        for name, body in meshes.items():
             mesh = Mesh(
                 torch.tensor(body.vertices, dtype=torch.float64),
                 torch.tensor(body.faces, dtype=torch.int64),
@@ -90,7 +90,7 @@ class Link:
             scene = scene.replace(name, mesh=mesh, pose=None)
         self.scene = scene
 
-    def moved(self, name: str, motion: Float[Tensor, "4 4"]) -> Scene:
+    def move_object(self, name: str, motion: Float[Tensor, "4 4"]) -> Scene:
         """The scene with one object moved rigidly.
 
         Args:
@@ -99,7 +99,7 @@ class Link:
         """
         return self.scene.replace(name, pose=compose(self.scene[name].transform, motion))
 
-    def map(self, scene: Scene, frame: int) -> Float[Tensor, "range u"]:
+    def predict_map(self, scene: Scene, frame: int) -> Float[Tensor, "range u"]:
         """The power that one position would show, the strongest over v.
 
         Args:
@@ -109,7 +109,7 @@ class Link:
         with torch.no_grad(), torch_threads(1):  # small work, which more threads slow
             return self._model.predict(scene, self.radar.frames([frame]), _SEED)[0].amax(2)
 
-    def seen(self, scene: Scene, frame: int) -> Seen:
+    def sample_paths(self, scene: Scene, frame: int) -> PositionSample:
         """Single paths of one bounce, and points of silhouettes.
 
         Args:
@@ -126,13 +126,13 @@ class Link:
             except InputError:  # silhouettes of sheets have no explicit paths
                 sampling = replace(sampling, boundary=False)
                 paths = trace_power(scene, link, sampling=sampling, seed=_SEED)
-        return self._sorted(paths, frame)
+        return self._sort_paths(paths, frame)
 
-    def _sorted(self, paths: Paths, frame: int) -> Seen:
+    def _sort_paths(self, paths: Paths, frame: int) -> PositionSample:
         place = self.radar.positions[frame].detach()
         rotation, grid = self.radar.link().rotations[frame].detach(), self.grid
         edges = paths.last[paths.boundary]
-        paths = paths.chosen(~paths.boundary)
+        paths = paths.select(~paths.boundary)
         toward = torch.nn.functional.normalize(paths.last - place, dim=1) @ rotation
         origin = float(self.radar.origins[frame])
         bins = torch.stack(
@@ -144,4 +144,6 @@ class Link:
             ],
             dim=1,
         )
-        return Seen(place, torch.stack([paths.first, paths.last], 1), paths.power, bins, edges)
+        return PositionSample(
+            place, torch.stack([paths.first, paths.last], 1), paths.power, bins, edges
+        )

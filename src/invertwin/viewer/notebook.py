@@ -10,15 +10,15 @@ import torch
 from matplotlib.figure import Figure
 
 from invertwin import plotting
-from invertwin.capture import Capture, shown_ranges
+from invertwin.capture import Capture, search_ranges
 from invertwin.channel import Grid
 from invertwin.inversion import Reconstruction
 from invertwin.radar import Radar, SampledWaveform
 from invertwin.scene import Scene
-from invertwin.scene.shape_models.density import without_clouds
+from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.viewer.display import Display
-from invertwin.viewer.layers import display_of
-from invertwin.viewer.link import Link
+from invertwin.viewer.layers import build_display
+from invertwin.viewer.link import InteractiveSensor
 from invertwin.viewer.server import Viewer
 
 
@@ -36,8 +36,8 @@ def show(
     Raises:
         InputError: No `viser`, or a host without a token.
     """
-    display: Display = display_of(scene, {} if radar is None else {"": (radar, grid)}, "scene")
-    links = {} if radar is None or grid is None else {"": Link(scene, radar, grid)}
+    display: Display = build_display(scene, {} if radar is None else {"": (radar, grid)}, "scene")
+    links = {} if radar is None or grid is None else {"": InteractiveSensor(scene, radar, grid)}
     viewer = Viewer(display, links, **options)
     print(f"open {viewer.address}")
     return viewer
@@ -62,7 +62,7 @@ def scene_html(scene: Scene) -> str:
     Args:
         scene: The scene.
     """
-    surfaces = without_clouds(scene)
+    surfaces = replace_clouds(scene)
     rows = [
         (
             name,
@@ -74,7 +74,7 @@ def scene_html(scene: Scene) -> str:
         for name, item in scene.objects.items()
     ]
     heads = ("object", "triangles", "material", "size [m]", "middle [m]")
-    return _shown(plotting.scene(surfaces), "three views of the scene", heads, rows)
+    return _figure_and_table(plotting.scene(surfaces), "three views of the scene", heads, rows)
 
 
 def radar_html(radar: Radar) -> str:
@@ -88,7 +88,9 @@ def radar_html(radar: Radar) -> str:
     axes = figure.subplots()
     axes.plot(places[:, 0].numpy(), places[:, 1].numpy(), ".")
     axes.set(xlabel="x [mm]", ylabel="y [mm]", title="virtual array")
-    return _shown(figure, "places of the virtual elements", ("quantity", "value"), _of_radar(radar))
+    return _figure_and_table(
+        figure, "places of the virtual elements", ("quantity", "value"), _radar_rows(radar)
+    )
 
 
 def capture_html(capture: Capture) -> str:
@@ -99,7 +101,7 @@ def capture_html(capture: Capture) -> str:
     """
     radar = capture.radar()
     if "beat" in capture.dataset:
-        grid = radar.grid(*shown_ranges(capture, None, None))
+        grid = radar.grid(*search_ranges(capture, None, None))
         figure = plotting.spectrum({"first frame": capture.frames([0]).spectrum(grid)}, grid)
     else:
         figure = Figure(figsize=(5, 2.5), layout="constrained")
@@ -107,7 +109,9 @@ def capture_html(capture: Capture) -> str:
         level = 20 * torch.log10(capture.range_profile[0].abs().clamp_min(1e-30))
         axes.plot(capture.ranges.numpy(), level.numpy())
         axes.set(xlabel="range [m]", ylabel="power [dB]", title="first frame")
-    return _shown(figure, "map of the first frame", ("quantity", "value"), _of_radar(radar))
+    return _figure_and_table(
+        figure, "map of the first frame", ("quantity", "value"), _radar_rows(radar)
+    )
 
 
 def reconstruction_html(found: Reconstruction) -> str:
@@ -133,10 +137,10 @@ def reconstruction_html(found: Reconstruction) -> str:
             rows.append((name, ", ".join(f"{x:.4g}" for x in numbers.tolist())))
     rows += [(f"{name}, within (95 %)", f"± {width:.2g}") for name, width in bars.items()]
     figure = plotting.convergence({"loss": [[step["loss"] for step in found.history]]})
-    return _shown(figure, "loss over the steps", ("quantity", "value"), rows)
+    return _figure_and_table(figure, "loss over the steps", ("quantity", "value"), rows)
 
 
-def _of_radar(radar: Radar) -> list[tuple[str, Any]]:
+def _radar_rows(radar: Radar) -> list[tuple[str, Any]]:
     waveform = radar.waveform
     rows: list[tuple[str, Any]] = [
         ("positions", radar.frame_count),
@@ -155,7 +159,9 @@ def _extent(vertices: torch.Tensor) -> list[float]:
     return (vertices.amax(0) - vertices.amin(0)).detach().tolist()
 
 
-def _shown(figure: Figure, alt: str, heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+def _figure_and_table(
+    figure: Figure, alt: str, heads: Sequence[str], rows: Iterable[Sequence[Any]]
+) -> str:
     """A picture above a table; texts of users are escaped."""
     png = base64.b64encode(plotting.png_bytes(figure)).decode()
     cells = [[html.escape(str(cell)) for cell in row] for row in (heads, *rows)]

@@ -13,70 +13,70 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from invertwin.viewer.display import Display, Step
-from invertwin.viewer.layers import ELLIPSOID, OF_POSITION, PATHS
-from invertwin.viewer.link import Link
+from invertwin.viewer.display import Display, DisplayStep
+from invertwin.viewer.layers import ELLIPSOID, POSITION_LAYERS, SAMPLED_PATHS
+from invertwin.viewer.link import InteractiveSensor
 from invertwin.viewer.panels import (
-    APART,
-    DARKEST,
-    LARGEST,
+    MAX_RESIDUAL_DB,
     MEASURED,
-    POWER,
+    MIN_LEVEL_DB,
+    POWER_COLORMAP,
     RESIDUAL,
+    RESIDUAL_COLORMAP,
     SIMULATED,
-    decibels,
+    relative_decibels,
 )
-from invertwin.viewer.sensor_maps import SensorMaps, sensor_maps
+from invertwin.viewer.sensor_maps import SensorMaps, collect_sensor_maps
 
-_MOST_BYTES = 1_500_000  # of the steps on a page
+_MAX_BYTES = 1_500_000  # of the steps on a page
 
 
-def page_html(display: Display, links: Mapping[str, Link] | None = None) -> str:
+def page_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None = None) -> str:
     """A whole page with a display.
 
     Args:
         display: What is shown.
-        links: As of `view_html`.
+        sensors: As of `view_html`.
     """
     title = html.escape(display.title)
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy()}">'
+        f'<meta http-equiv="Content-Security-Policy" content="{content_security_policy()}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{title}</title><style>:root {{ color-scheme: light dark; }} "
         "body { font: 15px/1.5 system-ui, sans-serif; margin: 1rem; }</style></head>\n"
-        f"<body><h1>{title}</h1>\n{view_html(display, links)}</body></html>\n"
+        f"<body><h1>{title}</h1>\n{view_html(display, sensors)}</body></html>\n"
     )
 
 
-def view_html(display: Display, links: Mapping[str, Link] | None = None) -> str:
+def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None = None) -> str:
     """A display as a part of a page; one page may hold it once.
 
     Of many steps it keeps as many as fit into 1.5 MB, evenly chosen, the last one among them.
 
     Args:
         display: What is shown.
-        links: The forward model of each sensor, by its name: the page has the maps that it
+        sensors: The forward model of each sensor, by its name: the page has the maps that it
             simulates at every step, and says which points feed a bin. None shows what was
             measured alone.
     """
     faces = {x.name.removeprefix("twin/"): x.faces for x in display.layers}
 
-    def packed(step: Step) -> dict[str, Any]:
+    def pack_step(step: DisplayStep) -> dict[str, Any]:
         bodies = {
             # Triangles are mostly those of the layer.
-            f"twin/{name}": _arrays(
+            f"twin/{name}": _encode_mesh(
                 body.vertices, None if np.array_equal(body.faces, faces[name]) else body.faces
             )
             for name, body in step.bodies.items()
         }
         return {"label": step.label, "bodies": bodies}
 
-    size = sum(len(json.dumps(packed(step))) for step in display.steps[-1:])
-    count = max(2, min(len(display.steps), _MOST_BYTES // max(size, 1)))
+    size = sum(len(json.dumps(pack_step(step))) for step in display.steps[-1:])
+    count = max(2, min(len(display.steps), _MAX_BYTES // max(size, 1)))
     chosen = np.unique(np.linspace(0, len(display.steps) - 1, count).astype(int))
     kept = [display.steps[k] for k in chosen] if display.steps else []
-    maps = sensor_maps(replace(display, steps=kept), links or {})
+    maps = collect_sensor_maps(replace(display, steps=kept), sensors or {})
     low, high = display.box
     data = {
         "up": display.up,
@@ -91,20 +91,23 @@ def view_html(display: Display, links: Mapping[str, Link] | None = None) -> str:
                 "opacity": layer.opacity,
                 "shown": layer.shown,
                 "through": layer.group == ELLIPSOID,  # it is inside of its object
-                **_arrays(layer.points, layer.faces),
+                **_encode_mesh(layer.points, layer.faces),
             }
             for layer in display.layers
         ],
-        "steps": [packed(step) for step in kept],
-        "sensors": [_sensor(name, own) for name, own in maps.items()],
+        "steps": [pack_step(step) for step in kept],
+        "sensors": [_sensor_data(name, own) for name, own in maps.items()],
         "position": [
-            {"name": name, "color": color, "size": size, "shown": name != PATHS}
-            for name, (color, size) in OF_POSITION.items()
+            {"name": name, "color": color, "size": size, "shown": name != SAMPLED_PATHS}
+            for name, (color, size) in POSITION_LAYERS.items()
         ],
         "pictures": {"measured": MEASURED, "simulated": SIMULATED, "residual": RESIDUAL},
-        "colors": {"power": _colors(POWER), "apart": _colors(APART)},
-        "depth": -DARKEST,
-        "largest": LARGEST,
+        "colors": {
+            "power": _colormap_bytes(POWER_COLORMAP),
+            "apart": _colormap_bytes(RESIDUAL_COLORMAP),
+        },
+        "depth": -MIN_LEVEL_DB,
+        "largest": MAX_RESIDUAL_DB,
     }
     # The only character that could end the element.
     text = json.dumps(data).replace("<", "\\u003c")
@@ -115,7 +118,7 @@ def view_html(display: Display, links: Mapping[str, Link] | None = None) -> str:
     )
 
 
-def policy() -> str:
+def content_security_policy() -> str:
     """What a page with a display may do: run our script alone, and load nothing."""
     digest = base64.b64encode(hashlib.sha256(_script().encode()).digest()).decode()
     return (
@@ -124,11 +127,13 @@ def policy() -> str:
     )
 
 
-def _sensor(name: str, maps: SensorMaps) -> dict[str, Any]:
+def _sensor_data(name: str, maps: SensorMaps) -> dict[str, Any]:
     """Maps of a sensor, each value one byte: 255 is the peak of its map, 0 the darkest."""
 
-    def packed(power: NDArray[np.float32]) -> str:
-        return _text(np.rint(255 * (1 - decibels(power) / DARKEST)).astype(np.uint8))
+    def pack_power(power: NDArray[np.float32]) -> str:
+        return _base64(
+            np.rint(255 * (1 - relative_decibels(power) / MIN_LEVEL_DB)).astype(np.uint8)
+        )
 
     some = maps.measured if maps.simulated is None else maps.simulated
     assert some is not None
@@ -137,32 +142,32 @@ def _sensor(name: str, maps: SensorMaps) -> dict[str, Any]:
         "frames": maps.frames,
         "grid": maps.grid,
         "shape": some.shape[-2:],
-        "places": maps.places.tolist(),
+        "places": maps.positions.tolist(),
         "rotations": maps.rotations.tolist(),
         "origins": maps.origins.tolist(),
-        "measured": None if maps.measured is None else packed(maps.measured),
-        "simulated": None if maps.simulated is None else [packed(x) for x in maps.simulated],
+        "measured": None if maps.measured is None else pack_power(maps.measured),
+        "simulated": None if maps.simulated is None else [pack_power(x) for x in maps.simulated],
     }
 
 
-def _colors(name: str) -> str:
+def _colormap_bytes(name: str) -> str:
     """A colour map as 256 times red, green and blue."""
     from matplotlib import colormaps
 
-    return _text(colormaps[name](np.arange(256), bytes=True)[:, :3])
+    return _base64(colormaps[name](np.arange(256), bytes=True)[:, :3])
 
 
-def _text(array: NDArray[Any]) -> str:
+def _base64(array: NDArray[Any]) -> str:
     """Bytes of an array, as base64."""
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 
-def _arrays(points: NDArray[Any], faces: NDArray[Any] | None) -> dict[str, str]:
+def _encode_mesh(points: NDArray[Any], faces: NDArray[Any] | None) -> dict[str, str]:
     """Numbers in little-endian order, as base64."""
     found = {"points": points.astype("<f4")} | (
         {} if faces is None else {"faces": faces.astype("<u4")}
     )
-    return {name: _text(array) for name, array in found.items()}
+    return {name: _base64(array) for name, array in found.items()}
 
 
 @cache

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from invertwin.viewer.display import Display
 
 MEASURED, SIMULATED, RESIDUAL = "measured", "simulated", "residual"
-POWER, APART = "viridis", "RdBu_r"  # colour maps
-DARKEST = -40.0  # dB below the peak
-LARGEST = 15.0  # dB of a residual
-_PIXELS = 200  # along the shorter side of a picture, at least
+POWER_COLORMAP, RESIDUAL_COLORMAP = "viridis", "RdBu_r"  # colour maps
+MIN_LEVEL_DB = -40.0  # dB below the peak
+MAX_RESIDUAL_DB = 15.0  # dB of a residual
+_MIN_PIXELS = 200  # along the shorter side of a picture, at least
 
 
-class Panels:
+class MapPanels:
     """Pictures in a row above the scene, each bin of which can be clicked.
 
     Args:
@@ -70,12 +70,12 @@ class Panels:
             choose: Takes the numbers of its range and its u.
         """
         for name, node in self._nodes.items():
-            node.on_click(self._clicked(name, choose))
+            node.on_click(self._click_handler(name, choose))
 
-    def _clicked(
+    def _click_handler(
         self, name: str, choose: Callable[[tuple[int, int]], None]
     ) -> Callable[[Any], None]:
-        def clicked(event: Any) -> None:
+        def handle_click(event: Any) -> None:
             origin, toward = np.array(event.ray_origin), np.array(event.ray_direction)
             right, up = self._axes
             normal = np.cross(right, up)
@@ -85,7 +85,7 @@ class Panels:
             found = np.floor(shares * self._shape).astype(int).clip(0, np.array(self._shape) - 1)
             choose((int(found[0]), int(found[1])))
 
-        return clicked
+        return handle_click
 
     def show(self, maps: Mapping[str, NDArray[np.float32]], chosen: tuple[int, int] | None) -> None:
         """Draw maps, each below its own peak; the residual where both are known.
@@ -97,25 +97,30 @@ class Panels:
         from matplotlib import colormaps
 
         self._shape = next(iter(maps.values())).shape if maps else (1, 1)
-        levels = {name: decibels(power) for name, power in maps.items()}
-        pictures = {name: colormaps[POWER](1 - level / DARKEST) for name, level in levels.items()}
+        levels = {name: relative_decibels(power) for name, power in maps.items()}
+        pictures = {
+            name: colormaps[POWER_COLORMAP](1 - level / MIN_LEVEL_DB)
+            for name, level in levels.items()
+        }
         if MEASURED in levels and SIMULATED in levels:
             apart = levels[MEASURED] - levels[SIMULATED]
-            pictures[RESIDUAL] = colormaps[APART](0.5 + apart / (2 * LARGEST))
+            pictures[RESIDUAL] = colormaps[RESIDUAL_COLORMAP](0.5 + apart / (2 * MAX_RESIDUAL_DB))
         for name, node in self._nodes.items():
             node.visible = name in pictures
         for name, colors in pictures.items():
-            if name in self._nodes and not (name in maps and self._has(name, maps[name], chosen)):
-                self._nodes[name].image = _drawn(np.uint8(255 * colors[..., :3]), chosen)
+            if name in self._nodes and not (
+                name in maps and self._is_current(name, maps[name], chosen)
+            ):
+                self._nodes[name].image = _draw_picture(np.uint8(255 * colors[..., :3]), chosen)
 
-    def _has(self, name: str, power: NDArray[np.float32], chosen: Any) -> bool:
+    def _is_current(self, name: str, power: NDArray[np.float32], chosen: Any) -> bool:
         """Whether a picture shows that already; from now on it does."""
         before, frame = self._known.get(name, (None, None))
         self._known[name] = power, chosen
         return before is not None and frame == chosen and np.array_equal(before, power)
 
 
-def decibels(power: NDArray[np.float32]) -> NDArray[Any]:
+def relative_decibels(power: NDArray[np.float32]) -> NDArray[Any]:
     """A map below its own peak [dB], none below the darkest.
 
     Args:
@@ -123,12 +128,12 @@ def decibels(power: NDArray[np.float32]) -> NDArray[Any]:
     """
     peak = power.max((-2, -1), keepdims=True)
     level = 10 * np.log10(np.maximum(power / np.where(peak > 0, peak, 1.0), 1e-30))
-    return level.clip(DARKEST, 0.0)
+    return level.clip(MIN_LEVEL_DB, 0.0)
 
 
-def _drawn(colors: Any, chosen: tuple[int, int] | None) -> NDArray[np.uint8]:
+def _draw_picture(colors: Any, chosen: tuple[int, int] | None) -> NDArray[np.uint8]:
     """A picture with the farthest range on top, each bin some pixels large."""
-    times = [max(1, -(-_PIXELS // count)) for count in colors.shape[:2]]
+    times = [max(1, -(-_MIN_PIXELS // count)) for count in colors.shape[:2]]
     large = colors.repeat(times[0], axis=0).repeat(times[1], axis=1)
     if chosen is not None:
         rows, columns = (

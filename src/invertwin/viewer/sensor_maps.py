@@ -12,13 +12,13 @@ from torch import Tensor
 
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.viewer.display import Display
-from invertwin.viewer.layers import floats
-from invertwin.viewer.link import Link
+from invertwin.viewer.layers import to_float32
+from invertwin.viewer.link import InteractiveSensor
 from invertwin.viewer.panels import MEASURED
 
-_MOST_MAPS = 144  # simulated ones of a page, over sensors, steps and positions
-_MOST_FRAMES = 8  # positions of a sensor
-_MOST_BINS = 96  # of a map along range, and across
+_MAX_MAPS = 144  # simulated ones of a page, over sensors, steps and positions
+_MAX_FRAMES = 8  # positions of a sensor
+_MAX_BINS = 96  # of a map along range, and across
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,26 +37,28 @@ class SensorMaps:
 
     frames: list[int]
     grid: tuple[float, float, float, float]
-    places: NDArray[np.float32]
+    positions: NDArray[np.float32]
     rotations: NDArray[np.float32]
     origins: NDArray[np.float32]
     measured: NDArray[np.float32] | None
     simulated: NDArray[np.float32] | None
 
 
-def sensor_maps(display: Display, links: Mapping[str, Link]) -> dict[str, SensorMaps]:
+def collect_sensor_maps(
+    display: Display, sensors: Mapping[str, InteractiveSensor]
+) -> dict[str, SensorMaps]:
     """Maps of all sensors at some of their positions, by the name of the sensor.
 
     The links are left with the bodies of the last step.
 
     Args:
         display: With its steps and with what was measured.
-        links: The forward model of each sensor.
+        sensors: The forward model of each sensor.
     """
-    names = list(dict.fromkeys([*display.maps, *links]))
-    count = _MOST_MAPS // (max(1, len(display.steps)) * max(1, len(names)))
+    names = list(dict.fromkeys([*display.maps, *sensors]))
+    count = _MAX_MAPS // (max(1, len(display.steps)) * max(1, len(names)))
     found = {
-        name: _of_sensor(display, name, links.get(name), min(max(1, count), _MOST_FRAMES))
+        name: _collect_maps(display, name, sensors.get(name), min(max(1, count), _MAX_FRAMES))
         for name in names
     }
     return {
@@ -66,62 +68,68 @@ def sensor_maps(display: Display, links: Mapping[str, Link]) -> dict[str, Sensor
     }
 
 
-def _of_sensor(display: Display, name: str, link: Link | None, count: int) -> SensorMaps:
+def _collect_maps(
+    display: Display, name: str, sensor: InteractiveSensor | None, count: int
+) -> SensorMaps:
     known = display.maps.get(name)
     if known is None:
-        assert link is not None
+        assert sensor is not None
         frames, ranges, across = (
-            list(range(link.radar.frame_count)),
-            link.grid.ranges.tolist(),
-            link.grid.u.tolist(),
+            list(range(sensor.radar.frame_count)),
+            sensor.grid.ranges.tolist(),
+            sensor.grid.u.tolist(),
         )
     else:
         frames, ranges, across = known.frames, known.ranges, known.across
     chosen = np.unique(np.linspace(0, len(frames) - 1, count).astype(int)).tolist()
     frames = [frames[k] for k in chosen]
-    blocks = [-(-len(axis) // _MOST_BINS) for axis in (ranges, across)]
+    blocks = [-(-len(axis) // _MAX_BINS) for axis in (ranges, across)]
 
-    def coarse(power: Tensor) -> NDArray[np.float32]:
+    def max_pool(power: Tensor) -> NDArray[np.float32]:
         """The strongest of each block of bins."""
         flat = power.reshape(-1, 1, *power.shape[-2:])
         pooled = torch.nn.functional.max_pool2d(flat, blocks, ceil_mode=True)
-        return floats(pooled.reshape(*power.shape[:-2], *pooled.shape[-2:]))
+        return to_float32(pooled.reshape(*power.shape[:-2], *pooled.shape[-2:]))
 
     measured = None
     if known is not None and MEASURED in known.power:
-        measured = coarse(torch.from_numpy(known.power[MEASURED][chosen]))
-    simulated = None if link is None else _simulated(display, link, frames)
+        measured = max_pool(torch.from_numpy(known.power[MEASURED][chosen]))
+    simulated = None if sensor is None else _simulate_maps(display, sensor, frames)
     places, rotations, origins = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0)
-    if link is not None:
-        radar = link.radar.frames(frames)
+    if sensor is not None:
+        radar = sensor.radar.frames(frames)
         places, rotations, origins = radar.positions, radar.link().rotations, radar.origins
-    start, step = zip(*(_axis(*x) for x in zip((ranges, across), blocks, strict=True)), strict=True)
+    start, step = zip(
+        *(_block_axis(*x) for x in zip((ranges, across), blocks, strict=True)), strict=True
+    )
     return SensorMaps(
         frames,
         (start[0], step[0], start[1], step[1]),
-        floats(places),
-        floats(rotations),
-        floats(origins),
+        to_float32(places),
+        to_float32(rotations),
+        to_float32(origins),
         measured,
-        None if simulated is None else coarse(simulated),
+        None if simulated is None else max_pool(simulated),
     )
 
 
-def _simulated(display: Display, link: Link, frames: list[int]) -> Tensor | None:
+def _simulate_maps(display: Display, sensor: InteractiveSensor, frames: list[int]) -> Tensor | None:
     """Power [step, frame, range, u]; None for scenes that have no smooth map."""
     found = []
     with warnings.catch_warnings(), suppress(InputError):
         warnings.simplefilter("ignore", PhysicsWarning)  # of bins that are coarse for a fit
         for step in display.steps or [None]:
             if step is not None:
-                link.take(step.bodies)
-            found.append(torch.stack([link.map(link.scene, frame).float() for frame in frames]))
+                sensor.replace_meshes(step.bodies)
+            found.append(
+                torch.stack([sensor.predict_map(sensor.scene, frame).float() for frame in frames])
+            )
     if len(found) < max(1, len(display.steps)):
         return None
     return torch.stack(found)
 
 
-def _axis(centers: list[float], block: int) -> tuple[float, float]:
+def _block_axis(centers: list[float], block: int) -> tuple[float, float]:
     """Middle of the first block of bins, and the distance of blocks."""
     step = centers[1] - centers[0] if len(centers) > 1 else 1.0
     return centers[0] + (block - 1) / 2 * step, block * step

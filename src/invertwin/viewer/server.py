@@ -16,29 +16,37 @@ import torch
 
 from invertwin.errors import InputError
 from invertwin.scene import rigid, rotation_from_quaternion
-from invertwin.viewer.display import Display, Layer, Maps, Step
-from invertwin.viewer.guard import LOOPBACK, Guard, guarding
-from invertwin.viewer.layers import EDGES, ELLIPSOID, FED, OF_POSITION, PATHS, SEEN, floats
-from invertwin.viewer.link import Link, Seen
-from invertwin.viewer.panels import MEASURED, RESIDUAL, SIMULATED, Panels
+from invertwin.viewer.display import Display, DisplayLayer, DisplayMaps, DisplayStep
+from invertwin.viewer.guard import LOOPBACK, AccessGuard, install_guard
+from invertwin.viewer.layers import (
+    BIN_POINTS,
+    BOUNDARY_POINTS,
+    ELLIPSOID,
+    POSITION_LAYERS,
+    SAMPLED_PATHS,
+    VISIBLE_POINTS,
+    to_float32,
+)
+from invertwin.viewer.link import InteractiveSensor, PositionSample
+from invertwin.viewer.panels import MEASURED, RESIDUAL, SIMULATED, MapPanels
 
-_NOBODY = "nothing"
-_SHOWN_PATHS = 100  # rays that are drawn
-_TIMES = 10  # updates over which their rate is taken
-_PAUSE = 1.0  # seconds: later updates do not follow each other
-_STILL = 0.4  # seconds after which nothing moves
+_NO_OBJECT = "nothing"
+_MAX_PATHS = 100  # rays that are drawn
+_RATE_WINDOW = 10  # updates over which their rate is taken
+_MAX_INTERVAL = 1.0  # seconds: later updates do not follow each other
+_SETTLE_TIME = 0.4  # seconds after which nothing moves
 
 
 @dataclass
-class _Wish:
+class _ViewerState:
     """What the person has chosen last."""
 
     step: int
     sensor: str
     frame: int = 0
-    moved: str = _NOBODY
-    turn: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
-    place: tuple[float, ...] = (0.0, 0.0, 0.0)
+    moved_object: str = _NO_OBJECT
+    quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)
     bin: tuple[int, int] | None = None
 
 
@@ -49,11 +57,11 @@ class Viewer:
 
     Args:
         display: What is shown.
-        links: Of each sensor by its name: let people move objects, and show maps and paths.
+        sensors: Of each sensor by its name: let people move objects, and show maps and paths.
             None = it only shows.
         host: Where it listens.
         port: The first one that is tried.
-        token: See ``Guard``.
+        token: See ``AccessGuard``.
 
     Attributes:
         address: What to open in a browser.
@@ -65,32 +73,34 @@ class Viewer:
     def __init__(
         self,
         display: Display,
-        links: Mapping[str, Link] | None = None,
+        sensors: Mapping[str, InteractiveSensor] | None = None,
         *,
         host: str = LOOPBACK,
         port: int = 8080,
         token: str | None = None,
     ) -> None:
-        guard = Guard(host, token)
-        self._server = _started(guard, host, port)
+        guard = AccessGuard(host, token)
+        self._server = _start_server(guard, host, port)
         query = "" if token is None else f"/?token={token}"
         # A host that means every address of this machine is none that a browser could open.
         reached = socket.gethostname() if host in ("0.0.0.0", "::") else host
         named = f"[{reached}]" if ":" in reached else reached
         self.address = f"http://{named}:{self._server.get_port()}{query}"
-        self._links, self._steps = dict(links or {}), list(display.steps)
+        self._links, self._steps = dict(sensors or {}), list(display.steps)
         self._display = display
         self._lock, self._due, self._closed = threading.Lock(), threading.Event(), False
         self._sensors = list(dict.fromkeys([*display.maps, *self._links]))
-        self._wish = _Wish(step=len(self._steps) - 1, sensor=next(iter(self._sensors), ""))
-        self._found: dict[int, Mapping[str, Maps]] = {}  # what sensors see at steps as they come
+        self._wish = _ViewerState(step=len(self._steps) - 1, sensor=next(iter(self._sensors), ""))
+        self._found: dict[
+            int, Mapping[str, DisplayMaps]
+        ] = {}  # what sensors see at steps as they come
         self._taken: int | None = None  # the step whose bodies the link has
-        self._times: deque[float] = deque(maxlen=_TIMES)
-        self._seen: Seen | None = None
+        self._times: deque[float] = deque(maxlen=_RATE_WINDOW)
+        self._seen: PositionSample | None = None
         self._nodes: dict[str, Any] = {}
-        self._visible = display.groups | {x: x != PATHS for x in OF_POSITION if links}
-        self._arrange()
-        self._worker = threading.Thread(target=self._work, daemon=True)
+        self._visible = display.groups | {x: x != SAMPLED_PATHS for x in POSITION_LAYERS if sensors}
+        self._build_window()
+        self._worker = threading.Thread(target=self._run_worker, daemon=True)
         self._worker.start()
         self._due.set()
 
@@ -100,7 +110,7 @@ class Viewer:
         times = list(self._times)
         return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
 
-    def add_step(self, step: Step, maps: Mapping[str, Maps] | None = None) -> None:
+    def add_step(self, step: DisplayStep, maps: Mapping[str, DisplayMaps] | None = None) -> None:
         """Show a further step of a fit that goes on; who looks at the last one follows.
 
         Args:
@@ -115,7 +125,7 @@ class Viewer:
         self._step.visible = len(self._steps) > 1
         if follows:
             self._step.value = len(self._steps) - 1
-            self._choose(step=len(self._steps) - 1)
+            self._update_state(step=len(self._steps) - 1)
 
     def wait(self) -> None:
         """Return when the viewer is closed; Ctrl-C closes it."""
@@ -140,13 +150,13 @@ class Viewer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _choose(self, **changes: Any) -> None:
+    def _update_state(self, **changes: Any) -> None:
         """Note what the person wants; the worker takes the latest."""
         with self._lock:
             self._wish = replace(self._wish, **changes)
         self._due.set()
 
-    def _arrange(self) -> None:
+    def _build_window(self) -> None:
         """Put everything into the window."""
         display, gui, scene = self._display, self._server.gui, self._server.scene
         scene.set_up_direction(display.up)
@@ -162,23 +172,23 @@ class Viewer:
         self._step = gui.add_slider(
             "step", 0, max(1, count - 1), 1, max(0, count - 1), visible=count > 1
         )
-        self._step.on_update(lambda _: self._choose(step=int(self._step.value)))
+        self._step.on_update(lambda _: self._update_state(step=int(self._step.value)))
         self._where = gui.add_text("fit", "", disabled=True, visible=count > 1)
         low, high = display.box
         self._size = float(np.linalg.norm(high - low)) or 1.0
-        self._arrange_sensors()
+        self._build_sensor_controls()
         with gui.add_folder("layers"):
             for group, shown in self._visible.items():
                 box = gui.add_checkbox(group, shown)
-                box.on_update(self._switch(group))
+                box.on_update(self._visibility_handler(group))
         self._said = gui.add_text("note", "", disabled=True, visible=False)
         for layer in display.layers:
-            self._put(layer)
+            self._draw_layer(layer)
         shown = [MEASURED] if display.maps else []
         if self._links or any(SIMULATED in maps.power for maps in display.maps.values()):
             shown += [SIMULATED, RESIDUAL] if shown else [SIMULATED]
-        self._panels = Panels(self._server, display, shown)
-        self._panels.on_click(lambda found: self._choose(bin=found))
+        self._panels = MapPanels(self._server, display, shown)
+        self._panels.on_click(lambda found: self._update_state(bin=found))
         camera = self._server.initial_camera
         middle = (low + high) / 2
         up, ahead = np.array(display.up), np.array(display.ahead)
@@ -189,30 +199,30 @@ class Viewer:
         )
         camera.up = up
 
-    def _arrange_sensors(self) -> None:
+    def _build_sensor_controls(self) -> None:
         gui = self._server.gui
         if not self._sensors:
             return
         several = len(self._sensors) > 1
         self._sensor = gui.add_dropdown("sensor", self._sensors, visible=several)
-        self._sensor.on_update(lambda _: self._sense(str(self._sensor.value)))
+        self._sensor.on_update(lambda _: self._select_sensor(str(self._sensor.value)))
         self._frame = gui.add_slider("position", 0, 1, 1, 0)
-        self._frame.on_update(lambda _: self._choose(frame=int(self._frame.value)))
+        self._frame.on_update(lambda _: self._update_state(frame=int(self._frame.value)))
         self._axes = gui.add_markdown("")
         self._bin = gui.add_text("bin", "", disabled=True)
-        self._sense(self._wish.sensor)
+        self._select_sensor(self._wish.sensor)
         if not self._links:
             return
         names = next(iter(self._links.values())).names
-        self._mover = gui.add_dropdown("move", (_NOBODY, *names), initial_value=_NOBODY)
-        self._mover.on_update(lambda _: self._grab(str(self._mover.value)))
+        self._mover = gui.add_dropdown("move", (_NO_OBJECT, *names), initial_value=_NO_OBJECT)
+        self._mover.on_update(lambda _: self._select_object(str(self._mover.value)))
         self._rate = gui.add_text("maps a second", "", disabled=True)
         self._gizmo = self._server.scene.add_transform_controls(
             "/gizmo", scale=0.4 * self._size, depth_test=False, visible=False
         )
-        self._gizmo.on_update(lambda _: self._move())
+        self._gizmo.on_update(lambda _: self._follow_gizmo())
 
-    def _sense(self, name: str) -> None:
+    def _select_sensor(self, name: str) -> None:
         """Look through another sensor, from its first position."""
         link, maps = self._links.get(name), self._display.maps.get(name)
         frames = link.radar.frame_count if link else maps.frames[-1] + 1 if maps else 1
@@ -223,55 +233,57 @@ class Viewer:
             f"Maps: range upwards from {ranges[0]:.2f} to {ranges[-1]:.2f} m, "
             f"u from {across[-1]:.2f} on the left to {across[0]:.2f}."
         )
-        self._choose(sensor=name, frame=0, bin=None)
+        self._update_state(sensor=name, frame=0, bin=None)
 
-    def _switch(self, group: str) -> Callable[[Any], None]:
-        def switch(event: Any) -> None:
+    def _visibility_handler(self, group: str) -> Callable[[Any], None]:
+        def set_visibility(event: Any) -> None:
             self._visible[group] = bool(event.target.value)
             for name, node in list(self._nodes.items()):
                 if name.split("/")[0] == group:
                     node.visible = self._visible[group]
 
-        return switch
+        return set_visibility
 
-    def _grab(self, name: str) -> None:
+    def _select_object(self, name: str) -> None:
         """Let the person move an object, from where the step has it."""
-        self._release()
-        if name != _NOBODY:
+        self._release_object()
+        if name != _NO_OBJECT:
             link = self._links[self._wish.sensor]
             center = tuple(link.scene[name].center.detach().tolist())
             self._gizmo.position, self._gizmo.wxyz = center, (1.0, 0.0, 0.0, 0.0)
             self._center = np.array(center)
-            self._choose(moved=name, turn=(1.0, 0.0, 0.0, 0.0), place=center)
-        self._gizmo.visible = name != _NOBODY
+            self._update_state(moved_object=name, quaternion=(1.0, 0.0, 0.0, 0.0), position=center)
+        self._gizmo.visible = name != _NO_OBJECT
 
-    def _release(self) -> None:
+    def _release_object(self) -> None:
         """Put what was moved back."""
-        node = self._nodes.get(f"twin/{self._wish.moved}")
+        node = self._nodes.get(f"twin/{self._wish.moved_object}")
         if node is not None:
             node.wxyz, node.position = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        self._choose(moved=_NOBODY)
+        self._update_state(moved_object=_NO_OBJECT)
 
-    def _move(self) -> None:
+    def _follow_gizmo(self) -> None:
         """Follow the gizmo: the surface at once, the map when it is traced."""
         wish = self._wish
-        if wish.moved == _NOBODY:
+        if wish.moved_object == _NO_OBJECT:
             return
         turn = tuple(float(x) for x in self._gizmo.wxyz)
         place = tuple(float(x) for x in self._gizmo.position)
-        node = self._nodes.get(f"twin/{wish.moved}")
+        node = self._nodes.get(f"twin/{wish.moved_object}")
         if node is not None:
-            motion = self._motion(turn, place).numpy()
+            motion = self._rigid_motion(turn, place).numpy()
             with self._server.atomic():
                 node.wxyz, node.position = turn, motion[:3, 3]
-        self._choose(turn=turn, place=place)
+        self._update_state(quaternion=turn, position=place)
 
-    def _motion(self, turn: tuple[float, ...], place: tuple[float, ...]) -> torch.Tensor:
-        rotation = rotation_from_quaternion(torch.tensor(turn, dtype=torch.float64))
+    def _rigid_motion(
+        self, quaternion: tuple[float, ...], position: tuple[float, ...]
+    ) -> torch.Tensor:
+        rotation = rotation_from_quaternion(torch.tensor(quaternion, dtype=torch.float64))
         center = torch.as_tensor(self._center, dtype=torch.float64)
-        return rigid(rotation, torch.tensor(place, dtype=torch.float64) - rotation @ center)
+        return rigid(rotation, torch.tensor(position, dtype=torch.float64) - rotation @ center)
 
-    def _put(self, layer: Layer, size: float = 1.0) -> None:
+    def _draw_layer(self, layer: DisplayLayer, size: float = 1.0) -> None:
         """Draw a layer, in place of the one of its name."""
         scene, visible = self._server.scene, self._visible[layer.group]
         # Slashes would part a name into nodes of a tree, which are hidden together.
@@ -311,7 +323,7 @@ class Viewer:
             )
         self._nodes[layer.name] = made
 
-    def _work(self) -> None:
+    def _run_worker(self) -> None:
         """Trace what the person wants, the latest alone; single paths when nothing moves."""
         while True:
             self._due.wait()
@@ -323,55 +335,55 @@ class Viewer:
             try:
                 self._show_step(wish)
                 if self._sensors:
-                    self._follow(wish)
+                    self._update_maps(wish)
                 self._said.visible = False
             except InputError as error:
                 self._said.value, self._said.visible = str(error), True
 
-    def _show_step(self, wish: _Wish) -> None:
-        if not self._steps or wish.step == self._taken:
+    def _show_step(self, state: _ViewerState) -> None:
+        if not self._steps or state.step == self._taken:
             return
-        if wish.moved != _NOBODY:
-            self._mover.value = _NOBODY  # what was moved stands where the step has it
-        self._taken, step = wish.step, self._steps[wish.step]
-        for layer in self._display.at_step(step).layers:
+        if state.moved != _NO_OBJECT:
+            self._mover.value = _NO_OBJECT  # what was moved stands where the step has it
+        self._taken, step = state.step, self._steps[state.step]
+        for layer in self._display.show_step(step).layers:
             if layer.name.removeprefix("twin/") in step.bodies:
                 node = self._nodes[layer.name]
                 if node.faces.shape == layer.faces.shape and (node.faces == layer.faces).all():
                     node.vertices = layer.points
                 else:
-                    self._put(layer)
+                    self._draw_layer(layer)
         self._where.visible, self._where.value = True, step.label
         for link in self._links.values():
-            link.take(step.bodies)
+            link.replace_meshes(step.bodies)
 
-    def _follow(self, wish: _Wish) -> None:
+    def _update_maps(self, state: _ViewerState) -> None:
         """Show the maps of a position, and its paths once nothing moves."""
-        link, known = self._links.get(wish.sensor), self._display.maps.get(wish.sensor)
-        maps = known.at(wish.frame) if known else {}
-        if (found := self._found.get(wish.step, {}).get(wish.sensor)) is not None:
-            maps |= found.at(wish.frame)
+        link, known = self._links.get(state.sensor), self._display.maps.get(state.sensor)
+        maps = known.maps_of_frame(state.frame) if known else {}
+        if (found := self._found.get(state.step, {}).get(state.sensor)) is not None:
+            maps |= found.maps_of_frame(state.frame)
         if link is None:
             scene = None
-        elif wish.moved == _NOBODY:
+        elif state.moved == _NO_OBJECT:
             scene = link.scene
         else:
-            scene = link.moved(wish.moved, self._motion(wish.turn, wish.place))
+            scene = link.move_object(state.moved, self._rigid_motion(state.turn, state.place))
         if link is not None and scene is not None:
-            maps |= {SIMULATED: floats(link.map(scene, wish.frame))}
-        self._panels.show(maps, wish.bin)
-        if wish.bin is not None:
-            self._bin.value = self._told(wish.sensor, *wish.bin)
+            maps |= {SIMULATED: to_float32(link.predict_map(scene, state.frame))}
+        self._panels.show(maps, state.bin)
+        if state.bin is not None:
+            self._bin.value = self._describe_bin(state.sensor, *state.bin)
         if link is None or scene is None:
             return
         now = time.perf_counter()
-        if self._times and now - self._times[-1] > _PAUSE:
+        if self._times and now - self._times[-1] > _MAX_INTERVAL:
             self._times.clear()
         self._times.append(now)
-        if len(self._times) == _TIMES:
+        if len(self._times) == _RATE_WINDOW:
             self._rate.value = f"{self.rate:.0f}"
-        if not self._due.wait(_STILL):
-            self._show_paths(link.seen(scene, wish.frame), wish.bin)
+        if not self._due.wait(_SETTLE_TIME):
+            self._show_paths(link.sample_paths(scene, state.frame), state.bin)
 
     def _axes_of(self, sensor: str) -> tuple[list[float], list[float]]:
         """Range [m] of each row and u of each column of a sensor's maps."""
@@ -381,26 +393,31 @@ class Viewer:
         maps = self._display.maps[sensor]
         return maps.ranges, maps.across
 
-    def _told(self, sensor: str, row: int, column: int) -> str:
+    def _describe_bin(self, sensor: str, row: int, column: int) -> str:
         """A bin in words."""
         ranges, across = self._axes_of(sensor)
         return f"range {ranges[row]:.2f} m, u {across[column]:.3f}"
 
-    def _show_paths(self, seen: Seen, chosen: tuple[int, int] | None) -> None:
-        points = floats(seen.points)
-        some = points[:: max(1, len(points) // _SHOWN_PATHS)]
-        place = np.broadcast_to(floats(seen.place), some[:, 0].shape)
+    def _show_paths(self, sample: PositionSample, chosen: tuple[int, int] | None) -> None:
+        points = to_float32(sample.points)
+        some = points[:: max(1, len(points) // _MAX_PATHS)]
+        place = np.broadcast_to(to_float32(sample.position), some[:, 0].shape)
         corners = np.stack([place, some[:, 0], some[:, 0], some[:, 1]], axis=1)
-        fed = floats(seen.feeding(*chosen)) if chosen else np.zeros((0, 3), np.float32)
-        found = {PATHS: corners.reshape(-1, 3), SEEN: points[:, 1], EDGES: seen.edges, FED: fed}
+        fed = to_float32(sample.points_in_bin(*chosen)) if chosen else np.zeros((0, 3), np.float32)
+        found = {
+            SAMPLED_PATHS: corners.reshape(-1, 3),
+            VISIBLE_POINTS: points[:, 1],
+            BOUNDARY_POINTS: sample.edges,
+            BIN_POINTS: fed,
+        }
         with self._server.atomic():
             for name, places in found.items():
-                color, size = OF_POSITION[name]
-                kind = "lines" if name == PATHS else "points"
-                self._put(Layer(name, kind, floats(places), color=color), size)
+                color, size = POSITION_LAYERS[name]
+                kind = "lines" if name == SAMPLED_PATHS else "points"
+                self._draw_layer(DisplayLayer(name, kind, to_float32(places), color=color), size)
 
 
-def _started(guard: Guard, host: str, port: int) -> Any:
+def _start_server(guard: AccessGuard, host: str, port: int) -> Any:
     """The server of viser, behind a guard."""
     try:
         viser: Any = importlib.import_module("viser")
@@ -410,11 +427,11 @@ def _started(guard: Guard, host: str, port: int) -> Any:
             'pip install "invertwin[view]"'
         ) from None
 
-    class Server(viser.ViserServer):
+    class _LocalServer(viser.ViserServer):
         """One that never opens a tunnel to a server of others, which any browser might ask for."""
 
         def request_share_url(self, verbose: bool = True) -> None:
             return None
 
-    with guarding(guard), redirect_stdout(io.StringIO()):
-        return Server(host=host, port=port, verbose=False)
+    with install_guard(guard), redirect_stdout(io.StringIO()):
+        return _LocalServer(host=host, port=port, verbose=False)

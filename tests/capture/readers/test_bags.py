@@ -113,7 +113,7 @@ def test_topics_have_their_types(bag):
 def test_samples_of_a_message_of_ones_own_become_chirps(bag):
     found = read_topic(bag, "/adc", "samples")
     assert (found.times - STARTED).tolist() == [0.5, 1.5, 2.5]
-    samples = found.stacked().view(3, 4, 1, 2, 8)
+    samples = found.stack().view(3, 4, 1, 2, 8)
     assert samples.dtype == torch.int16
     settings = ChirpSettings(
         start_frequency=77e9, slope=60e12, sample_rate=5e6, samples=8, loops=4, frames=3, real=True,
@@ -125,14 +125,14 @@ def test_samples_of_a_message_of_ones_own_become_chirps(bag):
 
 def test_a_number_within_messages_is_an_array(bag):
     found = read_topic(bag, "/pose", "pose.position.x")
-    torch.testing.assert_close(found.stacked(), torch.tensor([0.0, 0.1, 0.2]).double())
+    torch.testing.assert_close(found.stack(), torch.tensor([0.0, 0.1, 0.2]).double())
 
 
 def test_poses_are_a_track(bag):
     track = read_track(bag, "/pose")
     assert (track.times - STARTED).tolist() == [0.5, 1.5, 2.5]
     assert track.positions[:, 1:].tolist() == [[1.0, -2.0]] * 3
-    middle = track.at(torch.tensor([STARTED + 1.0], dtype=torch.float64))
+    middle = track.interpolate(torch.tensor([STARTED + 1.0], dtype=torch.float64))
     assert float(middle[0, 0]) == pytest.approx(0.05)
 
 
@@ -167,10 +167,10 @@ def test_no_bag_is_one_line(tmp_path):
 
 
 def test_messages_of_different_sizes_do_not_stack():
-    from invertwin.capture.readers.bags import Messages
+    from invertwin.capture.readers.bags import BagMessages
 
     with pytest.raises(InputError, match="got 2 sizes"):
-        Messages(torch.zeros(2).double(), [np.zeros(3), np.zeros(4)]).stacked()
+        BagMessages(torch.zeros(2).double(), [np.zeros(3), np.zeros(4)]).stack()
 
 
 def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch):

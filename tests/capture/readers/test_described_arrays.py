@@ -9,7 +9,11 @@ import scipy.io
 import torch
 
 from invertwin.capture import ChirpData, ChirpSettings, read
-from invertwin.capture.readers.described_arrays import described_board, read_chirps, write_chirps
+from invertwin.capture.readers.described_arrays import (
+    load_described_board,
+    read_chirps,
+    write_chirps,
+)
 from invertwin.errors import InputError
 from invertwin.radar.boards import board
 from invertwin.radar.waveform import PhysicsWarning
@@ -138,11 +142,11 @@ def test_matlab_shows_dimensions_in_its_own_order(tmp_path, described):
 
 
 def test_a_description_becomes_a_capture(described):
-    capture = read(described()).capture(0)
+    capture = read(described()).to_capture(0)
     assert torch.equal(capture.beat, read_chirps(described()).samples[:, 0])
     tx, _ = board("xWR1843").arrays(elevation=1)
     assert torch.equal(capture.radar().transmitters.positions, tx.positions)
-    down = read(described(), board=described_board(described(), elevation=-1))
+    down = read(described(), board=load_described_board(described(), elevation=-1))
     assert torch.equal(down.radar().transmitters.positions[:, 1], -tx.positions[:, 1])
     other = board("xWR1443").arrays(elevation=1, azimuth=-1)
     given = read(described(), board=other)

@@ -60,7 +60,7 @@ def test_polarisations(tmp_path):
         assert loaded.transmitters.jones.equals(radar.transmitters.jones)
         one, other = (r.receivers.jones for r in (radar, loaded))
         assert torch.allclose(
-            one.mixtures @ one.towards(there), other.mixtures @ other.towards(there)
+            one.mixtures @ one.evaluate(there), other.mixtures @ other.evaluate(there)
         )
 
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from invertwin.capture import load_section, load_touchstone
+from invertwin.capture import load_rcs, load_touchstone
 from invertwin.errors import InputError
 
 TWO_PORTS = """! made by hand
@@ -20,7 +20,7 @@ TWO_PORTS = """! made by hand
 def test_rows_of_a_cross_section(tmp_path):
     file = tmp_path / "plate.txt"
     file.write_text("1e9 90.0 0.0 -3.5\n1e9 90.0 45.0 -20.0 \n")
-    found = load_section(file)
+    found = load_rcs(file)
     assert found.frequency.tolist() == [1e9, 1e9]
     assert found.phi.tolist() == pytest.approx([0.0, math.pi / 4])
     assert found.dbsm.tolist() == [-3.5, -20.0]
@@ -31,7 +31,7 @@ def test_other_tables_are_refused(tmp_path, text):
     file = tmp_path / "plate.txt"
     file.write_text(text)
     with pytest.raises(InputError, match="expected rows of frequency, theta, phi and RCS"):
-        load_section(file)
+        load_rcs(file)
 
 
 def test_two_ports_with_noise(tmp_path):

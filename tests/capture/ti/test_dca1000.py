@@ -238,7 +238,7 @@ def test_a_recording_becomes_a_capture(tmp_path):
     write_samples(tmp_path / "adc.bin", data)
     write_cfg(tmp_path / "profile.cfg", SETTINGS)
     mounted = Mounting("xWR1843", elevation=-1)
-    capture = read(tmp_path / "adc.bin", tmp_path / "profile.cfg", board=mounted).capture(1)
+    capture = read(tmp_path / "adc.bin", tmp_path / "profile.cfg", board=mounted).to_capture(1)
     assert torch.equal(capture.beat, data.samples[:, 1])
     assert capture.times.tolist() == pytest.approx([0.0, 0.1, 0.2])
     tx, rx = board("xWR1843").arrays(elevation=-1, transmitters=[1, 3, 2], receivers=[1, 2, 4])
@@ -248,7 +248,7 @@ def test_a_recording_becomes_a_capture(tmp_path):
     assert torch.equal(Capture.load(tmp_path / "capture.nc").beat, capture.beat)
     unknown = replace(SETTINGS, lanes=None)
     given = read(tmp_path / "adc.bin", unknown, board=(tx, rx), lanes=2)
-    torch.testing.assert_close(given.capture().beat, data.samples.mean(1))
+    torch.testing.assert_close(given.to_capture().beat, data.samples.mean(1))
 
 
 def test_a_setup_is_enough(tmp_path):
@@ -259,12 +259,12 @@ def test_a_setup_is_enough(tmp_path):
     setup = {"configUsed": "D:\\data\\bench.mmwave.json", "capturedFiles": files}
     (tmp_path / "bench.setup.json").write_text(json.dumps(setup))
     mounted = Mounting("xWR1843", elevation=1)
-    capture = read(tmp_path / "bench.setup.json", board=mounted).capture(0)
+    capture = read(tmp_path / "bench.setup.json", board=mounted).to_capture(0)
     assert torch.equal(capture.beat, data.samples[:, 0])
     write_setup(
         tmp_path / "own.setup.json", tmp_path / "bench.mmwave.json", [tmp_path / "adc_Raw_0.bin"]
     )
-    own = read(tmp_path / "own.setup.json", board=mounted).capture(0)
+    own = read(tmp_path / "own.setup.json", board=mounted).to_capture(0)
     assert torch.equal(own.beat, capture.beat)
     with pytest.raises(InputError, match=r"expected adc_Raw_1\.bin beside"):
         write_setup(tmp_path / "x.setup.json", "bench.mmwave.json", ["adc_Raw_1.bin"])
@@ -281,7 +281,7 @@ def test_a_simulated_echo_is_found_in_its_file(tmp_path):
     beat = (2e-5 * torch.exp(2j * torch.pi * cycles)).expand(1, 3, 3, 64)
     write_samples(tmp_path / "adc.bin", adc_counts(beat, settings, full_scale=1e-4))
     mounted = Mounting("xWR1843", elevation=1)
-    capture = read(tmp_path / "adc.bin", settings, board=mounted).capture()
+    capture = read(tmp_path / "adc.bin", settings, board=mounted).to_capture()
     grid = capture.radar().grid(0.0, 6.0)
     profile = capture.spectrum(grid)[0].amax((1, 2))
     assert grid.ranges[profile.argmax()] == pytest.approx(3.0, abs=chirp.range_resolution / 2)

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from invertwin.capture import ChirpSettings, adc_counts
-from invertwin.capture.ti import changed, read_samples, write_samples
-from invertwin.capture.ti.layouts import CLEAR, candidates, evidence
+from invertwin.capture.ti import change_settings, read_samples, write_samples
+from invertwin.capture.ti.layouts import MIN_BORDER_RATIO, find_candidates, measure_evidence
 from invertwin.errors import InputError
 from invertwin.radar import Radar
 from invertwin.radar.boards import board
@@ -64,23 +64,23 @@ def test_the_samples_tell(tmp_path, kind, wrong, right):
     if kind == {"lanes": 4} and "receivers" in wrong:
         right = "receivers=4, samples=64"
     with pytest.raises(InputError, match=rf"what fits: {right} \(prediction fails .* more"):
-        read_samples(path, changed(settings, wrong))
+        read_samples(path, change_settings(settings, wrong))
     assert read_samples(path, settings).frame_count == 2
 
 
 def test_lanes_that_are_wrong_are_seen_in_files_of_the_same_size(tmp_path):
     path = recorded(tmp_path / "adc.bin")
     with pytest.raises(InputError, match=r"break elsewhere; what fits: lanes=2 \("):
-        read_samples(path, changed(SETTINGS, {"lanes": 4}))
+        read_samples(path, change_settings(SETTINGS, {"lanes": 4}))
 
 
 def test_what_no_sample_tells_is_refused(tmp_path):
     """Loops or frames: the same blocks."""
     path = recorded(tmp_path / "adc.bin")
     with pytest.raises(InputError, match=r"loops=4 .*frames=|frames=.* loops=4 .*do not tell"):
-        read_samples(path, changed(SETTINGS, {"loops": 2}))
+        read_samples(path, change_settings(SETTINGS, {"loops": 2}))
     with pytest.raises(InputError, match="the samples do not tell these apart"):
-        read_samples(path, changed(SETTINGS, {"loops": 8}))
+        read_samples(path, change_settings(SETTINGS, {"loops": 8}))
 
 
 def test_a_stopped_recording_is_read_where_samples_agree(tmp_path):
@@ -95,7 +95,7 @@ def test_without_a_number_of_frames_samples_still_contradict(tmp_path):
     endless = replace(SETTINGS, frames=None)
     assert read_samples(path, endless).frame_count == 2
     with pytest.raises(InputError, match=r"what fits: .*receivers=4"):
-        read_samples(path, changed(endless, {"receivers": 2, "lanes": 4}))
+        read_samples(path, change_settings(endless, {"receivers": 2, "lanes": 4}))
 
 
 def test_a_ramp_holds_its_samples(tmp_path):
@@ -103,26 +103,26 @@ def test_a_ramp_holds_its_samples(tmp_path):
     words = torch.from_file(
         str(recorded(tmp_path / "adc.bin")), dtype=torch.int16, size=2 * 2 * 4 * 64 * 8
     ).numpy()
-    found = candidates(words, replace(SETTINGS, samples=50, frame_period=2e-3))
+    found = find_candidates(words, replace(SETTINGS, samples=50, frame_period=2e-3))
     assert {one.changes.get("samples") for one in found} >= {64, 128}
     for one in found:
         s = one.settings
         assert s.samples / s.sample_rate <= s.ramp_time
         assert s.loops * len(s.transmit_order) * 65e-6 <= 2e-3
     (alone,) = [one for one in found if one.changes == {"samples": 64}]
-    assert alone.evidence.breaks > 10 * CLEAR
-    assert evidence(words, replace(SETTINGS, samples=128)).breaks < 1
-    assert evidence(words, replace(SETTINGS, samples=32)).breaks < CLEAR
+    assert alone.evidence.border_ratio > 10 * MIN_BORDER_RATIO
+    assert measure_evidence(words, replace(SETTINGS, samples=128)).border_ratio < 1
+    assert measure_evidence(words, replace(SETTINGS, samples=32)).border_ratio < MIN_BORDER_RATIO
 
 
 def test_noise_tells_nothing(tmp_path):
     path = recorded(tmp_path / "adc.bin", noise=100.0)
     assert read_samples(path, SETTINGS).frame_count == 2
     with pytest.raises(InputError, match="do not tell where blocks end"):
-        read_samples(path, changed(SETTINGS, {"samples": 100}))
+        read_samples(path, change_settings(SETTINGS, {"samples": 100}))
 
 
 def test_only_known_settings_are_changed():
-    assert changed(SETTINGS, {"receivers": 2}).receivers == (1, 2)
+    assert change_settings(SETTINGS, {"receivers": 2}).receivers == (1, 2)
     with pytest.raises(InputError, match="changes of lanes, real"):
-        changed(SETTINGS, {"slope": 1e12})
+        change_settings(SETTINGS, {"slope": 1e12})

@@ -11,10 +11,10 @@ from invertwin.channel import (
     Link,
     Paths,
     Sampling,
-    interference,
-    trace_chains,
+    as_absorbers,
+    combine_coherently,
+    trace_facet_paths,
     trace_target,
-    without_echoes,
 )
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -65,9 +65,9 @@ def test_pairs_sum_to_the_square_of_the_field(stretch):
     antennas = link(wavelength=WAVELENGTH)
     scene = Scene({"corner": beside(1.0)["corner"]})
     paths = trace_target(scene, "corner", antennas, sampling=DRAWN, stretch=stretch)
-    both = interference(paths, antennas, always, stretch=stretch).power.sum()
+    both = combine_coherently(paths, antennas, always, stretch=stretch).power.sum()
     assert float(both) == pytest.approx(float(total(paths, stretch)), rel=1e-9)
-    apart = interference(paths, antennas, never, stretch=stretch).power.sum()
+    apart = combine_coherently(paths, antennas, never, stretch=stretch).power.sum()
     assert float(apart) == pytest.approx(float(paths.coefficient.abs().square().sum()), rel=1e-9)
 
 
@@ -78,14 +78,14 @@ def test_powers_alone_are_low_by_the_number_of_chains(mesh, depth, low):
     target = Scene({"target": thing(mesh or trihedral(0.05), material=METAL)})
     paths = trace_target(target, "target", antennas, sampling=Sampling(depth=depth))
     last = trace_target(target, "target", antennas, sampling=Sampling(depth=depth - 1))
-    chains = paths.chosen(torch.arange(len(paths)) >= len(last))
+    chains = paths.select(torch.arange(len(paths)) >= len(last))
     assert (chains.delay - chains.delay[0]).abs().max() * SPEED_OF_LIGHT < 1e-4
     # Plates of the dihedral are two triangles each: a way ends on the left one or on the right one.
     ways = (
         [chains.last[:, 0] < 0, chains.last[:, 0] > 0] if mesh else torch.eye(6, dtype=torch.bool)
     )
-    powers = [interference(chains.chosen(way), antennas, always).power.sum() for way in ways]
-    ratio = interference(chains, antennas, always).power.sum() / torch.stack(powers).sum()
+    powers = [combine_coherently(chains.select(way), antennas, always).power.sum() for way in ways]
+    ratio = combine_coherently(chains, antennas, always).power.sum() / torch.stack(powers).sum()
     assert 10 * math.log10(float(ratio)) == pytest.approx(low, abs=0.02)
 
 
@@ -96,7 +96,7 @@ def test_a_stretched_wavelength_keeps_the_peak_and_widens_the_lobe():
     def power(turn: float, stretch: float) -> float:
         scene = Scene({"plate": thing(plate(0.05, 0.05), turn=(0.0, turn, 0.0), material=METAL)})
         paths = trace_target(scene, "plate", antennas, sampling=Sampling(1), stretch=stretch)
-        return float(interference(paths, antennas, always, stretch=stretch).power.sum())
+        return float(combine_coherently(paths, antennas, always, stretch=stretch).power.sum())
 
     peak = power(0.0, 1.0)
     assert power(0.0, 3.0) == pytest.approx(peak, rel=1e-6)
@@ -126,7 +126,7 @@ def test_what_stands_before_a_target_hides_it_smoothly():
 
 def test_what_stands_behind_or_is_black_hides_nothing():
     antennas = link(wavelength=WAVELENGTH)
-    alone = trace_chains(Scene({"corner": beside(0.0)["corner"]}), antennas, 3)
+    alone = trace_facet_paths(Scene({"corner": beside(0.0)["corner"]}), antennas, 3)
     behind = trace_target(beside(0.0, 1.7), "corner", antennas, sampling=DRAWN)
     assert torch.allclose(behind.coefficient, alone.coefficient)
 
@@ -135,14 +135,14 @@ def test_separate_antennas_each_need_sight():
     """A box before the receiver alone hides the target, too."""
     antennas = link(((-1.0, 0.0, 0.0),), ((0.0, 0.0, 0.0),), wavelength=WAVELENGTH)
     paths = trace_target(beside(0.0), "corner", antennas, sampling=DRAWN)
-    assert not paths.carries.any()
+    assert not paths.has_field.any()
 
 
 def test_no_echoes_but_the_same_shadows():
-    dark = without_echoes(beside(0.0), ["corner"])
-    assert not dark["corner"].material.surface(77e9).amplitude.any()
+    dark = as_absorbers(beside(0.0), ["corner"])
+    assert not dark["corner"].material.scattering_law(77e9).amplitude.any()
     assert torch.equal(dark["corner"].vertices, beside(0.0)["corner"].vertices)
-    assert dark["box"].material.surface(77e9).amplitude.any()
+    assert dark["box"].material.scattering_law(77e9).amplitude.any()
 
 
 def test_refusals_name_what_they_refuse():
@@ -171,7 +171,7 @@ def test_derivatives_are_differences_past_a_box():
         moved = scene.replace("corner", pose=pose)
         drawn = replace(DRAWN, boundary=boundary)
         paths = trace_target(moved, "corner", antennas, sampling=drawn)
-        found = interference(paths, antennas, always)
+        found = combine_coherently(paths, antennas, always)
         # Moments of the map: power, and where it is.
         return torch.stack([found.power.sum(), (found.power * found.range).sum()]) * 1e9
 
@@ -194,9 +194,13 @@ def test_a_link_of_many_frames_keeps_them_apart():
     places = float64([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.1, -0.2]])
     antennas = link(places, wavelength=WAVELENGTH)
     scene = Scene({"corner": beside(1.0)["corner"]})
-    whole = interference(trace_target(scene, "corner", antennas, sampling=DRAWN), antennas, always)
+    whole = combine_coherently(
+        trace_target(scene, "corner", antennas, sampling=DRAWN), antennas, always
+    )
     for number, place in enumerate(places):
         single: Link = link(place[None], wavelength=WAVELENGTH)
-        own = interference(trace_target(scene, "corner", single, sampling=DRAWN), single, always)
+        own = combine_coherently(
+            trace_target(scene, "corner", single, sampling=DRAWN), single, always
+        )
         found = whole.power[whole.frame == number].sum()
         assert float(found) == pytest.approx(float(own.power.sum()), rel=1e-9)

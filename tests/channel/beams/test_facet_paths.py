@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from invertwin.channel import Link, Sampling, trace_chains, trace_field
+from invertwin.channel import Link, Sampling, trace_facet_paths, trace_field
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene import (
@@ -55,7 +55,7 @@ def test_polygons_agree_with_sampled_rays(turn):
     sampled = trace_field(
         scene, far, sampling=Sampling(depth=3, samples=60_000, boundary=False), seed=1
     )
-    ratio = fields(trace_chains(scene, far, 3)) / fields(sampled)
+    ratio = fields(trace_facet_paths(scene, far, 3)) / fields(sampled)
     assert (20 * ratio.abs().log10()).abs().max() < 0.2
     assert ratio.angle().abs().max() < 0.03
 
@@ -63,8 +63,8 @@ def test_polygons_agree_with_sampled_rays(turn):
 def test_chains_of_three_bounces_have_the_range_of_the_apex():
     scene = corner()
     apex = scene["corner"].transform[:3, 3]
-    paths = trace_chains(scene, antennas(), 3)
-    third = paths.chosen(torch.arange(len(paths)) >= len(paths) - 6 * len(PLACES))
+    paths = trace_facet_paths(scene, antennas(), 3)
+    third = paths.select(torch.arange(len(paths)) >= len(paths) - 6 * len(PLACES))
     # The unfolded image of a chain's last point and the apex are on one straight way.
     expected = (PLACES - apex).norm(dim=1)[third.frame]
     assert torch.allclose(third.range, expected, atol=1e-4)
@@ -79,7 +79,7 @@ def test_derivatives_are_differences():
 
     def values(vector: Tensor) -> Tensor:
         pose = rigid(rotation_from_vector(vector[3:]), vector[:3])
-        field = fields(trace_chains(corner(pose), antennas(), 3))
+        field = fields(trace_facet_paths(corner(pose), antennas(), 3))
         return torch.cat([field.abs().square(), field.angle()])
 
     at = float64([0.004, -0.003, 0.002, 0.03, -0.05, 0.02])
@@ -95,32 +95,32 @@ def test_turned_about_its_axis_a_corner_looks_the_same_from_its_central_zone():
     powers = []
     for roll in (0.0, 0.3):
         pose = rigid(rotation_from_vector(float64([0.0, 0.0, roll])))
-        paths = trace_chains(corner(pose), antennas(), 3)
-        two = trace_chains(corner(pose), antennas(), 2)
+        paths = trace_facet_paths(corner(pose), antennas(), 3)
+        two = trace_facet_paths(corner(pose), antennas(), 2)
         powers.append((fields(paths) - fields(two)).abs())
     assert torch.allclose(*powers, rtol=5e-3)
 
 
 def test_only_few_flat_conductors_have_chains():
     with pytest.raises(InputError, match="expected smooth conductors alone"):
-        trace_chains(Scene({"wall": thing(plate(1, 1))}), antennas(), 1)
+        trace_facet_paths(Scene({"wall": thing(plate(1, 1))}), antennas(), 1)
     boxes = {
         name: thing(box((0.1, 0.1, 0.1)), (x, 0.0, 0.0), material=PerfectConductor())
         for name, x in (("left", -1.0), ("middle", 0.0), ("right", 1.0))
     }
     with pytest.raises(InputError, match="expected at most 24 triangles"):
-        trace_chains(Scene(boxes), antennas(), 1)
+        trace_facet_paths(Scene(boxes), antennas(), 1)
 
 
 @pytest.mark.parametrize("pair", ["VV", "HH", "VH"])
 def test_chains_are_polarised(pair):
     """A rolled dihedral at 4 m, as sampled rays have it."""
-    jones = [Polarisation.of(name, 0.0, 1) for name in pair]
+    jones = [Polarisation.from_jones(name, 0.0, 1) for name in pair]
     far = replace(link(2 * PLACES, wavelength=WAVELENGTH), tx_jones=jones[0], rx_jones=jones[1])
     pose = rigid(rotation_from_vector(float64([0.0, 0.0, 0.3])), float64([0.0, 0.0, 0.0]))
     scene = Scene({"a": Object(dihedral(0.05), PerfectConductor(), pose)})
     sampled = trace_field(
         scene, far, sampling=Sampling(depth=2, samples=60_000, boundary=False), seed=1
     )
-    ratio = fields(trace_chains(scene, far, 2)) / fields(sampled)
+    ratio = fields(trace_facet_paths(scene, far, 2)) / fields(sampled)
     assert float((ratio[0] - 1).abs()) < 0.05  # the other places are off its lobe

@@ -104,7 +104,7 @@ def test_a_sheet_before_a_corner_weakens_and_delays():
     board = thing(plate(0.5, 0.5), (0, 0, -1.0), material=Slab(2.7, 0.05, thickness=0.01))
     bare = paths_of(Scene(corner), antennas)
     behind = paths_of(Scene({**corner, "board": board}), antennas)
-    coherent = behind.chosen((behind.last[:, 2] > -0.1) & (behind.first[:, 2] > -0.1))
+    coherent = behind.select((behind.last[:, 2] > -0.1) & (behind.first[:, 2] > -0.1))
     strength = float(response(coherent, antennas).abs() / response(bare, antennas).abs())
     assert 0.1 < strength < 0.9
     assert float(coherent.delay.mean() - bare.delay.mean()) * SPEED_OF_LIGHT > 0.005

@@ -36,7 +36,7 @@ LEFT = (0.5**0.5, -(0.5**0.5) * 1j)
 def antennas(sent: Any, received: Any, *places: Any, leakage: float = 0.0) -> Link:
     """Antennas of two polarisations, 20 m before the origin unless said otherwise."""
     where = places or (((0.0, 0.0, -DISTANCE),),)
-    jones = [Polarisation.of(value, leakage, 1) for value in (sent, received)]
+    jones = [Polarisation.from_jones(value, leakage, 1) for value in (sent, received)]
     found = link(*where, wavelength=WAVELENGTH)
     return replace(found, tx_jones=jones[0], rx_jones=jones[1])
 
@@ -194,7 +194,9 @@ def test_elements_that_leak_are_mixtures():
     sent, received = array.jones.mixtures[1], array.jones.mixtures[2]
     channel = torch.einsum("r,prt,t->p", received, paths.matrix, sent)
     alone = replace(
-        both, tx_jones=Polarisation.of("V", leak[1], 1), rx_jones=Polarisation.of("V", leak[2], 1)
+        both,
+        tx_jones=Polarisation.from_jones("V", leak[1], 1),
+        rx_jones=Polarisation.from_jones("V", leak[2], 1),
     )
     single = traced(scene, alone)
     assert single.matrix is None

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from invertwin.channel import Link
-from invertwin.channel.coherent.radar_equation import SurfacePaths, path_view, unblocked
+from invertwin.channel.coherent.radar_equation import SurfacePaths, evaluate_paths, find_unblocked
 from invertwin.channel.coherent.rough_paths import draw_rough_paths
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry, flatten
@@ -61,8 +61,8 @@ def powers(geometry: Geometry, poses: Link, paths: SurfacePaths, frame: int) -> 
     """What every path carries in a frame."""
     frames = torch.full((len(paths.weight),), frame)
     rays = RayScene(geometry, poses)
-    seen = unblocked(rays, frames, paths)
-    return path_view(rays, frames[seen], paths.keep(seen)).power * paths.weight[seen]
+    seen = find_unblocked(rays, frames, paths)
+    return evaluate_paths(rays, frames[seen], paths.select(seen)).power * paths.weight[seen]
 
 
 @pytest.mark.parametrize("where", ["at the reference poses", "from another pose"])
@@ -78,7 +78,7 @@ def test_an_echo_by_a_wall_has_its_power_and_many_paths(where):
     for seed in (1, 2, 3):
         paths = draw_rough_paths(whole, drawn_for, count=COUNT, depth=3, seed=seed)[1]
         objects = geometry.face_object[paths.face]
-        paths = paths.keep((objects == torch.tensor([WALL, ITEM, WALL])).all(1))
+        paths = paths.select((objects == torch.tensor([WALL, ITEM, WALL])).all(1))
         found.append(powers(geometry, poses, paths, 1))
     sums = torch.stack([power.sum() for power in found]) / truth
     many = torch.stack([power.sum().square() / power.square().sum() for power in found])

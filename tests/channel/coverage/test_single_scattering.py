@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from invertwin.channel import RayPaths, Sampling, trace_scattered
+from invertwin.channel import RayPaths, Sampling, trace_single_scattering
 from invertwin.channel.coverage import single_scattering as module
 from invertwin.scene import Dielectric, PerfectConductor, RoughConductor, Scene, box, plate
 from scenes import float64, thing
@@ -29,7 +29,7 @@ def summed(scene: Scene = SCENE, depth: int = 2, rays: int | None = None) -> Ten
     for name in set(scene.names) - {"floor"}:
         rough = rough.replace(name, material=Dielectric(1.0))
     sampling = Sampling(depth, 96_000)
-    return trace_scattered(
+    return trace_single_scattering(
         scene, rough, TX, PLACES, 3e9, strength, 2, rays=rays, sampling=sampling, seed=4
     )
 
@@ -37,7 +37,7 @@ def summed(scene: Scene = SCENE, depth: int = 2, rays: int | None = None) -> Ten
 def test_chunks_of_points_add_up(monkeypatch):
     whole = summed()
     assert bool((whole > 0).all())
-    monkeypatch.setattr(module, "_AT_ONCE", 700)
+    monkeypatch.setattr(module, "_POINTS_AT_ONCE", 700)
     torch.testing.assert_close(summed(), whole, rtol=1e-12, atol=0)
 
 

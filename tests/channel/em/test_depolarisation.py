@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_power, trace_power
-from invertwin.channel.em.depolarisation import coupled_field, coupled_power
+from invertwin.channel.em.depolarisation import random_scattering_matrix, received_power_fraction
 from invertwin.errors import InputError
 from invertwin.scene import Dielectric, JonesTable, Object, Scene, linear_array, plate
 from invertwin.scene.polarisation import Polarisation
@@ -20,7 +20,7 @@ WHOLE = Grid(-4.0, 1.0, 16)
 
 
 def antennas(sent: Any, received: Any, *places: Any) -> Link:
-    jones = [Polarisation.of(value, 0.0, 1) for value in (sent, received)]
+    jones = [Polarisation.from_jones(value, 0.0, 1) for value in (sent, received)]
     found = link(*(places or (((0.0, 0.0, 0.0),),)))
     return replace(found, tx_jones=jones[0], rx_jones=jones[1])
 
@@ -40,9 +40,9 @@ def antennas(sent: Any, received: Any, *places: Any) -> Link:
 def test_a_mirror_turns_handedness_and_keeps_v_and_h(sent, received, once, twice):
     clean = torch.zeros(1, dtype=torch.float64)
     between = antennas(sent, received)
-    assert float(coupled_power(between, [clean])) == pytest.approx(once, abs=1e-12)
-    assert float(coupled_power(between, [clean] * 2)) == pytest.approx(twice, abs=1e-12)
-    assert float(coupled_power(between, [clean] * 3)) == pytest.approx(once, abs=1e-12)
+    assert float(received_power_fraction(between, [clean])) == pytest.approx(once, abs=1e-12)
+    assert float(received_power_fraction(between, [clean] * 2)) == pytest.approx(twice, abs=1e-12)
+    assert float(received_power_fraction(between, [clean] * 3)) == pytest.approx(once, abs=1e-12)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -51,13 +51,14 @@ def test_random_fields_have_the_power_that_is_stated(count):
     shares = [torch.full((40_000,), chi, dtype=torch.float64) for chi in (0.05, 0.2, 0.1)][:count]
     phase = 6.28 * torch.rand(40_000, generator=torch.Generator().manual_seed(1)).double()
     fields = (
-        coupled_field(shares, phase) * torch.polar(torch.ones_like(phase), phase)[:, None, None]
+        random_scattering_matrix(shares, phase)
+        * torch.polar(torch.ones_like(phase), phase)[:, None, None]
     )
     for sent, received in [("V", "V"), ("V", "H"), (SLANT, SLANT), (RIGHT, RIGHT), (RIGHT, LEFT),
                            ((0.6, 0.8j), SLANT)]:  # fmt: skip
         between = antennas(sent, received)
         seen = between.rx_jones.vectors[0] @ fields @ between.tx_jones.vectors[0]
-        stated = float(coupled_power(between, shares)[0])
+        stated = float(received_power_fraction(between, shares)[0])
         assert float(seen.abs().square().mean()) == pytest.approx(stated, abs=0.015)
         assert float(seen.mean().abs()) < 0.03
 

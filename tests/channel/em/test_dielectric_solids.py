@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 import invertwin as iw
-from invertwin.channel.beams.beam_tracing import beams, facets_of
-from invertwin.channel.em.dielectric_solids import interiors
+from invertwin.channel.beams.beam_tracing import build_facets, trace_beams
+from invertwin.channel.em.dielectric_solids import group_solids
 from invertwin.channel.em.plane_waves import area_vector, dot
 from invertwin.channel.rays.topology import topology_of
 from invertwin.channel.rcs import far_field as signature
-from invertwin.channel.rcs.dielectric_interfaces import at_surface
+from invertwin.channel.rcs.dielectric_interfaces import scatter_at_interfaces
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import (
@@ -189,33 +189,35 @@ def test_power_that_enters_a_clear_block_leaves_it(angle):
     scene = Scene({"block": Object(box((0.03, 0.03, 0.02)), RefractingBody(4.0))})
     item = scene.objects["block"]
     topology = topology_of([item.mesh])
-    facets = facets_of(item.vertices, topology)
+    facets = build_facets(item.vertices, topology)
     incident = float64([[math.sin(angle), 0.0, -math.cos(angle)]])
     k = 2 * math.pi / 0.01
-    skins = signature._skins(scene, topology, 30e9)
-    entered = interiors([skins], [k], facets.corners, facets.solid, topology.face_object, ["block"])
+    skins = signature._smooth_interfaces(scene, topology, 30e9)
+    entered = group_solids(
+        [skins], [k], facets.corners, facets.solid, topology.face_object, ["block"]
+    )
     solids = entered[0][0]
     assert solids is not None
     unit = torch.eye(3, dtype=torch.complex128)[1:2].repeat(2, 1)[None]  # E along y, twice
     again = passed = torch.zeros(0)
     came = out = 0.0
-    for number, bounce in enumerate(beams(facets, incident, 24, solids=solids)):
+    for number, bounce in enumerate(trace_beams(facets, incident, 24, solids=solids)):
         field = unit.expand(len(bounce.aspect), 2, 3)
         if number:
-            through = bounce.passed[:, None, None]
-            field = torch.where(through, passed[bounce.before], again[bounce.before])
-        met = at_surface(
+            through = bounce.transmitted[:, None, None]
+            field = torch.where(through, passed[bounce.parent], again[bounce.parent])
+        met = scatter_at_interfaces(
             solids, skins.rows(bounce.facet), k, bounce, field, incident[bounce.aspect]
         )
         area = area_vector(bounce.polygon).norm(dim=1)
-        flow = -dot(bounce.normal, bounce.wave.real) * area
+        flow = -dot(bounce.normal, bounce.wave_vector.real) * area
         if not number:
             came += float((flow * field[:, 0].abs().square().sum(1)).sum())
-            out += float((flow * met.mirrored[:, 0].abs().square().sum(1)).sum())
+            out += float((flow * met.reflected[:, 0].abs().square().sum(1)).sum())
         else:
-            rest = field[:, 0].abs().square().sum(1) - met.mirrored[:, 0].abs().square().sum(1)
+            rest = field[:, 0].abs().square().sum(1) - met.reflected[:, 0].abs().square().sum(1)
             out += float((flow * rest).sum())
-        again, passed = met.mirrored, met.passed
+        again, passed = met.reflected, met.transmitted
     if angle == 0.0:
         assert out == pytest.approx(came, rel=1e-9)
     else:
@@ -225,7 +227,7 @@ def test_power_that_enters_a_clear_block_leaves_it(angle):
 
 @pytest.mark.parametrize("few", [24, 0])
 def test_reciprocity(few, monkeypatch):
-    monkeypatch.setattr(signature, "FEW", few)
+    monkeypatch.setattr(signature, "MAX_FACETS_BEAM_TRACING", few)
     turn = rigid(rotation_from_vector(float64([0.4, 0.3, 0.2])), float64([0.0, 0.0, 0.03]))
     scene = Scene(
         {

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_batch, deposit_power
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.interior_silhouettes import InteriorEdgeSampler
-from invertwin.channel.power.silhouettes import EdgeSampler
+from invertwin.channel.power.interior_silhouettes import InteriorSilhouetteSampler
+from invertwin.channel.power.silhouettes import SilhouetteSampler
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.batching import stand_apart
+from invertwin.channel.rays.batching import arrange_scenes
 from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.errors import InputError
@@ -239,13 +239,13 @@ def test_scenes_far_and_near_get_as_many_boundary_samples():
     }
     both = flatten(Scene({**near.objects, **far}), around.wavelength)
     with tracing():
-        rays = RayScene(*stand_apart(both, around, torch.tensor([0, 0, 1, 1])))
-        inputs = Inputs.of(rays)
+        rays = RayScene(*arrange_scenes(both, around, torch.tensor([0, 0, 1, 1])))
+        inputs = Inputs.from_rays(rays)
         edges = rays.topology.edges
         scene = rays.topology.vertex_object[edges[:, 0]] // 2
         samplers = (
-            EdgeSampler(rays, inputs, ("tx", "rx"), 100, 1),
-            InteriorEdgeSampler(rays, inputs, 100, 1),
+            SilhouetteSampler(rays, inputs, ("tx", "rx"), 100, 1),
+            InteriorSilhouetteSampler(rays, inputs, 100, 1),
         )
         for sampler in samplers:
             weights = to_torch(sampler.choice.weights).reshape(-1, len(edges)).sum(0)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from invertwin.channel import Grid
-from invertwin.channel.power.bins import Bins, Contribution, Layout
+from invertwin.channel.power.bins import BinAccumulator, BinLayout, PathContribution
 from invertwin.channel.rays.backend import mi
 
 FRAMES, PATHS = 2, 50_000
@@ -22,7 +22,7 @@ GRIDS = {
 }
 
 
-def paths() -> tuple[Contribution, tuple, object]:
+def paths() -> tuple[PathContribution, tuple, object]:
     """Paths on the grids and beside them, their derivatives, and which of them exist."""
     draw = np.random.default_rng(1).uniform
 
@@ -30,7 +30,9 @@ def paths() -> tuple[Contribution, tuple, object]:
         return mi.Float(draw(low, high, PATHS).astype(np.float32))
 
     frame = mi.UInt32((np.arange(PATHS) % FRAMES).astype(np.uint32))
-    found = Contribution(frame, column(0, 1), column(1.7, 3.4), column(-0.8, 0.6), column(-1, 1))
+    found = PathContribution(
+        frame, column(0, 1), column(1.7, 3.4), column(-0.8, 0.6), column(-1, 1)
+    )
     dots = tuple(column(-1, 1) for _ in range(4))
     exists = column(0, 1) < 0.9  # pyright: ignore[reportOperatorIssue]
     return found, dots, exists
@@ -82,28 +84,28 @@ def spline(found, dots, exists, grid: Grid, derivative: bool) -> np.ndarray:
 @pytest.mark.parametrize("derivative", [False, True], ids=["value", "derivative"])
 def test_bins_hold_what_falls_on_them(name, derivative):
     found, dots, exists = paths()
-    bins = Bins(Layout(GRIDS[name], FRAMES))
+    bins = BinAccumulator(BinLayout(GRIDS[name], FRAMES))
     if derivative:
-        bins.add_derivative(found, dots, exists)
+        bins.add_tangent(found, dots, exists)
     else:
         bins.add(found, exists)
     dr.eval(bins.values)
     expected = torch.from_numpy(spline(found, dots, exists, GRIDS[name], derivative)).float()
-    assert bins.map().shape == expected.shape
+    assert bins.to_map().shape == expected.shape
     assert expected.abs().sum() > 100
     scale = float(expected.abs().max())
     # A path that falls halfway between two bins may be rounded to either, with equal weights.
-    assert torch.allclose(bins.map(), expected, rtol=1e-4, atol=1e-4 * scale)
+    assert torch.allclose(bins.to_map(), expected, rtol=1e-4, atol=1e-4 * scale)
 
 
 @pytest.mark.parametrize("derivative", [False, True], ids=["value", "derivative"])
 def test_ranges_count_from_the_origin_of_their_frame(derivative):
     found, dots, exists = paths()
     origin, frame = torch.tensor([1.5, 2.25]).double(), found.frame.numpy()
-    layout = Layout(replace(GRIDS["all"], range_start=0.0), FRAMES, origin)
-    bins = Bins(layout)
+    layout = BinLayout(replace(GRIDS["all"], range_start=0.0), FRAMES, origin)
+    bins = BinAccumulator(layout)
     if derivative:
-        bins.add_derivative(found, dots, exists)
+        bins.add_tangent(found, dots, exists)
     else:
         bins.add(found, exists)
     shown = mi.Float((found.range.numpy() - origin.numpy()[frame]).astype(np.float32))
@@ -111,7 +113,7 @@ def test_ranges_count_from_the_origin_of_their_frame(derivative):
     expected = torch.from_numpy(spline(moved, dots, exists, layout.grid, derivative)).float()
     assert expected[0].abs().sum() > 100
     scale = float(expected.abs().max())
-    assert torch.allclose(bins.map(), expected, rtol=1e-4, atol=1e-4 * scale)
+    assert torch.allclose(bins.to_map(), expected, rtol=1e-4, atol=1e-4 * scale)
 
 
 def test_sums_of_many_paths_are_rounded_little():
@@ -120,14 +122,14 @@ def test_sums_of_many_paths_are_rounded_little():
     frame = mi.UInt32(np.zeros(len(power), dtype=np.uint32))
     still = mi.Float(2.3)
     grid = Grid(2.0, 0.1, 7)
-    bins = Bins(Layout(grid, 1))
+    bins = BinAccumulator(BinLayout(grid, 1))
     bins.add(
-        Contribution(frame, mi.Float(power), still, mi.Float(0.0), mi.Float(0.0)), mi.Bool(True)
+        PathContribution(frame, mi.Float(power), still, mi.Float(0.0), mi.Float(0.0)), mi.Bool(True)
     )
     dr.eval(bins.values)
     exact = power.astype(np.float64).sum()
     assert (
-        abs(float(bins.map().double().sum()) / exact - 1) < 5e-5
+        abs(float(bins.to_map().double().sum()) / exact - 1) < 5e-5
     )  # one sum of float32 is off by percents
 
 
@@ -135,7 +137,7 @@ def test_many_amounts_in_few_bins_are_rounded_little():
     """A million equal amounts in one bin: one sum in single precision would be 0.01 off."""
     count = 1_000_000
     ones, zeros = dr.full(mi.Float, 0.1, count), dr.zeros(mi.Float, count)
-    out = Bins(Layout(GRIDS["nothing"], 1))
-    out.add(Contribution(dr.zeros(mi.UInt32, count), ones, ones, zeros, zeros), mi.Bool(True))
-    total = float(out.map().double().sum())
+    out = BinAccumulator(BinLayout(GRIDS["nothing"], 1))
+    out.add(PathContribution(dr.zeros(mi.UInt32, count), ones, ones, zeros, zeros), mi.Bool(True))
+    total = float(out.to_map().double().sum())
     assert total == pytest.approx(count * float(np.float32(0.1)), rel=2e-5)

@@ -21,7 +21,7 @@ from invertwin.scene import (
     Object,
     RoughDielectric,
     Scene,
-    Table,
+    TabulatedPattern,
     box,
     plate,
     rigid,
@@ -38,10 +38,10 @@ BOX = Grid(
 )
 
 
-def lopsided() -> Table:
+def lopsided() -> TabulatedPattern:
     """A pattern that depends on both angles."""
     theta, phi = torch.linspace(0, 2.0, 9).double(), torch.linspace(-3, 3, 7).double()
-    return Table(theta, phi, 2 + torch.cos(theta)[:, None] * torch.cos(phi - 0.4)[None])
+    return TabulatedPattern(theta, phi, 2 + torch.cos(theta)[:, None] * torch.cos(phi - 0.4)[None])
 
 
 def leaves(bistatic: bool) -> dict[str, Tensor]:
@@ -375,12 +375,12 @@ def test_a_call_leaves_nothing_to_the_garbage_collector(monkeypatch):
     """Records of paths are large; they go with the last reference to the map."""
     alive = []
 
-    class Seen(trace.Trace):
+    class Seen(trace.PowerTracer):
         def __init__(self, *given, **named):
             super().__init__(*given, **named)
             alive.append(weakref.ref(self))
 
-    monkeypatch.setattr("invertwin.channel.power.deposit.Trace", Seen)
+    monkeypatch.setattr("invertwin.channel.power.deposit.PowerTracer", Seen)
     shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     scene = Scene(
         {

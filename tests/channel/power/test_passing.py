@@ -59,7 +59,7 @@ def test_a_wall_behind_a_board_is_fainter_and_later(angle):
         for s in (bare, covered)
     ]
     ranges = [float((m * behind.ranges).sum() / m.sum()) for m in maps]
-    surface = board.surface(FREQUENCY)
+    surface = board.scattering_law(FREQUENCY)
     share = table(surface.transmittance, math.cos(angle))
     assert share < 0.9
     assert float(maps[1].sum() / maps[0].sum()) == pytest.approx(share**2, rel=0.01)

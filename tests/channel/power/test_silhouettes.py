@@ -9,7 +9,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from invertwin.channel import Grid, Sampling, deposit_power, use_backend
-from invertwin.channel.power.discrete import Proportional
+from invertwin.channel.power.discrete import DiscreteSampler
 from invertwin.channel.rays.backend import mi
 from invertwin.scene import Mesh, Object, Scene, plate, sphere
 from scenes import float64, link, noise, thing
@@ -35,7 +35,7 @@ def drawn(weights, count):
     """Entries, rests and probabilities of numbers spread evenly over [0, 1)."""
     spread = (np.arange(count, dtype=np.float32) + 0.5) / count
     with use_backend("cpu"):
-        return tuple(np.array(c) for c in Proportional(mi.Float(weights)).draw(mi.Float(spread)))
+        return tuple(np.array(c) for c in DiscreteSampler(mi.Float(weights)).draw(mi.Float(spread)))
 
 
 def test_entries_are_drawn_in_proportion():

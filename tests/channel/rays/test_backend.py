@@ -8,7 +8,14 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from invertwin.channel import Sampling, alone, backend, deposit_power, trace_field, use_backend
+from invertwin.channel import (
+    Sampling,
+    backend,
+    deposit_power,
+    trace_field,
+    tracer_lock,
+    use_backend,
+)
 from invertwin.errors import InputError
 from scenes import GRID, link, occluder
 
@@ -64,7 +71,7 @@ def test_threads_wait_for_rays_and_for_forward_derivatives():
         traced.set()
 
     worker = threading.Thread(target=trace)
-    with alone, forward_ad.dual_level():
+    with tracer_lock, forward_ad.dual_level():
         worker.start()
         assert not traced.wait(0.5)
         slope(1)  # the thread that holds the lock may trace

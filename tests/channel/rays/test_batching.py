@@ -2,7 +2,7 @@
 
 import torch
 
-from invertwin.channel.rays.batching import stand_apart
+from invertwin.channel.rays.batching import arrange_scenes
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Scene, box
 from scenes import WAVELENGTH, float64, link, thing
@@ -17,7 +17,7 @@ def apart(count: int, tx: object = ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))):
         objects[f"b{number}"] = thing(SMALL, (0, 0.2, 1 + 0.3 * number))
         owners += [number, number]
     given, around = flatten(Scene(objects), WAVELENGTH), link(tx)
-    return given, around, *stand_apart(given, around, torch.tensor(owners))
+    return given, around, *arrange_scenes(given, around, torch.tensor(owners))
 
 
 def test_every_scene_has_a_box_of_its_own_with_its_antennas():

@@ -7,7 +7,7 @@ from torch import Tensor
 from invertwin.channel import Grid, Sampling, deposit_power
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
-from invertwin.channel.rays.brute_force import MOST, Few
+from invertwin.channel.rays.brute_force import MAX_TESTS, BruteForceIntersector
 from invertwin.scene import Mesh, Scene, box, plate
 from scenes import link, relative, thing
 
@@ -50,16 +50,16 @@ def device(start: Tensor, way: Tensor) -> tuple[object, object]:
     )
 
 
-@pytest.mark.parametrize("count", [1, 12, MOST])
+@pytest.mark.parametrize("count", [1, 12, MAX_TESTS])
 def test_rays_meet_what_they_meet_in_float64(count):
     triangles, (start, way) = corners(count, 1), rays(2)
     faces = torch.arange(3 * count).reshape(-1, 3)
     truth, distance = met_first(triangles, start, way)
     with tracing("cpu"):
-        few = Few(triangles.reshape(-1, 3), faces)
+        few = BruteForceIntersector(triangles.reshape(-1, 3), faces)
         origin, direction = device(start, way)
-        valid, face, b1, b2, along = few.nearest(mi.Ray3f(origin, direction), mi.Bool(True))
-        blocked = few.blocked(mi.Ray3f(origin, direction, 1.0, 0.0, []), mi.Bool(True))
+        valid, face, b1, b2, along = few.find_nearest(mi.Ray3f(origin, direction), mi.Bool(True))
+        blocked = few.is_blocked(mi.Ray3f(origin, direction, 1.0, 0.0, []), mi.Bool(True))
         found = to_torch(dr.select(valid, mi.Int32(face), -1)).long()
         same = found == truth
         assert int((~same).sum()) <= 3  # at rims
@@ -92,10 +92,12 @@ def test_halves_of_a_parallelogram_are_told_apart():
     ):
         truth, _ = met_first(points[corners_of], start, way)
         with tracing("cpu"):
-            few = Few(points, corners_of)
-            assert few.tests == 6
+            few = BruteForceIntersector(points, corners_of)
+            assert few.test_count == 6
             origin, direction = device(start, way)
-            valid, face, b1, b2, along = few.nearest(mi.Ray3f(origin, direction), mi.Bool(True))
+            valid, face, b1, b2, along = few.find_nearest(
+                mi.Ray3f(origin, direction), mi.Bool(True)
+            )
             same = to_torch(dr.select(valid, mi.Int32(face), -1)).long() == truth
             assert int((~same).sum()) <= 3
             hit = same & (truth >= 0)
@@ -117,16 +119,20 @@ def test_only_parallelograms_are_one_test():
     bent[3, 2] += 1e-6
     wide[3, 0] -= 1e-6
     with tracing("cpu"):
-        assert Few(square, faces).tests == 1
-        assert Few(bent, faces).tests == Few(wide, faces).tests == 2
-        assert Few(square, torch.tensor([[0, 1, 2], [0, 3, 2]])).tests == 2
+        assert BruteForceIntersector(square, faces).test_count == 1
+        assert (
+            BruteForceIntersector(bent, faces).test_count
+            == BruteForceIntersector(wide, faces).test_count
+            == 2
+        )
+        assert BruteForceIntersector(square, torch.tensor([[0, 1, 2], [0, 3, 2]])).test_count == 2
         strip = plate(1.0, 1.0, divisions=5)
-        few = Few.of(strip.vertices, strip.faces)
+        few = BruteForceIntersector.build(strip.vertices, strip.faces)
         assert few is None  # 50 triangles, 25 squares
         strip = plate(1.0, 1.0, divisions=4)
-        few = Few.of(strip.vertices, strip.faces)
+        few = BruteForceIntersector.build(strip.vertices, strip.faces)
         assert few is not None
-        assert few.tests >= 16
+        assert few.test_count >= 16
 
 
 def test_inactive_rays_and_triangles_without_area_meet_nothing():
@@ -139,10 +145,10 @@ def test_inactive_rays_and_triangles_without_area_meet_nothing():
             (whole, True, True),
             (whole, False, False),
         ):
-            few = Few(triangle, torch.tensor([[0, 1, 2]]))
-            valid = few.nearest(ray, mi.Bool(active))[0]
+            few = BruteForceIntersector(triangle, torch.tensor([[0, 1, 2]]))
+            valid = few.find_nearest(ray, mi.Bool(active))[0]
             assert bool(to_torch(valid)[0]) == met
-            assert bool(to_torch(few.blocked(ray, mi.Bool(active)))[0]) == met
+            assert bool(to_torch(few.is_blocked(ray, mi.Bool(active)))[0]) == met
 
 
 @pytest.mark.parametrize("divisions", [1, 3])
@@ -161,11 +167,13 @@ def test_maps_and_derivatives_are_those_of_the_tree(divisions, monkeypatch):
         return out.detach(), shift.grad
 
     asked = []
-    true = Few.of
-    monkeypatch.setattr(Few, "of", lambda *given: asked.append(true(*given)) or asked[-1])
+    true = BruteForceIntersector.build
+    monkeypatch.setattr(
+        BruteForceIntersector, "build", lambda *given: asked.append(true(*given)) or asked[-1]
+    )
     first = result()
     assert asked[-1] is not None
-    monkeypatch.setattr(Few, "of", lambda *_: None)
+    monkeypatch.setattr(BruteForceIntersector, "build", lambda *_: None)
     second = result()
     for one, other in zip(first, second, strict=True):
         assert relative(one, other) < 1e-3

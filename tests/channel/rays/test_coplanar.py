@@ -9,7 +9,7 @@ import torch
 
 from invertwin.channel.rays import coplanar
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.coplanar import warn_of_coplanar
+from invertwin.channel.rays.coplanar import warn_coplanar_surfaces
 from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.errors import PhysicsWarning
@@ -28,7 +28,7 @@ def told(*, antennas: Any = ((0.0, 1.0, 0.0),), moving: Any = "", **objects: Any
     with tracing(), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         rays = RayScene(flatten(Scene(objects), WAVELENGTH), link(tuple(map(tuple, antennas))))
-        warn_of_coplanar(rays)
+        warn_coplanar_surfaces(rays)
     one, other = list(objects)[:2]
     for warning in caught:
         assert warning.category is PhysicsWarning
@@ -87,13 +87,13 @@ def test_what_is_hidden_is_not_told():
 
 def test_only_what_has_moved_is_looked_at_again(monkeypatch):
     asked = []
-    true = coplanar._in_one_place  # pyright: ignore[reportPrivateUsage]
+    true = coplanar._find_visible_pairs  # pyright: ignore[reportPrivateUsage]
 
     def spy(rays, pairs):
         asked.append(pairs.sum().item())
         return true(rays, pairs)
 
-    monkeypatch.setattr(coplanar, "_in_one_place", spy)
+    monkeypatch.setattr(coplanar, "_find_visible_pairs", spy)
     items = {"floor": floor(), "rug": rug(0.0), "box": thing(box(0.2), (-1.0, 0.5, 2.0))}
     lifted = Object(items["rug"].mesh, METAL, rug(0.01).pose)
     moved = Object(items["box"].mesh, PAINT, rigid(translation=(-1.0, 0.6, 2.0)))

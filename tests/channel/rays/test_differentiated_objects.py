@@ -10,12 +10,12 @@ from torch import Tensor
 
 from invertwin.channel import Sampling, deposit_power
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.interior_silhouettes import InteriorEdgeSampler
-from invertwin.channel.power.silhouettes import EdgeSampler
+from invertwin.channel.power.interior_silhouettes import InteriorSilhouetteSampler
+from invertwin.channel.power.silhouettes import SilhouetteSampler
 from invertwin.channel.rays import ray_scene
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
-from invertwin.channel.rays.differentiated_objects import NO_PLACE
+from invertwin.channel.rays.differentiated_objects import NO_TARGET
 from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, rigid, sphere
@@ -49,7 +49,7 @@ def test_only_shadows_that_cannot_move_are_left_out(moved, depth, monkeypatch):
     """Whatever moves: also a wall on which things at rest cast shadows."""
     seeds = range(4)
     chosen = torch.stack([slope(moved, depth, seed) for seed in seeds])
-    monkeypatch.setattr(ray_scene, "Movers", lambda *_: None)
+    monkeypatch.setattr(ray_scene, "DifferentiatedObjects", lambda *_: None)
     every = torch.stack([slope(moved, depth, seed) for seed in seeds])
     gap = (chosen.mean(0) - every.mean(0)).abs().sum() / every.mean(0).abs().sum()
     assert float(gap) < 0.02
@@ -59,9 +59,9 @@ def drawn(scene: Scene, samples: int = 4000) -> tuple[Tensor, Tensor]:
     """Per boundary sample, the object of its edge and of the triangle in its shadow."""
     with tracing():
         geometry = flatten(scene, WAVELENGTH)
-        rays = RayScene(geometry, link(), antennas_move=False)
-        sampler = EdgeSampler(rays, Inputs.of(rays), ("tx",), samples, 1)
-        points = sampler.draw(dr.arange(mi.UInt32, samples)).kept()
+        rays = RayScene(geometry, link(), differentiate_antennas=False)
+        sampler = SilhouetteSampler(rays, Inputs.from_rays(rays), ("tx",), samples, 1)
+        points = sampler.draw(dr.arange(mi.UInt32, samples)).compress()
         first, face = to_torch(mi.Int32(points.first)), to_torch(mi.Int32(points.face))
         owner = geometry.topology.vertex_object
         return owner[first.long()], geometry.face_object[face.long()]
@@ -107,7 +107,7 @@ def reach(offset: Callable[[float], list[float]]) -> list[bool]:
         ball = Object(sphere(0.1, 2), RoughDielectric(4.0), rigid(translation=place))
         scene = Scene({"edge": thing(plate(0.5, 0.5), (0.25, 0.0, 1.0)), "ball": ball})
         with tracing():
-            rays = RayScene(flatten(scene, WAVELENGTH), link(), antennas_move=False)
+            rays = RayScene(flatten(scene, WAVELENGTH), link(), differentiate_antennas=False)
             assert rays.differentiated_objects is not None
             edge = dr.arange(mi.UInt32, 5)  # those of the plate
             y0, y1 = rays.exact_ends(edge)
@@ -132,12 +132,12 @@ def test_a_ball_is_asked_for_where_a_shadow_may_reach_it():
 def test_antennas_that_move_move_all_shadows(moves, monkeypatch):
     asked = []
 
-    class Seen(ray_scene.Movers):
+    class Seen(ray_scene.DifferentiatedObjects):
         def __init__(self, *given):
             super().__init__(*given)
             asked.append(self)
 
-    monkeypatch.setattr(ray_scene, "Movers", Seen)
+    monkeypatch.setattr(ray_scene, "DifferentiatedObjects", Seen)
     item = OBJECTS["screen"]
     vertices = item.mesh.vertices.clone().requires_grad_()
     scene = Scene(OBJECTS).replace("screen", mesh=Mesh(vertices, item.mesh.faces))
@@ -152,7 +152,9 @@ def test_a_scene_of_which_nothing_or_all_moves_asks_nobody():
     still = flatten(Scene(OBJECTS), WAVELENGTH)
     with tracing():
         for flags in ((False,) * 4, (True,) * 4):
-            rays = RayScene(replace(still, moving=flags), link(), antennas_move=False)
+            rays = RayScene(
+                replace(still, differentiated=flags), link(), differentiate_antennas=False
+            )
             assert rays.differentiated_objects is None
 
 
@@ -168,15 +170,17 @@ def test_lines_towards_what_moves_are_as_likely_as_said(at):
     }
     scene = Scene({"wall": thing(plate(4.0, 4.0), (0.0, 0.0, 3.0)), **balls})
     with tracing():
-        movers = RayScene(flatten(scene, WAVELENGTH), link(), antennas_move=False).movers
+        movers = RayScene(
+            flatten(scene, WAVELENGTH), link(), differentiate_antennas=False
+        ).differentiated_objects
         assert movers is not None
         sampler = mi.PCG32(count)
         place = mi.Point3f(*at)
         every = mi.warp.square_to_uniform_sphere(
             mi.Point2f(sampler.next_float32(), sampler.next_float32())
         )
-        evenly = to_torch(movers.line_density(place, mi.Vector3f(every), NO_PLACE)).double()
-        drawn, ball = movers.towards(place, [sampler.next_float32() for _ in range(3)])
+        evenly = to_torch(movers.line_density(place, mi.Vector3f(every), NO_TARGET)).double()
+        drawn, ball = movers.sample_direction(place, [sampler.next_float32() for _ in range(3)])
         aimed = to_torch(movers.line_density(place, drawn, ball)).double()
     sphere_area = 4 * torch.pi
     assert float(evenly.mean()) * sphere_area == pytest.approx(1.0, rel=0.02)
@@ -202,14 +206,16 @@ def test_shadows_of_things_at_rest_on_what_moves_are_found_more_often(monkeypatc
         )
         with tracing():
             geometry = flatten(scene, WAVELENGTH)
-            rays = RayScene(geometry, link(), antennas_move=False)
-            sampler = InteriorEdgeSampler(rays, Inputs.of(rays), 100_000, 1)
-            points = sampler.draw(dr.arange(mi.UInt32, sampler.size)).kept().edge
+            rays = RayScene(geometry, link(), differentiate_antennas=False)
+            sampler = InteriorSilhouetteSampler(rays, Inputs.from_rays(rays), 100_000, 1)
+            points = sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress().edge
             owner = geometry.topology.vertex_object[to_torch(mi.Int32(points.first)).long()]
             return int((owner != 2).sum())
 
     aimed = kept()
-    monkeypatch.setattr(InteriorEdgeSampler, "_aimed", lambda *given: given[-2:])
+    monkeypatch.setattr(
+        InteriorSilhouetteSampler, "_aim_at_differentiated", lambda *given: given[-2:]
+    )
     assert aimed > 3 * kept() > 0
 
 
@@ -219,10 +225,12 @@ def test_directions_to_something_small_and_far_are_as_likely_as_said():
     ball = Object(sphere(0.05, 2), RoughDielectric(4.0), rigid(translation=place))
     scene = Scene({"wall": thing(plate(4.0, 4.0), (0.0, 0.0, 3.0)), "ball": ball})
     with tracing():
-        movers = RayScene(flatten(scene, WAVELENGTH), link(), antennas_move=False).movers
+        movers = RayScene(
+            flatten(scene, WAVELENGTH), link(), differentiate_antennas=False
+        ).differentiated_objects
         assert movers is not None
         sampler, at = mi.PCG32(10_000), mi.Point3f(0.0)
-        drawn, aimed = movers.towards(at, [sampler.next_float32() for _ in range(3)])
+        drawn, aimed = movers.sample_direction(at, [sampler.next_float32() for _ in range(3)])
         density = to_torch(movers.line_density(at, drawn, aimed)).double()
     area = torch.pi * (0.05 / 200) ** 2
     assert float((density * 2 * area - 1).abs().max()) < 0.01

@@ -5,7 +5,11 @@ import math
 import pytest
 import torch
 
-from invertwin.channel.rays.intersections import Contacts, contacts_of, may_meet
+from invertwin.channel.rays.intersections import (
+    IntersectionCurves,
+    find_intersection_curves,
+    find_possible_intersections,
+)
 from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Mesh, Object, Scene, box, plate, rigid, sphere
@@ -14,7 +18,7 @@ from scenes import WAVELENGTH, link, thing
 FLOOR = thing(plate(4.0, 4.0), turn=(math.pi / 2, 0, 0))
 
 
-def met(still: Object, moving: Object, *, deforming: bool = False) -> Contacts | None:
+def met(still: Object, moving: Object, *, deforming: bool = False) -> IntersectionCurves | None:
     """Where two objects meet, one of which moves (or only it, if its shape changes)."""
     if deforming:
         vertices = moving.mesh.vertices.clone().requires_grad_()
@@ -22,11 +26,11 @@ def met(still: Object, moving: Object, *, deforming: bool = False) -> Contacts |
     else:
         pose = moving.transform.clone().requires_grad_()
         objects = {"still": still, "moving": Object(moving.mesh, moving.material, pose)}
-    return contacts_of(RayScene(flatten(Scene(objects), WAVELENGTH), link()))
+    return find_intersection_curves(RayScene(flatten(Scene(objects), WAVELENGTH), link()))
 
 
-def length(found: Contacts, touching: bool = False) -> float:
-    chosen = found.chosen(found.touching == touching)
+def length(found: IntersectionCurves, touching: bool = False) -> float:
+    chosen = found.select(found.touching == touching)
     return float((chosen.end - chosen.start).norm(dim=1).sum())
 
 
@@ -52,7 +56,7 @@ def test_a_box_sunk_into_the_floor_meets_it_around_itself(depth):
 def test_a_box_that_stands_on_the_floor_touches_it(up):
     found = met(FLOOR, thing(box([0.5, 0.4, 0.3], 2), (0, 0.2 * up, 0), (0, 0.5, 0)))
     assert found is not None
-    assert found.close
+    assert found.has_close_surfaces
     assert found.touching.all()
     assert len(found.first) > 0
 
@@ -60,7 +64,7 @@ def test_a_box_that_stands_on_the_floor_touches_it(up):
 def test_a_box_above_the_floor_meets_nothing():
     found = met(FLOOR, thing(box([0.5, 0.4, 0.3], 2), (0, 0.2 + 1e-8, 0), (0, 0.5, 0)))
     assert found is not None
-    assert found.close
+    assert found.has_close_surfaces
     assert len(found.first) == 0
     assert met(FLOOR, thing(box([0.5, 0.4, 0.3]), (0, 0.21, 0))) is None
 
@@ -88,7 +92,7 @@ def test_a_mesh_meets_itself_only_where_its_shape_changes():
 
 def test_nothing_is_looked_for_where_nothing_moves():
     balls = Scene({name: thing(sphere(0.25, 2), (x, 0, 1.5)) for name, x in (("a", 0), ("b", 0.1))})
-    assert contacts_of(RayScene(flatten(balls, WAVELENGTH), link())) is None
+    assert find_intersection_curves(RayScene(flatten(balls, WAVELENGTH), link())) is None
 
 
 def test_boxes_that_overlap_are_found_with_what_they_share():
@@ -101,7 +105,7 @@ def test_boxes_that_overlap_are_found_with_what_they_share():
         for k, place in enumerate(places.clone())
     }
     geometry = flatten(Scene(objects), WAVELENGTH)
-    pairs, low, high = may_meet(geometry)
+    pairs, low, high = find_possible_intersections(geometry)
     for i in range(30):
         shared = [
             (torch.maximum(places[i], places[j]) - 0.1, torch.minimum(places[i], places[j]) + 0.1)

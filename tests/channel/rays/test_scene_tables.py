@@ -36,7 +36,7 @@ def test_objects_of_one_material_share_its_row_and_values_per_triangle_have_rows
     assert len(found.surfaces.diffuse) == 1 + 12 + 1
     for number, item in enumerate(scene.objects.values()):
         rows = found.face_surface[found.face_object == number]
-        own = item.material.surface(299_792_458.0 / 4e-3)
+        own = item.material.scattering_law(299_792_458.0 / 4e-3)
         assert torch.equal(found.surfaces.exponents[rows], own.exponents.expand(len(rows), 3))
 
 
@@ -49,7 +49,7 @@ def test_a_shared_material_gets_the_derivatives_of_all_its_objects():
     found.surfaces.exponents[found.face_surface].sum().backward()
     both = slope.grad
     slope.grad = None
-    shiny.surface(299_792_458.0 / 4e-3).exponents.sum().backward()
+    shiny.scattering_law(299_792_458.0 / 4e-3).exponents.sum().backward()
     assert slope.grad is not None
     assert both is not None
     assert float(both) == pytest.approx(24 * float(slope.grad))
@@ -70,5 +70,5 @@ def test_what_moves_is_said_of_each_object():
         ),
         4e-3,
     )
-    assert found.moving == (False, True, True, False)
-    assert found.deforming == (False, False, True, False)
+    assert found.differentiated == (False, True, True, False)
+    assert found.shape_differentiated == (False, False, True, False)

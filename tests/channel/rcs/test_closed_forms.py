@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from invertwin.capture import load_section
+from invertwin.capture import load_rcs
 from invertwin.channel import (
     DihedralByMoments,
     DihedralSection,
@@ -15,7 +15,7 @@ from invertwin.channel import (
     SquareTrihedralSection,
     TrihedralSection,
 )
-from invertwin.channel.rcs.closed_forms import strip_across, strip_along
+from invertwin.channel.rcs.closed_forms import strip_section_te, strip_section_tm
 from invertwin.constants import SPEED_OF_LIGHT
 from scenes import float64
 
@@ -84,12 +84,12 @@ def test_a_sphere_of_high_loss_is_one_of_metal():
 @pytest.mark.parametrize(("name", "radius"), [("s2", 0.3), ("s7", 9.6)])
 def test_spheres_are_those_of_the_published_table(data_folder, name, radius):
     for band in ("f1", "f6"):
-        data = load_section(data_folder / "austin_rcs" / "IA" / f"ref_rcs.I.A.{name}.{band}.V.txt")
+        data = load_rcs(data_folder / "austin_rcs" / "IA" / f"ref_rcs.I.A.{name}.{band}.V.txt")
         found = SphereSection(radius).section(data.frequency[:1], AHEAD)
         assert 10 * math.log10(float(found)) == pytest.approx(float(data.dbsm[0]), abs=1e-5)
 
 
-@pytest.mark.parametrize("solve", [strip_along, strip_across])
+@pytest.mark.parametrize("solve", [strip_section_tm, strip_section_te])
 def test_a_wide_strip_has_the_flash_of_physical_optics(solve):
     line = np.linspace(-0.5, 0.5, 241)[:, None] * [10 * WAVELENGTH, 0.0]
     k = 2 * math.pi / WAVELENGTH

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from invertwin.channel.beams.beam_tracing import Bounce
-from invertwin.channel.em.dielectric_solids import Solids, normal_part, refracted
-from invertwin.channel.em.plane_waves import Skins, dot, mirrored, reflected
-from invertwin.channel.rcs.dielectric_interfaces import at_surface, passage
+from invertwin.channel.beams.beam_tracing import IlluminatedPatches
+from invertwin.channel.em.dielectric_solids import DielectricSolids, normal_component, refract_waves
+from invertwin.channel.em.plane_waves import SmoothInterfaces, dot, reflect_field, reflect_vectors
+from invertwin.channel.rcs.dielectric_interfaces import apply_fresnel, scatter_at_interfaces
 from invertwin.scene.material.fresnel import fresnel_coefficients
 from scenes import complex128, float64
 
@@ -19,8 +19,10 @@ EPSILON = complex128([2.5 - 0.1j])
 AIR = complex128([1.0])
 LOSSLESS = complex128([2.5])
 YES, NO = torch.tensor([True]), torch.tensor([False])
-BLOCK = Solids(torch.tensor([0]), YES, NO, LOSSLESS, K, ["block"])
-BODY = Skins(torch.tensor([False]), EPSILON, float64([torch.inf]), float64([1.0]), float64([0.0]))
+BLOCK = DielectricSolids(torch.tensor([0]), YES, NO, LOSSLESS, K, ["block"])
+BODY = SmoothInterfaces(
+    torch.tensor([False]), EPSILON, float64([torch.inf]), float64([1.0]), float64([0.0])
+)
 
 
 def wave(epsilon: Tensor, angle: float) -> tuple[Tensor, Tensor]:
@@ -34,12 +36,12 @@ def wave(epsilon: Tensor, angle: float) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("angle", [0.0, 0.4, 1.2])
 def test_from_air_it_is_the_law_of_half_spaces(angle):
     k, field = wave(AIR, angle)
-    found = passage(AIR, EPSILON, UPWARDS, k, field)
-    expected = reflected(BODY, K, UPWARDS, k.real, field)
-    assert torch.allclose(found.mirrored, expected, atol=1e-12)
+    found = apply_fresnel(AIR, EPSILON, UPWARDS, k, field)
+    expected = reflect_field(BODY, K, UPWARDS, k.real, field)
+    assert torch.allclose(found.reflected, expected, atol=1e-12)
     law = fresnel_coefficients(EPSILON, float64([math.cos(angle)]))
-    assert abs(complex(found.passed[0, 0, 1] - law.transmission_s)) < 1e-12
-    length = dot(found.passed[0, 1], found.passed[0, 1])  # E·E, without conjugation
+    assert abs(complex(found.transmitted[0, 0, 1] - law.transmission_s)) < 1e-12
+    length = dot(found.transmitted[0, 1], found.transmitted[0, 1])  # E·E, without conjugation
     assert abs(complex(length.sqrt() - law.transmission_p)) < 1e-12
 
 
@@ -47,15 +49,15 @@ def test_from_air_it_is_the_law_of_half_spaces(angle):
 def test_from_within_stokes_relations_hold(angle):
     """r′ = −r and t t′ = 1 − r² of each polarisation (Stokes)."""
     k, field = wave(AIR, angle)
-    there = passage(AIR, EPSILON, UPWARDS, k, field)
-    inner, _ = refracted(EPSILON, k, UPWARDS)
-    onwards = passage(EPSILON, AIR, UPWARDS, inner, there.passed)
-    r = [complex(dot(m, m).sqrt()) for m in there.mirrored[0]]
+    there = apply_fresnel(AIR, EPSILON, UPWARDS, k, field)
+    inner, _ = refract_waves(EPSILON, k, UPWARDS)
+    onwards = apply_fresnel(EPSILON, AIR, UPWARDS, inner, there.transmitted)
+    r = [complex(dot(m, m).sqrt()) for m in there.reflected[0]]
     for number in (0, 1):
-        rest = onwards.passed[0, number] - (1 - r[number] ** 2) * field[0, number]
+        rest = onwards.transmitted[0, number] - (1 - r[number] ** 2) * field[0, number]
         assert float(rest.abs().max()) < 1e-12
-    back = complex(onwards.mirrored[0, 0, 1] / there.passed[0, 0, 1])
-    assert abs(back + complex(there.mirrored[0, 0, 1])) < 1e-12
+    back = complex(onwards.reflected[0, 0, 1] / there.transmitted[0, 0, 1])
+    assert abs(back + complex(there.reflected[0, 0, 1])) < 1e-12
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.5, 0.68])
@@ -64,9 +66,9 @@ def test_what_goes_in_comes_out(angle, outwards):
     """Σ Re(K_n) |E|² of both waves that leave is that of the one that comes (no loss)."""
     media = (LOSSLESS, AIR) if outwards else (AIR, LOSSLESS)
     k, field = wave(media[0], angle)
-    found = passage(*media, UPWARDS, k, field)
-    p, q = normal_part(media[0], k, UPWARDS).real, normal_part(media[1], k, UPWARDS).real
-    power = p * found.mirrored.abs().square().sum(2) + q * found.passed.abs().square().sum(2)
+    found = apply_fresnel(*media, UPWARDS, k, field)
+    p, q = normal_component(media[0], k, UPWARDS).real, normal_component(media[1], k, UPWARDS).real
+    power = p * found.reflected.abs().square().sum(2) + q * found.transmitted.abs().square().sum(2)
     beyond = outwards and math.sin(angle) > 1 / math.sqrt(2.5)
     assert (float(q) == 0.0) == beyond
     assert torch.allclose(power, p * torch.ones_like(power), rtol=1e-12)
@@ -76,33 +78,35 @@ def test_total_reflection_turns_the_phases_as_textbooks_say():
     """tan(δ_s/2) = √(sin² − 1/ε)/cos, with r = exp(jδ) for exp(+jωt)."""
     angle = 0.9
     k, field = wave(LOSSLESS, angle)
-    found = passage(LOSSLESS, AIR, UPWARDS, k, field)
+    found = apply_fresnel(LOSSLESS, AIR, UPWARDS, k, field)
     turn = 2 * math.atan(math.sqrt(math.sin(angle) ** 2 - 1 / 2.5) / math.cos(angle))
-    assert complex(found.mirrored[0, 0, 1]) == pytest.approx(
+    assert complex(found.reflected[0, 0, 1]) == pytest.approx(
         complex(math.cos(turn), math.sin(turn)), abs=1e-12
     )
-    decays = normal_part(AIR, k, UPWARDS)
+    decays = normal_component(AIR, k, UPWARDS)
     assert float(decays.imag) < 0
-    assert not bool(refracted(AIR, k, UPWARDS)[1])
+    assert not bool(refract_waves(AIR, k, UPWARDS)[1])
 
 
-def inner_bounce(k: Tensor) -> Bounce:
+def inner_bounce(k: Tensor) -> IlluminatedPatches:
     """A patch of a solid's face that is met from within: the normal is that of the inner side."""
     number, plain = torch.tensor([0]), complex128([1.0])
     place = torch.zeros(1, 3, 3, dtype=torch.float64)
     d = torch.nn.functional.normalize(k.real, dim=1)
-    return Bounce(number, number, UPWARDS, d, plain, place, number, k, number, number >= 0, plain)
+    return IlluminatedPatches(
+        number, number, UPWARDS, d, plain, place, number, k, number, number >= 0, plain
+    )
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, 0.6])
 def test_the_outer_side_sends_what_passes(angle):
     """(jk/2π) cosθ′ E′ per m² in the refracted direction: a patch of an endless plane."""
     k, field = wave(LOSSLESS, angle)
-    onwards, _ = refracted(AIR, k, UPWARDS)
-    met = at_surface(BLOCK, BODY, K, inner_bounce(k), field, onwards.real)
+    onwards, _ = refract_waves(AIR, k, UPWARDS)
+    met = scatter_at_interfaces(BLOCK, BODY, K, inner_bounce(k), field, onwards.real)
     cosine = -float(onwards[0, 2].real)
-    expected = 1j * K / (2 * math.pi) * cosine * met.passed
-    assert torch.allclose(met.sent, expected, atol=1e-9 * K)
+    expected = 1j * K / (2 * math.pi) * cosine * met.transmitted
+    assert torch.allclose(met.radiated, expected, atol=1e-9 * K)
 
 
 def test_roughness_takes_less_from_what_passes_than_from_what_is_mirrored_inside():
@@ -110,7 +114,7 @@ def test_roughness_takes_less_from_what_passes_than_from_what_is_mirrored_inside
     k, field = wave(LOSSLESS, 0.3)
     height = 4e-4
     smooth, rough = (
-        at_surface(
+        scatter_at_interfaces(
             BLOCK, BODY._replace(rms_height=float64([h])), K, inner_bounce(k), field, UPWARDS
         )
         for h in (0.0, height)
@@ -121,16 +125,16 @@ def test_roughness_takes_less_from_what_passes_than_from_what_is_mirrored_inside
         math.exp(-0.5 * (K * height * (p - q)) ** 2),
         math.exp(-0.5 * (K * height * 2 * p) ** 2),
     )
-    assert torch.allclose(rough.passed, smooth.passed * passed)
-    assert torch.allclose(rough.mirrored, smooth.mirrored * kept)
+    assert torch.allclose(rough.transmitted, smooth.transmitted * passed)
+    assert torch.allclose(rough.reflected, smooth.reflected * kept)
 
 
 def test_a_conductor_inside_mirrors_and_sends_nothing():
     k, field = wave(EPSILON, 0.4)
-    metal = Solids(torch.tensor([1]), NO, YES, EPSILON.repeat(2), K, ["block", "plate"])
-    met = at_surface(metal, BODY, K, inner_bounce(k), field, UPWARDS)
-    assert float(met.sent.abs().max()) == 0
-    total = met.mirrored + field
+    metal = DielectricSolids(torch.tensor([1]), NO, YES, EPSILON.repeat(2), K, ["block", "plate"])
+    met = scatter_at_interfaces(metal, BODY, K, inner_bounce(k), field, UPWARDS)
+    assert float(met.radiated.abs().max()) == 0
+    total = met.reflected + field
     assert float(torch.linalg.cross(total, UPWARDS[:, None].to(total.dtype)).abs().max()) < 1e-12
-    onwards = mirrored(k, UPWARDS)
-    assert float(dot(onwards[:, None], met.mirrored).abs().max()) < 1e-12
+    onwards = reflect_vectors(k, UPWARDS)
+    assert float(dot(onwards[:, None], met.reflected).abs().max()) < 1e-12

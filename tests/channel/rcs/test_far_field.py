@@ -10,22 +10,22 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel import SphereSection, trace_signature
+from invertwin.channel import SphereSection, trace_far_field
 from invertwin.channel.beams.beam_tracing import clip
 from invertwin.channel.em.plane_waves import (
-    Skins,
+    SmoothInterfaces,
     area_vector,
     dot,
-    mirrored,
     polarisations,
     polygon_integral,
-    radiated,
-    reflected,
+    radiate_field,
+    reflect_field,
+    reflect_vectors,
 )
-from invertwin.channel.em.wedges import Wedges, find_wedges, fringe_field, run_on
+from invertwin.channel.em.wedges import Wedges, find_wedges, fringe_field, select_body_edges
 from invertwin.channel.rays.topology import topology_of
 from invertwin.channel.rcs import far_field as signature
-from invertwin.channel.rcs.closed_forms import strip_across, strip_along
+from invertwin.channel.rcs.closed_forms import strip_section_te, strip_section_tm
 from invertwin.channel.rcs.moments import efie_solver as meshed
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
@@ -60,7 +60,7 @@ UP = float64([0.0, 1.0, 0.0])
 @pytest.fixture(autouse=True)
 def bounces_and_edges_alone(monkeypatch):
     """What is solved instead where targets are small has tests of its own."""
-    monkeypatch.setattr(meshed, "MOST_SIDES", 0)
+    monkeypatch.setattr(meshed, "MAX_UNKNOWNS", 0)
 
 
 def traced(scene: Scene, directions: object, receivers: Tensor | None = None, **options) -> dict:
@@ -73,7 +73,7 @@ def traced(scene: Scene, directions: object, receivers: Tensor | None = None, **
     } | options
     frequencies = float64([given.pop("frequency", FREQUENCY)])
     toward = normalize(torch.as_tensor(directions, dtype=torch.float64), dim=1)
-    found = trace_signature(scene, toward, receivers, frequencies, **given)
+    found = trace_far_field(scene, toward, receivers, frequencies, **given)
     return {name: part[0] for name, part in found.items()}
 
 
@@ -155,7 +155,7 @@ def test_clipping_keeps_what_is_in_front():
 # The laws at a surface.
 
 
-def skins(**values: object) -> Skins:
+def skins(**values: object) -> SmoothInterfaces:
     given = {
         "conducting": False,
         "permittivity": 1 + 0j,
@@ -165,7 +165,7 @@ def skins(**values: object) -> Skins:
     } | values
     kinds = [torch.bool, torch.complex128, *[torch.float64] * 3]
     columns = zip(given.values(), kinds, strict=True)
-    return Skins(*(torch.tensor([value], dtype=kind) for value, kind in columns))
+    return SmoothInterfaces(*(torch.tensor([value], dtype=kind) for value, kind in columns))
 
 
 def incident(angle: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -185,9 +185,9 @@ def test_what_a_surface_sends_to_its_mirror_direction_is_its_reflection(kind, an
         "body": skins(permittivity=4 - 0.5j),
         "sheet": skins(permittivity=3 - 0.1j, thickness=2.3e-3),
     }[kind]
-    onwards = mirrored(direction, normal)
-    sent = radiated(own, K, normal, direction, field, onwards)
-    back = reflected(own, K, normal, direction, field)
+    onwards = reflect_vectors(direction, normal)
+    sent = radiate_field(own, K, normal, direction, field, onwards)
+    back = reflect_field(own, K, normal, direction, field)
     expected = 1j * K / (2 * math.pi) * math.cos(angle) * back
     assert torch.allclose(sent, expected, atol=1e-9 * K)
 
@@ -205,7 +205,7 @@ def test_reflection_coefficients_are_those_of_the_materials(angle):
         (skins(permittivity=4 - 0.5j), half, 1.0),
         (skins(permittivity=epsilon, thickness=2.3e-3), sheet, front),
     ):
-        back = reflected(own, K, normal, direction, field)
+        back = reflect_field(own, K, normal, direction, field)
         assert abs(complex(back[0, 0, 1]) - complex(found.reflection_s) * turn) < 1e-9
         # A conductor has r_p = 1, which turns the part along the surface over.
         after = float64([-math.cos(angle), 0, math.sin(angle)])
@@ -220,7 +220,7 @@ def test_a_sheet_takes_from_the_wave_behind_it_what_does_not_pass():
     passed = slab_coefficients([layer.sheet(FREQUENCY)], float64([math.cos(angle)]), FREQUENCY)
     epsilon = complex(layer.complex_permittivity(FREQUENCY))
     own = skins(permittivity=epsilon, thickness=thickness)
-    sent = radiated(own, K, normal, direction, field, direction)
+    sent = radiate_field(own, K, normal, direction, field, direction)
     through = np.exp(1j * K * math.cos(angle) * thickness)
     for number, t in enumerate((passed.transmission_s, passed.transmission_p)):
         lost = complex(t) * through - 1
@@ -233,14 +233,14 @@ def test_a_thin_sheet_of_high_permittivity_reflects_like_its_impedance():
     normal, direction, field = incident(0.6)
     load, thickness = 0.8j, 1e-9
     own = skins(permittivity=1 + load / (0.5j * K * thickness), thickness=thickness)
-    back = reflected(own, K, normal, direction, field)
+    back = reflect_field(own, K, normal, direction, field)
     assert abs(complex(back[0, 0, 1]) + load / (math.cos(0.6) + load)) < 1e-4
 
 
 def test_roughness_takes_its_share_of_the_coherent_power():
     normal, direction, field = incident(0.5)
     own = skins(conducting=True, rms_height=5e-4, coherent=0.8)
-    power = reflected(own, K, normal, direction, field).abs().square().sum(2) / 0.64
+    power = reflect_field(own, K, normal, direction, field).abs().square().sum(2) / 0.64
     expected = math.exp(-((2 * K * 5e-4 * math.cos(0.5)) ** 2))
     assert torch.allclose(power, torch.full_like(power, expected))
 
@@ -251,8 +251,8 @@ def test_roughness_leaves_the_shadow_and_takes_from_the_flash(kind):
     own = {"conducting": True} if kind == "metal" else {"permittivity": 3, "thickness": 2e-3}
     smooth, rough = skins(**own), skins(**own, rms_height=5e-4)
     lost = math.exp(-0.5 * (2 * K * 5e-4 * math.cos(0.5)) ** 2)
-    for towards, expected in ((direction, 1.0), (mirrored(direction, normal), lost)):
-        sent = [radiated(s, K, normal, direction, field, towards) for s in (smooth, rough)]
+    for towards, expected in ((direction, 1.0), (reflect_vectors(direction, normal), lost)):
+        sent = [radiate_field(s, K, normal, direction, field, towards) for s in (smooth, rough)]
         assert torch.allclose(sent[1], sent[0] * expected)
 
 
@@ -306,7 +306,7 @@ def test_edges_bring_a_plate_to_the_method_of_moments(channel):
     angles = torch.deg2rad(torch.linspace(20, 60, 41, dtype=torch.float64))
     directions = torch.stack([angles.sin(), torch.zeros_like(angles), -angles.cos()], 1)
     line = np.linspace(-0.5, 0.5, 97)[:, None] * [width, 0.0]
-    solve = (strip_along, strip_across)[channel]
+    solve = (strip_section_tm, strip_section_te)[channel]
     exact = torch.from_numpy(solve(line, K, directions[:, [0, 2]].numpy()))
     exact = 10 * torch.log10(2 * height**2 / WAVELENGTH * exact)
     parts = traced(metal(plate(width, height)), directions, depth=1, edges=2)
@@ -332,8 +332,8 @@ def edges_of(mesh: Mesh) -> tuple[int, int]:
     """How many sharp edges a mesh has, and how many of them are edges of the body."""
     shape = topology_of([mesh])
     corners = mesh.vertices[shape.faces]
-    wedges = find_wedges(corners, mesh.vertices[shape.edges], shape.beside)
-    return len(wedges.start), int(run_on(wedges, 2 * WAVELENGTH).sum())
+    wedges = find_wedges(corners, mesh.vertices[shape.edges], shape.edge_faces)
+    return len(wedges.start), int(select_body_edges(wedges, 2 * WAVELENGTH).sum())
 
 
 def spindle(length: float, radius: float, step: float, base: bool) -> Mesh:
@@ -421,7 +421,7 @@ def test_tubes_agree_with_beams(kind, monkeypatch):
     """One meaning, two ways, in shadows and with separate antennas."""
     sent, received = random_directions(8, 1), random_directions(8, 2)
     exact = traced(crowd(kind), sent, received)
-    monkeypatch.setattr(signature, "FEW", 0)
+    monkeypatch.setattr(signature, "MAX_FACETS_BEAM_TRACING", 0)
     found = traced(crowd(kind), sent, received, tubes_per_wavelength=8.0)
     # At random angles the fields of later orders are sidelobes, small beside what cancels.
     for name, tolerance in (("order 1", 0.01), ("order 2", 0.1), ("order 3", 0.15)):
@@ -433,7 +433,7 @@ def test_tubes_agree_with_beams(kind, monkeypatch):
 @pytest.mark.parametrize("kind", ["metal", "solid", "dielectric"])
 @pytest.mark.parametrize("few", [24, 0])
 def test_reciprocity(kind, few, monkeypatch):
-    monkeypatch.setattr(signature, "FEW", few)
+    monkeypatch.setattr(signature, "MAX_FACETS_BEAM_TRACING", few)
     sent, received = random_directions(6, 3), random_directions(6, 4)
     there = total(crowd(kind), sent, received, edges=2)
     back = total(crowd(kind), received, sent, edges=2)
@@ -446,7 +446,7 @@ def test_reciprocity(kind, few, monkeypatch):
 )
 def test_solids_of_dielectric_have_not_changed_what_metal_sends(few, kind, monkeypatch):
     """The values of commit 5b65aad, before waves entered solids."""
-    monkeypatch.setattr(signature, "FEW", few)
+    monkeypatch.setattr(signature, "MAX_FACETS_BEAM_TRACING", few)
     found = total(crowd(kind), random_directions(2, 11), random_directions(2, 12), edges=2)
     before = {
         ("metal", 24): (
@@ -483,7 +483,7 @@ def test_one_antenna_sees_equal_cross_polar_terms():
 def test_two_runs_are_equal():
     for kind, few in (("metal", 24), ("solid", 0)):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(signature, "FEW", few)
+            patch.setattr(signature, "MAX_FACETS_BEAM_TRACING", few)
             runs = [total(crowd(kind), random_directions(4)) for _ in range(2)]
         assert torch.equal(*runs)
 

@@ -8,10 +8,14 @@ from torch import Tensor
 
 import invertwin as iw
 from invertwin.channel import SphereSection
-from invertwin.channel.beams.beam_tracing import facets_of
+from invertwin.channel.beams.beam_tracing import build_facets
 from invertwin.channel.rays.topology import topology_of
 from invertwin.channel.rcs import far_field as signature
-from invertwin.channel.rcs.rays_in_dielectrics import _fitted, _spread, curved
+from invertwin.channel.rcs.rays_in_dielectrics import (
+    _fit_wave_vector,
+    _spreading_factor,
+    group_smooth_faces,
+)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import (
@@ -59,7 +63,7 @@ def test_tubes_agree_with_beams(loss, monkeypatch):
         "depth": 4,
     }
     exact = iw.rcs(above_metal(loss), **given).parts
-    monkeypatch.setattr(signature, "FEW", 0)
+    monkeypatch.setattr(signature, "MAX_FACETS_BEAM_TRACING", 0)
     found = iw.rcs(above_metal(loss), **given).parts
     for order, tolerance in ((1, 0.01), (2, 0.1), (3, 0.02), (4, 0.1)):
         part = exact[f"order {order}"]
@@ -109,13 +113,13 @@ def test_the_back_of_a_sphere_is_that_of_mie():
 def test_normals_are_those_of_the_smooth_surface_and_of_flat_faces():
     ball = sphere(RADIUS, 3)
     shape = topology_of([ball])
-    surface = curved(facets_of(ball.vertices, shape), shape.beside)
+    surface = group_smooth_faces(build_facets(ball.vertices, shape), shape.edge_faces)
     assert int(surface.face.max()) == 0
     exact = ball.vertices[shape.faces] / RADIUS
     assert float((surface.normals - exact).norm(dim=2).max()) < 0.02
     drum = cylinder(0.03, 0.05)
     shape = topology_of([drum])
-    surface = curved(facets_of(drum.vertices, shape), shape.beside)
+    surface = group_smooth_faces(build_facets(drum.vertices, shape), shape.edge_faces)
     assert int(surface.face.max()) == 2  # the round side and both ends
     normals = [surface.facets.normal[surface.face == number] for number in range(3)]
     flat = [number for number in range(3) if float(normals[number].std(0).max()) < 1e-9]
@@ -133,14 +137,14 @@ def test_a_tube_keeps_its_power_and_turns_by_a_quarter_at_each_line_of_a_focus(
 ):
     start = float64([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]])
     end = start * float64([along, aside, 1.0]) + float64([0.3, 0.2, -5.0])
-    found = complex(_spread(float64([[0.0, 0.0, -1.0]]), start, end)[0])
+    found = complex(_spreading_factor(float64([[0.0, 0.0, -1.0]]), start, end)[0])
     assert found == pytest.approx(expected, abs=1e-12)
 
 
 def test_the_phase_of_a_tube_is_that_of_its_corners():
     corners = float64([[[0, 0, 0.1], [1, 0, 0.3], [0.2, 1, 0]]])
     phases = complex128([[0.3, 0.5 - 0.1j, -0.2]])
-    k = _fitted(complex128([[0.0, 0.1, -1.0]]), corners, phases)
+    k = _fit_wave_vector(complex128([[0.0, 0.1, -1.0]]), corners, phases)
     met = (k[:, None] * corners).sum(2)
     assert torch.allclose(met - met[:, :1], phases - phases[:, :1])
 

@@ -5,17 +5,17 @@ import math
 import pytest
 import torch
 
-from invertwin.channel.em.utd import conductor
+from invertwin.channel.em.utd import conductor_coefficients
 from invertwin.channel.em.wedges import Wedges
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.topology import topology_of
-from invertwin.channel.specular.candidates import Powers
-from invertwin.channel.specular.corner_diffraction import round_corner
-from invertwin.channel.specular.diffracted_paths import diffracted_paths
-from invertwin.channel.specular.diffraction_candidates import find_bends
-from invertwin.channel.specular.edge_path_geometry import Edge, over_edges
-from invertwin.channel.specular.image_method import Walls
-from invertwin.channel.specular.wedge_scene import EdgedScene
+from invertwin.channel.specular.candidates import FaceInteractions
+from invertwin.channel.specular.corner_diffraction import diffract_round_corner
+from invertwin.channel.specular.diffracted_paths import evaluate_diffracted_paths
+from invertwin.channel.specular.diffraction_candidates import find_diffraction_candidates
+from invertwin.channel.specular.edge_path_geometry import PathEdge, diffract_over_edges
+from invertwin.channel.specular.image_method import CandidateSurfaces
+from invertwin.channel.specular.wedge_scene import WedgeScene
 from invertwin.scene import box
 
 K = 2 * math.pi
@@ -42,9 +42,9 @@ END, FACES = torch.tensor([1]), torch.tensor([[0, 1]])
 def both(rx, tx):
     """The first edge alone, and on round the next."""
     zero, last = number([0.0]), number([1.5 * math.pi])
-    alone = over_edges([Edge(SENDS)], tx, rx, K)
-    edges = [Edge(SENDS, azimuth=zero), Edge(NEXT, azimuth_in=last)]
-    return alone, round_corner(edges, END, FACES, tx, rx, K)
+    alone = diffract_over_edges([PathEdge(SENDS)], tx, rx, K)
+    edges = [PathEdge(SENDS, azimuth=zero), PathEdge(NEXT, azimuth_in=last)]
+    return alone, diffract_round_corner(edges, END, FACES, tx, rx, K)
 
 
 @pytest.mark.parametrize(("aside", "most"), [(-10.0, 0.1), (0.5, 1e-5), (3.0, 1e-5)])
@@ -63,8 +63,11 @@ def test_hidden_end_leaves_no_step(aside, most):
     step = lost + onwards.transfer - both(below, tx)[1].transfer
     if before:
         assert step.abs().max() > 0.2 * lost.abs().max()
-        edges = [Edge(SENDS, azimuth=number([0.0])), Edge(NEXT, azimuth_in=number([1.5 * math.pi]))]
-        over = [over_edges(edges, tx, rx, K).transfer for rx in (above, below)]
+        edges = [
+            PathEdge(SENDS, azimuth=number([0.0])),
+            PathEdge(NEXT, azimuth_in=number([1.5 * math.pi])),
+        ]
+        over = [diffract_over_edges(edges, tx, rx, K).transfer for rx in (above, below)]
         step = step + over[0] - over[1]
     assert step.abs().max() < most * lost.abs().max()
 
@@ -81,10 +84,10 @@ def test_derivatives():
     def value(tx, rx, end):
         sends = Wedges(**(vars(SENDS) | {"end": end}))
         edges = [
-            Edge(sends, azimuth=number([0.0])),
-            Edge(NEXT, azimuth_in=number([1.5 * math.pi])),
+            PathEdge(sends, azimuth=number([0.0])),
+            PathEdge(NEXT, azimuth_in=number([1.5 * math.pi])),
         ]
-        return torch.view_as_real(round_corner(edges, END, FACES, tx, rx, K).transfer)
+        return torch.view_as_real(diffract_round_corner(edges, END, FACES, tx, rx, K).transfer)
 
     given = number([[0.5, 9.0, 5.0]]), number([[7.0, -8.0, -2.0]]), SENDS.end.clone()
     assert torch.autograd.gradcheck(value, tuple(v.requires_grad_() for v in given))
@@ -94,14 +97,18 @@ def whole(tx, rx, order, *, corners=True):
     """What the edges of a box send."""
     mesh = box((5.0, 3.0, 4.0))
     topology = topology_of([mesh])
-    walls = Walls(mesh.vertices, topology, tx)
-    around = EdgedScene(mesh.vertices, topology, walls, lambda _, cosine: conductor(0, cosine))
+    walls = CandidateSurfaces(mesh.vertices, topology, tx)
+    around = WedgeScene(
+        mesh.vertices, topology, walls, lambda _, cosine: conductor_coefficients(0, cosine)
+    )
     none = torch.zeros(len(topology.faces), dtype=torch.bool)
     total = torch.zeros(len(rx), 3, 3, dtype=torch.complex128)
     with tracing():
-        for bends in find_bends(around, Powers(none, none), tx, rx, order, 0, None, 0):
+        for bends in find_diffraction_candidates(
+            around, FaceInteractions(none, none), tx, rx, order, 0, None, 0
+        ):
             if corners or bends.corner is None:
-                sent = diffracted_paths(around, bends, tx, rx, K)
+                sent = evaluate_diffracted_paths(around, bends, tx, rx, K)
                 turn = torch.polar(torch.ones_like(sent.length), -K * sent.length)
                 total = total.index_add(0, sent.rx, sent.transfer * turn[:, None, None])
     return total

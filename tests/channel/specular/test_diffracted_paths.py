@@ -5,15 +5,15 @@ import math
 import pytest
 import torch
 
-from invertwin.channel.em.utd import conductor
+from invertwin.channel.em.utd import conductor_coefficients
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.ray_scene import visible
+from invertwin.channel.rays.ray_scene import is_visible
 from invertwin.channel.rays.topology import topology_of
-from invertwin.channel.specular.candidates import Powers
-from invertwin.channel.specular.diffracted_paths import diffracted_paths
-from invertwin.channel.specular.diffraction_candidates import find_bends
-from invertwin.channel.specular.image_method import Walls
-from invertwin.channel.specular.wedge_scene import EdgedScene
+from invertwin.channel.specular.candidates import FaceInteractions
+from invertwin.channel.specular.diffracted_paths import evaluate_diffracted_paths
+from invertwin.channel.specular.diffraction_candidates import find_diffraction_candidates
+from invertwin.channel.specular.image_method import CandidateSurfaces
+from invertwin.channel.specular.wedge_scene import WedgeScene
 from invertwin.scene import Mesh, box, plate
 
 K = 2 * math.pi
@@ -24,22 +24,26 @@ def surroundings(*meshes, scale=1.0):
     """Conductors; a wavelength is a metre."""
     vertices = torch.cat([mesh.vertices for mesh in meshes]) * scale
     topology = topology_of(list(meshes))
-    walls = Walls(vertices.detach(), topology, TX[None])
-    return EdgedScene(vertices, topology, walls, lambda _, cosine: conductor(0, cosine))
+    walls = CandidateSurfaces(vertices.detach(), topology, TX[None])
+    return WedgeScene(
+        vertices, topology, walls, lambda _, cosine: conductor_coefficients(0, cosine)
+    )
 
 
 def sent_by(around, tx, rx, order=1):
     """What edges alone send, by their number from one to order."""
     none = torch.zeros(len(around.topology.faces), dtype=torch.bool)
-    found = find_bends(around, Powers(none, none), tx, rx, order, 0, None, 0)
-    return [diffracted_paths(around, some, tx, rx, K) for some in found]
+    found = find_diffraction_candidates(
+        around, FaceInteractions(none, none), tx, rx, order, 0, None, 0
+    )
+    return [evaluate_diffracted_paths(around, some, tx, rx, K) for some in found]
 
 
 def behind(around, rx):
     """The field behind a sheet: the straight wave, and what its edges send."""
     tx = TX.expand(len(rx), 3)
     with tracing():
-        lit = visible(around.walls, tx, rx)
+        lit = is_visible(around.walls, tx, rx)
         (sent,) = sent_by(around, TX[None], rx)
     length = (rx - tx).norm(dim=1)
     way = (rx - tx) / length[:, None]

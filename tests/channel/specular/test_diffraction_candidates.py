@@ -63,7 +63,7 @@ def of_kind(paths: RayPaths, steps: str, edge_of: str = "wall") -> RayPaths:
     good = (paths.kinds == kinds).all(1)
     if "D" in steps:
         good &= paths.objects[:, steps.index("D")] == paths.names.index(edge_of)
-    return paths.chosen(good)
+    return paths.select(good)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_sheets_before_an_edge_are_those_of_the_straight_path():
 def test_the_way_back_is_the_way_forth():
     around = scene(CONCRETE, GLASS, pane=pane(size=1.5))
     rx = torch.stack([RX, float64([1.2, 4.0, 2.0])])
-    forth, back = trace(around, TX, rx), trace(around, rx, TX).reversed()
+    forth, back = trace(around, TX, rx), trace(around, rx, TX).reverse()
     met = {"".join("-RTD"[kind] for kind in row if kind) for row in forth.kinds.tolist()}
     assert {"RD", "DR", "TD", "DT"} <= met
     assert len(forth) == len(back)
@@ -173,7 +173,7 @@ def test_all_sequences_are_those_that_rays_find():
     # From the far ends of the floor, the wall and the pane behind one another are small.
     at_floor = [((paths.kinds == 3) & (paths.objects == 0)).any(1) for paths in found]
     shot, tried = (
-        paths.chosen(~rows).sorted() for paths, rows in zip(found, at_floor, strict=True)
+        paths.select(~rows).sort_rows() for paths, rows in zip(found, at_floor, strict=True)
     )
     assert len(shot) == len(tried) > 20
     torch.testing.assert_close(shot.delay, tried.delay)
@@ -251,7 +251,7 @@ def test_doppler_is_that_of_moved_geometry():
     moves = float64([1.0, 2.0, 3.0]), float64([-3.0, 0.5, 1.0])
 
     def at(time: float) -> RayPaths:
-        return trace(moving.at(time), TX + moves[0] * time, RX + moves[1] * time)
+        return trace(moving.advance(time), TX + moves[0] * time, RX + moves[1] * time)
 
     paths = trace(moving, tx_velocity=moves[0], rx_velocity=moves[1])
     later, earlier = at(1e-6), at(-1e-6)

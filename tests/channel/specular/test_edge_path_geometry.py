@@ -7,9 +7,13 @@ from itertools import pairwise
 import pytest
 import torch
 
-from invertwin.channel.em.utd import conductor
-from invertwin.channel.em.wedges import Wedges, joined_wedges
-from invertwin.channel.specular.edge_path_geometry import Edge, over_edges, several_turning_points
+from invertwin.channel.em.utd import conductor_coefficients
+from invertwin.channel.em.wedges import Wedges, merge_collinear_wedges
+from invertwin.channel.specular.edge_path_geometry import (
+    PathEdge,
+    diffract_over_edges,
+    multiple_diffraction_points,
+)
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
 
 K = 2 * math.pi
@@ -48,11 +52,11 @@ def lossy(face, cosine):
 def grazing():
     """The two edges of the box's side, which is the first face of both, in the wave's order."""
     zero = number([0.0])
-    return [Edge(FIRST, azimuth=zero), Edge(SECOND, azimuth_in=zero)]
+    return [PathEdge(FIRST, azimuth=zero), PathEdge(SECOND, azimuth_in=zero)]
 
 
 def test_one_edge_is_met_at_equal_angles():
-    found = over_edges([Edge(FIRST)], TX, RX, K)
+    found = diffract_over_edges([PathEdge(FIRST)], TX, RX, K)
     point = found.points[0, 0]
     before, after = (
         torch.nn.functional.normalize(p, dim=-1) for p in (point - TX[0], RX[0] - point)
@@ -61,7 +65,7 @@ def test_one_edge_is_met_at_equal_angles():
 
 
 def test_path_over_two_edges_is_the_shortest():
-    found = over_edges([Edge(FIRST), Edge(LEANS)], TX, RX, K)
+    found = diffract_over_edges([PathEdge(FIRST), PathEdge(LEANS)], TX, RX, K)
     assert bool(found.stationary)
 
     def length(first, second):
@@ -82,20 +86,26 @@ def test_path_over_two_edges_is_the_shortest():
 def test_paths_back_are_the_same():
     edges = grazing()
     cases = {
-        "one": ([Edge(FIRST, lossy)], [Edge(FIRST, lossy)]),
-        "free": ([Edge(FIRST), Edge(LEANS)], [Edge(LEANS), Edge(FIRST)]),
+        "one": ([PathEdge(FIRST, lossy)], [PathEdge(FIRST, lossy)]),
+        "free": ([PathEdge(FIRST), PathEdge(LEANS)], [PathEdge(LEANS), PathEdge(FIRST)]),
         "three": (
-            [Edge(FIRST, lossy), Edge(LEANS), Edge(SKEW)],
-            [Edge(SKEW), Edge(LEANS), Edge(FIRST, lossy)],
+            [PathEdge(FIRST, lossy), PathEdge(LEANS), PathEdge(SKEW)],
+            [PathEdge(SKEW), PathEdge(LEANS), PathEdge(FIRST, lossy)],
         ),
-        "lossy": ([Edge(FIRST, lossy), Edge(LEANS)], [Edge(LEANS), Edge(FIRST, lossy)]),
+        "lossy": (
+            [PathEdge(FIRST, lossy), PathEdge(LEANS)],
+            [PathEdge(LEANS), PathEdge(FIRST, lossy)],
+        ),
         "face": (
             edges,
-            [Edge(SECOND, azimuth=edges[0].azimuth), Edge(FIRST, azimuth_in=edges[0].azimuth)],
+            [
+                PathEdge(SECOND, azimuth=edges[0].azimuth),
+                PathEdge(FIRST, azimuth_in=edges[0].azimuth),
+            ],
         ),
     }
     for name, (there, back) in cases.items():
-        sent, returned = over_edges(there, TX, RX, K), over_edges(back, RX, TX, K)
+        sent, returned = diffract_over_edges(there, TX, RX, K), diffract_over_edges(back, RX, TX, K)
         scale = sent.transfer.abs().max()
         assert scale > 1e-6, name
         assert (sent.transfer - returned.transfer.mT).abs().max() < 1e-12 * scale, name
@@ -109,14 +119,14 @@ def test_paths_back_are_the_same():
 def test_second_edge_takes_over_where_the_first_one_hides(off, endless, most):
     """Behind the plane of the side the wave of the first edge ends; both together do not jump."""
     tx = number([[3.0, off, 0.4]])
-    edges = [replace(edge, endless=endless) for edge in grazing()]
+    edges = [replace(edge, infinite=endless) for edge in grazing()]
 
     def field(height):
         rx = number([[-9.0, height, 0.9]])
-        sent = over_edges(edges, tx, rx, K)
+        sent = diffract_over_edges(edges, tx, rx, K)
         total = sent.transfer * torch.exp(-1j * K * sent.length)
         if height > 0:
-            once = over_edges([Edge(FIRST, endless=endless)], tx, rx, K)
+            once = diffract_over_edges([PathEdge(FIRST, infinite=endless)], tx, rx, K)
             total = total + once.transfer * torch.exp(-1j * K * once.length)
         return total[0], sent.transfer[0]
 
@@ -132,21 +142,27 @@ def test_third_edge_takes_over_where_the_second_one_hides():
     zero, last = number([0.0]), number([1.5 * math.pi])
     for off in (-2.0, -0.2):
         tx = number([[3.0, off, 0.4]])
-        first, second = (replace(edge, endless=True) for edge in grazing())
-        edges = [first, replace(second, azimuth=last), Edge(third, azimuth_in=zero, endless=True)]
+        first, second = (replace(edge, infinite=True) for edge in grazing())
+        edges = [
+            first,
+            replace(second, azimuth=last),
+            PathEdge(third, azimuth_in=zero, infinite=True),
+        ]
         fields = []
         for aside in (-1e-7, 1e-7):
             rx = number([[-4.0 + aside, -9.0, 0.9]])
-            sent, twice = (over_edges(some, tx, rx, K) for some in (edges, [first, second]))
+            sent, twice = (
+                diffract_over_edges(some, tx, rx, K) for some in (edges, [first, second])
+            )
             fields.append([s.transfer * torch.exp(-1j * K * s.length) for s in (sent, twice)])
         (before, lost), (after, _) = fields
         assert (after - before - lost).norm() < 0.005 * lost.norm()
         back = [
-            Edge(third, azimuth=zero, endless=True),
-            Edge(SECOND, azimuth_in=last, azimuth=zero, endless=True),
-            Edge(FIRST, azimuth_in=zero, endless=True),
+            PathEdge(third, azimuth=zero, infinite=True),
+            PathEdge(SECOND, azimuth_in=last, azimuth=zero, infinite=True),
+            PathEdge(FIRST, azimuth_in=zero, infinite=True),
         ]
-        returned = over_edges(back, rx, tx, K).transfer.mT
+        returned = diffract_over_edges(back, rx, tx, K).transfer.mT
         assert (sent.transfer - returned).abs().max() < 1e-12 * returned.abs().max()
 
 
@@ -155,7 +171,7 @@ def test_path_over_edges_that_meet_is_found():
     corner, along, down = (number(p) for p in ([0.0, 0, 0], [4.0, 0, 0], [0, -4.0, 0]))
     edges = [wedge(corner.tolist(), end.tolist(), [1.0, -1.0, 0.0]) for end in (along, down)]
     tx, rx = number([[9.0, 4.0, 0.8]]), number([[-3.0, -2.0, -1.0]])
-    points, stationary = several_turning_points(edges, tx, rx)
+    points, stationary = multiple_diffraction_points(edges, tx, rx)
     assert bool(stationary)
     assert points[0, 0, 0] > 0.5
     assert points[0, 1, 1] < -0.2
@@ -164,8 +180,8 @@ def test_path_over_edges_that_meet_is_found():
 def test_edge_in_pieces_is_the_whole_edge():
     lower = Wedges(**(vars(FIRST) | {"start": number([[0.0, 0.0, 0.5]])}))
     upper = Wedges(**(vars(FIRST) | {"end": number([[0.0, 0.0, 0.5]])}))
-    whole = over_edges([Edge(FIRST)], TX, RX, K).transfer
-    parts = [over_edges([Edge(piece)], TX, RX, K).transfer for piece in (lower, upper)]
+    whole = diffract_over_edges([PathEdge(FIRST)], TX, RX, K).transfer
+    parts = [diffract_over_edges([PathEdge(piece)], TX, RX, K).transfer for piece in (lower, upper)]
     assert (whole - sum(parts)).abs().max() < 1e-14
     both = Wedges(
         *(
@@ -173,9 +189,9 @@ def test_edge_in_pieces_is_the_whole_edge():
             for column in zip(vars(upper).values(), vars(lower).values(), strict=True)
         )
     )
-    joined = joined_wedges(both)
+    joined = merge_collinear_wedges(both)
     assert len(joined.start) == 1
-    assert (over_edges([Edge(joined)], TX, RX, K).transfer - whole).abs().max() < 1e-14
+    assert (diffract_over_edges([PathEdge(joined)], TX, RX, K).transfer - whole).abs().max() < 1e-14
 
 
 def test_edges_of_other_planes_stay_apart():
@@ -185,18 +201,20 @@ def test_edges_of_other_planes_stay_apart():
             for column in zip(vars(FIRST).values(), vars(LEANS).values(), strict=True)
         )
     )
-    assert len(joined_wedges(both).start) == 2
+    assert len(merge_collinear_wedges(both).start) == 2
 
 
 def test_long_edge_is_endless():
     long = Wedges(
         **(vars(FIRST) | {"start": number([[0.0, 0.0, 1e6]]), "end": number([[0.0, 0.0, -1e6]])})
     )
-    ended = over_edges([Edge(long)], TX, RX, K).transfer
-    endless = over_edges([Edge(FIRST, endless=True)], TX, RX, K).transfer
+    ended = diffract_over_edges([PathEdge(long)], TX, RX, K).transfer
+    endless = diffract_over_edges([PathEdge(FIRST, infinite=True)], TX, RX, K).transfer
     # What the ends send falls with the root of the distance of waves in phase.
     assert (ended - endless).norm() < 1e-3 * endless.norm()
-    assert (over_edges([Edge(FIRST)], TX, RX, K).transfer - endless).norm() > 0.02 * endless.norm()
+    assert (
+        diffract_over_edges([PathEdge(FIRST)], TX, RX, K).transfer - endless
+    ).norm() > 0.02 * endless.norm()
 
 
 @pytest.mark.slow
@@ -205,11 +223,11 @@ def test_derivatives():
 
     def whole(tx, rx, end):
         at = Wedges(**(vars(FIRST) | {"end": end}))
-        once = over_edges([Edge(at, lossy)], tx, rx, K)
-        twice = over_edges([Edge(at), Edge(LEANS)], tx, rx, K)
-        along = over_edges([Edge(at, azimuth=edges[0].azimuth), edges[1]], tx, rx, K)
-        thrice = over_edges([Edge(at), Edge(LEANS), Edge(SKEW)], tx, rx, K)
-        sloped = over_edges([Edge(at)], tx, rx, K, slopes=True).slopes
+        once = diffract_over_edges([PathEdge(at, lossy)], tx, rx, K)
+        twice = diffract_over_edges([PathEdge(at), PathEdge(LEANS)], tx, rx, K)
+        along = diffract_over_edges([PathEdge(at, azimuth=edges[0].azimuth), edges[1]], tx, rx, K)
+        thrice = diffract_over_edges([PathEdge(at), PathEdge(LEANS), PathEdge(SKEW)], tx, rx, K)
+        sloped = diffract_over_edges([PathEdge(at)], tx, rx, K, slopes=True).slopes
         assert sloped is not None
         fields = (once.transfer, twice.transfer, along.transfer, thrice.transfer, *sloped)
         sent = torch.stack(fields)
@@ -236,6 +254,11 @@ def test_a_body_of_air_does_not_diffract():
         return FieldCoefficients(0 * one, 0 * one, one, one)
 
     sheet = Wedges(**(vars(LEANS)))
-    sent = over_edges([Edge(sheet, air)], TX, RX, K).transfer
+    sent = diffract_over_edges([PathEdge(sheet, air)], TX, RX, K).transfer
     assert sent.abs().max() < 1e-15
-    assert over_edges([Edge(sheet, conductor)], TX, RX, K).transfer.abs().max() > 1e-4
+    assert (
+        diffract_over_edges([PathEdge(sheet, conductor_coefficients)], TX, RX, K)
+        .transfer.abs()
+        .max()
+        > 1e-4
+    )

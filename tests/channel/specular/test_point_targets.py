@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from invertwin.channel import trace_echoes
+from invertwin.channel import trace_point_targets
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar import FMCW, Radar, beat_signal
@@ -50,7 +50,7 @@ def device(polarisation: str = "V", count: int = 1, **more: Any) -> Radar:
 @pytest.mark.parametrize("polarisation", ["V", "H"])
 def test_a_floor_shows_a_target_three_times(polarisation):
     radar = device(polarisation)
-    paths = trace_echoes(FLOOR, radar.link(), [TARGET], [0.5])
+    paths = trace_point_targets(FLOOR, radar.link(), [TARGET], [0.5])
     # Direct, mixed (both ways round), double mirror.
     expected = [DIRECT, (DIRECT + MIRRORED) / 2, (DIRECT + MIRRORED) / 2, MIRRORED]
     order = paths.range.argsort()
@@ -73,7 +73,7 @@ def test_levels_follow_the_floor_and_the_pattern():
     earth = Dielectric(4.0, 0.05, scattering=0.0)
     radar = device("H", pattern=Cosine(2.0))
     scene = FLOOR.replace("floor", material=earth)
-    found = trace_echoes(scene, radar.link(), [TARGET], [1.0])
+    found = trace_point_targets(scene, radar.link(), [TARGET], [1.0])
     order = found.range.argsort()
     ratio = (found.coefficient[order][3] / found.coefficient[order][0]).abs()
     sine = (HEIGHT + 0.7) / MIRRORED
@@ -87,10 +87,10 @@ def test_levels_follow_the_floor_and_the_pattern():
 def test_elements_of_an_array_see_the_image():
     """Each pair of elements as a radar of its own."""
     radar = device("H", count=3)
-    paths = trace_echoes(FLOOR, radar.link(), [TARGET], [1.0])
+    paths = trace_point_targets(FLOOR, radar.link(), [TARGET], [1.0])
     whole = beat_signal(paths, radar)
     tx, rx = radar.elements()
-    mixed = paths.chosen((paths.range - (DIRECT + MIRRORED) / 2).abs() < 1e-9)
+    mixed = paths.select((paths.range - (DIRECT + MIRRORED) / 2).abs() < 1e-9)
     for number in range(3):
         place = tx[0, number]
         direct = float((place - float64(TARGET)).norm())
@@ -105,7 +105,7 @@ def test_elements_of_an_array_see_the_image():
 
 def test_beat_signals_have_the_ranges():
     radar = device("H")
-    paths = trace_echoes(FLOOR, radar.link(), [TARGET], [1.0])
+    paths = trace_point_targets(FLOOR, radar.link(), [TARGET], [1.0])
     signal = beat_signal(paths, radar)[0, 0, 0]
     time = torch.arange(64).double() * DURATION / 64
     slope = BANDWIDTH / DURATION
@@ -120,7 +120,7 @@ def test_a_moving_target_turns_the_phase():
     """A step of the target changes the delays of all ways as their images say."""
     radar, step = device("H"), 1e-4
     first, second = (
-        trace_echoes(FLOOR, radar.link(), [[8.0 + x, 0.0, 0.7]], [1.0]) for x in (0.0, step)
+        trace_point_targets(FLOOR, radar.link(), [[8.0 + x, 0.0, 0.7]], [1.0]) for x in (0.0, step)
     )
     rates = (second.range - first.range)[first.range.argsort()] / step
     expected = [8 / DIRECT, 4 / DIRECT + 4 / MIRRORED, 4 / DIRECT + 4 / MIRRORED, 8 / MIRRORED]
@@ -132,7 +132,7 @@ def test_derivatives_are_differences():
 
     def power(height: torch.Tensor) -> torch.Tensor:
         place = torch.stack([float64(8.0), float64(0.0), height])[None]
-        paths = trace_echoes(FLOOR, radar.link(), place, [1.0])
+        paths = trace_point_targets(FLOOR, radar.link(), place, [1.0])
         turn = torch.polar(torch.ones(4).double(), -2 * math.pi * FREQUENCY * paths.delay)
         return (paths.coefficient * turn).sum().abs().square().log()
 
@@ -148,15 +148,15 @@ def test_a_wall_hides_a_target_but_not_its_image():
     # 0.5 m high about the direct line; the mirrored way passes below.
     wall = Object(plate(0.5, 2.4), PerfectConductor(), rigid(across, float64([4.0, 0.0, 1.0])))
     scene = Scene({**FLOOR.objects, "wall": wall})
-    found = trace_echoes(scene, device().link(), [TARGET], [1.0])
+    found = trace_point_targets(scene, device().link(), [TARGET], [1.0])
     assert found.range.tolist() == pytest.approx([MIRRORED], rel=1e-12)
 
 
 def test_wrong_targets_are_refused():
     link = device().link()
     with pytest.raises(InputError, match="targets"):
-        trace_echoes(FLOOR, link, [[1.0, 2.0]], [1.0])
+        trace_point_targets(FLOOR, link, [[1.0, 2.0]], [1.0])
     with pytest.raises(InputError, match="cross-sections >= 0"):
-        trace_echoes(FLOOR, link, [TARGET], [-1.0])
+        trace_point_targets(FLOOR, link, [TARGET], [-1.0])
     with pytest.raises(InputError, match="cross-sections"):
-        trace_echoes(FLOOR, link, [TARGET], [1.0, 2.0])
+        trace_point_targets(FLOOR, link, [TARGET], [1.0, 2.0])

@@ -26,7 +26,7 @@ from invertwin.scene import (
     box,
     dihedral,
     fresnel_coefficients,
-    joined,
+    merge_meshes,
     plate,
     rigid,
     rotation_from_vector,
@@ -106,7 +106,7 @@ def test_corners_send_back_what_comes(plates, depth):
     scene = Scene({"corner": corner})
     tx, rx = [0.1, 0.0, 0.0], [-0.1, 0.1, 0.05]
     paths = trace(scene, tx, rx, depth=depth)
-    last = paths.chosen(paths.depth == plates)
+    last = paths.select(paths.depth == plates)
     faces = corner.vertices[corner.mesh.faces]
     normal = torch.linalg.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
     normal = normal / normal.norm(dim=1, keepdim=True)
@@ -174,9 +174,9 @@ def test_all_sequences_are_those_that_rays_find():
     scene = room(Dielectric(5.0, 0.1, scattering=0.0))
     ends = [[1.3, -1.1, 0.7], [0.2, 1.0, -0.3]], [[-1.4, 0.9, -0.6], [2.0, -1.5, 1.0]]
     shot, tried = (trace(scene, *ends, depth=3, rays=rays) for rays in (100_000, None))
-    assert tried.missed is None
-    assert shot.missed is not None
-    assert 0 <= shot.missed < 1e-3
+    assert tried.missed_fraction is None
+    assert shot.missed_fraction is not None
+    assert 0 <= shot.missed_fraction < 1e-3
     for name in ("delay", "tx", "rx", "kinds", "faces", "coefficient"):
         torch.testing.assert_close(getattr(shot, name), getattr(tried, name))
 
@@ -184,7 +184,8 @@ def test_all_sequences_are_those_that_rays_find():
 def test_more_rays_miss_less():
     ball = Scene({"ball": Object(sphere(0.5, 4), METAL, rigid(translation=[0.0, 0.0, 2.0]))})
     few, many = (
-        float(trace(ball, [0, 0, 0], [0.3, 0, 0], rays=n).missed or 0.0) for n in (2_000, 200_000)
+        float(trace(ball, [0, 0, 0], [0.3, 0, 0], rays=n).missed_fraction or 0.0)
+        for n in (2_000, 200_000)
     )
     assert 0 < many < few
 
@@ -197,7 +198,7 @@ def test_the_way_back_is_the_way_forth():
     tx, rx = [1.3, -1.1, 0.7], [[-1.4, 0.9, -0.6], [0.4, 1.2, -1.0]]
     forth, back = trace(scene, tx, rx, depth=3), trace(scene, rx, tx, depth=3)
     assert len(forth) > 20
-    again = back.reversed()
+    again = back.reverse()
     for name in ("delay", "coefficient", "departure", "arrival", "vertices"):
         torch.testing.assert_close(
             getattr(forth, name), getattr(again, name), rtol=1e-9, atol=1e-13
@@ -209,9 +210,9 @@ def test_the_way_back_is_the_way_forth():
 def test_inside_of_a_wall_nothing_gets_out():
     wall = Scene({"wall": Object(box((2.0, 0.2, 2.0)), Dielectric(5.0, 0.1))})
     paths = trace(wall, [0.0, 0.0, 0.0], [[0.3, 2.0, 0.4], [0.3, 0.05, 0.4]], depth=3)
-    assert not len(paths.between(0, 0))
-    assert len(paths.between(0, 1)) > 0
-    assert float(response(paths.between(0, 0)).abs().sum()) == 0
+    assert not len(paths.select_link(0, 0))
+    assert len(paths.select_link(0, 1)) > 0
+    assert float(response(paths.select_link(0, 0)).abs().sum()) == 0
 
 
 def test_a_lost_link_gives_zeros_and_zero_gradients():
@@ -258,7 +259,7 @@ def test_coplanar_and_doubled_faces_count_once():
     for scene in (
         Scene({"wall": Object(many, METAL)}),
         Scene({"wall": Object(twice, METAL)}),
-        Scene({"wall": Object(joined([twice, plate(3.0, 3.0)]), METAL)}),
+        Scene({"wall": Object(merge_meshes([twice, plate(3.0, 3.0)]), METAL)}),
         Scene({"left": halves[0], "right": halves[1]}),
     ):
         found = trace(scene, *ends)
@@ -323,7 +324,7 @@ def test_a_slab_of_air_is_not_there():
     ends = [1.3, -1.1, 0.7], [-1.4, 0.9, -0.6]
     air = thing(plate(20.0, 20.0), (0.2, 0.1, 0.3), (0.4, 0.3, 0.2), Slab(1.0, thickness=0.2))
     with_air = trace(Scene({**scene.objects, "air": air}), *ends, depth=3)
-    through = with_air.chosen((with_air.kinds == 2).any(1))
+    through = with_air.select((with_air.kinds == 2).any(1))
     assert len(through) > 3
     bare = trace(scene, *ends, depth=3)
     for row in range(len(through)):
@@ -435,7 +436,7 @@ def test_doppler_is_that_of_moved_geometry():
     moves = float64([1.0, 2.0, 3.0]), float64([-3.0, 0.5, 1.0])
 
     def at(time: float) -> RayPaths:
-        return trace(scene.at(time), tx + moves[0] * time, rx + moves[1] * time, depth=4)
+        return trace(scene.advance(time), tx + moves[0] * time, rx + moves[1] * time, depth=4)
 
     paths = trace(scene, tx, rx, depth=4, tx_velocity=moves[0], rx_velocity=moves[1])
     later, earlier = at(1e-5), at(-1e-5)
@@ -449,7 +450,7 @@ def test_ten_thousand_receivers():
     places = torch.rand(10_000, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     rx = (places - 0.5) * float64([4.9, 3.9, 2.9])
     paths = trace(room(), [1.3, -1.1, 0.7], rx, depth=2, rays=10_000)
-    row, filled = paths.padded()
+    row, filled = paths.pad_links()
     assert row.shape == (1, 10_000, 25)  # 1, 6 and 18 images
     assert filled.all()
     assert torch.equal(paths.rx[row[0]], torch.arange(10_000)[:, None].expand(-1, 25))
@@ -482,7 +483,7 @@ def test_a_scene_of_20_000_triangles():
     assert len(ball.mesh.faces) == 20_480
     met = paths.objects == paths.names.index("ball")
     assert int(met.any(1).sum()) >= 3
-    assert not bool((paths.between(0, 0).depth == 0).any())  # in its shadow
+    assert not bool((paths.select_link(0, 0).depth == 0).any())  # in its shadow
     radius = (paths.vertices[met] - float64([0.0, 0.0, 2.0])).norm(dim=1)
     assert float((radius - 0.5).abs().max()) < 1e-3
     vertices = torch.cat([item.vertices for item in scene.objects.values()])
@@ -505,7 +506,7 @@ def test_a_scene_of_20_000_triangles():
 def walk(places: Tensor, plane: Scene, edges: int) -> Tensor:
     """Field over that of free space along a walk behind a plate."""
     paths = trace(plane, [0.0, 0.0, -8.0], places, edges=edges, depth=1)
-    fields = [response(paths.between(0, n))[0, 0].abs() for n in range(len(places))]
+    fields = [response(paths.select_link(0, n))[0, 0].abs() for n in range(len(places))]
     free = WAVELENGTH / (4 * math.pi * (places - float64([0.0, 0.0, -8.0])).norm(dim=1))
     return torch.stack(fields) / free
 
@@ -562,7 +563,7 @@ def test_four_edges_are_too_many():
 def test_padded_links_may_be_empty():
     wall = Scene({"wall": Object(plate(50.0, 50.0), METAL)})
     paths = trace(wall, [[0, 0, 2.0], [0, 0, 1.0]], [[1, 0, -1.0], [1, 0, 1.0], [0, 1, 1.0]])
-    row, filled = paths.padded()
+    row, filled = paths.pad_links()
     assert row.shape == (2, 3, 2)
     assert filled.sum(2).tolist() == [[0, 2, 2], [0, 2, 2]]
     assert paths.delay[row][filled].min() > 0

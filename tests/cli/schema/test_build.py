@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from invertwin.cli.fits.problem import Problem, starts_of
+from invertwin.cli.fits.problem import Problem, make_starts
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import to_toml, validate
+from invertwin.cli.schema.run_file import to_toml, validate_run
 from invertwin.errors import InputError
-from invertwin.inversion import displaced, residual
+from invertwin.inversion import displace, pose_error
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.reconstruction import Optimizer
 from invertwin.scene import (
@@ -39,7 +39,7 @@ RADAR = {
 
 def read(**changes):
     raw = {"task": "reconstruct", "scene": {"box": make_box()}} | changes
-    return validate(raw, Path("run.toml"))
+    return validate_run(raw, Path("run.toml"))
 
 
 def make_box(**changes):
@@ -61,7 +61,7 @@ def test_truth_replaces_only_what_it_names():
         scene={"box": make_box(position=[0, 0, 2], rotation_deg=[0, 10, 0])},
         truth={"box": {"position": [0.1, 0, 2]}},
     )
-    found = residual(build.scene(run)["box"], build.true_scene(run)["box"])
+    found = pose_error(build.scene(run)["box"], build.true_scene(run)["box"])
     assert found is not None
     torch.testing.assert_close(found.offset, torch.tensor([-0.1, 0, 0], dtype=torch.float64))
     assert found.angle < 1e-7
@@ -87,7 +87,7 @@ def test_every_shape_and_parts_can_be_built(tmp_path):
         },
     }
     raw = {"task": "simulate", "scene": {k: v | {"material": ROUGH} for k, v in shapes.items()}}
-    scene = build.scene(validate(raw, tmp_path / "run.toml"))
+    scene = build.scene(validate_run(raw, tmp_path / "run.toml"))
     assert set(scene.names) == set(shapes)
     slits = scene["parts"].vertices
     assert (slits[:, 0].min(), slits[:, 0].max()) == (-1.5, 1.25)
@@ -96,7 +96,7 @@ def test_every_shape_and_parts_can_be_built(tmp_path):
 def test_missing_mesh_names_the_object(tmp_path):
     raw = {"task": "simulate", "scene": {"car": {"file": "car.obj", "material": ROUGH}}}
     with pytest.raises(InputError, match=r"scene\.car: .*car\.obj"):
-        build.scene(validate(raw, tmp_path / "run.toml"))
+        build.scene(validate_run(raw, tmp_path / "run.toml"))
 
 
 @pytest.mark.parametrize(
@@ -145,9 +145,9 @@ def test_starts_are_as_far_off_as_asked_and_repeat():
     assert run.starts is not None
     scene, truth = build.scene(run), build.true_scene(run)
     problem = Problem(run, scene, truth, frozenset())
-    found, again = starts_of(problem), starts_of(problem)
+    found, again = make_starts(problem), make_starts(problem)
     for start, same in zip(found, again, strict=True):
-        rest = residual(start["box"], truth["box"])
+        rest = pose_error(start["box"], truth["box"])
         assert rest is not None
         assert 0.3 <= rest.distance <= 0.4
         assert math.radians(15) <= rest.angle <= math.radians(25)
@@ -167,7 +167,7 @@ def test_starts_in_a_plane_about_one_axis():
     run = read(starts=table, seed=7)
     assert run.starts is not None
     scene = build.scene(run)
-    for start in starts_of(Problem(run, scene, scene, frozenset())):
+    for start in make_starts(Problem(run, scene, scene, frozenset())):
         assert abs(float(start["box"].center[1])) < 1e-12
         torch.testing.assert_close(start["box"].transform[1, :3], scene["box"].transform[1, :3])
 
@@ -191,21 +191,21 @@ def test_residual_of_a_known_similarity(shape):
     truth = build.scene(read(scene={"x": shape | {"material": ROUGH}}))
     vector = torch.tensor([0.2, -0.7, 0.4], dtype=torch.float64)
     offset = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
-    moved = displaced(truth["x"], offset, vector)
-    found = residual(moved, truth["x"])
+    moved = displace(truth["x"], offset, vector)
+    found = pose_error(moved, truth["x"])
     assert found is not None
     torch.testing.assert_close(found.offset, offset)
     expected = float(rotation_angle(rotation_from_vector(vector)))
     assert math.isclose(found.angle, expected, rel_tol=1e-9)
     half = build.scene(read(scene={"x": shape | {"material": ROUGH, "scale": 0.5}}))
-    smaller = residual(half["x"], truth["x"])
+    smaller = pose_error(half["x"], truth["x"])
     assert smaller is not None
     assert math.isclose(smaller.scale, 0.5)
 
 
 def test_objects_of_other_triangles_have_no_residual():
     one, other = (build.scene(read(scene={"x": make_box(divisions=n)})) for n in (1, 2))
-    assert residual(one["x"], other["x"]) is None
+    assert pose_error(one["x"], other["x"]) is None
 
 
 def test_parameters_start_as_the_identity():
@@ -254,14 +254,14 @@ ROOM = """<scene version="3.0.0">
 def read_room(tmp_path, **changes):
     (tmp_path / "room.xml").write_text(ROOM)
     raw = {"task": "reconstruct", "scene_file": {"file": "room.xml"}} | changes
-    return validate(raw, tmp_path / "run.toml")
+    return validate_run(raw, tmp_path / "run.toml")
 
 
 def test_scene_file_beside_scene_tables(tmp_path):
     metal = {"kind": "perfect_conductor"}
     table = {"file": "room.xml", "materials": {"mat-metal": metal}, "material": ROUGH}
     run = read_room(tmp_path, scene_file=table, scene={"box": make_box()})
-    assert validate(tomllib.loads(to_toml(run)), tmp_path / "run.toml") == run
+    assert validate_run(tomllib.loads(to_toml(run)), tmp_path / "run.toml") == run
     scene = build.scene(run)
     assert scene.names == ("floor", "ball", "box")
     assert isinstance(scene["floor"].material, PerfectConductor)
@@ -274,10 +274,10 @@ def test_scene_file_beside_scene_tables(tmp_path):
 def test_truth_of_a_scene_file_places_from_where_the_file_does(tmp_path):
     run = read_room(tmp_path, truth={"floor": {"position": [0.5, 0, 0]}, "ball": {"scale": 2.0}})
     scene, truth = build.scene(run), build.true_scene(run)
-    found = residual(scene["floor"], truth["floor"])
+    found = pose_error(scene["floor"], truth["floor"])
     assert found is not None
     torch.testing.assert_close(found.offset, torch.tensor([-0.5, 0, 0], dtype=torch.float64))
-    larger = residual(scene["ball"], truth["ball"])
+    larger = pose_error(scene["ball"], truth["ball"])
     assert larger is not None
     assert math.isclose(larger.scale, 0.5)
 
@@ -302,7 +302,7 @@ def test_scene_file_errors_name_the_key(tmp_path, changes, said):
 def test_a_room_stands_before_the_other_objects():
     table = {"width": 4.5, "furniture": ["sofa", "table"], "materials": {"floor": ROUGH}}
     run = read(room=table, truth={"sofa": {"material": ROUGH}, "table": {"position": [1, 0, 2]}})
-    assert validate(tomllib.loads(to_toml(run)), Path("run.toml")) == run
+    assert validate_run(tomllib.loads(to_toml(run)), Path("run.toml")) == run
     scene, truth, made = build.scene(run), build.true_scene(run), room(4.5, furniture=["sofa"])
     assert scene.names == (*made, "table", "box")
     for name in made:
@@ -404,11 +404,11 @@ def test_loss_and_optimizer_pass_on_what_is_given():
         loss={"kind": "likelihood", "floor": 0.05, "levels": 2},
         optimizer={"rate": 0.02, "rotation_rate": 0.2},
     )
-    loss, optimizer = build.made(run, "loss"), build.made(run, "optimizer")
+    loss, optimizer = build.build_section(run, "loss"), build.build_section(run, "optimizer")
     assert (loss.kind, loss.floor, loss.levels) == ("likelihood", 0.05, 2)
     assert (optimizer.rate, optimizer.rotation_rate) == (0.02, 0.2)
-    assert build.made(read(), "loss") == SpectrumLoss()
-    assert build.made(read(), "optimizer") == Optimizer()
+    assert build.build_section(read(), "loss") == SpectrumLoss()
+    assert build.build_section(read(), "optimizer") == Optimizer()
 
 
 @pytest.mark.parametrize(

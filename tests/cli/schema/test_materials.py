@@ -10,9 +10,9 @@ import torch
 
 from invertwin.cli.schema import build
 from invertwin.cli.schema.keys import key_tables
-from invertwin.cli.schema.run_file import load_run, to_toml, validate
+from invertwin.cli.schema.run_file import load_run, to_toml, validate_run
 from invertwin.errors import InputError
-from invertwin.inversion.metrics import value_errors
+from invertwin.inversion.metrics import material_errors
 from invertwin.scene import (
     Dielectric,
     Itu,
@@ -38,7 +38,7 @@ ROUGHNESS = {
 def read(material: dict[str, Any], folder: Path = Path(), **changes):
     wall = {"shape": "plate", "width": 1.0, "height": 2.0, "material": material}
     raw = {"task": "reconstruct", "scene": {"wall": wall}} | changes
-    return validate(raw, folder / "run.toml")
+    return validate_run(raw, folder / "run.toml")
 
 
 def material_of(table: dict[str, Any], folder: Path = Path()) -> Any:
@@ -201,9 +201,9 @@ def test_truth_may_be_of_another_material_and_the_error_is_told():
     assert truth["wall"].material.faces == 2
     assert torch.equal(truth["wall"].vertices, scene["wall"].vertices)
     found, true = (whole["wall"].material for whole in (scene, truth))
-    errors = value_errors(run.parameters[0].values, found, true, 77e9)
+    errors = material_errors(run.parameters[0].values, found, true, 77e9)
     assert errors == pytest.approx({"permittivity_error": 0.27 / 2.73, "thickness_error": 0.2})
-    assert value_errors(["thickness"], true, true, 77e9) == {"thickness_error": 0}
+    assert material_errors(["thickness"], true, true, 77e9) == {"thickness_error": 0}
     with pytest.raises(InputError, match=r"truth\.wall\.material: expected a material of ITU"):
         build.true_scene(read(known, truth={"wall": {"material": real | {"itu": "woood"}}}))
 
@@ -233,7 +233,7 @@ def test_materials_of_a_scene_file_take_no_images(tmp_path):
         "file": "room.xml",
         "material": {"kind": "dielectric", "permittivity": {"image": "x.npy"}},
     }
-    run = validate({"task": "simulate", "scene_file": table}, tmp_path / "run.toml")
+    run = validate_run({"task": "simulate", "scene_file": table}, tmp_path / "run.toml")
     with pytest.raises(
         InputError, match=r"scene_file\.material\.permittivity: expected permittivity as a number"
     ):

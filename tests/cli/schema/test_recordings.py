@@ -14,10 +14,10 @@ from invertwin.capture import Capture, ChannelCalibration, ChirpData
 from invertwin.capture.readers import described_arrays
 from invertwin.capture.ti import read_cfg, read_recording, read_settings
 from invertwin.cli import schema
-from invertwin.cli.commands.raw_files import settings_of_run
+from invertwin.cli.commands.raw_files import make_chirp_settings
 from invertwin.cli.schema import build, sensors
-from invertwin.cli.schema.recordings import measured
-from invertwin.cli.schema.run_file import to_toml, validate
+from invertwin.cli.schema.recordings import build_capture
+from invertwin.cli.schema.run_file import to_toml, validate_run
 from invertwin.errors import InputError
 from invertwin.radar import FMCW, OFDM, Impulse, SteppedFrequency
 from invertwin.radar.boards import board
@@ -145,7 +145,7 @@ def test_what_a_run_file_says_is_written_back():
         "data": {"kind": "dca1000", "file": "/x.bin", "settings": "/x.cfg", "board": BOARD},
     }
     run = read(**sections)
-    assert validate(tomllib.loads(to_toml(run)), Path("run.toml")) == run
+    assert validate_run(tomllib.loads(to_toml(run)), Path("run.toml")) == run
 
 
 def test_impairments_reach_the_front_end():
@@ -258,7 +258,7 @@ def data_table(**changes):
 
 def test_recordings_get_poses_and_calibrated_channels(train, tmp_path):
     table = {"kind": "arrays", "file": str(train / "chirps.toml")}
-    plain = measured(data_table(**table))
+    plain = build_capture(data_table(**table))
     chirps = described_arrays.read_chirps(train / "chirps.toml")
     assert torch.equal(plain.beat, chirps.samples.mean(1))
     gains = torch.polar(torch.ones(2, 4), torch.arange(8.0).reshape(2, 4)).to(torch.complex128)
@@ -269,14 +269,14 @@ def test_recordings_get_poses_and_calibrated_channels(train, tmp_path):
         "positions": [[0, 0, -1]],
         "orientation": {"rotation_deg": [0, 90, 0]},
     }
-    second = measured(data_table(**table, frame=1))
+    second = build_capture(data_table(**table, frame=1))
     assert torch.equal(second.beat, plain.beat[1:])
-    placed = measured(data_table(**table, **changes))
+    placed = build_capture(data_table(**table, **changes))
     expected = chirps.samples[:, 2] / ChannelCalibration(gains).gains[..., None]
     torch.testing.assert_close(placed.beat, expected)
     assert placed.radar().positions.tolist() == [[0, 0, -1], [0, 0, -1]]
     assert placed.radar().range_origin is None
-    far = measured(data_table(**table, **changes, range_center=[0.0, 3.0, 3.0]))
+    far = build_capture(data_table(**table, **changes, range_center=[0.0, 3.0, 3.0]))
     assert far.radar().origins.tolist() == pytest.approx([5.0, 5.0], abs=0.01)  # of a wide board
     rotations = placed.radar().rotations
     assert rotations is not None
@@ -298,7 +298,7 @@ def test_recordings_get_poses_and_calibrated_channels(train, tmp_path):
 def test_recordings_that_do_not_fit_are_refused(train, changes, message):
     table = {"kind": "arrays", "file": str(train / "chirps.toml")} | changes
     with pytest.raises(InputError, match=message):
-        measured(data_table(**table))
+        build_capture(data_table(**table))
 
 
 @pytest.mark.parametrize(
@@ -335,11 +335,11 @@ def test_samples_are_kept_as_they_are(tmp_path):
     radar = radar_of(table)
     run = read(radar=table, chirps={"count": 2, "interval": 6e-5})
     beat = torch.randn(1, 2, 3, 4, 64, dtype=torch.complex128, generator=torch.Generator())
-    data = ChirpData(beat, replace(settings_of_run(run, radar), real=False))
+    data = ChirpData(beat, replace(make_chirp_settings(run, radar), real=False))
     assert isinstance(data, ChirpData)
     arrays = (radar.transmitters, radar.receivers)
     described_arrays.write_chirps(tmp_path / "a.toml", data, "a.npy", arrays)
-    described = described_arrays.described_board(tmp_path / "a.toml")
+    described = described_arrays.load_described_board(tmp_path / "a.toml")
     assert isinstance(described, tuple)
     tx, rx = described
     assert torch.equal(tx.positions, radar.transmitters.positions)

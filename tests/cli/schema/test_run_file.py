@@ -7,7 +7,7 @@ import pytest
 
 from cli.small import RUN
 from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.run_file import load_run, stated, validate
+from invertwin.cli.schema.run_file import load_run, to_minimal_toml, validate_run
 from invertwin.errors import InputError
 
 REPOSITORY = Path(__file__).parents[2]
@@ -29,7 +29,7 @@ def run(**changes):
 
 def error_of(raw) -> str:
     with pytest.raises(InputError) as caught:
-        validate(raw, Path("run.toml"))
+        validate_run(raw, Path("run.toml"))
     message = str(caught.value)
     assert "\n" not in message
     return message.removeprefix("run.toml: ")
@@ -210,7 +210,7 @@ def test_files_are_looked_for_beside_the_run_file_then_in_the_data_folder(tmp_pa
         scene={"mesh": {"file": "mesh.obj", "material": ROUGH}},
         data={"kind": "rail_sar", "folder": "recording"},
     )
-    read = validate(raw, source)
+    read = validate_run(raw, source)
     assert read.scene["mesh"].model_dump()["file"] == str(tmp_path / "runs" / "mesh.obj")
     assert read.data is not None
     assert read.data.model_dump()["folder"] == str(data / "recording")
@@ -242,7 +242,7 @@ def test_all_typos_are_told_at_once_beside_wrong_values(tmp_path):
     text = text.replace("divisions = 3", "divisions = 0\nwidht = 1.0")
     text = text.replace("steps = 8", "stepz = 8\nsamplez = 3").replace("range_max", "range_mx")
     with pytest.raises(InputError) as found:
-        validate(tomllib.loads(text), tmp_path / "run.toml")
+        validate_run(tomllib.loads(text), tmp_path / "run.toml")
     said = str(found.value).split(" — also ")
     paths = {line.removeprefix(f"{tmp_path}/run.toml: ").split(":")[0] for line in said}
     assert paths == {
@@ -258,10 +258,12 @@ def test_all_typos_are_told_at_once_beside_wrong_values(tmp_path):
 
 
 def test_what_is_stated_stays_apart_from_defaults():
-    read = validate(run(seed=4), Path("run.toml"))
-    again = validate(tomllib.loads(stated(read)), Path("run.toml"))
+    read = validate_run(run(seed=4), Path("run.toml"))
+    again = validate_run(tomllib.loads(to_minimal_toml(read)), Path("run.toml"))
     assert again == read
     assert again.model_fields_set == read.model_fields_set
     assert "loss" not in again.model_fields_set
-    other = validate(tomllib.loads(stated(read.model_copy(update={"seed": 5}))), Path("run.toml"))
+    other = validate_run(
+        tomllib.loads(to_minimal_toml(read.model_copy(update={"seed": 5}))), Path("run.toml")
+    )
     assert other.seed == 5

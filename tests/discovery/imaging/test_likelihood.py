@@ -6,7 +6,11 @@ import pytest
 import torch
 
 import invertwin as iw
-from invertwin.discovery.imaging.likelihood import HeavyTailed, background, shared_bins
+from invertwin.discovery.imaging.likelihood import (
+    HeavyTailedLoss,
+    count_bins_per_draw,
+    estimate_background,
+)
 from invertwin.scene import AntennaArray, linear_array
 
 CHIRP = iw.FMCW(start_frequency=77e9, bandwidth=1e9, duration=50e-6, samples=64)
@@ -19,7 +23,7 @@ def radar(frames: int = 1) -> iw.Radar:
 
 
 def test_it_is_zero_at_the_data_and_larger_on_both_sides():
-    loss = HeavyTailed(torch.zeros(1, dtype=torch.float64), degrees=4.0)
+    loss = HeavyTailedLoss(torch.zeros(1, dtype=torch.float64), degrees=4.0)
     power = torch.full((1, 1, 1, 1), 3.0, dtype=torch.float64)
     assert float(loss(power, power)) == pytest.approx(0.0, abs=1e-12)
     assert float(loss(0.5 * power, power)) > 0.05
@@ -27,7 +31,7 @@ def test_it_is_zero_at_the_data_and_larger_on_both_sides():
 
 
 def test_many_degrees_are_plain_speckle():
-    loss = HeavyTailed(torch.zeros(1, dtype=torch.float64), degrees=1e6)
+    loss = HeavyTailedLoss(torch.zeros(1, dtype=torch.float64), degrees=1e6)
     mean = torch.full((1, 1, 1, 1), 2.0, dtype=torch.float64)
     q = 3.5
     expected = q - math.log(q) - 1
@@ -35,7 +39,7 @@ def test_many_degrees_are_plain_speckle():
 
 
 def test_an_echo_that_nothing_explains_counts_as_its_logarithm():
-    loss = HeavyTailed(torch.ones(1, dtype=torch.float64), degrees=4.0)
+    loss = HeavyTailedLoss(torch.ones(1, dtype=torch.float64), degrees=4.0)
     nothing = torch.zeros(1, 1, 1, 1, dtype=torch.float64)
     far, farther = (float(loss(nothing, torch.full_like(nothing, p))) for p in (1e4, 1e6))
     assert farther - far == pytest.approx(4.0 * math.log(1e2), rel=0.01)
@@ -45,7 +49,7 @@ def test_the_background_is_the_mean_of_noise_beside_a_bright_thing():
     torch.manual_seed(0)
     power = -torch.rand(40, 5, 30, 1, dtype=torch.float64).log() * 2e-3
     power[:, 2, :8] += 5.0  # a quarter of the directions
-    found = background(power)
+    found = estimate_background(power)
     assert found[[0, 1, 3, 4]].tolist() == pytest.approx([2e-3] * 4, rel=0.1)
     assert float(found[2]) < 4e-3
 
@@ -59,4 +63,4 @@ def test_noise_has_as_many_draws_as_bins_over_the_shared_ones():
     power = power[:, :, 8:-8]  # the outermost directions see less of their neighbours
     mean = power.flatten(1).mean(1)
     draws = float((mean.mean() / mean.std()) ** 2)
-    assert power[0].numel() / shared_bins(device, grid) == pytest.approx(draws, rel=0.25)
+    assert power[0].numel() / count_bins_per_draw(device, grid) == pytest.approx(draws, rel=0.25)

@@ -6,8 +6,12 @@ import torch
 import invertwin as iw
 from invertwin.channel import Paths
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.discovery.imaging.likelihood import background
-from invertwin.discovery.imaging.reflectivity import responses, sharpened, thinned
+from invertwin.discovery.imaging.likelihood import estimate_background
+from invertwin.discovery.imaging.reflectivity import (
+    compute_response,
+    reconstruct_reflectivity,
+    thin_map,
+)
 from invertwin.errors import InputError
 from invertwin.radar import beat_signal
 from invertwin.scene import Cosine, linear_array
@@ -53,7 +57,9 @@ def test_a_point_answers_as_the_radar_equation_says():
     device = radar()
     grid = device.grid(0.8, 3.5)
     place = torch.tensor([[0.21, 0.0, -0.13]], dtype=torch.float64)
-    found = responses(device, grid, place).maps(torch.tensor([0.5], dtype=torch.float64))
+    found = compute_response(device, grid, place).predict_maps(
+        torch.tensor([0.5], dtype=torch.float64)
+    )
     true = echo(device, place[0], 0.5)
     near = found > 0.05 * found.amax((1, 2, 3), keepdim=True)
     assert int(near.sum()) > 50
@@ -70,11 +76,11 @@ def test_two_points_closer_than_a_beam_are_two_in_the_image():
     at = torch.tensor([[-0.1, 0.0, 0.0], [0.2, 0.0, 0.1]], dtype=torch.float64)
     power = echo(device, at[0], 1.0) + echo(device, at[1], 0.3)
     power = power + 1e-6 * power.max()
-    some, coarse = thinned(power, device, grid)
+    some, coarse = thin_map(power, device, grid)
     assert some.shape == (device.frame_count, *coarse.shape)
     assert some[0].numel() < power[0].numel() / 4
-    rest = background(some)[:, None, None].expand_as(some)
-    image = sharpened(responses(device, coarse, places), some, rest)
+    rest = estimate_background(some)[:, None, None].expand_as(some)
+    image = reconstruct_reflectivity(compute_response(device, coarse, places), some, rest)
     assert float(image.min()) >= 0.0
     for place, section in ((at[0], 1.0), (at[1], 0.3)):
         near = (places - place).norm(dim=1) < 0.08
@@ -87,4 +93,4 @@ def test_too_many_places_are_refused():
     device = radar()
     places = torch.zeros(3_000_000, 3, dtype=torch.float64)
     with pytest.raises(InputError, match="smaller region"):
-        responses(device, device.grid(0.8, 3.5), places)
+        compute_response(device, device.grid(0.8, 3.5), places)

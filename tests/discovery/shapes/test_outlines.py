@@ -9,10 +9,10 @@ import torch
 import invertwin as iw
 from discovery.test_recordings import around
 from discovery.test_search import search_of
-from invertwin.discovery.search import Search
-from invertwin.discovery.shapes.outlines import outlined
-from invertwin.discovery.shapes.primitives import Figure
-from invertwin.discovery.shapes.prisms import Prism, contour
+from invertwin.discovery.search import ShapeSearch
+from invertwin.discovery.shapes.outlines import fit_outlines
+from invertwin.discovery.shapes.primitives import ShapeParameters
+from invertwin.discovery.shapes.prisms import PrismParameters, prism_contour
 from invertwin.scene import Mesh, RoughDielectric, box
 
 CORNERS = ((-0.4, -0.3), (0.5, -0.2), (-0.1, 0.5))
@@ -30,13 +30,13 @@ def wedge(corners: Sequence[tuple[float, float]], height: float) -> Mesh:
     return Mesh(torch.tensor(rows, dtype=torch.float64), torch.tensor(faces))
 
 
-def search_for(mesh: Mesh, count: int) -> Search:
+def search_for(mesh: Mesh, count: int) -> ShapeSearch:
     """A search of one thing, from places around it."""
     things = {"thing": iw.Object(mesh, RoughDielectric(permittivity=4.0))}
     return search_of(iw.Scene(things), around(count))
 
 
-def overlap(prism: Prism, corners: Sequence[tuple[float, float]]) -> float:
+def overlap(prism: PrismParameters, corners: Sequence[tuple[float, float]]) -> float:
     """Intersection over union of the outline with a convex polygon."""
     line = torch.linspace(-0.8, 0.8, 161, dtype=torch.float64)
     places = torch.cartesian_prod(line, line)
@@ -46,40 +46,43 @@ def overlap(prism: Prism, corners: Sequence[tuple[float, float]]) -> float:
         turn = (angle.roll(-1, 1) - angle + math.pi).remainder(2 * math.pi) - math.pi
         return turn.sum(1).abs() > math.pi
 
-    first = inside(contour(prism))
+    first = inside(prism_contour(prism))
     second = inside(torch.tensor(corners, dtype=torch.float64))
     return float((first & second).sum()) / float((first | second).sum())
 
 
 def test_a_triangle_in_four_pieces_becomes_one_prism():
     search = search_for(wedge(CORNERS, 0.8), 24)
-    assert search.held is not None
+    assert search.held_out_frames is not None
     pieces = [
-        Figure("box", (0.0, -0.1), 0.0, 0.65, 0.28, 0.8, 0.05),
-        Figure("box", (-0.07, 0.2), 0.0, 0.23, 0.3, 0.8, 0.05),
-        Figure("cylinder", (0.42, -0.17), 0.0, 0.12, 0.12, 0.8, 0.05),
-        Figure("corner", (-0.1, 0.48), 1.2, height=0.8, brightness=2.0),
+        ShapeParameters("box", (0.0, -0.1), 0.0, 0.65, 0.28, 0.8, 0.05),
+        ShapeParameters("box", (-0.07, 0.2), 0.0, 0.23, 0.3, 0.8, 0.05),
+        ShapeParameters("cylinder", (0.42, -0.17), 0.0, 0.12, 0.12, 0.8, 0.05),
+        ShapeParameters("corner", (-0.1, 0.48), 1.2, height=0.8, brightness=2.0),
     ]
-    pieces, _ = search.fitted.fitted(pieces, 20)
-    (found,) = outlined(search.fitted, search.held, pieces)
-    assert isinstance(found, Prism)
+    pieces, _ = search.fitted_frames.fit(pieces, 20)
+    (found,) = fit_outlines(search.fitted_frames, search.held_out_frames, pieces)
+    assert isinstance(found, PrismParameters)
     assert overlap(found, CORNERS) > 0.85
     middle = [0.5 * (min(row) + max(row)) for row in zip(*CORNERS, strict=True)]
-    assert math.dist(found.place, middle) < 0.03
-    gains = [float(search.held.gains(shapes).sum()) for shapes in ([found], pieces)]
+    assert math.dist(found.position, middle) < 0.03
+    gains = [
+        float(search.held_out_frames.log_likelihood_gains(shapes).sum())
+        for shapes in ([found], pieces)
+    ]
     assert gains[0] > gains[1] + 5
 
 
 def test_a_box_stays_a_box_and_others_are_left_alone():
     search = search_for(box((0.7, 1.2, 0.4)), 12)
-    assert search.held is not None
-    true = Figure("box", (0.0, 0.0), 0.0, 0.7, 0.4, 0.6, 0.05)
-    (settled,) = search.settled([true])
-    assert outlined(search.fitted, search.held, [settled]) == [settled]
+    assert search.held_out_frames is not None
+    true = ShapeParameters("box", (0.0, 0.0), 0.0, 0.7, 0.4, 0.6, 0.05)
+    (settled,) = search.refine([true])
+    assert fit_outlines(search.fitted_frames, search.held_out_frames, [settled]) == [settled]
     # Too small for an outline, thin, or a person: nothing is tried.
     for other in (
         replace(true, length=0.2, width=0.2),
         replace(true, kind="wall", width=0.02),
         replace(true, kind="person"),
     ):
-        assert outlined(search.fitted, search.held, [other]) == [other]
+        assert fit_outlines(search.fitted_frames, search.held_out_frames, [other]) == [other]

@@ -6,13 +6,19 @@ from typing import Literal
 import pytest
 import torch
 
-from invertwin.discovery.shapes.primitives import Figure, Primitive
-from invertwin.discovery.shapes.prisms import Outline, Prism, contour, prism_of, unknown
+from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters
+from invertwin.discovery.shapes.prisms import (
+    OutlineModel,
+    PrismParameters,
+    make_shape_model,
+    merge_into_prism,
+    prism_contour,
+)
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.scene import Mesh, Scene
 
-BOX = Figure("box", (0.3, -0.4), 0.5, 0.8, 0.5, 1.1, 0.05)
-POST = Figure("cylinder", (-0.05, -0.21), 0.0, 0.3, 0.3, 0.7, 0.2)
+BOX = ShapeParameters("box", (0.3, -0.4), 0.5, 0.8, 0.5, 1.1, 0.05)
+POST = ShapeParameters("cylinder", (-0.05, -0.21), 0.0, 0.3, 0.3, 0.7, 0.2)
 LEVEL, SPACING = -0.2, 0.04
 
 
@@ -22,28 +28,33 @@ def volume(mesh: Mesh) -> torch.Tensor:
     return (a * torch.linalg.cross(b, c)).sum() / 6
 
 
-def outline_of(*figures: Figure, up: Literal["y", "z"] = "y") -> Outline:
+def outline_of(*figures: ShapeParameters, up: Literal["y", "z"] = "y") -> OutlineModel:
     ground = Ground(up)
-    return Outline("thing", prism_of(figures, ground, LEVEL, SPACING), ground, LEVEL)
+    return OutlineModel("thing", merge_into_prism(figures, ground, LEVEL, SPACING), ground, LEVEL)
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_a_prism_starts_as_what_it_is_made_from(up):
     ground = Ground(up)
     one = outline_of(BOX, up=up)
-    mesh, true = one.mesh(), Primitive("thing", BOX, ground, LEVEL).mesh()
+    mesh, true = one.mesh(), PrimitiveModel("thing", BOX, ground, LEVEL).mesh()
     # Faces look outward, and all of the box is there; corners are rounded by less than a node.
     assert float(volume(mesh).detach()) == pytest.approx(0.8 * 0.5 * 1.1, rel=0.02)
     for low in (True, False):
         ends = [m.vertices.amin(0) if low else m.vertices.amax(0) for m in (mesh, true)]
         assert float((ends[0] - ends[1]).detach().abs().max()) < 0.5 * SPACING
-    found = one.figure
-    assert (found.kind, found.named, found.turned, found.ball) == ("prism", "prism", False, False)
-    assert found.place == pytest.approx(BOX.place, abs=0.01)
+    found = one.shape
+    assert (found.kind, found.effective_kind, found.has_yaw, found.has_free_height) == (
+        "prism",
+        "prism",
+        False,
+        False,
+    )
+    assert found.position == pytest.approx(BOX.position, abs=0.01)
     assert (found.height, found.brightness) == pytest.approx((1.1, 0.05))
     # Written down and begun anew, it is the same.
-    again = unknown("thing", found, ground, LEVEL)
-    assert isinstance(again, Outline)
+    again = make_shape_model("thing", found, ground, LEVEL)
+    assert isinstance(again, OutlineModel)
     assert torch.allclose(again.mesh().vertices, mesh.vertices, atol=1e-9)
 
 
@@ -53,16 +64,16 @@ def area(line: torch.Tensor) -> float:
 
 
 def test_shapes_that_touch_become_one_of_the_largest_ones_height():
-    one = prism_of([BOX, POST], Ground(), LEVEL, SPACING)
+    one = merge_into_prism([BOX, POST], Ground(), LEVEL, SPACING)
     assert (one.height, one.brightness) == (1.1, 0.05)
-    box, post = (prism_of([part], Ground(), LEVEL, SPACING) for part in (BOX, POST))
-    assert area(contour(box)) == pytest.approx(0.8 * 0.5, rel=0.01)
-    assert area(contour(post)) == pytest.approx(math.pi * 0.15**2, rel=0.03)
+    box, post = (merge_into_prism([part], Ground(), LEVEL, SPACING) for part in (BOX, POST))
+    assert area(prism_contour(box)) == pytest.approx(0.8 * 0.5, rel=0.01)
+    assert area(prism_contour(post)) == pytest.approx(math.pi * 0.15**2, rel=0.03)
     # The post stands to a half in the box.
-    assert 0.4 + 0.02 < area(contour(one)) < 0.4 + 0.05
+    assert 0.4 + 0.02 < area(prism_contour(one)) < 0.4 + 0.05
     # One line goes around both.
-    line = contour(one)
-    for place in (BOX.place, POST.place):
+    line = prism_contour(one)
+    for place in (BOX.position, POST.position):
         turn = line - torch.tensor(place)
         angle = torch.atan2(turn[:, 1], turn[:, 0])
         winding = (angle.roll(-1) - angle + math.pi).remainder(2 * math.pi) - math.pi
@@ -84,7 +95,7 @@ def test_the_surface_follows_all_numbers(up):
         one.place.add_(torch.tensor([0.1, -0.05]))
     moved = one.mesh().vertices.mean(0) - mesh.vertices.mean(0)
     expected = torch.zeros(3, dtype=torch.float64)
-    expected[list(ground.level)] = torch.tensor([0.1, -0.05], dtype=torch.float64)
+    expected[list(ground.plane_axes)] = torch.tensor([0.1, -0.05], dtype=torch.float64)
     assert torch.allclose(moved, expected, atol=1e-6)
     rows = {row.name: row for row in one.coordinates()}
     assert list(rows) == [
@@ -100,8 +111,8 @@ def test_the_surface_follows_all_numbers(up):
 
 def test_it_is_an_object_of_a_scene():
     one = outline_of(BOX)
-    scene = one(Scene({"thing": Primitive("thing", POST, Ground()).item}))
+    scene = one(Scene({"thing": PrimitiveModel("thing", POST, Ground()).item}))
     assert len(scene["thing"].mesh.faces) == len(one.mesh().faces)
     assert set(one.values()) == {"thing.place", "thing.height", "thing.brightness"}
     assert math.isclose(float(one.values()["thing.height"]), 1.1)
-    assert isinstance(one.figure, Prism)
+    assert isinstance(one.shape, PrismParameters)

@@ -6,15 +6,20 @@ import pytest
 import torch
 
 from blobs import LAW, Blob, Needle
-from invertwin.inversion import Observation, Optimizer, Schedule, displaced, reconstruct
-from invertwin.inversion.confidence.ambiguities import Rival, rivals, same, turns
+from invertwin.inversion import Observation, Optimizer, Schedule, displace, reconstruct
+from invertwin.inversion.confidence.ambiguities import (
+    Ambiguity,
+    are_same_poses,
+    candidate_rotations,
+    find_ambiguities,
+)
 from invertwin.scene import Mesh, Pose, Scene, Translation, box, sphere, text
 from scenes import float64, thing
 
 
 def angles(mesh: Mesh, module: torch.nn.Module) -> list[float]:
     """Turns about the vertical that are tried [°]."""
-    found = turns(module, Scene({"it": thing(mesh, (0.1, 0.0, 2.0))}))
+    found = candidate_rotations(module, Scene({"it": thing(mesh, (0.1, 0.0, 2.0))}))
     return [round(math.degrees(float(turn[1])), 6) for turn in found]
 
 
@@ -48,15 +53,15 @@ def test_poses_that_look_alike_are_the_same():
 
     def turned(degrees: float) -> Scene:
         return scene.replace(
-            "it", pose=displaced(scene["it"], none, math.radians(degrees) * float64([0, 1, 0])).pose
+            "it", pose=displace(scene["it"], none, math.radians(degrees) * float64([0, 1, 0])).pose
         )
 
-    assert same(scene, turned(180.0), ["it"])
-    assert same(scene, turned(4.0), ["it"])
-    assert not same(scene, turned(90.0), ["it"])
-    assert not same(scene, turned(30.0), ["it"])
-    moved = displaced(scene["it"], float64([0.05, 0.0, 0.0])).pose
-    assert not same(scene, scene.replace("it", pose=moved), ["it"])
+    assert are_same_poses(scene, turned(180.0), ["it"])
+    assert are_same_poses(scene, turned(4.0), ["it"])
+    assert not are_same_poses(scene, turned(90.0), ["it"])
+    assert not are_same_poses(scene, turned(30.0), ["it"])
+    moved = displace(scene["it"], float64([0.05, 0.0, 0.0])).pose
+    assert not are_same_poses(scene, scene.replace("it", pose=moved), ["it"])
 
 
 def test_a_body_that_is_nearly_its_own_half_turn_is_not_the_same():
@@ -64,15 +69,15 @@ def test_a_body_that_is_nearly_its_own_half_turn_is_not_the_same():
     vertices = mesh.vertices.clone()
     vertices[vertices[:, 0] > 0, 1] *= 0.6  # its back is lower than its front
     body = thing(Mesh(vertices, mesh.faces), (0.1, 0.0, 2.0))
-    half = displaced(body, torch.zeros(3, dtype=torch.float64), math.pi * float64([0, 1, 0]))
-    assert not same(Scene({"it": body}), Scene({"it": half}), ["it"])
+    half = displace(body, torch.zeros(3, dtype=torch.float64), math.pi * float64([0, 1, 0]))
+    assert not are_same_poses(Scene({"it": body}), Scene({"it": half}), ["it"])
     assert angles(body.mesh, Pose("it", **YAW)) == [180.0]
 
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(("score", "better", "rejected"), [(3.0, False, True), (3.0, True, False)])
 def test_a_rival_that_explains_the_data_better_is_never_rejected(score, better, rejected):
-    assert Rival(None, score, better, "turned").rejected is rejected  # pyright: ignore[reportArgumentType]
+    assert Ambiguity(None, score, better, "turned").is_rejected is rejected  # pyright: ignore[reportArgumentType]
 
 
 def wedge() -> Scene:
@@ -84,7 +89,7 @@ def wedge() -> Scene:
 
 def test_a_turn_that_explains_the_data_as_well_makes_the_verdict_ambiguous():
     scene, model = wedge(), Needle()
-    look = model.looks(scene, None, 0)
+    look = model.realisations(scene, None, 0)
     assert look is not None
     found = reconstruct(
         scene,
@@ -96,20 +101,20 @@ def test_a_turn_that_explains_the_data_as_well_makes_the_verdict_ambiguous():
     )
     before = found.scene["ball"].transform
     assert found.verdict.word == "ambiguous"
-    (rival,) = found.verdict.rivals
-    assert rival.told.startswith(("ball turned by 180.0° about y", "ball turned by 179."))
+    (rival,) = found.verdict.ambiguities
+    assert rival.description.startswith(("ball turned by 180.0° about y", "ball turned by 179."))
     assert rival.score is not None
     assert rival.score < 2.33
     assert found.verdict.reasons == (
-        f"{rival.told} explains the data as well: z = {rival.score:.1f}",
+        f"{rival.description} explains the data as well: z = {rival.score:.1f}",
     )
     # The fit itself is left as it was.
-    assert torch.equal(found.end.fit.twin()["ball"].transform, before)
+    assert torch.equal(found.result.fit.twin()["ball"].transform, before)
 
 
 def test_a_position_alone_has_no_rivals():
     scene, model = wedge(), Blob()
-    look = model.looks(scene, None, 0)
+    look = model.realisations(scene, None, 0)
     assert look is not None
     found = reconstruct(
         scene,
@@ -119,4 +124,4 @@ def test_a_position_alone_has_no_rivals():
         optimizer=Optimizer("gauss_newton", rate=0.1),
         schedule=Schedule(5),
     )
-    assert list(rivals(found.end)) == []
+    assert list(find_ambiguities(found.result)) == []

@@ -16,7 +16,7 @@ from invertwin.inversion import (
     Schedule,
     reconstruct,
 )
-from invertwin.inversion.confidence.uncertainty import coordinates
+from invertwin.inversion.confidence.uncertainty import iterate_coordinates
 from invertwin.radar.parameters import RadarPose, RangeBias
 from invertwin.scene import Pose, Scale, Scene, Translation
 from invertwin.scene.parameters import Coordinate
@@ -25,7 +25,7 @@ from scenes import float64
 
 def fitted(model: Blob, seed: int = 0, axes: str = "x", loss: Any = LAW) -> Reconstruction:
     """A fit of one look at a ball at x = 0.1."""
-    look = replace(model, known=True).looks(scene(0.1), None, 0)
+    look = replace(model, known=True).realisations(scene(0.1), None, 0)
     assert look is not None
     return reconstruct(
         scene(0.05),
@@ -46,7 +46,7 @@ def test_errors_are_those_that_speckle_allows():
     assert found.deviations["ball.x"] == pytest.approx(deviation(0.1, 4), rel=0.25)
     # Student's law with 63 degrees of freedom.
     assert found.interval(0.95)["ball.x"] == pytest.approx(1.998 * found.deviations["ball.x"], 1e-3)
-    assert (found.count, found.by) == (64, "looks")
+    assert (found.count, found.source) == (64, "looks")
 
 
 @pytest.mark.slow
@@ -64,7 +64,7 @@ def test_stated_errors_hold():
 
 def test_without_looks_the_frames_tell():
     found = fitted(Blob(frames=40, known=False)).uncertainty
-    assert (found.count, found.by) == (40, "frames")
+    assert (found.count, found.source) == (40, "frames")
     assert found.deviations["ball.x"] == pytest.approx(deviation(0.1, 40), rel=0.35)
     assert found.interval()["ball.x"] > 2.02 * found.deviations["ball.x"]
 
@@ -108,7 +108,7 @@ class Mixed(nn.Module):
 
 
 def test_a_mixed_direction_is_named_with_its_parts():
-    look = Blob().looks(scene(0.1), None, 0)
+    look = Blob().realisations(scene(0.1), None, 0)
     assert look is not None
     found = reconstruct(
         scene(),
@@ -136,7 +136,7 @@ def test_modules_name_theircoordinates():
             Translation("ball").requires_grad_(False),
         ]
     )
-    found = {c.name: c for c in coordinates(named)}
+    found = {c.name: c for c in iterate_coordinates(named)}
     assert list(found) == [
         *("ball.x", "ball.yaw", "ball.scale", "range_bias", "3.weight[0]", "3.weight[1]")
     ]

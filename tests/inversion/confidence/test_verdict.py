@@ -24,14 +24,14 @@ def fitted(data: Tensor, start: float = 0.05, model: Blob | None = None) -> Reco
 
 
 def look(seed: int, x: float = 0.1) -> Tensor:
-    drawn = Blob().looks(scene(x), None, 0)
+    drawn = Blob().realisations(scene(x), None, 0)
     assert drawn is not None
     return drawn(seed, 0.0)
 
 
 def test_right_ends_are_consistent():
     found = [fitted(look(seed)).verdict for seed in range(20)]
-    assert sum(verdict.consistent for verdict in found) >= 19
+    assert sum(verdict.is_consistent for verdict in found) >= 19
     excess = torch.tensor([verdict.excess for verdict in found], dtype=torch.float64)
     assert abs(float(excess.mean())) < 0.8
     assert 0.6 < float(excess.std()) < 1.5
@@ -63,14 +63,14 @@ class Dark(Blob):
 def test_a_start_that_shows_nothing_is_lost():
     found = fitted(look(0), start=0.2, model=Dark())
     assert found.status == "budget"
-    assert found.lost
+    assert found.is_uninformative
     assert found.verdict.word == "lost"
     assert "0 % of the power of observation 1" in found.verdict.reasons[0]
 
 
 def test_without_looks_it_is_not_known():
     found = fitted(look(0), model=Blob(known=False))
-    assert not found.lost
+    assert not found.is_uninformative
     verdict = found.verdict
     assert verdict.word == "unknown"
     assert verdict.excess is None
@@ -87,5 +87,5 @@ def test_an_end_worse_than_its_start_says_so():
 def test_values_next_to_the_end_of_their_range_are_named(diffuse, near):
     assert MaterialValues("ball", diffuse=diffuse).at_bounds() == near
     item = thing(sphere(0.1, 1), material=RoughDielectric(4.0))
-    thin = MaterialValues("ball", permittivity=1.00005).of("ball", ["permittivity"], item)
+    thin = MaterialValues("ball", permittivity=1.00005).from_object("ball", ["permittivity"], item)
     assert thin.at_bounds() == []

@@ -7,8 +7,8 @@ import torch
 
 from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck.gradcheck import Check, gradcheck
-from invertwin.inversion.gradcheck.lines import line_of
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
+from invertwin.inversion.gradcheck.lines import make_line
 from invertwin.models.radar import ExactMap, SurrogateMap
 from invertwin.radar import Radar, Surrogate
 from invertwin.radar.parameters import RadarPose
@@ -16,7 +16,7 @@ from invertwin.scene import Scene
 from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation
 from scenes import float64, occluder, radar
 
-CHEAP = Check(repeats=2, difference_samples=200_000, noise=0.02, max_pairs=6)
+CHEAP = GradcheckSettings(repeats=2, difference_samples=200_000, noise=0.02, max_pairs=6)
 KERNELS = Surrogate("gaussian", range_width=2.0, angle_width=1.0)
 DRAWN = Sampling(depth=1, samples=100_000, boundary_samples=50_000)
 SLIDE = {"translation": float64([1.0, 0.0, 0.0])}
@@ -36,7 +36,7 @@ def test_a_right_gradient_passes_and_reports():
         SLIDE,
         scene=occluder(),
         sensor=device,
-        check=CHEAP,
+        settings=CHEAP,
         progress=lines.append,
     )
     assert report.full.relative_l1 < 0.03
@@ -78,7 +78,7 @@ def test_a_wrong_gradient_fails():
         SLIDE["translation"],
         scene=occluder(),
         sensor=device,
-        check=CHEAP,
+        settings=CHEAP,
     )
     assert report.full.relative_l1 == pytest.approx(0.5, abs=0.05)
     assert abs(report.full.order) < 0.5
@@ -93,7 +93,7 @@ def test_nothing_that_moves_is_refused():
             SLIDE,
             scene=occluder(),
             sensor=device,
-            check=CHEAP,
+            settings=CHEAP,
         )
 
 
@@ -115,7 +115,7 @@ def test_bad_tangents_are_named(module, tangent, message):
     device = radar()
     model = model_of(device.grid(0.4, 2.8))
     with pytest.raises(InputError, match=message):
-        gradcheck(model, module, tangent, scene=occluder(), sensor=device, check=CHEAP)
+        gradcheck(model, module, tangent, scene=occluder(), sensor=device, settings=CHEAP)
 
 
 def test_models_without_a_mean_derivative_are_refused():
@@ -140,10 +140,10 @@ def test_models_without_a_mean_derivative_are_refused():
 def test_lines_start_at_the_scene(module, tangent):
     scene, device = occluder(), radar()
     of_radar = isinstance(module, RadarPose)
-    line = line_of(module, tangent, device if of_radar else scene)
+    line = make_line(module, tangent, device if of_radar else scene)
 
     def at(theta: float) -> tuple[Scene, Radar]:
-        found = line.end(theta)
+        found = line.evaluate_end(theta)
         return (scene, found) if of_radar else (found, device)
 
     moved, seen = at(0.0)

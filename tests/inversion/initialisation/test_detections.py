@@ -11,17 +11,17 @@ from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
 from invertwin.inversion.initialisation.detections import (
     Ground,
-    best_pose,
-    detected_points,
-    echo_image,
+    backproject_power,
+    candidate_poses,
+    detect_echoes,
+    estimate_density,
+    estimate_position,
+    estimate_scale,
+    find_bright_nodes,
+    find_largest_group,
     fit_rectangle,
-    guess_density,
-    guess_poses,
-    guess_position,
-    guess_scale,
-    image_points,
-    largest_group,
     principal_rectangle,
+    select_pose,
 )
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.radar import FMCW, Radar, Surrogate
@@ -62,7 +62,7 @@ def truck() -> Mesh:
 
 
 def parked(yaw_deg: float) -> Scene:
-    turn = Ground().turn(math.radians(yaw_deg))
+    turn = Ground().yaw_rotation(math.radians(yaw_deg))
     return Scene({"truck": Object(truck(), RoughDielectric(4.0), rigid(turn, PLACE))})
 
 
@@ -79,7 +79,7 @@ def seen() -> tuple[Scene, Capture, Grid]:
 def sides(yaw_deg: float, length: float = 4.0, width: float = 1.8, up: str = "y") -> Tensor:
     """Points on the two sides of a rectangle at PLACE that face the origin, with 2 cm of noise."""
     plane, generator = Ground(up), torch.Generator().manual_seed(1)  # pyright: ignore[reportArgumentType]
-    axes = plane.turn(math.radians(yaw_deg))[:, plane.level]
+    axes = plane.yaw_rotation(math.radians(yaw_deg))[:, plane.plane_axes]
     center = float64(PLACE)
     if up == "z":
         center = center[[0, 2, 1]]
@@ -110,26 +110,28 @@ def test_one_of_four_poses_is_the_true_one(yaw: float) -> None:
     mesh = box((4.0, 1.5, 1.8))
     item = Object(mesh, RoughDielectric(4.0), rigid(translation=[20.0, 0.3, -4.0]))
     found = fit_rectangle(points, radar, resolution=0.05)
-    turn = Ground().turn(math.radians(yaw))
+    turn = Ground().yaw_rotation(math.radians(yaw))
     errors = [
         (
             float((pose[[0, 2], 3] - float64(PLACE)[[0, 2]]).norm()),
             math.degrees(rotation_angle(pose[:3, :3] @ turn.T)),
         )
-        for pose in guess_poses(item, found, radar)
+        for pose in candidate_poses(item, found, radar)
     ]
     distance, angle = min(errors, key=lambda error: error[1])
     assert distance < 0.12
     assert angle < 1.5
-    assert all(float(pose[1, 3]) == pytest.approx(0.3) for pose in guess_poses(item, found, radar))
-    assert guess_scale(item, found) == pytest.approx(1.0, abs=0.06)
+    assert all(
+        float(pose[1, 3]) == pytest.approx(0.3) for pose in candidate_poses(item, found, radar)
+    )
+    assert estimate_scale(item, found) == pytest.approx(1.0, abs=0.06)
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_principal_axes_turn_with_the_points(up: str) -> None:
     generator = torch.Generator().manual_seed(0)
     plane = Ground(up)  # pyright: ignore[reportArgumentType]
-    axes = plane.turn(math.radians(25))[:, plane.level]
+    axes = plane.yaw_rotation(math.radians(25))[:, plane.plane_axes]
     spread = torch.randn(500, 2, generator=generator, dtype=torch.float64) * float64([2.0, 0.3])
     found = principal_rectangle(spread @ axes.T + 1.0, ground=plane)
     assert math.degrees(found.yaw) % 180 == pytest.approx(25, abs=2)
@@ -140,28 +142,30 @@ def test_the_largest_group_and_its_middle() -> None:
     generator = torch.Generator().manual_seed(0)
     many, few = torch.randn(2, 60, 3, generator=generator, dtype=torch.float64) * 0.1
     points = torch.cat([many, many[:3], few[:20] + 5.0])
-    group = largest_group(points, 0.5)
+    group = find_largest_group(points, 0.5)
     assert len(group) == 63
-    torch.testing.assert_close(guess_position(group), torch.zeros(3).double(), atol=0.05, rtol=0.0)
+    torch.testing.assert_close(
+        estimate_position(group), torch.zeros(3).double(), atol=0.05, rtol=0.0
+    )
 
 
 def test_detections_lie_on_the_object(seen: tuple[Scene, Capture, Grid]) -> None:
     scene, capture, grid = seen
-    points = detected_points(capture, grid, LOW, HIGH)
+    points = detect_echoes(capture, grid, LOW, HIGH)
     assert len(points) > 20
     reach = (points - scene["truck"].center)[:, [0, 2]].norm(dim=1)
     assert float(reach.median()) < 1.0
     with pytest.raises(InputError, match="enlarge the box"):
-        detected_points(capture, grid, [-3.0, -1.0, 8.8], [-2.8, 1.0, 9.0])
+        detect_echoes(capture, grid, [-3.0, -1.0, 8.8], [-2.8, 1.0, 9.0])
 
 
 def test_the_image_shows_what_faces_the_radar(seen: tuple[Scene, Capture, Grid]) -> None:
     scene, capture, grid = seen
-    points = image_points(capture, grid, LOW, HIGH, step=0.1)
+    points = find_bright_nodes(capture, grid, LOW, HIGH, step=0.1)
     offset = points.mean(0) - scene["truck"].center
     assert float(offset[[0, 2]].norm()) < 0.7
     assert float(offset[2]) < 0.1
-    behind = echo_image(capture, grid, float64([[0.4, 0.0, 6.0], [0.4, 0.0, -6.0]]))
+    behind = backproject_power(capture, grid, float64([[0.4, 0.0, 6.0], [0.4, 0.0, -6.0]]))
     assert float(behind[1]) == 0
 
 
@@ -179,19 +183,21 @@ def test_single_channels_are_summed_coherently() -> None:
     found = simulate(Scene({"ball": ball}), radar, grid, sampling=sampling, seed=0)
     assert found.beat is not None
     capture = Capture.from_beat(found.beat, radar)
-    points = image_points(capture, grid, [-0.5, -0.01, 2.0], [0.5, 0.01, 3.0], step=0.02, share=0.7)
-    assert float((guess_position(points) - place)[[0, 2]].norm()) < 0.05
+    points = find_bright_nodes(
+        capture, grid, [-0.5, -0.01, 2.0], [0.5, 0.01, 3.0], step=0.02, fraction=0.7
+    )
+    assert float((estimate_position(points) - place)[[0, 2]].norm()) < 0.05
 
 
 def test_the_loss_tells_front_from_back(seen: tuple[Scene, Capture, Grid]) -> None:
     scene, capture, grid = seen
     radar = capture.radar()
     rectangle = fit_rectangle(
-        largest_group(detected_points(capture, grid, LOW, HIGH), 1.0), radar, resolution=0.15
+        find_largest_group(detect_echoes(capture, grid, LOW, HIGH), 1.0), radar, resolution=0.15
     )
     anywhere = scene.replace("truck", pose=None)
-    poses = guess_poses(anywhere["truck"], rectangle, radar)
-    chosen, losses = best_pose(
+    poses = candidate_poses(anywhere["truck"], rectangle, radar)
+    chosen, losses = select_pose(
         anywhere,
         "truck",
         poses,
@@ -211,7 +217,7 @@ def test_the_loss_tells_front_from_back(seen: tuple[Scene, Capture, Grid]) -> No
 def test_the_density_is_where_the_echoes_are(seen: tuple[Scene, Capture, Grid]) -> None:
     scene, capture, grid = seen
     item = scene["truck"]
-    found = guess_density(
+    found = estimate_density(
         capture, grid, item, "truck", [-1.5, -0.3, -1.5], [1.5, 0.3, 1.5], (21, 3, 21)
     )
     assert found(scene)["truck"].cloud is not None

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from blobs import BINS, LAW, Blob, Needle, scene
 from invertwin.errors import InputError
-from invertwin.inversion import Observation, Optimizer, Schedule, nearby, pose_grid
+from invertwin.inversion import Observation, Optimizer, Schedule, pose_grid, sample_nearby_poses
 from invertwin.inversion.initialisation.multi_start import Search, search
 from invertwin.scene import Object, Pose, Scene, Translation, box
 from scenes import float64, thing
@@ -30,7 +30,7 @@ class Mirrored(Blob):
 
 def found(model: Blob, places: list[float], seed: int = 0) -> Search:
     """Fits to a ball at x = 0.8 from starts at some places."""
-    look = model.looks(scene(0.8), None, 0)
+    look = model.realisations(scene(0.8), None, 0)
     assert look is not None
     starts = [scene(x)["ball"] for x in places]
     return search(
@@ -45,14 +45,14 @@ def found(model: Blob, places: list[float], seed: int = 0) -> Search:
 
 
 def places_of(search: Search) -> list[float]:
-    return [float(end.scene["ball"].center[0].detach()) for end in search.ends]
+    return [float(end.scene["ball"].center[0].detach()) for end in search.minima]
 
 
 def test_two_minima_that_look_alike_are_both_listed():
     result = found(Mirrored(), [0.7, -0.7, 0.72, -0.72])
     assert sorted(places_of(result)) == pytest.approx([-0.8, 0.8], abs=0.03)
-    assert result.best is result.ends[0]
-    assert result.rivals[0] is None
+    assert result.best is result.minima[0]
+    assert result.scores[0] is None
     (told,) = result.ambiguities
     assert told.startswith(("ball moved by 1.5", "ball moved by 1.6"))
     assert "explains the data nearly as well" in told
@@ -61,9 +61,9 @@ def test_two_minima_that_look_alike_are_both_listed():
 def test_a_minimum_that_the_data_tell_is_rejected():
     result = found(Mirrored(share=0.4), [-0.7, 0.7])
     assert places_of(result)[0] == pytest.approx(0.8, abs=0.03)
-    assert len(result.ends) == 2
-    assert result.rivals[1] is not None
-    assert result.rivals[1] > 2.33
+    assert len(result.minima) == 2
+    assert result.scores[1] is not None
+    assert result.scores[1] > 2.33
     assert result.ambiguities == ()
 
 
@@ -72,7 +72,7 @@ def test_a_right_competitor_is_not_rejected(seed):
     """Where the other end is the right one by chance of the starts, its rival score is small."""
     result = found(Mirrored(share=0.95), [-0.7, 0.7], seed)
     right = min(range(2), key=lambda k: abs(places_of(result)[k] - 0.8))
-    score = result.rivals[right]
+    score = result.scores[right]
     assert score is None or score < 2.33
 
 
@@ -81,7 +81,7 @@ def test_half_turns_are_tried_without_being_asked():
     vertices = bar["ball"].mesh.vertices * float64([1.0, 1.0, 1.0])
     vertices[vertices[:, 0] > 0] *= 0.5  # so that both ends differ
     bar = bar.replace("ball", mesh=type(bar["ball"].mesh)(vertices, bar["ball"].mesh.faces))
-    look = Needle().looks(bar, None, 0)
+    look = Needle().realisations(bar, None, 0)
     assert look is not None
     result = search(
         bar,
@@ -92,7 +92,7 @@ def test_half_turns_are_tried_without_being_asked():
         optimizer=Optimizer("gauss_newton", rate=0.1),
         schedule=Schedule(5),
     )
-    assert len(result.ends) == 2
+    assert len(result.minima) == 2
     (told,) = result.ambiguities
     assert "180.0° about y" in told or "179." in told
 
@@ -116,9 +116,11 @@ def test_no_starts_are_refused():
 def test_random_starts_serve_as_well():
     generator = torch.Generator().manual_seed(1)
     starts: list[Object] = list(
-        nearby(scene(0.8)["ball"], 3, distance=(0.05, 0.1), axes="x", generator=generator)
+        sample_nearby_poses(
+            scene(0.8)["ball"], 3, distance=(0.05, 0.1), axes="x", generator=generator
+        )
     )
-    look = Blob().looks(scene(0.8), None, 0)
+    look = Blob().realisations(scene(0.8), None, 0)
     assert look is not None
     result = search(
         scene(),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from invertwin.errors import InputError
-from invertwin.inversion import FirstPose, displaced, nearby, residual
+from invertwin.inversion import InitialPoseEstimator, displace, pose_error, sample_nearby_poses
 from invertwin.scene import PerfectConductor, box, rigid
 from invertwin.scene.scene import Object
 
@@ -17,12 +17,12 @@ ITEM = Object(box([0.2, 0.3, 0.4]), PerfectConductor(), rigid(translation=[1.0, 
 def drawn(seed: int = 0, **changes):
     settings: dict[str, Any] = {"distance": (0.3, 0.4), "angle": (0.2, 0.5)} | changes
     generator = torch.Generator().manual_seed(seed)
-    return list(nearby(ITEM, 5, **settings, generator=generator))
+    return list(sample_nearby_poses(ITEM, 5, **settings, generator=generator))
 
 
 def test_poses_are_as_far_off_as_asked_and_repeat():
     for copy, same in zip(drawn(), drawn(), strict=True):
-        rest = residual(copy, ITEM)
+        rest = pose_error(copy, ITEM)
         assert rest is not None
         assert 0.3 <= rest.distance <= 0.4
         assert 0.2 - 1e-9 <= rest.angle <= 0.5 + 1e-9
@@ -39,10 +39,10 @@ def test_offsets_keep_to_their_axes_and_turns_to_theirs():
 
 def test_a_displaced_object_turns_about_its_centre():
     offset = torch.tensor([0.1, 0.0, -0.2], dtype=torch.float64)
-    moved = displaced(ITEM, offset)
+    moved = displace(ITEM, offset)
     torch.testing.assert_close(moved.vertices, ITEM.vertices + offset)
     half_turn = torch.tensor([0.0, math.pi, 0.0], dtype=torch.float64)
-    turned = displaced(ITEM, 0 * offset, half_turn)
+    turned = displace(ITEM, 0 * offset, half_turn)
     mirrored = 2 * ITEM.center - ITEM.vertices
     torch.testing.assert_close(turned.vertices[:, [0, 2]], mirrored[:, [0, 2]])
 
@@ -54,4 +54,4 @@ def test_a_displaced_object_turns_about_its_centre():
 def test_a_first_pose_is_looked_for_in_a_box_unless_it_is_known(pose, box, said):
     corner = None if box is None else torch.tensor(box, dtype=torch.float64)
     with pytest.raises(InputError, match=said):
-        FirstPose(corner, corner, pose=pose)
+        InitialPoseEstimator(corner, corner, pose=pose)

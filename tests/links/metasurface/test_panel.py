@@ -9,21 +9,21 @@ import torch
 from torch import Tensor
 from torch.func import jvp
 
-from invertwin.channel import lit_fractions, trace_paths
+from invertwin.channel import trace_paths, visible_fractions
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links import (
     CellSampling,
     MapPlane,
     Metasurface,
-    Reception,
+    PropagationSettings,
     Transmitters,
     frequency_response,
     panel_paths,
     received_gain,
 )
 from invertwin.links.metasurface.panel import panel_response
-from invertwin.links.places import Points
+from invertwin.links.places import ReceiverPoints
 from invertwin.models.radio import RadioMap
 from invertwin.scene import Cosine, Object, PerfectConductor, Scene, plate, rigid
 from scenes import float64
@@ -80,7 +80,7 @@ def test_its_paths_have_the_signs_of_a_mirror():
     tilt = math.radians(20.0)
     tx, rx = ([s * math.sin(tilt), 0.0, abs(s) * math.cos(tilt)] for s in (-1.0, 1.3))
     truth = trace_paths(mirror, tx, rx, FREQUENCY, depth=1, rays=None)
-    truth = truth.chosen(truth.depth == 1)
+    truth = truth.select(truth.depth == 1)
     found = panel_paths(aside(), panel(int(1.2 / (WAVELENGTH / 2))), tx, rx, FREQUENCY)
     phases = [
         paths.coefficient
@@ -95,7 +95,7 @@ def test_gain_of_a_focus_grows_with_the_square_of_the_number():
     tx, rx = [0.0, 0.5, 8.0], [1.0, -0.5, 9.0]
     power = []
     for count in (8, 16):
-        focused = panel(count).focused(tx, rx, FREQUENCY)
+        focused = panel(count).focus(tx, rx, FREQUENCY)
         ends = float64([tx]), float64([rx])
         power.append(float(panel_response(aside(), focused, *ends, FREQUENCY).abs()) ** 2)
     assert power[1] / power[0] == pytest.approx(16.0, rel=1e-2)
@@ -103,7 +103,7 @@ def test_gain_of_a_focus_grows_with_the_square_of_the_number():
 
 def test_one_bit_costs_four_decibels():
     tx, rx = [0.3, 0.5, 2.0], [1.0, -0.5, 2.5]
-    focused = panel(64).focused(tx, rx, FREQUENCY)
+    focused = panel(64).focus(tx, rx, FREQUENCY)
     levels = []
     for bits in (None, 1, 2):
         found = panel_response(
@@ -123,19 +123,19 @@ def test_rounded_phases_pass_derivatives_straight_through():
 
 def test_the_reverse_path_is_the_path():
     tx, rx = float64([[0.1, 0.2, 2.0], [-1.0, 0.3, 2.2]]), behind(5)
-    chosen = panel(16).focused(tx[0], rx[0], FREQUENCY)
+    chosen = panel(16).focus(tx[0], rx[0], FREQUENCY)
     there = panel_paths(screened(), chosen, tx, rx, FREQUENCY)
-    back = panel_paths(screened(), chosen, rx, tx, FREQUENCY).reversed()
+    back = panel_paths(screened(), chosen, rx, tx, FREQUENCY).reverse()
     assert len(there) == len(back) > 0
     assert torch.allclose(there.coefficient, back.coefficient, rtol=1e-10, atol=1e-20)
     assert torch.allclose(there.departure, back.departure)
 
 
 def test_far_away_waves_are_plane():
-    chosen = panel(12).focused([5.0, 0.0, 30.0], [-8.0, 3.0, 40.0], FREQUENCY)
+    chosen = panel(12).focus([5.0, 0.0, 30.0], [-8.0, 3.0, 40.0], FREQUENCY)
     tx, rx = float64([[5.0, 0.0, 30.0]]), behind(20) * 40.0
     exact, far = (
-        panel_response(aside(), chosen, tx, rx, FREQUENCY, far=far) for far in (False, True)
+        panel_response(aside(), chosen, tx, rx, FREQUENCY, far_field=far) for far in (False, True)
     )
     assert float((far - exact).abs().max() / exact.abs().max()) < 0.02
 
@@ -157,9 +157,9 @@ def test_an_antenna_behind_gets_nothing():
 
 def test_lit_fractions_are_those_of_a_straight_edge():
     chosen, rx = replace(panel(32), position=float64([0.02, 0.0, 0.0])), behind(100)
-    found = lit_fractions(screened(), rx, chosen.cells)
+    found = visible_fractions(screened(), rx, chosen.cells)
     edge = rx[:, 0] - rx[:, 0] * rx[:, 2] / (rx[:, 2] - 1)  # shadows of x > edge at z = 0
-    truth = (edge[:, None] - chosen.cells.places[:, 0]) / (WAVELENGTH / 2) + 0.5
+    truth = (edge[:, None] - chosen.cells.centers[:, 0]) / (WAVELENGTH / 2) + 0.5
     assert ((truth > 0) & (truth < 1)).sum() > 100
     assert float((found - truth.clamp(0, 1)).abs().max()) < 1e-9
 
@@ -170,7 +170,7 @@ def test_two_shadows_do_not_light_each_other():
     both = Scene({**screened().objects, "second": second})
     rx = float64([[0.0, 0.0, 3.0]])
     cells = replace(panel(32), position=float64([0.02, 0.0, 0.0])).cells
-    assert torch.equal(lit_fractions(both, rx, cells), lit_fractions(screened(), rx, cells))
+    assert torch.equal(visible_fractions(both, rx, cells), visible_fractions(screened(), rx, cells))
 
 
 @pytest.mark.parametrize("moved", ["position", "yaw", "blocker"])
@@ -187,7 +187,7 @@ def test_derivatives_hold_the_motion_of_shadows(moved: str):
             c, s, one = theta.cos(), theta.sin(), torch.ones_like(theta)
             turn = torch.stack([c, zero, s, zero, one, zero, -s, zero, c]).view(3, 3)
             chosen = replace(chosen, axes=turn, position=float64([0.01, 0.0, 0.0]))
-        chosen = chosen.focused([-0.5, 0.0, 3.0], [0.0, 0.0, 2.0], FREQUENCY)
+        chosen = chosen.focus([-0.5, 0.0, 3.0], [0.0, 0.0, 2.0], FREQUENCY)
         found = panel_response(scene, chosen, tx, rx, FREQUENCY, boundary=boundary)
         return 1e6 * found.abs().square().sum()
 
@@ -204,7 +204,7 @@ def test_derivatives_hold_the_motion_of_shadows(moved: str):
 
 def test_paths_add_up_coherently():
     tx, rx = [-1.0, 0.0, 3.0], [[-0.4, 0.1, 2.0], [-0.2, -0.2, 2.5]]
-    chosen = panel(16).focused(tx, rx[0], FREQUENCY)
+    chosen = panel(16).focus(tx, rx[0], FREQUENCY)
     direct = trace_paths(screened(), tx, rx, FREQUENCY, depth=0)
     over = panel_paths(screened(), [chosen], tx, rx, FREQUENCY)
     total = frequency_response(direct + over, [FREQUENCY])
@@ -220,10 +220,14 @@ def test_a_radio_map_has_panels():
         Transmitters(float64([[-1.0, 0.0, 3.0]])),
         float64([[-0.4, 0.1, 2.0], [-0.2, -0.2, 2.5]]),
     )
-    chosen = panel(16).focused([-1.0, 0.0, 3.0], rx[0], FREQUENCY)
+    chosen = panel(16).focus([-1.0, 0.0, 3.0], rx[0], FREQUENCY)
     for bandwidth in (0.0, None):
         maps = [
-            RadioMap(Points(rx), Reception(FREQUENCY, bandwidth, depth=0, panels=p), "path_gain")
+            RadioMap(
+                ReceiverPoints(rx),
+                PropagationSettings(FREQUENCY, bandwidth, depth=0, panels=p),
+                "path_gain",
+            )
             for p in ((), (chosen,))
         ]
         without, with_panel = (model.predict(screened(), tx, 0) for model in maps)
@@ -266,14 +270,14 @@ def test_wrong_calls_are_refused():
 def test_cells_hold_what_panels_send_and_how_a_screen_moves_it():
     mast = Transmitters(float64([-0.6, 0.1, 1.4]))
     cell = MapPlane.horizontal([-0.3, -0.2], [0.3, 0.2], 2.0, 0.6, CellSampling(points=25))
-    reception = Reception(FREQUENCY, depth=0, panels=[panel(16)])
+    reception = PropagationSettings(FREQUENCY, depth=0, panels=[panel(16)])
 
-    def gain(shift: Tensor, reception: Reception) -> Tensor:
-        return cell.received(screened(shift), mast, reception, 3).gain.sum()
+    def gain(shift: Tensor, reception: PropagationSettings) -> Tensor:
+        return cell.link_statistics(screened(shift), mast, reception, 3).gain.sum()
 
     shift = float64(0.05)
     with_panel, without = (gain(shift, r) for r in (reception, replace(reception, panels=())))
-    points = cell.drawn(np.random.default_rng(np.random.SeedSequence([3, 1]))).flatten(0, 1)
+    points = cell.sample_points(np.random.default_rng(np.random.SeedSequence([3, 1]))).flatten(0, 1)
     over = panel_paths(screened(shift), panel(16), mast.positions, points, FREQUENCY)
     assert float(with_panel - without) == pytest.approx(float(received_gain(over).mean()), rel=1e-9)
     alone = {how: gain(shift + way, reception) for how, way in (("up", 1e-4), ("down", -1e-4))}

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.links import Metasurface, PlacedPanel, WallPath
+from invertwin.links import Metasurface, PanelPlacement, WallPath
 from invertwin.links.metasurface.placement import (
     Coverage,
     Descent,
-    Placing,
+    PanelDesign,
     evaluations_until,
     soft_quantile,
 )
@@ -34,15 +34,15 @@ def coverage(count: int) -> Coverage:
     return Coverage.of(scene, TX, places, FREQUENCY, 0.3)
 
 
-def placing(count: int = 40) -> Placing:
+def placing(count: int = 40) -> PanelDesign:
     """8 × 8 elements on the wall x = 3.9, of which a part sees behind the screen."""
     aim = coverage(count)
     path = WallPath([[3.9, -2.9], [3.9, 2.9]], 1.8)
     none = torch.zeros(8, 8, dtype=torch.float64)
     panel = Metasurface(float64([0.0, 0.0, 0.0]), torch.eye(3, dtype=torch.float64), none, SPACING)
 
-    def make(along: float, yaw: float, spread: Sequence[float]) -> PlacedPanel:
-        return PlacedPanel(
+    def make(along: float, yaw: float, spread: Sequence[float]) -> PanelPlacement:
+        return PanelPlacement(
             path,
             TX,
             [1.0, 1.5, 1.2],
@@ -53,7 +53,7 @@ def placing(count: int = 40) -> Placing:
             spread=spread,
         )
 
-    return Placing(aim, panel, make, 0.4, 0.3, count)
+    return PanelDesign(aim, panel, make, 0.4, 0.3, count)
 
 
 def test_a_soft_quantile_becomes_the_quantile():

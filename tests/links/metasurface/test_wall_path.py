@@ -7,7 +7,7 @@ import torch
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.links import Metasurface, PlacedPanel, WallPath
+from invertwin.links import Metasurface, PanelPlacement, WallPath
 from scenes import float64
 
 FREQUENCY = 28e9
@@ -25,7 +25,7 @@ def test_a_path_goes_on_smoothly_round_its_corners(corners: list[list[float]]):
     step = 1e-4
     stops = torch.arange(0.0, path.length - 2 * step, 0.07).double()
     for stop in stops:
-        places, normals = zip(*(path.at(stop + k * step) for k in (0, 1)), strict=True)
+        places, normals = zip(*(path.locate(stop + k * step) for k in (0, 1)), strict=True)
         along = (places[1] - places[0]) / step
         assert float(along.norm()) == pytest.approx(1.0, abs=1e-3)
         assert abs(float(along @ normals[0])) < 1e-3
@@ -39,9 +39,9 @@ def test_derivatives_by_the_place_run_along_the_path():
         here = float64(stop).requires_grad_()
         for k in range(3):
             for value in range(2):
-                (slope,) = torch.autograd.grad(path.at(here)[value][k] + 0 * here, here)
+                (slope,) = torch.autograd.grad(path.locate(here)[value][k] + 0 * here, here)
                 with torch.no_grad():
-                    ends = [path.at(float64(stop + s * 1e-6))[value][k] for s in (1, -1)]
+                    ends = [path.locate(float64(stop + s * 1e-6))[value][k] for s in (1, -1)]
                 truth = float(ends[0] - ends[1]) / 2e-6
                 assert float(slope) == pytest.approx(truth, abs=1e-6)
 
@@ -52,7 +52,7 @@ def test_a_placed_panel_stays_focused():
     axes, none = torch.eye(3).double(), torch.zeros(6, 4).double()
     plain = Metasurface(torch.zeros(3).double(), axes, none, SPACING)
     for along, yaw in ((1.0, 0.3), (6.0, -0.2)):
-        module = PlacedPanel(path, tx, target, FREQUENCY, (6, 4), along=along, yaw=yaw)
+        module = PanelPlacement(path, tx, target, FREQUENCY, (6, 4), along=along, yaw=yaw)
         with torch.no_grad():
             placed = module(plain)
         elements = placed.cells.places
@@ -60,13 +60,13 @@ def test_a_placed_panel_stays_focused():
         left = placed.phase.ravel() - 2 * math.pi * FREQUENCY / SPEED_OF_LIGHT * length
         assert float(left.abs().max()) < 1e-9
         assert float(torch.linalg.det(placed.axes)) == pytest.approx(1.0)
-        inward = path.at(float64(along))[1]
+        inward = path.locate(float64(along))[1]
         assert float(placed.axes[:, 2] @ inward) == pytest.approx(math.cos(yaw))
 
 
 def test_what_is_fitted_has_names():
     path = WallPath(ROOM, 1.5, 0.2, True)
-    module = PlacedPanel(path, [1.0, 1, 1], [2.0, 2, 1], FREQUENCY, (6, 4), along=2.0)
+    module = PanelPlacement(path, [1.0, 1, 1], [2.0, 2, 1], FREQUENCY, (6, 4), along=2.0)
     assert {n: tuple(p.shape) for n, p in module.named_parameters()} == {
         "along": (),
         "yaw": (),

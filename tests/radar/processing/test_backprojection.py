@@ -169,7 +169,7 @@ def spotlight(distance: float, straight: bool) -> Radar:
     away = level * (torch.ones_like(turn) if straight else turn.cos())
     places = torch.stack([along, -away, height * torch.ones_like(turn)], dim=1)
     one = linear_array(1, 1.0)
-    return Radar(one, one, PULSES, places).centered([0.0, 0.0, 0.0])
+    return Radar(one, one, PULSES, places).center_on([0.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("straight", [False, True], ids=["circle", "line"])

@@ -27,26 +27,26 @@ def test_a_weak_mover_is_found_beside_a_strong_echo(rate):
     """Also a slow one, next to range rate zero; 30 dB below what stands still."""
     mover = moving_point(RADAR, CHIRPS, 4.5, rate * BIN, -0.2, amplitude=0.03)
     maps = doppler_maps(STILL + mover + 0.1 * noise(1), RADAR, GRID, CHIRPS)
-    assert maps.strongest.range == pytest.approx(3.0, abs=0.06)
-    assert maps.mover is not None
-    assert maps.mover.range == pytest.approx(4.5, abs=0.06)
-    assert maps.mover.velocity == pytest.approx(rate * BIN, abs=BIN)
-    assert maps.mover.u == pytest.approx(-0.2, abs=0.1)
-    assert maps.movers is not None
-    assert GRID.ranges[int(maps.movers.amax((1, 2)).argmax())] == pytest.approx(4.5, abs=0.06)
+    assert maps.strongest_peak.range == pytest.approx(3.0, abs=0.06)
+    assert maps.moving_peak is not None
+    assert maps.moving_peak.range == pytest.approx(4.5, abs=0.06)
+    assert maps.moving_peak.velocity == pytest.approx(rate * BIN, abs=BIN)
+    assert maps.moving_peak.u == pytest.approx(-0.2, abs=0.1)
+    assert maps.moving_power is not None
+    assert GRID.ranges[int(maps.moving_power.amax((1, 2)).argmax())] == pytest.approx(4.5, abs=0.06)
 
 
 def test_nothing_moves_in_noise():
     """One of a thousand recordings may; no one of these does."""
     for seed in range(10):
         maps = doppler_maps(STILL + 0.3 * noise(seed), RADAR, GRID, CHIRPS)
-        assert maps.mover is None
-        assert maps.movers is None
+        assert maps.moving_peak is None
+        assert maps.moving_power is None
 
 
 def test_rounding_and_drift_do_not_move():
-    assert doppler_maps(STILL, RADAR, GRID, CHIRPS).mover is None
-    assert doppler_maps(STILL.to(torch.complex64), RADAR, GRID, CHIRPS).mover is None
+    assert doppler_maps(STILL, RADAR, GRID, CHIRPS).moving_peak is None
+    assert doppler_maps(STILL.to(torch.complex64), RADAR, GRID, CHIRPS).moving_peak is None
     drift = torch.exp(1j * math.radians(3) * torch.linspace(-1, 1, 32, dtype=torch.float64))
     drifting = STILL * drift[:, None, None, None]
-    assert doppler_maps(drifting + 0.01 * noise(1), RADAR, GRID, CHIRPS).mover is None
+    assert doppler_maps(drifting + 0.01 * noise(1), RADAR, GRID, CHIRPS).moving_peak is None

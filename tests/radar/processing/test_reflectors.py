@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from invertwin.radar import FMCW, Chirps, Radar, points_csv, points_of
+from invertwin.radar import FMCW, Chirps, Radar, detect_points, format_points_csv
 from invertwin.radar.boards import board
 from invertwin.radar.processing.reflectors import noise_power
 from oracles.moving_point import moving_point
@@ -32,7 +32,7 @@ def test_each_reflector_is_a_point(count, level):
     chirps = Chirps(count, 40e-6)
     beat = torch.stack([moving_point(RADAR, chirps, *p[:4], amplitude=p[4]) for p in POINTS]).sum(0)
     beat = beat + level * noise(beat.shape)
-    found = points_of(beat, RADAR, GRID, None if count == 1 else chirps, 0)
+    found = detect_points(beat, RADAR, GRID, None if count == 1 else chirps, 0)
     assert len(found) == len(POINTS)
     rows = found.power.argsort(descending=True).tolist()
     for i, (distance, rate, u, v, amplitude) in zip(rows, POINTS, strict=True):
@@ -51,9 +51,9 @@ def test_each_reflector_is_a_point(count, level):
 def test_noise_has_no_points(count):
     chirps = Chirps(count, 40e-6)
     beat = noise(torch.Size([1, count, 3, 4, 64]))
-    found = points_of(beat, RADAR, GRID, None if count == 1 else chirps, 0)
+    found = detect_points(beat, RADAR, GRID, None if count == 1 else chirps, 0)
     assert len(found) <= 1
-    assert points_csv(found).startswith("range_m,velocity_m_s,u,v,power_db,x_m,y_m,z_m\n")
+    assert format_points_csv(found).startswith("range_m,velocity_m_s,u,v,power_db,x_m,y_m,z_m\n")
 
 
 def test_noise_power_of_any_quantile():

@@ -174,7 +174,7 @@ def test_any_motion_as_a_function_of_time(name):
         paths,
         RADAR,
         chirps,
-        places=lambda time: way(torch.tensor(time, dtype=torch.float64)) + offsets,
+        trajectory=lambda time: way(torch.tensor(time, dtype=torch.float64)) + offsets,
     )
     assert relative(listed, expected) < 1e-6
 
@@ -183,7 +183,7 @@ def test_a_function_of_time_is_what_velocities_are():
     scene = moving([1.0, 0.0, -3.0])
     options: dict[str, Any] = {"seed": 1, "sampling": FEW}
     by_velocity = simulate_chirps(scene, RADAR, CHIRPS, retrace=True, **options)
-    by_function = simulate_chirps(scene.at, RADAR, CHIRPS, **options)
+    by_function = simulate_chirps(scene.advance, RADAR, CHIRPS, **options)
     assert relative(by_function, by_velocity) < 1e-9
 
 
@@ -200,7 +200,7 @@ def test_impairments_of_moving_scenes():
     noisy = replace(front, phase_noise=PhaseNoise((1e5,), (-80.0,)))
     assert simulate_chirps(scene, RADAR, CHIRPS, impairments=noisy, **options).shape == clean.shape
     with pytest.raises(InputError, match="without retracing"):
-        simulate_chirps(scene.at, RADAR, CHIRPS, impairments=noisy, **options)
+        simulate_chirps(scene.advance, RADAR, CHIRPS, impairments=noisy, **options)
 
 
 def test_objects_and_triangles_stay():

@@ -201,7 +201,7 @@ def test_values_and_gradients_in_both_modes_equal_the_plain_sum(samples, track):
             tangents.append(forward_ad.unpack_dual(signal).tangent)
     assert tangents[0] is not None
     assert (tangents[1] - tangents[0]).norm() < 1e-7 * tangents[0].norm()
-    none = paths.chosen(torch.zeros(0, dtype=torch.int64))
+    none = paths.select(torch.zeros(0, dtype=torch.int64))
     assert not beat_signal(none, radar).any()
 
 
@@ -348,7 +348,7 @@ def test_ofdm_in_the_time_domain(point_paths):
     points[:, 2] = shifts.double() * waveform.range_resolution
     expected = beat_signal(point_paths(radar, points, coefficient), radar)
     assert (found - expected).norm() < 1e-6 * expected.norm()
-    assert torch.allclose(waveform.received(expected[0, 0, 0], symbols), received, atol=1e-6)
+    assert torch.allclose(waveform.receive_symbols(expected[0, 0, 0], symbols), received, atol=1e-6)
     # The range profile is the inverse FFT of Y/X.
     grid = radar.grid(0, 63 * waveform.range_resolution, oversample=1)
     profile = range_profile(found.expand(1, 1, 1, -1), radar, grid)[0, 0, 0]
@@ -361,7 +361,7 @@ def test_ofdm_symbols_must_fit():
     waveform = OFDM(76e9, 2e6, 16)
     samples = torch.ones(2, 16, dtype=torch.complex128)
     with pytest.raises(InputError, match="expected 16 symbols, got 15"):
-        waveform.received(samples[:, :15], samples[0, :15])
+        waveform.receive_symbols(samples[:, :15], samples[0, :15])
     with pytest.raises(InputError, match="got 1 zeros of 16"):
         waveform.beat(samples, torch.arange(16.0).to(torch.complex128))
 

@@ -4,7 +4,7 @@ import torch
 
 from invertwin.channel import Sampling, trace_field
 from invertwin.radar import exact_spectrum
-from invertwin.radar.signal.realisations import Looks
+from invertwin.radar.signal.realisations import SpeckleRealisations
 from invertwin.scene import Scene, plate
 from invertwin.simulation import simulate
 from scenes import float64, radar, relative, thing
@@ -16,7 +16,9 @@ SCENE = Scene({"plate": thing(plate(0.5, 0.4), (0.1, 0.0, 1.5), (0.0, 0.3, 0.0))
 def test_looks_have_the_statistics_of_exact_recordings():
     device = radar([[-0.2, 0.0, 0.0], [0.2, 0.0, 0.0]], receivers=8)
     grid = device.grid(1.0, 2.0, 0.6)
-    looks = Looks(trace_field(SCENE, device.link(), sampling=SAMPLING, seed=1), device)
+    looks = SpeckleRealisations(
+        trace_field(SCENE, device.link(), sampling=SAMPLING, seed=1), device
+    )
     drawn = torch.stack([exact_spectrum(looks.beat(k), device, grid) for k in range(200)])
     exact = torch.stack(
         [simulate(SCENE, device, grid, seed=k, sampling=SAMPLING).spectrum for k in range(60)]
@@ -50,7 +52,9 @@ def test_frames_share_speckle_as_far_as_they_are_near():
     """The plate's 0.5 m at 1.5 m let speckle go after λR/(2 · 0.5 m) = 6 mm."""
     device = radar([[0.0, 0.0, 0.0], [0.0003, 0.0, 0.0], [0.1, 0.0, 0.0]], receivers=1)
     grid = device.grid(1.2, 1.8)
-    looks = Looks(trace_field(SCENE, device.link(), sampling=SAMPLING, seed=1), device)
+    looks = SpeckleRealisations(
+        trace_field(SCENE, device.link(), sampling=SAMPLING, seed=1), device
+    )
     maps = torch.stack([exact_spectrum(looks.beat(k), device, grid) for k in range(200)])
     bright = maps.mean((0, 1)) > 0.3 * maps.mean((0, 1)).max()
     rows = _excess(maps)[:, :, bright].permute(1, 2, 0).double()
@@ -63,6 +67,8 @@ def test_frames_share_speckle_as_far_as_they_are_near():
 
 def test_another_seed_is_another_look():
     device = radar(float64([[0.0, 0.0, 0.0]]), receivers=2)
-    looks = Looks(trace_field(SCENE, device.link(), sampling=SAMPLING, seed=1), device)
+    looks = SpeckleRealisations(
+        trace_field(SCENE, device.link(), sampling=SAMPLING, seed=1), device
+    )
     assert torch.equal(looks.beat(3), looks.beat(3))
     assert relative(looks.beat(3).abs(), looks.beat(4).abs()) > 0.3

@@ -12,7 +12,7 @@ from invertwin.radar.boards import board
 from invertwin.radar.processing.doppler import range_doppler_angle, velocity_axis
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps, moving_beat
-from invertwin.radar.surrogate.range_doppler import moving_power
+from invertwin.radar.surrogate.range_doppler import range_doppler_power
 from invertwin.radar.waveform import FMCW
 from invertwin.scene.pose import look_at
 
@@ -64,7 +64,7 @@ def test_power_in_motion_is_the_mean_of_exact_signals(name, elevation):
     chirps = Chirps(32, 60e-6)
     paths = paths_of(radar, PLACES, POWERS)
     rates = velocity_axis(radar, chirps, 64)
-    found = moving_power(paths, VELOCITIES, radar, grid, chirps, rates)
+    found = range_doppler_power(paths, VELOCITIES, radar, grid, chirps, rates)
     expected = exact(radar, grid, chirps, 64)
     # What is left: points at metres are no plane waves, and migrate within the frame.
     assert float((found - expected).abs().max() / expected.max()) < 0.02
@@ -79,12 +79,12 @@ def test_transmitters_are_compensated_for_the_bin_not_for_the_point():
     paths = paths_of(radar, PLACES[:1], POWERS[:1])
     toward = PLACES[:1] / PLACES[:1].norm()
     off = torch.tensor([-2.0, 0.0, 2.0], dtype=torch.float64)
-    found = moving_power(paths, 0 * toward, radar, grid, chirps, off)[0, ..., 0].amax(1)
+    found = range_doppler_power(paths, 0 * toward, radar, grid, chirps, off)[0, ..., 0].amax(1)
     peaks = grid.u[found.argmax(1)]
     assert float(peaks[1]) == pytest.approx(float(toward[0, 0]), abs=grid.u_step)
     assert float((peaks[0] - peaks[2]).abs()) > 1.5 * grid.u_step
     at_once = replace(chirps, tdm=False)
-    found = moving_power(paths, 0 * toward, radar, grid, at_once, off)[0, ..., 0].amax(1)
+    found = range_doppler_power(paths, 0 * toward, radar, grid, at_once, off)[0, ..., 0].amax(1)
     assert len(grid.u[found.argmax(1)].unique()) == 1
 
 
@@ -92,7 +92,9 @@ def test_world_and_frames_turn_with_the_radar():
     radar = make_radar()
     grid, chirps = radar.grid(2.0, 3.8), Chirps(16, 60e-6)
     rates = velocity_axis(radar, chirps)
-    here = moving_power(paths_of(radar, PLACES, POWERS), VELOCITIES, radar, grid, chirps, rates)
+    here = range_doppler_power(
+        paths_of(radar, PLACES, POWERS), VELOCITIES, radar, grid, chirps, rates
+    )
     shift = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     turn = look_at(torch.zeros(1, 3, dtype=torch.float64), [1.0, 0.0, 1.0])[0]
     radars = replace(
@@ -103,7 +105,7 @@ def test_world_and_frames_turn_with_the_radar():
     moved = paths_of(radar, PLACES, POWERS)
     place = PLACES @ turn.T + shift
     moved = replace(moved, frame=moved.frame + 1, first=place, last=place)
-    there = moving_power(moved, VELOCITIES @ turn.T, radars, grid, chirps, rates)
+    there = range_doppler_power(moved, VELOCITIES @ turn.T, radars, grid, chirps, rates)
     torch.testing.assert_close(there[1], here[0], rtol=1e-9, atol=1e-12)
     assert not there[0].any()
 
@@ -115,7 +117,9 @@ def test_derivatives_are_those_of_differences():
     rates = velocity_axis(radar, chirps)[6:12]
 
     def shown(place, velocity, power):
-        return moving_power(paths_of(radar, place, power), velocity, radar, grid, chirps, rates)
+        return range_doppler_power(
+            paths_of(radar, place, power), velocity, radar, grid, chirps, rates
+        )
 
     given = [x[:1].clone().requires_grad_() for x in (PLACES, VELOCITIES, POWERS)]
     assert torch.autograd.gradcheck(shown, given, eps=1e-5, atol=1e-4, rtol=1e-3)
@@ -126,9 +130,9 @@ def test_wrong_velocities_windows_and_grids_are_refused(unchecked):
     grid, rates = radar.grid(2.0, 3.8), torch.zeros(1, dtype=torch.float64)
     paths = paths_of(radar, PLACES, POWERS)
     with pytest.raises(InputError, match="one per path"):
-        moving_power(paths, VELOCITIES[:1], radar, grid, chirps, rates)
+        range_doppler_power(paths, VELOCITIES[:1], radar, grid, chirps, rates)
     with pytest.raises(InputError, match="got 'kaiser'"):
-        moving_power(paths, VELOCITIES, radar, grid, chirps, rates, window="kaiser")
+        range_doppler_power(paths, VELOCITIES, radar, grid, chirps, rates, window="kaiser")
     flat = replace(grid, u_count=1)
     with pytest.raises(InputError, match="resolves u"):
-        moving_power(paths, VELOCITIES, radar, flat, chirps, rates)
+        range_doppler_power(paths, VELOCITIES, radar, flat, chirps, rates)

@@ -20,9 +20,9 @@ from invertwin.radar import (
     Waveform,
     airy,
     beat_signal,
-    chosen_surrogate,
     exact_spectrum,
     normalized_gaussian,
+    resolve_surrogate,
     surrogate_spectrum,
 )
 from invertwin.radar.surrogate.point_spread import range_point_spread
@@ -402,13 +402,13 @@ def test_annealing_ends_at_the_exact_response(linear, point_paths):
 
 
 def test_one_switch_for_all(linear):
-    assert chosen_surrogate(None) is None
-    assert chosen_surrogate("exact") is None
-    assert chosen_surrogate("gaussian") == Surrogate("gaussian", "airy")
+    assert resolve_surrogate(None) is None
+    assert resolve_surrogate("exact") is None
+    assert resolve_surrogate("gaussian") == Surrogate("gaussian", "airy")
     mine = Surrogate(range_width=1.0)
-    assert chosen_surrogate(mine) is mine
+    assert resolve_surrogate(mine) is mine
     with pytest.raises(InputError, match=r"one of exact, response, .* got 'bessel'"):
-        chosen_surrogate("bessel")
+        resolve_surrogate("bessel")
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -59,7 +59,7 @@ def test_a_model_becomes_a_template_in_our_axes():
     assert template.faces.tolist() == [[0, 1, 2]]
     assert template.shape_count == 1
     still = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
-    taller, joints = template.posed(still, float64([0.3]))
+    taller, joints = template.apply_pose(still, float64([0.3]))
     assert torch.allclose(taller, 1.8 * skin / 1.5)
     assert torch.allclose(joints[1], float64([0, 1.8, 0]))
 
@@ -89,7 +89,7 @@ def test_skinning_is_that_of_anny_itself():
     draw = torch.Generator().manual_seed(0)
     turns = 0.3 * torch.randn(len(template.names), 3, generator=draw, dtype=torch.float64)
     rotations = torch.stack([rotation_from_vector(turn) for turn in turns])
-    skin, joints = template.posed(rotations, torch.zeros(1, dtype=torch.float64))
+    skin, joints = template.apply_pose(rotations, torch.zeros(1, dtype=torch.float64))
     whole = [rotations[0]]
     for joint, parent in enumerate(template.parents[1:], start=1):
         whole.append(whole[parent] @ rotations[joint])
@@ -106,5 +106,5 @@ def test_skinning_is_that_of_anny_itself():
     higher = values | {"height": values["height"] + 0.03}
     taller = model(pose_parameters=None, phenotype_kwargs=higher)["rest_vertices"][0]
     still = torch.eye(3, dtype=torch.float64).repeat(len(template.names), 1, 1)
-    found, _ = template.posed(still, float64([0.03]))
+    found, _ = template.apply_pose(still, float64([0.03]))
     assert torch.allclose(taller @ TURN.T, found, atol=1e-6)

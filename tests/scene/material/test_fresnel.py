@@ -48,7 +48,9 @@ def test_coefficients_equal_the_closed_forms_in_360_cases():
         for name, value in expected.items():
             worst = max(worst, abs(complex(getattr(got, name)) - value))
         cases += 2  # both polarisations
-        table = RoughDielectric(permittivity, conductivity).surface(FREQUENCY).amplitude[node]
+        table = (
+            RoughDielectric(permittivity, conductivity).scattering_law(FREQUENCY).amplitude[node]
+        )
         mean = (abs(expected["reflection_s"]) ** 2 + abs(expected["reflection_p"]) ** 2) / 2
         worst = max(worst, abs(float(table) - math.sqrt(mean)))
     assert cases == 360
@@ -74,7 +76,7 @@ def test_a_conductor_reflects_with_opposite_signs():
 
 
 def test_a_refracting_body_has_an_index_and_an_attenuation():
-    surface = RefractingBody(4.0, 0.5).surface(10e9)
+    surface = RefractingBody(4.0, 0.5).scattering_law(10e9)
     epsilon = complex(complex_permittivity(4.0, 0.5, 10e9))
     root = np.sqrt(epsilon)
     assert float(surface.index) == pytest.approx(root.real, rel=1e-14)

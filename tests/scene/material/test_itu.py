@@ -88,12 +88,12 @@ def test_other_values_beside_the_table():
 def test_outside_the_table_warns_once():
     material = RoughDielectric.itu("brick")
     with pytest.warns(OutsideTableWarning, match="brick from 1 to 40 GHz, got 77 GHz") as caught:
-        first = material.surface(77e9)
+        first = material.scattering_law(77e9)
     assert len(caught) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        again = material.surface(77e9)
-        RoughDielectric.itu("brick").surface(79e9)
+        again = material.scattering_law(77e9)
+        RoughDielectric.itu("brick").scattering_law(79e9)
     assert torch.equal(first.amplitude, again.amplitude)
     # The nearer of two ranges serves between them.
     with pytest.warns(OutsideTableWarning, match="0.1 to 100 and 220 to 450 GHz"):

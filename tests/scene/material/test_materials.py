@@ -26,13 +26,13 @@ FREQUENCY = 77e9
 
 
 def test_surface_tables():
-    surface = RoughDielectric(4.0, diffuse=0.25, lobe_width=0.3).surface(FREQUENCY)
+    surface = RoughDielectric(4.0, diffuse=0.25, lobe_width=0.3).scattering_law(FREQUENCY)
     assert surface.amplitude.shape == (256,)
     assert surface.amplitude.dtype == torch.float64
     assert float(surface.amplitude[-1]) == pytest.approx(1 / 3)
     assert float(surface.diffuse) == 0.25
     assert float(surface.lobes[0]) == pytest.approx(0.75 / float(lobe_integral(lobe_exponent(0.3))))
-    mirror = PerfectConductor().surface(FREQUENCY)
+    mirror = PerfectConductor().scattering_law(FREQUENCY)
     assert (mirror.amplitude == 1).all()
     assert float(mirror.diffuse) == 0.0
     assert PerfectConductor.coherent
@@ -43,7 +43,7 @@ def test_surface_tables():
 def test_gradients_of_the_tables(values):
     def tables(permittivity, conductivity, diffuse, lobe_width):
         material = RoughDielectric(permittivity, conductivity, diffuse, lobe_width)
-        surface = material.surface(FREQUENCY)
+        surface = material.scattering_law(FREQUENCY)
         return surface.amplitude, surface.diffuse, surface.lobes, surface.exponents
 
     inputs = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in values]
@@ -52,13 +52,15 @@ def test_gradients_of_the_tables(values):
 
 def test_gradient_of_the_conductor_lobe():
     width = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda w: PerfectConductor(w).surface(FREQUENCY).lobes, width)
+    assert torch.autograd.gradcheck(
+        lambda w: PerfectConductor(w).scattering_law(FREQUENCY).lobes, width
+    )
 
 
 def test_gradient_is_zero_in_vacuum():
     """The amplitude √R has a corner there, |ε − 1| at every angle: its mean slope is chosen."""
     permittivity = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
-    RoughDielectric(permittivity).surface(FREQUENCY).amplitude.sum().backward()
+    RoughDielectric(permittivity).scattering_law(FREQUENCY).amplitude.sum().backward()
     assert permittivity.grad is not None
     assert float(permittivity.grad) == 0.0
 
@@ -87,9 +89,9 @@ def test_each_material_fills_its_part_of_the_surface(make, lets_through, refract
 
 def test_effective_roughness_contains_the_simple_one():
     # A Lambertian share d is scattering with S² = d; a lobe of slopes m has the exponent 1/m².
-    simple = RoughDielectric(4.0, 0.1, diffuse=0.36, lobe_width=0.3).surface(FREQUENCY)
+    simple = RoughDielectric(4.0, 0.1, diffuse=0.36, lobe_width=0.3).scattering_law(FREQUENCY)
     slope = float(lobe_exponent(0.3)) ** -0.5
-    effective = Dielectric(4.0, 0.1, scattering=0.6, rms_slope=slope).surface(FREQUENCY)
+    effective = Dielectric(4.0, 0.1, scattering=0.6, rms_slope=slope).scattering_law(FREQUENCY)
     assert torch.equal(simple.amplitude, effective.amplitude)
     assert torch.allclose(simple.diffuse, effective.diffuse)
     assert torch.allclose(simple.lobes, effective.lobes)
@@ -147,8 +149,8 @@ def test_every_value_has_a_range():
         (lambda: RoughDielectric(3.0, diffuse=1.1), r"diffuse fraction in \[0, 1\], got 1.1"),
         (lambda: RoughDielectric(3.0, lobe_width=0.0), "lobe width"),
         (lambda: PerfectConductor(lobe_width=10.0), "lobe width"),
-        (lambda: PerfectConductor().surface(0.0), "frequency"),
-        (lambda: RoughDielectric(3.0).surface(math.nan), "frequency"),
+        (lambda: PerfectConductor().scattering_law(0.0), "frequency"),
+        (lambda: RoughDielectric(3.0).scattering_law(math.nan), "frequency"),
         (lambda: complex_permittivity(0.5, 0.0, 1e9), "relative permittivity"),
         (lambda: complex_permittivity(2.0, -1.0, 1e9), "conductivity"),
     ],

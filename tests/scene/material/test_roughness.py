@@ -17,8 +17,8 @@ from invertwin.scene import (
     PerfectConductor,
     RoughConductor,
     RoughDielectric,
+    ScatteringLaw,
     Slab,
-    Surface,
     complex_permittivity,
     fresnel_reflectance,
     lobe_exponent,
@@ -45,7 +45,7 @@ ROUGH: list[Material] = [
 ]
 
 
-def amplitude_at(surface: Surface, cosine: Tensor) -> Tensor:
+def amplitude_at(surface: ScatteringLaw, cosine: Tensor) -> Tensor:
     """The tabulated amplitude, linear between nodes and 0 below the horizon."""
     return between_nodes(surface.amplitude, cosine)
 
@@ -57,7 +57,7 @@ def between_nodes(values: Tensor, cosine: Tensor) -> Tensor:
     return torch.where(cosine > 0, value, 0.0)
 
 
-def reflectance_distribution(surface: Surface, incoming: Tensor, outgoing: Tensor) -> Tensor:
+def reflectance_distribution(surface: ScatteringLaw, incoming: Tensor, outgoing: Tensor) -> Tensor:
     """f_r of the module text, for a surface with normal z."""
     cos_in, cos_out = incoming[..., 2], outgoing[..., 2]
     along = (incoming * outgoing).sum(-1)
@@ -69,7 +69,7 @@ def reflectance_distribution(surface: Surface, incoming: Tensor, outgoing: Tenso
     return amplitude_at(surface, cos_in) * amplitude_at(surface, cos_out) * shape
 
 
-def albedo(surface: Surface, cos_in: Tensor) -> Tensor:
+def albedo(surface: ScatteringLaw, cos_in: Tensor) -> Tensor:
     """Reflected over incident power: ∫ f_r cosθo dω by quadrature, [angle].
 
     Each lobe is integrated over directions around its own axis, with t = ((1+cosψ)/2)^(p+1) as the
@@ -108,8 +108,10 @@ def test_energy_never_exceeds_what_came_in():
                 diffuse=diffuse,
                 lobe_width=float(width),
             )
-            worst = max(worst, float(albedo(material.surface(FREQUENCY), ANGLES).max()))
-        worst = max(worst, float(albedo(PerfectConductor(float(width)).surface(1e9), ANGLES).max()))
+            worst = max(worst, float(albedo(material.scattering_law(FREQUENCY), ANGLES).max()))
+        worst = max(
+            worst, float(albedo(PerfectConductor(float(width)).scattering_law(1e9), ANGLES).max())
+        )
     assert 0.9 < worst <= 1 + 2e-5
 
 
@@ -124,7 +126,7 @@ def test_mirrored_and_incoherent_power_are_all_that_is_reflected(slope, within, 
     k = 2 * math.pi * FREQUENCY / SPEED_OF_LIGHT
     expected = 0.75 * torch.exp(-((2 * k * height * angles) ** 2))
     torch.testing.assert_close(kept, expected, rtol=1e-12, atol=0)
-    surface = metal.incoherent(FREQUENCY)
+    surface = metal.incoherent_law(FREQUENCY)
     total = kept + albedo(surface, angles)
     torch.testing.assert_close(total, torch.ones_like(total), rtol=0, atol=within)
     if not height:
@@ -133,13 +135,13 @@ def test_mirrored_and_incoherent_power_are_all_that_is_reflected(slope, within, 
 
 def test_stacks_lose_what_they_mirror():
     stack = Multilayer([Layer(4.0, thickness=1e-3), Layer(2.0, thickness=2e-3)], scattering=0.3)
-    assert float(stack.surface(FREQUENCY).lobes[0]) > 0
-    assert not stack.incoherent(FREQUENCY).lobes[0]
+    assert float(stack.scattering_law(FREQUENCY).lobes[0]) > 0
+    assert not stack.incoherent_law(FREQUENCY).lobes[0]
 
 
 @pytest.mark.parametrize("width", [0.5, 5.0, 60.0, 180.0])
 def test_conductor_returns_everything_at_normal_incidence(width):
-    surface = PerfectConductor(math.radians(width)).surface(FREQUENCY)
+    surface = PerfectConductor(math.radians(width)).scattering_law(FREQUENCY)
     assert float(albedo(surface, cosines(1.0))) == pytest.approx(1.0, abs=2e-5)
 
 
@@ -150,7 +152,7 @@ def test_dielectric_returns_about_its_fresnel_reflectance(diffuse):
     expected = fresnel_reflectance(complex_permittivity(4.0, 0.0, FREQUENCY), cosines(1.0))
     # The diffuse part reaches grazing angles, where reflection is stronger.
     tolerance = 0.02 + 0.25 * diffuse
-    assert float(albedo(material.surface(FREQUENCY), cosines(1.0))) == pytest.approx(
+    assert float(albedo(material.scattering_law(FREQUENCY), cosines(1.0))) == pytest.approx(
         float(expected), rel=tolerance
     )
 
@@ -161,7 +163,7 @@ def test_reciprocity():
     directions[..., 2] = directions[..., 2].abs()
     a, b = torch.nn.functional.normalize(directions, dim=-1)
     for material in (RoughDielectric(3.0, 0.5, diffuse=0.4), PerfectConductor(), *ROUGH):
-        surface = material.surface(FREQUENCY)
+        surface = material.scattering_law(FREQUENCY)
         forward = reflectance_distribution(surface, a, b)
         assert torch.allclose(forward, reflectance_distribution(surface, b, a), rtol=1e-10)
         assert (forward >= 0).all()
@@ -191,7 +193,7 @@ def test_three_lobes_never_return_more_than_came_in(material):
 def test_the_sum_over_the_hemisphere_is_the_albedo(cos_in):
     # Brute force over all directions, with no knowledge of the lobes' axes.
     material = Dielectric(4.0, scattering=0.8, rms_slope=0.4, lambertian=0.2, directive=0.3)
-    surface = material.surface(FREQUENCY)
+    surface = material.scattering_law(FREQUENCY)
     cosine = (torch.arange(600, dtype=torch.float64) + 0.5) / 600
     phi = 2 * math.pi * (torch.arange(240, dtype=torch.float64) + 0.5) / 240
     sine = (1 - cosine**2).sqrt()[:, None]
@@ -205,12 +207,12 @@ def test_the_sum_over_the_hemisphere_is_the_albedo(cos_in):
 
 def test_a_sheet_returns_and_lets_through_about_what_came_in():
     # √(R R) is right on average over angles only; this is the worst of some hundred sheets.
-    resonant = Slab(7.3948, thickness=6.366326e-3, scattering=1.0).surface(FREQUENCY)
-    board = Slab.itu("plasterboard", thickness=12.5e-3, scattering=1.0).surface(FREQUENCY)
+    resonant = Slab(7.3948, thickness=6.366326e-3, scattering=1.0).scattering_law(FREQUENCY)
+    board = Slab.itu("plasterboard", thickness=12.5e-3, scattering=1.0).scattering_law(FREQUENCY)
     everywhere = albedo(resonant, NODES) + resonant.transmittance[::5]
     assert 1.05 < float(everywhere.max()) < 1.12
     assert float((albedo(board, NODES) + board.transmittance[::5]).max()) < 1
-    mirror = Slab(7.3948, thickness=6.366326e-3, rms_slope=0.01).surface(FREQUENCY)
+    mirror = Slab(7.3948, thickness=6.366326e-3, rms_slope=0.01).scattering_law(FREQUENCY)
     assert float((albedo(mirror, NODES) + mirror.transmittance[::5]).max()) < 1.01
 
 
@@ -227,7 +229,7 @@ def test_shares_of_the_power():
 def test_backscattering_points_back():
     surface = RoughConductor(
         scattering=1.0, lambertian=0.0, directive=0.0, backscatter_exponent=50.0
-    ).surface(FREQUENCY)
+    ).scattering_law(FREQUENCY)
     incoming = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
     mirrored = torch.tensor([-0.6, 0.0, 0.8], dtype=torch.float64)
     back = reflectance_distribution(surface, incoming, incoming)

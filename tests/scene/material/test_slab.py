@@ -50,7 +50,7 @@ def test_one_slab_equals_the_airy_formula_in_360_cases():
         slab = Slab(permittivity, conductivity, thickness=thickness)
         cosine = torch.from_numpy(NODES)
         got = slab_coefficients([slab.sheet(FREQUENCY)], cosine, FREQUENCY)
-        surface = slab.surface(FREQUENCY)
+        surface = slab.scattering_law(FREQUENCY)
         for node in ANGLES:
             powers = []
             for polarisation in ("s", "p"):
@@ -124,7 +124,7 @@ def mean_excess(layers_at, cosine, frequency):
 @pytest.mark.parametrize("node", [5, 60, 128, 200, 255])
 def test_excess_is_the_group_delay_of_the_transmission_line(node):
     expected = mean_excess(line_at, NODES[node], FREQUENCY)
-    got = float(WALL.surface(FREQUENCY).extra_length[node])
+    got = float(WALL.scattering_law(FREQUENCY).extra_length[node])
     assert got == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
@@ -135,14 +135,14 @@ def test_excess_of_a_table_material_includes_its_dispersion():
         return [(complex(30 * ghz**-0.4, -loss), 5e-3)]
 
     slab = Slab.itu("wet_ground", thickness=5e-3)
-    got = slab.surface(5e9).extra_length[[40, 255]].tolist()
+    got = slab.scattering_law(5e9).extra_length[[40, 255]].tolist()
     for node, length in zip((40, 255), got, strict=True):
         assert length == pytest.approx(mean_excess(ground, NODES[node], 5e9), rel=1e-6)
 
 
 def test_excess_of_a_faint_slab_is_the_extra_optical_path():
     # Hardly any reflection: what is left is d (√(ε − sin²θ) − cosθ).
-    surface = Slab(1.0004, thickness=0.02).surface(FREQUENCY)
+    surface = Slab(1.0004, thickness=0.02).scattering_law(FREQUENCY)
     cosine = NODES[[100, 200, 255]]
     expected = 0.02 * (np.sqrt(0.0004 + cosine**2) - cosine)
     got = surface.extra_length[[100, 200, 255]].tolist()
@@ -156,14 +156,14 @@ def test_the_phase_through_the_thickness_is_counted_once():
     one = torch.ones(1, dtype=torch.float64)
     got = slab_coefficients([air.sheet(FREQUENCY)], one, FREQUENCY)
     assert complex(got.transmission_s) == pytest.approx(-1j, abs=1e-12)
-    assert air.surface(FREQUENCY).extra_length.abs().max() < 1e-9
-    assert (air.surface(FREQUENCY).amplitude == 0).all()
+    assert air.scattering_law(FREQUENCY).extra_length.abs().max() < 1e-9
+    assert (air.scattering_law(FREQUENCY).amplitude == 0).all()
 
 
 @pytest.mark.parametrize("thickness", [1e-3, 7.3e-3, 50e-3])
 @pytest.mark.parametrize("permittivity", [1.2, 2.73, 9.0])
 def test_what_is_not_absorbed_is_reflected_or_transmitted(permittivity, thickness):
-    surface = Slab(permittivity, thickness=thickness).surface(FREQUENCY)
+    surface = Slab(permittivity, thickness=thickness).scattering_law(FREQUENCY)
     total = surface.amplitude**2 + surface.transmittance
     assert (total - 1).abs().max() < 1e-9
 
@@ -181,23 +181,23 @@ def test_reflected_transmitted_and_absorbed_power_add_up(polarisation, cosine):
 
 def test_a_stack_transmits_the_same_from_both_sides():
     back = Multilayer(WALL.layers[::-1])
-    front, behind = WALL.surface(FREQUENCY), back.surface(FREQUENCY)
+    front, behind = WALL.scattering_law(FREQUENCY), back.scattering_law(FREQUENCY)
     assert torch.allclose(front.transmittance, behind.transmittance, rtol=1e-10)
     assert torch.allclose(front.extra_length, behind.extra_length, rtol=1e-8)
     assert not torch.allclose(front.amplitude, behind.amplitude, rtol=1e-3)
 
 
 def test_two_halves_make_the_whole():
-    whole = Slab(4.0, 0.2, thickness=6e-3).surface(FREQUENCY)
-    halves = Multilayer([Layer(4.0, 0.2, thickness=3e-3)] * 2).surface(FREQUENCY)
+    whole = Slab(4.0, 0.2, thickness=6e-3).scattering_law(FREQUENCY)
+    halves = Multilayer([Layer(4.0, 0.2, thickness=3e-3)] * 2).scattering_law(FREQUENCY)
     for name in ("amplitude", "transmittance", "extra_length"):
         assert torch.allclose(getattr(whole, name), getattr(halves, name), atol=1e-12)
 
 
 def test_a_thick_lossy_slab_is_a_half_space():
     # exp(+kd Im √ε) is far beyond the largest number here: only decaying exponentials are formed.
-    surface = Slab(4.0, 1e4, thickness=10.0).surface(FREQUENCY)
-    expected = RoughDielectric(4.0, 1e4).surface(FREQUENCY).amplitude
+    surface = Slab(4.0, 1e4, thickness=10.0).scattering_law(FREQUENCY)
+    expected = RoughDielectric(4.0, 1e4).scattering_law(FREQUENCY).amplitude
     assert torch.allclose(surface.amplitude, expected, atol=1e-9)
     assert (surface.transmittance == 0).all()
     assert torch.isfinite(surface.extra_length).all()
@@ -245,13 +245,13 @@ def test_power_is_kept_at_the_ends(permittivity, conductivity, thickness):
         torch.tensor(v, dtype=torch.float64, requires_grad=True)
         for v in (permittivity, conductivity, thickness)
     ]
-    surface = Slab(values[0], values[1], thickness=values[2]).surface(FREQUENCY)
+    surface = Slab(values[0], values[1], thickness=values[2]).scattering_law(FREQUENCY)
     for table in (surface.amplitude, surface.transmittance, surface.extra_length):
         gradients = torch.autograd.grad(table[1:].sum(), values, retain_graph=True)
         assert all(torch.isfinite(g) for g in gradients)
     reflected = surface.amplitude.square()
     if conductivity > 0:
-        half_space = RoughDielectric(permittivity, conductivity).surface(FREQUENCY)
+        half_space = RoughDielectric(permittivity, conductivity).scattering_law(FREQUENCY)
         torch.testing.assert_close(surface.amplitude, half_space.amplitude)
         assert not surface.transmittance.any()
         return
@@ -283,7 +283,7 @@ def test_power_is_kept_at_the_ends(permittivity, conductivity, thickness):
             lambda: slab_coefficients([Layer(2.0, thickness=0.01)], torch.ones(1).double(), 1e9),  # pyright: ignore[reportArgumentType]
             "layers at a frequency, got Layer",
         ),
-        (lambda: Slab(2.0, thickness=0.01).surface(-1.0), "frequency"),
+        (lambda: Slab(2.0, thickness=0.01).scattering_law(-1.0), "frequency"),
         (lambda: Slab(Itu("concrete"), thickness=Itu("concrete")), "thickness"),  # pyright: ignore[reportArgumentType]
     ],
 )

@@ -61,14 +61,14 @@ def test_coordinates_per_vertex_are_those_of_the_corners():
 def test_texture_laid_over_a_plate():
     pixels = torch.tensor([[1.0, 2.0], [3.0, 4.0]], dtype=torch.float64)
     wall = plate(3.0, 2.0, divisions=2)
-    texture = Texture.over(pixels, wall)
+    texture = Texture.from_projection(pixels, wall)
     middles = wall.vertices[wall.faces].mean(1)
     for place, value in zip(middles, texture.values, strict=True):
         column, row = int(place[0] > 0), int(place[1] < 0)
         assert abs(float(value) - float(pixels[row, column])) < 1  # bilinear, nearest wins
     flat = Mesh(wall.vertices * torch.tensor([1.0, 0.0, 1.0]), wall.faces)
     with pytest.raises(InputError, match="width and height"):
-        Texture.over(pixels, flat)
+        Texture.from_projection(pixels, flat)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (4, 1)])
@@ -85,7 +85,7 @@ def test_texture_is_differentiable_in_its_image():
     uv = corners()
 
     def amplitudes(pixels):
-        return RoughDielectric(Texture(pixels, uv)).surface(FREQUENCY).amplitude[:, ::50]
+        return RoughDielectric(Texture(pixels, uv)).scattering_law(FREQUENCY).amplitude[:, ::50]
 
     inputs = image().requires_grad_()
     assert torch.autograd.gradcheck(amplitudes, inputs, check_forward_ad=True)
@@ -118,7 +118,7 @@ def test_values_per_triangle_are_those_of_single_objects(make):
 
 def test_gradients_per_triangle():
     def tables(permittivity, conductivity, thickness):
-        surface = Slab(permittivity, conductivity, thickness=thickness).surface(FREQUENCY)
+        surface = Slab(permittivity, conductivity, thickness=thickness).scattering_law(FREQUENCY)
         return surface.amplitude[:, 3::50], surface.transmittance[:, 3::50]
 
     rows = ([2.5, 4.0], [0.1, 0.5], [1.1e-3, 2.3e-3])
@@ -131,8 +131,8 @@ def test_lists_become_tensors():
     assert isinstance(material.permittivity, torch.Tensor)
     assert torch.equal(material.permittivity, torch.tensor([2.0, 3.0], dtype=torch.float64))
     scene = Scene({"wall": Object(WALL, material)})
-    rows = [RoughDielectric(value).surface(FREQUENCY).amplitude for value in (2.0, 3.0)]
-    amplitude = scene["wall"].material.surface(FREQUENCY).amplitude
+    rows = [RoughDielectric(value).scattering_law(FREQUENCY).amplitude for value in (2.0, 3.0)]
+    amplitude = scene["wall"].material.scattering_law(FREQUENCY).amplitude
     torch.testing.assert_close(amplitude, torch.stack(rows))
 
 

@@ -60,7 +60,7 @@ def test_left_is_half_a_cycle_behind_right():
             early, late = walk.rotations(phase), walk.rotations(phase + 0.5)
             assert torch.allclose(early[right], late[left], atol=1e-12)
     mirror = float64([-1.0, 1.0, 1.0])
-    here, there = (BODY.posed(walk.rotations(phase))[1] for phase in (0.3, 0.8))
+    here, there = (BODY.apply_pose(walk.rotations(phase))[1] for phase in (0.3, 0.8))
     for name in ("shoulder", "elbow", "hip", "knee"):
         right, left = (BODY.joint(f"{side}_{name}") for side in ("right", "left"))
         # The thorax's control points are no exact mirror image.
@@ -81,7 +81,7 @@ def test_angles_pass_the_published_control_points():
 
 
 def test_the_right_foot_lands_ahead_and_the_left_arm_swings_with_it():
-    joints = BODY.posed(Walking(BODY, 1.4).rotations(0.0))[1]
+    joints = BODY.apply_pose(Walking(BODY, 1.4).rotations(0.0))[1]
     z = {name: float(joints[BODY.joint(name), 2]) for name in BODY.names}
     assert z["right_knee"] < z["left_knee"] - 0.2
     assert z["left_elbow"] < z["right_elbow"] - 0.05

@@ -8,7 +8,7 @@ import torch
 
 from invertwin.errors import InputError
 from invertwin.scene import (
-    InMotion,
+    MovingScene,
     Object,
     RoughDielectric,
     Scene,
@@ -29,7 +29,7 @@ STANDING = Object(BODY.mesh({}), RoughDielectric(4.0), rigid(translation=[0.0, H
 def joints(motion: Sitting | Waving, time: float, body=BODY) -> dict[str, torch.Tensor]:
     """Places of the joints above a floor at y = 0 [m]."""
     rotations, shift = motion.posture(time)
-    places = body.posed(rotations)[1] + shift + float64([0.0, standing_height(body), 0.0])
+    places = body.apply_pose(rotations)[1] + shift + float64([0.0, standing_height(body), 0.0])
     return dict(zip(body.names, places, strict=True))
 
 
@@ -112,7 +112,7 @@ def test_a_person_who_walks_can_wave():
     assert not torch.allclose(both.posture(1.7)[0][row], walk.posture(1.7)[0][row], atol=0.1)
     assert torch.allclose(both.posture(9.0)[0], walk.posture(9.0)[0], atol=1e-9)
     assert torch.equal(both.posture(1.7)[1], walk.posture(1.7)[1])
-    scene = InMotion(Scene({"person": STANDING}), {"person": both})
+    scene = MovingScene(Scene({"person": STANDING}), {"person": both})
     assert torch.equal(scene(1.7)["person"].vertices, both(STANDING, 1.7).vertices)
 
 

@@ -10,14 +10,14 @@ from invertwin.errors import InputError
 from invertwin.radar import FMCW, Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.scene import (
-    Along,
     AntennaArray,
-    InMotion,
+    AxisRotation,
+    MovingScene,
     Object,
     RoughDielectric,
     Scene,
-    Spline,
-    Turning,
+    SplineTrajectory,
+    TrajectoryMotion,
     Walking,
     box,
     person,
@@ -30,7 +30,7 @@ from scenes import float64
 
 PAINT = RoughDielectric(4.0)
 TIMES = [0.0, 0.4, 1.0, 1.5]
-PATH = Spline(TIMES, [[0, 0, 5], [0.4, 0, 4.5], [1.0, 0.2, 4.2], [1.1, 0.1, 3.0]])
+PATH = SplineTrajectory(TIMES, [[0, 0, 5], [0.4, 0, 4.5], [1.0, 0.2, 4.2], [1.1, 0.1, 3.0]])
 STEP = 1e-5
 
 
@@ -43,7 +43,7 @@ def speeds(mover, item, time):
 def test_the_rim_of_a_wheel_is_as_fast_as_rate_times_radius():
     turn = rotation_from_vector(float64([0.3, -0.5, 0.2]))
     wheel = Object(sphere(0.3, 2), PAINT, rigid(turn, [1.0, 0.5, 2.0]))
-    spin = Turning([0.0, 0.0, 2.0], rate=7.0)
+    spin = AxisRotation([0.0, 0.0, 2.0], rate=7.0)
     points = wheel.mesh.vertices
     radii = points[:, :2].norm(dim=1)
     found = speeds(spin, wheel, 0.13)
@@ -57,36 +57,37 @@ def test_the_rim_of_a_wheel_is_as_fast_as_rate_times_radius():
 
 def test_a_crank_turns_about_a_place_of_its_own():
     pedal = Object(box((0.1, 0.02, 0.05)), PAINT, rigid(translation=[0.0, 0.0, 3.0]))
-    crank = Turning([1.0, 0.0, 0.0], rate=2 * math.pi, center=[0.0, -0.17, 0.0])
+    crank = AxisRotation([1.0, 0.0, 0.0], rate=2 * math.pi, center=[0.0, -0.17, 0.0])
     low = crank(pedal, 0.5).center
     assert torch.allclose(low, float64([0.0, -0.34, 3.0]), atol=1e-12)
 
 
 def test_a_spline_meets_its_places_and_its_velocity_is_their_derivative():
-    for time, place in zip(TIMES, PATH.places, strict=True):
+    for time, place in zip(TIMES, PATH.positions, strict=True):
         assert torch.allclose(PATH.position(time), place, atol=1e-12)
     for time in (0.1, 0.4, 0.77, 1.3):
         change = PATH.position(time + STEP) - PATH.position(time - STEP)
         assert torch.allclose(PATH.velocity(time), change / (2 * STEP), atol=1e-7)
-    even = Spline([0.0, 1.0, 3.0], [[0, 0, 0], [2, 0, 1], [6, 0, 3]])
+    even = SplineTrajectory([0.0, 1.0, 3.0], [[0, 0, 0], [2, 0, 1], [6, 0, 3]])
     assert torch.allclose(even.velocity(2.2), float64([2.0, 0.0, 1.0]), atol=1e-12)
 
 
 def test_an_object_follows_a_path_and_looks_ahead():
     item = Object(box(0.2), PAINT, rigid(translation=[0.0, 0.3, 0.0]))
-    moved = Along(PATH, heading=True)(item, 0.7)
+    moved = TrajectoryMotion(PATH, heading=True)(item, 0.7)
     assert torch.allclose(moved.center, PATH.position(0.7) + float64([0, 0.3, 0]), atol=1e-12)
     way = PATH.velocity(0.7) * float64([1.0, 0.0, 1.0])
     front = moved.transform[:3, :3] @ float64([0.0, 0.0, -1.0])
     assert torch.allclose(front, way / way.norm(), atol=1e-12)
-    assert torch.equal(Along(PATH)(item, 0.7).transform[:3, :3], torch.eye(3).double())
+    assert torch.equal(TrajectoryMotion(PATH)(item, 0.7).transform[:3, :3], torch.eye(3).double())
 
 
 def test_a_rolling_wheel_stands_where_it_touches():
     wheel = Object(sphere(0.25, 3), PAINT)
-    road = Spline([0.0, 2.0], [[0, 0.25, 4.0], [3.0, 0.25, 4.0]])
-    rolling = InMotion(
-        Scene({"wheel": wheel}), {"wheel": (Turning([0, 0, 1.0], -1.5 / 0.25), Along(road))}
+    road = SplineTrajectory([0.0, 2.0], [[0, 0.25, 4.0], [3.0, 0.25, 4.0]])
+    rolling = MovingScene(
+        Scene({"wheel": wheel}),
+        {"wheel": (AxisRotation([0, 0, 1.0], -1.5 / 0.25), TrajectoryMotion(road))},
     )
     found = speeds(lambda _, time: rolling(time)["wheel"], wheel, 0.8)
     points = rolling(0.8)["wheel"].vertices
@@ -106,8 +107,8 @@ def test_triangles_and_what_stands_still_stay():
             "car": Object(box(0.5), PAINT, velocity=float64([0.0, 0.0, 2.0])),
         }
     )
-    walk = (Walking(body, 1.0, on_spot=True), Along(PATH, heading=True))
-    scene = InMotion(still, {"person": walk})
+    walk = (Walking(body, 1.0, on_spot=True), TrajectoryMotion(PATH, heading=True))
+    scene = MovingScene(still, {"person": walk})
     early, late = scene(0.1), scene(0.6)
     assert early.names == still.names
     assert torch.equal(early["box"].vertices, late["box"].vertices)
@@ -123,9 +124,9 @@ def test_a_radar_sees_the_doppler_of_a_path():
     chirp = FMCW(77e9, 1e9, 20e-6, 32)
     one = AntennaArray(float64([[0.0, 0.0, 0.0]]))
     radar = Radar(one, one, chirp, float64([[0.0, 0.0, 0.0]]))
-    path = Spline([0.0, 1.0], [[0.0, 0.0, 2.0], [0.0, 0.0, -1.0]])
+    path = SplineTrajectory([0.0, 1.0], [[0.0, 0.0, 2.0], [0.0, 0.0, -1.0]])
     ball = Object(sphere(0.02, 2), PAINT)
-    scene = InMotion(Scene({"ball": ball}), {"ball": Along(path)})
+    scene = MovingScene(Scene({"ball": ball}), {"ball": TrajectoryMotion(path)})
     few = Sampling(depth=1, points_per_m2=20_000.0)
     beat = simulate_chirps(
         scene, radar, Chirps(8, 100e-6), seed=3, sampling=few, visibility_every=8
@@ -138,25 +139,27 @@ def test_a_radar_sees_the_doppler_of_a_path():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Turning([0, 0, 0], 1.0), "axis with a direction"),
-        (lambda: Turning([0, 0, 1], math.inf), "rate"),
-        (lambda: Spline([0.0, 0.0], [[0, 0, 0], [1, 1, 1]]), "rising times"),
-        (lambda: Spline([0.0, 1.0], [[0, 0, 0]]), "places"),
+        (lambda: AxisRotation([0, 0, 0], 1.0), "axis with a direction"),
+        (lambda: AxisRotation([0, 0, 1], math.inf), "rate"),
+        (lambda: SplineTrajectory([0.0, 0.0], [[0, 0, 0], [1, 1, 1]]), "rising times"),
+        (lambda: SplineTrajectory([0.0, 1.0], [[0, 0, 0]]), "places"),
         (lambda: PATH.position(1.6), r"\[0, 1.5\] s, got 1.6"),
         (
-            lambda: Along(Spline([0.0, 1.0], [[0, 0, 0], [0, 1, 0]]), heading=True)(
-                Object(box(1.0), PAINT), 0.5
-            ),
+            lambda: TrajectoryMotion(
+                SplineTrajectory([0.0, 1.0], [[0, 0, 0], [0, 1, 0]]), heading=True
+            )(Object(box(1.0), PAINT), 0.5),
             "level velocity",
         ),
         (
-            lambda: InMotion(Scene({"a": Object(box(1.0), PAINT)}), {"b": Along(PATH)}),
+            lambda: MovingScene(
+                Scene({"a": Object(box(1.0), PAINT)}), {"b": TrajectoryMotion(PATH)}
+            ),
             "name of an object",
         ),
         (
-            lambda: InMotion(
+            lambda: MovingScene(
                 Scene({"a": Object(box(1.0), PAINT, velocity=float64([1.0, 0.0, 0.0]))}),
-                {"a": Along(PATH)},
+                {"a": TrajectoryMotion(PATH)},
             ),
             "beside its motion",
         ),

@@ -99,8 +99,8 @@ def test_names_are_one_for_each_joint():
 def test_a_posed_skin_tells_its_joint_angles():
     draw = torch.Generator().manual_seed(3)
     turns = 0.5 * torch.randn(len(TEMPLATE.names), 3, generator=draw, dtype=torch.float64)
-    body = TEMPLATE.scaled(1.3)
+    body = TEMPLATE.scale(1.3)
     skin = SkinnedBody("person", body, turns)(SCENE)["person"].mesh.vertices
-    assert torch.allclose(body.rotations_of(skin), turns, atol=1e-9)
+    assert torch.allclose(body.estimate_rotations(skin), turns, atol=1e-9)
     rest = SkinnedBody("person", body)(SCENE)["person"].mesh.vertices
-    assert torch.allclose(body.rotations_of(rest), torch.zeros_like(turns), atol=1e-9)
+    assert torch.allclose(body.estimate_rotations(rest), torch.zeros_like(turns), atol=1e-9)

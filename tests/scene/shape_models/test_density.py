@@ -8,7 +8,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.metrics import volume_iou
 from invertwin.scene import DensityGrid, Object, RoughDielectric, Scene, plate, sphere
 from invertwin.scene.parameters import Scale, Translation
-from invertwin.scene.shape_models.density import without_clouds
+from invertwin.scene.shape_models.density import replace_clouds
 
 BOX = [-0.5] * 3, [0.5] * 3
 
@@ -32,7 +32,7 @@ def test_densities_come_back_and_are_never_negative() -> None:
 
 
 def test_an_even_start_has_the_depth_it_was_given() -> None:
-    grid = DensityGrid.even("item", [0, 0, 0], [2, 1, 1], (9, 5, 5), depth=0.3)
+    grid = DensityGrid.from_optical_depth("item", [0, 0, 0], [2, 1, 1], (9, 5, 5), depth=0.3)
     torch.testing.assert_close(
         2 * grid.density.detach(), torch.full((9, 5, 5), 0.3, dtype=torch.float64)
     )
@@ -53,8 +53,8 @@ def test_a_scene_without_clouds() -> None:
     marker = Object(plate(1.0, 1.0), RoughDielectric(4.0))
     scene = Scene({"soft": marker, "even": marker, "hard": marker})
     scene = DensityGrid("soft", *BOX, ball())(scene)
-    scene = DensityGrid.even("even", *BOX, (3, 3, 3))(scene)
-    solid = without_clouds(scene)
+    scene = DensityGrid.from_optical_depth("even", *BOX, (3, 3, 3))(scene)
+    solid = replace_clouds(scene)
     assert all(item.cloud is None for item in solid.objects.values())
     assert volume_iou(solid["soft"].mesh, sphere(0.3), voxel=0.02) > 0.9
     assert solid["even"].mesh is marker.mesh
@@ -91,7 +91,7 @@ def test_what_a_cloud_does_not_show_cannot_be_fitted(order):
     scene = Scene({"ball": Object(sphere(0.1, 1), RoughDielectric(4.0))})
     made = {
         "size": Scale("ball"),
-        "cloud": DensityGrid.even("ball", [-0.2] * 3, [0.2] * 3, (3, 3, 3)),
+        "cloud": DensityGrid.from_optical_depth("ball", [-0.2] * 3, [0.2] * 3, (3, 3, 3)),
     }
     first, last = (made[name] for name in order)
     with pytest.raises(
@@ -102,7 +102,7 @@ def test_what_a_cloud_does_not_show_cannot_be_fitted(order):
 
 def test_a_cloud_can_be_moved():
     scene = Scene({"ball": Object(sphere(0.1, 1), RoughDielectric(4.0))})
-    scene = DensityGrid.even("ball", [-0.2] * 3, [0.2] * 3, (3, 3, 3))(scene)
+    scene = DensityGrid.from_optical_depth("ball", [-0.2] * 3, [0.2] * 3, (3, 3, 3))(scene)
     moved = Translation("ball", [0.1, 0, 0])(scene)["ball"]
     offset = moved.transform[:3, 3] - scene["ball"].transform[:3, 3]
     torch.testing.assert_close(offset, torch.tensor([0.1, 0, 0], dtype=torch.float64))

@@ -44,7 +44,7 @@ def bodies(mesh: Mesh) -> int:
 
 
 def grid(radius: float = 0.3, counts: tuple[int, int, int] = (21, 17, 19)) -> DistanceGrid:
-    return DistanceGrid.sampled("ball", LOW, HIGH, counts, ball(radius, (0.03, 0.01, -0.02)))
+    return DistanceGrid.from_function("ball", LOW, HIGH, counts, ball(radius, (0.03, 0.01, -0.02)))
 
 
 def net(counts: int = 17) -> NeuralDistance:
@@ -57,7 +57,7 @@ def net(counts: int = 17) -> NeuralDistance:
 
 
 def test_mesh_of_a_ball_lies_on_it_and_faces_outwards():
-    mesh = iso_surface(ball(0.3), Lattice.between(LOW, HIGH, (25, 21, 23)))
+    mesh = iso_surface(ball(0.3), Lattice.from_bounds(LOW, HIGH, (25, 21, 23)))
     assert torch.allclose(mesh.vertices.norm(dim=1), float64(0.3), atol=1e-9)
     assert float(volume(mesh)) == pytest.approx(4 / 3 * math.pi * 0.3**3, rel=0.01)
     assert bodies(mesh) == 1
@@ -68,7 +68,7 @@ def test_grid_interpolates_its_nodes_and_straight_lines_exactly():
     nodes = field.lattice.nodes.reshape(-1, 3)
     assert torch.allclose(field.distance(nodes), field.value.flatten(), atol=1e-12)
     slope = float64([0.3, -1.0, 2.0])
-    line = DistanceGrid.sampled("ball", LOW, HIGH, (4, 5, 6), lambda p: p @ slope)
+    line = DistanceGrid.from_function("ball", LOW, HIGH, (4, 5, 6), lambda p: p @ slope)
     generator = torch.Generator().manual_seed(0)
     points = float64(LOW) + torch.rand(50, 3, generator=generator, dtype=torch.float64) * (
         float64(HIGH) - float64(LOW)
@@ -174,7 +174,7 @@ def test_derivative_of_the_volume_is_that_of_meshing_anew():
 def test_topology_changes_while_a_grid_is_fitted():
     """Two balls that touch lose volume by gradient steps on the nodes' values: they part."""
     near = [ball(0.2, (x, 0, 0)) for x in (0.19, -0.19)]
-    field = DistanceGrid.sampled(
+    field = DistanceGrid.from_function(
         "ball", LOW, HIGH, (21, 17, 19), lambda p: torch.minimum(near[0](p), near[1](p))
     )
     target = 2 * 4 / 3 * math.pi * 0.15**3
@@ -240,7 +240,7 @@ def test_bad_grid_values(unchecked):
 
 def test_smoothing_changes_steps_but_neither_shape_nor_reach():
     rough, smooth = (
-        DistanceGrid.sampled("ball", LOW, HIGH, (9, 8, 7), ball(0.2), amount)
+        DistanceGrid.from_function("ball", LOW, HIGH, (9, 8, 7), ball(0.2), amount)
         for amount in (0.0, 5.0)
     )
     assert torch.allclose(smooth.distances, rough.distances, atol=1e-12)
@@ -265,4 +265,4 @@ def test_smoothing_changes_steps_but_neither_shape_nor_reach():
 
 def test_a_negative_smoothing():
     with pytest.raises(InputError, match="smoothing"):
-        DistanceGrid.sampled("ball", LOW, HIGH, (9, 8, 7), ball(0.2), -1.0)
+        DistanceGrid.from_function("ball", LOW, HIGH, (9, 8, 7), ball(0.2), -1.0)

@@ -81,7 +81,7 @@ def test_a_field_of_64_nodes_a_side_decodes_within_a_second():
 
 def test_the_whole_field_its_slices_and_its_points_are_one():
     z, counts = latent(1), (9, 8, 7)
-    points = Lattice.between(PRIOR.low, PRIOR.high, counts).nodes.reshape(-1, 3)
+    points = Lattice.from_bounds(PRIOR.low, PRIOR.high, counts).nodes.reshape(-1, 3)
     whole = PRIOR.decode(z, counts)
     assert torch.allclose(whole.reshape(-1), PRIOR.distance(points, z), atol=1e-12)
     mirrored = PRIOR.distance(points * float64([1, -1, 1]), z)
@@ -189,7 +189,7 @@ def test_what_is_no_prior_is_refused(tmp_path):
 def test_a_decoder_of_other_nodes_is_refused():
     decoder = Decoder(2, 4, 3, 5)
     with pytest.raises(InputError, match="half the nodes"):
-        ShapePrior(decoder, Lattice.between([-1, -1, -1], [1, 1, 1], (5, 5, 5)))
+        ShapePrior(decoder, Lattice.from_bounds([-1, -1, -1], [1, 1, 1], (5, 5, 5)))
 
 
 def test_derivatives_are_the_same_on_a_surface_that_is_known():

@@ -5,27 +5,27 @@ from typing import Annotated
 
 import typer
 
-from invertwin.cli.options import FileArgument, Options, Where, with_options
+from invertwin.cli.options import FileArgument, OutputOptions, RunOptions, with_options
 
 
-@with_options(Options)
-def loss_scan(options: Options, file: FileArgument) -> None:
+@with_options(RunOptions)
+def loss_scan(options: RunOptions, file: FileArgument) -> None:
     """Show the losses of signals and of the surrogate along a line."""
-    from invertwin.cli.schema.run_file import about_file
+    from invertwin.cli.schema.run_file import prefix_file_errors
     from invertwin.cli.terminal import load_runs, print_tables, run_folder
 
     runs = load_runs([file], options, "loss-scan", ("loss_scan", "radar", "grid", "data"))
     with run_folder(options, Path("out", file.stem), runs) as folder:
         from invertwin_studies.loss_scan import run_loss_scan
 
-        with about_file(file):
+        with prefix_file_errors(file):
             tables = run_loss_scan(runs[file.stem], folder)
         print_tables(tables)
 
 
-@with_options(Where)
+@with_options(OutputOptions)
 def train_prior(
-    options: Where,
+    options: OutputOptions,
     cars: Annotated[int, typer.Option(min=100, help="Cars that are drawn for it.")] = 3000,
     latent: Annotated[int, typer.Option(min=1, max=64, help="Coordinates of a shape.")] = 24,
     epochs: Annotated[int, typer.Option(min=1, help="Times that every car is seen.")] = 40,
@@ -33,7 +33,7 @@ def train_prior(
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
 ) -> None:
     """Train a shape prior on cars of the generator; the packaged one by default."""
-    from invertwin.cli.terminal import now_and_then, print_tables, run_folder
+    from invertwin.cli.terminal import limit_rate, print_tables, run_folder
     from invertwin_studies import train_prior as training
     from invertwin_studies.prior_training import Training
 
@@ -41,5 +41,5 @@ def train_prior(
     again = f"train-prior --cars {cars} --latent {latent} --epochs {epochs} --seed {seed}"
     again += " --wheels" if wheels else ""
     with run_folder(options, Path("out/train_prior")) as folder:
-        tables = training.run_train_prior(settings, folder, again, now_and_then())
+        tables = training.run_train_prior(settings, folder, again, limit_rate())
         print_tables(tables)

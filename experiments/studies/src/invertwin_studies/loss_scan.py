@@ -10,15 +10,15 @@ from torch import Tensor
 
 from invertwin.capture import Capture
 from invertwin.channel import Grid, Sampling
-from invertwin.cli.commands.landscape import exact_losses, line_through
-from invertwin.cli.estimate import Sensor, require_room
-from invertwin.cli.exact_signals import exact
-from invertwin.cli.report import Table, finish, picture
+from invertwin.cli.commands.landscape import evaluate_exact_losses, make_object_line
+from invertwin.cli.estimate import SensorSetup, require_resources
+from invertwin.cli.exact_signals import simulate_exact
+from invertwin.cli.report import ReportTable, save_picture, write_report
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import need
+from invertwin.cli.schema.run_file import require_section
 from invertwin.errors import InputError
 from invertwin.inversion import Observation
-from invertwin.inversion.gradcheck.lines import Line, losses_along
+from invertwin.inversion.gradcheck.lines import ParameterLine, evaluate_losses
 from invertwin.inversion.loss import relative_error
 from invertwin.models.radar import BeatMap, SurrogateMap
 from invertwin.radar.processing.direction import music
@@ -46,7 +46,7 @@ _NOTE = (
 )
 
 
-def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
+def run_loss_scan(run: RunFile, folder: RunFolder) -> list[ReportTable]:
     """Scan the line of a run file, write the folder, and return the table to print.
 
     Args:
@@ -54,11 +54,11 @@ def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
         folder: Of the run.
     """
     begin = time.perf_counter()
-    settings: LossScan = need(run, "loss_scan", "loss-scan")
+    settings: LossScan = require_section(run, "loss_scan", "loss-scan")
     truth = build.true_scene(run)
-    radar = build.radar(need(run, "radar", "loss-scan"))
-    grid = build.grid(need(run, "grid", "loss-scan"), radar)
-    depth = getattr(need(run, "data", "loss-scan"), "depth", 1)
+    radar = build.radar(require_section(run, "radar", "loss-scan"))
+    grid = build.grid(require_section(run, "grid", "loss-scan"), radar)
+    depth = getattr(require_section(run, "data", "loss-scan"), "depth", 1)
     if run.surrogate.exact:
         raise InputError(
             "surrogate.exact: expected a smooth map beside the exact signals, got no surrogate; "
@@ -66,9 +66,9 @@ def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
         )
     if depth > 1:
         raise InputError(f"data.depth: expected 1 for loss-scan, got {depth}; set depth = 1")
-    require_room(run, truth, {"": Sensor(run, radar, grid)})
-    found = exact(run, truth, radar, grid)
-    line, along = line_through(truth, settings.object, settings.axis)
+    require_resources(run, truth, {"": SensorSetup(run, radar, grid)})
+    found = simulate_exact(run, truth, radar, grid)
+    line, along = make_object_line(truth, settings.object, settings.axis)
     near, wide = _losses(run, settings, line, radar, grid, found.beat)
     wavelengths = 2 * settings.span / radar.waveform.wavelength
     minima = {name: deep_minima(losses) for name, (_, losses) in near.items()}
@@ -83,17 +83,17 @@ def run_loss_scan(run: RunFile, folder: RunFolder) -> list[Table]:
         "wall_seconds": time.perf_counter() - begin,
     }
     figure = scan({TITLES[name]: curve for name, curve in near.items()}, wide, along)
-    drawn = picture(folder, "losses", figure, "Loss against displacement")
+    drawn = save_picture(folder, "losses", figure, "Loss against displacement")
     title = run.title or "Losses along a line"
     status = f"{along}, {2 * settings.span:g} m in {settings.points} steps."
     parts = [_table(metrics, along), drawn]
-    return finish(folder, metrics, title, status, parts, again="loss-scan", note=run.note)
+    return write_report(folder, metrics, title, status, parts, again="loss-scan", note=run.note)
 
 
 def _losses(
     run: RunFile,
     settings: LossScan,
-    line: Line,
+    line: ParameterLine,
     radar: Radar,
     grid: Grid,
     measured: Tensor,
@@ -101,8 +101,8 @@ def _losses(
     """The four curves near the truth, and the surrogate's farther away."""
     capture = Capture.from_beat(measured, radar)
     sampling = Sampling(depth=1, samples=settings.samples)
-    model = SurrogateMap(grid, build.made(run, "surrogate"), sampling)
-    smooth = Observation(model, radar, capture, loss=build.made(run, "loss"))
+    model = SurrogateMap(grid, build.build_section(run, "surrogate"), sampling)
+    smooth = Observation(model, radar, capture, loss=build.build_section(run, "loss"))
     first = radar.frames([0])
     views = _views(settings, first, grid)
 
@@ -114,10 +114,12 @@ def _losses(
 
     x = np.linspace(-settings.span, settings.span, settings.points)
     far = np.linspace(-settings.wide_span, settings.wide_span, settings.wide_points)
-    exact = exact_losses(run, line, x, Observation(BeatMap(grid), first, measured[:1], loss=errors))
+    exact = evaluate_exact_losses(
+        run, line, x, Observation(BeatMap(grid), first, measured[:1], loss=errors)
+    )
     near = {name: (x, exact[:, k]) for k, name in enumerate(views)}
-    near["surrogate"] = (x, losses_along(line, x, smooth, seed=run.seed).numpy())
-    return near, (far, losses_along(line, far, smooth, seed=run.seed).numpy())
+    near["surrogate"] = (x, evaluate_losses(line, x, smooth, seed=run.seed).numpy())
+    return near, (far, evaluate_losses(line, far, smooth, seed=run.seed).numpy())
 
 
 def _views(settings: LossScan, radar: Radar, grid: Grid) -> dict[str, Callable[[Tensor], Tensor]]:
@@ -144,7 +146,7 @@ def _lowest(curve: Curve) -> float:
     return float(curve[0][np.argmin(curve[1])])
 
 
-def _table(metrics: dict[str, Any], along: str) -> Table:
+def _table(metrics: dict[str, Any], along: str) -> ReportTable:
     rows = [
         [
             title,
@@ -160,4 +162,4 @@ def _table(metrics: dict[str, Any], along: str) -> Table:
         f"Local minima: {along}, over {metrics['span_wavelengths']:.3g} wavelengths of "
         f"{wavelength:.3g} mm"
     )
-    return Table(title, columns, rows, _NOTE)
+    return ReportTable(title, columns, rows, _NOTE)

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from invertwin.channel import Sampling, draw_speckle
-from invertwin.cli.commands.gradcheck import Checked
-from invertwin.cli.report import Table
+from invertwin.cli.commands.gradcheck import GradcheckOutcome
+from invertwin.cli.report import ReportTable
 from invertwin.cli.schema import build
 from invertwin_studies.figures import Derivative, derivatives
 from invertwin_studies.peers.edge_sampling import edge_sampling_derivative
@@ -38,7 +38,7 @@ NOTE = (
 _NO_UNIT = ("music_difference", "music_direct")
 
 
-def compare(settings: Methods, checked: Checked) -> tuple[dict[str, Any], Figure]:
+def compare(settings: Methods, checked: GradcheckOutcome) -> tuple[dict[str, Any], Figure]:
     """All methods on the scene of a gradient check that is done.
 
     Args:
@@ -49,8 +49,8 @@ def compare(settings: Methods, checked: Checked) -> tuple[dict[str, Any], Figure
         Per method, what metrics.json holds; and the figure of all derivatives.
     """
     run, scene, radar, grid = checked.run, checked.scene, checked.radar, checked.grid
-    direction, report, say = checked.direction, checked.report, checked.say
-    surrogate = build.made(run, "surrogate")
+    direction, report, say = checked.apply_theta, checked.report, checked.say
+    surrogate = build.build_section(run, "surrogate")
     truth = report.difference
     say("MUSIC")
     music = MusicMap(
@@ -136,7 +136,7 @@ def best_factor(values: Tensor, truth: Tensor) -> float:
     return float(ratio[int((weight < 0.5 * weight[-1]).sum())])
 
 
-def methods_table(name: str, found: Mapping[str, Any]) -> Table:
+def methods_table(name: str, found: Mapping[str, Any]) -> ReportTable:
     """One row a method; what is not installed says so.
 
     Args:
@@ -148,7 +148,7 @@ def methods_table(name: str, found: Mapping[str, Any]) -> Table:
         for key, title in NAMES.items()
     ]
     columns = ("method", "relative L1", "MAE, unit maximum", "")
-    return Table(f"Ways to the derivative of {name}", columns, rows, NOTE)
+    return ReportTable(f"Ways to the derivative of {name}", columns, rows, NOTE)
 
 
 def _unit(values: Tensor) -> Tensor:

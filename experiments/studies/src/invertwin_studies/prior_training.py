@@ -110,7 +110,7 @@ def train_prior(settings: Training | None = None, say: Callable[[str], None] = p
         The prior and how well it does; the same seed gives the same to rounding.
     """
     plan = Training() if settings is None else settings
-    lattice = Lattice.between(_LOW, _HIGH, _NODES)
+    lattice = Lattice.from_bounds(_LOW, _HIGH, _NODES)
     say("settings: " + ", ".join(f"{key} {value}" for key, value in asdict(plan).items()))
     begun = time.monotonic()
     cars = car_distances(lattice, plan.cars + plan.held_out, plan.seed, plan.wheels)

@@ -66,16 +66,16 @@ class RandomPhaseMap(ForwardModel):
         return recording.spectrum(self.grid).to(torch.float32)
 
     @property
-    def widened(self) -> bool:
+    def has_blur(self) -> bool:
         """Whether the kernels have an extra width."""
         return self.surrogate.range_width > 0
 
-    def narrowed(self, share: float) -> "RandomPhaseMap":
+    def scale_blur(self, fraction: float) -> "RandomPhaseMap":
         """The model with this share of its extra width."""
-        width = share * self.surrogate.range_width
+        width = fraction * self.surrogate.range_width
         return replace(self, surrogate=replace(self.surrogate, range_width=width))
 
-    def blurred(self, observed: Tensor, sensor: Radar) -> Tensor:
+    def blur_observed(self, observed: Tensor, sensor: Radar) -> Tensor:
         """An observed map with the extra width."""
         return self.surrogate.blur(observed, sensor, self.grid)
 

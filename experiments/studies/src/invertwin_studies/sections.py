@@ -10,8 +10,8 @@ from invertwin.registry.section import Section
 if TYPE_CHECKING:  # run files are read in milliseconds, the rest takes seconds to import
     from matplotlib.figure import Figure
 
-    from invertwin.cli.commands.gradcheck import Checked
-    from invertwin.cli.report import Table
+    from invertwin.cli.commands.gradcheck import GradcheckOutcome
+    from invertwin.cli.report import ReportTable
 
 Subarray = Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=2)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -34,13 +34,13 @@ class Methods(Section):
         "Red: grows with θ; blue: falls. One colour scale for all that have a unit of power."
     )
 
-    def compare(self, checked: "Checked") -> "tuple[dict[str, Any], Figure]":
+    def compare(self, checked: "GradcheckOutcome") -> "tuple[dict[str, Any], Figure]":
         """What metrics.json holds of every method, and the figure of all maps."""
         from invertwin_studies.methods import compare
 
         return compare(self, checked)
 
-    def table(self, name: str, found: Mapping[str, Any]) -> "Table":
+    def table(self, name: str, found: Mapping[str, Any]) -> "ReportTable":
         """One row a method; what is not installed says so.
 
         Args:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from invertwin.cli.report import Picture, Table, report_html
+from invertwin.cli.report import ReportPicture, ReportTable, report_html
 from invertwin.plotting import PALETTE, png_bytes
 from invertwin.scene import Mesh, ShapePrior, load_prior
 from invertwin.storage.run_folder import RunFolder
@@ -31,7 +31,7 @@ _LABELS = {
 
 def run_train_prior(
     settings: Training, folder: RunFolder, again: str, say: Callable[[str], None]
-) -> list[Table]:
+) -> list[ReportTable]:
     """Trains a prior and writes it with its log, numbers and pictures.
 
     Args:
@@ -64,15 +64,15 @@ def run_train_prior(
     }
     folder.write_text("train.log", "\n".join(lines) + "\n")
     folder.write_json("metrics.json", {**metrics, "history": trained.history})
-    table = Table(
+    table = ReportTable(
         "Shape prior",
         ["quantity", "value"],
         [[label, metrics[key]] for key, label in _LABELS.items()],
         "Errors are root mean squares of distances, weighted by closeness to the surface.",
     )
     pictures = [
-        Picture("Learning", png_bytes(_curve(trained))),
-        Picture(
+        ReportPicture("Learning", png_bytes(_curve(trained))),
+        ReportPicture(
             "What the coordinates do",
             png_bytes(_gallery(prior)),
             "From the side and from above: one coordinate a row, in standard deviations; the "

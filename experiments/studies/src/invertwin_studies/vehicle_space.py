@@ -14,7 +14,7 @@ from invertwin.limits import Count, Positive
 from invertwin.registry.section import InputPath
 from invertwin.scene import LinearShape, Mesh, ShapeSpace
 from invertwin.scene.files import load_mesh
-from invertwin.scene.remeshing import remeshed
+from invertwin.scene.remeshing import remesh
 from invertwin.storage.untrusted import read_arrays
 
 Level = Literal["coarse", "fine"]
@@ -39,7 +39,7 @@ def vehicle(
     """
     space = load_vehicle_space(folder, level)
     mesh = space.mesh(space.mean.new_tensor(coefficients))
-    return mesh if max_edge is None else remeshed(mesh, max_edge)
+    return mesh if max_edge is None else remesh(mesh, max_edge)
 
 
 def vehicle_coordinates(
@@ -82,7 +82,7 @@ def load_vehicle_space(folder: str | Path, level: Level = "fine") -> ShapeSpace:
 
     Args:
         folder: holds ``vehicle3d_pca.npz``, ``body_mean.obj`` and ``dodec_mean.obj``.
-        level: ``fine`` has 127 vertices and 78 modes, ``coarse`` 16 and 14.
+        level: ``fine`` has 127 vertices and 78 modes, ``coarsen_map`` 16 and 14.
 
     Raises:
         InputError: no such level, files missing, or arrays that do not fit.

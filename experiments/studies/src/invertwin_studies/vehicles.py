@@ -323,7 +323,7 @@ def car_mesh(car: Car, spacing: float = 0.05, wheels: bool = True) -> Mesh:
     low, high = car.box
     counts = [math.ceil((b - a) / step) + 1 for a, b in zip(low, high, strict=True)]
     field: Callable[[Tensor], Tensor] = lambda points: car_distance(car, points, wheels)  # noqa: E731
-    return iso_surface(field, Lattice.between(low, high, counts))
+    return iso_surface(field, Lattice.from_bounds(low, high, counts))
 
 
 def _side_view(car: Car) -> np.ndarray:

@@ -17,16 +17,22 @@ from torch import Tensor
 
 from invertwin.capture.track import Track
 from invertwin.errors import InputError
-from invertwin.storage.untrusted import reader
+from invertwin.storage.untrusted import safe_reader
 
 # Where messages with poses keep the place, by the names of their fields.
-_PLACES = ("pose.pose.position", "pose.position", "transform.translation", "point", "position")
+_POSITION_FIELDS = (
+    "pose.pose.position",
+    "pose.position",
+    "transform.translation",
+    "point",
+    "position",
+)
 # Numbers of `sensor_msgs/PointField`, and what they are to NumPy.
-_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 @dataclass(frozen=True, eq=False)
-class Messages:
+class BagMessages:
     """A field of all messages of a topic.
 
     Attributes:
@@ -37,7 +43,7 @@ class Messages:
     times: Float64[Tensor, " message"]
     values: list[NDArray[Any]]
 
-    def stacked(self) -> Tensor:
+    def stack(self) -> Tensor:
         """All values as one tensor, messages first.
 
         Raises:
@@ -52,7 +58,7 @@ class Messages:
         return torch.from_numpy(np.stack(self.values))
 
 
-@reader("a bag of ROS 1 or ROS 2")
+@safe_reader("a bag of ROS 1 or ROS 2")
 def bag_topics(path: str | Path) -> dict[str, str]:
     """What a bag holds: the type of the messages of every topic.
 
@@ -62,12 +68,12 @@ def bag_topics(path: str | Path) -> dict[str, str]:
     Raises:
         InputError: No bag, or the package rosbags is missing.
     """
-    with _opened(path) as bag:
+    with _open_bag(path) as bag:
         return dict(sorted((one.topic, one.msgtype) for one in bag.connections))
 
 
-@reader("a bag of ROS 1 or ROS 2")
-def read_topic(path: str | Path, topic: str, field: str) -> Messages:
+@safe_reader("a bag of ROS 1 or ROS 2")
+def read_topic(path: str | Path, topic: str, field: str) -> BagMessages:
     """Read one field of all messages of a topic, such as the samples of a radar.
 
     Radars have no common message, so name the field that holds the samples, and arrange them:
@@ -83,12 +89,12 @@ def read_topic(path: str | Path, topic: str, field: str) -> Messages:
         InputError: No bag, no such topic or field, a field that is no array of numbers, or the
             package rosbags is missing.
     """
-    found = list(_messages(path, topic, lambda message: _array(message, field)))
+    found = list(_read_messages(path, topic, lambda message: _field_array(message, field)))
     times = torch.tensor([time for time, _ in found], dtype=torch.float64)
-    return Messages(times, [value for _, value in found])
+    return BagMessages(times, [value for _, value in found])
 
 
-@reader("a bag of ROS 1 or ROS 2")
+@safe_reader("a bag of ROS 1 or ROS 2")
 def read_track(path: str | Path, topic: str) -> Track:
     """Read where something was over time, such as the radar, from messages that hold its pose.
 
@@ -104,8 +110,8 @@ def read_track(path: str | Path, topic: str) -> Track:
             missing.
     """
 
-    def place(message: Any) -> list[float]:
-        for name in _PLACES:
+    def read_position(message: Any) -> list[float]:
+        for name in _POSITION_FIELDS:
             held = message
             for part in name.split("."):
                 held = getattr(held, part, None)
@@ -116,7 +122,7 @@ def read_track(path: str | Path, topic: str) -> Track:
             "Odometry, PoseStamped or TransformStamped, or read_topic"
         )
 
-    found = dict(_messages(path, topic, place))
+    found = dict(_read_messages(path, topic, read_position))
     times = sorted(found)
     rows = [found[time] for time in times]
     return Track(
@@ -125,7 +131,7 @@ def read_track(path: str | Path, topic: str) -> Track:
     )
 
 
-@reader("a bag of ROS 1 or ROS 2")
+@safe_reader("a bag of ROS 1 or ROS 2")
 def read_clouds(path: str | Path, topic: str) -> list[dict[str, Float64[Tensor, " point"]]]:
     """Read all point clouds of a topic of ``sensor_msgs/PointCloud2``.
 
@@ -141,7 +147,7 @@ def read_clouds(path: str | Path, topic: str) -> list[dict[str, Float64[Tensor, 
         InputError: No bag, no such topic, other messages, or the package rosbags is missing.
     """
 
-    def cloud(message: Any) -> dict[str, Tensor]:
+    def parse_cloud(message: Any) -> dict[str, Tensor]:
         if not hasattr(message, "point_step"):
             raise InputError(
                 f"expected point clouds on {topic}, got {message.__msgtype__}; give a topic of "
@@ -151,7 +157,7 @@ def read_clouds(path: str | Path, topic: str) -> list[dict[str, Float64[Tensor, 
         kind = np.dtype(
             {
                 "names": [one.name for one in message.fields],
-                "formats": [order + _NUMBERS[one.datatype] for one in message.fields],
+                "formats": [order + _FIELD_TYPES[one.datatype] for one in message.fields],
                 "offsets": [one.offset for one in message.fields],
                 "itemsize": message.point_step,
             }
@@ -163,11 +169,11 @@ def read_clouds(path: str | Path, topic: str) -> list[dict[str, Float64[Tensor, 
             name: torch.from_numpy(points[name].astype(np.float64)) for name in kind.names or ()
         }
 
-    return [one for _, one in _messages(path, topic, cloud)]
+    return [one for _, one in _read_messages(path, topic, parse_cloud)]
 
 
 @contextmanager
-def _opened(path: str | Path) -> Iterator[Any]:
+def _open_bag(path: str | Path) -> Iterator[Any]:
     """A bag that can be read."""
     try:
         from rosbags.highlevel import AnyReader
@@ -184,11 +190,11 @@ def _opened(path: str | Path) -> Iterator[Any]:
         yield bag
 
 
-def _messages(
-    path: str | Path, topic: str, act: Callable[[Any], Any]
+def _read_messages(
+    path: str | Path, topic: str, parse: Callable[[Any], Any]
 ) -> Iterator[tuple[float, Any]]:
     """Time of every message of a topic [s], and what a function makes of it."""
-    with _opened(path) as bag:
+    with _open_bag(path) as bag:
         chosen = [one for one in bag.connections if one.topic == topic]
         if not chosen:
             known = ", ".join(sorted({one.topic for one in bag.connections})) or "none"
@@ -197,10 +203,10 @@ def _messages(
             message = bag.deserialize(raw, connection.msgtype)
             stamp = getattr(getattr(message, "header", None), "stamp", None)
             time = recorded * 1e-9 if stamp is None else stamp.sec + stamp.nanosec * 1e-9
-            yield time, act(message)
+            yield time, parse(message)
 
 
-def _array(message: Any, field: str) -> NDArray[Any]:
+def _field_array(message: Any, field: str) -> NDArray[Any]:
     held = message
     for part in field.split("."):
         known = [name for name in getattr(held, "__dataclass_fields__", {}) if name[0] != "_"]

@@ -59,7 +59,7 @@ def to_openradar(
     Raises:
         InputError: An order that does not name every transmitter once.
     """
-    return beat[:, :, _turns(order, beat.shape[2])].flatten(1, 2)
+    return beat[:, :, _check_transmit_order(order, beat.shape[2])].flatten(1, 2)
 
 
 def from_openradar(
@@ -79,10 +79,12 @@ def from_openradar(
             transmitter once.
     """
     _check_divides(adc_data.shape[1], transmitters, "chirps", "transmitters")
-    return adc_data.unflatten(1, (-1, transmitters))[:, :, _turns(order, transmitters).argsort()]
+    return adc_data.unflatten(1, (-1, transmitters))[
+        :, :, _check_transmit_order(order, transmitters).argsort()
+    ]
 
 
-def _turns(order: Sequence[int] | None, transmitters: int) -> Tensor:
+def _check_transmit_order(order: Sequence[int] | None, transmitters: int) -> Tensor:
     turns = list(range(transmitters)) if order is None else list(order)
     if sorted(turns) != list(range(transmitters)):
         raise InputError(

@@ -15,35 +15,35 @@ import torch
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
 from invertwin.checks import checked_tensor
 from invertwin.errors import InputError
-from invertwin.radar.boards import Elements, Mounting
+from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.scene.antenna import AntennaArray
-from invertwin.storage.folders import replacing
-from invertwin.storage.isolated_reader import read_apart
+from invertwin.storage.folders import replace_file
+from invertwin.storage.isolated_reader import read_isolated
 from invertwin.storage.untrusted import (
+    convert_read_errors,
     existing_file,
     read_arrays,
     read_npy,
-    reader,
-    reading,
+    safe_reader,
 )
 
 # The data tell these settings by their shape and kind.
-_TOLD = {"samples", "loops", "frames", "real", "swap_iq", "lanes"}
+_KNOWN_FROM_DATA = {"samples", "loops", "frames", "real", "swap_iq", "lanes"}
 _KEYS = {
     "data": {"file", "variable", "dimensions", "conjugate"},
-    "settings": {field.name for field in fields(ChirpSettings)} - _TOLD,
+    "settings": {field.name for field in fields(ChirpSettings)} - _KNOWN_FROM_DATA,
     "radar": {"board", "elevation", "azimuth", "tx_positions", "rx_positions"},
 }
-_ENDINGS = (".npy", ".npz", ".h5", ".hdf5", ".mat")
+_SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 
 
-@reader("a description of samples")
-def described_board(
+@safe_reader("a description of samples")
+def load_described_board(
     path: str | Path,
     board: str | None = None,
     elevation: int | None = None,
     azimuth: int | None = None,
-) -> Mounting | Elements:
+) -> Mounting | TxRxArrays:
     """The elements that recorded described samples: a board as it is mounted, or TX and RX.
 
     The description's ``[radar]`` says it: ``board``, ``elevation`` and ``azimuth`` of a preset, or
@@ -58,7 +58,7 @@ def described_board(
     Raises:
         InputError: neither the arguments nor the description say which.
     """
-    described = _described_chirps(Path(path)).get("radar", {})
+    described = _load_chirp_description(Path(path)).get("radar", {})
     if board is None:
         board, tx, rx = (described.get(key) for key in ("board", "tx_positions", "rx_positions"))
         if (board is None) == (tx is None or rx is None):
@@ -76,7 +76,7 @@ def described_board(
     )
 
 
-@reader("samples as their description says")
+@safe_reader("samples as their description says")
 def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
     """Read every chirp of described samples.
 
@@ -109,12 +109,12 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
         InputError: no file, a damaged one, unknown or missing keys, or dimensions that do not fit.
     """
     path = Path(path)
-    description = _described_chirps(path)
+    description = _load_chirp_description(path)
     data, given = description["data"], description["settings"]
     array = load_array(path.parent / str(data["file"]), data.get("variable"), trusted=trusted)
     real = array.dtype.kind != "c"
     order = data.get("dimensions", list(CHIRP_DIMS))
-    samples = arranged(array, order, len(given.get("transmit_order", [])) or None)
+    samples = arrange_dimensions(array, order, len(given.get("transmit_order", [])) or None)
     if data.get("conjugate", False):
         samples = samples.conj()
     _, loops, tx, rx, count = samples.shape
@@ -138,7 +138,7 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
 
 
 def write_chirps(
-    path: str | Path, data: ChirpData, file: str, arrays: Elements | None = None
+    path: str | Path, data: ChirpData, file: str, arrays: TxRxArrays | None = None
 ) -> None:
     """Write samples, bit for bit, and the description that `read_chirps` reads.
 
@@ -154,15 +154,15 @@ def write_chirps(
     """
     path = Path(path)
     target = path.parent / file
-    if target.suffix not in _ENDINGS or target.parent != path.parent:
+    if target.suffix not in _SUFFIXES or target.parent != path.parent:
         raise InputError(
-            f"expected a file name that ends in {', '.join(_ENDINGS)}, got {file!r}; "
+            f"expected a file name that ends in {', '.join(_SUFFIXES)}, got {file!r}; "
             "the data lie beside their description"
         )
     s = data.settings
     samples = data.samples.detach().cpu().resolve_conj().numpy()
     array = np.ascontiguousarray(np.real(samples)) if s.real else samples
-    with replacing(target) as part:
+    with replace_file(target) as part:
         if target.suffix == ".npy":
             np.save(part, array)
         elif target.suffix == ".npz":
@@ -181,7 +181,7 @@ def write_chirps(
     if arrays is not None:
         tx, rx = (array.positions.tolist() for array in arrays)
         description["radar"] = {"tx_positions": tx, "rx_positions": rx}
-    with replacing(path) as part:
+    with replace_file(path) as part:
         part.write_text(tomli_w.dumps(description), encoding="utf-8")
 
 
@@ -199,7 +199,7 @@ def element_array(positions: Any, name: str) -> AntennaArray:
     return AntennaArray(checked_tensor(positions, (None, 3), f"{name} positions", do))
 
 
-def _described_chirps(path: Path) -> dict[str, dict[str, Any]]:
+def _load_chirp_description(path: Path) -> dict[str, dict[str, Any]]:
     description = load_description(path, _KEYS)
     if "file" not in description.get("data", {}) or "settings" not in description:
         raise InputError(
@@ -219,7 +219,7 @@ def load_description(path: Path, keys: Mapping[str, set[str]]) -> dict[str, dict
         InputError: no such file, no TOML, or other sections or keys.
     """
     existing_file(path, "a TOML description")
-    with reading(path, "TOML", "give the description of the data, not the data"):
+    with convert_read_errors(path, "TOML", "give the description of the data, not the data"):
         description = tomllib.loads(path.read_text(encoding="utf-8"))
     for section, given in description.items():
         known = keys.get(section)
@@ -245,15 +245,15 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
     """
     existing_file(path, "the data file that [data] names")
     ending = path.suffix.lower()
-    if ending not in _ENDINGS:
+    if ending not in _SUFFIXES:
         raise InputError(
-            f"expected a file that ends in {', '.join(_ENDINGS)}, got {path.name}; convert it"
+            f"expected a file that ends in {', '.join(_SUFFIXES)}, got {path.name}; convert it"
         )
     if ending != ".npy" and variable is None:
         raise InputError(f"expected a variable in {path.name}, got none; add it to [data]")
-    with reading(path, f"a whole {ending} file"):
+    with convert_read_errors(path, f"a whole {ending} file"):
         try:
-            array = _loaded(path, ending, variable, trusted=trusted)
+            array = _load_file(path, ending, variable, trusted=trusted)
         except KeyError:
             raise InputError(
                 f"expected a variable {variable!r} in {path.name}, got none; check its spelling"
@@ -270,18 +270,18 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
     return array
 
 
-def _loaded(path: Path, ending: str, variable: str | None, *, trusted: bool) -> np.ndarray:
-    if ending == ".npy":
+def _load_file(path: Path, suffix: str, variable: str | None, *, trusted: bool) -> np.ndarray:
+    if suffix == ".npy":
         return read_npy(path)
-    if ending == ".npz":
+    if suffix == ".npz":
         return read_arrays(path, "it is damaged or of another kind", [str(variable)])[str(variable)]
-    stored = read_apart(
-        path, "matlab" if ending == ".mat" else "hdf5", str(variable), trusted=trusted
+    stored = read_isolated(
+        path, "matlab" if suffix == ".mat" else "hdf5", str(variable), trusted=trusted
     )
     return stored.arrays[str(variable)].values
 
 
-def arranged(array: np.ndarray, order: Any, transmitters: int | None) -> np.ndarray:
+def arrange_dimensions(array: np.ndarray, order: Any, transmitters: int | None) -> np.ndarray:
     """Complex (frame, chirp, tx, rx, sample).
 
     Args:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from invertwin.capture.capture import Capture
 from invertwin.capture.readers.described_arrays import (
-    arranged,
+    arrange_dimensions,
     element_array,
     load_array,
     load_description,
@@ -24,7 +24,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SteppedFrequency
 from invertwin.scene import look_at
-from invertwin.storage.untrusted import read_npy, read_text, reader, reading
+from invertwin.storage.untrusted import convert_read_errors, read_npy, read_text, safe_reader
 
 TOUCHSTONE = re.compile(r"\.s\d+p", re.IGNORECASE)
 """Ending of a Touchstone file."""
@@ -38,7 +38,7 @@ _KEYS = {
     },
 }
 _DWELL = 1e-3  # s, of an analyser whose filter is 1 kHz wide
-_EVEN = 0.01  # of a step: how far a frequency may be off; then a phase is right to 4°
+_SPACING_TOLERANCE = 0.01  # of a step: how far a frequency may be off; then a phase is right to 4°
 
 
 def describes_sweeps(path: str | Path) -> bool:
@@ -54,7 +54,7 @@ def describes_sweeps(path: str | Path) -> bool:
     return re.search(r"^\s*\[sweep\]", text, re.MULTILINE) is not None
 
 
-@reader("sweeps over frequency")
+@safe_reader("sweeps over frequency")
 def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     """Read sweeps over equally spaced frequencies: one signal per frame.
 
@@ -107,14 +107,14 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     else:
         description = load_description(path, _KEYS)
     data, sweep, radar = (description.get(name, {}) for name in ("data", "sweep", "radar"))
-    files = _files(path.parent, data)
+    files = _find_data_files(path.parent, data)
     tx, rx = (
         element_array(radar.get(f"{end}_positions", [[0.0, 0.0, 0.0]]), end.upper())
         for end in ("tx", "rx")
     )
-    source = _Source(files[0], trusted)
+    source = _SweepFile(files[0], trusted)
     if TOUCHSTONE.fullmatch(files[0].suffix):
-        frequencies, beat = _touchstone(files, sweep, path.parent)
+        frequencies, beat = _load_touchstone_sweeps(files, sweep, path.parent)
     else:
         if len(files) > 1:
             raise InputError(
@@ -124,7 +124,7 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
         senders = len(tx.positions)
         array = load_array(files[0], data.get("variable"), trusted=trusted)
         order = data.get("dimensions", ["frame", "tx", "rx", "sample"])
-        samples = torch.from_numpy(arranged(array, order, senders))
+        samples = torch.from_numpy(arrange_dimensions(array, order, senders))
         if samples.shape[1] != 1:
             raise InputError(
                 f"expected one sweep a frame, got {samples.shape[1]} chirps; name that dimension "
@@ -132,18 +132,18 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
             )
         beat = samples[:, 0].conj() if data.get("conjugate", False) else samples[:, 0]
         beat = beat.resolve_conj()
-        frequencies = _frequencies(source, sweep, beat.shape[-1])
-    start, step = _spacing(frequencies)
+        frequencies = _load_frequencies(source, sweep, beat.shape[-1])
+    start, step = _frequency_spacing(frequencies)
     waveform = SteppedFrequency(start, step, len(frequencies), sweep.get("dwell", _DWELL))
-    places = _places(source, radar.get("positions"), len(beat))
+    places = _load_positions(source, radar.get("positions"), len(beat))
     toward = radar.get("look_at")
     turned = None if toward is None else look_at(places, toward)
     device = Radar(tx, rx, waveform, places, turned)
-    return Capture.from_beat(beat, _centered(device, source, radar))
+    return Capture.from_beat(beat, _set_range_origin(device, source, radar))
 
 
 @dataclass(frozen=True)
-class _Source:
+class _SweepFile:
     """Where a description finds what it names: in its data file, or in files beside it."""
 
     file: Path
@@ -164,7 +164,7 @@ class _Source:
         return load_array(self.file, given, trusted=self.trusted)
 
 
-def _files(folder: Path, data: dict[str, Any]) -> list[Path]:
+def _find_data_files(folder: Path, data: dict[str, Any]) -> list[Path]:
     """The data files of a description, at least one."""
     if ("file" in data) == ("files" in data):
         raise InputError(
@@ -182,21 +182,29 @@ def _files(folder: Path, data: dict[str, Any]) -> list[Path]:
     return found
 
 
-def _touchstone(
+def _load_touchstone_sweeps(
     files: list[Path], sweep: dict[str, Any], folder: Path
 ) -> tuple[Float64[Tensor, " sample"], Complex128[Tensor, "frame 1 1 sample"]]:
     """Frequencies, and the beat signal of every file less the background."""
-    frequencies, first = _parameter(files[0], sweep)
-    rows = [first, *(_same(_parameter(file, sweep), frequencies, file) for file in files[1:])]
+    frequencies, first = _load_parameter(files[0], sweep)
+    rows = [
+        first,
+        *(
+            _require_same_frequencies(_load_parameter(file, sweep), frequencies, file)
+            for file in files[1:]
+        ),
+    ]
     response = torch.stack(rows)
     if "background" in sweep:
         file = folder / str(sweep["background"])
-        response = response - _same(_parameter(file, sweep), frequencies, file)
+        response = response - _require_same_frequencies(
+            _load_parameter(file, sweep), frequencies, file
+        )
     # The beat signal is conj(H), as that of OFDM.
     return frequencies, response.conj().resolve_conj()[:, None, None]
 
 
-def _parameter(file: Path, sweep: dict[str, Any]) -> tuple[Tensor, Tensor]:
+def _load_parameter(file: Path, sweep: dict[str, Any]) -> tuple[Tensor, Tensor]:
     """Frequencies of a Touchstone file, and one of its scattering parameters."""
     found = load_touchstone(file)
     ports = found.parameters.shape[1]
@@ -211,7 +219,9 @@ def _parameter(file: Path, sweep: dict[str, Any]) -> tuple[Tensor, Tensor]:
     return found.frequencies, found.parameters[:, out - 1, into - 1]
 
 
-def _same(found: tuple[Tensor, Tensor], frequencies: Tensor, file: Path) -> Tensor:
+def _require_same_frequencies(
+    found: tuple[Tensor, Tensor], frequencies: Tensor, file: Path
+) -> Tensor:
     """The response of a file, if it was swept over the same frequencies."""
     own, response = found
     if len(own) != len(frequencies) or bool(((own - frequencies).abs() > 1e-9 * own).any()):
@@ -223,8 +233,8 @@ def _same(found: tuple[Tensor, Tensor], frequencies: Tensor, file: Path) -> Tens
     return response
 
 
-def _frequencies(
-    source: _Source, sweep: dict[str, Any], samples: int
+def _load_frequencies(
+    source: _SweepFile, sweep: dict[str, Any], samples: int
 ) -> Float64[Tensor, " sample"]:
     """Frequencies of the samples of a phase history."""
     if "frequencies" in sweep:
@@ -239,7 +249,7 @@ def _frequencies(
     return float(sweep["start_frequency"]) + float(sweep["step"]) * count
 
 
-def _spacing(frequencies: Float64[Tensor, " sample"]) -> tuple[float, float]:
+def _frequency_spacing(frequencies: Float64[Tensor, " sample"]) -> tuple[float, float]:
     """First frequency and step of equally spaced ones [Hz]."""
     count = len(frequencies)
     if count < 2:
@@ -249,7 +259,7 @@ def _spacing(frequencies: Float64[Tensor, " sample"]) -> tuple[float, float]:
     first = float(frequencies[0])
     step = (float(frequencies[-1]) - first) / (count - 1)
     line = first + step * torch.arange(count, dtype=torch.float64)
-    if not (step > 0 and (frequencies - line).abs().max() <= _EVEN * step):
+    if not (step > 0 and (frequencies - line).abs().max() <= _SPACING_TOLERANCE * step):
         steps = frequencies.diff()
         raise InputError(
             f"expected ascending, equally spaced frequencies, got steps from "
@@ -259,7 +269,7 @@ def _spacing(frequencies: Float64[Tensor, " sample"]) -> tuple[float, float]:
     return first, step
 
 
-def _places(source: _Source, given: Any, frames: int) -> Float64[Tensor, "frame 3"]:
+def _load_positions(source: _SweepFile, given: Any, frames: int) -> Float64[Tensor, "frame 3"]:
     """The radar's position in every frame."""
     if given is None and frames > 1:
         raise InputError(
@@ -269,27 +279,27 @@ def _places(source: _Source, given: Any, frames: int) -> Float64[Tensor, "frame 
     if given is None:
         return torch.zeros(1, 3, dtype=torch.float64)
     if isinstance(given, str) and given.lower().endswith(".csv"):
-        given = _rows(source.file.parent / given)
+        given = _read_position_rows(source.file.parent / given)
     elif isinstance(given, list) and any(isinstance(name, str) for name in given):
         given = np.stack([np.ravel(source.values(name)) for name in given], axis=-1)
     do = "give x, y, z in metres of every frame"
     return checked_tensor(source.values(given), (frames, 3), "positions in [radar]", do)
 
 
-def _rows(file: Path) -> list[list[float]]:
+def _read_position_rows(file: Path) -> list[list[float]]:
     """x, y, z of a CSV file whose first line says which column is which."""
     what = "lines of x,y,z [m] after a line of these heads"
     text = read_text(file, what)
-    with reading(file, what, "write them with points as decimal marks"):
+    with convert_read_errors(file, what, "write them with points as decimal marks"):
         return [[float(row[axis]) for axis in "xyz"] for row in csv.DictReader(text.splitlines())]
 
 
-def _centered(device: Radar, source: _Source, radar: dict[str, Any]) -> Radar:
+def _set_range_origin(device: Radar, source: _SweepFile, radar: dict[str, Any]) -> Radar:
     """The radar with the range origin of its data."""
     if "range_origin" in radar and "range_center" in radar:
         raise InputError("expected range_origin or range_center in [radar], got both; remove one")
     if "range_center" in radar:
-        return device.centered(radar["range_center"])
+        return device.center_on(radar["range_center"])
     if "range_origin" not in radar:
         return device
     given = np.ravel(source.values(radar["range_origin"])).astype(float)

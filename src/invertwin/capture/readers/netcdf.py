@@ -6,9 +6,9 @@ import numpy as np
 import xarray as xr
 
 from invertwin.errors import InputError
-from invertwin.storage.folders import replacing
-from invertwin.storage.isolated_reader import read_apart
-from invertwin.storage.untrusted import existing_file, reading
+from invertwin.storage.folders import replace_file
+from invertwin.storage.isolated_reader import read_isolated
+from invertwin.storage.untrusted import convert_read_errors, existing_file
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> None:
@@ -21,8 +21,8 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
     Raises:
         InputError: the folder does not exist.
     """
-    with replacing(path) as part:
-        real = _split(dataset)
+    with replace_file(path) as part:
+        real = _split_complex(dataset)
         # No fill values: they would mark numbers as missing.
         encoding = {str(variable): {"_FillValue": None} for variable in real.variables}
         real.to_netcdf(part, engine="h5netcdf", encoding=encoding)
@@ -39,12 +39,12 @@ def read_dataset(path: Path, *, trusted: bool = False) -> xr.Dataset:
         InputError: no such file, or one that is damaged or no NetCDF.
     """
     existing_file(path, "a capture file")
-    with reading(path, "a whole NetCDF file"):
-        stored = read_apart(path, "netcdf", trusted=trusted)
-        return _joined(xr.Dataset(stored.arrays, attrs=stored.attributes))
+    with convert_read_errors(path, "a whole NetCDF file"):
+        stored = read_isolated(path, "netcdf", trusted=trusted)
+        return _join_complex(xr.Dataset(stored.arrays, attrs=stored.attributes))
 
 
-def _split(dataset: xr.Dataset) -> xr.Dataset:
+def _split_complex(dataset: xr.Dataset) -> xr.Dataset:
     for name, whole in dataset.data_vars.items():
         if whole.dtype.kind == "c":
             parts = {f"{name}_real": whole.real, f"{name}_imag": whole.imag}
@@ -53,7 +53,7 @@ def _split(dataset: xr.Dataset) -> xr.Dataset:
     return dataset
 
 
-def _joined(dataset: xr.Dataset) -> xr.Dataset:
+def _join_complex(dataset: xr.Dataset) -> xr.Dataset:
     for name in [str(key) for key in dataset.data_vars if str(key).endswith("_real")]:
         real, whole = dataset[name], name.removesuffix("_real")
         imaginary = dataset.get(f"{whole}_imag")

@@ -12,7 +12,7 @@ from torch import Tensor
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
-from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Pattern, Table
+from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Pattern, TabulatedPattern
 from invertwin.scene.polarisation import JonesTable, Polarisation
 
 WAVEFORMS: dict[str, type[Waveform]] = {
@@ -34,11 +34,11 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
     if kind not in WAVEFORMS or not isinstance(waveform, tuple(WAVEFORMS.values())):
         raise InputError(f"expected a waveform of {', '.join(WAVEFORMS)}, got {kind}; use those")
     variables = {
-        "position": labelled(("frame", "axis"), radar.positions, "m"),
-        "rotation": labelled(("frame", "axis", "radar_axis"), radar.link().rotations, "1"),
+        "position": to_data_array(("frame", "axis"), radar.positions, "m"),
+        "rotation": to_data_array(("frame", "axis", "radar_axis"), radar.link().rotations, "1"),
     }
     if radar.range_origin is not None:
-        variables["range_origin"] = labelled(("frame",), radar.range_origin, "m")
+        variables["range_origin"] = to_data_array(("frame",), radar.range_origin, "m")
     attributes: dict[str, Any] = {
         "waveform": kind,
         **asdict(waveform),  # type: ignore[call-overload]
@@ -47,7 +47,7 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
         "visibility": _VISIBILITY[radar.shared_visibility],
     }
     for end, array in (("tx", radar.transmitters), ("rx", radar.receivers)):
-        variables[f"{end}_position"] = labelled((end, "radar_axis"), array.positions, "m")
+        variables[f"{end}_position"] = to_data_array((end, "radar_axis"), array.positions, "m")
         arrays, named = _pattern_fields(end, array.pattern)
         variables |= arrays | _jones_fields(end, array.jones)
         attributes |= named
@@ -64,30 +64,30 @@ def radar_from_fields(dataset: xr.Dataset) -> Radar:
         transmitters=_array_from_fields("tx", dataset),
         receivers=_array_from_fields("rx", dataset),
         waveform=_waveform(dataset.attrs),
-        positions=tensor(dataset, "position"),
-        rotations=tensor(dataset, "rotation"),
-        window=str(_held(dataset.attrs, "window")),
-        array_window=str(_held(dataset.attrs, "array_window")),
-        shared_visibility=_named(
+        positions=read_tensor(dataset, "position"),
+        rotations=read_tensor(dataset, "rotation"),
+        window=str(_get_entry(dataset.attrs, "window")),
+        array_window=str(_get_entry(dataset.attrs, "array_window")),
+        shared_visibility=_get_choice(
             dataset.attrs, "visibility", {v: k for k, v in _VISIBILITY.items()}
         ),
-        range_origin=tensor(dataset, "range_origin") if "range_origin" in dataset else None,
+        range_origin=read_tensor(dataset, "range_origin") if "range_origin" in dataset else None,
     )
 
 
 def _waveform(attributes: Mapping[Hashable, Any]) -> Waveform:
     """The waveform named by the attribute ``waveform``, with its fields."""
-    kind = _named(attributes, "waveform", WAVEFORMS)
+    kind = _get_choice(attributes, "waveform", WAVEFORMS)
     # Numbers come back from a file as NumPy scalars.
     types = get_type_hints(kind)  # without the limits that annotations may have
     values = {
-        field.name: (int if types[field.name] is int else float)(_held(attributes, field.name))
+        field.name: (int if types[field.name] is int else float)(_get_entry(attributes, field.name))
         for field in fields(kind)
     }
     return kind(**values)  # pyright: ignore[reportArgumentType]
 
 
-def labelled(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArray:
+def to_data_array(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArray:
     """A copy of a tensor with named dimensions and a unit.
 
     Args:
@@ -108,7 +108,7 @@ def labelled(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArray:
     )
 
 
-def tensor(dataset: xr.Dataset, name: str) -> Tensor:
+def read_tensor(dataset: xr.Dataset, name: str) -> Tensor:
     """A copy of a variable as a tensor.
 
     Args:
@@ -118,10 +118,10 @@ def tensor(dataset: xr.Dataset, name: str) -> Tensor:
     Raises:
         InputError: the variable is missing.
     """
-    return torch.from_numpy(np.array(_held(dataset.variables, name, "a variable").values))
+    return torch.from_numpy(np.array(_get_entry(dataset.variables, name, "a variable").values))
 
 
-def _held(entries: Mapping[Any, Any], name: str, what: str = "an attribute") -> Any:
+def _get_entry(entries: Mapping[Any, Any], name: str, what: str = "an attribute") -> Any:
     if name not in entries:
         raise InputError(
             f"expected a capture with {what} {name!r}, got none; "
@@ -130,8 +130,8 @@ def _held(entries: Mapping[Any, Any], name: str, what: str = "an attribute") -> 
     return entries[name]
 
 
-def _named(attributes: Mapping[Hashable, Any], name: str, choices: Mapping[str, Any]) -> Any:
-    value = _held(attributes, name)
+def _get_choice(attributes: Mapping[Hashable, Any], name: str, choices: Mapping[str, Any]) -> Any:
+    value = _get_entry(attributes, name)
     if value not in choices:
         raise InputError(
             f"expected {name} to be one of {', '.join(choices)}, got {value!r}; "
@@ -146,12 +146,12 @@ def _pattern_fields(end: str, pattern: Pattern) -> tuple[dict[str, xr.DataArray]
         return {}, {name: "isotropic"}
     if isinstance(pattern, Cosine):
         return {}, {name: "cosine", f"{name}_exponent": float(pattern.exponent)}
-    if isinstance(pattern, Table):
+    if isinstance(pattern, TabulatedPattern):
         theta, phi = f"{end}_theta", f"{end}_phi"
         return {
-            theta: labelled((theta,), pattern.theta, "rad"),
-            phi: labelled((phi,), pattern.phi, "rad"),
-            f"{end}_gain": labelled((theta, phi), pattern.gains, "1"),
+            theta: to_data_array((theta,), pattern.theta, "rad"),
+            phi: to_data_array((phi,), pattern.phi, "rad"),
+            f"{end}_gain": to_data_array((theta, phi), pattern.gains, "1"),
         }, {name: "table"}
     raise InputError(
         f"expected a pattern Isotropic, Cosine or Table, got {type(pattern).__name__}; "
@@ -162,40 +162,42 @@ def _pattern_fields(end: str, pattern: Pattern) -> tuple[dict[str, xr.DataArray]
 def _array_from_fields(end: str, dataset: xr.Dataset) -> AntennaArray:
     patterns = {
         "isotropic": Isotropic,
-        "cosine": lambda: Cosine(float(_held(dataset.attrs, f"{end}_pattern_exponent"))),
-        "table": lambda: Table(*(tensor(dataset, f"{end}_{k}") for k in ("theta", "phi", "gain"))),
+        "cosine": lambda: Cosine(float(_get_entry(dataset.attrs, f"{end}_pattern_exponent"))),
+        "table": lambda: TabulatedPattern(
+            *(read_tensor(dataset, f"{end}_{k}") for k in ("theta", "phi", "gain"))
+        ),
     }
-    pattern = _named(dataset.attrs, f"{end}_pattern", patterns)()
-    array = AntennaArray(tensor(dataset, f"{end}_position"), pattern)
+    pattern = _get_choice(dataset.attrs, f"{end}_pattern", patterns)()
+    array = AntennaArray(read_tensor(dataset, f"{end}_position"), pattern)
     if f"{end}_jones" in dataset.variables:
-        return replace(array, polarisation=_complex(dataset, f"{end}_jones"))
+        return replace(array, polarisation=_read_complex(dataset, f"{end}_jones"))
     if f"{end}_jones_table" not in dataset.variables:
         return array
-    theta, phi = (tensor(dataset, f"{end}_jones_{name}") for name in ("theta", "phi"))
-    table = JonesTable(theta, phi, _complex(dataset, f"{end}_jones_table"))
-    mixtures = _complex(dataset, f"{end}_mixture")
+    theta, phi = (read_tensor(dataset, f"{end}_jones_{name}") for name in ("theta", "phi"))
+    table = JonesTable(theta, phi, _read_complex(dataset, f"{end}_jones_table"))
+    mixtures = _read_complex(dataset, f"{end}_mixture")
     return replace(array, polarisation=table, leakage=mixtures[:, 1] / mixtures[:, 0])
 
 
 def _jones_fields(end: str, jones: Polarisation) -> dict[str, xr.DataArray]:
     """Polarisations; none where all elements are V, as in files of earlier versions."""
 
-    def of(dims: tuple[str, ...], value: Tensor) -> xr.DataArray:
-        return labelled((*dims, "polarisation", "part"), torch.view_as_real(value), "1")
+    def complex_array(dims: tuple[str, ...], value: Tensor) -> xr.DataArray:
+        return to_data_array((*dims, "polarisation", "part"), torch.view_as_real(value), "1")
 
     if not isinstance(jones.base, JonesTable):
         vectors = jones.vectors.resolve_conj()
         plain = bool((vectors == torch.tensor([1.0, 0.0])).all())
-        return {} if plain else {f"{end}_jones": of((end,), vectors)}
+        return {} if plain else {f"{end}_jones": complex_array((end,), vectors)}
     theta, phi = f"{end}_jones_theta", f"{end}_jones_phi"
     mixtures = torch.nn.functional.pad(jones.mixtures, (0, 2 - jones.mixtures.shape[1]))
     return {
-        theta: labelled((theta,), jones.base.theta, "rad"),
-        phi: labelled((phi,), jones.base.phi, "rad"),
-        f"{end}_jones_table": of((theta, phi), jones.base.vectors),
-        f"{end}_mixture": of((end,), mixtures),
+        theta: to_data_array((theta,), jones.base.theta, "rad"),
+        phi: to_data_array((phi,), jones.base.phi, "rad"),
+        f"{end}_jones_table": complex_array((theta, phi), jones.base.vectors),
+        f"{end}_mixture": complex_array((end,), mixtures),
     }
 
 
-def _complex(dataset: xr.Dataset, name: str) -> Tensor:
-    return torch.view_as_complex(tensor(dataset, name).contiguous())
+def _read_complex(dataset: xr.Dataset, name: str) -> Tensor:
+    return torch.view_as_complex(read_tensor(dataset, name).contiguous())

@@ -8,14 +8,14 @@ from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.readers import described_arrays, described_sweeps
 from invertwin.errors import InputError
-from invertwin.radar.boards import Elements, Mounting
+from invertwin.radar.boards import Mounting, TxRxArrays
 
 
 def read(
     path: str | Path,
     settings: str | Path | ChirpSettings | None = None,
     *,
-    board: Mounting | Elements | None = None,
+    board: Mounting | TxRxArrays | None = None,
     lanes: int | None = None,
     trusted: bool = False,
 ) -> Capture | ChirpCapture:
@@ -48,7 +48,7 @@ def read(
         return described_sweeps.read_sweeps(path, trusted=trusted)
     if ending == ".toml":
         chirps = described_arrays.read_chirps(path, trusted=trusted)
-        return chirps.recorded(board or described_arrays.described_board(path))
+        return chirps.to_chirp_capture(board or described_arrays.load_described_board(path))
     if ending not in (".bin", ".json"):
         raise InputError(
             "expected a recording that ends in .bin, .setup.json, .toml, .s1p, .s2p or .nc, got "
@@ -59,7 +59,7 @@ def read(
             "expected the board that recorded, got none; name a preset of invertwin.radar.boards "
             "as it was mounted"
         )
-    return ti.read_recording(path, settings, lanes).recorded(board)
+    return ti.read_recording(path, settings, lanes).to_chirp_capture(board)
 
 
 def is_sweeps(path: str | Path) -> bool:

@@ -11,7 +11,7 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.storage.untrusted import read_text, reading
+from invertwin.storage.untrusted import convert_read_errors, read_text
 
 _UNITS = {"HZ": 1.0, "KHZ": 1e3, "MHZ": 1e6, "GHZ": 1e9}
 _FORMATS = ("MA", "DB", "RI")
@@ -19,7 +19,7 @@ _PORTS = re.compile(r"\.s(\d+)p", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredSection:
+class MeasuredRcs:
     """A radar cross-section over aspect, one row a value.
 
     Attributes:
@@ -49,7 +49,7 @@ class Touchstone:
     resistance: float
 
 
-def load_section(file: str | Path) -> MeasuredSection:
+def load_rcs(file: str | Path) -> MeasuredRcs:
     """Read a text file of rows of frequency [Hz], θ [°], φ [°] and RCS [dBsm].
 
     Args:
@@ -60,12 +60,12 @@ def load_section(file: str | Path) -> MeasuredSection:
     """
     what = "rows of frequency, theta, phi and RCS"
     text = read_text(file, what)
-    with reading(file, what):
+    with convert_read_errors(file, what):
         rows = np.array([[float(cell) for cell in line.split()] for line in text.splitlines()])
         if rows.ndim != 2 or rows.shape[1] != 4 or not np.isfinite(rows).all():
             raise ValueError("other than four finite numbers a row")
     frequency, theta, phi, level = torch.from_numpy(rows.T.copy())
-    return MeasuredSection(frequency, theta.deg2rad(), phi.deg2rad(), level)
+    return MeasuredRcs(frequency, theta.deg2rad(), phi.deg2rad(), level)
 
 
 def load_touchstone(file: str | Path) -> Touchstone:
@@ -84,10 +84,10 @@ def load_touchstone(file: str | Path) -> Touchstone:
     count = int(ports[1])
     what = f"a Touchstone file of {count} ports"
     text = read_text(path, what)
-    with reading(path, what):
+    with convert_read_errors(path, what):
         lines = [line.split("!")[0].strip() for line in text.splitlines()]
         options = next((line[1:].upper().split() for line in lines if line.startswith("#")), [])
-        unit, kind, resistance = _options(options)
+        unit, kind, resistance = _parse_option_line(options)
         numbers = [float(word) for line in lines if line[:1] not in "#[" for word in line.split()]
         width = 1 + 2 * count**2
         if len(numbers) % width and count != 2:
@@ -98,7 +98,7 @@ def load_touchstone(file: str | Path) -> Touchstone:
         rows = rows[: falls[0] + 1] if len(falls) else rows
         if not len(rows) or not np.isfinite(rows).all():
             raise ValueError("no finite numbers")
-        matrix = _complex(rows[:, 1::2], rows[:, 2::2], kind).reshape(-1, count, count)
+        matrix = _to_complex(rows[:, 1::2], rows[:, 2::2], kind).reshape(-1, count, count)
     # Two ports are listed as S11, S21, S12, S22; others row by row.
     ordered = matrix.transpose(0, 2, 1) if count == 2 else matrix
     return Touchstone(
@@ -106,7 +106,7 @@ def load_touchstone(file: str | Path) -> Touchstone:
     )
 
 
-def _options(words: list[str]) -> tuple[float, str, float]:
+def _parse_option_line(words: list[str]) -> tuple[float, str, float]:
     """Unit, format and resistance of the option line; without one GHz, MA and 50 Ω."""
     unit, kind, resistance = 1e9, "MA", 50.0
     for number, word in enumerate(words):
@@ -121,7 +121,7 @@ def _options(words: list[str]) -> tuple[float, str, float]:
     return unit, kind, resistance
 
 
-def _complex(first: np.ndarray, second: np.ndarray, kind: str) -> np.ndarray:
+def _to_complex(first: np.ndarray, second: np.ndarray, kind: str) -> np.ndarray:
     if kind == "RI":
         return first + 1j * second
     size = first if kind == "MA" else 10 ** (first / 20)

@@ -20,13 +20,13 @@ _PROFILE = {
     "samples": 0,
     "sample_rate": 3,
 }
-_CHIRPS = 512  # that a front end can define
+_MAX_CHIRPS = 512  # that a front end can define
 BITS = {0: 12, 1: 14, 2: 16}
 """Code → resolution of the ADC."""
 BIT_CODES = {bits: code for code, bits in BITS.items()}
 
 
-def scaled(number: str | float | Decimal, exponent: int) -> float:
+def scale_decimal(number: str | float | Decimal, exponent: int) -> float:
     """number · 10^exponent, without the rounding of a float product.
 
     Args:
@@ -36,8 +36,8 @@ def scaled(number: str | float | Decimal, exponent: int) -> float:
     return float(Decimal(str(number)).scaleb(exponent))
 
 
-def text(number: float, exponent: int = 0) -> str:
-    """number · 10^exponent as plain decimals; `scaled` gives the same float back.
+def format_decimal(number: float, exponent: int = 0) -> str:
+    """number · 10^exponent as plain decimals; `scale_decimal` gives the same float back.
 
     Args:
         number: a number in SI units.
@@ -46,29 +46,29 @@ def text(number: float, exponent: int = 0) -> str:
     return f"{Decimal(repr(float(number))).scaleb(exponent).normalize():f}"
 
 
-def numbers(mask: int) -> tuple[int, ...]:
+def bits_to_numbers(mask: int) -> tuple[int, ...]:
     """Numbers from 1 of the bits that are set."""
     return tuple(bit + 1 for bit in range(mask.bit_length()) if mask >> bit & 1)
 
 
-def mask(chosen: Sequence[int]) -> int:
+def numbers_to_bits(chosen: Sequence[int]) -> int:
     """The bits of these numbers from 1."""
     return sum(1 << (number - 1) for number in chosen)
 
 
-def lanes_of(device: str) -> int | None:
+def device_lanes(device: str) -> int | None:
     """LVDS lanes of a device such as xWR1843 or xWR18xx; None if the name does not say."""
     match = re.search(r"[xai]wr(\d\d)", device.lower())
     return _LANES.get(match.group(1)) if match else None
 
 
 def profile_texts(chirp_settings: ChirpSettings) -> list[str]:
-    """The numbers of a profile as texts, in the order in which `settings` reads them."""
+    """The numbers of a profile as texts, in the order in which `frame_settings` reads them."""
     numbers = vars(chirp_settings) | {"ramp_end_time": chirp_settings.ramp_time}
-    return [text(numbers[name], -exponent) for name, exponent in _PROFILE.items()]
+    return [format_decimal(numbers[name], -exponent) for name, exponent in _PROFILE.items()]
 
 
-def settings(
+def frame_settings(
     profiles: Mapping[int, Any],
     keys: Sequence[Any],
     chirps: Iterable[tuple[int, int, int, int, bool]],
@@ -100,7 +100,7 @@ def settings(
         defined |= dict.fromkeys(range(first, last + 1), (profile, senders))
     first, last, loops, frames = (int(number) for number in frame[:4])
     _check_numbers(first, last)
-    order, used = _turns(defined, first, last)
+    order, used = _transmit_order(defined, first, last)
     if len(used) != 1 or not used <= set(profiles):
         raise InputError(
             f"expected one defined profile in all chirps of the frame, got {sorted(used)} of "
@@ -108,27 +108,28 @@ def settings(
         )
     profile = profiles[used.pop()]
     for (name, exponent), key in zip(_PROFILE.items(), keys, strict=True):
-        values[name] = scaled(profile[key], exponent)
+        values[name] = scale_decimal(profile[key], exponent)
     values["samples"] = int(values["samples"])
     order, loops = shortest_loop(order, loops)
     return ChirpSettings(
         transmit_order=order,
         loops=loops,
         frames=frames or None,
-        frame_period=scaled(frame[4], -3) or None,
+        frame_period=scale_decimal(frame[4], -3) or None,
         **values,
     )
 
 
 def _check_numbers(first: int, last: int) -> None:
-    if not 0 <= first <= last < _CHIRPS:
+    if not 0 <= first <= last < _MAX_CHIRPS:
         raise InputError(
-            f"expected chirps from 0 to {_CHIRPS - 1}, the first before the last, got {first} to "
+            f"expected chirps from 0 to {_MAX_CHIRPS - 1}, the first before the last, got "
+            f"{first} to "
             f"{last}; correct the settings"
         )
 
 
-def _turns(
+def _transmit_order(
     defined: Mapping[int, tuple[int, int]], first: int, last: int
 ) -> tuple[list[int], set[int]]:
     """Which transmitter sends in each chirp of a loop, and the profiles in use."""
@@ -140,7 +141,7 @@ def _turns(
                 f"{chirp}; the settings are incomplete"
             )
         profile, enabled = defined[chirp]
-        senders = numbers(enabled)
+        senders = bits_to_numbers(enabled)
         if len(senders) != 1:
             raise InputError(
                 f"expected one transmitter per chirp (TDM), got {len(senders)} in chirp {chirp}; "

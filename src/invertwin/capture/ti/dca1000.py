@@ -16,29 +16,29 @@ import torch
 
 from invertwin.capture.chirps import ChirpData, ChirpSettings
 from invertwin.capture.ti.layouts import (
-    CLEAR,
     LANE_COUNT,
-    Candidate,
-    advice,
-    better,
-    candidates,
-    evidence,
-    fits_layout,
+    MIN_BORDER_RATIO,
+    LayoutCandidate,
+    better_candidates,
+    block_layout,
+    find_candidates,
+    format_advice,
     frame_words,
-    layout,
+    layout_error,
+    measure_evidence,
     silent_lanes_contradict,
 )
 from invertwin.capture.ti.mmwave_studio import read_studio, setup_files
 from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.errors import InputError
 from invertwin.radar.waveform import PhysicsWarning
-from invertwin.storage.folders import replacing
-from invertwin.storage.untrusted import existing_file, reader
+from invertwin.storage.folders import replace_file
+from invertwin.storage.untrusted import existing_file, safe_reader
 
 _WORD = np.dtype("<i2")
 
 
-@reader("samples as their settings say")
+@safe_reader("samples as their settings say")
 def read_recording(
     path: str | Path, settings: str | Path | ChirpSettings | None = None, lanes: int | None = None
 ) -> ChirpData:
@@ -116,9 +116,9 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
         # Negative numbers may come without their sign bits.
         lost = words > 2 ** (settings.bits - 1) - 1
         words = np.where(lost, words - 2**settings.bits, words).astype(_WORD)
-    frames = _whole_frames(words, settings, name)
+    frames = _count_whole_frames(words, settings, name)
     words = words[: frames * frame_words(settings)].astype(np.float32)
-    parts = words.reshape(frames, -1).take(_places(settings), axis=1)
+    parts = words.reshape(frames, -1).take(_word_indices(settings), axis=1)
     samples = parts.astype(np.complex64) if settings.real else parts.view(np.complex64)
     data = ChirpData(torch.from_numpy(samples[..., 0]), replace(settings, frames=frames))
     data.warn_if_saturated()
@@ -152,8 +152,8 @@ def write_samples(path: str | Path, data: ChirpData) -> None:
             "take their real part or set real=False"
         )
     words = np.zeros((len(parts), frame_words(settings)), _WORD)
-    words[:, _places(settings)] = parts[..., :1] if settings.real else parts
-    with replacing(path) as part:
+    words[:, _word_indices(settings)] = parts[..., :1] if settings.real else parts
+    with replace_file(path) as part:
         words.tofile(part)
 
 
@@ -163,12 +163,12 @@ def _check_layout(settings: ChirpSettings) -> None:
             "expected settings with 2 or 4 LVDS lanes, got none; set lanes: 4 for xWR12xx and "
             "xWR14xx, 2 for xWR16xx, xWR18xx and xWR68xx"
         )
-    why = fits_layout(settings)
+    why = layout_error(settings)
     if why is not None:
         raise InputError(f"expected {why}")
 
 
-def _whole_frames(words: np.ndarray, settings: ChirpSettings, name: str) -> int:
+def _count_whole_frames(words: np.ndarray, settings: ChirpSettings, name: str) -> int:
     """Count the frames to read, and warn of what is missing.
 
     Settings whose size is not the file's are refused, unless the recording was cut off and its
@@ -179,13 +179,13 @@ def _whole_frames(words: np.ndarray, settings: ChirpSettings, name: str) -> int:
     expected = settings.frames
     exact = not rest and frames == (expected or frames) and frames > 0
     cut = frames > 0 and (expected is None or frames < expected)
-    others = _others(words, settings, exact=exact, cut=cut)
+    others = _find_alternatives(words, settings, exact=exact, truncated=cut)
     if others or not exact:
         if others:
             wanted = f"{expected} frames of {frame}" if expected else f"whole frames of {frame}"
             raise InputError(
                 f"expected the recording of its settings in {name} ({wanted} bytes), got {size} "
-                f"bytes{' whose chirps break elsewhere' if exact else ''}; {advice(others)}"
+                f"bytes{' whose chirps break elsewhere' if exact else ''}; {format_advice(others)}"
             )
         if not exact and expected is not None and not cut:
             raise InputError(
@@ -214,37 +214,37 @@ def _whole_frames(words: np.ndarray, settings: ChirpSettings, name: str) -> int:
     return frames
 
 
-def _others(
-    words: np.ndarray, settings: ChirpSettings, *, exact: bool, cut: bool
-) -> list[Candidate]:
+def _find_alternatives(
+    words: np.ndarray, settings: ChirpSettings, *, exact: bool, truncated: bool
+) -> list[LayoutCandidate]:
     """Other settings that the file speaks for, best first; none = it may be as stated.
 
     Args:
         words: Of the file.
         settings: As stated.
         exact: Whether the size is that of the settings.
-        cut: Whether it is that of a recording that was stopped.
+        truncated: Whether it is that of a recording that was stopped.
     """
-    sound = evidence(words, settings).breaks >= CLEAR if exact else False
+    sound = measure_evidence(words, settings).border_ratio >= MIN_BORDER_RATIO if exact else False
     if not words.size or (sound and not silent_lanes_contradict(words, settings)):
         return []
-    found = candidates(words, settings)
-    if not exact and not cut:
+    found = find_candidates(words, settings)
+    if not exact and not truncated:
         return found
     if silent_lanes_contradict(words, settings):
         return [one for one in found if not silent_lanes_contradict(words, one.settings)]
-    stated = evidence(words, settings)
-    others = better(found, stated)
+    stated = measure_evidence(words, settings)
+    others = better_candidates(found, stated)
     if exact or others:
         return others
     # The same blocks in other numbers: no sample tells a stopped recording from another one.
     alike = [one for one in found if len(one.changes) == 1 and "frames" not in one.changes]
-    if stated.breaks >= CLEAR:
-        alike = [one for one in alike if layout(one.settings) == layout(settings)]
+    if stated.border_ratio >= MIN_BORDER_RATIO:
+        alike = [one for one in alike if block_layout(one.settings) == block_layout(settings)]
     return [*(one for one in found if alike and set(one.changes) == {"frames"}), *alike]
 
 
-def _places(settings: ChirpSettings) -> np.ndarray:
+def _word_indices(settings: ChirpSettings) -> np.ndarray:
     """Which words of a frame are I and Q: numbers from 0 [chirp, tx, rx, sample, I and Q]."""
     s, parts = settings, 1 if settings.real else 2
     chirps = s.loops, len(s.transmit_order)

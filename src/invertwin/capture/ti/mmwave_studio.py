@@ -10,16 +10,16 @@ from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.ti.chirp_table import (
     BIT_CODES,
     BITS,
-    lanes_of,
-    mask,
-    numbers,
+    bits_to_numbers,
+    device_lanes,
+    format_decimal,
+    frame_settings,
+    numbers_to_bits,
     profile_texts,
-    settings,
-    text,
 )
 from invertwin.errors import InputError
-from invertwin.storage.folders import replacing
-from invertwin.storage.untrusted import existing_file, read_text, reader, reading
+from invertwin.storage.folders import replace_file
+from invertwin.storage.untrusted import convert_read_errors, existing_file, read_text, safe_reader
 
 # Names of the numbers of a profile, and of the frame.
 _PROFILE = (
@@ -40,7 +40,7 @@ _VARIATIONS = (
 )
 
 
-@reader("settings of mmWave Studio", "save them again with mmWave Studio")
+@safe_reader("settings of mmWave Studio", "save them again with mmWave Studio")
 def read_studio(path: str | Path) -> ChirpSettings:
     """Read the settings of a `.mmwave.json` file, or of the one that a `.setup.json` file names.
 
@@ -53,17 +53,17 @@ def read_studio(path: str | Path) -> ChirpSettings:
             differ, frames with sub-frames.
     """
     path = Path(path)
-    content = _json(path)
+    content = _load_json(path)
     device = ""
     if "configUsed" in content:
         device = str(content.get("mmWaveDevice", ""))
         mode = (content.get("DCA1000Config") or {}).get("dataLoggingMode", "raw")
         do = "files of other modes have headers and are not read"
-        _expect(mode, "raw", "a recording in raw mode (dataLoggingMode)", do)
-        path = _beside(path, str(content["configUsed"]))
-        content = _json(path)
+        _require_equal(mode, "raw", "a recording in raw mode (dataLoggingMode)", do)
+        path = _sibling_path(path, str(content["configUsed"]))
+        content = _load_json(path)
     try:
-        return _settings(content, device)
+        return _parse_settings(content, device)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from error
     except (KeyError, TypeError, ValueError, ArithmeticError) as error:
@@ -73,7 +73,7 @@ def read_studio(path: str | Path) -> ChirpSettings:
         ) from error
 
 
-@reader("a setup of mmWave Studio", "save it again with mmWave Studio")
+@safe_reader("a setup of mmWave Studio", "save it again with mmWave Studio")
 def setup_files(path: str | Path) -> list[Path]:
     """Find the raw files that a `.setup.json` file names, in the order of recording.
 
@@ -81,10 +81,10 @@ def setup_files(path: str | Path) -> list[Path]:
         InputError: no file, no JSON, or none that names raw files.
     """
     path = Path(path)
-    content = _json(path)
+    content = _load_json(path)
     try:
         captured = content["capturedFiles"]
-        names = [str(file["rawFileName"]) for file in _listed(captured["files"], "rawFileName")]
+        names = [str(file["rawFileName"]) for file in _list_items(captured["files"], "rawFileName")]
         base = str(captured.get("fileBasePath", ""))
     except (KeyError, TypeError):
         names, base = [], ""
@@ -92,12 +92,12 @@ def setup_files(path: str | Path) -> list[Path]:
         raise InputError(
             f"expected capturedFiles in {path.name}, got none; name the .bin files yourself"
         )
-    return [_beside(path, str(PureWindowsPath(base) / name)) for name in names]
+    return [_sibling_path(path, str(PureWindowsPath(base) / name)) for name in names]
 
 
-def _json(path: Path) -> dict[str, Any]:
+def _load_json(path: Path) -> dict[str, Any]:
     whole = read_text(path, "a .json file of mmWave Studio")
-    with reading(path, "JSON"):
+    with convert_read_errors(path, "JSON"):
         content = json.loads(whole, parse_float=Decimal)
     if not isinstance(content, dict):
         raise InputError(
@@ -106,32 +106,34 @@ def _json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _beside(path: Path, named: str) -> Path:
+def _sibling_path(path: Path, named: str) -> Path:
     if Path(named).is_file():
         return Path(named)
     # The name of a file on Windows or on this machine.
     return path.parent / PureWindowsPath(named).name
 
 
-def _settings(content: dict[str, Any], device: str) -> ChirpSettings:
-    found = _device(content["mmWaveDevices"])
+def _parse_settings(content: dict[str, Any], device: str) -> ChirpSettings:
+    found = _single_device(content["mmWaveDevices"])
     radio, record = found["rfConfig"], found["rawDataCaptureConfig"]
     kind = radio.get("waveformType", "legacyFrameChirp")
-    _expect(kind, "legacyFrameChirp", "legacyFrameChirp", "other frames are not supported")
+    _require_equal(kind, "legacyFrameChirp", "legacyFrameChirp", "other frames are not supported")
     sent = (record.get("rlDevDataPathCfg_t") or {}).get("transferFmtPkt0", "0x1")
     do = "record without chirp parameters and quality data"
-    _expect(_integer(sent), 1, "packets of samples only (transferFmtPkt0 1)", do)
-    layout, lanes = record["rlDevDataFmtCfg_t"], lanes_of(device)
+    _require_equal(_parse_integer(sent), 1, "packets of samples only (transferFmtPkt0 1)", do)
+    layout, lanes = record["rlDevDataFmtCfg_t"], device_lanes(device)
     if "rlDevLaneEnable_t" in record:
-        lanes = len(numbers(_integer(record["rlDevLaneEnable_t"]["laneEn"])))
+        lanes = len(bits_to_numbers(_parse_integer(record["rlDevLaneEnable_t"]["laneEn"])))
     if lanes in (2, 4):
         # 0 = receivers interleaved, as through 4 lanes; 1 = one after the other, as through 2.
         order, what = int(lanes == 2), f"chInterleave {int(lanes == 2)} with {lanes} LVDS lanes"
-        _expect(int(layout["chInterleave"]), order, what, "other orders are not supported")
-    profiles = [item["rlProfileCfg_t"] for item in _listed(radio["rlProfiles"], "rlProfileCfg_t")]
-    chirps = [item["rlChirpCfg_t"] for item in _listed(radio["rlChirps"], "rlChirpCfg_t")]
+        _require_equal(int(layout["chInterleave"]), order, what, "other orders are not supported")
+    profiles = [
+        item["rlProfileCfg_t"] for item in _list_items(radio["rlProfiles"], "rlProfileCfg_t")
+    ]
+    chirps = [item["rlChirpCfg_t"] for item in _list_items(radio["rlChirps"], "rlChirpCfg_t")]
     frame, output = radio["rlFrameCfg_t"], radio["rlAdcOutCfg_t"]["fmt"]
-    return settings(
+    return frame_settings(
         {int(profile["profileId"]): profile for profile in profiles},
         _PROFILE,
         [
@@ -139,13 +141,13 @@ def _settings(content: dict[str, Any], device: str) -> ChirpSettings:
                 int(chirp["chirpStartIdx"]),
                 int(chirp["chirpEndIdx"]),
                 int(chirp["profileId"]),
-                _integer(chirp["txEnable"]),
+                _parse_integer(chirp["txEnable"]),
                 any(float(chirp.get(name, 0)) for name in _VARIATIONS),
             )
             for chirp in chirps
         ],
         [frame[key] for key in _FRAME],
-        receivers=numbers(_integer(radio["rlChanCfg_t"]["rxChannelEn"])),
+        receivers=bits_to_numbers(_parse_integer(radio["rlChanCfg_t"]["rxChannelEn"])),
         real=int(output["b2AdcOutFmt"]) in (0, 3),
         swap_iq=bool(int(layout["iqSwapSel"])),
         bits=BITS[int(output["b2AdcBits"])],
@@ -153,16 +155,16 @@ def _settings(content: dict[str, Any], device: str) -> ChirpSettings:
     )
 
 
-def _device(written: Any) -> dict[str, Any]:
+def _single_device(written: Any) -> dict[str, Any]:
     """The one device of the settings."""
-    devices = _listed(written, "rfConfig")
+    devices = _list_items(written, "rfConfig")
     if not devices:
         raise InputError(
             "expected settings of one device, got none; connect the device in mmWave Studio, then "
             "save the settings again"
         )
     modes = [
-        _integer((device["rfConfig"].get("rlChanCfg_t") or {}).get("cascading", 0))
+        _parse_integer((device["rfConfig"].get("rlChanCfg_t") or {}).get("cascading", 0))
         for device in devices
     ]
     if any(modes):
@@ -171,11 +173,11 @@ def _device(written: Any) -> dict[str, Any]:
             f"{', '.join(map(str, modes))}); its raw files are not read, give its samples as arrays"
         )
     do = "name a file with the device that recorded alone; give samples of several as arrays"
-    _expect(len(devices), 1, "settings of one device", do)
+    _require_equal(len(devices), 1, "settings of one device", do)
     return devices[0]
 
 
-def _listed(written: Any, key: str) -> list[dict[str, Any]]:
+def _list_items(written: Any, key: str) -> list[dict[str, Any]]:
     """The items of a list. MATLAB writes a list of one as the item itself, others by names.
 
     Args:
@@ -189,12 +191,12 @@ def _listed(written: Any, key: str) -> list[dict[str, Any]]:
     return written
 
 
-def _expect(found: Any, known: Any, what: str, do: str) -> None:
+def _require_equal(found: Any, known: Any, what: str, do: str) -> None:
     if found != known:
         raise InputError(f"expected {what}, got {found}; {do}")
 
 
-def _integer(value: Any) -> int:
+def _parse_integer(value: Any) -> int:
     return int(value, 0) if isinstance(value, str) else int(value)
 
 
@@ -213,13 +215,13 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
         raise InputError("expected settings with 2 or 4 lanes, got none; set lanes")
     profile = dict(zip(_PROFILE, map(float, profile_texts(s)), strict=True))
     frame = (0, len(s.transmit_order) - 1, s.loops, s.frames or 0)
-    period = float(text(s.frame_period or 0.0, 3))
+    period = float(format_decimal(s.frame_period or 0.0, 3))
     radio = {
         "waveformType": "legacyFrameChirp",
         "MIMOScheme": "TDM",
         "rlChanCfg_t": {
-            "rxChannelEn": f"0x{mask(s.receivers):X}",
-            "txChannelEn": f"0x{mask(s.transmit_order):X}",
+            "rxChannelEn": f"0x{numbers_to_bits(s.receivers):X}",
+            "txChannelEn": f"0x{numbers_to_bits(s.transmit_order):X}",
             "cascading": 0,
         },
         "rlAdcOutCfg_t": {
@@ -237,7 +239,7 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
                     "chirpEndIdx": index,
                     "profileId": 0,
                     **dict.fromkeys(_VARIATIONS, 0.0),
-                    "txEnable": f"0x{mask([tx]):X}",
+                    "txEnable": f"0x{numbers_to_bits([tx]):X}",
                 }
             }
             for index, tx in enumerate(s.transmit_order)
@@ -249,7 +251,7 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
         "rlDevLaneEnable_t": {"laneEn": f"0x{2**s.lanes - 1:X}"},
     }
     device = {"mmWaveDeviceId": 0, "rfConfig": radio, "rawDataCaptureConfig": record}
-    with replacing(path) as part:
+    with replace_file(path) as part:
         part.write_text(json.dumps({"mmWaveDevices": [device]}, indent=2) + "\n", encoding="utf-8")
 
 
@@ -265,7 +267,7 @@ def write_setup(path: str | Path, settings: str | Path, recordings: Sequence[str
         InputError: the folder does not exist, or a file that is not in it.
     """
     path = Path(path)
-    with replacing(path) as part:
+    with replace_file(path) as part:
         for name in (Path(file).name for file in (settings, *recordings)):
             existing_file(path.parent / name, f"{name} beside {path}")
         names = [{"rawFileName": Path(file).name, "processedFileName": ""} for file in recordings]

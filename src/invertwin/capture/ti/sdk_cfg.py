@@ -7,16 +7,16 @@ from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.ti.chirp_table import (
     BIT_CODES,
     BITS,
-    lanes_of,
-    mask,
-    numbers,
+    bits_to_numbers,
+    device_lanes,
+    format_decimal,
+    frame_settings,
+    numbers_to_bits,
     profile_texts,
-    settings,
-    text,
 )
 from invertwin.errors import InputError
-from invertwin.storage.folders import replacing
-from invertwin.storage.untrusted import read_text, reader
+from invertwin.storage.folders import replace_file
+from invertwin.storage.untrusted import read_text, safe_reader
 
 # Fewest arguments of the commands that are read.
 _ARGUMENTS = {
@@ -28,12 +28,12 @@ _ARGUMENTS = {
     "frameCfg": 5,
     "lvdsStreamCfg": 2,
 }
-_ONCE = ("channelCfg", "adcCfg", "frameCfg")
+_UNIQUE_COMMANDS = ("channelCfg", "adcCfg", "frameCfg")
 # Places of the numbers of a profile in its command.
 _PROFILE = (1, 2, 3, 4, 7, 9, 10)
 
 
-@reader("settings of the mmWave SDK", "compare with the SDK's user guide")
+@safe_reader("settings of the mmWave SDK", "compare with the SDK's user guide")
 def read_cfg(path: str | Path) -> ChirpSettings:
     """Read `channelCfg`, `adcCfg`, `profileCfg`, `chirpCfg` and `frameCfg` of a `.cfg` file.
 
@@ -66,7 +66,7 @@ def read_cfg(path: str | Path) -> ChirpSettings:
             "sub-frames are not supported"
         )
     try:
-        return _settings(found, lanes_of(platform))
+        return _parse_settings(found, device_lanes(platform))
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from error
     except (ValueError, ArithmeticError) as error:
@@ -76,8 +76,8 @@ def read_cfg(path: str | Path) -> ChirpSettings:
         ) from error
 
 
-def _settings(found: dict[str, list[list[str]]], lanes: int | None) -> ChirpSettings:
-    for command in (*_ONCE, "profileCfg", "chirpCfg"):
+def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> ChirpSettings:
+    for command in (*_UNIQUE_COMMANDS, "profileCfg", "chirpCfg"):
         if command not in found:
             raise InputError(
                 f"expected a line {command}, got none; the settings are incomplete, or no .cfg file"
@@ -89,7 +89,7 @@ def _settings(found: dict[str, list[list[str]]], lanes: int | None) -> ChirpSett
                     f"expected at least {count} arguments of {command}, got {len(arguments)}; "
                     "the line is incomplete"
                 )
-    channel, adc, frame = (found[command][-1] for command in _ONCE)
+    channel, adc, frame = (found[command][-1] for command in _UNIQUE_COMMANDS)
     chirps = [
         (int(first), int(last), int(profile), int(tx, 0), any(map(float, variations)))
         for first, last, profile, *variations, tx in (chirp[:8] for chirp in found["chirpCfg"])
@@ -107,18 +107,18 @@ def _settings(found: dict[str, list[list[str]]], lanes: int | None) -> ChirpSett
             f"expected adcCfg with bits 0 to 2 and format 0 to 2, got {bits} and {kind}; "
             "see the SDK's user guide"
         )
-    read = settings(
+    read = frame_settings(
         {int(profile[0]): profile for profile in found["profileCfg"]},
         _PROFILE,
         chirps,
         frame,
-        receivers=numbers(int(channel[0], 0)),
+        receivers=bits_to_numbers(int(channel[0], 0)),
         real=kind == 0,
-        swap_iq=_swapped(found.get("adcbufCfg", [])),
+        swap_iq=_swaps_iq(found.get("adcbufCfg", [])),
         bits=BITS[bits],
         lanes=lanes,
     )
-    unused = set(read.transmit_order) - set(numbers(int(channel[1], 0)))
+    unused = set(read.transmit_order) - set(bits_to_numbers(int(channel[1], 0)))
     if unused:
         raise InputError(
             f"expected chirps of the transmitters that channelCfg enables, got TX {unused}; "
@@ -132,7 +132,7 @@ def _settings(found: dict[str, list[list[str]]], lanes: int | None) -> ChirpSett
     return read
 
 
-def _swapped(commands: Sequence[list[str]]) -> bool:
+def _swaps_iq(commands: Sequence[list[str]]) -> bool:
     """SampleSwap: 1 = Q in the lower half word, so first in the file."""
     # Since SDK 2 a sub-frame number comes first.
     return bool(commands) and bool(int(commands[-1][-3]))
@@ -156,15 +156,18 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
         "sensorStop",
         "flushCfg",
         "dfeDataOutputMode 1",
-        f"channelCfg {mask(s.receivers)} {mask(s.transmit_order)} 0",
+        f"channelCfg {numbers_to_bits(s.receivers)} {numbers_to_bits(s.transmit_order)} 0",
         f"adcCfg {BIT_CODES[s.bits]} {int(not s.real)}",
         f"adcbufCfg -1 {int(s.real)} {int(s.swap_iq)} 1 1",
         f"profileCfg 0 {start} {idle} {adc} {end} 0 0 {slope} 0 {samples} {rate} 0 0 30",
-        *(f"chirpCfg {i} {i} 0 0 0 0 0 {mask([tx])}" for i, tx in enumerate(s.transmit_order)),
+        *(
+            f"chirpCfg {i} {i} 0 0 0 0 0 {numbers_to_bits([tx])}"
+            for i, tx in enumerate(s.transmit_order)
+        ),
         f"frameCfg 0 {len(s.transmit_order) - 1} {s.loops} {s.frames or 0} "
-        f"{text(s.frame_period or 0, 3)} 1 0",
+        f"{format_decimal(s.frame_period or 0, 3)} 1 0",
         "lvdsStreamCfg -1 0 1 0",
         "sensorStart",
     ]
-    with replacing(path) as part:
+    with replace_file(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -16,16 +16,26 @@ from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.em.dielectric_solids import AIR, Solids, refracted
-from invertwin.channel.em.plane_waves import area_vector, cross, dot, mirrored, polygon_integral
+from invertwin.channel.em.dielectric_solids import AIR, DielectricSolids, refract_waves
+from invertwin.channel.em.plane_waves import (
+    area_vector,
+    cross,
+    dot,
+    polygon_integral,
+    reflect_vectors,
+)
 from invertwin.channel.rays.topology import Topology
 
-FEW = 24
+MAX_FACETS_BEAM_TRACING = 24
 """Triangles of a scene up to which beams are clipped exactly."""
-_EMPTY = 1e-12  # of the scene's size squared: a polygon of less area is none
-_FLAT = 1e-12  # of a polygon's size: a side between less different heights lies in the plane
-_LOST = 1e-6  # amplitude that losses leave of a wave, below which it is dropped
-_BEFORE = 1e-9  # of the scene's size: what rises less above a facet hides nothing of it
+_MIN_AREA = 1e-12  # of the scene's size squared: a polygon of less area is none
+_COPLANAR_TOLERANCE = (
+    1e-12  # of a polygon's size: a side between less different heights lies in the plane
+)
+_MIN_AMPLITUDE = 1e-6  # amplitude that losses leave of a wave, below which it is dropped
+_OCCLUSION_TOLERANCE = (
+    1e-9  # of the scene's size: what rises less above a facet hides nothing of it
+)
 
 
 @dataclass(frozen=True)
@@ -45,7 +55,7 @@ class Facets:
     size: float
 
 
-def facets_of(vertices: Float64[Tensor, "v 3"], topology: Topology) -> Facets:
+def build_facets(vertices: Float64[Tensor, "v 3"], topology: Topology) -> Facets:
     """The triangles of meshes as facets.
 
     Args:
@@ -64,7 +74,7 @@ def facets_of(vertices: Float64[Tensor, "v 3"], topology: Topology) -> Facets:
 
 
 @dataclass(frozen=True)
-class Bounce:
+class IlluminatedPatches:
     """Lit patches of one order, rows: each is where one beam ends.
 
     Attributes:
@@ -72,75 +82,77 @@ class Bounce:
         facet: what is lit.
         normal: of the facet, towards the beam's source.
         direction: d of the beam.
-        offset: c [m].
+        phase_offset: c [m].
         polygon: the lit part [m].
-        before: the row of the previous order that the beam comes from; −1 at the first.
-        wave: K, so that the wave has the phase −k(K·x + c): d in air, complex where it decays.
+        parent: the row of the previous order that the beam comes from; −1 at the first.
+        wave_vector: K, so that the wave has the phase −k(K·x + c): d in air, complex where it
+            decays.
         medium: number of the solid that the beam is in; −1 = air.
-        passed: whether it has crossed the face where it comes from, and was not mirrored there.
-        spread: its field over that of a plane wave, by how the ways of neighbours spread.
+        transmitted: whether it has crossed the face where it comes from, and was not mirrored
+            there.
+        spreading: its field over that of a plane wave, by how the ways of neighbours spread.
     """
 
     aspect: Int64[Tensor, " row"]
     facet: Int64[Tensor, " row"]
     normal: Float64[Tensor, "row 3"]
     direction: Float64[Tensor, "row 3"]
-    offset: Tensor
+    phase_offset: Tensor
     polygon: Float64[Tensor, "row corner 3"]
-    before: Int64[Tensor, " row"]
-    wave: Tensor
+    parent: Int64[Tensor, " row"]
+    wave_vector: Tensor
     medium: Int64[Tensor, " row"]
-    passed: Bool[Tensor, " row"]
-    spread: Tensor
+    transmitted: Bool[Tensor, " row"]
+    spreading: Tensor
 
-    def integral(
-        self, towards: Float64[Tensor, "row 3"]
+    def phase_integral(
+        self, scattering_direction: Float64[Tensor, "row 3"]
     ) -> Callable[[float], Complex128[Tensor, " row"]]:
         """∫ exp(−jk(K·x + c − s·x)) dA over each patch, by wave number k [1/m].
 
         Args:
-            towards: s, to the receiver.
+            scattering_direction: s, to the receiver.
         """
-        way = towards - self.wave
+        way = scattering_direction - self.wave_vector
         if not way.is_complex():
             patches = polygon_integral(self.polygon, way)
-            return lambda k: patches(k) * torch.exp(-1j * k * self.offset)
+            return lambda k: patches(k) * torch.exp(-1j * k * self.phase_offset)
         # About a corner: far from the origin, decaying waves are out of range.
         start = self.polygon[:, 0]
         patches = polygon_integral(self.polygon - start[:, None], way)
-        phase = dot(way, start) - self.offset
+        phase = dot(way, start) - self.phase_offset
         return lambda k: patches(k) * torch.exp(1j * k * phase)
 
 
-def in_air(
+def patches_in_air(
     aspect: Int64[Tensor, " row"],
     facet: Int64[Tensor, " row"],
     normal: Float64[Tensor, "row 3"],
     direction: Float64[Tensor, "row 3"],
-    offset: Float64[Tensor, " row"],
+    phase_offset: Float64[Tensor, " row"],
     polygon: Float64[Tensor, "row corner 3"],
-    before: Int64[Tensor, " row"],
-) -> Bounce:
+    parent: Int64[Tensor, " row"],
+) -> IlluminatedPatches:
     """Lit patches of waves that no solid has let in.
 
     Args:
-        aspect, facet, normal, direction, offset, polygon, before: as in `Bounce`.
+        aspect, facet, normal, direction, phase_offset, polygon, parent: as in `IlluminatedPatches`.
     """
-    air, plain = torch.full_like(aspect, AIR), torch.ones_like(offset)
+    air, plain = torch.full_like(aspect, AIR), torch.ones_like(phase_offset)
     none = torch.zeros_like(aspect, dtype=torch.bool)
-    return Bounce(
-        aspect, facet, normal, direction, offset, polygon, before, direction, air, none, plain
+    return IlluminatedPatches(
+        aspect, facet, normal, direction, phase_offset, polygon, parent, direction, air, none, plain
     )
 
 
-def beams(
+def trace_beams(
     facets: Facets,
     incident: Float64[Tensor, "aspect 3"],
     depth: int,
     *,
     boundary: bool = True,
-    solids: Solids | None = None,
-) -> Iterator[Bounce]:
+    solids: DielectricSolids | None = None,
+) -> Iterator[IlluminatedPatches]:
     """Lit patches of the first order, of the second, and so on, of plane waves.
 
     Args:
@@ -155,33 +167,42 @@ def beams(
     """
     last = None
     for _ in range(depth):
-        last = _next(facets, incident, last, solids)
+        last = _trace_order(facets, incident, last, solids)
         if not boundary:
-            last = _fixed(facets, last)
+            last = _attach_to_facets(facets, last)
         if not len(last.aspect):
             return
         yield last
 
 
-class _Source(NamedTuple):
+class _DepartingBeams(NamedTuple):
     """Beams that set out, one row each; ``side`` is normal to where from, on their side of it."""
 
     aspect: Tensor
-    own: Tensor
-    before: Tensor
-    side: Tensor
-    at: Tensor
+    source_facet: Tensor
+    parent: Tensor
+    source_normal: Tensor
+    source_point: Tensor
     direction: Tensor
-    offset: Tensor
-    wave: Tensor
+    phase_offset: Tensor
+    wave_vector: Tensor
     medium: Tensor
-    passed: Tensor
+    transmitted: Tensor
 
 
-def _next(facets: Facets, incident: Tensor, last: Bounce | None, solids: Solids | None) -> Bounce:
+def _trace_order(
+    facets: Facets,
+    incident: Tensor,
+    previous: IlluminatedPatches | None,
+    solids: DielectricSolids | None,
+) -> IlluminatedPatches:
     """All facets in all beams of one order."""
     count = len(facets.normal)
-    begun = _first(incident, solids) if last is None else _onwards(last, solids)
+    begun = (
+        _launch_plane_waves(incident, solids)
+        if previous is None
+        else _continue_beams(previous, solids)
+    )
     source = torch.arange(len(begun.aspect)).repeat_interleave(count)
     facet = torch.arange(count).repeat(len(begun.aspect))
     facing = dot(facets.normal[facet], begun.direction[source]).detach()
@@ -189,137 +210,163 @@ def _next(facets: Facets, incident: Tensor, last: Bounce | None, solids: Solids 
     if solids is not None:
         within = begun.medium[source] == solids.owner[facet]
         lit = torch.where(within, facing > 0, lit)
-    keep = (facet != begun.own[source]) & (facing.abs() > 1e-9) & lit
+    keep = (facet != begun.source_facet[source]) & (facing.abs() > 1e-9) & lit
     source, facet = source[keep], facet[keep]
     normal = -facing[keep].sign()[:, None] * facets.normal[facet]
-    bounce = Bounce(
+    bounce = IlluminatedPatches(
         begun.aspect[source],
         facet,
         normal,
         begun.direction[source],
-        begun.offset[source],
+        begun.phase_offset[source],
         facets.corners[facet],
         source,
-        begun.wave[source],
+        begun.wave_vector[source],
         begun.medium[source],
-        begun.passed[source],
+        begun.transmitted[source],
         torch.ones(len(source), dtype=torch.float64),
     )
-    if last is not None:
-        bounce = _within(facets, bounce, last, begun)
-    bounce = _unhidden(facets, bounce, None if last is None else begun, solids)
-    bounce = replace(bounce, before=begun.before[bounce.before])
+    if previous is not None:
+        bounce = _clip_to_beams(facets, bounce, previous, begun)
+    bounce = _remove_occluded(facets, bounce, None if previous is None else begun, solids)
+    bounce = replace(bounce, parent=begun.parent[bounce.parent])
     if solids is None:
         return bounce
-    bounce = rows_of(bounce, left(bounce, solids.wave_number))
-    solids.check(bounce.facet, bounce.medium)
+    bounce = select_patches(bounce, exceeds_min_amplitude(bounce, solids.wave_number))
+    solids.require_gaps(bounce.facet, bounce.medium)
     return bounce
 
 
-def _first(incident: Tensor, solids: Solids | None) -> _Source:
+def _launch_plane_waves(incident: Tensor, solids: DielectricSolids | None) -> _DepartingBeams:
     """Plane waves from far away."""
     none = torch.full((len(incident),), -1)
     wave = incident if solids is None else incident.to(torch.complex128)
     zeros = torch.zeros(len(incident), dtype=wave.dtype)
     aspect = torch.arange(len(incident))
     at, passed = torch.zeros_like(incident), none >= 0
-    return _Source(aspect, none, none, at, at, incident, zeros, wave, none, passed)
+    return _DepartingBeams(aspect, none, none, at, at, incident, zeros, wave, none, passed)
 
 
-def _onwards(last: Bounce, solids: Solids | None) -> _Source:
+def _continue_beams(
+    previous: IlluminatedPatches, solids: DielectricSolids | None
+) -> _DepartingBeams:
     """What a mirror sends on, and after that what faces of solids let through."""
-    direction, wave = mirrored(last.direction, last.normal), mirrored(last.wave, last.normal)
-    row, at = torch.arange(len(last.aspect)), last.polygon[:, 0]
+    direction, wave = (
+        reflect_vectors(previous.direction, previous.normal),
+        reflect_vectors(previous.wave_vector, previous.normal),
+    )
+    row, at = torch.arange(len(previous.aspect)), previous.polygon[:, 0]
     passed = torch.zeros_like(row, dtype=torch.bool)
-    medium, side = last.medium, last.normal
+    medium, side = previous.medium, previous.normal
     if solids is not None:
-        behind = solids.behind(last.facet, last.medium)
-        through, going = refracted(solids.inside(behind), last.wave, last.normal)
-        some = torch.nonzero(going & solids.clear[last.facet])[:, 0]
+        behind = solids.medium_behind(previous.facet, previous.medium)
+        through, going = refract_waves(
+            solids.permittivity_in(behind), previous.wave_vector, previous.normal
+        )
+        some = torch.nonzero(going & solids.transparent[previous.facet])[:, 0]
         row = torch.cat([row, some])
         at = at[row]
         passed = torch.cat([passed, torch.ones_like(some, dtype=torch.bool)])
         wave = torch.cat([wave, through[some]])
         direction = torch.cat([direction, normalize(through[some].real, dim=1)])
         medium = torch.cat([medium, behind[some]])
-        side = torch.cat([side, -last.normal[some]])
+        side = torch.cat([side, -previous.normal[some]])
     # Equal phases on the face itself.
-    offset = last.offset[row] + dot(last.wave[row] - wave, at.to(wave.dtype))
-    aspect, own = last.aspect[row], last.facet[row]
-    return _Source(aspect, own, row, side, at, direction, offset, wave, medium, passed)
+    offset = previous.phase_offset[row] + dot(previous.wave_vector[row] - wave, at.to(wave.dtype))
+    aspect, own = previous.aspect[row], previous.facet[row]
+    return _DepartingBeams(aspect, own, row, side, at, direction, offset, wave, medium, passed)
 
 
-def left(bounce: Bounce, wave_number: float) -> Bool[Tensor, " row"]:
+def exceeds_min_amplitude(patches: IlluminatedPatches, wave_number: float) -> Bool[Tensor, " row"]:
     """Whether losses leave anything of waves.
 
     Args:
-        bounce: where they end.
+        patches: where they end.
         wave_number: k [1/m].
     """
-    way = (dot(bounce.wave[:, None], bounce.polygon.to(bounce.wave.dtype)).detach()).imag
-    way = way + bounce.offset.detach().imag[:, None]
-    return wave_number * way.amax(1) > math.log(_LOST)
+    way = (
+        dot(patches.wave_vector[:, None], patches.polygon.to(patches.wave_vector.dtype)).detach()
+    ).imag
+    way = way + patches.phase_offset.detach().imag[:, None]
+    return wave_number * way.amax(1) > math.log(_MIN_AMPLITUDE)
 
 
-def _fixed(facets: Facets, bounce: Bounce) -> Bounce:
+def _attach_to_facets(facets: Facets, patches: IlluminatedPatches) -> IlluminatedPatches:
     """Patches whose corners are points of their facets and move with these alone."""
-    corners = facets.corners[bounce.facet]
+    corners = facets.corners[patches.facet]
     sides = corners[:, 1:] - corners[:, :1]
-    places = (bounce.polygon - corners[:, :1]).detach() @ torch.linalg.pinv(sides.detach())
-    return replace(bounce, polygon=corners[:, :1] + places @ sides)
+    places = (patches.polygon - corners[:, :1]).detach() @ torch.linalg.pinv(sides.detach())
+    return replace(patches, polygon=corners[:, :1] + places @ sides)
 
 
-def _within(facets: Facets, bounce: Bounce, last: Bounce, begun: _Source) -> Bounce:
+def _clip_to_beams(
+    facets: Facets,
+    patches: IlluminatedPatches,
+    previous: IlluminatedPatches,
+    departing: _DepartingBeams,
+) -> IlluminatedPatches:
     """The parts of facets that lie in the beams that a mirror, or a face, has sent."""
-    mirror = last.polygon[begun.before[bounce.before]]
-    polygon = _in_front(bounce.polygon, begun.side[bounce.before], mirror[:, 0], 0.0)
-    for plane, at, proper in _sides(mirror, bounce.direction):
+    mirror = previous.polygon[departing.parent[patches.parent]]
+    polygon = _clip_in_front(
+        patches.polygon, departing.source_normal[patches.parent], mirror[:, 0], 0.0
+    )
+    for plane, at, proper in _side_planes(mirror, patches.direction):
         polygon = clip(polygon, plane, torch.where(proper, dot(plane, at), -1.0))
-    return _proper(facets, bounce, polygon)
+    return _drop_degenerate(facets, patches, polygon)
 
 
-def _unhidden(
-    facets: Facets, bounce: Bounce, begun: _Source | None, solids: Solids | None
-) -> Bounce:
+def _remove_occluded(
+    facets: Facets,
+    patches: IlluminatedPatches,
+    departing: _DepartingBeams | None,
+    solids: DielectricSolids | None,
+) -> IlluminatedPatches:
     """What no other facet hides from the source, as convex pieces."""
     for other in range(len(facets.normal)):
-        if not len(bounce.aspect):
+        if not len(patches.aspect):
             break
-        above: Tensor | float = _BEFORE * facets.size
+        above: Tensor | float = _OCCLUSION_TOLERANCE * facets.size
         if solids is not None and bool(solids.conducting[other]):
             # A conductor that touches a dielectric is what waves meet there, from either side.
-            above = torch.where(solids.conducting[bounce.facet], above, -above)
-        shadow = facets.corners[other].expand(len(bounce.aspect), 3, 3)
-        shadow = _in_front(shadow, bounce.normal, bounce.polygon[:, 0], above)
-        if begun is not None:
-            plane, at = begun.side[bounce.before], begun.at[bounce.before]
-            shadow = _in_front(shadow, plane, at, _BEFORE * facets.size)
-        bounce = _without(facets, bounce, shadow)
-    return bounce
+            above = torch.where(solids.conducting[patches.facet], above, -above)
+        shadow = facets.corners[other].expand(len(patches.aspect), 3, 3)
+        shadow = _clip_in_front(shadow, patches.normal, patches.polygon[:, 0], above)
+        if departing is not None:
+            plane, at = (
+                departing.source_normal[patches.parent],
+                departing.source_point[patches.parent],
+            )
+            shadow = _clip_in_front(shadow, plane, at, _OCCLUSION_TOLERANCE * facets.size)
+        patches = _subtract_shadows(facets, patches, shadow)
+    return patches
 
 
-def _without(facets: Facets, bounce: Bounce, shadow: Tensor) -> Bounce:
+def _subtract_shadows(
+    facets: Facets, patches: IlluminatedPatches, shadow: Tensor
+) -> IlluminatedPatches:
     """Patches less the prisms along their beams above some polygons."""
-    sides = _sides(shadow, bounce.direction)
-    covered = bounce.polygon
+    sides = _side_planes(shadow, patches.direction)
+    covered = patches.polygon
     for plane, at, proper in sides:
         covered = clip(covered, plane, torch.where(proper, dot(plane, at), -1.0))
-    hidden = area_vector(covered).detach().norm(dim=1) > _EMPTY * facets.size**2
+    hidden = area_vector(covered).detach().norm(dim=1) > _MIN_AREA * facets.size**2
     # The prism of a polygon without area, or seen edge-on, hides nothing.
-    hidden &= dot(area_vector(shadow), bounce.direction).detach().abs() > _EMPTY * facets.size**2
+    hidden &= (
+        dot(area_vector(shadow), patches.direction).detach().abs() > _MIN_AREA * facets.size**2
+    )
     if not bool(hidden.any()):
-        return bounce
-    part = rows_of(bounce, hidden)
-    pieces, rest = [rows_of(bounce, ~hidden)], part.polygon
+        return patches
+    part = select_patches(patches, hidden)
+    pieces, rest = [select_patches(patches, ~hidden)], part.polygon
     for plane, at, proper in sides:
         plane, at, proper = plane[hidden], at[hidden], proper[hidden]
         outside = clip(rest, -plane, torch.where(proper, -dot(plane, at), 1.0))
-        pieces.append(_proper(facets, part, outside))
+        pieces.append(_drop_degenerate(facets, part, outside))
         rest = clip(rest, plane, torch.where(proper, dot(plane, at), -1.0))
-    return joined(pieces)
+    return concatenate_patches(pieces)
 
 
-def _sides(polygon: Tensor, direction: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
+def _side_planes(polygon: Tensor, direction: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Planes through a polygon's sides along a direction: inward normal, a point, whether any.
 
     Corners that coincide have none.
@@ -336,7 +383,9 @@ def _sides(polygon: Tensor, direction: Tensor) -> list[tuple[Tensor, Tensor, Ten
     return found
 
 
-def _in_front(polygon: Tensor, normal: Tensor, point: Tensor, margin: Tensor | float) -> Tensor:
+def _clip_in_front(
+    polygon: Tensor, normal: Tensor, point: Tensor, margin: Tensor | float
+) -> Tensor:
     return clip(polygon, normal, dot(normal, point) + margin)
 
 
@@ -363,7 +412,7 @@ def clip(
     # A side that lies in the plane, or one of no length, is crossed by rounding alone: where it is
     # crossed would have any derivative.
     extent = (polygon - polygon[:, :1]).detach().norm(dim=2).amax(1, keepdim=True)
-    steep = crossed & ((height - after).detach().abs() > _FLAT * extent)
+    steep = crossed & ((height - after).detach().abs() > _COPLANAR_TOLERANCE * extent)
     share = height / torch.where(steep, height - after, torch.ones_like(height))
     between = polygon + torch.where(steep, share, 0.0)[..., None] * (polygon.roll(-1, 1) - polygon)
     points = torch.stack([polygon, between], 2).flatten(1, 2)
@@ -377,24 +426,26 @@ def clip(
     return points.gather(1, index[..., None].expand(-1, -1, 3))
 
 
-def _proper(facets: Facets, bounce: Bounce, polygon: Tensor) -> Bounce:
+def _drop_degenerate(
+    facets: Facets, patches: IlluminatedPatches, polygon: Tensor
+) -> IlluminatedPatches:
     """Patches with these polygons, without those of no area."""
-    keep = area_vector(polygon).detach().norm(dim=1) > _EMPTY * facets.size**2
-    rows = rows_of(bounce, keep)
-    return Bounce(**{**vars(rows), "polygon": polygon[keep]})
+    keep = area_vector(polygon).detach().norm(dim=1) > _MIN_AREA * facets.size**2
+    rows = select_patches(patches, keep)
+    return IlluminatedPatches(**{**vars(rows), "polygon": polygon[keep]})
 
 
-def rows_of(bounce: Bounce, keep: Tensor) -> Bounce:
+def select_patches(patches: IlluminatedPatches, rows: Tensor) -> IlluminatedPatches:
     """Some rows.
 
     Args:
-        bounce: patches.
-        keep: which.
+        patches: patches.
+        rows: which.
     """
-    return Bounce(**{name: column[keep] for name, column in vars(bounce).items()})
+    return IlluminatedPatches(**{name: column[rows] for name, column in vars(patches).items()})
 
 
-def joined(parts: Sequence[Bounce]) -> Bounce:
+def concatenate_patches(parts: Sequence[IlluminatedPatches]) -> IlluminatedPatches:
     """All rows of several; polygons of few corners repeat their last.
 
     Args:
@@ -402,7 +453,7 @@ def joined(parts: Sequence[Bounce]) -> Bounce:
     """
     width = max(part.polygon.shape[1] for part in parts)
 
-    def wide(polygon: Tensor) -> Tensor:
+    def pad_corners(polygon: Tensor) -> Tensor:
         last = polygon[:, -1:].expand(-1, width - polygon.shape[1], -1)
         return torch.cat([polygon, last], 1)
 
@@ -411,4 +462,6 @@ def joined(parts: Sequence[Bounce]) -> Bounce:
         for name in vars(parts[0])
         if name != "polygon"
     }
-    return Bounce(**columns, polygon=torch.cat([wide(part.polygon) for part in parts]))
+    return IlluminatedPatches(
+        **columns, polygon=torch.cat([pad_corners(part.polygon) for part in parts])
+    )

@@ -12,24 +12,24 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.channel.beams.facet_paths import trace_chains
-from invertwin.channel.beams.partial_visibility import PanelCells, lit_fractions
-from invertwin.channel.em.plane_waves import cross, unit_across
-from invertwin.channel.paths import Link, Paths, joined
+from invertwin.channel.beams.facet_paths import trace_facet_paths
+from invertwin.channel.beams.partial_visibility import PanelCells, visible_fractions
+from invertwin.channel.em.plane_waves import cross, orthogonal_unit_vectors
+from invertwin.channel.paths import Link, Paths, concatenate_paths
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene.material.materials import RoughDielectric
 from invertwin.scene.scene import Scene
 
-Coherence = Callable[[Tensor, Tensor, Tensor], Tensor]
+CoherenceFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 """How much two echoes interfere whose ranges [m], u and v differ so much; 1 where they do not."""
 
-_BLACK = RoughDielectric(1.0)
-_CELLS = 12  # along each side of what is tried for shadows
+_ABSORBER = RoughDielectric(1.0)
+_CELLS_PER_SIDE = 12  # along each side of what is tried for shadows
 
 
-def without_echoes(scene: Scene, names: Collection[str]) -> Scene:
+def as_absorbers(scene: Scene, names: Collection[str]) -> Scene:
     """The scene with some objects that hide what is behind them and send nothing back.
 
     Args:
@@ -37,7 +37,7 @@ def without_echoes(scene: Scene, names: Collection[str]) -> Scene:
         names: Of those without an echo.
     """
     for name in names:
-        scene = scene.replace(name, material=_BLACK)
+        scene = scene.replace(name, material=_ABSORBER)
     return scene
 
 
@@ -55,14 +55,14 @@ def trace_target(
         name: Of the target, of at most 24 triangles of a smooth conductor.
         link: Antennas, per frame.
         sampling: Its ``depth`` and ``boundary`` count.
-        stretch: See ``trace_chains``.
+        stretch: See ``trace_facet_paths``.
 
     Raises:
-        InputError: A target that ``trace_chains`` refuses, or sheets and refracting bodies
+        InputError: A target that ``trace_facet_paths`` refuses, or sheets and refracting bodies
             elsewhere in the scene, since these hide a target in part only.
     """
     boundary = sampling.boundary
-    paths = trace_chains(
+    paths = trace_facet_paths(
         Scene({name: scene[name]}), link, sampling.depth, stretch=stretch, boundary=boundary
     )
     others = {n: o for n, o in scene.objects.items() if n != name and o.cloud is None}
@@ -71,18 +71,18 @@ def trace_target(
     rest = Scene(others)
     _require_opaque(rest, name, link)
     points = scene[name].vertices
-    lit = _lit_shares(rest, points, link.tx, boundary=boundary)
+    lit = _visible_shares(rest, points, link.tx, boundary=boundary)
     if not link.shared_visibility:
-        both = lit * _lit_shares(rest, points, link.rx, boundary=boundary)
+        both = lit * _visible_shares(rest, points, link.rx, boundary=boundary)
         # A root of zero has no derivative.
         seen = both > 0
         lit = torch.where(seen, torch.where(seen, both, 1.0).sqrt(), 0.0)
-    return paths.weighted(lit[paths.frame])
+    return paths.scale_fields(lit[paths.frame])
 
 
-def _require_opaque(rest: Scene, target: str, link: Link) -> None:
-    for name, item in rest.objects.items():
-        surface = item.material.surface(SPEED_OF_LIGHT / link.wavelength)
+def _require_opaque(others: Scene, target: str, link: Link) -> None:
+    for name, item in others.objects.items():
+        surface = item.material.scattering_law(SPEED_OF_LIGHT / link.wavelength)
         if bool(surface.transmittance.any()) or bool(surface.refraction.any()):
             raise InputError(
                 f"expected opaque objects beside the coherent target {target!r}, got {name!r}, "
@@ -90,38 +90,42 @@ def _require_opaque(rest: Scene, target: str, link: Link) -> None:
             )
 
 
-def _lit_shares(
-    rest: Scene,
+def _visible_shares(
+    others: Scene,
     points: Float64[Tensor, "v 3"],
-    places: Float64[Tensor, "place 3"],
+    antennas: Float64[Tensor, "place 3"],
     *,
     boundary: bool,
 ) -> Float64[Tensor, " place"]:
     """The share of a target's outline that each place sees past other objects."""
     return torch.stack(
         [
-            lit_fractions(rest, place[None], _outline(points, place), boundary=boundary).mean()
-            for place in places
+            visible_fractions(
+                others, place[None], _outline_cells(points, place), boundary=boundary
+            ).mean()
+            for place in antennas
         ]
     )
 
 
-def _outline(points: Float64[Tensor, "v 3"], place: Float64[Tensor, "3"]) -> PanelCells:
+def _outline_cells(points: Float64[Tensor, "v 3"], antenna: Float64[Tensor, "3"]) -> PanelCells:
     """Cells of the rectangle about points as a place sees them, where the foremost of them is."""
     middle = points.mean(0)
-    normal = torch.nn.functional.normalize(place - middle, dim=0)
-    right = unit_across(normal)
+    normal = torch.nn.functional.normalize(antenna - middle, dim=0)
+    right = orthogonal_unit_vectors(normal)
     axes = torch.stack([right, cross(normal, right), normal], 1)
     local = (points - middle) @ axes
     low, high = local.amin(0), local.amax(0)
     center = middle + axes @ torch.cat([0.5 * (low + high)[:2], high[2:]])
-    size = (high - low).detach()[:2] / _CELLS
-    steps = torch.arange(_CELLS, dtype=torch.float64) - 0.5 * (_CELLS - 1)
+    size = (high - low).detach()[:2] / _CELLS_PER_SIDE
+    steps = torch.arange(_CELLS_PER_SIDE, dtype=torch.float64) - 0.5 * (_CELLS_PER_SIDE - 1)
     offsets = torch.cartesian_prod(steps, steps) * size
     return PanelCells(center, axes, offsets, (float(size[0]), float(size[1])))
 
 
-def interference(paths: Paths, link: Link, coherence: Coherence, *, stretch: float = 1.0) -> Paths:
+def combine_coherently(
+    paths: Paths, link: Link, coherence: CoherenceFunction, *, stretch: float = 1.0
+) -> Paths:
     """The power of paths that add in field: of each, and of the interference of each two.
 
     ``|Σ aᵢ exp(−jkLᵢ)|² = Σᵢ |aᵢ|² + Σ_{i<j} 2 Re(aᵢ aⱼ* exp(−jk(Lᵢ − Lⱼ)))``. Interference lies
@@ -133,7 +137,7 @@ def interference(paths: Paths, link: Link, coherence: Coherence, *, stretch: flo
         paths: Of one target.
         link: The antennas that they belong to.
         coherence: The overlap, of differences in range [m], u and v.
-        stretch: The wavelength of phases in wavelengths of the antennas, see ``trace_chains``.
+        stretch: The wavelength of phases in wavelengths of the antennas, see ``trace_facet_paths``.
 
     Source: derivations §13.
     Differs from the source: phases between chains are kept, so that orders add in phase only where
@@ -145,27 +149,27 @@ def interference(paths: Paths, link: Link, coherence: Coherence, *, stretch: flo
     frames = [torch.nonzero(paths.frame == frame)[:, 0] for frame in range(link.frame_count)]
     pairs = [own[torch.triu_indices(len(own), len(own), 1)] for own in frames]
     one, other = torch.cat(pairs, 1)
-    places = torch.cat([paths.range[:, None], paths.cosines(link)], 1)
+    places = torch.cat([paths.range[:, None], paths.direction_cosines(link)], 1)
     overlap = coherence(*(places[one] - places[other]).unbind(1))
     cross_power = 2 * (field[one] * field[other].conj()).real * overlap
     own = torch.arange(len(field))
-    alone = _powers(paths, own, own, field.abs().square())
-    return joined([alone, _powers(paths, one, other, cross_power)])
+    alone = _midway_power_paths(paths, own, own, field.abs().square())
+    return concatenate_paths([alone, _midway_power_paths(paths, one, other, cross_power)])
 
 
-def _powers(paths: Paths, one: Tensor, other: Tensor, power: Tensor) -> Paths:
+def _midway_power_paths(paths: Paths, one: Tensor, other: Tensor, power: Tensor) -> Paths:
     """Power paths midway between others."""
 
-    def midway(places: Tensor) -> Tensor:
-        return 0.5 * (places[one] + places[other])
+    def midpoint(values: Tensor) -> Tensor:
+        return 0.5 * (values[one] + values[other])
 
     return Paths(
         frame=paths.frame[one],
-        delay=midway(paths.delay),
+        delay=midpoint(paths.delay),
         coefficient=torch.zeros_like(paths.coefficient[one]),
         power=power,
-        first=midway(paths.first),
-        last=midway(paths.last),
+        first=midpoint(paths.first),
+        last=midpoint(paths.last),
         kind="power",
         boundary=torch.zeros(len(one), dtype=torch.bool),
     )

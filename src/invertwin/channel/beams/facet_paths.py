@@ -13,22 +13,28 @@ from jaxtyping import Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.beams.beam_tracing import FEW, Bounce, Facets, beams, facets_of
+from invertwin.channel.beams.beam_tracing import (
+    MAX_FACETS_BEAM_TRACING,
+    Facets,
+    IlluminatedPatches,
+    build_facets,
+    trace_beams,
+)
 from invertwin.channel.em.antenna_fields import (
     antenna_fields,
-    combined,
+    combine_elements,
     conductor_field,
     current_kernel,
 )
 from invertwin.channel.em.plane_waves import area_vector, dot, polygon_integral
-from invertwin.channel.paths import Link, Paths, joined
+from invertwin.channel.paths import Link, Paths, concatenate_paths
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
 
-def trace_chains(
+def trace_facet_paths(
     scene: Scene, link: Link, depth: int, *, stretch: float = 1.0, boundary: bool = True
 ) -> Paths:
     """Field paths between few flat conductors, one for every beam; differentiable.
@@ -53,52 +59,57 @@ def trace_chains(
     Raises:
         InputError: Too many triangles, or another material.
     """
-    facets = _facets(scene, link)
+    facets = _conductor_facets(scene, link)
     middle = facets.corners.mean((0, 1))
     parts: list[Paths] = []
-    last: Bounce | None = None
+    last: IlluminatedPatches | None = None
     unfolding: _Unfolding | None = None
-    lit = beams(facets, normalize(middle - link.tx, dim=1), depth, boundary=boundary)
+    lit = trace_beams(facets, normalize(middle - link.tx, dim=1), depth, boundary=boundary)
     for order, bounce in enumerate(lit, 1):
-        unfolding = _unfolded(bounce, last, unfolding)
-        parts.append(_paths(bounce, unfolding, link, order, stretch))
+        unfolding = _unfold_reflections(bounce, last, unfolding)
+        parts.append(_field_paths(bounce, unfolding, link, order, stretch))
         last = bounce
     if not parts:
         raise InputError("expected facets that the radar lights, got none; check poses")
-    return joined(parts)
+    return concatenate_paths(parts)
 
 
 class _Unfolding(NamedTuple):
     """Per beam, the motion x → Mx + t that unfolds a point on its last facet."""
 
-    turn: Float64[Tensor, "row 3 3"]
-    shift: Float64[Tensor, "row 3"]
+    rotation: Float64[Tensor, "row 3 3"]
+    translation: Float64[Tensor, "row 3"]
 
 
-def _facets(scene: Scene, link: Link) -> Facets:
+def _conductor_facets(scene: Scene, link: Link) -> Facets:
     geometry = flatten(scene, link.wavelength)
     if not all(geometry.coherent):
         raise InputError(
             "expected smooth conductors alone for mirrored chains, got others; give a "
             "PerfectConductor, or use power paths"
         )
-    if len(geometry.faces) > FEW:
+    if len(geometry.faces) > MAX_FACETS_BEAM_TRACING:
         raise InputError(
-            f"expected at most {FEW} triangles for mirrored chains, got {len(geometry.faces)}; use "
+            f"expected at most {MAX_FACETS_BEAM_TRACING} triangles for mirrored chains, got "
+            f"{len(geometry.faces)}; use "
             "power paths, or simulate"
         )
-    return facets_of(geometry.vertices, geometry.topology)
+    return build_facets(geometry.vertices, geometry.topology)
 
 
-def _unfolded(bounce: Bounce, last: Bounce | None, before: _Unfolding | None) -> _Unfolding:
+def _unfold_reflections(
+    patches: IlluminatedPatches,
+    previous: IlluminatedPatches | None,
+    previous_unfolding: _Unfolding | None,
+) -> _Unfolding:
     """How points unfold through all mirrors but the facet itself."""
-    if last is None or before is None:
-        count = len(bounce.aspect)
+    if previous is None or previous_unfolding is None:
+        count = len(patches.aspect)
         eye = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
         return _Unfolding(eye, torch.zeros(count, 3, dtype=torch.float64))
-    row = bounce.before
-    normal, at = last.normal[row], last.polygon[row, 0]
-    turn, shift = before.turn[row], before.shift[row]
+    row = patches.parent
+    normal, at = previous.normal[row], previous.polygon[row, 0]
+    turn, shift = previous_unfolding.rotation[row], previous_unfolding.translation[row]
     # M (x − 2 n n·(x − p)) + t
     across = (turn @ normal[..., None])[..., 0]
     return _Unfolding(
@@ -107,26 +118,28 @@ def _unfolded(bounce: Bounce, last: Bounce | None, before: _Unfolding | None) ->
     )
 
 
-def _paths(bounce: Bounce, unfolding: _Unfolding, link: Link, order: int, stretch: float) -> Paths:
-    frame, place = bounce.aspect, _centroid(bounce.polygon)
+def _field_paths(
+    patches: IlluminatedPatches, unfolding: _Unfolding, link: Link, order: int, stretch: float
+) -> Paths:
+    frame, place = patches.aspect, _polygon_centroid(patches.polygon)
     tx, rx, rotation = link.tx[frame], link.rx[frame], link.rotations[frame]
-    image = torch.einsum("nij,nj->ni", unfolding.turn, place) + unfolding.shift
+    image = torch.einsum("nij,nj->ni", unfolding.rotation, place) + unfolding.translation
     forth, back = image - tx, rx - place
     length, distance = forth.norm(dim=1), back.norm(dim=1)
     start, onwards = forth / length[:, None], back / distance[:, None]
-    arriving = torch.einsum("nij,ni->nj", unfolding.turn, start)
+    arriving = torch.einsum("nij,ni->nj", unfolding.rotation, start)
     gain = link.tx_pattern.gain(torch.einsum("nij,ni->nj", rotation, start))
     gain = gain * link.rx_pattern.gain(torch.einsum("nij,ni->nj", rotation, -onwards))
-    area = polygon_integral(bounce.polygon - place[:, None], onwards - arriving)
+    area = polygon_integral(patches.polygon - place[:, None], onwards - arriving)
     sent = antenna_fields(link.tx_jones, rotation, start)
     # A mirror turns E as it turns places, and its sign.
-    sent = (-1.0) ** (order - 1) * sent @ unfolding.turn.to(sent.dtype)
+    sent = (-1.0) ** (order - 1) * sent @ unfolding.rotation.to(sent.dtype)
     received = antenna_fields(link.rx_jones, rotation, -onwards)
-    kernel = current_kernel(bounce.normal, arriving, sent, -onwards, received)
-    spread, leaving = gain / (length * distance) ** 2, dot(bounce.normal, onwards)
+    kernel = current_kernel(patches.normal, arriving, sent, -onwards, received)
+    spread, leaving = gain / (length * distance) ** 2, dot(patches.normal, onwards)
     fields = conductor_field(spread, kernel, leaving)
     integral = area(2 * torch.pi / (stretch * link.wavelength))
-    coefficient, matrix = combined(link, fields * integral[:, None, None])
+    coefficient, matrix = combine_elements(link, fields * integral[:, None, None])
     return Paths(
         frame=frame,
         delay=(length + distance) / SPEED_OF_LIGHT,
@@ -140,7 +153,7 @@ def _paths(bounce: Bounce, unfolding: _Unfolding, link: Link, order: int, stretc
     )
 
 
-def _centroid(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tensor, "row 3"]:
+def _polygon_centroid(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tensor, "row 3"]:
     """Of the area; the mean of the corners would jump where one more appears."""
     normal = normalize(area_vector(polygon), dim=1)
     spokes = polygon - polygon[:, :1]

@@ -16,16 +16,16 @@ from torch import Tensor
 
 from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.ray_scene import Occluders, visible
+from invertwin.channel.rays.ray_scene import Occluders, is_visible
 from invertwin.channel.rays.topology import Topology, topology_of
-from invertwin.checks import plain
+from invertwin.checks import strip_derivatives
 from invertwin.errors import InputError
 from invertwin.scene import Scene
 
-_PAIRS = 1 << 21  # of edges and places, or of edges and cells, at a time
-_LEVEL = 0.999  # of the way up to the place: edges above it cast no shadow onto the panel
-_ASIDE = 1e-4  # of the way to an edge: how far aside rays pass it
-_SAME_PLANE = 1e-9  # of lengths: an apex in the plane of a place and an edge
+_PAIRS_AT_ONCE = 1 << 21  # of edges and places, or of edges and cells, at a time
+_MAX_EDGE_LEVEL = 0.999  # of the way up to the place: edges above it cast no shadow onto the panel
+_RAY_OFFSET = 1e-4  # of the way to an edge: how far aside rays pass it
+_COPLANAR_TOLERANCE = 1e-9  # of lengths: an apex in the plane of a place and an edge
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class PanelCells:
     size: tuple[float, float]
 
     @property
-    def places(self) -> Float64[Tensor, "cell 3"]:
+    def centers(self) -> Float64[Tensor, "cell 3"]:
         """Centres of the cells in the world [m]."""
         return self.center + self.offsets @ self.axes[:, :2].T
 
@@ -53,36 +53,36 @@ class PanelCells:
     def radius(self) -> float:
         """From the centre to the farthest corner [m]."""
         half = 0.5 * torch.tensor(self.size, dtype=torch.float64)
-        return float((plain(self.offsets).abs() + half).norm(dim=1).max())
+        return float((strip_derivatives(self.offsets).abs() + half).norm(dim=1).max())
 
 
 @dataclass(frozen=True)
-class _Edges:
+class _ShadowingEdges:
     """Edges that may end shadows, one row for each place that they may shade.
 
     Attributes:
-        place: number of the place.
+        observer: number of the place.
         ends: numbers of the vertices.
         apex: a vertex of a triangle beside the edge, on the dark side.
-        share: part of the edge whose shadow is counted, from 0 to 1.
+        interval: part of the edge whose shadow is counted, from 0 to 1.
     """
 
-    place: Int64[Tensor, " row"]
+    observer: Int64[Tensor, " row"]
     ends: Int64[Tensor, "row 2"]
     apex: Int64[Tensor, " row"]
-    share: Float64[Tensor, "row 2"]
+    interval: Float64[Tensor, "row 2"]
 
-    def rows(self, index: Tensor) -> "_Edges":
+    def select(self, index: Tensor) -> "_ShadowingEdges":
         """Some rows."""
-        return _Edges(*(column[index] for column in vars(self).values()))
+        return _ShadowingEdges(*(column[index] for column in vars(self).values()))
 
 
-def lit_fractions(
+def visible_fractions(
     scene: Scene,
-    places: Float64[Tensor, "place 3"],
+    observers: Float64[Tensor, "place 3"],
     cells: PanelCells,
     *,
-    width: float = 0.0,
+    blur: float = 0.0,
     boundary: bool = True,
 ) -> Float64[Tensor, "place cell"]:
     """The fraction of each cell that a place sees, in front of the panel.
@@ -92,9 +92,9 @@ def lit_fractions(
 
     Args:
         scene: what is in the way; the panel is no part of it.
-        places: [m].
+        observers: [m].
         cells: of the panel.
-        width: added to the width over which shadows end [m]; 0 = that of a cell.
+        blur: added to the width over which shadows end [m]; 0 = that of a cell.
         boundary: False leaves out of derivatives that shadows move.
 
     Raises:
@@ -109,41 +109,52 @@ def lit_fractions(
     topology = topology_of([item.mesh for item in items])
     vertices = torch.cat([item.vertices for item in items])
     with tracing():
-        rays = Occluders(plain(vertices), topology, plain(cells.center))
-        still = PanelCells(plain(cells.center), plain(cells.axes), plain(cells.offsets), cells.size)
-        spots = plain(places)
-        edges = _candidates(plain(vertices), topology, spots, still, still.radius + width)
-        edges = _seen(rays, plain(vertices), spots, still, edges)
-        lit = _lit(rays, spots, still, edges, plain(vertices))
-        row, cell = _cut(edges, lit, (plain(vertices), spots, still), width)
+        rays = Occluders(strip_derivatives(vertices), topology, strip_derivatives(cells.center))
+        still = PanelCells(
+            strip_derivatives(cells.center),
+            strip_derivatives(cells.axes),
+            strip_derivatives(cells.offsets),
+            cells.size,
+        )
+        spots = strip_derivatives(observers)
+        edges = _find_silhouette_edges(
+            strip_derivatives(vertices), topology, spots, still, still.radius + blur
+        )
+        edges = _select_visible_edges(rays, strip_derivatives(vertices), spots, still, edges)
+        lit = _test_cell_centers(rays, spots, still, edges, strip_derivatives(vertices))
+        row, cell = _match_cells_to_edges(
+            edges, lit, (strip_derivatives(vertices), spots, still), blur
+        )
     found = lit.to(torch.float64)
     if not len(row):
         return found
-    moved = (vertices, places, cells) if boundary else (plain(vertices), spots, still)
-    edges = edges.rows(row)
+    moved = (
+        (vertices, observers, cells) if boundary else (strip_derivatives(vertices), spots, still)
+    )
+    edges = edges.select(row)
     offsets = moved[2].offsets[cell]
-    distance, across = _distances(_shadows(edges, *moved), offsets)
+    distance, across = _shadow_distances(_project_edges(edges, *moved), offsets)
     span = torch.tensor(cells.size, dtype=torch.float64)
-    share = distance / ((across.abs() * span).sum(-1) + width) + 0.5
-    return found.index_put((edges.place, cell), share.clamp(0.0, 1.0))
+    share = distance / ((across.abs() * span).sum(-1) + blur) + 0.5
+    return found.index_put((edges.observer, cell), share.clamp(0.0, 1.0))
 
 
-def _candidates(
-    vertices: Tensor, topology: Topology, places: Tensor, cells: PanelCells, reach: float
-) -> _Edges:
+def _find_silhouette_edges(
+    vertices: Tensor, topology: Topology, observers: Tensor, cells: PanelCells, reach: float
+) -> _ShadowingEdges:
     """Silhouette edges whose shadows end within reach of the panel's centre."""
     normal = cells.axes[:, 2]
-    found: list[_Edges] = []
+    found: list[_ShadowingEdges] = []
     count = len(topology.edges)
-    for some in torch.arange(len(places)).split(max(1, _PAIRS // max(1, count))):
+    for some in torch.arange(len(observers)).split(max(1, _PAIRS_AT_ONCE // max(1, count))):
         start, end = vertices[topology.edges].unbind(1)
-        spot = places[some, None]
+        spot = observers[some, None]
         plane = cross(start - spot, (end - start).expand(len(some), -1, -1))
         sides = []
-        for apex in topology.opposite.T:
+        for apex in topology.edge_apexes.T:
             offset = vertices[apex.clamp_min(0)] - start
             side = dot(plane, offset.expand_as(plane))
-            near = side.abs() <= _SAME_PLANE * plane.norm(dim=-1) * offset.norm(dim=-1)
+            near = side.abs() <= _COPLANAR_TOLERANCE * plane.norm(dim=-1) * offset.norm(dim=-1)
             side = torch.where(near | (apex < 0), 0.0, side.sign())
             sides.append(side)
         table = torch.stack(sides)
@@ -154,33 +165,35 @@ def _candidates(
         level = rise[:, None] / torch.where(height > 0, height, torch.inf)[None]
         first, slope = level[0], level[1] - level[0]
         safe = torch.where(slope == 0, 1.0, slope)
-        bounds = torch.stack([-first / safe, (_LEVEL - first) / safe])
-        inside = (first >= 0) & (first <= _LEVEL)
+        bounds = torch.stack([-first / safe, (_MAX_EDGE_LEVEL - first) / safe])
+        inside = (first >= 0) & (first <= _MAX_EDGE_LEVEL)
         low = torch.where(slope == 0, torch.where(inside, 0.0, 1.0), bounds.amin(0)).clamp_min(0)
         high = torch.where(slope == 0, torch.where(inside, 1.0, 0.0), bounds.amax(0)).clamp_max(1)
         place, edge = torch.nonzero(silhouette & (height > 0) & (low < high)).T
         chosen = table.abs()[:, place, edge].argmax(0)
         share = torch.stack([low[place, edge], high[place, edge]], 1)
-        apex = topology.opposite[edge, chosen]
-        found.append(_Edges(some[place], topology.edges[edge], apex, share))
-    edges = _Edges(*(torch.cat(c) for c in zip(*(vars(f).values() for f in found), strict=True)))
-    none = torch.zeros(len(edges.place), 2, dtype=torch.float64)
-    distance, _ = _distances(_shadows(edges, vertices, places, cells), none)
-    return edges.rows(torch.nonzero(distance.abs() <= reach)[:, 0])
+        apex = topology.edge_apexes[edge, chosen]
+        found.append(_ShadowingEdges(some[place], topology.edges[edge], apex, share))
+    edges = _ShadowingEdges(
+        *(torch.cat(c) for c in zip(*(vars(f).values() for f in found), strict=True))
+    )
+    none = torch.zeros(len(edges.observer), 2, dtype=torch.float64)
+    distance, _ = _shadow_distances(_project_edges(edges, vertices, observers, cells), none)
+    return edges.select(torch.nonzero(distance.abs() <= reach)[:, 0])
 
 
-def _shadows(
-    edges: _Edges, vertices: Tensor, places: Tensor, cells: PanelCells
+def _project_edges(
+    edges: _ShadowingEdges, vertices: Tensor, observers: Tensor, cells: PanelCells
 ) -> Float64[Tensor, "row 3 2"]:
     """Projections of both ends and of the apex's side onto the panel's plane, along its axes [m].
 
     The last one is a point beside the line on the dark side: the apex may have no projection.
     """
-    spot = places[edges.place]
+    spot = observers[edges.observer]
     ends = vertices[edges.ends]
     side = ends[:, 1] - ends[:, 0]
-    points = ends[:, :1] + edges.share[:, :, None] * side[:, None]
-    way = _ways(edges, vertices, places, cells)
+    points = ends[:, :1] + edges.interval[:, :, None] * side[:, None]
+    way = _edge_ray_fractions(edges, vertices, observers, cells)
     cast = spot[:, None] + (points - spot[:, None]) / way[..., None]
     flat = (cast - cells.center) @ cells.axes[:, :2]
     # The plane of place and edge cuts the panel's plane in the line; its normal tells the side.
@@ -190,31 +203,31 @@ def _shadows(
     return torch.cat([flat, (flat[:, 0] + toward)[:, None]], 1)
 
 
-def _ways(
-    edges: _Edges, vertices: Tensor, places: Tensor, cells: PanelCells
+def _edge_ray_fractions(
+    edges: _ShadowingEdges, vertices: Tensor, observers: Tensor, cells: PanelCells
 ) -> Float64[Tensor, "row 2"]:
     """Where ends of edges lie on the way from their places to the panel's plane: 0 to 1."""
     normal = cells.axes[:, 2]
-    height = (places[edges.place] - cells.center) @ normal
+    height = (observers[edges.observer] - cells.center) @ normal
     ends = ((vertices[edges.ends] - cells.center) @ normal) / height[:, None]
-    return 1 - (ends[:, :1] + edges.share * (ends[:, 1:] - ends[:, :1]))
+    return 1 - (ends[:, :1] + edges.interval * (ends[:, 1:] - ends[:, :1]))
 
 
-def _distances(
-    shadows: Float64[Tensor, "row 3 2"], at: Float64[Tensor, "row 2"]
+def _shadow_distances(
+    shadows: Float64[Tensor, "row 3 2"], points: Float64[Tensor, "row 2"]
 ) -> tuple[Float64[Tensor, " row"], Float64[Tensor, "row 2"]]:
     """How far points are from the ends of shadows, positive in the light, and unit normals.
 
     Args:
-        shadows: from ``_shadows``.
-        at: a point each, in the panel's plane [m].
+        shadows: from ``_project_edges``.
+        points: a point each, in the panel's plane [m].
     """
     start, end, dark = shadows.unbind(1)
     side = end - start
     length = side.norm(dim=1).clamp_min(1e-300)
     across = torch.stack([side[:, 1], -side[:, 0]], 1) / length[:, None]
     across = across * -((dark - start) * across).sum(1).detach().sign()[:, None]
-    offset = at - start
+    offset = points - start
     aside = (offset * across).sum(1)
     along = (offset * side).sum(1) / length
     beyond = along - along.clamp_min(0).minimum(length)
@@ -225,68 +238,71 @@ def _distances(
     return torch.where(past, sign * far, aside), across
 
 
-def _seen(
-    rays: Occluders, vertices: Tensor, places: Tensor, cells: PanelCells, edges: _Edges
-) -> _Edges:
+def _select_visible_edges(
+    rays: Occluders, vertices: Tensor, observers: Tensor, cells: PanelCells, edges: _ShadowingEdges
+) -> _ShadowingEdges:
     """Edges that nothing hides from their places, where their shadows are nearest to the panel.
 
     On the panel itself nothing else may shade the lit side of the line.
     """
-    if not len(edges.place):
+    if not len(edges.observer):
         return edges
-    shadows = _shadows(edges, vertices, places, cells)
+    shadows = _project_edges(edges, vertices, observers, cells)
     start, end, _ = shadows.unbind(1)
     side = end - start
     along = (-(start * side).sum(1) / side.square().sum(1).clamp_min(1e-300)).clamp(0, 1)
     nearest = start + along[:, None] * side
-    _, across = _distances(shadows, nearest)
-    spot = places[edges.place]
+    _, across = _shadow_distances(shadows, nearest)
+    spot = observers[edges.observer]
     foot = cells.center + nearest @ cells.axes[:, :2].T
-    step = _ASIDE * (foot - spot).norm(dim=1, keepdim=True) * (across @ cells.axes[:, :2].T)
+    step = _RAY_OFFSET * (foot - spot).norm(dim=1, keepdim=True) * (across @ cells.axes[:, :2].T)
     # Where the edge lies on the way from the place to its shadow.
-    first, last = _ways(edges, vertices, places, cells).unbind(1)
+    first, last = _edge_ray_fractions(edges, vertices, observers, cells).unbind(1)
     until = 1 / ((1 - along) / first + along / last)
     until = torch.where(nearest.norm(dim=1) <= cells.radius, 1.0, until)
-    free = visible(rays, spot, spot + until[:, None] * (foot + step - spot))
-    return edges.rows(torch.nonzero(free)[:, 0])
+    free = is_visible(rays, spot, spot + until[:, None] * (foot + step - spot))
+    return edges.select(torch.nonzero(free)[:, 0])
 
 
-def _lit(
-    rays: Occluders, places: Tensor, cells: PanelCells, edges: _Edges, vertices: Tensor
+def _test_cell_centers(
+    rays: Occluders, observers: Tensor, cells: PanelCells, edges: _ShadowingEdges, vertices: Tensor
 ) -> Bool[Tensor, "place cell"]:
     """Whether places see the centres of cells: all are tried where a shadow may end among them."""
-    none = torch.zeros(len(edges.place), 2, dtype=torch.float64)
-    distance, _ = _distances(_shadows(edges, vertices, places, cells), none)
-    mixed = torch.zeros(len(places), dtype=torch.bool)
-    mixed[edges.place[distance.abs() <= cells.radius]] = True
-    middle = visible(rays, places, cells.center.expand_as(places))
+    none = torch.zeros(len(edges.observer), 2, dtype=torch.float64)
+    distance, _ = _shadow_distances(_project_edges(edges, vertices, observers, cells), none)
+    mixed = torch.zeros(len(observers), dtype=torch.bool)
+    mixed[edges.observer[distance.abs() <= cells.radius]] = True
+    middle = is_visible(rays, observers, cells.center.expand_as(observers))
     found = middle[:, None].expand(-1, len(cells.offsets)).clone()
     rows = torch.nonzero(mixed)[:, 0]
     if len(rows):
         count = len(cells.offsets)
-        start = places[rows].repeat_interleave(count, 0)
-        found[rows] = visible(rays, start, cells.places.repeat(len(rows), 1)).view(-1, count)
+        start = observers[rows].repeat_interleave(count, 0)
+        found[rows] = is_visible(rays, start, cells.centers.repeat(len(rows), 1)).view(-1, count)
     return found
 
 
-def _cut(
-    edges: _Edges, lit: Tensor, at: tuple[Tensor, Tensor, PanelCells], width: float
+def _match_cells_to_edges(
+    edges: _ShadowingEdges,
+    is_visible: Tensor,
+    projection_args: tuple[Tensor, Tensor, PanelCells],
+    blur: float,
 ) -> tuple[Int64[Tensor, " cut"], Int64[Tensor, " cut"]]:
     """Which cells the end of a shadow cuts: rows of edges, and cells.
 
     Of several lines the nearest counts that has the cell's centre on the side that rays find.
     """
-    cells, count = at[2], lit.shape[1]
+    cells, count = projection_args[2], is_visible.shape[1]
     span = torch.tensor(cells.size, dtype=torch.float64)
-    best = torch.full_like(lit, torch.inf, dtype=torch.float64).ravel()
+    best = torch.full_like(is_visible, torch.inf, dtype=torch.float64).ravel()
     held: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-    for some in torch.arange(len(edges.place)).split(max(1, _PAIRS // count)):
-        own = edges.rows(some)
-        shadows = _shadows(own, *at).repeat_interleave(count, 0)
-        distance, across = _distances(shadows, cells.offsets.repeat(len(some), 1))
-        reach = 0.5 * ((across.abs() * span).sum(1) + width)
-        where = (own.place[:, None] * count + torch.arange(count)).ravel()
-        agrees = (distance >= 0) == lit.ravel()[where]
+    for some in torch.arange(len(edges.observer)).split(max(1, _PAIRS_AT_ONCE // count)):
+        own = edges.select(some)
+        shadows = _project_edges(own, *projection_args).repeat_interleave(count, 0)
+        distance, across = _shadow_distances(shadows, cells.offsets.repeat(len(some), 1))
+        reach = 0.5 * ((across.abs() * span).sum(1) + blur)
+        where = (own.observer[:, None] * count + torch.arange(count)).ravel()
+        agrees = (distance >= 0) == is_visible.ravel()[where]
         near = torch.nonzero(agrees & (distance.abs() < reach))[:, 0]
         held.append((some[near // count], near % count, where[near], distance[near].abs()))
     if not held:

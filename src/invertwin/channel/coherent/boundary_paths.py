@@ -8,25 +8,25 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.coherent.radar_equation import Echo, Place, radar_equation
+from invertwin.channel.coherent.radar_equation import MaterialPoints, PathTransfer, radar_equation
 from invertwin.channel.paths import Paths
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.silhouettes import EdgePoints, EdgeSampler
+from invertwin.channel.power.silhouettes import SilhouetteSample, SilhouetteSampler
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.ray_scene import RayScene, visible
-from invertwin.channel.rays.scene_tables import mixed
+from invertwin.channel.rays.ray_scene import RayScene, is_visible
+from invertwin.channel.rays.scene_tables import interpolate_values
 
 
 @dataclass(frozen=True)
-class ShadowEdge:
+class ProjectedSilhouettes:
     """Points on the edge of a shadow.
 
     Attributes:
         frame, face: Radar pose, and the triangle the shadow falls on.
         b1, b2: Where on the triangle.
-        place: Place where the shadow falls, detached.
-        speed: Area newly lit per unit of θ, over the probability of the sample: attached, and
+        point: Place where the shadow falls, detached.
+        area_rate: Area newly lit per unit of θ, over the probability of the sample: attached, and
             zero in derivative where the other antenna does not see the point.
     """
 
@@ -34,11 +34,11 @@ class ShadowEdge:
     face: Int64[Tensor, " n"]
     b1: Float64[Tensor, " n"]
     b2: Float64[Tensor, " n"]
-    place: Place
-    speed: Float64[Tensor, " n"]
+    point: MaterialPoints
+    area_rate: Float64[Tensor, " n"]
 
 
-def shadow_edge(rays: RayScene, points: EdgePoints) -> ShadowEdge:
+def project_silhouettes(rays: RayScene, points: SilhouetteSample) -> ProjectedSilhouettes:
     """Turn edge points into shadow points with the attached speed of the shadow's edge.
 
     ``T · (x_c − x_m)``: x_c is where the attached ray meets the attached plane behind the edge,
@@ -51,38 +51,41 @@ def shadow_edge(rays: RayScene, points: EdgePoints) -> ShadowEdge:
     """
     geometry, link = rays.geometry, rays.link
     tx, rx = link.tx[points.frame], link.rx[points.frame]
-    from_receiver = torch.as_tensor(points.receiver, dtype=torch.bool).reshape(-1, 1)
+    from_receiver = torch.as_tensor(points.is_receiver, dtype=torch.bool).reshape(-1, 1)
     c, other = torch.where(from_receiver, rx, tx), torch.where(from_receiver, tx, rx)
-    y0, y1 = geometry.vertices[points.first], geometry.vertices[points.second]
-    y = y0 + (y1 - y0) * points.along[:, None]
+    y0, y1 = geometry.vertices[points.first_vertex], geometry.vertices[points.second_vertex]
+    y = y0 + (y1 - y0) * points.edge_parameter[:, None]
     p0, p1, p2 = geometry.corners(points.face)
     plane = torch.linalg.cross(p1 - p0, p2 - p0)
     moving = c + (y - c) * (_dot(plane, p0 - c) / _dot(plane, y - c))[:, None]
 
     shadow, normal = moving.detach(), normalize(plane.detach(), dim=1)
     b1, b2 = _barycentric(shadow, p0.detach(), p1.detach(), p2.detach())
-    material = mixed((p0, p1, p2), b1, b2)
+    material = interpolate_values((p0, p1, p2), b1, b2)
 
     ray, edge = (y - c).detach(), (y1 - y0).detach()
     stretch = (shadow - c.detach()).norm(dim=1) / ray.norm(dim=1)
 
-    def projected(vector: Tensor) -> Tensor:
+    def project(vector: Tensor) -> Tensor:
         along = _dot(normal, vector) / _dot(normal, ray)
         return stretch[:, None] * (vector - ray * along[:, None])
 
     covered = points.side * _dot(normal, ray).sign()
-    tangent = torch.linalg.cross(normal, projected(edge)) * covered[:, None]
+    tangent = torch.linalg.cross(normal, project(edge)) * covered[:, None]
     weight = points.weight
     if not link.shared_visibility:
-        weight = weight * visible(rays, shadow, other)
+        weight = weight * is_visible(rays, shadow, other)
     speed = _dot(tangent, moving - material) * weight
     ones = torch.ones_like(b1)
-    place = Place(shadow, normal, ones, geometry.face_surface[points.face])
-    return ShadowEdge(points.frame, points.face, b1, b2, place, speed)
+    place = MaterialPoints(shadow, normal, ones, geometry.face_surface[points.face])
+    return ProjectedSilhouettes(points.frame, points.face, b1, b2, place, speed)
 
 
-def boundary_rows(
-    rays: RayScene, samples: int, seed: int, row: Callable[[ShadowEdge, Echo], Paths]
+def trace_shadow_boundary_paths(
+    rays: RayScene,
+    samples: int,
+    seed: int,
+    make_paths: Callable[[ProjectedSilhouettes, PathTransfer], Paths],
 ) -> list[Paths]:
     """Boundary paths of one bounce, of the segments at all antennas; none without silhouettes.
 
@@ -90,20 +93,20 @@ def boundary_rows(
         rays: The scene and its antennas.
         samples: Silhouette points over all antennas and frames.
         seed: Seed of the points.
-        row: Makes paths of shadow points and of the radar equation there.
+        make_paths: Makes paths of shadow points and of the radar equation there.
     """
     centres = ("tx",) if rays.link.shared_visibility else ("tx", "rx")
     count = samples // len(centres) * len(centres)
-    sampler = EdgeSampler(rays, Inputs.of(rays), centres, count, seed)
+    sampler = SilhouetteSampler(rays, Inputs.from_rays(rays), centres, count, seed)
     if not sampler.size:
         return []
-    drawn = sampler.draw(dr.arange(mi.UInt32, sampler.size)).kept()
+    drawn = sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress()
     columns = {n: to_torch(column) for n, column in vars(drawn).items() if column is not False}
     wide = {n: c.double() if c.is_floating_point() else c.long() for n, c in columns.items()}
-    edge = shadow_edge(rays, replace(drawn, **wide))
+    edge = project_silhouettes(rays, replace(drawn, **wide))
     with torch.no_grad():
-        echo = radar_equation(rays.geometry, rays.link, edge.frame, [edge.place])
-    return [row(edge, echo)]
+        echo = radar_equation(rays.geometry, rays.link, edge.frame, [edge.point])
+    return [make_paths(edge, echo)]
 
 
 def _barycentric(point: Tensor, p0: Tensor, p1: Tensor, p2: Tensor) -> tuple[Tensor, Tensor]:

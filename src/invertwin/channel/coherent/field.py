@@ -7,24 +7,31 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from invertwin.channel.coherent.boundary_paths import ShadowEdge, boundary_rows
-from invertwin.channel.coherent.multibounce_po import mirrored_paths, spread_points
-from invertwin.channel.coherent.polarised_scattering import mirror_matrix, rough_matrix
+from invertwin.channel.coherent.boundary_paths import (
+    ProjectedSilhouettes,
+    trace_shadow_boundary_paths,
+)
+from invertwin.channel.coherent.multibounce_po import sample_surface_points, trace_multibounce_paths
+from invertwin.channel.coherent.polarised_scattering import conductor_matrix, rough_path_matrix
 from invertwin.channel.coherent.radar_equation import (
-    Echo,
+    PathTransfer,
     SurfacePaths,
-    path_view,
-    unblocked,
+    evaluate_paths,
+    find_unblocked,
 )
 from invertwin.channel.coherent.speckle import Speckle, draw_speckle
-from invertwin.channel.em.antenna_fields import combined
-from invertwin.channel.paths import Link, Paths, joined
+from invertwin.channel.em.antenna_fields import combine_elements
+from invertwin.channel.paths import Link, Paths, concatenate_paths
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
-from invertwin.channel.rays.scene_tables import flatten, require_edges, silhouettes_move
+from invertwin.channel.rays.scene_tables import (
+    flatten,
+    is_visibility_differentiated,
+    require_silhouette_samples,
+)
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
-from invertwin.runtime.progress import told
+from invertwin.runtime.progress import track
 from invertwin.scene.scene import Scene
 
 _ROWS_AT_ONCE = 1 << 18  # frames × paths
@@ -56,28 +63,28 @@ def trace_field(
     depth = sampling.depth
     with tracing(sampling.backend):
         geometry = flatten(scene, link.wavelength, motion="fixed")
-        moves = sampling.boundary and silhouettes_move(geometry, link)
+        moves = sampling.boundary and is_visibility_differentiated(geometry, link)
         rays = RayScene(geometry, link)
         parts: list[Paths] = []
         if any(geometry.coherent):
             if sampling.boundary:
-                require_edges(geometry, link, sampling.boundary_samples)
-            if moves and geometry.sheets:
+                require_silhouette_samples(geometry, link, sampling.boundary_samples)
+            if moves and geometry.has_sheets:
                 raise InputError(
                     "expected no sheets where a derivative of coherent fields moves silhouettes, "
                     "got some; use power paths, or boundary=False for fixed visibility"
                 )
-            parts += _conductors(rays, sampling, seed)
+            parts += _trace_conductors(rays, sampling, seed)
         if moves and (depth > 1 or not all(geometry.coherent)):
             raise InputError(
                 "expected no geometry derivative of rough field paths, got one: single points "
                 "appear and vanish; use power paths, or boundary=False for fixed visibility"
             )
         if depth > 1:
-            geometry.require_rest(depth)
-            parts += mirrored_paths(rays, sampling, seed) if any(geometry.coherent) else []
+            geometry.require_static(depth)
+            parts += trace_multibounce_paths(rays, sampling, seed) if any(geometry.coherent) else []
         if all(geometry.coherent):
-            return joined(parts)
+            return concatenate_paths(parts)
         fixed = speckle or draw_speckle(scene, link, sampling, seed)
         if len(fixed.paths) < depth - 1:
             raise InputError(
@@ -86,57 +93,60 @@ def trace_field(
             )
         smooth = torch.tensor(geometry.coherent)[geometry.face_object]
         for paths in (fixed.points, *fixed.paths[: depth - 1]):
-            mixed = paths.keep(~smooth[paths.face].all(1))
-            parts += _fields(rays, mixed, "rough", partial(_rough_field, link))
-        return joined(parts)
+            mixed = paths.select(~smooth[paths.face].all(1))
+            parts += _trace_point_fields(rays, mixed, "rough", partial(_rough_field, link))
+        return concatenate_paths(parts)
 
 
-def _fields(
-    rays: RayScene, paths: SurfacePaths, kind: str, field: Callable[[SurfacePaths, Echo], Tensor]
+def _trace_point_fields(
+    rays: RayScene,
+    paths: SurfacePaths,
+    kind: str,
+    field: Callable[[SurfacePaths, PathTransfer], Tensor],
 ) -> list[Paths]:
     """The paths in every frame in which their field does not vanish."""
     found, count = [], len(paths.weight)
     frames = torch.arange(rays.link.frame_count)
-    for some in told(frames.split(max(1, _ROWS_AT_ONCE // max(1, count))), f"{kind} paths"):
+    for some in track(frames.split(max(1, _ROWS_AT_ONCE // max(1, count))), f"{kind} paths"):
         frame, row = some.repeat_interleave(count), torch.arange(count).repeat(len(some))
-        seen = unblocked(rays, frame, paths.keep(row))
-        kept = paths.keep(row[seen])
-        echo = path_view(rays, frame[seen], kept)
+        seen = find_unblocked(rays, frame, paths.select(row))
+        kept = paths.select(row[seen])
+        echo = evaluate_paths(rays, frame[seen], kept)
         velocity = kept.velocity(rays.geometry)
-        coefficient, matrix = combined(rays.link, field(kept, echo))
-        rows = echo.paths(kind, coefficient=coefficient, matrix=matrix, velocity=velocity)
+        coefficient, matrix = combine_elements(rays.link, field(kept, echo))
+        rows = echo.to_paths(kind, coefficient=coefficient, matrix=matrix, velocity=velocity)
         single = kept.face.shape[1] == 1
         face = kept.face[:, 0] if single else torch.full_like(kept.face[:, 0], -1)
         share = torch.stack([kept.b1[:, 0], kept.b2[:, 0]], dim=1)
-        rows = replace(rows, face=face, share=share)
-        found.append(rows.chosen(rows.carries))
+        rows = replace(rows, face=face, barycentric=share)
+        found.append(rows.select(rows.has_field))
     return found
 
 
-def _rough_field(link: Link, paths: SurfacePaths, echo: Echo) -> Tensor:
+def _rough_field(link: Link, paths: SurfacePaths, echo: PathTransfer) -> Tensor:
     """Amplitude sqrt(f · weight), with the phase of the path, from polarisation to polarisation."""
     # A root of zero has no derivative.
     lit = echo.power > 0
     root = (torch.where(lit, echo.power, 1.0) * paths.weight).sqrt()
     field = torch.polar(torch.where(lit, root, 0.0), paths.phase)
-    return field[:, None, None] * rough_matrix(link, echo, paths.phase)
+    return field[:, None, None] * rough_path_matrix(link, echo, paths.phase)
 
 
-def _conductors(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]:
+def _trace_conductors(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]:
     """Physical optics of the conductors, and its boundary paths."""
     coherent = torch.tensor(rays.geometry.coherent)[rays.geometry.face_object]
 
-    def field(paths: SurfacePaths, echo: Echo) -> Tensor:
-        return mirror_matrix(rays.link, echo) * paths.weight[:, None, None]
+    def field(paths: SurfacePaths, echo: PathTransfer) -> Tensor:
+        return conductor_matrix(rays.link, echo) * paths.weight[:, None, None]
 
-    def row(edge: ShadowEdge, echo: Echo) -> Paths:
-        speed = (edge.speed - edge.speed.detach()) * coherent[edge.face]
-        fields = mirror_matrix(rays.link, echo).detach() * speed[:, None, None]
-        coefficient, matrix = combined(rays.link, fields)
-        return echo.paths("coherent", coefficient=coefficient, matrix=matrix, boundary=True)
+    def boundary_paths(edge: ProjectedSilhouettes, echo: PathTransfer) -> Paths:
+        speed = (edge.area_rate - edge.area_rate.detach()) * coherent[edge.face]
+        fields = conductor_matrix(rays.link, echo).detach() * speed[:, None, None]
+        coefficient, matrix = combine_elements(rays.link, fields)
+        return echo.to_paths("coherent", coefficient=coefficient, matrix=matrix, boundary=True)
 
-    points = spread_points(face_areas(rays.geometry) * coherent, sampling.samples, seed)
-    parts = _fields(rays, points, "coherent", field)
+    points = sample_surface_points(face_areas(rays.geometry) * coherent, sampling.samples, seed)
+    parts = _trace_point_fields(rays, points, "coherent", field)
     if sampling.boundary:
-        parts += boundary_rows(rays, sampling.boundary_samples, seed, row)
+        parts += trace_shadow_boundary_paths(rays, sampling.boundary_samples, seed, boundary_paths)
     return parts

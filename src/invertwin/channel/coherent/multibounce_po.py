@@ -14,32 +14,32 @@ from jaxtyping import Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.coherent.radar_equation import SurfacePaths, passed
+from invertwin.channel.coherent.radar_equation import SurfacePaths, trace_transmittance
 from invertwin.channel.em.antenna_fields import (
     antenna_fields,
-    combined,
+    combine_elements,
     conductor_field,
     current_kernel,
 )
-from invertwin.channel.em.plane_waves import dot, mirrored
+from invertwin.channel.em.plane_waves import dot, reflect_vectors
 from invertwin.channel.paths import Paths
-from invertwin.channel.rays.ray_scene import NEAR, RayScene, face_areas, next_surface
-from invertwin.channel.rays.scene_tables import silhouettes_move
+from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene, face_areas, find_next_surface
+from invertwin.channel.rays.scene_tables import is_visibility_differentiated
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.runtime.progress import told
+from invertwin.runtime.progress import track
 
-_GOLDEN = (0.754_877_666_246_692_7, 0.569_840_290_998_053_2)  # the R2 low-discrepancy sequence
+_R2_STEPS = (0.754_877_666_246_692_7, 0.569_840_290_998_053_2)  # the R2 low-discrepancy sequence
 _ROWS_AT_ONCE = 1 << 18  # frames × rays
 
 
-def mirrored_paths(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]:
+def trace_multibounce_paths(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]:
     """Field paths of two bounces and more that only conductors mirror; detached.
 
     ``a = −(j/4π) √(G_t G_r)/(R r) p_r · [n × (d × E)] dA`` after m bounces, R the unfolded way to
     the last one, E ← 2(n·E)n − E at the others. The bracket is the mean of both ways, as in
-    ``mirror_matrix``. Rays begin at both antennas, each way with half of the field, which keeps
+    ``conductor_matrix``. Rays begin at both antennas, each way with half of the field, which keeps
     reciprocity.
 
     Args:
@@ -54,21 +54,23 @@ def mirrored_paths(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]
     """
     geometry = rays.geometry
     smooth = torch.tensor(geometry.coherent)[geometry.face_object]
-    points = spread_points(face_areas(geometry) * smooth, sampling.samples, seed)
+    points = sample_surface_points(face_areas(geometry) * smooth, sampling.samples, seed)
     link = rays.link
     same = torch.equal(link.tx, link.rx) and link.tx_jones.equals(link.rx_jones)
     found: list[Paths] = []
     frames = torch.arange(rays.link.frame_count)
     with torch.no_grad():
-        for some in told(frames.split(max(1, _ROWS_AT_ONCE // len(points.weight))), "mirrors"):
+        for some in track(frames.split(max(1, _ROWS_AT_ONCE // len(points.weight))), "mirrors"):
             row = torch.arange(len(points.weight)).repeat(len(some))
             frame = some.repeat_interleave(len(points.weight))
             for from_receiver in (False,) if same else (False, True):
                 share = 1.0 if same else 0.5
-                chain = _chain(rays, sampling.depth, smooth, frame, points.keep(row), from_receiver)
-                lit = [paths.chosen(paths.carries).weighted(share) for paths in chain]
+                chain = _follow_rays(
+                    rays, sampling.depth, smooth, frame, points.select(row), from_receiver
+                )
+                lit = [paths.select(paths.has_field).scale_fields(share) for paths in chain]
                 found += [paths for paths in lit if len(paths)]
-    if found and silhouettes_move(geometry, rays.link):
+    if found and is_visibility_differentiated(geometry, rays.link):
         raise InputError(
             "expected depth 1 for derivatives of fields between conductors, got "
             f"{sampling.depth}: mirrored paths have none; use depth=1, power paths, or rcs"
@@ -76,10 +78,10 @@ def mirrored_paths(rays: RayScene, sampling: Sampling, seed: int) -> list[Paths]
     return found
 
 
-def _chain(
+def _follow_rays(
     rays: RayScene,
     depth: int,
-    smooth: Tensor,
+    is_conductor: Tensor,
     frame: Tensor,
     points: SurfacePaths,
     from_receiver: bool,
@@ -91,9 +93,9 @@ def _chain(
     own, other = patterns[::-1] if from_receiver else patterns
     both = link.tx_jones, link.rx_jones
     own_jones, other_jones = both[::-1] if from_receiver else both
-    (place,) = points.places(geometry)
+    (place,) = points.material_points(geometry)
     antenna, position = here[frame], place.position
-    seen, extra = passed(rays, antenna, position)
+    seen, extra = trace_transmittance(rays, antenna, position)
     keep = torch.nonzero(seen > 0)[:, 0]
     frame, position, antenna = frame[keep], position[keep], antenna[keep]
     normal, through, extra = place.normal[keep], seen[keep], extra[keep]
@@ -108,12 +110,12 @@ def _chain(
     reach = float((extent.amax(0) - extent.amin(0)).norm()) * 1.01
     for _ in range(2, depth + 1):
         # Rays begin a little above the mirror: the ray tracer rounds places far from the antennas.
-        above = -dot(normal, direction).sign() * NEAR * (position - rays.origin).norm(dim=1)
-        direction = mirrored(direction, normal)
-        sent = -mirrored(sent, normal[:, None])
+        above = -dot(normal, direction).sign() * RAY_EPSILON * (position - rays.origin).norm(dim=1)
+        direction = reflect_vectors(direction, normal)
+        sent = -reflect_vectors(sent, normal[:, None])
         begin = position + above[:, None] * normal
-        face, _ = next_surface(rays, begin, begin + reach * direction)
-        hit = (face >= 0) & smooth[face.clamp_min(0)]
+        face, _ = find_next_surface(rays, begin, begin + reach * direction)
+        hit = (face >= 0) & is_conductor[face.clamp_min(0)]
         columns = (face, frame, position, length, start, gain, angle, direction, sent, extra)
         face, frame, position, length, start, gain, angle, direction, sent, extra = (
             column[hit] for column in columns
@@ -127,14 +129,14 @@ def _chain(
         distance = offset.norm(dim=1)
         onwards = offset / distance[:, None]
         leaving = torch.einsum("nij,ni->nj", link.rotations[frame], -onwards)
-        open_, more = passed(rays, position, there[frame])
+        open_, more = trace_transmittance(rays, position, there[frame])
         spread = gain * other.gain(leaving) * open_ / (length * distance) ** 2
         area = angle * length**2 / facing.abs().clamp_min(1e-9)
         lit_normal = -facing.sign()[:, None] * normal
         received = antenna_fields(other_jones, link.rotations[frame], -onwards)
         kernel = current_kernel(lit_normal, direction, sent, -onwards, received)
         fields = conductor_field(spread, kernel, dot(lit_normal, onwards)) * area[:, None, None]
-        coefficient, matrix = combined(link, fields.mT if from_receiver else fields)
+        coefficient, matrix = combine_elements(link, fields.mT if from_receiver else fields)
         image = here[frame] + length[:, None] * start  # the last point, unfolded
         first, last = (position, image) if from_receiver else (image, position)
         yield Paths(
@@ -150,7 +152,7 @@ def _chain(
         )
 
 
-def spread_points(areas: Float64[Tensor, " f"], count: int, seed: int) -> SurfacePaths:
+def sample_surface_points(areas: Float64[Tensor, " f"], count: int, seed: int) -> SurfacePaths:
     """Low-discrepancy points over triangles (error of an integral: 1/count).
 
     Args:
@@ -165,7 +167,7 @@ def spread_points(areas: Float64[Tensor, " f"], count: int, seed: int) -> Surfac
     # Jittered, not evenly spaced: even steps would beat with the order of a subdivided mesh.
     place = (index + rng.random(count)) / count * edges[-1]
     face = np.minimum(np.searchsorted(edges, place, side="right"), len(edges) - 1)
-    b = (shift[:, None] + index * np.array(_GOLDEN)[:, None]) % 1.0
+    b = (shift[:, None] + index * np.array(_R2_STEPS)[:, None]) % 1.0
     b = np.where(b.sum(0) > 1, 1 - b, b)
     b1, b2 = torch.from_numpy(b)[..., None]
     weight = torch.full((count,), float(edges[-1]) / count, dtype=torch.float64)

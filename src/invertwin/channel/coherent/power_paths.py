@@ -4,15 +4,23 @@ from collections.abc import Iterator
 
 import torch
 
-from invertwin.channel.coherent.boundary_paths import ShadowEdge, boundary_rows
-from invertwin.channel.coherent.radar_equation import Echo, SurfacePaths, path_view
-from invertwin.channel.em.depolarisation import coupled_power
-from invertwin.channel.paths import Link, Paths, joined
-from invertwin.channel.power.random_walk import Records
-from invertwin.channel.power.trace import Trace
+from invertwin.channel.coherent.boundary_paths import (
+    ProjectedSilhouettes,
+    trace_shadow_boundary_paths,
+)
+from invertwin.channel.coherent.radar_equation import PathTransfer, SurfacePaths, evaluate_paths
+from invertwin.channel.em.depolarisation import received_power_fraction
+from invertwin.channel.paths import Link, Paths, concatenate_paths
+from invertwin.channel.power.random_walk import PathRecords
+from invertwin.channel.power.trace import PowerTracer
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.scene_tables import Geometry, flatten, require_edges, silhouettes_move
+from invertwin.channel.rays.scene_tables import (
+    Geometry,
+    flatten,
+    is_visibility_differentiated,
+    require_silhouette_samples,
+)
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
@@ -39,35 +47,41 @@ def trace_power(scene: Scene, link: Link, *, sampling: Sampling, seed: int) -> P
     with tracing(sampling.backend):
         geometry = flatten(scene, link.wavelength, motion="free")
         if depth > 1:
-            geometry.require_rest(depth)
-        simple = depth == 1 and not geometry.sheets
-        if boundary and not simple and silhouettes_move(geometry, link):
+            geometry.require_static(depth)
+        simple = depth == 1 and not geometry.has_sheets
+        if boundary and not simple and is_visibility_differentiated(geometry, link):
             raise InputError(
                 "expected explicit paths of one bounce without sheets for derivatives in which "
                 f"silhouettes move, got {depth} bounces or sheets; use deposit_power, or "
                 "boundary=False for fixed visibility"
             )
         if boundary and simple:
-            require_edges(geometry, link, edges)
-        trace = Trace(geometry, link, sampling, seed)
-        if trace.contacts is not None and len(trace.contacts.first):
+            require_silhouette_samples(geometry, link, edges)
+        trace = PowerTracer(geometry, link, sampling, seed)
+        if trace.curves is not None and len(trace.curves.first):
             raise InputError(
                 "expected surfaces that do not meet for derivatives of explicit paths, got some "
                 "that cross or touch; use deposit_power, or contacts=False to leave out what moves"
             )
-        parts = [paths for records in trace.records() for paths in _walked(trace, records)]
+        parts = [
+            paths
+            for records in trace.iterate_records()
+            for paths in _read_random_walk(trace, records)
+        ]
         if boundary and simple and edges:
-            parts += boundary_rows(
-                trace.rays, edges, seed, lambda *found: _row(geometry, link, *found)
+            parts += trace_shadow_boundary_paths(
+                trace.rays, edges, seed, lambda *found: _boundary_paths(geometry, link, *found)
             )
-        return joined(parts)
+        return concatenate_paths(parts)
 
 
-def _row(geometry: Geometry, link: Link, edge: ShadowEdge, echo: Echo) -> Paths:
+def _boundary_paths(
+    geometry: Geometry, link: Link, shadow: ProjectedSilhouettes, echo: PathTransfer
+) -> Paths:
     """Boundary paths: no power, but a derivative."""
-    amount = echo.power * coupled_power(link, echo.depolarisation) * edge.speed
-    velocity = geometry.velocity(edge.face, edge.b1, edge.b2)
-    return echo.paths(
+    amount = echo.power * received_power_fraction(link, echo.depolarisation) * shadow.area_rate
+    velocity = geometry.velocity(shadow.face, shadow.b1, shadow.b2)
+    return echo.to_paths(
         "power",
         power=amount - amount.detach(),
         boundary=True,
@@ -75,19 +89,19 @@ def _row(geometry: Geometry, link: Link, edge: ShadowEdge, echo: Echo) -> Paths:
     )
 
 
-def _walked(trace: Trace, records: Records) -> Iterator[Paths]:
+def _read_random_walk(trace: PowerTracer, records: PathRecords) -> Iterator[Paths]:
     """The paths of one point, of two and so on; the kernel says what arrives at the last point."""
-    vertices = [records.at(number) for number in range(records.depth)]
+    vertices = [records.read_vertex(number) for number in range(records.depth)]
     face, b1, b2, throughput, seen = (
         torch.stack([to_torch(getattr(vertex, name)) for vertex in vertices], dim=1)
-        for name in ("face", "b1", "b2", "throughput", "seen")
+        for name in ("face", "b1", "b2", "throughput", "is_visible")
     )
     for count in range(1, records.depth + 1):
         lit = seen[:, count - 1].bool()
         weight = throughput[lit, count - 1].double()
         places = face[lit, :count].long(), b1[lit, :count].double(), b2[lit, :count].double()
         paths = SurfacePaths(*places, weight, torch.zeros_like(weight))
-        found = path_view(trace.rays, to_torch(records.frame).long()[lit], paths)
-        power = weight * found.power / found.arriving.detach().clamp_min(1e-300)
-        power = power * coupled_power(trace.rays.link, found.depolarisation)
-        yield found.paths("power", power=power, velocity=paths.velocity(trace.rays.geometry))
+        found = evaluate_paths(trace.rays, to_torch(records.frame).long()[lit], paths)
+        power = weight * found.power / found.incident_power.detach().clamp_min(1e-300)
+        power = power * received_power_fraction(trace.rays.link, found.depolarisation)
+        yield found.to_paths("power", power=power, velocity=paths.velocity(trace.rays.geometry))

@@ -16,15 +16,15 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.paths import Link, Paths
-from invertwin.channel.rays.ray_scene import RayScene, next_surface, visible
-from invertwin.channel.rays.scene_tables import Geometry, mixed
+from invertwin.channel.rays.ray_scene import RayScene, find_next_surface, is_visible
+from invertwin.channel.rays.scene_tables import Geometry, interpolate_values
 from invertwin.constants import SPEED_OF_LIGHT
 
-_MOST_SHEETS = 8  # that a segment of an explicit path may pass
+_MAX_SHEETS = 8  # that a segment of an explicit path may pass
 
 
 @dataclass(frozen=True)
-class Place:
+class MaterialPoints:
     """Material points, one row each.
 
     Attributes:
@@ -55,19 +55,19 @@ class SurfacePaths:
     weight: Float64[Tensor, " n"]
     phase: Float64[Tensor, " n"]
 
-    def keep(self, rows: Bool[Tensor, " n"] | Int64[Tensor, " m"]) -> "SurfacePaths":
+    def select(self, rows: Bool[Tensor, " n"] | Int64[Tensor, " m"]) -> "SurfacePaths":
         """The rows of a mask, or of indices."""
         return SurfacePaths(*(column[rows] for column in vars(self).values()))
 
-    def places(self, geometry: Geometry) -> list[Place]:
+    def material_points(self, geometry: Geometry) -> list[MaterialPoints]:
         """Where the points are now."""
         found = []
         for face, b1, b2 in zip(self.face.T, self.b1.T, self.b2.T, strict=True):
             p0, p1, p2 = geometry.corners(face)
             normal = torch.linalg.cross(p1 - p0, p2 - p0)
             double_area = normal.norm(dim=1)
-            place = Place(
-                position=mixed((p0, p1, p2), b1, b2),
+            place = MaterialPoints(
+                position=interpolate_values((p0, p1, p2), b1, b2),
                 normal=normal / double_area[:, None],
                 jacobian=double_area / double_area.detach(),
                 row=geometry.face_surface[face],
@@ -81,28 +81,28 @@ class SurfacePaths:
 
 
 @dataclass(frozen=True)
-class Echo:
+class PathTransfer:
     """What paths carry, attached; one row a path.
 
     Attributes:
         frame: Radar pose.
-        places: The points of the paths, in order from the transmitter.
+        points: The points of the paths, in order from the transmitter.
         power: Received over transmitted power per m² of every point; Jacobians included.
-        arriving: The same at the last point, before it scatters.
-        spread: Gains and 1/R² alone: the power without scattering, over (λ/4π)².
+        incident_power: The same at the last point, before it scatters.
+        spreading: Gains and 1/R² alone: the power without scattering, over (λ/4π)².
         length: Length from antenna to antenna [m].
         depolarisation: Share of the power that changes its polarisation, at every point.
     """
 
     frame: Int64[Tensor, " n"]
-    places: Sequence[Place]
+    points: Sequence[MaterialPoints]
     power: Float64[Tensor, " n"]
-    arriving: Float64[Tensor, " n"]
-    spread: Float64[Tensor, " n"]
+    incident_power: Float64[Tensor, " n"]
+    spreading: Float64[Tensor, " n"]
     length: Float64[Tensor, " n"]
     depolarisation: Sequence[Float64[Tensor, " n"]]
 
-    def paths(
+    def to_paths(
         self,
         kind: str,
         *,
@@ -124,8 +124,8 @@ class Echo:
             delay=self.length / SPEED_OF_LIGHT,
             coefficient=zero.to(torch.complex128) if coefficient is None else coefficient,
             power=zero if power is None else power,
-            first=self.places[0].position,
-            last=self.places[-1].position,
+            first=self.points[0].position,
+            last=self.points[-1].position,
             kind=kind,
             boundary=torch.full((len(self.frame),), boundary),
             velocity=velocity,
@@ -134,8 +134,8 @@ class Echo:
 
 
 def radar_equation(
-    geometry: Geometry, link: Link, frame: Int64[Tensor, " n"], places: Sequence[Place]
-) -> Echo:
+    geometry: Geometry, link: Link, frame: Int64[Tensor, " n"], points: Sequence[MaterialPoints]
+) -> PathTransfer:
     """Evaluate the radar equation of paths from antenna to antenna; nothing is in their way.
 
     ``(λ/4π)² G_t G_r Π 1/R² Π f |cosθ| |cosθ'|``, with the attenuation of segments inside bodies.
@@ -144,78 +144,88 @@ def radar_equation(
         geometry: The scene.
         link: Antennas.
         frame: Radar pose of every path.
-        places: The points of the paths, in order from the transmitter.
+        points: The points of the paths, in order from the transmitter.
     """
-    stops = [link.tx[frame], *(p.position for p in places), link.rx[frame]]
+    stops = [link.tx[frame], *(p.position for p in points), link.rx[frame]]
     offsets = [end - start for start, end in pairwise(stops)]
     distances = [offset.norm(dim=1) for offset in offsets]
     ways = [offset / r[:, None] for offset, r in zip(offsets, distances, strict=True)]
 
-    def seen(direction: Tensor) -> Tensor:
+    def to_radar_frame(direction: Tensor) -> Tensor:
         return torch.einsum("nij,ni->nj", link.rotations[frame], direction)
 
-    spread = link.tx_pattern.gain(seen(ways[0])) / distances[0] ** 2
-    ending = link.rx_pattern.gain(seen(-ways[-1])) / distances[-1] ** 2
+    spread = link.tx_pattern.gain(to_radar_frame(ways[0])) / distances[0] ** 2
+    ending = link.rx_pattern.gain(to_radar_frame(-ways[-1])) / distances[-1] ** 2
     length = distances[0] + distances[-1]
-    for number, (start, end) in enumerate(pairwise(places), start=1):
-        index, attenuation = _medium(geometry, start, end, ways[number])
+    for number, (start, end) in enumerate(pairwise(points), start=1):
+        index, attenuation = _segment_medium(geometry, start, end, ways[number])
         spread = spread * torch.exp(-attenuation * distances[number]) / distances[number] ** 2
         length = length + index * distances[number]
     *earlier, last = (
-        point.jacobian * scattered(geometry, point, -back, on)
-        for point, back, on in zip(places, ways, ways[1:], strict=False)
+        point.jacobian * evaluate_scattering(geometry, point, -back, on)
+        for point, back, on in zip(points, ways, ways[1:], strict=False)
     )
     arriving = math.prod(earlier, start=(link.wavelength / (4 * torch.pi)) ** 2 * spread)
     turned = [
         _depolarisation(geometry, point, -back, on)
-        for point, back, on in zip(places, ways, ways[1:], strict=False)
+        for point, back, on in zip(points, ways, ways[1:], strict=False)
     ]
-    return Echo(frame, places, arriving * last * ending, arriving, spread * ending, length, turned)
+    return PathTransfer(
+        frame, points, arriving * last * ending, arriving, spread * ending, length, turned
+    )
 
 
-def _depolarisation(geometry: Geometry, point: Place, back: Tensor, on: Tensor) -> Tensor:
+def _depolarisation(
+    geometry: Geometry, point: MaterialPoints, incident: Tensor, outgoing: Tensor
+) -> Tensor:
     """χ of what is scattered; what passes through a skin keeps its polarisation."""
-    back, on = ((point.normal * way).sum(1) for way in (back, on))
-    return torch.where(back * on > 0, geometry.surfaces.depolarisation[point.row], 0.0)
+    incident, outgoing = ((point.normal * way).sum(1) for way in (incident, outgoing))
+    return torch.where(incident * outgoing > 0, geometry.surfaces.depolarisation[point.row], 0.0)
 
 
-def scattered(geometry: Geometry, point: Place, back: Tensor, on: Tensor) -> Tensor:
+def evaluate_scattering(
+    geometry: Geometry, point: MaterialPoints, incident: Tensor, outgoing: Tensor
+) -> Tensor:
     """``f |cosθ| |cosθ'|`` between unit directions that point away from the surface.
 
     On one side, ``f`` is the distribution of ``scene.material``; through the skin of a body, see
-    ``Surfaces.refracted``.
+    ``ScatteringLawTables.refracted``.
 
     Args:
         geometry: The scene.
         point: Where on it.
-        back: To where the path comes from.
-        on: To where it goes on.
+        incident: To where the path comes from.
+        outgoing: To where it goes on.
     """
     surfaces, row, normal = geometry.surfaces, point.row, point.normal
-    first, second, between = ((a * b).sum(1) for a, b in ((normal, back), (normal, on), (back, on)))
+    first, second, between = (
+        (a * b).sum(1) for a, b in ((normal, incident), (normal, outgoing), (incident, outgoing))
+    )
     product = first * second
     shape = surfaces.diffuse[row] / torch.pi
     for number, cosine in enumerate((2 * product - between, 2 * product - between, between)):
-        if geometry.lobed[number]:
+        if geometry.has_lobe[number]:
             half = (0.5 * (1 + cosine)).clamp_min(1e-7)
             lobe = surfaces.lobes[row, number] * half ** surfaces.exponents[row, number]
-            if number == 0 and geometry.spread:
+            if number == 0 and geometry.has_spread:
                 for tilt in (first, second):
-                    lobe = lobe * _tabulated(surfaces.spread, row, tilt)
+                    lobe = lobe * _interpolate_table(surfaces.spread, row, tilt)
             shape = shape + lobe
-    outer = [_outside(geometry, row, cosine) for cosine in (first, second)]
+    outer = [_outer_cosine(geometry, row, cosine) for cosine in (first, second)]
     reflectance = torch.ones_like(product)
     for cosine, total in outer:
-        amplitude = _tabulated(surfaces.amplitude, row, cosine)
+        amplitude = _interpolate_table(surfaces.amplitude, row, cosine)
         reflectance = reflectance * torch.where(total, 1.0, amplitude)
     value = torch.where(product > 0, reflectance * shape * product, 0.0)
-    if not geometry.bodies:
+    if not geometry.has_refracting_bodies:
         return value
     variance = 2 / surfaces.exponents[row, 0].clamp_min(1.0)
     root, index = torch.ones_like(product), torch.ones_like(product)
     mismatch = torch.zeros_like(normal)
-    for (cosine, total), direction, tilt in zip(outer, (back, on), (first, second), strict=True):
-        passing = _tabulated(surfaces.refraction, row, cosine)
+    for (cosine, total), direction, tilt in zip(
+        outer, (incident, outgoing), (first, second), strict=True
+    ):
+        passing = _interpolate_table(surfaces.refraction, row, cosine)
         open_ = ~total & (passing > 0)
         root = root * torch.where(open_, torch.where(open_, passing, 1.0).sqrt(), 0.0)
         index = torch.where(tilt < 0, surfaces.index[row], 1.0)
@@ -224,9 +234,9 @@ def scattered(geometry: Geometry, point: Place, back: Tensor, on: Tensor) -> Ten
     return torch.where(product < 0, root * index**2 * lobe * product.abs(), value)
 
 
-def _outside(geometry: Geometry, row: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
+def _outer_cosine(geometry: Geometry, row: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
     """Cosine on the outer side of a skin (Snell), and whether there is none."""
-    if not geometry.bodies:
+    if not geometry.has_refracting_bodies:
         return cosine, torch.zeros_like(cosine, dtype=torch.bool)
     inside = cosine < 0
     square = 1 - geometry.surfaces.index[row] ** 2 * (1 - cosine**2)
@@ -235,19 +245,21 @@ def _outside(geometry: Geometry, row: Tensor, cosine: Tensor) -> tuple[Tensor, T
     return torch.where(inside, refracted, cosine), total
 
 
-def _medium(geometry: Geometry, start: Place, end: Place, way: Tensor) -> tuple[Tensor, Tensor]:
+def _segment_medium(
+    geometry: Geometry, start: MaterialPoints, end: MaterialPoints, direction: Tensor
+) -> tuple[Tensor, Tensor]:
     """Refractive index and attenuation of what lies between two points."""
-    index, attenuation = torch.ones_like(way[:, 0]), torch.zeros_like(way[:, 0])
+    index, attenuation = torch.ones_like(direction[:, 0]), torch.zeros_like(direction[:, 0])
     surfaces = geometry.surfaces
-    for point, sign in ((start, 1.0), (end, -1.0)) if geometry.bodies else ():
-        inside = (point.normal * way).sum(1) * sign < 0
+    for point, sign in ((start, 1.0), (end, -1.0)) if geometry.has_refracting_bodies else ():
+        inside = (point.normal * direction).sum(1) * sign < 0
         inside &= surfaces.refraction[point.row, -1] > 0
         index = torch.where(inside, surfaces.index[point.row], index)
         attenuation = torch.where(inside, surfaces.attenuation[point.row], attenuation)
     return index, attenuation
 
 
-def _tabulated(
+def _interpolate_table(
     table: Float64[Tensor, "row cos"], row: Int64[Tensor, " n"], cosine: Float64[Tensor, " n"]
 ) -> Float64[Tensor, " n"]:
     """A table over |cosθ|, linear between its entries."""
@@ -258,7 +270,7 @@ def _tabulated(
     return first + (second - first) * (t - low)
 
 
-def passed(
+def trace_transmittance(
     rays: RayScene, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]
 ) -> tuple[Float64[Tensor, " n"], Float64[Tensor, " n"]]:
     """Transmittance from point to point (0 if blocked), and the length that sheets add [m].
@@ -268,19 +280,19 @@ def passed(
         start, end: Points.
     """
     geometry, surfaces = rays.geometry, rays.geometry.surfaces
-    if not geometry.sheets:
-        clear = visible(rays, start, end).to(start)
+    if not geometry.has_sheets:
+        clear = is_visible(rays, start, end).to(start)
         return clear, torch.zeros_like(clear)
     transmittance = torch.ones(len(start), dtype=torch.float64)
     extra = torch.zeros_like(transmittance)
     at = torch.zeros_like(transmittance)
     rows = torch.arange(len(start))
     offset = end - start
-    for _ in range(_MOST_SHEETS + 1):
+    for _ in range(_MAX_SHEETS + 1):
         if not len(rows):
             break
         fixed = start.detach()[rows] + offset.detach()[rows] * at[rows, None]
-        hit, step = next_surface(rays, fixed, end.detach()[rows])
+        hit, step = find_next_surface(rays, fixed, end.detach()[rows])
         rows, hit, step = rows[hit >= 0], hit[hit >= 0], step[hit >= 0]
         at = at.index_add(0, rows, step * (1 - at[rows]))
         row = geometry.face_surface[hit]
@@ -288,15 +300,15 @@ def passed(
         normal = normalize(torch.linalg.cross(p1 - p0, p2 - p0), dim=1)
         cosine = (normal * normalize(offset[rows], dim=1)).sum(1)
         factor = torch.ones_like(transmittance).index_copy(
-            0, rows, _tabulated(surfaces.transmittance, row, cosine)
+            0, rows, _interpolate_table(surfaces.transmittance, row, cosine)
         )
         transmittance = transmittance * factor
-        extra = extra.index_add(0, rows, _tabulated(surfaces.extra_length, row, cosine))
+        extra = extra.index_add(0, rows, _interpolate_table(surfaces.extra_length, row, cosine))
         rows = rows[transmittance.detach()[rows] > 0]
     return transmittance * torch.ones_like(transmittance).index_fill(0, rows, 0.0), extra
 
 
-def unblocked(
+def find_unblocked(
     rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths
 ) -> Bool[Tensor, " n"]:
     """Which paths have nothing but sheets in their way.
@@ -307,11 +319,11 @@ def unblocked(
         paths: The points of the paths.
     """
     with torch.no_grad():
-        passes = _passes(rays, frame, paths.places(rays.geometry))
+        passes = _trace_segments(rays, frame, paths.material_points(rays.geometry))
         return torch.stack([transmittance > 0 for transmittance, _ in passes]).all(0)
 
 
-def path_view(rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths) -> Echo:
+def evaluate_paths(rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths) -> PathTransfer:
     """Evaluate the radar equation along unblocked paths, past the sheets in their way.
 
     Args:
@@ -319,30 +331,36 @@ def path_view(rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths) -
         frame: Radar pose of every path.
         paths: The points of the paths.
     """
-    echo = radar_equation(rays.geometry, rays.link, frame, paths.places(rays.geometry))
-    if not rays.geometry.sheets:
+    echo = radar_equation(rays.geometry, rays.link, frame, paths.material_points(rays.geometry))
+    if not rays.geometry.has_sheets:
         return echo
-    (*earlier, last), extras = zip(*_passes(rays, frame, echo.places), strict=True)
+    (*earlier, last), extras = zip(*_trace_segments(rays, frame, echo.points), strict=True)
     before = math.prod(earlier)
     return replace(
         echo,
         power=echo.power * before * last,
-        arriving=echo.arriving * before,
-        spread=echo.spread * before * last,
+        incident_power=echo.incident_power * before,
+        spreading=echo.spreading * before * last,
         length=echo.length + sum(extras),
     )
 
 
-def _passes(rays: RayScene, frame: Tensor, places: Sequence[Place]) -> list[tuple[Tensor, Tensor]]:
-    """What all segments of paths pass, see ``passed``."""
+def _trace_segments(
+    rays: RayScene, frame: Tensor, points: Sequence[MaterialPoints]
+) -> list[tuple[Tensor, Tensor]]:
+    """What all segments of paths pass, see ``trace_transmittance``."""
     link = rays.link
-    stops = [link.tx[frame], *(place.position for place in places), link.rx[frame]]
+    stops = [link.tx[frame], *(place.position for place in points), link.rx[frame]]
     found: list[tuple[Tensor, Tensor]] = []
     for start, end in pairwise(stops):
         # What the transmitter sees of a single point, the receiver sees too.
-        again = bool(found) and link.shared_visibility and len(places) == 1
-        if again and not rays.geometry.sheets:
+        again = bool(found) and link.shared_visibility and len(points) == 1
+        if again and not rays.geometry.has_sheets:
             found += found
         else:
-            found.append(passed(rays, end, start) if again else passed(rays, start, end))
+            found.append(
+                trace_transmittance(rays, end, start)
+                if again
+                else trace_transmittance(rays, start, end)
+            )
     return found

@@ -11,13 +11,17 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.coherent.radar_equation import SurfacePaths, passed, radar_equation
+from invertwin.channel.coherent.radar_equation import (
+    SurfacePaths,
+    radar_equation,
+    trace_transmittance,
+)
 from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand
 from invertwin.channel.power import random_walk as walk
 from invertwin.channel.rays.arrays import (
     opaque,
-    scrambled,
+    scramble_seed,
     to_float,
     to_index,
     to_torch,
@@ -26,15 +30,17 @@ from invertwin.channel.rays.arrays import (
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry, flatten
-from invertwin.runtime.progress import told
+from invertwin.runtime.progress import track
 from invertwin.scene.scene import Scene
 
 _LANES = 1 << 18  # walked at a time
-_KEPT = 0.25  # of the paths that are drawn; the others carry little
-_REFERENCES = 8  # frames that say how much a path carries
-_ALIKE = 0.5  # share of the draws that goes to all sequences of objects alike
-_BLIND = 0.1  # share that goes to paths whatever the reference frames see of them
-_AWAY = 0.125  # share of the first points that are lit from the side the antennas do not see
+_KEPT_SHARE = 0.25  # of the paths that are drawn; the others carry little
+_REFERENCE_FRAMES = 8  # frames that say how much a path carries
+_STRATIFIED_SHARE = 0.5  # share of the draws that goes to all sequences of objects alike
+_UNIFORM_SHARE = 0.1  # share that goes to paths whatever the reference frames see of them
+_BACKSIDE_SHARE = (
+    0.125  # share of the first points that are lit from the side the antennas do not see
+)
 
 
 def draw_rough_paths(
@@ -63,21 +69,23 @@ def draw_rough_paths(
     if depth < 2:
         return ()
     with torch.no_grad():
-        drawer = _Drawer(flatten(scene, link.wavelength, motion="fixed"), link, seed)
+        drawer = _RoughPathSampler(flatten(scene, link.wavelength, motion="fixed"), link, seed)
         rounds = -(-count // _LANES)
-        parts = [drawer.draw(turn, count // rounds, depth) for turn in told(range(rounds), "paths")]
-        return tuple(map(drawer.joined, zip(*parts, strict=True)))
+        parts = [
+            drawer.draw(turn, count // rounds, depth) for turn in track(range(rounds), "paths")
+        ]
+        return tuple(map(drawer.merge_rounds, zip(*parts, strict=True)))
 
 
-class _Drawer:
+class _RoughPathSampler:
     """Walks paths, and draws again from them where they carry power (splitting and roulette)."""
 
     def __init__(self, geometry: Geometry, link: Link, seed: int) -> None:
         self.geometry, self.link = geometry, link
         self.rays = RayScene(geometry, link)
-        self.inputs = integrand.Inputs.of(self.rays)
-        self.walk = walk.Walk(self.rays, self.inputs, seed)
-        self.seeds = scrambled(seed, 12), scrambled(seed, 13)
+        self.inputs = integrand.Inputs.from_rays(self.rays)
+        self.walk = walk.RandomWalk(self.rays, self.inputs, seed)
+        self.seeds = scramble_seed(seed, 12), scramble_seed(seed, 13)
         self.generator = torch.Generator().manual_seed(seed)
         areas = face_areas(geometry)
         owners = torch.zeros(len(geometry.coherent), dtype=torch.float64)
@@ -85,78 +93,86 @@ class _Drawer:
         share = areas / owners[geometry.face_object] / len(owners)
         self.areas = to_float(areas)
         self.faces = mi.DiscreteDistribution(to_float(share))
-        frames = torch.linspace(0, link.frame_count - 1, min(link.frame_count, _REFERENCES))
+        frames = torch.linspace(0, link.frame_count - 1, min(link.frame_count, _REFERENCE_FRAMES))
         self.frames = frames.round().long()
 
-    def draw(self, turn: int, lanes: int, depth: int) -> list[SurfacePaths]:
+    def draw(self, round_number: int, lanes: int, depth: int) -> list[SurfacePaths]:
         """Paths of two points and more, without phases, of one of the rounds."""
-        state = self._started(turn * lanes, lanes)
+        state = self._start_paths(round_number * lanes, lanes)
         places: list[Tensor] = []
         found = []
         for number in range(1, depth + 1):
             if number > 1:
                 state = self.walk.step(state)
-            places, alive, paths = self._walked(state, places)
+            places, alive, paths = self._read_points(state, places)
             if number > 1:
-                chance = self._shares(paths, received=True) * (lanes * _KEPT)
+                chance = self._selection_shares(paths, received=True) * (lanes * _KEPT_SHARE)
                 chance = chance.clamp_max(1.0)
                 found.append(
-                    replace(paths, weight=paths.weight / chance).keep(
-                        self._random(len(chance)) < chance
+                    replace(paths, weight=paths.weight / chance).select(
+                        self._draw_uniform(len(chance)) < chance
                     )
                 )
             if number < depth and len(alive):
-                shares = self._shares(paths, received=False)
-                drawn = (torch.arange(lanes) + self._random(1)) / lanes
+                shares = self._selection_shares(paths, received=False)
+                drawn = (torch.arange(lanes) + self._draw_uniform(1)) / lanes
                 row = torch.searchsorted(shares.cumsum(0), drawn).clamp_max(len(alive) - 1)
                 weight = paths.weight[row] / (shares[row] * lanes)
                 places = [column[row] for column in (paths.face, paths.b1, paths.b2)]
-                state = self._again(state, alive[row], weight)
+                state = self._resample_lanes(state, alive[row], weight)
         return found
 
-    def joined(self, parts: tuple[SurfacePaths, ...]) -> SurfacePaths:
+    def merge_rounds(self, parts: tuple[SurfacePaths, ...]) -> SurfacePaths:
         """Paths of one length from all rounds, each with a phase."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         face, b1, b2, weight, _ = (torch.cat(column) for column in columns)
-        phase = 2 * torch.pi * self._random(len(weight))
+        phase = 2 * torch.pi * self._draw_uniform(len(weight))
         return SurfacePaths(face, b1, b2, weight / len(parts), phase)
 
-    def _random(self, count: int) -> Tensor:
+    def _draw_uniform(self, count: int) -> Tensor:
         return torch.rand(count, generator=self.generator, dtype=torch.float64)
 
-    def _started(self, start: int, lanes: int) -> walk.State:
+    def _start_paths(self, start: int, lanes: int) -> walk.PathState:
         """First points, and for each a reference frame that lights it, or its mirror image."""
         lane = dr.arange(mi.UInt32, lanes)
         index = lane + opaque(start)
         place, side = uniform_pair(index, self.seeds[0])
         face, pmf = self.faces.sample_pmf((mi.Float(lane) + place) / lanes)
         b = mi.warp.square_to_uniform_triangle(mi.Point2f(*uniform_pair(index, self.seeds[1])))
-        point = integrand.place(self.inputs, face, b.x, b.y)
+        point = integrand.compute_interaction(self.inputs, face, b.x, b.y)
         frame = dr.gather(mi.UInt32, to_index(self.frames), index % opaque(len(self.frames)))
-        back, distance = integrand.segment(point.position, self.inputs.antenna(frame, False))
+        back, distance = integrand.direction_and_distance(
+            point.position, self.inputs.antenna_position(frame, False)
+        )
         turned = back - 2 * dr.dot(back, point.normal) * point.normal
-        back = dr.select(side < _AWAY, turned, back)
-        state = walk.start(index, frame, face, b.x, b.y, back, dr.ones(mi.Float, lanes), distance)
+        back = dr.select(side < _BACKSIDE_SHARE, turned, back)
+        state = walk.initial_state(
+            index, frame, face, b.x, b.y, back, dr.ones(mi.Float, lanes), distance
+        )
         area = dr.gather(mi.Float, self.areas, face)
-        state["weight"] = area / (pmf * lanes * dr.select(side < _AWAY, _AWAY, 1 - _AWAY))
+        state["weight"] = area / (
+            pmf * lanes * dr.select(side < _BACKSIDE_SHARE, _BACKSIDE_SHARE, 1 - _BACKSIDE_SHARE)
+        )
         return state
 
-    def _walked(
-        self, state: walk.State, before: list[Tensor]
+    def _read_points(
+        self, state: walk.PathState, previous: list[Tensor]
     ) -> tuple[list[Tensor], Tensor, SurfacePaths]:
         """Places of all lanes' points, the lanes that are alive, and their paths."""
         names = ("face", "b1", "b2", "weight", "active")
         dr.eval(*(state[name] for name in names))
         *latest, weight, active = (to_torch(state[name]) for name in names)
         places = [latest[0].long()[:, None], *(b.double()[:, None] for b in latest[1:])]
-        if before:
-            places = [torch.cat(pair, dim=1) for pair in zip(before, places, strict=True)]
+        if previous:
+            places = [torch.cat(pair, dim=1) for pair in zip(previous, places, strict=True)]
         alive = active.bool().nonzero()[:, 0]
         face, b1, b2 = (column[alive] for column in places)
         weight = weight.double()[alive]
         return places, alive, SurfacePaths(face, b1, b2, weight, torch.zeros_like(weight))
 
-    def _again(self, state: walk.State, parent: Tensor, weight: Tensor) -> walk.State:
+    def _resample_lanes(
+        self, state: walk.PathState, parent: Tensor, weight: Tensor
+    ) -> walk.PathState:
         """Lanes that go on from others; each has its own number, and so its own way."""
         at = to_index(parent)
         columns = {
@@ -173,11 +189,11 @@ class _Drawer:
             "active": dr.full(mi.Bool, True, len(parent)),
         }
 
-    def _shares(self, paths: SurfacePaths, *, received: bool) -> Tensor:
+    def _selection_shares(self, paths: SurfacePaths, *, received: bool) -> Tensor:
         """How the draws are shared among paths: by their power, and by sequences of objects."""
         if not len(paths.weight):
             return paths.weight
-        power = paths.weight * self._power(paths, received=received)
+        power = paths.weight * self._estimate_power(paths, received=received)
         blind = paths.weight / paths.weight.sum()
         total = power.sum()
         if not total > 0:
@@ -188,14 +204,16 @@ class _Drawer:
         sums = torch.zeros(int(family.max()) + 1, dtype=torch.float64).index_add(0, family, power)
         seen = int((sums > 0).sum())
         alike = power / sums.clamp_min(1e-300)[family] / seen
-        return _BLIND * blind + (1 - _BLIND) * (_ALIKE * alike + (1 - _ALIKE) * power / total)
+        return _UNIFORM_SHARE * blind + (1 - _UNIFORM_SHARE) * (
+            _STRATIFIED_SHARE * alike + (1 - _STRATIFIED_SHARE) * power / total
+        )
 
-    def _power(self, paths: SurfacePaths, *, received: bool) -> Tensor:
+    def _estimate_power(self, paths: SurfacePaths, *, received: bool) -> Tensor:
         """Power at the receiver or the last point, the mean of the reference frames.
 
         What lies between points is left out: this changes only how well paths are chosen.
         """
-        link, places = self.link, paths.places(self.geometry)
+        link, places = self.link, paths.material_points(self.geometry)
         last, total = places[-1], torch.zeros_like(paths.weight)
         for number in self.frames.tolist():
             frame = torch.full((len(total),), number)
@@ -206,10 +224,12 @@ class _Drawer:
             else:
                 before = places[-2].position if len(places) > 1 else link.tx[frame]
                 back = normalize(before - last.position, dim=1)
-                power = echo.arriving * (last.normal * back).sum(1).abs()
+                power = echo.incident_power * (last.normal * back).sum(1).abs()
             for antenna, point in ends:
                 lit = power > 0
-                transmittance, _ = passed(self.rays, antenna[frame[lit]], point.position[lit])
+                transmittance, _ = trace_transmittance(
+                    self.rays, antenna[frame[lit]], point.position[lit]
+                )
                 power = power.masked_scatter(lit, power[lit] * transmittance)
             total = total + power
         return total / len(self.frames)

@@ -11,12 +11,12 @@ from invertwin.channel.coherent.radar_equation import SurfacePaths
 from invertwin.channel.coherent.rough_paths import draw_rough_paths
 from invertwin.channel.paths import Link
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.sampling import REST, Densities, Sampling
+from invertwin.channel.sampling import ALL_OTHERS, Densities, Sampling
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
 
-def densities_of(scene: Scene, points_per_m2: Densities) -> dict[str, float]:
+def resolve_densities(scene: Scene, points_per_m2: Densities) -> dict[str, float]:
     """Points per m² of every rough object.
 
     Args:
@@ -29,18 +29,18 @@ def densities_of(scene: Scene, points_per_m2: Densities) -> dict[str, float]:
     rough = [name for name, item in scene.objects.items() if not item.material.coherent]
     if not isinstance(points_per_m2, Mapping):
         return dict.fromkeys(rough, points_per_m2)
-    unknown = [name for name in points_per_m2 if name not in (*scene.names, REST)]
+    unknown = [name for name in points_per_m2 if name not in (*scene.names, ALL_OTHERS)]
     if unknown:
         raise InputError(
             f"expected points_per_m2 of objects of the scene ({', '.join(scene.names)}), or of "
-            f'"{REST}" for all others, got {unknown[0]!r}; use one of these names'
+            f'"{ALL_OTHERS}" for all others, got {unknown[0]!r}; use one of these names'
         )
-    found = {name: points_per_m2.get(name, points_per_m2.get(REST)) for name in rough}
+    found = {name: points_per_m2.get(name, points_per_m2.get(ALL_OTHERS)) for name in rough}
     missing = [name for name, density in found.items() if density is None]
     if missing:
         raise InputError(
             f"expected points_per_m2 of every rough object, got none of {', '.join(missing)}; "
-            f'add them, or "{REST}" for all that are not named'
+            f'add them, or "{ALL_OTHERS}" for all that are not named'
         )
     return {name: density for name, density in found.items() if density is not None}
 
@@ -57,9 +57,9 @@ def draw_rough_points(scene: Scene, points_per_m2: Densities, seed: int) -> Surf
         seed: Hash key.
 
     Raises:
-        InputError: See ``densities_of``.
+        InputError: See ``resolve_densities``.
     """
-    densities = densities_of(scene, points_per_m2)
+    densities = resolve_densities(scene, points_per_m2)
     found: list[np.ndarray] = [np.zeros((5, 0))]
     offset = 0
     for name, item in scene.objects.items():
@@ -70,10 +70,12 @@ def draw_rough_points(scene: Scene, points_per_m2: Densities, seed: int) -> Surf
             key = np.uint64(zlib.crc32(name.encode()) ^ (seed * 0x9E3779B97F4A7C15 & (2**64 - 1)))
             face = np.arange(len(area), dtype=np.uint64)
             expected = area * densities[name]
-            count = np.floor(expected + _hash(key, face, face * 0, 0)).astype(np.int64)
+            count = np.floor(expected + _hash_uniform(key, face, face * 0, 0)).astype(np.int64)
             face = np.repeat(face, count)
             number = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
-            b1, b2, turn = (_hash(key, face, number.astype(np.uint64), k) for k in (1, 2, 3))
+            b1, b2, turn = (
+                _hash_uniform(key, face, number.astype(np.uint64), k) for k in (1, 2, 3)
+            )
             fold = b1 + b2 > 1
             b1, b2 = np.where(fold, 1 - b1, b1), np.where(fold, 1 - b2, b2)
             # A point stands for the area that is its own at the density of its object.
@@ -85,7 +87,7 @@ def draw_rough_points(scene: Scene, points_per_m2: Densities, seed: int) -> Surf
     return SurfacePaths(face.long()[:, None], b1[:, None], b2[:, None], weight, phase)
 
 
-def _hash(key: np.uint64, first: np.ndarray, second: np.ndarray, stream: int) -> np.ndarray:
+def _hash_uniform(key: np.uint64, first: np.ndarray, second: np.ndarray, stream: int) -> np.ndarray:
     """Uniform numbers in [0, 1): SplitMix64 over the words of the key."""
     with np.errstate(over="ignore"):
         state = np.full(first.shape, key, dtype=np.uint64)

@@ -12,26 +12,26 @@ _UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)  # of the radar
 
 
 def antenna_fields(
-    jones: Polarisation, rotation: Float64[Tensor, "row 3 3"], way: Float64[Tensor, "row 3"]
+    jones: Polarisation, rotation: Float64[Tensor, "row 3 3"], direction: Float64[Tensor, "row 3"]
 ) -> Complex128[Tensor, "row k 3"]:
     """Unit fields in the world that an array's vectors send along unit vectors, or hear from there.
 
     Args:
         jones: of the array.
         rotation: columns are the radar's axes.
-        way: away from the antenna.
+        direction: away from the antenna.
     """
-    local = torch.einsum("nij,ni->nj", rotation, way)
+    local = torch.einsum("nij,ni->nj", rotation, direction)
     axes = torch.einsum("nij,npj->npi", rotation, polarisations(-local, _UP))
-    return jones.towards(local) @ axes.to(torch.complex128)
+    return jones.evaluate(local) @ axes.to(torch.complex128)
 
 
 def current_kernel(
     normal: Float64[Tensor, "row 3"],
-    onwards: Float64[Tensor, "row 3"],
-    sent: Complex128[Tensor, "row t 3"],
-    back: Float64[Tensor, "row 3"],
-    received: Complex128[Tensor, "row r 3"],
+    incident_direction: Float64[Tensor, "row 3"],
+    incident_fields: Complex128[Tensor, "row t 3"],
+    reverse_direction: Float64[Tensor, "row 3"],
+    reverse_fields: Complex128[Tensor, "row r 3"],
 ) -> Complex128[Tensor, "row r t"]:
     """What the current that a wave induces on a conductor sends: p · [n × (d × E)].
 
@@ -39,34 +39,34 @@ def current_kernel(
 
     Args:
         normal: n, towards the source.
-        onwards: d, of the wave that arrives.
-        sent: its fields E.
-        back: d of the wave that the other antenna would send to this place.
-        received: fields of that wave.
+        incident_direction: d, of the wave that arrives.
+        incident_fields: its fields E.
+        reverse_direction: d of the wave that the other antenna would send to this place.
+        reverse_fields: fields of that wave.
     """
-    n, d, b = normal[:, None], onwards[:, None], back[:, None]
-    there = torch.linalg.cross(n.to(sent.dtype), cross(d, sent))
-    here = torch.linalg.cross(n.to(sent.dtype), cross(b, received))
-    return 0.5 * (received @ there.mT + here @ sent.mT)
+    n, d, b = normal[:, None], incident_direction[:, None], reverse_direction[:, None]
+    there = torch.linalg.cross(n.to(incident_fields.dtype), cross(d, incident_fields))
+    here = torch.linalg.cross(n.to(incident_fields.dtype), cross(b, reverse_fields))
+    return 0.5 * (reverse_fields @ there.mT + here @ incident_fields.mT)
 
 
 def conductor_field(
     spread: Float64[Tensor, " row"],
     kernel: Complex128[Tensor, "row r t"],
-    outgoing: Float64[Tensor, " row"],
+    outgoing_cosine: Float64[Tensor, " row"],
 ) -> Complex128[Tensor, "row r t"]:
     """Field coefficients per m² of a lit conductor: ``−(j/4π) √spread p · [n × (d × E)]``.
 
     Args:
         spread: gains and 1/R² of both ways, without scattering.
         kernel: p · [n × (d × E)].
-        outgoing: cosine to where the wave goes to, zero behind the lit side.
+        outgoing_cosine: cosine to where the wave goes to, zero behind the lit side.
     """
-    lit = (outgoing > 0).to(spread)
+    lit = (outgoing_cosine > 0).to(spread)
     return (-1j / (4 * torch.pi) * spread.sqrt() * lit)[:, None, None] * kernel
 
 
-def combined(
+def combine_elements(
     link: Link, matrix: Complex128[Tensor, "row r t"]
 ) -> tuple[Complex128[Tensor, " row"], Complex128[Tensor, "row r t"] | None]:
     """Coefficients of the mean elements, and the matrix where elements differ, as ``Paths`` wants.

@@ -24,7 +24,7 @@ _MATRICES = torch.tensor(
 _GOLDEN = 0.618_033_988_749_894_8
 
 
-class Share(NamedTuple):
+class PolarisationShare(NamedTuple):
     """A part of what antennas take: so much of a path's power × Π(1 − loss·χ) over its bounces.
 
     Attributes:
@@ -36,12 +36,12 @@ class Share(NamedTuple):
     even: float
     loss: float
 
-    def of(self, bounces: int) -> float:
+    def for_bounces(self, bounces: int) -> float:
         """That of paths of so many bounces."""
         return self.odd if bounces % 2 else self.even
 
 
-def power_shares(link: Link, *, depolarised: bool) -> list[Share]:
+def polarisation_shares(link: Link, *, depolarising: bool) -> list[PolarisationShare]:
     """What two antennas take of the power of paths: the sum of the shares.
 
     ½(I I' + q q' ± u u' ∓ v v') in Stokes parameters of their mean elements, which is |rᵀ t|² after
@@ -49,20 +49,24 @@ def power_shares(link: Link, *, depolarised: bool) -> list[Share]:
 
     Args:
         link: antennas.
-        depolarised: whether any surface depolarises.
+        depolarising: whether any surface depolarises.
 
     Raises:
         InputError: polarisations that depend on the direction.
     """
-    sent, received = (_stokes(j.vectors.mean(0)) for j in (link.tx_jones, link.rx_jones))
+    sent, received = (_stokes_parameters(j.vectors.mean(0)) for j in (link.tx_jones, link.rx_jones))
     whole, q, u, v = (0.5 * s * r for s, r in zip(sent, received, strict=True))
-    parts = [Share(whole, whole, 0.0), Share(q + u, q - u, _LINEAR), Share(-v, v, _CIRCULAR)]
-    if depolarised:
+    parts = [
+        PolarisationShare(whole, whole, 0.0),
+        PolarisationShare(q + u, q - u, _LINEAR),
+        PolarisationShare(-v, v, _CIRCULAR),
+    ]
+    if depolarising:
         return parts[:1] + [part for part in parts[1:] if part.odd or part.even]
-    return [Share(sum(p.odd for p in parts), sum(p.even for p in parts), 0.0)]
+    return [PolarisationShare(sum(p.odd for p in parts), sum(p.even for p in parts), 0.0)]
 
 
-def coupled_power(
+def received_power_fraction(
     link: Link, depolarisation: Sequence[Float64[Tensor, " row"]]
 ) -> Float64[Tensor, " row"]:
     """What antennas take of the power of paths.
@@ -73,20 +77,21 @@ def coupled_power(
     """
     depolarised = any(bool(value.detach().any()) for value in depolarisation)
     total = torch.zeros_like(depolarisation[0])
-    for share in power_shares(link, depolarised=depolarised):
-        kept = torch.full_like(total, share.of(len(depolarisation)))
+    for share in polarisation_shares(link, depolarising=depolarised):
+        kept = torch.full_like(total, share.for_bounces(len(depolarisation)))
         for value in depolarisation:
             kept = kept * (1 - share.loss * value)
         total = total + kept
     return total
 
 
-def coupled_field(
+def random_scattering_matrix(
     depolarisation: Sequence[Float64[Tensor, " row"]], phase: Float64[Tensor, " row"]
 ) -> Complex128[Tensor, "#row 2 2"]:
     """Fields between V and H of scatterers of random phase, received × sent, over their amplitude.
 
-    Their mean power is that of ``power_shares``: a mirror, dihedrals at two angles and a turn, each
+    Their mean power is that of ``polarisation_shares``: a mirror, dihedrals at two angles and a
+    turn, each
     with its chance and a phase of its own, which is a hash of the first.
 
     Args:
@@ -115,7 +120,7 @@ def coupled_field(
     return found
 
 
-def _stokes(vector: Complex128[Tensor, "2"]) -> tuple[float, float, float, float]:
+def _stokes_parameters(vector: Complex128[Tensor, "2"]) -> tuple[float, float, float, float]:
     first, second = complex(vector[0]), complex(vector[1])
     both = first * second.conjugate()
     powers = abs(first) ** 2, abs(second) ** 2

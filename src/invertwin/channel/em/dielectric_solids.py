@@ -13,23 +13,23 @@ import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.em.plane_waves import Skins, Vectors, cross, dot
-from invertwin.checks import differentiated
+from invertwin.channel.em.plane_waves import SmoothInterfaces, Vectors, cross, dot
+from invertwin.checks import is_differentiated
 from invertwin.errors import InputError
 
-OPAQUE = 1e-4
+MIN_CHORD_AMPLITUDE = 1e-4
 """Amplitude after the mean chord 4V/A of a body, below which nothing is followed inside."""
 AIR = -1
 """The medium outside."""
 
 
 @dataclass(frozen=True)
-class Solids:
+class DielectricSolids:
     """Interiors that waves enter, at frequencies of one permittivity each.
 
     Attributes:
         owner: number of the object that each facet belongs to.
-        clear: facets of bodies that waves enter.
+        transparent: facets of bodies that waves enter.
         conducting: facets of conductors.
         permittivity: complex, relative, inside each object; 1 where waves do not enter.
         wave_number: the least k of the frequencies [1/m], at which most is left.
@@ -37,13 +37,13 @@ class Solids:
     """
 
     owner: Int64[Tensor, " facet"]
-    clear: Bool[Tensor, " facet"]
+    transparent: Bool[Tensor, " facet"]
     conducting: Bool[Tensor, " facet"]
     permittivity: Complex128[Tensor, " object"]
     wave_number: float
     names: Sequence[str]
 
-    def inside(self, medium: Int64[Tensor, " row"]) -> Complex128[Tensor, " row"]:
+    def permittivity_in(self, medium: Int64[Tensor, " row"]) -> Complex128[Tensor, " row"]:
         """ε of media.
 
         Args:
@@ -52,7 +52,7 @@ class Solids:
         found = self.permittivity[medium.clamp_min(0)]
         return torch.where(medium < 0, torch.ones_like(found), found)
 
-    def behind(self, facet: Tensor, medium: Tensor) -> Int64[Tensor, " row"]:
+    def medium_behind(self, facet: Tensor, medium: Tensor) -> Int64[Tensor, " row"]:
         """The medium on the other side of faces of solids.
 
         Args:
@@ -61,7 +61,7 @@ class Solids:
         """
         return torch.where(medium < 0, self.owner[facet], AIR)
 
-    def check(self, facet: Int64[Tensor, " row"], medium: Int64[Tensor, " row"]) -> None:
+    def require_gaps(self, facet: Int64[Tensor, " row"], medium: Int64[Tensor, " row"]) -> None:
         """Refuse surfaces inside a solid, of which the laws here do not hold.
 
         Args:
@@ -83,68 +83,69 @@ class Solids:
             )
 
 
-def interiors(
-    skins: Sequence[Skins],
+def group_solids(
+    interfaces: Sequence[SmoothInterfaces],
     wave_numbers: Sequence[float],
     corners: Float64[Tensor, "facet 3 3"],
-    solid: Bool[Tensor, " facet"],
+    closed: Bool[Tensor, " facet"],
     owner: Int64[Tensor, " facet"],
     names: Sequence[str],
-) -> list[tuple[Solids | None, list[int]]]:
+) -> list[tuple[DielectricSolids | None, list[int]]]:
     """Groups of frequencies in which waves are refracted alike, and what they enter there.
 
-    A body is entered where it is closed, homogeneous, and leaves more than `OPAQUE` of a wave
+    A body is entered where it is closed, homogeneous, and leaves more than `MIN_CHORD_AMPLITUDE`
+    of a wave
     along its mean chord 4V/A.
 
     Args:
-        skins: of the facets, for each frequency.
+        interfaces: of the facets, for each frequency.
         wave_numbers: k of the frequencies [1/m].
         corners: of the facets [m].
-        solid: facets of closed bodies.
+        closed: facets of closed bodies.
         owner: the object of each facet.
         names: of the objects.
     """
     bodies = [torch.nonzero(owner == number)[:, 0] for number in range(len(names))]
     chords = [_mean_chord(corners.detach()[own]) for own in bodies]
     groups: dict[tuple[object, ...], list[int]] = {}
-    for f, (skin, k) in enumerate(zip(skins, wave_numbers, strict=True)):
+    for f, (skin, k) in enumerate(zip(interfaces, wave_numbers, strict=True)):
         # Equal values of two frequencies may have derivatives that differ.
-        key: list[object] = [f if differentiated(skin.permittivity) else None]
+        key: list[object] = [f if is_differentiated(skin.permittivity) else None]
         for own, chord in zip(bodies, chords, strict=True):
             rows = skin.rows(own)
-            entered = bool(solid[own].all()) and homogeneous(rows) and not _opaque(rows)
+            entered = bool(closed[own].all()) and is_homogeneous(rows) and not _is_opaque(rows)
             epsilon = complex(skin.permittivity[own[0]].detach())
             left = math.exp(k * chord * cmath.sqrt(epsilon).imag)
-            key.append(epsilon if entered and left > OPAQUE else None)
+            key.append(epsilon if entered and left > MIN_CHORD_AMPLITUDE else None)
         groups.setdefault(tuple(key), []).append(f)
-    found: list[tuple[Solids | None, list[int]]] = []
+    found: list[tuple[DielectricSolids | None, list[int]]] = []
     for alike, members in groups.items():
         entered = torch.tensor([value is not None for value in alike[1:]])
         if not bool(entered.any()):
             found.append((None, members))
             continue
-        skin = skins[members[0]]
+        skin = interfaces[members[0]]
         first = torch.stack([skin.permittivity[own[0]] for own in bodies])
         epsilon = torch.where(entered, first, torch.ones_like(first))
         least = min(wave_numbers[f] for f in members)
-        solids = Solids(owner, entered[owner], skin.conducting, epsilon, least, names)
+        solids = DielectricSolids(owner, entered[owner], skin.conducting, epsilon, least, names)
         found.append((solids, members))
     return found
 
 
-def homogeneous(skins: Skins) -> bool:
+def is_homogeneous(interfaces: SmoothInterfaces) -> bool:
     """Whether the permittivity of a surface is one; conductors and sheets count as such.
 
     Args:
-        skins: of its facets.
+        interfaces: of its facets.
     """
-    epsilon = skins.permittivity.detach()
-    return _opaque(skins) or bool((epsilon == epsilon[0]).all())
+    epsilon = interfaces.permittivity.detach()
+    return _is_opaque(interfaces) or bool((epsilon == epsilon[0]).all())
 
 
-def _opaque(skins: Skins) -> bool:
+def _is_opaque(interfaces: SmoothInterfaces) -> bool:
     """Whether there is no dielectric body behind a surface."""
-    return bool((skins.conducting | torch.isfinite(skins.thickness)).any())
+    return bool((interfaces.conducting | torch.isfinite(interfaces.thickness)).any())
 
 
 def _mean_chord(corners: Tensor) -> float:
@@ -155,8 +156,8 @@ def _mean_chord(corners: Tensor) -> float:
     return float(4 * volume.abs() / area) if float(area) > 0 else 0.0
 
 
-def normal_part(
-    permittivity: Complex128[Tensor, " row"], wave: Tensor, normal: Vectors
+def normal_component(
+    permittivity: Complex128[Tensor, " row"], wave_vector: Tensor, normal: Vectors
 ) -> Complex128[Tensor, " row"]:
     """q = √(ε − K_t·K_t), the part of K across a face behind it, K_t the part along the face.
 
@@ -164,26 +165,26 @@ def normal_part(
 
     Args:
         permittivity: ε behind the face.
-        wave: K.
+        wave_vector: K.
         normal: of the face.
     """
-    along = wave - dot(wave, normal)[:, None] * normal
+    along = wave_vector - dot(wave_vector, normal)[:, None] * normal
     square = permittivity - dot(along, along)
     root = torch.sqrt(square)
     wrong = (square.detach().real < 0) & (root.detach().imag > 0)
     return torch.where(wrong, -root, root)
 
 
-def refracted(
-    permittivity: Complex128[Tensor, " row"], wave: Tensor, normal: Vectors
+def refract_waves(
+    permittivity: Complex128[Tensor, " row"], wave_vector: Tensor, normal: Vectors
 ) -> tuple[Complex128[Tensor, "row 3"], Bool[Tensor, " row"]]:
     """K behind a face, whose part along the face is kept (Snell), and whether it goes on at all.
 
     Args:
         permittivity: ε behind the face.
-        wave: K before it.
+        wave_vector: K before it.
         normal: towards the source.
     """
-    root = normal_part(permittivity, wave, normal)
-    passed = wave - (dot(wave, normal) + root)[:, None] * normal
+    root = normal_component(permittivity, wave_vector, normal)
+    passed = wave_vector - (dot(wave_vector, normal) + root)[:, None] * normal
     return passed, root.detach().real > root.detach().imag.abs()

@@ -20,26 +20,26 @@ from invertwin.scene.material.fresnel import LEAST_COSINE
 Vectors = Float64[Tensor, "*row 3"]
 
 
-class Skins(NamedTuple):
+class SmoothInterfaces(NamedTuple):
     """What surfaces are made of at one frequency, one row a surface.
 
     Attributes:
         conducting: perfect conductors; the other fields but the last do not count there.
         permittivity: complex relative permittivity.
         thickness: of a sheet about the surface [m]; infinite for a body.
-        coherent: share of the reflected field that is not scattered, in [0, 1].
+        coherence: share of the reflected field that is not scattered, in [0, 1].
         rms_height: of the roughness [m].
     """
 
     conducting: Tensor
     permittivity: Complex128[Tensor, " row"]
     thickness: Float64[Tensor, " row"]
-    coherent: Float64[Tensor, " row"]
+    coherence: Float64[Tensor, " row"]
     rms_height: Float64[Tensor, " row"]
 
-    def rows(self, index: Tensor) -> "Skins":
+    def rows(self, index: Tensor) -> "SmoothInterfaces":
         """Some rows."""
-        return Skins(*(column[index] for column in self))
+        return SmoothInterfaces(*(column[index] for column in self))
 
 
 def dot(first: Tensor, second: Tensor) -> Tensor:
@@ -84,7 +84,7 @@ def polarisations(direction: Vectors, up: Float64[Tensor, "3"]) -> Float64[Tenso
     return torch.stack([cross(horizontal, direction), horizontal], dim=-2)
 
 
-def mirrored(vector: Tensor, normal: Vectors) -> Tensor:
+def reflect_vectors(vector: Tensor, normal: Vectors) -> Tensor:
     """A vector reflected by a plane: v − 2(n·v)n.
 
     Args:
@@ -94,8 +94,8 @@ def mirrored(vector: Tensor, normal: Vectors) -> Tensor:
     return vector - 2 * dot(normal, vector)[..., None] * normal
 
 
-def reflected(
-    skins: Skins,
+def reflect_field(
+    interfaces: SmoothInterfaces,
     wave_number: float,
     normal: Vectors,
     direction: Vectors,
@@ -107,24 +107,27 @@ def reflected(
     Roughness multiplies the field by exp(−½(2kσ cosθ)²).
 
     Args:
-        skins: one row each.
+        interfaces: one row each.
         wave_number: k [1/m].
         normal: towards the source.
         direction: d of the incident wave.
         field: E.
     """
     cosine = -dot(normal, direction)
-    kept = skins.coherent * kept_by_heights(skins, wave_number, 2 * cosine)
-    return _mirrored_field(skins, wave_number, normal, direction, field) * kept[:, None, None]
+    kept = interfaces.coherence * roughness_attenuation(interfaces, wave_number, 2 * cosine)
+    return (
+        _reflect_from_smooth(interfaces, wave_number, normal, direction, field)
+        * kept[:, None, None]
+    )
 
 
-def radiated(
-    skins: Skins,
+def radiate_field(
+    interfaces: SmoothInterfaces,
     wave_number: float,
     normal: Vectors,
     direction: Vectors,
     field: Complex128[Tensor, "row 2 3"],
-    towards: Vectors,
+    scattered_direction: Vectors,
 ) -> Complex128[Tensor, "row 2 3"]:
     """F per m² of a lit surface: what its currents send along ``towards``.
 
@@ -135,43 +138,45 @@ def radiated(
     exp(−½(kσ(cosθ + n·s))²) off: nothing straight on, where the shadow is.
 
     Args:
-        skins, wave_number, normal, direction, field: as in ``reflected``.
+        interfaces, wave_number, normal, direction, field: as in ``reflect_field``.
         towards: s, to the receiver.
 
     Source: derivations §13 and §14; Balanis, Advanced Engineering Electromagnetics, §6.8.
     """
-    again = _mirrored_field(skins, wave_number, normal, direction, field)
-    sent = sent_by_currents(wave_number, normal, direction, field, again, towards)
-    thin = torch.isfinite(skins.thickness) & ~skins.conducting
+    again = _reflect_from_smooth(interfaces, wave_number, normal, direction, field)
+    sent = radiate_currents(wave_number, normal, direction, field, again, scattered_direction)
+    thin = torch.isfinite(interfaces.thickness) & ~interfaces.conducting
     if bool(thin.any()):
-        sheet = _sheet_radiated(skins, wave_number, normal, direction, field, towards)
+        sheet = _radiate_sheet(
+            interfaces, wave_number, normal, direction, field, scattered_direction
+        )
         sent = torch.where(thin[:, None, None], sheet, sent)
-    leaving = dot(normal, towards)
-    kept = kept_by_heights(skins, wave_number, leaving - dot(normal, direction))
-    kept = kept * torch.where(leaving > 0, skins.coherent, 1.0)
-    return transverse(sent * kept[:, None, None], towards)
+    leaving = dot(normal, scattered_direction)
+    kept = roughness_attenuation(interfaces, wave_number, leaving - dot(normal, direction))
+    kept = kept * torch.where(leaving > 0, interfaces.coherence, 1.0)
+    return project_transverse(sent * kept[:, None, None], scattered_direction)
 
 
-def transverse(
-    field: Complex128[Tensor, "row 2 3"], towards: Vectors
+def project_transverse(
+    field: Complex128[Tensor, "row 2 3"], direction: Vectors
 ) -> Complex128[Tensor, "row 2 3"]:
     """Fields without their part along a direction.
 
     Args:
         field: F.
-        towards: s.
+        direction: s.
     """
-    s = towards[:, None]
+    s = direction[:, None]
     return field - dot(field, s.to(field.dtype))[..., None] * s
 
 
-def sent_by_currents(
+def radiate_currents(
     wave_number: float,
-    outwards: Vectors,
-    wave: Tensor,
+    normal: Vectors,
+    wave_vector: Tensor,
     field: Complex128[Tensor, "row 2 3"],
-    again: Complex128[Tensor, "row 2 3"],
-    towards: Vectors,
+    reflected_field: Complex128[Tensor, "row 2 3"],
+    scattered_direction: Vectors,
 ) -> Complex128[Tensor, "row 2 3"]:
     """−(jk/4π) [ηJ − s × M] per m² of the tangential fields of a wave and of its mirrored one.
 
@@ -180,49 +185,53 @@ def sent_by_currents(
 
     Args:
         wave_number: k [1/m].
-        outwards: n, on the side of the surface that sends.
-        wave: K over k: a unit vector in air.
-        field, again: E and E_r.
-        towards: s, to the receiver.
+        normal: n, on the side of the surface that sends.
+        wave_vector: K over k: a unit vector in air.
+        field, reflected_field: E and E_r.
+        scattered_direction: s, to the receiver.
 
     Source: derivations §13.
     """
-    n, s = outwards[:, None], towards[:, None]
-    onwards = mirrored(wave, outwards)[:, None]
-    electric = cross(n, cross(wave[:, None], field) + cross(onwards, again))
-    magnetic = cross(s, cross(n, field + again))
+    n, s = normal[:, None], scattered_direction[:, None]
+    onwards = reflect_vectors(wave_vector, normal)[:, None]
+    electric = cross(n, cross(wave_vector[:, None], field) + cross(onwards, reflected_field))
+    magnetic = cross(s, cross(n, field + reflected_field))
     return -1j * wave_number / (4 * math.pi) * (electric + magnetic)
 
 
-def kept_by_heights(
-    skins: Skins, wave_number: float, cosines: Float64[Tensor, " row"]
+def roughness_attenuation(
+    interfaces: SmoothInterfaces, wave_number: float, cosine_sum: Float64[Tensor, " row"]
 ) -> Float64[Tensor, " row"]:
     """Share of the field that roughness leaves: phases spread by kσ(cosθ + cosθ').
 
     Args:
-        skins: one row each.
+        interfaces: one row each.
         wave_number: k [1/m].
-        cosines: cosθ + cosθ', what a height changes of the way.
+        cosine_sum: cosθ + cosθ', what a height changes of the way.
     """
-    return torch.exp(-0.5 * (wave_number * skins.rms_height * cosines) ** 2)
+    return torch.exp(-0.5 * (wave_number * interfaces.rms_height * cosine_sum) ** 2)
 
 
-def _mirrored_field(
-    skins: Skins, wave_number: float, normal: Tensor, direction: Tensor, field: Tensor
+def _reflect_from_smooth(
+    interfaces: SmoothInterfaces,
+    wave_number: float,
+    normal: Tensor,
+    direction: Tensor,
+    field: Tensor,
 ) -> Tensor:
     """Reflected field of a surface without roughness."""
     n = normal[:, None]
     whole = 2 * dot(n, field)[..., None] * n - field
-    if bool(skins.conducting.all()):
+    if bool(interfaces.conducting.all()):
         return whole
     across, before, after = plane_of_incidence(normal, direction)
-    r_s, r_p = _coefficients(skins, wave_number, -dot(normal, direction))
+    r_s, r_p = _coefficients(interfaces, wave_number, -dot(normal, direction))
     part = r_s[:, None, None] * dot(across, field)[..., None] * across
     part = part + r_p[:, None, None] * dot(before, field)[..., None] * after
-    return torch.where(skins.conducting[:, None, None], whole, part)
+    return torch.where(interfaces.conducting[:, None, None], whole, part)
 
 
-def unit_across(direction: Float64[Tensor, "*row 3"]) -> Float64[Tensor, "*row 3"]:
+def orthogonal_unit_vectors(direction: Float64[Tensor, "*row 3"]) -> Float64[Tensor, "*row 3"]:
     """A unit vector at a right angle to each direction, any that turns with it.
 
     Args:
@@ -242,27 +251,29 @@ def plane_of_incidence(normal: Tensor, direction: Tensor) -> tuple[Tensor, Tenso
     across = cross(direction, normal)
     # At normal incidence any axis serves.
     steep = across.detach().norm(dim=-1, keepdim=True) < 1e-9
-    across = normalize(torch.where(steep, unit_across(normal), across), dim=-1)
-    onwards = mirrored(direction, normal)
+    across = normalize(torch.where(steep, orthogonal_unit_vectors(normal), across), dim=-1)
+    onwards = reflect_vectors(direction, normal)
     # A conductor has r_p = +1 between these two, r_s = −1.
     return (across[:, None], cross(direction, across)[:, None], cross(onwards, across)[:, None])
 
 
-def _media(skins: Skins, cosine: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _interface_terms(interfaces: SmoothInterfaces, cosine: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """ε, q = √(ε − sin²θ) and the safe cosine; of conductors those of air."""
-    epsilon = torch.where(skins.conducting, 1.0 + 0j, skins.permittivity)
+    epsilon = torch.where(interfaces.conducting, 1.0 + 0j, interfaces.permittivity)
     cosine = cosine.clamp_min(LEAST_COSINE)
     return epsilon, torch.sqrt(epsilon - 1 + cosine**2), cosine
 
 
-def _coefficients(skins: Skins, wave_number: float, cosine: Tensor) -> tuple[Tensor, Tensor]:
+def _coefficients(
+    interfaces: SmoothInterfaces, wave_number: float, cosine: Tensor
+) -> tuple[Tensor, Tensor]:
     """Reflection coefficients r_s and r_p of bodies, and of sheets about their middle."""
-    epsilon, root, cosine = _media(skins, cosine)
+    epsilon, root, cosine = _interface_terms(interfaces, cosine)
     r_s, r_p = _fresnel(epsilon, root, cosine)
-    thin = torch.isfinite(skins.thickness)
+    thin = torch.isfinite(interfaces.thickness)
     if not bool(thin.any()):
         return r_s, r_p
-    thickness = torch.where(thin, skins.thickness, 0.0)
+    thickness = torch.where(thin, interfaces.thickness, 0.0)
     once = torch.exp(-1j * wave_number * root * thickness)
     front = torch.exp(1j * wave_number * cosine * thickness)
 
@@ -278,34 +289,34 @@ def _fresnel(epsilon: Tensor, root: Tensor, cosine: Tensor) -> tuple[Tensor, Ten
     return (cosine - root) / (cosine + root), (parallel - root) / (parallel + root)
 
 
-def _sheet_radiated(
-    skins: Skins,
+def _radiate_sheet(
+    interfaces: SmoothInterfaces,
     wave_number: float,
     normal: Tensor,
     direction: Tensor,
     field: Tensor,
-    towards: Tensor,
+    scattered_direction: Tensor,
 ) -> Tensor:
     """F per m² of a sheet's polarisation current, before its part along s is taken off.
 
     Inside, waves go to and from the far face: E± exp(∓jkqζ) at the depth ζ, with q = √(ε − sin²θ).
     """
     k, cosine = wave_number, -dot(normal, direction)
-    epsilon, root, cosine = _media(skins, cosine)
-    thickness = torch.where(torch.isfinite(skins.thickness), skins.thickness, 0.0)
+    epsilon, root, cosine = _interface_terms(interfaces, cosine)
+    thickness = torch.where(torch.isfinite(interfaces.thickness), interfaces.thickness, 0.0)
     across, before, _ = plane_of_incidence(normal, direction)
     once = torch.exp(-1j * k * root * thickness)
     along = direction + cosine[:, None] * normal  # sinθ times its unit vector
     total = torch.zeros_like(field)
     # The fields refer to the middle; the front face is met earlier and seen later.
-    front = torch.exp(1j * k * (cosine + dot(towards, normal)) * thickness / 2)
+    front = torch.exp(1j * k * (cosine + dot(scattered_direction, normal)) * thickness / 2)
     r_s, r_p = _fresnel(epsilon, root, cosine)
     parts = ((r_s, cosine + root, across), (r_p, epsilon * cosine + root, before))
     for r, both, unit in parts:
         t = 2 * cosine / both
         amplitude = dot(unit, field) * (t / (1 - r**2 * once**2))[:, None]
         for way, strength in ((1.0, torch.ones_like(r)), (-1.0, -r * once**2)):
-            turn = k * (way * root + dot(towards, normal)) * thickness / 2
+            turn = k * (way * root + dot(scattered_direction, normal)) * thickness / 2
             depth = thickness * _sinc(turn) * torch.exp(-1j * turn)
             if unit is across:
                 vector = across.to(field.dtype)
@@ -325,25 +336,26 @@ def _sinc(x: Tensor) -> Tensor:
 
 
 def parallelogram_integral(
-    wave: Vectors, first: Vectors, second: Vectors
+    wave_vector: Vectors, first: Vectors, second: Vectors
 ) -> Float64[Tensor, " row"]:
     """∫ exp(j w·x) over a parallelogram about the origin, over its area.
 
     Args:
-        wave: w [1/m].
+        wave_vector: w [1/m].
         first, second: its sides [m].
     """
-    return _sinc(dot(wave, first) / 2) * _sinc(dot(wave, second) / 2)
+    return _sinc(dot(wave_vector, first) / 2) * _sinc(dot(wave_vector, second) / 2)
 
 
 def polygon_integral(
-    polygon: Float64[Tensor, "row corner 3"], way: Tensor
+    polygon: Float64[Tensor, "row corner 3"], direction: Tensor
 ) -> Callable[[float], Complex128[Tensor, " row"]]:
     """∫ exp(jk w·x) dA over flat polygons, exactly: a sum over their sides, by wave number k.
 
     Args:
         polygon: corners in order, about any point; some may coincide.
-        way: w, real, or complex where a wave decays; what does not depend on k is computed once.
+        direction: w, real, or complex where a wave decays; what does not depend on k is computed
+            once.
 
     Source: Gordon, "Far-field approximations to the Kirchhoff-Helmholtz representations of
     scattered fields", IEEE TAP 23, 1975. Near w ⊥ polygon the sum is 0/0; there two terms of the
@@ -353,7 +365,7 @@ def polygon_integral(
     size = area.norm(dim=-1)
     normal = area / size.clamp_min(1e-300)[:, None]
     middle = polygon.mean(1)
-    flat = way - dot(way, normal)[:, None] * normal
+    flat = direction - dot(direction, normal)[:, None] * normal
     square = dot(flat, flat)
     corners = polygon - middle[:, None]
     length = flat.detach().abs().square().sum(-1)
@@ -363,7 +375,7 @@ def polygon_integral(
     phase = dot(flat[:, None], corners + ends) / 2
     share = dot(cross(sides, normal[:, None]), flat[:, None])
     turn = dot(flat[:, None], sides) / 2
-    whole = dot(way, middle)
+    whole = dot(direction, middle)
     # ∫(1 + jw·x − (w·x)²/2) by the triangles about the first corner.
     first = dot(flat[:, None], corners)
     fan = torch.linalg.cross(
@@ -375,17 +387,17 @@ def polygon_integral(
     second = (weight * (a * a + b * b + c * c + a * b + a * c + b * c)).sum(1) / 6
     weight = weight.sum(1)
 
-    def at(k: float) -> Tensor:
+    def evaluate(k: float) -> Tensor:
         broad = largest * k**2 < 1e-6
-        exact = (share * _sinc(k * turn) * turned(k * phase)).sum(1)
+        exact = (share * _sinc(k * turn) * phasor(k * phase)).sum(1)
         exact = exact / torch.where(broad, torch.ones_like(square), square * k) / 1j
         series = weight + 1j * k * mean - k**2 * second / 2
-        return torch.where(broad, series, exact) * turned(k * whole)
+        return torch.where(broad, series, exact) * phasor(k * whole)
 
-    return at
+    return evaluate
 
 
-def turned(phase: Tensor) -> Tensor:
+def phasor(phase: Tensor) -> Tensor:
     """exp(j phase).
 
     Args:
@@ -406,7 +418,7 @@ def area_vector(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tensor, "ro
     return torch.linalg.cross(spokes, spokes.roll(-1, 1), dim=-1).sum(1) / 2
 
 
-def points_at(
+def interpolate_vectors(
     values: Float64[Tensor, "*#row 3 3"],
     corners: Float64[Tensor, "*#row 3 3"],
     points: Float64[Tensor, "*#row 3"],
@@ -418,10 +430,10 @@ def points_at(
         corners: Of the triangles [m].
         points: In them [m].
     """
-    return (shares(corners, points)[..., None] * values).sum(-2)
+    return (barycentric_coordinates(corners, points)[..., None] * values).sum(-2)
 
 
-def shares(
+def barycentric_coordinates(
     corners: Float64[Tensor, "*#row 3 3"], points: Float64[Tensor, "*#row 3"]
 ) -> Float64[Tensor, "*row 3"]:
     """Barycentric coordinates of points in triangles.

@@ -17,17 +17,17 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-_TERMS = 40  # of Weideman's sum: 1e-14
-_POINTS = 24  # of either quadrature: 1e-14
-_CHAINED = 48  # of that over a third edge
-_NEAR = 16.0  # s² + t² from which on the far quadrature serves
-_TURN = complex(math.sqrt(0.5), math.sqrt(0.5))  # exp(jπ/4)
-_ROOT = math.sqrt(math.pi)
-_DEEP = 6.0  # exp(−36) of the largest value, where an integral ends
+_WEIDEMAN_TERMS = 40  # of Weideman's sum: 1e-14
+_QUADRATURE_POINTS = 24  # of either quadrature: 1e-14
+_CHAIN_POINTS = 48  # of that over a third edge
+_NEAR_LIMIT = 16.0  # s² + t² from which on the far quadrature serves
+_EXP_J_PI_4 = complex(math.sqrt(0.5), math.sqrt(0.5))  # exp(jπ/4)
+_SQRT_PI = math.sqrt(math.pi)
+_DECAY_LIMIT = 6.0  # exp(−36) of the largest value, where an integral ends
 _ROWS_AT_ONCE = 1 << 13  # such pieces stay in the processor's cache: ten times as fast
 
 
-def _weideman(terms: int) -> tuple[float, list[float]]:
+def _weideman_coefficients(terms: int) -> tuple[float, list[float]]:
     """Scale and coefficients of the rational sum of w(z) = exp(−z²) erfc(−jz)."""
     count = 2 * terms
     scale = math.sqrt(terms / math.sqrt(2))
@@ -37,17 +37,17 @@ def _weideman(terms: int) -> tuple[float, list[float]]:
     return scale, found[terms:0:-1].tolist()
 
 
-def _graded(count: int) -> tuple[np.ndarray, np.ndarray]:
+def _graded_quadrature(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes and weights from 0 to 1, closer together near 0: Gauss's of the cube root."""
     node, weight = np.polynomial.legendre.leggauss(count)
     root = (node + 1) / 2
     return root**3, 1.5 * weight * root**2
 
 
-_SCALE, _COEFFICIENTS = _weideman(_TERMS)
-_LEGENDRE = tuple(zip(*np.polynomial.legendre.leggauss(_POINTS), strict=True))
-_GRADED = tuple(values.tolist() for values in _graded(_CHAINED))
-_LAGUERRE = tuple(zip(*np.polynomial.laguerre.laggauss(_POINTS), strict=True))
+_SCALE, _COEFFICIENTS = _weideman_coefficients(_WEIDEMAN_TERMS)
+_LEGENDRE_RULE = tuple(zip(*np.polynomial.legendre.leggauss(_QUADRATURE_POINTS), strict=True))
+_GRADED_RULE = tuple(values.tolist() for values in _graded_quadrature(_CHAIN_POINTS))
+_LAGUERRE_RULE = tuple(zip(*np.polynomial.laguerre.laggauss(_QUADRATURE_POINTS), strict=True))
 
 
 def transition(s: Float64[Tensor, "*row"]) -> Complex128[Tensor, "*row"]:
@@ -59,7 +59,7 @@ def transition(s: Float64[Tensor, "*row"]) -> Complex128[Tensor, "*row"]:
     Args:
         s: any finite numbers.
     """
-    return _Transition.apply(s)  # type: ignore[return-value]
+    return _TransitionFunction.apply(s)  # type: ignore[return-value]
 
 
 def end_transition(
@@ -75,7 +75,7 @@ def end_transition(
         s: as in ``transition``.
         t: lower limit τ = t of the integral; its upper limit is ∞.
     """
-    beyond = _Beyond.apply(s, t.abs())
+    beyond = _TruncatedTransition.apply(s, t.abs())
     return torch.where(t < 0, transition(s) - beyond, beyond)  # type: ignore[operator]
 
 
@@ -97,20 +97,20 @@ def edge_transition(
 def edge_transition_slope(
     s: Float64[Tensor, "*#row"],
     ends: Float64[Tensor, "*#row 2"] | None,
-    sent: Complex128[Tensor, "*row"],
+    value: Complex128[Tensor, "*row"],
 ) -> Complex128[Tensor, "*row"]:
     """Derivative of ``edge_transition`` by s.
 
     Args:
         s, ends: as there.
-        sent: its value.
+        value: its value.
     """
-    slope = 2j * s * sent - 2j
+    slope = 2j * s * value - 2j
     for t in () if ends is None else ends.unbind(-1):
-        size = _half(t.abs())
+        size = _half_erfc(t.abs())
         share = torch.where(t < 0, 1 - size, size)
         square = (s * s + t * t).clamp_min(1e-300)
-        slope = slope + 2j * share - _TURN / _ROOT * _wave(-t * t) / square * t
+        slope = slope + 2j * share - _EXP_J_PI_4 / _SQRT_PI * _phasor(-t * t) / square * t
     return slope
 
 
@@ -135,10 +135,10 @@ def corner_transition(
     w = side * coupling
     root = torch.sqrt((1 - w) * (1 + w))
     parts = [
-        _wave(own * own) * end_transition((other + w * own) / root, own)
+        _phasor(own * own) * end_transition((other + w * own) / root, own)
         for own, other in ((s, t), (t, s))
     ]
-    return (2j * _ROOT * _TURN.conjugate() * side / root) * (parts[0] + parts[1])
+    return (2j * _SQRT_PI * _EXP_J_PI_4.conjugate() * side / root) * (parts[0] + parts[1])
 
 
 def chain_transition(
@@ -160,20 +160,22 @@ def chain_transition(
         coupling: v and w, v² + w² < 1.
     """
     left = (1 - coupling[0] ** 2 - coupling[1] ** 2).clamp_min(1e-9)
-    node, weight = (torch.tensor(values, dtype=torch.float64) for values in _GRADED)
-    reach = _DEEP / left.detach().sqrt()
+    node, weight = (torch.tensor(values, dtype=torch.float64) for values in _GRADED_RULE)
+    reach = _DECAY_LIMIT / left.detach().sqrt()
     x, step = reach[:, None] * node, reach[:, None] * weight
     sides = []
     for values, w in zip(outer, coupling, strict=True):
-        up, down = (_Shifted.apply(values[..., None], sign * w[:, None], x) for sign in (1, -1))
+        up, down = (
+            _ShiftedTransition.apply(values[..., None], sign * w[:, None], x) for sign in (1, -1)
+        )
         sides.append(torch.stack([up + down, up - down]) / 2)
     falls = left[:, None] * x**2 + math.sqrt(2) * middle[..., None] * x
     turns = -math.sqrt(2) * middle[..., None] * x
-    kernel = torch.polar(2 * step * (-falls).exp(), turns) * _TURN
+    kernel = torch.polar(2 * step * (-falls).exp(), turns) * _EXP_J_PI_4
     return torch.einsum("crx,parx,qbrx->pqcabr", kernel, sides[0], sides[1])
 
 
-def _in_pieces(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
+def _apply_in_chunks(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
     """A function of numbers of one shape, some rows at a time."""
     pieces = zip(*(values.reshape(-1).split(_ROWS_AT_ONCE) for values in given), strict=True)
     return torch.cat([function(*piece) for piece in pieces]).reshape(given[0].shape)
@@ -181,22 +183,22 @@ def _in_pieces(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
 
 def _scaled_erfc(x: Tensor) -> Tensor:
     """exp(jx²) erfc(exp(jπ/4) x) of x ≥ 0: w(exp(j3π/4) x) by Weideman's sum."""
-    turned = x * complex(-_TURN.imag, -_TURN.real)  # j exp(j3π/4) x
+    turned = x * complex(-_EXP_J_PI_4.imag, -_EXP_J_PI_4.real)  # j exp(j3π/4) x
     below = _SCALE - turned
     ratio = (_SCALE + turned) / below
     total = torch.zeros_like(ratio) + _COEFFICIENTS[0]
     for coefficient in _COEFFICIENTS[1:]:
         total = total * ratio + coefficient
-    return (2 * total / below + 1 / _ROOT) / below
+    return (2 * total / below + 1 / _SQRT_PI) / below
 
 
-class _Shifted(torch.autograd.Function):
+class _ShiftedTransition(torch.autograd.Function):
     """exp(−w²x²) g(s − exp(−jπ/4) w x), where g is that of s ≥ 0 for all complex numbers."""
 
     @staticmethod
     def forward(s: Tensor, w: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]
         s, shift = torch.broadcast_tensors(s, w * x)
-        return _in_pieces(_shifted, s, shift)
+        return _apply_in_chunks(_evaluate_shifted, s, shift)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:  # type: ignore[override]
@@ -206,50 +208,50 @@ class _Shifted(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[override]
         s, w, x, found = ctx.saved_tensors
-        by_s, by_w = ((grad.conj() * slope).real for slope in _shifted_slopes(s, w, x, found))
+        by_s, by_w = ((grad.conj() * slope).real for slope in _shifted_derivatives(s, w, x, found))
         return by_s.sum_to_size(s.shape), by_w.sum_to_size(w.shape), None
 
     @staticmethod
     def jvp(ctx: Any, tangent_s: Any, tangent_w: Any, _: Any) -> Tensor:  # type: ignore[override]
         s, w, x, found = ctx.saved_tensors
-        by_s, by_w = _shifted_slopes(s, w, x, found)
+        by_s, by_w = _shifted_derivatives(s, w, x, found)
         return by_s * (torch.zeros_like(s) if tangent_s is None else tangent_s) + by_w * (
             torch.zeros_like(w) if tangent_w is None else tangent_w
         )
 
 
-def _shifted(s: Tensor, shift: Tensor) -> Tensor:
+def _evaluate_shifted(s: Tensor, shift: Tensor) -> Tensor:
     """One-dimensional; beyond s = √2 shift by way of the function of −s."""
-    way = s - _TURN.conjugate() * shift
+    way = s - _EXP_J_PI_4.conjugate() * shift
     over = shift * math.sqrt(2) > s
     size = _scaled_erfc(torch.where(over, -way, way)) * torch.exp(-shift * shift)
     turn = s * s - math.sqrt(2) * shift * s
     straight = torch.exp(torch.complex(-math.sqrt(2) * shift * s * over, turn))
-    return _ROOT * _TURN * torch.where(over, 2 * straight - size, size)
+    return _SQRT_PI * _EXP_J_PI_4 * torch.where(over, 2 * straight - size, size)
 
 
-def _shifted_slopes(s: Tensor, w: Tensor, x: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
-    way = s - _TURN.conjugate() * w * x
-    by_s = 2j * way * found - 2j * torch.exp(-((w * x) ** 2))
-    return by_s, -_TURN.conjugate() * x * by_s - 2 * w * x * x * found
+def _shifted_derivatives(s: Tensor, w: Tensor, x: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+    way = s - _EXP_J_PI_4.conjugate() * w * x
+    by_s = 2j * way * value - 2j * torch.exp(-((w * x) ** 2))
+    return by_s, -_EXP_J_PI_4.conjugate() * x * by_s - 2 * w * x * x * value
 
 
-def _wave(phase: Tensor) -> Tensor:
+def _phasor(phase: Tensor) -> Tensor:
     """exp(j phase)."""
     return torch.complex(phase.cos(), phase.sin())
 
 
-def _half(x: Tensor) -> Tensor:
+def _half_erfc(x: Tensor) -> Tensor:
     """½ erfc(exp(jπ/4) x) of x ≥ 0: the part of a straight wave that passes an edge."""
-    return 0.5 * _wave(-x * x) * _scaled_erfc(x)
+    return 0.5 * _phasor(-x * x) * _scaled_erfc(x)
 
 
-class _Transition(torch.autograd.Function):
+class _TransitionFunction(torch.autograd.Function):
     """g(s)."""
 
     @staticmethod
     def forward(s: Tensor) -> Tensor:  # type: ignore[override]
-        size = _ROOT * _TURN * _in_pieces(_scaled_erfc, s.abs())
+        size = _SQRT_PI * _EXP_J_PI_4 * _apply_in_chunks(_scaled_erfc, s.abs())
         return torch.where(s < 0, -size, size)
 
     @staticmethod
@@ -268,13 +270,13 @@ class _Transition(torch.autograd.Function):
         return tangent * (2j * s * g - 2j)
 
 
-class _Beyond(torch.autograd.Function):
+class _TruncatedTransition(torch.autograd.Function):
     """The part beyond t ≥ 0, odd in s."""
 
     @staticmethod
     def forward(s: Tensor, t: Tensor) -> Tensor:  # type: ignore[override]
         s, t = torch.broadcast_tensors(s, t)
-        found = _in_pieces(_beyond, s.abs(), t)
+        found = _apply_in_chunks(_evaluate_truncated, s.abs(), t)
         return torch.where(s < 0, -found, found)
 
     @staticmethod
@@ -285,48 +287,51 @@ class _Beyond(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         s, t, found = ctx.saved_tensors
-        by_s, by_t = ((grad.conj() * slope).real for slope in _slopes(s, t, found))
+        by_s, by_t = ((grad.conj() * slope).real for slope in _truncated_derivatives(s, t, found))
         return by_s.sum_to_size(s.shape), by_t.sum_to_size(t.shape)
 
     @staticmethod
     def jvp(ctx: Any, tangent_s: Tensor | None, tangent_t: Tensor | None) -> Tensor:  # type: ignore[override]
         s, t, found = ctx.saved_tensors
-        by_s, by_t = _slopes(s, t, found)
+        by_s, by_t = _truncated_derivatives(s, t, found)
         zero = torch.zeros_like(s)
         return by_s * (zero if tangent_s is None else tangent_s) + by_t * (
             torch.zeros_like(t) if tangent_t is None else tangent_t
         )
 
 
-def _slopes(s: Tensor, t: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
+def _truncated_derivatives(s: Tensor, t: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives of the part beyond t by s and by t; finite at s = t = 0, where there are none."""
     square = (s * s + t * t).clamp_min(1e-300)
-    half = _in_pieces(_half, t)
-    front = _TURN / _ROOT * _wave(-t * t) / square
-    return 2j * s * found - 2j * half + front * t, -front * s
+    half = _apply_in_chunks(_half_erfc, t)
+    front = _EXP_J_PI_4 / _SQRT_PI * _phasor(-t * t) / square
+    return 2j * s * value - 2j * half + front * t, -front * s
 
 
-def _beyond(s: Tensor, t: Tensor) -> Tensor:
+def _evaluate_truncated(s: Tensor, t: Tensor) -> Tensor:
     """The part beyond t ≥ 0 of s ≥ 0, in one dimension."""
     found = torch.empty(s.shape, dtype=torch.complex128)
     square = s * s + t * t
-    for rule, rows in ((_near, square < _NEAR), (_far, square >= _NEAR)):
+    for rule, rows in (
+        (_near_quadrature, square < _NEAR_LIMIT),
+        (_far_quadrature, square >= _NEAR_LIMIT),
+    ):
         at = torch.nonzero(rows)[:, 0]
         found[at] = rule(s[at], t[at])
-    return _TURN / _ROOT * found
+    return _EXP_J_PI_4 / _SQRT_PI * found
 
 
-def _near(s: Tensor, t: Tensor) -> Tensor:
+def _near_quadrature(s: Tensor, t: Tensor) -> Tensor:
     """exp(js²) [atan(s/t) − √π exp(jπ/4) s ∫ exp(−js²x²) erfc(exp(jπ/4) t x) dx], x from 0 to 1."""
     total = torch.zeros(s.shape, dtype=torch.complex128)
     square = s * s + t * t
-    for node, weight in _LEGENDRE:
+    for node, weight in _LEGENDRE_RULE:
         x = (node + 1) / 2
-        total = total + weight / 2 * _wave(-x * x * square) * _scaled_erfc(x * t)
-    return _wave(s * s) * (torch.atan2(s, t) - _ROOT * _TURN * s * total)
+        total = total + weight / 2 * _phasor(-x * x * square) * _scaled_erfc(x * t)
+    return _phasor(s * s) * (torch.atan2(s, t) - _SQRT_PI * _EXP_J_PI_4 * s * total)
 
 
-def _far(s: Tensor, t: Tensor) -> Tensor:
+def _far_quadrature(s: Tensor, t: Tensor) -> Tensor:
     """Down the steepest path, τ² = t² − jv; where s > t by way of the part with both exchanged.
 
     The parts beyond (s, t) and (t, s) are those of a right angle: a product of two edges.
@@ -334,9 +339,9 @@ def _far(s: Tensor, t: Tensor) -> Tensor:
     low, high = torch.minimum(s, t), torch.maximum(s, t)
     total = torch.zeros(s.shape, dtype=torch.complex128)
     square = high * high
-    for node, weight in _LAGUERRE:
+    for node, weight in _LAGUERRE_RULE:
         lower = torch.complex(square, torch.full_like(square, -node))
         total = total + weight / (torch.sqrt(lower) * (lower + low * low))
-    part = -0.5j * low * total * _wave(-high * high)
-    both = 0.5 * math.pi * _scaled_erfc(s) * _scaled_erfc(t) * _wave(-t * t)
-    return torch.where(s > t, both - part * _wave(s * s - low * low), part)
+    part = -0.5j * low * total * _phasor(-high * high)
+    both = 0.5 * math.pi * _scaled_erfc(s) * _scaled_erfc(t) * _phasor(-t * t)
+    return torch.where(s > t, both - part * _phasor(s * s - low * low), part)

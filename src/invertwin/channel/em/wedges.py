@@ -21,18 +21,22 @@ from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import cross, dot
-from invertwin.checks import plain
+from invertwin.checks import strip_derivatives
 
-LEAST_ANGLE = math.radians(10.0)
+MIN_EDGE_ANGLE = math.radians(10.0)
 """Nearer to grazing, or to the edge itself, fringe currents are not valid."""
-_ALIKE = 1e-6  # radians, and share of the scene's size: lines and planes that count as one
-_ANYWHERE = torch.tensor([0.8123, 0.4571, 0.3623], dtype=torch.float64)
-_SECOND_FIRST = torch.tensor([1, 0])
-_SHARP = 0.35  # rad that the normals of neighbours turn at an edge; less is a curved surface
-_POLE = 1e-5
-_SAME = 1e-9  # of the body's size: ends of edges this near are one
-_STRAIGHT = -math.cos(math.radians(30.0))  # cosine of two ends that run on
-_LIKE = 0.2  # of openings along a line, over π
+_MERGE_TOLERANCE = (
+    1e-6  # radians, and share of the scene's size: lines and planes that count as one
+)
+_GENERIC_DIRECTION = torch.tensor([0.8123, 0.4571, 0.3623], dtype=torch.float64)
+_SWAPPED_FACES = torch.tensor([1, 0])
+_MIN_CREASE_ANGLE = (
+    0.35  # rad that the normals of neighbours turn at an edge; less is a curved surface
+)
+_POLE_WIDTH = 1e-5
+_VERTEX_TOLERANCE = 1e-9  # of the body's size: ends of edges this near are one
+_MAX_COLLINEAR_COSINE = -math.cos(math.radians(30.0))  # cosine of two ends that run on
+_OPENING_TOLERANCE = 0.2  # of openings along a line, over π
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Wedges:
 
     Attributes:
         start, end: of the edge [m].
-        inwards: unit vectors from the edge into either face, across the edge.
+        face_tangents: unit vectors from the edge into either face, across the edge.
         normals: outward normals of the faces; opposite for the two sides of a sheet.
         opening: exterior angle over π: N = 2 of a half plane, 1.5 of a cube.
         faces: triangles beside the edge; of an edge that ends a sheet, the same one twice.
@@ -49,7 +53,7 @@ class Wedges:
 
     start: Float64[Tensor, "row 3"]
     end: Float64[Tensor, "row 3"]
-    inwards: Float64[Tensor, "row 2 3"]
+    face_tangents: Float64[Tensor, "row 2 3"]
     normals: Float64[Tensor, "row 2 3"]
     opening: Float64[Tensor, " row"]
     faces: Int64[Tensor, "row 2"]
@@ -61,8 +65,8 @@ class Wedges:
 
 def find_wedges(
     corners: Float64[Tensor, "facet 3 3"],
-    ends: Float64[Tensor, "edge 2 3"],
-    beside: Int64[Tensor, "edge k"],
+    endpoints: Float64[Tensor, "edge 2 3"],
+    edge_faces: Int64[Tensor, "edge k"],
 ) -> Wedges:
     """The sharp edges of a mesh: open edges, and edges at which normals turn by more than 20°.
 
@@ -71,16 +75,16 @@ def find_wedges(
 
     Args:
         corners: of the triangles [m].
-        ends: of the edges [m].
-        beside: triangles at each edge (−1: none).
+        endpoints: of the edges [m].
+        edge_faces: triangles at each edge (−1: none).
     """
     found: list[Wedges] = []
-    number = (beside >= 0).sum(1)
+    number = (edge_faces >= 0).sum(1)
     for count in (1, 2):
         edge = torch.nonzero(number == count)[:, 0]
-        faces = beside[edge].sort(1, descending=True).values[:, :count]
-        along = normalize(ends[edge, 1] - ends[edge, 0], dim=1)
-        inward = corners[faces].mean(2) - ends[edge, :1]
+        faces = edge_faces[edge].sort(1, descending=True).values[:, :count]
+        along = normalize(endpoints[edge, 1] - endpoints[edge, 0], dim=1)
+        inward = corners[faces].mean(2) - endpoints[edge, :1]
         inward = normalize(inward - dot(inward, along[:, None])[..., None] * along[:, None], dim=2)
         normal = cross(along[:, None], inward)
         # Triangles without area have no side to an edge.
@@ -91,7 +95,14 @@ def find_wedges(
             normals = torch.cat([normal, -normal], 1)
             opening = torch.full((len(edge),), 2.0, dtype=torch.float64)
             found.append(
-                Wedges(ends[edge, 0], ends[edge, 1], inwards, normals, opening, faces.expand(-1, 2))
+                Wedges(
+                    endpoints[edge, 0],
+                    endpoints[edge, 1],
+                    inwards,
+                    normals,
+                    opening,
+                    faces.expand(-1, 2),
+                )
             )
             continue
         # Angle from the first face to the second about the edge, through the first one's normal.
@@ -99,16 +110,18 @@ def find_wedges(
         turn = turn % (2 * math.pi)
         for sign in (1.0, -1.0):
             angle = turn if sign > 0 else 2 * math.pi - turn
-            keep = angle.detach() > math.pi + _SHARP
+            keep = angle.detach() > math.pi + _MIN_CREASE_ANGLE
             # Normals that point into this region: along the first turn, against the second.
             normals = torch.stack([sign * normal[:, 0], -sign * normal[:, 1]], 1)
-            wedge = Wedges(ends[edge, 0], ends[edge, 1], inward, normals, angle / math.pi, faces)
+            wedge = Wedges(
+                endpoints[edge, 0], endpoints[edge, 1], inward, normals, angle / math.pi, faces
+            )
             found.append(wedge.rows(keep))
     columns = zip(*(vars(part).values() for part in found), strict=True)
     return Wedges(*(torch.cat(column) for column in columns))
 
 
-def run_on(wedges: Wedges, least: float) -> Bool[Tensor, " row"]:
+def select_body_edges(wedges: Wedges, min_length: float) -> Bool[Tensor, " row"]:
     """Which edges are edges of the body, and not of the facets about a tip of a smooth one.
 
     Edges run on into others of like opening. About a tip, smooth facets turn sharply, but where the
@@ -117,14 +130,16 @@ def run_on(wedges: Wedges, least: float) -> Bool[Tensor, " row"]:
 
     Args:
         wedges: sharp edges.
-        least: extent of a long line [m].
+        min_length: extent of a long line [m].
     """
     count = len(wedges.start)
     ends = torch.cat([wedges.start, wedges.end]).detach()
     if not count:
         return torch.zeros(0, dtype=torch.bool)
     size = float((ends.amax(0) - ends.amin(0)).norm())
-    _, vertex = torch.unique((ends / (_SAME * size)).round(), dim=0, return_inverse=True)
+    _, vertex = torch.unique(
+        (ends / (_VERTEX_TOLERANCE * size)).round(), dim=0, return_inverse=True
+    )
     away = normalize(ends[:count] - ends[count:], dim=1)
     away = torch.cat([-away, away])
     opening = wedges.opening.detach().repeat(2)
@@ -132,8 +147,10 @@ def run_on(wedges: Wedges, least: float) -> Bool[Tensor, " row"]:
     pairs: list[Tensor] = [torch.zeros(2, 0, dtype=torch.int64)]
     for step in range(1, int(number.max())):
         own, other = order[:-step], order[step:]
-        joined = (vertex[own] == vertex[other]) & (dot(away[own], away[other]) < _STRAIGHT)
-        joined &= (opening[own] - opening[other]).abs() < _LIKE
+        joined = (vertex[own] == vertex[other]) & (
+            dot(away[own], away[other]) < _MAX_COLLINEAR_COSINE
+        )
+        joined &= (opening[own] - opening[other]).abs() < _OPENING_TOLERANCE
         pairs.append(torch.stack([own[joined], other[joined]]) % count)
     row, column = torch.cat(pairs, 1).numpy()
     graph = coo_array((np.ones(len(row)), (row, column)), shape=(count, count))
@@ -146,7 +163,7 @@ def run_on(wedges: Wedges, least: float) -> Bool[Tensor, " row"]:
         )
         for reduce in ("amin", "amax")
     )
-    short = (high - low).norm(dim=1) < least
+    short = (high - low).norm(dim=1) < min_length
     kept, left = torch.ones(lines, dtype=torch.bool), -1
     # Taking one away may leave the next with a loose end.
     while left != int(kept.sum()):
@@ -159,10 +176,10 @@ def run_on(wedges: Wedges, least: float) -> Bool[Tensor, " row"]:
 
 def edge_axis(wedges: Wedges) -> Float64[Tensor, "row 3"]:
     """Unit vectors along the edges, about which azimuths are counted from the first face."""
-    return cross(wedges.inwards[:, 0], wedges.normals[:, 0])
+    return cross(wedges.face_tangents[:, 0], wedges.normals[:, 0])
 
 
-def joined_wedges(wedges: Wedges) -> Wedges:
+def merge_collinear_wedges(wedges: Wedges) -> Wedges:
     """Edges that go on in a straight line between the same two planes as one, each along its axis.
 
     Args:
@@ -172,27 +189,27 @@ def joined_wedges(wedges: Wedges) -> Wedges:
         return wedges
     # Discrete: to `torch.func`, tensors made on the way would be its own.
     with _DisableFuncTorch():
-        order, against, first, last = _lines(wedges)
+        order, against, first, last = _group_collinear(wedges)
     rows = torch.arange(len(order))[:, None]
     start = torch.where(against, wedges.end, wedges.start)
     end = torch.where(against, wedges.start, wedges.end)
     return Wedges(
         start[first],
         end[last],
-        wedges.inwards[rows, order][first],
+        wedges.face_tangents[rows, order][first],
         wedges.normals[rows, order][first],
         wedges.opening[first],
         wedges.faces[rows, order][first],
     )
 
 
-def _lines(wedges: Wedges) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _group_collinear(wedges: Wedges) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Order of each edge's faces, whether it runs against its axis, first and last of each line."""
-    names = ("start", "end", "inwards", "normals")
-    start, end, inwards, normals = (plain(getattr(wedges, name)) for name in names)
+    names = ("start", "end", "face_tangents", "normals")
+    start, end, inwards, normals = (strip_derivatives(getattr(wedges, name)) for name in names)
     # Both orders of the faces are one edge: the first one leans more to some direction.
-    lean = (inwards + normals * math.sqrt(3)) @ _ANYWHERE
-    order = torch.where((lean[:, :1] < lean[:, 1:]), _SECOND_FIRST, _SECOND_FIRST.flip(0))
+    lean = (inwards + normals * math.sqrt(3)) @ _GENERIC_DIRECTION
+    order = torch.where((lean[:, :1] < lean[:, 1:]), _SWAPPED_FACES, _SWAPPED_FACES.flip(0))
     rows = torch.arange(len(order))[:, None]
     inwards, normals = inwards[rows, order], normals[rows, order]
     axis = cross(inwards[:, 0], normals[:, 0])
@@ -203,18 +220,18 @@ def _lines(wedges: Wedges) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     aside = (start - low[:, None] * axis) / size
     key = torch.cat([aside, inwards.flatten(1), normals.flatten(1)], 1)
     # Adding zero makes negative zeros positive.
-    rounded = (key / _ALIKE).round().numpy() + 0.0
+    rounded = (key / _MERGE_TOLERANCE).round().numpy() + 0.0
     line = np.unique(rounded, axis=0, return_inverse=True)[1].ravel()
     sequence = torch.from_numpy(np.lexsort((low.numpy(), line)))
     line = torch.from_numpy(line)[sequence]
     new = torch.ones(len(line), dtype=torch.bool)
-    gap = (low[sequence][1:] - high[sequence][:-1]).abs() > _ALIKE * size
+    gap = (low[sequence][1:] - high[sequence][:-1]).abs() > _MERGE_TOLERANCE * size
     new[1:] = (line[1:] != line[:-1]) | gap
     return order, against, sequence[new], sequence[new.roll(-1)]
 
 
-def outside(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:
-    """Whether a direction lies in each wedge's exterior, ``LEAST_ANGLE`` or more off its edge.
+def is_outside_wedge(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:
+    """Whether a direction lies in each wedge's exterior, ``MIN_EDGE_ANGLE`` or more off its edge.
 
     Args:
         wedges: one row each.
@@ -223,19 +240,19 @@ def outside(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:
     angle = azimuth(wedges, direction, 0)
     along = normalize(wedges.end - wedges.start, dim=1)
     return (angle <= wedges.opening * math.pi) & (
-        dot(along, direction).abs() < math.cos(LEAST_ANGLE)
+        dot(along, direction).abs() < math.cos(MIN_EDGE_ANGLE)
     )
 
 
-def grazes(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:
-    """Whether a direction lies within ``LEAST_ANGLE`` of the plane of a sheet with this edge.
+def is_grazing_sheet(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:
+    """Whether a direction lies within ``MIN_EDGE_ANGLE`` of the plane of a sheet with this edge.
 
     Args:
         wedges: one row each.
         direction: unit vectors from the edge.
     """
     flat = wedges.opening > 2 - 1e-6
-    return flat & (dot(wedges.normals[:, 0], direction).abs() < math.sin(LEAST_ANGLE))
+    return flat & (dot(wedges.normals[:, 0], direction).abs() < math.sin(MIN_EDGE_ANGLE))
 
 
 def azimuth(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
@@ -247,11 +264,11 @@ def azimuth(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
         face: 0 or 1.
     """
     return torch.atan2(
-        dot(wedges.normals[:, face], direction), dot(wedges.inwards[:, face], direction)
+        dot(wedges.normals[:, face], direction), dot(wedges.face_tangents[:, face], direction)
     ) % (2 * math.pi)
 
 
-def azimuth_outside(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
+def exterior_azimuth(wedges: Wedges, direction: Tensor, face: int) -> Tensor:
     """Angle about the edge from a face, of a direction outside, in [0, opening · π].
 
     One that grazes a face is not taken for one inside.
@@ -271,12 +288,12 @@ def fringe_field(
     wave_number: float,
     direction: Float64[Tensor, "row 3"],
     field: Float64[Tensor, "row 2 3"],
-    towards: Float64[Tensor, "row 3"],
+    scattered_direction: Float64[Tensor, "row 3"],
 ) -> Tensor:
     """F per metre of edge of the fringe currents, for both incident polarisations.
 
     ``(jk/4π) Σ_faces [ηI s×(s×t̂) + M s×t̂]``; the phases of incident and scattered wave are left
-    out, as they are of ``radiated``.
+    out, as they are of ``radiate_field``.
 
     Args:
         wedges: lit edges.
@@ -287,14 +304,14 @@ def fringe_field(
     """
     total = torch.zeros(len(direction), 2, 3, dtype=torch.complex128)
     for face in (0, 1):
-        along = cross(wedges.inwards[:, face], wedges.normals[:, face])
-        cos_in, cos_out = dot(along, direction), dot(along, towards)
+        along = cross(wedges.face_tangents[:, face], wedges.normals[:, face])
+        cos_in, cos_out = dot(along, direction), dot(along, scattered_direction)
         sin_in, sin_out = (1 - cos_in**2).sqrt(), (1 - cos_out**2).sqrt()
-        phi_in = azimuth_outside(wedges, -direction, face)
-        phi_out = azimuth_outside(wedges, towards, face)
+        phi_in = exterior_azimuth(wedges, -direction, face)
+        phi_out = exterior_azimuth(wedges, scattered_direction, face)
         mu = sin_out * torch.cos(phi_out) / sin_in
-        electric, magnetic = _strengths(wedges.opening, phi_in, mu)
-        across = cross(towards, along)
+        electric, magnetic = _fringe_coefficients(wedges.opening, phi_in, mu)
+        across = cross(scattered_direction, along)
         e = dot(along[:, None], field)
         h = dot(along[:, None], cross(direction[:, None], field))
         k = wave_number
@@ -303,20 +320,20 @@ def fringe_field(
             2j / (k * sin_in) * magnetic * straight
         )[:, None] * h
         charge = (-2j / k * magnetic * torch.sin(phi_out) / (sin_in * sin_out))[:, None] * h
-        total = total + current[..., None] * cross(towards, across)[:, None]
+        total = total + current[..., None] * cross(scattered_direction, across)[:, None]
         total = total + charge[..., None] * across[:, None]
     return 1j * wave_number / (4 * math.pi) * total
 
 
-def _strengths(opening: Tensor, azimuth: Tensor, mu: Tensor) -> tuple[Tensor, Tensor]:
+def _fringe_coefficients(opening: Tensor, azimuth: Tensor, mu: Tensor) -> tuple[Tensor, Tensor]:
     """A and B of one face: those of the wedge less those of physical optics.
 
     Both have the same pole at cosφ′ + μ = 0, the direction of the mirror; beside it their
     difference is smooth, so that a small step aside is exact enough.
     """
     pole = torch.cos(azimuth) + mu
-    step = 2 * _POLE / torch.sin(azimuth).abs().clamp_min(0.1)
-    azimuth = torch.where(pole.abs() < _POLE, azimuth + step, azimuth)
+    step = 2 * _POLE_WIDTH / torch.sin(azimuth).abs().clamp_min(0.1)
+    azimuth = torch.where(pole.abs() < _POLE_WIDTH, azimuth + step, azimuth)
     # arccos μ, also of |μ| > 1 (beyond Keller's cone), where it is complex.
     alpha = torch.arccos(mu.to(torch.complex128))
     rest = math.pi - alpha

@@ -17,18 +17,18 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from invertwin.channel.paths import Grid, Link, Paths
-from invertwin.channel.rays.arrays import shared, to_float, to_index, to_torch
+from invertwin.channel.rays.arrays import to_float, to_index, to_torch, view_as_torch
 from invertwin.channel.rays.backend import backend, dr, mi, tracing
 
 # Bytes that copies of a map, one a thread, may take; beyond, additions are atomic.
-_COPIES = 2**28
+_MAX_COPY_BYTES = 2**28
 # Numbers up to which a map has further copies, and the most of them: sums of many amounts are
 # rounded less where each copy takes some. They fit a core's cache.
-_ROUNDED_LESS, _MOST_COPIES = 2**16, 1024
+_MAX_COPIED_VALUES, _MAX_COPIES = 2**16, 1024
 
 
 @dataclass(frozen=True)
-class Contribution:
+class PathContribution:
     """Received over transmitted power per sample, and where it falls."""
 
     frame: Any  # radar pose
@@ -38,16 +38,16 @@ class Contribution:
     v: Any
 
     @property
-    def attached(self) -> tuple[Any, Any, Any, Any]:
+    def differentiable_values(self) -> tuple[Any, Any, Any, Any]:
         """The four values that may carry derivatives."""
         return self.power, self.range, self.u, self.v
 
 
-def _axis(position: Any, start: float, step: float, count: int) -> list[tuple[Any, ...]]:
+def _axis_taps(coordinate: Any, start: float, step: float, count: int) -> list[tuple[Any, ...]]:
     """Bin, whether it is on the axis, weight and weight's derivative of each tap of one axis."""
     if count == 1:
         return [(mi.Int32(0), mi.Bool(True), mi.Float(1.0), mi.Float(0.0))]
-    t = (dr.detach(position) - start) * (1 / step)
+    t = (dr.detach(coordinate) - start) * (1 / step)
     nearest = dr.round(t)
     d = t - nearest
     weights = 0.5 * dr.square(0.5 - d), 0.75 - dr.square(d), 0.5 * dr.square(0.5 + d)
@@ -58,7 +58,7 @@ def _axis(position: Any, start: float, step: float, count: int) -> list[tuple[An
 
 
 @dataclass(frozen=True)
-class Layout:
+class BinLayout:
     """The bins of a map, and the range from which each frame counts.
 
     Attributes:
@@ -72,14 +72,14 @@ class Layout:
     origin: Tensor | None = None
 
     @staticmethod
-    def of(grid: Grid, link: Link) -> "Layout":
+    def from_link(grid: Grid, link: Link) -> "BinLayout":
         """That of the maps of an antenna.
 
         Args:
             grid: Bins of one frame.
             link: Antennas.
         """
-        return Layout(grid, link.frame_count, link.range_origin)
+        return BinLayout(grid, link.frame_count, link.range_origin)
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
@@ -87,78 +87,85 @@ class Layout:
         return self.frames, *self.grid.shape
 
     @property
-    def fine(self) -> int:
+    def strip_axis(self) -> int:
         """The axis of strips: the last one of range, u and v that has bins to choose from."""
         return max((axis for axis, count in enumerate(self.grid.shape) if count > 1), default=2)
 
     @property
-    def strips(self) -> tuple[int, ...]:
+    def strip_shape(self) -> tuple[int, ...]:
         """The shape of an array of strips: the fine axis comes last, with one strip at each end."""
         rest = list(self.shape)
-        count = rest.pop(self.fine + 1)
+        count = rest.pop(self.strip_axis + 1)
         return *rest, count + 2, 4
 
-    def summed(self, strips: Any) -> Float32[Tensor, "frame range u v"]:
+    def sum_strips(self, strips: Any) -> Float32[Tensor, "frame range u v"]:
         """The map whose strips hold these amounts.
 
         Args:
             strips: A flat Dr.Jit array, one or more of the shape ``strips``.
         """
-        parts = shared(strips).reshape(-1, *self.strips)
+        parts = view_as_torch(strips).reshape(-1, *self.strip_shape)
         parts = parts[0] if len(parts) == 1 else parts.sum(0)
         total = parts[..., 2:, 0] + parts[..., 1:-1, 1] + parts[..., :-2, 2]
-        return total.movedim(-1, self.fine + 1)
+        return total.movedim(-1, self.strip_axis + 1)
 
-    def spread(self, bins: Float32[Tensor, "frame range u v"]) -> Any:
+    def expand_to_strips(self, bins: Float32[Tensor, "frame range u v"]) -> Any:
         """The adjoint of ``summed``: every strip gets the values of its three bins.
 
         Args:
             bins: A value for every bin.
         """
-        rows = torch.nn.functional.pad(bins.movedim(self.fine + 1, -1), (2, 3))
+        rows = torch.nn.functional.pad(bins.movedim(self.strip_axis + 1, -1), (2, 3))
         return to_float(rows.unfold(-1, 4, 1))
 
-    def shown(self, found: Contribution) -> Any:
+    def relative_range(self, path: PathContribution) -> Any:
         """Ranges of paths from the origin of their frame (detached).
 
         Args:
-            found: The paths.
+            path: The paths.
         """
-        length = dr.detach(found.range)
+        length = dr.detach(path.range)
         if self.origin is None:
             return length
-        return length - dr.gather(mi.Float, to_float(self.origin), mi.UInt32(found.frame))
+        return length - dr.gather(mi.Float, to_float(self.origin), mi.UInt32(path.frame))
 
 
 @dataclass(frozen=True)
 class _Strip:
     """Three bins side by side along the fine axis, and how paths fall on them (detached)."""
 
-    place: Any  # number of the strip
-    inside: Any  # whether its row is on the grid, and its middle at most one bin off it
-    across: Any  # weight of the row
-    slopes: list[Any]  # its derivatives in range, u and v; along the fine axis the weight itself
+    index: Any  # number of the strip
+    is_inside: Any  # whether its row is on the grid, and its middle at most one bin off it
+    transverse_weight: Any  # weight of the row
+    transverse_derivatives: list[
+        Any
+    ]  # its derivatives in range, u and v; along the fine axis the weight itself
     weights: list[Any]  # of the three bins
-    steep: list[Any]  # their derivatives along the fine axis
+    weight_derivatives: list[Any]  # their derivatives along the fine axis
 
-    def slope(self, axis: int, fine: int) -> list[Any]:
+    def tap_derivatives(self, axis: int, strip_axis: int) -> list[Any]:
         """Derivatives of the three weights along an axis.
 
         Args:
             axis: 0 range, 1 u, 2 v.
-            fine: That of the strips.
+            strip_axis: That of the strips.
         """
-        return [self.slopes[axis] * w for w in (self.steep if axis == fine else self.weights)]
+        return [
+            self.transverse_derivatives[axis] * w
+            for w in (self.weight_derivatives if axis == strip_axis else self.weights)
+        ]
 
 
-def _strips(layout: Layout, found: Contribution) -> Iterator[_Strip]:
+def _iterate_strips(layout: BinLayout, path: PathContribution) -> Iterator[_Strip]:
     """The strips that paths fall on: three for every other axis with bins to choose from."""
-    grid, fine = layout.grid, layout.fine
+    grid, fine = layout.grid, layout.strip_axis
     counts = list(grid.shape)
     axes = [
-        _axis(layout.shown(found), grid.range_start, grid.range_step, grid.range_count),
-        _axis(found.u, grid.u_start, grid.u_step, grid.u_count),
-        _axis(found.v, grid.v_start, grid.v_step, grid.v_count),
+        _axis_taps(
+            layout.relative_range(path), grid.range_start, grid.range_step, grid.range_count
+        ),
+        _axis_taps(path.u, grid.u_start, grid.u_step, grid.u_count),
+        _axis_taps(path.v, grid.v_start, grid.v_step, grid.v_count),
     ]
     none, one = mi.Float(0.0), mi.Float(1.0)
     along = axes[fine]
@@ -168,23 +175,23 @@ def _strips(layout: Layout, found: Contribution) -> Iterator[_Strip]:
     near = (middle >= -1) & (middle <= counts[fine])
     axes[fine], counts[fine] = [(mi.Int32(0), mi.Bool(True), one, one)], 1
     for taps in product(*axes):
-        row, inside = mi.Int32(found.frame), near
+        row, inside = mi.Int32(path.frame), near
         for (place, on_axis, _, _), count in zip(taps, counts, strict=True):
             row, inside = row * count + place, inside & on_axis
         yield _Strip(
-            place=mi.UInt32(row * length + middle + 1),
-            inside=inside,
-            across=math.prod(tap[2] for tap in taps),
-            slopes=[
+            index=mi.UInt32(row * length + middle + 1),
+            is_inside=inside,
+            transverse_weight=math.prod(tap[2] for tap in taps),
+            transverse_derivatives=[
                 math.prod(tap[3 if k == axis else 2] for k, tap in enumerate(taps))
                 for axis in range(3)
             ],
             weights=[tap[2] for tap in along],
-            steep=[tap[3] for tap in along],
+            weight_derivatives=[tap[3] for tap in along],
         )
 
 
-class Bins:
+class BinAccumulator:
     """A map that paths are added to.
 
     The three bins that lie side by side are added to at once, as one vector, to strips that
@@ -195,74 +202,74 @@ class Bins:
         layout: Its bins.
     """
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: BinLayout) -> None:
         self.layout = layout
-        self._strips = math.prod(layout.strips[:-1])
-        self._copies = min(_MOST_COPIES, max(1, _ROUNDED_LESS // (4 * self._strips)))
-        size = 4 * self._strips * self._copies
+        self._strip_count = math.prod(layout.strip_shape[:-1])
+        self._copies = min(_MAX_COPIES, max(1, _MAX_COPIED_VALUES // (4 * self._strip_count)))
+        size = 4 * self._strip_count * self._copies
         self.values = dr.zeros(mi.Float, size)
-        copied = backend() == "cpu" and 4 * size * dr.thread_count() <= _COPIES
+        copied = backend() == "cpu" and 4 * size * dr.thread_count() <= _MAX_COPY_BYTES
         self._mode = dr.ReduceMode.Expand if copied else dr.ReduceMode.Auto
 
-    def add(self, found: Contribution, active: Any) -> None:
+    def add(self, path: PathContribution, active: Any) -> None:
         """Add paths.
 
         Args:
-            found: The paths.
+            path: The paths.
             active: Which paths exist.
         """
-        for strip in _strips(self.layout, found):
-            power = found.power * strip.across
-            self._add([power * weight for weight in strip.weights], strip, active)
+        for strip in _iterate_strips(self.layout, path):
+            power = path.power * strip.transverse_weight
+            self._scatter_strip([power * weight for weight in strip.weights], strip, active)
 
-    def add_derivative(self, found: Contribution, dots: tuple, active: Any) -> None:
+    def add_tangent(self, path: PathContribution, tangents: tuple, active: Any) -> None:
         """Add the derivative of paths' deposit, given those of power, range, u and v.
 
         Args:
-            found: The paths.
-            dots: Derivatives of power, range, u and v.
+            path: The paths.
+            tangents: Derivatives of power, range, u and v.
             active: Which paths exist.
         """
-        power = dr.detach(found.power)
-        dot_power, *moves = dots
-        fine = self.layout.fine
-        for strip in _strips(self.layout, found):
-            values = [dot_power * strip.across * weight for weight in strip.weights]
+        power = dr.detach(path.power)
+        dot_power, *moves = tangents
+        fine = self.layout.strip_axis
+        for strip in _iterate_strips(self.layout, path):
+            values = [dot_power * strip.transverse_weight * weight for weight in strip.weights]
             for axis, dot in enumerate(moves):
-                slopes = strip.slope(axis, fine)
+                slopes = strip.tap_derivatives(axis, fine)
                 values = [v + power * dot * s for v, s in zip(values, slopes, strict=True)]
-            self._add(values, strip, active)
+            self._scatter_strip(values, strip, active)
 
-    def _add(self, values: list[Any], strip: _Strip, active: Any) -> None:
+    def _scatter_strip(self, values: list[Any], strip: _Strip, active: Any) -> None:
         amounts = mi.Vector4f(*values, 0.0)
-        lane = dr.arange(mi.UInt32, dr.width(amounts, strip.place))
-        place = strip.place + lane % self._copies * self._strips
-        dr.scatter_add(self.values, amounts, place, strip.inside & active, mode=self._mode)
+        lane = dr.arange(mi.UInt32, dr.width(amounts, strip.index))
+        place = strip.index + lane % self._copies * self._strip_count
+        dr.scatter_add(self.values, amounts, place, strip.is_inside & active, mode=self._mode)
 
-    def map(self) -> Float32[Tensor, "frame range u v"]:
+    def to_map(self) -> Float32[Tensor, "frame range u v"]:
         """What all bins hold."""
-        return self.layout.summed(self.values)
+        return self.layout.sum_strips(self.values)
 
 
-def gather(
-    seed: Any, layout: Layout, found: Contribution, active: Any
+def gather_adjoint(
+    strip_gradient: Any, layout: BinLayout, path: PathContribution, active: Any
 ) -> tuple[Any, Any, Any, Any]:
     """The adjoint of the deposit: ∂loss/∂(power, range, u, v) of every path.
 
     Args:
-        seed: ∂loss/∂map, as ``Layout.spread`` has it.
+        strip_gradient: ∂loss/∂map, as ``BinLayout.spread`` has it.
         layout: The bins.
-        found: The paths.
+        path: The paths.
         active: Which paths exist.
     """
     bars = [mi.Float(0.0) for _ in range(4)]
-    for strip in _strips(layout, found):
-        values = dr.gather(mi.Vector4f, seed, strip.place, strip.inside & active)
-        factors = [[strip.across * weight for weight in strip.weights]]
-        factors += [strip.slope(axis, layout.fine) for axis in range(3)]
+    for strip in _iterate_strips(layout, path):
+        values = dr.gather(mi.Vector4f, strip_gradient, strip.index, strip.is_inside & active)
+        factors = [[strip.transverse_weight * weight for weight in strip.weights]]
+        factors += [strip.tap_derivatives(axis, layout.strip_axis) for axis in range(3)]
         for number, three in enumerate(factors):
             bars[number] += sum(f * values[k] for k, f in enumerate(three))
-    power = dr.detach(found.power)
+    power = dr.detach(path.power)
     return bars[0], bars[1] * power, bars[2] * power, bars[3] * power
 
 
@@ -279,29 +286,31 @@ def deposit_paths(paths: Paths, link: Link, grid: Grid) -> Float32[Tensor, "fram
 
     Source: derivations §5.
     """
-    u, v = paths.cosines(link).unbind(1)
+    u, v = paths.direction_cosines(link).unbind(1)
     with tracing():
-        return Splat.apply(Layout.of(grid, link), paths.frame, paths.power, paths.range, u, v)
+        return Splat.apply(
+            BinLayout.from_link(grid, link), paths.frame, paths.power, paths.range, u, v
+        )
 
 
 class Splat(torch.autograd.Function):
     """Points into the bins of a map, with the derivatives of this file in both modes."""
 
     @staticmethod
-    def forward(ctx: Any, layout: Layout, frame: Tensor, *columns: Tensor) -> Tensor:
+    def forward(ctx: Any, layout: BinLayout, frame: Tensor, *columns: Tensor) -> Tensor:
         ctx.layout, ctx.backend = layout, backend()
         with tracing():
             places = [to_float(column) for column in columns]
-            ctx.found = Contribution(mi.Int32(to_index(frame)), *places)
-            out = Bins(layout)
+            ctx.found = PathContribution(mi.Int32(to_index(frame)), *places)
+            out = BinAccumulator(layout)
             out.add(ctx.found, True)
-            return out.map()
+            return out.to_map()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         with tracing(ctx.backend):
-            bars = gather(ctx.layout.spread(grad), ctx.layout, ctx.found, True)
+            bars = gather_adjoint(ctx.layout.expand_to_strips(grad), ctx.layout, ctx.found, True)
             return None, None, *(to_torch(bar).double() for bar in bars)
 
     @staticmethod
@@ -310,6 +319,6 @@ class Splat(torch.autograd.Function):
             dots = tuple(
                 mi.Float(0.0) if tangent is None else to_float(tangent) for tangent in tangents[2:]
             )
-            out = Bins(ctx.layout)
-            out.add_derivative(ctx.found, dots, True)
-            return out.map()
+            out = BinAccumulator(ctx.layout)
+            out.add_tangent(ctx.found, dots, True)
+            return out.to_map()

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import grid_sample
 
-from invertwin.channel.em.depolarisation import power_shares
+from invertwin.channel.em.depolarisation import polarisation_shares
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins
 from invertwin.channel.power.bins import Splat
@@ -26,8 +26,8 @@ from invertwin.errors import InputError
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.scene import Object
 
-_CHUNK = 262_144  # points at a time
-_FLAT = 1e-12  # least component of a direction: a ray along a face of the box
+_POINTS_PER_CHUNK = 262_144  # points at a time
+_MIN_COMPONENT = 1e-12  # least component of a direction: a ray along a face of the box
 
 
 def deposit_density(
@@ -66,39 +66,39 @@ def deposit_density(
         raise InputError(
             "expected a cloud at rest, got a velocity; a frame is one instant: use scene.at(time)"
         )
-    layout = bins.Layout.of(grid, link)
+    layout = bins.BinLayout.from_link(grid, link)
     with use_backend(sampling.backend):
-        rays = _Rays.of(item, link, sampling.samples, seed)
+        rays = _CloudRays.sample(item, link, sampling.samples, seed)
         parts = [Splat.apply(layout, *part) for part in rays.contributions()]
     return torch.stack(parts).sum(0)
 
 
 @dataclass(frozen=True)
-class _Rays:
+class _CloudRays:
     """Rays through a box: one row per ray, in the object's frame.
 
     Attributes:
         cloud: The density.
         link: Antennas.
         origins: Of the transmitter and the receiver of every frame.
-        turn: Rotation of the object.
+        rotation: Rotation of the object.
         frame: Of every ray.
-        through: Point of the box that the ray meets.
-        shift: Place of the points within their segments, in [0, 1).
+        box_points: Point of the box that the ray meets.
+        jitter: Place of the points within their segments, in [0, 1).
         steps: Segments of a ray.
     """
 
     cloud: Cloud
     link: Link
     origins: tuple[Float64[Tensor, "frame 3"], Float64[Tensor, "frame 3"]]
-    turn: Float64[Tensor, "3 3"]
+    rotation: Float64[Tensor, "3 3"]
     frame: Int64[Tensor, " ray"]
-    through: Float64[Tensor, "ray 3"]
-    shift: Float64[Tensor, " ray"]
+    box_points: Float64[Tensor, "ray 3"]
+    jitter: Float64[Tensor, " ray"]
     steps: int
 
     @staticmethod
-    def of(item: Object, link: Link, samples: int, seed: int) -> "_Rays":
+    def sample(item: Object, link: Link, samples: int, seed: int) -> "_CloudRays":
         cloud = item.cloud
         assert cloud is not None
         pose = item.transform
@@ -117,14 +117,14 @@ class _Rays:
         # Consecutive rows of a Sobol sequence are well spread: every frame gets its own.
         engine = torch.quasirandom.SobolEngine(4, scramble=True, seed=seed)
         numbers = engine.draw(link.frame_count * count, dtype=torch.float64)
-        return _Rays(
+        return _CloudRays(
             cloud=cloud,
             link=link,
             origins=(origins[0], origins[1]),
-            turn=turn,
+            rotation=turn,
             frame=torch.arange(link.frame_count).repeat_interleave(count),
-            through=cloud.low + numbers[:, :3] * (cloud.high - cloud.low),
-            shift=numbers[:, 3],
+            box_points=cloud.low + numbers[:, :3] * (cloud.high - cloud.low),
+            jitter=numbers[:, 3],
             steps=steps,
         )
 
@@ -132,26 +132,29 @@ class _Rays:
         """Frame, power, range, u and v of the points, so many at a time."""
         per_frame = len(self.frame) // self.link.frame_count
         ways = 1 if self.link.shared_visibility else self.steps
-        width = max(1, _CHUNK // (self.steps * ways))
+        width = max(1, _POINTS_PER_CHUNK // (self.steps * ways))
         for start in range(0, len(self.frame), width):
             part = slice(start, start + width)
             yield replace(
-                self, frame=self.frame[part], through=self.through[part], shift=self.shift[part]
-            )._seen(per_frame)
+                self,
+                frame=self.frame[part],
+                box_points=self.box_points[part],
+                jitter=self.jitter[part],
+            )._evaluate_points(per_frame)
 
-    def _seen(self, per_frame: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def _evaluate_points(self, per_frame: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         tx = self.origins[0][self.frame]
-        offset = self.through - tx
+        offset = self.box_points - tx
         way = offset / offset.norm(dim=1, keepdim=True)
-        near, far = self._chord(tx, way)
+        near, far = self._clip_to_box(tx, way)
         # Rays per steradian, of points spread evenly over the box: the chord's share of it.
         volume = (self.cloud.high - self.cloud.low).prod()
         weight = 3 * volume / ((far**3 - near**3) * per_frame)
         length = (far - near)[:, None] / self.steps
-        place = torch.arange(self.steps) + self.shift[:, None]
+        place = torch.arange(self.steps) + self.jitter[:, None]
         distance = near[:, None] + place * length  # from the transmitter
         points = tx[:, None] + distance[..., None] * way[:, None]
-        thickness = self._density(points) * length
+        thickness = self._interpolate_density(points) * length
         before = thickness.cumsum(1) - thickness
         link, frame = self.link, self.frame[:, None].expand_as(distance)
         if link.shared_visibility:
@@ -159,65 +162,75 @@ class _Rays:
         else:
             # Back to the start of the segment, as far as the way to it is as dense: without this
             # an opaque cell would count as if all came back from the point's depth in it.
-            ways = before + self._way_back(points, frame) - self.shift[:, None] * thickness
+            ways = (
+                before
+                + self._return_optical_depth(points, frame)
+                - self.jitter[:, None] * thickness
+            )
         held = -0.5 * torch.exp(-ways) * torch.expm1(-2 * thickness)
         back = points - self.origins[1][self.frame][:, None]
         return_way = back.norm(dim=2)
         rotation = link.rotations[self.frame]
         towards = [
-            torch.einsum("rij,rkj->rki", rotation.mT @ self.turn, direction)
+            torch.einsum("rij,rkj->rki", rotation.mT @ self.rotation, direction)
             for direction in (way[:, None], back / return_way[..., None])
         ]
         gain = link.tx_pattern.gain(towards[0]) * link.rx_pattern.gain(towards[1])
         scale = (link.wavelength / (4 * math.pi)) ** 2 * self.cloud.albedo / (4 * math.pi)
-        (share,) = power_shares(link, depolarised=False)
-        scale = scale * share.of(1)
+        (share,) = polarisation_shares(link, depolarising=False)
+        scale = scale * share.for_bounces(1)
         power = scale * weight[:, None] * gain * held / return_way.square()
         total = 0.5 * (distance + return_way)
         columns = [power, total, towards[1][..., 0], towards[1][..., 1]]
         return frame.reshape(-1), *(column.reshape(-1) for column in columns)  # type: ignore[return-value]
 
-    def _chord(self, origin: Tensor, way: Tensor) -> tuple[Tensor, Tensor]:
+    def _clip_to_box(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """Distances at which rays that meet the box enter and leave it."""
-        slope = torch.where(way.abs() < _FLAT, _FLAT, way)
+        slope = torch.where(direction.abs() < _MIN_COMPONENT, _MIN_COMPONENT, direction)
         first, second = (self.cloud.low - origin) / slope, (self.cloud.high - origin) / slope
         near = torch.minimum(first, second).amax(1).clamp_min(0.0)
         return near, torch.maximum(first, second).amin(1)
 
-    def _way_back(self, points: Tensor, frame: Tensor) -> Tensor:
+    def _return_optical_depth(self, points: Tensor, frame: Tensor) -> Tensor:
         """∫σ ds from points to the receiver."""
         flat = points.reshape(-1, 3)
         rx = self.origins[1][frame.reshape(-1)]
         offset = flat - rx
         distance = offset.norm(dim=1)
         way = offset / distance[:, None]
-        near, _ = self._chord(rx, way)
+        near, _ = self._clip_to_box(rx, way)
         length = (distance - near)[:, None] / self.steps
-        shift = self.shift[:, None].expand(points.shape[:2]).reshape(-1, 1)
+        shift = self.jitter[:, None].expand(points.shape[:2]).reshape(-1, 1)
         depth = near[:, None] + (torch.arange(self.steps) + shift) * length
         between = rx[:, None] + depth[..., None] * way[:, None]
-        return (self._density(between) * length).sum(1).reshape(points.shape[:2])
+        return (self._interpolate_density(between) * length).sum(1).reshape(points.shape[:2])
 
-    def _density(self, points: Float64[Tensor, "ray step 3"]) -> Float64[Tensor, "ray step"]:
+    def _interpolate_density(
+        self, points: Float64[Tensor, "ray step 3"]
+    ) -> Float64[Tensor, "ray step"]:
         place = 2 * (points - self.cloud.low) / (self.cloud.high - self.cloud.low) - 1
         found = _Trilinear.apply(self.cloud.density, place.reshape(-1, 3))
         return found.reshape(points.shape[:2])
 
 
-def _trilinear(values: Float64[Tensor, "x y z"], place: Float64[Tensor, "n 3"]) -> Tensor:
+def _interpolate_trilinear(
+    values: Float64[Tensor, "x y z"], positions: Float64[Tensor, "n 3"]
+) -> Tensor:
     """Values between the nodes of a grid that spans [-1, 1] along each axis."""
-    nodes = place.flip(-1)[None, :, None, None]  # grid_sample counts axes from the last one
+    nodes = positions.flip(-1)[None, :, None, None]  # grid_sample counts axes from the last one
     found = grid_sample(values[None, None], nodes, padding_mode="border", align_corners=True)
     return found.flatten()
 
 
 class _Trilinear(torch.autograd.Function):
-    """``_trilinear`` with the derivative in forward mode that torch 2.13 does not have."""
+    """``_interpolate_trilinear`` with the derivative in forward mode that torch 2.13 does not
+    have.
+    """
 
     @staticmethod
-    def forward(ctx: Any, values: Tensor, place: Tensor) -> Tensor:
-        ctx.inputs = values.detach(), place.detach()
-        return _trilinear(*ctx.inputs)
+    def forward(ctx: Any, values: Tensor, positions: Tensor) -> Tensor:
+        ctx.inputs = values.detach(), positions.detach()
+        return _interpolate_trilinear(*ctx.inputs)
 
     @staticmethod
     @once_differentiable
@@ -226,18 +239,18 @@ class _Trilinear(torch.autograd.Function):
         inputs = [tensor.detach().requires_grad_(wanted) for tensor, wanted in pairs]
         wanted = [tensor for tensor in inputs if tensor.requires_grad]
         with torch.enable_grad():
-            found = iter(torch.autograd.grad(_trilinear(*inputs), wanted, grad))
+            found = iter(torch.autograd.grad(_interpolate_trilinear(*inputs), wanted, grad))
         return tuple(next(found) if tensor.requires_grad else None for tensor in inputs)
 
     @staticmethod
-    def jvp(ctx: Any, values: Tensor | None, place: Tensor | None) -> Tensor:  # type: ignore[override]
+    def jvp(ctx: Any, values: Tensor | None, positions: Tensor | None) -> Tensor:  # type: ignore[override]
         known, at = ctx.inputs
         total = torch.zeros_like(at[:, 0])
         if values is not None:
-            total = total + _trilinear(values, at)
-        if place is not None:
+            total = total + _interpolate_trilinear(values, at)
+        if positions is not None:
             with torch.enable_grad():
                 at = at.detach().requires_grad_()
-                (slope,) = torch.autograd.grad(_trilinear(known, at).sum(), at)
-            total = total + (slope * place).sum(1)
+                (slope,) = torch.autograd.grad(_interpolate_trilinear(known, at).sum(), at)
+            total = total + (slope * positions).sum(1)
         return total

@@ -13,19 +13,23 @@ from jaxtyping import Float32
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 
-from invertwin.channel.em.depolarisation import power_shares
+from invertwin.channel.em.depolarisation import polarisation_shares
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins, replay
 from invertwin.channel.power.clouds import deposit_density
 from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table, to_table
-from invertwin.channel.power.trace import Trace, tables_of, without_derivatives
+from invertwin.channel.power.trace import (
+    PowerTracer,
+    differentiable_tables,
+    strip_scene_derivatives,
+)
 from invertwin.channel.rays.backend import backend, dr, mi, torch_threads, tracing
-from invertwin.channel.rays.batching import stand_apart
-from invertwin.channel.rays.scene_tables import Geometry, flatten, require_edges
+from invertwin.channel.rays.batching import arrange_scenes
+from invertwin.channel.rays.scene_tables import Geometry, flatten, require_silhouette_samples
 from invertwin.channel.sampling import Sampling
-from invertwin.checks import differentiated, plain
+from invertwin.checks import is_differentiated, strip_derivatives
 from invertwin.errors import InputError
-from invertwin.limits import MOST
+from invertwin.limits import MAX_COUNT
 from invertwin.scene.scene import Object, Scene
 
 
@@ -71,17 +75,19 @@ def deposit_power(
     """
     if scheme not in ("rays", "area"):
         raise InputError(f"expected scheme 'rays' or 'area', got {scheme!r}; choose one")
-    surfaces, clouds = _sorted(scene)
+    surfaces, clouds = _split_clouds(scene)
     soft = [deposit_density(item, link, grid, sampling=sampling, seed=seed) for item in clouds]
     if surfaces is None:
         return torch.stack(soft).sum(0)
     with tracing(sampling.backend), torch_threads(1):
         geometry = flatten(surfaces, link.wavelength)
         fixed = None
-        if reference is not None and (hard := _sorted(reference[0])[0]) is not None:
+        if reference is not None and (hard := _split_clouds(reference[0])[0]) is not None:
             fixed = flatten(hard, link.wavelength), reference[1]
-        shares = _shares(geometry, link, grid, sampling, seed, scheme=scheme, reference=fixed)
-    return _total([*soft, *shares])
+        shares = _deposit_surfaces(
+            geometry, link, grid, sampling, seed, scheme=scheme, reference=fixed
+        )
+    return _sum_maps([*soft, *shares])
 
 
 def deposit_batch(
@@ -122,19 +128,20 @@ def deposit_batch(
     if not objects:
         raise InputError("expected at least one scene, got none; give a list of scenes")
     drawn = len(scenes) * max(sampling.samples, sampling.boundary_samples)
-    if drawn > MOST:
+    if drawn > MAX_COUNT:
         raise InputError(
-            f"expected at most {MOST} samples of all scenes, got {drawn}; give fewer scenes or "
+            f"expected at most {MAX_COUNT} samples of all scenes, got {drawn}; give fewer scenes "
+            f"or "
             "samples at a time"
         )
     with tracing(sampling.backend), torch_threads(1):
         geometry = flatten(Scene(objects), link.wavelength)
-        geometry, links = stand_apart(geometry, link, torch.tensor(owners))
-        total = _total(_shares(geometry, links, grid, sampling, seed))
+        geometry, links = arrange_scenes(geometry, link, torch.tensor(owners))
+        total = _sum_maps(_deposit_surfaces(geometry, links, grid, sampling, seed))
     return total.unflatten(0, (len(scenes), link.frame_count))
 
 
-def _shares(
+def _deposit_surfaces(
     geometry: Geometry,
     link: Link,
     grid: Grid,
@@ -146,39 +153,39 @@ def _shares(
 ) -> list[Tensor]:
     """Maps of the surfaces whose sum counts: one for every share of polarised power."""
     if sampling.boundary:
-        require_edges(geometry, link, sampling.boundary_samples)
-    if any(differentiated(p.table()) for p in (link.tx_pattern, link.rx_pattern)):
+        require_silhouette_samples(geometry, link, sampling.boundary_samples)
+    if any(is_differentiated(p.table()) for p in (link.tx_pattern, link.rx_pattern)):
         raise InputError(
             "expected an antenna pattern without derivatives, got one that carries them; "
             "power paths do not differentiate patterns: detach its values"
         )
     turned = geometry.surfaces.depolarisation
-    depolarised = differentiated(turned) or bool(turned.any())
-    antennas_move = differentiated(link.tx) or differentiated(link.rx)
+    depolarised = is_differentiated(turned) or bool(turned.any())
+    antennas_move = is_differentiated(link.tx) or is_differentiated(link.rx)
     maps = []
-    for share in power_shares(link, depolarised=depolarised):
+    for share in polarisation_shares(link, depolarising=depolarised):
         lossy = geometry
         if share.loss:
-            surfaces = geometry.surfaces.scaled(1 - share.loss * turned)
+            surfaces = geometry.surfaces.scale(1 - share.loss * turned)
             lossy = replace(geometry, surfaces=surfaces)
         with _DisableFuncTorch():
-            bare = without_derivatives(lossy, link)
+            bare = strip_scene_derivatives(lossy, link)
             coupling = share.odd, share.even
-            trace = Trace(
+            trace = PowerTracer(
                 *bare, sampling, seed, scheme=scheme, reference=reference, coupling=coupling,
-                antennas_move=antennas_move,
+                differentiate_antennas=antennas_move,
             )  # fmt: skip
-        tables = tables_of(lossy, link)
-        layout = bins.Layout.of(grid, link)
-        maps.append(_Deposit.apply(trace, layout, any(map(differentiated, tables)), *tables))
+        tables = differentiable_tables(lossy, link)
+        layout = bins.BinLayout.from_link(grid, link)
+        maps.append(_Deposit.apply(trace, layout, any(map(is_differentiated, tables)), *tables))
     return maps
 
 
-def _total(maps: list[Tensor]) -> Tensor:
+def _sum_maps(maps: list[Tensor]) -> Tensor:
     return torch.stack(maps).sum(0) if len(maps) > 1 else maps[0]
 
 
-def _sorted(scene: Scene) -> tuple[Scene | None, list[Object]]:
+def _split_clouds(scene: Scene) -> tuple[Scene | None, list[Object]]:
     """The surfaces of a scene, if any, and its clouds."""
     clouds = [item for item in scene.objects.values() if item.cloud is not None]
     surfaces = {name: item for name, item in scene.objects.items() if item.cloud is None}
@@ -193,24 +200,26 @@ class _Deposit(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(trace: Trace, layout: bins.Layout, derivative: bool, *tables: Tensor) -> Tensor:
-        out = bins.Bins(layout)
-        trace.recorded = trace.deposit(out, record=derivative)
+    def forward(
+        trace: PowerTracer, layout: bins.BinLayout, derivative: bool, *tables: Tensor
+    ) -> Tensor:
+        out = bins.BinAccumulator(layout)
+        trace.last_records = trace.deposit(out, record=derivative)
         if derivative:
-            _ = trace.boundary_points  # prepared while the paths are walked
-        return out.map()
+            _ = trace.boundary_samples  # prepared while the paths are walked
+        return out.to_map()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # type: ignore[override]
         ctx.trace, ctx.layout, _, *tables = inputs
-        ctx.likes, ctx.backend = [plain(table) for table in tables], backend()
+        ctx.likes, ctx.backend = [strip_derivatives(table) for table in tables], backend()
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         wanted = tuple(
             n for n, w in zip(DIFFERENTIABLE, ctx.needs_input_grad[3:], strict=True) if w
         )
-        found = _Linear.apply(lambda grad: _pulled(ctx, wanted, grad), grad)
+        found = _Linear.apply(lambda grad: _pull_gradients(ctx, wanted, grad), grad)
         results = dict(zip(wanted, found, strict=True))
         return None, None, None, *(results.get(name) for name in DIFFERENTIABLE)
 
@@ -218,7 +227,7 @@ class _Deposit(torch.autograd.Function):
     def jvp(ctx: Any, _: None, __: None, ___: None, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
         given = {n: t for n, t in zip(DIFFERENTIABLE, tangents, strict=True) if t is not None}
         return _Linear.apply(
-            lambda *tangents: _pushed(ctx, tuple(given), *tangents), *given.values()
+            lambda *tangents: _push_tangents(ctx, tuple(given), *tangents), *given.values()
         )
 
     @staticmethod
@@ -262,65 +271,65 @@ class _Linear(torch.autograd.Function):
         return stacked, (0,) * len(stacked)
 
 
-def _pulled(ctx: Any, wanted: tuple[str, ...], grad: Tensor) -> tuple[Tensor, ...]:
+def _pull_gradients(ctx: Any, names: tuple[str, ...], grad: Tensor) -> tuple[Tensor, ...]:
     """Gradients with respect to some tables."""
-    trace: Trace = ctx.trace
+    trace: PowerTracer = ctx.trace
     with tracing(ctx.backend), torch_threads(1):
-        tables = _attached(trace, wanted)
-        inputs = trace.inputs(tables, together=("tx" in tables) == ("rx" in tables))
-        seed = ctx.layout.spread(grad)
+        tables = _attach_tables(trace, names)
+        inputs = trace.inputs(tables, joint_antennas=("tx" in tables) == ("rx" in tables))
+        seed = ctx.layout.expand_to_strips(grad)
 
         def gather(*path: Any) -> tuple[Any, Any, Any, Any]:
-            return bins.gather(seed, ctx.layout, *path)
+            return bins.gather_adjoint(seed, ctx.layout, *path)
 
-        boundary = trace.boundary(inputs)
-        for records in [trace.recorded] if trace.recorded else trace.records():
+        boundary = trace.trace_boundary(inputs)
+        for records in [trace.last_records] if trace.last_records else trace.iterate_records():
             replay.pull(trace.rays, inputs, records, gather)
             dr.eval([dr.grad(table) for table in tables.values()])
             del records  # before the next ones are made
         for paths in boundary:
-            total = paths.weighted(lambda *path: gather(*path)[0])
+            total = paths.sum_weighted(lambda *path: gather(*path)[0])
             if dr.grad_enabled(paths.speed):
                 dr.backward_from(paths.speed * total)
             dr.eval([dr.grad(table) for table in tables.values()])
         likes = dict(zip(DIFFERENTIABLE, ctx.likes, strict=True))
-        return tuple(from_table(name, dr.grad(tables[name]), likes[name]) for name in wanted)
+        return tuple(from_table(name, dr.grad(tables[name]), likes[name]) for name in names)
 
 
-def _pushed(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tensor:
+def _push_tangents(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tensor:
     """The map's derivative along tangents of some tables."""
-    trace: Trace = ctx.trace
+    trace: PowerTracer = ctx.trace
     with tracing(ctx.backend), torch_threads(1):
         given = dict(zip(names, tangents, strict=True))
-        tables = _attached(trace, names)
-        inputs = trace.inputs(tables, together=_equal(given.get("tx"), given.get("rx")))
-        out = bins.Bins(ctx.layout)
+        tables = _attach_tables(trace, names)
+        inputs = trace.inputs(tables, joint_antennas=_are_equal(given.get("tx"), given.get("rx")))
+        out = bins.BinAccumulator(ctx.layout)
 
-        def point_tangents() -> None:
+        def set_tangents() -> None:
             for name, table in tables.items():
                 dr.set_grad(table, to_table(name, given[name]))
 
-        boundary = trace.boundary(inputs)
-        for records in [trace.recorded] if trace.recorded else trace.records():
-            point_tangents()
-            replay.push(trace.rays, inputs, records, out.add_derivative)
+        boundary = trace.trace_boundary(inputs)
+        for records in [trace.last_records] if trace.last_records else trace.iterate_records():
+            set_tangents()
+            replay.push(trace.rays, inputs, records, out.add_tangent)
             dr.eval(out.values)
             del records
         for paths in boundary:
-            point_tangents()
+            set_tangents()
             paths.deposit(dr.forward_to(paths.speed), out.add)
             dr.eval(out.values)
-        return out.map()
+        return out.to_map()
 
 
-def _attached(trace: Trace, names: Iterable[str]) -> dict[str, Any]:
+def _attach_tables(trace: PowerTracer, names: Iterable[str]) -> dict[str, Any]:
     """Copies of some of the kernel's tables that carry derivatives."""
     tables = {name: mi.Float(trace.fixed.table(name)) for name in names}
     dr.enable_grad(list(tables.values()))
     return tables
 
 
-def _equal(first: Tensor | None, second: Tensor | None) -> bool:
+def _are_equal(first: Tensor | None, second: Tensor | None) -> bool:
     if first is None or second is None:
         return first is second
     return torch.equal(first, second)

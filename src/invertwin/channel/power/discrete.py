@@ -6,11 +6,13 @@ from invertwin.channel.rays.arrays import uniform_pair
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RayScene
 
-_RESOLVED = 5e-5  # chance of an edge from which float32 resolves a sample's place within it
+_MIN_RESOLVED_PROBABILITY = (
+    5e-5  # chance of an edge from which float32 resolves a sample's place within it
+)
 _LAST_BELOW_ONE = 1 - 2.0**-24
 
 
-class Proportional:
+class DiscreteSampler:
     """Draws entries in proportion to weights, without reading any back."""
 
     def __init__(self, weights: Any) -> None:
@@ -18,21 +20,23 @@ class Proportional:
         self.entries = dr.width(weights)
         self.total = dr.gather(mi.Float, self.sums, self.entries - 1)
 
-    def draw(self, spread: Any) -> tuple[Any, Any, Any]:
+    def draw(self, number: Any) -> tuple[Any, Any, Any]:
         """Entry, the rest of the number within it, and probability: zero if there is no entry."""
-        target = spread * self.total
+        target = number * self.total
 
-        def below(at: Any) -> Any:
+        def is_below(at: Any) -> Any:
             return dr.gather(mi.Float, self.sums, at) <= target
 
-        place: Any = dr.binary_search(0, self.entries - 1, below)
+        place: Any = dr.binary_search(0, self.entries - 1, is_below)
         weight = dr.gather(mi.Float, self.weights, place)
         last = dr.gather(mi.Float, self.sums, place) - weight
         rest = dr.clip((target - last) / weight, 0.0, _LAST_BELOW_ONE)
         return place, rest, dr.select(weight > 0, weight / self.total, 0.0)
 
 
-def by_object(rays: RayScene, edge: Any, weight: Any, receiver: Any, centres: int) -> Any:
+def balance_by_object(
+    rays: RayScene, edge: Any, weight: Any, receiver: Any, antenna_count: int
+) -> Any:
     """Weights of edges by which no object drowns another.
 
     An object gets the square root of the sum of its edges' weights, which is between a share by
@@ -43,22 +47,25 @@ def by_object(rays: RayScene, edge: Any, weight: Any, receiver: Any, centres: in
         edge: Edges.
         weight: Of each, by itself.
         receiver: Whether it is the receiver's silhouette.
-        centres: 2 if there are silhouettes of a receiver, else 1.
+        antenna_count: 2 if there are silhouettes of a receiver, else 1.
     """
     objects = len(rays.geometry.names)
     antenna = dr.select(receiver, mi.UInt32(1), 0)
     row = dr.gather(mi.UInt32, rays.topology.device_edge_object, edge) + antenna * objects
-    totals, sums = dr.zeros(mi.Float, centres * objects), dr.zeros(mi.Float, centres * rays.scenes)
+    totals, sums = (
+        dr.zeros(mi.Float, antenna_count * objects),
+        dr.zeros(mi.Float, antenna_count * rays.scene_count),
+    )
     dr.scatter_add(totals, weight, row)
-    roots, rows = dr.sqrt(totals), dr.arange(mi.UInt32, centres * objects)
+    roots, rows = dr.sqrt(totals), dr.arange(mi.UInt32, antenna_count * objects)
     scene = rays.object_scene(rows % objects)
-    dr.scatter_add(sums, roots, rows // objects * rays.scenes + scene)
-    part = antenna * rays.scenes + rays.edge_scene(edge)
+    dr.scatter_add(sums, roots, rows // objects * rays.scene_count + scene)
+    part = antenna * rays.scene_count + rays.edge_scene(edge)
     share: Any = weight / (dr.gather(mi.Float, roots, row) * dr.gather(mi.Float, sums, part))
     return dr.select(weight > 0, share, 0.0)
 
 
-def by_scene(rays: RayScene, scene: Any, weight: Any) -> Any:
+def balance_by_scene(rays: RayScene, scene: Any, weight: Any) -> Any:
     """Weights of which all scenes have the same sum, if they have any.
 
     Args:
@@ -66,25 +73,25 @@ def by_scene(rays: RayScene, scene: Any, weight: Any) -> Any:
         scene: Of each weight.
         weight: The weights.
     """
-    if rays.scenes == 1:
+    if rays.scene_count == 1:
         return weight
-    totals = dr.zeros(mi.Float, rays.scenes)
+    totals = dr.zeros(mi.Float, rays.scene_count)
     dr.scatter_add(totals, weight, scene)
     return dr.select(weight > 0, weight / dr.gather(mi.Float, totals, scene), 0.0)
 
 
-def place_along(
-    choice: Proportional, index: Any, count: int, seed: Any, key: Any = None
+def sample_edge_point(
+    sampler: DiscreteSampler, index: Any, count: int, seed: Any, key: Any = None
 ) -> tuple[Any, Any, Any]:
     """Entry of the choice, place along its edge and probability, stratified over count.
 
     Args:
-        choice: Of edges.
+        sampler: Of edges.
         index: Number of the sample.
         count: Of samples.
         seed: Of the numbers.
         key: What the numbers belong to, if not the index.
     """
     jitter, along = uniform_pair(index if key is None else key, seed)
-    place, rest, chance = choice.draw((mi.Float(index) + jitter) / count)
-    return place, dr.select(chance > _RESOLVED, rest, along), chance
+    place, rest, chance = sampler.draw((mi.Float(index) + jitter) / count)
+    return place, dr.select(chance > _MIN_RESOLVED_PROBABILITY, rest, along), chance

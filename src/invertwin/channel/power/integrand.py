@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from invertwin.channel.paths import Pattern
-from invertwin.channel.power.surface import SURFACE, Surfaces
+from invertwin.channel.paths import GainPattern
+from invertwin.channel.power.surface import SCATTERING_TABLES, ScatteringLawTables
 from invertwin.channel.rays import arrays
 from invertwin.channel.rays.arrays import (
-    between,
     from_points,
-    point_at,
+    gather_points,
+    interpolate_position,
     to_float,
     to_index,
     to_points,
@@ -26,8 +26,8 @@ from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RayScene
 
 #: The differentiable inputs of the kernel, in the order in which torch passes them.
-DIFFERENTIABLE = ("vertices", "tx", "rx", "rotations", *SURFACE)
-POINTS = DIFFERENTIABLE[:3]
+DIFFERENTIABLE = ("vertices", "tx", "rx", "rotations", *SCATTERING_TABLES)
+POINT_TABLES = DIFFERENTIABLE[:3]
 
 
 def to_table(name: str, values: Tensor) -> Any:
@@ -37,7 +37,7 @@ def to_table(name: str, values: Tensor) -> Any:
         name: Of the table.
         values: The torch table.
     """
-    return to_points(values) if name in POINTS else to_float(values)
+    return to_points(values) if name in POINT_TABLES else to_float(values)
 
 
 def from_table(name: str, values: Any, like: Tensor) -> Tensor:
@@ -48,7 +48,7 @@ def from_table(name: str, values: Any, like: Tensor) -> Tensor:
         values: The array.
         like: The torch table that it is laid out as.
     """
-    flat = from_points(values) if name in POINTS else to_torch(values)
+    flat = from_points(values) if name in POINT_TABLES else to_torch(values)
     return flat.reshape(like.shape).to(like)
 
 
@@ -60,7 +60,7 @@ class Inputs:
     tx: Any  # place of the transmitter in every frame, likewise
     rx: Any
     rotations: Any  # of the radar in every frame
-    surfaces: Surfaces
+    surfaces: ScatteringLawTables
     faces: Any  # vertices of every triangle
     face_surface: Any  # row of every triangle's surface
     triangles: Any  # ``RayScene.triangles``: what is read where vertices carry no derivatives
@@ -71,7 +71,7 @@ class Inputs:
     coupling: tuple[float, float] = (1.0, 1.0)  # of paths with an odd, an even number of bounces
 
     @staticmethod
-    def of(rays: RayScene, *, monostatic: bool = False) -> "Inputs":
+    def from_rays(rays: RayScene, *, monostatic: bool = False) -> "Inputs":
         """Upload a scene and its antennas; positions are taken about the local origin.
 
         Args:
@@ -85,37 +85,37 @@ class Inputs:
             tx=rays.tx,
             rx=rays.rx,
             rotations=to_float(link.rotations),
-            surfaces=Surfaces.of(rays.geometry),
+            surfaces=ScatteringLawTables.from_geometry(rays.geometry),
             faces=rays.topology.device_corners,
             face_surface=to_index(rays.geometry.face_surface),
             triangles=rays.triangles,
             monostatic=monostatic,
-            tx_pattern=PatternTable.of(link.tx_pattern),
-            rx_pattern=PatternTable.of(link.rx_pattern),
+            tx_pattern=PatternTable.from_pattern(link.tx_pattern),
+            rx_pattern=PatternTable.from_pattern(link.rx_pattern),
             scale=(link.wavelength / (4 * np.pi)) ** 2,
         )
 
     def table(self, name: str) -> Any:
         """One of the differentiable inputs."""
-        return self.surfaces.tables[name] if name in SURFACE else getattr(self, name)
+        return self.surfaces.tables[name] if name in SCATTERING_TABLES else getattr(self, name)
 
-    def replaced(self, tables: dict[str, Any]) -> "Inputs":
+    def with_tables(self, tables: dict[str, Any]) -> "Inputs":
         """With some of the differentiable inputs replaced."""
-        rows = {name: table for name, table in tables.items() if name in SURFACE}
-        others = {name: table for name, table in tables.items() if name not in SURFACE}
+        rows = {name: table for name, table in tables.items() if name in SCATTERING_TABLES}
+        others = {name: table for name, table in tables.items() if name not in SCATTERING_TABLES}
         surfaces = replace(self.surfaces, tables={**self.surfaces.tables, **rows})
         return replace(self, surfaces=surfaces, **others)
 
-    def detached(self) -> "Inputs":
+    def detach(self) -> "Inputs":
         """These values without derivatives."""
-        return self.replaced({name: dr.detach(self.table(name)) for name in DIFFERENTIABLE})
+        return self.with_tables({name: dr.detach(self.table(name)) for name in DIFFERENTIABLE})
 
-    def coupled(self, bounces: Any) -> Any:
+    def polarisation_factor(self, bounces: Any) -> Any:
         """What the antennas' polarisations take of paths with so many bounces."""
         odd, even = self.coupling
         return mi.Float(odd) if odd == even else dr.select((bounces & 1) == 1, odd, even)
 
-    def antenna(self, frame: Any, receiver: Any, active: Any = True) -> Any:
+    def antenna_position(self, frame: Any, receiver: Any, active: Any = True) -> Any:
         """Position of the receiver or the transmitter (a Python bool, or one per lane).
 
         Args:
@@ -125,22 +125,24 @@ class Inputs:
         """
         if receiver is True or receiver is False:
             table = self.rx if receiver and not self.monostatic else self.tx
-            return point_at(table, frame, active)
+            return gather_points(table, frame, active)
         return dr.select(
-            receiver, self.antenna(frame, True, active), self.antenna(frame, False, active)
+            receiver,
+            self.antenna_position(frame, True, active),
+            self.antenna_position(frame, False, active),
         )
 
-    def gain(self, frame: Any, receiver: Any, seen: Any) -> Any:
+    def gain(self, frame: Any, receiver: Any, direction: Any) -> Any:
         """Linear power gain of the receiver or the transmitter towards a radar-frame direction.
 
         Args:
             frame: Radar pose.
             receiver: Whether it is the receiver (a bool, or one per lane).
-            seen: Unit direction in the radar frame.
+            direction: Unit direction in the radar frame.
         """
         if receiver is True or receiver is False:
-            return (self.rx_pattern if receiver else self.tx_pattern).gain(seen)
-        return dr.select(receiver, self.rx_pattern.gain(seen), self.tx_pattern.gain(seen))
+            return (self.rx_pattern if receiver else self.tx_pattern).gain(direction)
+        return dr.select(receiver, self.rx_pattern.gain(direction), self.tx_pattern.gain(direction))
 
 
 @dataclass(frozen=True)
@@ -149,10 +151,10 @@ class PatternTable:
 
     values: Any  # gains, row after row
     shape: tuple[int, int]  # nodes in cosθ and φ
-    constant: float | None  # the gain, where it is the same everywhere
+    constant_gain: float | None  # the gain, where it is the same everywhere
 
     @staticmethod
-    def of(pattern: Pattern) -> "PatternTable":
+    def from_pattern(pattern: GainPattern) -> "PatternTable":
         table = pattern.table()
         rows, columns = int(table.shape[0]), int(table.shape[1])
         constant = float(table.reshape(-1)[0]) if rows * columns == 1 else None
@@ -160,8 +162,8 @@ class PatternTable:
 
     def gain(self, direction: Any) -> Any:
         """Linear power gain for a unit direction in the radar frame."""
-        if self.constant is not None:
-            return mi.Float(self.constant)
+        if self.constant_gain is not None:
+            return mi.Float(self.constant_gain)
         rows, columns = self.shape
         t = (dr.clip(direction.z, -1.0, 1.0) + 1) * (0.5 * (rows - 1))
         row = dr.minimum(mi.UInt32(dr.detach(t)), rows - 2)
@@ -199,38 +201,42 @@ def edge_ends(inputs: Inputs, first: Any, second: Any) -> tuple[Any, Any]:
         inputs: Tables of the kernel.
         first, second: Vertices at the ends.
     """
-    return point_at(inputs.vertices, first), point_at(inputs.vertices, second)
+    return gather_points(inputs.vertices, first), gather_points(inputs.vertices, second)
 
 
 @dataclass(frozen=True)
-class Place:
+class SurfaceInteraction:
     """A material point now; all but its surface is attached."""
 
     position: Any  # about the local origin [m]
     normal: Any  # of unit length
     jacobian: Any  # area of its triangle over that area detached: one in value
-    surface: Any  # row of its surface
+    surface_row: Any  # row of its surface
 
     @property
-    def parts(self) -> dict[str, Any]:
+    def detached_state(self) -> dict[str, Any]:
         """What a loop carries of it, detached."""
         return {
             "position": mi.Point3f(dr.detach(self.position)),
             "normal": mi.Vector3f(dr.detach(self.normal)),
-            "surface": self.surface,
+            "surface": self.surface_row,
         }
 
     @staticmethod
-    def of(parts: dict[str, Any]) -> "Place":
+    def from_state(state: dict[str, Any]) -> "SurfaceInteraction":
         """What a loop has carried.
 
         Args:
-            parts: As ``parts`` has them, among others.
+            state: As ``state`` has them, among others.
         """
-        return Place(parts["position"], parts["normal"], mi.Float(1.0), parts["surface"])
+        return SurfaceInteraction(
+            state["position"], state["normal"], mi.Float(1.0), state["surface"]
+        )
 
 
-def place(inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True) -> Place:
+def compute_interaction(
+    inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True
+) -> SurfaceInteraction:
     """Where a pair of barycentric coordinates lies now.
 
     Args:
@@ -246,20 +252,20 @@ def place(inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True) -> Pl
         )
         position = mi.Point3f(p0.xyz + b1 * first.xyz + b2 * second.xyz)
         normal = mi.Vector3f(p0.w, first.w, second.w)
-        return Place(position, normal, mi.Float(1.0), surface)
+        return SurfaceInteraction(position, normal, mi.Float(1.0), surface)
     triangle = p0, p1, p2 = corners(inputs, face, active)
     normal = dr.cross(p1 - p0, p2 - p0)
     double_area = dr.norm(normal)
-    return Place(
-        position=between(triangle, b1, b2),
+    return SurfaceInteraction(
+        position=interpolate_position(triangle, b1, b2),
         normal=normal / double_area,
         jacobian=double_area / dr.detach(double_area),
-        surface=surface,
+        surface_row=surface,
     )
 
 
 @dataclass(frozen=True)
-class Spot:
+class SurfacePoint:
     """A point of a surface.
 
     Attributes:
@@ -271,17 +277,17 @@ class Spot:
     b1: Any
     b2: Any
 
-    def place(self, inputs: Inputs, active: Any = True) -> Place:
+    def compute_interaction(self, inputs: Inputs, active: Any = True) -> SurfaceInteraction:
         """Where it is.
 
         Args:
             inputs: Tables of the kernel.
             active: Lanes.
         """
-        return place(inputs, self.face, self.b1, self.b2, active)
+        return compute_interaction(inputs, self.face, self.b1, self.b2, active)
 
 
-def pull_place(
+def pull_interaction(
     inputs: Inputs,
     face: Any,
     b1: Any,
@@ -291,14 +297,14 @@ def pull_place(
     normal: Any,
     jacobian: Any,
 ) -> None:
-    """The adjoint of ``place``, written out: add to the gradient of the corners.
+    """The adjoint of ``compute_interaction``, written out: add to the gradient of the corners.
 
     Args:
         inputs: Attached tables.
         face: Triangle.
         b1, b2: Barycentric coordinates.
         active: Lanes.
-        position, normal, jacobian: Derivatives of the loss by what ``place`` gives.
+        position, normal, jacobian: Derivatives of the loss by what ``compute_interaction`` gives.
     """
     first, second = (
         dr.gather(mi.Vector4f, inputs.triangles, face * 3 + k, active).xyz for k in (1, 2)
@@ -319,7 +325,7 @@ def pull_place(
     dr.backward_from(sum(dr.dot(point, bar) for point, bar in zip(corner, bars, strict=True)))
 
 
-def segment(start: Any, end: Any) -> tuple[Any, Any]:
+def direction_and_distance(start: Any, end: Any) -> tuple[Any, Any]:
     """Unit direction and distance from one point to another.
 
     Args:
@@ -330,7 +336,7 @@ def segment(start: Any, end: Any) -> tuple[Any, Any]:
     return offset / distance, distance
 
 
-def to_radar(inputs: Inputs, frame: Any, direction: Any, active: Any = True) -> Any:
+def to_radar_frame(inputs: Inputs, frame: Any, direction: Any, active: Any = True) -> Any:
     """World direction in the radar frame (the rotation's columns are the radar's axes).
 
     Args:
@@ -339,7 +345,7 @@ def to_radar(inputs: Inputs, frame: Any, direction: Any, active: Any = True) -> 
         direction: Unit direction in the world.
         active: Lanes.
     """
-    return along_axes(radar_axes(inputs, frame, active), direction)
+    return project_to_axes(radar_axes(inputs, frame, active), direction)
 
 
 def radar_axes(inputs: Inputs, frame: Any, active: Any = True) -> list[Any]:
@@ -353,7 +359,7 @@ def radar_axes(inputs: Inputs, frame: Any, active: Any = True) -> list[Any]:
     return [dr.gather(mi.Vector3f, inputs.rotations, frame * 3 + k, active) for k in range(3)]
 
 
-def along_axes(rows: list[Any], direction: Any) -> Any:
+def project_to_axes(rows: list[Any], direction: Any) -> Any:
     """World direction in the radar frame.
 
     Args:
@@ -364,45 +370,53 @@ def along_axes(rows: list[Any], direction: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Medium:
+class SegmentMedium:
     """What a segment runs through."""
 
-    index: Any  # refractive
+    refractive_index: Any  # refractive
     attenuation: Any  # of power [1/m]
 
 
-def medium(inputs: Inputs, start: Place, end: Place | None, towards: Any, active: Any) -> Medium:
+def find_medium(
+    inputs: Inputs,
+    start: SurfaceInteraction,
+    end: SurfaceInteraction | None,
+    direction: Any,
+    active: Any,
+) -> SegmentMedium:
     """The body inside of which a segment runs, if any: that of a skin it leaves or meets inside.
 
     Args:
         inputs: Tables.
         start: Where it starts.
         end: Where it ends; None for an antenna.
-        towards: Unit direction from start to end.
+        direction: Unit direction from start to end.
         active: Lanes.
     """
     index, attenuation = mi.Float(1.0), mi.Float(0.0)
     ends = ((start, 1.0),) if end is None else ((start, 1.0), (end, -1.0))
-    for place, sign in ends if inputs.surfaces.bodies else ():
-        inside = active & (dr.detach(dr.dot(place.normal, towards)) * sign < 0)
-        inside &= inputs.surfaces.is_skin(place.surface)
-        values = (inputs.surfaces.value(n, place.surface, inside) for n in ("index", "attenuation"))
+    for place, sign in ends if inputs.surfaces.has_refracting_bodies else ():
+        inside = active & (dr.detach(dr.dot(place.normal, direction)) * sign < 0)
+        inside &= inputs.surfaces.is_refracting(place.surface_row)
+        values = (
+            inputs.surfaces.value(n, place.surface_row, inside) for n in ("index", "attenuation")
+        )
         index, attenuation = (
             dr.select(inside, value, so_far)
             for value, so_far in zip(values, (index, attenuation), strict=True)
         )
-    return Medium(index, attenuation)
+    return SegmentMedium(index, attenuation)
 
 
 @dataclass(frozen=True)
-class End:
+class AntennaPose:
     """An antenna that a path ends at. To look it up before a loop spares the loop doing so."""
 
     position: Any  # about the local origin [m]
     axes: list[Any]  # rows of the radar's rotation
 
     @staticmethod
-    def of(inputs: Inputs, frame: Any, receiver: Any, active: Any = True) -> "End":
+    def look_up(inputs: Inputs, frame: Any, receiver: Any, active: Any = True) -> "AntennaPose":
         """Look it up.
 
         Args:
@@ -411,45 +425,50 @@ class End:
             receiver: Whether it is the receiver (a bool, or one per lane).
             active: Lanes.
         """
-        return End(inputs.antenna(frame, receiver, active), radar_axes(inputs, frame, active))
+        return AntennaPose(
+            inputs.antenna_position(frame, receiver, active), radar_axes(inputs, frame, active)
+        )
 
 
 @dataclass(frozen=True)
-class Connection:
+class AntennaConnection:
     """The last segment of a path, from a surface point to an antenna."""
 
     factor: Any  # f |cosθ| |cosθ'| G / R²
     distance: Any  # R [m]
-    seen: Any  # direction of the point in the radar frame
+    direction: Any  # direction of the point in the radar frame
 
 
-def connection(
+def connect_antenna(
     inputs: Inputs,
     frame: Any,
-    point: Place,
-    back: Any,
+    point: SurfaceInteraction,
+    incident: Any,
     receiver: Any = True,
     active: Any = True,
     *,
-    same: bool = False,
-    end: End | None = None,
-) -> Connection:
-    """Scatter what comes from ``back`` towards an antenna; ``same`` if it lies there.
+    is_same_antenna: bool = False,
+    antenna: AntennaPose | None = None,
+) -> AntennaConnection:
+    """Scatter what comes from ``incident`` towards an antenna; ``is_same_antenna`` if it lies
+    there.
 
     Args:
         inputs: Tables of the kernel.
         frame: Radar pose.
         point: The vertex.
-        back: Unit direction from where the path comes.
+        incident: Unit direction from where the path comes.
         receiver: Whether the antenna is the receiver (a bool, or one per lane).
         active: Lanes.
-        same: Whether the path comes from that very antenna.
-        end: The antenna, where it has been looked up.
+        is_same_antenna: Whether the path comes from that very antenna.
+        antenna: The antenna, where it has been looked up.
     """
-    end = end or End.of(inputs, frame, receiver, active)
-    to_antenna, distance = segment(point.position, end.position)
-    seen = along_axes(end.axes, -to_antenna)
-    on = None if same else to_antenna
-    value = inputs.surfaces.scattered(point.surface, point.normal, back, on, active)
+    antenna = antenna or AntennaPose.look_up(inputs, frame, receiver, active)
+    to_antenna, distance = direction_and_distance(point.position, antenna.position)
+    seen = project_to_axes(antenna.axes, -to_antenna)
+    on = None if is_same_antenna else to_antenna
+    value = inputs.surfaces.evaluate_scattering(
+        point.surface_row, point.normal, incident, on, active
+    )
     gain = inputs.gain(frame, receiver, seen)
-    return Connection(value * gain / dr.square(distance), distance, seen)
+    return AntennaConnection(value * gain / dr.square(distance), distance, seen)

@@ -4,22 +4,22 @@ from typing import Any
 
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.intersections import IN_PLANE
+from invertwin.channel.rays.intersections import PLANE_TOLERANCE
 from invertwin.channel.rays.ray_scene import RayScene
 
 # Of a mesh, so many triangles are looked at from an edge on, and more until rays that pass beside
 # the edge clear them, up to so many.
-_LEAST_FOLDS, _MOST_FOLDS = 8, 256
+_MIN_FOLD_TRIANGLES, _MAX_FOLD_TRIANGLES = 8, 256
 
 
-def folded(
+def is_hidden_by_fold(
     rays: RayScene,
     edge: Any,
-    place: Any,
-    way: Any,
-    outwards: Any,
-    aside: Any,
-    near: Any,
+    point: Any,
+    direction: Any,
+    outward: Any,
+    clearance: Any,
+    start_distance: Any,
     active: Any,
 ) -> Any:
     """Whether the mesh around an edge leads back into the way past it, where rays would miss it.
@@ -32,23 +32,23 @@ def folded(
     Args:
         rays: Rays.
         edge: Edges.
-        place: Points on them, float64.
-        way: Directions of rays past them, float64.
-        outwards: Unit directions off the edge's own triangles; zero where there are some all round.
-        aside: How far beside the edge rays pass [m].
-        near: How far off the edge they start [m].
+        point: Points on them, float64.
+        direction: Directions of rays past them, float64.
+        outward: Unit directions off the edge's own triangles; zero where there are some all round.
+        clearance: How far beside the edge rays pass [m].
+        start_distance: How far off the edge they start [m].
         active: Lanes.
     """
-    topology, most = rays.topology, opaque(_MOST_FOLDS)
-    across, along = dr.cross(way, outwards), dr.normalize(way)
+    topology, most = rays.topology, opaque(_MAX_FOLD_TRIANGLES)
+    across, along = dr.cross(direction, outward), dr.normalize(direction)
     start, found = mi.UInt32(edge), mi.Bool(False)
 
     def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
         state = dict(state)
         entry, face, going = state["edge"], state["face"], state["going"]
-        corners = dr.gather(mi.Vector3u, topology.device_welded, face, going)
+        corners = dr.gather(mi.Vector3u, topology.device_welded_faces, face, going)
         sides = dr.gather(mi.Vector3i, topology.device_face_edges, face, going)
-        offsets = [rays.exact(corner, going) - place for corner in corners]
+        offsets = [rays.exact_vertex(corner, going) - point for corner in corners]
         beyond = [dr.dot(across, offset) for offset in offsets]
         leaving, height, reach = mi.Int32(-1), mi.Float64(0.0), mi.Float64(0.0)
         for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
@@ -56,18 +56,22 @@ def folded(
             share = beyond[i] / (beyond[i] - beyond[j])
             at = offsets[i] + (offsets[j] - offsets[i]) * share
             leaving = dr.select(crosses, sides[k], leaving)
-            height = dr.select(crosses, dr.dot(outwards, at), height)
+            height = dr.select(crosses, dr.dot(outward, at), height)
             reach = dr.select(crosses, dr.dot(along, at), reach)
         on = going & (leaving >= 0)
-        rises = on & (height > IN_PLANE)
-        share = (aside - state["height"]) / (height - state["height"])
+        rises = on & (height > PLANE_TOLERANCE)
+        share = (clearance - state["height"]) / (height - state["height"])
         met = state["reach"] + (reach - state["reach"]) * share
-        state["found"] = state["found"] | (rises & ((height <= aside) | (dr.abs(met) <= near)))
+        state["found"] = state["found"] | (
+            rises & ((height <= clearance) | (dr.abs(met) <= start_distance))
+        )
         state["height"], state["reach"] = height, reach
-        low = (height < -aside) & (state["count"] >= _LEAST_FOLDS)
-        on &= (height <= IN_PLANE) & ~low
+        low = (height < -clearance) & (state["count"] >= _MIN_FOLD_TRIANGLES)
+        on &= (height <= PLANE_TOLERANCE) & ~low
         edge, after, others = mi.UInt32(dr.maximum(leaving, 0)), mi.UInt32(0), mi.UInt32(0)
-        for column, apex in zip(topology.device_beside, topology.device_opposite, strict=True):
+        for column, apex in zip(
+            topology.device_edge_faces, topology.device_edge_apexes, strict=True
+        ):
             next_face = dr.gather(mi.UInt32, column, edge, on)
             other = (dr.gather(mi.Int32, apex, edge, on) >= 0) & (next_face != face)
             after = dr.select(other, next_face, after)
@@ -76,7 +80,9 @@ def folded(
         state["going"] = on & (others == 1) & (state["count"] < most)
         return (state,)
 
-    for column, apex in zip(topology.device_beside[:2], topology.device_opposite[:2], strict=True):
+    for column, apex in zip(
+        topology.device_edge_faces[:2], topology.device_edge_apexes[:2], strict=True
+    ):
         there = active & (dr.gather(mi.Int32, apex, edge) >= 0) & (dr.squared_norm(across) > 0)
         state = {
             "edge": start,

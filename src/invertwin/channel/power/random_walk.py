@@ -1,7 +1,8 @@
 """Paths over surface points, drawn vertex by vertex in one symbolic loop.
 
 The loop is compiled once for any depth, and keeps no vertex unless asked to: then it writes one
-`Records` row a vertex, from which derivatives are replayed (``channel/power/replay.py``). Detached.
+`PathRecords` row a vertex, from which derivatives are replayed (``channel/power/replay.py``).
+Detached.
 """
 
 from collections.abc import Callable
@@ -10,33 +11,37 @@ from functools import cached_property
 from typing import Any
 
 from invertwin.channel.power import integrand
-from invertwin.channel.power.bins import Contribution
-from invertwin.channel.power.direction_sampling import Directions
-from invertwin.channel.power.integrand import Inputs, Place
-from invertwin.channel.power.transmission import Passage, land, passage
-from invertwin.channel.rays.arrays import opaque, scrambled, uniform_pair
+from invertwin.channel.power.bins import PathContribution
+from invertwin.channel.power.direction_sampling import DirectionSampler
+from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
+from invertwin.channel.power.transmission import (
+    SegmentTransmission,
+    trace_to_surface,
+    trace_transmission,
+)
+from invertwin.channel.rays.arrays import opaque, scramble_seed, uniform_pair
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.ray_scene import NEAR, RayScene
+from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
 
-_LEAST_SURVIVAL = 0.1  # of Russian roulette
-_ROULETTE_FROM = 3  # vertices after which it begins; shorter paths have less noise without
-_STREAM = 0x9E3779B9  # seeds of successive vertices
+_MIN_SURVIVAL = 0.1  # of Russian roulette
+_MIN_ROULETTE_VERTICES = 3  # vertices after which it begins; shorter paths have less noise without
+_STREAM_STEP = 0x9E3779B9  # seeds of successive vertices
 
 #: A path at its latest vertex, one lane each: what the loop carries.
-State = dict[str, Any]
+PathState = dict[str, Any]
 
 
-def start(
+def initial_state(
     index: Any,
     frame: Any,
     face: Any,
     b1: Any,
     b2: Any,
-    back: Any,
+    incident: Any,
     throughput: Any,
     length: Any,
-    passed: Passage | None = None,
-) -> State:
+    transmission: SegmentTransmission | None = None,
+) -> PathState:
     """The state at the first vertex.
 
     A state with a ``weight`` also follows one over the probability of its points per area. One with
@@ -47,10 +52,10 @@ def start(
         frame: Radar pose.
         face: Triangle.
         b1, b2: Barycentric coordinates.
-        back: Unit direction to where the path comes from.
+        incident: Unit direction to where the path comes from.
         throughput: All factors up to arriving here, over the probability of the samples.
         length: Of the path so far [m].
-        passed: What lies on the first segment, for antennas that share what they see.
+        transmission: What lies on the first segment, for antennas that share what they see.
     """
     count = dr.width(index)
     return {
@@ -61,16 +66,18 @@ def start(
         "face": face,
         "b1": b1,
         "b2": b2,
-        "back": mi.Vector3f(back),
+        "back": mi.Vector3f(incident),
         "throughput": throughput,
         "length": length,
         **(
-            {} if passed is None else {"transmittance": passed.transmittance, "extra": passed.extra}
+            {}
+            if transmission is None
+            else {"transmittance": transmission.transmittance, "extra": transmission.extra_length}
         ),
     }
 
 
-class Walk:
+class RandomWalk:
     """Continues paths, and shows every vertex to a visitor.
 
     Args:
@@ -82,14 +89,16 @@ class Walk:
     def __init__(self, rays: RayScene, inputs: Inputs, seed: int) -> None:
         self.rays = rays
         self.inputs = inputs
-        self.seed = scrambled(seed, 7)
+        self.seed = scramble_seed(seed, 7)
 
     @cached_property
-    def directions(self) -> Directions:
+    def direction_sampler(self) -> DirectionSampler:
         """How paths go on; those of one bounce never ask."""
-        return Directions(self.rays, self.inputs.surfaces)
+        return DirectionSampler(self.rays, self.inputs.surfaces)
 
-    def run(self, state: State, depth: Any, visit: Callable[[State, Place], None]) -> State:
+    def run(
+        self, state: PathState, depth: Any, visit: Callable[[PathState, SurfaceInteraction], None]
+    ) -> PathState:
         """Walk to the end of all paths; returns the last state.
 
         Args:
@@ -98,34 +107,34 @@ class Walk:
             visit: Called at every vertex; may change what it put into the state itself.
         """
         if isinstance(depth, int) and depth == 1:
-            visit(state, self._place(state))
+            visit(state, self._compute_interaction(state))
             return state
-        directions = self.directions  # uploaded before the loop is recorded
+        directions = self.direction_sampler  # uploaded before the loop is recorded
         last = opaque(depth) if isinstance(depth, int) else depth
         lanes = dr.width(state["index"])
         state = {**state, "last": mi.UInt32(last) + dr.zeros(mi.UInt32, lanes)}
         # Carried, since a vertex is located where it is found.
-        state |= self._place(state).parts
+        state |= self._compute_interaction(state).detached_state
 
-        def extended(state: State) -> tuple[State]:
+        def extend(state: PathState) -> tuple[PathState]:
             state = dict(state)
-            self._extend(state, Place.of(state), directions)
+            self._extend(state, SurfaceInteraction.from_state(state), directions)
             return (state,)
 
-        def ended(state: State) -> tuple[State]:
+        def stop(state: PathState) -> tuple[PathState]:
             return ({**state, "active": mi.Bool(False)},)
 
-        def body(state: State) -> tuple[State]:
+        def body(state: PathState) -> tuple[PathState]:
             state = dict(state)
-            visit(state, Place.of(state))
+            visit(state, SurfaceInteraction.from_state(state))
             # Packets of paths that have come to their last vertex spare the next one.
             going = state["active"] & (state["number"] < state["last"])
-            return dr.if_stmt((state,), going, extended, ended, mode="symbolic")
+            return dr.if_stmt((state,), going, extend, stop, mode="symbolic")
 
         (state,) = self.rays.loop((state,), lambda state: state["active"], body)
         return state
 
-    def step(self, state: State, point: Place | None = None) -> State:
+    def step(self, state: PathState, point: SurfaceInteraction | None = None) -> PathState:
         """One more vertex, outside any loop.
 
         Args:
@@ -133,10 +142,10 @@ class Walk:
             point: Its latest vertex, if not quite where the state has it.
         """
         state = {**state, "last": state["number"] + 1}
-        self._extend(state, point or self._place(state), self.directions)
+        self._extend(state, point or self._compute_interaction(state), self.direction_sampler)
         return state
 
-    def ended(self, first: State, count: Any, receiver: Any) -> State:
+    def trace_subpath(self, first: PathState, count: Any, receiver: Any) -> PathState:
         """The one path with ``count`` vertices that ends at an antenna: its amount and ``so_far``.
 
         Args:
@@ -149,8 +158,8 @@ class Walk:
         # What the antennas' polarisations take counts once, at the other end.
         inputs = replace(self.inputs, coupling=(1.0, 1.0))
 
-        def ending(state: State, point: Place) -> None:
-            path, exists = connect(self.rays, inputs, state, point, state["here"])
+        def record_last(state: PathState, point: SurfaceInteraction) -> None:
+            path, exists = connect_path(self.rays, inputs, state, point, state["here"])
             last = exists & (state["number"] == state["last"])
             state["amount"] = dr.select(last, path.power, state["amount"])
             state["so_far"] = dr.select(last, 2 * path.range, state["so_far"])
@@ -158,77 +167,81 @@ class Walk:
             state["v"] = dr.select(last, path.v, state["v"])
 
         with dr.suspend_grad():
-            return self.run(first, count, ending)
+            return self.run(first, count, record_last)
 
-    def _place(self, state: State) -> Place:
-        return integrand.place(
+    def _compute_interaction(self, state: PathState) -> SurfaceInteraction:
+        return integrand.compute_interaction(
             self.inputs, state["face"], state["b1"], state["b2"], state["active"]
         )
 
-    def _extend(self, state: State, point: Place, directions: Directions) -> None:
+    def _extend(
+        self, state: PathState, point: SurfaceInteraction, direction_sampler: DirectionSampler
+    ) -> None:
         """Draw the next vertex into the state; paths that miss or are too long end."""
         active = state["active"] & (state["number"] < state["last"])
         back = state["back"]
         scene = self.rays.frame_scene(state["frame"])
-        numbers = self._numbers(state)
-        drawn = directions.draw(point, back, numbers, scene)
+        numbers = self._uniform_numbers(state)
+        drawn = direction_sampler.draw(point, back, numbers, scene)
         omega = drawn.omega
-        scattered = self.inputs.surfaces.scattered(
-            point.surface, point.normal, back, mi.Vector3f(omega)
+        scattered = self.inputs.surfaces.evaluate_scattering(
+            point.surface_row, point.normal, back, mi.Vector3f(omega)
         )
-        ratio: Any = scattered / (drawn.scattered * dr.abs(dr.dot(point.normal, back)))
+        ratio: Any = scattered / (drawn.lobe_density * dr.abs(dr.dot(point.normal, back)))
         survival = dr.select(
-            state["number"] >= _ROULETTE_FROM,
-            dr.minimum(dr.maximum(ratio, _LEAST_SURVIVAL), 1.0),
+            state["number"] >= _MIN_ROULETTE_VERTICES,
+            dr.minimum(dr.maximum(ratio, _MIN_SURVIVAL), 1.0),
             1.0,
         )
         active &= (scattered > 0) & (numbers[1] < survival)
         side = dr.mulsign(point.normal, dr.dot(point.normal, omega))
-        origin = point.position + side * (NEAR * dr.norm(point.position))
+        origin = point.position + side * (RAY_EPSILON * dr.norm(point.position))
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega))
-        key = state["index"], self.seed + (state["number"] * 5 + 4) * _STREAM
-        hit = land(self.rays, self.inputs, ray, active, key, coherent=False)
-        active &= hit.valid & self.rays.in_scene(state["frame"], hit.face, active)
-        found = integrand.place(self.inputs, hit.face, hit.b1, hit.b2, active)
-        to_point, distance = integrand.segment(found.position, point.position)
+        key = state["index"], self.seed + (state["number"] * 5 + 4) * _STREAM_STEP
+        hit = trace_to_surface(self.rays, self.inputs, ray, active, key, coherent=False)
+        active &= hit.valid & self.rays.is_in_scene(state["frame"], hit.face, active)
+        found = integrand.compute_interaction(self.inputs, hit.face, hit.b1, hit.b2, active)
+        to_point, distance = integrand.direction_and_distance(found.position, point.position)
         cosine: Any = dr.abs(dr.dot(found.normal, to_point))
         active &= (cosine > 1e-6) & (distance > 0)
-        inside = integrand.medium(self.inputs, point, found, -to_point, active)
-        density = directions.density(point, drawn, hit.face, active, scene)
+        inside = integrand.find_medium(self.inputs, point, found, -to_point, active)
+        density = direction_sampler.density(point, drawn, hit.face, active, scene)
         active &= density > 0
-        odds = density * survival * cosine * hit.chance
+        odds = density * survival * cosine * hit.probability
         weight = scattered * hit.transmittance * dr.exp(-inside.attenuation * distance) / odds
         state["throughput"] = dr.select(active, state["throughput"] * weight, 0.0)
         if "weight" in state:
             state["weight"] = state["weight"] * dr.square(distance) / odds
         state["face"], state["b1"], state["b2"] = hit.face, hit.b1, hit.b2
-        state |= found.parts
+        state |= found.detached_state
         state["back"] = mi.Vector3f(to_point)
-        state["length"] = state["length"] + inside.index * distance + hit.extra
+        state["length"] = state["length"] + inside.refractive_index * distance + hit.extra_length
         state["number"] = state["number"] + 1
         state["active"] = active
 
-    def _numbers(self, state: State) -> list[Any]:
-        """Six uniform numbers of this vertex; ``land`` has a stream of its own after them."""
+    def _uniform_numbers(self, state: PathState) -> list[Any]:
+        """Six uniform numbers of this vertex; ``trace_to_surface`` has a stream of its own after
+        them.
+        """
         numbers = []
         for stream in range(3):
-            seed = self.seed + (state["number"] * 5 + stream) * _STREAM
+            seed = self.seed + (state["number"] * 5 + stream) * _STREAM_STEP
             numbers += uniform_pair(state["index"], seed)
         return numbers
 
 
-def connect(
+def connect_path(
     rays: RayScene,
     inputs: Inputs,
-    state: State,
-    point: Place,
+    state: PathState,
+    point: SurfaceInteraction,
     receiver: Any,
     *,
-    least: Any = 1,
-    shared: bool = False,
-    one_place: bool = False,
-    end: integrand.End | None = None,
-) -> tuple[Contribution, Any]:
+    min_vertices: Any = 1,
+    shared_visibility: bool = False,
+    monostatic: bool = False,
+    antenna: integrand.AntennaPose | None = None,
+) -> tuple[PathContribution, Any]:
     """The path that ends at the latest vertex, and whether it exists.
 
     Args:
@@ -238,40 +251,48 @@ def connect(
         point: Its latest vertex.
         receiver: Whether the path ends at the receiver (a bool, or one per lane). Where it ends at
             the transmitter, the state knows the receiver's direction ``u``, ``v``.
-        least: Fewest vertices of a path (a number, or one per lane).
-        shared: What the antenna at the start sees, the one at the end sees too.
-        one_place: Both are one.
-        end: The antenna at the end, if it has been looked up.
+        min_vertices: Fewest vertices of a path (a number, or one per lane).
+        shared_visibility: What the antenna at the start sees, the one at the end sees too.
+        monostatic: Both are one.
+        antenna: The antenna at the end, if it has been looked up.
     """
-    end = end or integrand.End.of(inputs, state["frame"], receiver, state["active"])
-    found = integrand.connection(
-        inputs, state["frame"], point, state["back"], receiver, same=one_place, end=end
+    antenna = antenna or integrand.AntennaPose.look_up(
+        inputs, state["frame"], receiver, state["active"]
     )
-    u, v = found.seen.x, found.seen.y
+    found = integrand.connect_antenna(
+        inputs,
+        state["frame"],
+        point,
+        state["back"],
+        receiver,
+        is_same_antenna=monostatic,
+        antenna=antenna,
+    )
+    u, v = found.direction.x, found.direction.y
     if receiver is not True:
         u, v = dr.select(receiver, u, state["u"]), dr.select(receiver, v, state["v"])
     bounces = state["number"] + state.get("earlier", 0)
-    power = state["throughput"] * found.factor * inputs.coupled(bounces)
-    exists = state["active"] & (power != 0) & (state["number"] >= least)
+    power = state["throughput"] * found.factor * inputs.polarisation_factor(bounces)
+    exists = state["active"] & (power != 0) & (state["number"] >= min_vertices)
     one, none = mi.Float(1.0), mi.Float(0.0)
     transmittance, extra = state.get("transmittance", one), state.get("extra", none)
-    if not (shared and "last" not in state):
-        first = exists & (state["number"] == 1) if shared else mi.Bool(False)
-        passed = passage(rays, inputs, point.position, end.position, exists & ~first)
+    if not (shared_visibility and "last" not in state):
+        first = exists & (state["number"] == 1) if shared_visibility else mi.Bool(False)
+        passed = trace_transmission(rays, inputs, point.position, antenna.position, exists & ~first)
         transmittance = dr.select(first, transmittance, passed.transmittance)
-        extra = dr.select(first, extra, passed.extra)
+        extra = dr.select(first, extra, passed.extra_length)
     length = 0.5 * (state["length"] + found.distance + extra)
-    return Contribution(state["frame"], power * transmittance, length, u, v), exists & (
+    return PathContribution(state["frame"], power * transmittance, length, u, v), exists & (
         transmittance > 0
     )
 
 
 @dataclass(frozen=True)
-class Recorded(integrand.Spot):
+class PathVertex(integrand.SurfacePoint):
     """One vertex of every path."""
 
     throughput: Any  # all factors so far; zero where the path has ended before
-    seen: Any  # whether the vertex is connected to the receiver
+    is_visible: Any  # whether the vertex is connected to the receiver
 
     @property
     def exists(self) -> Any:
@@ -280,7 +301,7 @@ class Recorded(integrand.Spot):
 
 
 @dataclass(frozen=True)
-class Records:
+class PathRecords:
     """Vertices of paths.
 
     What tells a vertex is written and read at once, as four numbers: triangle (its bits), two
@@ -288,7 +309,7 @@ class Records:
     that a path never had, nothing is written.
     """
 
-    lanes: int  # paths
+    path_count: int  # paths
     depth: int  # vertices of a path
     frame: Any  # radar pose of a lane
     count: Any  # vertices of a lane
@@ -296,19 +317,21 @@ class Records:
     length: Any  # from the transmitter to the vertex [m], [vertex × lane]
 
     @staticmethod
-    def single(state: State, seen: Any) -> "Records":
+    def from_single_vertex(state: PathState, is_visible: Any) -> "PathRecords":
         """Records of paths of one vertex.
 
         Args:
             state: The path so far.
-            seen: Whether the vertex is connected to the receiver.
+            is_visible: Whether the vertex is connected to the receiver.
         """
         lanes = dr.width(state["index"])
         count = dr.ones(mi.UInt32, lanes)
-        return Records(lanes, 1, state["frame"], count, _row(state, seen), state["length"])
+        return PathRecords(
+            lanes, 1, state["frame"], count, _pack_vertex(state, is_visible), state["length"]
+        )
 
     @staticmethod
-    def empty(state: State, depth: int) -> "Records":
+    def allocate(state: PathState, depth: int) -> "PathRecords":
         """Room for paths that start in this state.
 
         Args:
@@ -318,14 +341,14 @@ class Records:
         lanes = dr.width(state["index"])
         rows, length = dr.empty(mi.Float, 4 * lanes * depth), dr.empty(mi.Float, lanes * depth)
         count = dr.zeros(mi.UInt32, lanes)
-        return Records(lanes, depth, state["frame"], count, rows, length)
+        return PathRecords(lanes, depth, state["frame"], count, rows, length)
 
     @property
     def columns(self) -> list[Any]:
         """All arrays."""
         return [self.frame, self.count, self.rows, self.length]
 
-    def at(self, number: Any, active: Any = True) -> Recorded:
+    def read_vertex(self, number: Any, active: Any = True) -> PathVertex:
         """One vertex of every path.
 
         Args:
@@ -335,9 +358,9 @@ class Records:
         row = self.rows
         if self.depth > 1:
             there = active & (number < self.count)
-            row = dr.gather(mi.Vector4f, self.rows, self._places(number), there)
+            row = dr.gather(mi.Vector4f, self.rows, self._row_indices(number), there)
         face = dr.reinterpret_array(mi.UInt32, row.x)
-        return Recorded(face, row.y, row.z, dr.abs(row.w), row.w > 0)
+        return PathVertex(face, row.y, row.z, dr.abs(row.w), row.w > 0)
 
     def length_at(self, number: Any, active: Any) -> Any:
         """Length of every path up to one of its vertices [m].
@@ -348,25 +371,25 @@ class Records:
         """
         if self.depth == 1:
             return self.length
-        return dr.gather(mi.Float, self.length, self._places(number), active)
+        return dr.gather(mi.Float, self.length, self._row_indices(number), active)
 
-    def write(self, state: State, seen: Any) -> None:
+    def write(self, state: PathState, is_visible: Any) -> None:
         """Store the latest vertex.
 
         Args:
             state: The path so far; ``count`` in it comes to be the number of its vertices.
-            seen: Whether the vertex is connected to the receiver.
+            is_visible: Whether the vertex is connected to the receiver.
         """
         state["count"] = state["number"]
-        at = (state["number"] - 1) * self.lanes + state["lane"]
-        dr.scatter(self.rows, _row(state, seen), at, state["active"])
+        at = (state["number"] - 1) * self.path_count + state["lane"]
+        dr.scatter(self.rows, _pack_vertex(state, is_visible), at, state["active"])
         dr.scatter(self.length, state["length"], at, state["active"])
 
-    def _places(self, number: Any) -> Any:
-        return number * self.lanes + dr.arange(mi.UInt32, self.lanes)
+    def _row_indices(self, number: Any) -> Any:
+        return number * self.path_count + dr.arange(mi.UInt32, self.path_count)
 
 
-def _row(state: State, seen: Any) -> Any:
-    throughput = dr.select(seen, state["throughput"], -state["throughput"])
+def _pack_vertex(state: PathState, is_visible: Any) -> Any:
+    throughput = dr.select(is_visible, state["throughput"], -state["throughput"])
     face = dr.reinterpret_array(mi.Float, state["face"])
     return mi.Vector4f(face, state["b1"], state["b2"], throughput)

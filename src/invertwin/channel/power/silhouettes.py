@@ -10,26 +10,32 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from invertwin.channel.power import integrand
-from invertwin.channel.power.discrete import Proportional, by_object, place_along
+from invertwin.channel.power.discrete import DiscreteSampler, balance_by_object, sample_edge_point
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.mesh_folds import folded
-from invertwin.channel.power.transmission import Hit, land, passage
-from invertwin.channel.rays.arrays import between, point_at, scrambled
+from invertwin.channel.power.mesh_folds import is_hidden_by_fold
+from invertwin.channel.power.transmission import SegmentHit, trace_to_surface, trace_transmission
+from invertwin.channel.rays.arrays import gather_points, interpolate_position, scramble_seed
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.intersections import IN_PLANE
-from invertwin.channel.rays.ray_scene import NEAR, RayScene
+from invertwin.channel.rays.intersections import PLANE_TOLERANCE
+from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
 
-_GRAZING = 1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
+_MIN_GRAZING_COSINE = (
+    1e-5  # least cosine between a boundary ray and the normal of the shadowed surface
+)
 # Boundary rays start beside the edge, by this much (two roundings) of its distance from the origin
 # and its length: its own triangles, nearly edge-on, would else lie in their way.
-_BESIDE = 1e-7
-_MISSED = 2 * NEAR  # how far off an edge, of its distance, rays may miss what they meet
-_BEFORE = 3e-5  # how much before an edge, of its distance, such rays start among close surfaces
-_FLAT = 1e-6  # least opening [rad] of an edge that can hide something
+_EDGE_OFFSET = 1e-7
+_MISS_DISTANCE = (
+    2 * RAY_EPSILON
+)  # how far off an edge, of its distance, rays may miss what they meet
+_START_OFFSET = (
+    3e-5  # how much before an edge, of its distance, such rays start among close surfaces
+)
+_MIN_OPENING = 1e-6  # least opening [rad] of an edge that can hide something
 
 
 @dataclass(frozen=True)
-class EdgePoints:
+class SilhouetteSample:
     """Points on edges and the triangle on which their shadow falls (Dr.Jit arrays).
 
     ``open`` and ``covered`` are the transmittances of the edge's own triangles: 1 where there is
@@ -38,20 +44,22 @@ class EdgePoints:
     """
 
     index: Any  # of the sample
-    receiver: Any  # whether it is the receiver's silhouette; False where one serves both antennas
+    is_receiver: (
+        Any  # whether it is the receiver's silhouette; False where one serves both antennas
+    )
     frame: Any  # radar pose
-    first: Any  # vertices at the ends of the edge
-    second: Any
+    first_vertex: Any  # vertices at the ends of the edge
+    second_vertex: Any
     side: Any  # ±1: whether ray × edge points to the covered side
-    along: Any  # place from the first end to the second, 0 to 1
+    edge_parameter: Any  # place from the first end to the second, 0 to 1
     face: Any  # triangle on which the shadow falls
     weight: Any  # one over (samples × probability per ``along``)
     transmittance: Any  # of all other sheets on the way, and the length [m] that these add
-    extra: Any
-    open: Any  # beside the edge, on the other side
-    open_extra: Any
-    covered: Any  # on the covered side
-    covered_extra: Any
+    extra_length: Any
+    open_transmittance: Any  # beside the edge, on the other side
+    open_extra_length: Any
+    covered_transmittance: Any  # on the covered side
+    covered_extra_length: Any
 
     @property
     def size(self) -> int:
@@ -60,14 +68,25 @@ class EdgePoints:
 
     def sides(self, inputs: Inputs) -> list[tuple[float, Any, Any]]:
         """Sign, transmittance and extra length of either side of the shadow's edge."""
-        lit = (1.0, self.transmittance * self.open, self.extra + self.open_extra)
-        if not inputs.surfaces.sheets:
+        lit = (
+            1.0,
+            self.transmittance * self.open_transmittance,
+            self.extra_length + self.open_extra_length,
+        )
+        if not inputs.surfaces.has_sheets:
             return [lit]
-        return [lit, (-1.0, self.transmittance * self.covered, self.extra + self.covered_extra)]
+        return [
+            lit,
+            (
+                -1.0,
+                self.transmittance * self.covered_transmittance,
+                self.extra_length + self.covered_extra_length,
+            ),
+        ]
 
 
 @dataclass(frozen=True)
-class Shadow:
+class ShadowBoundaryPoint:
     """A point on a shadow's edge."""
 
     b1: Any  # barycentric coordinates, detached
@@ -76,22 +95,22 @@ class Shadow:
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SampleBatch:
     """Edge points of which some are void: recorded, and executed when asked for."""
 
     valid: Any  # which are not void
-    groups: tuple[Any, ...]  # dataclasses of arrays
-    kind: Callable[..., Any]  # makes the points of them
+    records: tuple[Any, ...]  # dataclasses of arrays
+    factory: Callable[..., Any]  # makes the points of them
 
     def launch(self) -> None:
         """Start the execution, without waiting for it."""
-        dr.eval(self.valid, *self.groups)
+        dr.eval(self.valid, *self.records)
 
-    def kept(self) -> Any:
+    def compress(self) -> Any:
         """The points that are not void."""
         self.launch()
         lanes: Any = dr.compress(self.valid)
-        return self.kind(
+        return self.factory(
             *(
                 type(group)(
                     *(
@@ -99,12 +118,12 @@ class Drawn:
                         for c in vars(group).values()
                     )
                 )
-                for group in self.groups
+                for group in self.records
             )
         )
 
 
-class EdgeSampler:
+class SilhouetteSampler:
     """Points on the silhouettes seen from one antenna or both, and where their shadows fall.
 
     An edge is a silhouette if all its triangles lie, as seen from the antenna, on one side of
@@ -115,118 +134,147 @@ class EdgeSampler:
     Args:
         rays: The scene and its antennas.
         inputs: Detached tables.
-        centres: Antennas whose silhouettes count: ``tx``, ``rx`` or both.
+        antennas: Antennas whose silhouettes count: ``tx``, ``rx`` or both.
         samples: Points over all frames and scenes.
         seed: Of the points.
-        close: Whether other surfaces may be close to edges.
+        has_close_surfaces: Whether other surfaces may be close to edges.
     """
 
     def __init__(
         self,
         rays: RayScene,
         inputs: Inputs,
-        centres: Sequence[str],
+        antennas: Sequence[str],
         samples: int,
         seed: int,
         *,
-        close: bool = False,
+        has_close_surfaces: bool = False,
     ) -> None:
         topology = rays.topology
-        self.rays, self.inputs, self.centres, self.close = rays, inputs, centres, close
-        entries = len(centres) * rays.looks * len(topology.edges)
-        edge, _, receiver, origin = self._seen(dr.arange(mi.UInt32, entries))
+        self.rays, self.inputs, self.antennas, self.has_close_surfaces = (
+            rays,
+            inputs,
+            antennas,
+            has_close_surfaces,
+        )
+        entries = len(antennas) * rays.poses_per_scene * len(topology.edges)
+        edge, _, receiver, origin = self._decode_entry(dr.arange(mi.UInt32, entries))
         y0, y1 = rays.exact_ends(edge)
         ends = [mi.Vector3d(y - mi.Vector3d(origin)) for y in (y0, y1)]
-        sides = _sides(rays, inputs, edge, 0.5 * (ends[0] + ends[1]))
+        sides = _classify_sides(rays, inputs, edge, 0.5 * (ends[0] + ends[1]))
         self.size = samples if entries else 0
         if self.size:
             seen = mi.Float(dr.atan2(dr.norm(dr.cross(*ends)), dr.dot(*ends)))
-            counts = sides.unlike
+            counts = sides.has_contrast
             if rays.differentiated_objects is not None:
                 counts &= rays.differentiated_objects.has_edge(
                     edge
                 ) | rays.differentiated_objects.beyond(edge, origin, y0, y1)
-            weight = dr.select(counts, seen * sides.step, 0.0)
-            self.choice = Proportional(by_object(rays, edge, weight, receiver, len(centres)))
-        self.seed, self.dice = scrambled(seed, 3), scrambled(seed, 9)
+            weight = dr.select(counts, seen * sides.contrast, 0.0)
+            self.choice = DiscreteSampler(
+                balance_by_object(rays, edge, weight, receiver, len(antennas))
+            )
+        self.seed, self.transmission_seed = scramble_seed(seed, 3), scramble_seed(seed, 9)
 
-    def _seen(self, entry: Any) -> tuple[Any, Any, Any, Any]:
+    def _decode_entry(self, entry: Any) -> tuple[Any, Any, Any, Any]:
         """Edge, frame, whether the antenna is the receiver of two, and its place."""
         rays, edges = self.rays, len(self.rays.topology.edges)
         look, edge = entry // edges, entry % edges
-        first = rays.edge_scene(edge) * rays.looks
-        if len(self.centres) == 1:
+        first = rays.edge_scene(edge) * rays.poses_per_scene
+        if len(self.antennas) == 1:
             frame = first + look
-            return edge, frame, False, point_at(getattr(rays, self.centres[0]), frame)
-        receiver = look >= rays.looks
-        frame = first + dr.select(receiver, look - rays.looks, look)
-        origin = dr.select(receiver, point_at(rays.rx, frame), point_at(rays.tx, frame))
+            return edge, frame, False, gather_points(getattr(rays, self.antennas[0]), frame)
+        receiver = look >= rays.poses_per_scene
+        frame = first + dr.select(receiver, look - rays.poses_per_scene, look)
+        origin = dr.select(receiver, gather_points(rays.rx, frame), gather_points(rays.tx, frame))
         return edge, frame, receiver, origin
 
-    def draw(self, index: Any) -> Drawn:
+    def draw(self, index: Any) -> SampleBatch:
         """The samples of the given indices below ``size``; those without a shadow are void."""
         rays, topology = self.rays, self.rays.topology
-        place, along, pmf = place_along(self.choice, index, self.size, self.seed)
-        edge, frame, receiver, origin = self._seen(place)
+        place, along, pmf = sample_edge_point(self.choice, index, self.size, self.seed)
+        edge, frame, receiver, origin = self._decode_entry(place)
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0, y1 = rays.exact_ends(edge)
         y = y0 + (y1 - y0) * mi.Float64(along)
         exact = y - mi.Vector3d(origin)
-        sides = _sides(rays, self.inputs, edge, exact)
-        aside = _BESIDE * (dr.norm(y) + dr.norm(y1 - y0))
-        beside, away = mi.Point3f(y + sides.outwards * aside), mi.Vector3f(exact)
-        reach = beside - away * _BEFORE if self.close else beside
-        before = passage(rays, self.inputs, reach, origin, pmf > 0)
-        valid = (pmf > 0) & (before.transmittance > 0) & sides.unlike
-        key = index, self.dice
-        hit = _ahead(
-            rays, self.inputs, (edge, along), beside, away, valid, key, close=self.close,
-            dealt=index,
-        )  # fmt: skip
-        valid &= hit.valid & _not_grazing(rays, hit.face, away, hit.valid)
-        valid &= rays.in_scene(frame, hit.face, hit.valid)
+        sides = _classify_sides(rays, self.inputs, edge, exact)
+        aside = _EDGE_OFFSET * (dr.norm(y) + dr.norm(y1 - y0))
+        beside, away = mi.Point3f(y + sides.outward * aside), mi.Vector3f(exact)
+        reach = beside - away * _START_OFFSET if self.has_close_surfaces else beside
+        before = trace_transmission(rays, self.inputs, reach, origin, pmf > 0)
+        valid = (pmf > 0) & (before.transmittance > 0) & sides.has_contrast
+        key = index, self.transmission_seed
+        hit = _trace_past_edge(
+            rays,
+            self.inputs,
+            (edge, along),
+            beside,
+            away,
+            valid,
+            key,
+            has_close_surfaces=self.has_close_surfaces,
+            stratified_bits=index,
+        )
+        valid &= hit.valid & _is_not_grazing(rays, hit.face, away, hit.valid)
+        valid &= rays.is_in_scene(frame, hit.face, hit.valid)
         if rays.differentiated_objects is not None:
             valid &= rays.differentiated_objects.has_edge(
                 edge
             ) | rays.differentiated_objects.has_face(hit.face, hit.valid)
         # Last, since it takes longest: packets without a shadow spare it.
-        near = _MISSED * dr.norm(exact)
-        valid &= ~folded(rays, edge, y, exact, sides.outwards, aside, near, valid)
-        found = EdgePoints(
-            index, receiver, frame, first, second, sides.side, along, hit.face,
-            weight=1 / (pmf * self.size * hit.chance),
+        near = _MISS_DISTANCE * dr.norm(exact)
+        valid &= ~is_hidden_by_fold(rays, edge, y, exact, sides.outward, aside, near, valid)
+        found = SilhouetteSample(
+            index,
+            receiver,
+            frame,
+            first,
+            second,
+            sides.side,
+            along,
+            hit.face,
+            weight=1 / (pmf * self.size * hit.probability),
             transmittance=before.transmittance * hit.transmittance,
-            extra=before.extra + hit.extra,
-            open=sides.open, open_extra=sides.open_extra,
-            covered=sides.covered, covered_extra=sides.covered_extra,
-        )  # fmt: skip
-        return Drawn(valid, (found,), lambda points: points)
+            extra_length=before.extra_length + hit.extra_length,
+            open_transmittance=sides.open_transmittance,
+            open_extra_length=sides.open_extra_length,
+            covered_transmittance=sides.covered_transmittance,
+            covered_extra_length=sides.covered_extra_length,
+        )
+        return SampleBatch(valid, (found,), lambda points: points)
 
 
 @dataclass(frozen=True)
-class _Sides:
-    """What an edge's triangles let through on either side of a direction; see ``EdgePoints``."""
+class _EdgeSides:
+    """What an edge's triangles let through on either side of a direction; see
+    ``SilhouetteSample``.
+    """
 
     side: Any
-    open: Any
-    open_extra: Any
-    covered: Any
-    covered_extra: Any
-    outwards: Any  # unit direction off the covered side; zero where there is something on both
+    open_transmittance: Any
+    open_extra_length: Any
+    covered_transmittance: Any
+    covered_extra_length: Any
+    outward: Any  # unit direction off the covered side; zero where there is something on both
 
     @property
-    def step(self) -> Any:
+    def contrast(self) -> Any:
         """How much of what passes changes from side to side; little where only its length does."""
-        return dr.abs(self.open - self.covered) + 0.05 * (self.open + self.covered)
+        return dr.abs(self.open_transmittance - self.covered_transmittance) + 0.05 * (
+            self.open_transmittance + self.covered_transmittance
+        )
 
     @property
-    def unlike(self) -> Any:
+    def has_contrast(self) -> Any:
         """Whether the sides differ by more than rounding."""
-        same_length = dr.abs(self.open_extra - self.covered_extra) <= 1e-7
-        return ~((dr.abs(self.open - self.covered) <= 1e-6) & same_length)
+        same_length = dr.abs(self.open_extra_length - self.covered_extra_length) <= 1e-7
+        return ~(
+            (dr.abs(self.open_transmittance - self.covered_transmittance) <= 1e-6) & same_length
+        )
 
 
-def _sides(rays: RayScene, inputs: Inputs, edge: Any, direction: Any) -> _Sides:
+def _classify_sides(rays: RayScene, inputs: Inputs, edge: Any, direction: Any) -> _EdgeSides:
     """Sort an edge's triangles by the side of the plane through edge and direction they lie on.
 
     An opaque edge is a silhouette if nothing is on one side. In float64: the triangles of a fine
@@ -237,9 +285,9 @@ def _sides(rays: RayScene, inputs: Inputs, edge: Any, direction: Any) -> _Sides:
     plane = dr.cross(direction, y1 - y0)
     offsets, heights = [], []
     most = mi.Float64(0.0)
-    for column in topology.device_opposite:
+    for column in topology.device_edge_apexes:
         apex = dr.gather(mi.Int32, column, edge)
-        offset = rays.exact(mi.UInt32(dr.maximum(apex, 0))) - y0
+        offset = rays.exact_vertex(mi.UInt32(dr.maximum(apex, 0))) - y0
         height = dr.select(apex >= 0, dr.dot(plane, offset), 0.0)
         # Squares, since Dr.Jit 1.5 drops the abs of a select on an abs.
         most = dr.select(dr.square(height) > dr.square(most), height, most)
@@ -248,12 +296,14 @@ def _sides(rays: RayScene, inputs: Inputs, edge: Any, direction: Any) -> _Sides:
     transmittances, lengths = [mi.Float(1.0), mi.Float(1.0)], [mi.Float(0.0), mi.Float(0.0)]
     for number, (offset, height) in enumerate(zip(offsets, heights, strict=True)):
         transmittance, extra = mi.Float(0.0), mi.Float(0.0)
-        if inputs.surfaces.sheets:
-            face = dr.gather(mi.UInt32, topology.device_beside[number], edge)
+        if inputs.surfaces.has_sheets:
+            face = dr.gather(mi.UInt32, topology.device_edge_faces[number], edge)
             row = dr.gather(mi.UInt32, inputs.face_surface, face)
             normal = dr.cross(y1 - y0, offset)
             cosine = dr.abs(dr.dot(normal, direction)) / (dr.norm(normal) * dr.norm(direction))
-            transmittance, extra = inputs.surfaces.through(row, mi.Float(cosine), height != 0)
+            transmittance, extra = inputs.surfaces.sheet_transmission(
+                row, mi.Float(cosine), height != 0
+            )
         for index, on in enumerate((height * most < 0, height * most > 0)):
             transmittances[index] = dr.select(
                 on, transmittances[index] * transmittance, transmittances[index]
@@ -261,7 +311,7 @@ def _sides(rays: RayScene, inputs: Inputs, edge: Any, direction: Any) -> _Sides:
             lengths[index] = dr.select(on, lengths[index] + extra, lengths[index])
     free = (transmittances[0] == 1) & (lengths[0] == 0)
     outwards = dr.select(free, -dr.mulsign(dr.normalize(plane), most), 0.0)
-    return _Sides(
+    return _EdgeSides(
         mi.Float(dr.sign(most)),
         transmittances[0],
         lengths[0],
@@ -271,18 +321,18 @@ def _sides(rays: RayScene, inputs: Inputs, edge: Any, direction: Any) -> _Sides:
     )
 
 
-def _ahead(
+def _trace_past_edge(
     rays: RayScene,
     inputs: Inputs,
-    place: tuple[Any, Any],
-    beside: Any,
-    way: Any,
+    edge_point: tuple[Any, Any],
+    origin: Any,
+    direction: Any,
     active: Any,
     key: tuple[Any, Any],
     *,
-    close: bool,
-    dealt: Any = None,
-) -> Hit:
+    has_close_surfaces: bool,
+    stratified_bits: Any = None,
+) -> SegmentHit:
     """What lies behind points on edges.
 
     Where surfaces are close the ray starts before the edge, so that it meets those in which the
@@ -293,49 +343,57 @@ def _ahead(
     Args:
         rays: Rays.
         inputs: Detached.
-        place: Edges, and where along them.
-        beside: From where rays start, off the edge.
-        way: Their directions, as long as the edge is far away.
+        edge_point: Edges, and where along them.
+        origin: From where rays start, off the edge.
+        direction: Their directions, as long as the edge is far away.
         active: Lanes.
-        key: See ``land``.
-        close: Whether other surfaces may be close to edges.
-        dealt: See ``land``.
+        key: See ``trace_to_surface``.
+        has_close_surfaces: Whether other surfaces may be close to edges.
+        stratified_bits: See ``trace_to_surface``.
     """
-    towards, distance = dr.normalize(way), dr.norm(way)
-    past = mi.Ray3f(mi.Point3f(beside + way * NEAR), mi.Vector3f(towards))
-    if not close:
-        return land(rays, inputs, past, active, key, coherent=False, dealt=dealt)
-    early = mi.Ray3f(mi.Point3f(beside - way * _BEFORE), mi.Vector3f(towards))
-    hit = land(rays, inputs, early, active, key, coherent=False, dealt=dealt)
-    point = between(rays.corners(hit.face, hit.valid), hit.b1, hit.b2)
-    near = hit.valid & (dr.norm(point - beside) < 2 * _BEFORE * distance)
-    edge, along = place
+    towards, distance = dr.normalize(direction), dr.norm(direction)
+    past = mi.Ray3f(mi.Point3f(origin + direction * RAY_EPSILON), mi.Vector3f(towards))
+    if not has_close_surfaces:
+        return trace_to_surface(
+            rays, inputs, past, active, key, coherent=False, stratified_bits=stratified_bits
+        )
+    early = mi.Ray3f(mi.Point3f(origin - direction * _START_OFFSET), mi.Vector3f(towards))
+    hit = trace_to_surface(
+        rays, inputs, early, active, key, coherent=False, stratified_bits=stratified_bits
+    )
+    point = interpolate_position(rays.corners(hit.face, hit.valid), hit.b1, hit.b2)
+    near = hit.valid & (dr.norm(point - origin) < 2 * _START_OFFSET * distance)
+    edge, along = edge_point
     own = mi.Bool(False)
     for beside_edge, apex in zip(
-        rays.topology.device_beside, rays.topology.device_opposite, strict=True
+        rays.topology.device_edge_faces, rays.topology.device_edge_apexes, strict=True
     ):
         is_there = dr.gather(mi.Int32, apex, edge) >= 0
         own |= is_there & (dr.gather(mi.UInt32, beside_edge, edge) == hit.face)
     own &= near
     y0, y1 = rays.exact_ends(edge)
-    p0, p1, p2 = map(rays.exact, dr.gather(mi.Vector3u, rays.topology.device_faces, hit.face))
+    p0, p1, p2 = map(
+        rays.exact_vertex, dr.gather(mi.Vector3u, rays.topology.device_faces, hit.face)
+    )
     normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
     height = dr.dot(normal, y0 + (y1 - y0) * mi.Float64(along) - p0)
-    crossed = -dr.mulsign(height, dr.dot(normal, mi.Vector3d(way))) < -IN_PLANE
-    again = land(rays, inputs, past, active & own, key, coherent=False, dealt=dealt)
+    crossed = -dr.mulsign(height, dr.dot(normal, mi.Vector3d(direction))) < -PLANE_TOLERANCE
+    again = trace_to_surface(
+        rays, inputs, past, active & own, key, coherent=False, stratified_bits=stratified_bits
+    )
     pairs = zip(vars(again).values(), vars(hit).values(), strict=True)
-    hit = Hit(*(dr.select(own, second, first) for second, first in pairs))
+    hit = SegmentHit(*(dr.select(own, second, first) for second, first in pairs))
     return replace(hit, valid=hit.valid & ~(near & ~own & crossed))
 
 
-def _not_grazing(rays: RayScene, face: Any, direction: Any, active: Any) -> Any:
+def _is_not_grazing(rays: RayScene, face: Any, direction: Any, active: Any) -> Any:
     """A ray in the plane of the triangle it meets has no shadow point there."""
     p0, p1, p2 = rays.corners(face, active)
     normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
-    return active & (dr.abs(dr.dot(normal, direction)) > _GRAZING * dr.norm(direction))
+    return active & (dr.abs(dr.dot(normal, direction)) > _MIN_GRAZING_COSINE * dr.norm(direction))
 
 
-def shadow_speed(inputs: Inputs, points: EdgePoints, centre: Any) -> Shadow:
+def shadow_speed(inputs: Inputs, samples: SilhouetteSample, source: Any) -> ShadowBoundaryPoint:
     """How fast the shadow that an edge casts from an attached centre sweeps a surface.
 
     ``T · (x_c − x_m)``: x_c is where the attached ray meets the attached plane behind the edge,
@@ -344,33 +402,33 @@ def shadow_speed(inputs: Inputs, points: EdgePoints, centre: Any) -> Shadow:
 
     Args:
         inputs: Attached tables.
-        points: On edges.
-        centre: From where the shadow is cast, attached.
+        samples: On edges.
+        source: From where the shadow is cast, attached.
     """
-    c, fixed = centre, inputs.detached()
-    y0, y1 = integrand.edge_ends(inputs, points.first, points.second)
-    y = y0 + (y1 - y0) * points.along
-    triangle = p0, p1, p2 = integrand.corners(inputs, points.face)
+    c, fixed = source, inputs.detach()
+    y0, y1 = integrand.edge_ends(inputs, samples.first_vertex, samples.second_vertex)
+    y = y0 + (y1 - y0) * samples.edge_parameter
+    triangle = p0, p1, p2 = integrand.corners(inputs, samples.face)
     plane = dr.cross(p1 - p0, p2 - p0)
     moving = c + (y - c) * (dr.dot(plane, p0 - c) / dr.dot(plane, y - c))
 
-    f0, f1, f2 = integrand.corners(fixed, points.face)
+    f0, f1, f2 = integrand.corners(fixed, samples.face)
     shadow, normal = dr.detach(moving), dr.normalize(dr.cross(f1 - f0, f2 - f0))
-    b1, b2 = barycentric(shadow, f0, f1, f2)
-    material = between(triangle, b1, b2)
+    b1, b2 = barycentric_coordinates(shadow, f0, f1, f2)
+    material = interpolate_position(triangle, b1, b2)
 
     ray, edge = dr.detach(y - c), dr.detach(y1 - y0)
     stretch = dr.norm(shadow - dr.detach(c)) / dr.norm(ray)
     slope = 1 / dr.dot(normal, ray)
 
-    def projected(vector: Any) -> Any:
+    def project_to_surface(vector: Any) -> Any:
         return stretch * (vector - ray * (dr.dot(normal, vector) * slope))
 
-    tangent = dr.mulsign(dr.cross(normal, projected(edge)), points.side * slope)
-    return Shadow(b1, b2, dr.dot(tangent, moving - material) * points.weight)
+    tangent = dr.mulsign(dr.cross(normal, project_to_surface(edge)), samples.side * slope)
+    return ShadowBoundaryPoint(b1, b2, dr.dot(tangent, moving - material) * samples.weight)
 
 
-def barycentric(point: Any, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any]:
+def barycentric_coordinates(point: Any, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any]:
     """Coordinates b1 and b2 of a point in the plane of a triangle.
 
     Args:

@@ -13,24 +13,28 @@ import numpy as np
 from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.transmission import DEALT, land, passage
+from invertwin.channel.power.transmission import (
+    STRATIFIED_SHEETS,
+    trace_to_surface,
+    trace_transmission,
+)
 from invertwin.channel.rays.arrays import (
-    between,
-    point_at,
-    scrambled,
+    gather_points,
+    interpolate_position,
+    scramble_seed,
     to_float,
     to_points,
     uniform_pair,
 )
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.bounding_spheres import Spheres
+from invertwin.channel.rays.bounding_spheres import BoundingSpheres
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.errors import InputError
 
 
 @dataclass(frozen=True)
-class Samples:
+class StartPoints:
     """Points on surfaces (Dr.Jit arrays)."""
 
     frame: Any  # radar pose
@@ -39,7 +43,7 @@ class Samples:
     b2: Any
     weight: Any  # one over (samples × probability per area)
     transmittance: Any  # of the sheets between transmitter and point
-    extra: Any  # length that these add [m]
+    extra_length: Any  # length that these add [m]
 
 
 class RaySampler:
@@ -59,17 +63,17 @@ class RaySampler:
         seed: int,
         reference: tuple[Geometry, Link] | None = None,
     ) -> None:
-        self.rays, self.spheres, self.centres = rays, rays.spheres, rays.tx
+        self.rays, self.spheres, self.origins = rays, rays.spheres, rays.tx
         if reference:
-            self.spheres = Spheres(reference[0], rays.origin, margin=1.1)
-            self.centres = to_points(reference[1].tx.detach() - rays.origin)
-        blocks = rays.looks * self.spheres.count
+            self.spheres = BoundingSpheres(reference[0], rays.origin, margin=1.1)
+            self.origins = to_points(reference[1].tx.detach() - rays.origin)
+        blocks = rays.poses_per_scene * self.spheres.object_count
         self.rows = max(1, int(np.sqrt(samples / blocks)))
         self.columns = max(1, samples // blocks // self.rows)
         self.size = blocks * self.rows * self.columns
-        self.seed, self.dice = scrambled(seed, 0), scrambled(seed, 8)
+        self.seed, self.transmission_seed = scramble_seed(seed, 0), scramble_seed(seed, 8)
 
-    def draw(self, index: Any, inputs: Inputs) -> Samples:
+    def draw(self, index: Any, inputs: Inputs) -> StartPoints:
         """The samples of the given indices below ``size``.
 
         Args:
@@ -78,9 +82,9 @@ class RaySampler:
         """
         rays, per_block = self.rays, self.rows * self.columns
         block, place = index // per_block, index % per_block
-        own, scene = self.spheres.listed(block % self.spheres.count)
-        frame = scene * rays.looks + block // self.spheres.count
-        centre = point_at(self.centres, frame)
+        own, scene = self.spheres.table_entry(block % self.spheres.object_count)
+        frame = scene * rays.poses_per_scene + block // self.spheres.object_count
+        centre = gather_points(self.origins, frame)
         axis, height, _ = self.spheres.cap(own, centre)
         jitter = uniform_pair(index, self.seed)
         column, row = place % self.columns, place // self.columns
@@ -94,27 +98,37 @@ class RaySampler:
         spread = dr.sqrt(height * (2 - depth))
         local = mi.Vector3f(disk.x * spread, disk.y * spread, 1 - depth)
         direction = dr.normalize(mi.Frame3f(axis).to_world(local))
-        group = own // self.spheres.size
-        found, around = self.spheres.density(rays, group, centre, direction, mi.Bool(True), own)
+        group = own // self.spheres.group_size
+        found, around = self.spheres.group_density(
+            rays, group, centre, direction, mi.Bool(True), own
+        )
         density = per_block * (found + around / (4 * dr.pi))
-        centre = point_at(rays.tx, frame)
+        centre = gather_points(rays.tx, frame)
         ray = mi.Ray3f(centre, direction)
-        key = index, self.dice
-        hit = land(
-            rays, inputs, ray, mi.Bool(True), key, coherent=True, dealt=_dealt(column, row)
-        )  # fmt: skip
-        point = integrand.place(inputs, hit.face, hit.b1, hit.b2)
+        key = index, self.transmission_seed
+        hit = trace_to_surface(
+            rays,
+            inputs,
+            ray,
+            mi.Bool(True),
+            key,
+            coherent=True,
+            stratified_bits=_stratified_bits(column, row),
+        )
+        point = integrand.compute_interaction(inputs, hit.face, hit.b1, hit.b2)
         cosine = dr.maximum(dr.abs(dr.dot(point.normal, direction)), 1e-6)
         distance = dr.squared_norm(point.position - centre)
-        counts = hit.valid & (self.spheres.group(hit.face) == group)
-        weight = dr.select(counts, distance / (cosine * density * hit.chance), 0.0)
-        return Samples(frame, hit.face, hit.b1, hit.b2, weight, hit.transmittance, hit.extra)
+        counts = hit.valid & (self.spheres.face_group(hit.face) == group)
+        weight = dr.select(counts, distance / (cosine * density * hit.probability), 0.0)
+        return StartPoints(
+            frame, hit.face, hit.b1, hit.b2, weight, hit.transmittance, hit.extra_length
+        )
 
 
-def _dealt(column: Any, row: Any) -> Any:
+def _stratified_bits(column: Any, row: Any) -> Any:
     """Bits by which a grid falls into halves that are as even as it is, and these again."""
     bits = mi.UInt32(0)
-    for k in range(DEALT // 2):
+    for k in range(STRATIFIED_SHEETS // 2):
         x, y = column >> k, row >> k
         bits |= (((x ^ y) & 1) | ((y & 1) << 1)) << (2 * k)
     return bits
@@ -151,9 +165,9 @@ class AreaSampler:
         self.per_frame = max(1, samples // rays.link.frame_count)
         self.size = self.per_frame * rays.link.frame_count
         self.distribution = mi.DiscreteDistribution(to_float(areas / areas.mean()))
-        self.seeds = scrambled(seed, 1), scrambled(seed, 2)
+        self.seeds = scramble_seed(seed, 1), scramble_seed(seed, 2)
 
-    def draw(self, index: Any, inputs: Inputs) -> Samples:
+    def draw(self, index: Any, inputs: Inputs) -> StartPoints:
         """The samples of the given indices below ``size``.
 
         Args:
@@ -168,7 +182,9 @@ class AreaSampler:
         b = mi.warp.square_to_uniform_triangle(mi.Point2f(*uniform_pair(index, self.seeds[1])))
         triangle = p0, p1, p2 = rays.corners(face)
         area = 0.5 * dr.norm(dr.cross(p1 - p0, p2 - p0))
-        position = between(triangle, b.x, b.y)
-        passed = passage(rays, inputs, point_at(rays.tx, frame), position, mi.Bool(True))
+        position = interpolate_position(triangle, b.x, b.y)
+        passed = trace_transmission(
+            rays, inputs, gather_points(rays.tx, frame), position, mi.Bool(True)
+        )
         weight = dr.select(passed.transmittance > 0, area / (pmf * self.per_frame), 0.0)
-        return Samples(frame, face, b.x, b.y, weight, passed.transmittance, passed.extra)
+        return StartPoints(frame, face, b.x, b.y, weight, passed.transmittance, passed.extra_length)

@@ -13,42 +13,44 @@ from torch import Tensor
 from invertwin.channel.rays.arrays import opaque, to_float
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene_tables import Geometry
-from invertwin.scene import Surface
+from invertwin.scene import ScatteringLaw
 
 #: Names of a surface's tables that kernels read; depolarisation scales others (``deposit_power``).
-SURFACE = tuple(field.name for field in fields(Surface) if field.name != "depolarisation")
-_COLUMNS = ("diffuse", "lobes", "exponents", "index", "attenuation")
+SCATTERING_TABLES = tuple(
+    field.name for field in fields(ScatteringLaw) if field.name != "depolarisation"
+)
+_CONSTANT_COLUMNS = ("diffuse", "lobes", "exponents", "index", "attenuation")
 
 
 @dataclass(frozen=True)
-class Surfaces:
+class ScatteringLawTables:
     """Rows of ``scene.material.Surface`` as flat Dr.Jit arrays, and what is known of all rows."""
 
-    tables: Mapping[str, Any]  # by the names of ``SURFACE``
-    cosines: int  # entries of a table over cosθ
-    lobed: tuple[bool, ...]  # which lobes have weight anywhere
-    sheets: bool  # whether something passes straight through any surface
-    bodies: bool  # whether any surface is the skin of a refracting body
-    spread: bool  # whether any specular lobe lacks what is mirrored
-    known: Mapping[str, list[Any]]  # columns that are the same in all rows, and need no look-up
+    tables: Mapping[str, Any]  # by the names of ``SCATTERING_TABLES``
+    cosine_count: int  # entries of a table over cosθ
+    has_lobe: tuple[bool, ...]  # which lobes have weight anywhere
+    has_sheets: bool  # whether something passes straight through any surface
+    has_refracting_bodies: bool  # whether any surface is the skin of a refracting body
+    has_spread: bool  # whether any specular lobe lacks what is mirrored
+    constants: Mapping[str, list[Any]]  # columns that are the same in all rows, and need no look-up
 
     @staticmethod
-    def of(geometry: Geometry) -> "Surfaces":
+    def from_geometry(geometry: Geometry) -> "ScatteringLawTables":
         """Upload the surfaces of a scene."""
         rows = geometry.surfaces
         known = {}
         if len(rows.diffuse) == 1:
-            known = {name: single_row(getattr(rows, name)) for name in _COLUMNS}
+            known = {name: opaque_row(getattr(rows, name)) for name in _CONSTANT_COLUMNS}
         if bool((rows.amplitude == rows.amplitude[0, 0]).all()):  # conductors
-            known["amplitude"] = single_row(rows.amplitude[:1, :1])
-        return Surfaces(
-            {name: to_float(getattr(rows, name)) for name in SURFACE},
-            known=known,
-            cosines=rows.amplitude.shape[1],
-            lobed=geometry.lobed,
-            sheets=geometry.sheets,
-            bodies=geometry.bodies,
-            spread=geometry.spread,
+            known["amplitude"] = opaque_row(rows.amplitude[:1, :1])
+        return ScatteringLawTables(
+            {name: to_float(getattr(rows, name)) for name in SCATTERING_TABLES},
+            constants=known,
+            cosine_count=rows.amplitude.shape[1],
+            has_lobe=geometry.has_lobe,
+            has_sheets=geometry.has_sheets,
+            has_refracting_bodies=geometry.has_refracting_bodies,
+            has_spread=geometry.has_spread,
         )
 
     def value(self, name: str, row: Any, active: Any = True) -> Any:
@@ -63,19 +65,19 @@ class Surfaces:
 
     def _column(self, name: str, number: int, count: int, row: Any, active: Any) -> Any:
         """One of the ``count`` numbers that a table has for every row."""
-        if self._is_known(name):
-            return mi.Float(self.known[name][number])
+        if self._is_constant(name):
+            return mi.Float(self.constants[name][number])
         return self._read(name, row * count + number, active)
 
-    def _is_known(self, name: str) -> bool:
-        return name in self.known and not dr.grad_enabled(self.tables[name])
+    def _is_constant(self, name: str) -> bool:
+        return name in self.constants and not dr.grad_enabled(self.tables[name])
 
-    def _read(self, name: str, at: Any, active: Any) -> Any:
+    def _read(self, name: str, index: Any, active: Any) -> Any:
         """Entries of a table; by all lanes where it has no derivatives, so that it is read once."""
         table = self.tables[name]
-        return dr.gather(mi.Float, table, at, active if dr.grad_enabled(table) else True)
+        return dr.gather(mi.Float, table, index, active if dr.grad_enabled(table) else True)
 
-    def tabulated(self, name: str, row: Any, cosine: Any, active: Any = True) -> Any:
+    def interpolate_cosine(self, name: str, row: Any, cosine: Any, active: Any = True) -> Any:
         """A table over cosθ, linear between its entries.
 
         Args:
@@ -84,15 +86,15 @@ class Surfaces:
             cosine: Of the angle of incidence, at least 0.
             active: Lanes.
         """
-        if self._is_known(name):
-            return mi.Float(self.known[name][0])
-        t = dr.minimum(cosine, 1.0) * (self.cosines - 1)
-        low = dr.minimum(mi.UInt32(dr.detach(t)), self.cosines - 2)
-        first = self._read(name, row * self.cosines + low, active)
-        second = self._read(name, row * self.cosines + low + 1, active)
+        if self._is_constant(name):
+            return mi.Float(self.constants[name][0])
+        t = dr.minimum(cosine, 1.0) * (self.cosine_count - 1)
+        low = dr.minimum(mi.UInt32(dr.detach(t)), self.cosine_count - 2)
+        first = self._read(name, row * self.cosine_count + low, active)
+        second = self._read(name, row * self.cosine_count + low + 1, active)
         return first + (second - first) * (t - mi.Float(low))
 
-    def through(self, row: Any, cosine: Any, active: Any = True) -> tuple[Any, Any]:
+    def sheet_transmission(self, row: Any, cosine: Any, active: Any = True) -> tuple[Any, Any]:
         """Transmittance of a sheet, and the length [m] that it adds.
 
         Args:
@@ -101,11 +103,12 @@ class Surfaces:
             active: Lanes.
         """
         return tuple(  # type: ignore[return-value]
-            self.tabulated(name, row, cosine, active) for name in ("transmittance", "extra_length")
+            self.interpolate_cosine(name, row, cosine, active)
+            for name in ("transmittance", "extra_length")
         )
 
-    def lobe(
-        self, number: int, row: Any, normal: Any, back: Any, on: Any, active: Any = True
+    def evaluate_lobe(
+        self, number: int, row: Any, normal: Any, incident: Any, outgoing: Any, active: Any = True
     ) -> tuple[Any, Any]:
         """``((1 + cosψ)/2)^p`` of one lobe, and its exponent p.
 
@@ -115,14 +118,14 @@ class Surfaces:
             number: 0 specular, 1 directive, 2 backscattering.
             row: Of the surface.
             normal: Unit normal.
-            back: Where the path comes from.
-            on: Where it goes on.
+            incident: Where the path comes from.
+            outgoing: Where it goes on.
             active: Lanes.
         """
-        axis = back if number == 2 else normal * (2 * dr.dot(normal, back)) - back
-        apart = dr.squared_norm(on - axis)
+        axis = incident if number == 2 else normal * (2 * dr.dot(normal, incident)) - incident
+        apart = dr.squared_norm(outgoing - axis)
         exponent = self.exponent(number, row, active)
-        return dr.exp(exponent * log_less(0.25 * apart)), exponent
+        return dr.exp(exponent * log_one_minus(0.25 * apart)), exponent
 
     def exponent(self, number: int, row: Any, active: Any = True) -> Any:
         """Exponent of a lobe.
@@ -134,7 +137,9 @@ class Surfaces:
         """
         return self._column("exponents", number, 3, row, active)
 
-    def scattered(self, row: Any, normal: Any, back: Any, on: Any, active: Any = True) -> Any:
+    def evaluate_scattering(
+        self, row: Any, normal: Any, incident: Any, outgoing: Any, active: Any = True
+    ) -> Any:
         """``f |cosθ| |cosθ'|`` between two unit directions that point away from the surface.
 
         On one side, ``f`` is the distribution of ``scene.material``; through the skin of a
@@ -143,41 +148,41 @@ class Surfaces:
         Args:
             row: Of the surface.
             normal: Unit normal.
-            back: Where the path comes from.
-            on: Where it goes on; None where both directions are one.
+            incident: Where the path comes from.
+            outgoing: Where it goes on; None where both directions are one.
             active: Lanes.
         """
-        first = dr.dot(normal, back)
+        first = dr.dot(normal, incident)
         low = self._amplitude(row, first, active)
-        if on is None:
-            on, product, reflectance = back, dr.square(first), dr.square(low)
+        if outgoing is None:
+            outgoing, product, reflectance = incident, dr.square(first), dr.square(low)
         else:
-            second = dr.dot(normal, on)
+            second = dr.dot(normal, outgoing)
             product = first * second
             reflectance = low * self._amplitude(row, second, active)
         shape = self.value("diffuse", row, active) * dr.inv_pi
-        for number, present in enumerate(self.lobed):
+        for number, present in enumerate(self.has_lobe):
             if present:
-                lobe, _ = self.lobe(number, row, normal, back, on, active)
-                if number == 0 and self.spread:
-                    for direction in (back, on):
+                lobe, _ = self.evaluate_lobe(number, row, normal, incident, outgoing, active)
+                if number == 0 and self.has_spread:
+                    for direction in (incident, outgoing):
                         cosine = dr.abs(dr.dot(normal, direction))
-                        lobe *= self.tabulated("spread", row, cosine, active)
+                        lobe *= self.interpolate_cosine("spread", row, cosine, active)
                 shape += self._column("lobes", number, 3, row, active) * lobe
         value = dr.select(dr.detach(product) > 0, reflectance * shape * product, 0.0)
-        if self.bodies and on is not back:
-            through = self.refracted(row, normal, back, on, active)
+        if self.has_refracting_bodies and outgoing is not incident:
+            through = self.evaluate_refraction(row, normal, incident, outgoing, active)
             value = dr.select(dr.detach(product) < 0, through, value)
         return value
 
     def _amplitude(self, row: Any, cosine: Any, active: Any) -> Any:
         """Square root of the reflectance; from inside a body, that of the refracted angle."""
-        if not self.bodies:
-            return self.tabulated("amplitude", row, dr.abs(cosine), active)
-        outer, total = self._outside(row, cosine, active)
-        return dr.select(total, 1.0, self.tabulated("amplitude", row, outer, active))
+        if not self.has_refracting_bodies:
+            return self.interpolate_cosine("amplitude", row, dr.abs(cosine), active)
+        outer, total = self._outer_cosine(row, cosine, active)
+        return dr.select(total, 1.0, self.interpolate_cosine("amplitude", row, outer, active))
 
-    def _outside(self, row: Any, cosine: Any, active: Any) -> tuple[Any, Any]:
+    def _outer_cosine(self, row: Any, cosine: Any, active: Any) -> tuple[Any, Any]:
         """Cosine on the outer side of a skin (Snell), and whether there is none."""
         inside = dr.detach(cosine) < 0
         index = self.value("index", row, active)
@@ -186,7 +191,9 @@ class Surfaces:
         refracted = dr.sqrt(dr.select(inside & ~total, square, 1.0))
         return dr.select(inside, refracted, cosine), total
 
-    def refracted(self, row: Any, normal: Any, back: Any, on: Any, active: Any) -> Any:
+    def evaluate_refraction(
+        self, row: Any, normal: Any, incident: Any, outgoing: Any, active: Any
+    ) -> Any:
         """``f |cosθ| |cosθ'|`` through the skin of a body, in a lobe about Snell's direction.
 
         ``f = n'² sqrt(T(θ) T(θ')) g(m)`` with the mismatch ``m = n d + n' d'`` of the directions'
@@ -196,16 +203,16 @@ class Surfaces:
         Args:
             row: Row of the surface.
             normal: Unit normal.
-            back, on: Unit directions of the path, away from the surface.
+            incident, outgoing: Unit directions of the path, away from the surface.
             active: Lanes.
         """
-        first, second = dr.dot(normal, back), dr.dot(normal, on)
+        first, second = dr.dot(normal, incident), dr.dot(normal, outgoing)
         inner = self.value("index", row, active)
         variance = self.refraction_variance(row, active)
         roots, mismatch, index = [], mi.Vector3f(0.0), mi.Float(1.0)
-        for direction, cosine in ((back, first), (on, second)):
-            outer, total = self._outside(row, cosine, active)
-            passing = self.tabulated("refraction", row, outer, active)
+        for direction, cosine in ((incident, first), (outgoing, second)):
+            outer, total = self._outer_cosine(row, cosine, active)
+            passing = self.interpolate_cosine("refraction", row, outer, active)
             # A root of zero has no derivative: opaque surfaces take part as well.
             open_ = ~total & (dr.detach(passing) > 0)
             roots.append(dr.select(open_, dr.sqrt(dr.select(open_, passing, 1.0)), 0.0))
@@ -224,13 +231,13 @@ class Surfaces:
         exponent = self.exponent(0, row, active)
         return 2 / dr.maximum(exponent, 1.0)
 
-    def is_skin(self, row: Any) -> Any:
+    def is_refracting(self, row: Any) -> Any:
         """Whether a surface is the skin of a refracting body."""
-        last = (row + 1) * self.cosines - 1
+        last = (row + 1) * self.cosine_count - 1
         return dr.detach(dr.gather(mi.Float, self.tables["refraction"], last)) > 0
 
 
-def single_row(row: Tensor) -> list[Any]:
+def opaque_row(row: Tensor) -> list[Any]:
     """The numbers of a table of one row, each for all lanes.
 
     Args:
@@ -239,14 +246,14 @@ def single_row(row: Tensor) -> list[Any]:
     return [opaque(float(number), "Float") for number in row.detach().ravel()]
 
 
-def log_less(share: Any) -> Any:
+def log_one_minus(fraction: Any) -> Any:
     """log(1 − x), at least that of 1e-7, with the digits of a small x.
 
     Args:
-        share: x, from 0 to 1.
+        fraction: x, from 0 to 1.
     """
-    series = -share * (1 + share * (1 / 2 + share / 3))
-    return dr.select(dr.detach(share) < 0.01, series, dr.log(dr.maximum(1 - share, 1e-7)))
+    series = -fraction * (1 + fraction * (1 / 2 + fraction / 3))
+    return dr.select(dr.detach(fraction) < 0.01, series, dr.log(dr.maximum(1 - fraction, 1e-7)))
 
 
 def gaussian(mismatch: Any, variance: Any) -> Any:

@@ -9,38 +9,38 @@ from torch import Tensor
 from torch._C import _DisableFuncTorch
 
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.checks import plain
+from invertwin.checks import strip_derivatives
 
 
 def to_float(values: Tensor) -> Any:
     """A flat Dr.Jit float array of a torch tensor (detached, float32)."""
-    return mi.Float(_aligned(values, torch.float32))
+    return mi.Float(_copy_aligned(values, torch.float32))
 
 
 def to_double(values: Tensor) -> Any:
     """A flat Dr.Jit float64 array of a torch tensor (detached)."""
-    return mi.Float64(_aligned(values, torch.float64))
+    return mi.Float64(_copy_aligned(values, torch.float64))
 
 
 def to_index(values: Tensor) -> Any:
     """A flat Dr.Jit index array of a torch tensor of non-negative integers."""
-    return mi.UInt32(_aligned(values, torch.int32).view(np.uint32))
+    return mi.UInt32(_copy_aligned(values, torch.int32).view(np.uint32))
 
 
 def to_signed(values: Tensor) -> Any:
     """A flat Dr.Jit array of a torch tensor of integers."""
-    return mi.Int32(_aligned(values, torch.int32))
+    return mi.Int32(_copy_aligned(values, torch.int32))
 
 
-def _aligned(values: Tensor, kind: torch.dtype) -> np.ndarray:
+def _copy_aligned(values: Tensor, dtype: torch.dtype) -> np.ndarray:
     """A flat copy in torch's own memory, which begins at a multiple of 64 bytes.
 
     Dr.Jit reads such memory in place. Where it begins elsewhere, as NumPy's may, Dr.Jit compiles
     kernels of their own for it.
     """
     with _DisableFuncTorch():  # within `torch.func`, even new tensors are wrapped
-        given = plain(values).cpu()
-        return torch.empty(given.shape, dtype=kind).copy_(given).ravel().numpy()
+        given = strip_derivatives(values).cpu()
+        return torch.empty(given.shape, dtype=dtype).copy_(given).ravel().numpy()
 
 
 def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> Any:
@@ -48,7 +48,7 @@ def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> Any:
     return to_float(torch.nn.functional.pad(values.detach().to(torch.float32), (0, 1)))
 
 
-def point_at(table: Any, index: Any, active: Any = True) -> Any:
+def gather_points(table: Any, index: Any, active: Any = True) -> Any:
     """Points of such an array.
 
     Args:
@@ -70,7 +70,7 @@ def to_torch(values: Any) -> Tensor:
     return torch.from_numpy(np.array(values))
 
 
-def shared(values: Any) -> Tensor:
+def view_as_torch(values: Any) -> Tensor:
     """The same as ``to_torch``, but in Dr.Jit's own memory where that is the CPU's: only to read.
 
     Args:
@@ -81,17 +81,17 @@ def shared(values: Any) -> Tensor:
     return torch.from_dlpack(values).cpu()
 
 
-def opaque(value: float | int, kind: str = "UInt32") -> Any:
+def opaque(value: float | int, type_name: str = "UInt32") -> Any:
     """A Dr.Jit scalar that the kernel reads from memory, so that a new value does not recompile.
 
     Args:
         value: The number.
-        kind: Its Dr.Jit type.
+        type_name: Its Dr.Jit type.
     """
-    return dr.opaque(getattr(mi, kind), value)
+    return dr.opaque(getattr(mi, type_name), value)
 
 
-def scrambled(seed: int, stream: int) -> Any:
+def scramble_seed(seed: int, stream: int) -> Any:
     """An opaque 32-bit seed; neighbouring seeds and streams are unrelated.
 
     Args:
@@ -107,7 +107,7 @@ def uniform_pair(index: Any, seed: Any) -> tuple[Any, Any]:
 
     Args:
         index: One a lane.
-        seed: From ``scrambled``.
+        seed: From ``scramble_seed``.
     """
     first, second = mi.sample_tea_32(index, seed)
     return mi.Float(first >> 8) * 2.0**-24, mi.Float(second >> 8) * 2.0**-24
@@ -123,10 +123,10 @@ def corners(vertices: Any, faces: Any, face: Any, active: Any = True) -> tuple[A
         active: Lanes.
     """
     index = dr.gather(mi.Vector4u, faces, face, active)
-    return tuple(point_at(vertices, index[k], active) for k in range(3))  # type: ignore[return-value]
+    return tuple(gather_points(vertices, index[k], active) for k in range(3))  # type: ignore[return-value]
 
 
-def between(triangle: tuple[Any, Any, Any], b1: Any, b2: Any) -> Any:
+def interpolate_position(triangle: tuple[Any, Any, Any], b1: Any, b2: Any) -> Any:
     """The point of a triangle with these barycentric coordinates.
 
     Args:

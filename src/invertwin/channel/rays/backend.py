@@ -18,23 +18,23 @@ from invertwin.errors import InputError
 from invertwin.runtime import doctor, threads
 
 VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
-alone = threading.RLock()
+tracer_lock = threading.RLock()
 """Held while rays are traced, or a level of forward-mode derivatives is open."""
 
 
-class _ThisThread(threading.local):
+class _ThreadState(threading.local):
     def __init__(self) -> None:
-        self.chosen: list[str] = []  # backends, the innermost one last
-        self.traces = False
+        self.backends: list[str] = []  # backends, the innermost one last
+        self.is_tracing = False
 
 
-_here = _ThisThread()
+_thread = _ThreadState()
 _forked = False  # whether the parent of this process had started the ray tracer
 
 
 @cache
 def _cuda_found() -> bool:
-    doctor.require()
+    doctor.require_backend()
     import drjit
 
     return bool(drjit.has_backend(drjit.JitBackend.CUDA))
@@ -49,12 +49,12 @@ def backend() -> str:
     Raises:
         InputError: A name that is not known, or CUDA asked for where there is none.
     """
-    if _here.chosen:
-        return _here.chosen[-1]
-    return _resolved(os.environ.get("INVERTWIN_BACKEND", "auto"))
+    if _thread.backends:
+        return _thread.backends[-1]
+    return _resolve_backend(os.environ.get("INVERTWIN_BACKEND", "auto"))
 
 
-def _resolved(name: str) -> str:
+def _resolve_backend(name: str) -> str:
     if name not in ("cpu", "cuda", "auto"):
         raise InputError(
             f"expected backend 'cpu', 'cuda' or 'auto', got {name!r}; "
@@ -70,18 +70,18 @@ def _resolved(name: str) -> str:
 @contextmanager
 def use_backend(name: str | None) -> Iterator[None]:
     """Choose ``cpu``, ``cuda`` or ``auto`` inside a ``with`` block; ``None`` changes nothing."""
-    _here.chosen.append(backend() if name is None else _resolved(name))
-    _turn()
+    _thread.backends.append(backend() if name is None else _resolve_backend(name))
+    _switch_types()
     try:
         yield
     finally:
-        _here.chosen.pop()
-        _turn()
+        _thread.backends.pop()
+        _switch_types()
 
 
-def _turn() -> None:
-    if _here.traces:
-        mi.turn(backend())
+def _switch_types() -> None:
+    if _thread.is_tracing:
+        mi.switch_types(backend())
 
 
 @contextmanager
@@ -99,25 +99,25 @@ def tracing(name: str | None = None) -> Iterator[None]:
             "expected a process with a ray tracer of its own, got a fork of one that had traced "
             "rays; start processes by multiprocessing.get_context('spawn')"
         )
-    with alone, use_backend(name):
-        outer = _here.traces
-        _here.traces = True
-        _turn()
+    with tracer_lock, use_backend(name):
+        outer = _thread.is_tracing
+        _thread.is_tracing = True
+        _switch_types()
         try:
             yield
             # Side effects and kernels under way are the thread's own: others would not wait.
             dr.eval()
             dr.sync_thread()
         finally:
-            _here.traces = outer
+            _thread.is_tracing = outer
             if not outer:
-                mi.turn(None)
+                mi.switch_types(None)
 
 
 def _after_fork() -> None:
     """In a forked child the threads of the ray tracer and of torch are gone; nobody waits."""
     global _forked
-    _forked = _forked or _loaded.cache_info().currsize > 0
+    _forked = _forked or _load_module.cache_info().currsize > 0
     if _forked:
         torch.set_num_threads(1)
 
@@ -141,10 +141,10 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 @cache
-def _loaded(module: str, name: str) -> Any:
-    doctor.require(name)
+def _load_module(module: str, name: str) -> Any:
+    doctor.require_backend(name)
     found, drjit = importlib.import_module(module), importlib.import_module("drjit")
-    count = threads.available()
+    count = threads.available_threads()
     if drjit.thread_count() != count:
         drjit.set_thread_count(count)
     # It has read the environment, unless it was imported before this package.
@@ -159,25 +159,25 @@ class _Mitsuba:
     def __init__(self) -> None:
         self._types: dict[str, dict[str, type]] = {}
 
-    def turn(self, wanted: str | None) -> None:
+    def switch_types(self, backend_name: str | None) -> None:
         """Know the types of one backend, or of none: where no one traces.
 
         Args:
-            wanted: The backend.
+            backend_name: The backend.
         """
         types = self._types
         self.__dict__.clear()
         # Kernels ask for types a thousand times, so that those in force are plain attributes.
-        self.__dict__.update(types.get(wanted or "", {}), _types=types)
+        self.__dict__.update(types.get(backend_name or "", {}), _types=types)
 
     def __getattr__(self, name: str) -> Any:
         wanted = backend()
-        module = _loaded("mitsuba", wanted)
+        module = _load_module("mitsuba", wanted)
         if module.variant() != VARIANTS[wanted]:
             module.set_variant(VARIANTS[wanted])
         found = getattr(module, name)
         # Types are those of one variant, whichever is set.
-        if isinstance(found, type) and _here.traces:
+        if isinstance(found, type) and _thread.is_tracing:
             self._types.setdefault(wanted, {})[name] = found
             setattr(self, name, found)
         return found
@@ -187,7 +187,7 @@ class _DrJit:
     """Dr.Jit, imported when it is first used."""
 
     def __getattr__(self, name: str) -> Any:
-        found = getattr(_loaded("drjit", backend()), name)
+        found = getattr(_load_module("drjit", backend()), name)
         setattr(self, name, found)  # the same for all backends, so that no one asks again
         return found
 

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from invertwin.channel.paths import Link
 from invertwin.channel.rays.scene_tables import Geometry
-from invertwin.checks import plain
+from invertwin.checks import strip_derivatives
 
-_GAP = 0.02  # between scenes, of the largest side of any
+_BOX_GAP = 0.02  # between scenes, of the largest side of any
 
 
-def stand_apart(
+def arrange_scenes(
     geometry: Geometry, link: Link, object_scene: Int64[Tensor, " object"]
 ) -> tuple[Geometry, Link]:
     """Move every scene, with radar poses of its own, into a box of its own.
@@ -33,32 +33,35 @@ def stand_apart(
     """
     owner = object_scene[geometry.topology.vertex_object]
     count = int(object_scene.max()) + 1
-    points, antennas = plain(geometry.vertices), torch.cat([plain(link.tx), plain(link.rx)])
+    points, antennas = (
+        strip_derivatives(geometry.vertices),
+        torch.cat([strip_derivatives(link.tx), strip_derivatives(link.rx)]),
+    )
     rows = owner[:, None].expand(-1, 3)
     low, high = (
         around.expand(count, 3).scatter_reduce(0, rows, points, how)
         for around, how in ((antennas.amin(0), "amin"), (antennas.amax(0), "amax"))
     )
-    shift = _places(count, (high - low).amax(0)) - 0.5 * (low + high)
+    shift = _box_centres(count, (high - low).amax(0)) - 0.5 * (low + high)
     vertices = geometry.vertices + shift[owner]
 
-    def moved(places: Tensor) -> Tensor:
-        return (places + shift[:, None]).flatten(0, 1)
+    def shift_positions(positions: Tensor) -> Tensor:
+        return (positions + shift[:, None]).flatten(0, 1)
 
     origin = None if link.range_origin is None else link.range_origin.repeat(count)
     moved_link = replace(
         link,
-        tx=moved(link.tx),
-        rx=moved(link.rx),
+        tx=shift_positions(link.tx),
+        rx=shift_positions(link.rx),
         rotations=link.rotations.repeat(count, 1, 1),
         range_origin=origin,
     )
     return replace(geometry, vertices=vertices, object_scene=object_scene), moved_link
 
 
-def _places(count: int, sides: Float64[Tensor, "3"]) -> Float64[Tensor, "scene 3"]:
+def _box_centres(count: int, sides: Float64[Tensor, "3"]) -> Float64[Tensor, "scene 3"]:
     """Middles of boxes of these sides, as close together as a lattice has them."""
-    cell = sides + _GAP * sides.max()
+    cell = sides + _BOX_GAP * sides.max()
     lattice = [1, 1, 1]
     while prod(lattice) < count:
         lattice[int((torch.tensor(lattice) * cell).argmin())] += 1

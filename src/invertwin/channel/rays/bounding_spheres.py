@@ -10,13 +10,13 @@ from torch import Tensor
 from invertwin.channel.rays.arrays import opaque, to_float, to_index
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.scene_tables import Geometry
-from invertwin.channel.rays.topology import side_by_side
+from invertwin.channel.rays.topology import morton_order
 
-_TOGETHER = 8  # objects of a group
-_NOWHERE = (0.0, 0.0, 0.0, -1.0)  # a sphere that nothing meets
+_MAX_GROUP_SIZE = 8  # objects of a group
+_EMPTY_SPHERE = (0.0, 0.0, 0.0, -1.0)  # a sphere that nothing meets
 
 
-class Spheres:
+class BoundingSpheres:
     """A sphere around each object, detached; objects that lie side by side form groups.
 
     Rays that are aimed at an object count where they end on one of its group: so the density of
@@ -32,32 +32,32 @@ class Spheres:
             origin: About which the kernel counts places [m].
             margin: By how much spheres are larger than they need to be.
         """
-        centres, radii = _around(geometry)
-        order = side_by_side(centres)
-        self.count = len(order)  # of all scenes
-        scene = np.zeros(self.count, dtype=np.int64)
+        centres, radii = _fit_spheres(geometry)
+        order = morton_order(centres)
+        self.object_count = len(order)  # of all scenes
+        scene = np.zeros(self.object_count, dtype=np.int64)
         if geometry.object_scene is not None:
             scene = geometry.object_scene.numpy()
             order = order[np.argsort(scene[order], kind="stable")]
         counts = np.bincount(scene)
-        self.most = int(counts.max())  # of one scene
-        self.size = -(-self.most // -(-self.most // _TOGETHER))
-        groups = -(-counts // self.size)
+        self.max_objects = int(counts.max())  # of one scene
+        self.group_size = -(-self.max_objects // -(-self.max_objects // _MAX_GROUP_SIZE))
+        groups = -(-counts // self.group_size)
         first = np.cumsum(groups) - groups
-        rank = np.arange(self.count) - (np.cumsum(counts) - counts)[scene[order]]
-        places = first[scene[order]] * self.size + rank
-        rows = np.full((int(groups.sum()) * self.size, 4), _NOWHERE)
+        rank = np.arange(self.object_count) - (np.cumsum(counts) - counts)[scene[order]]
+        places = first[scene[order]] * self.group_size + rank
+        rows = np.full((int(groups.sum()) * self.group_size, 4), _EMPTY_SPHERE)
         rows[places] = np.column_stack([centres - origin.numpy(), margin * radii])[order]
         self.table = to_float(torch.from_numpy(rows))
         of_object = np.empty_like(order)
-        of_object[order] = places // self.size
-        self.groups = len(rows) // self.size  # of all scenes
+        of_object[order] = places // self.group_size
+        self.group_count = len(rows) // self.group_size  # of all scenes
         self._group = to_index(torch.from_numpy(of_object))
         place = np.empty_like(order)
         place[order] = places
-        self._place = to_index(torch.from_numpy(place))
+        self._table_indices = to_index(torch.from_numpy(place))
         self._owner = geometry.topology.device_face_object
-        self._size = opaque(self.size)
+        self._size = opaque(self.group_size)
         self._scenes: dict[str, Any] | None = None
         if geometry.object_scene is not None:
             members = np.bincount(of_object)
@@ -67,7 +67,7 @@ class Spheres:
                 for name, column in {**columns, "members": members}.items()
             }
 
-    def listed(self, number: Any) -> tuple[Any, Any]:
+    def table_entry(self, number: Any) -> tuple[Any, Any]:
         """Place in the table and scene of objects, in the order of the table.
 
         Args:
@@ -80,38 +80,38 @@ class Spheres:
         )
         return place, scene
 
-    def groups_of(self, scene: Any) -> tuple[Any, Any]:
+    def scene_groups(self, scene: Any) -> tuple[Any, Any]:
         """The first group of a scene, and how many it has.
 
         Args:
             scene: Number of the scene.
         """
         if self._scenes is None:
-            return 0, self.groups
+            return 0, self.group_count
         first, groups = (
             dr.gather(mi.UInt32, self._scenes[name], scene) for name in ("first", "groups")
         )
         return first, groups
 
-    def members(self, group: Any) -> Any:
+    def member_count(self, group: Any) -> Any:
         """How many objects a group has.
 
         Args:
             group: The group.
         """
         if self._scenes is None:
-            return dr.minimum(self.size, self.count - group * self.size)
+            return dr.minimum(self.group_size, self.object_count - group * self.group_size)
         return dr.gather(mi.UInt32, self._scenes["members"], group)
 
-    def place(self, number: Any) -> Any:
+    def table_index(self, number: Any) -> Any:
         """Places of objects in the table.
 
         Args:
             number: Of the objects, as the scene numbers them.
         """
-        return dr.gather(mi.UInt32, self._place, number)
+        return dr.gather(mi.UInt32, self._table_indices, number)
 
-    def cap(self, place: Any, point: Any) -> tuple[Any, Any, Any]:
+    def cap(self, index: Any, point: Any) -> tuple[Any, Any, Any]:
         """Axis and height 1 − cos of the cap of directions in which an object lies.
 
         Args:
@@ -121,49 +121,49 @@ class Spheres:
         Returns:
             Both, and whether the point is outside of the sphere; inside, every direction counts.
         """
-        sphere = dr.gather(mi.Vector4f, self.table, place)
+        sphere = dr.gather(mi.Vector4f, self.table, index)
         offset = sphere.xyz - point
         distance, radius = dr.norm(offset), sphere.w
         outside = distance > radius
         axis = dr.select(outside, offset / distance, mi.Vector3f(0, 0, 1))
-        return axis, dr.select(outside, _height(radius / distance), 2.0), outside
+        return axis, dr.select(outside, _cap_height(radius / distance), 2.0), outside
 
-    def group(self, face: Any, active: Any = True) -> Any:
+    def face_group(self, face: Any, active: Any = True) -> Any:
         """The group of a triangle's object.
 
         Args:
             face: Triangle.
             active: Lanes.
         """
-        if self.groups == 1:
+        if self.group_count == 1:
             return mi.UInt32(0)
         owner = dr.gather(mi.UInt32, self._owner, face, active)
         return dr.gather(mi.UInt32, self._group, owner, active)
 
-    def share(self, place: Any, point: Any, direction: Any, aimed: Any) -> tuple[Any, Any]:
+    def cap_density(self, index: Any, point: Any, direction: Any, target: Any) -> tuple[Any, Any]:
         """One over the solid angle of an object's cap, if that holds a direction, else 0.
 
         Args:
             place: Of the object in the table.
             point: From where it is seen.
             direction: Unit vector.
-            aimed: Place of the object that the direction was drawn for, whose cap holds it.
+            target: Place of the object that the direction was drawn for, whose cap holds it.
 
         Returns:
             This, and whether the point is inside of the sphere, which then has no cap.
         """
-        sphere = dr.gather(mi.Vector4f, self.table, place)
+        sphere = dr.gather(mi.Vector4f, self.table, index)
         offset = sphere.xyz - point
         # The distance of the line from the centre, without a difference of squares.
         beside = dr.squared_norm(dr.cross(offset, direction))
         square, far = dr.square(sphere.w), dr.squared_norm(offset)
         within, there = far <= square, sphere.w > 0
-        met = (place == aimed) | ((dr.dot(offset, direction) > 0) & (beside <= square))
-        share = 1 / (2 * dr.pi * _height(sphere.w * dr.rsqrt(far)))
+        met = (index == target) | ((dr.dot(offset, direction) > 0) & (beside <= square))
+        share = 1 / (2 * dr.pi * _cap_height(sphere.w * dr.rsqrt(far)))
         return dr.select(there & met & ~within, share, 0.0), there & within
 
-    def density(
-        self, rays: Any, group: Any, point: Any, direction: Any, active: Any, aimed: Any
+    def group_density(
+        self, rays: Any, group: Any, point: Any, direction: Any, active: Any, target: Any
     ) -> tuple[Any, Any]:
         """Σ 1/(solid angle) over the caps of a group that hold a direction.
 
@@ -173,7 +173,7 @@ class Spheres:
             point: From where the objects are seen.
             direction: Unit vector.
             active: Lanes.
-            aimed: Place of the object that the direction was drawn for, whose cap holds it.
+            target: Place of the object that the direction was drawn for, whose cap holds it.
 
         Returns:
             The sum, and how many spheres of the group the point is inside of.
@@ -182,16 +182,16 @@ class Spheres:
         start = group * self._size + dr.zeros(mi.UInt32, lanes)
         end = dr.select(active, start + self._size, 0)
 
-        def step(place: Any, total: Any, inside: Any) -> tuple[Any, Any, Any]:
-            share, within = self.share(place, point, direction, aimed)
-            return place + 1, total + share, inside + dr.select(within, 1.0, 0.0)
+        def step(index: Any, total: Any, inside: Any) -> tuple[Any, Any, Any]:
+            share, within = self.cap_density(index, point, direction, target)
+            return index + 1, total + share, inside + dr.select(within, 1.0, 0.0)
 
         none = dr.zeros(mi.Float, lanes)
         state = rays.loop((start, none, none), lambda place, *_: place < end, step)
         return state[1], state[2]
 
 
-def in_cap(axis: Any, height: Any, numbers: list[Any]) -> Any:
+def sample_cap(axis: Any, height: Any, numbers: list[Any]) -> Any:
     """Uniform on the spherical cap of a height 1 − cos about an axis.
 
     Args:
@@ -205,14 +205,14 @@ def in_cap(axis: Any, height: Any, numbers: list[Any]) -> Any:
     return dr.normalize(mi.Frame3f(axis).to_world(mi.Vector3f(c * sine, s * sine, 1 - depth)))
 
 
-def _height(sine: Any) -> Any:
+def _cap_height(sine: Any) -> Any:
     square = dr.minimum(dr.square(sine), 1.0)
     return square / (1 + dr.sqrt(1 - square))
 
 
-def _around(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+def _fit_spheres(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
     """Centre and radius of a sphere around each object [m]."""
-    used, first, owner = geometry.topology.used
+    used, first, owner = geometry.topology.used_vertices
     corners = geometry.vertices.detach().numpy()[used]
     low, high = (f.reduceat(corners, first) for f in (np.minimum, np.maximum))
     centre = 0.5 * (low + high)

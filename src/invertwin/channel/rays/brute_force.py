@@ -14,11 +14,11 @@ from invertwin.channel.rays.arrays import opaque, to_index
 from invertwin.channel.rays.backend import dr, mi
 
 #: Most tests of such a scene: with 24 paths take three quarters of their time, from 40 on more.
-MOST = 24
-_SAME = 1e-9  # how near corners are that are one, of the largest coordinate
+MAX_TESTS = 24
+_CORNER_TOLERANCE = 1e-9  # how near corners are that are one, of the largest coordinate
 
 
-class Few:
+class BruteForceIntersector:
     """A few triangles, each known to all lanes.
 
     Every test has a corner, its normal (of any length), and two vectors in its plane whose products
@@ -30,21 +30,23 @@ class Few:
     """
 
     @staticmethod
-    def of(vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]) -> "Few | None":
+    def build(
+        vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]
+    ) -> "BruteForceIntersector | None":
         """None where there are too many of them.
 
         Args:
             vertices: About the local origin [m].
             faces: At least one triangle.
         """
-        if len(faces) > 2 * MOST:
+        if len(faces) > 2 * MAX_TESTS:
             return None
-        few = Few(vertices, faces)
-        return few if few.tests <= MOST else None
+        few = BruteForceIntersector(vertices, faces)
+        return few if few.test_count <= MAX_TESTS else None
 
     def __init__(self, vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]) -> None:
         triangles = vertices[faces]
-        pairs = _parallelograms(triangles)
+        pairs = _pair_parallelograms(triangles)
         paired = {face for pair in pairs for face in (pair[0], pair[2])}
         alone = [(face, 0, face, 0) for face in range(len(faces)) if face not in paired]
         rows = torch.tensor([*pairs, *alone])
@@ -59,12 +61,12 @@ class Few:
         )
         # A triangle without area is met by no ray: products with NaN are not in any interval.
         numbers = torch.stack([p0, normal, *along], dim=1).tolist()
-        self._pairs, self.tests = len(pairs), len(rows)
-        self._patches = [[_point(vector) for vector in row] for row in numbers]
+        self._pairs, self.test_count = len(pairs), len(rows)
+        self._patches = [[_opaque_vector(vector) for vector in row] for row in numbers]
         #: Of every test, for its near and its far half: the triangle, and which corner comes first.
         self._halves = to_index(rows)
 
-    def nearest(self, ray: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def find_nearest(self, ray: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
         """The first triangle on a ray.
 
         Args:
@@ -76,8 +78,8 @@ class Few:
         """
         far, u, v = mi.Float(ray.maxt), mi.Float(0.0), mi.Float(0.0)
         test, valid = mi.UInt32(0), mi.Bool(False)
-        for number in range(self.tests):
-            along, x, y, met = self._met(number, ray, far)
+        for number in range(self.test_count):
+            along, x, y, met = self._intersect_patch(number, ray, far)
             far, u, v = dr.select(met, along, far), dr.select(met, x, u), dr.select(met, y, v)
             test, valid = dr.select(met, number, test), valid | met
         valid &= active
@@ -95,7 +97,7 @@ class Few:
         )
         return valid, half.x, b1, b2, far
 
-    def blocked(self, ray: Any, active: Any) -> Any:
+    def is_blocked(self, ray: Any, active: Any) -> Any:
         """Whether any triangle is on a ray.
 
         Args:
@@ -103,11 +105,13 @@ class Few:
             active: Lanes.
         """
         blocked = mi.Bool(False)
-        for number in range(self.tests):
-            blocked |= self._met(number, ray, ray.maxt)[3]
+        for number in range(self.test_count):
+            blocked |= self._intersect_patch(number, ray, ray.maxt)[3]
         return blocked & active
 
-    def _met(self, number: int, ray: Any, far: Any) -> tuple[Any, Any, Any, Any]:
+    def _intersect_patch(
+        self, number: int, ray: Any, max_distance: Any
+    ) -> tuple[Any, Any, Any, Any]:
         """Distance and coordinates where a ray meets a plane, and whether that is within."""
         corner, normal, first, second = self._patches[number]
         origin = mi.Vector3f(ray.o - corner)
@@ -115,26 +119,26 @@ class Few:
         place = dr.fma(ray.d, along, origin)
         u, v = dr.dot(first, place), dr.dot(second, place)
         within = (u <= 1) & (v <= 1) if number < self._pairs else u + v <= 1
-        return along, u, v, (along > 0) & (along < far) & (u >= 0) & (v >= 0) & within
+        return along, u, v, (along > 0) & (along < max_distance) & (u >= 0) & (v >= 0) & within
 
 
-def _point(numbers: list[float]) -> Any:
+def _opaque_vector(numbers: list[float]) -> Any:
     return mi.Vector3f(*(opaque(number, "Float") for number in numbers))
 
 
-def _parallelograms(triangles: Float64[Tensor, "n 3 3"]) -> list[tuple[int, int, int, int]]:
+def _pair_parallelograms(triangles: Float64[Tensor, "n 3 3"]) -> list[tuple[int, int, int, int]]:
     """Pairs of triangles that make one, no triangle twice.
 
     Of both: its number, and which of its corners is opposite to the side that they have in common.
     """
     after, last = triangles.roll(-1, 1), triangles.roll(-2, 1)
     opposite = after + last - triangles
-    most = _SAME * triangles.abs().max()
+    most = _CORNER_TOLERANCE * triangles.abs().max()
 
-    def alike(one: Tensor, other: Tensor) -> Tensor:
+    def are_equal(one: Tensor, other: Tensor) -> Tensor:
         return (one.flatten(0, 1)[:, None] - other.flatten(0, 1)).abs().amax(2) <= most
 
-    found = alike(opposite, triangles) & alike(after, last) & alike(last, after)
+    found = are_equal(opposite, triangles) & are_equal(after, last) & are_equal(last, after)
     solid = torch.linalg.cross(after - triangles, last - triangles).flatten(0, 1).abs().amax(1) > 0
     found &= solid[:, None] & solid
     taken, pairs = set[int](), []

@@ -6,18 +6,18 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.rays.intersections import shared_boxes
-from invertwin.channel.rays.ray_scene import NEAR, RayScene, visible
+from invertwin.channel.rays.intersections import find_overlapping_boxes
+from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene, is_visible
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.errors import PhysicsWarning
 
-_PAIRS = 20_000  # of triangles in one plane that are compared, evenly chosen of more
-_PLACES = 64  # of a pair of objects that are looked at
-_LOOKS = 16  # radar poses that are asked
-_INSIDE = 1e-6  # least barycentric coordinate: what only touches does not overlap
-_ALIKE = 1e-3  # largest sine of the angle between planes that are one
+_MAX_PAIRS = 20_000  # of triangles in one plane that are compared, evenly chosen of more
+_MAX_POINTS = 64  # of a pair of objects that are looked at
+_MAX_POSES = 16  # radar poses that are asked
+_MIN_BARYCENTRIC = 1e-6  # least barycentric coordinate: what only touches does not overlap
+_MAX_PLANE_SINE = 1e-3  # largest sine of the angle between planes that are one
 #: Barycentric coordinates of a triangle's middle, and of places just within corners and sides.
-_WITHIN = torch.tensor(
+_TEST_POINTS = torch.tensor(
     [
         [1 / 3, 1 / 3, 1 / 3],
         *([0.98 if k == j else 0.01 for k in range(3)] for j in range(3)),
@@ -27,7 +27,7 @@ _WITHIN = torch.tensor(
 )
 
 
-def warn_of_coplanar(rays: RayScene) -> None:
+def warn_coplanar_surfaces(rays: RayScene) -> None:
     """Warn where an antenna sees two objects in one place, unless it makes no difference.
 
     It makes none where both are at rest and of one material. What is hidden, as the underside of a
@@ -37,7 +37,7 @@ def warn_of_coplanar(rays: RayScene) -> None:
         rays: The scene and its antennas.
     """
     geometry = rays.geometry
-    for one, other in sorted(_told(rays, _matters(geometry))):
+    for one, other in sorted(_find_coplanar_pairs(rays, _relevant_pairs(geometry))):
         warnings.warn(
             f"{geometry.names[one]} and {geometry.names[other]} lie in one plane, in a place that "
             "an antenna sees: which of them a ray meets there is left to rounding, so that values "
@@ -47,27 +47,31 @@ def warn_of_coplanar(rays: RayScene) -> None:
         )
 
 
-def _told(rays: RayScene, pairs: Bool[Tensor, "object object"]) -> set[tuple[int, int]]:
+def _find_coplanar_pairs(
+    rays: RayScene, pairs: Bool[Tensor, "object object"]
+) -> set[tuple[int, int]]:
     """Pairs of objects that lie in one place that is seen; what has not moved is known by now."""
     topology, points = rays.topology, rays.geometry.vertices.detach()
     antennas = torch.cat([rays.link.tx.detach(), rays.link.rx.detach()])
     known, asked = set[tuple[int, int]](), pairs
-    if topology.looked is not None:
-        found, *before = topology.looked
+    if topology.coplanar_cache is not None:
+        found, *before = topology.coplanar_cache
         if torch.equal(before[0], pairs) and torch.equal(before[1], antennas):
             moved = torch.zeros(len(pairs), dtype=torch.bool)
             moved[topology.vertex_object[(points != before[2]).any(1)]] = True
             asked = pairs & (moved[:, None] | moved)
             known = {(one, other) for one, other in found if not bool(asked[one, other])}
-    known |= _in_one_place(rays, asked) if bool(asked.any()) else set()
-    topology.looked = known, pairs, antennas, points
+    known |= _find_visible_pairs(rays, asked) if bool(asked.any()) else set()
+    topology.coplanar_cache = known, pairs, antennas, points
     return known
 
 
-def _in_one_place(rays: RayScene, pairs: Bool[Tensor, "object object"]) -> set[tuple[int, int]]:
+def _find_visible_pairs(
+    rays: RayScene, pairs: Bool[Tensor, "object object"]
+) -> set[tuple[int, int]]:
     """Those of some pairs of objects that lie in one plane where an antenna sees it."""
     geometry, told = rays.geometry, set[tuple[int, int]]()
-    pairs, low, high = shared_boxes(geometry, pairs)
+    pairs, low, high = find_overlapping_boxes(geometry, pairs)
     if not bool(pairs.any()):
         return told
     points = geometry.vertices.detach() - rays.origin
@@ -78,22 +82,22 @@ def _in_one_place(rays: RayScene, pairs: Bool[Tensor, "object object"]) -> set[t
     faces = near.all(1).nonzero()[:, 0]
     if not len(faces):
         return told
-    first, second = _in_one_plane(triangles[faces], owner[faces])
+    first, second = _pair_coplanar_triangles(triangles[faces], owner[faces])
     first, second = faces[first], faces[second]
     kept = pairs[owner[first], owner[second]]
     first, second = first[kept], second[kept]
-    face, place, normal = _shared(triangles, first, second)
+    face, place, normal = _find_common_points(triangles, first, second)
     couple = torch.stack([owner[first], owner[second]], 1).sort(1).values[face]
     for one, other in couple.unique(dim=0).tolist():
         here = ((couple[:, 0] == one) & (couple[:, 1] == other)).nonzero()[:, 0]
-        here = here[:: -(-len(here) // _PLACES)]
+        here = here[:: -(-len(here) // _MAX_POINTS)]
         scene = 0 if geometry.object_scene is None else int(geometry.object_scene[one])
-        if _seen(rays, place[here], normal[here], scene):
+        if _is_any_visible(rays, place[here], normal[here], scene):
             told.add((one, other))
     return told
 
 
-def _matters(geometry: Geometry) -> Bool[Tensor, "object object"]:
+def _relevant_pairs(geometry: Geometry) -> Bool[Tensor, "object object"]:
     """Pairs of objects of which one moves, or which differ in their material."""
     count, owner = len(geometry.names), geometry.face_object
     lowest, highest = (
@@ -102,60 +106,62 @@ def _matters(geometry: Geometry) -> Bool[Tensor, "object object"]:
         )
         for how in ("amin", "amax")
     )
-    moving = torch.tensor(geometry.moving)
+    moving = torch.tensor(geometry.differentiated)
     pairs = moving[:, None] | moving
     pairs |= (lowest[:, None] != lowest) | (lowest != highest)[:, None] | (lowest != highest)
     return pairs.fill_diagonal_(False)
 
 
-def _reach(places: Float64[Tensor, "*n 3"]) -> Float64[Tensor, "*n"]:
+def _ray_tolerance(points: Float64[Tensor, "*n 3"]) -> Float64[Tensor, "*n"]:
     """How near surfaces are that rays take for one [m]."""
-    return NEAR * places.norm(dim=-1) + 1e-9
+    return RAY_EPSILON * points.norm(dim=-1) + 1e-9
 
 
-def _in_one_plane(
-    triangles: Float64[Tensor, "n 3 3"], owner: Int64[Tensor, " n"]
+def _pair_coplanar_triangles(
+    triangles: Float64[Tensor, "n 3 3"], owners: Int64[Tensor, " n"]
 ) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
     """Pairs of triangles whose planes are as far from the origin, on the same side of it."""
     normal = _unit_normal(triangles)
     largest = normal.gather(1, normal.abs().argmax(1, keepdim=True))
     away = (normal * triangles[:, 0]).sum(1) * largest[:, 0].sign()
-    most = _reach(triangles).max()
+    most = _ray_tolerance(triangles).max()
     away, order = away.sort()
-    near = _beside_another(away, owner[order], most)
+    near = _has_near_neighbour(away, owners[order], most)
     away, order = away[near], order[near]
     until = torch.searchsorted(away, away + most, right=True)
     counts = until - torch.arange(len(away)) - 1
     total, sums = int(counts.sum()), counts.cumsum(0)
-    chosen = torch.arange(0, total, max(1, -(-total // _PAIRS)))
+    chosen = torch.arange(0, total, max(1, -(-total // _MAX_PAIRS)))
     first = torch.searchsorted(sums, chosen, right=True)
     second = first + 1 + chosen - (sums - counts)[first]
     return order[first], order[second]
 
 
-def _beside_another(
-    away: Float64[Tensor, " n"], owner: Int64[Tensor, " n"], most: Tensor
+def _has_near_neighbour(
+    offsets: Float64[Tensor, " n"], owner: Int64[Tensor, " n"], max_distance: Tensor
 ) -> Bool[Tensor, " n"]:
     """Which of some sorted numbers have one of another owner within reach."""
     change = (owner[1:] != owner[:-1]).nonzero()[:, 0]  # the last number of every run
     if not len(change):
-        return torch.zeros(len(away), dtype=torch.bool)
-    number = torch.arange(len(away))
+        return torch.zeros(len(offsets), dtype=torch.bool)
+    number = torch.arange(len(offsets))
     run = torch.searchsorted(change, number)
-    after = (run < len(change)) & (away[change[run.clamp_max(len(change) - 1)] + 1] - away <= most)
-    before = (run > 0) & (away - away[change[(run - 1).clamp_min(0)]] <= most)
+    after = (run < len(change)) & (
+        offsets[change[run.clamp_max(len(change) - 1)] + 1] - offsets <= max_distance
+    )
+    before = (run > 0) & (offsets - offsets[change[(run - 1).clamp_min(0)]] <= max_distance)
     return after | before
 
 
-def _shared(
+def _find_common_points(
     triangles: Float64[Tensor, "f 3 3"], first: Int64[Tensor, " n"], second: Int64[Tensor, " n"]
 ) -> tuple[Int64[Tensor, " m"], Float64[Tensor, "m 3"], Float64[Tensor, "m 3"]]:
     """Places that two triangles have in common: number of the pair, place and normal."""
     parts = []
     normals = [_unit_normal(triangles[face]) for face in (first, second)]
-    alike = torch.linalg.cross(*normals).norm(dim=1) < _ALIKE
+    alike = torch.linalg.cross(*normals).norm(dim=1) < _MAX_PLANE_SINE
     for own, other, normal in ((first, second, normals[1]), (second, first, normals[0])):
-        places = (_WITHIN[:, :, None] * triangles[own][:, None]).sum(2)  # [n, 7, 3]
+        places = (_TEST_POINTS[:, :, None] * triangles[own][:, None]).sum(2)  # [n, 7, 3]
         a, b, c = triangles[other][:, None].unbind(2)
         height = ((places - a) * normal[:, None]).sum(2)
         area = (torch.linalg.cross(b - a, c - a) * normal[:, None]).sum(2)
@@ -163,26 +169,30 @@ def _shared(
             (torch.linalg.cross(y - x, places - x) * normal[:, None]).sum(2) / area
             for x, y in ((a, b), (b, c), (c, a))
         ]
-        inside = torch.stack(shares).amin(0) > _INSIDE
-        pair, place = (inside & (height.abs() <= _reach(places)) & alike[:, None]).nonzero().T
+        inside = torch.stack(shares).amin(0) > _MIN_BARYCENTRIC
+        pair, place = (
+            (inside & (height.abs() <= _ray_tolerance(places)) & alike[:, None]).nonzero().T
+        )
         parts.append((pair, places[pair, place], normal[pair]))
     pair, place, normal = (torch.cat(column) for column in zip(*parts, strict=True))
     return pair, place, normal
 
 
-def _seen(
-    rays: RayScene, place: Float64[Tensor, "n 3"], normal: Float64[Tensor, "n 3"], scene: int
+def _is_any_visible(
+    rays: RayScene, points: Float64[Tensor, "n 3"], normal: Float64[Tensor, "n 3"], scene: int
 ) -> bool:
     """Whether an antenna sees any of some places past all surfaces but those in their plane."""
-    looks = scene * rays.looks + torch.arange(0, rays.looks, max(1, -(-rays.looks // _LOOKS)))
+    looks = scene * rays.poses_per_scene + torch.arange(
+        0, rays.poses_per_scene, max(1, -(-rays.poses_per_scene // _MAX_POSES))
+    )
     link = rays.link
     antennas = torch.cat([link.tx.detach()[looks], link.rx.detach()[looks]]) - rays.origin
-    towards = torch.nn.functional.normalize(antennas[:, None] - place, dim=2)
+    towards = torch.nn.functional.normalize(antennas[:, None] - points, dim=2)
     tilt = (towards * normal).sum(2)
-    above = place + normal * (2 * tilt.sign() * _reach(place))[..., None]
+    above = points + normal * (2 * tilt.sign() * _ray_tolerance(points))[..., None]
     ends = antennas[:, None].expand_as(above)
-    clear = tilt.abs() > _ALIKE
-    return bool(visible(rays, above[clear] + rays.origin, ends[clear] + rays.origin).any())
+    clear = tilt.abs() > _MAX_PLANE_SINE
+    return bool(is_visible(rays, above[clear] + rays.origin, ends[clear] + rays.origin).any())
 
 
 def _unit_normal(triangles: Float64[Tensor, "n 3 3"]) -> Float64[Tensor, "n 3"]:

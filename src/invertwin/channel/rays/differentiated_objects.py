@@ -8,37 +8,37 @@ from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_index
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.bounding_spheres import in_cap
+from invertwin.channel.rays.bounding_spheres import sample_cap
 
-NO_PLACE = 0xFFFFFFFF  # no place in a table
-_SLACK = 1e-4  # of a distance: far more than rounding
+NO_TARGET = 0xFFFFFFFF  # no place in a table
+_TOLERANCE = 1e-4  # of a distance: far more than rounding
 
 
-class Movers:
+class DifferentiatedObjects:
     """Objects through whose vertices derivatives flow, where the antennas and others stand still.
 
     A shadow moves over a surface if what casts it moves or the surface does. So an edge at rest
     counts only if its shadow may fall on an object that moves.
 
     Args:
-        moving: Per object, whether it moves; some do.
+        differentiated: Per object, whether it moves; some do.
         rays: The ray scene whose kernels this is a part of.
     """
 
-    def __init__(self, moving: Bool[Tensor, " object"], rays: Any) -> None:
+    def __init__(self, differentiated: Bool[Tensor, " object"], rays: Any) -> None:
         self._rays = rays
-        self._moving = to_index(moving)
-        self._numbers = to_index(torch.nonzero(moving)[:, 0])
-        self._count = opaque(int(moving.sum()))
+        self._differentiated = to_index(differentiated)
+        self._numbers = to_index(torch.nonzero(differentiated)[:, 0])
+        self._count = opaque(int(differentiated.sum()))
 
-    def has(self, owner: Any, active: Any = True) -> Any:
+    def has_object(self, owner: Any, active: Any = True) -> Any:
         """Whether objects move.
 
         Args:
             owner: Numbers of the objects.
             active: Lanes.
         """
-        return dr.gather(mi.UInt32, self._moving, owner, active) > 0
+        return dr.gather(mi.UInt32, self._differentiated, owner, active) > 0
 
     def has_face(self, face: Any, active: Any = True) -> Any:
         """Whether triangles are parts of objects that move.
@@ -48,7 +48,7 @@ class Movers:
             active: Lanes.
         """
         owners = self._rays.topology.device_face_object
-        return self.has(dr.gather(mi.UInt32, owners, face, active), active)
+        return self.has_object(dr.gather(mi.UInt32, owners, face, active), active)
 
     def has_edge(self, edge: Any) -> Any:
         """Whether edges are parts of objects that move.
@@ -56,35 +56,35 @@ class Movers:
         Args:
             edge: Edges.
         """
-        return self.has(dr.gather(mi.UInt32, self._rays.topology.device_edge_object, edge))
+        return self.has_object(dr.gather(mi.UInt32, self._rays.topology.device_edge_object, edge))
 
-    def towards(self, place: Any, numbers: list[Any]) -> tuple[Any, Any]:
+    def sample_direction(self, point: Any, numbers: list[Any]) -> tuple[Any, Any]:
         """A direction to the sphere of an object that moves, and the object's place in the table.
 
         Args:
-            place: From where.
+            point: From where.
             numbers: Three uniform numbers.
         """
         spheres = self._rays.spheres
         number = dr.minimum(mi.UInt32(numbers[0] * self._count), self._count - 1)
-        aimed = spheres.place(dr.gather(mi.UInt32, self._numbers, number))
-        axis, height, _ = spheres.cap(aimed, place)
-        return in_cap(axis, height, numbers[1:]), aimed
+        aimed = spheres.table_index(dr.gather(mi.UInt32, self._numbers, number))
+        axis, height, _ = spheres.cap(aimed, point)
+        return sample_cap(axis, height, numbers[1:]), aimed
 
-    def line_density(self, place: Any, direction: Any, aimed: Any) -> Any:
+    def line_density(self, point: Any, direction: Any, target: Any) -> Any:
         """Probability per solid angle of such directions, of which half are turned round.
 
         Args:
-            place: From where.
+            point: From where.
             direction: Unit vectors.
-            aimed: What ``towards`` drew them for; any other number where it did not.
+            target: What ``towards`` drew them for; any other number where it did not.
         """
         rays, spheres = self._rays, self._rays.spheres
 
         def step(number: Any, total: Any) -> tuple[Any, Any]:
-            at = spheres.place(dr.gather(mi.UInt32, self._numbers, number))
-            ahead, within = spheres.share(at, place, direction, aimed)
-            behind, _ = spheres.share(at, place, -direction, NO_PLACE)
+            at = spheres.table_index(dr.gather(mi.UInt32, self._numbers, number))
+            ahead, within = spheres.cap_density(at, point, direction, target)
+            behind, _ = spheres.cap_density(at, point, -direction, NO_TARGET)
             found = dr.select(within, 1 / (4 * dr.pi), 0.5 * (ahead + behind))
             return number + 1, total + found
 
@@ -96,7 +96,7 @@ class Movers:
         )
         return state[1] / mi.Float(self._count)
 
-    def beyond(self, edge: Any, origin: Any, y0: Any, y1: Any) -> Any:
+    def may_receive_shadow(self, edge: Any, origin: Any, y0: Any, y1: Any) -> Any:
         """Whether shadows of edges may fall on an object that moves: its sphere is asked.
 
         Args:
@@ -118,7 +118,7 @@ class Movers:
 
         def step(number: Any, found: Any) -> tuple[Any, Any]:
             owner = dr.gather(mi.UInt32, self._numbers, number)
-            sphere = dr.gather(mi.Vector4f, spheres.table, spheres.place(owner))
+            sphere = dr.gather(mi.Vector4f, spheres.table, spheres.table_index(owner))
             centre, radius = sphere.xyz - origin, sphere.w
             # Within the sector of directions through the edge, or beside one of its rims.
             height = dr.dot(centre, normal)
@@ -130,7 +130,7 @@ class Movers:
                 at = dr.maximum(dr.dot(centre, rim), 0.0)
                 away = dr.minimum(away, dr.norm(centre - rim * at))
             far = dr.norm(centre) + radius
-            met = (away <= radius + _SLACK * far) & (far * (1 + _SLACK) >= near)
+            met = (away <= radius + _TOLERANCE * far) & (far * (1 + _TOLERANCE) >= near)
             return number + 1, found | (met & (rays.object_scene(owner) == scene))
 
         lanes = dr.width(edge)

@@ -10,27 +10,27 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.rays.arrays import point_at, to_index, to_torch
+from invertwin.channel.rays.arrays import gather_points, to_index, to_torch
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.ray_scene import NEAR, RayScene
+from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import Topology
 
-IN_PLANE = 1e-9  # closer than this to a plane [m] is in it
-_FLAT = 1e-7  # least sine of the angle between two planes that cross
-_BEYOND = 4e-7  # how far an edge's ray goes beyond its ends, relative to their coordinates
-_MOST = 64  # surfaces that an edge may pass
+PLANE_TOLERANCE = 1e-9  # closer than this to a plane [m] is in it
+_MIN_PLANE_SINE = 1e-7  # least sine of the angle between two planes that cross
+_EDGE_EXTENSION = 4e-7  # how far an edge's ray goes beyond its ends, relative to their coordinates
+_MAX_HITS = 64  # surfaces that an edge may pass
 
 
 @dataclass(frozen=True)
-class Contacts:
+class IntersectionCurves:
     """Segments that two triangles have in common.
 
     Attributes:
         first, second: The triangles.
         start, end: Of the segments, in the world [m].
         touching: Where one surface ends in the other: no segment of a crossing.
-        close: Whether two objects are so close that one's edges may lie in the other.
+        has_close_surfaces: Whether two objects are so close that one's edges may lie in the other.
     """
 
     first: Int64[Tensor, " n"]
@@ -38,22 +38,24 @@ class Contacts:
     start: Float64[Tensor, "n 3"]
     end: Float64[Tensor, "n 3"]
     touching: Bool[Tensor, " n"]
-    close: bool = False
+    has_close_surfaces: bool = False
 
-    def chosen(self, mask: Bool[Tensor, " n"]) -> "Contacts":
+    def select(self, mask: Bool[Tensor, " n"]) -> "IntersectionCurves":
         """Some of them."""
         rows = {k: v[mask] for k, v in vars(self).items() if isinstance(v, Tensor)}
         return replace(self, **rows)
 
 
-_NONE = Contacts(
+_EMPTY = IntersectionCurves(
     *(torch.zeros(0, dtype=torch.int64) for _ in range(2)),
     *(torch.zeros(0, 3, dtype=torch.float64) for _ in range(2)),
     touching=torch.zeros(0, dtype=torch.bool),
 )
 
 
-def may_meet(geometry: Geometry) -> tuple[Bool[Tensor, "object object"], Tensor, Tensor]:
+def find_possible_intersections(
+    geometry: Geometry,
+) -> tuple[Bool[Tensor, "object object"], Tensor, Tensor]:
     """Which objects' boxes overlap while one moves past the other, and where, per object.
 
     An object meets itself where its own shape changes.
@@ -61,12 +63,14 @@ def may_meet(geometry: Geometry) -> tuple[Bool[Tensor, "object object"], Tensor,
     Args:
         geometry: The scene.
     """
-    moving, deforming = (torch.tensor(flags) for flags in (geometry.moving, geometry.deforming))
+    moving, deforming = (
+        torch.tensor(flags) for flags in (geometry.differentiated, geometry.shape_differentiated)
+    )
     pairs = (moving[:, None] | moving).fill_diagonal_(False) | torch.diag(deforming)
-    return shared_boxes(geometry, pairs)
+    return find_overlapping_boxes(geometry, pairs)
 
 
-def shared_boxes(
+def find_overlapping_boxes(
     geometry: Geometry, pairs: Bool[Tensor, "object object"]
 ) -> tuple[Bool[Tensor, "object object"], Tensor, Tensor]:
     """Those of some pairs of objects whose boxes overlap, and where, per object.
@@ -75,7 +79,7 @@ def shared_boxes(
         geometry: The scene.
         pairs: Of objects.
     """
-    count = len(geometry.moving)
+    count = len(geometry.differentiated)
     owner = geometry.topology.vertex_object[:, None].expand(-1, 3)
     points = geometry.vertices.detach()
     reduced = (
@@ -97,16 +101,16 @@ def shared_boxes(
     return pairs, place, until
 
 
-def contacts_of(rays: RayScene) -> Contacts | None:
+def find_intersection_curves(rays: RayScene) -> IntersectionCurves | None:
     """All segments in which surfaces meet that move past each other; None if none can.
 
     Args:
         rays: The scene.
     """
     geometry, topology = rays.geometry, rays.topology
-    if not any(geometry.moving):
+    if not any(geometry.differentiated):
         return None
-    pairs, low, high = may_meet(geometry)
+    pairs, low, high = find_possible_intersections(geometry)
     if not bool(pairs.any()):
         return None
     points = geometry.vertices.detach()
@@ -115,8 +119,8 @@ def contacts_of(rays: RayScene) -> Contacts | None:
     inside = (ends.amin(1) <= high[owner]) & (ends.amax(1) >= low[owner])
     edges = torch.nonzero(inside.all(1))[:, 0]
     others = pairs.clone().fill_diagonal_(False).any(1)
-    edge, face = _passed(rays, edges, others[owner[edges]])
-    beside, face = topology.beside[edge], face[:, None].expand(-1, topology.beside.shape[1])
+    edge, face = _trace_edges(rays, edges, others[owner[edges]])
+    beside, face = topology.edge_faces[edge], face[:, None].expand(-1, topology.edge_faces.shape[1])
     pairs_met = torch.stack([beside[beside >= 0], face[beside >= 0]])
     seen, parts = torch.zeros(0, dtype=torch.int64), []
     while True:
@@ -127,15 +131,15 @@ def contacts_of(rays: RayScene) -> Contacts | None:
         seen = torch.cat([seen, key])
         first, second = key // len(geometry.faces), key % len(geometry.faces)
         met = pairs[geometry.face_object[first], geometry.face_object[second]]
-        corners = topology.welded[first], topology.welded[second]
+        corners = topology.welded_faces[first], topology.welded_faces[second]
         met &= ~(corners[0][:, :, None] == corners[1][:, None]).flatten(1).any(1)
-        found = _NONE
+        found = _EMPTY
         if bool(met.any()):
-            found = common_segments(points, topology, first[met], second[met])
+            found = intersect_triangles(points, topology, first[met], second[met])
         parts.append(found)
         if not len(found.first):
             break
-        around = [topology.around(face) for face in (found.first, found.second)]
+        around = [topology.face_neighbours(face) for face in (found.first, found.second)]
         pairs_met = torch.stack(torch.broadcast_tensors(around[0][:, :, None], around[1][:, None]))
         pairs_met = pairs_met.flatten(1)
         pairs_met = pairs_met[:, (pairs_met >= 0).all(0)]
@@ -144,31 +148,31 @@ def contacts_of(rays: RayScene) -> Contacts | None:
         for name, value in vars(found).items()
         if isinstance(value, Tensor)
     }
-    return Contacts(**rows, close=bool(others.any()))
+    return IntersectionCurves(**rows, has_close_surfaces=bool(others.any()))
 
 
-def _passed(
-    rays: RayScene, edges: Int64[Tensor, " n"], beyond: Bool[Tensor, " n"]
+def _trace_edges(
+    rays: RayScene, edges: Int64[Tensor, " n"], extended: Bool[Tensor, " n"]
 ) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
     """Edges and the triangles that they pass, one row each; some a little beyond their ends."""
     # Both ways, so that of two surfaces close to each other neither hides the other.
-    edge = to_index(torch.cat([edges, edges[beyond]]))
-    longer = to_index(torch.cat([beyond, beyond[beyond]])) > 0
+    edge = to_index(torch.cat([edges, edges[extended]]))
+    longer = to_index(torch.cat([extended, extended[extended]])) > 0
     back = dr.arange(mi.UInt32, dr.width(edge)) >= len(edges)
     y0, y1 = (
-        point_at(rays.vertices, dr.gather(mi.UInt32, ends, edge))
+        gather_points(rays.vertices, dr.gather(mi.UInt32, ends, edge))
         for ends in rays.topology.device_edges
     )
     start, offset = dr.select(back, y1, y0), dr.select(back, y0 - y1, y1 - y0)
-    step = _BEYOND * (dr.norm(y0) + dr.norm(y1)) / dr.maximum(dr.norm(offset), 1e-30)
-    step = dr.minimum(step + NEAR, 0.5)
-    at = dr.select(longer, -step, NEAR)
-    until = dr.select(longer, 1 + step, 1 - NEAR)
+    step = _EDGE_EXTENSION * (dr.norm(y0) + dr.norm(y1)) / dr.maximum(dr.norm(offset), 1e-30)
+    step = dr.minimum(step + RAY_EPSILON, 0.5)
+    at = dr.select(longer, -step, RAY_EPSILON)
+    until = dr.select(longer, 1 + step, 1 - RAY_EPSILON)
     rows, faces = [edges[:0]], [edges[:0]]
-    for _ in range(_MOST):
+    for _ in range(_MAX_HITS):
         ray = mi.Ray3f(mi.Point3f(start + offset * at), mi.Vector3f(offset), until - at, 0.0, [])
-        hit = rays.nearest(ray, at < until)
-        at = at + hit.along + step
+        hit = rays.find_nearest(ray, at < until)
+        at = at + hit.t + step
         lanes = dr.compress(hit.valid)
         if not dr.width(lanes):
             break
@@ -182,12 +186,12 @@ def _passed(
     return torch.cat(rows), torch.cat(faces)
 
 
-def common_segments(
+def intersect_triangles(
     points: Float64[Tensor, "v 3"],
     topology: Topology,
     first: Int64[Tensor, " n"],
     second: Int64[Tensor, " n"],
-) -> Contacts:
+) -> IntersectionCurves:
     """What pairs of triangles have in common, where it is a segment.
 
     Args:
@@ -196,39 +200,39 @@ def common_segments(
         first, second: The triangles of each pair.
     """
     faces = first, second
-    triangles = [points[topology.welded[face]] for face in faces]
+    triangles = [points[topology.welded_faces[face]] for face in faces]
     normals = [_unit(torch.linalg.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])) for t in triangles]
     line = torch.linalg.cross(normals[0], normals[1])
-    kept = line.norm(dim=1) > _FLAT
+    kept = line.norm(dim=1) > _MIN_PLANE_SINE
     line = _unit(line)
     sides, spans, touching = [], [], torch.zeros(len(first), dtype=torch.bool)
     for own, other in ((0, 1), (1, 0)):
         plane, normal = triangles[other][:, 0], normals[other]
         height = ((triangles[own] - plane[:, None]) * normal[:, None]).sum(2)
-        height = torch.where(height.abs() < IN_PLANE, 0.0, height)
+        height = torch.where(height.abs() < PLANE_TOLERANCE, 0.0, height)
         kept &= (height.amin(1) <= 0) & (height.amax(1) >= 0)
         # An edge in the plane: the surface crosses there if it goes on to the plane's other side.
         lies = (height == 0).sum(1) == 2
         apex = height.abs().argmax(1, keepdim=True)
         edge = topology.face_edges[faces[own]].gather(1, apex)[:, 0]
-        nearby = topology.opposite[edge.clamp_min(0)]
+        nearby = topology.edge_apexes[edge.clamp_min(0)]
         there = ((points[nearby.clamp_min(0)] - plane[:, None]) * normal[:, None]).sum(2)
         mine = height.gather(1, apex)
-        across = ((nearby >= 0) & (there * mine < 0) & (there.abs() >= IN_PLANE)).any(1)
+        across = ((nearby >= 0) & (there * mine < 0) & (there.abs() >= PLANE_TOLERANCE)).any(1)
         touching |= lies & ~across
         kept &= ~(lies & across & (mine[:, 0] > 0))  # the triangle on the other side has it
         sides.append(height)
-        spans.append(_span(triangles[own], height, line))
+        spans.append(_line_interval(triangles[own], height, line))
     (low, high, place), (others_low, others_high, _) = spans
     low, high = torch.maximum(low, others_low), torch.minimum(high, others_high)
     kept &= high > low
     at = (place * line).sum(1)
     ends = (place + line * (value - at)[:, None] for value in (low, high))
     start, end = (value[kept] for value in ends)
-    return Contacts(first[kept], second[kept], start, end, touching[kept])
+    return IntersectionCurves(first[kept], second[kept], start, end, touching[kept])
 
 
-def _span(
+def _line_interval(
     triangle: Float64[Tensor, "n 3 3"], height: Float64[Tensor, "n 3"], line: Float64[Tensor, "n 3"]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """From where to where along the line a triangle is in a plane, and a point of it there."""
@@ -248,10 +252,10 @@ def _unit(vectors: Tensor) -> Tensor:
     return vectors / vectors.norm(dim=1, keepdim=True).clamp_min(1e-300)
 
 
-_PAIRS = 1 << 22  # triangles × triangles whose boxes are compared at a time
+_BOX_PAIRS_AT_ONCE = 1 << 22  # triangles × triangles whose boxes are compared at a time
 
 
-def close_pairs(
+def find_overlapping_pairs(
     first: Float64[Tensor, "n 3 3"], second: Float64[Tensor, "m 3 3"]
 ) -> tuple[Int64[Tensor, " pair"], Int64[Tensor, " pair"]]:
     """Pairs of triangles whose boxes overlap.
@@ -261,7 +265,7 @@ def close_pairs(
     """
     low, high = second.amin(1), second.amax(1)
     rows = [torch.zeros(2, 0, dtype=torch.int64)]
-    block = max(1, _PAIRS // len(second))
+    block = max(1, _BOX_PAIRS_AT_ONCE // len(second))
     for begin in range(0, len(first), block):
         some = first[begin : begin + block, None]
         met = ((some.amin(2) <= high) & (some.amax(2) >= low)).all(2)

@@ -20,9 +20,9 @@ from invertwin.channel.rays.arrays import (
     to_torch,
 )
 from invertwin.channel.rays.backend import backend, dr, mi, tracing
-from invertwin.channel.rays.bounding_spheres import Spheres
-from invertwin.channel.rays.brute_force import Few
-from invertwin.channel.rays.differentiated_objects import Movers
+from invertwin.channel.rays.bounding_spheres import BoundingSpheres
+from invertwin.channel.rays.brute_force import BruteForceIntersector
+from invertwin.channel.rays.differentiated_objects import DifferentiatedObjects
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.checks import ArrayLike, checked_tensor
@@ -31,26 +31,26 @@ from invertwin.scene.mesh import Mesh
 
 # Offset along a ray, relative to its length: fifty float32 roundings of a coordinate, and small
 # enough that the dark side of a 0.3 m ball stays dark from a kilometre away.
-NEAR = 3e-6
-_SLIVER = 1e-3  # a triangle's area over its squared sides, below which it is one
+RAY_EPSILON = 3e-6
+_MIN_RELATIVE_AREA = 1e-3  # a triangle's area over its squared sides, below which it is one
 
 
 @dataclass(frozen=True)
-class Nearest:
+class RayIntersection:
     """What a ray meets first.
 
     Attributes:
         valid: Whether it meets anything; else the rest is not defined.
         face: Triangle.
         b1, b2: Barycentric coordinates.
-        along: How far along the ray, in lengths of its direction.
+        t: How far along the ray, in lengths of its direction.
     """
 
     valid: Any
     face: Any
     b1: Any
     b2: Any
-    along: Any
+    t: Any
 
 
 class Occluders:
@@ -69,7 +69,7 @@ class Occluders:
         self.origin = origin
         self.local_vertices = (vertices.detach() - origin).to(torch.float32)
         #: The triangles by themselves, where they are so few that no tree is needed.
-        self.few: Few | None = None
+        self.brute_force: BruteForceIntersector | None = None
 
     @property
     def scene(self) -> Any:
@@ -87,24 +87,26 @@ class Occluders:
             going: Takes the state; which lanes go on.
             step: Takes the state and returns the next one.
         """
-        if self.few is None:
+        if self.brute_force is None:
             _ = self.scene
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
             return dr.while_loop(state, going, step, mode="symbolic")
 
-    def clear(self, start: Any, end: Any, active: Any = True) -> Any:
+    def is_clear(self, start: Any, end: Any, active: Any = True) -> Any:
         """Whether nothing lies between two points (their own surfaces excluded).
 
         Args:
             start, end: Points.
             active: Lanes.
         """
-        ray = mi.Ray3f(start + (end - start) * NEAR, end - start, 1 - 2 * NEAR, 0.0, [])
-        if self.few is not None:
-            return active & ~self.few.blocked(ray, active)
+        ray = mi.Ray3f(
+            start + (end - start) * RAY_EPSILON, end - start, 1 - 2 * RAY_EPSILON, 0.0, []
+        )
+        if self.brute_force is not None:
+            return active & ~self.brute_force.is_blocked(ray, active)
         return active & ~self.scene.ray_test(ray, active)
 
-    def nearest(self, ray: Any, active: Any, *, coherent: bool = False) -> "Nearest":
+    def find_nearest(self, ray: Any, active: Any, *, coherent: bool = False) -> "RayIntersection":
         """The first triangle on a ray.
 
         Args:
@@ -112,15 +114,15 @@ class Occluders:
             active: Lanes.
             coherent: Whether neighbouring rays are alike.
         """
-        if self.few is not None:
-            return Nearest(*self.few.nearest(ray, active))
+        if self.brute_force is not None:
+            return RayIntersection(*self.brute_force.find_nearest(ray, active))
         hit = self.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
         valid = active & hit.is_valid()
-        return Nearest(valid, hit.prim_index, hit.prim_uv.x, hit.prim_uv.y, hit.t)
+        return RayIntersection(valid, hit.prim_index, hit.prim_uv.x, hit.prim_uv.y, hit.t)
 
-    def located(self, place: Float64[Tensor, "n 3"]) -> Any:
+    def to_local_points(self, points: Float64[Tensor, "n 3"]) -> Any:
         """World points as Dr.Jit points about the origin."""
-        local = (place.detach() - self.origin).to(torch.float32)
+        local = (points.detach() - self.origin).to(torch.float32)
         return mi.Point3f(*(to_float(local[:, k]) for k in range(3)))
 
 
@@ -130,37 +132,43 @@ class RayScene(Occluders):
     Args:
         geometry: The scene.
         link: The antennas; the local origin is the mean place of the transmitters.
-        antennas_move: Whether derivatives may flow through the places of antennas.
+        differentiate_antennas: Whether derivatives may flow through the places of antennas.
     """
 
-    def __init__(self, geometry: Geometry, link: Link, *, antennas_move: bool = True) -> None:
+    def __init__(
+        self, geometry: Geometry, link: Link, *, differentiate_antennas: bool = True
+    ) -> None:
         origin = link.tx.detach().mean(dim=0)
         super().__init__(geometry.vertices, geometry.topology, origin)
         # A GPU walks trees in hardware.
         if backend() == "cpu":
-            self.few = Few.of(geometry.vertices.detach() - origin, geometry.faces)
+            self.brute_force = BruteForceIntersector.build(
+                geometry.vertices.detach() - origin, geometry.faces
+            )
         self.geometry = geometry
         self.link = link
         self.vertices = to_points(self.local_vertices)
         self.tx = to_points(link.tx - origin)
         self.rx = to_points(link.rx - origin)
         # Lanes without a hit are evaluated on a sound triangle, then masked: no NaN can leak.
-        self.sound_face = opaque(_sound_face(geometry))
+        self.fallback_face = opaque(_find_fallback_face(geometry))
         owners = geometry.object_scene
-        self.scenes = 1 if owners is None else int(owners.max()) + 1
+        self.scene_count = 1 if owners is None else int(owners.max()) + 1
         #: Radar poses that look at one scene; those of the first scene come first.
-        self.looks = link.frame_count // self.scenes
-        self._scene_of = None if owners is None else to_index(owners)
-        some = any(geometry.moving) and not all(geometry.moving)
+        self.poses_per_scene = link.frame_count // self.scene_count
+        self._scene_of_object = None if owners is None else to_index(owners)
+        some = any(geometry.differentiated) and not all(geometry.differentiated)
         #: Objects that move where others and the antennas do not; None where that is not so.
-        self.movers = None
-        if some and not antennas_move:
-            self.movers = Movers(torch.tensor(geometry.moving), self)
+        self.differentiated_objects = None
+        if some and not differentiate_antennas:
+            self.differentiated_objects = DifferentiatedObjects(
+                torch.tensor(geometry.differentiated), self
+            )
 
     @cached_property
-    def spheres(self) -> Spheres:
+    def spheres(self) -> BoundingSpheres:
         """Around the objects."""
-        return Spheres(self.geometry, self.origin, margin=1.001)
+        return BoundingSpheres(self.geometry, self.origin, margin=1.001)
 
     @cached_property
     def triangles(self) -> Any:
@@ -178,7 +186,7 @@ class RayScene(Occluders):
         """Vertices in float64, three numbers each."""
         return to_double(self.geometry.vertices.detach() - self.origin)
 
-    def exact(self, vertex: Any, active: Any = True) -> Any:
+    def exact_vertex(self, vertex: Any, active: Any = True) -> Any:
         """Vertices in float64.
 
         Args:
@@ -194,7 +202,9 @@ class RayScene(Occluders):
             edge: Their numbers.
         """
         first, second = self.topology.device_edges
-        return tuple(self.exact(dr.gather(mi.UInt32, ends, edge)) for ends in (first, second))  # type: ignore[return-value]
+        return tuple(
+            self.exact_vertex(dr.gather(mi.UInt32, ends, edge)) for ends in (first, second)
+        )  # type: ignore[return-value]
 
     def object_scene(self, number: Any) -> Any:
         """The scenes of objects.
@@ -202,9 +212,9 @@ class RayScene(Occluders):
         Args:
             number: Of the objects.
         """
-        if self._scene_of is None:
+        if self._scene_of_object is None:
             return mi.UInt32(0)
-        return dr.gather(mi.UInt32, self._scene_of, number)
+        return dr.gather(mi.UInt32, self._scene_of_object, number)
 
     def edge_scene(self, edge: Any) -> Any:
         """The scenes of edges.
@@ -212,7 +222,7 @@ class RayScene(Occluders):
         Args:
             edge: Their numbers.
         """
-        if self._scene_of is None:
+        if self._scene_of_object is None:
             return mi.UInt32(0)
         return self.object_scene(dr.gather(mi.UInt32, self.topology.device_edge_object, edge))
 
@@ -222,9 +232,9 @@ class RayScene(Occluders):
         Args:
             frame: Radar poses.
         """
-        return mi.UInt32(0) if self._scene_of is None else frame // self.looks
+        return mi.UInt32(0) if self._scene_of_object is None else frame // self.poses_per_scene
 
-    def in_scene(self, frame: Any, face: Any, active: Any = True) -> Any:
+    def is_in_scene(self, frame: Any, face: Any, active: Any = True) -> Any:
         """Whether triangles belong to the scene that a radar pose looks at.
 
         A ray that leaves its scene ends for it, whatever it meets in another one.
@@ -234,10 +244,10 @@ class RayScene(Occluders):
             face: Triangle.
             active: Lanes.
         """
-        if self._scene_of is None:
+        if self._scene_of_object is None:
             return mi.Bool(True)
         owner = dr.gather(mi.UInt32, self.topology.device_face_object, face, active)
-        scene = dr.gather(mi.UInt32, self._scene_of, owner, active)
+        scene = dr.gather(mi.UInt32, self._scene_of_object, owner, active)
         return scene == self.frame_scene(frame)
 
     def corners(self, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
@@ -250,17 +260,17 @@ class RayScene(Occluders):
         return arrays.corners(self.vertices, self.topology.device_corners, face, active)
 
 
-def _sound_face(geometry: Geometry) -> int:
+def _find_fallback_face(geometry: Geometry) -> int:
     """A triangle that is no sliver; the last answer while it stays one, which is quicker."""
     topology = geometry.topology
-    if topology.sound_face is not None:
-        p0, p1, p2 = geometry.vertices.detach()[geometry.faces[topology.sound_face]]
+    if topology.fallback_face is not None:
+        p0, p1, p2 = geometry.vertices.detach()[geometry.faces[topology.fallback_face]]
         sides = torch.stack([p1 - p0, p2 - p0])
         area = torch.linalg.cross(sides[0], sides[1]).norm()
-        if area > _SLIVER * sides.square().sum():
-            return topology.sound_face
-    topology.sound_face = int(face_areas(geometry).argmax())
-    return topology.sound_face
+        if area > _MIN_RELATIVE_AREA * sides.square().sum():
+            return topology.fallback_face
+    topology.fallback_face = int(face_areas(geometry).argmax())
+    return topology.fallback_face
 
 
 def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:
@@ -272,7 +282,9 @@ def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:
     return areas
 
 
-def visible(rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]) -> Tensor:
+def is_visible(
+    rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]
+) -> Tensor:
     """Whether nothing lies between pairs of world points (torch in, torch out).
 
     Args:
@@ -281,10 +293,10 @@ def visible(rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor,
     """
     if not len(start):
         return torch.zeros(0, dtype=torch.bool)
-    return to_torch(rays.clear(rays.located(start), rays.located(end))).bool()
+    return to_torch(rays.is_clear(rays.to_local_points(start), rays.to_local_points(end))).bool()
 
 
-def next_surface(
+def find_next_surface(
     rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]
 ) -> tuple[Int64[Tensor, " n"], Float64[Tensor, " n"]]:
     """First triangle between pairs of world points (−1: none), and how far along it lies.
@@ -295,12 +307,12 @@ def next_surface(
     """
     if not len(start):
         return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
-    origin = rays.located(start)
-    offset = rays.located(end) - origin
-    ray = mi.Ray3f(origin + offset * NEAR, mi.Vector3f(offset), 1 - 2 * NEAR, 0.0, [])
+    origin = rays.to_local_points(start)
+    offset = rays.to_local_points(end) - origin
+    ray = mi.Ray3f(origin + offset * RAY_EPSILON, mi.Vector3f(offset), 1 - 2 * RAY_EPSILON, 0.0, [])
     hit = rays.scene.ray_intersect_preliminary(ray)
     face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
-    along = dr.select(hit.is_valid(), hit.t + NEAR, 1.0)
+    along = dr.select(hit.is_valid(), hit.t + RAY_EPSILON, 1.0)
     return to_torch(face).long(), to_torch(along).double()
 
 
@@ -323,6 +335,6 @@ def visible_points(
         rays = Occluders(mesh.vertices, topology_of([mesh]), places.detach().mean(dim=0))
         for place in places:
             hidden = torch.nonzero(~seen)[:, 0]
-            clear = visible(rays, points[hidden], place.expand(len(hidden), 3))
+            clear = is_visible(rays, points[hidden], place.expand(len(hidden), 3))
             seen[hidden[clear]] = True
     return seen

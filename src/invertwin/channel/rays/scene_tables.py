@@ -12,16 +12,16 @@ from torch import Tensor
 
 from invertwin.channel.paths import Link
 from invertwin.channel.rays.topology import Topology, topology_of
-from invertwin.checks import differentiated
+from invertwin.checks import is_differentiated
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.scene import Material, Surface
-from invertwin.scene.scene import Object, Scene, placed
+from invertwin.scene import Material, ScatteringLaw
+from invertwin.scene.scene import Object, Scene, transform_vertices
 
-_WIDE = 0.2  # radians: no mesh is too coarse for such lobes
+_WIDE_LOBE = 0.2  # radians: no mesh is too coarse for such lobes
 
 
-def mixed(corners: tuple[Tensor, Tensor, Tensor], b1: Tensor, b2: Tensor) -> Tensor:
+def interpolate_values(corners: tuple[Tensor, Tensor, Tensor], b1: Tensor, b2: Tensor) -> Tensor:
     """Values at barycentric coordinates of triangles, from those at the corners.
 
     Args:
@@ -43,14 +43,14 @@ class Geometry:
         face_object: Index of the object of each triangle.
         face_surface: Row of each triangle in the tables of surfaces.
         surfaces: What surfaces do, one row per material, or per triangle where its values differ.
-        lobed: Which lobes have weight, or a derivative that could give them some.
-        sheets: Whether something passes straight through any surface.
-        bodies: Whether any surface is the skin of a refracting body.
-        spread: Whether any specular lobe lacks what is mirrored.
+        has_lobe: Which lobes have weight, or a derivative that could give them some.
+        has_sheets: Whether something passes straight through any surface.
+        has_refracting_bodies: Whether any surface is the skin of a refracting body.
+        has_spread: Whether any specular lobe lacks what is mirrored.
         names: Of the objects.
         coherent: Per object, whether its field paths have a deterministic phase.
-        moving: Per object, whether derivatives flow through its place or its shape.
-        deforming: Per object, whether they flow through its shape.
+        differentiated: Per object, whether derivatives flow through its place or its shape.
+        shape_differentiated: Per object, whether they flow through its shape.
         topology: What depends on the connectivity only.
         velocities: World velocities of the vertices [m/s]; None = all at rest.
         object_scene: Per object, the scene that it belongs to, where several stand apart (see
@@ -61,15 +61,15 @@ class Geometry:
     faces: Int64[Tensor, "f 3"]
     face_object: Int64[Tensor, " f"]
     face_surface: Int64[Tensor, " f"]
-    surfaces: Surface
-    lobed: tuple[bool, ...]
-    sheets: bool
-    bodies: bool
-    spread: bool
+    surfaces: ScatteringLaw
+    has_lobe: tuple[bool, ...]
+    has_sheets: bool
+    has_refracting_bodies: bool
+    has_spread: bool
     names: tuple[str, ...]
     coherent: tuple[bool, ...]
-    moving: tuple[bool, ...]
-    deforming: tuple[bool, ...]
+    differentiated: tuple[bool, ...]
+    shape_differentiated: tuple[bool, ...]
     topology: Topology
     velocities: Float64[Tensor, "v 3"] | None = None
     object_scene: Int64[Tensor, " object"] | None = None
@@ -91,9 +91,9 @@ class Geometry:
         if self.velocities is None:
             return None
         v0, v1, v2 = (self.velocities[self.faces[face, k]] for k in range(3))
-        return mixed((v0, v1, v2), b1, b2)
+        return interpolate_values((v0, v1, v2), b1, b2)
 
-    def require_rest(self, depth: int) -> None:
+    def require_static(self, depth: int) -> None:
         """Refuse paths of several bounces of objects in motion.
 
         Raises:
@@ -106,17 +106,17 @@ class Geometry:
             )
 
 
-def silhouettes_move(geometry: Geometry, link: Link) -> bool:
+def is_visibility_differentiated(geometry: Geometry, link: Link) -> bool:
     """Whether a derivative flows through anything that decides what is visible.
 
     Args:
         geometry: The scene.
         link: Antennas.
     """
-    return any(differentiated(value) for value in (geometry.vertices, link.tx, link.rx))
+    return any(is_differentiated(value) for value in (geometry.vertices, link.tx, link.rx))
 
 
-def require_edges(geometry: Geometry, link: Link, samples: int) -> None:
+def require_silhouette_samples(geometry: Geometry, link: Link, samples: int) -> None:
     """Refuse a derivative that would silently leave moving silhouettes out.
 
     Args:
@@ -127,7 +127,7 @@ def require_edges(geometry: Geometry, link: Link, samples: int) -> None:
     Raises:
         InputError: Silhouettes move and there are no samples of them.
     """
-    if samples < 1 and silhouettes_move(geometry, link):
+    if samples < 1 and is_visibility_differentiated(geometry, link):
         raise InputError(
             "expected boundary_samples >= 1 for a derivative in which silhouettes move, got "
             f"{samples}; give some, or boundary=False for fixed visibility"
@@ -155,8 +155,8 @@ def flatten(
             f"expected objects with surfaces, got clouds for {', '.join(clouds)}; only power "
             "(deposit_power, the surrogate) is computed of clouds: mesh them for exact signals"
         )
-    fitted = [n for n, o in scene.objects.items() if differentiated(o.velocity)]
-    moving = fitted or [n for n, o in scene.objects.items() if _moves(o)]
+    fitted = [n for n, o in scene.objects.items() if is_differentiated(o.velocity)]
+    moving = fitted or [n for n, o in scene.objects.items() if _is_moving(o)]
     if (fitted and motion != "free") or (moving and motion == "refused"):
         names = ", ".join(moving)
         what = "velocities without gradients, got" if fitted else "objects at rest, got"
@@ -164,45 +164,49 @@ def flatten(
             f"expected {what} velocities on {names}; a frame is one instant: use scene.at(time) "
             "and then replace(name, velocity=None), or simulate_chirps for motion within a frame"
         )
-    vertices = torch.cat(placed(objects))
+    vertices = torch.cat(transform_vertices(objects))
     topology = topology_of([item.mesh for item in objects])
-    surfaces, face_surface = _surfaces(objects, SPEED_OF_LIGHT / wavelength, topology.face_object)
+    surfaces, face_surface = _collect_scattering_laws(
+        objects, SPEED_OF_LIGHT / wavelength, topology.face_object
+    )
     skins = surfaces.refraction.any(1)
     for number, name in enumerate(scene.objects) if bool(skins.any()) else ():
         own = topology.face_object == number
         if bool(skins[face_surface[own]].any()):
-            _require_solid(
+            _require_closed(
                 name, vertices.detach()[topology.faces[own]], number in topology.open_objects
             )
-    _warn_of_facets(list(scene.objects), topology, vertices, surfaces, face_surface)
-    deforming = tuple(differentiated(item.mesh.vertices) for item in objects)
-    weights, free = surfaces.lobes, differentiated(surfaces.lobes)
+    _warn_coarse_facets(list(scene.objects), topology, vertices, surfaces, face_surface)
+    deforming = tuple(is_differentiated(item.mesh.vertices) for item in objects)
+    weights, free = surfaces.lobes, is_differentiated(surfaces.lobes)
     return Geometry(
         vertices=vertices,
         faces=topology.faces,
         face_object=topology.face_object,
         face_surface=face_surface,
         surfaces=surfaces,
-        lobed=tuple(free or bool(weight.any()) for weight in weights.T),
-        sheets=bool(surfaces.transmittance.any()),
-        bodies=bool(skins.any()),
-        spread=bool((surfaces.spread != 1).any()),
+        has_lobe=tuple(free or bool(weight.any()) for weight in weights.T),
+        has_sheets=bool(surfaces.transmittance.any()),
+        has_refracting_bodies=bool(skins.any()),
+        has_spread=bool((surfaces.spread != 1).any()),
         names=tuple(scene.objects),
         coherent=tuple(item.material.coherent for item in objects),
-        moving=tuple(o or differentiated(i.pose) for o, i in zip(deforming, objects, strict=True)),
-        deforming=deforming,
+        differentiated=tuple(
+            o or is_differentiated(i.pose) for o, i in zip(deforming, objects, strict=True)
+        ),
+        shape_differentiated=deforming,
         topology=topology,
         velocities=torch.cat([vertex_velocities(item) for item in objects]) if moving else None,
     )
 
 
-def _warn_of_facets(
-    names: list[str], topology: Topology, vertices: Tensor, surfaces: Surface, rows: Tensor
+def _warn_coarse_facets(
+    names: list[str], topology: Topology, vertices: Tensor, surfaces: ScatteringLaw, rows: Tensor
 ) -> None:
     """Warn where a curved mesh is so coarse that its narrow lobes do not meet: it glints."""
     width = surfaces.exponents.detach().clamp_min(1e-9).rsqrt()
     narrow = torch.where(surfaces.lobes.detach() > 0, width, 1.0).amin(1)[rows]
-    if not bool((narrow < _WIDE).any()):
+    if not bool((narrow < _WIDE_LOBE).any()):
         return
     for number, name in enumerate(names):
         angle, lobe = topology.facet_angle(number, vertices), float("inf")
@@ -218,7 +222,7 @@ def _warn_of_facets(
             )
 
 
-def _require_solid(name: str, triangles: Tensor, is_open: bool) -> None:
+def _require_closed(name: str, triangles: Tensor, is_open: bool) -> None:
     """Refuse a refracting body without an inside."""
     volume = (triangles[:, 0] * torch.linalg.cross(triangles[:, 1], triangles[:, 2])).sum() / 6
     if is_open or not volume > 0:
@@ -229,21 +233,23 @@ def _require_solid(name: str, triangles: Tensor, is_open: bool) -> None:
         )
 
 
-def _surface(material: Material, frequency: float) -> Surface:
+def _scattering_law(material: Material, frequency: float) -> ScatteringLaw:
     """What a material does; remembered where it is frozen and of plain numbers."""
     frozen = getattr(type(material), "__dataclass_params__", None)
     plain = all(isinstance(value, int | float | str) for value in vars(material).values())
     if plain and frozen is not None and frozen.frozen:
-        return _remembered(material, frequency)
-    return material.surface(frequency)
+        return _cached_scattering_law(material, frequency)
+    return material.scattering_law(frequency)
 
 
 @lru_cache(maxsize=64)
-def _remembered(material: Material, frequency: float) -> Surface:
-    return material.surface(frequency)
+def _cached_scattering_law(material: Material, frequency: float) -> ScatteringLaw:
+    return material.scattering_law(frequency)
 
 
-def _surfaces(objects: list[Object], frequency: float, owner: Tensor) -> tuple[Surface, Tensor]:
+def _collect_scattering_laws(
+    objects: list[Object], frequency: float, owner: Tensor
+) -> tuple[ScatteringLaw, Tensor]:
     """The rows of all surfaces, and the row of every triangle.
 
     Objects of one material share its rows.
@@ -253,13 +259,13 @@ def _surfaces(objects: list[Object], frequency: float, owner: Tensor) -> tuple[S
         frequency: [Hz].
         owner: Object of every triangle.
     """
-    rows: dict[int, tuple[int, Surface]] = {}  # the first row, and what the surface does
-    of_material: dict[int, Surface] = {}
+    rows: dict[int, tuple[int, ScatteringLaw]] = {}  # the first row, and what the surface does
+    of_material: dict[int, ScatteringLaw] = {}
     count, first, single = 0, [], []
     for item in objects:
         key, faces = id(item.material), len(item.mesh.faces)
         if key not in of_material:
-            of_material[key] = _surface(item.material, frequency)
+            of_material[key] = _scattering_law(item.material, frequency)
         surface = of_material[key]
         per_face = surface.diffuse.ndim == 1
         if per_face and len(surface.diffuse) != faces:
@@ -279,7 +285,7 @@ def _surfaces(objects: list[Object], frequency: float, owner: Tensor) -> tuple[S
                 for _, surface in rows.values()
             ]
         )
-        for field in fields(Surface)
+        for field in fields(ScatteringLaw)
     }
     face_surface = torch.tensor(first)[owner]
     if not all(single):
@@ -287,10 +293,10 @@ def _surfaces(objects: list[Object], frequency: float, owner: Tensor) -> tuple[S
         counts = torch.tensor([len(item.mesh.faces) for item in objects])
         number = torch.arange(len(owner)) - (counts.cumsum(0) - counts)[owner]
         face_surface += torch.where(torch.tensor(single)[owner], 0, number)
-    return Surface(**columns), face_surface
+    return ScatteringLaw(**columns), face_surface
 
 
-def _moves(item: Object) -> bool:
+def _is_moving(item: Object) -> bool:
     return item.velocity is not None and bool(item.velocity.any())
 
 

@@ -13,12 +13,15 @@ from torch._C import _DisableFuncTorch
 
 from invertwin.channel.rays.arrays import to_float, to_index, to_signed
 from invertwin.channel.rays.backend import VARIANTS, backend, mi
-from invertwin.checks import plain
+from invertwin.checks import strip_derivatives
 from invertwin.scene.mesh import Mesh
 
-_KEPT_TOPOLOGIES = 8
-_FLAT, _SHARP = 1e-6, 0.35  # radians: rounding of coordinates; an edge of the object itself
-_UNGROUPED = 256  # triangles that are not worth a group
+_MAX_CACHED_TOPOLOGIES = 8
+_MIN_SMOOTH_ANGLE, _MAX_SMOOTH_ANGLE = (
+    1e-6,
+    0.35,
+)  # radians: rounding of coordinates; an edge of the object itself
+_MAX_UNGROUPED_FACES = 256  # triangles that are not worth a group
 
 
 class Topology:
@@ -35,24 +38,24 @@ class Topology:
     def __init__(self, faces: Tensor, face_object: Tensor, vertices: Tensor) -> None:
         self.faces = faces
         self.face_object = face_object
-        self.sound_face: int | None = None  # a triangle that was no sliver when last looked at
+        self.fallback_face: int | None = None  # a triangle that was no sliver when last looked at
         #: Objects in one place, when last looked at, and for which pairs, antennas and vertices.
-        self.looked: tuple[set[tuple[int, int]], Tensor, Tensor, Tensor] | None = None
+        self.coplanar_cache: tuple[set[tuple[int, int]], Tensor, Tensor, Tensor] | None = None
         owner = torch.zeros(len(vertices), dtype=torch.int64)
         owner[faces.ravel()] = face_object.repeat_interleave(3)
         self.vertex_object = owner
         used = faces.unique()
         # Vertices of triangles, the first of each object among them, and the object of each.
         first = torch.searchsorted(owner[used], torch.arange(int(owner.max()) + 1))
-        self.used = used.numpy(), first.numpy(), owner[used].numpy()
+        self.used_vertices = used.numpy(), first.numpy(), owner[used].numpy()
         places = torch.cat([owner[:, None].double(), vertices], dim=1).numpy()
         tables = edges_of(faces.numpy(), places)
         # Of each object, side by side: samples that follow this order are spread over its surface.
-        order = torch.from_numpy(side_by_side(vertices[tables[0]].mean(1).numpy()))
+        order = torch.from_numpy(morton_order(vertices[tables[0]].mean(1).numpy()))
         order = order[owner[tables[0][order, 0]].argsort(stable=True)]
-        self.edges, self.opposite, self.beside = (table[order] for table in tables)
-        beside = self.beside
-        alone = (self.opposite >= 0).sum(1) == 1
+        self.edges, self.edge_apexes, self.edge_faces = (table[order] for table in tables)
+        beside = self.edge_faces
+        alone = (self.edge_apexes >= 0).sum(1) == 1
         self.open_objects = set(face_object[beside[alone, 0]].tolist())
         self.device_faces = to_index(faces)
         #: The same, four numbers each, the last one zero: each is read as a whole.
@@ -60,21 +63,21 @@ class Topology:
         self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
         self.device_edge_object = to_index(owner[self.edges[:, 0]])
-        self.device_opposite = [to_signed(column) for column in self.opposite.T]
-        self.device_beside = [to_index(column) for column in beside.clamp_min(0).T]
+        self.device_edge_apexes = [to_signed(column) for column in self.edge_apexes.T]
+        self.device_edge_faces = [to_index(column) for column in beside.clamp_min(0).T]
         mesh = mi.Mesh("scene", vertex_count=len(vertices), face_count=len(faces))
         self._parameters = mi.traverse(mesh)
         self._parameters["faces"] = self.device_faces
         self._uploaded: Tensor | None = None
-        self._facets: Tensor | None = None
+        self._facet_angles: Tensor | None = None
         self._mesh = mesh
         self._scene: Any = None
 
     @cached_property
-    def welded(self) -> Int64[Tensor, "f 3"]:
+    def welded_faces(self) -> Int64[Tensor, "f 3"]:
         """Vertices of triangles, where vertices at one place count as one; in any order."""
         table = self.faces.clone()
-        for face, apex in zip(self.beside.T, self.opposite.T, strict=True):
+        for face, apex in zip(self.edge_faces.T, self.edge_apexes.T, strict=True):
             at = face >= 0
             table[face[at]] = torch.cat([self.edges[at], apex[at, None]], 1)
         return table
@@ -83,9 +86,9 @@ class Topology:
     def face_edges(self) -> Int64[Tensor, "f 3"]:
         """The edge opposite to each of a triangle's ``welded`` vertices (−1: no proper edge)."""
         table = torch.full_like(self.faces, -1)
-        for face, apex in zip(self.beside.T, self.opposite.T, strict=True):
+        for face, apex in zip(self.edge_faces.T, self.edge_apexes.T, strict=True):
             edge = torch.nonzero(face >= 0)[:, 0]
-            slot = (self.welded[face[edge]] == apex[edge, None]).int().argmax(1)
+            slot = (self.welded_faces[face[edge]] == apex[edge, None]).int().argmax(1)
             table[face[edge], slot] = edge
         return table
 
@@ -98,33 +101,33 @@ class Topology:
             number: Of the object.
             vertices: World positions [m].
         """
-        if self._facets is None:
+        if self._facet_angles is None:
             a, b, c = vertices.detach()[self.faces].unbind(1)
             normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
-            both = self.beside[(self.beside >= 0).all(1)]
+            both = self.edge_faces[(self.edge_faces >= 0).all(1)]
             first, second = normals[both[:, 0]], normals[both[:, 1]]
             angle = 2 * torch.asin((0.5 * (first - second).norm(dim=1)).clamp_max(1.0))
             owner = self.face_object[both[:, 0]]
-            smooth = (angle > _FLAT) & (angle < _SHARP)
-            self._facets = torch.zeros(int(self.face_object.max()) + 1, dtype=torch.float64)
+            smooth = (angle > _MIN_SMOOTH_ANGLE) & (angle < _MAX_SMOOTH_ANGLE)
+            self._facet_angles = torch.zeros(int(self.face_object.max()) + 1, dtype=torch.float64)
             for k in owner[smooth].unique():
-                self._facets[k] = angle[smooth & (owner == k)].median()
-        return float(self._facets[number])
+                self._facet_angles[k] = angle[smooth & (owner == k)].median()
+        return float(self._facet_angles[number])
 
     @cached_property
-    def device_welded(self) -> Any:
+    def device_welded_faces(self) -> Any:
         """``welded`` as a flat array of the ray tracer."""
-        return to_index(self.welded)
+        return to_index(self.welded_faces)
 
     @cached_property
     def device_face_edges(self) -> Any:
         """``face_edges`` as a flat array of the ray tracer."""
         return to_signed(self.face_edges)
 
-    def around(self, faces: Int64[Tensor, " n"]) -> Int64[Tensor, "n k"]:
+    def face_neighbours(self, faces: Int64[Tensor, " n"]) -> Int64[Tensor, "n k"]:
         """Triangles and all that share an edge with them (−1: none)."""
         edges = self.face_edges[faces]
-        nearby = torch.where(edges[..., None] >= 0, self.beside[edges.clamp_min(0)], -1)
+        nearby = torch.where(edges[..., None] >= 0, self.edge_faces[edges.clamp_min(0)], -1)
         return torch.cat([faces[:, None], nearby.flatten(1)], 1)
 
     def ray_scene(self, vertices: Tensor) -> Any:
@@ -154,7 +157,7 @@ class Topology:
 
         Rays through a group take longer, so that small meshes, built in no time, stay without.
         """
-        if backend() == "cuda" or len(self.faces) <= _UNGROUPED:
+        if backend() == "cuda" or len(self.faces) <= _MAX_UNGROUPED_FACES:
             return {"mesh": self._mesh}
         reference = {"type": "ref", "id": "group"}
         return {
@@ -174,33 +177,36 @@ def topology_of(meshes: list[Mesh]) -> Topology:
     if key not in _topologies:
         starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
         with _DisableFuncTorch():
-            faces = [plain(mesh.faces) + start for mesh, start in zip(meshes, starts, strict=False)]
+            faces = [
+                strip_derivatives(mesh.faces) + start
+                for mesh, start in zip(meshes, starts, strict=False)
+            ]
             objects = [torch.full((len(mesh.faces),), n) for n, mesh in enumerate(meshes)]
             # In the objects' own frames, where equal positions are equal to the last bit.
-            vertices = torch.cat([plain(mesh.vertices) for mesh in meshes])
+            vertices = torch.cat([strip_derivatives(mesh.vertices) for mesh in meshes])
             made = Topology(torch.cat(faces), torch.cat(objects), vertices)
         _topologies[key] = (owners, made)
-        while len(_topologies) > _KEPT_TOPOLOGIES:
+        while len(_topologies) > _MAX_CACHED_TOPOLOGIES:
             _topologies.popitem(last=False)
     _topologies.move_to_end(key)
     return _topologies[key][1]
 
 
 def edges_of(
-    faces: np.ndarray, places: np.ndarray
+    faces: np.ndarray, vertex_keys: np.ndarray
 ) -> tuple[Int64[Tensor, "e 2"], Int64[Tensor, "e k"], Int64[Tensor, "e k"]]:
     """Edges of a triangle mesh, with opposite vertex and number of every triangle at the edge.
 
-    Vertices with equal rows in ``places`` (object and position) count as one, so that a mesh
+    Vertices with equal rows in ``vertex_keys`` (object and position) count as one, so that a mesh
     with split vertices has no false open edges; objects that touch may part. The other two tables
     have as many columns as the edge with most triangles (2 for a manifold mesh); absent ones are
     −1.
 
     Args:
         faces: Vertex indices of triangles.
-        places: One row a vertex: object and position.
+        vertex_keys: One row a vertex: object and position.
     """
-    _, first, inverse = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    _, first, inverse = np.unique(vertex_keys, axis=0, return_index=True, return_inverse=True)
     welded = first[inverse.ravel()][faces]
     corners = [(0, 1, 2), (1, 2, 0), (2, 0, 1)]
     ends = np.concatenate([np.sort(welded[:, [a, b]], axis=1) for a, b, _ in corners])
@@ -219,14 +225,14 @@ def edges_of(
     return torch.from_numpy(tables[0]), torch.from_numpy(tables[1]), torch.from_numpy(tables[2])
 
 
-def side_by_side(places: np.ndarray) -> np.ndarray:
+def morton_order(positions: np.ndarray) -> np.ndarray:
     """The order of places along a curve that fills space (Morton).
 
     Args:
-        places: [n, 3].
+        positions: [n, 3].
     """
-    if not len(places):
+    if not len(positions):
         return np.zeros(0, dtype=np.int64)
-    cells = ((places - places.min(0)) / (np.ptp(places) or 1.0) * 1023).astype(np.int64)
+    cells = ((positions - positions.min(0)) / (np.ptp(positions) or 1.0) * 1023).astype(np.int64)
     bits = (cells[..., None] >> np.arange(10)) & 1
     return np.argsort((bits << (3 * np.arange(10) + np.arange(3)[:, None])).sum((1, 2)))

@@ -18,37 +18,37 @@ from torch.nn.functional import normalize
 from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
-from invertwin.channel.rays.intersections import close_pairs, common_segments
+from invertwin.channel.rays.intersections import find_overlapping_pairs, intersect_triangles
 from invertwin.channel.rays.ray_scene import Occluders
 from invertwin.channel.rays.topology import topology_of
-from invertwin.checks import differentiated, plain
+from invertwin.checks import is_differentiated, strip_derivatives
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
 
 @dataclass(frozen=True)
-class Curves:
+class DiscontinuityCurves:
     """Straight pieces of the curves at which what is seen may jump; detached.
 
     Attributes:
         start, end: Of the pieces [m].
         first, second: Edges: vertices at the ends. Crossings: the two triangles.
-        crossing: Whether it is a crossing.
+        is_intersection: Whether it is a crossing.
     """
 
     start: Float64[Tensor, "piece 3"]
     end: Float64[Tensor, "piece 3"]
     first: Int64[Tensor, " piece"]
     second: Int64[Tensor, " piece"]
-    crossing: bool
+    is_intersection: bool
 
 
-class Sight:
+class ViewpointScene:
     """A scene as one place sees it.
 
     Args:
         scene: Surfaces only.
-        place: [3] in the world [m].
+        viewpoint: [3] in the world [m].
 
     Attributes:
         names: Of the objects.
@@ -58,7 +58,7 @@ class Sight:
         InputError: A cloud in the scene.
     """
 
-    def __init__(self, scene: Scene, place: Float64[Tensor, "3"]) -> None:
+    def __init__(self, scene: Scene, viewpoint: Float64[Tensor, "3"]) -> None:
         objects = scene.objects.values()
         clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
         if clouds:
@@ -67,18 +67,20 @@ class Sight:
             )
         self.names = tuple(scene.objects)
         self._vertices = torch.cat([item.vertices for item in objects])
-        self._place = place
+        self._viewpoint = viewpoint
         with tracing():
             self._topology = topology_of([item.mesh for item in objects])
-            self._occluders = Occluders(plain(self._vertices), self._topology, plain(place))
+            self._occluders = Occluders(
+                strip_derivatives(self._vertices), self._topology, strip_derivatives(viewpoint)
+            )
         self.face_object = self._topology.face_object
 
     @property
-    def moves(self) -> bool:
+    def is_differentiated(self) -> bool:
         """Whether derivatives flow to the scene's places or to the place itself."""
-        return differentiated(self._vertices) or differentiated(self._place)
+        return is_differentiated(self._vertices) or is_differentiated(self._viewpoint)
 
-    def first(self, directions: Float64[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
+    def find_first_faces(self, directions: Float64[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
         """The triangle that each ray from the place meets first (−1: none).
 
         Args:
@@ -86,14 +88,14 @@ class Sight:
         """
         if not len(directions):
             return torch.zeros(0, dtype=torch.int64)
-        way = normalize(plain(directions), dim=1).to(torch.float32)
+        way = normalize(strip_derivatives(directions), dim=1).to(torch.float32)
         with tracing():
             ray = mi.Ray3f(mi.Point3f(0.0), mi.Vector3f(*(to_float(way[:, k]) for k in range(3))))
             hit = self._occluders.scene.ray_intersect_preliminary(ray)
             face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
             return to_torch(face).long()
 
-    def along(
+    def plane_distances(
         self, face: Int64[Tensor, " n"], directions: Float64[Tensor, "n 3"]
     ) -> Float64[Tensor, " n"]:
         """How many lengths of its direction each ray goes to the plane of a triangle; attached.
@@ -104,29 +106,31 @@ class Sight:
         """
         a, b, c = self._vertices[self._topology.faces[face]].unbind(1)
         normal = cross(b - a, c - a)
-        return dot(a - self._place, normal) / dot(directions, normal)
+        return dot(a - self._viewpoint, normal) / dot(directions, normal)
 
-    def outlines(self) -> Curves:
+    def find_silhouettes(self) -> DiscontinuityCurves:
         """Edges where surfaces end, or turn away from the place."""
-        topology, points = self._topology, plain(self._vertices)
+        topology, points = self._topology, strip_derivatives(self._vertices)
         # Triangles may be wound either way, so that normals say nothing: both neighbours lie on one
         # side of the plane through the edge and the place.
-        beside, apex = topology.beside, topology.opposite
+        beside, apex = topology.edge_faces, topology.edge_apexes
         alone = (beside >= 0).sum(1) != 2
         ends = points[topology.edges]
         pair = [points[apex[:, k].clamp_min(0)] for k in range(min(2, apex.shape[1]))]
         turns = torch.zeros(len(beside), dtype=torch.bool)
         if len(pair) == 2:
-            across = cross(ends[:, 1] - ends[:, 0], ends[:, 0] - plain(self._place))
+            across = cross(ends[:, 1] - ends[:, 0], ends[:, 0] - strip_derivatives(self._viewpoint))
             sides = [dot(point - ends[:, 0], across) for point in pair]
             turns = sides[0] * sides[1] >= 0
         chosen = torch.nonzero(alone | turns)[:, 0]
         first, second = topology.edges[chosen].unbind(1)
-        return Curves(points[first], points[second], first, second, crossing=False)
+        return DiscontinuityCurves(
+            points[first], points[second], first, second, is_intersection=False
+        )
 
-    def crossings(self) -> Curves:
+    def find_intersections(self) -> DiscontinuityCurves:
         """Curves in which two objects cross."""
-        points, topology = plain(self._vertices), self._topology
+        points, topology = strip_derivatives(self._vertices), self._topology
         corners = points[topology.faces]
         low, high = corners.amin(1), corners.amax(1)
         parts = []
@@ -141,39 +145,42 @@ class Sight:
                     break
             if not all(map(len, own)):
                 continue
-            here, there = close_pairs(corners[own[0]], corners[own[1]])
-            met = common_segments(points, topology, own[0][here], own[1][there])
-            parts.append(met.chosen(~met.touching))
+            here, there = find_overlapping_pairs(corners[own[0]], corners[own[1]])
+            met = intersect_triangles(points, topology, own[0][here], own[1][there])
+            parts.append(met.select(~met.touching))
         none = topology.edges[:0, 0]
-        return Curves(
+        return DiscontinuityCurves(
             torch.cat([corners[:0, 0], *(part.start for part in parts)]),
             torch.cat([corners[:0, 0], *(part.end for part in parts)]),
             torch.cat([none, *(part.first for part in parts)]),
             torch.cat([none, *(part.second for part in parts)]),
-            crossing=True,
+            is_intersection=True,
         )
 
-    def points(
-        self, curves: Curves, piece: Int64[Tensor, " n"], share: Float64[Tensor, " n"]
+    def points_on_curves(
+        self,
+        curves: DiscontinuityCurves,
+        piece: Int64[Tensor, " n"],
+        fraction: Float64[Tensor, " n"],
     ) -> Float64[Tensor, "n 3"]:
         """Points of curves, attached: they move with the edge, or with the planes that cross.
 
         Args:
             curves: From ``outlines`` or ``crossings``.
             piece: Of them.
-            share: Place from the start to the end of the piece, 0 to 1.
+            fraction: Place from the start to the end of the piece, 0 to 1.
         """
         first, second = curves.first[piece], curves.second[piece]
-        if not curves.crossing:
-            return torch.lerp(self._vertices[first], self._vertices[second], share[:, None])
-        at = torch.lerp(curves.start[piece], curves.end[piece], share[:, None])
+        if not curves.is_intersection:
+            return torch.lerp(self._vertices[first], self._vertices[second], fraction[:, None])
+        at = torch.lerp(curves.start[piece], curves.end[piece], fraction[:, None])
         rows, heights = [], []
         for face in (first, second):
             a, b, c = self._vertices[self._topology.faces[face]].unbind(1)
             normal = normalize(cross(b - a, c - a), dim=1)
             rows.append(normal)
             heights.append(dot(a - at, normal))
-        rows.append(plain(cross(rows[0], rows[1])))
-        heights.append(torch.zeros_like(share))
+        rows.append(strip_derivatives(cross(rows[0], rows[1])))
+        heights.append(torch.zeros_like(fraction))
         shift = torch.linalg.solve(torch.stack(rows, 1), torch.stack(heights, 1)[..., None])
         return at + shift[..., 0]

@@ -21,8 +21,8 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.limits import NonNegative, Positive
 from invertwin.scene.shapes import trihedral
 
-_PER_WAVELENGTH = 24  # segments of the method of moments
-_POINTS = 4  # of its quadrature on a segment
+_SEGMENTS_PER_WAVELENGTH = 24  # segments of the method of moments
+_QUADRATURE_POINTS = 4  # of its quadrature on a segment
 _EULER = math.exp(np.euler_gamma)
 
 
@@ -158,10 +158,10 @@ class SphereSection(CrossSection):
         Args:
             frequencies: [Hz].
         """
-        found = [self._of(2 * math.pi * f / SPEED_OF_LIGHT) for f in frequencies.tolist()]
+        found = [self._amplitude_at(2 * math.pi * f / SPEED_OF_LIGHT) for f in frequencies.tolist()]
         return torch.tensor(found, dtype=torch.complex128)
 
-    def _of(self, k: float) -> complex:
+    def _amplitude_at(self, k: float) -> complex:
         x = k * self.radius
         n = np.arange(1, int(x + 4 * x ** (1 / 3) + 12))
         j, h = spherical_jn(n, x), spherical_jn(n, x) - 1j * spherical_yn(n, x)
@@ -172,13 +172,13 @@ class SphereSection(CrossSection):
             a, b = j / h, xj / xh
         else:
             epsilon = self.permittivity * (1 - 1j * self.loss_tangent)
-            u = _logarithmic(np.sqrt(epsilon) * x, len(n))
+            u = _logarithmic_derivatives(np.sqrt(epsilon) * x, len(n))
             a = (u * j - xj) / (u * h - xh)
             b = (u * j - epsilon * xj) / (u * h - epsilon * xh)
         return complex(1j * ((-1.0) ** n * (n + 0.5) * (b - a)).sum() / k)
 
 
-def _logarithmic(z: complex, count: int) -> NDArray[np.complex128]:
+def _logarithmic_derivatives(z: complex, count: int) -> NDArray[np.complex128]:
     """(z j_n(z))′/j_n(z) for n = 1 … count: downwards, which is stable and never overflows."""
     last = max(count, math.ceil(abs(z))) + 16
     found = np.zeros(last + 1, dtype=np.complex128)
@@ -209,19 +209,19 @@ class DihedralByMoments(CrossSection):
         for frequency in frequencies.tolist():
             wavelength = SPEED_OF_LIGHT / frequency
             nodes = self._nodes(wavelength)
-            solve = strip_along if self.polarisation == "V" else strip_across
+            solve = strip_section_tm if self.polarisation == "V" else strip_section_te
             width = solve(nodes, 2 * math.pi / wavelength, flat)
             rows.append(torch.from_numpy(2 * self.edge**2 / wavelength * width))
         return torch.stack(rows)
 
     def _nodes(self, wavelength: float) -> NDArray[np.float64]:
         """Corners of the segments, from one free edge by the crease to the other."""
-        count = math.ceil(self.edge / wavelength * _PER_WAVELENGTH)
+        count = math.ceil(self.edge / wavelength * _SEGMENTS_PER_WAVELENGTH)
         along = np.linspace(-1, 1, 2 * count + 1) * self.edge / math.sqrt(2)
         return np.column_stack([along, -np.abs(along)])
 
 
-def strip_along(
+def strip_section_tm(
     nodes: NDArray[np.float64], k: float, directions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """σ_2D [m] of a thin conductor, E along its axis: ∫ηJ k/4 H₀(k|r − r′|) dl′ = E, pulses.
@@ -240,13 +240,13 @@ def strip_along(
     return k / 4 * np.abs(sent) ** 2
 
 
-def strip_across(
+def strip_section_te(
     nodes: NDArray[np.float64], k: float, directions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """σ_2D [m] of a thin conductor, H along its axis: mixed potentials, triangles about each node.
 
     Args:
-        nodes, k, directions: as in ``strip_along``.
+        nodes, k, directions: as in ``strip_section_tm``.
 
     Source: Harrington, Field Computation by Moment Methods, §3.3.
     """
@@ -283,7 +283,7 @@ def _potentials(nodes: NDArray[np.float64], k: float) -> NDArray[np.complex128]:
     """∫ H₀(k|r_p − r′|)/4j dr′ over segment q at the middle of p; its own by the small argument."""
     middle, length, tangent = _segments(nodes)
     found = np.zeros((len(length), len(length)), dtype=np.complex128)
-    for at, weight in zip(*roots_legendre(_POINTS), strict=True):
+    for at, weight in zip(*roots_legendre(_QUADRATURE_POINTS), strict=True):
         place = middle + tangent * (length * at / 2)[:, None]
         distance = np.linalg.norm(middle[:, None] - place, axis=2)
         np.fill_diagonal(distance, 1.0)

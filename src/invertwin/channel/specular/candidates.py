@@ -20,29 +20,30 @@ from invertwin.channel.specular.image_method import Planes
 from invertwin.errors import InputError
 
 if TYPE_CHECKING:  # walls know the planes that sequences are made of
-    from invertwin.channel.specular.image_method import Walls
+    from invertwin.channel.specular.image_method import CandidateSurfaces
 
 _LANES = 1 << 20
-_MOST = 1_000_000  # sequences that are tried one by one
+_MAX_SEQUENCES = 1_000_000  # sequences that are tried one by one
 _GOLDEN = math.pi * (1 + math.sqrt(5))
 
 
 @dataclass(frozen=True)
-class Sequences:
+class CandidateSequences:
     """Candidates by length.
 
     Attributes:
         steps: For each number of steps from 1, the sequences, [sequence, step].
-        missed: Estimated share of directions whose sequences have not been found; None if there are
+        missed_fraction: Estimated share of directions whose sequences have not been found; None
+            if there are
             no others.
     """
 
     steps: tuple[Tensor, ...]
-    missed: float | None
+    missed_fraction: float | None
 
 
 @dataclass(frozen=True)
-class Powers:
+class FaceInteractions:
     """What triangles can do to a ray.
 
     Attributes:
@@ -54,12 +55,14 @@ class Powers:
     transmit: Bool[Tensor, " f"]
 
 
-def every_sequence(planes: Planes, powers: Powers, depth: int) -> Sequences:
+def enumerate_sequences(
+    planes: Planes, interactions: FaceInteractions, depth: int
+) -> CandidateSequences:
     """All sequences of planes, no plane twice in a row.
 
     Args:
         planes: Of the scene.
-        powers: Of the triangles.
+        interactions: Of the triangles.
         depth: Most steps.
 
     Raises:
@@ -68,14 +71,14 @@ def every_sequence(planes: Planes, powers: Powers, depth: int) -> Sequences:
     known = planes.face_plane >= 0
     options = torch.cat(
         [
-            2 * planes.face_plane[powers.reflect & known],
-            2 * planes.face_plane[powers.transmit & known] + 1,
+            2 * planes.face_plane[interactions.reflect & known],
+            2 * planes.face_plane[interactions.transmit & known] + 1,
         ]
     ).unique()
     count = sum(len(options) ** step for step in range(1, depth + 1))
-    if count > _MOST:
+    if count > _MAX_SEQUENCES:
         raise InputError(
-            f"expected at most {_MOST:,} sequences to try one by one, got {count:.3g} of "
+            f"expected at most {_MAX_SEQUENCES:,} sequences to try one by one, got {count:.3g} of "
             f"{len(planes)} planes and depth {depth}; give a number of rays, or a smaller depth"
         )
     found, last = [], torch.zeros(1, 0, dtype=torch.int64)
@@ -86,18 +89,18 @@ def every_sequence(planes: Planes, powers: Powers, depth: int) -> Sequences:
             grown = grown[grown[:, -1] // 2 != grown[:, -2] // 2]
         found.append(grown)
         last = grown
-    return Sequences(tuple(found), None)
+    return CandidateSequences(tuple(found), None)
 
 
-def shot_sequences(
-    walls: "Walls",
+def shoot_sequences(
+    surfaces: "CandidateSurfaces",
     planes: Planes,
-    powers: Powers,
-    places: Float64[Tensor, "place 3"],
+    interactions: FaceInteractions,
+    origins: Float64[Tensor, "place 3"],
     depth: int,
     rays: int,
     seed: int,
-) -> Sequences:
+) -> CandidateSequences:
     """The sequences that rays from some places follow.
 
     Directions are those of a spiral of evenly spread points, turned at random for every place. At a
@@ -105,48 +108,49 @@ def shot_sequences(
     that fills the solid angle Ω about the antenna is missed by all N with the probability
     (1 − Ω/4π)^N < exp(−NΩ/4π); even directions miss less.
 
-    ``Sequences.missed`` is the estimate of Good and Turing: sequences that one ray alone has
+    ``CandidateSequences.missed`` is the estimate of Good and Turing: sequences that one ray alone
+    has
     followed, over the number of rays.
 
     Args:
-        walls: What may be in the way.
+        surfaces: What may be in the way.
         planes: Of the scene, about the same origin.
-        powers: Of the triangles.
-        places: From where rays are shot [m].
+        interactions: Of the triangles.
+        origins: From where rays are shot [m].
         depth: Most steps.
         rays: How many from each place.
         seed: Of the turns.
 
     Source: I. J. Good, "The population frequencies of species", Biometrika 40, 1953.
     """
-    tables = _Tables(walls, planes, powers)
+    tables = _SequenceTracer(surfaces, planes, interactions)
     # A ray may part at every step.
-    parts = 2 ** (depth if bool(powers.transmit.any()) else 0)
+    parts = 2 ** (depth if bool(interactions.transmit.any()) else 0)
     chunk = max(1, _LANES // parts)
     leaves = torch.zeros(0, depth, dtype=torch.int64)
     count = torch.zeros(0, dtype=torch.int64)
     none = torch.zeros(1, 0, dtype=torch.int64)
-    for number, place in enumerate(places):
-        turn = _random_turn(seed, number)
+    for number, place in enumerate(origins):
+        turn = _random_rotation(seed, number)
         for start in range(0, rays, chunk):
             index = torch.arange(start, min(start + chunk, rays))
-            directions = _spiral(index, rays) @ turn.T
+            directions = _spiral_directions(index, rays) @ turn.T
             alike = torch.zeros(len(index), dtype=torch.int64)
-            row, times = tables.followed(place, directions, depth, none, alike)
-            leaves, count = _merged(torch.cat([leaves, row]), torch.cat([count, times]))
+            row, times = tables.follow_rays(place, directions, depth, none, alike)
+            leaves, count = _merge_counts(torch.cat([leaves, row]), torch.cat([count, times]))
     found: list[Tensor] = []
     for length in range(1, depth + 1):
         some = leaves[(leaves[:, length - 1] >= 0), :length]
         found.append(some.unique(dim=0) if len(some) else some)
-    missed = min(1.0, float((count == 1).sum()) / (rays * len(places)))
-    return Sequences(tuple(found), missed)
+    missed = min(1.0, float((count == 1).sum()) / (rays * len(origins)))
+    return CandidateSequences(tuple(found), missed)
 
 
-def sequences_from_edges(
-    walls: "Walls",
+def shoot_sequences_from_edges(
+    surfaces: "CandidateSurfaces",
     planes: Planes,
-    powers: Powers,
-    places: Float64[Tensor, "ray 3"],
+    interactions: FaceInteractions,
+    origins: Float64[Tensor, "ray 3"],
     edge: Int64[Tensor, " ray"],
     depth: int,
     seed: int,
@@ -154,22 +158,22 @@ def sequences_from_edges(
     """The sequences that rays from edges follow: number of the edge, then steps; by length from 1.
 
     Args:
-        walls: What may be in the way.
+        surfaces: What may be in the way.
         planes: Of the scene, about the same origin.
-        powers: Of the triangles.
-        places: Where rays start; their directions are random [m].
+        interactions: Of the triangles.
+        origins: Where rays start; their directions are random [m].
         edge: Numbers of the edges there, from zero without gaps.
         depth: Most steps.
         seed: Of the directions.
     """
-    tables = _Tables(walls, planes, powers)
-    parts = 2 ** (depth if bool(powers.transmit.any()) else 0)
-    draws = np.random.default_rng(seed).standard_normal((len(places), 3))
+    tables = _SequenceTracer(surfaces, planes, interactions)
+    parts = 2 ** (depth if bool(interactions.transmit.any()) else 0)
+    draws = np.random.default_rng(seed).standard_normal((len(origins), 3))
     directions = normalize(torch.from_numpy(draws), dim=1)
     prefix = torch.arange(int(edge.max()) + 1)[:, None]
     leaves = torch.zeros(0, depth + 1, dtype=torch.int64)
-    for some in torch.arange(len(places)).split(max(1, _LANES // parts)):
-        rows, _ = tables.followed(places[some], directions[some], depth, prefix, edge[some])
+    for some in torch.arange(len(origins)).split(max(1, _LANES // parts)):
+        rows, _ = tables.follow_rays(origins[some], directions[some], depth, prefix, edge[some])
         leaves = torch.cat([leaves, rows]).unique(dim=0)
     found: list[Tensor] = []
     for length in range(1, depth + 1):
@@ -178,12 +182,12 @@ def sequences_from_edges(
     return found
 
 
-def _merged(rows: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+def _merge_counts(rows: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     alike, group = rows.unique(dim=0, return_inverse=True)
     return alike, torch.zeros(len(alike), dtype=torch.int64).index_add(0, group, counts)
 
 
-def _spiral(index: Tensor, count: int) -> Float64[Tensor, "n 3"]:
+def _spiral_directions(index: Tensor, count: int) -> Float64[Tensor, "n 3"]:
     """Evenly spread directions: of a golden spiral."""
     z = 1 - (2 * index.double() + 1) / count
     around = _GOLDEN * index.double()
@@ -191,77 +195,84 @@ def _spiral(index: Tensor, count: int) -> Float64[Tensor, "n 3"]:
     return torch.stack([ring * around.cos(), ring * around.sin(), z], 1)
 
 
-def _random_turn(seed: int, number: int) -> Float64[Tensor, "3 3"]:
+def _random_rotation(seed: int, number: int) -> Float64[Tensor, "3 3"]:
     draws = np.random.default_rng(np.random.SeedSequence([seed, number])).standard_normal((3, 3))
     q, _ = np.linalg.qr(draws)
     return torch.from_numpy(q)
 
 
-class _Tables:
+class _SequenceTracer:
     """The scene as rays that follow sequences need it."""
 
-    def __init__(self, walls: "Walls", planes: Planes, powers: Powers) -> None:
-        self.walls = walls
+    def __init__(
+        self, surfaces: "CandidateSurfaces", planes: Planes, interactions: FaceInteractions
+    ) -> None:
+        self.surfaces = surfaces
         self.planes = planes
-        self.powers = powers
+        self.interactions = interactions
         self.normal = to_float(planes.normal)
         self.face_plane = to_index(planes.face_plane.clamp_min(0))
 
-    def followed(
-        self, place: Tensor, directions: Tensor, depth: int, known: Tensor, number: Tensor
+    def follow_rays(
+        self,
+        position: Tensor,
+        directions: Tensor,
+        depth: int,
+        prefixes: Tensor,
+        prefix_index: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Sequences of rays, filled up with −1, and how many rays follow each.
 
         They start from one place, or each from its own, with the rows ``number`` of ``known``.
         """
-        local = (place - self.walls.origin).to(torch.float32)
+        local = (position - self.surfaces.origin).to(torch.float32)
         origin = local.expand(len(directions), 3)
         direction = directions.to(torch.float32)
         # Sequences share their beginnings: each is the number of its parent, and one more step.
         ended: list[tuple[Tensor, Tensor]] = []
-        width = known.shape[1] + depth
+        width = prefixes.shape[1] + depth
         for step in range(depth):
             if step:
-                origin = origin + self.walls.margin * direction
-            face, place_hit, mirrored = self._next(origin, direction)
+                origin = origin + self.surfaces.margin * direction
+            face, place_hit, mirrored = self._intersect_rays(origin, direction)
             hit = (face >= 0) & (self.planes.face_plane[face.clamp_min(0)] >= 0)
-            ended.append((known, number[~hit]))
-            number, face, place_hit, mirrored, direction = (
-                column[hit] for column in (number, face, place_hit, mirrored, direction)
+            ended.append((prefixes, prefix_index[~hit]))
+            prefix_index, face, place_hit, mirrored, direction = (
+                column[hit] for column in (prefix_index, face, place_hit, mirrored, direction)
             )
             both = []
             for powers, onwards, bit in (
-                (self.powers.reflect, mirrored, 0),
-                (self.powers.transmit, direction, 1),
+                (self.interactions.reflect, mirrored, 0),
+                (self.interactions.transmit, direction, 1),
             ):
                 goes = powers[face]
                 code = 2 * self.planes.face_plane[face[goes]] + bit
-                both.append((number[goes], code, place_hit[goes], onwards[goes]))
-            stops = ~(self.powers.reflect[face] | self.powers.transmit[face])
-            ended.append((known, number[stops]))
-            number, code, origin, direction = (
+                both.append((prefix_index[goes], code, place_hit[goes], onwards[goes]))
+            stops = ~(self.interactions.reflect[face] | self.interactions.transmit[face])
+            ended.append((prefixes, prefix_index[stops]))
+            prefix_index, code, origin, direction = (
                 torch.cat(column) for column in zip(*both, strict=True)
             )
             options = 2 * len(self.planes)
-            pair, number = (number * options + code).unique(return_inverse=True)
-            known = torch.cat([known[pair // options], (pair % options)[:, None]], 1)
+            pair, prefix_index = (prefix_index * options + code).unique(return_inverse=True)
+            prefixes = torch.cat([prefixes[pair // options], (pair % options)[:, None]], 1)
             if step == depth - 1:
-                ended.append((known, number))
+                ended.append((prefixes, prefix_index))
         rows, counts = [], []
-        for table, number in ended:
-            some, count = number.unique(return_counts=True)
+        for table, prefix_index in ended:
+            some, count = prefix_index.unique(return_counts=True)
             rows.append(torch.nn.functional.pad(table[some], (0, width - table.shape[1]), value=-1))
             counts.append(count)
         return torch.cat(rows), torch.cat(counts)
 
-    def _next(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _intersect_rays(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The triangle that each ray meets (−1: none), where, and the mirrored direction."""
         if not len(origin):
             none = torch.zeros(0, 3)
             return torch.zeros(0, dtype=torch.int64), none, none
         start = mi.Point3f(*(to_float(origin[:, k].contiguous()) for k in range(3)))
         way = mi.Vector3f(*(to_float(direction[:, k].contiguous()) for k in range(3)))
-        hit = self.walls.scene.ray_intersect_preliminary(mi.Ray3f(start, way))
+        hit = self.surfaces.scene.ray_intersect_preliminary(mi.Ray3f(start, way))
         valid = hit.is_valid()
         face = dr.select(valid, mi.Int32(hit.prim_index), -1)
         plane = dr.gather(mi.UInt32, self.face_plane, hit.prim_index, valid)
@@ -270,8 +281,8 @@ class _Tables:
         mirrored = way - 2 * dr.dot(way, normal) * normal
         dr.eval(face, place, mirrored)
         found = to_torch(face).long()
-        return found, _columns(place), _columns(mirrored)
+        return found, _stack_components(place), _stack_components(mirrored)
 
 
-def _columns(vector: object) -> Tensor:
+def _stack_components(vector: object) -> Tensor:
     return torch.stack([to_torch(vector[k]) for k in range(3)], 1)  # type: ignore[index]

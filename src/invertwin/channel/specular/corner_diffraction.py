@@ -18,24 +18,24 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import cross, dot
-from invertwin.channel.em.utd import Order, Turn, diffraction_dyads
-from invertwin.channel.em.wedges import Wedges, azimuth_outside, edge_axis
+from invertwin.channel.em.utd import DyadDerivative, EdgeDiffraction, diffraction_dyads
+from invertwin.channel.em.wedges import Wedges, edge_axis, exterior_azimuth
 from invertwin.channel.specular.edge_path_geometry import (
-    Edge,
     EdgePaths,
+    PathEdge,
     Route,
     find_route,
-    transfers,
+    transfer_dyads,
 )
 
-_LOW = 1e-18  # sin² of angles that count as none
+_MIN_SQUARED_SINE = 1e-18  # sin² of angles that count as none
 
 
-def face_share(
+def face_weight(
     edge: Wedges,
-    last: Wedges,
+    next_edge: Wedges,
     faces: Int64[Tensor, "row 2"],
-    way: Float64[Tensor, "row 3"],
+    direction: Float64[Tensor, "row 3"],
 ) -> Float64[Tensor, " row"]:
     """How much of a wave from a corner runs along a face there: cos² of its angles off the plane.
 
@@ -43,19 +43,19 @@ def face_share(
 
     Args:
         edge: sends the wave.
-        last: the next edge of this face.
+        next_edge: the next edge of this face.
         faces: which face this is of either edge, 0 or 1.
-        way: unit vectors from the corner.
+        direction: unit vectors from the corner.
     """
-    row = torch.arange(len(way))
-    high = dot(edge.normals[row, faces[:, 0]], way) ** 2
-    over = dot(edge.inwards[row, faces[:, 0]], way).clamp_min(0.0) ** 2
-    beyond = dot(last.inwards[row, faces[:, 1]], way).clamp_max(0.0) ** 2
+    row = torch.arange(len(direction))
+    high = dot(edge.normals[row, faces[:, 0]], direction) ** 2
+    over = dot(edge.face_tangents[row, faces[:, 0]], direction).clamp_min(0.0) ** 2
+    beyond = dot(next_edge.face_tangents[row, faces[:, 1]], direction).clamp_max(0.0) ** 2
     return over * beyond / ((over + high) * (beyond + high)).clamp_min(1e-300)
 
 
-def round_corner(
-    edges: Sequence[Edge],
+def diffract_round_corner(
+    edges: Sequence[PathEdge],
     end: Int64[Tensor, " row"],
     faces: Int64[Tensor, "row 2"],
     tx: Float64[Tensor, "row 3"],
@@ -70,7 +70,7 @@ def round_corner(
 
     - 1/(1 + x³), x = 2r/λ, where the ray of X runs r along the face to the last edge: what a path
       over both edges is short of there,
-    - ``face_share``,
+    - ``face_weight``,
     - sin²α/(sin²α + sin²β) of the angles of the ways to and from the corner off the plane. With
       both in the plane, the wave that meets the corner first is the same thing.
 
@@ -83,8 +83,8 @@ def round_corner(
     """
     before, last = edges[:-1], edges[-1]
     route, row = find_route(before, tx, rx), torch.arange(len(end))
-    wedges, turns = before[-1].wedges, route.turns(wave_number)
-    past, root = (each[row, end] for each in route.beyond(len(before) - 1, wave_number))
+    wedges, turns = before[-1].wedges, route.edge_diffractions(wave_number)
+    past, root = (each[row, end] for each in route.end_distances(len(before) - 1, wave_number))
     corner = torch.where(end[:, None] > 0, wedges.end, wedges.start)
     onwards = rx - corner
     way = normalize(onwards, dim=1)
@@ -93,29 +93,31 @@ def round_corner(
     sine = cross(edge_axis(last.wedges), way).norm(dim=1)
     if last.azimuth_in is None:
         raise ValueError("no face lies between both edges")
-    azimuth = azimuth_outside(last.wedges, way, 0)
-    turned = Turn(last.wedges, way, way, last.azimuth_in, azimuth, length * sine**2, last.faces)
-    orders: tuple[Order, ...] = ("value", "out") if len(before) == 1 else ("value",)
-    sent = transfers(route, turns, wave_number, orders)
+    azimuth = exterior_azimuth(last.wedges, way, 0)
+    turned = EdgeDiffraction(
+        last.wedges, way, way, last.azimuth_in, azimuth, length * sine**2, last.face_coefficients
+    )
+    orders: tuple[DyadDerivative, ...] = ("value", "out") if len(before) == 1 else ("value",)
+    sent = transfer_dyads(route, turns, wave_number, orders)
     dyads = diffraction_dyads(turned, wave_number, ("value", "in"))
     transfer = dyads[0] @ sent[0]
     if len(sent) > 1:
         # Off the face, azimuths grow from the face 0 and fall from the other.
         side = torch.where(faces[:, 0] == faces[:, 1], 1.0, -1.0)
-        scale = side / (1j * wave_number * sine * turns[0].sine * reach)
+        scale = side / (1j * wave_number * sine * turns[0].sin_beta * reach)
         transfer = transfer + scale[:, None, None] * (dyads[1] @ sent[1])
     normal = wedges.normals[row, faces[:, 0]]
     came = normalize(route.vertices[:, -3] - corner, dim=1)
-    high, low = (dot(normal, u) ** 2 + _LOW for u in (came, way))
-    share = _short(route, end, last.wedges, past, wave_number) * high / (high + low)
-    share = 0.5 * share * face_share(wedges, last.wedges, faces, way) / length.sqrt()
+    high, low = (dot(normal, u) ** 2 + _MIN_SQUARED_SINE for u in (came, way))
+    share = _deficit_weight(route, end, last.wedges, past, wave_number) * high / (high + low)
+    share = 0.5 * share * face_weight(wedges, last.wedges, faces, way) / length.sqrt()
     points = torch.cat([route.points, corner[:, None]], 1)
     transfer = transfer * share[:, None, None]
     return EdgePaths(points, route.legs.sum(1), transfer, route.stationary)
 
 
-def _short(
-    route: Route, end: Tensor, last: Wedges, past: Tensor, wave_number: float
+def _deficit_weight(
+    route: Route, end: Tensor, last: Wedges, end_distance: Tensor, wave_number: float
 ) -> Float64[Tensor, " row"]:
     """1/(1 + x³): of a triangle along the face, from the point of the edge to the last edge."""
     wedges = route.edges[-1].wedges
@@ -127,5 +129,5 @@ def _short(
     ahead = dot(normalize(route.vertices[:, -1] - route.vertices[:, -2], dim=1), outwards)
     aside = (1 - ahead**2).clamp_min(1e-12).sqrt()
     meets = (sine * ahead + cosine * aside).clamp_min(0.0) ** 3
-    far = (wave_number * past * sine / math.pi) ** 3
-    return torch.where(past > 0, meets / (meets + far).clamp_min(1e-300), 1.0)
+    far = (wave_number * end_distance * sine / math.pi) ** 3
+    return torch.where(end_distance > 0, meets / (meets + far).clamp_min(1e-300), 1.0)

@@ -14,14 +14,19 @@ from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.em.plane_waves import cross, dot, mirrored, plane_of_incidence
+from invertwin.channel.em.plane_waves import cross, dot, plane_of_incidence, reflect_vectors
 from invertwin.channel.em.wedges import edge_axis
-from invertwin.channel.specular.corner_diffraction import round_corner
-from invertwin.channel.specular.diffraction_candidates import Bends, Corner, Legs, along_faces
-from invertwin.channel.specular.edge_path_geometry import Edge, EdgePaths, over_edges
-from invertwin.channel.specular.image_method import corners_of, images
+from invertwin.channel.specular.corner_diffraction import diffract_round_corner
+from invertwin.channel.specular.diffraction_candidates import (
+    Corner,
+    DiffractionCandidates,
+    PathLegs,
+    face_azimuths,
+)
+from invertwin.channel.specular.edge_path_geometry import EdgePaths, PathEdge, diffract_over_edges
+from invertwin.channel.specular.image_method import image_positions, interaction_points
 from invertwin.channel.specular.ray_paths import DIFFRACTION
-from invertwin.channel.specular.wedge_scene import EdgedScene, on_edge
+from invertwin.channel.specular.wedge_scene import WedgeScene, clamp_to_edge
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,7 @@ class DiffractedPaths:
             past it [m].
         kinds: what happens there, by ``KINDS``.
         faces: triangles; of an edge, that of its first face.
-        ways: unit vectors of the legs, from the transmitter on.
+        directions: unit vectors of the legs, from the transmitter on.
         length: of the path by these points [m].
         transfer: E at the receiver of E at 1 m from the transmitter, without the phase of
             ``length`` [1/m]; world coordinates, receive × transmit.
@@ -51,7 +56,7 @@ class DiffractedPaths:
     points: Float64[Tensor, "row vertex 3"]
     kinds: Int64[Tensor, "row vertex"]
     faces: Int64[Tensor, "row vertex"]
-    ways: Float64[Tensor, "row leg 3"]
+    directions: Float64[Tensor, "row leg 3"]
     length: Float64[Tensor, " row"]
     transfer: Complex128[Tensor, "row 3 3"]
     slopes: Complex128[Tensor, "row 2 3 3"]
@@ -59,9 +64,9 @@ class DiffractedPaths:
     corner: Corner = None
 
 
-def diffracted_paths(
-    around: EdgedScene,
-    bends: Bends,
+def evaluate_diffracted_paths(
+    wedge_scene: WedgeScene,
+    candidates: DiffractionCandidates,
     tx: Float64[Tensor, "tx 3"],
     rx: Float64[Tensor, "rx 3"],
     wave_number: float,
@@ -69,21 +74,24 @@ def diffracted_paths(
     """What paths round edges are worth.
 
     Args:
-        around: the scene.
-        bends: the paths, see ``find_bends``.
+        wedge_scene: the scene.
+        candidates: the paths, see ``find_diffraction_candidates``.
         tx, rx: antennas [m].
         wave_number: k [1/m].
     """
-    source, target = tx[bends.tx], rx[bends.rx]
-    legs = [_Mirrors(around, bends.before, source), _Mirrors(around, _back(bends.after), target)]
-    angles = along_faces(around, bends)
+    source, target = tx[candidates.tx], rx[candidates.rx]
+    legs = [
+        _AntennaLeg(wedge_scene, candidates.before, source),
+        _AntennaLeg(wedge_scene, _reverse_legs(candidates.after), target),
+    ]
+    angles = face_azimuths(wedge_scene, candidates)
     arrive, leave = ([None, *angles[..., 1].T], [*angles[..., 0].T, None])
     edges = [
-        around.edge(row, pair, absorbs=bends.absorbs)
-        for row, pair in zip(bends.edge.T, zip(arrive, leave, strict=True), strict=True)
+        wedge_scene.path_edge(row, pair, absorbing=candidates.absorbing)
+        for row, pair in zip(candidates.edge.T, zip(arrive, leave, strict=True), strict=True)
     ]
-    sent = _sent(bends, edges, legs[0].image, legs[1].image, wave_number)
-    places = [on_edge(edge.wedges, sent.points[:, n]) for n, edge in enumerate(edges)]
+    sent = _edge_fields(candidates, edges, legs[0].image, legs[1].image, wave_number)
+    places = [clamp_to_edge(edge.wedges, sent.points[:, n]) for n, edge in enumerate(edges)]
     stops = torch.stack([legs[0].image, *places, legs[1].image], 1)
     pieces = stops[:, 1:] - stops[:, :-1]
     length = pieces.norm(dim=2).sum(1)
@@ -96,91 +104,99 @@ def diffracted_paths(
     slopes = torch.zeros_like(sent.transfer).expand(2, -1, -1, -1)
     if sent.slopes is not None:
         slopes = leaving @ (sent.slopes * turn) @ arriving
-    axes = [leg.turned(-edge_axis(edges[n].wedges)) for leg, n in zip(legs, (0, -1), strict=True)]
+    axes = [
+        leg.rotate_axis(-edge_axis(edges[n].wedges)) for leg, n in zip(legs, (0, -1), strict=True)
+    ]
     ways = [normalize(pieces, dim=2)[:, 1:-1]]
-    ways.insert(0, torch.stack(legs[0].ways(places[0]), 1))
-    ways.append(-torch.stack(legs[1].ways(places[-1]), 1).flip(1))
-    points = [legs[0].corners(places[0]), torch.stack(places, 1)]
-    points.append(legs[1].corners(places[-1]).flip(1))
-    kinds = [bends.before.kinds, torch.full_like(bends.edge, DIFFRACTION), bends.after.kinds]
-    first = around.plain.faces[bends.edge, 0]
+    ways.insert(0, torch.stack(legs[0].directions(places[0]), 1))
+    ways.append(-torch.stack(legs[1].directions(places[-1]), 1).flip(1))
+    points = [legs[0].interaction_points(places[0]), torch.stack(places, 1)]
+    points.append(legs[1].interaction_points(places[-1]).flip(1))
+    kinds = [
+        candidates.before.kinds,
+        torch.full_like(candidates.edge, DIFFRACTION),
+        candidates.after.kinds,
+    ]
+    first = wedge_scene.detached_wedges.faces[candidates.edge, 0]
     return DiffractedPaths(
-        bends.tx,
-        bends.rx,
-        bends.edge,
+        candidates.tx,
+        candidates.rx,
+        candidates.edge,
         torch.cat(points, 1),
         torch.cat(kinds, 1),
-        torch.cat([bends.before.faces, first, bends.after.faces], 1),
+        torch.cat([candidates.before.faces, first, candidates.after.faces], 1),
         torch.cat(ways, 1),
         length,
         leaving @ (sent.transfer * turn) @ arriving,
         slopes.transpose(0, 1),
         torch.stack(axes, 1),
-        bends.corner,
+        candidates.corner,
     )
 
 
-def _sent(bends: Bends, edges: list[Edge], tx: Tensor, rx: Tensor, k: float) -> EdgePaths:
-    if bends.end is None:
-        return over_edges(edges, tx, rx, k, slopes=len(edges) == 1)
-    if bends.corner == "last":
-        return round_corner(edges, bends.end, bends.between[:, -1], tx, rx, k)
+def _edge_fields(
+    candidates: DiffractionCandidates, edges: list[PathEdge], tx: Tensor, rx: Tensor, k: float
+) -> EdgePaths:
+    if candidates.end is None:
+        return diffract_over_edges(edges, tx, rx, k, slopes=len(edges) == 1)
+    if candidates.corner == "last":
+        return diffract_round_corner(edges, candidates.end, candidates.between[:, -1], tx, rx, k)
     # Reciprocity: the way back ends in the corner.
     back = [replace(e, azimuth_in=e.azimuth, azimuth=e.azimuth_in) for e in reversed(edges)]
-    found = round_corner(back, bends.end, bends.between[:, 0].flip(1), rx, tx, k)
+    found = diffract_round_corner(back, candidates.end, candidates.between[:, 0].flip(1), rx, tx, k)
     return replace(found, points=found.points.flip(1), transfer=found.transfer.mT)
 
 
-def _back(legs: Legs) -> Legs:
-    return Legs(legs.faces.flip(1), legs.through.flip(1))
+def _reverse_legs(legs: PathLegs) -> PathLegs:
+    return PathLegs(legs.faces.flip(1), legs.transmitted.flip(1))
 
 
-class _Mirrors:
+class _AntennaLeg:
     """Surfaces between an antenna and an edge, in this order, differentiable."""
 
-    def __init__(self, around: EdgedScene, legs: Legs, place: Tensor) -> None:
-        corners = around.vertices[around.topology.faces[legs.faces]]
-        self.around = around
+    def __init__(self, wedge_scene: WedgeScene, legs: PathLegs, position: Tensor) -> None:
+        corners = wedge_scene.vertices[wedge_scene.topology.faces[legs.faces]]
+        self.wedge_scene = wedge_scene
         self.legs = legs
         self.normal = normalize(
             cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]),
             dim=-1,
         )
         self.point = corners[..., 0, :]
-        self.seen = images(place, self.point, self.normal, legs.through)
+        self.images = image_positions(position, self.point, self.normal, legs.transmitted)
 
     @property
     def image(self) -> Float64[Tensor, "row 3"]:
         """Of the antenna, as the edge sees it."""
-        return self.seen[-1]
+        return self.images[-1]
 
-    def corners(self, point: Tensor) -> Float64[Tensor, "row step 3"]:
+    def interaction_points(self, point: Tensor) -> Float64[Tensor, "row step 3"]:
         """Where the way to a point meets the surfaces."""
-        found = corners_of(point, self.seen, self.point, self.normal)
+        found = interaction_points(point, self.images, self.point, self.normal)
         return torch.stack(found, 1) if found else self.point
 
-    def ways(self, point: Tensor) -> list[Tensor]:
+    def directions(self, point: Tensor) -> list[Tensor]:
         """Unit vectors of the way to a point, from the antenna on."""
         found = [normalize(point - self.image, dim=1)]
         for step in reversed(range(self.normal.shape[1])):
-            turned = mirrored(found[0], self.normal[:, step])
-            found.insert(0, torch.where(self.legs.through[:, step, None], found[0], turned))
+            turned = reflect_vectors(found[0], self.normal[:, step])
+            found.insert(0, torch.where(self.legs.transmitted[:, step, None], found[0], turned))
         return found
 
-    def turned(self, axis: Tensor) -> Tensor:
+    def rotate_axis(self, axis: Tensor) -> Tensor:
         """An axis of rotation near the edge, as it is near the antenna."""
         for step in reversed(range(self.normal.shape[1])):
-            back = -mirrored(axis, self.normal[:, step])
-            axis = torch.where(self.legs.through[:, step, None], axis, back)
+            back = -reflect_vectors(axis, self.normal[:, step])
+            axis = torch.where(self.legs.transmitted[:, step, None], axis, back)
         return axis
 
     def dyad(self, point: Tensor) -> Complex128[Tensor, "row 3 3"]:
         """E that arrives at a point, of E that leaves the antenna."""
-        ways = self.ways(point)
+        ways = self.directions(point)
         total = torch.eye(3, dtype=torch.complex128).expand(len(point), 3, 3)
-        for step, through in enumerate(self.legs.through.unbind(1)):
+        for step, through in enumerate(self.legs.transmitted.unbind(1)):
             normal, way = self.normal[:, step], ways[step]
-            law = self.around.coefficients(self.legs.faces[:, step], dot(normal, way).abs())
+            law = self.wedge_scene.coefficients(self.legs.faces[:, step], dot(normal, way).abs())
             s, before, after = (v[:, 0] for v in plane_of_incidence(normal, way))
             passing = through[:, None]
             both = torch.where(passing, before, after)

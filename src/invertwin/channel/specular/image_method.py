@@ -20,22 +20,22 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.em.plane_waves import cross, dot, mirrored, unit_across
+from invertwin.channel.em.plane_waves import cross, dot, orthogonal_unit_vectors, reflect_vectors
 from invertwin.channel.rays.arrays import opaque, to_double, to_float, to_index, to_torch
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.ray_scene import NEAR, Occluders
+from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
 
-_ALIKE = 1e-5  # radians, and share of the scene's size, within which planes are one
+_PLANE_TOLERANCE = 1e-5  # radians, and share of the scene's size, within which planes are one
 
 
 _LANES = 1 << 19
-_PAIRS = 1 << 22  # segments × triangles of the exact test at a time
-_ASIDE = 4.0  # margins between the rays that try a segment
-_EXACT = 1e-9  # of the scene's size: float64 places closer than this are one
+_MAX_PAIRS = 1 << 22  # segments × triangles of the exact test at a time
+_RAY_SPREAD = 4.0  # margins between the rays that try a segment
+_EXACT_TOLERANCE = 1e-9  # of the scene's size: float64 places closer than this are one
 
 
-class Walls(Occluders):
+class CandidateSurfaces(Occluders):
     """What may be in the way between antennas, and the planes that mirror.
 
     Args:
@@ -54,8 +54,8 @@ class Walls(Occluders):
         super().__init__(vertices, topology, (ends.amax(0) + ends.amin(0)) / 2)
         self.exact_vertices = vertices - self.origin
         self.size = float((ends - self.origin).norm(dim=1).max())
-        self.margin = NEAR * self.size
-        self.planes: Planes = planes_of(self.exact_vertices, topology.faces)
+        self.margin = RAY_EPSILON * self.size
+        self.planes: Planes = find_planes(self.exact_vertices, topology.faces)
 
     @cached_property
     def device_planes(self) -> dict[str, Any]:
@@ -77,7 +77,7 @@ class Walls(Occluders):
         return tables | {"of_face": to_index(planes.face_plane.clamp_min(0))}
 
     @cached_property
-    def device_rims(self) -> Any:
+    def device_rim_widths(self) -> Any:
         """How near to their sides rays may have missed triangles: share of the least height."""
         corners = self.exact_vertices[self.topology.faces]
         sides = corners.roll(-1, 1) - corners
@@ -87,49 +87,49 @@ class Walls(Occluders):
 
 
 @dataclass(frozen=True)
-class Chains:
+class SpecularPaths:
     """Specular paths of one number of steps, as triangles that they meet; detached.
 
     Attributes:
         source, target: Numbers of the antennas.
         faces: Triangles, from the source on.
-        through: Whether the path goes through them instead of being mirrored.
+        transmitted: Whether the path goes through them instead of being mirrored.
     """
 
     source: Int64[Tensor, " path"]
     target: Int64[Tensor, " path"]
     faces: Int64[Tensor, "path step"]
-    through: Bool[Tensor, "path step"]
+    transmitted: Bool[Tensor, "path step"]
 
-    def reversed(self) -> "Chains":
+    def reverse(self) -> "SpecularPaths":
         """From target to source."""
-        return Chains(self.target, self.source, self.faces.flip(1), self.through.flip(1))
+        return SpecularPaths(self.target, self.source, self.faces.flip(1), self.transmitted.flip(1))
 
 
-def images(
-    place: Float64[Tensor, "row 3"],
+def image_positions(
+    position: Float64[Tensor, "row 3"],
     point: Float64[Tensor, "row step 3"],
     normal: Float64[Tensor, "row step 3"],
-    through: Bool[Tensor, "row step"],
+    transmitted: Bool[Tensor, "row step"],
 ) -> list[Float64[Tensor, "row 3"]]:
     """A place, and its images after each step.
 
     Args:
         place: Of the source.
         point, normal: Of the planes.
-        through: Steps that leave the image where it is.
+        transmitted: Steps that leave the image where it is.
     """
-    found = [place]
+    found = [position]
     for step in range(point.shape[1]):
         n, p = normal[:, step], point[:, step]
-        turned = p + mirrored(found[-1] - p, n)
-        found.append(torch.where(through[:, step, None], found[-1], turned))
+        turned = p + reflect_vectors(found[-1] - p, n)
+        found.append(torch.where(transmitted[:, step, None], found[-1], turned))
     return found
 
 
-def corners_of(
+def interaction_points(
     target: Float64[Tensor, "row 3"],
-    seen: list[Float64[Tensor, "row 3"]],
+    images: list[Float64[Tensor, "row 3"]],
     point: Float64[Tensor, "row step 3"],
     normal: Float64[Tensor, "row step 3"],
 ) -> list[Float64[Tensor, "row 3"]]:
@@ -137,13 +137,13 @@ def corners_of(
 
     Args:
         target: Places.
-        seen: From ``images``.
+        images: From ``images``.
         point, normal: Of the planes.
     """
     found: list[Tensor] = []
     place = target
     for step in reversed(range(point.shape[1])):
-        n, way = normal[:, step], seen[step + 1] - place
+        n, way = normal[:, step], images[step + 1] - place
         falls = dot(way, n)
         share = dot(point[:, step] - place, n) / torch.where(
             falls == 0, torch.ones_like(falls), falls
@@ -153,93 +153,97 @@ def corners_of(
     return found
 
 
-def chains_between(
-    walls: Walls,
+def find_paths_between(
+    surfaces: CandidateSurfaces,
     steps: Int64[Tensor, "sequence step"],
     source: Float64[Tensor, "3"],
     targets: Float64[Tensor, "target 3"],
-    number: int,
-) -> list[Chains]:
+    source_index: int,
+) -> list[SpecularPaths]:
     """The paths that follow given sequences from one source to all targets.
 
     Args:
-        walls: The scene.
-        steps: Sequences, see ``sequences``.
+        surfaces: The scene.
+        steps: Sequences, see ``sample_rows``.
         source, targets: World positions [m].
-        number: Of the source.
+        source_index: Of the source.
     """
     own = torch.zeros(len(targets), dtype=torch.int64)
-    found = chains_from(walls, steps, source[None], own, targets)
-    return [replace(some, source=torch.full_like(some.source, number)) for some in found]
+    found = find_paths_from(surfaces, steps, source[None], own, targets)
+    return [replace(some, source=torch.full_like(some.source, source_index)) for some in found]
 
 
-def chains_from(
-    walls: Walls,
+def find_paths_from(
+    surfaces: CandidateSurfaces,
     steps: Int64[Tensor, "sequence step"],
     sources: Float64[Tensor, "source 3"],
-    number: Int64[Tensor, " target"],
+    source_index: Int64[Tensor, " target"],
     targets: Float64[Tensor, "target 3"],
-    rests: Int64[Tensor, " target"] | None = None,
-) -> list[Chains]:
+    target_planes: Int64[Tensor, " target"] | None = None,
+) -> list[SpecularPaths]:
     """The paths that follow given sequences to each target from its own source.
 
     Args:
-        walls: The scene.
-        steps: Sequences, see ``sequences``.
+        surfaces: The scene.
+        steps: Sequences, see ``sample_rows``.
         sources, targets: World positions [m].
-        number: Of the source of each target.
-        rests: Planes of the scene that targets lie in, −1 where in none; None = none does.
+        source_index: Of the source of each target.
+        target_planes: Planes of the scene that targets lie in, −1 where in none; None = none does.
     """
-    found: list[Chains] = []
+    found: list[SpecularPaths] = []
     for some in steps.split(max(1, _LANES // len(sources))):
-        screen = _Screen(walls, some, sources)
+        screen = _SequenceScreen(surfaces, some, sources)
         block = max(1, _LANES // len(some))
         for begin in range(0, len(targets), block):
             rows = slice(begin, begin + block)
-            target, sequence = screen.passed(targets[rows], number[rows])
+            target, sequence = screen.select_candidates(targets[rows], source_index[rows])
             target = target + begin
-            chosen, source = some[sequence], number[target]
-            lies = None if rests is None else rests[target]
-            good, faces = clear_ways(walls, chosen, sources[source], targets[target], lies)
+            chosen, source = some[sequence], source_index[target]
+            lies = None if target_planes is None else target_planes[target]
+            good, faces = find_unobstructed_paths(
+                surfaces, chosen, sources[source], targets[target], lies
+            )
             through = (chosen[good] & 1).bool()
-            found.append(Chains(source[good], target[good], faces[good], through))
+            found.append(SpecularPaths(source[good], target[good], faces[good], through))
     return found
 
 
-class _Screen:
+class _SequenceScreen:
     """Tries all sequences from some sources by one ray a segment, in kernels of many lanes."""
 
-    def __init__(self, walls: Walls, steps: Tensor, sources: Tensor) -> None:
-        self.walls = walls
+    def __init__(self, surfaces: CandidateSurfaces, steps: Tensor, sources: Tensor) -> None:
+        self.surfaces = surfaces
         self.length = steps.shape[1]
         self.count = len(steps)
-        planes = walls.planes
-        place = (sources - walls.origin).repeat_interleave(self.count, 0)
+        planes = surfaces.planes
+        place = (sources - surfaces.origin).repeat_interleave(self.count, 0)
         every = steps.repeat(len(sources), 1)
         plane = every >> 1
-        seen = images(place, planes.point[plane], planes.normal[plane], (every & 1).bool())
+        seen = image_positions(place, planes.point[plane], planes.normal[plane], (every & 1).bool())
         self.images = to_double(torch.stack(seen, 1))
         self.steps = to_index(steps) if self.length else None
 
-    def passed(self, targets: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
+    def select_candidates(self, targets: Tensor, source_index: Tensor) -> tuple[Tensor, Tensor]:
         """Targets and sequences of what may be paths from the sources of these numbers."""
         lane = dr.arange(mi.UInt32, self.count * len(targets))
         count = opaque(self.count)
         target, row = lane // count, lane % count
-        places = to_double(targets - self.walls.origin)
+        places = to_double(targets - self.surfaces.origin)
         end = dr.gather(mi.Vector3d, places, target)
-        first = (dr.gather(mi.UInt32, to_index(number), target) * count + row) * (self.length + 1)
-        ok, corners, planes, normals = self._corners(row, first, end)
-        good = to_torch(self._clear(first, ok, [*corners, end], planes, normals))
+        first = (dr.gather(mi.UInt32, to_index(source_index), target) * count + row) * (
+            self.length + 1
+        )
+        ok, corners, planes, normals = self._intersect_planes(row, first, end)
+        good = to_torch(self._is_unobstructed(first, ok, [*corners, end], planes, normals))
         keep = torch.nonzero(good)[:, 0]
         return keep // self.count, keep % self.count
 
-    def _corners(
+    def _intersect_planes(
         self, row: Any, first: Any, end: Any
     ) -> tuple[Any, list[Any], list[Any], list[Any]]:
         """Where the lines to the images cut the planes, inside of their rectangles."""
-        walls, table = self.walls, self.walls.device_planes
-        near = opaque(_EXACT * walls.size, "Float64")
+        walls, table = self.surfaces, self.surfaces.device_planes
+        near = opaque(_EXACT_TOLERANCE * walls.size, "Float64")
         wide = opaque(walls.margin, "Float64")
         ok, place = mi.Bool(True), end
         corners, planes, normals = [], [], []
@@ -268,14 +272,14 @@ class _Screen:
             normals.insert(0, normal)
         return ok, corners, planes, normals
 
-    def _clear(
+    def _is_unobstructed(
         self, first: Any, ok: Any, ends: list[Any], planes: list[Any], normals: list[Any]
     ) -> Any:
         """Whether one ray a segment meets nothing, or what it should; seams let rays through.
 
         What it meets at a triangle's rim is left to the exact test.
         """
-        walls = self.walls
+        walls = self.surfaces
         margin, scene = opaque(walls.margin, "Float64"), walls.scene
         start = dr.gather(mi.Vector3d, self.images, first)
         for step, end in enumerate(ends):
@@ -297,7 +301,7 @@ class _Screen:
             hit = scene.ray_intersect_preliminary(ray, active=ok)
             valid = hit.is_valid() & ok
             u, v = hit.prim_uv.x, hit.prim_uv.y
-            rim = dr.gather(mi.Float, walls.device_rims, hit.prim_index, valid)
+            rim = dr.gather(mi.Float, walls.device_rim_widths, hit.prim_index, valid)
             deep = valid & (dr.minimum(dr.minimum(u, v), 1 - u - v) > rim)
             plane = dr.gather(mi.UInt32, walls.device_planes["of_face"], hit.prim_index, valid)
             if step:
@@ -310,42 +314,42 @@ class _Screen:
 
 
 @dataclass(frozen=True)
-class _Segments:
+class _SpecularSegments:
     """Straight pieces of paths, one row each; planes are −1 at antennas.
 
     Attributes:
         start, end: [m].
         plane_before, plane: Of the surfaces at start and end.
-        rests: Planes that the ends of last pieces lie in, else −1.
+        target_plane: Planes that the ends of last pieces lie in, else −1.
     """
 
     start: Tensor
     end: Tensor
     plane_before: Tensor
     plane: Tensor
-    rests: Tensor
+    target_plane: Tensor
 
 
-def reaching(
-    walls: Walls,
+def intersects_planes(
+    surfaces: CandidateSurfaces,
     steps: Int64[Tensor, "row step"],
-    seen: list[Float64[Tensor, "row 3"]],
+    images: list[Float64[Tensor, "row 3"]],
     target: Float64[Tensor, "row 3"],
 ) -> Bool[Tensor, " row"]:
     """Whether lines to the images cut the planes inside of their rectangles, in the right order.
 
     Args:
-        walls: The scene.
-        steps: Sequences, see ``sequences``.
-        seen: From ``images``, about the scene's origin.
+        surfaces: The scene.
+        steps: Sequences, see ``sample_rows``.
+        images: From ``images``, about the scene's origin.
         target: Places about it.
     """
-    planes, place = walls.planes, target
-    near = _EXACT * walls.size
+    planes, place = surfaces.planes, target
+    near = _EXACT_TOLERANCE * surfaces.size
     ok = torch.ones(len(target), dtype=torch.bool)
     for step in reversed(range(steps.shape[1])):
         plane, through = steps[:, step] >> 1, (steps[:, step] & 1).bool()
-        point, normal, way = planes.point[plane], planes.normal[plane], seen[step + 1] - place
+        point, normal, way = planes.point[plane], planes.normal[plane], images[step + 1] - place
         falls = dot(way, normal)
         ok &= falls != 0
         share = dot(point - place, normal) / torch.where(falls == 0, torch.ones_like(falls), falls)
@@ -355,123 +359,133 @@ def reaching(
         ok &= share * reach < reach - near
         place = place + share[:, None] * way
         at = torch.einsum("rx,rax->ra", place - point, planes.axes[plane])
-        ok &= (at >= planes.low[plane] - walls.margin).all(1)
-        ok &= (at <= planes.high[plane] + walls.margin).all(1)
+        ok &= (at >= planes.low[plane] - surfaces.margin).all(1)
+        ok &= (at <= planes.high[plane] + surfaces.margin).all(1)
     return ok
 
 
-def clear_ways(
-    walls: Walls,
+def find_unobstructed_paths(
+    surfaces: CandidateSurfaces,
     steps: Int64[Tensor, "row step"],
     source: Float64[Tensor, "row 3"],
     targets: Float64[Tensor, "row 3"],
-    rests: Int64[Tensor, " row"] | None = None,
+    target_planes: Int64[Tensor, " row"] | None = None,
 ) -> tuple[Bool[Tensor, " row"], Int64[Tensor, "row step"]]:
     """Which ways by given planes are free, and the triangles that they meet.
 
     Args:
-        walls: The scene.
-        steps: Sequences, see ``sequences``.
+        surfaces: The scene.
+        steps: Sequences, see ``sample_rows``.
         source, targets: World positions [m].
-        rests: Planes of the scene that targets lie in, −1 where in none; None = none does.
+        target_planes: Planes of the scene that targets lie in, −1 where in none; None = none does.
     """
     count, length = steps.shape
     if not count:
         return torch.zeros(0, dtype=torch.bool), torch.zeros_like(steps)
-    planes, plane = walls.planes, steps >> 1
+    planes, plane = surfaces.planes, steps >> 1
     point, normal = planes.point[plane], planes.normal[plane]
-    place, target = source - walls.origin, targets - walls.origin
-    seen = images(place, point, normal, (steps & 1).bool())
-    nodes = torch.stack([place, *corners_of(target, seen, point, normal), target], 1)
+    place, target = source - surfaces.origin, targets - surfaces.origin
+    seen = image_positions(place, point, normal, (steps & 1).bool())
+    nodes = torch.stack([place, *interaction_points(target, seen, point, normal), target], 1)
     none = torch.full((count, 1), -1)
     before, after = torch.cat([none, plane], 1), torch.cat([plane, none], 1)
-    lies = none if rests is None else rests[:, None]
+    lies = none if target_planes is None else target_planes[:, None]
     last = torch.cat([torch.full_like(plane, -1), lies], 1)
     starts, ends = nodes[:, :-1].reshape(-1, 3), nodes[:, 1:].reshape(-1, 3)
-    pieces = _Segments(starts, ends, before.ravel(), after.ravel(), last.ravel())
-    met, good = _tried(walls, pieces)
+    pieces = _SpecularSegments(starts, ends, before.ravel(), after.ravel(), last.ravel())
+    met, good = _test_segments(surfaces, pieces)
     met, good = met.view(count, length + 1), good.view(count, length + 1)
-    apart = (target - seen[-1]).norm(dim=1) > _EXACT * walls.size
+    apart = (target - seen[-1]).norm(dim=1) > _EXACT_TOLERANCE * surfaces.size
     return good.all(1) & apart, met[:, :length]
 
 
-def _tried(walls: Walls, pieces: _Segments) -> tuple[Tensor, Tensor]:
+def _test_segments(
+    surfaces: CandidateSurfaces, segments: _SpecularSegments
+) -> tuple[Tensor, Tensor]:
     """The triangle at the end of each segment, and whether the segment exists."""
-    way = pieces.end - pieces.start
+    way = segments.end - segments.start
     unit = normalize(way, dim=1)
-    first = unit_across(unit)
+    first = orthogonal_unit_vectors(unit)
     second = cross(unit, first)
     votes = torch.zeros(len(unit), dtype=torch.int64)
     met = torch.full_like(votes, -1)
     for number in range(4):  # the last one goes straight
         angle = torch.tensor(2.1 * number, dtype=torch.float64)
-        aside = _ASIDE * walls.margin * (angle.cos() * first + angle.sin() * second)
+        aside = _RAY_SPREAD * surfaces.margin * (angle.cos() * first + angle.sin() * second)
         if number == 3:
             aside = torch.zeros_like(aside)
-        start = pieces.start + _in_plane(walls, aside, unit, pieces.plane_before)
-        end = pieces.end + _in_plane(walls, aside, unit, torch.maximum(pieces.plane, pieces.rests))
-        face = _cast(walls, start, end, pieces)
-        good = torch.where(pieces.plane >= 0, face >= 0, face == -1)
+        start = segments.start + _shift_in_plane(surfaces, aside, unit, segments.plane_before)
+        end = segments.end + _shift_in_plane(
+            surfaces, aside, unit, torch.maximum(segments.plane, segments.target_plane)
+        )
+        face = _cast_rays(surfaces, start, end, segments)
+        good = torch.where(segments.plane >= 0, face >= 0, face == -1)
         votes += good
         met = face
     unsure = torch.nonzero((votes > 0) & (votes < 4))[:, 0]
     good = votes == 4
     if len(unsure):
-        rows = _Segments(*(column[unsure] for column in vars(pieces).values()))
-        good[unsure], met[unsure] = _decided(walls, rows)
+        rows = _SpecularSegments(*(column[unsure] for column in vars(segments).values()))
+        good[unsure], met[unsure] = _test_exactly(surfaces, rows)
     return met, good
 
 
-def _in_plane(walls: Walls, aside: Tensor, unit: Tensor, plane: Tensor) -> Tensor:
+def _shift_in_plane(
+    surfaces: CandidateSurfaces, offset: Tensor, direction: Tensor, plane: Tensor
+) -> Tensor:
     """A step aside, prolonged along the segment to stay in the plane at its end."""
-    normal = walls.planes.normal[plane.clamp_min(0)]
-    falls = dot(unit, normal)
+    normal = surfaces.planes.normal[plane.clamp_min(0)]
+    falls = dot(direction, normal)
     steep = (plane >= 0) & (falls.abs() > 0.02)
-    share = torch.where(steep, dot(aside, normal) / torch.where(steep, falls, 1.0), 0.0)
-    return aside - share[:, None] * unit
+    share = torch.where(steep, dot(offset, normal) / torch.where(steep, falls, 1.0), 0.0)
+    return offset - share[:, None] * direction
 
 
-def _cast(walls: Walls, start: Tensor, end: Tensor, pieces: _Segments) -> Tensor:
+def _cast_rays(
+    surfaces: CandidateSurfaces, start: Tensor, end: Tensor, segments: _SpecularSegments
+) -> Tensor:
     """Triangle of the right plane at each segment's end; −1 nothing met, −2 something else met."""
-    planes, margin = walls.planes, walls.margin
+    planes, margin = surfaces.planes, surfaces.margin
     way = end - start
     length = way.norm(dim=1)
     unit = normalize(way, dim=1)
-    before = planes.normal[pieces.plane_before.clamp_min(0)]
-    lift = torch.where(pieces.plane_before >= 0, margin * dot(unit, before).sign(), 0.0)
-    held = torch.maximum(pieces.plane, pieces.rests)
+    before = planes.normal[segments.plane_before.clamp_min(0)]
+    lift = torch.where(segments.plane_before >= 0, margin * dot(unit, before).sign(), 0.0)
+    held = torch.maximum(segments.plane, segments.target_plane)
     over = 2 * margin / dot(unit, planes.normal[held.clamp_min(0)]).abs().clamp_min(1e-3)
-    over = torch.where(pieces.plane >= 0, over, torch.where(held >= 0, -over, -margin))
+    over = torch.where(segments.plane >= 0, over, torch.where(held >= 0, -over, -margin))
     begin = (start + lift[:, None] * before).to(torch.float32)
-    origin = _vector(mi.Point3f, begin)
-    direction = _vector(mi.Vector3f, unit.to(torch.float32))
+    origin = _mitsuba_vector(mi.Point3f, begin)
+    direction = _mitsuba_vector(mi.Vector3f, unit.to(torch.float32))
     far = mi.Float(to_double((length + over).clamp_min(0.0)))
-    hit = walls.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction, far, 0.0, []))
+    hit = surfaces.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction, far, 0.0, []))
     valid = hit.is_valid()
     face = to_torch(dr.select(valid, mi.Int32(hit.prim_index), -1)).long()
     distance = to_torch(dr.select(valid, hit.t, 0.0)).double()
-    there = (face >= 0) & (planes.face_plane[face.clamp_min(0)] == pieces.plane)
+    there = (face >= 0) & (planes.face_plane[face.clamp_min(0)] == segments.plane)
     there &= distance > length - over
     return torch.where(there | (face < 0), face, -2)
 
 
-def _vector(kind: Any, values: Tensor) -> Any:
+def _mitsuba_vector(kind: Any, values: Tensor) -> Any:
     return kind(*(to_float(values[:, k]) for k in range(3)))
 
 
-def _decided(walls: Walls, pieces: _Segments) -> tuple[Tensor, Tensor]:
+def _test_exactly(
+    surfaces: CandidateSurfaces, segments: _SpecularSegments
+) -> tuple[Tensor, Tensor]:
     """The same in float64, over all triangles; their edges belong to them."""
-    planes, vertices = walls.planes, walls.exact_vertices
-    a, b, c = vertices[walls.topology.faces].unbind(1)
+    planes, vertices = surfaces.planes, surfaces.exact_vertices
+    a, b, c = vertices[surfaces.topology.faces].unbind(1)
     first, second = b - a, c - a
     area = cross(first, second)
     square = dot(area, area).clamp_min(1e-300)
-    good = torch.ones(len(pieces.start), dtype=torch.bool)
+    good = torch.ones(len(segments.start), dtype=torch.bool)
     met = torch.full((len(good),), -1)
-    near, wide = _EXACT * walls.size, 1e-9
+    near, wide = _EXACT_TOLERANCE * surfaces.size, 1e-9
     every = torch.arange(len(good))
-    for some in every.split(max(1, _PAIRS // len(a))):
-        start, end = pieces.start[some, None], pieces.end[some, None]
+    for some in every.split(max(1, _MAX_PAIRS // len(a))):
+        start, end = segments.start[some, None], segments.end[some, None]
         way = end - start
         length = way.norm(dim=2)
         falls = dot(way, area.expand(len(some), -1, -1))
@@ -486,14 +500,14 @@ def _decided(walls: Walls, pieces: _Segments) -> tuple[Tensor, Tensor]:
             return torch.minimum(torch.minimum(u, v), 1 - u - v)
 
         own = planes.face_plane
-        ends = (own == pieces.plane_before[some, None]) | (own == pieces.plane[some, None])
-        ends |= (own == pieces.rests[some, None]) & (own >= 0)
+        ends = (own == segments.plane_before[some, None]) | (own == segments.plane[some, None])
+        ends |= (own == segments.target_plane[some, None]) & (own >= 0)
         between = (share * length > near) & (share * length < length - near)
         crossing = between & (falls != 0) & ~ends & (own >= 0)
         blocked = crossing & (inside(start + share[..., None] * way) >= -wide)
-        depth = torch.where(own == pieces.plane[some, None], inside(end), -torch.inf)
+        depth = torch.where(own == segments.plane[some, None], inside(end), -torch.inf)
         best, face = depth.max(1)
-        surface = pieces.plane[some] >= 0
+        surface = segments.plane[some] >= 0
         met[some] = torch.where(surface, face, -1)
         good[some] = ~blocked.any(1) & (~surface | (best >= -wide))
     return good, met
@@ -522,7 +536,7 @@ class Planes:
         return len(self.point)
 
 
-def planes_of(vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]) -> Planes:
+def find_planes(vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]) -> Planes:
     """The planes of all triangles. Those that nearly coincide are one, whatever object has them.
 
     Args:
@@ -539,7 +553,7 @@ def planes_of(vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]) -> 
     lead = normal.abs().argmax(1, keepdim=True)
     normal = normal * normal.gather(1, lead).sign()
     offset = (normal * corners[whole, 0]).sum(1) / size
-    key = (torch.cat([normal, offset[:, None]], 1) / _ALIKE).round().numpy() + 0.0
+    key = (torch.cat([normal, offset[:, None]], 1) / _PLANE_TOLERANCE).round().numpy() + 0.0
     _, plane = np.unique(key, axis=0, return_inverse=True)
     plane = torch.from_numpy(plane.ravel())
     count = int(plane.max()) + 1 if len(plane) else 0

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel.em.antenna_fields import antenna_fields, combined
+from invertwin.channel.em.antenna_fields import antenna_fields, combine_elements
 from invertwin.channel.em.plane_waves import polarisations
-from invertwin.channel.paths import Link, Paths, joined
+from invertwin.channel.paths import Link, Paths, concatenate_paths
 from invertwin.channel.specular.ray_paths import RayPaths
 from invertwin.channel.specular.trace_paths import trace_paths
 from invertwin.checks import ArrayLike, checked_tensor
@@ -24,11 +24,11 @@ from invertwin.scene.scene import Scene
 _UP = (0.0, 0.0, 1.0)  # of V in ``RayPaths``
 
 
-def trace_echoes(
+def trace_point_targets(
     scene: Scene,
     link: Link,
     targets: ArrayLike,
-    sections: ArrayLike,
+    cross_sections: ArrayLike,
     *,
     depth: int = 1,
     rays: int | None = 100_000,
@@ -49,7 +49,7 @@ def trace_echoes(
         scene: What mirrors, lets through and hides.
         link: Antennas, per frame, such as ``radar.link()``.
         targets: [target, 3] in the world [m].
-        sections: σ of each [m²].
+        cross_sections: σ of each [m²].
         depth: Most surfaces that one leg meets.
         rays: Shot to find them; None tries every sequence.
         seed: Of the rays.
@@ -61,7 +61,7 @@ def trace_echoes(
     """
     places = checked_tensor(targets, (None, 3), "targets [m]", "give a row of x, y, z for each")
     sizes = checked_tensor(
-        sections, (len(places),), "cross-sections [m²]", "give one for each target"
+        cross_sections, (len(places),), "cross-sections [m²]", "give one for each target"
     )
     if not len(places) or bool((sizes < 0).any()):
         raise InputError(
@@ -77,47 +77,49 @@ def trace_echoes(
     strength = (4 * math.pi * sizes).sqrt() / link.wavelength
     parts = []
     for frame in range(link.frame_count):
-        own = forth.chosen(forth.tx == frame), back.chosen(back.tx == frame)
-        out, home = _pairs(own[0].rx, own[1].rx)
-        parts.append(_echoes(link, frame, own[0].chosen(out), own[1].chosen(home), strength))
-    return joined(parts)
+        own = forth.select(forth.tx == frame), back.select(back.tx == frame)
+        out, home = _match_legs(own[0].rx, own[1].rx)
+        parts.append(_echo_paths(link, frame, own[0].select(out), own[1].select(home), strength))
+    return concatenate_paths(parts)
 
 
-def _pairs(out: Tensor, home: Tensor) -> tuple[Tensor, Tensor]:
+def _match_legs(outbound: Tensor, inbound: Tensor) -> tuple[Tensor, Tensor]:
     """Numbers of all pairs of legs that meet one target."""
-    first, second = torch.nonzero(out[:, None] == home).unbind(1)
+    first, second = torch.nonzero(outbound[:, None] == inbound).unbind(1)
     return first, second
 
 
-def _echoes(link: Link, frame: int, out: RayPaths, home: RayPaths, strength: Tensor) -> Paths:
+def _echo_paths(
+    link: Link, frame: int, outbound: RayPaths, inbound: RayPaths, strength: Tensor
+) -> Paths:
     """One echo for each pair of legs, both from their antenna to the target."""
     # A leg back is the leg there the other way: its matrix is transposed.
-    sent = _antenna(link, frame, out, transmits=True)
-    received = _antenna(link, frame, home, transmits=False)
-    there = torch.einsum("nij,ntj->nti", out.coefficient, sent)
-    back = torch.einsum("nij,nrj->nri", home.coefficient, received)
+    sent = _antenna_amplitudes(link, frame, outbound, transmits=True)
+    received = _antenna_amplitudes(link, frame, inbound, transmits=False)
+    there = torch.einsum("nij,ntj->nti", outbound.coefficient, sent)
+    back = torch.einsum("nij,nrj->nri", inbound.coefficient, received)
     # What arrives at the target as a vector in the world leaves it as that vector.
-    arrives, leaves = _axes(out.arrival), _axes(home.arrival)
+    arrives, leaves = _polarisation_axes(outbound.arrival), _polarisation_axes(inbound.arrival)
     turn = torch.einsum("nix,njx->nij", leaves, arrives).to(there.dtype)
     matrix = torch.einsum("nri,nij,ntj->nrt", back, turn, there)
-    matrix = matrix * strength[out.rx][:, None, None]
-    coefficient, whole = combined(link, matrix)
-    delay = out.delay + home.delay
+    matrix = matrix * strength[outbound.rx][:, None, None]
+    coefficient, whole = combine_elements(link, matrix)
+    delay = outbound.delay + inbound.delay
     return Paths(
-        frame=torch.full((len(out),), frame),
+        frame=torch.full((len(outbound),), frame),
         delay=delay,
         coefficient=coefficient,
         power=torch.zeros_like(delay),
         # Where the elements of an array see the target: at its image.
-        first=link.tx[frame] + out.length[:, None] * out.departure,
-        last=link.rx[frame] + home.length[:, None] * home.departure,
+        first=link.tx[frame] + outbound.length[:, None] * outbound.departure,
+        last=link.rx[frame] + inbound.length[:, None] * inbound.departure,
         kind="coherent",
-        boundary=torch.zeros(len(out), dtype=torch.bool),
+        boundary=torch.zeros(len(outbound), dtype=torch.bool),
         matrix=whole,
     )
 
 
-def _antenna(
+def _antenna_amplitudes(
     link: Link, frame: int, legs: RayPaths, *, transmits: bool
 ) -> Complex128[Tensor, "row k 2"]:
     """Fields of an antenna's vectors along legs, over V and H of ``RayPaths``."""
@@ -128,9 +130,9 @@ def _antenna(
     lit = gain > 0  # a root of zero has no derivative
     strength = torch.where(lit, torch.where(lit, gain, 1.0).sqrt(), 0.0)
     fields = antenna_fields(jones, rotation, legs.departure)
-    axes = _axes(legs.departure).to(fields.dtype)
+    axes = _polarisation_axes(legs.departure).to(fields.dtype)
     return strength[:, None, None] * torch.einsum("nkx,nix->nki", fields, axes)
 
 
-def _axes(direction: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 2 3"]:
+def _polarisation_axes(direction: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 2 3"]:
     return polarisations(direction, torch.tensor(_UP, dtype=torch.float64))

@@ -46,7 +46,7 @@ class RayPaths:
             receiver's by an angle about ``axes``, in which the fields turn with the directions
             [1/rad]; zero of all others. None = no path has any.
         axes: Unit vectors of these rotations, at the transmitter and at the receiver.
-        missed: Of the directions of the antennas that rays were shot from, the share whose
+        missed_fraction: Of the directions of the antennas that rays were shot from, the share whose
             sequences of surfaces no ray has followed: an estimate; None where all sequences have
             been tried.
     """
@@ -67,7 +67,7 @@ class RayPaths:
     doppler: Float64[Tensor, " path"]
     slopes: Complex128[Tensor, "path 2 2 2"] | None = None
     axes: Float64[Tensor, "path 2 3"] | None = None
-    missed: float | None = None
+    missed_fraction: float | None = None
 
     def __len__(self) -> int:
         return self.delay.shape[0]
@@ -87,7 +87,7 @@ class RayPaths:
         """Number of the pair of antennas: receivers run fastest."""
         return self.tx * self.counts[1] + self.rx
 
-    def chosen(self, rows: Bool[Tensor, " path"] | Int64[Tensor, " some"]) -> "RayPaths":
+    def select(self, rows: Bool[Tensor, " path"] | Int64[Tensor, " some"]) -> "RayPaths":
         """Only some of the paths.
 
         Args:
@@ -96,21 +96,21 @@ class RayPaths:
         columns = {n: value[rows] for n, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(self, **columns)
 
-    def between(self, tx: int, rx: int) -> "RayPaths":
+    def select_link(self, tx: int, rx: int) -> "RayPaths":
         """The paths of one link.
 
         Args:
             tx: Number of the transmitter.
             rx: Number of the receiver.
         """
-        return self.chosen((self.tx == tx) & (self.rx == rx))
+        return self.select((self.tx == tx) & (self.rx == rx))
 
-    def sorted(self) -> "RayPaths":
+    def sort_rows(self) -> "RayPaths":
         """The paths in the order of transmitter, receiver and delay."""
         by_delay = self.delay.detach().argsort(stable=True)
-        return self.chosen(by_delay[self.link[by_delay].argsort(stable=True)])
+        return self.select(by_delay[self.link[by_delay].argsort(stable=True)])
 
-    def padded(self) -> tuple[Int64[Tensor, "tx rx place"], Bool[Tensor, "tx rx place"]]:
+    def pad_links(self) -> tuple[Int64[Tensor, "tx rx place"], Bool[Tensor, "tx rx place"]]:
         """Row numbers by link, filled up with zeros, and which of them are paths.
 
         ``paths.delay[row]`` is then a table of delays; multiply by the mask what has to vanish.
@@ -125,7 +125,7 @@ class RayPaths:
         filled[self.link[order], place] = True
         return row.unflatten(0, self.counts), filled.unflatten(0, self.counts)
 
-    def reversed(self) -> "RayPaths":
+    def reverse(self) -> "RayPaths":
         """The same paths the other way, with transmitters and receivers exchanged."""
         depth = self.depth[:, None]
         width = torch.arange(self.kinds.shape[1])
@@ -145,20 +145,20 @@ class RayPaths:
             departure=self.arrival,
             arrival=self.departure,
             **turned,
-        ).sorted()
+        ).sort_rows()
 
     def __add__(self, other: "RayPaths") -> "RayPaths":
-        return joined([self, other])
+        return join_ray_paths([self, other])
 
 
-def joined(parts: Sequence[RayPaths]) -> RayPaths:
+def join_ray_paths(parts: Sequence[RayPaths]) -> RayPaths:
     """All paths of the same antennas and scene, in the order of ``RayPaths``.
 
     Args:
         parts: At least one; they may have other numbers of vertices.
     """
     if any(part.slopes is not None for part in parts):
-        parts = [_sloped(part) for part in parts]
+        parts = [_add_slopes(part) for part in parts]
     first = parts[0]
     width = max((part.kinds.shape[1] for part in parts if len(part)), default=0)
     fill = {"vertices": 0.0, "kinds": 0, "faces": -1, "objects": -1}
@@ -168,12 +168,12 @@ def joined(parts: Sequence[RayPaths]) -> RayPaths:
         if not isinstance(values[0], Tensor):
             continue
         if name in fill:
-            values = [_widened(value, width, fill[name]) for value in values]
+            values = [_pad_columns(value, width, fill[name]) for value in values]
         columns[name] = torch.cat(values)
-    return replace(first, **columns).sorted()
+    return replace(first, **columns).sort_rows()
 
 
-def _sloped(paths: RayPaths) -> RayPaths:
+def _add_slopes(paths: RayPaths) -> RayPaths:
     """With slopes, zero if there are none."""
     if paths.slopes is not None:
         return paths
@@ -181,13 +181,13 @@ def _sloped(paths: RayPaths) -> RayPaths:
     return replace(paths, slopes=slopes, axes=paths.delay.new_zeros(len(paths), 2, 3))
 
 
-def _widened(value: Tensor, width: int, fill: float) -> Tensor:
+def _pad_columns(value: Tensor, width: int, fill: float) -> Tensor:
     value = value[:, :width]
     more = value.new_full((len(value), width - value.shape[1], *value.shape[2:]), fill)
     return torch.cat([value, more], 1)
 
 
-def joint(
+def match_rows(
     first: Int64[Tensor, " n"], second: Int64[Tensor, " m"], count: int
 ) -> tuple[Int64[Tensor, " pair"], Int64[Tensor, " pair"]]:
     """Rows of all pairs with the same number, in the order of the first table's rows.

@@ -1,6 +1,7 @@
 """Specular paths between antennas: geometry and polarised fields, differentiable.
 
-Which paths there are is found by rays and is detached (``images``). What they are worth is computed
+Which paths there are is found by rays and is detached (``image_positions``). What they are worth
+is computed
 here from the vertices of the triangles that they meet: the length to the image of the transmitter,
 and the field, turned from one plane of incidence to the next.
 
@@ -19,53 +20,56 @@ from torch.utils.checkpoint import checkpoint
 
 from invertwin.channel.em.plane_waves import (
     dot,
-    mirrored,
+    interpolate_vectors,
     plane_of_incidence,
-    points_at,
     polarisations,
+    reflect_vectors,
 )
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.scene_tables import vertex_velocities
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.channel.specular.candidates import (
-    Powers,
-    Sequences,
-    every_sequence,
-    shot_sequences,
+    CandidateSequences,
+    FaceInteractions,
+    enumerate_sequences,
+    shoot_sequences,
 )
-from invertwin.channel.specular.diffracted_paths import diffracted_paths
-from invertwin.channel.specular.diffraction_candidates import Bends, find_bends
+from invertwin.channel.specular.diffracted_paths import evaluate_diffracted_paths
+from invertwin.channel.specular.diffraction_candidates import (
+    DiffractionCandidates,
+    find_diffraction_candidates,
+)
 from invertwin.channel.specular.image_method import (
-    Chains,
-    Walls,
-    chains_between,
-    corners_of,
-    images,
+    CandidateSurfaces,
+    SpecularPaths,
+    find_paths_between,
+    image_positions,
+    interaction_points,
 )
-from invertwin.channel.specular.ray_paths import REFLECTION, TRANSMISSION, RayPaths, joined
-from invertwin.channel.specular.wedge_scene import EdgedScene
+from invertwin.channel.specular.ray_paths import REFLECTION, TRANSMISSION, RayPaths, join_ray_paths
+from invertwin.channel.specular.wedge_scene import WedgeScene
 from invertwin.checks import (
     ArrayLike,
     checked_count,
     checked_number,
     checked_tensor,
-    plain,
+    strip_derivatives,
 )
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.limits import MOST
+from invertwin.limits import MAX_COUNT
 from invertwin.scene import FieldCoefficients
 from invertwin.scene.scene import Scene
 
-_DEEPEST, _MOST_EDGES = 6, 3
+_MAX_DEPTH, _MAX_EDGES = 6, 3
 _ROWS_AT_ONCE = 1 << 15
-_BENT_AT_ONCE = 1 << 13  # paths round edges, which hold more
+_DIFFRACTED_ROWS_AT_ONCE = 1 << 13  # paths round edges, which hold more
 _UP = (0.0, 0.0, 1.0)
-_STILL = "give one vector, or one per antenna"
+_VELOCITY_HINT = "give one vector, or one per antenna"
 
 
 @dataclass(frozen=True)
-class Stage:
+class PathScene:
     """Scene and antennas as paths are computed from them, differentiable.
 
     Attributes:
@@ -135,77 +139,86 @@ def trace_paths(
 
     Source: derivations §9 and §10.
     """
-    stage = staged(scene, tx, rx, frequency, tx_velocity, rx_velocity)
+    stage = prepare_path_scene(scene, tx, rx, frequency, tx_velocity, rx_velocity)
     most = checked_count(depth, "depth", 0)
-    if most > _DEEPEST:
+    if most > _MAX_DEPTH:
         raise InputError(
-            f"expected a depth of at most {_DEEPEST}, got {most}; paths of more mirrors are weak"
+            f"expected a depth of at most {_MAX_DEPTH}, got {most}; paths of more mirrors are weak"
         )
-    if checked_count(edges, "edges", 0) > _MOST_EDGES:
-        raise InputError(f"expected at most {_MOST_EDGES} edges on a path, got {edges}")
-    if rays is not None and not 1 <= checked_count(rays, "rays", 1) <= MOST:
-        raise InputError(f"expected at most {MOST:,} rays, got {rays}; shoot fewer")
+    if checked_count(edges, "edges", 0) > _MAX_EDGES:
+        raise InputError(f"expected at most {_MAX_EDGES} edges on a path, got {edges}")
+    if rays is not None and not 1 <= checked_count(rays, "rays", 1) <= MAX_COUNT:
+        raise InputError(f"expected at most {MAX_COUNT:,} rays, got {rays}; shoot fewer")
     with tracing():
-        powers = powers_of(stage)
+        powers = face_interactions(stage)
         # Discrete: to `torch.func`, tensors made on the way would be its own.
         with _DisableFuncTorch():
-            walls = _walls(stage)
-            found, missed = _searched(stage, walls, powers, most, rays, seed)
-            bends = _bends(stage, walls, powers, edges, most, rays, seed) if edges else []
-        parts = [part for chains in found for part in paths_of(stage, chains)]
-        around = _around(stage, walls)
-        parts += [part for some in bends for part in _bent(stage, around, some)]
-    return replace(joined(parts), missed=missed)
+            walls = _candidate_surfaces(stage)
+            found, missed = _find_specular(stage, walls, powers, most, rays, seed)
+            bends = _find_diffracted(stage, walls, powers, edges, most, rays, seed) if edges else []
+        parts = [part for chains in found for part in evaluate_paths(stage, chains)]
+        around = _wedge_scene(stage, walls)
+        parts += [part for some in bends for part in _evaluate_diffracted(stage, around, some)]
+    return replace(join_ray_paths(parts), missed_fraction=missed)
 
 
-def _walls(stage: Stage) -> Walls:
-    antennas = torch.cat([plain(stage.tx), plain(stage.rx)])
-    return Walls(plain(stage.vertices), stage.topology, antennas)
+def _candidate_surfaces(path_scene: PathScene) -> CandidateSurfaces:
+    antennas = torch.cat([strip_derivatives(path_scene.tx), strip_derivatives(path_scene.rx)])
+    return CandidateSurfaces(strip_derivatives(path_scene.vertices), path_scene.topology, antennas)
 
 
-def _bends(
-    stage: Stage,
-    walls: Walls,
-    powers: Powers,
+def _find_diffracted(
+    path_scene: PathScene,
+    surfaces: CandidateSurfaces,
+    interactions: FaceInteractions,
     edges: int,
     depth: int,
     rays: int | None,
     seed: int,
-) -> list[Bends]:
+) -> list[DiffractionCandidates]:
     """Which paths go round edges."""
-    bare = replace(_around(stage, walls), vertices=plain(stage.vertices))
-    ends = plain(stage.tx), plain(stage.rx)
-    return list(find_bends(bare, powers, *ends, edges, depth, rays, seed))
+    bare = replace(
+        _wedge_scene(path_scene, surfaces), vertices=strip_derivatives(path_scene.vertices)
+    )
+    ends = strip_derivatives(path_scene.tx), strip_derivatives(path_scene.rx)
+    return list(find_diffraction_candidates(bare, interactions, *ends, edges, depth, rays, seed))
 
 
-def _searched(
-    stage: Stage, walls: Walls, powers: Powers, depth: int, rays: int | None, seed: int
-) -> tuple[list[Chains], float | None]:
+def _find_specular(
+    path_scene: PathScene,
+    surfaces: CandidateSurfaces,
+    interactions: FaceInteractions,
+    depth: int,
+    rays: int | None,
+    seed: int,
+) -> tuple[list[SpecularPaths], float | None]:
     """Which paths there are, and the share of directions that was missed."""
-    tx, rx = plain(stage.tx), plain(stage.rx)
+    tx, rx = strip_derivatives(path_scene.tx), strip_derivatives(path_scene.rx)
     swapped = len(rx) < len(tx)
     sources, targets = (rx, tx) if swapped else (tx, rx)
     if not depth:
-        sequences = Sequences((), None)
+        sequences = CandidateSequences((), None)
     elif rays is None:
-        sequences = every_sequence(walls.planes, powers, depth)
+        sequences = enumerate_sequences(surfaces.planes, interactions, depth)
     else:
-        sequences = shot_sequences(walls, walls.planes, powers, sources, depth, rays, seed)
-    found: list[Chains] = []
+        sequences = shoot_sequences(
+            surfaces, surfaces.planes, interactions, sources, depth, rays, seed
+        )
+    found: list[SpecularPaths] = []
     for steps in (torch.zeros(1, 0, dtype=torch.int64), *sequences.steps):
         for number, source in enumerate(sources) if len(steps) else ():
-            found += chains_between(walls, steps, source, targets, number)
-    return [chains.reversed() if swapped else chains for chains in found], sequences.missed
+            found += find_paths_between(surfaces, steps, source, targets, number)
+    return [chains.reverse() if swapped else chains for chains in found], sequences.missed_fraction
 
 
-def staged(
+def prepare_path_scene(
     scene: Scene,
     tx: ArrayLike,
     rx: ArrayLike,
     frequency: float,
     tx_velocity: ArrayLike,
     rx_velocity: ArrayLike,
-) -> Stage:
+) -> PathScene:
     """A scene and antennas as the search for paths needs them.
 
     Args:
@@ -223,16 +236,16 @@ def staged(
         raise InputError(
             f"expected objects with surfaces, got clouds for {', '.join(clouds)}; mesh them"
         )
-    ends = [_antennas(place, what) for place, what in ((tx, "tx"), (rx, "rx"))]
+    ends = [_check_positions(place, what) for place, what in ((tx, "tx"), (rx, "rx"))]
     speeds = [
-        _velocities(value, len(end), what)
+        _check_velocities(value, len(end), what)
         for value, end, what in ((tx_velocity, ends[0], "tx"), (rx_velocity, ends[1], "rx"))
     ]
     vertices = [item.vertices for item in objects]
     velocities = None
     if any(item.velocity is not None for item in objects):
         velocities = torch.cat([vertex_velocities(item) for item in objects])
-    return Stage(
+    return PathScene(
         scene,
         topology_of([item.mesh for item in objects]),
         torch.cat(vertices),
@@ -245,8 +258,8 @@ def staged(
     )
 
 
-def _antennas(places: ArrayLike, what: str) -> Tensor:
-    found = torch.as_tensor(places, dtype=torch.float64)
+def _check_positions(positions: ArrayLike, what: str) -> Tensor:
+    found = torch.as_tensor(positions, dtype=torch.float64)
     rows = found[None] if found.ndim == 1 else found
     rows = checked_tensor(rows, (None, 3), f"{what} places [m]", "give x, y, z of each")
     if not len(rows):
@@ -254,54 +267,56 @@ def _antennas(places: ArrayLike, what: str) -> Tensor:
     return rows
 
 
-def _velocities(value: ArrayLike, count: int, what: str) -> Tensor:
+def _check_velocities(value: ArrayLike, count: int, what: str) -> Tensor:
     found = torch.as_tensor(value, dtype=torch.float64)
     rows = found.expand(count, 3) if found.ndim == 1 and len(found) == 3 else found
-    return checked_tensor(rows, (count, 3), f"{what} velocities [m/s]", _STILL)
+    return checked_tensor(rows, (count, 3), f"{what} velocities [m/s]", _VELOCITY_HINT)
 
 
-def powers_of(stage: Stage) -> Powers:
+def face_interactions(path_scene: PathScene) -> FaceInteractions:
     """Which triangles mirror, and which let through, at 45°."""
     reflect, transmit = [], []
-    for item in stage.scene.objects.values():
+    for item in path_scene.scene.objects.values():
         count = len(item.mesh.faces)
         cosine = torch.full((count,), math.sqrt(0.5), dtype=torch.float64)
         with torch.no_grad():
-            found = item.material.coefficients(stage.frequency, cosine, torch.arange(count))
-        moduli = [plain(value).abs() for value in found]
+            found = item.material.coefficients(path_scene.frequency, cosine, torch.arange(count))
+        moduli = [strip_derivatives(value).abs() for value in found]
         reflect.append((moduli[0] + moduli[1]) > 0)
         transmit.append((moduli[2] + moduli[3]) > 0)
-    return Powers(torch.cat(reflect), torch.cat(transmit))
+    return FaceInteractions(torch.cat(reflect), torch.cat(transmit))
 
 
-def _around(stage: Stage, walls: Walls) -> EdgedScene:
-    return EdgedScene(
-        stage.vertices,
-        stage.topology,
-        walls,
-        lambda faces, cosine: _coefficients(stage, faces, cosine),
+def _wedge_scene(path_scene: PathScene, surfaces: CandidateSurfaces) -> WedgeScene:
+    return WedgeScene(
+        path_scene.vertices,
+        path_scene.topology,
+        surfaces,
+        lambda faces, cosine: _face_coefficients(path_scene, faces, cosine),
     )
 
 
-def _bent(stage: Stage, around: EdgedScene, found: Bends) -> list[RayPaths]:
-    """Paths round edges in pieces, as in ``paths_of``."""
-    rows = torch.arange(len(found.tx))
-    some = (stage.vertices, stage.tx, stage.rx)
-    heavy = len(rows) > _BENT_AT_ONCE and any(value.requires_grad for value in some)
+def _evaluate_diffracted(
+    path_scene: PathScene, wedge_scene: WedgeScene, candidates: DiffractionCandidates
+) -> list[RayPaths]:
+    """Paths round edges in pieces, as in ``evaluate_paths``."""
+    rows = torch.arange(len(candidates.tx))
+    some = (path_scene.vertices, path_scene.tx, path_scene.rx)
+    heavy = len(rows) > _DIFFRACTED_ROWS_AT_ONCE and any(value.requires_grad for value in some)
     parts: list[RayPaths] = []
-    for row in rows.split(_BENT_AT_ONCE):
-        part = found.rows(row)
+    for row in rows.split(_DIFFRACTED_ROWS_AT_ONCE):
+        part = candidates.rows(row)
 
-        def columns(part: Bends = part) -> tuple[Tensor, ...]:
-            return _bent_columns(stage, around, part)
+        def columns(part: DiffractionCandidates = part) -> tuple[Tensor, ...]:
+            return _diffracted_columns(path_scene, wedge_scene, part)
 
         values = checkpoint(columns, use_reentrant=False) if heavy else columns()
         delay, coefficient, departure, arrival, vertices, doppler, *rest = values
         kinds, faces, slopes, axes = rest
         parts.append(
             RayPaths(
-                (len(stage.tx), len(stage.rx)),
-                stage.frequency,
+                (len(path_scene.tx), len(path_scene.rx)),
+                path_scene.frequency,
                 part.tx,
                 part.rx,
                 delay,
@@ -311,8 +326,8 @@ def _bent(stage: Stage, around: EdgedScene, found: Bends) -> list[RayPaths]:
                 vertices,
                 kinds,
                 faces,
-                stage.topology.face_object[faces],
-                stage.scene.names,
+                path_scene.topology.face_object[faces],
+                path_scene.scene.names,
                 doppler,
                 slopes if part.edge.shape[1] == 1 else None,
                 axes if part.edge.shape[1] == 1 else None,
@@ -321,18 +336,25 @@ def _bent(stage: Stage, around: EdgedScene, found: Bends) -> list[RayPaths]:
     return parts
 
 
-def _bent_columns(stage: Stage, around: EdgedScene, bends: Bends) -> tuple[Tensor, ...]:
+def _diffracted_columns(
+    path_scene: PathScene, wedge_scene: WedgeScene, candidates: DiffractionCandidates
+) -> tuple[Tensor, ...]:
     """As ``_columns``, and kinds, faces, slopes and axes, of paths round edges."""
-    k = 2 * math.pi * stage.frequency / SPEED_OF_LIGHT
-    found = diffracted_paths(around, bends, stage.tx, stage.rx, k)
-    departure, arrival = found.ways[:, 0], -found.ways[:, -1]
+    k = 2 * math.pi * path_scene.frequency / SPEED_OF_LIGHT
+    found = evaluate_diffracted_paths(wedge_scene, candidates, path_scene.tx, path_scene.rx, k)
+    departure, arrival = found.directions[:, 0], -found.directions[:, -1]
     up = torch.tensor(_UP, dtype=torch.float64)
     sent, received = (polarisations(way, up).to(found.transfer) for way in (departure, arrival))
     matrix = torch.einsum("pri,pij,ptj->prt", received, found.transfer, sent)
     slopes = torch.einsum("pri,psij,ptj->psrt", received, found.slopes, sent)
-    scale = SPEED_OF_LIGHT / stage.frequency / (4 * math.pi)
-    rate = _approach(
-        stage, bends.tx, bends.rx, list(found.ways.unbind(1)), found.points, found.faces
+    scale = SPEED_OF_LIGHT / path_scene.frequency / (4 * math.pi)
+    rate = _shortening_rate(
+        path_scene,
+        candidates.tx,
+        candidates.rx,
+        list(found.directions.unbind(1)),
+        found.points,
+        found.faces,
     )
     return (
         found.length / SPEED_OF_LIGHT,
@@ -340,7 +362,7 @@ def _bent_columns(stage: Stage, around: EdgedScene, bends: Bends) -> tuple[Tenso
         departure,
         arrival,
         found.points,
-        stage.frequency / SPEED_OF_LIGHT * rate,
+        path_scene.frequency / SPEED_OF_LIGHT * rate,
         found.kinds,
         found.faces,
         slopes * scale,
@@ -348,130 +370,147 @@ def _bent_columns(stage: Stage, around: EdgedScene, bends: Bends) -> tuple[Tenso
     )
 
 
-def _approach(
-    stage: Stage,
+def _shortening_rate(
+    path_scene: PathScene,
     tx: Tensor,
     rx: Tensor,
-    ways: list[Tensor],
+    directions: list[Tensor],
     vertices: Float64[Tensor, "path vertex 3"],
     faces: Int64[Tensor, "path vertex"],
 ) -> Float64[Tensor, " path"]:
     """How fast paths get shorter [m/s]."""
-    rate = dot(ways[0], stage.tx_velocity[tx]) - dot(ways[-1], stage.rx_velocity[rx])
-    if stage.velocities is not None and faces.shape[1]:
-        triangles = stage.topology.faces[faces]
-        moved = points_at(stage.velocities[triangles], stage.vertices[triangles], vertices)
+    rate = dot(directions[0], path_scene.tx_velocity[tx]) - dot(
+        directions[-1], path_scene.rx_velocity[rx]
+    )
+    if path_scene.velocities is not None and faces.shape[1]:
+        triangles = path_scene.topology.faces[faces]
+        moved = interpolate_vectors(
+            path_scene.velocities[triangles], path_scene.vertices[triangles], vertices
+        )
         for step in range(faces.shape[1]):
-            rate = rate + dot(ways[step + 1] - ways[step], moved[:, step])
+            rate = rate + dot(directions[step + 1] - directions[step], moved[:, step])
     return rate
 
 
-def paths_of(stage: Stage, chains: Chains) -> list[RayPaths]:
+def evaluate_paths(path_scene: PathScene, specular_paths: SpecularPaths) -> list[RayPaths]:
     """The paths in pieces; what derivatives need is computed again for each, not kept.
 
     Args:
-        stage: Scene and antennas.
-        chains: Which surfaces each path meets.
+        path_scene: Scene and antennas.
+        specular_paths: Which surfaces each path meets.
     """
-    rows = torch.arange(len(chains.source))
-    some = (stage.vertices, stage.tx, stage.rx)
+    rows = torch.arange(len(specular_paths.source))
+    some = (path_scene.vertices, path_scene.tx, path_scene.rx)
     heavy = len(rows) > _ROWS_AT_ONCE and any(value.requires_grad for value in some)
     found: list[RayPaths] = []
     for row in rows.split(_ROWS_AT_ONCE):
-        part = Chains(*(column[row] for column in vars(chains).values()))
+        part = SpecularPaths(*(column[row] for column in vars(specular_paths).values()))
 
-        def columns(part: Chains = part) -> tuple[Tensor, ...]:
-            return _columns(stage, part)
+        def columns(part: SpecularPaths = part) -> tuple[Tensor, ...]:
+            return _specular_columns(path_scene, part)
 
         values = checkpoint(columns, use_reentrant=False) if heavy else columns()
-        found.append(_rows(stage, part, values))
+        found.append(_assemble_paths(path_scene, part, values))
     return found
 
 
-def _rows(stage: Stage, chains: Chains, values: tuple[Tensor, ...]) -> RayPaths:
+def _assemble_paths(
+    path_scene: PathScene, specular_paths: SpecularPaths, values: tuple[Tensor, ...]
+) -> RayPaths:
     delay, coefficient, departure, arrival, vertices, doppler = values
     return RayPaths(
-        (len(stage.tx), len(stage.rx)),
-        stage.frequency,
-        chains.source,
-        chains.target,
+        (len(path_scene.tx), len(path_scene.rx)),
+        path_scene.frequency,
+        specular_paths.source,
+        specular_paths.target,
         delay,
         coefficient,
         departure,
         arrival,
         vertices,
-        torch.where(chains.through, TRANSMISSION, REFLECTION),
-        chains.faces,
-        stage.topology.face_object[chains.faces],
-        stage.scene.names,
+        torch.where(specular_paths.transmitted, TRANSMISSION, REFLECTION),
+        specular_paths.faces,
+        path_scene.topology.face_object[specular_paths.faces],
+        path_scene.scene.names,
         doppler,
     )
 
 
-def _columns(stage: Stage, chains: Chains) -> tuple[Tensor, ...]:
+def _specular_columns(path_scene: PathScene, specular_paths: SpecularPaths) -> tuple[Tensor, ...]:
     """Delay, coefficient, departure, arrival, vertices and Doppler shift of paths of one length."""
-    tx, rx = stage.tx[chains.source], stage.rx[chains.target]
-    count, length = chains.faces.shape
-    corners = stage.vertices[stage.topology.faces[chains.faces]]
+    tx, rx = path_scene.tx[specular_paths.source], path_scene.rx[specular_paths.target]
+    count, length = specular_paths.faces.shape
+    corners = path_scene.vertices[path_scene.topology.faces[specular_paths.faces]]
     sides = corners[..., 1:, :] - corners[..., :1, :]
     normal = normalize(torch.linalg.cross(sides[..., 0, :], sides[..., 1, :]), dim=-1)
     point = corners[..., 0, :]
-    seen = images(tx, point, normal, chains.through)
+    seen = image_positions(tx, point, normal, specular_paths.transmitted)
     whole = rx - seen[-1]
     distance = whole.norm(dim=1)
     ways = [whole / distance[:, None]]
     for step in reversed(range(length)):
-        turned = mirrored(ways[0], normal[:, step])
-        ways.insert(0, torch.where(chains.through[:, step, None], ways[0], turned))
+        turned = reflect_vectors(ways[0], normal[:, step])
+        ways.insert(0, torch.where(specular_paths.transmitted[:, step, None], ways[0], turned))
     cosine = [dot(way, normal[:, step]).abs() for step, way in enumerate(ways[:length])]
-    field = _field(stage, chains, ways, normal, cosine)
-    spread = SPEED_OF_LIGHT / stage.frequency / (4 * math.pi) / distance
-    nodes = corners_of(rx, seen, point, normal)
+    field = _transfer_matrix(path_scene, specular_paths, ways, normal, cosine)
+    spread = SPEED_OF_LIGHT / path_scene.frequency / (4 * math.pi) / distance
+    nodes = interaction_points(rx, seen, point, normal)
     vertices = torch.stack(nodes, 1) if nodes else torch.zeros(count, 0, 3, dtype=torch.float64)
-    rate = _approach(stage, chains.source, chains.target, ways, vertices, chains.faces)
+    rate = _shortening_rate(
+        path_scene,
+        specular_paths.source,
+        specular_paths.target,
+        ways,
+        vertices,
+        specular_paths.faces,
+    )
     return (
         distance / SPEED_OF_LIGHT,
         field * spread[:, None, None],
         ways[0],
         -ways[-1],
         vertices,
-        stage.frequency / SPEED_OF_LIGHT * rate,
+        path_scene.frequency / SPEED_OF_LIGHT * rate,
     )
 
 
-def _field(
-    stage: Stage, chains: Chains, ways: list[Tensor], normal: Tensor, cosine: list[Tensor]
+def _transfer_matrix(
+    path_scene: PathScene,
+    specular_paths: SpecularPaths,
+    directions: list[Tensor],
+    normal: Tensor,
+    cosine: list[Tensor],
 ) -> Complex128[Tensor, "path 2 2"]:
     """Field over that of the transmitter, V and H at both ends, without the spreading."""
     up = torch.tensor(_UP, dtype=torch.float64)
-    before = polarisations(ways[0], up)
+    before = polarisations(directions[0], up)
     matrix = torch.eye(2, dtype=torch.complex128).expand(len(before), 2, 2)
     every = torch.stack(cosine, 1).ravel() if cosine else torch.zeros(0, dtype=torch.float64)
-    met = _coefficients(stage, chains.faces.ravel(), every)
-    r_s, r_p, t_s, t_p = (value.view(chains.faces.shape).unbind(1) for value in met)
-    for step, passing in enumerate(chains.through.unbind(1)):
-        across, into, out = plane_of_incidence(normal[:, step], ways[step])
+    met = _face_coefficients(path_scene, specular_paths.faces.ravel(), every)
+    r_s, r_p, t_s, t_p = (value.view(specular_paths.faces.shape).unbind(1) for value in met)
+    for step, passing in enumerate(specular_paths.transmitted.unbind(1)):
+        across, into, out = plane_of_incidence(normal[:, step], directions[step])
         through = passing[:, None]
-        matrix = _turn(torch.cat([across, into], 1), before) @ matrix
+        matrix = _change_of_basis(torch.cat([across, into], 1), before) @ matrix
         mirrors = torch.stack([r_s[step], r_p[step]], 1)
         passes = torch.stack([t_s[step], t_p[step]], 1)
         matrix = torch.where(through, passes, mirrors)[..., None] * matrix
         before = torch.cat([across, torch.where(through[..., None], into, out)], 1)
-    return _turn(polarisations(-ways[-1], up), before) @ matrix
+    return _change_of_basis(polarisations(-directions[-1], up), before) @ matrix
 
 
-def _turn(new: Tensor, old: Tensor) -> Tensor:
+def _change_of_basis(new: Tensor, old: Tensor) -> Tensor:
     """Matrix from components along two unit vectors to those along two others."""
     return dot(new[:, :, None], old[:, None]).to(torch.complex128)
 
 
-def _coefficients(
-    stage: Stage, faces: Int64[Tensor, " n"], cosine: Float64[Tensor, " n"]
+def _face_coefficients(
+    path_scene: PathScene, faces: Int64[Tensor, " n"], cosine: Float64[Tensor, " n"]
 ) -> FieldCoefficients:
     """What triangles reflect and let through; every material is asked once."""
-    items = list(stage.scene.objects.values())
-    owner = stage.topology.face_object[faces]
-    first = torch.searchsorted(stage.topology.face_object, torch.arange(len(items)))
+    items = list(path_scene.scene.objects.values())
+    owner = path_scene.topology.face_object[faces]
+    first = torch.searchsorted(path_scene.topology.face_object, torch.arange(len(items)))
     kinds: dict[int, int] = {}
     alike = torch.tensor([kinds.setdefault(id(item.material), len(kinds)) for item in items])
     found = [torch.zeros(len(faces), dtype=torch.complex128) for _ in range(4)]
@@ -485,7 +524,7 @@ def _coefficients(
         if not len(rows):
             continue
         triangle = faces[rows] - first[owner[rows]]
-        values = item.material.coefficients(stage.frequency, cosine[rows], triangle)
+        values = item.material.coefficients(path_scene.frequency, cosine[rows], triangle)
         found = [
             total.index_put((rows,), value.to(torch.complex128))
             for total, value in zip(found, values, strict=True)

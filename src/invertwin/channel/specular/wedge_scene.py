@@ -19,91 +19,100 @@ from invertwin.channel.em.wedges import (
     azimuth,
     edge_axis,
     find_wedges,
-    joined_wedges,
+    merge_collinear_wedges,
 )
 from invertwin.channel.rays.topology import Topology
-from invertwin.channel.specular.edge_path_geometry import Edge
-from invertwin.channel.specular.image_method import Walls, clear_ways
-from invertwin.checks import plain
+from invertwin.channel.specular.edge_path_geometry import PathEdge
+from invertwin.channel.specular.image_method import CandidateSurfaces, find_unobstructed_paths
+from invertwin.checks import strip_derivatives
 from invertwin.scene.material.fresnel import FieldCoefficients
 
-Coefficients = Callable[[Int64[Tensor, " n"], Float64[Tensor, " n"]], FieldCoefficients]
+TriangleCoefficients = Callable[[Int64[Tensor, " n"], Float64[Tensor, " n"]], FieldCoefficients]
 """What triangles reflect and let through at cosines of the angle of incidence, about the mesh."""
 
-_OFF = 10.0  # margins of the ray scene: how far aside of an edge rays to it end
-_GRAZING = 1e-9  # rad
-_PIECES = 16  # of an edge, each free or covered as a whole
-_AROUND = (0.1, 0.26, 0.42, 0.58, 0.74, 0.9)  # corners of a way round an edge, in its exterior
+_OFFSET_MARGINS = 10.0  # margins of the ray scene: how far aside of an edge rays to it end
+_GRAZING_TOLERANCE = 1e-9  # rad
+_EDGE_PIECES = 16  # of an edge, each free or covered as a whole
+_DETOUR_ANGLES = (
+    0.1,
+    0.26,
+    0.42,
+    0.58,
+    0.74,
+    0.9,
+)  # corners of a way round an edge, in its exterior
 
 
 @dataclass(frozen=True)
-class EdgedScene:
+class WedgeScene:
     """A scene as diffraction sees it.
 
     Attributes:
         vertices: of all objects [m].
         topology: their triangles.
-        walls: what rays meet.
+        surfaces: what rays meet.
         coefficients: of the triangles.
     """
 
     vertices: Float64[Tensor, "v 3"]
     topology: Topology
-    walls: Walls
-    coefficients: Coefficients
+    surfaces: CandidateSurfaces
+    coefficients: TriangleCoefficients
 
     @cached_property
     def wedges(self) -> Wedges:
         """Sharp edges, each as long as it goes straight on."""
-        return _sharp(self.vertices, self.topology)
+        return _sharp_edges(self.vertices, self.topology)
 
     @cached_property
-    def plain(self) -> Wedges:
+    def detached_wedges(self) -> Wedges:
         """The same, detached."""
-        return _sharp(plain(self.vertices), self.topology)
+        return _sharp_edges(strip_derivatives(self.vertices), self.topology)
 
     @property
-    def off(self) -> float:
+    def ray_offset(self) -> float:
         """How far aside of edges rays to them end [m]."""
-        return _OFF * self.walls.margin
+        return _OFFSET_MARGINS * self.surfaces.margin
 
-    def edge(
+    def path_edge(
         self,
         row: Tensor,
-        known: tuple[Tensor | None, Tensor | None] = (None, None),
+        known_azimuths: tuple[Tensor | None, Tensor | None] = (None, None),
         *,
-        absorbs: bool = False,
-    ) -> Edge:
+        absorbing: bool = False,
+    ) -> PathEdge:
         """Edges on paths' ways.
 
         Args:
             row: numbers of wedges.
-            known: azimuths of incidence and of departure, where a path runs along a face.
-            absorbs: take the faces as such that neither mirror nor let through.
+            known_azimuths: azimuths of incidence and of departure, where a path runs along a face.
+            absorbing: take the faces as such that neither mirror nor let through.
         """
         wedges = self.wedges.rows(row)
 
         def faces(face: int, cosine: Tensor) -> FieldCoefficients:
             return self.coefficients(wedges.faces[:, face], cosine)
 
-        return Edge(wedges, faces, *known, absorbs=absorbs)
+        return PathEdge(wedges, faces, *known_azimuths, absorbing=absorbing)
 
-    def beside(self, row: Tensor, points: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 3"]:
+    def offset_points(
+        self, row: Tensor, points: Float64[Tensor, "row 3"]
+    ) -> Float64[Tensor, "row 3"]:
         """Points a little off edges and their ends, to which rays can be cast; detached.
 
         Args:
             row: numbers of wedges.
             points: on the lines of the edges [m].
         """
-        wedges = self.plain.rows(row)
+        wedges = self.detached_wedges.rows(row)
         side = wedges.end - wedges.start
-        share = dot(plain(points) - wedges.start, side) / dot(side, side)
-        inset = (self.off / side.norm(dim=1)).clamp(max=0.25)
+        share = dot(strip_derivatives(points) - wedges.start, side) / dot(side, side)
+        inset = (self.ray_offset / side.norm(dim=1)).clamp(max=0.25)
         share = torch.minimum(torch.maximum(share, inset), 1 - inset)
-        aside = normalize((wedges.normals - wedges.inwards).sum(1), dim=1)
-        return wedges.start + share[:, None] * side + self.off * aside
+        aside = normalize((wedges.normals - wedges.face_tangents).sum(1), dim=1)
+        return wedges.start + share[:, None] * side + self.ray_offset * aside
 
-    def free(self, row: Tensor, points: Float64[Tensor, "row 3"]) -> Bool[Tensor, " row"]:
+    def is_diffracting(self, row: Tensor, points: Float64[Tensor, "row 3"]) -> Bool[Tensor, " row"]:
         """Whether an edge is one there: nothing else fills part of its exterior.
 
         Plates that meet in a seam, and a box on the floor, have edges that do not diffract.
@@ -112,53 +121,53 @@ class EdgedScene:
             row: numbers of wedges.
             points: on the lines of the edges [m].
         """
-        wedges = self.plain.rows(row)
+        wedges = self.detached_wedges.rows(row)
         side = wedges.end - wedges.start
-        share = dot(plain(points) - wedges.start, side) / dot(side, side)
-        return self._open[row, (share * _PIECES).long().clamp(0, _PIECES - 1)]
+        share = dot(strip_derivatives(points) - wedges.start, side) / dot(side, side)
+        return self._is_piece_open[row, (share * _EDGE_PIECES).long().clamp(0, _EDGE_PIECES - 1)]
 
     @cached_property
-    def _open(self) -> Bool[Tensor, "edge piece"]:
+    def _is_piece_open(self) -> Bool[Tensor, "edge piece"]:
         """Whether a ray can go round the middle of each piece of each edge."""
-        wedges = self.plain
-        share = (torch.arange(_PIECES, dtype=torch.float64) + 0.5) / _PIECES
+        wedges = self.detached_wedges
+        share = (torch.arange(_EDGE_PIECES, dtype=torch.float64) + 0.5) / _EDGE_PIECES
         places = wedges.start[:, None] + share[:, None] * (wedges.end - wedges.start)[:, None]
-        into, normal = wedges.inwards[:, 0], wedges.normals[:, 0]
+        into, normal = wedges.face_tangents[:, 0], wedges.normals[:, 0]
         stops: list[Tensor] = []
-        for part in _AROUND:
+        for part in _DETOUR_ANGLES:
             angle = (part * torch.pi * wedges.opening)[:, None]
-            aside = self.off * (angle.cos() * into + angle.sin() * normal)
+            aside = self.ray_offset * (angle.cos() * into + angle.sin() * normal)
             stops.append((places + aside[:, None]).reshape(-1, 3))
         clear = torch.ones(len(stops[0]), dtype=torch.bool)
         none = torch.zeros(len(clear), 0, dtype=torch.int64)
         for start, end in pairwise(stops):
-            clear &= clear_ways(self.walls, none, start, end)[0]
-        return clear.reshape(-1, _PIECES)
+            clear &= find_unobstructed_paths(self.surfaces, none, start, end)[0]
+        return clear.reshape(-1, _EDGE_PIECES)
 
 
-def _sharp(vertices: Tensor, topology: Topology) -> Wedges:
+def _sharp_edges(vertices: Tensor, topology: Topology) -> Wedges:
     ends = vertices[topology.edges]
-    return joined_wedges(find_wedges(vertices[topology.faces], ends, topology.beside))
+    return merge_collinear_wedges(find_wedges(vertices[topology.faces], ends, topology.edge_faces))
 
 
-def exterior(wedges: Wedges, places: Float64[Tensor, "row 3"]) -> Bool[Tensor, " row"]:
+def is_exterior(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Bool[Tensor, " row"]:
     """Which places lie outside of wedges that go on for ever; on a face is outside.
 
     Args:
         wedges: one row each.
-        places: [m].
+        points: [m].
     """
-    offset = (places - wedges.start).detach()
+    offset = (points - wedges.start).detach()
     angle = azimuth(wedges, offset, 0).detach()
-    inside = (angle > wedges.opening.detach() * torch.pi + _GRAZING) & (
-        angle < 2 * torch.pi - _GRAZING
+    inside = (angle > wedges.opening.detach() * torch.pi + _GRAZING_TOLERANCE) & (
+        angle < 2 * torch.pi - _GRAZING_TOLERANCE
     )
     axis = edge_axis(wedges).detach()
     aside = offset - dot(offset, axis)[:, None] * axis
     return ~inside & (aside.norm(dim=1) > 0)
 
 
-def on_edge(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 3"]:
+def clamp_to_edge(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 3"]:
     """The nearest points of edges to points on their lines.
 
     Args:

@@ -6,70 +6,92 @@ from dataclasses import replace
 
 import torch
 
-from invertwin.channel import Sampling, densities_of
-from invertwin.cli.estimate import Estimate, Sensor, estimate_of, of_sensor, of_signature
-from invertwin.cli.exact_signals import chirp_train, exact
-from invertwin.cli.fits.problem import FULL, sensors_of, settings_of, stages_of, varied_run
-from invertwin.cli.report import Table, texts
+from invertwin.channel import Sampling, resolve_densities
+from invertwin.cli.estimate import (
+    ResourceEstimate,
+    SensorSetup,
+    estimate_rcs_resources,
+    estimate_resources,
+    estimate_sensor_resources,
+)
+from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact
+from invertwin.cli.fits.problem import (
+    OWN_METHOD,
+    build_sensors,
+    method_run,
+    require_settings,
+    stage_runs,
+)
+from invertwin.cli.report import ReportTable, load_texts
 from invertwin.cli.schema import RunFile, SimulatedData, build
-from invertwin.cli.schema.recordings import chirp_capture
-from invertwin.cli.schema.run_file import about, need
-from invertwin.cli.schema.shape_tables import Mover
+from invertwin.cli.schema.recordings import build_chirp_capture
+from invertwin.cli.schema.run_file import prefix_errors, require_section
+from invertwin.cli.schema.shape_tables import MovingTargetParameter
 from invertwin.models.radar import SurrogateMap
-from invertwin.runtime.memory import free_memory, gigabytes
-from invertwin.runtime.progress import time_left
+from invertwin.runtime.memory import format_gigabytes, free_memory
+from invertwin.runtime.progress import format_duration
 from invertwin.scene import Scene, Translation
 
-_FRAMES = 4  # of the radar, or aspects, in the probe
-_FEW, _MANY = 10_000, 100_000  # rays or paths that are timed: less than a second of work
-_DERIVATIVES = 4  # times the work of a map: a step of a fit with one or several derivatives
-_FITS = ("reconstruct", "demo")
-_SIMULATED = ("simulate", "dataset")
+_PROBE_FRAMES = 4  # of the radar, or aspects, in the probe
+_SMALL_PROBE, _LARGE_PROBE = (
+    10_000,
+    100_000,
+)  # rays or paths that are timed: less than a second of work
+_DERIVATIVE_COST = 4  # times the work of a map: a step of a fit with one or several derivatives
+_FIT_TASKS = ("reconstruct", "demo")
+_SIMULATION_TASKS = ("simulate", "dataset")
 
 
-def run_check(run: RunFile) -> tuple[list[Table], str]:
+def run_check(run: RunFile) -> tuple[list[ReportTable], str]:
     """Tables of what a run needs and of its meshes, and a line with its time.
 
     Raises:
         InputError: What the run's own command refuses before it begins.
     """
     if run.rcs is not None:
-        return _of_signature(run)
+        return _check_rcs(run)
     if run.map is not None:
-        return _of_radio_map(run)
+        return _check_radio_map(run)
     if run.placement is not None:
-        return _of_placement(run)
+        return _check_placement(run)
     if run.image is not None and run.task == "gradcheck":
-        return _of_image(run)
-    truth, sensors = build.true_scene(run), _sensors(run)
+        return _check_image(run)
+    truth, sensors = build.true_scene(run), _build_sensors(run)
     build.parameters(
-        [table for table in run.parameters if not isinstance(table, Mover)],
+        [table for table in run.parameters if not isinstance(table, MovingTargetParameter)],
         build.scene(run),
         run.scene,
     )
-    found = estimate_of(run, truth, sensors)
-    found.require()
-    seconds = _seconds(run, found, truth, sensors)
-    return _tables(found, truth, seconds, f"{found.rays:.2g} rays and {found.rows:.2g} paths")
+    found = estimate_resources(run, truth, sensors)
+    found.require_available()
+    seconds = _estimate_seconds(run, found, truth, sensors)
+    return _make_tables(
+        found, truth, seconds, f"{found.ray_count:.2g} rays and {found.path_count:.2g} paths"
+    )
 
 
-def _tables(found: Estimate, scene: Scene, seconds: float, work: str) -> tuple[list[Table], str]:
-    rows = [[part.name, part.count, part.memory / 1e9, part.key] for part in found.parts]
+def _make_tables(
+    found: ResourceEstimate, scene: Scene, seconds: float, work: str
+) -> tuple[list[ReportTable], str]:
+    rows = [[part.name, part.count, part.memory / 1e9, part.key] for part in found.memory_items]
     heads = ("needs", "how many", "GB", "key")
     line = (
-        f"about {gigabytes(found.memory)} of {gigabytes(free_memory())} free, and "
-        f"{time_left(seconds)} for {work}"
+        f"about {format_gigabytes(found.memory)} of {format_gigabytes(free_memory())} free, and "
+        f"{format_duration(seconds)} for {work}"
     )
-    return [Table("Estimate", heads, rows, texts("notes")["estimate"]), _meshes(scene)], line
+    return [
+        ReportTable("Estimate", heads, rows, load_texts("notes")["estimate"]),
+        _mesh_table(scene),
+    ], line
 
 
-def _of_placement(run: RunFile) -> tuple[list[Table], str]:
+def _check_placement(run: RunFile) -> tuple[list[ReportTable], str]:
     """The same of `[placement]`: its time is that of one evaluation, and of one derivative."""
-    placing, module = build.placing(run, build.scene(run))
-    table = need(run, "placement", run.task)
+    placing, module = build.panel_design(run, build.scene(run))
+    table = require_section(run, "placement", run.task)
     settings = table.descent.build()
-    once = _timed(lambda: placing.level(module))
-    step = _timed(lambda: placing.descend(module, 1, settings, width=0.0))
+    once = _time_call(lambda: placing.level(module))
+    step = _time_call(lambda: placing.descend(module, 1, settings, width=0.0))
     steps = settings.tracks * settings.track_steps + settings.steps
     grid = table.grid.places * table.grid.yaws * len(table.grid.spread_deg) ** 2
     levels = grid + 2 * table.starts * settings.scouts
@@ -86,58 +108,58 @@ def _of_placement(run: RunFile) -> tuple[list[Table], str]:
     seconds = levels * once + descents * step
     if run.task == "gradcheck":
         seconds = 10 * once
-    line = f"about {time_left(seconds)} for {levels} evaluations and {descents} derivatives"
+    line = f"about {format_duration(seconds)} for {levels} evaluations and {descents} derivatives"
     heads = ("needs", "how many", "key")
-    return [Table("Estimate", heads, rows), _meshes(build.scene(run))], line
+    return [ReportTable("Estimate", heads, rows), _mesh_table(build.scene(run))], line
 
 
-def _of_radio_map(run: RunFile) -> tuple[list[Table], str]:
+def _check_radio_map(run: RunFile) -> tuple[list[ReportTable], str]:
     """The same of `[map]`, whose memory does not grow: the time of one map of each stage."""
     scene = build.true_scene(run)
-    with about("transmitter"):
-        sensor = need(run, "transmitter", "[map]").build()
+    with prefix_errors("transmitter"):
+        sensor = require_section(run, "transmitter", "[map]").build()
 
-    def once(own: RunFile) -> float:
-        with about("map"), torch.no_grad():
-            model = need(own, "map", run.task).build()
-            return _timed(lambda: model.predict(scene, sensor, 0))
+    def time_map(own: RunFile) -> float:
+        with prefix_errors("map"), torch.no_grad():
+            model = require_section(own, "map", run.task).build()
+            return _time_call(lambda: model.predict(scene, sensor, 0))
 
     starts = 1 if run.transmitter_starts is None else run.transmitter_starts.count
     rows: list[list[object]] = [["starts", starts, "transmitter_starts.count"]]
     if run.task == "reconstruct":
         seconds = 0.0
-        for mode in (FULL, *run.variants):
-            for number, (_, own) in enumerate(stages_of(varied_run(run, mode)), 1):
-                steps = settings_of(own).steps
+        for mode in (OWN_METHOD, *run.variants):
+            for number, (_, own) in enumerate(stage_runs(method_run(run, mode)), 1):
+                steps = require_settings(own).steps
                 rows.append([f"steps, {mode}, stage {number}", steps, "reconstruct.steps"])
-                seconds += starts * steps * _DERIVATIVES * once(own)
+                seconds += starts * steps * _DERIVATIVE_COST * time_map(own)
     else:
-        check = need(run, "gradcheck", run.task)
+        check = require_section(run, "gradcheck", run.task)
         count = 4 * (check.repeats + check.max_pairs)
         rows.append(["maps", count, "gradcheck.repeats, gradcheck.max_pairs"])
-        seconds = count * once(run)
-    line = f"about {time_left(seconds)} for {len(sensor.positions)} transmitters"
-    return [Table("Estimate", ("needs", "how many", "key"), rows), _meshes(scene)], line
+        seconds = count * time_map(run)
+    line = f"about {format_duration(seconds)} for {len(sensor.positions)} transmitters"
+    return [ReportTable("Estimate", ("needs", "how many", "key"), rows), _mesh_table(scene)], line
 
 
-def _of_image(run: RunFile) -> tuple[list[Table], str]:
+def _check_image(run: RunFile) -> tuple[list[ReportTable], str]:
     """The same of `[image]`, whose memory does not grow: the time of one image."""
-    scene, check = build.scene(run), need(run, "gradcheck", run.task)
-    model, camera = build.made(run, "image"), build.made(run, "camera")
+    scene, check = build.scene(run), require_section(run, "gradcheck", run.task)
+    model, camera = build.build_section(run, "image"), build.build_section(run, "camera")
     rays = len(camera.positions) * camera.width * camera.height * model.sampling.samples
     ends, slopes = 4 * check.max_pairs, 4 * check.repeats
     with torch.no_grad():
-        ray = _timed(lambda: model.predict(scene, camera, 0)) / rays
-    count = ends * max(rays, check.difference_samples) + _DERIVATIVES * slopes * rays
+        ray = _time_call(lambda: model.predict(scene, camera, 0)) / rays
+    count = ends * max(rays, check.difference_samples) + _DERIVATIVE_COST * slopes * rays
     rows: list[list[object]] = [
         ["images", ends + slopes, "gradcheck.max_pairs, gradcheck.repeats"],
         ["rays", count, "gradcheck.difference_samples"],
     ]
-    line = f"about {time_left(count * ray)} for {count:.2g} rays"
-    return [Table("Estimate", ("needs", "how many", "key"), rows), _meshes(scene)], line
+    line = f"about {format_duration(count * ray)} for {count:.2g} rays"
+    return [ReportTable("Estimate", ("needs", "how many", "key"), rows), _mesh_table(scene)], line
 
 
-def _timed(work: Callable[[], object]) -> float:
+def _time_call(work: Callable[[], object]) -> float:
     """Seconds of some work, once it has been compiled."""
     work()
     begin = time.perf_counter()
@@ -145,74 +167,80 @@ def _timed(work: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
-def _of_signature(run: RunFile) -> tuple[list[Table], str]:
+def _check_rcs(run: RunFile) -> tuple[list[ReportTable], str]:
     """The same of `[rcs]`: its time is that of one aspect and of a few more, carried on."""
-    table, scene = need(run, "rcs", run.task), build.scene(run)
-    found = of_signature(run, scene)
-    found.require()
+    table, scene = require_section(run, "rcs", run.task), build.scene(run)
+    found = estimate_rcs_resources(run, scene)
+    found.require_available()
     count = table.aspect_count
 
-    def traced(aspects: int) -> float:
+    def time_aspects(aspects: int) -> float:
         chosen = torch.linspace(0, count - 1, aspects).round().long().tolist()
         begin = time.perf_counter()
-        with about("rcs"), torch.no_grad():
+        with prefix_errors("rcs"), torch.no_grad():
             table.at(chosen).build({Scene: scene})
         return time.perf_counter() - begin
 
-    traced(1)  # compiled now
-    one, few = traced(1), traced(min(count, _FRAMES))
-    slope = max(0.0, few - one) / max(1, min(count, _FRAMES) - 1)
+    time_aspects(1)  # compiled now
+    one, few = time_aspects(1), time_aspects(min(count, _PROBE_FRAMES))
+    slope = max(0.0, few - one) / max(1, min(count, _PROBE_FRAMES) - 1)
     check = run.gradcheck if run.task == "gradcheck" else None
     times = 1 if check is None else 4 * (check.repeats + check.max_pairs)
     seconds = times * (one + slope * (count - 1))
     again = "" if times == 1 else f", {times} times"
-    return _tables(found, scene, seconds, f"{count} aspects{again}")
+    return _make_tables(found, scene, seconds, f"{count} aspects{again}")
 
 
-def _meshes(scene: Scene) -> Table:
+def _mesh_table(scene: Scene) -> ReportTable:
     heads = ("object", "size [m]", "triangles", "open edges", "non-manifold edges")
     rows = []
     for name, item in scene.objects.items():
         found = item.mesh.summary()
         edges = found.open_edges, found.nonmanifold_edges
         rows.append([name, list(found.extent), found.triangles, *edges])
-    return Table("Meshes", heads, rows)
+    return ReportTable("Meshes", heads, rows)
 
 
-def _sensors(run: RunFile) -> Mapping[str, Sensor]:
-    mover = isinstance(next(iter(run.parameters), None), Mover)
+def _build_sensors(run: RunFile) -> Mapping[str, SensorSetup]:
+    mover = isinstance(next(iter(run.parameters), None), MovingTargetParameter)
     measured = run.data is not None and not isinstance(run.data, SimulatedData)
-    if run.task in _FITS and not mover:
-        return sensors_of(run)
-    table = need(run, "grid", run.task)
+    if run.task in _FIT_TASKS and not mover:
+        return build_sensors(run)
+    table = require_section(run, "grid", run.task)
     radar = (
-        chirp_capture(run.data).device if measured else build.radar(need(run, "radar", run.task))
+        build_chirp_capture(run.data).device
+        if measured
+        else build.radar(require_section(run, "radar", run.task))
     )
-    return {"": Sensor(run, radar, build.grid(table, radar))}
+    return {"": SensorSetup(run, radar, build.grid(table, radar))}
 
 
-def _seconds(run: RunFile, found: Estimate, truth: Scene, sensors: Mapping[str, Sensor]) -> float:
+def _estimate_seconds(
+    run: RunFile, found: ResourceEstimate, truth: Scene, sensors: Mapping[str, SensorSetup]
+) -> float:
     """Time of the run, from the time of a few rays and a few paths on this machine."""
     whole, settings = next(iter(sensors.values())), run.gradcheck or run.reconstruct
     depth = settings.depth if settings else run.data.depth if run.data else 1
     frames = whole.radar.frame_count
-    sensor = replace(whole, radar=whole.radar.frames(range(min(_FRAMES, frames))))
+    sensor = replace(whole, radar=whole.radar.frames(range(min(_PROBE_FRAMES, frames))))
     still = Scene({name: replace(item, velocity=None) for name, item in truth.objects.items()})
-    each, ray = _line(lambda count: _map(sensor, still, depth, count, run.task not in _SIMULATED))
+    each, ray = _fit_cost(
+        lambda count: _predict_map(sensor, still, depth, count, run.task not in _SIMULATION_TASKS)
+    )
     used = min(getattr(settings, "frames_per_step", None) or frames, frames)
-    seconds = found.maps * each * used / sensor.radar.frame_count + found.rays * ray
-    if found.rows:
-        each, row = _line(lambda count: _signals(sensor, truth, count))
+    seconds = found.map_count * each * used / sensor.radar.frame_count + found.ray_count * ray
+    if found.path_count:
+        each, row = _fit_cost(lambda count: _simulate_signals(sensor, truth, count))
         each *= frames / sensor.radar.frame_count
-        seconds += found.recordings * each + found.rows * row
+        seconds += found.recording_count * each + found.path_count * row
     return seconds
 
 
-def _line(work: Callable[[int], float]) -> tuple[float, float]:
+def _fit_cost(work: Callable[[int], float]) -> tuple[float, float]:
     """Seconds that work takes at least, and more of them for each ray or path."""
-    work(_FEW)  # compiled now
+    work(_SMALL_PROBE)  # compiled now
     times, counts = [time.perf_counter()], []
-    for count in (_FEW, _MANY):
+    for count in (_SMALL_PROBE, _LARGE_PROBE):
         counts.append(work(count))
         times.append(time.perf_counter())
     first, last = times[1] - times[0], times[2] - times[1]
@@ -220,11 +248,11 @@ def _line(work: Callable[[int], float]) -> tuple[float, float]:
     return max(0.0, first - slope * counts[0]), slope
 
 
-def _map(sensor: Sensor, truth: Scene, depth: int, count: int, fitted: bool) -> float:
+def _predict_map(sensor: SensorSetup, truth: Scene, depth: int, count: int, fitted: bool) -> float:
     """Predict a smooth map, with its derivative where it is fitted; return the number of rays."""
     rays, edges = round(0.8 * count), round(0.2 * count)
     sampling = Sampling(depth=depth, samples=rays, boundary_samples=edges, boundary=fitted)
-    model = SurrogateMap(sensor.grid, build.made(sensor.run, "surrogate"), sampling)
+    model = SurrogateMap(sensor.grid, build.build_section(sensor.run, "surrogate"), sampling)
     module = Translation(truth.names[0])
     with torch.set_grad_enabled(fitted):
         found = model.predict(module(truth) if fitted else truth, sensor.radar, 0)
@@ -233,14 +261,17 @@ def _map(sensor: Sensor, truth: Scene, depth: int, count: int, fitted: bool) -> 
     return count
 
 
-def _signals(sensor: Sensor, truth: Scene, count: int) -> float:
+def _simulate_signals(sensor: SensorSetup, truth: Scene, count: int) -> float:
     """Simulate exact signals of about so many paths; return their number."""
-    data, whole = need(sensor.run, "data", "a simulation"), of_sensor(sensor, truth)[1]
+    data, whole = (
+        require_section(sensor.run, "data", "a simulation"),
+        estimate_sensor_resources(sensor, truth)[1],
+    )
     share = min(1.0, count / whole)
     fewer = {
         "points_per_m2": {
             name: density * share
-            for name, density in densities_of(truth, data.points_per_m2).items()
+            for name, density in resolve_densities(truth, data.points_per_m2).items()
         },
         "samples": max(1, round(data.samples * share)),
         "rough_paths": max(1, round(data.rough_paths * share)),
@@ -248,7 +279,7 @@ def _signals(sensor: Sensor, truth: Scene, count: int) -> float:
     }
     run = sensor.run.model_copy(update={"data": data.model_copy(update=fewer)})
     if run.chirps is None:
-        exact(run, truth, sensor.radar, sensor.grid)
+        simulate_exact(run, truth, sensor.radar, sensor.grid)
     else:
-        chirp_train(run, truth, sensor.radar, run.chirps.build())
+        simulate_chirp_beats(run, truth, sensor.radar, run.chirps.build())
     return whole * share

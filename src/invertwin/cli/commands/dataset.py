@@ -17,39 +17,45 @@ import torch
 
 from invertwin import __version__
 from invertwin.channel import Paths
-from invertwin.cli.estimate import Sensor, require_room
-from invertwin.cli.exact_signals import chirp_train, exact
-from invertwin.cli.report import Table, finish, quantities
+from invertwin.cli.estimate import SensorSetup, require_resources
+from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact
+from invertwin.cli.report import ReportTable, quantity_table, write_report
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.motion_tables import at_start, joints_at_start
-from invertwin.cli.schema.run_file import about_file, load_run, need, to_toml, validate
-from invertwin.cli.schema.variation import sample_of
-from invertwin.datasets import Samples, object_labels, radar_labels, seen_triangles
+from invertwin.cli.schema.motion_tables import joint_positions_at_start, scene_at_start
+from invertwin.cli.schema.run_file import (
+    load_run,
+    prefix_file_errors,
+    require_section,
+    to_toml,
+    validate_run,
+)
+from invertwin.cli.schema.variation import draw_sample
+from invertwin.datasets import SampleDataset, object_labels, radar_labels, triangle_visibility
 from invertwin.datasets.shards import (
     FORMAT,
     MANIFEST,
-    Array,
-    Manifest,
+    ArrayInfo,
+    DatasetManifest,
     Shard,
-    described,
-    npy,
-    packed,
-    ranges,
+    describe_shard,
+    npy_bytes,
+    pack_shard,
     shard_name,
+    shard_ranges,
 )
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar import range_doppler_angle
 from invertwin.radar.radar import Radar
-from invertwin.runtime.engines import Engine, spread
-from invertwin.runtime.progress import told
+from invertwin.runtime.engines import Engine, run_jobs
+from invertwin.runtime.progress import track
 from invertwin.scene import Scene
 from invertwin.storage.folders import PARTS, UNFINISHED
 from invertwin.storage.run_folder import RunFolder, open_run
 
-NEEDS = ("dataset", "radar", "grid", "data")
-_COMPUTE = ("drjit", "finufft", "mitsuba", "numpy", "torch")
-_NAMES = {"raw": "beat", "map": "map"}  # of arrays, by what the run file calls them
-_FIELD = "√(received over sent)"
+DATASET_SECTIONS = ("dataset", "radar", "grid", "data")
+_NUMERICAL_PACKAGES = ("drjit", "finufft", "mitsuba", "numpy", "torch")
+_ARRAY_NAMES = {"raw": "beat", "map": "map"}  # of arrays, by what the run file calls them
+_FIELD_UNIT = "√(received over sent)"
 
 
 def dataset(
@@ -62,7 +68,7 @@ def dataset(
     seed: int | None = None,
     overwrite: bool = False,
     resume: bool = False,
-) -> Samples:
+) -> SampleDataset:
     """Simulate a data set: samples of a run file with ``[dataset]`` and ``[[vary]]``.
 
     Sample i depends on the run file, the seed and i only. So any number of workers, parts and
@@ -88,19 +94,19 @@ def dataset(
     """
     file = Path(run_file)
     run = load_run(file)
-    with about_file(file):
-        for section in NEEDS:
-            need(run, section, "dataset")
+    with prefix_file_errors(file):
+        for section in DATASET_SECTIONS:
+            require_section(run, section, "dataset")
     run = run if seed is None else run.model_copy(update={"seed": seed})
-    place = folder_of_part(Path(folder), part)
+    place = part_folder(Path(folder), part)
     with open_run(place, {"run": to_toml(run)}, overwrite=overwrite, resume=resume) as opened:
         if not opened.complete:
-            with about_file(file):
+            with prefix_file_errors(file):
                 run_dataset(run, opened, part, engine, workers)
-    return Samples(place)
+    return SampleDataset(place)
 
 
-def folder_of_part(folder: Path, part: tuple[int, int]) -> Path:
+def part_folder(folder: Path, part: tuple[int, int]) -> Path:
     """Where a part of a data set is written.
 
     Args:
@@ -110,7 +116,7 @@ def folder_of_part(folder: Path, part: tuple[int, int]) -> Path:
     return folder if part == (1, 1) else folder / f"part_{part[0]}_of_{part[1]}"
 
 
-def part_of(text: str | None) -> tuple[int, int]:
+def parse_part(text: str | None) -> tuple[int, int]:
     """The part that `--shard i/n` names.
 
     Raises:
@@ -126,7 +132,7 @@ def part_of(text: str | None) -> tuple[int, int]:
 
 def run_dataset(
     run: RunFile, folder: RunFolder, part: tuple[int, int], engine: Engine, workers: int
-) -> list[Table]:
+) -> list[ReportTable]:
     """Simulate the shards of a part that are not there yet; return the tables to print.
 
     Args:
@@ -138,72 +144,72 @@ def run_dataset(
     Raises:
         InputError: A sample that cannot be simulated; the message names it.
     """
-    table, begin = need(run, "dataset", "a data set"), time.perf_counter()
-    wanted = ranges(table.samples, table.shard, part)
+    table, begin = require_section(run, "dataset", "a data set"), time.perf_counter()
+    wanted = shard_ranges(table.samples, table.shard, part)
     _check_first(run, wanted[0][1])
-    found = {number: _finished(folder, number) for number, _, _ in wanted}
+    found = {number: _read_finished_shard(folder, number) for number, _, _ in wanted}
     missing = [row for row in wanted if found[row[0]] is None]
     text = to_toml(run)
     jobs = [(text, first, count) for _, first, count in missing]
-    with closing(spread(shard_content, jobs, engine=engine, workers=workers)) as done:
-        for _ in told(missing, "shards"):
+    with closing(run_jobs(make_shard, jobs, engine=engine, workers=workers)) as done:
+        for _ in track(missing, "shards"):
             at, content = next(done)
             number, first, count = missing[at]
             name = shard_name(number)
             folder.write_bytes(name, content)
-            found[number] = described(name, first, count, content).model_dump()
-            folder.write_json(_part(number), found[number])
+            found[number] = describe_shard(name, first, count, content).model_dump()
+            folder.write_json(_shard_row_path(number), found[number])
     shards = [Shard.model_validate(found[number]) for number, _, _ in wanted]
     _write_manifest(run, folder, part, shards)
     seconds = time.perf_counter() - begin
-    return _report(run, folder, shards, sum(count for _, _, count in missing), seconds)
+    return _write_report(run, folder, shards, sum(count for _, _, count in missing), seconds)
 
 
-def shard_content(job: tuple[str, int, int]) -> bytes:
+def make_shard(job: tuple[str, int, int]) -> bytes:
     """A shard as a tar file: what a worker does.
 
     Args:
         job: The run file of the data set, the first sample, and how many.
     """
     text, first, count = job
-    run = validate(tomllib.loads(text), Path("run.toml"))
+    run = validate_run(tomllib.loads(text), Path("run.toml"))
 
-    def samples() -> Iterator[tuple[int, dict[str, bytes]]]:
+    def iterate_samples() -> Iterator[tuple[int, dict[str, bytes]]]:
         for index in range(first, first + count):
-            yield index, sample_content(run, index)
+            yield index, make_sample(run, index)
 
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore", PhysicsWarning)  # told once, where the run began
-        return packed(samples())
+        return pack_shard(iterate_samples())
 
 
-def sample_content(run: RunFile, index: int) -> dict[str, bytes]:
+def make_sample(run: RunFile, index: int) -> dict[str, bytes]:
     """The files of a sample by the ends of their names: arrays, labels, and its own run file.
 
     Args:
         run: The run file of the data set.
         index: Of the sample.
     """
-    own = sample_run(run, index)
-    with about_file(Path(f"sample {index}")):
-        scene, sensor = _built(own)
-        table = need(run, "dataset", "a data set")
-        arrays = _signals(own, scene, sensor, table)
-        begun = _labelled(own, scene, sensor.radar)
-        seen = seen_triangles(begun, sensor.radar)
+    own = make_sample_run(run, index)
+    with prefix_file_errors(Path(f"sample {index}")):
+        scene, sensor = _build_sample(own)
+        table = require_section(run, "dataset", "a data set")
+        arrays = _simulate_signals(own, scene, sensor, table)
+        begun = _labelled_scene(own, scene, sensor.radar)
+        seen = triangle_visibility(begun, sensor.radar)
     if table.masks:
         arrays["masks"] = torch.cat(list(seen.values()), dim=1).numpy()
     labels = {
         "index": index,
-        "objects": object_labels(begun, seen, table.classes, joints_at_start(own, begun)),
+        "objects": object_labels(begun, seen, table.classes, joint_positions_at_start(own, begun)),
         "radar": radar_labels(sensor.radar),
     }
-    files = {f"{name}.npy": npy(array) for name, array in arrays.items()}
+    files = {f"{name}.npy": npy_bytes(array) for name, array in arrays.items()}
     text = json.dumps(labels, ensure_ascii=False, allow_nan=False)
     return files | {"labels.json": text.encode(), "run.toml": to_toml(own).encode()}
 
 
-def sample_run(run: RunFile, index: int) -> RunFile:
+def make_sample_run(run: RunFile, index: int) -> RunFile:
     """The run file of a sample: what `invertwin simulate` takes.
 
     Args:
@@ -213,46 +219,50 @@ def sample_run(run: RunFile, index: int) -> RunFile:
     Raises:
         InputError: Drawn values that are no run file together; the message names the sample.
     """
-    with about_file(Path(f"sample {index}")):
-        raw = sample_of(run, run.alone(), index)
-    return validate(raw, Path(f"sample {index}"))
+    with prefix_file_errors(Path(f"sample {index}")):
+        raw = draw_sample(run, run.dump_without_dataset(), index)
+    return validate_run(raw, Path(f"sample {index}"))
 
 
-def _built(run: RunFile) -> tuple[Scene, Sensor]:
+def _build_sample(run: RunFile) -> tuple[Scene, SensorSetup]:
     scene = build.true_scene(run)
-    radar = build.radar(need(run, "radar", "a sample"))
-    return scene, Sensor(run, radar, build.grid(need(run, "grid", "a sample"), radar))
+    radar = build.radar(require_section(run, "radar", "a sample"))
+    return scene, SensorSetup(
+        run, radar, build.grid(require_section(run, "grid", "a sample"), radar)
+    )
 
 
 def _check_first(run: RunFile, index: int) -> None:
     """Build a sample before any work is done: its errors and its warnings come at once."""
-    own = sample_run(run, index)
-    with about_file(Path(f"sample {index}")):
-        scene, sensor = _built(own)
-        require_room(own, scene, {"": sensor})
+    own = make_sample_run(run, index)
+    with prefix_file_errors(Path(f"sample {index}")):
+        scene, sensor = _build_sample(own)
+        require_resources(own, scene, {"": sensor})
 
 
-def _signals(run: RunFile, scene: Scene, sensor: Sensor, table: Any) -> dict[str, np.ndarray]:
+def _simulate_signals(
+    run: RunFile, scene: Scene, sensor: SensorSetup, table: Any
+) -> dict[str, np.ndarray]:
     """Exact signals and what is made of them, by name."""
     if run.chirps is None:
-        simulated = exact(run, scene, sensor.radar, sensor.grid)
+        simulated = simulate_exact(run, scene, sensor.radar, sensor.grid)
         beat, power = simulated.beat, simulated.spectrum
         more = _path_arrays(simulated.paths) if table.paths else {}
     else:
         chirps = run.chirps.build()
-        beat, more = chirp_train(run, scene, sensor.radar, chirps), {}
+        beat, more = simulate_chirp_beats(run, scene, sensor.radar, chirps), {}
         power = torch.zeros(0)
         if "map" in table.signals:
             power = range_doppler_angle(beat, sensor.radar, sensor.grid, chirps)
     found = {"raw": beat.resolve_conj().to(torch.complex64), "map": power.float()}
-    return {_NAMES[name]: found[name].numpy() for name in table.signals} | more
+    return {_ARRAY_NAMES[name]: found[name].numpy() for name in table.signals} | more
 
 
-def _labelled(run: RunFile, scene: Scene, radar: Radar) -> Scene:
+def _labelled_scene(run: RunFile, scene: Scene, radar: Radar) -> Scene:
     """The scene as the frame begins, which labels are of."""
     if run.chirps is None:
         return scene
-    return at_start(run, scene, float(run.chirps.build().times(radar.shape[1]).max()))
+    return scene_at_start(run, scene, float(run.chirps.build().times(radar.shape[1]).max()))
 
 
 def _path_arrays(paths: Paths) -> dict[str, np.ndarray]:
@@ -260,21 +270,21 @@ def _path_arrays(paths: Paths) -> dict[str, np.ndarray]:
     return {f"paths_{name}": getattr(paths, name).detach().numpy() for name in kept}
 
 
-def _arrays(run: RunFile) -> dict[str, Array]:
+def _describe_arrays(run: RunFile) -> dict[str, ArrayInfo]:
     """What the manifest says of the arrays."""
-    table = need(run, "dataset", "a data set")
+    table = require_section(run, "dataset", "a data set")
     chirp, rate = ([], []) if run.chirps is None else (["chirp"], ["velocity"])
     known = {
-        "beat": Array(dims=["frame", *chirp, "tx", "rx", "sample"], unit=_FIELD),
-        "map": Array(dims=["frame", *rate, "range", "u", "v"], unit="received over sent"),
-        "masks": Array(dims=["frame", "triangle"], unit="share that is seen"),
-        "paths_frame": Array(dims=["path"], unit="number"),
-        "paths_delay": Array(dims=["path"], unit="s"),
-        "paths_coefficient": Array(dims=["path"], unit=_FIELD),
-        "paths_first": Array(dims=["path", "xyz"], unit="m"),
-        "paths_last": Array(dims=["path", "xyz"], unit="m"),
+        "beat": ArrayInfo(dims=["frame", *chirp, "tx", "rx", "sample"], unit=_FIELD_UNIT),
+        "map": ArrayInfo(dims=["frame", *rate, "range", "u", "v"], unit="received over sent"),
+        "masks": ArrayInfo(dims=["frame", "triangle"], unit="share that is seen"),
+        "paths_frame": ArrayInfo(dims=["path"], unit="number"),
+        "paths_delay": ArrayInfo(dims=["path"], unit="s"),
+        "paths_coefficient": ArrayInfo(dims=["path"], unit=_FIELD_UNIT),
+        "paths_first": ArrayInfo(dims=["path", "xyz"], unit="m"),
+        "paths_last": ArrayInfo(dims=["path", "xyz"], unit="m"),
     }
-    held = {_NAMES[name] for name in table.signals}
+    held = {_ARRAY_NAMES[name] for name in table.signals}
     held |= {"masks"} if table.masks else set()
     return {n: a for n, a in known.items() if n in held or (table.paths and "paths_" in n)}
 
@@ -282,22 +292,22 @@ def _arrays(run: RunFile) -> dict[str, Array]:
 def _write_manifest(
     run: RunFile, folder: RunFolder, part: tuple[int, int], shards: list[Shard]
 ) -> None:
-    versions = {name: metadata.version(name) for name in _COMPUTE}
-    found = Manifest(
+    versions = {name: metadata.version(name) for name in _NUMERICAL_PACKAGES}
+    found = DatasetManifest(
         format=FORMAT,
-        samples=need(run, "dataset", "a data set").samples,
+        samples=require_section(run, "dataset", "a data set").samples,
         part=part,
         fingerprint=hashlib.sha256(to_toml(run).encode()).hexdigest(),
         versions={"invertwin": __version__, **versions},
-        arrays=_arrays(run),
+        arrays=_describe_arrays(run),
         shards=shards,
     )
     folder.write_text(MANIFEST, found.model_dump_json(indent=1) + "\n")
 
 
-def _report(
+def _write_report(
     run: RunFile, folder: RunFolder, shards: list[Shard], made: int, seconds: float
-) -> list[Table]:
+) -> list[ReportTable]:
     count = sum(shard.samples for shard in shards)
     metrics = {
         "task": "dataset",
@@ -308,19 +318,21 @@ def _report(
         "wall_seconds": seconds,
     }
     status = f"{count} samples in {len(shards)} shards."
-    parts = [quantities("Data set", metrics)]
-    return finish(
+    parts = [quantity_table("Data set", metrics)]
+    return write_report(
         folder, metrics, run.title or "Data set", status, parts, again="dataset", note=run.note
     )
 
 
-def _finished(folder: RunFolder, number: int) -> dict[str, Any] | None:
+def _read_finished_shard(folder: RunFolder, number: int) -> dict[str, Any] | None:
     """The manifest's row of a shard that an interrupted run has written whole, or None."""
     unfinished = folder.path / UNFINISHED
-    there = (unfinished / _part(number)).exists() and (unfinished / shard_name(number)).exists()
-    return folder.read_json(_part(number)) if there else None
+    there = (unfinished / _shard_row_path(number)).exists() and (
+        unfinished / shard_name(number)
+    ).exists()
+    return folder.read_json(_shard_row_path(number)) if there else None
 
 
-def _part(number: int) -> str:
+def _shard_row_path(number: int) -> str:
     """What is kept of a shard that is done, until the run ends."""
     return f"{PARTS}/shard-{number:06d}.json"

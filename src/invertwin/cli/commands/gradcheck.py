@@ -12,47 +12,47 @@ from torch import Tensor
 
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
-from invertwin.cli.estimate import Sensor, of_signature, require_room
-from invertwin.cli.report import Picture, Table, finish, picture, texts
+from invertwin.cli.estimate import SensorSetup, estimate_rcs_resources, require_resources
+from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.gradcheck import Gradcheck
-from invertwin.cli.schema.run_file import about, need
-from invertwin.cli.schema.signature import swept
-from invertwin.cli.terminal import in_parts
+from invertwin.cli.schema.gradcheck import GradcheckTable
+from invertwin.cli.schema.run_file import prefix_errors, require_section
+from invertwin.cli.schema.signature import expand_values
+from invertwin.cli.terminal import compute_in_parts
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.inversion.gradcheck.gradcheck import Agreement, GradientReport, gradcheck
-from invertwin.inversion.gradcheck.lines import line_of
-from invertwin.links import MapPlane, Points
+from invertwin.inversion.gradcheck.gradcheck import GradientAgreement, GradientReport, gradcheck
+from invertwin.inversion.gradcheck.lines import make_line
+from invertwin.links import MapPlane, ReceiverPoints
 from invertwin.models.radar import SurrogateMap
 from invertwin.models.radio import PanelMap
-from invertwin.models.rcs import SignatureMap
+from invertwin.models.rcs import RcsMap
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 from invertwin.signatures import Signature
 from invertwin.storage.run_folder import RunFolder
 
-_COLUMNS = (
+_TABLE_COLUMNS = (
     *("scene", "L1 full", "L1 interior", "L1 no interior edges", "L1 no contact", "ratio"),
     *("L2 full", "correlation", "noise", "steps differ", "order", "pairs"),
 )
-_KEPT = (
+_REPORT_FIELDS = (
     *("full", "interior", "no_interior_edges", "no_contact"),
     *("difference_noise", "step_agreement", "pairs"),
 )
 # Units of a derivative with respect to θ, by the value that θ changes; angles are told apart.
-_UNITS = {
+_DERIVATIVE_UNITS = {
     **dict.fromkeys(("translation", "offsets", "value"), "1/m"),
     "place": "1/m",
     "log_scale": "per relative size",
     "log_density": "per relative density",
 }
 # Kinds whose objects keep their triangles.
-_MOVES = ("translation", "pose", "scale", "material", "radar_pose", "radar_path")
+_FIXED_TRIANGLE_KINDS = ("translation", "pose", "scale", "material", "radar_pose", "radar_path")
 
 
 @dataclass(frozen=True)
-class Checked:
+class GradcheckOutcome:
     """A gradient check that is done, for the studies that compare something with it."""
 
     run: RunFile
@@ -63,12 +63,12 @@ class Checked:
     report: GradientReport
     say: Callable[[str], None]  # takes a line of progress
 
-    def direction(self, scene: Scene, radar: Radar, theta: Tensor) -> tuple[Scene, Radar]:
+    def apply_theta(self, scene: Scene, radar: Radar, theta: Tensor) -> tuple[Scene, Radar]:
         """Scene and radar, moved by θ."""
         module, tangent = build.tangent(self.run, scene)
-        if need(self.run, "gradcheck", "gradcheck").of == "sensor":
-            return scene, line_of(module, tangent, radar).at(theta)
-        return line_of(module, tangent, scene).at(theta), radar
+        if require_section(self.run, "gradcheck", "gradcheck").of == "sensor":
+            return scene, make_line(module, tangent, radar).evaluate(theta)
+        return make_line(module, tangent, scene).evaluate(theta), radar
 
 
 @runtime_checkable
@@ -80,11 +80,11 @@ class GradcheckStudy(Protocol):
 
     picture_note: str
 
-    def compare(self, checked: Checked) -> tuple[dict[str, Any], Figure]:
+    def compare(self, checked: GradcheckOutcome) -> tuple[dict[str, Any], Figure]:
         """Results for metrics.json, and a figure."""
         ...
 
-    def table(self, name: str, found: Mapping[str, Any]) -> Table:
+    def table(self, name: str, found: Mapping[str, Any]) -> ReportTable:
         """The table of those results.
 
         Args:
@@ -99,42 +99,44 @@ def run_gradcheck(
     files: Mapping[str, Path],
     folder: RunFolder,
     say: Callable[[str], None],
-) -> list[Table]:
+) -> list[ReportTable]:
     """Check every run file, write the folder, and return the tables to print."""
     begin = time.perf_counter()
     scenes: dict[str, Any] = {}
     compared: dict[str, Any] = {}
-    studies: list[Table] = []
-    pictures: list[Picture] = []
+    studies: list[ReportTable] = []
+    pictures: list[ReportPicture] = []
 
     def check(name: str, run: RunFile) -> dict[str, Any]:
-        return _check(name, run, folder, lambda line: say(f"{name}: {line}"))
+        return _run_check(name, run, folder, lambda line: say(f"{name}: {line}"))
 
-    for name, run, found in in_parts(runs, files, folder, check):
+    for name, run, found in compute_in_parts(runs, files, folder, check):
         scenes[name] = found
-        shown = {f"{name}_scene": (run.title or name, ""), name: (name, _note(run, found))}
-        for key, study in _studies(run).items():
+        shown = {f"{name}_scene": (run.title or name, ""), name: (name, _picture_note(run, found))}
+        for key, study in _find_studies(run).items():
             compared[key] = found[key]
             studies.append(study.table(name, found[key]))
             shown[f"{name}_{key}"] = studies[-1].title, study.picture_note
         for file, (title, note) in shown.items():
-            pictures.append(Picture(title, folder.file(f"{file}.png").read_bytes(), note))
+            pictures.append(ReportPicture(title, folder.file(f"{file}.png").read_bytes(), note))
     metrics = {"task": "gradcheck", "scenes": scenes, "wall_seconds": time.perf_counter() - begin}
     if len(scenes) == 1:
         metrics |= compared
-    rows = [_row(*item) for item in scenes.items()]
-    legend = texts("notes")["gradcheck"]
+    rows = [_table_row(*item) for item in scenes.items()]
+    legend = load_texts("notes")["gradcheck"]
     # What no scene has, such as contacts, takes the room of numbers in a terminal.
-    told = [k for k in range(len(_COLUMNS)) if any(row[k] is not None for row in rows)]
-    columns, rows = [_COLUMNS[k] for k in told], [[row[k] for k in told] for row in rows]
-    table = Table("Agreement with central differences", columns, rows, legend)
+    told = [k for k in range(len(_TABLE_COLUMNS)) if any(row[k] is not None for row in rows)]
+    columns, rows = [_TABLE_COLUMNS[k] for k in told], [[row[k] for k in told] for row in rows]
+    table = ReportTable("Agreement with central differences", columns, rows, legend)
     count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
     parts = [table, *studies, *pictures]
-    return finish(folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck")
+    return write_report(
+        folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck"
+    )
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _GradcheckTarget:
     """What is differentiated."""
 
     model: ForwardModel
@@ -143,51 +145,53 @@ class _Seen:
     draw: Callable[[GradientReport], Figure]
 
 
-def _signature(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
+def _rcs_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _GradcheckTarget:
     """The signature of `[rcs]`."""
-    table = need(run, "rcs", "gradcheck")
-    of_signature(run, scene).require()
+    table = require_section(run, "rcs", "gradcheck")
+    estimate_rcs_resources(run, scene).require_available()
 
-    def signature(scene: Scene, **more: Any) -> Signature:
-        with about("rcs"):
+    def compute_rcs(scene: Scene, **more: Any) -> Signature:
+        with prefix_errors("rcs"):
             return table.build({Scene: scene}, **more)
 
     def draw(report: GradientReport) -> Figure:
         angles, label = table.angles
         size = report.difference.abs().sum((0, 1))
         i, j = max(table.channels.values(), key=lambda at: float(size[at]))
-        curves = {n: values[:, :, i, j] for n, values in _derivatives(report).items()}
+        curves = {n: values[:, :, i, j] for n, values in _derivative_maps(report).items()}
         if len(angles) > 1:
             places = (angles, label)
             curves = {name: values[0] for name, values in curves.items()}
         else:
-            places = (swept(table.frequencies) / 1e9, "frequency [GHz]")
+            places = (expand_values(table.frequencies) / 1e9, "frequency [GHz]")
             curves = {name: values[:, 0] for name, values in curves.items()}
-        return plotting.slopes(curves, *places, f"∂σ, σ in m² [{_unit(settings)}]")
+        return plotting.rcs_derivatives(
+            curves, *places, f"∂σ, σ in m² [{_derivative_unit(settings)}]"
+        )
 
-    return _Seen(SignatureMap(signature), None, None, draw)
+    return _GradcheckTarget(RcsMap(compute_rcs), None, None, draw)
 
 
-def _radio_map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
+def _radio_map_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _GradcheckTarget:
     """The gain at the points or over the cells of `[map]`."""
-    with about("map"):
-        model = need(run, "map", "gradcheck").build()
-    sensor = need(run, "transmitter", "gradcheck").build()
+    with prefix_errors("map"):
+        model = require_section(run, "map", "gradcheck").build()
+    sensor = require_section(run, "transmitter", "gradcheck").build()
     places = model.places
-    drawn = isinstance(places, MapPlane | Points)
+    drawn = isinstance(places, MapPlane | ReceiverPoints)
     if not drawn or len(sensor.positions) > 1 or model.quantity != "gain":
         raise InputError(
             'map: expected quantity = "gain", places of kind "points" or "plane" and one '
             "transmitter, got others; gradient checks compare and draw these"
         )
-    label = f"∂ gain [peaks, {_unit(settings)}]"
+    label = f"∂ gain [peaks, {_derivative_unit(settings)}]"
 
     def draw(report: GradientReport) -> Figure:
         peak = float(report.value.max())
-        rates = {name: values[0] / peak for name, values in _derivatives(report).items()}
-        if isinstance(places, Points):
+        rates = {name: values[0] / peak for name, values in _derivative_maps(report).items()}
+        if isinstance(places, ReceiverPoints):
             number = torch.arange(len(places.positions), dtype=torch.float64)
-            return plotting.slopes(rates, number, "receiver", label)
+            return plotting.rcs_derivatives(rates, number, "receiver", label)
         return plotting.coverage(
             {},
             places,
@@ -197,67 +201,71 @@ def _radio_map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
             derivative_label=label,
         )
 
-    return _Seen(model, sensor, None, draw)
+    return _GradcheckTarget(model, sensor, None, draw)
 
 
-def _image(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
+def _image_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _GradcheckTarget:
     """What `[camera]` shows as `[image]`."""
-    need(run, "camera", "an image")
-    kind = need(run, "image", "gradcheck").kind
-    model, camera = build.made(run, "image"), build.made(run, "camera")
+    require_section(run, "camera", "an image")
+    kind = require_section(run, "image", "gradcheck").kind
+    model, camera = build.build_section(run, "image"), build.build_section(run, "camera")
     unit = "" if kind == "silhouette" else "m · "
 
     def draw(report: GradientReport) -> Figure:
-        rates = {name: values[0] for name, values in _derivatives(report).items()}
-        label = f"∂ {kind} [{unit}{_unit(settings)}]"
+        rates = {name: values[0] for name, values in _derivative_maps(report).items()}
+        label = f"∂ {kind} [{unit}{_derivative_unit(settings)}]"
         return plotting.images({kind: report.value[0]}, rates, label)
 
-    return _Seen(model, camera, None, draw)
+    return _GradcheckTarget(model, camera, None, draw)
 
 
-def _map(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
+def _radar_map_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _GradcheckTarget:
     """The smooth map of `[radar]`, `[grid]` and `[surrogate]`."""
     if run.surrogate.exact:
         raise InputError(
             "surrogate.exact: expected a smooth map to differentiate, got exact signals; remove "
             "it: silhouettes of single rough points have no derivative"
         )
-    radar = build.radar(need(run, "radar", "gradcheck"))
-    grid = build.grid(need(run, "grid", "gradcheck"), radar)
-    require_room(run, scene, {"": Sensor(run, radar, grid)})
+    radar = build.radar(require_section(run, "radar", "gradcheck"))
+    grid = build.grid(require_section(run, "grid", "gradcheck"), radar)
+    require_resources(run, scene, {"": SensorSetup(run, radar, grid)})
     drawn = {key: getattr(settings, key) for key in ("depth", "samples", "boundary_samples")}
-    model = SurrogateMap(grid, build.made(run, "surrogate"), Sampling(**drawn))
-    return _Seen(model, radar, (radar, grid), lambda report: _maps(report, grid, settings))
+    model = SurrogateMap(grid, build.build_section(run, "surrogate"), Sampling(**drawn))
+    return _GradcheckTarget(
+        model, radar, (radar, grid), lambda report: _draw_maps(report, grid, settings)
+    )
 
 
-def _panel(run: RunFile, settings: Gradcheck, scene: Scene) -> _Seen:
+def _panel_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _GradcheckTarget:
     """What the metasurface of `[placement]` brings to receivers."""
-    placing, module = build.placing(run, scene)
+    placing, module = build.panel_design(run, scene)
     aim = placing.coverage
     with torch.no_grad():
         panel = placing.panel if settings.parameter.kind == "panel" else module(placing.panel)
 
     def draw(report: GradientReport) -> Figure:
         order = report.difference[0].argsort()
-        curves = {n: values[0, order] for n, values in _derivatives(report).items()}
+        curves = {n: values[0, order] for n, values in _derivative_maps(report).items()}
         number = torch.arange(len(order), dtype=torch.float64)
-        return plotting.slopes(curves, number, "receiver", f"∂ path gain [{_unit(settings)}]")
+        return plotting.rcs_derivatives(
+            curves, number, "receiver", f"∂ path gain [{_derivative_unit(settings)}]"
+        )
 
-    return _Seen(PanelMap(aim.tx, aim.receivers, aim.frequency), panel, None, draw)
+    return _GradcheckTarget(PanelMap(aim.tx, aim.receivers, aim.frequency), panel, None, draw)
 
 
-def _check(
+def _run_check(
     name: str, run: RunFile, folder: RunFolder, say: Callable[[str], None]
 ) -> dict[str, Any]:
     begin = time.perf_counter()
-    settings = need(run, "gradcheck", "gradcheck")
+    settings = require_section(run, "gradcheck", "gradcheck")
     scene = build.scene(run)
-    seen = _seen_of(run)(run, settings, scene)
+    seen = _select_target(run)(run, settings, scene)
     module, tangent = build.tangent(run, scene)
-    for key in _studies(run):
+    for key in _find_studies(run):
         if seen.device is None:
             raise InputError(f"{key}: expected [radar] and [grid] with it, got none; remove it")
-        if settings.parameter.kind not in _MOVES:
+        if settings.parameter.kind not in _FIXED_TRIANGLE_KINDS:
             raise InputError(
                 f"{key}: expected a parameter that moves something, got one of a shape; remove it"
             )
@@ -269,48 +277,48 @@ def _check(
         tangent,
         scene=scene,
         sensor=seen.sensor,
-        of=settings.of,
-        check=check,
+        acts_on=settings.of,
+        settings=check,
         seed=run.seed,
         progress=say,
     )
-    picture(folder, f"{name}", seen.draw(report))
+    save_picture(folder, f"{name}", seen.draw(report))
     moved = filter(None, [getattr(settings.parameter, "object", None)])
-    picture(folder, f"{name}_scene", plotting.scene(scene, radar, highlight=[*moved]))
-    kept = {key: value for key in _KEPT if (value := getattr(report, key)) is not None}
-    found = {k: asdict(v) if isinstance(v, Agreement) else v for k, v in kept.items()}
+    save_picture(folder, f"{name}_scene", plotting.scene(scene, radar, highlight=[*moved]))
+    kept = {key: value for key in _REPORT_FIELDS if (value := getattr(report, key)) is not None}
+    found = {k: asdict(v) if isinstance(v, GradientAgreement) else v for k, v in kept.items()}
     if seen.device is not None:
-        checked = Checked(run, scene, *seen.device, check.step, report, say)
-        for key, study in _studies(run).items():
+        checked = GradcheckOutcome(run, scene, *seen.device, check.step, report, say)
+        for key, study in _find_studies(run).items():
             found[key], figure = study.compare(checked)
-            picture(folder, f"{name}_{key}", figure)
+            save_picture(folder, f"{name}_{key}", figure)
     return found | {"seconds": time.perf_counter() - begin}
 
 
-def _seen_of(run: RunFile) -> Callable[[RunFile, Gradcheck, Scene], _Seen]:
+def _select_target(run: RunFile) -> Callable[[RunFile, GradcheckTable, Scene], _GradcheckTarget]:
     """What makes a gradient check of the sections that are there."""
     if run.placement is not None:
-        return _panel
+        return _panel_target
     if run.image is not None:
-        return _image
+        return _image_target
     if run.map is not None:
-        return _radio_map
-    return _map if run.rcs is None else _signature
+        return _radio_map_target
+    return _radar_map_target if run.rcs is None else _rcs_target
 
 
-def _studies(run: RunFile) -> dict[str, GradcheckStudy]:
+def _find_studies(run: RunFile) -> dict[str, GradcheckStudy]:
     """The sections that compare something with the gradient check."""
     values = {key: getattr(run, key) for key in type(run).model_fields}
     return {key: value for key, value in values.items() if isinstance(value, GradcheckStudy)}
 
 
-def _maps(report: GradientReport, grid: Grid, settings: Gradcheck) -> Figure:
+def _draw_maps(report: GradientReport, grid: Grid, settings: GradcheckTable) -> Figure:
     error = {"full − differences, own scale": report.gradient - report.difference}
-    label = f"∂ power (received/sent) [{_unit(settings)}]"
-    return plotting.gradient(_derivatives(report), grid, label=label, own_scale=error)
+    label = f"∂ power (received/sent) [{_derivative_unit(settings)}]"
+    return plotting.gradient(_derivative_maps(report), grid, label=label, own_scale=error)
 
 
-def _derivatives(report: GradientReport) -> dict[str, Tensor]:
+def _derivative_maps(report: GradientReport) -> dict[str, Tensor]:
     return {
         "differences": report.difference,
         "full": report.gradient,
@@ -318,13 +326,13 @@ def _derivatives(report: GradientReport) -> dict[str, Tensor]:
     }
 
 
-def _unit(settings: Gradcheck) -> str:
+def _derivative_unit(settings: GradcheckTable) -> str:
     """Of a derivative of a number by θ."""
     name = next(iter(settings.tangent))
-    return "1/rad" if settings.turns else _UNITS.get(name, f"per unit of {name}")
+    return "1/rad" if settings.changes_angle else _DERIVATIVE_UNITS.get(name, f"per unit of {name}")
 
 
-def _row(name: str, found: Mapping[str, Any]) -> list[Any]:
+def _table_row(name: str, found: Mapping[str, Any]) -> list[Any]:
     full, interior = found["full"], found["interior"]["relative_l1"]
     less = [found.get(key, {}).get("relative_l1") for key in ("no_interior_edges", "no_contact")]
     ratio = interior / full["relative_l1"] if full["relative_l1"] else None
@@ -333,8 +341,8 @@ def _row(name: str, found: Mapping[str, Any]) -> list[Any]:
     return [name, *errors, full["correlation"], *differences, found["pairs"]]
 
 
-def _note(run: RunFile, found: Mapping[str, Any]) -> str:
-    settings = need(run, "gradcheck", "gradcheck")
+def _picture_note(run: RunFile, found: Mapping[str, Any]) -> str:
+    settings = require_section(run, "gradcheck", "gradcheck")
     names = ", ".join(name.replace("_", " ") for name in settings.tangent)
     of = getattr(settings.parameter, "object", "the radar")
     return f"Derivative with respect to the {names} of {of}; {found['seconds']:.0f} s. {run.note}"

@@ -10,70 +10,74 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from invertwin import plotting
-from invertwin.cli.fits.problem import Problem, models_of
+from invertwin.cli.fits.problem import Problem, make_models
 from invertwin.cli.schema import RunFile, SimulatedData, build
-from invertwin.cli.schema.run_file import need
-from invertwin.cli.terminal import counted
+from invertwin.cli.schema.run_file import require_section
+from invertwin.cli.terminal import count_progress
 from invertwin.inversion import Observation
-from invertwin.inversion.gradcheck.lines import Line, line_of, losses_along
+from invertwin.inversion.gradcheck.lines import ParameterLine, evaluate_losses, make_line
 from invertwin.inversion.loss import relative_error
 from invertwin.models.radar import BeatMap
 from invertwin.scene import Scene, Translation
 
 
-def landscape(problem: Problem, console: Console) -> tuple[Figure, dict[str, Any]]:
+def plot_landscape(problem: Problem, console: Console) -> tuple[Figure, dict[str, Any]]:
     """The figure of the `[landscape]` table, and the local minima of every curve.
 
     For the exact signal one channel of one frame is enough to show the shape.
     """
-    run, truth, sight = problem.run, problem.truth, problem.first
-    table = need(run, "landscape", "the loss landscape")
-    line, along = line_through(truth, table.object, table.axis)
+    run, truth, sight = problem.run, problem.truth, problem.first_sensor
+    table = require_section(run, "landscape", "the loss landscape")
+    line, along = make_object_line(truth, table.object, table.axis)
     fine = np.linspace(-table.exact_span, table.exact_span, table.exact_points)
     wide = np.linspace(-table.span, table.span, table.points)
     model, first = BeatMap(sight.grid, channels=(slice(1), slice(1))), sight.radar.frames([0])
     beat = Observation(model, first, sight.capture.beat[:1, :1, :1], loss=relative_error)
-    with counted(console, "loss landscape, exact signal", len(fine)) as advance:
-        exact = exact_losses(run, line, fine, beat, advance)
-    model, loss = models_of(problem)[0], build.made(run, "loss")
+    with count_progress(console, "loss landscape, exact signal", len(fine)) as advance:
+        exact = evaluate_exact_losses(run, line, fine, beat, advance)
+    model, loss = make_models(problem)[0], build.build_section(run, "loss")
     smooth = {}
     for name, share in (("first widths", 1.0), ("no extra width", 0.0)):
-        seen = Observation(model.narrowed(share), sight.radar, sight.capture, loss=loss)
-        with counted(console, f"loss landscape, {name}", len(wide)) as advance:
-            losses = losses_along(line, told(wide, advance), seen, seed=run.seed).numpy()
+        seen = Observation(model.scale_blur(share), sight.radar, sight.capture, loss=loss)
+        with count_progress(console, f"loss landscape, {name}", len(wide)) as advance:
+            losses = evaluate_losses(
+                line, iterate_and_advance(wide, advance), seen, seed=run.seed
+            ).numpy()
         smooth[f"surrogate, {name}"] = wide, losses
     minima = {"exact": exact, **{name: losses for name, (_, losses) in smooth.items()}}
     counts = {name: plotting.count_minima(losses) for name, losses in minima.items()}
     return plotting.landscape((fine, exact), smooth, along), {"local_minima": counts}
 
 
-def line_through(truth: Scene, name: str, axis: Sequence[float]) -> tuple[Line, str]:
+def make_object_line(truth: Scene, name: str, axis: Sequence[float]) -> tuple[ParameterLine, str]:
     """The line on which one object is off the truth by θ [m], and what figures call it."""
     unit = torch.tensor(axis, dtype=torch.float64)
     used = [letter for letter, value in zip("xyz", axis, strict=True) if value]
     way = f"({', '.join(f'{value:g}' for value in axis)})"
     along = f"{name} along {used[0] if len(used) == 1 and sum(axis) > 0 else way}"
-    return line_of(Translation(name), unit / unit.norm(), truth), along
+    return make_line(Translation(name), unit / unit.norm(), truth), along
 
 
-def told(offsets: Iterable[float], advance: Callable[[], None]) -> Iterator[float]:
+def iterate_and_advance(offsets: Iterable[float], advance: Callable[[], None]) -> Iterator[float]:
     """The offsets of a line, and a call whenever one is done."""
     for offset in offsets:
         yield offset
         advance()
 
 
-def exact_losses(
+def evaluate_exact_losses(
     run: RunFile,
-    line: Line,
+    line: ParameterLine,
     offsets: np.ndarray,
-    seen: Observation,
+    observation: Observation,
     advance: Callable[[], None] = lambda: None,
 ) -> np.ndarray:
     """Losses of exact signals along a line, with the rough points of the simulated data."""
-    data = need(run, "data", "the loss landscape")
+    data = require_section(run, "data", "the loss landscape")
     assert isinstance(data, SimulatedData)
     drawn = {"samples": data.samples, "points_per_m2": data.points_per_m2, "boundary": False}
-    seen = replace(seen, model=seen.model.sampled_by(depth=1, **drawn))
+    observation = replace(observation, model=observation.model.with_sampling(depth=1, **drawn))
     seed = run.seed if data.seed is None else data.seed
-    return losses_along(line, told(offsets, advance), seen, seed=seed).numpy()
+    return evaluate_losses(
+        line, iterate_and_advance(offsets, advance), observation, seed=seed
+    ).numpy()

@@ -12,14 +12,20 @@ from rich.console import Console
 from torch import Tensor
 
 from invertwin import plotting
-from invertwin.cli.report import Table, finish, picture, texts
+from invertwin.cli.report import ReportTable, load_texts, save_picture, write_report
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.placement import Placement
-from invertwin.cli.schema.run_file import need
-from invertwin.cli.terminal import progress
-from invertwin.links.metasurface.placement import Coverage, Found, Placing, Trial, evaluations_until
-from invertwin.runtime.progress import told
-from invertwin.seeds import derived_seed
+from invertwin.cli.schema.run_file import require_section
+from invertwin.cli.terminal import show_progress
+from invertwin.links.metasurface.placement import (
+    Coverage,
+    Found,
+    PanelDesign,
+    Trial,
+    evaluations_until,
+)
+from invertwin.runtime.progress import track
+from invertwin.seeds import derive_seed
 from invertwin.storage.folders import PARTS
 from invertwin.storage.run_folder import RunFolder
 
@@ -28,7 +34,9 @@ _CELLS = 2500  # of a drawn map
 _FLOOR = 1e-16
 
 
-def run_placement(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
+def run_placement(
+    run: RunFile, folder: RunFolder, console: Console
+) -> tuple[list[ReportTable], str]:
     """Place the panel from every start, beside the grid and annealing; write the folder.
 
     Args:
@@ -37,16 +45,16 @@ def run_placement(run: RunFile, folder: RunFolder, console: Console) -> tuple[li
         console: Where progress is shown.
     """
     begin = time.perf_counter()
-    table, scene = need(run, "placement", "reconstruct"), build.scene(run)
+    table, scene = require_section(run, "placement", "reconstruct"), build.scene(run)
     grid = table.grid
-    placing, _ = build.placing(run, scene)
+    placing, _ = build.panel_design(run, scene)
     scored = table.coverage(scene, run.seed, scored=True)
-    with progress(console):
+    with show_progress(console):
         trials = placing.trials(grid.places, grid.yaws, [math.radians(a) for a in grid.spread_deg])
         tried = _kept(folder, "grid", lambda: _exhaustive(table, placing, trials))
         rows: list[dict[str, Any]] = []
-        for number in told(range(table.starts), "start"):
-            seed = derived_seed(run.seed, 2, number)
+        for number in track(range(table.starts), "start"):
+            seed = derive_seed(run.seed, 2, number)
             also = number < table.annealed_starts
             search = partial(_start, table, placing, scored, tried, seed, annealed=also)
             rows.append(_kept(folder, f"start_{number}", search))
@@ -54,10 +62,12 @@ def run_placement(run: RunFile, folder: RunFolder, console: Console) -> tuple[li
     metrics = _metrics(run, placing, scored, rows, tried)
     state = _state(max(rows, key=lambda row: row["level_db"]))
     pictures = [
-        picture(
+        save_picture(
             folder, "landscape", _landscape(table, placing, trials, levels, rows), note="placement"
         ),
-        picture(folder, "coverage", _maps(run, table, placing, state), note="placement_coverage"),
+        save_picture(
+            folder, "coverage", _maps(run, table, placing, state), note="placement_coverage"
+        ),
     ]
     metrics["wall_seconds"] = time.perf_counter() - begin
     columns = ("start", "found / exhaustive", "interior only", "annealing", "evaluations ratio")
@@ -71,14 +81,14 @@ def run_placement(run: RunFile, folder: RunFolder, console: Console) -> tuple[li
         ]
         for number, row in enumerate(rows)
     ]
-    notes = texts("notes")
-    parts = [Table("Starts", columns, shown, notes["placement_starts"]), *pictures]
+    notes = load_texts("notes")
+    parts = [ReportTable("Starts", columns, shown, notes["placement_starts"]), *pictures]
     status = (
         f"{metrics['successes']} of {table.starts} starts reach {_AS_GOOD:g} of the best of the "
         f"grid; the worst {table.share:.0%} of receivers gain {metrics['gain_db']:.1f} dB"
     )
     title = run.title or "Placement of a metasurface"
-    tables = finish(folder, metrics, title, status, parts, again="reconstruct", note=run.note)
+    tables = write_report(folder, metrics, title, status, parts, again="reconstruct", note=run.note)
     return tables, status
 
 
@@ -100,7 +110,7 @@ def _state(row: dict[str, Any]) -> dict[str, Tensor]:
     return {n: torch.tensor(v, dtype=torch.float64) for n, v in row["state"].items()}
 
 
-def _exhaustive(table: Placement, placing: Placing, trials: list[Trial]) -> dict[str, Any]:
+def _exhaustive(table: Placement, placing: PanelDesign, trials: list[Trial]) -> dict[str, Any]:
     """The grid, and its best, whose place and phases are then fitted as at the end of a search."""
     settings, levels = table.descent.build(), placing.exhaustive(trials)
     module = placing.make(*trials[int(levels.argmax())])
@@ -112,7 +122,7 @@ def _exhaustive(table: Placement, placing: Placing, trials: list[Trial]) -> dict
 
 def _start(
     table: Placement,
-    placing: Placing,
+    placing: PanelDesign,
     scored: Coverage,
     tried: dict[str, Any],
     seed: int,
@@ -152,7 +162,7 @@ def _start(
 
 def _metrics(
     run: RunFile,
-    placing: Placing,
+    placing: PanelDesign,
     scored: Coverage,
     rows: list[dict[str, Any]],
     tried: dict[str, Any],
@@ -189,7 +199,7 @@ def _metrics(
 
 def _landscape(
     table: Placement,
-    placing: Placing,
+    placing: PanelDesign,
     trials: list[Trial],
     levels: Tensor,
     rows: list[dict[str, Any]],
@@ -203,7 +213,7 @@ def _landscape(
     return plotting.placements(along, best, ends)
 
 
-def _maps(run: RunFile, table: Placement, placing: Placing, state: dict[str, Tensor]) -> Any:
+def _maps(run: RunFile, table: Placement, placing: PanelDesign, state: dict[str, Tensor]) -> Any:
     """Path gain over the floor plan, without the panel and with it."""
     low, high = (
         torch.tensor(end, dtype=torch.float64)

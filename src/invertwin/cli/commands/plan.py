@@ -10,28 +10,28 @@ from rich.console import Console
 
 from invertwin.cli.fits.problem import (
     Problem,
-    another,
-    observations_of,
-    problem_of,
-    stages_of,
-    unknowns_of,
+    build_problem,
+    make_observations,
+    make_unknowns,
+    stage_runs,
+    with_new_recording,
 )
-from invertwin.cli.fits.scores import certainty_table
-from invertwin.cli.report import Table, finish, texts
-from invertwin.cli.schema import Plan, RunFile, SimulatedData, build
-from invertwin.cli.schema.run_file import need
-from invertwin.cli.terminal import progress
+from invertwin.cli.fits.scores import error_bar_table
+from invertwin.cli.report import ReportTable, load_texts, write_report
+from invertwin.cli.schema import PlanTable, RunFile, SimulatedData, build
+from invertwin.cli.schema.run_file import require_section
+from invertwin.cli.terminal import show_progress
 from invertwin.errors import InputError
-from invertwin.inversion import fit_at, planned
-from invertwin.inversion.confidence.planning import missed
-from invertwin.inversion.confidence.report import bars
+from invertwin.inversion import plan_error_bars, prepare_fit
+from invertwin.inversion.confidence.planning import fit_errors
+from invertwin.inversion.confidence.report import error_bar_metrics
 from invertwin.storage.folders import PARTS
 from invertwin.storage.run_folder import RunFolder
 
 
 def run_plan(
     run: RunFile, folder: RunFolder, console: Console, say: Callable[[str], None]
-) -> list[Table]:
+) -> list[ReportTable]:
     """State the error bars of a run that has not been recorded; return the tables to print.
 
     Simulated fits that an interrupted run has finished are not done again.
@@ -39,7 +39,7 @@ def run_plan(
     Raises:
         InputError: Data that are measured, not simulated; candidates of several sensors.
     """
-    begin, table = time.perf_counter(), run.plan or Plan()
+    begin, table = time.perf_counter(), run.plan or PlanTable()
     for own in [run, *run.observations.values()]:
         if own.data is not None and not isinstance(own.data, SimulatedData):
             raise InputError(
@@ -48,51 +48,56 @@ def run_plan(
             )
     wide, places = run, torch.zeros(0, 3)
     if table.candidates is not None:
-        radar = need(run, "radar", "positions to add")
+        radar = require_section(run, "radar", "positions to add")
         places = radar.model_copy(update={"positions": table.candidates}).poses(1)[0]
         every = [*radar.poses(1)[0].tolist(), *places.tolist()]
         wide = run.model_copy(update={"radar": radar.model_copy(update={"positions": every})})
-    own = problem_of(wide, console)
+    own = build_problem(wide, console)
     console.print("error bars")
-    with progress(console):
-        found, added = planned(_at_truth(own), len(places))
-    metrics: dict[str, Any] = {"task": "plan", **bars(found), "verdict_reasons": []}
-    first = len(own.first.radar.positions) - len(places)
+    with show_progress(console):
+        found, added = plan_error_bars(_prepare_fit_at_truth(own), len(places))
+    metrics: dict[str, Any] = {"task": "plan", **error_bar_metrics(found), "verdict_reasons": []}
+    first = len(own.first_sensor.radar.positions) - len(places)
     metrics["candidates"] = [
         {
             "position": places[one.frame - first].tolist(),
-            "share": one.share,
-            "standard_deviations": one.bars.deviations,
+            "share": one.deviation_ratio,
+            "standard_deviations": one.error_bars.deviations,
         }
         for one in added
     ]
-    metrics |= _compared(replace(own, run=run), found.deviations, folder, console, say)
+    metrics |= _compare_with_fits(replace(own, run=run), found.deviations, folder, console, say)
     metrics["wall_seconds"] = time.perf_counter() - begin
-    parts = [replace(certainty_table(metrics), title="Expected error bars")]
+    parts = [replace(error_bar_table(metrics), title="Expected error bars")]
     if added:
         ranked = enumerate(metrics["candidates"], 1)
         rows = [[str(rank), row["position"], row["share"]] for rank, row in ranked]
-        heads, note = ("rank", "position [m]", "deviations, times"), texts("notes")["candidates"]
-        parts.append(Table("Positions to add", heads, rows, note))
+        heads, note = (
+            ("rank", "position [m]", "deviations, times"),
+            load_texts("notes")["candidates"],
+        )
+        parts.append(ReportTable("Positions to add", heads, rows, note))
     status = f"{len(found.names)} parameters, {len(found.unobserved)} directions not observed."
-    return finish(folder, metrics, run.title or "Plan", status, parts, again="plan", note=run.note)
+    return write_report(
+        folder, metrics, run.title or "Plan", status, parts, again="plan", note=run.note
+    )
 
 
-def _at_truth(problem: Problem) -> Any:
+def _prepare_fit_at_truth(problem: Problem) -> Any:
     # Error bars are those of the last stage, which may have another model.
-    last = replace(problem, run=stages_of(problem.run)[-1][1])
-    return fit_at(
+    last = replace(problem, run=stage_runs(problem.run)[-1][1])
+    return prepare_fit(
         problem.truth,
-        observations_of(last),
-        unknowns_of(problem.run),
-        loss=build.made(problem.run, "loss"),
+        make_observations(last),
+        make_unknowns(problem.run),
+        loss=build.build_section(problem.run, "loss"),
         seed=problem.run.seed,
     )
 
 
-def _compared(
+def _compare_with_fits(
     problem: Problem,
-    stated: dict[str, float],
+    predicted_deviations: dict[str, float],
     folder: RunFolder,
     console: Console,
     say: Callable[[str], None],
@@ -106,7 +111,9 @@ def _compared(
         part = f"{PARTS}/fit_{number:03d}.json"
         row = folder.read_json(part)
         if row is None:
-            row = missed(_at_truth(another(problem, number + 1, console)))
+            row = fit_errors(
+                _prepare_fit_at_truth(with_new_recording(problem, number + 1, console))
+            )
             folder.write_json(part, row)
             done += 1
         left = (time.perf_counter() - begin) / max(done, 1) * (count - number - 1)
@@ -118,5 +125,7 @@ def _compared(
         "simulated_fits": count,
         "observed_deviations": spread,
         "observed_means": dict(zip(rows[0], errors.mean(0).tolist(), strict=True)),
-        "predicted_over_observed": {n: stated[n] / spread[n] for n in stated if spread.get(n)},
+        "predicted_over_observed": {
+            n: predicted_deviations[n] / spread[n] for n in predicted_deviations if spread.get(n)
+        },
     }

@@ -4,19 +4,19 @@ import torch
 from jaxtyping import Complex
 from torch import Tensor
 
-from invertwin.capture import ChirpSettings, adc_counts, settings_of, ti
-from invertwin.cli.schema import Raw, RunFile
-from invertwin.cli.schema.run_file import about
+from invertwin.capture import ChirpSettings, adc_counts, make_settings, ti
+from invertwin.cli.schema import RawTable, RunFile
+from invertwin.cli.schema.run_file import prefix_errors
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW
 from invertwin.storage.run_folder import RunFolder
 
 # A largest sample at this part of the full scale leaves room for those of other seeds.
-_HEADROOM = 1.25
+_FULL_SCALE_MARGIN = 1.25
 
 
-def settings_of_run(run: RunFile, radar: Radar) -> ChirpSettings:
+def make_chirp_settings(run: RunFile, radar: Radar) -> ChirpSettings:
     """Settings that would record what the run file simulates.
 
     Raises:
@@ -28,7 +28,7 @@ def settings_of_run(run: RunFile, radar: Radar) -> ChirpSettings:
             f'raw: expected radar.waveform.kind = "fmcw", got {type(radar.waveform).__name__}; '
             "raw files are those of FMCW boards: remove [raw]"
         )
-    raw = run.raw or Raw()
+    raw = run.raw or RawTable()
     ramp = raw.adc_start_time + radar.waveform.duration
     idle = 0.0
     if run.chirps is not None:
@@ -44,8 +44,8 @@ def settings_of_run(run: RunFile, radar: Radar) -> ChirpSettings:
                 f"{run.chirps.interval:g}; idle time comes on top"
             )
     board = None if run.radar is None else run.radar.board
-    with about("raw"):
-        return settings_of(
+    with prefix_errors("raw"):
+        return make_settings(
             radar.waveform,
             (board and board.transmitters) or len(radar.transmitters.positions),
             (board and board.receivers) or len(radar.receivers.positions),
@@ -57,7 +57,7 @@ def settings_of_run(run: RunFile, radar: Radar) -> ChirpSettings:
         )
 
 
-def write_raw(
+def write_raw_files(
     run: RunFile,
     radar: Radar,
     beat: Complex[Tensor, "frame chirp tx rx sample"] | Complex[Tensor, "frame tx rx sample"],
@@ -69,12 +69,12 @@ def write_raw(
         InputError: What no such file can hold.
     """
     assert run.raw is not None
-    settings = settings_of_run(run, radar)
+    settings = make_chirp_settings(run, radar)
     full_scale = run.raw.full_scale
     if full_scale is None:
         largest = float(torch.view_as_real(beat.resolve_conj()).abs().max())
-        full_scale = _HEADROOM * largest if largest > 0 else 1.0
-    with about("raw"):
+        full_scale = _FULL_SCALE_MARGIN * largest if largest > 0 else 1.0
+    with prefix_errors("raw"):
         data = adc_counts(beat, settings, full_scale)
         samples = folder.file("raw/capture.bin")
         ti.write_samples(samples, data)

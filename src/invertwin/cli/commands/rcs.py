@@ -10,22 +10,24 @@ import torch
 from torch import Tensor
 
 from invertwin import plotting
-from invertwin.capture import load_section
-from invertwin.cli.estimate import of_signature
-from invertwin.cli.report import Picture, Table, finish, picture, texts
+from invertwin.capture import load_rcs
+from invertwin.cli.estimate import estimate_rcs_resources
+from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import about, need
-from invertwin.cli.schema.signature import Measurement, Rcs
-from invertwin.cli.terminal import in_parts
+from invertwin.cli.schema.run_file import prefix_errors, require_section
+from invertwin.cli.schema.signature import RcsMeasurement, RcsTable
+from invertwin.cli.terminal import compute_in_parts
 from invertwin.errors import InputError
 from invertwin.scene import Scene
-from invertwin.signatures import Signature, decibels
+from invertwin.signatures import Signature, to_dbsm
 from invertwin.storage.run_folder import RunFolder
 
-_NOTHING = -200.0  # dBsm that rounding leaves where there is no field
-_SAME = 1e-6  # rad or share of the frequency by which a measured row may be off a swept one
-_MOST_PANELS = 4
-_Found = dict[str, Any]
+_MIN_LEVEL = -200.0  # dBsm that rounding leaves where there is no field
+_MATCH_TOLERANCE = (
+    1e-6  # rad or share of the frequency by which a measured row may be off a swept one
+)
+_MAX_PANELS = 4
+_RcsMetrics = dict[str, Any]
 
 
 def run_rcs(
@@ -33,21 +35,21 @@ def run_rcs(
     files: Mapping[str, Path],
     folder: RunFolder,
     say: Callable[[str], None],
-) -> list[Table]:
+) -> list[ReportTable]:
     """Compute every run file's signature, write the folder, and return the tables to print."""
     begin = time.perf_counter()
-    scenes: dict[str, _Found] = {}
-    pictures: list[Picture] = []
+    scenes: dict[str, _RcsMetrics] = {}
+    pictures: list[ReportPicture] = []
 
-    def compute(name: str, run: RunFile) -> _Found:
+    def compute(name: str, run: RunFile) -> _RcsMetrics:
         say(name)
-        return _signature(name, run, folder)
+        return _compute_rcs(name, run, folder)
 
-    for name, run, found in in_parts(runs, files, folder, compute):
+    for name, run, found in compute_in_parts(runs, files, folder, compute):
         scenes[name] = found
         for file, title in found.pop("pictures").items():
             title = title if len(runs) == 1 else f"{name}: {title}"
-            pictures.append(Picture(title, folder.file(f"{file}.png").read_bytes(), run.note))
+            pictures.append(ReportPicture(title, folder.file(f"{file}.png").read_bytes(), run.note))
     metrics = {"task": "rcs", "scenes": scenes, "wall_seconds": time.perf_counter() - begin}
     if len(scenes) == 1:
         metrics |= next(iter(scenes.values()))
@@ -63,48 +65,53 @@ def run_rcs(
             stacklevel=2,
         )
         status += f" Skipped a comparison: {missing}."
-    return finish(
-        folder, metrics, "Radar signatures", status, [*_tables(scenes), *pictures], again="rcs"
+    return write_report(
+        folder, metrics, "Radar signatures", status, [*_make_tables(scenes), *pictures], again="rcs"
     )
 
 
-def _signature(name: str, run: RunFile, folder: RunFolder) -> _Found:
+def _compute_rcs(name: str, run: RunFile, folder: RunFolder) -> _RcsMetrics:
     begin = time.perf_counter()
-    table: Rcs = need(run, "rcs", "rcs")
+    table: RcsTable = require_section(run, "rcs", "rcs")
     scene = build.scene(run)
-    of_signature(run, scene).require()
-    with about("rcs"):
+    estimate_rcs_resources(run, scene).require_available()
+    with prefix_errors("rcs"):
         found = table.build({Scene: scene})
-    kept: _Found = {
+    kept: _RcsMetrics = {
         "peak_dbsm": {
-            channel: _level(found.dbsm[:, :, i, j]) for channel, (i, j) in table.channels.items()
+            channel: _peak_level(found.dbsm[:, :, i, j])
+            for channel, (i, j) in table.channels.items()
         }
     }
     if table.cases:
-        kept["error_db"] = {case: _error(table, case, found) for case in table.cases}
-    measured, skipped = _measured(table, found)
+        kept["error_db"] = {case: _case_error(table, case, found) for case in table.cases}
+    measured, skipped = _load_measurements(table, found)
     if measured:
-        kept["mean_db"] = {key: _mean(found.dbsm, *rest) for key, rest in measured.items()}
+        kept["mean_db"] = {
+            key: _mean_difference(found.dbsm, *rest) for key, rest in measured.items()
+        }
         optics = [v for part, v in found.parts.items() if part.startswith("order")]
-        alone = decibels(torch.stack(optics).sum(0))
-        kept["mean_db_optics"] = {key: _mean(alone, *rest) for key, rest in measured.items()}
+        alone = to_dbsm(torch.stack(optics).sum(0))
+        kept["mean_db_optics"] = {
+            key: _mean_difference(alone, *rest) for key, rest in measured.items()
+        }
     if skipped:
         kept["skipped"] = skipped
-    folder.write_text(f"{name}.csv", _rows(table, found))
-    kept["pictures"] = _pictures(name, table, found, measured, folder)
+    folder.write_text(f"{name}.csv", _format_csv(table, found))
+    kept["pictures"] = _draw_pictures(name, table, found, measured, folder)
     return kept | {"seconds": time.perf_counter() - begin}
 
 
-def _level(levels: Tensor) -> float | None:
+def _peak_level(levels: Tensor) -> float | None:
     """The largest, unless it is none."""
     level = float(levels.max())
-    return level if level > _NOTHING else None
+    return level if level > _MIN_LEVEL else None
 
 
-def _error(table: Rcs, name: str, found: Signature) -> float:
+def _case_error(table: RcsTable, name: str, found: Signature) -> float:
     """How far a case is from what it should be, in dB."""
     case = table.cases[name]
-    with about(f"rcs.cases.{name}"):
+    with prefix_errors(f"rcs.cases.{name}"):
         if case.part is not None and case.part not in found.parts:
             raise InputError(
                 f"expected a part ({', '.join(found.parts)}), got {case.part}; choose one", "part"
@@ -113,28 +120,32 @@ def _error(table: Rcs, name: str, found: Signature) -> float:
     whole = found.matrix if case.part is None else found.parts[case.part]
     i, j = table.channels[case.channel]
     truth = 10 * torch.log10(oracle.section(found.frequencies, found.directions))
-    error = decibels(whole[:, :, i, j]) - truth
+    error = to_dbsm(whole[:, :, i, j]) - truth
     return float(error.square().mean().sqrt() if case.statistic == "rms" else error.abs().max())
 
 
-_Rows = tuple[Tensor, Tensor, Tensor, tuple[int, int]]  # frequency, aspect, level, channel
+_MeasuredRows = tuple[Tensor, Tensor, Tensor, tuple[int, int]]  # frequency, aspect, level, channel
 
 
-def _measured(table: Rcs, found: Signature) -> tuple[dict[str, _Rows], list[str]]:
+def _load_measurements(
+    table: RcsTable, found: Signature
+) -> tuple[dict[str, _MeasuredRows], list[str]]:
     """Measured rows that were swept, by frequency and polarisation; and what is not there."""
-    rows: dict[str, _Rows] = {}
+    rows: dict[str, _MeasuredRows] = {}
     skipped: list[str] = []
     for number, measurement in enumerate(table.measured):
         if not Path(measurement.file).exists():
             skipped.append(measurement.file)
             continue
-        with about(f"rcs.measured[{number}]"):
-            rows |= _of_file(table, measurement, found)
+        with prefix_errors(f"rcs.measured[{number}]"):
+            rows |= _match_measurement(table, measurement, found)
     return rows, skipped
 
 
-def _of_file(table: Rcs, measurement: Measurement, found: Signature) -> dict[str, _Rows]:
-    data = load_section(measurement.file)
+def _match_measurement(
+    table: RcsTable, measurement: RcsMeasurement, found: Signature
+) -> dict[str, _MeasuredRows]:
+    data = load_rcs(measurement.file)
     towards = torch.stack(
         [data.theta.sin() * data.phi.cos(), data.theta.sin() * data.phi.sin(), data.theta.cos()], 1
     )
@@ -142,7 +153,7 @@ def _of_file(table: Rcs, measurement: Measurement, found: Signature) -> dict[str
     off, aspect = apart.min(1)
     share = (data.frequency[:, None] / found.frequencies - 1).abs()
     other, frequency = share.min(1)
-    same = (off < _SAME) & (other < _SAME)
+    same = (off < _MATCH_TOLERANCE) & (other < _MATCH_TOLERANCE)
     if not bool(same.any()):
         raise InputError(
             f"expected rows of swept angles and frequencies, got none of {len(same)} in "
@@ -150,7 +161,7 @@ def _of_file(table: Rcs, measurement: Measurement, found: Signature) -> dict[str
             "file",
         )
     channel = table.channels[measurement.channel]
-    keys: dict[str, _Rows] = {}
+    keys: dict[str, _MeasuredRows] = {}
     for f in frequency[same].unique().tolist():
         own = same & (frequency == f)
         letter = (
@@ -161,25 +172,29 @@ def _of_file(table: Rcs, measurement: Measurement, found: Signature) -> dict[str
     return keys
 
 
-def _mean(
+def _mean_difference(
     levels: Tensor, frequency: Tensor, aspect: Tensor, measured: Tensor, channel: tuple[int, int]
 ) -> float:
     """Mean absolute difference from the measurement in dB."""
     return float((levels[frequency, aspect, channel[0], channel[1]] - measured).abs().mean())
 
 
-def _pictures(
-    name: str, table: Rcs, found: Signature, measured: Mapping[str, _Rows], folder: RunFolder
+def _draw_pictures(
+    name: str,
+    table: RcsTable,
+    found: Signature,
+    measured: Mapping[str, _MeasuredRows],
+    folder: RunFolder,
 ) -> dict[str, str]:
     """Draw what was found; file names and titles."""
     shown = {name: "Radar cross-section"}
-    angles, label = table.angles
+    angles, label = table.swept_angles
     first, *_, second = table.channels.values()
     names = {at: channel for channel, at in table.channels.items()}
     levels = found.dbsm
     panels: dict[str, dict[str, Tensor]] = {}
     if len(angles) > 1:
-        for f, frequency in enumerate(found.frequencies.tolist()[:_MOST_PANELS]):
+        for f, frequency in enumerate(found.frequencies.tolist()[:_MAX_PANELS]):
             curves = {names[at]: levels[f, :, at[0], at[1]] for at in (first, second)}
             for rows in measured.values():
                 if int(rows[0][0]) == f:
@@ -187,39 +202,39 @@ def _pictures(
                     line[rows[1]] = rows[2]
                     curves[f"measured {names[rows[3]]}"] = line
             panels[f"{frequency / 1e9:g} GHz"] = curves
-        figure = plotting.sections(panels, angles, label)
+        figure = plotting.rcs_curves(panels, angles, label)
     else:
         panels[""] = {names[at]: levels[:, 0, at[0], at[1]] for at in (first, second)}
-        figure = plotting.sections(panels, found.frequencies / 1e9, "frequency [GHz]")
-    picture(folder, name, figure)
+        figure = plotting.rcs_curves(panels, found.frequencies / 1e9, "frequency [GHz]")
+    save_picture(folder, name, figure)
     if table.profile:
-        with about("rcs.profile"):
+        with prefix_errors("rcs.profile"):
             ranges, profile = found.range_profile()
-        figure = plotting.profile(decibels(profile[..., 0, 0]), ranges, angles, label)
-        picture(folder, f"{name}_profile", figure)
+        figure = plotting.rcs_profile(to_dbsm(profile[..., 0, 0]), ranges, angles, label)
+        save_picture(folder, f"{name}_profile", figure)
         shown[f"{name}_profile"] = f"Range profile, {names[first]}"
     if table.image is not None:
         side = table.image
-        axes = _plane(found)
+        axes = _image_axes(found)
         steps = torch.linspace(-side.extent, side.extent, side.pixels, dtype=torch.float64)
         across, along = torch.meshgrid(steps, steps, indexing="xy")
         points = across[..., None] * axes[1] + along[..., None] * axes[0]
-        figure = plotting.focused(
-            decibels(found.image(points)[..., 0, 0]),
+        figure = plotting.rcs_image(
+            to_dbsm(found.image(points)[..., 0, 0]),
             side.extent,
             ("across [m]", "towards the middle aspect [m]"),
         )
-        picture(folder, f"{name}_image", figure)
+        save_picture(folder, f"{name}_image", figure)
         shown[f"{name}_image"] = f"Image, {names[first]}"
     return shown
 
 
-def _plane(found: Signature) -> tuple[Tensor, Tensor]:
+def _image_axes(found: Signature) -> tuple[Tensor, Tensor]:
     """Unit vectors towards the middle of the sweep, and across in its plane."""
     middle = found.directions[len(found.directions) // 2]
     across = found.directions[-1] - found.directions[0]
     across = across - (across @ middle) * middle
-    if float(across.norm()) < _SAME:
+    if float(across.norm()) < _MATCH_TOLERANCE:
         raise InputError(
             "expected several aspects for an image, got one direction; sweep an angle",
             "rcs.image",
@@ -227,7 +242,7 @@ def _plane(found: Signature) -> tuple[Tensor, Tensor]:
     return middle, across / across.norm()
 
 
-def _rows(table: Rcs, found: Signature) -> str:
+def _format_csv(table: RcsTable, found: Signature) -> str:
     """All of S as text."""
     names = list(table.channels)
     lines = ["frequency_hz,x,y,z," + ",".join(f"{n}_re_m,{n}_im_m" for n in names)]
@@ -245,20 +260,22 @@ def _rows(table: Rcs, found: Signature) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _tables(scenes: Mapping[str, _Found]) -> list[Table]:
+def _make_tables(scenes: Mapping[str, _RcsMetrics]) -> list[ReportTable]:
     peaks = [[name, *found["peak_dbsm"].values()] for name, found in scenes.items()]
     letters = {tuple(found["peak_dbsm"]) for found in scenes.values()}
     columns = letters.pop() if len(letters) == 1 else ("co-polar", "cross", "cross", "orthogonal")
-    note = texts("notes")["rcs_peaks"]
-    tables = [Table("Peaks [dBsm]", ["target", *columns], peaks, note)]
+    note = load_texts("notes")["rcs_peaks"]
+    tables = [ReportTable("Peaks [dBsm]", ["target", *columns], peaks, note)]
     cases = [
         [name, case, error]
         for name, found in scenes.items()
         for case, error in found.get("error_db", {}).items()
     ]
     if cases:
-        note = texts("notes")["rcs_cases"]
-        tables.append(Table("Against what is known", ["target", "case", "error [dB]"], cases, note))
+        note = load_texts("notes")["rcs_cases"]
+        tables.append(
+            ReportTable("Against what is known", ["target", "case", "error [dB]"], cases, note)
+        )
     rows = [
         [name, key, error, found["mean_db_optics"][key]]
         for name, found in scenes.items()
@@ -266,6 +283,6 @@ def _tables(scenes: Mapping[str, _Found]) -> list[Table]:
     ]
     if rows:
         columns = ["target", "frequency, polarisation", "mean error [dB]", "physical optics alone"]
-        note = texts("notes")["rcs_measured"]
-        tables.append(Table("Against measurements", columns, rows, note))
+        note = load_texts("notes")["rcs_measured"]
+        tables.append(ReportTable("Against measurements", columns, rows, note))
     return tables

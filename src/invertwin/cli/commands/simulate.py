@@ -13,12 +13,16 @@ from invertwin import plotting
 from invertwin.capture import Capture, ChirpData
 from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid, Sampling
-from invertwin.cli.commands.raw_files import settings_of_run, write_raw
-from invertwin.cli.estimate import Sensor, require_room
-from invertwin.cli.exact_signals import _simulated, chirp_train, exact
-from invertwin.cli.report import Table, finish, picture, quantities
+from invertwin.cli.commands.raw_files import make_chirp_settings, write_raw_files
+from invertwin.cli.estimate import SensorSetup, require_resources
+from invertwin.cli.exact_signals import (
+    _require_simulated_data,
+    simulate_chirp_beats,
+    simulate_exact,
+)
+from invertwin.cli.report import ReportTable, quantity_table, save_picture, write_report
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import about, need
+from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.models.radar import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, doppler_maps, velocity_span
 from invertwin.radar.radar import Radar
@@ -27,18 +31,20 @@ from invertwin.scene.files import save_mesh
 from invertwin.storage.run_folder import RunFolder
 
 _SURROGATE_SAMPLES = 2_000_000
-_Outcome = tuple[torch.Tensor, dict[str, Any], Figure, str]  # signals, metrics, picture, its note
+_SimulationOutcome = tuple[
+    torch.Tensor, dict[str, Any], Figure, str
+]  # signals, metrics, picture, its note
 
 
-def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
+def run_simulate(run: RunFile, folder: RunFolder) -> list[ReportTable]:
     """Simulate the true scene of a run file, write the folder, return the tables to print."""
     scene = build.true_scene(run)
-    radar = build.radar(need(run, "radar", "simulate"))
-    grid = build.grid(need(run, "grid", "simulate"), radar)
+    radar = build.radar(require_section(run, "radar", "simulate"))
+    grid = build.grid(require_section(run, "grid", "simulate"), radar)
     if run.raw is not None:
-        settings_of_run(run, radar)  # its errors come before any work
-    require_room(run, scene, {"": Sensor(run, radar, grid)})
-    simulated = _frames if run.chirps is None else _chirps
+        make_chirp_settings(run, radar)  # its errors come before any work
+    require_resources(run, scene, {"": SensorSetup(run, radar, grid)})
+    simulated = _simulate_frames if run.chirps is None else _simulate_moving_frames
     beat, found, figure, note = simulated(run, folder, scene, radar, grid)
     metrics = {
         "task": "simulate",
@@ -48,27 +54,29 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[Table]:
         **found,
     }
     if run.raw is not None:
-        metrics |= write_raw(run, radar, beat, folder)
+        metrics |= write_raw_files(run, radar, beat, folder)
     save_mesh(folder.file("twin.ply"), scene)
     view = plotting.scene(scene, radar, highlight=list(run.truth))
     shown = ("spectra", "Spectra") if run.chirps is None else ("doppler", "First frame")
     parts = [
-        quantities("Simulation", metrics),
-        picture(folder, "scene", view),
-        picture(folder, shown[0], figure, shown[1], note),
+        quantity_table("Simulation", metrics),
+        save_picture(folder, "scene", view),
+        save_picture(folder, shown[0], figure, shown[1], note),
     ]
     count = f"{found['chirps']} chirps a frame" if run.chirps else f"{found['paths']} paths"
     status = f"{count}, {radar.frame_count} frames."
     title = run.title or "Simulation"
-    return finish(folder, metrics, title, status, parts, again="simulate", note=run.note)
+    return write_report(folder, metrics, title, status, parts, again="simulate", note=run.note)
 
 
-def _frames(run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid) -> _Outcome:
+def _simulate_frames(
+    run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid
+) -> _SimulationOutcome:
     """One ramp a frame, beside what the surrogate makes of the scene."""
     begin = time.perf_counter()
-    found = exact(run, scene, radar, grid)
+    found = simulate_exact(run, scene, radar, grid)
     seconds = time.perf_counter() - begin
-    data = _simulated(run)
+    data = _require_simulated_data(run)
     sampling = Sampling(depth=data.depth, samples=_SURROGATE_SAMPLES)
     model = SurrogateMap(grid, sampling=sampling)
     with torch.no_grad():
@@ -77,7 +85,7 @@ def _frames(run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: G
     one_bounce = replace(model, sampling=Sampling(1, points_per_m2=data.points_per_m2))
     metrics = {
         "paths": len(found.paths),
-        **_peak(found.spectrum, grid),
+        **_find_peak(found.spectrum, grid),
         "surrogate_correlation": surrogate_correlation(
             scene, radar.frames([0]), one_bounce, seed=run.seed
         ),
@@ -87,31 +95,33 @@ def _frames(run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: G
     return found.beat, metrics, plotting.spectrum(maps, grid), "surrogate"
 
 
-def _chirps(run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid) -> _Outcome:
+def _simulate_moving_frames(
+    run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid
+) -> _SimulationOutcome:
     """Several ramps a frame, between which objects move."""
-    table = need(run, "chirps", "several ramps a frame")
+    table = require_section(run, "chirps", "several ramps a frame")
     begin = time.perf_counter()
     chirps = table.build()
-    beat = chirp_train(run, scene, radar, chirps)
+    beat = simulate_chirp_beats(run, scene, radar, chirps)
     seconds = time.perf_counter() - begin
     maps = doppler_maps(beat, radar, grid, chirps)
     if table.tdm and isinstance(radar.waveform, FMCW):
         arrays = (radar.transmitters, radar.receivers)
         folder.file("chirps.npy")
-        with about("chirps"):
-            data = ChirpData(beat, replace(settings_of_run(run, radar), real=False))
+        with prefix_errors("chirps"):
+            data = ChirpData(beat, replace(make_chirp_settings(run, radar), real=False))
             described_arrays.write_chirps(folder.file("chirps.toml"), data, "chirps.npy", arrays)
     metrics = {
         "chirps": chirps.count,
         "velocity_span_m_s": velocity_span(radar, chirps),
-        **maps.strongest.metrics("peak"),
-        **({} if maps.mover is None else maps.mover.metrics("mover")),
+        **maps.strongest_peak.metrics("peak"),
+        **({} if maps.moving_peak is None else maps.moving_peak.metrics("mover")),
         "wall_seconds": seconds,
     }
     return beat, metrics, plotting.range_doppler(maps), "doppler"
 
 
-def _peak(spectrum: torch.Tensor, grid: Grid) -> dict[str, float | None]:
+def _find_peak(spectrum: torch.Tensor, grid: Grid) -> dict[str, float | None]:
     """Where the power, summed over frames, is largest, and the largest of one frame in dB."""
     total = spectrum.sum(0)
     r, u, v = np.unravel_index(int(total.argmax()), total.shape)

@@ -10,82 +10,84 @@ import torch
 
 from invertwin.capture import Capture, ChirpCapture
 from invertwin.cli.commands.look import read_recording
-from invertwin.cli.exact_signals import exact
-from invertwin.cli.options import Find
-from invertwin.cli.report import Picture, Table, finish, picture, texts
+from invertwin.cli.exact_signals import simulate_exact
+from invertwin.cli.options import TwinOptions
+from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
 from invertwin.cli.schema import build
 from invertwin.cli.schema.recordings import SimulatedData
-from invertwin.cli.schema.run_file import about_file, is_run_file, load_run, need
-from invertwin.discovery import Twin, still_capture, twin
+from invertwin.cli.schema.run_file import is_run_file, load_run, prefix_file_errors, require_section
+from invertwin.discovery import Twin, average_chirps, twin
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.inversion.metrics import compare_shapes
 from invertwin.plotting import found as pictures
 from invertwin.plotting import spectrum
-from invertwin.scene import RoughDielectric, Scene, joined, save_mesh
+from invertwin.scene import RoughDielectric, Scene, merge_meshes, save_mesh
 from invertwin.storage.run_folder import RunFolder
 
-_SURE = 0.5  # confidence of things that are counted
+_MIN_EXISTENCE_PROBABILITY = 0.5  # confidence of things that are counted
 # Of the command line; they win over those of a run file.
-_OPTIONS = ("low", "high", "range_max", "level", "height", "up", "rays", "seed")
+_TWIN_OPTION_NAMES = ("low", "high", "range_max", "level", "height", "up", "rays", "seed")
 
 
-def run_twin(find: Find, folder: RunFolder) -> list[Table]:
+def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
     """Read a recording, search it, write the twin; return the tables to print.
 
     Raises:
         InputError: A recording or options that do not fit each other; nothing has been written.
     """
     begin = time.perf_counter()
-    stated = {name: getattr(find, name) for name in _OPTIONS}
+    stated = {name: getattr(arguments, name) for name in _TWIN_OPTION_NAMES}
     options = {name: value for name, value in stated.items() if value is not None}
     truth = None
-    if is_run_file(find.recording):
-        recording, truth, table = _of_run_file(find)
+    if is_run_file(arguments.recording):
+        recording, truth, table = _load_run_file(arguments)
         options = table | options
     else:
-        _, recording = read_recording(find)
+        _, recording = read_recording(arguments)
     ground = Ground(options.get("up", "y"))
     rest = {name: value for name, value in options.items() if name != "up"}
     found = twin(recording, ground=ground, **rest)
-    sure = [thing for thing in found.things if thing.confidence > _SURE]
+    sure = [
+        thing for thing in found.objects if thing.existence_probability > _MIN_EXISTENCE_PROBABILITY
+    ]
     metrics: dict[str, Any] = {
         "task": "twin",
-        "things": [thing.row() for thing in found.things],
+        "things": [thing.to_metrics() for thing in found.objects],
         "count": len(sure),
-        "unsure": len(found.things) - len(sure),
+        "unsure": len(found.objects) - len(sure),
         "notes": list(found.notes),
     }
-    if found.picture is not None:
-        metrics["never_seen_share"] = float((found.picture.views == 0).double().mean())
+    if found.image is not None:
+        metrics["never_seen_share"] = float((found.image.view_counts == 0).double().mean())
     scene = found.scene
     if scene is not None and found.predicted is not None and found.observed is not None:
         explained = found.observed.double().log() - found.predicted.double().log()
         metrics["residual_log_std"] = float(explained.std())
     if truth is not None and scene is not None:
-        metrics |= _scores(scene, truth)
+        metrics |= _score_twin(scene, truth)
     metrics["wall_seconds"] = time.perf_counter() - begin
     if scene is not None:
         save_mesh(folder.file("twin.glb"), scene)
-        folder.write_text("twin.toml", tomli_w.dumps(_described(found, folder)))
-    parts: list[Table | Picture] = [_table(found)]
+        folder.write_text("twin.toml", tomli_w.dumps(_describe_as_run(found, folder)))
+    parts: list[ReportTable | ReportPicture] = [_object_table(found)]
     parts += [
-        picture(folder, "ground", pictures.ground(found), "The ground from above", "ground"),
-        *_maps(found, folder),
+        save_picture(folder, "ground", pictures.ground(found), "The ground from above", "ground"),
+        *_draw_maps(found, folder),
     ]
     said = "; ".join(found.notes) or f"{len(sure)} things, {metrics['unsure']} unsure ones"
-    title = find.recording.name
-    still = still_capture(recording)
+    title = arguments.recording.name
+    still = average_chirps(recording)
     if found.calibration is not None:
         found.calibration.save(folder.file("channels.json"))
         still = found.calibration.apply(still)
     still.save(folder.file("capture.nc"))
     # Movers are in the chirps alone, which a capture does not keep.
     name = title if isinstance(recording, ChirpCapture) else "capture.nc"
-    again = " ".join(["twin", name, *_stated(options)])
-    return finish(folder, metrics, title, f"{said}.", parts, again=again)
+    again = " ".join(["twin", name, *_to_arguments(options)])
+    return write_report(folder, metrics, title, f"{said}.", parts, again=again)
 
 
-def _stated(options: dict[str, Any]) -> list[str]:
+def _to_arguments(options: dict[str, Any]) -> list[str]:
     """Options as the command line takes them."""
     found: list[str] = []
     for name, value in options.items():
@@ -94,27 +96,27 @@ def _stated(options: dict[str, Any]) -> list[str]:
     return found
 
 
-def _of_run_file(
-    find: Find,
+def _load_run_file(
+    options: TwinOptions,
 ) -> tuple[Capture | ChirpCapture, Scene | None, dict[str, Any]]:
     """The data of a run file, what is true of them, and what it says of the search."""
-    with about_file(find.recording):
-        run = load_run(find.recording)
+    with prefix_file_errors(options.recording):
+        run = load_run(options.recording)
         given = {} if run.twin is None else run.twin.model_dump(exclude_none=True)
         given["seed"] = run.seed
-        data = need(run, "data", "a twin")
+        data = require_section(run, "data", "a twin")
         if not isinstance(data, SimulatedData):
             return data.build(), None, given
-        radar = build.radar(need(run, "radar", "simulated data"))
-        grid = build.grid(need(run, "grid", "simulated data"), radar)
+        radar = build.radar(require_section(run, "radar", "simulated data"))
+        grid = build.grid(require_section(run, "grid", "simulated data"), radar)
         truth = build.true_scene(run)
-        capture = Capture.from_beat(exact(run, truth, radar, grid).beat, radar)
+        capture = Capture.from_beat(simulate_exact(run, truth, radar, grid).beat, radar)
         return capture, truth, given
 
 
-def _scores(scene: Scene, truth: Scene) -> dict[str, Any]:
+def _score_twin(scene: Scene, truth: Scene) -> dict[str, Any]:
     whole = [
-        joined(
+        merge_meshes(
             [replace(item.mesh, vertices=item.vertices.detach()) for item in one.objects.values()]
         )
         for one in (scene, truth)
@@ -125,61 +127,61 @@ def _scores(scene: Scene, truth: Scene) -> dict[str, Any]:
     }
 
 
-def _table(found: Twin) -> Table:
-    up = found.ground.vertical
+def _object_table(twin: Twin) -> ReportTable:
+    up = twin.ground.up_axis
     heads = ["thing", "kind", "confidence", *(f"{'xyz'[axis]} [m]" for axis in range(3))]
     heads += ["± [m]", "yaw [°]", "length, width, height [m]", "speed [m/s]"]
     rows: list[list[Any]] = []
-    for thing in found.things:
-        figure = thing.figure
+    for thing in twin.objects:
+        figure = thing.shape
         along = [*("xyz"[axis] for axis in range(3) if axis != up), "range", "across"]
         known = [thing.deviations[name] for name in along if name in thing.deviations]
         size, yaw, rate = None, None, None
         if figure is not None:
             size = None if figure.kind == "corner" else [figure.length, figure.width, figure.height]
-            yaw = math.degrees(figure.yaw) if figure.turned else None
+            yaw = math.degrees(figure.yaw) if figure.has_yaw else None
         if thing.velocity is not None:
             rate = float(thing.velocity.norm())
         share = f"{thing.kind} {thing.probabilities.get(thing.kind, 1.0):.2f}"
-        row = [thing.name, share, thing.confidence, *thing.position.tolist()]
+        row = [thing.name, share, thing.existence_probability, *thing.position.tolist()]
         rows.append([*row, max(known) if known else None, yaw, size, rate])
-    return Table("Things", heads, rows, texts("notes")["things"])
+    return ReportTable("Things", heads, rows, load_texts("notes")["things"])
 
 
-def _maps(found: Twin, folder: RunFolder) -> list[Picture]:
-    if found.predicted is None or found.observed is None or found.grid is None:
+def _draw_maps(twin: Twin, folder: RunFolder) -> list[ReportPicture]:
+    if twin.predicted is None or twin.observed is None or twin.grid is None:
         return []
-    shown = {"recording": found.observed, "twin": found.predicted}
-    ratio = found.observed.double() / found.predicted.double()
-    shown["recording over twin"] = ratio.to(found.observed)
-    return [picture(folder, "maps", spectrum(shown, found.grid), "Maps", "twin_maps")]
+    shown = {"recording": twin.observed, "twin": twin.predicted}
+    ratio = twin.observed.double() / twin.predicted.double()
+    shown["recording over twin"] = ratio.to(twin.observed)
+    return [save_picture(folder, "maps", spectrum(shown, twin.grid), "Maps", "twin_maps")]
 
 
-def _described(found: Twin, folder: RunFolder) -> dict[str, Any]:
+def _describe_as_run(twin: Twin, folder: RunFolder) -> dict[str, Any]:
     """A run file that simulates the things that have a shape, and fits their poses on."""
-    assert found.grid is not None
-    assert found.scene is not None
+    assert twin.grid is not None
+    assert twin.scene is not None
     scene: dict[str, Any] = {}
-    axis = found.ground.vertical
-    for thing in found.things:
-        if (figure := thing.figure) is None:
+    axis = twin.ground.up_axis
+    for thing in twin.objects:
+        if (figure := thing.shape) is None:
             continue
         turn = [0.0, 0.0, 0.0]
         turn[axis] = math.degrees(figure.yaw)
         sides = [figure.length] * 3
-        sides[found.ground.level[1]] = figure.width
+        sides[twin.ground.plane_axes[1]] = figure.width
         sides[axis] = figure.height
         shape: dict[str, Any] = {"shape": "sphere", "radius": 0.5 * figure.length}
         if figure.kind in ("person", "vehicle", "corner", "prism"):
-            item = found.scene.objects[thing.name]
+            item = twin.scene.objects[thing.name]
             mesh = replace(item.mesh, vertices=item.vertices - thing.position)
             save_mesh(folder.file(f"{thing.name}.ply"), mesh)
             shape = {"file": f"{thing.name}.ply"}
-        elif figure.boxed:
+        elif figure.is_rectangular:
             shape = {"shape": "box", "size": sides, "rotation_deg": turn}
         elif figure.kind == "cylinder":
             shape = {"shape": "cylinder", "radius": 0.5 * figure.length, "height": figure.height}
-            if found.ground.up == "z":
+            if twin.ground.up == "z":
                 shape["rotation_deg"] = [90.0, 0.0, 0.0]
         material = figure.material
         described: dict[str, Any] = {"kind": "rough_conductor"}
@@ -191,7 +193,7 @@ def _described(found: Twin, folder: RunFolder) -> dict[str, Any]:
             "position": thing.position.tolist(),
             "material": described,
         }
-    grid = found.grid
+    grid = twin.grid
     last = grid.range_start + grid.range_step * (grid.range_count - 1)
     return {
         "task": "reconstruct",

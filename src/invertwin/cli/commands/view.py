@@ -6,23 +6,23 @@ from pathlib import Path
 
 from rich.console import Console
 
-from invertwin.capture import Capture, shown_ranges
+from invertwin.capture import Capture, search_ranges
 from invertwin.channel import Grid
-from invertwin.cli.fits.displays import VIEW
-from invertwin.cli.fits.problem import fitted_objects, sensors_of
+from invertwin.cli.fits.displays import VIEW_FILE
+from invertwin.cli.fits.problem import build_sensors, fitted_objects
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import about_file, load_run
+from invertwin.cli.schema.run_file import load_run, prefix_file_errors
 from invertwin.errors import InputError
 from invertwin.radar import Radar
 from invertwin.viewer import (
     MEASURED,
+    AccessGuard,
     Display,
-    Guard,
-    Link,
-    Maps,
+    DisplayMaps,
+    InteractiveSensor,
     Viewer,
+    build_display,
     capture_layers,
-    display_of,
     page_html,
 )
 
@@ -42,8 +42,8 @@ def run_view(
         InputError: A target that is none of these, or a host without a token.
     """
     if record is None:
-        Guard(host, token)  # its errors come before any work
-    display, links = shown_of(target)
+        AccessGuard(host, token)  # its errors come before any work
+    display, links = load_display(target)
     if record is not None:
         record.write_text(page_html(display, links), encoding="utf-8")
         console.print(f"written: {record}", markup=False, soft_wrap=True)
@@ -55,7 +55,7 @@ def run_view(
             viewer.wait()
 
 
-def shown_of(target: Path) -> tuple[Display, dict[str, Link]]:
+def load_display(target: Path) -> tuple[Display, dict[str, InteractiveSensor]]:
     """What there is to see of a target, and by sensor what lets people move it.
 
     Args:
@@ -72,61 +72,65 @@ def shown_of(target: Path) -> tuple[Display, dict[str, Link]]:
                 f"expected a run folder with its run.toml, got {target} without one; name a folder "
                 "of invertwin reconstruct, simulate or twin, a run file, or a capture (.nc)"
             )
-        return _of_run(file, target)
+        return _display_of_run(file, target)
     if target.suffix == ".nc":
-        return _of_capture(target), {}
+        return _display_of_capture(target), {}
     if target.suffix == ".toml":
-        return _of_run(target, None)
+        return _display_of_run(target, None)
     raise InputError(
         f"expected a run folder, a run file (.toml) or a capture (.nc), got {target}; read other "
         "recordings with invertwin look, which writes a capture"
     )
 
 
-def _of_run(file: Path, folder: Path | None) -> tuple[Display, dict[str, Link]]:
+def _display_of_run(
+    file: Path, folder: Path | None
+) -> tuple[Display, dict[str, InteractiveSensor]]:
     run: RunFile = load_run(file)
-    with about_file(file):
+    with prefix_file_errors(file):
         scene, truth = build.scene(run), build.true_scene(run)
-        radars = _radars(run)
+        radars = _build_radars(run)
         title = run.title or file.stem
         names = fitted_objects(run)
         # Without a fit what stands there is shown where it stands.
-        own = truth if folder is None or not (folder / VIEW).exists() else scene
+        own = truth if folder is None or not (folder / VIEW_FILE).exists() else scene
         depth = run.reconstruct.depth if run.reconstruct else getattr(run.data, "depth", 1)
         links = {
-            name: Link(own, radar, grid, depth)
+            name: InteractiveSensor(own, radar, grid, depth)
             for name, (radar, grid) in radars.items()
             if grid is not None
         }
-        display = display_of(own, radars, title, fitted=names or list(run.truth))
-    if folder is not None and (folder / VIEW).exists():
-        display = Display.load(folder / VIEW)
+        display = build_display(own, radars, title, fitted=names or list(run.truth))
+    if folder is not None and (folder / VIEW_FILE).exists():
+        display = Display.load(folder / VIEW_FILE)
         for link in links.values():
             if display.steps:
-                link.take(display.steps[-1].bodies)
+                link.replace_meshes(display.steps[-1].bodies)
     elif folder is not None and (folder / "capture.nc").exists() and "" in links:
         capture, grid = Capture.load(folder / "capture.nc"), links[""].grid
-        display = replace(display, maps={"": Maps.of({MEASURED: capture.spectrum(grid)}, grid)})
+        display = replace(
+            display, maps={"": DisplayMaps.from_spectra({MEASURED: capture.spectrum(grid)}, grid)}
+        )
     return display, links
 
 
-def _radars(run: RunFile) -> dict[str, tuple[Radar, Grid | None]]:
+def _build_radars(run: RunFile) -> dict[str, tuple[Radar, Grid | None]]:
     """The radars of a run file with their bins, by name; none where it has no map of them."""
     if (run.observations or (run.data and run.grid)) and not run.map:
-        return {name: (own.radar, own.grid) for name, own in sensors_of(run).items()}
+        return {name: (own.radar, own.grid) for name, own in build_sensors(run).items()}
     if run.radar is None:
         return {}
     radar = build.radar(run.radar)
     return {"": (radar, None if run.grid is None else build.grid(run.grid, radar))}
 
 
-def _of_capture(file: Path) -> Display:
+def _display_of_capture(file: Path) -> Display:
     capture = Capture.load(file)
     radar, grid = capture.radar(), None
-    low, high = shown_ranges(capture, None, None) if "beat" in capture.dataset else (0.0, 0.0)
+    low, high = search_ranges(capture, None, None) if "beat" in capture.dataset else (0.0, 0.0)
     maps = {}
     if high > low:
         grid = radar.grid(low, high)
-        maps[""] = Maps.of({MEASURED: capture.spectrum(grid)}, grid)
-    display = display_of(None, {"": (radar, grid)}, file.name)
+        maps[""] = DisplayMaps.from_spectra({MEASURED: capture.spectrum(grid)}, grid)
+    display = build_display(None, {"": (radar, grid)}, file.name)
     return replace(display, layers=[*capture_layers(capture), *display.layers], maps=maps)

@@ -15,27 +15,27 @@ from invertwin.errors import InputError
 from invertwin.inversion import Callback
 from invertwin.inversion.fit import Fit
 from invertwin.scene import Scene
-from invertwin.scene.shape_models.density import without_clouds
+from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.folders import PARTS
 from invertwin.viewer import (
     MEASURED,
     SIMULATED,
-    Body,
     Display,
-    Maps,
-    Step,
-    body_of,
-    display_of,
+    DisplayMaps,
+    DisplayMesh,
+    DisplayStep,
+    build_display,
+    display_mesh,
     ellipsoid_layers,
     scene_layers,
 )
 
-VIEW = "view.npz"
+VIEW_FILE = "view.npz"
 """The file of a run folder that `invertwin view` shows."""
-_MOST_STEPS = 24  # of a fit, that are kept
+_MAX_STEPS = 24  # of a fit, that are kept
 
 
-class KeptSteps(Callback):
+class StepRecorder(Callback):
     """Keeps where a fit stood, in a file beside its checkpoint.
 
     Args:
@@ -52,19 +52,19 @@ class KeptSteps(Callback):
         names: Collection[str],
         total: int,
         every: int,
-        show: Callable[[Fit, Step], None] | None,
+        show: Callable[[Fit, DisplayStep], None] | None,
     ) -> None:
         self._file, self._names, self._show = file, names, show
-        self._apart, self._every = math.ceil(total / _MOST_STEPS), every
-        self._steps: list[Step] = []
+        self._apart, self._every = math.ceil(total / _MAX_STEPS), every
+        self._steps: list[DisplayStep] = []
         self._written = 0
 
     def begin(self, fit: Fit) -> None:
         """Note the start, or read what an interrupted run has kept."""
         if not self._steps:
-            self._steps = steps_in(self._file)
+            self._steps = load_steps(self._file)
         if not self._steps:
-            self._keep(fit, Step(0, "start", self._bodies(fit.twin())))
+            self._keep(fit, DisplayStep(0, "start", self._display_meshes(fit.twin())))
 
     def step(self, fit: Fit, row: dict[str, Any]) -> None:
         """Keep some of the steps."""
@@ -75,7 +75,7 @@ class KeptSteps(Callback):
             label = f"step {number}, loss {row['loss']:.4g}"
             # Parameters that the scene refuses have no picture; the fit ends as diverged.
             with suppress(InputError):
-                self._keep(fit, Step(number, label, self._bodies(fit.twin())))
+                self._keep(fit, DisplayStep(number, label, self._display_meshes(fit.twin())))
         if fit.progress.step % self._every == 0:
             self._write()
 
@@ -83,7 +83,7 @@ class KeptSteps(Callback):
         """Write what is kept."""
         self._write()
 
-    def _keep(self, fit: Fit, step: Step) -> None:
+    def _keep(self, fit: Fit, step: DisplayStep) -> None:
         self._steps.append(step)
         if self._show is not None:
             self._show(fit, step)
@@ -93,19 +93,19 @@ class KeptSteps(Callback):
             self._written = self._steps[-1].number
             Display("", [], self._steps).save(self._file)
 
-    def _bodies(self, scene: Scene) -> dict[str, Body]:
-        scene = without_clouds(scene)
+    def _display_meshes(self, scene: Scene) -> dict[str, DisplayMesh]:
+        scene = replace_clouds(scene)
         before = self._steps[-1].bodies if self._steps else {}
         found = {}
         for name in self._names:
-            body = body_of(scene[name])
+            body = display_mesh(scene[name])
             if name in before and np.array_equal(body.faces, before[name].faces):
-                body = Body(body.vertices, before[name].faces)  # kept once
+                body = DisplayMesh(body.vertices, before[name].faces)  # kept once
             found[name] = body
         return found
 
 
-def steps_file(checkpoint: str) -> str:
+def steps_path(checkpoint: str) -> str:
     """Where the steps of a fit are kept, as a path in the run's folder.
 
     Args:
@@ -114,22 +114,22 @@ def steps_file(checkpoint: str) -> str:
     return f"{PARTS}/{Path(checkpoint).stem}_steps.npz"
 
 
-def steps_in(file: Path) -> list[Step]:
+def load_steps(file: Path) -> list[DisplayStep]:
     """The steps that a fit has kept.
 
     Args:
-        file: Of `KeptSteps`.
+        file: Of `StepRecorder`.
     """
     return list(Display.load(file).steps) if file.exists() else []
 
 
-def display_of_fit(
+def make_fit_display(
     problem: Problem,
     start: Scene,
     twin: Scene,
     maps: Mapping[str, Sequence[Tensor]],
     metrics: Mapping[str, Any],
-    steps: Sequence[Step],
+    steps: Sequence[DisplayStep],
 ) -> Display:
     """A display of a fit that has ended.
 
@@ -141,35 +141,37 @@ def display_of_fit(
         metrics: Its error bars.
         steps: Those that were kept.
     """
-    display = display_of_problem(problem, twin)
+    display = make_problem_display(problem, twin)
     names = [name for name in fitted_objects(problem.run) if name in start.names]
-    more = scene_layers(start, "start", fitted=names, only=True)
+    more = scene_layers(start, "start", fitted=names, fitted_only=True)
     return replace(
         display,
         layers=[*display.layers, *more, *ellipsoid_layers(twin, metrics)],
         steps=steps,
-        maps=maps_of_sensors(problem, {MEASURED: maps["measured"], SIMULATED: maps["twin"]}),
+        maps=make_sensor_maps(problem, {MEASURED: maps["measured"], SIMULATED: maps["twin"]}),
     )
 
 
-def maps_of_sensors(
-    problem: Problem, spectra: Mapping[str, Sequence[Tensor]], most: int | None = None
-) -> dict[str, Maps]:
+def make_sensor_maps(
+    problem: Problem, spectra: Mapping[str, Sequence[Tensor]], max_values: int | None = None
+) -> dict[str, DisplayMaps]:
     """What the sensors of a fit see, by their names.
 
     Args:
         problem: What is fitted.
         spectra: Power [frame, range, u, v] of every sensor, by what is shown.
-        most: Values that are kept of a sensor, about; None = of a few megabytes.
+        max_values: Values that are kept of a sensor, about; None = of a few megabytes.
     """
-    limit = {} if most is None else {"most": most}
+    limit = {} if max_values is None else {"most": max_values}
     return {
-        name: Maps.of({what: own[k] for what, own in spectra.items()}, sight.grid, **limit)
-        for k, (name, sight) in enumerate(problem.sights.items())
+        name: DisplayMaps.from_spectra(
+            {what: own[k] for what, own in spectra.items()}, sight.grid, **limit
+        )
+        for k, (name, sight) in enumerate(problem.sensor_data.items())
     }
 
 
-def display_of_problem(problem: Problem, scene: Scene) -> Display:
+def make_problem_display(problem: Problem, scene: Scene) -> Display:
     """A display of a fit: its objects, the truth where it is known, the radars.
 
     Args:
@@ -177,7 +179,7 @@ def display_of_problem(problem: Problem, scene: Scene) -> Display:
         scene: The start or the twin.
     """
     names = [name for name in fitted_objects(problem.run) if name in scene.names]
-    known = any(name in problem.known for name in names)
-    sights = {name: (sight.radar, sight.grid) for name, sight in problem.sights.items()}
+    known = any(name in problem.known_objects for name in names)
+    sights = {name: (sight.radar, sight.grid) for name, sight in problem.sensor_data.items()}
     title = problem.run.title or "Reconstruction"
-    return display_of(scene, sights, title, truth=problem.truth if known else None, fitted=names)
+    return build_display(scene, sights, title, truth=problem.truth if known else None, fitted=names)

@@ -12,23 +12,23 @@ from rich.console import Console
 from torch import nn
 
 from invertwin.capture import calibrate
-from invertwin.cli.fits.displays import KeptSteps, steps_file
+from invertwin.cli.fits.displays import StepRecorder, steps_path
 from invertwin.cli.fits.problem import (
-    FULL,
+    OWN_METHOD,
     Problem,
     fitted_objects,
-    known_of,
-    models_of,
-    observations_of,
-    recorded_anew,
-    schedule_of,
-    settings_of,
-    unknowns_of,
-    varied,
+    has_recording_per_start,
+    known_truth,
+    make_models,
+    make_observations,
+    make_schedule,
+    make_unknowns,
+    require_settings,
+    with_method,
 )
-from invertwin.cli.fits.scores import scores
-from invertwin.cli.fits.shape_scores import CURVE, watch_of
-from invertwin.cli.fits.spreading import part_name
+from invertwin.cli.fits.scores import score_fit
+from invertwin.cli.fits.shape_scores import CURVE_KEY, make_shape_metric
+from invertwin.cli.fits.spreading import fit_file_stem
 from invertwin.cli.schema import build
 from invertwin.errors import InputError
 from invertwin.inversion import (
@@ -40,60 +40,60 @@ from invertwin.inversion import (
     Stage,
     Watch,
     reconstruct,
+    report_progress,
     search,
-    watched,
 )
-from invertwin.inversion.callbacks import stage_file
-from invertwin.inversion.confidence.report import certainty
+from invertwin.inversion.callbacks import stage_checkpoint_path
+from invertwin.inversion.confidence.report import confidence_metrics
 from invertwin.inversion.fit import Fit
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.scene import Object, Scene
-from invertwin.seeds import derived_seed
+from invertwin.seeds import derive_seed
 from invertwin.storage.folders import PARTS
 from invertwin.storage.run_folder import RunFolder
-from invertwin.viewer import Step
+from invertwin.viewer import DisplayStep
 
 
-def calibrated(
+def calibrate_problem(
     problem: Problem, folder: RunFolder, console: Console
 ) -> tuple[Problem, dict[str, Any]]:
     """The problem with range bias and clock offset found on an object whose place is known."""
     run, table = problem.run, problem.run.calibration
     if table is None:
         return problem, {}
-    if len(problem.sights) > 1:
+    if len(problem.sensor_data) > 1:
         raise InputError(
             "calibration: expected one sensor, got several; calibrate each recording by itself"
         )
-    sight, target = problem.first, problem.truth[table.object]
+    sight, target = problem.first_sensor, problem.truth[table.object]
     if table.method == "backprojection":
         capture, row = calibrate(sight.capture, target.center), {}
     else:
         bias, clock = RangeBias(), ClockOffset(sight.capture.positions)
-        own = replace(problem, run=run.varied(table))
-        schedule, (model,) = settings_of(own.run).build(), models_of(own)
-        with watched("calibration", schedule.steps, console) as shown:
+        own = replace(problem, run=run.apply_overrides(table))
+        schedule, (model,) = require_settings(own.run).build(), make_models(own)
+        with report_progress("calibration", schedule.steps, console) as shown:
             found = reconstruct(
                 Scene({table.object: target}),
                 Observation(model, sight.radar, sight.capture, parameters=[bias, clock]),
                 [],
-                loss=build.made(run, "loss"),
-                optimizer=build.made(own.run, "optimizer"),
+                loss=build.build_section(run, "loss"),
+                optimizer=build.build_section(own.run, "optimizer"),
                 schedule=schedule,
-                callbacks=[*shown, _checkpoint(problem, folder, f"{PARTS}/calibration.pt")],
+                callbacks=[*shown, _make_checkpoint(problem, folder, f"{PARTS}/calibration.pt")],
                 seed=run.seed,
             )
-        capture = sight.capture.recalibrated(
+        capture = sight.capture.recalibrate(
             sight.capture.clock_offset + float(clock.shift.detach()),
             sight.capture.range_bias + float(bias.bias.detach()),
         )
         row = {"loss": found.loss, "status": found.status}
     row |= {"clock_offset_s": capture.clock_offset, "range_bias_m": capture.range_bias}
     sight = replace(sight, capture=capture, radar=capture.radar())
-    return replace(problem, sights=dict.fromkeys(problem.sights, sight)), row
+    return replace(problem, sensor_data=dict.fromkeys(problem.sensor_data, sight)), row
 
 
-def fit(
+def run_fit(
     problem: Problem,
     start: Scene,
     index: int,
@@ -101,7 +101,7 @@ def fit(
     folder: RunFolder,
     console: Console,
     checkpoint: str | None,
-    show: Callable[[Fit, Step], None] | None = None,
+    show: Callable[[Fit, DisplayStep], None] | None = None,
 ) -> tuple[dict[str, Any], Callable[[], Reconstruction]]:
     """One fit, or what an interrupted run has kept of it.
 
@@ -118,85 +118,89 @@ def fit(
     Returns:
         The row of the fit, and a function that gives its outcome.
     """
-    part = part_name(mode, index)
+    part = fit_file_stem(mode, index)
     checkpoint = checkpoint or f"{part}.pt"
-    own = varied(problem, mode)
-    stages = schedule_of(own)
-    again = partial(_staged, own, stages, start, index, folder, checkpoint, show)
+    own = with_method(problem, mode)
+    stages = make_schedule(own)
+    again = partial(_fit_or_search, own, stages, start, index, folder, checkpoint, show)
     row = folder.read_json(f"{part}.json")
     if row is not None:
         # The checkpoints say what the fit found; nothing is fitted again.
         return row, lambda: again()[0]
     begin = time.perf_counter()
-    name = f"start {index + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
-    with watched(name, sum(stage.steps for stage in stages), console) as shown:
+    name = f"start {index + 1}" + ("" if mode == OWN_METHOD else f", {mode.replace('_', ' ')}")
+    with report_progress(name, sum(stage.steps for stage in stages), console) as shown:
         found, found_ends = again(shown)
     row = {
         "start": index,
-        **scores(own, start, found.scene),
+        **score_fit(own, start, found.scene),
         "loss": found.loss,
         "status": found.status,
-        "lost": found.lost,
+        "lost": found.is_uninformative,
         "steps": found.steps,
         "seconds": time.perf_counter() - begin,
-        "values": _values(found.parameters),
+        "values": _fitted_values(found.parameters),
         "checkpoint": found_ends.pop("checkpoint", checkpoint),
         **found_ends,
-        **(certainty(found, known_of(own)) if recorded_anew(own.run) else {}),
+        **(confidence_metrics(found, known_truth(own)) if has_recording_per_start(own.run) else {}),
         "losses": [step["loss"] for step in found.history],
-        "curve": [[step["step"] + 1, step[CURVE]] for step in found.history if CURVE in step],
+        "curve": [
+            [step["step"] + 1, step[CURVE_KEY]] for step in found.history if CURVE_KEY in step
+        ],
     }
     folder.write_json(f"{part}.json", row)
     # The twins of many recordings are read again, not kept.
-    return row, (lambda: again()[0]) if recorded_anew(own.run) else lambda: found
+    return row, (lambda: again()[0]) if has_recording_per_start(own.run) else lambda: found
 
 
-def _staged(
+def _fit_or_search(
     problem: Problem,
     stages: Sequence[Stage],
     start: Scene,
     index: int,
     folder: RunFolder,
     checkpoint: str,
-    show: Callable[[Fit, Step], None] | None,
-    shown: Sequence[Report] = (),
+    show: Callable[[Fit, DisplayStep], None] | None,
+    reports: Sequence[Report] = (),
 ) -> tuple[Reconstruction, dict[str, Any]]:
     """A fit, or a search about its start; and what the row says of the search."""
-    run, watch = problem.run, watch_of(problem)
+    run, watch = problem.run, make_shape_metric(problem)
     every = run.measures.every if run.measures else 1
 
-    def callbacks(file: str) -> list[Callback]:
+    def make_callbacks(file: str) -> list[Callback]:
         for k in range(len(stages) - 1):
-            folder.file(str(stage_file(Path(file), k)))
+            folder.file(str(stage_checkpoint_path(Path(file), k)))
         watching = [] if watch is None else [Watch(watch, every)]
-        kept = KeptSteps(
-            folder.file(steps_file(file)),
+        kept = StepRecorder(
+            folder.file(steps_path(file)),
             [name for name in dict.fromkeys(fitted_objects(run)) if name in start.names],
             sum(stage.steps for stage in stages),
-            settings_of(run).checkpoint_every,
-            show if shown else None,
+            require_settings(run).checkpoint_every,
+            show if reports else None,
         )
-        return [*watching, *shown, _checkpoint(problem, folder, file), kept]
+        return [*watching, *reports, _make_checkpoint(problem, folder, file), kept]
 
-    given = start, observations_of(problem), unknowns_of(run)
-    how: dict[str, Any] = {key: build.made(run, key) for key in ("loss", "optimizer")}
-    how |= {"schedule": stages, "seed": derived_seed(run.seed, index)}
+    given = start, make_observations(problem), make_unknowns(run)
+    how: dict[str, Any] = {key: build.build_section(run, key) for key in ("loss", "optimizer")}
+    how |= {"schedule": stages, "seed": derive_seed(run.seed, index)}
     if run.search is None:
-        return reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
+        return reconstruct(*given, callbacks=make_callbacks(checkpoint), **how), {}
     name, part = run.search.object, f"{PARTS}/{Path(checkpoint).stem}_fit"
     chance = torch.Generator().manual_seed(how["seed"])
-    poses = build.made(run, "search", {Object: start[name], torch.Generator: chance})
+    poses = build.build_section(run, "search", {Object: start[name], torch.Generator: chance})
     starts = {name: [start[name], *poses]}
-    found = search(*given, starts, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how)
-    return found.best, {"checkpoint": f"{part}{found.number}.pt", **found.rows()}
+    found = search(*given, starts, callbacks=lambda n: make_callbacks(f"{part}{n}.pt"), **how)
+    return found.best, {"checkpoint": f"{part}{found.best_number}.pt", **found.to_metrics()}
 
 
-def _checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:
+def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:
     """Goes on from its own unfinished part; open_run has settled what may be there."""
-    return Checkpoint(folder.file(name), settings_of(problem.run).checkpoint_every, resume=True)
+    return Checkpoint(
+        folder.file(name), require_settings(problem.run).checkpoint_every, resume=True
+    )
 
 
-def _values(modules: nn.ModuleList) -> dict[str, Any]:
+def _fitted_values(modules: nn.ModuleList) -> dict[str, Any]:
     """Fitted values by name; vertices are in the mesh file and the checkpoint."""
     rows: dict[str, Any] = {}
     for module in modules:

@@ -13,19 +13,31 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
-from invertwin.cli.estimate import Sensor, require_room
-from invertwin.cli.exact_signals import chirp_train
-from invertwin.cli.report import Picture, Table, finish, picture, quantities, texts
+from invertwin.cli.estimate import SensorSetup, require_resources
+from invertwin.cli.exact_signals import simulate_chirp_beats
+from invertwin.cli.report import (
+    ReportPicture,
+    ReportTable,
+    load_texts,
+    quantity_table,
+    save_picture,
+    write_report,
+)
 from invertwin.cli.schema import RunFile, SimulatedData, build
-from invertwin.cli.schema.motion_tables import at_start
-from invertwin.cli.schema.recordings import chirp_capture
-from invertwin.cli.schema.run_file import about, need
-from invertwin.cli.schema.shape_tables import Mover
-from invertwin.discovery import MoverMaps, MoverTwin, MovingBody, strongest_mover
+from invertwin.cli.schema.motion_tables import scene_at_start
+from invertwin.cli.schema.recordings import build_chirp_capture
+from invertwin.cli.schema.run_file import prefix_errors, require_section
+from invertwin.cli.schema.shape_tables import MovingTargetParameter
+from invertwin.discovery import (
+    MovingBody,
+    MovingTargetFit,
+    MovingTargetMaps,
+    detect_strongest_target,
+)
 from invertwin.errors import InputError
-from invertwin.inversion import CorrelationLoss, Observation, Schedule, reconstruct, watched
-from invertwin.models.doppler import MotionMap
-from invertwin.plotting import RATE_LABEL, U_LABEL, Panel
+from invertwin.inversion import CorrelationLoss, Observation, Schedule, reconstruct, report_progress
+from invertwin.models.doppler import RangeDopplerMap
+from invertwin.plotting import RATE_LABEL, U_LABEL, MapPanel
 from invertwin.radar import doppler_maps
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
@@ -40,14 +52,14 @@ _SCALES = {
 }
 
 
-def _scores(maps: MoverMaps, recording: ChirpCapture, prefix: str = "") -> dict[str, Any]:
+def _scores(maps: MovingTargetMaps, recording: ChirpCapture, prefix: str = "") -> dict[str, Any]:
     """Correlations with a recording, by scale."""
     rows = maps.correlations(recording)
     headline = {f"{prefix}{name}_correlation": v for name, v in rows["magnitude"].items()}
     return {**headline, f"{prefix}correlations": rows}
 
 
-def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Table], str]:
+def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[ReportTable], str]:
     """Find the strongest mover, fit a twin to it, write the folder.
 
     Raises:
@@ -60,7 +72,7 @@ def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[T
     whole = _fitted(run, table, scene, recording, "twin", console)
     # The first half of the chirps predicts the second; nothing is taken from that.
     count = recording.chirps.count // 2
-    first, second = recording.loops(0, count), recording.loops(count, count)
+    first, second = recording.select_chirps(0, count), recording.select_chirps(count, count)
     half = _fitted(run, table, scene, first, "twin of the first half", console)
     seconds = time.perf_counter() - started
     later = float(_times(recording)[count, 0])
@@ -68,16 +80,16 @@ def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[T
     metrics: dict[str, Any] = {
         "task": run.task,
         "mover_range_m": whole.body.echo.range,
-        "mover_velocity_m_s": whole.body.echo.rate,
+        "mover_velocity_m_s": whole.body.echo.range_rate,
         "mover_azimuth_deg": math.degrees(math.asin(max(-1.0, min(1.0, whole.body.echo.u)))),
         "phase_coherence": whole.body.echo.coherence,
-        **_scores(whole.maps(scene, _CELLS, seed=run.seed), recording),
-        **_scores(half.maps(scene, _CELLS, time=later, seed=run.seed), second, "heldout_"),
+        **_scores(whole.predict_maps(scene, _CELLS, seed=run.seed), recording),
+        **_scores(half.predict_maps(scene, _CELLS, time=later, seed=run.seed), second, "heldout_"),
         "twin": {name: value.tolist() for name, value in values.items()},
         **_errors(run, table.object, recording, values),
-        "loss": whole.outcome.history[-1]["loss"],
-        "steps": whole.outcome.steps,
-        "status": whole.outcome.status,
+        "loss": whole.reconstruction.history[-1]["loss"],
+        "steps": whole.reconstruction.steps,
+        "status": whole.reconstruction.status,
         "fit_seconds": seconds,
     }
     drawn = _pictures(run, folder, whole, half, scene)
@@ -91,12 +103,14 @@ def run_mover(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[T
         f"{metrics['bare_psf_correlation']:.3f}."
     )
     title, parts = run.title or "A moving twin", [result, *drawn, *others]
-    tables = finish(folder, metrics, title, outcome, parts, again="reconstruct", note=run.note)
+    tables = write_report(
+        folder, metrics, title, outcome, parts, again="reconstruct", note=run.note
+    )
     return tables, outcome
 
 
-def _mover(run: RunFile) -> Mover:
-    table, *others = need(run, "parameters", "reconstruct")
+def _mover(run: RunFile) -> MovingTargetParameter:
+    table, *others = require_section(run, "parameters", "reconstruct")
     if others:
         kinds = ", ".join(parameter.kind for parameter in run.parameters)
         raise InputError(f"parameters: expected a mover alone, got {kinds}; leave only the mover")
@@ -110,16 +124,19 @@ def _mover(run: RunFile) -> Mover:
 
 
 def _recorded(run: RunFile) -> ChirpCapture:
-    data = need(run, "data", "a mover")
+    data = require_section(run, "data", "a mover")
     if isinstance(data, SimulatedData):
-        radar = build.radar(need(run, "radar", "simulated data"))
-        chirps = need(run, "chirps", "a mover in simulated data").build()
-        truth, grid = build.true_scene(run), build.grid(need(run, "grid", "reconstruct"), radar)
-        require_room(run, truth, {"": Sensor(run, radar, grid)})
-        beat = chirp_train(run, truth, radar, chirps)
+        radar = build.radar(require_section(run, "radar", "simulated data"))
+        chirps = require_section(run, "chirps", "a mover in simulated data").build()
+        truth, grid = (
+            build.true_scene(run),
+            build.grid(require_section(run, "grid", "reconstruct"), radar),
+        )
+        require_resources(run, truth, {"": SensorSetup(run, radar, grid)})
+        beat = simulate_chirp_beats(run, truth, radar, chirps)
         recording = ChirpCapture(beat, radar, chirps)
     else:
-        recording = chirp_capture(data)
+        recording = build_chirp_capture(data)
     if recording.device.frame_count > 1:
         raise InputError(
             f"data: expected one frame with a mover, got {recording.device.frame_count}; "
@@ -129,33 +146,41 @@ def _recorded(run: RunFile) -> ChirpCapture:
 
 
 def _fitted(
-    run: RunFile, table: Mover, scene: Scene, recording: ChirpCapture, name: str, console: Console
-) -> MoverTwin:
-    settings, grid = need(run, "reconstruct", "reconstruct"), need(run, "grid", "reconstruct")
+    run: RunFile,
+    table: MovingTargetParameter,
+    scene: Scene,
+    recording: ChirpCapture,
+    name: str,
+    console: Console,
+) -> MovingTargetFit:
+    settings, grid = (
+        require_section(run, "reconstruct", "reconstruct"),
+        require_section(run, "grid", "reconstruct"),
+    )
     radar = recording.radar()
-    model = MotionMap.of(
+    model = RangeDopplerMap.from_chirps(
         radar,
         build.grid(grid, radar),
         recording.chirps,
         math.ceil(grid.oversample),
         Sampling(depth=1, samples=settings.samples, boundary=False),
     )
-    echo = strongest_mover(recording, model)
-    with about(f"scene.{table.object}"):
+    echo = detect_strongest_target(recording, model)
+    with prefix_errors(f"scene.{table.object}"):
         body = MovingBody(table.object, scene, radar, echo, table.free)
-    near = model.around(echo.range, echo.rate, table.cells, radar)
-    with watched(name, settings.steps, console) as callbacks:
+    near = model.crop_around(echo.range, echo.range_rate, table.cells, radar)
+    with report_progress(name, settings.steps, console) as callbacks:
         found = reconstruct(
             scene,
             Observation(near, radar, recording),
             body,
             loss=CorrelationLoss(),
-            optimizer=build.made(run, "optimizer"),
+            optimizer=build.build_section(run, "optimizer"),
             schedule=Schedule(settings.steps),
             callbacks=callbacks,
             seed=run.seed,
         )
-    return MoverTwin(recording, model, body, found)
+    return MovingTargetFit(recording, model, body, found)
 
 
 def _times(recording: ChirpCapture) -> Tensor:
@@ -173,7 +198,7 @@ def _errors(
     if not isinstance(run.data, SimulatedData) and name not in run.truth:
         return {}
     times = _times(recording)
-    truth = at_start(run, build.true_scene(run), float(times.max()))[name]
+    truth = scene_at_start(run, build.true_scene(run), float(times.max()))[name]
     still = torch.zeros(1, 3, dtype=torch.float64)
     velocity = (still if truth.velocity is None else truth.velocity).reshape(-1, 3).mean(0)
     place = truth.center + velocity * times.mean()
@@ -184,29 +209,29 @@ def _errors(
 
 
 def _pictures(
-    run: RunFile, folder: RunFolder, whole: MoverTwin, half: MoverTwin, scene: Scene
-) -> list[Picture]:
+    run: RunFile, folder: RunFolder, whole: MovingTargetFit, half: MovingTargetFit, scene: Scene
+) -> list[ReportPicture]:
     recording, radar = whole.recording, whole.recording.radar()
-    wide = whole.maps(scene, _DRAWN_CELLS, seed=run.seed)
+    wide = whole.predict_maps(scene, _DRAWN_CELLS, seed=run.seed)
     grid, rates = wide.model.grid, wide.model.rates
     maps = {
         "recorded": wide.model.observe(recording)[0],
-        "twin": wide.twin,
-        "point target": wide.point,
+        "twin": wide.twin_map,
+        "point target": wide.point_map,
     }
     over_rates = {
-        name: Panel(power.amax((2, 3)).T, grid.ranges, rates, RATE_LABEL)
+        name: MapPanel(power.amax((2, 3)).T, grid.ranges, rates, RATE_LABEL)
         for name, power in maps.items()
     }
     over_directions = {
-        name: Panel(power.amax((0, 3)), grid.ranges, grid.u, U_LABEL)
+        name: MapPanel(power.amax((0, 3)), grid.ranges, grid.u, U_LABEL)
         for name, power in maps.items()
     }
     with torch.no_grad():
         begun = MovingBody(whole.body.object, scene, radar, whole.body.echo)(scene)
         scenes = {"start": begun, "twin": whole.body(scene)}
     losses = {
-        name: [[row["loss"] for row in fit.outcome.history]]
+        name: [[row["loss"] for row in fit.reconstruction.history]]
         for name, fit in (("twin", whole), ("twin of the first half", half))
     }
     seen = doppler_maps(recording.beat, radar, whole.model.grid, recording.chirps)
@@ -222,19 +247,19 @@ def _pictures(
         "scene": (where, "Where it is", "mover_scene"),
         "loss": (plotting.convergence(losses), "1 − correlation of the magnitudes", ""),
     }
-    return [picture(folder, name, *shown) for name, shown in drawn.items()]
+    return [save_picture(folder, name, *shown) for name, shown in drawn.items()]
 
 
-def _tables(metrics: Mapping[str, Any]) -> list[Table]:
+def _tables(metrics: Mapping[str, Any]) -> list[ReportTable]:
     columns = list(product(("", "heldout_"), ("twin", "bare_psf")))
     scales: list[Sequence[Any]] = [
         [label, *(metrics[f"{part}correlations"][scale][name] for part, name in columns)]
         for scale, label in _SCALES.items()
     ]
     heads = ["map", "twin", "point", "twin, second half", "point, second half"]
-    note = texts("notes")["mover_correlation"]
+    note = load_texts("notes")["mover_correlation"]
     return [
-        quantities("Result", metrics, skip=("loss",)),
-        Table("Correlation with the recording", heads, scales, note),
-        quantities("The twin", metrics["twin"], of="mover"),
+        quantity_table("Result", metrics, skip=("loss",)),
+        ReportTable("Correlation with the recording", heads, scales, note),
+        quantity_table("The twin", metrics["twin"], label_table="mover"),
     ]

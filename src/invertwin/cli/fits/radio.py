@@ -14,15 +14,15 @@ from torch import Tensor, nn
 
 from invertwin import plotting
 from invertwin.channel import trace_paths
-from invertwin.cli.fits.problem import FULL, settings_of, stages_of, varied_run
-from invertwin.cli.fits.scores import certainty_table
-from invertwin.cli.fits.spreading import QUIET, Workers, fit_elsewhere, part_name
-from invertwin.cli.report import Table, finish, picture, quantities, texts
+from invertwin.cli.fits.problem import OWN_METHOD, method_run, require_settings, stage_runs
+from invertwin.cli.fits.scores import error_bar_table
+from invertwin.cli.fits.spreading import QUIET_CONSOLE, FitWorkers, distribute_fits, fit_file_stem
+from invertwin.cli.report import ReportTable, load_texts, quantity_table, save_picture, write_report
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.radio_tables import ReceivedData, ReceivedFile
-from invertwin.cli.schema.run_file import about, need
-from invertwin.cli.schema.shape_tables import given_for
-from invertwin.cli.terminal import progress
+from invertwin.cli.schema.run_file import prefix_errors, require_section
+from invertwin.cli.schema.shape_tables import module_values
+from invertwin.cli.terminal import show_progress
 from invertwin.errors import InputError
 from invertwin.inversion import (
     Checkpoint,
@@ -31,14 +31,14 @@ from invertwin.inversion import (
     Stage,
     Unknown,
     reconstruct,
-    watched,
+    report_progress,
 )
-from invertwin.inversion.confidence.ambiguities import REJECTED, score
-from invertwin.inversion.confidence.report import certainty
-from invertwin.links import Points, Transmitters
+from invertwin.inversion.confidence.ambiguities import REJECTION_ZSCORE, difference_score
+from invertwin.inversion.confidence.report import confidence_metrics
+from invertwin.links import ReceiverPoints, Transmitters
 from invertwin.models.radio import RadioMap
 from invertwin.scene import Scene
-from invertwin.seeds import derived_seed
+from invertwin.seeds import derive_seed
 from invertwin.storage.run_folder import RunFolder
 
 _TRANSMITTER = "transmitter"  # kind of its parameter
@@ -69,7 +69,7 @@ class Heard:
     sensor: Transmitters
     true_sensor: Transmitters | None
     levels: Tensor
-    places: Points | None
+    places: ReceiverPoints | None
 
     def model(self, run: RunFile) -> RadioMap:
         """The forward model of a way to fit, or of a stage of one.
@@ -77,14 +77,14 @@ class Heard:
         Args:
             run: Its run file.
         """
-        with about("map"):
-            found = need(run, "map", "received levels").build()
+        with prefix_errors("map"):
+            found = require_section(run, "map", "received levels").build()
         return found if self.places is None else replace(found, places=self.places)
 
 
 def run_radio(
-    run: RunFile, folder: RunFolder, console: Console, workers: Workers | None = None
-) -> tuple[list[Table], str]:
+    run: RunFile, folder: RunFolder, console: Console, workers: FitWorkers | None = None
+) -> tuple[list[ReportTable], str]:
     """Fit from every start, write the folder; return the tables to print and the outcome.
 
     Starts that an interrupted run has finished are not fitted again.
@@ -98,10 +98,10 @@ def run_radio(
     begin = time.perf_counter()
     heard = _heard(run, console)
     starts = _starts(heard)
-    modes = [FULL, *run.variants]
+    modes = [OWN_METHOD, *run.variants]
     if workers is not None:
         fits = [(mode, number) for mode in modes for number in range(len(starts))]
-        fit_elsewhere(_fit_one, run, folder, console, workers, fits)
+        distribute_fits(_fit_one, run, folder, console, workers, fits)
     rows: dict[str, list[dict[str, Any]]] = {}
     again: list[Callable[[], Reconstruction]] = []
     for mode in modes:
@@ -109,12 +109,12 @@ def run_radio(
         for number, start in enumerate(starts):
             row, outcome = _fitted(heard, start, number, mode, folder, console)
             rows[mode].append(row)
-            again += [outcome] if mode == FULL else []
-    order = sorted(range(len(starts)), key=lambda k: _rank(rows[FULL][k]))
-    best, found = rows[FULL][order[0]], again[order[0]]()
-    with progress(console):
-        believed = certainty(found, {})
-        others = _others(heard, found, [(rows[FULL][k], again[k]) for k in order[1:]])
+            again += [outcome] if mode == OWN_METHOD else []
+    order = sorted(range(len(starts)), key=lambda k: _rank(rows[OWN_METHOD][k]))
+    best, found = rows[OWN_METHOD][order[0]], again[order[0]]()
+    with show_progress(console):
+        believed = confidence_metrics(found, {})
+        others = _others(heard, found, [(rows[OWN_METHOD][k], again[k]) for k in order[1:]])
     metrics: dict[str, Any] = {
         "task": run.task,
         "starts_count": len(starts),
@@ -124,10 +124,10 @@ def run_radio(
         **{key: best[key] for key in ("status", "steps", "loss", "start")},
         "parameters": best["values"],
         **_line_of_sight(heard, found),
-        "starts": rows[FULL],
+        "starts": rows[OWN_METHOD],
         **{f"starts_{mode}": rows[mode] for mode in modes[1:]},
     }
-    spread = spread_of_ends(heard, rows[FULL], best, believed.get("within_95", {}))
+    spread = spread_of_ends(heard, rows[OWN_METHOD], best, believed.get("within_95", {}))
     metrics |= spread
     alone = bool(spread) and not spread["ends_within_bars"]
     if (others or alone) and metrics["verdict"] == "consistent":
@@ -135,35 +135,35 @@ def run_radio(
     metrics["fit_seconds"] = sum(row["seconds"] for fits in rows.values() for row in fits)
     metrics["wall_seconds"] = time.perf_counter() - begin
     losses = {name: [row["losses"] for row in fits] for name, fits in rows.items()}
-    drawn = [picture(folder, "loss", plotting.convergence(losses))]
+    drawn = [save_picture(folder, "loss", plotting.convergence(losses))]
     if _located(run):
-        drawn.append(picture(folder, "plan", _plan(heard, rows[FULL], found)))
+        drawn.append(save_picture(folder, "plan", _plan(heard, rows[OWN_METHOD], found)))
     parts = [*_tables(heard, metrics, rows), *drawn]
     title, outcome = run.title or "Received levels", _outcome(run, metrics)
-    return finish(folder, metrics, title, outcome, parts, again="reconstruct", note=run.note), (
-        outcome
-    )
+    return write_report(
+        folder, metrics, title, outcome, parts, again="reconstruct", note=run.note
+    ), (outcome)
 
 
 def _fit_one(run: RunFile, mode: str, number: int, folder: RunFolder) -> None:
     """What a worker does of a run: one fit, which leaves its files in the folder."""
-    heard = _heard(run, QUIET)
-    _fitted(heard, _starts(heard)[number], number, mode, folder, QUIET)
+    heard = _heard(run, QUIET_CONSOLE)
+    _fitted(heard, _starts(heard)[number], number, mode, folder, QUIET_CONSOLE)
 
 
 def _heard(run: RunFile, console: Console) -> Heard:
     """The problem of a run file; simulated levels are simulated here."""
-    settings_of(run)
+    require_settings(run)
     for name in _FOREIGN:
         if getattr(run, name):
             raise InputError(f"{name}: expected no such section with [map], got one; remove it")
-    need(run, "parameters", "reconstruct")
+    require_section(run, "parameters", "reconstruct")
     scene, truth = build.scene(run), build.true_scene(run)
-    with about("transmitter"):
-        sensor = need(run, "transmitter", "[map]").build()
-    data = need(run, "data", "reconstruct")
+    with prefix_errors("transmitter"):
+        sensor = require_section(run, "transmitter", "[map]").build()
+    data = require_section(run, "data", "reconstruct")
     if isinstance(data, ReceivedFile):
-        with about("data"):
+        with prefix_errors("data"):
             places, levels = data.read()
         if len(levels) != len(sensor.positions):
             raise InputError(
@@ -175,18 +175,18 @@ def _heard(run: RunFile, console: Console) -> Heard:
         raise InputError(
             f"data.kind: expected received or received_file with [map], got {data.kind}; choose one"
         )
-    with about("data"):
+    with prefix_errors("data"):
         real = sensor if data.positions is None else _moved(sensor, data.positions)
     heard = Heard(run, scene, truth, sensor, real, torch.zeros(0), None)
     console.print("simulating the levels of the true scene")
     model, seed = heard.model(run), run.seed if data.seed is None else data.seed
     given = {name: getattr(data, name) for name in ("bandwidth", "depth", "edges", "rays")}
     richer = {name: value for name, value in given.items() if value is not None}
-    with about("data"), torch.no_grad():
-        model = replace(model, reception=replace(model.reception, **richer))
-        mean = model.predict(truth, real, derived_seed(seed, 0))
-    look = replace(model, scatter=data.noise).looks_about(mean)
-    return replace(heard, levels=look(derived_seed(seed, 1), 0.0))
+    with prefix_errors("data"), torch.no_grad():
+        model = replace(model, propagation=replace(model.propagation, **richer))
+        mean = model.predict(truth, real, derive_seed(seed, 0))
+    look = replace(model, scatter=data.noise).realisations_about(mean)
+    return replace(heard, levels=look(derive_seed(seed, 1), 0.0))
 
 
 def _moved(sensor: Transmitters, positions: Sequence[Sequence[float]]) -> Transmitters:
@@ -205,20 +205,20 @@ def _starts(heard: Heard) -> list[Tensor]:
     table = heard.run.transmitter_starts
     if table is None:
         return [heard.sensor.positions[0]]
-    with about("transmitter_starts"):
-        return [*table.places(heard.scene, heard.run.seed)]
+    with prefix_errors("transmitter_starts"):
+        return [*table.sample_positions(heard.scene, heard.run.seed)]
 
 
 def _stages(heard: Heard, run: RunFile) -> list[Stage]:
-    names = build.named(run.parameters)
+    names = build.tables_by_name(run.parameters)
     return [
         Stage(
-            **vars(settings_of(own).build()),
+            **vars(require_settings(own).build()),
             unknowns=tuple(n for n in table.parameters if n in names),
-            optimizer=build.made(own, "optimizer"),
+            optimizer=build.build_section(own, "optimizer"),
             models=[heard.model(own)],
         )
-        for table, own in stages_of(run)
+        for table, own in stage_runs(run)
     ]
 
 
@@ -226,15 +226,15 @@ def _fitted(
     heard: Heard, start: Tensor, number: int, mode: str, folder: RunFolder, console: Console
 ) -> tuple[dict[str, Any], Callable[[], Reconstruction]]:
     """The row of a fit, or what an interrupted run has kept of it, and what gives its outcome."""
-    run = varied_run(heard.run, mode)
-    stages, part = _stages(heard, run), part_name(mode, number)
+    run = method_run(heard.run, mode)
+    stages, part = _stages(heard, run), fit_file_stem(mode, number)
     again = partial(_fit, heard, run, stages, start, number, folder, f"{part}.pt")
     kept = folder.read_json(f"{part}.json")
     if kept is not None:
         return kept, again
     begin = time.perf_counter()
-    name = f"start {number + 1}" + ("" if mode == FULL else f", {mode.replace('_', ' ')}")
-    with watched(name, sum(stage.steps for stage in stages), console) as shown:
+    name = f"start {number + 1}" + ("" if mode == OWN_METHOD else f", {mode.replace('_', ' ')}")
+    with report_progress(name, sum(stage.steps for stage in stages), console) as shown:
         found = again(shown)
     place = found.sensors[0].positions[0].detach()
     row: dict[str, Any] = {
@@ -251,7 +251,7 @@ def _fitted(
         real = heard.true_sensor.positions[0]
         row |= {"start_error_m": float((start - real).norm())}
         row |= {"position_error_m": float((place - real).norm())}
-        row["success"] = row["position_error_m"] <= settings_of(run).position_limit
+        row["success"] = row["position_error_m"] <= require_settings(run).position_limit
     folder.write_json(f"{part}.json", row)
     return row, lambda: found
 
@@ -267,11 +267,11 @@ def _fit(
     shown: Sequence[Any] = (),
 ) -> Reconstruction:
     own: dict[str, nn.Module | Unknown] = {}
-    makers = build.builders(run.parameters, run.scene)
+    makers = build.module_builders(run.parameters, run.scene)
     unknowns: dict[str, nn.Module | Unknown] = {}
-    for name, table in build.named(run.parameters).items():
+    for name, table in build.tables_by_name(run.parameters).items():
         if table.kind == _TRANSMITTER:
-            with about(f"parameters.{name}"):
+            with prefix_errors(f"parameters.{name}"):
                 own[name] = Unknown(table.build(None, initial=start), table.rate)
         else:
             unknowns[name] = Unknown(makers[name], table.rate)
@@ -281,13 +281,15 @@ def _fit(
         heard.scene,
         Observation(stages[-1].models[0], sensor, heard.levels, parameters=own),
         unknowns,
-        loss=build.made(run, "loss"),
+        loss=build.build_section(run, "loss"),
         schedule=stages,
         callbacks=[
             *shown,
-            Checkpoint(folder.file(checkpoint), settings_of(run).checkpoint_every, resume=True),
+            Checkpoint(
+                folder.file(checkpoint), require_settings(run).checkpoint_every, resume=True
+            ),
         ],
-        seed=derived_seed(run.seed, number),
+        seed=derive_seed(run.seed, number),
     )
 
 
@@ -317,7 +319,7 @@ def _others(
     """Ends elsewhere that the data do not reject, beside the best one."""
     if not _located(heard.run):
         return {}
-    limit = settings_of(heard.run).position_limit
+    limit = require_settings(heard.run).position_limit
     kept, told = [best.sensors[0].positions[0].detach()], []
     for _, again in ends:
         end = again()
@@ -325,8 +327,8 @@ def _others(
         if min(float((place - other).norm()) for other in kept) <= limit:
             continue
         kept.append(place)
-        found = score(best.end, end.end)
-        if found is not None and found < REJECTED:
+        found = difference_score(best.result, end.result)
+        if found is not None and found < REJECTION_ZSCORE:
             where = ", ".join(f"{x:.2f}" for x in place.tolist())
             told.append(f"a transmitter at {where} m explains the data as well: z = {found:.1f}")
     return {"ambiguities": told} if told else {}
@@ -356,7 +358,7 @@ def spread_of_ends(
         for row in rows
         if row["start"] != best["start"] and row["status"] != "diverged"
     }
-    limit = settings_of(heard.run).position_limit
+    limit = require_settings(heard.run).position_limit
     near = [off for off in apart.values() if math.hypot(*off) <= limit]
     if len(near) < _FEW_ENDS:
         return {}
@@ -391,16 +393,16 @@ def _scores(
     found: dict[str, Any] = {}
     if "success" in best:
         for mode in modes:
-            tail = "" if mode == FULL else f"_{mode}"
+            tail = "" if mode == OWN_METHOD else f"_{mode}"
             found[f"successes{tail}"] = sum(row["success"] for row in rows[mode])
             found[f"errors_m{tail}"] = [row["position_error_m"] for row in rows[mode]]
-        found["start_errors_m"] = [row["start_error_m"] for row in rows[FULL]]
+        found["start_errors_m"] = [row["start_error_m"] for row in rows[OWN_METHOD]]
         found |= {"position_error_m": best["position_error_m"], "success": best["success"]}
     materials = _materials(heard)
     if materials:
         found["true_values"] = materials
         for mode in modes:
-            tail = "" if mode == FULL else f"_{mode}"
+            tail = "" if mode == OWN_METHOD else f"_{mode}"
             values = min(rows[mode], key=_rank)["values"]
             found[f"relative_errors{tail}"] = {
                 name: abs(values[name] / value - 1) for name, value in materials.items()
@@ -415,7 +417,7 @@ def _materials(heard: Heard) -> dict[str, float]:
     found: dict[str, float] = {}
     for table in heard.run.parameters:
         if table.kind == "material":
-            module = table.build(given_for(table.object, heard.truth, heard.run.scene))
+            module = table.build(module_values(table.object, heard.truth, heard.run.scene))
             found |= {n: float(v) for n, v in module.values().items() if v.numel() == 1}
     return found
 
@@ -423,11 +425,11 @@ def _materials(heard: Heard) -> dict[str, float]:
 def _line_of_sight(heard: Heard, found: Reconstruction) -> dict[str, Any]:
     """The share of links whose line of sight is blocked, at the truth or else at the twin."""
     places = heard.places or heard.model(heard.run).places
-    if not isinstance(places, Points):
+    if not isinstance(places, ReceiverPoints):
         return {}
     sensor = heard.true_sensor or found.sensors[0]
     scene = heard.truth if heard.true_sensor else found.scene
-    frequency = heard.model(heard.run).reception.frequency
+    frequency = heard.model(heard.run).propagation.frequency
     ends = sensor.positions.detach(), places.positions
     with torch.no_grad():
         count = len(trace_paths(scene, *ends, frequency, depth=0))
@@ -441,20 +443,20 @@ def _plan(heard: Heard, rows: Sequence[dict[str, Any]], best: Reconstruction) ->
     if heard.true_sensor is not None:
         shown = {"truth": heard.true_sensor.positions[:1], "found": place}
     places = heard.places or heard.model(heard.run).places
-    if isinstance(places, Points):
+    if isinstance(places, ReceiverPoints):
         shown["receivers"] = places.positions
     ends = [[row["start_position"], row["values"]["transmitter.position"]] for row in rows]
     fits = torch.tensor(ends, dtype=torch.float64)
-    return plotting.located(best.scene, float(place[0, 2]), shown, fits)
+    return plotting.transmitter_fits(best.scene, float(place[0, 2]), shown, fits)
 
 
 def _outcome(run: RunFile, metrics: Mapping[str, Any]) -> str:
-    ended = texts("outcomes")[metrics["status"]].format(steps=metrics["steps"])
-    believed = texts("verdicts")[metrics["verdict"]]
+    ended = load_texts("outcomes")[metrics["status"]].format(steps=metrics["steps"])
+    believed = load_texts("verdicts")[metrics["verdict"]]
     count = metrics["starts_count"]
     which = f"Best of {count} starts: " if count > 1 else ""
     if "successes" in metrics:
-        limit = settings_of(run).position_limit
+        limit = require_settings(run).position_limit
         return (
             f"{which}{metrics['position_error_m']:.3f} m from the truth; {ended}. "
             f"{metrics['successes']} of {count} starts end within {limit:g} m. {believed}"
@@ -464,22 +466,22 @@ def _outcome(run: RunFile, metrics: Mapping[str, Any]) -> str:
 
 def _tables(
     heard: Heard, metrics: Mapping[str, Any], rows: Mapping[str, list[dict[str, Any]]]
-) -> list[Table]:
-    result = quantities("Result", metrics)
+) -> list[ReportTable]:
+    result = quantity_table("Result", metrics)
     true = metrics.get("true_values", {})
     if heard.true_sensor is not None and _located(heard.run):
         true = {**true, "transmitter.position": heard.true_sensor.positions[0].tolist()}
     cells = [[name, value, true.get(name)] for name, value in metrics["parameters"].items()]
-    tables = [result, Table("Parameters", ["parameter", "result", "truth"], cells)]
-    tables.append(certainty_table(dict(metrics)))
+    tables = [result, ReportTable("Parameters", ["parameter", "result", "truth"], cells)]
+    tables.append(error_bar_table(dict(metrics)))
     if "successes" in metrics:
         heads = ["fit", "successes", "median error [m]", "largest error [m]"]
         cells = []
         for mode in rows:
-            tail = "" if mode == FULL else f"_{mode}"
+            tail = "" if mode == OWN_METHOD else f"_{mode}"
             errors = sorted(metrics[f"errors_m{tail}"])
-            name = "full" if mode == FULL else mode.replace("_", " ")
+            name = "full" if mode == OWN_METHOD else mode.replace("_", " ")
             middle = errors[len(errors) // 2]
             cells.append([name, metrics[f"successes{tail}"], middle, errors[-1]])
-        tables.append(Table("Ways to fit", heads, cells))
+        tables.append(ReportTable("Ways to fit", heads, cells))
     return tables

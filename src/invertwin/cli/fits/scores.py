@@ -11,42 +11,42 @@ from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
 from invertwin.cli.fits.problem import (
     Problem,
-    fitted_of,
-    points_per_m2,
-    settings_of,
-    sharp_models,
-    shown_models,
+    fitted_tables,
+    make_display_models,
+    make_unblurred_models,
+    require_settings,
+    rough_point_densities,
 )
-from invertwin.cli.fits.shape_scores import shape_scores
-from invertwin.cli.report import Table, texts
+from invertwin.cli.fits.shape_scores import score_shape
+from invertwin.cli.report import ReportTable, load_texts
 from invertwin.cli.schema import SimulatedData, build
 from invertwin.errors import InputError
 from invertwin.inversion.loss import Objective
-from invertwin.inversion.metrics import axis_error, residual, value_errors
+from invertwin.inversion.metrics import axis_error, material_errors, pose_error
 from invertwin.models.radar import surrogate_correlation
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene import Mesh, Scene, SkinnedBody
-from invertwin.scene.shape_models.density import without_clouds
+from invertwin.scene.shape_models.density import replace_clouds
 
 
-def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
+def score_fit(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     """How far start and twin are from the truth, where it is known."""
-    name, twin = problem.target, without_clouds(twin)
+    name, twin = problem.scored_object, replace_clouds(twin)
     if name is None:
         return {}
     place = twin[name].center.detach().tolist()
-    if name not in problem.known:
+    if name not in problem.known_objects:
         return {"position": place}
-    shapes = shape_scores(problem, without_clouds(start), twin)
-    before = residual(start[name], problem.truth[name])
-    after = residual(twin[name], problem.truth[name])
+    shapes = score_shape(problem, replace_clouds(start), twin)
+    before = pose_error(start[name], problem.truth[name])
+    after = pose_error(twin[name], problem.truth[name])
     if before is None or after is None:
         return {"position": place, **shapes}
-    settings = settings_of(problem.run)
-    body = build.body_of(problem.run, problem.scene, name)
+    settings = require_settings(problem.run)
+    body = build.fitted_body(problem.run, problem.scene, name)
     if body is not None:
-        angles = joint_scores(body, *(s[name].mesh for s in (start, twin, problem.truth)))
+        angles = score_joints(body, *(s[name].mesh for s in (start, twin, problem.truth)))
         good = angles["joint_error_after_deg"] <= settings.joint_limit_deg
         return {**angles, "success": good, "position": place, **shapes}
     rows: dict[str, Any] = {
@@ -69,7 +69,7 @@ def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
             "position": twin[name].transform[:3, 3].tolist(),
             **shapes,
         }
-    fitted = fitted_of(problem.run).values()
+    fitted = fitted_tables(problem.run).values()
     kinds = {table.kind for table in fitted}
     if "pose" in kinds:
         angle = math.degrees(after.angle)
@@ -77,15 +77,15 @@ def scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
         rows["success"] &= angle <= settings.rotation_limit_deg
     if "scale" in kinds:
         rows |= {"scale_error": abs(after.scale - 1)}
-    told = [table for table in fitted if _made_known(problem, table)]
-    frequency = problem.first.radar.waveform.center_frequency
+    told = [table for table in fitted if _is_material_known(problem, table)]
+    frequency = problem.first_sensor.radar.waveform.center_frequency
     for table in told:
         ends = twin[table.object].material, problem.truth[table.object].material
-        rows |= value_errors(table.values, *ends, frequency, table.layer)
+        rows |= material_errors(table.values, *ends, frequency, table.layer)
     return rows | shapes
 
 
-def joint_scores(body: SkinnedBody, start: Mesh, found: Mesh, truth: Mesh) -> dict[str, float]:
+def score_joints(body: SkinnedBody, start: Mesh, found: Mesh, truth: Mesh) -> dict[str, float]:
     """Angles [°] by which the free joints are off, means over them and each at the end."""
     before, after = (body.joint_errors(mesh, truth) for mesh in (start, found))
     return {
@@ -95,7 +95,7 @@ def joint_scores(body: SkinnedBody, start: Mesh, found: Mesh, truth: Mesh) -> di
     }
 
 
-def _made_known(problem: Problem, parameter: Any) -> bool:
+def _is_material_known(problem: Problem, parameter: Any) -> bool:
     """Whether the run file tells what a fitted object is really made of."""
     if parameter.kind != "material":
         return False
@@ -104,11 +104,11 @@ def _made_known(problem: Problem, parameter: Any) -> bool:
     return stated or isinstance(problem.run.data, SimulatedData)
 
 
-def summary(
+def summarise_successes(
     problem: Problem, rows: dict[str, list[dict[str, Any]]], modes: Sequence[str]
 ) -> dict[str, Any]:
     """Successes of every way to fit, the run's own first; of several sensors, also each alone."""
-    if problem.target not in problem.known or "success" not in rows[modes[0]][0]:
+    if problem.scored_object not in problem.known_objects or "success" not in rows[modes[0]][0]:
         return {}
     counts = {mode: sum(row.get("success", False) for row in rows[mode]) for mode in modes}
     found = {"successes": counts[modes[0]], "starts_count": len(rows[modes[0]])}
@@ -123,14 +123,16 @@ def summary(
     return found
 
 
-def heldout(problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any]) -> dict[str, Any]:
+def score_held_out(
+    problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any]
+) -> dict[str, Any]:
     """For calibrated captures: the error on an object that took no part in the calibration."""
     table = problem.run.calibration
-    name = problem.target
-    if table is None or name is None or name not in problem.known or name == table.object:
+    name = problem.scored_object
+    if table is None or name is None or name not in problem.known_objects or name == table.object:
         return {}
     truth, known = problem.truth[name].center, problem.truth[table.object].center
-    focused = calibrate(problem.first.capture, known)
+    focused = calibrate(problem.first_sensor.capture, known)
     peak = locate(focused, truth)
     places = torch.tensor([row["position"] for row in rows], dtype=torch.float64)
     spread = (places - places.mean(0)).norm(dim=1).max()
@@ -145,39 +147,41 @@ def heldout(problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any]) 
     }
 
 
-def without_history(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def drop_histories(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The rows of the fits as metrics keep them."""
     long = ("losses", "curve", "checkpoint")
     return [{key: value for key, value in row.items() if key not in long} for row in rows]
 
 
-def sharp_maps(problem: Problem, scene: Scene, radars: Sequence[Radar]) -> list[torch.Tensor]:
+def predict_unblurred_maps(
+    problem: Problem, scene: Scene, radars: Sequence[Radar]
+) -> list[torch.Tensor]:
     """The surrogate's map of every sensor, as fitted, without extra widths."""
-    counts = {"samples": 4 * settings_of(problem.run).samples, "boundary_samples": 0}
+    counts = {"samples": 4 * require_settings(problem.run).samples, "boundary_samples": 0}
     with torch.no_grad():
         return [
-            model.sampled_by(**counts).predict(scene, radar, problem.run.seed)
-            for model, radar in zip(shown_models(problem), radars, strict=True)
+            model.with_sampling(**counts).predict(scene, radar, problem.run.seed)
+            for model, radar in zip(make_display_models(problem), radars, strict=True)
         ]
 
 
-def agreement(problem: Problem, twin: Scene, radar: Radar) -> dict[str, float]:
+def surrogate_agreement(problem: Problem, twin: Scene, radar: Radar) -> dict[str, float]:
     """Correlation of the surrogate with the mean of exact spectra: one bounce, first frame."""
     if not isinstance(radar.waveform, SampledWaveform):
         return {}
-    sampling = Sampling(depth=1, points_per_m2=points_per_m2(problem.run))
-    model = replace(sharp_models(problem)[0], sampling=sampling)
+    sampling = Sampling(depth=1, points_per_m2=rough_point_densities(problem.run))
+    model = replace(make_unblurred_models(problem)[0], sampling=sampling)
     first = replace(radar.frames([0]), range_bias=0.0)
     found = surrogate_correlation(twin, first, model, seed=problem.run.seed)
     return {"surrogate_correlation": found}
 
 
-def misfit(
+def total_loss(
     problem: Problem, simulated: Sequence[torch.Tensor], measured: Sequence[torch.Tensor]
 ) -> float | None:
     """The weighted mean of the losses of all sensors; None where a map without power has none."""
-    loss = build.made(problem.run, "loss")
-    weights = tuple(sight.weight for sight in problem.sights.values())
+    loss = build.build_section(problem.run, "loss")
+    weights = tuple(sight.weight for sight in problem.sensor_data.values())
     try:
         pairs = list(zip(simulated, measured, strict=True))
         return float(Objective((loss,) * len(weights), weights)(pairs))
@@ -185,7 +189,7 @@ def misfit(
         return None
 
 
-def certainty_table(metrics: dict[str, Any]) -> Table:
+def error_bar_table(metrics: dict[str, Any]) -> ReportTable:
     """The error bars of the best fit."""
     cells = []
     for name, value in metrics.get("standard_deviations", {}).items():
@@ -204,5 +208,5 @@ def certainty_table(metrics: dict[str, Any]) -> Table:
     told = ("verdict_reasons", "ambiguities", "unobserved")
     said = [text for key in told for text in metrics.get(key, [])]
     said += [metrics["spread_note"]] if "spread_note" in metrics else []
-    said.append(metrics.get("no_error_bars", texts("notes")["error_bars"]))
-    return Table("Error bars", heads, cells, "\n".join(said))
+    said.append(metrics.get("no_error_bars", load_texts("notes")["error_bars"]))
+    return ReportTable("Error bars", heads, cells, "\n".join(said))

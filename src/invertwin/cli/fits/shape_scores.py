@@ -6,46 +6,48 @@ from typing import Any
 import torch
 
 from invertwin.cli.fits.problem import Problem
-from invertwin.cli.report import texts
-from invertwin.cli.schema.run_file import about
+from invertwin.cli.report import load_texts
+from invertwin.cli.schema.run_file import prefix_errors
 from invertwin.errors import InputError
 from invertwin.inversion.metrics import (
     ShapeMetrics,
     compare_shapes,
+    count_topology,
     is_watertight,
-    topology,
     volume_iou,
 )
 from invertwin.scene import Mesh, Scene
-from invertwin.scene.shape_models.density import without_clouds
+from invertwin.scene.shape_models.density import replace_clouds
 
-CURVE = "chamfer_m"
+CURVE_KEY = "chamfer_m"
 """What the curves show."""
-_BEGINNINGS = ("chamfer", "fscore", "iou", "normal_consistency", "components", "euler_number")
-_WHOSE = {"start_": ", start", "true_": ", truth", "": ""}
-_PARTS = {"_whole": ", whole surface", "_seen": ", surface that is seen", "": ""}
+_MEASURE_PREFIXES = ("chamfer", "fscore", "iou", "normal_consistency", "components", "euler_number")
+_SUBJECT_LABELS = {"start_": ", start", "true_": ", truth", "": ""}
+_SURFACE_LABELS = {"_whole": ", whole surface", "_seen": ", surface that is seen", "": ""}
 
 
 def is_shape_key(key: str) -> bool:
     """Whether a number of a fit is a measure of its shape."""
-    return key.startswith(tuple(whose + name for whose in _WHOSE for name in _BEGINNINGS))
+    return key.startswith(
+        tuple(whose + name for whose in _SUBJECT_LABELS for name in _MEASURE_PREFIXES)
+    )
 
 
 def shape_label(key: str) -> str:
     """What a measure is, in words."""
-    whose = next(whose for whose in _WHOSE if key.startswith(whose))
-    part = next(part for part in _PARTS if part in key)
+    whose = next(whose for whose in _SUBJECT_LABELS if key.startswith(whose))
+    part = next(part for part in _SURFACE_LABELS if part in key)
     name = key.removeprefix(whose).replace(part, "")
     if name.startswith("fscore"):
         name = f"F-score at {name.removeprefix('fscore_').removesuffix('cm')} cm"
-    return texts("shapes").get(name, name) + _PARTS[part] + _WHOSE[whose]
+    return load_texts("shapes").get(name, name) + _SURFACE_LABELS[part] + _SUBJECT_LABELS[whose]
 
 
 def short_label(key: str) -> str:
     """A measure as the head of a narrow column."""
     if key.startswith("fscore"):
         return f"F {key.removeprefix('fscore_').removesuffix('cm')} cm"
-    return texts("shape_columns").get(key, key)
+    return load_texts("shape_columns").get(key, key)
 
 
 def check_measures(problem: Problem, start: Scene) -> None:
@@ -57,14 +59,14 @@ def check_measures(problem: Problem, start: Scene) -> None:
     table = problem.measures
     if table is None:
         return
-    with about("measures"):
-        _compared(problem, start, table.seen)
-        truth = _placed(problem.truth, table.object)
+    with prefix_errors("measures"):
+        _compare_surfaces(problem, start, table.seen)
+        truth = _world_mesh(problem.truth, table.object)
         if is_watertight(truth):
             volume_iou(truth, truth, table.voxel)
 
 
-def shape_scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
+def score_shape(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     """Measures of the found shape, whole and as far as some radar position sees it.
 
     Those without an ending are the ones that the run file asks for. Parts and holes are those of
@@ -74,58 +76,70 @@ def shape_scores(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     table = problem.measures
     if table is None:
         return {}
-    rows = _rows(problem, twin, table.seen)
-    rows |= _rows(problem, twin, False, "_whole") | _rows(problem, twin, True, "_seen")
-    rows |= _topology(twin[table.object].mesh)
-    truth = _topology(problem.truth[table.object].mesh)
-    before = _rows(problem, start, table.seen) | _topology(start[table.object].mesh)
+    rows = _shape_metrics(problem, twin, table.seen)
+    rows |= _shape_metrics(problem, twin, False, "_whole") | _shape_metrics(
+        problem, twin, True, "_seen"
+    )
+    rows |= _topology_metrics(twin[table.object].mesh)
+    truth = _topology_metrics(problem.truth[table.object].mesh)
+    before = _shape_metrics(problem, start, table.seen) | _topology_metrics(
+        start[table.object].mesh
+    )
     rows |= {f"true_{key}": value for key, value in truth.items()}
     return rows | {f"start_{key}": value for key, value in before.items()}
 
 
-def watch_of(problem: Problem) -> Callable[[Scene], dict[str, float]] | None:
+def make_shape_metric(problem: Problem) -> Callable[[Scene], dict[str, float]] | None:
     """What is noted of the twin during the fit, where the truth is known."""
     table = problem.measures
     if table is None:
         return None
 
-    def watch(scene: Scene) -> dict[str, float]:
-        return {CURVE: _compared(problem, without_clouds(scene), table.seen, volume=False).chamfer}
+    def measure_shape(scene: Scene) -> dict[str, float]:
+        return {
+            CURVE_KEY: _compare_surfaces(
+                problem, replace_clouds(scene), table.seen, volume=False
+            ).chamfer
+        }
 
-    return watch
+    return measure_shape
 
 
-def _compared(problem: Problem, scene: Scene, seen: bool, volume: bool = True) -> ShapeMetrics:
+def _compare_surfaces(
+    problem: Problem, scene: Scene, visible_only: bool, volume: bool = True
+) -> ShapeMetrics:
     table = problem.measures
     assert table is not None
-    eyes = [sight.radar.positions.detach() for sight in problem.sights.values()]
+    eyes = [sight.radar.positions.detach() for sight in problem.sensor_data.values()]
     return compare_shapes(
-        _placed(scene, table.object),
-        _placed(problem.truth, table.object),
-        seen_from=torch.cat(eyes) if seen else None,
+        _world_mesh(scene, table.object),
+        _world_mesh(problem.truth, table.object),
+        seen_from=torch.cat(eyes) if visible_only else None,
         thresholds=table.thresholds,
         voxel=table.voxel if volume else None,
     )
 
 
-def _rows(problem: Problem, scene: Scene, seen: bool, ending: str = "") -> dict[str, Any]:
+def _shape_metrics(
+    problem: Problem, scene: Scene, visible_only: bool, suffix: str = ""
+) -> dict[str, Any]:
     """Measures as metrics keep them; none if the shape is empty or invisible."""
     try:
-        found = _compared(problem, scene, seen)
+        found = _compare_surfaces(problem, scene, visible_only)
     except InputError:
         return {}
-    rows: dict[str, Any] = {f"chamfer{ending}_m": found.chamfer}
+    rows: dict[str, Any] = {f"chamfer{suffix}_m": found.chamfer}
     for threshold, value in found.fscore.items():
-        rows[f"fscore_{threshold * 100:g}cm{ending}"] = value
+        rows[f"fscore_{threshold * 100:g}cm{suffix}"] = value
     if found.iou is not None:
-        rows[f"iou{ending}"] = found.iou
-    return rows | {f"normal_consistency{ending}": found.normal_consistency}
+        rows[f"iou{suffix}"] = found.iou
+    return rows | {f"normal_consistency{suffix}": found.normal_consistency}
 
 
-def _topology(mesh: Mesh) -> dict[str, Any]:
-    return dict(vars(topology(mesh))) if is_watertight(mesh) else {}
+def _topology_metrics(mesh: Mesh) -> dict[str, Any]:
+    return dict(vars(count_topology(mesh))) if is_watertight(mesh) else {}
 
 
-def _placed(scene: Scene, name: str) -> Mesh:
+def _world_mesh(scene: Scene, name: str) -> Mesh:
     """The object's mesh in the world."""
     return Mesh(scene[name].vertices.detach(), scene[name].mesh.faces)

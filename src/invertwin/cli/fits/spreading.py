@@ -15,21 +15,21 @@ from pathlib import Path
 from rich.console import Console
 
 from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.run_file import stated, validate
-from invertwin.cli.terminal import progress
+from invertwin.cli.schema.run_file import to_minimal_toml, validate_run
+from invertwin.cli.terminal import show_progress
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.runtime.engines import Engine, spread
-from invertwin.runtime.progress import told
+from invertwin.runtime.engines import Engine, run_jobs
+from invertwin.runtime.progress import track
 from invertwin.storage.folders import PARTS, UNFINISHED
 from invertwin.storage.run_folder import RunFolder, open_run
 
-QUIET = Console(quiet=True)
-FitOne = Callable[[RunFile, str, int, RunFolder], object]
+QUIET_CONSOLE = Console(quiet=True)
+FitFunction = Callable[[RunFile, str, int, RunFolder], object]
 """Run file, way to fit, number of the start, folder → a fit that leaves its files there."""
 
 
 @dataclass(frozen=True)
-class Workers:
+class FitWorkers:
     """Who fits.
 
     Attributes:
@@ -41,7 +41,7 @@ class Workers:
     count: int
 
     @classmethod
-    def asked(cls, engine: Engine, count: int | None) -> "Workers | None":
+    def from_options(cls, engine: Engine, count: int | None) -> "FitWorkers | None":
         """What the options `--engine` and `--workers` ask for; None without them.
 
         Args:
@@ -52,30 +52,30 @@ class Workers:
 
 
 @dataclass(frozen=True)
-class Job:
+class FitJob:
     """One fit.
 
     Attributes:
         fit_one: Fits; a function of a module.
-        text: The run file.
+        run_toml: The run file.
         mode: The run's own way to fit, or a variant.
         start: Number of the start.
         files: What the fit goes on from, such as the calibration, by path in the folder.
     """
 
-    fit_one: FitOne
-    text: str
+    fit_one: FitFunction
+    run_toml: str
     mode: str
     start: int
     files: Mapping[str, bytes]
 
 
-def fit_elsewhere(
-    fit_one: FitOne,
+def distribute_fits(
+    fit_one: FitFunction,
     run: RunFile,
     folder: RunFolder,
     console: Console,
-    workers: Workers,
+    workers: FitWorkers,
     fits: Sequence[tuple[str, int]],
 ) -> None:
     """Let others make the fits that are not in the folder yet, and put their files there.
@@ -92,25 +92,25 @@ def fit_elsewhere(
         InputError: What a fit refuses, or only one fit.
     """
     if len(fits) == 1:
-        raise refused("one fit")
-    text, begun = stated(run), f"{PARTS}/calibration.pt"
+        raise no_parallel_fits_error("one fit")
+    text, begun = to_minimal_toml(run), f"{PARTS}/calibration.pt"
     path = folder.path / UNFINISHED / begun
     files = {begun: path.read_bytes()} if path.exists() else {}
     jobs = [
-        Job(fit_one, text, mode, start, files)
+        FitJob(fit_one, text, mode, start, files)
         for mode, start in fits
-        if folder.read_json(f"{part_name(mode, start)}.json") is None
+        if folder.read_json(f"{fit_file_stem(mode, start)}.json") is None
     ]
-    found = spread(fitted_files, jobs, engine=workers.engine, workers=workers.count)
-    with progress(console), closing(found) as done:
-        for _ in told(jobs, "fits"):
+    found = run_jobs(run_fit_job, jobs, engine=workers.engine, workers=workers.count)
+    with show_progress(console), closing(found) as done:
+        for _ in track(jobs, "fits"):
             _, made = next(done)
             # A row says that its fit is done, so it comes last.
             for name in sorted(made, key=lambda name: name.endswith(".json")):
                 folder.write_bytes(name, made[name])
 
 
-def refused(got: str) -> InputError:
+def no_parallel_fits_error(got: str) -> InputError:
     """The error where there is nothing to spread.
 
     Args:
@@ -122,7 +122,7 @@ def refused(got: str) -> InputError:
     )
 
 
-def part_name(mode: str, start: int) -> str:
+def fit_file_stem(mode: str, start: int) -> str:
     """How the files of a fit begin, in the run's folder.
 
     Args:
@@ -132,16 +132,16 @@ def part_name(mode: str, start: int) -> str:
     return f"{PARTS}/{mode}_{start:02d}"
 
 
-def fitted_files(job: Job) -> dict[str, bytes]:
+def run_fit_job(job: FitJob) -> dict[str, bytes]:
     """The files of a fit by their path in the run's folder: what a worker does.
 
     Args:
         job: The fit.
     """
-    run = validate(tomllib.loads(job.text), Path("run.toml"))
+    run = validate_run(tomllib.loads(job.run_toml), Path("run.toml"))
     with tempfile.TemporaryDirectory() as scratch, warnings.catch_warnings():
         warnings.simplefilter("ignore", PhysicsWarning)  # told once, where the run began
-        with open_run(Path(scratch, "fit"), {"run": job.text}) as folder:
+        with open_run(Path(scratch, "fit"), {"run": job.run_toml}) as folder:
             for name, content in job.files.items():
                 folder.write_bytes(name, content)
             job.fit_one(run, job.mode, job.start, folder)

@@ -9,37 +9,46 @@ import torch
 
 from invertwin import plotting
 from invertwin.cli.fits.problem import (
-    FULL,
-    INTERIOR,
+    INTERIOR_ONLY,
+    OWN_METHOD,
     Problem,
-    annealed_until,
+    blur_end_step,
     fitted_objects,
-    settings_of,
+    require_settings,
 )
-from invertwin.cli.fits.scores import certainty_table
-from invertwin.cli.fits.shape_scores import CURVE, is_shape_key, shape_label, short_label
-from invertwin.cli.report import Picture, Table, picture, quantities, shown, texts
+from invertwin.cli.fits.scores import error_bar_table
+from invertwin.cli.fits.shape_scores import CURVE_KEY, is_shape_key, shape_label, short_label
+from invertwin.cli.report import (
+    ReportPicture,
+    ReportTable,
+    format_cell,
+    load_texts,
+    quantity_table,
+    save_picture,
+)
 from invertwin.cli.schema import RunFile, SimulatedData
-from invertwin.inversion.metrics import residual
+from invertwin.inversion.metrics import pose_error
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.material.values import RANGES
 from invertwin.storage.run_folder import RunFolder
 
-_MATERIAL = {f"{name}_error": name for name in RANGES}
+_MATERIAL_ERRORS = {f"{name}_error": name for name in RANGES}
 _UNITS = {"translation": " [m]", "rotation": " [rad, rotation vector]", "scale": " [factor]"}
-_CONVENTIONAL = (
+_INITIAL_METRICS = (
     ("distance to the truth [m]", "start_distance_m", "position_error_m"),
     ("angle to the truth [°]", "start_angle_deg", "rotation_error_deg"),
     ("size, share off the truth", "initial_scale_error", "scale_error"),
     ("loss without extra width", "start_loss_sharp", "loss_sharp"),
 )
-_BEGUN = f"start_{CURVE}"
-COLUMNS = texts("starts") | {key: f"{name} off by" for key, name in _MATERIAL.items()}
+_START_CURVE_KEY = f"start_{CURVE_KEY}"
+START_COLUMNS = load_texts("starts") | {
+    key: f"{name} off by" for key, name in _MATERIAL_ERRORS.items()
+}
 """Heads of the table of starts; what metrics.json says of the best one."""
 
 
 @dataclass(frozen=True)
-class Fitted:
+class BestFit:
     """The best fit of a run, beside all others."""
 
     problem: Problem
@@ -51,46 +60,52 @@ class Fitted:
     residuals: list[torch.Tensor]  # of the best one, one for every sensor or none
 
     @property
-    def ways(self) -> list[tuple[str, list[dict[str, Any]]]]:
+    def fits_by_method(self) -> list[tuple[str, list[dict[str, Any]]]]:
         """The fits of every way to fit, by its name in words."""
         run = self.problem.run
-        own = "with boundary terms" if settings_of(run).boundary else "interior only"
-        if set(self.rows) - {FULL, INTERIOR}:
+        own = "with boundary terms" if require_settings(run).boundary else "interior only"
+        if set(self.rows) - {OWN_METHOD, INTERIOR_ONLY}:
             own = "as the run says"
         return [
-            (own if mode == FULL else mode.replace("_", " "), fits)
+            (own if mode == OWN_METHOD else mode.replace("_", " "), fits)
             for mode, fits in self.rows.items()
         ]
 
 
-def tables_of(fitted: Fitted) -> list[Table]:
+def make_tables(fitted: BestFit) -> list[ReportTable]:
     """What is printed, and shown in the report."""
     metrics = fitted.metrics
-    tables = [_result(fitted.problem.run, metrics)]
-    for way, fits in fitted.ways:
+    tables = [_result_table(fitted.problem.run, metrics)]
+    for way, fits in fitted.fits_by_method:
         if len(fits) > 1:
-            keys = [key for key in COLUMNS if key in fits[0]]
+            keys = [key for key in START_COLUMNS if key in fits[0]]
             cells = [
-                [row["start"] + 1, *(_cell(key, row[key], row.get("lost", False)) for key in keys)]
+                [
+                    row["start"] + 1,
+                    *(_format_status(key, row[key], row.get("lost", False)) for key in keys),
+                ]
                 for row in fits
             ]
-            heads = ["start", *(COLUMNS[key] for key in keys)]
-            tables.append(Table(f"Starts, {way}", heads, cells))
-    if len(fitted.ways) > 1 and any(is_shape_key(key) for key in metrics):
-        tables.append(_variants(fitted))
-    tables += [_places(fitted), certainty_table(metrics)]
+            heads = ["start", *(START_COLUMNS[key] for key in keys)]
+            tables.append(ReportTable(f"Starts, {way}", heads, cells))
+    if len(fitted.fits_by_method) > 1 and any(is_shape_key(key) for key in metrics):
+        tables.append(_method_table(fitted))
+    tables += [_pose_table(fitted), error_bar_table(metrics)]
     moves = [[k + _UNITS.get(k.split(".")[-1], ""), v] for k, v in metrics["parameters"].items()]
     if moves:
-        tables.append(Table("Moves from the start", ["parameter", "value"], moves))
+        tables.append(ReportTable("Moves from the start", ["parameter", "value"], moves))
     if "initial_seconds" in metrics:
-        tables.append(_added(fitted.problem.run, metrics))
+        tables.append(_refinement_table(fitted.problem.run, metrics))
     return tables
 
 
-def _result(run: RunFile, metrics: dict[str, Any]) -> Table:
-    rows: list[list[Any]] = [["verdict", metrics["verdict"]], ["why it stopped", _ended(metrics)]]
+def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
+    rows: list[list[Any]] = [
+        ["verdict", metrics["verdict"]],
+        ["why it stopped", _stop_reason(metrics)],
+    ]
     if "success" in metrics:
-        count, limits = metrics["starts_count"], _limits(run, metrics)
+        count, limits = metrics["starts_count"], _success_limits(run, metrics)
         if count == 1:
             rows.append([f"within {limits} of the truth", metrics["success"]])
         else:
@@ -98,134 +113,140 @@ def _result(run: RunFile, metrics: dict[str, Any]) -> Table:
         if "successes_interior_only" in metrics:
             text = f"{metrics['successes_interior_only']} of {count}"
             rows.append(["the same without boundary terms", text])
-    skip = () if annealed_until(run) else ("start_loss_sharp", "loss_sharp")
-    rows.extend(map(list, quantities("", metrics, skip=skip).rows))
-    made_of = {key: name for key, name in _MATERIAL.items() if key in metrics}
+    skip = () if blur_end_step(run) else ("start_loss_sharp", "loss_sharp")
+    rows.extend(map(list, quantity_table("", metrics, skip=skip).rows))
+    made_of = {key: name for key, name in _MATERIAL_ERRORS.items() if key in metrics}
     rows += [[f"{name}, share off the truth", metrics[key]] for key, name in made_of.items()]
     for key in metrics:
-        if _own_shape(run, key):
+        if _is_own_shape_key(run, key):
             rows.append([shape_label(key), metrics[key]])
             found = key.removeprefix("start_")
             if found not in metrics:
                 rows.append([shape_label(found), None])
-    calibration = {k: _cell(k, v) for k, v in metrics.get("calibration", {}).items()}
-    rows.extend(map(list, quantities("", calibration, of="calibration").rows))
-    return Table("Result", ["quantity", "value"], rows)
+    calibration = {k: _format_status(k, v) for k, v in metrics.get("calibration", {}).items()}
+    rows.extend(map(list, quantity_table("", calibration, label_table="calibration").rows))
+    return ReportTable("Result", ["quantity", "value"], rows)
 
 
-def _variants(fitted: Fitted) -> Table:
+def _method_table(fitted: BestFit) -> ReportTable:
     """What each way to fit has made of the shape, means over the starts."""
-    first = fitted.ways[0][1][0]
+    first = fitted.fits_by_method[0][1][0]
     begun = [key for key in first if key.startswith("start_") and is_shape_key(key)]
     keys = [key.removeprefix("start_") for key in begun]
     cells: list[list[Any]] = [["start", *(first[key] for key in begun)]]
-    for way, fits in fitted.ways:
+    for way, fits in fitted.fits_by_method:
         means = [[row[key] for row in fits if key in row] for key in keys]
         cells.append([way, *(sum(v) / len(v) if v else None for v in means)])
-    return Table("Ways to fit", ["fit", *(short_label(key) for key in keys)], cells)
+    return ReportTable("Ways to fit", ["fit", *(short_label(key) for key in keys)], cells)
 
 
-def _places(fitted: Fitted) -> Table:
+def _pose_table(fitted: BestFit) -> ReportTable:
     """Where the fitted objects stand, and how they are turned."""
     problem, cells = fitted.problem, []
     for name in dict.fromkeys(fitted_objects(problem.run)):
-        known = name in problem.known
+        known = name in problem.known_objects
         scenes = [fitted.start, fitted.twin, *([problem.truth] if known else [])]
         centers = [scene[name].center.detach().tolist() for scene in scenes]
         for i, axis in enumerate("xyz"):
-            cells.append([f"{name}.{axis} [m]", *(_clean(center[i]) for center in centers)])
+            cells.append([f"{name}.{axis} [m]", *(_round_zero(center[i]) for center in centers)])
         if known and "rotation_error_deg" in fitted.metrics:
-            off = [residual(scene[name], problem.truth[name]) for scene in scenes]
-            angles = [_clean(math.degrees(found.angle)) if found else None for found in off]
+            off = [pose_error(scene[name], problem.truth[name]) for scene in scenes]
+            angles = [_round_zero(math.degrees(found.angle)) if found else None for found in off]
             cells.append([f"{name}, angle to the truth [°]", *angles])
     cells = [row + [None] * (4 - len(row)) for row in cells]
-    return Table("Parameters", ["parameter", "start", "result", "truth"], cells)
+    return ReportTable("Parameters", ["parameter", "start", "result", "truth"], cells)
 
 
-def _own_shape(run: RunFile, key: str) -> bool:
+def _is_own_shape_key(run: RunFile, key: str) -> bool:
     """Whether a number measures the shape that the run's own way to fit has found."""
     return is_shape_key(key) and not key.endswith(tuple(f"_{mode}" for mode in run.variants))
 
 
-def _added(run: RunFile, metrics: dict[str, Any]) -> Table:
+def _refinement_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
     """What the fit has made better: the conventional guess beside the twin."""
-    shapes = [(shape_label(key), f"start_{key}", key) for key in metrics if _own_shape(run, key)]
+    shapes = [
+        (shape_label(key), f"start_{key}", key) for key in metrics if _is_own_shape_key(run, key)
+    ]
     rows = [
         [label, metrics[before], metrics[after]]
-        for label, before, after in (*_CONVENTIONAL, *shapes)
+        for label, before, after in (*_INITIAL_METRICS, *shapes)
         if metrics.get(before) is not None and metrics.get(after) is not None
     ]
-    legend = texts("notes")["initial_points" if "initial_points" in metrics else "initial"]
+    legend = load_texts("notes")["initial_points" if "initial_points" in metrics else "initial"]
     columns = ["quantity", "conventional guess", "refined twin"]
-    return Table("What the refinement added", columns, rows, legend.format(**metrics))
+    return ReportTable("What the refinement added", columns, rows, legend.format(**metrics))
 
 
-def pictures_of(fitted: Fitted, folder: RunFolder) -> list[Picture]:
+def draw_pictures(fitted: BestFit, folder: RunFolder) -> list[ReportPicture]:
     """Write the pictures of the best fit; return those of the report."""
     problem, metrics = fitted.problem, fitted.metrics
     run, truth, fitted_names = problem.run, problem.truth, fitted_objects(problem.run)
-    known = {k: truth[k] for k in truth.names if k in problem.known and k in fitted_names}
+    known = {k: truth[k] for k in truth.names if k in problem.known_objects and k in fitted_names}
     scenes = {"truth": truth} if known else {}
     scenes |= {"start": fitted.start, "twin": fitted.twin}
     outline = Scene(known) if known else None
-    radars = [sight.radar for sight in problem.sights.values()]
+    radars = [sight.radar for sight in problem.sensor_data.values()]
     figure = plotting.scene(scenes, radars, highlight=fitted_names, outline=outline)
-    found = [picture(folder, "scene", figure, note="scene" if "success" in metrics else "")]
+    found = [save_picture(folder, "scene", figure, note="scene" if "success" in metrics else "")]
     data = "exact simulation" if isinstance(run.data, SimulatedData) else "measured"
     titles = {"measured": f"data ({data})", "start": "surrogate, start", "twin": "surrogate, twin"}
-    for number, (name, sight) in enumerate(problem.sights.items()):
+    for number, (name, sight) in enumerate(problem.sensor_data.items()):
         titled = {titles[key]: maps[number] for key, maps in fitted.maps.items()}
         file = f"spectra_{name}" if name else "spectra"
-        found.append(picture(folder, file, plotting.spectrum(titled, sight.grid), note="spectra"))
-    for (name, sight), apart in zip(problem.sights.items(), fitted.residuals, strict=False):
+        found.append(
+            save_picture(folder, file, plotting.spectrum(titled, sight.grid), note="spectra")
+        )
+    for (name, sight), apart in zip(problem.sensor_data.items(), fitted.residuals, strict=False):
         figure = plotting.residuals(apart, sight.grid)
         file = f"residuals_{name}" if name else "residuals"
-        found.append(picture(folder, file, figure, note="residuals"))
-    losses = {way: [row["losses"] for row in fits] for way, fits in fitted.ways}
-    annealed, notes = annealed_until(run), texts("notes")
+        found.append(save_picture(folder, file, figure, note="residuals"))
+    losses = {way: [row["losses"] for row in fits] for way, fits in fitted.fits_by_method}
+    annealed, notes = blur_end_step(run), load_texts("notes")
     before = metrics["start_loss_sharp"] if annealed else None
     figure, note = plotting.convergence(losses, annealed=annealed, before=before), ""
     if annealed is not None:
         told = None not in (before, metrics["loss_sharp"])
         note = notes["loss"] + (notes["loss_sharp"].format(**metrics) if told else "")
-    found.append(picture(folder, "loss", figure, note=note))
+    found.append(save_picture(folder, "loss", figure, note=note))
     if run.measures is not None:
-        folder.write_bytes("turntable.gif", _turntable(fitted, run.measures.object))
-        curves = {way: [_curve(row) for row in fits] for way, fits in fitted.ways}
+        folder.write_bytes("turntable.gif", _draw_turntable(fitted, run.measures.object))
+        curves = {way: [_shape_curve(row) for row in fits] for way, fits in fitted.fits_by_method}
         if any(curve for fits in curves.values() for curve in fits):
             figure = plotting.convergence(losses, curves)
-            found.append(picture(folder, "convergence", figure))
+            found.append(save_picture(folder, "convergence", figure))
     if run.landscape is not None and "landscape" in metrics:
         minima = metrics["landscape"]["local_minima"]["exact"]
         span = {"span_mm": run.landscape.exact_span * 1e3}
         note = notes["landscape"].format(object=run.landscape.object, exact=minima, **span)
-        found.append(Picture("Landscape", folder.file("landscape.png").read_bytes(), note))
+        found.append(ReportPicture("Landscape", folder.file("landscape.png").read_bytes(), note))
     return found
 
 
-def _turntable(fitted: Fitted, name: str) -> bytes:
+def _draw_turntable(fitted: BestFit, name: str) -> bytes:
     """The object from all around, moving."""
     problem = fitted.problem
-    scenes = {"truth": problem.truth} if name in problem.known else {}
+    scenes = {"truth": problem.truth} if name in problem.known_objects else {}
     scenes |= {"start": fitted.start, "twin": fitted.twin}
-    turns = problem.first.radar.rotations
+    turns = problem.first_sensor.radar.rotations
     up = (0.0, 1.0, 0.0) if turns is None else turns.detach().mean(0)[:, 1]
     found = {key: scene[name] for key, scene in scenes.items()}
     meshes = {key: Mesh(item.vertices, item.mesh.faces) for key, item in found.items()}
     return plotting.turntable(meshes, up)
 
 
-def _curve(row: dict[str, Any]) -> list[list[float]]:
+def _shape_curve(row: dict[str, Any]) -> list[list[float]]:
     """How the measure went, from the start on where that is scored."""
-    begun: list[list[float]] = [[0, row[_BEGUN]]] if row["curve"] and _BEGUN in row else []
+    begun: list[list[float]] = (
+        [[0, row[_START_CURVE_KEY]]] if row["curve"] and _START_CURVE_KEY in row else []
+    )
     return [*begun, *row["curve"]]
 
 
-def status(run: RunFile, metrics: dict[str, Any]) -> str:
+def describe_outcome(run: RunFile, metrics: dict[str, Any]) -> str:
     """What came out, in a sentence or two."""
     count = metrics.get("starts_count", 1)
     which = f"Best of {count} starts: " if count > 1 else ""
-    ended, believed = _ended(metrics), texts("verdicts")[metrics["verdict"]]
+    ended, believed = _stop_reason(metrics), load_texts("verdicts")[metrics["verdict"]]
     many = "joint_error_after_deg" in metrics or count > 1
     if "joint_error_after_deg" in metrics:
         score = f"{which}joints {metrics['joint_error_after_deg']:.1f}° off, mean; {ended}."
@@ -238,19 +259,19 @@ def status(run: RunFile, metrics: dict[str, Any]) -> str:
         return f"{which}Chamfer distance {change}; {ended}."
     else:
         return f"{which}{ended}. {believed}"
-    limits = _limits(run, metrics)
+    limits = _success_limits(run, metrics)
     if many:
         return f"{score} {metrics['successes']} of {count} starts end within {limits}. {believed}"
-    return f"{score} A success is within {limits}: {shown(metrics['success'])}. {believed}"
+    return f"{score} A success is within {limits}: {format_cell(metrics['success'])}. {believed}"
 
 
-def _ended(metrics: dict[str, Any]) -> str:
-    return texts("outcomes")[metrics["status"]].format(steps=metrics["steps"])
+def _stop_reason(metrics: dict[str, Any]) -> str:
+    return load_texts("outcomes")[metrics["status"]].format(steps=metrics["steps"])
 
 
-def _limits(run: RunFile, metrics: dict[str, Any]) -> str:
+def _success_limits(run: RunFile, metrics: dict[str, Any]) -> str:
     """How near the truth counts as a success."""
-    settings = settings_of(run)
+    settings = require_settings(run)
     if "joint_error_after_deg" in metrics:
         return f"{settings.joint_limit_deg:g}° (mean over the joints)"
     turned = "rotation_error_deg" in metrics
@@ -258,11 +279,11 @@ def _limits(run: RunFile, metrics: dict[str, Any]) -> str:
     return f"{settings.position_limit:g} m{angle}"
 
 
-def _cell(key: str, value: Any, lost: bool = False) -> Any:
+def _format_status(key: str, value: Any, uninformative: bool = False) -> Any:
     """What a table shows of a number; a start that is lost says so, however it ended."""
-    return texts("ends")["lost" if lost else value] if key == "status" else value
+    return load_texts("ends")["lost" if uninformative else value] if key == "status" else value
 
 
-def _clean(value: float) -> float:
+def _round_zero(value: float) -> float:
     """Without what rounding leaves of a zero."""
     return round(value, 9) + 0.0

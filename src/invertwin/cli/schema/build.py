@@ -8,18 +8,18 @@ from typing import Any
 import torch
 from torch import nn
 
-from invertwin.cli.schema import RunFile, SceneFile
-from invertwin.cli.schema.run_file import about as about
-from invertwin.cli.schema.run_file import need, unknown_object
+from invertwin.cli.schema import RunFile, SceneFileTable
+from invertwin.cli.schema.run_file import prefix_errors as prefix_errors
+from invertwin.cli.schema.run_file import require_section, unknown_object_message
 from invertwin.cli.schema.sensors import grid as grid
 from invertwin.cli.schema.sensors import radar as radar
-from invertwin.cli.schema.shape_tables import ObjectTable, Placement, given_for
+from invertwin.cli.schema.shape_tables import ObjectTable, ShapePoseTable, module_values
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck.tangents import Change, changes_of
-from invertwin.links.metasurface.placement import Placing
-from invertwin.links.metasurface.wall_path import PlacedPanel
-from invertwin.registry.kinds import Table
-from invertwin.scene import Mesh, Object, Scene, SkinnedBody, joined
+from invertwin.inversion.gradcheck.tangents import ParameterChange, parameter_changes
+from invertwin.links.metasurface.placement import PanelDesign
+from invertwin.links.metasurface.wall_path import PanelPlacement
+from invertwin.registry.kinds import ConstructorTable
+from invertwin.scene import Mesh, Object, Scene, SkinnedBody, merge_meshes
 from invertwin.scene.files import CONCRETE, load_scene_xml
 
 
@@ -32,20 +32,20 @@ def scene(run: RunFile) -> Scene:
     """
     built: dict[str, Object] = {}
     if run.scene_file is not None:
-        with about("scene_file"):
-            built.update(_from_file(run.scene_file).objects)
+        with prefix_errors("scene_file"):
+            built.update(_load_scene_file(run.scene_file).objects)
     if run.room is not None:
-        with about("room"):
+        with prefix_errors("room"):
             for name, item in run.room.build().items():
                 _require_new(name, built)
                 built[name] = item
     for name, table in run.scene.items():
-        with about(f"scene.{name}"):
+        with prefix_errors(f"scene.{name}"):
             _require_new(name, built)
             built[name] = table.build()
-    for path, name in run.references():
+    for path, name in run.object_references():
         if name not in built:
-            raise InputError(unknown_object(path, name, list(built)))
+            raise InputError(unknown_object_message(path, name, list(built)))
     return Scene(built)
 
 
@@ -63,8 +63,10 @@ def true_scene(run: RunFile) -> Scene:
     for name, truth in run.truth.items():
         changes = {key: value for key, value in truth if value is not None}
         parts = changes.pop("parts", None)
-        with about(f"truth.{name}"):
-            shape = {} if parts is None else {"mesh": joined([part.build() for part in parts])}
+        with prefix_errors(f"truth.{name}"):
+            shape = (
+                {} if parts is None else {"mesh": merge_meshes([part.build() for part in parts])}
+            )
             if name in run.scene:
                 item = run.scene[name].model_copy(update=changes).build(**shape)
             else:
@@ -79,27 +81,27 @@ def true_scene(run: RunFile) -> Scene:
                 if (velocity := changes.pop("velocity", None)) is not None:
                     item = replace(item, velocity=torch.tensor(velocity, dtype=torch.float64))
                 changes.setdefault("position", item.transform[:3, 3].tolist())
-                place = Placement(**changes)
+                place = ShapePoseTable(**changes)
                 mesh = Mesh(item.mesh.vertices * place.scale, item.mesh.faces)
-                item = replace(item, mesh=shape.get("mesh", mesh), pose=place.pose())
+                item = replace(item, mesh=shape.get("mesh", mesh), pose=place.build_pose())
                 if made_of is not None:
-                    with about("material"):
+                    with prefix_errors("material"):
                         item = replace(item, material=made_of.build({Mesh: item.mesh}))
         found = Scene({**found.objects, name: item})
     return found
 
 
-def _from_file(table: SceneFile) -> Scene:
+def _load_scene_file(table: SceneFileTable) -> Scene:
     materials = {}
     for name, found in table.materials.items():
-        with about(f"materials.{name}"):
+        with prefix_errors(f"materials.{name}"):
             materials[name] = found.build()
-    with about("material"):
+    with prefix_errors("material"):
         others = CONCRETE if table.material is None else table.material.build()
     return load_scene_xml(table.file, materials, others)
 
 
-def made(run: RunFile, section: str, given: Mapping[type, object] | None = None) -> Any:
+def build_section(run: RunFile, section: str, given: Mapping[type, object] | None = None) -> Any:
     """What the constructor of a section of the run file makes of it.
 
     Args:
@@ -107,11 +109,11 @@ def made(run: RunFile, section: str, given: Mapping[type, object] | None = None)
         section: Such as "loss".
         given: Values that a constructor may ask for, by their type.
     """
-    with about(section):
+    with prefix_errors(section):
         return getattr(run, section).build(given)
 
 
-def builders(
+def module_builders(
     tables: Sequence[Any], objects: Mapping[str, ObjectTable] | None = None
 ) -> dict[str, Callable[[Scene], nn.Module]]:
     """What makes the modules of the `[[parameters]]` tables for a scene, by name, in order.
@@ -119,12 +121,12 @@ def builders(
     Bodies and learned shapes are those of their `[scene.<name>]` tables, the objects.
     """
     return {
-        name: partial(_module, table, f"parameters[{i}]", objects or {})
-        for i, (name, table) in enumerate(named(tables).items())
+        name: partial(_build_module, table, f"parameters[{i}]", objects or {})
+        for i, (name, table) in enumerate(tables_by_name(tables).items())
     }
 
 
-def named(tables: Sequence[Any]) -> dict[str, Any]:
+def tables_by_name(tables: Sequence[Any]) -> dict[str, Any]:
     """The `[[parameters]]` tables by what stages and variants call them."""
     names = [table.name or table.kind for table in tables]
     # Twice the same kind without names is fine where nothing calls them by name.
@@ -141,10 +143,10 @@ def parameters(
         InputError: A material value that the object's material does not have, or that starts at
             the end of its range; a box that does not hold the object.
     """
-    return [make(scene) for make in builders(tables, objects).values()]
+    return [make(scene) for make in module_builders(tables, objects).values()]
 
 
-def body_of(run: RunFile, scene: Scene, name: str) -> SkinnedBody | None:
+def fitted_body(run: RunFile, scene: Scene, name: str) -> SkinnedBody | None:
     """The body of an object whose joints are fitted; None for other objects.
 
     Args:
@@ -157,42 +159,44 @@ def body_of(run: RunFile, scene: Scene, name: str) -> SkinnedBody | None:
     return found[0] if found else None  # type: ignore[return-value]
 
 
-def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, Change]]:
+def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, ParameterChange]]:
     """The module that a gradient check moves, and how its values change with θ.
 
     Args:
         run: With a `[gradcheck]` table.
         scene: At θ = 0.
     """
-    table = need(run, "gradcheck", "a gradient check")
+    table = require_section(run, "gradcheck", "a gradient check")
     if table.parameter.kind == "transmitter":
-        sensor = need(run, "transmitter", "a transmitter that moves").build()
+        sensor = require_section(run, "transmitter", "a transmitter that moves").build()
         module: nn.Module = table.parameter.build(None, initial=sensor.positions[0])
     else:
-        own, panel = run.scene, _panel(run, scene)
-        module = _module(table.parameter, "gradcheck.parameter", own, scene, panel)
-    changes = {n: c.build() if isinstance(c, Table) else c for n, c in table.tangent.items()}
-    with about("gradcheck.tangent"):
-        changes_of(module, changes)
+        own, panel = run.scene, _panel_values(run, scene)
+        module = _build_module(table.parameter, "gradcheck.parameter", own, scene, panel)
+    changes = {
+        n: c.build() if isinstance(c, ConstructorTable) else c for n, c in table.tangent.items()
+    }
+    with prefix_errors("gradcheck.tangent"):
+        parameter_changes(module, changes)
     return module, changes
 
 
-def placing(run: RunFile, scene: Scene) -> tuple[Placing, PlacedPanel]:
+def panel_design(run: RunFile, scene: Scene) -> tuple[PanelDesign, PanelPlacement]:
     """The metasurface of `[placement]`, and where a gradient check has it.
 
     Raises:
         InputError: What the library refuses, by its key.
     """
-    table = need(run, "placement", "a metasurface")
+    table = require_section(run, "placement", "a metasurface")
     found = table.placing(table.coverage(scene, run.seed))
     return found, table.example(found)
 
 
-def _panel(run: RunFile, scene: Scene) -> dict[type, object]:
-    return {} if run.placement is None else {PlacedPanel: placing(run, scene)[1]}
+def _panel_values(run: RunFile, scene: Scene) -> dict[type, object]:
+    return {} if run.placement is None else {PanelPlacement: panel_design(run, scene)[1]}
 
 
-def _module(
+def _build_module(
     table: Any,
     path: str,
     objects: Mapping[str, ObjectTable],
@@ -202,6 +206,6 @@ def _module(
     name = getattr(table, "object", None)
     given: dict[type, object] = {Scene: scene, **(more or {})}
     if name is not None:
-        given = given_for(name, scene, objects)
-    with about(path):
+        given = module_values(name, scene, objects)
+    with prefix_errors(path):
         return table.build(given)

@@ -9,18 +9,18 @@ from invertwin.camera import Camera, CameraPose, ImageSampling
 from invertwin.forward_model import ForwardModel
 from invertwin.limits import RADIANS, Count, Positive
 from invertwin.models.camera import DepthMap, SilhouetteMap
-from invertwin.registry.kinds import Group, OneOf, Registry, TableOf
+from invertwin.registry.kinds import KindGroup, OneOf, Registry, TableOf
 
-Place = Annotated[Sequence[float], Len(3, 3)]
+PointValues = Annotated[Sequence[float], Len(3, 3)]
 
 
-def looking(
-    positions: Annotated[Sequence[Place], MinLen(1)],
-    look_at: Place,
+def look_at_camera(
+    positions: Annotated[Sequence[PointValues], MinLen(1)],
+    look_at: PointValues,
     width: Count,
     height: Count,
     field_of_view: Annotated[float, RADIANS],
-    up: Place = (0.0, 0.0, 1.0),
+    up: PointValues = (0.0, 0.0, 1.0),
 ) -> Camera:
     """Pinhole cameras that look at a point, upright.
 
@@ -32,7 +32,7 @@ def looking(
         field_of_view: across the width.
         up: in the world; the upper side of the images points there.
     """
-    return Camera.looking(
+    return Camera.look_at(
         positions, look_at, width=width, height=height, field_of_view=field_of_view, up=up
     )
 
@@ -61,13 +61,13 @@ def depth(far: Positive, samples: Count = 16, outline_samples: Count = 64) -> De
     return DepthMap(far, ImageSampling(samples, outline_samples))
 
 
-AnyCamera = Annotated[Any, TableOf(looking, checked=True)]
+AnyCamera = Annotated[Any, TableOf(look_at_camera, checked=True)]
 AnyImage = Annotated[Any, OneOf("image")]
 
 
 def register(registry: Registry) -> None:
     """Add images, and the pose of a camera."""
-    registry.groups["image"] = Group(product=ForwardModel)
+    registry.groups["image"] = KindGroup(product=ForwardModel)
     registry.add("image", "silhouette", silhouette)
     registry.add("image", "depth", depth)
     registry.add("parameter", "camera_pose", CameraPose, without=("translation", "rotation"))

@@ -9,12 +9,12 @@ from invertwin.channel import (
     SquareTrihedralSection,
     TrihedralSection,
 )
-from invertwin.registry.kinds import Group, Registry
+from invertwin.registry.kinds import KindGroup, Registry
 
 
 def register(registry: Registry) -> None:
     """Add the oracles of radar signatures."""
-    registry.groups["cross_section"] = Group(product=CrossSection)
+    registry.groups["cross_section"] = KindGroup(product=CrossSection)
     for name, kind in (
         ("plate", PlateSection),
         ("dihedral", DihedralSection),

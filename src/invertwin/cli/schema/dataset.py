@@ -5,23 +5,23 @@ from typing import Annotated, Any, Literal
 from annotated_types import MinLen
 from pydantic import GetCoreSchemaHandler, model_validator
 
-from invertwin.cli.schema.variation import steps_of
+from invertwin.cli.schema.variation import parse_key_path
 from invertwin.datasets import Choice, Integer, LogUniform, Normal, Presence, Uniform
 from invertwin.limits import Count
-from invertwin.registry.kinds import Group, Registry, Table, number_or_list
-from invertwin.registry.section import Section, Words, fail
+from invertwin.registry.kinds import ConstructorTable, KindGroup, Registry, number_or_list
+from invertwin.registry.section import PrintableText, Section, raise_key_error
 from invertwin.registry.section import key as described
 
-_OWN = ("task", "seed", "dataset", "vary")  # of the data set itself
-_PATH = Annotated[Words, MinLen(1)]
+_DATASET_SECTIONS = ("task", "seed", "dataset", "vary")  # of the data set itself
+_KeyPathText = Annotated[PrintableText, MinLen(1)]
 
 
-class _Paths:
+class _KeyPaths:
     """Annotates a key that is one path, or a list of them."""
 
     @classmethod
     def __get_pydantic_core_schema__(cls, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        kind = number_or_list(_PATH, Annotated[list[_PATH], MinLen(1)])
+        kind = number_or_list(_KeyPathText, Annotated[list[_KeyPathText], MinLen(1)])
         return handler.generate_schema(kind)
 
 
@@ -35,15 +35,17 @@ class DatasetTable(Section):
         "rate, too",
         ["map"],
     )
-    classes: dict[str, Words] = described("class of an object by its name; without it its name", {})
+    classes: dict[str, PrintableText] = described(
+        "class of an object by its name; without it its name", {}
+    )
     masks: bool = described("write how much of every triangle each radar position sees", False)
     paths: bool = described("write the paths of every sample; not with [chirps]", False)
 
 
-class VaryTable(Table):
+class VaryTable(ConstructorTable):
     """What is drawn anew for every sample."""
 
-    key: Annotated[Any, _Paths] = described(
+    key: Annotated[Any, _KeyPaths] = described(
         "its path in the run file, such as scene.box.position[0]; a list of paths gets one value"
     )
 
@@ -53,12 +55,13 @@ class VaryTable(Table):
         return [self.key] if isinstance(self.key, str) else self.key
 
     @model_validator(mode="after")
-    def _leads_somewhere(self) -> "VaryTable":
+    def _check_paths(self) -> "VaryTable":
         for path in self.paths:
-            steps = steps_of(path)
-            if not steps or steps[0] in _OWN:
-                fail(
-                    f"expected a path such as scene.box.position[0], and none of {', '.join(_OWN)},"
+            steps = parse_key_path(path)
+            if not steps or steps[0] in _DATASET_SECTIONS:
+                raise_key_error(
+                    f"expected a path such as scene.box.position[0], and none of "
+                    f"{', '.join(_DATASET_SECTIONS)},"
                     f' got "{path}"; correct it',
                     "key",
                 )
@@ -67,7 +70,7 @@ class VaryTable(Table):
 
 def register(registry: Registry) -> None:
     """Add the distributions."""
-    registry.groups["distribution"] = Group(base=VaryTable)
+    registry.groups["distribution"] = KindGroup(base=VaryTable)
     for name, make in (
         ("uniform", Uniform),
         ("log_uniform", LogUniform),

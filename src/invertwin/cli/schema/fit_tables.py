@@ -8,18 +8,18 @@ from pydantic import model_validator
 from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
 from invertwin.inversion.initialisation.multi_start import pose_grid
-from invertwin.inversion.initialisation.starts import nearby, posed
+from invertwin.inversion.initialisation.starts import place_at_poses, sample_nearby_poses
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.optimizer import Optimizer
-from invertwin.models.facets import ChainField, ChainMap
+from invertwin.models.facets import FacetField, FacetMap
 from invertwin.models.radar import SurrogateMap
-from invertwin.radar.surrogate.surrogate import Surrogate, chosen_surrogate
-from invertwin.registry.kinds import Group, Registry, Table
-from invertwin.registry.section import fail, key
+from invertwin.radar.surrogate.surrogate import Surrogate, resolve_surrogate
+from invertwin.registry.kinds import ConstructorTable, KindGroup, Registry
+from invertwin.registry.section import key, raise_key_error
 from invertwin.scene.scene import Object
 
 
-class SurrogateTable(Table):
+class SurrogateTable(ConstructorTable):
     """Kernels of the smooth model; the extra widths anneal to zero, in cells.
 
     A name may stand for the table: surrogate = "exact", "response", "annealed", "gaussian" or
@@ -30,17 +30,17 @@ class SurrogateTable(Table):
 
     @model_validator(mode="before")
     @classmethod
-    def _by_name(cls, data: Any) -> Any:
+    def _accept_name(cls, data: Any) -> Any:
         if not isinstance(data, str):
             return data
         try:
-            chosen = chosen_surrogate(data)
+            chosen = resolve_surrogate(data)
         except InputError as error:
-            fail(str(error))
+            raise_key_error(str(error))
         return {"exact": True} if chosen is None else {"exact": False, **vars(chosen)}
 
 
-class SearchTable(Table):
+class SearchTable(ConstructorTable):
     """Poses in which an object may begin, beside its start; the best few are fitted."""
 
     object: str = key("name in the scene")
@@ -48,18 +48,22 @@ class SearchTable(Table):
 
 def register(registry: Registry) -> None:
     """Add losses, optimizers and models beside the surrogate's; others come from plugins."""
-    registry.groups["loss"] = Group(default="mse")
-    registry.groups["optimizer"] = Group(default="adam")
-    registry.groups["model"] = Group()
-    registry.groups["search"] = Group(base=SearchTable)
+    registry.groups["loss"] = KindGroup(default="mse")
+    registry.groups["optimizer"] = KindGroup(default="adam")
+    registry.groups["model"] = KindGroup()
+    registry.groups["search"] = KindGroup(base=SearchTable)
     registry.given |= {Grid, Surrogate, Sampling, Object, torch.Generator}
     registry.add("loss", "mse", SpectrumLoss, without=("floor", "degrees"))
     registry.add("loss", "likelihood", SpectrumLoss, without=("degrees",))
     registry.add("loss", "heavy_tailed", SpectrumLoss)
     registry.add("model", "surrogate", SurrogateMap, without=("_reference",), checked=False)
-    registry.add("model", "chains", ChainMap, checked=False)
-    registry.add("model", "chain_field", ChainField, checked=False)
-    for name, make in (("random", nearby), ("grid", pose_grid), ("given", posed)):
+    registry.add("model", "chains", FacetMap, checked=False)
+    registry.add("model", "chain_field", FacetField, checked=False)
+    for name, make in (
+        ("random", sample_nearby_poses),
+        ("grid", pose_grid),
+        ("given", place_at_poses),
+    ):
         registry.add("search", name, make)
     for name in ("adam", "sgd", "gauss_newton"):
         registry.add("optimizer", name, Optimizer, without=("module_rates",))

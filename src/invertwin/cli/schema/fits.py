@@ -8,16 +8,16 @@ from pydantic import PlainSerializer, WrapValidator
 
 from invertwin.channel import Sampling
 from invertwin.cli.schema.fit_tables import SurrogateTable
-from invertwin.inversion.initialisation.initial_pose import FirstPose
-from invertwin.inversion.initialisation.starts import nearby
+from invertwin.inversion.initialisation.initial_pose import InitialPoseEstimator
+from invertwin.inversion.initialisation.starts import sample_nearby_poses
 from invertwin.inversion.schedule import Schedule
 from invertwin.limits import Count, NonNegative, Positive
 from invertwin.radar.surrogate.surrogate import Surrogate
-from invertwin.registry.kinds import OneOf, Table, TableOf, registry
+from invertwin.registry.kinds import ConstructorTable, OneOf, TableOf, registry
 from invertwin.registry.section import Section, Seed, Vector, key
 
 
-class _StartsTable(Table):
+class _StartsTable(ConstructorTable):
     """Random starting poses about the true pose of one object."""
 
     object: str = key("name in the scene")
@@ -27,27 +27,27 @@ class _StartsTable(Table):
     seed: Seed | None = key("without it the run's", None)
 
 
-class _InitialTable(Table):
+class _InitialTable(ConstructorTable):
     """Where an object stands by conventional processing: the fit starts there."""
 
     object: str = key("name in the scene")
 
 
-AnyStarts = Annotated[Any, TableOf(nearby, _StartsTable, ("generator",))]
-AnyInitial = Annotated[Any, TableOf(FirstPose, _InitialTable)]
+AnyStarts = Annotated[Any, TableOf(sample_nearby_poses, _StartsTable, ("generator",))]
+AnyInitial = Annotated[Any, TableOf(InitialPoseEstimator, _InitialTable)]
 
-SAMPLED = registry.table_of(
+SamplingBase = registry.constructor_table(
     Sampling,
     "SamplingTable",
     without=("interior_edges", "points_per_m2", "rough_paths", "memory_budget", "backend"),
 )
 
 
-class Budget(registry.table_of(Schedule, "Schedule", SAMPLED)):
+class Budget(registry.constructor_table(Schedule, "Schedule", SamplingBase)):
     """How long a fit lasts, and what it samples."""
 
 
-class Reconstruct(Budget):
+class ReconstructTable(Budget):
     """The fit: its budget, and what counts as a success."""
 
     parameters: list[str] = key("names of the parameters that are fitted; empty = all", [])
@@ -64,36 +64,41 @@ class Reconstruct(Budget):
     joint_limit_deg: Positive = key("largest mean error over the free joints of a body", 5.0)
 
 
-def _checked(value: Any, check: Callable[[Any], Any]) -> Any:
+def _validate_unchanged(value: Any, check: Callable[[Any], Any]) -> Any:
     check(value)
     return value
 
 
 # A table of a part stays as given. What must be complete to be right is checked once it is merged.
-_GIVEN = WrapValidator(lambda value, _: value), PlainSerializer(lambda value: value)
-_CHECKED = WrapValidator(_checked), _GIVEN[1]
-AnyTable = dict[str, Any]
+_KEEP_AS_GIVEN = WrapValidator(lambda value, _: value), PlainSerializer(lambda value: value)
+_VALIDATE_AS_GIVEN = WrapValidator(_validate_unchanged), _KEEP_AS_GIVEN[1]
+TomlTable = dict[str, Any]
 
 
-class Part(Section):
+class RunOverrides(Section):
     """A part of a run: its sections hold only what differs from the run."""
 
-    reconstruct: Annotated[Budget, *_CHECKED] = key("what differs from [reconstruct]", None)
-    optimizer: Annotated[Any, OneOf("optimizer"), *_GIVEN] = key(
+    reconstruct: Annotated[Budget, *_VALIDATE_AS_GIVEN] = key(
+        "what differs from [reconstruct]", None
+    )
+    optimizer: Annotated[Any, OneOf("optimizer"), *_KEEP_AS_GIVEN] = key(
         "what differs from [optimizer]; another `kind` replaces it", None
     )
-    surrogate: Annotated[Any, TableOf(Surrogate, SurrogateTable), *_GIVEN] = key(
+    surrogate: Annotated[Any, TableOf(Surrogate, SurrogateTable), *_KEEP_AS_GIVEN] = key(
         "what differs from [surrogate], or a name that replaces it", None
     )
-    model: AnyTable | None = key("what differs from [model]; another `kind` replaces it", None)
-    map: AnyTable | None = key("what differs from [map]", None)
+    model: TomlTable | None = key("what differs from [model]; another `kind` replaces it", None)
+    map: TomlTable | None = key("what differs from [map]", None)
 
-    def changes(self) -> dict[str, Any]:
+    def overrides(self) -> dict[str, Any]:
         """What is merged over the run; a part has no stages."""
-        return {**self.model_dump(include=set(Part.model_fields), exclude_none=True), "stages": []}
+        return {
+            **self.model_dump(include=set(RunOverrides.model_fields), exclude_none=True),
+            "stages": [],
+        }
 
 
-class Stage(Part):
+class StageTable(RunOverrides):
     """A part of a fit, from where the one before has ended."""
 
     parameters: list[str] = key(
@@ -107,32 +112,32 @@ class Stage(Part):
     )
 
 
-class Variant(Part):
+class VariantTable(RunOverrides):
     """The same data and starts, fitted in another way, to compare."""
 
-    reconstruct: Annotated[Reconstruct, *_CHECKED] = key(  # type: ignore[override]
+    reconstruct: Annotated[ReconstructTable, *_VALIDATE_AS_GIVEN] = key(  # type: ignore[override]
         "what differs from [reconstruct]", None
     )
-    loss: AnyTable | None = key("what differs from [loss]", None)
+    loss: TomlTable | None = key("what differs from [loss]", None)
     parameters: list[Annotated[Any, OneOf("parameter")]] | None = key(
         "in place of [[parameters]]", None
     )
-    stages: list[Stage] | None = key("in place of [[stages]]", None)
+    stages: list[StageTable] | None = key("in place of [[stages]]", None)
 
-    def changes(self) -> dict[str, Any]:
+    def overrides(self) -> dict[str, Any]:
         """What is merged over the run."""
         return self.model_dump(exclude_unset=True, exclude_none=True)
 
-    def placed(self, run: Any) -> "Variant":
+    def with_resolved_paths(self, run: Any) -> "VariantTable":
         """The variant with paths of files as the run that it makes has found them."""
         found: dict[str, Any] = {}
-        for name, change in self.changes().items():
+        for name, change in self.overrides().items():
             value = run.model_dump(include={name}, exclude_unset=True)[name]
             found[name] = {k: value[k] for k in change} if isinstance(change, dict) else value
-        return Variant.model_validate(found)
+        return VariantTable.model_validate(found)
 
 
-class Calibration(Part):
+class CalibrationTable(RunOverrides):
     """Range bias and clock offset from one object whose place is known, before the fit."""
 
     object: str = key("name of the known object")
@@ -141,7 +146,7 @@ class Calibration(Part):
     )
 
 
-class Measures(Section):
+class MeasuresTable(Section):
     """How near the found shape is to the true one, in numbers and pictures."""
 
     object: str = key("name in the scene")
@@ -151,14 +156,14 @@ class Measures(Section):
     every: Count = key("steps between two points of the curve", 10)
 
 
-class Plan(Section):
+class PlanTable(Section):
     """What a plan is compared with, and what it tries."""
 
     fits: Annotated[int, Ge(0)] = key("simulated fits whose spread it is compared with", 0)
     candidates: Annotated[Any, OneOf("track")] | None = key("m, positions that may be added", None)
 
 
-class Landscape(Section):
+class LandscapeTable(Section):
     """Losses along a line through the truth: exact signal beside surrogate."""
 
     object: str = key("name in the scene")

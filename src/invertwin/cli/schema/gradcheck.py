@@ -5,29 +5,31 @@ from typing import Annotated, Any, Literal
 
 from pydantic import GetCoreSchemaHandler, model_validator
 
-from invertwin.inversion.gradcheck.gradcheck import Check
-from invertwin.inversion.gradcheck.tangents import Bump
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings
+from invertwin.inversion.gradcheck.tangents import GaussianBump
 from invertwin.limits import Count, Positive
-from invertwin.registry.kinds import OneOf, Table, number_or_list, registry
-from invertwin.registry.section import Depth, check_presence, fail, key
+from invertwin.registry.kinds import ConstructorTable, OneOf, number_or_list, registry
+from invertwin.registry.section import Depth, check_presence, key, raise_key_error
 
 
-class _Change:
+class _ParameterRate:
     """Annotates a key that says how fast a value changes with θ."""
 
     @classmethod
     def __get_pydantic_core_schema__(cls, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        bump = registry.table_of(Bump, "Bump", checked=None)
+        bump = registry.constructor_table(GaussianBump, "Bump", checked=None)
         return handler.generate_schema(number_or_list(float, list[Any], bump))
 
 
-class Gradcheck(Table):
-    """Derivative of the map against central differences: `Check`, and what is checked."""
+class GradcheckTable(ConstructorTable):
+    """Derivative of the map against central differences: `GradcheckSettings`, and what is
+    checked.
+    """
 
-    parameter: Annotated[Any, OneOf("parameter", Table)] = key(
+    parameter: Annotated[Any, OneOf("parameter", ConstructorTable)] = key(
         "what changes with θ, as in [[parameters]]; θ = 0 is its start"
     )
-    tangent: dict[str, Annotated[Any, _Change]] = key(
+    tangent: dict[str, Annotated[Any, _ParameterRate]] = key(
         "how fast its values change with θ, by name: a number for all entries, a list, or a bump "
         "over the nodes of a grid"
     )
@@ -38,25 +40,27 @@ class Gradcheck(Table):
     boundary_samples: Count = key("silhouette samples of one derivative", 1_000_000)
 
     @property
-    def of(self) -> Literal["scene", "sensor"]:
+    def acts_on(self) -> Literal["scene", "sensor"]:
         """What changes with θ."""
         moved = ("radar_pose", "radar_path", "camera_pose", "transmitter", "panel")
         return "sensor" if self.parameter.kind in moved else "scene"
 
     @property
-    def turns(self) -> bool:
+    def changes_angle(self) -> bool:
         """Whether θ is an angle."""
         return not {"rotation", "yaw"}.isdisjoint(self.tangent) or self.parameter.kind == "body"
 
-    def build(self, given: Any = None, /, **more: Any) -> Check:
+    def build(self, given: Any = None, /, **more: Any) -> GradcheckSettings:
         """How sharp the check is."""
         turn = {} if self.step_deg is None else {"step": math.radians(self.step_deg)}
         return super().build(given, **turn, **more)
 
     @model_validator(mode="after")
-    def _complete(self) -> "Gradcheck":
+    def _require_step(self) -> "GradcheckTable":
         if self.parameter.kind == "mover":
-            fail("expected a parameter of the scene or the radar, got a mover; choose another kind")
-        wanted = {"step_deg": self.turns, "step": not self.turns}
+            raise_key_error(
+                "expected a parameter of the scene or the radar, got a mover; choose another kind"
+            )
+        wanted = {"step_deg": self.changes_angle, "step": not self.changes_angle}
         check_presence(self, wanted, f"with kind = {self.parameter.kind}")
         return self

@@ -11,25 +11,30 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from invertwin.cli.report import Table
+from invertwin.cli.report import ReportTable
 from invertwin.errors import InputError
 from invertwin.registry.kinds import PLUGINS
 from invertwin.runtime.doctor import cache_folder
-from invertwin.storage.folders import replacing
+from invertwin.storage.folders import replace_file
 
-COLUMNS = ("key", "value", "default", "unit or meaning")
-_WORDS = {"number": "number", "integer": "integer", "boolean": "true or false", "string": "text"}
-_SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
-Schema = dict[str, Any]
+KEY_COLUMNS = ("key", "value", "default", "unit or meaning")
+_TYPE_NAMES = {
+    "number": "number",
+    "integer": "integer",
+    "boolean": "true or false",
+    "string": "text",
+}
+_LIMIT_SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+JsonSchema = dict[str, Any]
 
 
-def json_schema() -> Schema:
+def json_schema() -> JsonSchema:
     """The JSON Schema of run files, for editors; kinds and sections of plugins are in it.
 
     Making it imports all that run files may name, which takes seconds; so it is kept on disk until
     a file of the installed code changes.
     """
-    file = cache_folder() / f"keys-{_installed()}.json"
+    file = cache_folder() / f"keys-{_code_digest()}.json"
     with contextlib.suppress(OSError, ValueError):
         return json.loads(file.read_text(encoding="utf-8"))
     from invertwin.cli.schema import RunFile
@@ -41,12 +46,12 @@ def json_schema() -> Schema:
         file.parent.mkdir(parents=True, exist_ok=True)
         for old in file.parent.glob("keys-*.json"):
             old.unlink()
-        with replacing(file) as part:
+        with replace_file(file) as part:
             part.write_text(json.dumps(schema), encoding="utf-8")
     return schema
 
 
-def _installed() -> str:
+def _code_digest() -> str:
     """A digest of the code that says what run files may name, plugins with it."""
     found = hashlib.sha256(f"{sys.version} {metadata.version('pydantic')}".encode())
     for name in sorted({"invertwin", *(e.module for e in metadata.entry_points(group=PLUGINS))}):
@@ -59,19 +64,19 @@ def _installed() -> str:
     return found.hexdigest()[:16]
 
 
-def key_index() -> Table:
+def key_index() -> ReportTable:
     """The sections of a run file, and what each is."""
     top = json_schema()
     rows = [
         [name, top["properties"][name].get("description", "")]
         for name in top["properties"]
-        if _below(top["properties"][name], top["$defs"])
+        if _nested_tables(top["properties"][name], top["$defs"])
     ]
     note = "invertwin keys SECTION prints the keys of one, such as radar or radar.waveform."
-    return Table("Sections of a run file", ("section", "what it is"), rows, note)
+    return ReportTable("Sections of a run file", ("section", "what it is"), rows, note)
 
 
-def key_tables(section: str) -> list[Table]:
+def key_tables(section: str) -> list[ReportTable]:
     """The tables of a section of a run file and of what is in it.
 
     Args:
@@ -80,11 +85,11 @@ def key_tables(section: str) -> list[Table]:
     Raises:
         InputError: There is no such section.
     """
-    found = dict(_sections(json_schema()))
+    found = dict(_iterate_sections(json_schema()))
     wanted = section.strip("[]")
-    names = [name for name in found if f"{_plain(name)}.".startswith(f"{wanted}.")]
+    names = [name for name in found if f"{_plain_path(name)}.".startswith(f"{wanted}.")]
     if not names:
-        known = [_plain(name) for name in found if name]
+        known = [_plain_path(name) for name in found if name]
         close = difflib.get_close_matches(wanted, known, n=1)
         advice = f"did you mean `{close[0]}`?" if close else "choose one"
         raise InputError(
@@ -94,60 +99,71 @@ def key_tables(section: str) -> list[Table]:
     return [table for name in names for table in found[name]]
 
 
-def _plain(name: str) -> str:
+def _plain_path(name: str) -> str:
     return name.replace(".<name>", "").replace("[", "").replace("]", "")
 
 
-def _sections(top: Schema) -> Iterator[tuple[str, list[Table]]]:
+def _iterate_sections(top: JsonSchema) -> Iterator[tuple[str, list[ReportTable]]]:
     """Path and tables of every section, each right before those inside it.
 
     The top level comes first; its path is empty. A table that comes again is referred to.
     """
-    defined: dict[str, Schema] = top.get("$defs", {})
+    defined: dict[str, JsonSchema] = top.get("$defs", {})
     seen: dict[frozenset[str], str] = {}
 
-    def walk(path: str, models: Sequence[Schema]) -> Iterator[tuple[str, list[Table]]]:
+    def walk(path: str, models: Sequence[JsonSchema]) -> Iterator[tuple[str, list[ReportTable]]]:
         title = f"[{path}]" if path else "top of the file, and its sections"
-        common = set.intersection(*map(_untagged, models)) if len(models) > 1 else set()
-        shared = [key for key in models[0]["properties"] if (key, _note(models[0], key)) in common]
-        inner: list[tuple[str, list[Schema]]] = []
+        common = set.intersection(*map(_keys_without_tag, models)) if len(models) > 1 else set()
+        shared = [
+            key
+            for key in models[0]["properties"]
+            if (key, _key_description(models[0], key)) in common
+        ]
+        inner: list[tuple[str, list[JsonSchema]]] = []
         tables = []
         if shared:
             rows = [row(path, models[0], key, inner) for key in shared]
-            tables.append(Table(f"{title}, all kinds", COLUMNS, rows, ""))
+            tables.append(ReportTable(f"{title}, all kinds", KEY_COLUMNS, rows, ""))
         for model in models:
             keys = [key for key in model.get("properties", {}) if key not in shared]
             rows = [row(path, model, key, inner) for key in keys]
-            tag = "".join(f" {key} = {value}" for key, value in _tags(model).items())
+            tag = "".join(f" {key} = {value}" for key, value in _kind_tags(model).items())
             own = title if len(models) == 1 else f"{title}{tag or f' with {keys[0]}'}"
             document = " ".join(model.get("description", "").split())
             if rows or document:
-                tables.append(Table(own, COLUMNS, rows, document))
+                tables.append(ReportTable(own, KEY_COLUMNS, rows, document))
         yield path, tables
         for place, kinds in inner:
             yield from walk(place, kinds)
 
-    def row(path: str, model: Schema, key: str, inner: list[tuple[str, list[Schema]]]) -> list[Any]:
-        value, note = model["properties"][key], _note(model, key)
-        below = _below(value, defined)
+    def row(
+        path: str, model: JsonSchema, key: str, inner: list[tuple[str, list[JsonSchema]]]
+    ) -> list[Any]:
+        value, note = model["properties"][key], _key_description(model, key)
+        below = _nested_tables(value, defined)
         place = f"{path}.{key}" if path else key
         if "additionalProperties" in value and below and not path:
             place += ".<name>"
         elif value.get("type") == "array" and below and not path:
             place = f"[{key}]"
-        identity = frozenset(str(_tags(found) or found["title"]) for found in below)
+        identity = frozenset(str(_kind_tags(found) or found["title"]) for found in below)
         if below and identity in seen:
             note += f"; keys as in [{seen[identity]}]"
         elif below:
             inner.append((place, below))
             seen[identity] = place
         required = key in model.get("required", ())
-        return [key, _described(value), "required" if required else _default(value), note]
+        return [
+            key,
+            _describe_value(value),
+            "required" if required else _format_default(value),
+            note,
+        ]
 
     yield from walk("", [top])
 
 
-def _below(value: Schema, defined: Mapping[str, Schema]) -> list[Schema]:
+def _nested_tables(value: JsonSchema, defined: Mapping[str, JsonSchema]) -> list[JsonSchema]:
     """The tables that a value may be, or hold."""
     if "$ref" in value:
         model = defined[value["$ref"].rpartition("/")[2]]
@@ -155,51 +171,57 @@ def _below(value: Schema, defined: Mapping[str, Schema]) -> list[Schema]:
     held = [value[key] for key in ("items", "additionalProperties") if key in value]
     parts = [*value.get("anyOf", ()), *value.get("oneOf", ()), *held]
     tables = (part for part in parts if isinstance(part, dict))
-    return list({id(model): model for part in tables for model in _below(part, defined)}.values())
+    return list(
+        {id(model): model for part in tables for model in _nested_tables(part, defined)}.values()
+    )
 
 
-def _described(value: Schema) -> str:
+def _describe_value(value: JsonSchema) -> str:
     parts = [*value.get("anyOf", ()), *value.get("oneOf", ())]
     if parts:
-        words = [_described(part) for part in parts if part.get("type") != "null"]
+        words = [_describe_value(part) for part in parts if part.get("type") != "null"]
         return " or ".join(dict.fromkeys(words))
     if "const" in value or "enum" in value:
-        return ", ".join(map(_shown, value.get("enum", [value.get("const")])))
+        return ", ".join(map(_format_value, value.get("enum", [value.get("const")])))
     if value.get("type") == "array":
-        item, least = _described(value.get("items", {})), value.get("minItems")
+        item, least = _describe_value(value.get("items", {})), value.get("minItems")
         exact = least is not None and least == value.get("maxItems")
         return f"{least} × {item}" if exact else f"list of {item}"
     if "$ref" in value or value.get("type", "object") == "object":
         return "table"
-    signs = [f"{sign} {value[name]:.10g}" for name, sign in _SIGNS.items() if name in value]
-    return " ".join([_WORDS[value["type"]], ", ".join(signs)]).strip()
+    signs = [f"{sign} {value[name]:.10g}" for name, sign in _LIMIT_SIGNS.items() if name in value]
+    return " ".join([_TYPE_NAMES[value["type"]], ", ".join(signs)]).strip()
 
 
-def _note(model: Schema, key: str) -> str:
+def _key_description(model: JsonSchema, key: str) -> str:
     return model["properties"][key].get("description", "")
 
 
-def _tags(model: Schema) -> dict[str, str]:
+def _kind_tags(model: JsonSchema) -> dict[str, str]:
     """The key that tells a kind from the others, with its one value."""
     values = model.get("properties", {}).items()
-    return {key: _shown(value["const"]) for key, value in values if "const" in value}
+    return {key: _format_value(value["const"]) for key, value in values if "const" in value}
 
 
-def _untagged(model: Schema) -> set[tuple[str, str]]:
+def _keys_without_tag(model: JsonSchema) -> set[tuple[str, str]]:
     """Keys and what they mean, without the one that names the kind."""
-    tags = _tags(model)
-    return {(key, _note(model, key)) for key in model.get("properties", {}) if key not in tags}
+    tags = _kind_tags(model)
+    return {
+        (key, _key_description(model, key))
+        for key in model.get("properties", {})
+        if key not in tags
+    }
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _default(value: Schema) -> str | None:
+def _format_default(value: JsonSchema) -> str | None:
     default = value.get("default")
     if default is None or default in ({}, []):
         return None
     if not isinstance(default, dict):
-        return _shown(default)
+        return _format_value(default)
     (name, item), *others = default.items()
-    return None if others else f"{{{name} = {_shown(item)}}}"
+    return None if others else f"{{{name} = {_format_value(item)}}}"

@@ -10,8 +10,14 @@ from annotated_types import Ge, Gt, Le, MinLen
 from pydantic import model_validator
 
 from invertwin.errors import InputError
-from invertwin.registry.kinds import Form, Group, Registry, Table, number_or_list
-from invertwin.registry.section import InputPath, Section, fail, key
+from invertwin.registry.kinds import (
+    ConstructorTable,
+    KindGroup,
+    Registry,
+    ValueFormat,
+    number_or_list,
+)
+from invertwin.registry.section import InputPath, Section, key, raise_key_error
 from invertwin.scene import (
     Dielectric,
     Itu,
@@ -29,7 +35,7 @@ from invertwin.scene.material.materials import Medium
 from invertwin.scene.material.values import RANGES, Value
 from invertwin.storage.untrusted import read_npy
 
-_KINDS: Mapping[str, type[Material]] = {
+_MATERIAL_CLASSES: Mapping[str, type[Material]] = {
     "rough_dielectric": RoughDielectric,
     "perfect_conductor": PerfectConductor,
     "rough_conductor": RoughConductor,
@@ -59,16 +65,18 @@ def _value_type(name: str, angle: bool) -> Any:
     return number_or_list(number, Annotated[list[number], MinLen(1)], TextureFile)
 
 
-class MediumTable(Table):
+class MediumTable(ConstructorTable):
     """A dielectric, by numbers or from the ITU table."""
 
     optional: ClassVar = ("permittivity", "conductivity")
     itu: Annotated[str, MinLen(1)] | None = key("name in the table of ITU-R P.2040", None)
 
     @model_validator(mode="after")
-    def _known(self) -> "MediumTable":
+    def _require_permittivity(self) -> "MediumTable":
         if self.itu is None and getattr(self, "permittivity", None) is None:
-            fail("expected `permittivity`, or `itu` with a name of its table, got neither; add one")
+            raise_key_error(
+                "expected `permittivity`, or `itu` with a name of its table, got neither; add one"
+            )
         return self
 
     def library_values(self, given: Mapping[type, object]) -> dict[str, Any]:
@@ -81,15 +89,15 @@ class MediumTable(Table):
 
 def register(registry: Registry) -> None:
     """Add the materials."""
-    registry.groups["material"] = Group()
-    registry.forms[Texture] = Form(_value_type, _value)
+    registry.groups["material"] = KindGroup()
+    registry.forms[Texture] = ValueFormat(_value_type, _build_value)
     registry.bases[Medium] = MediumTable
     registry.given.add(Mesh)
-    for name, kind in _KINDS.items():
+    for name, kind in _MATERIAL_CLASSES.items():
         registry.add("material", name, kind)
 
 
-def _value(value: Any, name: str, angle: bool, given: Mapping[type, object]) -> Value:
+def _build_value(value: Any, name: str, angle: bool, given: Mapping[type, object]) -> Value:
     if isinstance(value, list):
         row = torch.tensor(value, dtype=torch.float64)
         return torch.deg2rad(row) if angle else row
@@ -101,5 +109,5 @@ def _value(value: Any, name: str, angle: bool, given: Mapping[type, object]) -> 
             f"expected {name} as a number for the materials of a scene file, got an image; "
             "give textures to objects of their own"
         )
-    texture = Texture.over(read_npy(value.image), mesh)
+    texture = Texture.from_projection(read_npy(value.image), mesh)
     return replace(texture, image=torch.deg2rad(texture.image)) if angle else texture

@@ -3,16 +3,16 @@
 from torch import Tensor
 
 from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.run_file import about
-from invertwin.cli.schema.shape_tables import ObjectTable, joint_places, template_of
+from invertwin.cli.schema.run_file import prefix_errors
+from invertwin.cli.schema.shape_tables import ObjectTable, body_template_of, joint_positions
 from invertwin.errors import InputError
-from invertwin.scene import InMotion, Mover, Scene, Sitting, Walking, Waving
+from invertwin.scene import MovingScene, ObjectMotion, Scene, Sitting, Walking, Waving
 from invertwin.scene.people.body import BodyTemplate
 
-_PEOPLE = (Walking, Sitting, Waving)
+_PERSON_MOTIONS = (Walking, Sitting, Waving)
 
 
-def in_motion(run: RunFile, scene: Scene) -> Scene | InMotion:
+def build_moving_scene(run: RunFile, scene: Scene) -> Scene | MovingScene:
     """The scene as a function of time, or as it is where nothing has a motion.
 
     Args:
@@ -25,13 +25,13 @@ def in_motion(run: RunFile, scene: Scene) -> Scene | InMotion:
     movers = {}
     for name, table in run.scene.items():
         if table.motion:
-            with about(f"scene.{name}"):
-                movers[name] = _movers(table)
-                InMotion(scene, {name: movers[name]})
-    return InMotion(scene, movers) if movers else scene
+            with prefix_errors(f"scene.{name}"):
+                movers[name] = _build_motions(table)
+                MovingScene(scene, {name: movers[name]})
+    return MovingScene(scene, movers) if movers else scene
 
 
-def at_start(run: RunFile, scene: Scene, duration: float) -> Scene:
+def scene_at_start(run: RunFile, scene: Scene, duration: float) -> Scene:
     """The scene as a frame begins; what has a motion has its mean velocity over the frame.
 
     Args:
@@ -39,31 +39,31 @@ def at_start(run: RunFile, scene: Scene, duration: float) -> Scene:
         scene: What it describes.
         duration: Of the frame [s].
     """
-    motion = in_motion(run, scene)
+    motion = build_moving_scene(run, scene)
     if isinstance(motion, Scene):
         return motion
     begin, end = motion(0.0), motion(duration)
-    for name in motion.movers:
+    for name in motion.motions:
         mean = (end[name].vertices - begin[name].vertices) / duration
         begin = begin.replace(name, velocity=mean)
     return begin
 
 
-def joints_at_start(run: RunFile, scene: Scene) -> dict[str, dict[str, Tensor]]:
+def joint_positions_at_start(run: RunFile, scene: Scene) -> dict[str, dict[str, Tensor]]:
     """Where joints of bodies are in the world as a frame begins [m], by object and name.
 
     Args:
         run: The run file.
-        scene: From ``at_start``.
+        scene: From ``scene_at_start``.
     """
     found = {}
     for name, table in run.scene.items():
         truth = run.truth[name].model_dump(exclude_none=True) if name in run.truth else {}
         real, rotations = table.model_copy(update=truth), None
-        for mover in _movers(real):
+        for mover in _build_motions(real):
             posture = getattr(mover, "posture", None)
             rotations = rotations if posture is None else posture(0.0)[0]
-        found[name] = joint_places(real, scene[name], rotations)
+        found[name] = joint_positions(real, scene[name], rotations)
     return {name: joints for name, joints in found.items() if joints}
 
 
@@ -75,34 +75,34 @@ def refuse_motion(run: RunFile) -> None:
     """
     for name, table in run.scene.items():
         if table.motion:
-            with about(f"scene.{name}.motion"):
+            with prefix_errors(f"scene.{name}.motion"):
                 raise InputError(
                     "expected a section [chirps] with it, got none; add it, or remove the motion"
                 )
 
 
-def _movers(table: ObjectTable) -> list[Mover]:
+def _build_motions(table: ObjectTable) -> list[ObjectMotion]:
     """What an object does; waving replaces what the person does meanwhile."""
-    found: list[Mover] = []
+    found: list[ObjectMotion] = []
     for number, row in enumerate(table.motion):
-        with about(f"motion[{number}]"):
+        with prefix_errors(f"motion[{number}]"):
             if "body" not in row.made_from:
                 found.append(row.build())
                 continue
-            earlier = [mover for mover in found if isinstance(mover, _PEOPLE)]
+            earlier = [mover for mover in found if isinstance(mover, _PERSON_MOTIONS)]
             if earlier and (row.kind != "waving" or isinstance(earlier[0], Waving)):
                 raise InputError(
                     "expected one motion of a person, or waving after another, got two; remove one"
                 )
             given: dict[type, object] = {type(mover): mover for mover in earlier}
-            body = earlier[0].body if earlier else _body(table)
+            body = earlier[0].body if earlier else _require_body(table)
             found = [mover for mover in found if mover not in earlier]
             found.append(row.build({BodyTemplate: body, **given}))
     return found
 
 
-def _body(table: ObjectTable) -> BodyTemplate:
-    template = template_of(table)
+def _require_body(table: ObjectTable) -> BodyTemplate:
+    template = body_template_of(table)
     if template is None:
         raise InputError(
             'expected an object with shape = "body", got another; give it this shape, or choose '

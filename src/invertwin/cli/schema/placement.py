@@ -9,14 +9,14 @@ import torch
 from annotated_types import Ge, Gt, Len, Lt, MinLen
 from torch import Tensor
 
-from invertwin.limits import Count, NonNegative, Positive, Several
+from invertwin.limits import Count, CountOfTwo, NonNegative, Positive
 from invertwin.links.metasurface.panel import Metasurface
-from invertwin.links.metasurface.placement import Coverage, Descent, Placing
-from invertwin.links.metasurface.wall_path import PlacedPanel, WallPath
+from invertwin.links.metasurface.placement import Coverage, Descent, PanelDesign
+from invertwin.links.metasurface.wall_path import PanelPlacement, WallPath
 from invertwin.registry.kinds import OneOf, TableOf
-from invertwin.registry.section import Section, Seed, Vector, about, key
+from invertwin.registry.section import Section, Seed, Vector, key, prefix_errors
 from invertwin.scene import Scene
-from invertwin.seeds import derived_seed
+from invertwin.seeds import derive_seed
 
 _POINT = Annotated[list[float], Len(2, 2)]
 _AIMED = 0.25  # share of the receivers, the worst ones, on whose middle the panel is focused
@@ -27,9 +27,9 @@ class Receivers(Section):
 
     low: Vector = key("m, a corner of the box")
     high: Vector = key("m, the opposite corner")
-    count: Several = key("those that the search sees", 4800)
-    batch: Several = key("of them, in one evaluation", 1200)
-    scored: Several = key("others, of another seed, that score what was found", 4000)
+    count: CountOfTwo = key("those that the search sees", 4800)
+    batch: CountOfTwo = key("of them, in one evaluation", 1200)
+    scored: CountOfTwo = key("others, of another seed, that score what was found", 4000)
 
     def drawn(self, count: int, seed: int) -> Tensor:
         """Places [count, 3] [m]."""
@@ -61,7 +61,7 @@ class Panel(Section):
 class PlacementGrid(Section):
     """The grid whose best place is what a search should find."""
 
-    places: Several = key("on the path", 80)
+    places: CountOfTwo = key("on the path", 80)
     yaws: Count = key("between the limits", 5)
     spread_deg: Annotated[list[NonNegative], MinLen(1)] = key(
         "half widths of the beam, of which every pair is tried", [5.0, 15.0]
@@ -104,11 +104,11 @@ class Placement(Section):
         """
         seed = run_seed if self.seed is None else self.seed
         count = self.receivers.scored if scored else self.receivers.count
-        with about("placement"):
+        with prefix_errors("placement"):
             return Coverage.of(
                 scene,
                 torch.tensor(self.transmitter, dtype=torch.float64),
-                self.receivers.drawn(count, derived_seed(seed, int(scored))),
+                self.receivers.drawn(count, derive_seed(seed, int(scored))),
                 self.frequency,
                 self.share,
                 depth=self.depth,
@@ -116,16 +116,16 @@ class Placement(Section):
                 seed=seed,
             )
 
-    def placing(self, coverage: Coverage) -> Placing:
+    def placing(self, coverage: Coverage) -> PanelDesign:
         """The panel and where it may stand.
 
         Args:
             coverage: The aim.
         """
         table, walls = self.panel, self.walls
-        with about("placement.walls"):
+        with prefix_errors("placement.walls"):
             path = WallPath(walls.corners, walls.height, walls.radius, walls.closed)
-        with about("placement.panel"):
+        with prefix_errors("placement.panel"):
             none = torch.zeros(*table.counts, dtype=torch.float64)
             place = torch.zeros(3, dtype=torch.float64)
             axes = torch.eye(3, dtype=torch.float64)
@@ -134,8 +134,8 @@ class Placement(Section):
             panel = replace(panel, bits=table.bits, pattern=pattern)
         target = self.focus(coverage)
 
-        def make(along: float, yaw: float, spread: Sequence[float]) -> PlacedPanel:
-            return PlacedPanel(
+        def make(along: float, yaw: float, spread: Sequence[float]) -> PanelPlacement:
+            return PanelPlacement(
                 path,
                 coverage.tx,
                 target,
@@ -147,7 +147,7 @@ class Placement(Section):
             )
 
         limits = math.radians(self.yaw_limit_deg), math.radians(self.spread_limit_deg)
-        return Placing(coverage, panel, make, *limits, self.receivers.batch)
+        return PanelDesign(coverage, panel, make, *limits, self.receivers.batch)
 
     def focus(self, coverage: Coverage) -> Tensor:
         """On what the panel is focused [m]."""
@@ -156,7 +156,7 @@ class Placement(Section):
         worst = coverage.direct <= torch.quantile(coverage.direct, _AIMED)
         return coverage.receivers[worst].mean(0)
 
-    def example(self, placing: Placing) -> PlacedPanel:
+    def example(self, placing: PanelDesign) -> PanelPlacement:
         """The module of a gradient check, at its start."""
         spread = [math.radians(angle) for angle in self.spread_start_deg]
         return placing.make(self.along, math.radians(self.yaw_deg), spread)

@@ -6,48 +6,55 @@ import torch
 from annotated_types import MinLen
 from torch import Tensor
 
-from invertwin.cli.schema.fits import SAMPLED
-from invertwin.cli.schema.sensors import LookAt, Orientation, Polarised, Turned
+from invertwin.cli.schema.fits import SamplingBase
+from invertwin.cli.schema.sensors import (
+    LookAtOrientation,
+    Orientation,
+    PolarisationValue,
+    RotatedOrientation,
+)
 from invertwin.errors import InputError
 from invertwin.limits import Count, NonNegative
-from invertwin.links import Reception, Terminals, Transmitters
+from invertwin.links import AntennaMount, PropagationSettings, Transmitters
 from invertwin.models.radio import RadioMap
 from invertwin.registry.kinds import OneOf, TableOf, registry
-from invertwin.registry.section import Section, Seed, Vector, about, key
+from invertwin.registry.section import Section, Seed, Vector, key, prefix_errors
 from invertwin.scene import AntennaArray, Mesh, Scene, look_at, rotation_from_vector
 from invertwin.scene.shape_models.distance import signed_distance
 
-_TRIES = 10_000  # places that are drawn, before that is given up
+_MAX_DRAWS = 10_000  # places that are drawn, before that is given up
 
 
 class AntennaTable(Section):
     """An antenna of one element."""
 
     pattern: Annotated[Any, OneOf("pattern")] | None = key("without it isotropic", None)
-    polarisation: Polarised = key('"V", "H", "circular" (right-hand) or two numbers (V, H)', "V")
+    polarisation: PolarisationValue = key(
+        '"V", "H", "circular" (right-hand) or two numbers (V, H)', "V"
+    )
     orientation: Orientation | None = key(
         "look_at or rotation_deg of its axes (x right, y up, z ahead); without it y is the world's "
         "z axis and it looks along x",
         None,
     )
 
-    def terminals(self, places: Tensor) -> Terminals:
+    def build_mount(self, positions: Tensor) -> AntennaMount:
         """The antenna at places.
 
         Args:
-            places: [place, 3] [m].
+            positions: [place, 3] [m].
         """
         pattern = {} if self.pattern is None else {"pattern": self.pattern.build()}
         element = torch.zeros(1, 3, dtype=torch.float64)
         array = AntennaArray(element, polarisation=self.polarisation, **pattern)
         if self.orientation is None:
-            return Terminals(array)
-        if isinstance(self.orientation, LookAt):
-            with about("orientation.look_at"):
-                return Terminals(array, look_at(places, self.orientation.look_at))
-        assert isinstance(self.orientation, Turned)
+            return AntennaMount(array)
+        if isinstance(self.orientation, LookAtOrientation):
+            with prefix_errors("orientation.look_at"):
+                return AntennaMount(array, look_at(positions, self.orientation.look_at))
+        assert isinstance(self.orientation, RotatedOrientation)
         turn = torch.tensor(self.orientation.rotation_deg, dtype=torch.float64).deg2rad()
-        return Terminals(array, rotation_from_vector(turn))
+        return AntennaMount(array, rotation_from_vector(turn))
 
 
 class TransmitterTable(AntennaTable):
@@ -61,36 +68,40 @@ class TransmitterTable(AntennaTable):
     def build(self) -> Transmitters:
         """The transmitters."""
         places = torch.tensor(self.positions, dtype=torch.float64)
-        return Transmitters(places, self.terminals(places), self.power_dbm)
+        return Transmitters(places, self.build_mount(places), self.power_dbm)
 
 
-RECEPTION: Any = registry.table_of(Reception, "Reception", without=("receivers", "panels", "rough"))
+PropagationBase: Any = registry.constructor_table(
+    PropagationSettings, "Reception", without=("receivers", "panels", "rough")
+)
 
 
-class RoughTable(SAMPLED):
+class RoughPathsTable(SamplingBase):
     """How paths that rough surfaces scatter are drawn."""
 
 
-class MapTable(registry.table_of(RadioMap, "RadioMap", RECEPTION, without=("reception",))):
+class MapTable(
+    registry.constructor_table(RadioMap, "RadioMap", PropagationBase, without=("propagation",))
+):
     """What receivers at known places get of the transmitters."""
 
     antenna: AntennaTable = key("of every receiver", AntennaTable())
-    rough: RoughTable | None = key(
+    rough: RoughPathsTable | None = key(
         "paths that rough surfaces scatter, whose power is added; without it left out", None
     )
 
     def build(self, given: Any = None, /, **more: Any) -> RadioMap:
         """The forward model."""
-        how = {name: getattr(self, name) for name in RECEPTION.made_from}
-        with about("places"):
+        how = {name: getattr(self, name) for name in PropagationBase.made_from}
+        with prefix_errors("places"):
             places = self.places.build()
-        receivers = self.antenna.terminals(getattr(places, "positions", torch.zeros(1, 3)))
+        receivers = self.antenna.build_mount(getattr(places, "positions", torch.zeros(1, 3)))
         rough = None if self.rough is None else self.rough.build()
-        reception = Reception(**how, receivers=receivers, rough=rough)
-        return super().build(given, places=places, reception=reception, **more)
+        reception = PropagationSettings(**how, receivers=receivers, rough=rough)
+        return super().build(given, places=places, propagation=reception, **more)
 
 
-class TransmitterStarts(Section):
+class TransmitterStartsTable(Section):
     """Random places of the first transmitter in a box, outside of solid objects."""
 
     low: Vector = key("corner of the box [m]")
@@ -99,7 +110,7 @@ class TransmitterStarts(Section):
     clear: NonNegative = key("least distance to all surfaces [m]", 0.1)
     seed: Seed | None = key("without it the run's", None)
 
-    def places(self, scene: Scene, seed: int) -> Tensor:
+    def sample_positions(self, scene: Scene, seed: int) -> Tensor:
         """Where fits start [start, 3].
 
         Args:
@@ -111,21 +122,21 @@ class TransmitterStarts(Section):
         """
         generator = torch.Generator().manual_seed(seed if self.seed is None else self.seed)
         low, high = (torch.tensor(c, dtype=torch.float64) for c in (self.low, self.high))
-        return _free_places(scene, (low, high), self.count, self.clear, generator)
+        return _sample_free_positions(scene, (low, high), self.count, self.clear, generator)
 
 
-AnyMap = Annotated[Any, TableOf(RadioMap, MapTable, ("reception",), checked=False)]
+AnyMap = Annotated[Any, TableOf(RadioMap, MapTable, ("propagation",), checked=False)]
 
 
-def _free_places(
-    scene: Scene, box: tuple[Tensor, Tensor], count: int, clear: float, chance: torch.Generator
+def _sample_free_positions(
+    scene: Scene, box: tuple[Tensor, Tensor], count: int, clear: float, generator: torch.Generator
 ) -> Tensor:
     found: list[Tensor] = []
     meshes = [Mesh(item.vertices.detach(), item.mesh.faces) for item in scene.objects.values()]
     # The room is no solid object: it holds the whole box.
     around = [bool((signed_distance(mesh, torch.stack(box)) < 0).all()) for mesh in meshes]
-    for _ in range(_TRIES):
-        share = torch.rand(1, 3, generator=chance, dtype=torch.float64)
+    for _ in range(_MAX_DRAWS):
+        share = torch.rand(1, 3, generator=generator, dtype=torch.float64)
         place = box[0] + share * (box[1] - box[0])
         off = [float(signed_distance(mesh, place)) for mesh in meshes]
         if all(abs(d) >= clear and (d > 0 or held) for d, held in zip(off, around, strict=True)):

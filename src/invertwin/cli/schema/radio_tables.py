@@ -14,12 +14,12 @@ from invertwin.links import (
     CellSampling,
     MapMesh,
     MapPlane,
-    Places,
-    Points,
+    ReceiverLocations,
+    ReceiverPoints,
     TransmitterPosition,
 )
-from invertwin.registry.kinds import Group, Registry
-from invertwin.registry.section import InputPath, Section, Seed, Vector, about, key
+from invertwin.registry.kinds import KindGroup, Registry
+from invertwin.registry.section import InputPath, Section, Seed, Vector, key, prefix_errors
 from invertwin.scene import load_mesh
 
 
@@ -47,21 +47,21 @@ class ReceivedFile(Section):
     kind: Literal["received_file"]
     file: InputPath = key("CSV: x,y,z [m], then the levels")
 
-    def read(self) -> tuple[Points, Tensor]:
+    def read(self) -> tuple[ReceiverPoints, Tensor]:
         """Places, and levels [tx, place].
 
         Raises:
             InputError: No such file, or no numbers.
         """
-        with about("file"):
-            rows = _rows(self.file, 4)
-        return Points(rows[:, :3]), rows[:, 3:].T
+        with prefix_errors("file"):
+            rows = _read_rows(self.file, 4)
+        return ReceiverPoints(rows[:, :3]), rows[:, 3:].T
 
 
 def register(registry: Registry) -> None:
     """Add places of radio maps, and data of received levels."""
-    registry.groups["places"] = Group(product=Places, default="points")
-    registry.add("places", "points", Points)
+    registry.groups["places"] = KindGroup(product=ReceiverLocations, default="points")
+    registry.add("places", "points", ReceiverPoints)
     registry.add("places", "random", random_points)
     registry.add("places", "file", points_file, untagged=True)
     registry.add("places", "plane", plane_cells)
@@ -73,7 +73,7 @@ def register(registry: Registry) -> None:
 
 def random_points(
     low: Sequence[float], high: Sequence[float], count: Count, seed: Annotated[int, Ge(0)] = 0
-) -> Points:
+) -> ReceiverPoints:
     """Random points in a box, evenly spread.
 
     Args:
@@ -85,17 +85,17 @@ def random_points(
     generator = torch.Generator().manual_seed(seed)
     ends = [torch.tensor(corner, dtype=torch.float64) for corner in (low, high)]
     share = torch.rand(count, 3, generator=generator, dtype=torch.float64)
-    return Points(ends[0] + share * (ends[1] - ends[0]))
+    return ReceiverPoints(ends[0] + share * (ends[1] - ends[0]))
 
 
-def points_file(file: InputPath) -> Points:
+def points_file(file: InputPath) -> ReceiverPoints:
     """Points of a CSV file with one line of heads: x,y,z [m].
 
     Args:
         file: path, from the run file's folder.
     """
-    with about("file"):
-        return Points(_rows(file, 3)[:, :3])
+    with prefix_errors("file"):
+        return ReceiverPoints(_read_rows(file, 3)[:, :3])
 
 
 def plane_cells(
@@ -127,18 +127,18 @@ def mesh_cells(file: InputPath, points: Count = 16, edge_points: Count = 20_000)
         points: in a triangle, at least.
         edge_points: on edges of the scene, for each transmitter; they serve derivatives alone.
     """
-    with about("file"):
+    with prefix_errors("file"):
         return MapMesh(load_mesh(file), CellSampling(points, edge_points))
 
 
-def _rows(file: str, least: int) -> Tensor:
+def _read_rows(file: str, min_columns: int) -> Tensor:
     try:
         rows = np.loadtxt(file, delimiter=",", skiprows=1, ndmin=2)
     except (OSError, ValueError, UnicodeDecodeError) as error:
         raise InputError(f"expected rows of numbers apart by commas, got {error}") from None
-    if rows.shape[1] < least or not len(rows) or not np.isfinite(rows).all():
+    if rows.shape[1] < min_columns or not len(rows) or not np.isfinite(rows).all():
         raise InputError(
-            f"expected rows of at least {least} finite numbers below a line of heads, got "
+            f"expected rows of at least {min_columns} finite numbers below a line of heads, got "
             f"{rows.shape[0]} rows of {rows.shape[1]}; see docs/run_files.md"
         )
     return torch.from_numpy(rows)

@@ -9,15 +9,23 @@ from pydantic import GetCoreSchemaHandler, model_validator
 from invertwin.capture import Capture, ChannelCalibration, ChirpCapture, ChirpData, ti
 from invertwin.capture.readers import described_arrays, described_sweeps
 from invertwin.capture.readers.radar_fields import WAVEFORMS
-from invertwin.cli.schema.sensors import Posed
+from invertwin.cli.schema.sensors import RadarPoseTable
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.radar.boards import Mounting
-from invertwin.registry.kinds import Group, Registry, Table, number_or_list, registry
-from invertwin.registry.section import Depth, InputPath, Section, Seed, about, fail, key
+from invertwin.registry.kinds import ConstructorTable, KindGroup, Registry, number_or_list, registry
+from invertwin.registry.section import (
+    Depth,
+    InputPath,
+    Section,
+    Seed,
+    key,
+    prefix_errors,
+    raise_key_error,
+)
 
 
-class _Densities:
+class _PointDensities:
     """Annotates points per m²: a number, or a table with one for each object."""
 
     @classmethod
@@ -29,7 +37,7 @@ class SimulatedData(Section):
     """Exact signals of the true scene, with noise."""
 
     kind: Literal["simulated"]
-    points_per_m2: Annotated[Any, _Densities] = key(
+    points_per_m2: Annotated[Any, _PointDensities] = key(
         'rough points per m²: a number, or a table by object, "*" for all others'
     )
     samples: Count = key("coherent paths", 200_000)
@@ -43,11 +51,11 @@ class SimulatedData(Section):
     @model_validator(mode="after")
     def _one_noise_level(self) -> "SimulatedData":
         if self.snr_db is not None and self.noise_figure_db is not None:
-            fail("expected snr_db or noise_figure_db, got both; remove one")
+            raise_key_error("expected snr_db or noise_figure_db, got both; remove one")
         return self
 
 
-class DataTable(Table):
+class RecordingTable(ConstructorTable):
     """Measured data."""
 
     channels: InputPath | None = key(
@@ -59,11 +67,11 @@ class DataTable(Table):
         found = super().build(given, **more)
         if self.channels is None:
             return found
-        with about("channels"):
+        with prefix_errors("channels"):
             return ChannelCalibration.load(self.channels).apply(found)
 
 
-class ChirpTable(DataTable, Posed):
+class ChirpRecordingTable(RecordingTable, RadarPoseTable):
     """Raw chirps of a board, made one signal per frame."""
 
     chirp: Annotated[int, Ge(0)] | None = key(
@@ -79,25 +87,25 @@ class ChirpTable(DataTable, Posed):
         found = super().build(given, **more)
         assert isinstance(found, ChirpCapture)
         if self.frame is not None:
-            with about("frame"):
+            with prefix_errors("frame"):
                 found = found.frames([self.frame])
-        found = found.placed(*self.poses(found.frame_count))
-        return replace(found, device=self.centered(found.device))
+        found = found.with_poses(*self.poses(found.frame_count))
+        return replace(found, device=self.apply_range_center(found.device))
 
 
 def register(kinds: Registry) -> None:
     """Add the readers; what one returns says which keys it has beside its own."""
-    kinds.groups["data"] = Group()
-    kinds.bases[Capture] = DataTable
-    kinds.bases[ChirpCapture] = ChirpTable
+    kinds.groups["data"] = KindGroup()
+    kinds.bases[Capture] = RecordingTable
+    kinds.bases[ChirpCapture] = ChirpRecordingTable
     kinds.add("data", "simulated", SimulatedData)
-    kinds.add("data", "capture", saved)
-    kinds.add("data", "dca1000", dca1000)
-    kinds.add("data", "arrays", arrays)
-    kinds.add("data", "sweeps", sweeps)
+    kinds.add("data", "capture", load_capture)
+    kinds.add("data", "dca1000", read_dca1000)
+    kinds.add("data", "arrays", read_arrays)
+    kinds.add("data", "sweeps", read_sweep_files)
 
 
-def saved(file: InputPath, trusted: bool = False) -> Capture:
+def load_capture(file: InputPath, trusted: bool = False) -> Capture:
     """A capture saved by the library (NetCDF).
 
     Args:
@@ -105,14 +113,14 @@ def saved(file: InputPath, trusted: bool = False) -> Capture:
         trusted: true reads it in this process, not in a child process.
     """
     for name in registry.names("waveform"):
-        kind = registry.table("waveform", name).made_by
+        kind = registry.kind_table("waveform", name).made_by
         if isinstance(kind, type):  # a file of a plugin's radar names its waveform
             WAVEFORMS.setdefault(kind.__name__, kind)
-    with about("file"):
+    with prefix_errors("file"):
         return Capture.load(file, trusted=trusted)
 
 
-def dca1000(
+def read_dca1000(
     file: InputPath,
     board: Mounting,
     settings: InputPath | None = None,
@@ -126,12 +134,14 @@ def dca1000(
         settings: .cfg or .mmwave.json; without it what the .setup.json names.
         lanes: of the LVDS link, where the settings do not say.
     """
-    with about("file"):
+    with prefix_errors("file"):
         chirps = ti.read_recording(file, settings, lanes)
-    return recorded(chirps, board)
+    return assign_board(chirps, board)
 
 
-def arrays(file: InputPath, board: Mounting | None = None, trusted: bool = False) -> ChirpCapture:
+def read_arrays(
+    file: InputPath, board: Mounting | None = None, trusted: bool = False
+) -> ChirpCapture:
     """Samples in a NumPy, HDF5 or MATLAB file with a TOML description beside it.
 
     Args:
@@ -139,51 +149,51 @@ def arrays(file: InputPath, board: Mounting | None = None, trusted: bool = False
         board: whose elements recorded; without it what the description says.
         trusted: true reads it in this process, not in a child process.
     """
-    with about("file"):
+    with prefix_errors("file"):
         chirps = described_arrays.read_chirps(file, trusted=trusted)
     if board is not None:
-        return recorded(chirps, board)
-    with about("board"):
-        return chirps.recorded(described_arrays.described_board(file))
+        return assign_board(chirps, board)
+    with prefix_errors("board"):
+        return chirps.to_chirp_capture(described_arrays.load_described_board(file))
 
 
-def sweeps(file: InputPath, trusted: bool = False) -> Capture:
+def read_sweep_files(file: InputPath, trusted: bool = False) -> Capture:
     """Sweeps over frequency: a Touchstone file, or a TOML description of files or of arrays.
 
     Args:
         file: the description, or one Touchstone file.
         trusted: true reads it in this process, not in a child process.
     """
-    with about("file"):
+    with prefix_errors("file"):
         return described_sweeps.read_sweeps(file, trusted=trusted)
 
 
-def recorded(chirps: ChirpData, board: Mounting) -> ChirpCapture:
+def assign_board(chirps: ChirpData, board: Mounting) -> ChirpCapture:
     """Chirps that the elements of a board have recorded, those that the settings name."""
-    with about("board"):
-        return chirps.recorded(board)
+    with prefix_errors("board"):
+        return chirps.to_chirp_capture(board)
 
 
-def measured(data: Any) -> Capture:
+def build_capture(data: Any) -> Capture:
     """The capture of a `[data]` table that names a recording.
 
     Raises:
         InputError: Files that are missing, damaged or contradict each other.
     """
-    with about("data"):
+    with prefix_errors("data"):
         found = data.build()
         if isinstance(found, Capture):
             return found
         return found.capture("mean" if data.chirp is None else data.chirp)
 
 
-def chirp_capture(data: Any) -> ChirpCapture:
+def build_chirp_capture(data: Any) -> ChirpCapture:
     """The recording of a `[data]` table with every chirp of its frames.
 
     Raises:
         InputError: Data without chirps, or files that are missing or damaged.
     """
-    with about("data"):
+    with prefix_errors("data"):
         found = None if data.kind == "simulated" else data.build()
     if not isinstance(found, ChirpCapture):
         raise InputError(

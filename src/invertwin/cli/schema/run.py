@@ -9,69 +9,77 @@ from annotated_types import MinLen
 from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
-from invertwin.channel import REST
+from invertwin.channel import ALL_OTHERS
 from invertwin.cli.schema.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.schema.dataset import DatasetTable
 from invertwin.cli.schema.fit_tables import SurrogateTable
 from invertwin.cli.schema.fits import (
     AnyInitial,
     AnyStarts,
-    Calibration,
-    Landscape,
-    Measures,
-    Part,
-    Plan,
-    Reconstruct,
-    Stage,
-    Variant,
+    CalibrationTable,
+    LandscapeTable,
+    MeasuresTable,
+    PlanTable,
+    ReconstructTable,
+    RunOverrides,
+    StageTable,
+    VariantTable,
 )
-from invertwin.cli.schema.gradcheck import Gradcheck
+from invertwin.cli.schema.gradcheck import GradcheckTable
 from invertwin.cli.schema.placement import Placement
-from invertwin.cli.schema.radio import AnyMap, TransmitterStarts, TransmitterTable
+from invertwin.cli.schema.radio import AnyMap, TransmitterStartsTable, TransmitterTable
 from invertwin.cli.schema.recordings import SimulatedData
 from invertwin.cli.schema.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
 from invertwin.cli.schema.shape_tables import LearnedTable, RoomTable
-from invertwin.cli.schema.signature import Rcs
+from invertwin.cli.schema.signature import RcsTable
 from invertwin.cli.schema.twin import TwinTable
-from invertwin.cli.schema.variation import check_varied
+from invertwin.cli.schema.variation import check_samples
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck.gradcheck import Check
+from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.registry.kinds import NameOf, OneOf, TableOf, load_plugins, registry
-from invertwin.registry.section import InputPath, Section, Seed, Vector, Words, fail, key
+from invertwin.registry.section import (
+    InputPath,
+    PrintableText,
+    Section,
+    Seed,
+    Vector,
+    key,
+    raise_key_error,
+)
 from invertwin.scene.rooms import room
 from invertwin.signatures import rcs
 
 # How a run calls its own fits, and how names of its metrics end.
-_TAKEN = ("full", "whole", "seen", "count", "m", "number", "consistency")
+_RESERVED_NAMES = ("full", "whole", "seen", "count", "m", "number", "consistency")
 
 # Keys of a gradient check that say how paths are drawn.
-_DRAWN = (
+_SAMPLING_KEYS = (
     *("depth", "samples", "boundary_samples", "repeats", "difference_samples", "noise"),
     *("max_pairs", "scheme"),
 )
 
-_AS_GIVEN: dict[str, Any] = {"exclude_unset": True, "exclude_none": True}
+_DUMP_GIVEN: dict[str, Any] = {"exclude_unset": True, "exclude_none": True}
 
 AnyMaterial = Annotated[Any, OneOf("material")]
 AnyModel = Annotated[Any, OneOf("model")]
 AnyData = Annotated[Any, OneOf("data")]
 AnyRoom = Annotated[Any, TableOf(room, RoomTable, checked=True)]
 AnySurrogate = Annotated[Any, TableOf(Surrogate, SurrogateTable)]
-AnyGradcheck = Annotated[Any, TableOf(Check, Gradcheck)]
+AnyGradcheck = Annotated[Any, TableOf(GradcheckSettings, GradcheckTable)]
 AnyRcs = Annotated[
     Any,
     TableOf(
         rcs,
-        Rcs,
+        RcsTable,
         ("directions", "frequencies", "receivers", "polarisation", "boundary"),
         checked=False,
     ),
 ]
 
 
-class SceneFile(Section):
+class SceneFileTable(Section):
     """Objects from the geometry of a Mitsuba or Sionna scene file (XML), named as in the file."""
 
     file: InputPath = key("path, from the run file's folder")
@@ -79,7 +87,7 @@ class SceneFile(Section):
     material: AnyMaterial | None = key("material of all other objects; without it concrete", None)
 
 
-class Truth(Section):
+class TruthTable(Section):
     """What an object really is: replaces values of its scene table, key by key."""
 
     position: Vector | None = key("m", None)
@@ -93,7 +101,7 @@ class Truth(Section):
     )
 
 
-class Raw(Section):
+class RawTable(Section):
     """Raw files as other tools read them: DCA1000 samples, SDK and mmWave Studio settings."""
 
     lanes: Literal[2, 4] = key("of the LVDS link: 4 for xWR12xx and xWR14xx, 2 for later ones", 2)
@@ -126,24 +134,24 @@ class _RunFile(Section):
     """A whole run file; which sections a command needs is checked by the command."""
 
     task: Annotated[str, NameOf("task")] = key("what the file is for")
-    title: Words = key("heading of the report", "")
+    title: PrintableText = key("heading of the report", "")
     note: str = key("shown in the report", "")
     seed: Seed = key("seed of all random numbers", 0)
     scene: dict[str, Annotated[Any, OneOf("object")]] = key("[scene.<name>]: an object each", {})
-    scene_file: SceneFile | None = key("objects from a file", None)
+    scene_file: SceneFileTable | None = key("objects from a file", None)
     room: AnyRoom | None = key("a furnished room: floor, ceiling, walls, furniture", None)
-    truth: dict[str, Truth] = key("[truth.<name>]: where an object really is", {})
+    truth: dict[str, TruthTable] = key("[truth.<name>]: where an object really is", {})
     radar: AnyRadar | None = key("what measures; not with a capture", None)
     grid: AnyGrid | None = key("the map that is compared", None)
     chirps: AnyChirps | None = key("several ramps a frame", None)
     impairments: AnyImpairments | None = key("what the front end of simulated data adds", None)
-    raw: Raw | None = key("raw files that simulate writes beside the capture", None)
+    raw: RawTable | None = key("raw files that simulate writes beside the capture", None)
     data: AnyData | None = key("what is fitted", None)
     transmitter: TransmitterTable | None = key("what sends, with [map]", None)
     map: AnyMap | None = key("what receivers at known places get of [transmitter]", None)
     camera: AnyCamera | None = key("what sees [image]", None)
     image: AnyImage | None = key("what [camera] shows; with [gradcheck] it is differentiated", None)
-    transmitter_starts: TransmitterStarts | None = key(
+    transmitter_starts: TransmitterStartsTable | None = key(
         "where fits of the first transmitter start; without it where [transmitter] says", None
     )
     observations: dict[str, ObservationTable] = key(
@@ -156,7 +164,7 @@ class _RunFile(Section):
     search: Annotated[Any, OneOf("search")] | None = key(
         "several poses to begin from at every start; the best end counts", None
     )
-    plan: Plan | None = key("what `invertwin plan` compares and tries", None)
+    plan: PlanTable | None = key("what `invertwin plan` compares and tries", None)
     twin: TwinTable | None = key("the ground that `invertwin twin` searches", None)
     initial: AnyInitial | None = key(
         "where the fit starts by conventional processing, not with [starts]", None
@@ -167,14 +175,14 @@ class _RunFile(Section):
     optimizer: Annotated[Any, OneOf("optimizer")] = key(
         "how a gradient becomes a step", {}, validate_default=True
     )
-    reconstruct: Reconstruct | None = key("the fit", None)
-    stages: list[Stage] = key(
+    reconstruct: ReconstructTable | None = key("the fit", None)
+    stages: list[StageTable] = key(
         "[[stages]]: parts of the fit, one after another; without them one", []
     )
-    variants: dict[str, Variant] = key("[variants.<name>]: other ways to fit, to compare", {})
-    measures: Measures | None = key("scores of the found shape", None)
-    calibration: Calibration | None = key("calibration before the fit", None)
-    landscape: Landscape | None = key("losses along a line", None)
+    variants: dict[str, VariantTable] = key("[variants.<name>]: other ways to fit, to compare", {})
+    measures: MeasuresTable | None = key("scores of the found shape", None)
+    calibration: CalibrationTable | None = key("calibration before the fit", None)
+    landscape: LandscapeTable | None = key("losses along a line", None)
     gradcheck: AnyGradcheck | None = key("the gradient check", None)
     placement: Placement | None = key(
         "a metasurface that is placed; with [gradcheck] what is differentiated", None
@@ -187,7 +195,7 @@ class _RunFile(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _levels_have_no_gain(cls, data: Any) -> Any:
+    def _set_level_loss(cls, data: Any) -> Any:
         """Received levels [dB] are compared as they are, at one resolution, unless said else."""
         read = data.get("data") if isinstance(data, dict) and "loss" not in data else None
         if isinstance(read, dict) and read.get("kind") in ("received", "received_file"):
@@ -195,20 +203,20 @@ class _RunFile(Section):
         return data
 
     @model_validator(mode="after")
-    def _names_exist(self) -> "_RunFile":
+    def _check_object_names(self) -> "_RunFile":
         if self.scene_file is None:
             known = [*self.scene, *({} if self.room is None else self.room.build())]
             if not known:
-                fail("expected at least 1 object, got none; add [scene.<name>]", "scene")
+                raise_key_error("expected at least 1 object, got none; add [scene.<name>]", "scene")
             # The names of a scene file are known once it is read.
-            for path, name in self.references():
+            for path, name in self.object_references():
                 if name not in known:
                     context = {"path": path, "name": name, "known": known}
                     raise PydanticCustomError("unknown_object", "unknown object", context)
         return self
 
     @model_validator(mode="after")
-    def _a_signature_is_differentiated_alone(self) -> "_RunFile":
+    def _check_gradcheck_sections(self) -> "_RunFile":
         seen = next((n for n in ("image", "map") if getattr(self, n) is not None), None)
         if self.gradcheck is None or (self.rcs is None and seen is None):
             return self
@@ -218,48 +226,54 @@ class _RunFile(Section):
             others = {"radar", "grid", "rcs", "map"} - {seen}
             for path in [*given, *(n for n in sorted(others) if getattr(self, n))]:
                 what = f"expected nothing with [{seen}], which has its own, got a value; remove it"
-                fail(what, path)
+                raise_key_error(what, path)
             return self
         if self.gradcheck.of == "sensor":
-            fail(
+            raise_key_error(
                 "expected a parameter of the scene with [rcs], got radar_pose; turn the scene",
                 "gradcheck.parameter.kind",
             )
         given = [name for name in ("radar", "grid") if getattr(self, name) is not None]
-        given += [f"gradcheck.{n}" for n in _DRAWN if n in self.gradcheck.model_fields_set]
+        given += [f"gradcheck.{n}" for n in _SAMPLING_KEYS if n in self.gradcheck.model_fields_set]
         for path in given:
-            fail("expected nothing with [rcs], which draws no paths, got a value; remove it", path)
+            raise_key_error(
+                "expected nothing with [rcs], which draws no paths, got a value; remove it", path
+            )
         return self
 
     @model_validator(mode="after")
-    def _variants_are_named(self) -> "_RunFile":
+    def _check_variant_names(self) -> "_RunFile":
         for name in self.variants:
-            if name in _TAKEN or not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", name):
-                fail(
+            if name in _RESERVED_NAMES or not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", name):
+                raise_key_error(
                     "expected names of letters, digits and _ that begin with a letter, other than "
-                    f"{', '.join(_TAKEN)}, got {json.dumps(name)}; choose another",
+                    f"{', '.join(_RESERVED_NAMES)}, got {json.dumps(name)}; choose another",
                     "variants",
                 )
         return self
 
     @model_validator(mode="after")
-    def _names_are_known(self) -> "_RunFile":
+    def _check_parameter_names(self) -> "_RunFile":
         names = [table.name or table.kind for table in self.parameters]
         free = {n for n, t in zip(names, self.parameters, strict=True) if t.kind == "vertices"}
         doubled = next((name for name in names if names.count(name) > 1), None)
         if doubled and (self.stages or self.variants):
-            fail(f'expected parameters of different names, got "{doubled}" twice; add `name`')
+            raise_key_error(
+                f'expected parameters of different names, got "{doubled}" twice; add `name`'
+            )
         own = set(names)
         if self.reconstruct is not None:
             sensors, used = [*self.observations], self.reconstruct
-            _named("parameters", used.parameters, names, "reconstruct.parameters")
-            _named("observations", used.observations, sensors, "reconstruct.observations")
+            _require_known_names("parameters", used.parameters, names, "reconstruct.parameters")
+            _require_known_names(
+                "observations", used.observations, sensors, "reconstruct.observations"
+            )
             own = set(used.parameters) or own
         for i, stage in enumerate(self.stages):
-            _named("parameters", stage.parameters, names, f"stages[{i}].parameters")
+            _require_known_names("parameters", stage.parameters, names, f"stages[{i}].parameters")
             fitted = own & set(stage.parameters or names)
             if stage.remesh and fitted and not fitted & free:
-                fail(
+                raise_key_error(
                     'expected a parameter with kind = "vertices" among those of the stage, got '
                     "none; add one, or remove `remesh`",
                     f"stages[{i}].remesh",
@@ -267,11 +281,11 @@ class _RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _turned_joints_are_fitted(self) -> "_RunFile":
+    def _check_joint_starts(self) -> "_RunFile":
         if self.starts is not None and self.starts.joint_deg > 0:
             name = self.starts.object
             if not any(p.kind == "body" and p.object == name for p in self.parameters):
-                fail(
+                raise_key_error(
                     f'expected a parameter with kind = "body" of {name}, whose joints it turns, '
                     "got none; add one, or remove `joint_deg`",
                     "starts.joint_deg",
@@ -279,82 +293,94 @@ class _RunFile(Section):
         return self
 
     @model_validator(mode="after")
-    def _learned_shapes_have_their_own_size(self) -> "_RunFile":
-        unknowns = self.unknowns.values()
+    def _check_learned_shapes(self) -> "_RunFile":
+        unknowns = self.parameter_tables.values()
         learned: list[Any] = [table for table in unknowns if isinstance(table, LearnedTable)]
         for parameter in learned:
             name, why = parameter.object, f'with kind = "{parameter.kind}", which has its own size'
             scale = self.scene[name].scale if name in self.scene else 1.0
             if scale != 1:
-                fail(f"expected 1 {why}, got {scale:g}; remove it", f"scene.{name}.scale")
+                raise_key_error(
+                    f"expected 1 {why}, got {scale:g}; remove it", f"scene.{name}.scale"
+                )
             if self.initial is not None and self.initial.object == name and self.initial.scale:
-                fail(f"expected false {why}, got true; remove it", "initial.scale")
+                raise_key_error(f"expected false {why}, got true; remove it", "initial.scale")
         return self
 
     @model_validator(mode="after")
-    def _parts_are_runs(self, info: Any) -> "_RunFile":
+    def _check_overrides(self, info: Any) -> "_RunFile":
         """Every stage and variant makes a run that is right; errors begin at its own path."""
-        runs = _parts(type(self))
-        runs.model_validate({"stages": [self._with(s) for s in self.stages]}, context=info.context)
-        variants = {name: self._with(variant) for name, variant in self.variants.items()}
+        runs = _overrides_model(type(self))
+        runs.model_validate(
+            {"stages": [self._dump_with_overrides(s) for s in self.stages]}, context=info.context
+        )
+        variants = {
+            name: self._dump_with_overrides(variant) for name, variant in self.variants.items()
+        }
         found = runs.model_validate({"variants": variants}, context=info.context).variants
         for name, run in found.items():
-            self.variants[name] = self.variants[name].placed(run)
+            self.variants[name] = self.variants[name].with_resolved_paths(run)
         if self.calibration is not None:
-            runs.model_validate({"calibration": self._with(self.calibration)}, context=info.context)
+            runs.model_validate(
+                {"calibration": self._dump_with_overrides(self.calibration)}, context=info.context
+            )
         return self
 
     @model_validator(mode="after")
-    def _samples_are_runs(self, info: Any) -> "_RunFile":
+    def _check_samples(self, info: Any) -> "_RunFile":
         """Errors begin at the table that draws what is wrong."""
         if self.vary and self.dataset is None:
-            fail("expected a section [dataset] with it, got none; add it", "vary")
+            raise_key_error("expected a section [dataset] with it, got none; add it", "vary")
         if self.dataset is not None:
-            self._require_simulated()
-        check_varied(self, self.alone(), info)
+            self._require_simulated_data()
+        check_samples(self, self.dump_without_dataset(), info)
         return self
 
-    def _require_simulated(self) -> None:
+    def _require_simulated_data(self) -> None:
         """What a data set cannot be made of."""
         if self.dataset is not None and self.dataset.paths and self.chirps is not None:
-            fail("expected false with [chirps], got true; remove it", "dataset.paths")
+            raise_key_error("expected false with [chirps], got true; remove it", "dataset.paths")
         if self.observations:
-            fail("expected none with [dataset], which has one radar, got some", "observations")
+            raise_key_error(
+                "expected none with [dataset], which has one radar, got some", "observations"
+            )
         if self.data is not None and not isinstance(self.data, SimulatedData):
             got = f'expected "simulated" with [dataset], got "{self.data.kind}"'
-            fail(f"{got}; give points_per_m2 and snr_db instead of a recording", "data.kind")
+            raise_key_error(
+                f"{got}; give points_per_m2 and snr_db instead of a recording", "data.kind"
+            )
 
-    def alone(self) -> dict[str, Any]:
+    def dump_without_dataset(self) -> dict[str, Any]:
         """As TOML, without what makes it a data set."""
-        return self.model_dump(**_AS_GIVEN, exclude={"dataset", "vary"})
+        return self.model_dump(**_DUMP_GIVEN, exclude={"dataset", "vary"})
 
-    def varied(self, part: Part) -> "_RunFile":
+    def apply_overrides(self, part: RunOverrides) -> "_RunFile":
         """The run file with a stage, a variant or the calibration merged over it."""
-        return type(self).model_validate(self._with(part))
+        return type(self).model_validate(self._dump_with_overrides(part))
 
-    def _with(self, part: Part) -> dict[str, Any]:
+    def _dump_with_overrides(self, part: RunOverrides) -> dict[str, Any]:
         """The run file as TOML, with a part: keys of tables replace keys, all else is replaced."""
-        found = self.model_dump(**_AS_GIVEN, exclude={"variants", "calibration"})
-        for name, change in part.changes().items():
-            found[name] = _merged(getattr(self, name), change)
+        found = self.model_dump(**_DUMP_GIVEN, exclude={"variants", "calibration"})
+        for name, change in part.overrides().items():
+            found[name] = _merge_table(getattr(self, name), change)
             for sensor, table in self.observations.items():
                 if getattr(table, name, None) is not None:
-                    found["observations"][sensor][name] = _merged(getattr(table, name), change)
+                    found["observations"][sensor][name] = _merge_table(getattr(table, name), change)
         return found
 
     @property
-    def unknowns(self) -> dict[str, Any]:
+    def parameter_tables(self) -> dict[str, Any]:
         """The tables of what is unknown, and of what a gradient check moves, by path."""
         found = {f"parameters[{i}]": table for i, table in enumerate(self.parameters)}
         own = {} if self.gradcheck is None else {"gradcheck.parameter": self.gradcheck.parameter}
         return found | own
 
-    def references(self) -> list[tuple[str, str]]:
+    def object_references(self) -> list[tuple[str, str]]:
         """Where the run file names an object of the scene: path and name."""
         used = [(f"truth.{name}", name) for name in self.truth]
         if self.dataset is not None:
             used += [(f"dataset.classes.{name}", name) for name in self.dataset.classes]
-        for path, table in self.unknowns.items():
+        for path, table in self.parameter_tables.items():
             if getattr(table, "object", None) is not None:
                 used.append((f"{path}.object", table.object))
         used += [("image.objects", name) for name in getattr(self.image, "objects", [])]
@@ -362,7 +388,9 @@ class _RunFile(Section):
         data |= {f"observations.{name}.data": t.data for name, t in self.observations.items()}
         for path, table in data.items():
             found = getattr(table, "points_per_m2", None)
-            named = [name for name in found if name != REST] if isinstance(found, dict) else []
+            named = (
+                [name for name in found if name != ALL_OTHERS] if isinstance(found, dict) else []
+            )
             used += [(f"{path}.points_per_m2.{name}", name) for name in named]
         for section in type(self).model_fields:
             name = getattr(getattr(self, section), "object", None)
@@ -371,23 +399,23 @@ class _RunFile(Section):
         return used
 
 
-def _named(what: str, used: list[str], known: list[str], path: str) -> None:
+def _require_known_names(what: str, used: list[str], known: list[str], path: str) -> None:
     for name in used:
         if name not in known:
             got = f'expected names of {what} ({", ".join(known)}), got "{name}"; correct it'
-            fail(got, path)
+            raise_key_error(got, path)
 
 
-def _merged(table: Any, change: Any) -> Any:
+def _merge_table(table: Any, change: Any) -> Any:
     """A table with other keys, or what replaces it: a list, a name, a table of another kind."""
     kind = getattr(table, "kind", None)
     if table is None or not isinstance(change, dict) or change.get("kind", kind) != kind:
         return change
-    return table.model_dump(**_AS_GIVEN) | change
+    return table.model_dump(**_DUMP_GIVEN) | change
 
 
 @cache
-def _parts(run: type[_RunFile]) -> Any:
+def _overrides_model(run: type[_RunFile]) -> Any:
     """Runs where the run file has its parts."""
     return create_model(
         "Parts",
@@ -397,10 +425,10 @@ def _parts(run: type[_RunFile]) -> Any:
     )
 
 
-def _with_plugins() -> type[_RunFile]:
+def _add_plugin_sections() -> type[_RunFile]:
     """The run file with the sections of installed plugins."""
     tables = {
-        name: registry.table_of(model, name.title().replace("_", ""), checked=None)
+        name: registry.constructor_table(model, name.title().replace("_", ""), checked=None)
         for name, model in load_plugins().sections.items()
     }
     taken = sorted(set(tables) & set(_RunFile.model_fields))
@@ -416,4 +444,4 @@ def _with_plugins() -> type[_RunFile]:
 if TYPE_CHECKING:
     RunFile = _RunFile
 else:
-    RunFile = _with_plugins()
+    RunFile = _add_plugin_sections()

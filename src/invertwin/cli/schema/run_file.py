@@ -18,23 +18,25 @@ from pydantic_core import ErrorDetails
 
 from invertwin.errors import InputError
 from invertwin.registry.section import TAG_MARK
-from invertwin.registry.section import about as about
-from invertwin.storage.untrusted import reading
+from invertwin.registry.section import prefix_errors as prefix_errors
+from invertwin.storage.untrusted import convert_read_errors
 
-_MOST_ERRORS = 20  # in one line
+_MAX_ERRORS = 20  # in one line
 # Sections and kinds of the package in experiments/studies.
-_STUDIES = ("methods", "loss_scan", "openradar", "rail_sar", "vehicle", "shape_space")
-_BELONG = {
+_STUDY_NAMES = ("methods", "loss_scan", "openradar", "rail_sar", "vehicle", "shape_space")
+_KEYS_BY_TABLE = {
     "reconstruct": "steps samples boundary_samples boundary annealing observations",
     "optimizer": "rate final_rate",
     "surrogate": "range_width angle_width",
     "parameters": "smooth",
 }
-_MOVED = {key: f"write it in `{place}`" for place, keys in _BELONG.items() for key in keys.split()}
-_MOVED["also_interior_only"] = "add [variants.interior_only] with reconstruct.boundary = false"
+_MOVED_KEYS = {
+    key: f"write it in `{place}`" for place, keys in _KEYS_BY_TABLE.items() for key in keys.split()
+}
+_MOVED_KEYS["also_interior_only"] = "add [variants.interior_only] with reconstruct.boundary = false"
 """Where keys belong that stand in the wrong table, or are gone."""
-_INSTALL = "install the studies: pip install -e ./experiments/studies"
-_WORDS = {
+_INSTALL_STUDIES_ADVICE = "install the studies: pip install -e ./experiments/studies"
+_PHRASE_REPLACEMENTS = {
     r"a valid dictionary( or .*)?": "a table",
     r"a valid string": "a text in quotes",
     r"a valid boolean": "true or false",
@@ -61,12 +63,12 @@ def load_run(path: Path) -> Any:
         raise InputError(
             f"{path}: expected a readable run file, got an error: {reason}; give a TOML text file"
         ) from None
-    with reading(path, "a run file in TOML", "simplify it"):
+    with convert_read_errors(path, "a run file in TOML", "simplify it"):
         try:
             raw = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
-            raise InputError(_syntax_error(path, text, str(error))) from None
-    return validate(raw, path)
+            raise InputError(_syntax_error_message(path, text, str(error))) from None
+    return validate_run(raw, path)
 
 
 def is_run_file(path: Path) -> bool:
@@ -79,7 +81,7 @@ def is_run_file(path: Path) -> bool:
         return False
 
 
-def need(run: Any, section: str, command: str, otherwise: str = "add it") -> Any:
+def require_section(run: Any, section: str, command: str, otherwise: str = "add it") -> Any:
     """A section that a command cannot do without.
 
     Raises:
@@ -97,7 +99,7 @@ def need(run: Any, section: str, command: str, otherwise: str = "add it") -> Any
 
 
 @contextmanager
-def about_file(path: Path) -> Iterator[None]:
+def prefix_file_errors(path: Path) -> Iterator[None]:
     """Add the name of the run file to errors."""
     try:
         yield
@@ -105,7 +107,7 @@ def about_file(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: {error}") from None
 
 
-def validate(raw: dict[str, Any], source: Path) -> Any:
+def validate_run(raw: dict[str, Any], source: Path) -> Any:
     """The run file of parsed TOML; `source` names it in errors and anchors relative paths.
 
     Raises:
@@ -117,8 +119,8 @@ def validate(raw: dict[str, Any], source: Path) -> Any:
         return RunFile.model_validate(raw, context={"folder": source.parent})
     except ValidationError as error:
         errors = error.errors(include_url=False)
-        lines = dict.fromkeys(_explain(item) for item in errors)
-        raise InputError(f"{source}: {' — also '.join([*lines][:_MOST_ERRORS])}") from None
+        lines = dict.fromkeys(_explain_error(item) for item in errors)
+        raise InputError(f"{source}: {' — also '.join([*lines][:_MAX_ERRORS])}") from None
 
 
 def to_toml(run: Any) -> str:
@@ -126,32 +128,33 @@ def to_toml(run: Any) -> str:
     return tomli_w.dumps(run.model_dump(exclude_none=True))
 
 
-def stated(run: Any) -> str:
+def to_minimal_toml(run: Any) -> str:
     """The run file without what it leaves to defaults, some of which depend on other sections."""
     return tomli_w.dumps(run.model_dump(exclude_unset=True, exclude_none=True))
 
 
-def unknown_object(path: str, name: str, known: Sequence[str]) -> str:
+def unknown_object_message(path: str, name: str, known: Sequence[str]) -> str:
     """What is wrong with a key that names an object which the scene does not have."""
     return (
         f"{path}: expected the name of an object of the scene ({', '.join(known)}), "
-        f"got {_shown(name)}; " + _nearest(name, known, "add it to the scene")
+        f"got {_format_value(name)}; " + _suggest_name(name, known, "add it to the scene")
     )
 
 
-def _syntax_error(path: Path, text: str, message: str) -> str:
+def _syntax_error_message(path: Path, text: str, message: str) -> str:
     place = re.search(r" \(at line (\d+), column \d+\)$", message)
     lines = text.splitlines() or [""]
     number = int(place[1]) if place else len(lines)
     reason = message[: place.start()] if place else message
     line = lines[min(number, len(lines)) - 1].strip()
     return (
-        f"{path}: line {number}: expected TOML, got {_shown(line)} ({' '.join(reason.split())}); "
+        f"{path}: line {number}: expected TOML, got {_format_value(line)} "
+        f"({' '.join(reason.split())}); "
         "correct that line"
     )
 
 
-def _explain(error: ErrorDetails) -> str:
+def _explain_error(error: ErrorDetails) -> str:
     """One pydantic error as `path: expected ..., got ...; do ...`."""
     path = ""
     for item in error["loc"]:
@@ -159,22 +162,22 @@ def _explain(error: ErrorDetails) -> str:
             path += f"[{item}]"
         elif not item.startswith(TAG_MARK):
             path += f".{item}" if path else item
-    got = _shown(error["input"])
+    got = _format_value(error["input"])
     context = error.get("ctx", {})
     match error["type"]:
         case "unknown_key":
             key, allowed = context["key"], context["allowed"]
-            said = f"expected one of the keys {', '.join(allowed)}, got {_shown(key)}; "
-            if not path and key in _STUDIES:
-                return f"{key}: {said}{_INSTALL}"
+            said = f"expected one of the keys {', '.join(allowed)}, got {_format_value(key)}; "
+            if not path and key in _STUDY_NAMES:
+                return f"{key}: {said}{_INSTALL_STUDIES_ADVICE}"
             return (
                 f"{path}.{key}".lstrip(".")
                 + f": {said}"
-                + (_MOVED.get(key) or _nearest(key, allowed, "remove the key"))
+                + (_MOVED_KEYS.get(key) or _suggest_name(key, allowed, "remove the key"))
             )
         case "unknown_object":
             at = ".".join(filter(None, (path, context["path"])))
-            return unknown_object(at, context["name"], context["known"])
+            return unknown_object_message(at, context["name"], context["known"])
         case "union_tag_not_found":
             keys = context["discriminator"].removesuffix("()").split(",")
             present = list(error["input"]) if isinstance(error["input"], dict) else []
@@ -186,12 +189,17 @@ def _explain(error: ErrorDetails) -> str:
             tags = [t.strip(f" '{TAG_MARK}") for t in context["expected_tags"].split(",")]
             allowed = [tag for tag in tags if tag not in (*others, "points")]
             tag = context["tag"].strip(TAG_MARK)
-            return f"{path}.{key}: expected one of {', '.join(allowed)}, got {_shown(tag)}; " + (
-                _INSTALL if tag in _STUDIES else _nearest(tag, allowed, "choose one")
+            return (
+                f"{path}.{key}: expected one of {', '.join(allowed)}, got {_format_value(tag)}; "
+                + (
+                    _INSTALL_STUDIES_ADVICE
+                    if tag in _STUDY_NAMES
+                    else _suggest_name(tag, allowed, "choose one")
+                )
             )
         case "literal_error":
             allowed = [t.strip(" '") for t in context["expected"].replace(" or ", ", ").split(",")]
-            return f"{path}: expected one of {', '.join(allowed)}, got {got}; " + _nearest(
+            return f"{path}: expected one of {', '.join(allowed)}, got {got}; " + _suggest_name(
                 str(error["input"]), allowed, "choose one"
             )
         case "missing":
@@ -206,12 +214,12 @@ def _explain(error: ErrorDetails) -> str:
             return ".".join(filter(None, (path, context["path"]))) + f": {error['msg']}"
     # Pydantic says "..., got a number with a fractional part": the value itself says it, too.
     expected = error["msg"].removeprefix("Input should be ").split(", got ")[0]
-    for words, ours in _WORDS.items():
+    for words, ours in _PHRASE_REPLACEMENTS.items():
         expected = re.sub(words, ours, expected)
     return f"{path}: expected {expected}, got {got}; correct the value"
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     try:
         text = json.dumps(value, ensure_ascii=False)
     except TypeError:
@@ -219,6 +227,6 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _nearest(given: str, allowed: Sequence[str], otherwise: str) -> str:
+def _suggest_name(given: str, allowed: Sequence[str], otherwise: str) -> str:
     close = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
     return f"did you mean `{close[0]}`?" if close else otherwise

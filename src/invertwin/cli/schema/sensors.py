@@ -16,8 +16,23 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.signal.impairments import Impairments
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
-from invertwin.registry.kinds import Group, OneOf, Registry, Table, TableOf, number_or_list
-from invertwin.registry.section import TAG_MARK, Section, Vector, about, check_presence, key, tag_by
+from invertwin.registry.kinds import (
+    ConstructorTable,
+    KindGroup,
+    OneOf,
+    Registry,
+    TableOf,
+    number_or_list,
+)
+from invertwin.registry.section import (
+    TAG_MARK,
+    Section,
+    Vector,
+    check_presence,
+    key,
+    prefix_errors,
+    tag_by,
+)
 from invertwin.scene import (
     AntennaArray,
     Cosine,
@@ -28,9 +43,9 @@ from invertwin.scene import (
     planar_array,
     rotation_from_vector,
 )
-from invertwin.scene import Table as PatternTable
+from invertwin.scene import TabulatedPattern as PatternTable
 
-Numbers = Annotated[list[Count], MinLen(1)]
+ElementNumbers = Annotated[list[Count], MinLen(1)]
 
 
 @dataclass(frozen=True)
@@ -44,18 +59,24 @@ class _OneOrEach:
         return handler.generate_schema(number_or_list(self.one, list[self.each]))
 
 
-_NUMBERS = _OneOrEach(float, float)
-Polarised = Annotated[Any, _OneOrEach(Literal["V", "H", "circular"], Annotated[Any, _NUMBERS])]
-_POLARISED = '"V", "H", "circular" (right-hand) or two numbers (V, H), of all elements or of each'
-_LEAKAGE = "field of the orthogonal polarisation over that of the wanted one"
+_NumberOrEach = _OneOrEach(float, float)
+PolarisationValue = Annotated[
+    Any, _OneOrEach(Literal["V", "H", "circular"], Annotated[Any, _NumberOrEach])
+]
+_POLARISATION_HELP = (
+    '"V", "H", "circular" (right-hand) or two numbers (V, H), of all elements or of each'
+)
+_LEAKAGE_HELP = "field of the orthogonal polarisation over that of the wanted one"
 
 
-class ArrayTable(Table):
+class ArrayTable(ConstructorTable):
     """Antenna elements in the radar frame (x right, y up, z boresight)."""
 
     center: Vector = key("m, in the radar frame", [0.0, 0.0, 0.0])
-    polarisation: Polarised = key(_POLARISED, "V")
-    leakage: Annotated[Any, _NUMBERS] = key(_LEAKAGE + ", of all elements or of each", 0.0)
+    polarisation: PolarisationValue = key(_POLARISATION_HELP, "V")
+    leakage: Annotated[Any, _NumberOrEach] = key(
+        _LEAKAGE_HELP + ", of all elements or of each", 0.0
+    )
 
     def build(self, given: Any = None, /, **more: Any) -> AntennaArray:
         """The elements about their centre."""
@@ -63,22 +84,24 @@ class ArrayTable(Table):
         return replace(array, positions=array.positions + _float64(self.center))
 
 
-class BoardTable(Table):
+class BoardTable(ConstructorTable):
     """Elements on a board's grid of half wavelengths."""
 
     elevation: Literal[-1, 1] | None = key(
         "1 = rows grow upwards, -1 = downwards; required where there are several rows", None
     )
     azimuth: Literal[-1, 1] = key("1 = columns grow to the right, -1 = to the left", 1)
-    transmitters: Numbers | None = key(
+    transmitters: ElementNumbers | None = key(
         "numbers from 1 in the order of sending; without it all, or those of the recording", None
     )
-    receivers: Numbers | None = key(
+    receivers: ElementNumbers | None = key(
         "numbers from 1, ascending; without it all, or those of the recording", None
     )
     pattern: Annotated[Any, OneOf("pattern")] | None = key("of every element; else isotropic", None)
-    polarisation: Polarised | None = key(_POLARISED + "; without it the board's", None)
-    leakage: float = key(_LEAKAGE, 0.0)
+    polarisation: PolarisationValue | None = key(
+        _POLARISATION_HELP + "; without it the board's", None
+    )
+    leakage: float = key(_LEAKAGE_HELP, 0.0)
 
     def build(self, given: Any = None, /, **more: Any) -> boards.Mounting:
         """The board as it is mounted."""
@@ -94,30 +117,32 @@ class BoardTable(Table):
         )
 
 
-class LookAt(Section):
+class LookAtOrientation(Section):
     look_at: Vector = key("m, the point that boresight is turned to")
 
 
-class Turned(Section):
+class RotatedOrientation(Section):
     rotation_deg: Vector = key("rotation vector, the same at every position")
 
 
-Track = Annotated[Any, OneOf("track")]
+TrackValue = Annotated[Any, OneOf("track")]
 Orientation = Annotated[
-    Annotated[LookAt, Tag(TAG_MARK + "look_at")]
-    | Annotated[Turned, Tag(TAG_MARK + "rotation_deg")],
+    Annotated[LookAtOrientation, Tag(TAG_MARK + "look_at")]
+    | Annotated[RotatedOrientation, Tag(TAG_MARK + "rotation_deg")],
     tag_by(("look_at", "rotation_deg")),
 ]
 
 
-class Posed(Table):
+class RadarPoseTable(ConstructorTable):
     """Where a radar is in every frame."""
 
-    positions: Track = key(
+    positions: TrackValue = key(
         "m, one for each frame: a list of points or a track; for a recording also one for all",
         [[0.0, 0.0, 0.0]],
     )
-    orientation: Orientation = key("look_at or rotation_deg", Turned(rotation_deg=[0.0, 0.0, 0.0]))
+    orientation: Orientation = key(
+        "look_at or rotation_deg", RotatedOrientation(rotation_deg=[0.0, 0.0, 0.0])
+    )
     range_center: Vector | None = key(
         "m, a point in the world that has range 0 in every frame, as in data that are motion "
         "compensated to a scene; without it ranges count from the radar",
@@ -137,13 +162,13 @@ class Posed(Table):
         places = _float64(self.positions) if listed else self.positions.build()
         if len(places) == 1:
             places = places.expand(frames, 3).clone()
-        if isinstance(self.orientation, LookAt):
-            with about("orientation.look_at"):
+        if isinstance(self.orientation, LookAtOrientation):
+            with prefix_errors("orientation.look_at"):
                 return places, look_at(places, self.orientation.look_at)
         turn = rotation_from_vector(_float64(self.orientation.rotation_deg).deg2rad())
         return places, turn.expand(len(places), 3, 3).clone()
 
-    def centered(self, radar: Radar) -> Radar:
+    def apply_range_center(self, radar: Radar) -> Radar:
         """The radar with the range origin of its data.
 
         Args:
@@ -151,10 +176,10 @@ class Posed(Table):
         """
         if self.range_center is None:
             return radar
-        return radar.centered(_float64(self.range_center))
+        return radar.center_on(_float64(self.range_center))
 
 
-class RadarTable(Posed):
+class RadarTable(RadarPoseTable):
     """Arrays, waveform and poses; one frame per position."""
 
     board: Annotated[Any, OneOf("board")] | None = key("antenna elements of a board, or:", None)
@@ -162,7 +187,7 @@ class RadarTable(Posed):
     receivers: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
 
     @model_validator(mode="after")
-    def _elements(self) -> "RadarTable":
+    def _check_elements(self) -> "RadarTable":
         arrays = self.board is None
         wanted = {"transmitters": arrays, "receivers": arrays}
         check_presence(self, wanted, f"with{'out' if arrays else ''} `board`")
@@ -171,17 +196,17 @@ class RadarTable(Posed):
     def build(self, given: Any = None, /, **more: Any) -> Radar:
         """The radar, one frame per position."""
         if self.board is not None:
-            with about("board"):
+            with prefix_errors("board"):
                 arrays = self.board.build().arrays()
             more |= {"transmitters": arrays[0], "receivers": arrays[1]}
         more["positions"], more["rotations"] = self.poses(1)
         found = super().build(given, **more)
-        found = self.centered(found)
+        found = self.apply_range_center(found)
         WAVEFORMS.setdefault(type(found.waveform).__name__, type(found.waveform))
         return found
 
 
-class ChirpsTable(Table):
+class ChirpsTable(ConstructorTable):
     """Several ramps a frame: objects move between them, and range rates are resolved."""
 
     count: Annotated[int, Ge(2)] = key("ramps of each transmitter in a frame (loops)")
@@ -207,28 +232,28 @@ AnyImpairments = Annotated[Any, TableOf(Impairments, without=("snr_db", "noise_f
 
 def register(registry: Registry) -> None:
     """Add waveforms, antennas, boards and tracks."""
-    registry.groups["pattern"] = Group(product=Pattern)
-    registry.groups["waveform"] = Group(product=Waveform)
-    registry.groups["array"] = Group(base=ArrayTable, product=AntennaArray)
-    registry.groups["board"] = Group(base=BoardTable, product=boards.Mounting)
-    registry.groups["track"] = Group(points=Annotated[list[Vector], MinLen(1)])
+    registry.groups["pattern"] = KindGroup(product=Pattern)
+    registry.groups["waveform"] = KindGroup(product=Waveform)
+    registry.groups["array"] = KindGroup(base=ArrayTable, product=AntennaArray)
+    registry.groups["board"] = KindGroup(base=BoardTable, product=boards.Mounting)
+    registry.groups["track"] = KindGroup(points=Annotated[list[Vector], MinLen(1)])
     waveforms = {"fmcw": FMCW, "stepped": SteppedFrequency, "ofdm": OFDM, "impulse": Impulse}
     for name, waveform in waveforms.items():
         registry.add("waveform", name, waveform)
     registry.add("pattern", "isotropic", Isotropic)
     registry.add("pattern", "cosine", Cosine)
-    registry.add("pattern", "table", PatternTable.of_decibels, checked=True)
+    registry.add("pattern", "table", PatternTable.from_decibels, checked=True)
     registry.add("array", "planar", planar_array)
     registry.add("array", "linear", linear_array)
     registry.add("array", "positions", AntennaArray)
     registry.add("board", "name", boards.board, untagged=True)
-    registry.add("board", "tx_places", own_board, untagged=True)
+    registry.add("board", "tx_places", custom_board, untagged=True)
     for curve in (tracks.line, tracks.arc, tracks.grid):
         registry.add("track", curve.__name__, curve)
 
 
-def own_board(
-    tx_places: boards.Places, rx_places: boards.Places, design_frequency: Positive
+def custom_board(
+    tx_places: boards.ElementGrid, rx_places: boards.ElementGrid, design_frequency: Positive
 ) -> boards.Board:
     """A board of one's own: a table of places.
 
@@ -246,7 +271,7 @@ def radar(table: Any) -> Radar:
     Raises:
         InputError: Values the radar refuses, or a target straight above a position.
     """
-    with about("radar"):
+    with prefix_errors("radar"):
         return table.build()
 
 
@@ -256,14 +281,14 @@ def grid(table: Any, radar: Radar) -> Grid:
     Raises:
         InputError: Limits that the radar refuses or does not reach.
     """
-    with about("grid"):
+    with prefix_errors("grid"):
         return table.build(self=radar)
 
 
 def impairments(table: Any, data: Any) -> Impairments:
     """The front end of the `[impairments]` table, if any, with the noise of simulated `[data]`."""
     noise = {"snr_db": data.snr_db, "noise_figure_db": data.noise_figure_db}
-    with about("impairments"):
+    with prefix_errors("impairments"):
         return Impairments(**noise) if table is None else table.build(**noise)
 
 

@@ -12,13 +12,13 @@ from invertwin.checks import ArrayLike, Point
 from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
-from invertwin.links.metasurface.wall_path import PlacedPanel
-from invertwin.radar.parameters import RadarPath, RadarPose
+from invertwin.links.metasurface.wall_path import PanelPlacement
+from invertwin.radar.parameters import RadarPose, RadarTrajectory
 from invertwin.radar.radar import Radar
-from invertwin.registry.kinds import Group, OneOf, Registry, Table
-from invertwin.registry.section import Counts, InputPath, Vector, about, key
+from invertwin.registry.kinds import ConstructorTable, KindGroup, OneOf, Registry
+from invertwin.registry.section import Counts, InputPath, Vector, key, prefix_errors
 from invertwin.scene import (
-    Along,
+    AxisRotation,
     DensityGrid,
     DistanceGrid,
     LatticeDeformation,
@@ -31,12 +31,12 @@ from invertwin.scene import (
     Sitting,
     SkinnedBody,
     SmoothVertices,
-    Spline,
-    Turning,
+    SplineTrajectory,
+    TrajectoryMotion,
     Walking,
     Waving,
-    joined,
     load_prior,
+    merge_meshes,
     rigid,
     rotation_from_vector,
     shapes,
@@ -47,30 +47,30 @@ from invertwin.scene.people.body import BodyTemplate
 from invertwin.scene.people.body_models import body, body_template
 
 
-class Placement(Table):
+class ShapePoseTable(ConstructorTable):
     """Where a shape stands: scaled, then rotated about its own origin, then moved."""
 
     position: Vector = key("m", [0.0, 0.0, 0.0])
     rotation_deg: Vector = key("rotation vector", [0.0, 0.0, 0.0])
     scale: Positive = key("factor", 1.0)
 
-    def mesh(self) -> Mesh:
+    def build_mesh(self) -> Mesh:
         """In its own frame, scaled but not placed."""
         mesh = super().build()
         return Mesh(mesh.vertices * self.scale, mesh.faces)
 
-    def pose(self) -> Tensor:
+    def build_pose(self) -> Tensor:
         """Where it stands [4, 4]."""
         turn = torch.tensor(self.rotation_deg, dtype=torch.float64).deg2rad()
         return rigid(rotation_from_vector(turn), torch.tensor(self.position, dtype=torch.float64))
 
     def build(self, given: Any = None, /, **more: Any) -> Any:
         """The mesh as a part of an object, placed within it."""
-        mesh, pose = self.mesh(), self.pose()
+        mesh, pose = self.build_mesh(), self.build_pose()
         return Mesh(mesh.vertices @ pose[:3, :3].T + pose[:3, 3], mesh.faces)
 
 
-class _Body(Table):
+class _ObjectProperties(ConstructorTable):
     material: Annotated[Any, OneOf("material")] = key("what it is made of")
     velocity: Vector | None = key("m/s", None)
     motion: list[Annotated[Any, OneOf("motion")]] = key(
@@ -78,20 +78,20 @@ class _Body(Table):
     )
 
 
-class ObjectTable(Placement, _Body):
+class ObjectTable(ShapePoseTable, _ObjectProperties):
     """A shape with what makes it an object of the scene."""
 
     def build(self, given: Any = None, /, **more: Any) -> Object:
         """The object; `mesh` stands in for its shape."""
-        mesh = more["mesh"] if more else self.mesh()
-        with about("material"):
+        mesh = more["mesh"] if more else self.build_mesh()
+        with prefix_errors("material"):
             material = self.material.build({Mesh: mesh})
         still = self.velocity is None
         velocity = None if still else torch.tensor(self.velocity, dtype=torch.float64)
-        return Object(mesh, material, self.pose(), velocity)
+        return Object(mesh, material, self.build_pose(), velocity)
 
 
-class RoomTable(Table):
+class RoomTable(ConstructorTable):
     """A furnished room, whose objects stand beside those of `[scene.<name>]`."""
 
     materials: dict[str, Annotated[Any, OneOf("material")]] = key(
@@ -106,7 +106,7 @@ class RoomTable(Table):
         """
         found: dict[str, Object] = super().build(given, **more)
         for name, table in self.materials.items():
-            with about(f"materials.{name}"):
+            with prefix_errors(f"materials.{name}"):
                 if name not in found:
                     raise InputError(
                         f"expected an object of the room ({', '.join(found)}), got none of this "
@@ -116,14 +116,14 @@ class RoomTable(Table):
         return found
 
 
-class ParameterTable(Table):
+class ParameterTable(ConstructorTable):
     """What every parameter may have."""
 
     name: str | None = key("by which stages and variants call it; without it its kind", None)
     rate: Positive | None = key("of its own; without it the optimizer's", None)
 
 
-class LatentTable(Table):
+class LatentTable(ConstructorTable):
     """Coordinates in standard deviations."""
 
     weight: NonNegative = key("of ½ Σ z²", 0.0)
@@ -133,7 +133,7 @@ class LearnedTable(LatentTable):
     """Coordinates of a learned shape, which has a size of its own."""
 
 
-class Mover(ParameterTable):
+class MovingTargetParameter(ParameterTable):
     """Place, size, velocity, turn and diffuse share of a rough body in motion.
 
     Starts at the strongest echo that moves, with the object's size; the data must have chirps.
@@ -153,10 +153,10 @@ class PanelParameter(ParameterTable):
 
     kind: Literal["panel"]
 
-    def build(self, given: Mapping[type, object] | None = None, /, **more: Any) -> PlacedPanel:
+    def build(self, given: Mapping[type, object] | None = None, /, **more: Any) -> PanelPlacement:
         """The module of the section."""
-        found = (given or {}).get(PlacedPanel)
-        if not isinstance(found, PlacedPanel):
+        found = (given or {}).get(PanelPlacement)
+        if not isinstance(found, PanelPlacement):
             raise InputError(
                 "expected a section [placement] and a gradient check with the metasurface, got "
                 "none; choose another kind"
@@ -166,48 +166,50 @@ class PanelParameter(ParameterTable):
 
 def register(registry: Registry) -> None:
     """Add shapes, and the modules that fit them."""
-    registry.groups["shape"] = Group(tag="shape", base=Placement, product=Mesh)
-    registry.groups["object"] = Group(tag="shape", base=ObjectTable, includes="shape")
-    registry.groups["parameter"] = Group(base=ParameterTable)
+    registry.groups["shape"] = KindGroup(tag="shape", base=ShapePoseTable, product=Mesh)
+    registry.groups["object"] = KindGroup(tag="shape", base=ObjectTable, includes="shape")
+    registry.groups["parameter"] = KindGroup(base=ParameterTable)
     registry.bases |= dict.fromkeys((PriorShape, LinearShape), LearnedTable)
-    registry.bases[RadarPath] = LatentTable
+    registry.bases[RadarTrajectory] = LatentTable
     registry.given |= {Scene, Mesh, Object, ObjectTable, BodyTemplate, Walking, Sitting}
-    registry.groups["motion"] = Group()
+    registry.groups["motion"] = KindGroup()
     for name, make in (
         ("walking", Walking),
         ("sitting", Sitting),
         ("waving", Waving),
-        ("turning", Turning),
-        ("along", along),
+        ("turning", AxisRotation),
+        ("along", follow_spline),
     ):
         registry.add("motion", name, make, checked=False)
     for name in ("plate", "box", "sphere", "cylinder", "dihedral", "trihedral", "text"):
         registry.add("shape", name, getattr(shapes, name))
-    registry.add("shape", "prior", learned)
+    registry.add("shape", "prior", learned_car)
     registry.add("shape", "body", body)
     registry.add("shape", "file", load_mesh, untagged=True)
-    registry.add("object", "parts", joined, untagged=True)
+    registry.add("object", "parts", merge_meshes, untagged=True)
     for name, make, without in (
         ("translation", Translation, ("initial",)),
         ("pose", Pose, ("translation", "rotation")),
         ("scale", Scale, ("initial",)),
-        ("vertices", vertices, ()),
+        ("vertices", free_vertices, ()),
         ("lattice", LatticeDeformation, ()),
-        ("distance_grid", DistanceGrid.of_mesh, ()),
+        ("distance_grid", DistanceGrid.from_mesh, ()),
         ("neural_distance", NeuralDistance, ("seed",)),
-        ("density", DensityGrid.of_object, ()),
-        ("prior", prior, ()),
-        ("body", joints, ()),
-        ("material", MaterialValues.of, ()),
+        ("density", DensityGrid.from_object, ()),
+        ("prior", prior_shape, ()),
+        ("body", body_joints, ()),
+        ("material", MaterialValues.from_object, ()),
         ("radar_pose", RadarPose, ("translation", "rotation")),
-        ("radar_path", RadarPath, ()),
-        ("mover", Mover, ()),
+        ("radar_path", RadarTrajectory, ()),
+        ("mover", MovingTargetParameter, ()),
         ("panel", PanelParameter, ()),
     ):
         registry.add("parameter", name, make, without=without)
 
 
-def along(times: ArrayLike, places: Sequence[Point], heading: bool = False) -> Along:
+def follow_spline(
+    times: ArrayLike, places: Sequence[Point], heading: bool = False
+) -> TrajectoryMotion:
     """Carry the object along a natural cubic spline; its position counts from the spline's place.
 
     Args:
@@ -215,10 +217,10 @@ def along(times: ArrayLike, places: Sequence[Point], heading: bool = False) -> A
         places: x, y and z of each [m].
         heading: turn it about the vertical, so that its front, −z, looks where it goes.
     """
-    return Along(Spline(times, places), heading)
+    return TrajectoryMotion(SplineTrajectory(times, places), heading)
 
 
-def learned(latent: Sequence[float] | None = None, prior: InputPath | None = None) -> Mesh:
+def learned_car(latent: Sequence[float] | None = None, prior: InputPath | None = None) -> Mesh:
     """A car of the learned prior: x ahead, y to the left, z up, on the ground z = 0.
 
     Args:
@@ -230,7 +232,7 @@ def learned(latent: Sequence[float] | None = None, prior: InputPath | None = Non
     return found.mesh(mean if latent is None else mean.new_tensor(latent))
 
 
-def vertices(
+def free_vertices(
     object: str, mesh: Mesh, laplacian: NonNegative = 0.0, smooth: NonNegative = 0.0
 ) -> nn.Module:
     """Free vertices, held together by a Laplacian term, or moved in smooth steps.
@@ -243,7 +245,7 @@ def vertices(
     return Vertices(object, len(mesh.vertices))
 
 
-def prior(
+def prior_shape(
     object: str,
     table: ObjectTable | None = None,
     file: InputPath | None = None,
@@ -257,11 +259,11 @@ def prior(
         counts: nodes along x, y and z at which it is meshed; without it every 0.1 m or so.
     """
     known: Any = table
-    same = _shape(known) == "prior" and known.prior == file
+    same = _shape_kind(known) == "prior" and known.prior == file
     return PriorShape(object, load_prior(file), known.latent if same else None, counts)
 
 
-def joints(
+def body_joints(
     object: str,
     joints: Annotated[Mapping[str, Axes], MinLen(1)],
     mesh: Mesh,
@@ -275,20 +277,20 @@ def joints(
     Raises:
         InputError: The object is no body, or has no such joint.
     """
-    found = template_of(table)
+    found = body_template_of(table)
     if found is None:
         raise InputError(
             f'expected an object with shape = "body", got {object}; give it this shape, or use '
             'kind = "pose"'
         )
-    return SkinnedBody.of(object, found, mesh, joints)
+    return SkinnedBody.from_mesh(object, found, mesh, joints)
 
 
-def _shape(table: Any) -> str | None:
+def _shape_kind(table: Any) -> str | None:
     return getattr(table, "shape", None)
 
 
-def shape_terms(table: Any, module: nn.Module, scene: Scene | Radar) -> list[Regularizer]:
+def shape_regularizers(table: Any, module: nn.Module, scene: Scene | Radar) -> list[Regularizer]:
     """Terms of the loss that keep a fitted shape, or a path, plausible."""
     if isinstance(scene, Scene) and table.kind == "vertices" and table.laplacian > 0:
         return [Laplacian(scene, table.object, table.laplacian)]
@@ -297,26 +299,26 @@ def shape_terms(table: Any, module: nn.Module, scene: Scene | Radar) -> list[Reg
     return []
 
 
-def given_for(name: str, scene: Scene, objects: Mapping[str, Any]) -> dict[type, object]:
+def module_values(name: str, scene: Scene, objects: Mapping[str, Any]) -> dict[type, object]:
     """What a module of an object may ask for beside its keys, where a fit starts."""
     item, table = scene[name], objects.get(name)
     found: dict[type, object] = {Scene: scene, Object: item, Mesh: item.mesh}
     return found if table is None else {**found, ObjectTable: table}
 
 
-def template_of(table: Any) -> BodyTemplate | None:
+def body_template_of(table: Any) -> BodyTemplate | None:
     """The body of an object's table in its rest pose; None of other shapes.
 
     Args:
         table: Of the object.
     """
-    if _shape(table) != "body":
+    if _shape_kind(table) != "body":
         return None
     found = body_template(table.model, table.file, table.height, table.spacing)
-    return found.scaled(table.scale)
+    return found.scale(table.scale)
 
 
-def joint_places(table: Any, item: Object, rotations: Tensor | None = None) -> dict[str, Tensor]:
+def joint_positions(table: Any, item: Object, rotations: Tensor | None = None) -> dict[str, Tensor]:
     """Where the joints of a body are in the world [m], by name; none of other objects.
 
     Args:
@@ -324,12 +326,12 @@ def joint_places(table: Any, item: Object, rotations: Tensor | None = None) -> d
         item: What it has made.
         rotations: Of every joint in the frame of its parent; without them those of the table.
     """
-    template = template_of(table)
+    template = body_template_of(table)
     if template is None:
         return {}
     if rotations is None:
         turns = {name: torch.tensor(turn).deg2rad() for name, turn in table.angles_deg.items()}
         rotations = rotation_from_vector(template.rotations(turns))
-    places = template.posed(rotations)[1]
+    places = template.apply_pose(rotations)[1]
     world = places @ item.transform[:3, :3].T + item.transform[:3, 3]
     return dict(zip(template.names, world, strict=True))

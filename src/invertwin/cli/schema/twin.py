@@ -7,14 +7,16 @@ from annotated_types import Ge, Len
 from invertwin.limits import NonNegative, Positive
 from invertwin.registry.section import Section, key
 
-Corner = Annotated[list[float], Len(2, 2)]
+GroundCorner = Annotated[list[float], Len(2, 2)]
 
 
 class TwinTable(Section):
     """The part of the ground that `invertwin twin` searches, and how."""
 
-    low: Corner | None = key("m, a corner along the two axes of the ground; else all seen", None)
-    high: Corner | None = key("m, the opposite corner", None)
+    low: GroundCorner | None = key(
+        "m, a corner along the two axes of the ground; else all seen", None
+    )
+    high: GroundCorner | None = key("m, the opposite corner", None)
     range_max: Positive | None = key("m; without it the last range with echoes", None)
     up: Literal["y", "z"] = key("world axis that points up", "y")
     level: float | None = key("m, of the ground; without it 0.6 below the radars", None)

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from invertwin.datasets import KEPT
+from invertwin.datasets import UNCHANGED
 from invertwin.errors import InputError
-from invertwin.registry.section import fail
-from invertwin.seeds import derived_seed
+from invertwin.registry.section import raise_key_error
+from invertwin.seeds import derive_seed
 
-Steps = tuple[str | int, ...]
-_STEP = re.compile(r'(?:^|(?<=.)\.)(?:"([^"]+)"|([^.\[\]"\s]+))|\[(\d+)\]')
-_KNOWN = 12  # names that an error lists
+KeyPath = tuple[str | int, ...]
+_KEY_PATH_PATTERN = re.compile(r'(?:^|(?<=.)\.)(?:"([^"]+)"|([^.\[\]"\s]+))|\[(\d+)\]')
+_MAX_LISTED_NAMES = 12  # names that an error lists
 
 
-def steps_of(path: str) -> Steps:
+def parse_key_path(path: str) -> KeyPath:
     """Names and numbers of a path such as ``scene.box.position[0]``; none where it is no path.
 
     A name with dots stands in quotes.
@@ -27,7 +27,7 @@ def steps_of(path: str) -> Steps:
     steps: list[str | int] = []
     place = 0
     while place < len(path):
-        found = _STEP.match(path, place)
+        found = _KEY_PATH_PATTERN.match(path, place)
         if found is None:
             return ()
         quoted, name, number = found.groups()
@@ -36,7 +36,7 @@ def steps_of(path: str) -> Steps:
     return tuple(steps)
 
 
-def check_varied(run: Any, raw: dict[str, Any], info: Any) -> None:
+def check_samples(run: Any, raw: dict[str, Any], info: Any) -> None:
     """Refuse a run file whose samples would be no run files; errors begin at the table.
 
     Every distribution is tried at its ends, the other keys as they are stated.
@@ -48,22 +48,24 @@ def check_varied(run: Any, raw: dict[str, Any], info: Any) -> None:
     """
     kind = type(run)
     whole = TypeAdapter(dict[str, kind])  # type: ignore[valid-type]
-    taken: set[Steps] = set()
+    taken: set[KeyPath] = set()
     for number, table in enumerate(run.vary):
         at = f"vary[{number}]"
         for path in table.paths:
-            if steps_of(path) in taken:
-                fail(f'expected every key once, got "{path}" twice; remove one', f"{at}.key")
-            taken.add(steps_of(path))
+            if parse_key_path(path) in taken:
+                raise_key_error(
+                    f'expected every key once, got "{path}" twice; remove one', f"{at}.key"
+                )
+            taken.add(parse_key_path(path))
         for value in table.build().ends():
             try:
-                changed = with_values(raw, ((path, value) for path in table.paths))
+                changed = set_values(raw, ((path, value) for path in table.paths))
             except InputError as error:
-                fail(str(error), f"{at}.key")
+                raise_key_error(str(error), f"{at}.key")
             whole.validate_python({at: changed}, context=info.context)
 
 
-def sample_of(run: Any, raw: dict[str, Any], index: int) -> dict[str, Any]:
+def draw_sample(run: Any, raw: dict[str, Any], index: int) -> dict[str, Any]:
     """The run file of a sample as TOML; it depends on the run file, its seed and the index only.
 
     Args:
@@ -78,15 +80,15 @@ def sample_of(run: Any, raw: dict[str, Any], index: int) -> dict[str, Any]:
     for number, table in enumerate(run.vary, 1):
         words = np.random.SeedSequence(run.seed, spawn_key=(index, number))
         value = table.build().draw(np.random.default_rng(words))
-        if value is not KEPT:
+        if value is not UNCHANGED:
             drawn += [(path, value) for path in table.paths]
-    return with_values(raw, drawn) | {
+    return set_values(raw, drawn) | {
         "task": "simulate",
-        "seed": derived_seed(run.seed, index, 0),
+        "seed": derive_seed(run.seed, index, 0),
     }
 
 
-def with_values(raw: dict[str, Any], values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+def set_values(raw: dict[str, Any], values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """A run file as TOML with other values; None takes a key away, after all else is done.
 
     Args:
@@ -98,32 +100,32 @@ def with_values(raw: dict[str, Any], values: Iterable[tuple[str, Any]]) -> dict[
     """
     changed, removed = copy.deepcopy(raw), []
     for path, value in values:
-        holder, last = _holder(changed, path)
+        holder, last = _find_holder(changed, path)
         if value is None:
             removed.append((holder, last))
         else:
             holder[last] = copy.deepcopy(value)
     # Of a list the last ones first: the others keep their numbers until then.
-    for holder, last in sorted(removed, key=lambda row: row[1] if _is_number(row[1]) else -1)[::-1]:
-        if _is_number(last) or last in holder:
+    for holder, last in sorted(removed, key=lambda row: row[1] if _is_index(row[1]) else -1)[::-1]:
+        if _is_index(last) or last in holder:
             del holder[last]
     return changed
 
 
-def _holder(raw: dict[str, Any], path: str) -> tuple[Any, Any]:
+def _find_holder(raw: dict[str, Any], path: str) -> tuple[Any, Any]:
     """The table or list that holds a key, and the key."""
-    *way, last = steps_of(path)
+    *way, last = parse_key_path(path)
     holder: Any = raw
     for step in way:
-        holder = _entry(holder, step, path)
-    if _is_number(last):
-        _entry(holder, last, path)
+        holder = _get_entry(holder, step, path)
+    if _is_index(last):
+        _get_entry(holder, last, path)
     elif not isinstance(holder, dict):
         raise InputError(f'{path}: expected a table before "{last}", got {holder}; correct the key')
     return holder, last
 
 
-def _entry(holder: Any, step: str | int, path: str) -> Any:
+def _get_entry(holder: Any, step: str | int, path: str) -> Any:
     if isinstance(step, int):
         if isinstance(holder, list) and step < len(holder):
             return holder[step]
@@ -137,10 +139,11 @@ def _entry(holder: Any, step: str | int, path: str) -> Any:
         return holder[step]
     close = difflib.get_close_matches(step, known, n=1)
     raise InputError(
-        f"{path}: expected a table that the run file has ({', '.join(known[:_KNOWN]) or 'none'}), "
+        f"{path}: expected a table that the run file has "
+        f"({', '.join(known[:_MAX_LISTED_NAMES]) or 'none'}), "
         f'got "{step}"; ' + (f"did you mean `{close[0]}`?" if close else "add it")
     )
 
 
-def _is_number(step: str | int) -> bool:
+def _is_index(step: str | int) -> bool:
     return isinstance(step, int)

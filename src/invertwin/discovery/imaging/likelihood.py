@@ -11,16 +11,16 @@ from invertwin.channel import Grid
 from invertwin.inversion import speckle_divergence
 from invertwin.radar import Radar
 from invertwin.radar.aperture import aperture
-from invertwin.radar.radar import sampled
+from invertwin.radar.radar import require_sampled_waveform
 from invertwin.radar.waveform import unit_window
 
-DEGREES = 4.0
+TAIL_DEGREES = 4.0
 """Of the heavy-tailed speckle."""
-_LEAST = 1e-30  # of power, to keep logarithms finite
-_QUIET = 0.25  # quantile of a range bin that is taken for background
+_MIN_POWER = 1e-30  # of power, to keep logarithms finite
+_BACKGROUND_QUANTILE = 0.25  # quantile of a range bin that is taken for background
 
 
-def background(power: Float[Tensor, "frame range u v"]) -> Float64[Tensor, " range"]:
+def estimate_background(power: Float[Tensor, "frame range u v"]) -> Float64[Tensor, " range"]:
     """The level of noise and of clutter that nothing explains, of every range bin.
 
     The lower quartile of exponentially distributed power is 0.288 of its mean. Objects that fill
@@ -30,12 +30,12 @@ def background(power: Float[Tensor, "frame range u v"]) -> Float64[Tensor, " ran
         power: Measured maps.
     """
     flat = power.detach().double().movedim(1, 0).flatten(1)
-    level = torch.quantile(flat, _QUIET, dim=1) / -math.log(1 - _QUIET)
+    level = torch.quantile(flat, _BACKGROUND_QUANTILE, dim=1) / -math.log(1 - _BACKGROUND_QUANTILE)
     floor = 1e-12 * float(power.max())
     return level.clamp_min(floor)
 
 
-def shared_bins(radar: Radar, grid: Grid) -> float:
+def count_bins_per_draw(radar: Radar, grid: Grid) -> float:
     """How many bins of a map are worth one that is independent of all others.
 
     Fields of noise in bins that are l apart correlate as the windows do; powers correlate as the
@@ -46,7 +46,7 @@ def shared_bins(radar: Radar, grid: Grid) -> float:
         grid: Bins.
     """
     total = 1.0
-    for axis in axes_of(radar, grid):
+    for axis in map_axes(radar, grid):
         if axis.count > 1:
             lags = torch.arange(-axis.count + 1, axis.count, dtype=torch.float64)
             # Of all pairs of bins of the axis, this share is so far apart.
@@ -58,7 +58,7 @@ def shared_bins(radar: Radar, grid: Grid) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Axis:
+class MapAxis:
     """One axis of a map: what is summed to make its bins.
 
     Attributes:
@@ -84,7 +84,7 @@ class Axis:
         return field.abs().square()
 
 
-def axes_of(radar: Radar, grid: Grid) -> list[Axis]:
+def map_axes(radar: Radar, grid: Grid) -> list[MapAxis]:
     """The axes of a map: range, u and v.
 
     Args:
@@ -94,19 +94,19 @@ def axes_of(radar: Radar, grid: Grid) -> list[Axis]:
     Raises:
         InputError: A radar that does not sample its echoes.
     """
-    waveform, array = sampled(radar), aperture(radar)
+    waveform, array = require_sampled_waveform(radar), aperture(radar)
     window = unit_window(radar.window, waveform.samples)
     sample = torch.arange(waveform.samples, dtype=torch.float64) / waveform.max_range
     x, y = array.x[array.column] / waveform.wavelength, array.y[array.row] / waveform.wavelength
     return [
-        Axis(window, sample, grid.range_start, grid.range_step, grid.range_count),
-        Axis(array.weight, x, grid.u_start, grid.u_step, grid.u_count),
-        Axis(array.weight, y, grid.v_start, grid.v_step, grid.v_count),
+        MapAxis(window, sample, grid.range_start, grid.range_step, grid.range_count),
+        MapAxis(array.weight, x, grid.u_start, grid.u_step, grid.u_count),
+        MapAxis(array.weight, y, grid.v_start, grid.v_step, grid.v_count),
     ]
 
 
 @dataclass(frozen=True, eq=False)
-class HeavyTailed:
+class HeavyTailedLoss:
     """How unlikely maps are, where single bins may be much brighter or dimmer than predicted.
 
     The ``speckle_divergence`` of echoes whose mean is itself uncertain, with a background of its
@@ -118,7 +118,7 @@ class HeavyTailed:
     """
 
     level: Float64[Tensor, " range"]
-    degrees: float = DEGREES
+    degrees: float = TAIL_DEGREES
 
     def __call__(
         self,
@@ -126,9 +126,9 @@ class HeavyTailed:
         observed: Float[Tensor, "frame range u v"],
     ) -> Float[Tensor, ""]:
         """The mean of ``rows`` over all bins."""
-        return self.rows(predicted, observed).mean()
+        return self.bin_losses(predicted, observed).mean()
 
-    def rows(
+    def bin_losses(
         self,
         predicted: Float[Tensor, "frame range u v"],
         observed: Float[Tensor, "frame range u v"],
@@ -141,4 +141,4 @@ class HeavyTailed:
         """
         # Power that is predicted is positive but for rounding.
         mean = predicted.clamp_min(0.0) + self.level.to(predicted)[:, None, None]
-        return speckle_divergence(observed.to(predicted).clamp_min(_LEAST) / mean, self.degrees)
+        return speckle_divergence(observed.to(predicted).clamp_min(_MIN_POWER) / mean, self.degrees)

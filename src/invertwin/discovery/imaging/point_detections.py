@@ -9,21 +9,23 @@ from torch import Tensor
 
 from invertwin.capture import Capture, ChirpCapture, backproject
 from invertwin.channel import Grid
-from invertwin.discovery.imaging.reflectivity import cell_of
-from invertwin.discovery.outcome import Thing
-from invertwin.inversion.initialisation.detections import linked
-from invertwin.radar import noise_power, points_of, range_doppler, velocity_span
+from invertwin.discovery.imaging.reflectivity import direction_cell
+from invertwin.discovery.outcome import DetectedObject
+from invertwin.inversion.initialisation.detections import label_groups
+from invertwin.radar import detect_points, noise_power, range_doppler, velocity_span
 from invertwin.radar.aperture import aperture
 
-_CELLS = 3.0  # of range and rate between echoes of one mover
-_STRONG = 0.1  # of the strongest: dimmer peaks may be sidelobes
-_SIDELOBE = 3e-3  # of the strongest mover: dimmer ones may be its sidelobes
-_SURE = 0.5  # of the strongest: brighter peaks are no sidelobes
-_BEAM = 0.3  # of a beam: how well a direction is known
-_CHUNK = 20_000  # points of an image at a time
+_MAX_GROUP_CELLS = 3.0  # of range and rate between echoes of one mover
+_MIN_RELATIVE_PEAK = 0.1  # of the strongest: dimmer peaks may be sidelobes
+_TARGET_SIDELOBE_LEVEL = 3e-3  # of the strongest mover: dimmer ones may be its sidelobes
+_NO_SIDELOBE_LEVEL = 0.5  # of the strongest: brighter peaks are no sidelobes
+_DIRECTION_ERROR_BEAMS = 0.3  # of a beam: how well a direction is known
+_POINTS_PER_CHUNK = 20_000  # points of an image at a time
 
 
-def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
+def detect_moving_targets(
+    recording: ChirpCapture, grid: Grid, frame: int = 0
+) -> list[DetectedObject]:
     """What moves in one frame, the strongest first, after the mean over the chirps is removed.
 
     Echoes that are near in range and range rate are one thing; its strongest echo says where it is.
@@ -38,27 +40,34 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
         return []
     beat = recording.beat - recording.beat.mean(1, keepdim=True)
     radar, chirps = recording.radar(), recording.chirps
-    points = points_of(beat, radar, grid, chirps, frame)
+    points = detect_points(beat, radar, grid, chirps, frame)
     if points is None or not len(points.power):
         return []
     cell = 2 * velocity_span(radar, chirps) / chirps.count
-    origin, own_velocity = radar.positions[frame].detach(), own_velocities(recording)[frame]
+    origin, own_velocity = radar.positions[frame].detach(), platform_velocities(recording)[frame]
     aways = torch.nn.functional.normalize(points.position.detach().double() - origin, dim=1)
     rates = points.velocity + aways @ own_velocity
     # What stands still has lost its mean only; a direction is known to a part of a beam.
-    blur = float(own_velocity.norm()) * cell_of(aperture(radar).x, radar) * _BEAM
+    blur = (
+        float(own_velocity.norm())
+        * direction_cell(aperture(radar).x, radar)
+        * _DIRECTION_ERROR_BEAMS
+    )
     moves = rates.abs() > cell + blur
-    scales = torch.tensor([radar.waveform.range_resolution, cell], dtype=torch.float64) * _CELLS
+    scales = (
+        torch.tensor([radar.waveform.range_resolution, cell], dtype=torch.float64)
+        * _MAX_GROUP_CELLS
+    )
     rows = moves.nonzero()[:, 0]
     if not len(rows):
         return []
     where = torch.stack([points.range, rates], dim=1)[rows] / scales
-    labels = linked(where, 1.0)
+    labels = label_groups(where, 1.0)
     flat = range_doppler(beat[frame : frame + 1], radar.frames([frame]), grid, chirps)
     # Beams over all channels have this much less noise than one channel.
     noise = noise_power(flat.abs().square(), 1) / len(radar.virtual_positions)
     draws, top = flat.numel(), float(points.power[rows].max())
-    found: list[Thing] = []
+    found: list[DetectedObject] = []
     for number in range(int(labels.max()) + 1):
         own = rows[labels == number]
         best = own[points.power[own].argmax()]
@@ -70,9 +79,9 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
             for values in (points.range, rates)
         ]
         position = points.position[best].detach().double()
-        beam = cell_of(aperture(radar).x, radar) * float((position - origin).norm())
+        beam = direction_cell(aperture(radar).x, radar) * float((position - origin).norm())
         found.append(
-            Thing(
+            DetectedObject(
                 f"mover_{number + 1}",
                 "point",
                 {"point": 1.0},
@@ -80,11 +89,11 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
                 None,
                 {
                     "range": max(spread[0], 0.3 * radar.waveform.range_resolution),
-                    "across": _BEAM * beam,
+                    "across": _DIRECTION_ERROR_BEAMS * beam,
                     "range_rate": max(spread[1], 0.3 * cell),
                 },
                 max(0.0, 1 - draws * math.exp(-min(power / noise, 700.0)))
-                * min(1.0, power / (_SIDELOBE * top)),
+                * min(1.0, power / (_TARGET_SIDELOBE_LEVEL * top)),
                 float(rates[best]) * aways[best],
             )
         )
@@ -95,7 +104,7 @@ def movers(recording: ChirpCapture, grid: Grid, frame: int = 0) -> list[Thing]:
     return [replace(thing, name=f"mover_{k}") for k, thing in enumerate(found, 1)]
 
 
-def own_velocities(recording: ChirpCapture) -> Float64[Tensor, "frame 3"]:
+def platform_velocities(recording: ChirpCapture) -> Float64[Tensor, "frame 3"]:
     """Velocity of the radar in every frame, from where it was before and after [m/s].
 
     Args:
@@ -108,7 +117,7 @@ def own_velocities(recording: ChirpCapture) -> Float64[Tensor, "frame 3"]:
     return along
 
 
-def dense(capture: Capture) -> bool:
+def is_dense_track(capture: Capture) -> bool:
     """Whether frames follow each other so closely that echoes add up in phase along the track.
 
     Args:
@@ -122,13 +131,13 @@ def dense(capture: Capture) -> bool:
 
 
 def coherent_image(
-    capture: Capture, places: Float64[Tensor, "place 3"]
+    capture: Capture, positions: Float64[Tensor, "place 3"]
 ) -> tuple[Float64[Tensor, " place"], Float64[Tensor, " place"]]:
     """The backprojected image along a track, and how well the frames agree.
 
     Args:
         capture: The recording.
-        places: In the world [m].
+        positions: In the world [m].
 
     Returns:
         Power with the spreading loss removed, and the share of all power that is in phase:
@@ -136,7 +145,8 @@ def coherent_image(
     """
     count = capture.radar().frame_count
     parts = [
-        (backproject(capture, part), _alone(capture, part, count)) for part in places.split(_CHUNK)
+        (backproject(capture, part), _single_frame_power(capture, part, count))
+        for part in positions.split(_POINTS_PER_CHUNK)
     ]
     field = torch.cat([image for image, _ in parts])
     power = torch.cat([alone for _, alone in parts])
@@ -144,48 +154,48 @@ def coherent_image(
     return image, image / power.clamp_min(1e-300)
 
 
-def _alone(capture: Capture, places: Tensor, count: int) -> Tensor:
-    total = torch.zeros(len(places), dtype=torch.float64)
+def _single_frame_power(capture: Capture, positions: Tensor, count: int) -> Tensor:
+    total = torch.zeros(len(positions), dtype=torch.float64)
     for frame in range(count):
-        total += backproject(capture.frames([frame]), places).abs().square().double()
+        total += backproject(capture.frames([frame]), positions).abs().square().double()
     return total / count
 
 
-def points_along(
-    capture: Capture, places: Float64[Tensor, "place 3"], apart: float
-) -> tuple[list[Thing], Float64[Tensor, " place"]]:
+def locate_coherent_points(
+    capture: Capture, positions: Float64[Tensor, "place 3"], min_separation: float
+) -> tuple[list[DetectedObject], Float64[Tensor, " place"]]:
     """Points where the echoes of many frames agree in phase, the brightest first; and the image.
 
     Args:
         capture: A recording along a dense track.
-        places: Of the image, in the world [m].
-        apart: Peaks that are nearer to a brighter one are its sidelobes [m].
+        positions: Of the image, in the world [m].
+        min_separation: Peaks that are nearer to a brighter one are its sidelobes [m].
     """
-    image, agree = coherent_image(capture, places)
+    image, agree = coherent_image(capture, positions)
     count = capture.radar().frame_count
     noise = noise_power(image, 1)
-    left, found = image.clone(), list[Thing]()
+    left, found = image.clone(), list[DetectedObject]()
     cell = capture.radar().waveform.range_resolution
     top = float(image.max())
     while True:
         peak = int(left.argmax())
         value = float(left[peak])
-        if value < _STRONG * top or value < noise * (math.log(len(places)) + 3):
+        if value < _MIN_RELATIVE_PEAK * top or value < noise * (math.log(len(positions)) + 3):
             break
-        near = (places - places[peak]).norm(dim=1)
-        left[near < apart] = 0.0
-        blob = (near < apart) & (image > 0.5 * value)
+        near = (positions - positions[peak]).norm(dim=1)
+        left[near < min_separation] = 0.0
+        blob = (near < min_separation) & (image > 0.5 * value)
         weight = image[blob] / image[blob].sum()
-        middle = (weight[:, None] * places[blob]).sum(0)
-        spread = (weight[:, None] * (places[blob] - middle).square()).sum(0).sqrt()
-        chance = len(places) * math.exp(-min(count * float(agree[peak]), 700.0))
-        share = min(1.0, value / (_SURE * top))
+        middle = (weight[:, None] * positions[blob]).sum(0)
+        spread = (weight[:, None] * (positions[blob] - middle).square()).sum(0).sqrt()
+        chance = len(positions) * math.exp(-min(count * float(agree[peak]), 700.0))
+        share = min(1.0, value / (_NO_SIDELOBE_LEVEL * top))
         found.append(
-            Thing(
+            DetectedObject(
                 f"point_{len(found) + 1}",
                 "point",
                 {"point": 1.0},
-                places[peak].double(),
+                positions[peak].double(),
                 None,
                 dict(zip("xyz", spread.clamp_min(0.3 * cell).tolist(), strict=True)),
                 max(0.0, 1 - chance) * share,

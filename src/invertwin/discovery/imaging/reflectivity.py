@@ -9,21 +9,21 @@ from scipy import sparse
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.discovery.imaging.likelihood import DEGREES, Axis, axes_of
+from invertwin.discovery.imaging.likelihood import TAIL_DEGREES, MapAxis, map_axes
 from invertwin.errors import InputError
 from invertwin.inversion import speckle_weight
 from invertwin.radar import Radar
 from invertwin.radar.aperture import aperture
-from invertwin.runtime.progress import told
+from invertwin.runtime.progress import track
 
-_LEAST = 1e-3  # of a response, relative to its peak: less is left out
-_NONE = 1e-30  # of a response: the place is out of sight [1/m²]
-_FINE = 32  # entries of a kernel's table in one bin
-_MOST = 8e7  # entries of the matrix: 8 bytes each
+_MIN_RELATIVE_RESPONSE = 1e-3  # of a response, relative to its peak: less is left out
+_MIN_RESPONSE = 1e-30  # of a response: the place is out of sight [1/m²]
+_TABLE_STEPS_PER_BIN = 32  # entries of a kernel's table in one bin
+_MAX_MATRIX_ENTRIES = 8e7  # entries of the matrix: 8 bytes each
 
 
 @dataclass(frozen=True, eq=False)
-class Response:
+class ImageResponse:
     """What scatterers at some places add to all bins of all maps.
 
     Attributes:
@@ -34,7 +34,9 @@ class Response:
     matrix: sparse.csr_matrix
     shape: tuple[int, ...]
 
-    def maps(self, strength: Float64[Tensor, " place"]) -> Float64[Tensor, "frame range u v"]:
+    def predict_maps(
+        self, strength: Float64[Tensor, " place"]
+    ) -> Float64[Tensor, "frame range u v"]:
         """The maps of scatterers.
 
         Args:
@@ -42,7 +44,9 @@ class Response:
         """
         return torch.from_numpy(self.matrix @ strength.numpy()).reshape(self.shape)
 
-    def means(self, values: Float64[Tensor, "frame range u v"]) -> Float64[Tensor, "frame place"]:
+    def average_over_bins(
+        self, values: Float64[Tensor, "frame range u v"]
+    ) -> Float64[Tensor, "frame place"]:
         """The mean of values over the bins of every place, frame by frame.
 
         Args:
@@ -52,11 +56,11 @@ class Response:
         found = []
         for frame, row in enumerate(values.numpy().reshape(len(values), -1)):
             part = sparse.csc_matrix(self.matrix[frame * bins : (frame + 1) * bins].T)
-            found.append((part @ row) / np.maximum(part @ np.ones(bins), _NONE))
+            found.append((part @ row) / np.maximum(part @ np.ones(bins), _MIN_RESPONSE))
         return torch.from_numpy(np.stack(found))
 
 
-def thinned(
+def thin_map(
     power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
 ) -> tuple[Float64[Tensor, "frame some_range some_u some_v"], Grid]:
     """One bin of a map for each cell of range and direction: nearly independent ones.
@@ -67,7 +71,10 @@ def thinned(
         grid: Bins of the maps.
     """
     array = aperture(radar)
-    cells = [radar.waveform.range_resolution, *(cell_of(p, radar) for p in (array.x, array.y))]
+    cells = [
+        radar.waveform.range_resolution,
+        *(direction_cell(p, radar) for p in (array.x, array.y)),
+    ]
     steps = [
         max(1, round(cell / step)) if count > 1 else 1
         for cell, step, count in zip(
@@ -86,83 +93,88 @@ def thinned(
     )
 
 
-def cell_of(places: Float64[Tensor, " place"], radar: Radar) -> float:
+def direction_cell(positions: Float64[Tensor, " place"], radar: Radar) -> float:
     """Width of a beam of elements in direction cosines.
 
     Args:
-        places: Of the elements along one axis [m].
+        positions: Of the elements along one axis [m].
         radar: Its wavelength counts.
     """
-    if len(places) == 1:
+    if len(positions) == 1:
         return 2.0
-    extent = float(places.max() - places.min()) * len(places) / (len(places) - 1)
+    extent = float(positions.max() - positions.min()) * len(positions) / (len(positions) - 1)
     return radar.waveform.wavelength / extent
 
 
-def responses(radar: Radar, grid: Grid, places: Float64[Tensor, "place 3"]) -> Response:
+def compute_response(
+    radar: Radar, grid: Grid, positions: Float64[Tensor, "place 3"]
+) -> ImageResponse:
     """The response of a radar to scatterers that reflect alike in all directions, in free space.
 
     Args:
         radar: With its positions.
         grid: Bins.
-        places: In the world [m].
+        positions: In the world [m].
 
     Raises:
         InputError: More places than memory allows, or a radar of pulses.
     """
     link, shape = radar.link(), (radar.frame_count, *grid.shape)
-    tables = [_Kernel.of(axis) for axis in axes_of(radar, grid)]
-    estimate = len(places) * radar.frame_count * np.prod([len(table.offsets) for table in tables])
-    if estimate > 4 * _MOST:
+    tables = [_AxisResponseTable.from_axis(axis) for axis in map_axes(radar, grid)]
+    estimate = (
+        len(positions) * radar.frame_count * np.prod([len(table.offsets) for table in tables])
+    )
+    if estimate > 4 * _MAX_MATRIX_ENTRIES:
         raise InputError(
-            f"expected at most {4 * _MOST:.0e} pairs of places and bins, got {estimate:.0e}; look "
+            f"expected at most {4 * _MAX_MATRIX_ENTRIES:.0e} pairs of places and bins, got "
+            f"{estimate:.0e}; look "
             "at a smaller region, or with a coarser step"
         )
-    columns = np.arange(len(places), dtype=np.int32)
+    columns = np.arange(len(positions), dtype=np.int32)
     frames = []
-    for frame in told(range(radar.frame_count), "responses of places"):
+    for frame in track(range(radar.frame_count), "responses of places"):
         lengths, seen = [], []
         for ends in (link.tx, link.rx):
-            way = places - ends[frame].detach()
+            way = positions - ends[frame].detach()
             lengths.append(way.norm(dim=1))
             seen.append(way / lengths[-1][:, None] @ link.rotations[frame].detach())
         gain = link.tx_pattern.gain(seen[0]) * link.rx_pattern.gain(seen[1])
         gain = gain * radar.waveform.wavelength**2 / (4 * torch.pi) ** 3
         strength = (gain / (lengths[0] * lengths[1]) ** 2).numpy()
         where = (0.5 * (lengths[0] + lengths[1]), seen[1][:, 0], seen[1][:, 1])
-        row, value = np.zeros((len(places), 1), dtype=np.int64), np.ones((len(places), 1))
-        inside = np.ones((len(places), 1), dtype=bool)
+        row, value = np.zeros((len(positions), 1), dtype=np.int64), np.ones((len(positions), 1))
+        inside = np.ones((len(positions), 1), dtype=bool)
         for table, place in zip(tables, where, strict=True):
-            bins, part = table.near(place.numpy())
+            bins, part = table.near_bins(place.numpy())
             valid = (bins >= 0) & (bins < table.count)
-            row = (row[:, :, None] * table.count + bins[:, None]).reshape(len(places), -1)
-            value = (value[:, :, None] * part[:, None]).reshape(len(places), -1)
-            inside = (inside[:, :, None] & valid[:, None]).reshape(len(places), -1)
-        kept = inside & (value > _LEAST) & (strength[:, None] > 0)
+            row = (row[:, :, None] * table.count + bins[:, None]).reshape(len(positions), -1)
+            value = (value[:, :, None] * part[:, None]).reshape(len(positions), -1)
+            inside = (inside[:, :, None] & valid[:, None]).reshape(len(positions), -1)
+        kept = inside & (value > _MIN_RELATIVE_RESPONSE) & (strength[:, None] > 0)
         index = np.broadcast_to(columns[:, None], kept.shape)[kept]
         entries = (value * strength[:, None])[kept].astype(np.float32)
         frames.append(
             sparse.csr_matrix(
                 (entries, (row[kept].astype(np.int32), index)),
-                shape=(int(np.prod(grid.shape)), len(places)),
+                shape=(int(np.prod(grid.shape)), len(positions)),
             )
         )
-    return Response(sparse.csr_matrix(sparse.vstack(frames)), shape)
+    return ImageResponse(sparse.csr_matrix(sparse.vstack(frames)), shape)
 
 
-def sharpened(
-    response: Response,
+def reconstruct_reflectivity(
+    response: ImageResponse,
     power: Float64[Tensor, "frame range u v"],
-    rest: Float64[Tensor, "frame range u v"],
+    known_power: Float64[Tensor, "frame range u v"],
     *,
     steps: int = 40,
-    degrees: float = DEGREES,
+    degrees: float = TAIL_DEGREES,
 ) -> Float64[Tensor, " place"]:
     """The reflectivity under which the maps are likeliest, by multiplicative steps.
 
     Each step multiplies the strength of a place by the root of how much brighter than predicted
     its bins are. It never turns negative. Bins that are far too bright count less, as in
-    ``HeavyTailed``.
+    ``HeavyTailedLoss``.
 
     Source: Févotte, Bertin and Durrieu, "Nonnegative matrix factorization with the Itakura–Saito
     divergence", Neural Computation 21, 2009.
@@ -171,7 +183,7 @@ def sharpened(
     Args:
         response: Of the places.
         power: Measured maps.
-        rest: Power of what is known already, and of the background.
+        known_power: Power of what is known already, and of the background.
         steps: How many.
         degrees: Of the speckle.
 
@@ -181,12 +193,12 @@ def sharpened(
     matrix = response.matrix
     back = sparse.csc_matrix(matrix.T)
     data = power.numpy().astype(np.float32).reshape(-1)
-    known = rest.numpy().astype(np.float32).reshape(-1)
+    known = known_power.numpy().astype(np.float32).reshape(-1)
     total = np.asarray(matrix.sum(axis=0)).ravel()
     excess = np.maximum(data - known, 0.0)
     strength = np.full(len(total), excess.sum() / total.sum(), dtype=np.float32)
     strength[total <= 0] = 0.0
-    for _ in told(range(steps), "sharp image"):
+    for _ in track(range(steps), "sharp image"):
         mean = matrix @ strength + known
         ratio = data / mean
         brighter = back @ (ratio * speckle_weight(ratio, degrees) / mean)
@@ -196,7 +208,7 @@ def sharpened(
 
 
 @dataclass(frozen=True, eq=False)
-class _Kernel:
+class _AxisResponseTable:
     """The response along one axis of the map, in bins from its centre, as a table."""
 
     start: float
@@ -206,27 +218,35 @@ class _Kernel:
     table: np.ndarray
 
     @classmethod
-    def of(cls, axis: Axis) -> "_Kernel":
+    def from_axis(cls, axis: MapAxis) -> "_AxisResponseTable":
         start, step, count = axis.start, axis.step, axis.count
         if count == 1:
             return cls(start, step, 1, np.zeros(1, dtype=np.int64), np.ones(1))
-        lags = torch.arange(-16 * _FINE, 16 * _FINE + 1, dtype=torch.float64) / _FINE
+        lags = (
+            torch.arange(
+                -16 * _TABLE_STEPS_PER_BIN, 16 * _TABLE_STEPS_PER_BIN + 1, dtype=torch.float64
+            )
+            / _TABLE_STEPS_PER_BIN
+        )
         power = axis.response(lags)
         # Up to the first null: what lies beyond is below the background of most recordings.
-        middle = 16 * _FINE
+        middle = 16 * _TABLE_STEPS_PER_BIN
         rising = (power[middle + 1 :] > power[middle:-1]).nonzero()
         reach = int(rising[0]) if len(rising) else middle
         power[: middle - reach] = 0.0
         power[middle + reach + 1 :] = 0.0
-        half = reach // _FINE + 1
+        half = reach // _TABLE_STEPS_PER_BIN + 1
         return cls(start, step, count, np.arange(-half, half + 1), power.numpy())
 
-    def near(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def near_bins(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bins near places [place, n], and the response there."""
         if self.count == 1:
-            zero = np.zeros((len(place), 1), dtype=np.int64)
-            return zero, np.ones((len(place), 1))
-        at = (place - self.start) / self.step
+            zero = np.zeros((len(positions), 1), dtype=np.int64)
+            return zero, np.ones((len(positions), 1))
+        at = (positions - self.start) / self.step
         bins = np.round(at).astype(np.int64)[:, None] + self.offsets
-        lag = np.round((bins - at[:, None]) * _FINE).astype(np.int64) + 16 * _FINE
+        lag = (
+            np.round((bins - at[:, None]) * _TABLE_STEPS_PER_BIN).astype(np.int64)
+            + 16 * _TABLE_STEPS_PER_BIN
+        )
         return bins, self.table[lag]

@@ -5,19 +5,21 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from invertwin.discovery.assembly import Assembly
-from invertwin.discovery.search import apart
-from invertwin.discovery.shapes.primitives import Figure
-from invertwin.discovery.shapes.prisms import prism_of
+from invertwin.discovery.assembly import ShapeLikelihood
+from invertwin.discovery.search import shape_gap
+from invertwin.discovery.shapes.primitives import ShapeParameters
+from invertwin.discovery.shapes.prisms import merge_into_prism
 
-_TOUCH = 2.0  # cells of range between shapes that may be one
-_LEAST = 6.0  # cells of range along the longer side of a shape whose outline can be told
-_STEPS = 80  # of a fit
-_CLEAR = 5.0  # logarithm of the odds for a free outline
-_PLAIN = ("box", "cylinder", "sphere")  # may be something else even alone
+_MAX_GAP_CELLS = 2.0  # cells of range between shapes that may be one
+_MIN_LENGTH_CELLS = 6.0  # cells of range along the longer side of a shape whose outline can be told
+_FIT_STEPS = 80  # of a fit
+_MIN_LOG_ODDS = 5.0  # logarithm of the odds for a free outline
+_REPLACEABLE_KINDS = ("box", "cylinder", "sphere")  # may be something else even alone
 
 
-def outlined(fitted: Assembly, held: Assembly, shapes: Sequence[Figure]) -> list[Figure]:
+def fit_outlines(
+    fitted: ShapeLikelihood, held: ShapeLikelihood, shapes: Sequence[ShapeParameters]
+) -> list[ShapeParameters]:
     """Shapes, with one prism in place of those that touch, or of one, where it is likelier.
 
     Simple shapes explain a thing of another form by several of them. A free outline explains
@@ -29,42 +31,51 @@ def outlined(fitted: Assembly, held: Assembly, shapes: Sequence[Figure]) -> list
         shapes: After their fit.
     """
     cell = fitted.radar.waveform.range_resolution
-    touching = _touching(fitted, shapes, _TOUCH * cell)
-    parts = [part for part in touching if _worth(part, _LEAST * cell)]
+    touching = _group_touching(fitted, shapes, _MAX_GAP_CELLS * cell)
+    parts = [part for part in touching if _is_outline_candidate(part, _MIN_LENGTH_CELLS * cell)]
     if not parts:
         return list(shapes)
-    starts = [prism_of(_solid(part), fitted.ground, fitted.level, cell) for part in parts]
+    starts = [
+        merge_into_prism(_select_solid(part), fitted.ground, fitted.level, cell) for part in parts
+    ]
     freed = [one for part in parts for one in part]
-    new, _ = fitted.fitted([*starts, *_without(shapes, freed)], _STEPS)
+    new, _ = fitted.fit([*starts, *_remove_shapes(shapes, freed)], _FIT_STEPS)
     found = list(shapes)
     for part, one in zip(parts, new, strict=False):
-        changed = [*_without(found, part), one]
-        if float((held.gains(changed) - held.gains(found)).sum()) > _CLEAR:
+        changed = [*_remove_shapes(found, part), one]
+        if (
+            float((held.log_likelihood_gains(changed) - held.log_likelihood_gains(found)).sum())
+            > _MIN_LOG_ODDS
+        ):
             found = changed
     return found
 
 
-def _touching(one: Assembly, shapes: Sequence[Figure], gap: float) -> list[list[Figure]]:
+def _group_touching(
+    likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters], max_gap: float
+) -> list[list[ShapeParameters]]:
     """Shapes that hang together, nearer to each other than a gap [m]."""
     count = len(shapes)
     near = np.zeros((count, count))
     for a in range(count):
         for b in range(a):
-            near[a, b] = apart(shapes[a], shapes[b], one.ground) < gap
+            near[a, b] = shape_gap(shapes[a], shapes[b], likelihood.ground) < max_gap
     total, labels = connected_components(near, directed=False)
     return [[shapes[k] for k in np.flatnonzero(labels == part).tolist()] for part in range(total)]
 
 
-def _worth(part: Sequence[Figure], least: float) -> bool:
+def _is_outline_candidate(group: Sequence[ShapeParameters], min_length: float) -> bool:
     """Whether shapes that touch may be a prism, the larger of which is longer than least [m]."""
-    solid = _solid(part)
-    large = any(max(one.length, one.width) > least for one in solid)
-    return large and (len(part) > 1 or solid[0].kind in _PLAIN)
+    solid = _select_solid(group)
+    large = any(max(one.length, one.width) > min_length for one in solid)
+    return large and (len(group) > 1 or solid[0].kind in _REPLACEABLE_KINDS)
 
 
-def _solid(shapes: Sequence[Figure]) -> list[Figure]:
+def _select_solid(shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
     return [one for one in shapes if one.kind not in ("corner", "point")]
 
 
-def _without(shapes: Sequence[Figure], some: Sequence[Figure]) -> list[Figure]:
-    return [shape for shape in shapes if not any(shape is one for one in some)]
+def _remove_shapes(
+    shapes: Sequence[ShapeParameters], removed: Sequence[ShapeParameters]
+) -> list[ShapeParameters]:
+    return [shape for shape in shapes if not any(shape is one for one in removed)]

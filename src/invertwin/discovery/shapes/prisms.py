@@ -9,19 +9,19 @@ from jaxtyping import Float64
 from skimage.measure import find_contours
 from torch import Tensor, nn
 
-from invertwin.discovery.shapes.primitives import Figure, Primitive, Unknown
+from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters, UnknownShape
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.scene import DistanceGrid, Mesh, iso_surface, signed_distance
 from invertwin.scene.parameters import Coordinate
 from invertwin.scene.shape_models.lattice import Lattice
 
-_SMOOTH = 20.0  # of signed distances, see ``DistanceGrid``
-_MARGIN = 6  # nodes around what a prism starts from
-_NODES = 60  # along a side, at most
+_SMOOTHING = 20.0  # of signed distances, see ``DistanceGrid``
+_MARGIN_NODES = 6  # nodes around what a prism starts from
+_MAX_NODES = 60  # along a side, at most
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Prism(Figure):
+class PrismParameters(ShapeParameters):
     """A thing with vertical sides, of any outline. It has no yaw.
 
     Attributes:
@@ -35,22 +35,24 @@ class Prism(Figure):
     middle: tuple[float, float]
 
 
-def prism_of(figures: Sequence[Figure], ground: Ground, level: float, spacing: float) -> Prism:
+def merge_into_prism(
+    shapes: Sequence[ShapeParameters], ground: Ground, level: float, spacing: float
+) -> PrismParameters:
     """One prism in place of some shapes: their union, of the largest one's height.
 
     Args:
-        figures: The shapes.
+        shapes: The shapes.
         ground: The plane.
         level: Height of the ground [m].
         spacing: Between nodes at least [m].
     """
-    up, axes = ground.vertical, list(ground.level)
+    up, axes = ground.up_axis, list(ground.plane_axes)
     with torch.no_grad():
-        meshes = [unknown("", one, ground, level).item.mesh for one in figures]
+        meshes = [make_shape_model("", one, ground, level).item.mesh for one in shapes]
     points = torch.cat([mesh.vertices for mesh in meshes])[:, axes]
     low, high = points.amin(0), points.amax(0)
-    step = max(spacing, float((high - low).max()) / (_NODES - 2 * _MARGIN))
-    counts = [math.ceil(float(side) / step) + 2 * _MARGIN + 1 for side in high - low]
+    step = max(spacing, float((high - low).max()) / (_MAX_NODES - 2 * _MARGIN_NODES))
+    counts = [math.ceil(float(side) / step) + 2 * _MARGIN_NODES + 1 for side in high - low]
     middle = 0.5 * (low + high)
     lines = [
         float(m) + step * (torch.arange(n, dtype=torch.float64) - 0.5 * (n - 1))
@@ -63,9 +65,9 @@ def prism_of(figures: Sequence[Figure], ground: Ground, level: float, spacing: f
     for mesh in meshes:
         nodes[:, up] = 0.5 * (mesh.vertices[:, up].amin() + mesh.vertices[:, up].amax())
         parts.append(signed_distance(mesh, nodes))
-    largest = max(figures, key=lambda one: one.length * one.width)
+    largest = max(shapes, key=lambda one: one.length * one.width)
     x, y = middle.tolist()
-    return Prism(
+    return PrismParameters(
         "prism",
         (x, y),
         height=largest.height,
@@ -76,7 +78,7 @@ def prism_of(figures: Sequence[Figure], ground: Ground, level: float, spacing: f
     )
 
 
-class Outline(Unknown):
+class OutlineModel(UnknownShape):
     """A prism as an unknown: its outline, place, height and brightness.
 
     Args:
@@ -91,36 +93,38 @@ class Outline(Unknown):
         size: Parameter, a third of the logarithm of the height.
     """
 
-    def __init__(self, name: str, start: Prism, ground: Ground, level: float = 0.0) -> None:
+    def __init__(
+        self, name: str, start: PrismParameters, ground: Ground, level: float = 0.0
+    ) -> None:
         super().__init__(name, ground, level, start.middle, start.brightness)
         self.start = start
         counts = torch.tensor(start.distances.shape, dtype=torch.float64)
         half = torch.ones(3, dtype=torch.float64)
-        half[list(ground.level)] = 0.5 * start.spacing * (counts - 1)
+        half[list(ground.plane_axes)] = 0.5 * start.spacing * (counts - 1)
         # The same at two heights; half way between them both count alike, so that they stay alike.
-        same = torch.stack([start.distances] * 2, dim=ground.vertical)
-        self.sides = DistanceGrid(name, (-half).tolist(), half.tolist(), same, _SMOOTH)
-        size = math.log(start.height) / self.SIZE
+        same = torch.stack([start.distances] * 2, dim=ground.up_axis)
+        self.sides = DistanceGrid(name, (-half).tolist(), half.tolist(), same, _SMOOTHING)
+        size = math.log(start.height) / self.SIZE_SCALE
         self.size = nn.Parameter(torch.tensor(size, dtype=torch.float64))
 
     @property
     def height(self) -> Float64[Tensor, ""]:
         """Of the prism [m]."""
-        return (self.SIZE * self.size).exp()
+        return (self.SIZE_SCALE * self.size).exp()
 
     @property
-    def figure(self) -> Prism:
+    def shape(self) -> PrismParameters:
         """Its present numbers."""
         with torch.no_grad():
-            sides = self.mesh().vertices[:, list(self.ground.level)]
+            sides = self.mesh().vertices[:, list(self.ground.plane_axes)]
             low, high = sides.amin(0), sides.amax(0)
             x, y = (0.5 * (low + high)).tolist()
             length, width = (high - low).tolist()
             a, b = self.place.tolist()
-            distances = self.sides.distances.select(self.ground.vertical, 0).clone()
+            distances = self.sides.distances.select(self.ground.up_axis, 0).clone()
         return replace(
             self.start,
-            place=(x, y),
+            position=(x, y),
             length=length,
             width=width,
             height=float(self.height.detach()),
@@ -131,16 +135,16 @@ class Outline(Unknown):
 
     def mesh(self) -> Mesh:
         """The surface in the world, differentiable by all parameters."""
-        up, grid = self.ground.vertical, self.sides.lattice
+        up, grid = self.ground.up_axis, self.sides.lattice
         low, high, counts = grid.low.clone(), grid.high.clone(), list(grid.counts)
         place = torch.zeros(3, dtype=torch.float64)
         place[up] = self.level
-        place = place.index_put((torch.tensor(self.ground.level),), self.place)
+        place = place.index_put((torch.tensor(self.ground.plane_axes),), self.place)
         step, tall = self.start.spacing, float(self.height.detach())
         counts[up] = math.ceil(tall / step) + 4
         low[up], high[up] = -2 * step, tall + 2 * step
 
-        def field(points: Tensor) -> Tensor:
+        def signed_distance_field(points: Tensor) -> Tensor:
             local = points - place
             beside = local.index_fill(1, torch.tensor([up]), 0.0)
             half = 0.5 * self.height
@@ -148,7 +152,7 @@ class Outline(Unknown):
             return torch.maximum(self.sides.distance(beside), above)
 
         at = place.detach()
-        return iso_surface(field, Lattice.between(at + low, at + high, counts))
+        return iso_surface(signed_distance_field, Lattice.from_bounds(at + low, at + high, counts))
 
     def values(self) -> dict[str, Tensor]:
         """What is fitted by name, in SI units."""
@@ -158,26 +162,28 @@ class Outline(Unknown):
     def coordinates(self) -> list[Coordinate]:
         """Place, height and brightness; the outline moves as a whole."""
         height = float(self.height.detach())
-        slope = torch.tensor(1 / (self.SIZE * height), dtype=torch.float64)
+        slope = torch.tensor(1 / (self.SIZE_SCALE * height), dtype=torch.float64)
         tall = Coordinate(f"{self.object}.height", "m", {"size": slope}, 0.1)
-        return [*self.places(), tall, self.bright()]
+        return [*self.position_coordinates(), tall, self.brightness_coordinate()]
 
 
-def unknown(name: str, figure: Figure, ground: Ground, level: float) -> Primitive | Outline:
+def make_shape_model(
+    name: str, shape: ShapeParameters, ground: Ground, level: float
+) -> PrimitiveModel | OutlineModel:
     """A shape as an unknown.
 
     Args:
         name: Of the object.
-        figure: Its first numbers.
+        shape: Its first numbers.
         ground: The plane.
         level: Height of the ground [m].
     """
-    if isinstance(figure, Prism):
-        return Outline(name, figure, ground, level)
-    return Primitive(name, figure, ground, level)
+    if isinstance(shape, PrismParameters):
+        return OutlineModel(name, shape, ground, level)
+    return PrimitiveModel(name, shape, ground, level)
 
 
-def contour(prism: Prism) -> Float64[Tensor, "corner 2"]:
+def prism_contour(prism: PrismParameters) -> Float64[Tensor, "corner 2"]:
     """The longest closed line of a prism's outline on the ground [m].
 
     Args:

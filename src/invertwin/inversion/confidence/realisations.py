@@ -10,60 +10,67 @@ import torch
 from torch import Tensor
 
 from invertwin.inversion.fit import Fit
-from invertwin.inversion.loss import Maps, SpectrumLoss, pooled
-from invertwin.runtime.progress import told
-from invertwin.seeds import derived_seed
+from invertwin.inversion.loss import MapPairs, SpectrumLoss, halve_resolution
+from invertwin.runtime.progress import track
+from invertwin.seeds import derive_seed
 
-_LOOKS = 64  # they tell a standard deviation to 9 %
-_DARK = 0.2  # the share of bins, the darkest, in which noise is measured
-_COARSE = 2  # times that bins are joined in pairs where residuals are looked at
+_REALISATION_COUNT = 64  # they tell a standard deviation to 9 %
+_NOISE_BIN_FRACTION = 0.2  # the share of bins, the darkest, in which noise is measured
+_POOLING_LEVELS = 2  # times that bins are joined in pairs where residuals are looked at
 
 
 @dataclass(frozen=True, eq=False)
-class Draws:
+class RealisationStatistics:
     """What the loss of a fit is on looks at its own twin.
 
     Attributes:
         losses: Of every look.
-        slopes: For every look, the derivatives of the loss by the map of every observation.
-        coarse: For every look, the coarse map of every observation, see ``coarse``.
+        gradients: For every look, the derivatives of the loss by the map of every observation.
+        coarse_maps: For every look, the coarse map of every observation, see ``coarse_maps``.
     """
 
     losses: list[float]
-    slopes: list[list[Tensor]]
-    coarse: list[list[Tensor]]
+    gradients: list[list[Tensor]]
+    coarse_maps: list[list[Tensor]]
 
 
-class End:
+class FitResult:
     """The end of a fit: its maps, and looks at its twin.
 
     Args:
         fit: A fit that has ended.
-        maps, looks: Those of some frames only, in place of its own.
+        maps, realisations: Those of some frames only, in place of its own.
     """
 
     def __init__(
-        self, fit: Fit, maps: Maps | None = None, looks: Sequence[list[Tensor]] | None = None
+        self,
+        fit: Fit,
+        maps: MapPairs | None = None,
+        realisations: Sequence[list[Tensor]] | None = None,
     ) -> None:
-        self.fit, self._maps, self._looks = fit, maps, looks
+        self.fit, self._maps, self._looks = fit, maps, realisations
 
-    def frames(self, chosen: Sequence[int], looks: Sequence[list[Tensor]]) -> "End":
+    def select_frames(
+        self, indices: Sequence[int], realisations: Sequence[list[Tensor]]
+    ) -> "FitResult":
         """The same for some frames of every observation.
 
         Args:
-            chosen: Their numbers.
-            looks: Those of all frames.
+            indices: Their numbers.
+            realisations: Those of all frames.
         """
-        maps = [(a[chosen], b[chosen]) for a, b in self.maps]
-        return End(self.fit, maps, [[power[chosen] for power in look] for look in looks])
+        maps = [(a[indices], b[indices]) for a, b in self.maps]
+        return FitResult(
+            self.fit, maps, [[power[indices] for power in look] for look in realisations]
+        )
 
     @cached_property
-    def maps(self) -> Maps:
+    def maps(self) -> MapPairs:
         """The predicted and the observed map of every observation, sharp and with all frames."""
         if self._maps is not None:
             return self._maps
         with torch.no_grad():
-            ends = [self.fit.sharp_maps(number) for number in (0, 1)]
+            ends = [self.fit.unblurred_maps(number) for number in (0, 1)]
         return [((a + c) / 2, b) for (a, b), (c, _) in zip(*ends, strict=True)]
 
     @cached_property
@@ -77,36 +84,36 @@ class End:
         return found
 
     @cached_property
-    def draws(self) -> Draws | None:
+    def realisation_statistics(self) -> RealisationStatistics | None:
         """Looks at the twin; None where a model gives none, or a gain is zero."""
-        found = Draws([], [], [])
-        for seen in self.looks():
-            loss, slopes = self.slopes(
+        found = RealisationStatistics([], [], [])
+        for seen in self.realisations():
+            loss, slopes = self.loss_gradients(
                 [(a, look) for (a, _), look in zip(self.maps, seen, strict=True)]
             )
             found.losses.append(loss)
-            found.slopes.append(slopes)
-            found.coarse.append([coarse(look) for look in seen])
+            found.gradients.append(slopes)
+            found.coarse_maps.append([coarsen_map(look) for look in seen])
         return found if found.losses else None
 
-    def looks(self) -> Iterator[list[Tensor]]:
+    def realisations(self) -> Iterator[list[Tensor]]:
         """Maps of every observation as recordings of the twin would show them, with noise."""
         if self._looks is not None:
             yield from self._looks
             return
-        looks = [look for look in self.fit.looks(0) if look is not None]
+        looks = [look for look in self.fit.realisations(0) if look is not None]
         if not min(self.gains) > 0 or len(looks) < len(self.maps):
             return
         models = [observation.model for observation in self.fit.observations]
         every = zip(self.maps, self.gains, models, strict=True)
-        noises = [_noise(*pair, gain, model.fields) for pair, gain, model in every]
-        for number in told(range(_LOOKS), "looks at the twin"):
+        noises = [_estimate_noise(*pair, gain, model.holds_fields) for pair, gain, model in every]
+        for number in track(range(_REALISATION_COUNT), "looks at the twin"):
             yield [
-                look(derived_seed(number, k), noise)
+                look(derive_seed(number, k), noise)
                 for k, (look, noise) in enumerate(zip(looks, noises, strict=True))
             ]
 
-    def slopes(self, maps: Maps) -> tuple[float, list[Tensor]]:
+    def loss_gradients(self, maps: MapPairs) -> tuple[float, list[Tensor]]:
         """The loss, and its derivative by every predicted map.
 
         Args:
@@ -118,31 +125,31 @@ class End:
             return float(loss.detach()), list(torch.autograd.grad(loss, [a for a, _ in attached]))
 
 
-def coarse(power: Tensor) -> Tensor:
+def coarsen_map(power: Tensor) -> Tensor:
     """A map with bins joined four by four along every axis, its mean over frames.
 
     Args:
         power: [frame, …].
     """
-    for _ in range(_COARSE):
-        power = pooled(power)
+    for _ in range(_POOLING_LEVELS):
+        power = halve_resolution(power)
     return power.mean(0)
 
 
-def zscore(value: float, drawn: Sequence[float]) -> float:
+def zscore(value: float, samples: Sequence[float]) -> float:
     """How many standard deviations a number is above the mean of others.
 
     Args:
         value: The number.
-        drawn: The others.
+        samples: The others.
     """
-    others = torch.tensor(drawn, dtype=torch.float64)
+    others = torch.tensor(samples, dtype=torch.float64)
     return (value - float(others.mean())) / max(float(others.std()), 1e-30)
 
 
-def _noise(predicted: Tensor, observed: Tensor, gain: float, fields: bool) -> float:
+def _estimate_noise(predicted: Tensor, observed: Tensor, gain: float, holds_fields: bool) -> float:
     """Mean noise in a bin, in units of the predicted map: what its darkest bins hold beyond it."""
     flat: Any = predicted.flatten()
-    dark = flat.abs().argsort()[: max(1, math.ceil(_DARK * len(flat)))]
+    dark = flat.abs().argsort()[: max(1, math.ceil(_NOISE_BIN_FRACTION * len(flat)))]
     rest = observed.flatten()[dark] / gain - flat[dark]
-    return max(0.0, float((rest.square() if fields else rest).mean()))
+    return max(0.0, float((rest.square() if holds_fields else rest).mean()))

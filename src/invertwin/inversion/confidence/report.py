@@ -6,58 +6,60 @@ from typing import Any
 
 from invertwin.errors import InputError
 from invertwin.inversion.confidence.uncertainty import Uncertainty
-from invertwin.inversion.metrics import residual
+from invertwin.inversion.metrics import pose_error
 from invertwin.inversion.reconstruction import Reconstruction
 from invertwin.scene.scene import Object
 
 _COORDINATES = ("x", "y", "z", "pitch", "yaw", "roll")
 
 
-def certainty(found: Reconstruction, truth: Mapping[str, Object]) -> dict[str, Any]:
+def confidence_metrics(fit: Reconstruction, truth: Mapping[str, Object]) -> dict[str, Any]:
     """Verdict and error bars of a fit, and how far it is from what is known.
 
     Args:
-        found: The fit.
+        fit: The fit.
         truth: Objects as they really are, by name.
     """
-    seen = found.verdict
+    seen = fit.verdict
     rows: dict[str, Any] = {"verdict": seen.word, "loss_excess": seen.excess}
     rows |= {"structure_excess": seen.structure, "verdict_reasons": list(seen.reasons)}
-    rows["rivals"] = [{"pose": rival.told, "score": rival.score} for rival in seen.rivals]
+    rows["rivals"] = [
+        {"pose": rival.description, "score": rival.score} for rival in seen.ambiguities
+    ]
     errors: dict[str, float] = {}
     for name, item in truth.items():
-        off = residual(found.scene[name], item)
+        off = pose_error(fit.scene[name], item)
         if off is not None:
-            values = [*off.offset.tolist(), *off.turn.tolist()]
+            values = [*off.offset.tolist(), *off.rotation.tolist()]
             keys = [f"{name}.{coordinate}" for coordinate in _COORDINATES]
             errors |= dict(zip(keys, values, strict=True))
     rows |= {"errors": errors} if errors else {}
     try:
-        return rows | bars(found.uncertainty)
+        return rows | error_bar_metrics(fit.uncertainty)
     except InputError as error:
         return {**rows, "no_error_bars": str(error)}
 
 
-def bars(found: Uncertainty) -> dict[str, Any]:
+def error_bar_metrics(uncertainty: Uncertainty) -> dict[str, Any]:
     """Error bars as numbers by name.
 
     Args:
-        found: The error bars.
+        uncertainty: The error bars.
     """
     return {
-        "standard_deviations": found.deviations,
-        "within_95": found.interval(),
-        "units": dict(zip(found.names, found.units, strict=True)),
-        "correlations": found.correlations,
-        "unobserved": list(found.unobserved),
+        "standard_deviations": uncertainty.deviations,
+        "within_95": uncertainty.interval(),
+        "units": dict(zip(uncertainty.names, uncertainty.units, strict=True)),
+        "correlations": uncertainty.correlations,
+        "unobserved": list(uncertainty.unobserved),
     }
 
 
-def coverage(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def error_bar_coverage(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Over recordings: the share of errors within the error bars, and how large these are.
 
     Args:
-        rows: Of every recording, what ``certainty`` says.
+        rows: Of every recording, what ``confidence_metrics`` says.
     """
     names = [n for n in rows[0].get("errors", {}) if n in rows[0].get("within_95", {})]
     hits, ratios = {}, {}

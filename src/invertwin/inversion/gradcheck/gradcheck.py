@@ -11,21 +11,21 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.channel import alone
+from invertwin.channel import tracer_lock
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.inversion.gradcheck.lines import line_of
-from invertwin.inversion.gradcheck.tangents import Change
+from invertwin.inversion.gradcheck.lines import make_line
+from invertwin.inversion.gradcheck.tangents import ParameterChange
 from invertwin.limits import Count, NonNegative, Positive
 from invertwin.scene.scene import Scene
-from invertwin.seeds import derived_seed
+from invertwin.seeds import derive_seed
 
-_LEAST_PAIRS = 4
-_ROUNDING = 1e-3  # relative change of a gradient that is none
+_MIN_PAIRS = 4
+_MIN_RELATIVE_CHANGE = 1e-3  # relative change of a gradient that is none
 
 
 @dataclass(frozen=True)
-class Check:
+class GradcheckSettings:
     """How sharp a gradient check is.
 
     Attributes:
@@ -46,7 +46,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class GradientAgreement:
     """How close a gradient map is to the differences.
 
     Attributes:
@@ -80,10 +80,10 @@ class GradientReport:
         value, gradient, interior_gradient, difference: The map and its derivatives.
     """
 
-    full: Agreement
-    interior: Agreement
-    no_interior_edges: Agreement | None
-    no_contact: Agreement | None
+    full: GradientAgreement
+    interior: GradientAgreement
+    no_interior_edges: GradientAgreement | None
+    no_contact: GradientAgreement | None
     difference_noise: float
     step_agreement: float
     pairs: int
@@ -96,12 +96,12 @@ class GradientReport:
 def gradcheck(
     model: ForwardModel,
     module: nn.Module,
-    tangent: Mapping[str, Change] | Tensor,
+    tangent: Mapping[str, ParameterChange] | Tensor,
     *,
     scene: Scene,
     sensor: Any,
-    of: Literal["scene", "sensor"] = "scene",
-    check: Check | None = None,
+    acts_on: Literal["scene", "sensor"] = "scene",
+    settings: GradcheckSettings | None = None,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> GradientReport:
@@ -119,8 +119,8 @@ def gradcheck(
             parameter; see ``invertwin.inversion.gradcheck.tangents.changes_of``.
         scene: What the module is applied to, or sees.
         sensor: What sees the scene.
-        of: Whether the module maps the scene or the sensor.
-        check: How sharp the check is.
+        acts_on: Whether the module maps the scene or the sensor.
+        settings: How sharp the check is.
         seed: Of all random numbers.
         progress: Called with one line now and then.
 
@@ -128,30 +128,32 @@ def gradcheck(
         InputError: A tangent that does not fit the module, a model whose derivatives have no
             mean, or a map that does not depend on θ (all differences are zero).
     """
-    check = check or Check()
-    if not model.smooth:
+    settings = settings or GradcheckSettings()
+    if not model.is_smooth:
         raise InputError(
             f"expected a smooth model, got {type(model).__name__}, whose silhouettes of single "
             "rough points have no derivative; use one such as SurrogateMap"
         )
-    target = scene if of == "scene" else sensor
-    line = line_of(module, tangent, target)
-    least, repeats = (_LEAST_PAIRS, check.repeats) if model.random else (1, 1)
+    target = scene if acts_on == "scene" else sensor
+    line = make_line(module, tangent, target)
+    least, repeats = (_MIN_PAIRS, settings.repeats) if model.is_random else (1, 1)
 
-    def seen(moved: Any) -> tuple[Scene, Any]:
-        return (moved, sensor) if of == "scene" else (scene, moved)
+    def make_inputs(moved: Any) -> tuple[Scene, Any]:
+        return (moved, sensor) if acts_on == "scene" else (scene, moved)
 
     with torch.no_grad():
-        middle = seen(line.at(torch.zeros((), dtype=torch.float64)))
-    paired = model.for_differences(*middle, check.difference_samples, check.scheme)
+        middle = make_inputs(line.evaluate(torch.zeros((), dtype=torch.float64)))
+    paired = model.for_differences(*middle, settings.difference_samples, settings.scheme)
 
     def derivative(chosen: ForwardModel) -> tuple[Tensor, Tensor]:
         primals, tangents = [], []
         for number in range(repeats):
-            with alone, forward_ad.dual_level():
+            with tracer_lock, forward_ad.dual_level():
                 zero = torch.zeros((), dtype=torch.float64)
                 theta = forward_ad.make_dual(zero, torch.ones_like(zero))
-                out = chosen.predict(*seen(line.at(theta)), derived_seed(seed, 0, number)).double()
+                out = chosen.predict(
+                    *make_inputs(line.evaluate(theta)), derive_seed(seed, 0, number)
+                ).double()
                 primal, slope = forward_ad.unpack_dual(out)
                 primals.append(primal)
                 tangents.append(torch.zeros_like(primal) if slope is None else slope)
@@ -159,7 +161,9 @@ def gradcheck(
 
     def difference(epsilon: float, number: int) -> Tensor:
         ends = [
-            paired.predict(*seen(line.end(sign * epsilon)), derived_seed(seed, 1, number)).double()
+            paired.predict(
+                *make_inputs(line.evaluate_end(sign * epsilon)), derive_seed(seed, 1, number)
+            ).double()
             for sign in (1.0, -1.0)
         ]
         return (ends[0] - ends[1]) / (2 * epsilon)
@@ -170,13 +174,15 @@ def gradcheck(
         apart_gradient = less.get("contacts")
         if apart_gradient is not None:
             changed = (apart_gradient - gradient).abs().sum()
-            if not changed > _ROUNDING * gradient.abs().sum():
+            if not changed > _MIN_RELATIVE_CHANGE * gradient.abs().sum():
                 apart_gradient = None
         interior_gradient = less.get("boundary", gradient)
-        if model.random:
-            pairs, reached = _converged(lambda n: difference(check.step, n), check, progress)
+        if model.is_random:
+            pairs, reached = _average_differences(
+                lambda n: difference(settings.step, n), settings, progress
+            )
         else:
-            pairs, reached = difference(check.step, 0)[None], 0.0
+            pairs, reached = difference(settings.step, 0)[None], 0.0
         truth = pairs.mean(0)
         if not truth.abs().sum() > 0:
             raise InputError(
@@ -184,15 +190,15 @@ def gradcheck(
                 "check the grid and what the parameter moves"
             )
         half, far, farther = (
-            torch.stack([difference(factor * check.step, n) for n in range(least)]).mean(0)
+            torch.stack([difference(factor * settings.step, n) for n in range(least)]).mean(0)
             for factor in (0.5, 4.0, 8.0)
         )
         same = pairs[:least].mean(0)
     return GradientReport(
-        full=_agreement(gradient, truth, far, farther),
-        interior=_agreement(interior_gradient, truth, far, farther),
-        no_interior_edges=_agreement(less.get("interior_edges"), truth, far, farther),
-        no_contact=_agreement(apart_gradient, truth, far, farther),
+        full=_measure_agreement(gradient, truth, far, farther),
+        interior=_measure_agreement(interior_gradient, truth, far, farther),
+        no_interior_edges=_measure_agreement(less.get("interior_edges"), truth, far, farther),
+        no_contact=_measure_agreement(apart_gradient, truth, far, farther),
         difference_noise=reached,
         step_agreement=float((same - half).abs().sum() / same.abs().sum()),
         pairs=len(pairs),
@@ -203,27 +209,29 @@ def gradcheck(
     )
 
 
-def _converged(
-    difference: Callable[[int], Tensor], check: Check, progress: Callable[[str], None] | None
+def _average_differences(
+    difference: Callable[[int], Tensor],
+    settings: GradcheckSettings,
+    progress: Callable[[str], None] | None,
 ) -> tuple[Tensor, float]:
     """Difference pairs, as many as the noise asks for, and the noise of their mean."""
     pairs: list[Tensor] = []
     reached, begin = math.inf, time.monotonic()
-    while len(pairs) < check.max_pairs and (len(pairs) < _LEAST_PAIRS or reached > check.noise):
+    while len(pairs) < settings.max_pairs and (len(pairs) < _MIN_PAIRS or reached > settings.noise):
         pairs.append(difference(len(pairs)))
         if len(pairs) >= 2:
-            reached = _noise(torch.stack(pairs))
+            reached = _relative_noise(torch.stack(pairs))
             if progress:
                 # Noise falls with the root of the number of pairs.
-                enough = len(pairs) * (reached / max(check.noise, 1e-9)) ** 2
-                count = min(check.max_pairs, max(_LEAST_PAIRS, math.ceil(enough)))
+                enough = len(pairs) * (reached / max(settings.noise, 1e-9)) ** 2
+                count = min(settings.max_pairs, max(_MIN_PAIRS, math.ceil(enough)))
                 left = (time.monotonic() - begin) / len(pairs) * max(count - len(pairs), 0)
                 noise = f"difference noise {reached:.4f}, about {left:.0f} s left"
                 progress(f"{len(pairs)} pairs, {noise}")
     return torch.stack(pairs), reached
 
 
-def _noise(pairs: Tensor) -> float:
+def _relative_noise(pairs: Tensor) -> float:
     """‖standard error of the mean‖₁ / ‖mean‖₁."""
     mean = pairs.mean(0)
     error = pairs.std(0) / math.sqrt(len(pairs))
@@ -231,18 +239,20 @@ def _noise(pairs: Tensor) -> float:
 
 
 @overload
-def _agreement(gradient: Tensor, truth: Tensor, far: Tensor, farther: Tensor) -> Agreement: ...
+def _measure_agreement(
+    gradient: Tensor, truth: Tensor, far: Tensor, farther: Tensor
+) -> GradientAgreement: ...
 @overload
-def _agreement(gradient: None, truth: Tensor, far: Tensor, farther: Tensor) -> None: ...
-def _agreement(
+def _measure_agreement(gradient: None, truth: Tensor, far: Tensor, farther: Tensor) -> None: ...
+def _measure_agreement(
     gradient: Tensor | None, truth: Tensor, far: Tensor, farther: Tensor
-) -> Agreement | None:
+) -> GradientAgreement | None:
     if gradient is None:
         return None
     miss = gradient - truth
     both = torch.stack([gradient.flatten(), truth.flatten()])
     errors = [float((d - gradient).norm()) for d in (far, farther)]
-    return Agreement(
+    return GradientAgreement(
         relative_l1=float(miss.abs().sum() / truth.abs().sum()),
         relative_l2=float(miss.norm() / truth.norm()),
         correlation=float(torch.corrcoef(both)[0, 1]),

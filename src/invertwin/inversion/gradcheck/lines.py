@@ -8,44 +8,46 @@ from torch import Tensor, nn
 
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck.tangents import Change, changes_of
+from invertwin.inversion.gradcheck.tangents import ParameterChange, parameter_changes
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.observation import Observation
 from invertwin.scene.mesh import Mesh
 
-_NEWTON = 8  # steps along a normal, onto the zero of the changed field
-_ON = 1e-9  # m, how near a point is to that zero
+_NEWTON_STEPS = 8  # steps along a normal, onto the zero of the changed field
+_SURFACE_TOLERANCE = 1e-9  # m, how near a point is to that zero
 
 
-class Line:
+class ParameterLine:
     """The parameters of a module, moved by θ times a tangent."""
 
-    def __init__(self, module: nn.Module, tangent: Mapping[str, Change], target: Any) -> None:
+    def __init__(
+        self, module: nn.Module, tangent: Mapping[str, ParameterChange], target: Any
+    ) -> None:
         """Move the parameters of a module.
 
         Args:
             module: Maps the target.
-            tangent: Changes of its values by name, see ``changes_of``.
+            tangent: Changes of its values by name, see ``parameter_changes``.
             target: The scene or the sensor that the module maps.
 
         Raises:
             InputError: A name or a shape that the module does not have.
         """
         self._module, self._target = module, target
-        self._tangent = changes_of(module, tangent)
+        self._tangent = parameter_changes(module, tangent)
         self._start = {name: value.detach() for name, value in module.named_parameters()}
 
-    def at(self, theta: Tensor) -> Any:
+    def evaluate(self, theta: Tensor) -> Any:
         """The module's result at a scalar θ, which may carry a derivative."""
         moved = {n: self._start[n] + theta * change for n, change in self._tangent.items()}
         return torch.func.functional_call(self._module, self._start | moved, (self._target,))
 
-    def end(self, theta: float) -> Any:
+    def evaluate_end(self, theta: float) -> Any:
         """The module's result at θ, one end of a difference."""
-        return self.at(torch.tensor(theta, dtype=torch.float64))
+        return self.evaluate(torch.tensor(theta, dtype=torch.float64))
 
 
-class FieldLine(Line):
+class DistanceFieldLine(ParameterLine):
     """A line of a signed distance, whose differences keep the triangles of θ = 0.
 
     Differences with common random numbers need triangles that stay the same ones, so ends are not
@@ -53,33 +55,39 @@ class FieldLine(Line):
     Derivatives go through the module as it is, its marching cubes included.
     """
 
-    def __init__(self, module: nn.Module, tangent: Mapping[str, Change], target: Any) -> None:
-        """Move a module with an ``object`` and its ``distance`` at points; see ``Line``."""
+    def __init__(
+        self, module: nn.Module, tangent: Mapping[str, ParameterChange], target: Any
+    ) -> None:
+        """Move a module with an ``object`` and its ``distance`` at points; see
+        ``ParameterLine``.
+        """
         super().__init__(module, tangent, target)
-        self._field, self._object = _Field(module), str(module.object)
+        self._field, self._object = _DistanceModule(module), str(module.object)
         with torch.no_grad():
             self._scene = module(target)
         self._mesh = self._scene[self._object].mesh
-        _, slope = self._slopes(0.0, self._mesh.vertices.detach())
+        _, slope = self._distance_and_gradient(0.0, self._mesh.vertices.detach())
         self._normals = slope / slope.norm(dim=1, keepdim=True)
 
-    def end(self, theta: float) -> Any:
-        """The scene with the first mesh moved onto the changed surface. See ``Line.end``."""
+    def evaluate_end(self, theta: float) -> Any:
+        """The scene with the first mesh moved onto the changed surface. See
+        ``ParameterLine.end``.
+        """
         places = self._mesh.vertices.detach()
-        for _ in range(_NEWTON):
-            found, slope = self._slopes(theta, places)
+        for _ in range(_NEWTON_STEPS):
+            found, slope = self._distance_and_gradient(theta, places)
             places = places - self._normals * (found / (slope * self._normals).sum(1))[:, None]
-        found, _ = self._slopes(theta, places)
-        if not bool(found.abs().max() < _ON):
+        found, _ = self._distance_and_gradient(theta, places)
+        if not bool(found.abs().max() < _SURFACE_TOLERANCE):
             raise InputError(
                 "expected a surface that follows θ along its normals, got points that do not meet "
                 f"it at θ = {theta:.3g}; take a smaller step"
             )
         return self._scene.replace(self._object, mesh=Mesh(places, self._mesh.faces))
 
-    def _slopes(self, theta: float, places: Tensor) -> tuple[Tensor, Tensor]:
+    def _distance_and_gradient(self, theta: float, positions: Tensor) -> tuple[Tensor, Tensor]:
         """The changed distance at points, and its gradient there."""
-        at = places.detach().requires_grad_()
+        at = positions.detach().requires_grad_()
         moved = {
             f"shape.{name}": self._start[name] + theta * change
             for name, change in self._tangent.items()
@@ -90,12 +98,14 @@ class FieldLine(Line):
         return found.detach(), slope
 
 
-def line_of(module: nn.Module, tangent: Mapping[str, Change] | Tensor, target: Any) -> Line:
+def make_line(
+    module: nn.Module, tangent: Mapping[str, ParameterChange] | Tensor, target: Any
+) -> ParameterLine:
     """The line of a module's parameters along a tangent.
 
     Args:
         module: Maps the target.
-        tangent: Changes of its values by name, see ``changes_of``, or of its only parameter.
+        tangent: Changes of its values by name, see ``parameter_changes``, or of its only parameter.
         target: The scene or the sensor that the module maps.
 
     Raises:
@@ -110,11 +120,11 @@ def line_of(module: nn.Module, tangent: Mapping[str, Change] | Tensor, target: A
             )
         tangent = {names[0]: tangent}
     meshed_anew = hasattr(module, "distance") and hasattr(module, "object")
-    return (FieldLine if meshed_anew else Line)(module, tangent, target)
+    return (DistanceFieldLine if meshed_anew else ParameterLine)(module, tangent, target)
 
 
-def losses_along(
-    line: Line, offsets: Iterable[float], observation: Observation, *, seed: int = 0
+def evaluate_losses(
+    line: ParameterLine, offsets: Iterable[float], observation: Observation, *, seed: int = 0
 ) -> Tensor:
     """The loss of one observation along a line of scenes: its loss landscape.
 
@@ -122,7 +132,7 @@ def losses_along(
     same rough points where the model has them.
 
     Args:
-        line: Of a module that maps the scene, see ``line_of``.
+        line: Of a module that maps the scene, see ``make_line``.
         offsets: θ of every scene.
         observation: Its loss may return several numbers; without one it is ``SpectrumLoss``.
         seed: Of all random numbers.
@@ -132,21 +142,21 @@ def losses_along(
     """
     sensor, loss = observation.sensor, observation.loss or SpectrumLoss()
     with torch.no_grad():
-        observed, start = observation.observed(), line.end(0.0)
-        observed = observation.model.blurred(observed, sensor)
-        model = observation.model.prepared(start, sensor, seed)
+        observed, start = observation.observed_map(), line.evaluate_end(0.0)
+        observed = observation.model.blur_observed(observed, sensor)
+        model = observation.model.prepare(start, sensor, seed)
         samples = getattr(model, "sampling", Sampling()).samples
         model = model.for_differences(start, sensor, samples, "area")
-        maps = (model.predict(line.end(float(offset)), sensor, seed) for offset in offsets)
+        maps = (model.predict(line.evaluate_end(float(offset)), sensor, seed) for offset in offsets)
         return torch.stack([loss(predicted, observed) for predicted in maps])
 
 
-class _Field(nn.Module):
+class _DistanceModule(nn.Module):
     """A module whose call is the distance of a shape."""
 
     def __init__(self, shape: nn.Module) -> None:
         super().__init__()
         self.shape = shape
 
-    def forward(self, places: Tensor) -> Tensor:
-        return self.shape.distance(places)  # type: ignore[operator]
+    def forward(self, positions: Tensor) -> Tensor:
+        return self.shape.distance(positions)  # type: ignore[operator]

@@ -14,7 +14,7 @@ from invertwin.scene.shape_models.lattice import Lattice
 
 
 @dataclass(frozen=True)
-class Bump:
+class GaussianBump:
     """A round bump over the nodes of a grid: ``height · exp(−|x − center|² / (2 width²))``.
 
     Attributes:
@@ -27,7 +27,7 @@ class Bump:
     width: Positive
     height: float | Sequence[float] = 1.0
 
-    def over(self, lattice: Lattice, shape: Sequence[int]) -> Tensor:
+    def evaluate(self, lattice: Lattice, shape: Sequence[int]) -> Tensor:
         """The change of every entry of a parameter.
 
         Args:
@@ -35,18 +35,20 @@ class Bump:
             shape: Of the parameter. It may have nodes beyond the lattice, as many on every side.
         """
         beyond = (shape[0] - lattice.counts[0]) / 2 * lattice.spacing
-        nodes = Lattice.between(lattice.low - beyond, lattice.high + beyond, shape[:3]).nodes
+        nodes = Lattice.from_bounds(lattice.low - beyond, lattice.high + beyond, shape[:3]).nodes
         far = (nodes - nodes.new_tensor(self.center)).square().sum(-1)
         bump = torch.exp(-far / (2 * self.width**2))
         height = bump.new_tensor(self.height)
         return bump[..., None] * height if height.ndim else bump * height
 
 
-Change = float | ArrayLike | Bump
+ParameterChange = float | ArrayLike | GaussianBump
 """One number for all entries, all entries, the first ones of a row, or a bump over a grid."""
 
 
-def changes_of(module: nn.Module, tangent: Mapping[str, Change]) -> dict[str, Tensor]:
+def parameter_changes(
+    module: nn.Module, tangent: Mapping[str, ParameterChange]
+) -> dict[str, Tensor]:
     """Changes of a module's parameters, by name, for θ = 1.
 
     A tangent names parameters, or what the module calls some of their entries (see ``Entries``):
@@ -68,7 +70,7 @@ def changes_of(module: nn.Module, tangent: Mapping[str, Change]) -> dict[str, Te
     parts = {name: start[found.parameter][found.index] for name, found in known.items()}
     changes: dict[str, Tensor] = {}
     for name, change in tangent.items():
-        rate = _rate(change, parts.get(name), getattr(module, "lattice", None))
+        rate = _entry_changes(change, parts.get(name), getattr(module, "lattice", None))
         if name not in parts or rate.shape != parts[name].shape:
             shapes = ", ".join(f"{other} {tuple(part.shape)}" for other, part in parts.items())
             raise InputError(
@@ -81,12 +83,12 @@ def changes_of(module: nn.Module, tangent: Mapping[str, Change]) -> dict[str, Te
     return changes
 
 
-def _rate(change: Change, part: Tensor | None, lattice: Lattice | None) -> Tensor:
+def _entry_changes(change: ParameterChange, part: Tensor | None, lattice: Lattice | None) -> Tensor:
     """How fast every one of some entries changes; None stands for unknown ones."""
-    if isinstance(change, Bump):
+    if isinstance(change, GaussianBump):
         if lattice is None or part is None or part.ndim < 3:
             raise InputError("expected numbers, got a bump; bumps are for the nodes of a grid")
-        return change.over(lattice, part.shape)
+        return change.evaluate(lattice, part.shape)
     try:
         rate = torch.as_tensor(change, dtype=torch.float64)
     except (TypeError, ValueError):

@@ -28,11 +28,11 @@ from invertwin.runtime.memory import require_at_most
 from invertwin.scene import DensityGrid, Object, Scene, rigid, rotation_from_vector
 from invertwin.scene.shape_models.lattice import Lattice
 
-_TURNS = 91  # yaws that a rectangle is tried at, over a quarter turn
-_EDGE = 0.02  # share of the points beyond a side of a rectangle
-_MOST_NODES = 1e6  # along a side of an image; the lattice has its own limits
-_RANK = 0.25  # of the training cells: most of them may hold the target itself
-_CHUNK = 20_000  # points of an image at a time
+_YAW_COUNT = 91  # yaws that a rectangle is tried at, over a quarter turn
+_TRIMMED_FRACTION = 0.02  # share of the points beyond a side of a rectangle
+_MAX_NODES_PER_SIDE = 1e6  # along a side of an image; the lattice has its own limits
+_CFAR_RANK = 0.25  # of the training cells: most of them may hold the target itself
+_POINTS_PER_CHUNK = 20_000  # points of an image at a time
 
 
 @dataclass(frozen=True)
@@ -45,32 +45,32 @@ class Ground:
         check_fields(self)
 
     @property
-    def vertical(self) -> int:
+    def up_axis(self) -> int:
         """Index of the axis that points up."""
         return "xyz".index(self.up)
 
     @property
-    def level(self) -> tuple[int, int]:
+    def plane_axes(self) -> tuple[int, int]:
         """Indices of the two axes of the plane."""
         return (0, 2) if self.up == "y" else (0, 1)
 
     @property
-    def sense(self) -> float:
+    def yaw_sign(self) -> float:
         """1 if a positive yaw turns the first axis of the plane towards the second, else −1."""
         return -1.0 if self.up == "y" else 1.0
 
-    def turn(self, yaw: float) -> Float64[Tensor, "3 3"]:
+    def yaw_rotation(self, yaw: float) -> Float64[Tensor, "3 3"]:
         """The rotation by a yaw [rad] about the axis that points up."""
         vector = torch.zeros(3, dtype=torch.float64)
-        vector[self.vertical] = yaw
+        vector[self.up_axis] = yaw
         return rotation_from_vector(vector)
 
 
-_UPRIGHT = Ground()
+_DEFAULT_GROUND = Ground()
 
 
 @dataclass(frozen=True, eq=False)
-class Rectangle:
+class GroundRectangle:
     """An object on the ground, seen from above.
 
     Attributes:
@@ -85,7 +85,7 @@ class Rectangle:
     size: tuple[float, float]
 
 
-def detected_points(
+def detect_echoes(
     capture: Capture, grid: Grid, low: ArrayLike, high: ArrayLike, *, false_alarm: float = 1e-6
 ) -> Float64[Tensor, "point 3"]:
     """Find echoes within a box of the world by ordered-statistics CFAR and its local maxima.
@@ -101,12 +101,15 @@ def detected_points(
     Raises:
         InputError: nothing is detected within the box, or it has no volume.
     """
-    box = Lattice.between(low, high, (2, 2, 2))
+    box = Lattice.from_bounds(low, high, (2, 2, 2))
     power = capture.spectrum(grid).detach().double()
     strongest = power.amax(3)
     # A frame at a time: the training cells of all take much memory.
     detections = torch.stack(
-        [ordered_statistics_cfar(frame, false_alarm=false_alarm, rank=_RANK) for frame in strongest]
+        [
+            ordered_statistics_cfar(frame, false_alarm=false_alarm, rank=_CFAR_RANK)
+            for frame in strongest
+        ]
     )
     found = peaks(power, detections, capture.radar(), grid).position
     inside = (found >= box.low) & (found <= box.high)
@@ -121,7 +124,7 @@ def detected_points(
     return kept
 
 
-def echo_image(
+def backproject_power(
     capture: Capture, grid: Grid, points: Float64[Tensor, "*point 3"]
 ) -> Float64[Tensor, "*point"]:
     """Backproject power to points of the world, with the spreading loss removed.
@@ -137,22 +140,26 @@ def echo_image(
     """
     flat = points.reshape(-1, 3)
     if grid.u_count == grid.v_count == 1:
-        parts = [backproject(capture, part).abs().square() for part in flat.split(_CHUNK)]
+        parts = [
+            backproject(capture, part).abs().square() for part in flat.split(_POINTS_PER_CHUNK)
+        ]
         return torch.cat(parts).reshape(points.shape[:-1])
     maps = capture.spectrum(grid).detach().double()
     radar = capture.radar()
-    total = torch.cat([_incoherent(maps, radar, grid, part) for part in flat.split(_CHUNK)])
+    total = torch.cat(
+        [_incoherent_power(maps, radar, grid, part) for part in flat.split(_POINTS_PER_CHUNK)]
+    )
     return total.reshape(points.shape[:-1])
 
 
-def image_points(
+def find_bright_nodes(
     capture: Capture,
     grid: Grid,
     low: ArrayLike,
     high: ArrayLike,
     *,
     step: float,
-    share: float = 0.3,
+    fraction: float = 0.3,
 ) -> Float64[Tensor, "point 3"]:
     """Find the nodes of a backprojected image that are nearly as bright as its strongest one.
 
@@ -161,7 +168,7 @@ def image_points(
         grid: bins of its maps.
         low, high: opposite corners of the image in the world [m].
         step: distance of neighbouring nodes, about [m].
-        share: least brightness of a node, relative to the strongest.
+        fraction: least brightness of a node, relative to the strongest.
 
     Raises:
         InputError: a box without volume or echoes, or a step that is not positive.
@@ -170,18 +177,18 @@ def image_points(
     width = checked_number(step, "step of the image [m]", 0.0, open_low=True)
     most = float(size.max()) / width
     require_at_most(
-        most, _MOST_NODES, "nodes along a side", "give metres, or a larger step", "step"
+        most, _MAX_NODES_PER_SIDE, "nodes along a side", "give metres, or a larger step", "step"
     )
     counts = [max(2, round(float(side) / width) + 1) for side in size]
-    nodes = Lattice.between(low, high, counts).nodes
+    nodes = Lattice.from_bounds(low, high, counts).nodes
     if (height := _unresolved_height(capture.radar(), grid)) is not None:
         # Nothing tells heights apart: the plane in the middle stands for all.
         nodes = nodes.mean(height, keepdim=True)
-    image = _seen(echo_image(capture, grid, nodes))
-    return nodes[image >= share * image.max()]
+    image = _require_echoes(backproject_power(capture, grid, nodes))
+    return nodes[image >= fraction * image.max()]
 
 
-def linked(points: Float64[Tensor, "point axis"], gap: float) -> Int64[Tensor, " point"]:
+def label_groups(points: Float64[Tensor, "point axis"], gap: float) -> Int64[Tensor, " point"]:
     """Number the groups of points that are linked by steps of at most a gap.
 
     Args:
@@ -194,14 +201,14 @@ def linked(points: Float64[Tensor, "point axis"], gap: float) -> Int64[Tensor, "
     return torch.from_numpy(label.astype("int64"))
 
 
-def largest_group(points: Float64[Tensor, "point 3"], gap: float) -> Float64[Tensor, "part 3"]:
+def find_largest_group(points: Float64[Tensor, "point 3"], gap: float) -> Float64[Tensor, "part 3"]:
     """Find the largest set of points that are linked by steps of at most a gap [m].
 
     Args:
         points: [m].
         gap: longest step between linked points [m].
     """
-    labels = linked(points, gap)
+    labels = label_groups(points, gap)
     return points[labels == torch.bincount(labels).argmax()]
 
 
@@ -209,9 +216,9 @@ def fit_rectangle(
     points: Float64[Tensor, "point 3"],
     radar: Radar,
     *,
-    ground: Ground = _UPRIGHT,
+    ground: Ground = _DEFAULT_GROUND,
     resolution: float = 0.1,
-) -> Rectangle:
+) -> GroundRectangle:
     """Fit a rectangle in the ground plane to points on its near sides, an L shape.
 
     Every yaw of a quarter turn is tried; the best one has most points close to the two sides
@@ -233,10 +240,10 @@ def fit_rectangle(
     """
     if len(points) < 3:
         raise InputError(f"expected at least 3 points, got {len(points)}; use pose = 'position'")
-    best: tuple[float, Rectangle] | None = None
-    for yaw in torch.linspace(0, math.pi / 2, _TURNS, dtype=torch.float64)[:-1].tolist():
-        found = _bounded(points, yaw, ground)
-        axes = ground.turn(yaw)[:, ground.level]
+    best: tuple[float, GroundRectangle] | None = None
+    for yaw in torch.linspace(0, math.pi / 2, _YAW_COUNT, dtype=torch.float64)[:-1].tolist():
+        found = _bounding_rectangle(points, yaw, ground)
+        axes = ground.yaw_rotation(yaw)[:, ground.plane_axes]
         offsets = (points - found.center) @ axes
         away = (radar.positions.detach().mean(0) - found.center) @ axes
         half = torch.tensor(found.size).double() / 2
@@ -252,40 +259,40 @@ def fit_rectangle(
 
 
 def principal_rectangle(
-    points: Float64[Tensor, "point 3"], *, ground: Ground = _UPRIGHT
-) -> Rectangle:
+    points: Float64[Tensor, "point 3"], *, ground: Ground = _DEFAULT_GROUND
+) -> GroundRectangle:
     """Fit a rectangle along the points' principal axes in the ground plane.
 
     Args:
         points: [m].
         ground: the plane.
     """
-    flat = points[:, ground.level]
+    flat = points[:, ground.plane_axes]
     _, axes = torch.linalg.eigh(torch.cov(flat.T))
     first = axes[:, 1]
     # The image of the first ground axis under a yaw about y is (cos, −sin) in (x, z).
-    yaw = math.atan2(ground.sense * float(first[1]), float(first[0]))
-    return _bounded(points, yaw, ground)
+    yaw = math.atan2(ground.yaw_sign * float(first[1]), float(first[0]))
+    return _bounding_rectangle(points, yaw, ground)
 
 
-def guess_position(points: Float64[Tensor, "point 3"]) -> Float64[Tensor, "3"]:
+def estimate_position(points: Float64[Tensor, "point 3"]) -> Float64[Tensor, "3"]:
     """Guess a position [m]: the median of the points along each axis."""
     return points.median(0).values
 
 
-def guess_poses(
-    item: Object, found: Rectangle, radar: Radar, *, ground: Ground = _UPRIGHT
+def candidate_poses(
+    item: Object, rectangle: GroundRectangle, radar: Radar, *, ground: Ground = _DEFAULT_GROUND
 ) -> list[Float64[Tensor, "4 4"]]:
     """List the four poses in which an object of known size stands in a rectangle.
 
     Its upright attitude and its height are kept. Each side that faces the radar is put where the
     rectangle has it, so that the hidden part of the object lies behind; along an axis on which
     the radar faces no side, the middles agree. A rectangle does not tell front from back, nor
-    always length from width: ``best_pose`` chooses.
+    always length from width: ``select_pose`` chooses.
 
     Args:
         item: the object; its present pose gives attitude and height.
-        found: the rectangle.
+        rectangle: the rectangle.
         radar: its positions.
         ground: the plane.
     """
@@ -293,23 +300,23 @@ def guess_poses(
     start = item.transform.detach()
     level = item.vertices.detach() - center
     where = radar.positions.detach().mean(0)
-    axes = ground.turn(found.yaw)[:, ground.level]
-    half = torch.tensor(found.size).double() / 2
-    away = (where - found.center) @ axes
+    axes = ground.yaw_rotation(rectangle.yaw)[:, ground.plane_axes]
+    half = torch.tensor(rectangle.size).double() / 2
+    away = (where - rectangle.center) @ axes
     poses = []
     for quarter in range(4):
-        turn = ground.turn(found.yaw + quarter * math.pi / 2)
+        turn = ground.yaw_rotation(rectangle.yaw + quarter * math.pi / 2)
         own = (level @ turn.T) @ axes
         # Where the object's middle lies when its near side is the rectangle's.
         near = torch.where(away > 0, half - own.amax(0), -half - own.amin(0))
         middle = -0.5 * (own.amax(0) + own.amin(0))
-        place = found.center + axes @ torch.where(away.abs() > half, near, middle)
-        place[ground.vertical] = center[ground.vertical]
+        place = rectangle.center + axes @ torch.where(away.abs() > half, near, middle)
+        place[ground.up_axis] = center[ground.up_axis]
         poses.append(rigid(turn, place - turn @ center) @ start)
     return poses
 
 
-def best_pose(
+def select_pose(
     scene: Scene,
     name: str,
     poses: Sequence[Float64[Tensor, "4 4"]],
@@ -358,22 +365,24 @@ def best_pose(
     return scenes[losses.index(min(losses))], losses
 
 
-def guess_scale(item: Object, found: Rectangle, *, ground: Ground = _UPRIGHT) -> float:
+def estimate_scale(
+    item: Object, rectangle: GroundRectangle, *, ground: Ground = _DEFAULT_GROUND
+) -> float:
     """Guess a scale: the longer side of a rectangle over that of an object.
 
     The longer side is the one that is seen from most places; the other often hides its far end.
 
     Args:
         item: the object.
-        found: rectangle around its points.
+        rectangle: rectangle around its points.
         ground: the plane.
     """
-    extent = item.vertices.detach()[:, ground.level]
+    extent = item.vertices.detach()[:, ground.plane_axes]
     longest = float((extent.amax(0) - extent.amin(0)).max())
-    return max(found.size) / longest
+    return max(rectangle.size) / longest
 
 
-def guess_density(
+def estimate_density(
     capture: Capture,
     grid: Grid,
     item: Object,
@@ -398,25 +407,29 @@ def guess_density(
     Raises:
         InputError: no echoes in the box.
     """
-    lattice = Lattice.between(low, high, counts)
+    lattice = Lattice.from_bounds(low, high, counts)
     pose = item.transform.detach()
-    image = _seen(echo_image(capture, grid, lattice.nodes @ pose[:3, :3].T + pose[:3, 3]))
+    image = _require_echoes(
+        backproject_power(capture, grid, lattice.nodes @ pose[:3, :3].T + pose[:3, 3])
+    )
     density = depth / float(lattice.spacing.mean()) * image / image.max()
     return DensityGrid(name, low, high, density)
 
 
-def _bounded(points: Tensor, yaw: float, ground: Ground) -> Rectangle:
+def _bounding_rectangle(points: Tensor, yaw: float, ground: Ground) -> GroundRectangle:
     """The rectangle of a yaw around all but the outermost points."""
-    axes = ground.turn(yaw)[:, ground.level]
+    axes = ground.yaw_rotation(yaw)[:, ground.plane_axes]
     middle = points.median(0).values
     places = (points - middle) @ axes
-    low, high = (torch.quantile(places, q, dim=0) for q in (_EDGE, 1 - _EDGE))
+    low, high = (
+        torch.quantile(places, q, dim=0) for q in (_TRIMMED_FRACTION, 1 - _TRIMMED_FRACTION)
+    )
     center = middle + axes @ ((low + high) / 2)
     first, second = (high - low).tolist()
-    return Rectangle(center, yaw, (first, second))
+    return GroundRectangle(center, yaw, (first, second))
 
 
-def _incoherent(maps: Tensor, radar: Radar, grid: Grid, points: Tensor) -> Tensor:
+def _incoherent_power(maps: Tensor, radar: Radar, grid: Grid, points: Tensor) -> Tensor:
     """Mean over frames of the maps at the points, times R⁴."""
     link, origins = radar.link(), radar.origins
     total = torch.zeros(len(points), dtype=torch.float64)
@@ -444,7 +457,7 @@ def _unresolved_height(radar: Radar, grid: Grid) -> int | None:
     return int(radar.link().rotations.detach()[0, :, 1].abs().argmax())
 
 
-def _seen(image: Tensor) -> Tensor:
+def _require_echoes(image: Tensor) -> Tensor:
     """An image, if there is something in it."""
     if not float(image.max()) > 0:
         raise InputError("expected echoes in the box, got none; move the box into the grid")

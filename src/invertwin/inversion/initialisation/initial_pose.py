@@ -13,15 +13,15 @@ from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.inversion.initialisation.detections import (
     Ground,
-    best_pose,
-    detected_points,
+    candidate_poses,
+    detect_echoes,
+    estimate_position,
+    estimate_scale,
+    find_bright_nodes,
+    find_largest_group,
     fit_rectangle,
-    guess_poses,
-    guess_position,
-    guess_scale,
-    image_points,
-    largest_group,
     principal_rectangle,
+    select_pose,
 )
 from invertwin.limits import Positive
 from invertwin.radar.surrogate.surrogate import Surrogate
@@ -30,28 +30,28 @@ from invertwin.scene.pose import rigid
 from invertwin.scene.scene import Scene
 
 # Wide enough for a guess that is off by a cell, sharp enough to tell front from back.
-_KERNELS = Surrogate(range_width=1.0, angle_width=0.5)
+_POSE_SURROGATE = Surrogate(range_width=1.0, angle_width=0.5)
 
 
 @dataclass(frozen=True)
-class Guess:
+class InitialEstimate:
     """A scene with an object where conventional processing has found it.
 
     Attributes:
         scene: The scene.
-        points: Number of echoes that the object was found by.
+        detection_count: Number of echoes that the object was found by.
         losses: Losses of the poses that were tried, where there were several.
-        size: Size of the rectangle around the echoes, where one was fitted [m].
+        rectangle_size: Size of the rectangle around the echoes, where one was fitted [m].
     """
 
     scene: Scene
-    points: int = 0
+    detection_count: int = 0
     losses: list[float] = field(default_factory=list)
-    size: tuple[float, float] | None = None
+    rectangle_size: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
-class FirstPose:
+class InitialPoseEstimator:
     """How an object is found by conventional processing.
 
     Attributes:
@@ -89,7 +89,7 @@ class FirstPose:
                     f'expected {no}`{name}` with pose = "{self.pose}", got {got}; {do}'
                 )
 
-    def find(
+    def estimate(
         self,
         scene: Scene,
         name: str,
@@ -98,7 +98,7 @@ class FirstPose:
         *,
         loss: Callable[[Tensor, Tensor], Tensor],
         seed: int = 0,
-    ) -> Guess:
+    ) -> InitialEstimate:
         """Put an object where its echoes are.
 
         Args:
@@ -113,32 +113,38 @@ class FirstPose:
             InputError: No echoes, or too few points.
         """
         if self.low is None or self.high is None:
-            return Guess(scene)
+            return InitialEstimate(scene)
         if self.method == "points":
-            points = detected_points(
-                capture, grid, self.low, self.high, false_alarm=self.false_alarm
-            )
+            points = detect_echoes(capture, grid, self.low, self.high, false_alarm=self.false_alarm)
         else:
-            points = image_points(capture, grid, self.low, self.high, step=self.step)
-        points = largest_group(points, self.gap)
+            points = find_bright_nodes(capture, grid, self.low, self.high, step=self.step)
+        points = find_largest_group(points, self.gap)
         plane, item, radar = Ground(self.up), scene[name], capture.radar()
         if self.pose == "position":
-            shift = guess_position(points) - item.center.detach()
-            shift[plane.vertical] = 0.0
+            shift = estimate_position(points) - item.center.detach()
+            shift[plane.up_axis] = 0.0
             moved = rigid(translation=shift) @ item.transform
-            return Guess(scene.replace(name, pose=moved), len(points))
+            return InitialEstimate(scene.replace(name, pose=moved), len(points))
         if self.pose == "axes":
             rectangle = principal_rectangle(points, ground=plane)
         else:
             resolution = radar.waveform.range_resolution
             rectangle = fit_rectangle(points, radar, ground=plane, resolution=resolution)
         if self.scale:
-            factor = guess_scale(item, rectangle, ground=plane)
+            factor = estimate_scale(item, rectangle, ground=plane)
             middle = item.mesh.center
             mesh = Mesh(middle + (item.mesh.vertices - middle) * factor, item.mesh.faces)
             scene = scene.replace(name, mesh=mesh)
-        poses = guess_poses(scene[name], rectangle, radar, ground=plane)
-        scene, losses = best_pose(
-            scene, name, poses, radar, capture, grid, loss=loss, surrogate=_KERNELS, seed=seed
+        poses = candidate_poses(scene[name], rectangle, radar, ground=plane)
+        scene, losses = select_pose(
+            scene,
+            name,
+            poses,
+            radar,
+            capture,
+            grid,
+            loss=loss,
+            surrogate=_POSE_SURROGATE,
+            seed=seed,
         )
-        return Guess(scene, len(points), losses, rectangle.size)
+        return InitialEstimate(scene, len(points), losses, rectangle.size)

@@ -14,10 +14,16 @@ from invertwin.channel import Sampling
 from invertwin.checks import Point
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.inversion.confidence.ambiguities import REJECTED, same, score, turns, way
+from invertwin.inversion.confidence.ambiguities import (
+    REJECTION_ZSCORE,
+    are_same_poses,
+    candidate_rotations,
+    describe_difference,
+    difference_score,
+)
 from invertwin.inversion.fit import Callback
 from invertwin.inversion.loss import Objective, SpectrumLoss
-from invertwin.inversion.metrics import residual
+from invertwin.inversion.metrics import pose_error
 from invertwin.inversion.observation import Observation, Unknowns
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.reconstruction import Reconstruction, reconstruct
@@ -25,13 +31,13 @@ from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule
 from invertwin.limits import Count, Positive
 from invertwin.runtime.memory import require_at_most
-from invertwin.scene.scene import Object, Scene, displaced
-from invertwin.seeds import derived_seed
+from invertwin.scene.scene import Object, Scene, displace
+from invertwin.seeds import derive_seed
 
-_MOST_POSES = 1e4
-_FITS = 4  # full fits of the best starts
-_FEWER = 8  # samples of a screened start: a share of those of a fit
-_NEAR_PLACE, _NEAR_TURN = 0.1, 0.35  # m and rad: of starts as near one is enough
+_MAX_POSES = 1e4
+_FULL_FIT_COUNT = 4  # full fits of the best starts
+_SCREENING_DIVISOR = 8  # samples of a screened start: a share of those of a fit
+_SAME_START_DISTANCE, _SAME_START_ANGLE = 0.1, 0.35  # m and rad: of starts as near one is enough
 
 
 @dataclass(frozen=True)
@@ -40,27 +46,31 @@ class Search:
 
     Attributes:
         best: The fit with the lowest loss.
-        ends: All ends that differ, the best first.
+        minima: All ends that differ, the best first.
         rivals: For every end how unlikely the difference of its loss and the best one's is, were it
             right, in standard deviations over looks at its twin. None where there are no looks.
         ambiguities: A sentence for every end that the data do not reject.
-        number: Of the best fit, as ``callbacks`` got it.
+        best_number: Of the best fit, as ``callbacks`` got it.
         objects: Names of those with several starts.
     """
 
     best: Reconstruction
-    ends: list[Reconstruction]
-    rivals: list[float | None]
+    minima: list[Reconstruction]
+    scores: list[float | None]
     ambiguities: tuple[str, ...]
-    number: int
+    best_number: int
     objects: tuple[str, ...]
 
-    def rows(self) -> dict[str, Any]:
+    def to_metrics(self) -> dict[str, Any]:
         """The other ends as numbers: how they differ from the best, loss, score."""
         best = self.best.scene
         ends = [
-            {"pose": way(best, end.scene, self.objects), "loss": end.loss, "score": score}
-            for end, score in zip(self.ends[1:], self.rivals[1:], strict=True)
+            {
+                "pose": describe_difference(best, end.scene, self.objects),
+                "loss": end.loss,
+                "score": score,
+            }
+            for end, score in zip(self.minima[1:], self.scores[1:], strict=True)
         ]
         return {"other_ends": ends, "ambiguities": list(self.ambiguities)}
 
@@ -89,7 +99,7 @@ def pose_grid(
         )
     places = math.prod(1 + float(b - a) / step for a, b in zip(low, high, strict=True)) * turns
     require_at_most(
-        places, _MOST_POSES, "poses", "give metres, a larger step, or fewer turns", "step"
+        places, _MAX_POSES, "poses", "give metres, a larger step, or fewer turns", "step"
     )
     axes = [
         torch.linspace(a, b, 1 + math.ceil((b - a) / step - 1e-9), dtype=torch.float64)
@@ -97,7 +107,7 @@ def pose_grid(
     ]
     about = 2 * math.pi / turns * torch.tensor(axis, dtype=torch.float64)
     for place, turn in product(torch.cartesian_prod(*axes), range(turns)):
-        yield displaced(item, place - item.center.detach(), turn * about)
+        yield displace(item, place - item.center.detach(), turn * about)
 
 
 def search(
@@ -125,7 +135,7 @@ def search(
         observations: What was observed.
         parameters: Unknowns of the scene; every fit takes a copy.
         starts: By the name of an object, the poses in which it may begin: given ones, random ones
-            from ``nearby``, or those of ``pose_grid``.
+            from ``sample_nearby_poses``, or those of ``pose_grid``.
         loss: How maps are compared.
         optimizer: Kind and rates.
         schedule: Of every fit.
@@ -142,7 +152,7 @@ def search(
         raise InputError("expected at least one start, got none; give poses of an object")
     watched = [observations] if isinstance(observations, Observation) else list(observations)
     rule = loss or SpectrumLoss()
-    screened = sorted(begun, key=_screening(watched, rule, seed))
+    screened = sorted(begun, key=_make_screening_loss(watched, rule, seed))
 
     def fit(start: Scene, number: int) -> Reconstruction:
         return reconstruct(
@@ -154,35 +164,41 @@ def search(
             schedule=schedule,
             regularizers=regularizers,
             callbacks=callbacks(number),
-            seed=derived_seed(seed, number),
+            seed=derive_seed(seed, number),
         )
 
-    found = [fit(start, number) for number, start in enumerate(_apart(screened, names))]
-    best = min(found, key=_sharp)
-    for start in _turned(best):
+    found = [
+        fit(start, number) for number, start in enumerate(_select_distinct_starts(screened, names))
+    ]
+    best = min(found, key=_unblurred_loss)
+    for start in _rotated_starts(best):
         found.append(fit(start, len(found)))
     ends: list[Reconstruction] = []
-    for end in sorted(found, key=_sharp):
-        if not any(same(end.scene, other.scene, names) for other in ends):
+    for end in sorted(found, key=_unblurred_loss):
+        if not any(are_same_poses(end.scene, other.scene, names) for other in ends):
             ends.append(end)
-    rivals = [None if k == 0 else score(ends[0].end, end.end) for k, end in enumerate(ends)]
+    rivals = [
+        None if k == 0 else difference_score(ends[0].result, end.result)
+        for k, end in enumerate(ends)
+    ]
     told = tuple(
-        f"{way(ends[0].scene, end.scene, names)} explains the data nearly as well: z = {z:.1f}"
+        f"{describe_difference(ends[0].scene, end.scene, names)} explains the data nearly as "
+        f"well: z = {z:.1f}"
         for end, z in zip(ends, rivals, strict=True)
-        if z is not None and z < REJECTED
+        if z is not None and z < REJECTION_ZSCORE
     )
     return Search(ends[0], ends, rivals, told, found.index(ends[0]), tuple(names))
 
 
-def _screening(
+def _make_screening_loss(
     observations: Sequence[Observation], loss: Callable[[Tensor, Tensor], Tensor], seed: int
 ) -> Callable[[Scene], float]:
     """The loss of a scene at the widest blur."""
     objective = Objective(
         tuple(o.loss or loss for o in observations), tuple(o.weight for o in observations)
     )
-    blurred = [o.model.blurred(o.observed(), o.sensor) for o in observations]
-    models = [_coarse(o.model) for o in observations]
+    blurred = [o.model.blur_observed(o.observed_map(), o.sensor) for o in observations]
+    models = [_reduce_samples(o.model) for o in observations]
 
     def score(scene: Scene) -> float:
         with torch.no_grad():
@@ -195,39 +211,43 @@ def _screening(
     return score
 
 
-def _coarse(model: ForwardModel) -> ForwardModel:
+def _reduce_samples(model: ForwardModel) -> ForwardModel:
     """The model with few samples: enough for a blurred map."""
     sampling = getattr(model, "sampling", None)
     if not isinstance(sampling, Sampling):
         return model
-    return model.sampled_by(samples=max(1, sampling.samples // _FEWER), boundary=False)
+    return model.with_sampling(
+        samples=max(1, sampling.samples // _SCREENING_DIVISOR), boundary=False
+    )
 
 
-def _sharp(found: Reconstruction) -> float:
-    return float(found.end.fit.objective(found.end.maps))
+def _unblurred_loss(found: Reconstruction) -> float:
+    return float(found.result.fit.objective(found.result.maps))
 
 
-def _turned(found: Reconstruction) -> Iterator[Scene]:
+def _rotated_starts(found: Reconstruction) -> Iterator[Scene]:
     """The twin with an object turned so that it looks much the same."""
     none = torch.zeros(3, dtype=torch.float64)
     for module in found.parameters:
-        for turn in turns(module, found.scene):
-            moved = displaced(found.scene[str(module.object)], none, turn)
+        for turn in candidate_rotations(module, found.scene):
+            moved = displace(found.scene[str(module.object)], none, turn)
             yield found.scene.replace(str(module.object), pose=moved.transform.detach())
 
 
-def _apart(scenes: Sequence[Scene], names: Sequence[str]) -> list[Scene]:
+def _select_distinct_starts(scenes: Sequence[Scene], names: Sequence[str]) -> list[Scene]:
     """The first scenes, without those that a better one stands for."""
     kept: list[Scene] = []
     for scene in scenes:
-        if len(kept) == _FITS:
+        if len(kept) == _FULL_FIT_COUNT:
             break
-        if not any(_near(scene, other, names) for other in kept):
+        if not any(_are_near(scene, other, names) for other in kept):
             kept.append(scene)
     return kept
 
 
-def _near(first: Scene, second: Scene, names: Sequence[str]) -> bool:
+def _are_near(first: Scene, second: Scene, names: Sequence[str]) -> bool:
     """Whether one start stands for another."""
-    offs = [residual(first[name], second[name]) for name in names]
-    return all(o and o.distance < _NEAR_PLACE and o.angle < _NEAR_TURN for o in offs)
+    offs = [pose_error(first[name], second[name]) for name in names]
+    return all(
+        o and o.distance < _SAME_START_DISTANCE and o.angle < _SAME_START_ANGLE for o in offs
+    )

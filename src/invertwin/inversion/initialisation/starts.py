@@ -14,18 +14,18 @@ from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Axes, Count, NonNegative
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.pose import rigid, rotation_from_vector
-from invertwin.scene.scene import Object, displaced
+from invertwin.scene.scene import Object, displace
 
-_MOST_COPIES = 1e4
-Interval = tuple[NonNegative, NonNegative]
+_MAX_COPIES = 1e4
+DrawInterval = tuple[NonNegative, NonNegative]
 
 
-def nearby(
+def sample_nearby_poses(
     item: Object,
     count: Count = 1,
     *,
-    distance: Interval,
-    angle: Annotated[Interval, RADIANS] = (0.0, 0.0),
+    distance: DrawInterval,
+    angle: Annotated[DrawInterval, RADIANS] = (0.0, 0.0),
     axes: Axes = "xyz",
     rotation_axis: Float64[Tensor, "3"] | None = None,
     generator: torch.Generator,
@@ -41,26 +41,26 @@ def nearby(
         rotation_axis: without it any axis
         generator: Of the random numbers. They are drawn copy by copy.
     """
-    require_at_most(count, _MOST_COPIES, "poses", "lower count", "count")
+    require_at_most(count, _MAX_COPIES, "poses", "lower count", "count")
 
-    def uniform(low: float, high: float) -> float:
+    def draw_uniform(low: float, high: float) -> float:
         return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
 
-    def direction(letters: str) -> Tensor:
+    def draw_direction(letters: str) -> Tensor:
         vector = torch.randn(3, generator=generator, dtype=torch.float64)
         vector = vector * torch.tensor([letter in letters for letter in "xyz"])
         return vector / vector.norm()
 
     for _ in range(count):
-        offset = uniform(*distance) * direction(axes)
-        about = direction("xyz")
+        offset = draw_uniform(*distance) * draw_direction(axes)
+        about = draw_direction("xyz")
         if rotation_axis is not None:
-            sign = 1 if uniform(0, 1) < 0.5 else -1
+            sign = 1 if draw_uniform(0, 1) < 0.5 else -1
             about = rotation_axis / rotation_axis.norm() * sign
-        yield displaced(item, offset, uniform(*angle) * about)
+        yield displace(item, offset, draw_uniform(*angle) * about)
 
 
-def posed(
+def place_at_poses(
     item: Object,
     positions: Annotated[Sequence[Point], MinLen(1)],
     rotations: Annotated[Sequence[Point], RADIANS] = (),

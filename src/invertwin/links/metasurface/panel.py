@@ -19,20 +19,20 @@ from torch.utils.checkpoint import checkpoint
 
 from invertwin.channel import (
     METASURFACE,
+    GainPattern,
     PanelCells,
-    Pattern,
     RayPaths,
-    lit_fractions,
     polarisations,
+    visible_fractions,
 )
 from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene import Scene
 
-_VALUES_AT_ONCE = 1 << 22  # of antennas and elements
+_VALUES_PER_CHUNK = 1 << 22  # of antennas and elements
 _UP = (0.0, 0.0, 1.0)  # of V in ``RayPaths``
-_MOST_BITS = 8
+_MAX_BITS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class Metasurface:
     spacing: float
     amplitude: float | Float64[Tensor, "_ _"] = 1.0
     bits: int | None = None
-    pattern: Pattern | None = None
+    pattern: GainPattern | None = None
 
     def __post_init__(self) -> None:
         what = "of a metasurface"
@@ -89,10 +89,8 @@ class Metasurface:
         if bool((amplitude.detach() < 0).any()):
             raise InputError(f"expected amplitudes {what} of at least 0, got less; turn the phase")
         checked_number(self.spacing, f"spacing {what} [m]", 0.0, open_low=True)
-        if self.bits is not None and checked_count(self.bits, f"bits {what}", 1) > _MOST_BITS:
-            raise InputError(
-                f"expected at most {_MOST_BITS} bits {what}, got {self.bits}; use None"
-            )
+        if self.bits is not None and checked_count(self.bits, f"bits {what}", 1) > _MAX_BITS:
+            raise InputError(f"expected at most {_MAX_BITS} bits {what}, got {self.bits}; use None")
         found = {"position": place, "axes": axes, "phase": phase, "amplitude": amplitude}
         for name, value in found.items():
             object.__setattr__(self, name, value)
@@ -117,7 +115,7 @@ class Metasurface:
         assert isinstance(self.amplitude, Tensor)
         return torch.polar(self.amplitude.ravel(), phase)
 
-    def focused(self, tx: ArrayLike, target: ArrayLike, frequency: float) -> "Metasurface":
+    def focus(self, tx: ArrayLike, target: ArrayLike, frequency: float) -> "Metasurface":
         """The panel with phases that focus a transmitter on a point, added to its own.
 
         Args:
@@ -127,7 +125,7 @@ class Metasurface:
         """
         do = "give x, y, z"
         ends = [checked_tensor(p, (3,), "ends of a focus [m]", do) for p in (tx, target)]
-        elements = self.cells.places
+        elements = self.cells.centers
         length = (elements[:, None] - torch.stack(ends)).norm(dim=2).sum(1)
         turn = 2 * math.pi * frequency / SPEED_OF_LIGHT * length
         return replace(self, phase=self.phase + turn.view(self.phase.shape))
@@ -140,9 +138,9 @@ def panel_response(
     rx: Float64[Tensor, "rx 3"],
     frequency: float,
     *,
-    width: float = 0.0,
+    blur: float = 0.0,
     boundary: bool = True,
-    far: bool = False,
+    far_field: bool = False,
 ) -> Complex128[Tensor, "tx rx"]:
     """The sum over a panel's elements for fields that a mirror keeps, isotropic antennas.
 
@@ -153,44 +151,51 @@ def panel_response(
         panel: The metasurface.
         tx, rx: Places of the antennas [m].
         frequency: [Hz].
-        width: Added to the width over which shadows end on the panel [m].
+        blur: Added to the width over which shadows end on the panel [m].
         boundary: False leaves out of derivatives that shadows move over the panel.
-        far: Waves are plane over the panel: quicker, right beyond 2D²/λ.
+        far_field: Waves are plane over the panel: quicker, right beyond 2D²/λ.
     """
     cells, k = panel.cells, 2 * math.pi * frequency / SPEED_OF_LIGHT
     both = torch.cat([tx, rx])
-    lit = lit_fractions(scene, both, cells, width=width, boundary=boundary)
-    sent = _waves(panel, cells, tx, lit[: len(tx)], k, far)
+    lit = visible_fractions(scene, both, cells, blur=blur, boundary=boundary)
+    sent = _element_waves(panel, cells, tx, lit[: len(tx)], k, far_field)
     weights = panel.response
     scale = panel.spacing**2 * k / (2 * math.pi)
     seen = (lit[len(tx) :] > 0).any(1) & bool((lit[: len(tx)] > 0).any())
     live = torch.nonzero(seen)[:, 0]
-    heavy = len(live) * len(weights) > _VALUES_AT_ONCE
+    heavy = len(live) * len(weights) > _VALUES_PER_CHUNK
     found = [torch.zeros(len(tx), 0, dtype=torch.complex128)]
 
-    def total(places: Tensor, lit: Tensor) -> Tensor:
-        wave, cosine = _waves(panel, cells, places, lit, k, far)
+    def sum_elements(positions: Tensor, visible: Tensor) -> Tensor:
+        wave, cosine = _element_waves(panel, cells, positions, visible, k, far_field)
         first = sent[0] * weights
         if panel.pattern is not None:
             return (first * sent[1]) @ (wave * cosine).T
         half = (first * sent[1]) @ (wave * (cosine > 0)).T
         return 0.5 * (half + (first * (sent[1] > 0)) @ (wave * cosine).T)
 
-    for some in live.split(max(1, _VALUES_AT_ONCE // len(weights))):
+    for some in live.split(max(1, _VALUES_PER_CHUNK // len(weights))):
         rows = rx[some], lit[len(tx) + some]
-        found.append(checkpoint(total, *rows, use_reentrant=False) if heavy else total(*rows))
+        found.append(
+            checkpoint(sum_elements, *rows, use_reentrant=False) if heavy else sum_elements(*rows)
+        )
     sums = torch.zeros(len(tx), len(rx), dtype=torch.complex128)
     return sums.index_copy(1, live, -1j / (2 * k) * scale * torch.cat(found, 1))
 
 
-def _waves(
-    panel: Metasurface, cells: PanelCells, places: Tensor, lit: Tensor, k: float, far: bool
+def _element_waves(
+    panel: Metasurface,
+    cells: PanelCells,
+    positions: Tensor,
+    visible: Tensor,
+    wave_number: float,
+    far_field: bool,
 ) -> tuple[Complex128[Tensor, "place element"], Float64[Tensor, "place element"]]:
     """Wave of each place at each element, over its phase at the centre, and its obliquity."""
-    whole = (places - panel.position) @ panel.axes
+    whole = (positions - panel.position) @ panel.axes
     reach = whole.norm(dim=1, keepdim=True)
     shift = -whole[:, :2] @ cells.offsets.T
-    if far:
+    if far_field:
         later, length = shift / reach, reach.expand_as(shift)
     else:
         # The difference of squares is exact where that of lengths would cancel.
@@ -200,7 +205,7 @@ def _waves(
     if panel.pattern is None:
         obliquity = whole[:, 2:].clamp_min(0) / length
     else:
-        aside = whole[:, None, :2] - (0 if far else cells.offsets)
+        aside = whole[:, None, :2] - (0 if far_field else cells.offsets)
         up = whole[:, None, 2:].expand(-1, len(cells.offsets), 1)
         gain = panel.pattern.gain(
             torch.cat([aside.expand(*up.shape[:2], 2), up], 2) / length[..., None]
@@ -208,7 +213,7 @@ def _waves(
         some = gain > 0  # a root of zero has no derivative
         # Of a cell of λ/2, π is the gain that takes all of what falls on it.
         obliquity = torch.where(some, torch.where(some, gain, 1.0) / math.pi, 0.0).sqrt()
-    return torch.polar(lit / length, -k * later), obliquity
+    return torch.polar(visible / length, -wave_number * later), obliquity
 
 
 def panel_paths(
@@ -218,9 +223,9 @@ def panel_paths(
     rx: ArrayLike,
     frequency: float,
     *,
-    width: float = 0.0,
+    blur: float = 0.0,
     boundary: bool = True,
-    far: bool = False,
+    far_field: bool = False,
 ) -> RayPaths:
     """Paths over metasurfaces: one for each panel and link, whose coefficient sums up its elements.
 
@@ -234,10 +239,10 @@ def panel_paths(
         tx: Transmitters, [3] or [tx, 3] in the world [m].
         rx: Receivers, [3] or [rx, 3] [m].
         frequency: Of the coefficients [Hz].
-        width: Added to the width over which shadows end on a panel [m]; more than 0 smooths the
+        blur: Added to the width over which shadows end on a panel [m]; more than 0 smooths the
             landscape of a fit.
         boundary: False leaves out of derivatives that shadows move over panels, for ablation.
-        far: Waves are plane over a panel: quicker, right beyond 2D²/λ.
+        far_field: Waves are plane over a panel: quicker, right beyond 2D²/λ.
 
     Raises:
         InputError: Wrong shapes or numbers, or an antenna within a spacing of a panel.
@@ -245,18 +250,25 @@ def panel_paths(
     Source: derivations §12.
     """
     several = [panels] if isinstance(panels, Metasurface) else list(panels)
-    ends = [_places(place, what) for place, what in ((tx, "tx"), (rx, "rx"))]
+    ends = [_check_positions(place, what) for place, what in ((tx, "tx"), (rx, "rx"))]
     checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-    checked_number(width, "width of shadows [m]", 0.0)
+    checked_number(blur, "width of shadows [m]", 0.0)
     counts = len(ends[0]), len(ends[1])
     up = torch.tensor(_UP, dtype=torch.float64)
     source = torch.arange(counts[0]).repeat_interleave(counts[1])
     target = torch.arange(counts[1]).repeat(counts[0])
     rows: list[RayPaths] = []
     for panel in several:
-        _require_off(panel, torch.cat(ends))
+        _require_clearance(panel, torch.cat(ends))
         total = panel_response(
-            scene, panel, ends[0], ends[1], frequency, width=width, boundary=boundary, far=far
+            scene,
+            panel,
+            ends[0],
+            ends[1],
+            frequency,
+            blur=blur,
+            boundary=boundary,
+            far_field=far_field,
         ).ravel()
         link = torch.nonzero(total.detach() != 0)[:, 0]
         ways = [
@@ -292,10 +304,10 @@ def panel_paths(
     found = rows[0]
     for more in rows[1:]:
         found = found + more
-    return found.sorted()
+    return found.sort_rows()
 
 
-def _places(value: ArrayLike, what: str) -> Tensor:
+def _check_positions(value: ArrayLike, what: str) -> Tensor:
     given = torch.as_tensor(value, dtype=torch.float64)
     given = given[None] if given.ndim == 1 else given
     found = checked_tensor(given, (None, 3), f"{what} places [m]", "give x, y, z of each")
@@ -304,8 +316,8 @@ def _places(value: ArrayLike, what: str) -> Tensor:
     return found
 
 
-def _require_off(panel: Metasurface, places: Tensor) -> None:
-    local = (places.detach() - panel.position.detach()) @ panel.axes.detach()
+def _require_clearance(panel: Metasurface, positions: Tensor) -> None:
+    local = (positions.detach() - panel.position.detach()) @ panel.axes.detach()
     half = 0.5 * panel.spacing * torch.tensor(panel.phase.shape, dtype=torch.float64)
     beyond = (local[:, :2].abs() - half).clamp_min(0)
     if float((beyond.square().sum(1) + local[:, 2].square()).min()) < panel.spacing**2:

@@ -12,11 +12,11 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.channel import trace_paths
-from invertwin.limits import Angle, Count, NonNegative, Positive, Share
+from invertwin.limits import Angle, Count, NonNegative, Positive, UnitFraction
 from invertwin.links.metasurface.panel import Metasurface, panel_response
-from invertwin.links.metasurface.wall_path import PlacedPanel
+from invertwin.links.metasurface.wall_path import PanelPlacement
 from invertwin.links.responses import frequency_response
-from invertwin.runtime.progress import told
+from invertwin.runtime.progress import track
 from invertwin.scene import Scene
 
 Trial = tuple[float, float, tuple[float, float]]
@@ -73,7 +73,7 @@ class Coverage:
     receivers: Float64[Tensor, "rx 3"]
     frequency: float
     direct: Float64[Tensor, " rx"]
-    share: Share = 0.1
+    share: UnitFraction = 0.1
 
     @classmethod
     def of(
@@ -122,7 +122,7 @@ class Coverage:
             self.tx[None],
             self.receivers,
             self.frequency,
-            width=width,
+            blur=width,
             boundary=boundary,
         )[0]
         return self.direct + over.real.square() + over.imag.square()
@@ -206,7 +206,7 @@ class Found:
 
 
 @dataclass(frozen=True, eq=False)
-class Placing:
+class PanelDesign:
     """A panel, what it may do, and what it is for.
 
     Attributes:
@@ -221,12 +221,12 @@ class Placing:
 
     coverage: Coverage
     panel: Metasurface
-    make: Callable[[float, float, Sequence[float]], PlacedPanel]
+    make: Callable[[float, float, Sequence[float]], PanelPlacement]
     yaw_limit: Angle
     spread_limit: Angle
     batch: int
 
-    def level(self, module: PlacedPanel, coverage: Coverage | None = None) -> float:
+    def level(self, module: PanelPlacement, coverage: Coverage | None = None) -> float:
         """The aim of a placed panel [dB].
 
         Args:
@@ -237,13 +237,13 @@ class Placing:
         with torch.no_grad():
             return float(aim.aim(module(self.panel)))
 
-    def module(self, state: dict[str, Tensor]) -> PlacedPanel:
+    def module(self, state: dict[str, Tensor]) -> PanelPlacement:
         """A module with the values of a search's end."""
         module = self.make(0.0, 0.0, (0.0, 0.0))
         module.load_state_dict(state)
         return module
 
-    def drawn(self, generator: torch.Generator, count: int = 1) -> list[PlacedPanel]:
+    def drawn(self, generator: torch.Generator, count: int = 1) -> list[PanelPlacement]:
         """Modules at random places, yaws and spreads, each from a slice of its own of every range.
 
         Args:
@@ -264,10 +264,10 @@ class Placing:
         ]
 
     @property
-    def _example(self) -> PlacedPanel:
+    def _example(self) -> PanelPlacement:
         return self.make(0.0, 0.0, (0.0, 0.0))
 
-    def keep_inside(self, module: PlacedPanel) -> None:
+    def keep_inside(self, module: PanelPlacement) -> None:
         """Move values that have left their ranges back to the ends."""
         with torch.no_grad():
             module.yaw.clamp_(-self.yaw_limit, self.yaw_limit)
@@ -277,7 +277,7 @@ class Placing:
 
     def descend(
         self,
-        module: PlacedPanel,
+        module: PanelPlacement,
         steps: int,
         settings: Descent,
         *,
@@ -327,7 +327,7 @@ class Placing:
         generator = torch.Generator().manual_seed(seed)
         scouts = self.drawn(generator, settings.scouts)
         scouts.sort(key=self.level, reverse=True)
-        tracks: list[PlacedPanel] = []
+        tracks: list[PanelPlacement] = []
         for scout in scouts:
             if len(tracks) < settings.tracks and all(self._apart(scout, own) for own in tracks):
                 tracks.append(scout)
@@ -346,7 +346,7 @@ class Placing:
         state = {name: value.clone() for name, value in best.state_dict().items()}
         return Found(state, self.level(best), settings.evaluations)
 
-    def _apart(self, first: PlacedPanel, second: PlacedPanel) -> bool:
+    def _apart(self, first: PanelPlacement, second: PanelPlacement) -> bool:
         """Whether two panels stand at places that are tracks of their own."""
         length = first.path.length
         gap = abs(float(first.along.detach() - second.along.detach()))
@@ -383,7 +383,7 @@ class Placing:
                 found.history.append((found.evaluations, level))
         return found
 
-    def _disturb(self, module: PlacedPanel, size: float, generator: torch.Generator) -> None:
+    def _disturb(self, module: PanelPlacement, size: float, generator: torch.Generator) -> None:
         """A random move, of a share of the ranges."""
         u = torch.randn(8, generator=generator, dtype=torch.float64)
         with torch.no_grad():
@@ -422,7 +422,7 @@ class Placing:
 
     def exhaustive(self, trials: Sequence[Trial]) -> Float64[Tensor, " trial"]:
         """The aim of every trial [dB]."""
-        levels = [self.level(self.make(*trial)) for trial in told(trials, "exhaustive grid")]
+        levels = [self.level(self.make(*trial)) for trial in track(trials, "exhaustive grid")]
         return torch.tensor(levels, dtype=torch.float64)
 
 

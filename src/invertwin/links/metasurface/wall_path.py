@@ -13,19 +13,19 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links.metasurface.panel import Metasurface
 
-_DO = "give x, y of at least two corners, the room on the left"
+_CORNERS_ADVICE = "give x, y of at least two corners, the room on the left"
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
-class _Piece:
+class _PathSegment:
     """A straight or round piece of a path: where it begins, and its bend [1/m], left positive."""
 
-    begin: float
+    offset: float
     length: float
     start: Tensor
-    along: Tensor
-    bend: float
+    direction: Tensor
+    curvature: float
 
 
 class WallPath:
@@ -52,37 +52,43 @@ class WallPath:
         radius: float = 0.2,
         closed: bool = False,
     ) -> None:
-        flat = checked_tensor(corners, (None, 2), "corners of a path along walls [m]", _DO)
+        flat = checked_tensor(
+            corners, (None, 2), "corners of a path along walls [m]", _CORNERS_ADVICE
+        )
         if len(flat) < 2 + closed:
-            raise InputError(f"expected more corners of a path along walls, got {len(flat)}; {_DO}")
+            raise InputError(
+                f"expected more corners of a path along walls, got {len(flat)}; {_CORNERS_ADVICE}"
+            )
         level = checked_number(height, "height of a path [m]", -math.inf)
         bow = checked_number(radius, "radius of corners [m]", 0.0, open_low=True)
         points = torch.cat([flat, torch.full((len(flat), 1), level, dtype=torch.float64)], 1)
         self.closed = closed
-        self._pieces = _pieces(points, bow, closed)
-        self.length = self._pieces[-1].begin + self._pieces[-1].length
+        self._pieces = _build_segments(points, bow, closed)
+        self.length = self._pieces[-1].offset + self._pieces[-1].length
 
-    def at(self, along: Float64[Tensor, ""]) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
+    def locate(
+        self, distance: Float64[Tensor, ""]
+    ) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
         """Position [m], and the unit vector into the room.
 
         Args:
-            along: Length of the path up to here [m]; beyond the ends of an open path it goes
+            distance: Length of the path up to here [m]; beyond the ends of an open path it goes
                 straight on, a closed one is gone round again.
         """
         if self.closed:
-            along = along - self.length * math.floor(float(along.detach()) / self.length)
-        here = float(along.detach())
-        piece = next((p for p in self._pieces if here < p.begin + p.length), self._pieces[-1])
-        inward = torch.linalg.cross(_UP, piece.along)
-        rest = along - piece.begin
-        if not piece.bend:
-            return piece.start + rest * piece.along, inward
-        turn = rest * piece.bend
-        normal = inward * turn.cos() - piece.along * turn.sin()
-        return piece.start + (inward - normal) / piece.bend, normal
+            distance = distance - self.length * math.floor(float(distance.detach()) / self.length)
+        here = float(distance.detach())
+        piece = next((p for p in self._pieces if here < p.offset + p.length), self._pieces[-1])
+        inward = torch.linalg.cross(_UP, piece.direction)
+        rest = distance - piece.offset
+        if not piece.curvature:
+            return piece.start + rest * piece.direction, inward
+        turn = rest * piece.curvature
+        normal = inward * turn.cos() - piece.direction * turn.sin()
+        return piece.start + (inward - normal) / piece.curvature, normal
 
 
-def _pieces(points: Tensor, radius: float, closed: bool) -> list[_Piece]:
+def _build_segments(points: Tensor, radius: float, closed: bool) -> list[_PathSegment]:
     ends = torch.cat([points, points[:1]]) if closed else points
     sides = ends[1:] - ends[:-1]
     lengths = sides.norm(dim=1)
@@ -98,7 +104,7 @@ def _pieces(points: Tensor, radius: float, closed: bool) -> list[_Piece]:
             turns[n + 1] = math.atan2(cross, float(units[n] @ units[after]))
     turns[0] = turns[count] if closed else 0.0
     cuts = [radius * math.tan(abs(turn) / 2) for turn in turns]
-    found: list[_Piece] = []
+    found: list[_PathSegment] = []
     begin = 0.0
     for n in range(count):
         left = float(lengths[n]) - cuts[n] - cuts[n + 1]
@@ -108,17 +114,17 @@ def _pieces(points: Tensor, radius: float, closed: bool) -> list[_Piece]:
                 f"with a radius of {radius:g} m; lower the radius"
             )
         start = ends[n] + cuts[n] * units[n]
-        found.append(_Piece(begin, left, start, units[n], 0.0))
+        found.append(_PathSegment(begin, left, start, units[n], 0.0))
         begin += left
         if turns[n + 1]:
             bend = math.copysign(1 / radius, turns[n + 1])
             round_ = radius * abs(turns[n + 1])
-            found.append(_Piece(begin, round_, start + left * units[n], units[n], bend))
+            found.append(_PathSegment(begin, round_, start + left * units[n], units[n], bend))
             begin += round_
     return found
 
 
-class PlacedPanel(nn.Module):
+class PanelPlacement(nn.Module):
     """A module Metasurface → Metasurface: its place along walls, its yaw, and its phases.
 
     Phases are those of a focus that stays where it is when the panel moves, widened by a quadratic
@@ -170,7 +176,7 @@ class PlacedPanel(nn.Module):
 
     def forward(self, panel: Metasurface) -> Metasurface:
         """The panel where it stands, with its phases."""
-        place, normal = self.path.at(self.along)
+        place, normal = self.path.locate(self.along)
         turned = normal * self.yaw.cos() + torch.linalg.cross(_UP, normal) * self.yaw.sin()
         axes = torch.stack([torch.linalg.cross(_UP, turned), _UP, turned], 1)
         offsets = panel.cells.offsets
@@ -179,7 +185,7 @@ class PlacedPanel(nn.Module):
         bowed = 0.5 * wave_number * (offsets.square() / half) @ self.spread
         phase = panel.phase + self.shift + bowed.view(panel.phase.shape)
         placed = replace(panel, position=place, axes=axes, phase=phase)
-        return placed.focused(self._tx, self._target, self._frequency)
+        return placed.focus(self._tx, self._target, self._frequency)
 
     def values(self) -> dict[str, Tensor]:
         """Place [m], yaw and spread [rad] by name, for progress and reports."""

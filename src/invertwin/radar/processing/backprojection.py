@@ -8,7 +8,7 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar.radar import Radar, checked_beat, sampled
+from invertwin.radar.radar import Radar, checked_beat, require_sampled_waveform
 from invertwin.radar.waveform import unit_window
 
 # Linear interpolation between samples this much denser errs by (π/8)²/8 = 2 % at the very edge of a
@@ -40,7 +40,7 @@ def backproject_beat(
         InputError: The signal does not fit the radar, the radar has no beat signal, or a point
             lies beyond the unambiguous ranges, see ``Radar.range_limits``.
     """
-    waveform = sampled(radar)
+    waveform = require_sampled_waveform(radar)
     tx, rx = (places.to(beat.device) for places in radar.elements())
     flat = points.reshape(-1, 3).to(beat.device)
     middle = waveform.samples // 2
@@ -54,12 +54,12 @@ def backproject_beat(
     origin_delays, limits = radar.origin_delays.to(beat.device), radar.range_limits
     image = torch.zeros(len(flat), dtype=torch.complex128, device=beat.device)
     for frame in range(radar.frame_count):
-        to_tx, to_rx = distances(tx[frame], flat), distances(rx[frame], flat)
+        to_tx, to_rx = pairwise_distances(tx[frame], flat), pairwise_distances(rx[frame], flat)
         for sender in range(tx.shape[1]):
             delay = (to_tx[sender] + to_rx) / SPEED_OF_LIGHT - origin_delays[frame]
             _check_range(delay, limits)
             index = torch.remainder(delay * (waveform.step * length), length)
-            echo = between_samples(spectrum[frame, sender], index)
+            echo = interpolate_samples(spectrum[frame, sender], index)
             cycles = delay * (
                 waveform.start_frequency
                 + middle * waveform.step
@@ -72,8 +72,8 @@ def backproject_beat(
     return (image / channels).reshape(points.shape[:-1])
 
 
-def distances(
-    places: Float64[Tensor, "place 3"], points: Float64[Tensor, "point 3"]
+def pairwise_distances(
+    positions: Float64[Tensor, "place 3"], points: Float64[Tensor, "point 3"]
 ) -> Float64[Tensor, "place point"]:
     """Distances from every place to every point [m].
 
@@ -81,10 +81,10 @@ def distances(
         places, points: [m].
     """
     # The matrix product that cdist takes by default cancels digits.
-    return torch.cdist(places, points, compute_mode="donot_use_mm_for_euclid_dist")
+    return torch.cdist(positions, points, compute_mode="donot_use_mm_for_euclid_dist")
 
 
-def between_samples(
+def interpolate_samples(
     samples: Complex128[Tensor, "row sample"], index: Float64[Tensor, "row point"]
 ) -> Complex128[Tensor, "row point"]:
     """Interpolate linearly along each row at an index that may have a fraction.

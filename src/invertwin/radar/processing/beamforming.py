@@ -37,7 +37,7 @@ def beamform(
         return channels.abs().square().mean(1)[..., None, None]
     array = aperture(radar)
     array.check_resolved(grid)
-    if array.separable:
+    if array.is_separable:
         return _separable_power(channels, array, grid)
     both = array.beams(grid.u, grid.v, array.x[array.column], array.y[array.row]) * array.weight
     power = (both.to(channels) @ channels).abs().square().unflatten(1, (grid.u_count, grid.v_count))
@@ -62,14 +62,14 @@ def _separable_power(
 ) -> Float[Tensor, "frame range u v"]:
     plane = array.plane(channels.movedim(1, -1))
 
-    def steered(cosines: Tensor, places: Tensor, weight: Tensor) -> Tensor:
+    def steer(cosines: Tensor, places: Tensor, weight: Tensor) -> Tensor:
         return (array.steering(cosines, places) * (weight / weight.sum())).to(channels)
 
     if grid.v_count > 1:
-        v = steered(grid.v, array.y, array.y_taper * array.counts.sum(0))
+        v = steer(grid.v, array.y, array.y_taper * array.counts.sum(0))
         plane = torch.einsum("vy,frxy->frxv", v, plane)
     if grid.u_count > 1:
-        u = steered(grid.u, array.x, array.x_taper * array.counts.sum(1))
+        u = steer(grid.u, array.x, array.x_taper * array.counts.sum(1))
         plane = torch.einsum("ux,frxv->fruv", u, plane)
     power = plane.abs().square()
     if grid.u_count == 1:

@@ -13,7 +13,7 @@ from scipy.special import gammaincc, gammaincinv
 from scipy.stats import beta, f
 from torch import Tensor
 
-from invertwin.channel import Grid, differentiated
+from invertwin.channel import Grid, is_differentiated
 from invertwin.checks import check_shape
 from invertwin.errors import InputError
 from invertwin.radar.processing.doppler import velocity_axis, velocity_span
@@ -148,7 +148,7 @@ def point_cloud(
     _check_shapes(power, detections, expected, "frame, velocity, range, u, v")
     power, detections = power.to("cpu", torch.float64), detections.cpu()
     count = power.shape[1]
-    seen = _within_sphere(power, grid).flatten(3)
+    seen = _mask_visible_region(power, grid).flatten(3)
     strongest = seen.amax(-1)
     # The ends of the axis of range rates are neighbours.
     ends = ("nearest", "wrap", "nearest")
@@ -164,7 +164,7 @@ def point_cloud(
     rates = rates + _refinement(power, cell, 1, wrap=True) * span / count
     if fold is not None:
         rates = rates + fold.cpu()[frame, velocity, place] * span
-    return _refined(power, cell, rates, radar, grid)
+    return _refine_points(power, cell, rates, radar, grid)
 
 
 def peaks(
@@ -190,13 +190,13 @@ def peaks(
     """
     _refuse_gradients(power, "peaks")
     _check_shapes(power, detections, (radar.frame_count, *grid.shape), "frame, range, u, v")
-    seen = _within_sphere(power.to("cpu", torch.float64), grid)
+    seen = _mask_visible_region(power.to("cpu", torch.float64), grid)
     highest = torch.from_numpy(maximum_filter(seen.numpy(), (1, 3, 3, 3), mode="nearest"))
     found = detections.cpu()[..., None] & (seen == highest) & (seen > 0)
     frame, place, u, v = torch.nonzero(found, as_tuple=True)
     rates = torch.zeros(len(frame), dtype=torch.float64)
     cell = [frame, torch.zeros_like(frame), place, u, v]
-    return _refined(seen[:, None], cell, rates, radar, grid)
+    return _refine_points(seen[:, None], cell, rates, radar, grid)
 
 
 def _check_shapes(power: Tensor, detections: Tensor, expected: tuple[int, ...], axes: str) -> None:
@@ -205,12 +205,12 @@ def _check_shapes(power: Tensor, detections: Tensor, expected: tuple[int, ...], 
     check_shape(detections, expected[:3], "detections beside power", do)
 
 
-def _within_sphere(power: Tensor, grid: Grid) -> Tensor:
+def _mask_visible_region(power: Tensor, grid: Grid) -> Tensor:
     """The map with zeros where no direction exists."""
     return power.masked_fill(grid.u[:, None].square() + grid.v.square() > 1, 0.0)
 
 
-def _refined(
+def _refine_points(
     power: Tensor, cell: list[Tensor], rates: Tensor, radar: Radar, grid: Grid
 ) -> PointCloud:
     """Points at the cells, their ranges and directions between the bins, and their places."""
@@ -247,7 +247,7 @@ def world_positions(
 
 
 def _refuse_gradients(power: Tensor, name: str) -> None:
-    if differentiated(power):
+    if is_differentiated(power):
         raise InputError(
             f"expected power without gradients in {name}, got a tensor that has them; a detection "
             "is not differentiable: pass power.detach(), and fit with the power itself"
@@ -296,10 +296,10 @@ def _training_cells(
 
 
 @lru_cache(maxsize=1024)
-def _ordered_factor(cells: int, place: int, false_alarm: float, looks: int) -> float:
+def _ordered_factor(cells: int, rank: int, false_alarm: float, looks: int) -> float:
     """Multiple of the place-th of the cells that noise exceeds with the given probability."""
     nodes = (np.arange(_QUADRATURE) + 0.5) / _QUADRATURE
-    weights = beta.pdf(nodes, place, cells - place + 1)
+    weights = beta.pdf(nodes, rank, cells - rank + 1)
     levels, weights = gammaincinv(looks, nodes), weights / weights.sum()
 
     def excess(factor: float) -> float:

@@ -248,7 +248,7 @@ def _snapshots(
     plane = array.plane(channels).flatten(-2)[..., taken.to(channels.device)]
     x = array.x.repeat_interleave(rows)[taken]
     y = array.y.repeat(columns)[taken]
-    uniform = bool(taken.all()) and _uniform(array.x) and _uniform(array.y)
+    uniform = bool(taken.all()) and _is_uniform(array.x) and _is_uniform(array.y)
     if (smoothing is not None or forward_backward) and not uniform:
         raise InputError(
             "expected a uniform rectangle of virtual elements for smoothing and "
@@ -271,6 +271,6 @@ def _snapshots(
     return _Snapshots(plane, array, x, y)
 
 
-def _uniform(places: Float64[Tensor, " place"]) -> bool:
-    steps = places.diff()
+def _is_uniform(positions: Float64[Tensor, " place"]) -> bool:
+    steps = positions.diff()
     return len(steps) < 2 or bool((steps - steps.mean()).abs().max() <= _UNIFORMITY * steps.mean())

@@ -94,7 +94,7 @@ def range_doppler(
             f"expected at least {chirps.count} bins, one per chirp, got {bins}; use fewer chirps "
             "instead"
         )
-    profile = range_profile(beat.flatten(0, 1), _repeated(radar, chirps.count), grid)
+    profile = range_profile(beat.flatten(0, 1), _repeat_poses(radar, chirps.count), grid)
     slow = profile.unflatten(0, expected)
     return _doppler_transform(slow.movedim(1, -1), window, bins).movedim(-1, 1)
 
@@ -160,7 +160,9 @@ def resolve_fold(
     if not candidates:
         raise InputError("expected at least one candidate, got none; (0, -1, 1) are usual")
     peaks = [
-        _steered(compensate_tdm(spectrum.detach(), radar, chirps, fold), radar, grid).amax((-2, -1))
+        _steer_beams(compensate_tdm(spectrum.detach(), radar, chirps, fold), radar, grid).amax(
+            (-2, -1)
+        )
         for fold in candidates
     ]
     # Rounding errors must not decide between equals.
@@ -196,7 +198,7 @@ def range_doppler_angle(
         InputError: As these three.
     """
     spectrum = range_doppler(beat, radar, grid, chirps, window=window, bins=bins)
-    return _steered(compensate_tdm(spectrum, radar, chirps, fold), radar, grid)
+    return _steer_beams(compensate_tdm(spectrum, radar, chirps, fold), radar, grid)
 
 
 def micro_doppler(
@@ -235,11 +237,11 @@ def micro_doppler(
     return Spectrogram(power, times, velocity_axis(radar, chirps, length))
 
 
-def _steered(
+def _steer_beams(
     spectrum: Complex[Tensor, "frame velocity tx rx range"], radar: Radar, grid: Grid
 ) -> Float[Tensor, "frame velocity range u v"]:
     frames, count = spectrum.shape[:2]
-    power = beamform(spectrum.flatten(0, 1), _repeated(radar, count), grid)
+    power = beamform(spectrum.flatten(0, 1), _repeat_poses(radar, count), grid)
     return power.unflatten(0, (frames, count))
 
 
@@ -250,6 +252,6 @@ def _doppler_transform(
     return torch.fft.fftshift(torch.fft.fft(slow * weight, bins), dim=-1)
 
 
-def _repeated(radar: Radar, count: int) -> Radar:
+def _repeat_poses(radar: Radar, count: int) -> Radar:
     """The radar with each pose as often as it has chirps or bins."""
     return radar.frames(torch.arange(radar.frame_count).repeat_interleave(count))

@@ -21,16 +21,16 @@ from invertwin.radar.processing.doppler import (
 from invertwin.radar.processing.reflectors import noise_power
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
-from invertwin.runtime.progress import told
+from invertwin.runtime.progress import track
 
 # Bins of range rate on either side of zero where slow drift of what stands still is seen, and how
 # far below the still echo of its range such drift stays.
-_STILL_BINS = 2
-_DRIFT = 1e-3
+_STATIC_BINS = 2
+_DRIFT_LEVEL = 1e-3
 # Bins of range rate of which one range alone tells its noise.
 _OWN_NOISE = 16
 # Probability that noise alone is taken for something that moves, and the rounding of samples.
-_FALSE_MOVER = 1e-3
+_FALSE_ALARM_RATE = 1e-3
 _ROUNDING = 1e-12
 _BINS_AT_ONCE = 2e7  # of range rate, range, u, v
 
@@ -72,20 +72,20 @@ class DopplerMaps:
         grid: Ranges and directions.
         velocities: Range rates [m/s].
         range_doppler: Mean power of the channels [velocity, range].
-        everything: Power over range and direction, all range rates summed [range, u, v].
-        movers: Power over range and direction of the chirps without their mean, which is what
+        total_power: Power over range and direction, all range rates summed [range, u, v].
+        moving_power: Power over range and direction of the chirps without their mean, which is what
             stands still [range, u, v]; None = nothing moves.
-        strongest: The strongest cell of all.
-        mover: The strongest cell that moves; None = nothing is above the noise.
+        strongest_peak: The strongest cell of all.
+        moving_peak: The strongest cell that moves; None = nothing is above the noise.
     """
 
     grid: Grid
     velocities: Float64[Tensor, " velocity"]
     range_doppler: Float[Tensor, "velocity range"]
-    everything: Float64[Tensor, "range u v"]
-    movers: Float64[Tensor, "range u v"] | None
-    strongest: Peak
-    mover: Peak | None
+    total_power: Float64[Tensor, "range u v"]
+    moving_power: Float64[Tensor, "range u v"] | None
+    strongest_peak: Peak
+    moving_peak: Peak | None
 
 
 def doppler_maps(
@@ -117,17 +117,19 @@ def doppler_maps(
     radar, signal = radar.frames([frame]), beat[frame : frame + 1]
     cube = range_doppler(signal, radar, grid, chirps)
     flat = cube.abs().square().mean((2, 3))[0]
-    everything, strongest = _summed(cube, radar, grid, chirps, torch.ones_like(flat) > 0)
+    everything, strongest = _sum_range_rates(cube, radar, grid, chirps, torch.ones_like(flat) > 0)
     moving = range_doppler(signal - signal.mean(1, keepdim=True), radar, grid, chirps)
-    cells = _moving_cells(moving.abs().square().mean((2, 3))[0], flat, len(radar.virtual_positions))
+    cells = _detect_moving_cells(
+        moving.abs().square().mean((2, 3))[0], flat, len(radar.virtual_positions)
+    )
     movers, mover = None, None
     if bool(cells.any()):
-        movers, mover = _summed(moving, radar, grid, chirps, cells)
+        movers, mover = _sum_range_rates(moving, radar, grid, chirps, cells)
     velocities = velocity_axis(radar, chirps)
     return DopplerMaps(grid, velocities, flat, everything, movers, strongest, mover)
 
 
-def _summed(
+def _sum_range_rates(
     cube: Complex[Tensor, "frame velocity tx rx range"],
     radar: Radar,
     grid: Grid,
@@ -141,32 +143,32 @@ def _summed(
     total = torch.zeros(grid.shape, dtype=torch.float64)
     seen = (grid.u[:, None].square() + grid.v.square()) <= 1
     peaks: list[Peak] = []
-    for rows in told(torch.arange(chirps.count).split(chunk), "range rates"):
+    for rows in track(torch.arange(chirps.count).split(chunk), "range rates"):
         power = beamform(cube[rows], radar.frames([0] * len(rows)), grid).double() * seen
         total += power.sum(0)
         power = power * candidates[rows][:, :, None, None]
         peaks += [
-            peak_of(part, grid, float(rate))
+            find_peak(part, grid, float(rate))
             for part, rate in zip(power, velocities[rows], strict=True)
         ]
     return total, max(peaks, key=attrgetter("power"))
 
 
-def _moving_cells(
+def _detect_moving_cells(
     moving: Float[Tensor, "velocity range"], flat: Float[Tensor, "velocity range"], looks: int
 ) -> Bool[Tensor, "velocity range"]:
     """Cells above what noise and drift explain."""
     moving, middle = moving.double(), len(flat) // 2
     rows = [noise_power(row, looks) for row in moving.T] if len(flat) >= _OWN_NOISE else [0.0]
     level = torch.tensor(rows, dtype=torch.float64).clamp_min(noise_power(moving, looks))
-    factor = float(gammainccinv(looks, _FALSE_MOVER / moving.numel())) / looks
+    factor = float(gammainccinv(looks, _FALSE_ALARM_RATE / moving.numel())) / looks
     least = (factor * level).clamp_min(_ROUNDING * float(flat.max()))
-    slow = (torch.arange(len(flat)) - middle).abs() <= _STILL_BINS
-    drift = torch.where(slow[:, None], _DRIFT * flat[middle].double(), 0.0)
+    slow = (torch.arange(len(flat)) - middle).abs() <= _STATIC_BINS
+    drift = torch.where(slow[:, None], _DRIFT_LEVEL * flat[middle].double(), 0.0)
     return (moving > least) & (moving > drift)
 
 
-def sharp_map(
+def high_resolution_map(
     profile: Complex[Tensor, "snapshot tx rx range"],
     radar: Radar,
     grid: Grid,
@@ -194,14 +196,14 @@ def sharp_map(
     return power * (grid.u[:, None].square() + grid.v.square() <= 1)
 
 
-def snapshots_of(
+def doppler_snapshots(
     beat: Complex[Tensor, "frame chirp tx rx sample"],
     radar: Radar,
     grid: Grid,
     chirps: Chirps,
     frame: int,
 ) -> Complex[Tensor, "velocity tx rx range"]:
-    """The bins of range rate of one frame as snapshots for `sharp_map`.
+    """The bins of range rate of one frame as snapshots for `high_resolution_map`.
 
     Args:
         beat: Chirps of every transmitter.
@@ -215,7 +217,7 @@ def snapshots_of(
     return compensate_tdm(cube, radar, chirps)[0]
 
 
-def peak_of(spectrum: Float[Tensor, "range u v"], grid: Grid, velocity: float = 0.0) -> Peak:
+def find_peak(spectrum: Float[Tensor, "range u v"], grid: Grid, velocity: float = 0.0) -> Peak:
     """The strongest cell of a map of one range rate.
 
     Args:

@@ -6,7 +6,7 @@ import numpy as np
 
 from invertwin.errors import InputError
 from invertwin.radar.processing.detection import PointCloud
-from invertwin.storage.folders import replacing
+from invertwin.storage.folders import replace_file
 
 
 def save_points(path: str | Path, points: PointCloud) -> None:
@@ -37,7 +37,7 @@ def save_points(path: str | Path, points: PointCloud) -> None:
     order = np.argsort(-columns["power"], kind="stable")
     columns["power"] = 10 * np.log10(columns["power"])
     table = np.stack([values[order] for values in columns.values()], axis=1).astype("<f4")
-    with replacing(file) as part:
+    with replace_file(file) as part:
         part.write_bytes(header(list(columns), len(table)).encode("ascii") + table.tobytes())
 
 

@@ -27,21 +27,21 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.signal.range_profile import range_profile
 from invertwin.radar.waveform import unit_window
-from invertwin.runtime.progress import told
+from invertwin.runtime.progress import track
 
 # With fewer range rates the cells that train a threshold lie along range alone. Half of them may
 # then hold other reflectors.
-_FEW_RATES = 13
+_MIN_RATES_2D = 13
 _GUARD, _TRAINING, _RANK = (0, 4), (0, 16), 0.5
 # What stronger reflectors leave at a point, in power, below which it counts as their sidelobe.
 _ABOVE_SIDELOBES = 4.0
 # A further direction in one cell has at least this part of the strongest one's power: errors of
 # gains and phases of a board's channels leave that much.
-_WEAKEST_BESIDE = 0.1
-_FALSE_DIRECTION = 1e-3
+_MIN_RELATIVE_POWER = 0.1
+_FALSE_DIRECTION_RATE = 1e-3
 
 
-def points_of(
+def detect_points(
     beat: Complex[Tensor, "frame chirp tx rx sample"],
     radar: Radar,
     grid: Grid,
@@ -74,7 +74,7 @@ def points_of(
     flat = cube.abs().square().mean((1, 2))
     noise = noise_power(flat, looks)
     rows: list[list[float]] = []
-    for v, r in told(_cells(flat, radar, grid, looks), "points"):
+    for v, r in track(_find_cells(flat, radar, grid, looks), "points"):
         rate = float(rates[v]) + _vertex(flat[[v - 1, v, (v + 1) % len(flat)], r]) * span / len(
             flat
         )
@@ -82,7 +82,7 @@ def points_of(
         place = float(grid.ranges[r]) + _vertex(flat[v, near]) * grid.range_step
         rows += [
             [place, rate, *direction]
-            for direction in _directions(cube[v, :, :, r], radar, grid, noise)
+            for direction in _resolve_directions(cube[v, :, :, r], radar, grid, noise)
         ]
     table = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5)
     ranges, found, u, v, power = table.T
@@ -92,7 +92,7 @@ def points_of(
     )
 
 
-def points_csv(points: PointCloud) -> str:
+def format_points_csv(points: PointCloud) -> str:
     """One line per point, the strongest first."""
     lines = ["range_m,velocity_m_s,u,v,power_db,x_m,y_m,z_m"]
     for i in points.power.argsort(descending=True).tolist():
@@ -114,12 +114,12 @@ def noise_power(power: Float[Tensor, "*cell"], looks: int, empty: float = 0.5) -
     return level * looks / float(gammaincinv(looks, empty))
 
 
-def _cells(
+def _find_cells(
     flat: Float64[Tensor, "velocity range"], radar: Radar, grid: Grid, looks: int
 ) -> list[tuple[int, int]]:
     """Bins of range rate and range that hold reflectors, the strongest first."""
     around = maximum_filter(flat.numpy(), 3, mode=("wrap", "nearest"))  # type: ignore[arg-type]
-    found = _detected(flat, looks) & (flat == torch.from_numpy(around)) & (flat > 0)
+    found = _threshold_cells(flat, looks) & (flat == torch.from_numpy(around)) & (flat > 0)
     places = torch.nonzero(found)
     places = places[flat[found].argsort(descending=True)]
     left = torch.ones(len(places), dtype=torch.bool)
@@ -129,15 +129,15 @@ def _cells(
             left[i] = False
             continue
         chosen.append((v, r))
-        response = _response(places - places[i], len(flat), radar, grid)
+        response = _sidelobe_response(places - places[i], len(flat), radar, grid)
         reach += (flat[v, r] * response).sqrt()
     return chosen
 
 
-def _detected(
+def _threshold_cells(
     flat: Float64[Tensor, "velocity range"], looks: int
 ) -> Bool[Tensor, "velocity range"]:
-    if len(flat) >= _FEW_RATES:
+    if len(flat) >= _MIN_RATES_2D:
         return cell_averaging_cfar(flat, looks=looks)
     rows = [
         ordered_statistics_cfar(
@@ -148,8 +148,8 @@ def _detected(
     return torch.cat(rows)
 
 
-def _response(
-    apart: Int64[Tensor, "cell 2"], count: int, radar: Radar, grid: Grid
+def _sidelobe_response(
+    offsets: Int64[Tensor, "cell 2"], count: int, radar: Radar, grid: Grid
 ) -> Float64[Tensor, " cell"]:
     """Highest power of a point in cells apart from its own, by the windows over chirps and samples.
 
@@ -157,7 +157,7 @@ def _response(
     """
     weight = unit_window("hamming", count).to(torch.complex128)
     beside = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
-    rates, ranges = (apart.double()[..., None] + beside).unbind(1)
+    rates, ranges = (offsets.double()[..., None] + beside).unbind(1)
     turns = rates[..., None] / count * torch.arange(count)
     over_rates = (torch.exp(2j * math.pi * turns) @ weight).abs().square()
     distance = (ranges * grid.range_step).flatten()
@@ -165,27 +165,29 @@ def _response(
     return over_rates.amax(1) * over_ranges.amax(1)
 
 
-def _directions(
+def _resolve_directions(
     cell: Complex128[Tensor, "tx rx"], radar: Radar, grid: Grid, noise: float
 ) -> list[list[float]]:
     """Directions u, v and powers in one cell, the strongest first."""
     channels, left = cell.flatten(), cell
     one = replace(grid, range_start=0.0, range_count=1)
     seen = grid.u[:, None].square() + grid.v.square() <= 1
-    false = -math.log(_FALSE_DIRECTION / float(seen.sum()))
+    false = -math.log(_FALSE_DIRECTION_RATE / float(seen.sum()))
     places: list[tuple[float, float]] = []
     powers: list[float] = []
     for _ in range(max(1, len(channels) // 2)):
         power = beamform(left[None, :, :, None], radar, one)[0, 0].double() * seen
         at = int(power.argmax())
         u, v = float(grid.u[at // grid.v_count]), float(grid.v[at % grid.v_count])
-        u, v = _refined(left.flatten(), radar, grid, u, v)
+        u, v = _refine_direction(left.flatten(), radar, grid, u, v)
         models = torch.stack([_plane_wave(radar, grid, *place) for place in [*places, (u, v)]], 1)
         amplitudes = torch.linalg.lstsq(models, channels[:, None]).solution
         found = amplitudes.abs().square()[:, 0].tolist()
-        if powers and found[-1] < max(_WEAKEST_BESIDE * powers[0], false * noise / len(channels)):
+        if powers and found[-1] < max(
+            _MIN_RELATIVE_POWER * powers[0], false * noise / len(channels)
+        ):
             break
-        if any(_beside(radar, (u, v), place) for place in places):
+        if any(_share_beam(radar, (u, v), place) for place in places):
             break
         places, powers = [*places, (u, v)], found
         left = (channels[:, None] - models @ amplitudes).reshape(cell.shape)
@@ -194,7 +196,7 @@ def _directions(
     return [[*place, power] for place, power in zip(places, powers, strict=True)]
 
 
-def _beside(radar: Radar, one: tuple[float, float], other: tuple[float, float]) -> bool:
+def _share_beam(radar: Radar, one: tuple[float, float], other: tuple[float, float]) -> bool:
     """Whether two directions are less than a beam apart."""
     du, dv = (abs(a - b) / w for a, b, w in zip(one, other, radar.beamwidth, strict=True))
     return math.hypot(du, dv) < 1
@@ -208,7 +210,7 @@ def _plane_wave(radar: Radar, grid: Grid, u: float, v: float) -> Complex128[Tens
     return torch.polar(torch.ones_like(phase), phase)
 
 
-def _refined(
+def _refine_direction(
     channels: Complex128[Tensor, " channel"], radar: Radar, grid: Grid, u: float, v: float
 ) -> tuple[float, float]:
     """The direction near one of the grid in which the channels add up best."""

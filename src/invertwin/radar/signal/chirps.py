@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel import Paths, alone
+from invertwin.channel import Paths, tracer_lock
 from invertwin.checks import check_fields
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
-from invertwin.radar.radar import Radar, sampled
+from invertwin.radar.radar import Radar, require_sampled_waveform
 from invertwin.radar.signal.nufft import (
     beat_of_delays,
     instants_derivative,
@@ -22,13 +22,13 @@ from invertwin.radar.signal.nufft import (
 )
 from invertwin.radar.signal.range_profile import beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, SampledWaveform, SteppedFrequency
-from invertwin.runtime.progress import told
+from invertwin.runtime.progress import track
 
 # Largest error of interpolating a path's phase factor between the instants of a ramp.
 _INTERPOLATION_ERROR = 1e-6
-_MOST_INSTANTS = 33
+_MAX_INSTANTS = 33
 
-Places = Callable[[float], Float64[Tensor, "path 3"]]
+PointTrajectory = Callable[[float], Float64[Tensor, "path 3"]]
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def moving_beat(
     radar: Radar,
     chirps: Chirps,
     *,
-    places: Places | None = None,
+    trajectory: PointTrajectory | None = None,
     tolerance: float = 1e-9,
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
     """Beat signals of a train of chirps, during which scattering points move.
@@ -123,7 +123,7 @@ def moving_beat(
         paths: Paths that ``trace_field`` gives for a scene with velocities.
         radar: One with samples, at rest within a frame.
         chirps: Timing.
-        places: World positions of the paths' points [m] at a time [s] after the start of the
+        trajectory: World positions of the paths' points [m] at a time [s] after the start of the
             frame, for motion that is not uniform; None = they move with their velocities.
         tolerance: Relative error of the sums, see ``beat_signal``.
 
@@ -131,9 +131,9 @@ def moving_beat(
         InputError: As ``beat_signal``; moving paths of several bounces; points so fast that a
             ramp cannot follow them.
     """
-    waveform = sampled(radar)
+    waveform = require_sampled_waveform(radar)
     check_paths(paths, radar, waveform)
-    if places is None and paths.velocity is None:
+    if trajectory is None and paths.velocity is None:
         beat = beat_signal(paths, radar, tolerance=tolerance)
         return beat[:, None].repeat(1, chirps.count, 1, 1, 1)
     if not torch.equal(paths.first, paths.last):
@@ -141,11 +141,11 @@ def moving_beat(
             "expected paths of one bounce, got paths whose first and last points differ; "
             "simulate their motion chirp by chirp with simulate_chirps(retrace=True)"
         )
-    train = Train(paths, radar, places or _uniform(paths), tolerance)
-    return every_ramp(chirps, radar.shape[1], train.ramp)
+    train = ChirpTrain(paths, radar, trajectory or _uniform_trajectory(paths), tolerance)
+    return simulate_chirp_train(chirps, radar.shape[1], train.simulate_ramp)
 
 
-def every_ramp(
+def simulate_chirp_train(
     chirps: Chirps,
     transmitters: int,
     ramp: Callable[[float, list[int]], Complex128[Tensor, "frame sender rx sample"]],
@@ -158,7 +158,7 @@ def every_ramp(
         ramp: Signals of one ramp, from its start [s] and the transmitters that send then.
     """
     rows = []
-    for starts in told(chirps.times(transmitters).tolist(), "chirps"):
+    for starts in track(chirps.times(transmitters).tolist(), "chirps"):
         signals = {}
         for start in sorted(set(starts)):
             senders = [tx for tx, time in enumerate(starts) if time == start]
@@ -186,7 +186,7 @@ def range_rate(paths: Paths, radar: Radar) -> Float64[Tensor, " path"]:
         return 0.5 * ((point - tx).norm(dim=1) + (point - rx).norm(dim=1))
 
     now = torch.zeros((), dtype=torch.float64, device=velocity.device)
-    with alone:
+    with tracer_lock:
         return torch.func.jvp(half_length, (now,), (torch.ones_like(now),))[1]
 
 
@@ -198,53 +198,55 @@ def sample_interval(waveform: SampledWaveform) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Train:
+class ChirpTrain:
     """Paths whose points move, and the ramps that see them.
 
     Attributes:
         paths: Their frames, coefficients, and delays at their first points.
         radar: One with samples.
-        places: Positions of the first points at a time; the last ones move with them.
+        trajectory: Positions of the first points at a time; the last ones move with them.
         tolerance: Relative error of the sums.
     """
 
     paths: Paths
     radar: Radar
-    places: Places
+    trajectory: PointTrajectory
     tolerance: float = 1e-9
 
-    def ramp(
-        self, start: float, senders: Sequence[int]
+    def simulate_ramp(
+        self, start: float, active_transmitters: Sequence[int]
     ) -> Complex128[Tensor, "frame sender rx sample"]:
         """Record one ramp with all receivers.
 
         Args:
             start: Start of the ramp [s].
-            senders: Transmitters that send at once.
+            active_transmitters: Transmitters that send at once.
         """
-        paths, waveform = self.paths, sampled(self.radar)
+        paths, waveform = self.paths, require_sampled_waveform(self.radar)
         device = paths.delay.device
         centers = [centre.to(device) for centre in (self.radar.link().tx, self.radar.link().rx)]
         span = paths.last - paths.first
-        segments = _length(paths.first, span, centers[0][paths.frame], centers[1][paths.frame])
+        segments = _segment_length(
+            paths.first, span, centers[0][paths.frame], centers[1][paths.frame]
+        )
         origins = self.radar.origin_delays.to(device)[paths.frame]
         inner = paths.delay - origins - segments / SPEED_OF_LIGHT
-        placed = self._placed(start, 1 if sample_interval(waveform) == 0 else 3)
+        placed = self._points_at_instants(start, 1 if sample_interval(waveform) == 0 else 3)
         if len(placed) > 1 and len(paths):
-            length = _length(placed, span, centers[0][paths.frame], centers[1][paths.frame])
+            length = _segment_length(placed, span, centers[0][paths.frame], centers[1][paths.frame])
             cycles = phase_cycles((length / SPEED_OF_LIGHT).detach(), waveform)
             bend = math.pi * float((cycles[0] - 2 * cycles[1] + cycles[2]).abs().max())
-            count = _instants(bend)
-            placed = placed if count == 3 else self._placed(start, count)
+            count = _count_instants(bend)
+            placed = placed if count == 3 else self._points_at_instants(start, count)
         transmitters, receivers = (places.to(device) for places in self.radar.elements())
-        signals: list[list[Tensor]] = [[] for _ in senders]
+        signals: list[list[Tensor]] = [[] for _ in active_transmitters]
         for frame in range(self.radar.frame_count):
             rows = torch.nonzero(paths.frame == frame)[:, 0]
-            points = self._when_scattered(placed[:, rows], centers[1][frame])
-            own, rest = paths.chosen(rows), inner[rows]
+            points = self._scattering_points(placed[:, rows], centers[1][frame])
+            own, rest = paths.select(rows), inner[rows]
             ends = points + span[rows]
             back = [(ends - place).norm(dim=-1) for place in receivers[frame]]
-            for tx, found in zip(senders, signals, strict=True):
+            for tx, found in zip(active_transmitters, signals, strict=True):
                 forth = (points - transmitters[frame, tx]).norm(dim=-1)
                 channels = [
                     beat_of_delays(
@@ -258,47 +260,47 @@ class Train:
                 found.append(torch.stack(channels))
         return torch.stack([torch.stack(found) for found in signals], dim=1)
 
-    def _placed(self, start: float, count: int) -> Float64[Tensor, "instant path 3"]:
+    def _points_at_instants(self, start: float, count: int) -> Float64[Tensor, "instant path 3"]:
         """The points at the instants of a ramp."""
-        waveform = sampled(self.radar)
+        waveform = require_sampled_waveform(self.radar)
         interval = sample_interval(waveform)
         instants = ramp_instants(waveform.samples, count) if interval else torch.zeros(1)
-        return torch.stack([self.places(start + interval * n) for n in instants.tolist()])
+        return torch.stack([self.trajectory(start + interval * n) for n in instants.tolist()])
 
-    def _when_scattered(
+    def _scattering_points(
         self, points: Float64[Tensor, "instant path 3"], receiver: Float64[Tensor, "3"]
     ) -> Float64[Tensor, "instant path 3"]:
         """The points at the times when they scattered what is received at the instants."""
         if len(points) == 1:
             return points
-        waveform = sampled(self.radar)
+        waveform = require_sampled_waveform(self.radar)
         per_sample = instants_derivative(waveform.samples, len(points)).to(points.device)
         velocity = torch.einsum("kl,lpc->kpc", per_sample, points) / sample_interval(waveform)
         lag = (points - receiver).norm(dim=-1, keepdim=True) / SPEED_OF_LIGHT
         return points - lag * velocity
 
 
-def _uniform(paths: Paths) -> Places:
+def _uniform_trajectory(paths: Paths) -> PointTrajectory:
     velocity = paths.velocity
     assert velocity is not None
     return lambda time: paths.first + velocity * time
 
 
-def _length(first: Tensor, span: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
+def _segment_length(first: Tensor, span: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
     return (first - tx).norm(dim=-1) + (first + span - rx).norm(dim=-1)
 
 
-def _instants(bend: float) -> int:
+def _count_instants(curvature: float) -> int:
     """Count the instants of a ramp that follow phases which bend by this much at its ends [rad].
 
     Of exp(jψ) with ψ of second degree over [-1, 1], the power h = (count + 1)/2 is the first that a
     polynomial through the instants misses, by ψʰ/h! · 2^(1 − count).
     """
-    for count in range(3, _MOST_INSTANTS + 1, 2):
+    for count in range(3, _MAX_INSTANTS + 1, 2):
         power = (count + 1) // 2
-        if bend**power / math.factorial(power) * 2.0 ** (1 - count) <= _INTERPOLATION_ERROR:
+        if curvature**power / math.factorial(power) * 2.0 ** (1 - count) <= _INTERPOLATION_ERROR:
             return count
     raise InputError(
         f"expected points whose phase is near to a line over a ramp, got one that bends by "
-        f"{bend:.3g} rad; check velocities [m/s] and times [s], or shorten the ramp"
+        f"{curvature:.3g} rad; check velocities [m/s] and times [s], or shorten the ramp"
     )

@@ -22,8 +22,8 @@ from torch import Tensor
 from invertwin.channel import Paths
 from invertwin.checks import check_fields, checked_number
 from invertwin.errors import InputError
-from invertwin.limits import RADIANS, NonNegative, Positive, Usual
-from invertwin.radar.radar import Radar, sampled
+from invertwin.limits import RADIANS, NonNegative, Positive, UsualValue
+from invertwin.radar.radar import Radar, require_sampled_waveform
 from invertwin.radar.signal.chirps import Chirps, moving_beat
 from invertwin.radar.signal.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, PhysicsWarning, SteppedFrequency
@@ -32,7 +32,7 @@ from invertwin.radar.waveform import FMCW, PhysicsWarning, SteppedFrequency
 # them it is then off by less than 1 % there.
 _DELAY_STEP = 0.25
 # Offsets are this many times finer than one sweep resolves, so that noise does not repeat in it.
-_FINER = 4
+_OSCILLATOR_OVERSAMPLING = 4
 
 Level = Annotated[float, Gt(-400), Lt(0)]  # dB below what is sent
 
@@ -92,7 +92,7 @@ class Leakage:
         InputError: A delay that is not one of a board, or more received than sent.
     """
 
-    delay: Annotated[NonNegative, Usual("seconds", 1e-9, high=1e-6)]
+    delay: Annotated[NonNegative, UsualValue("seconds", 1e-9, high=1e-6)]
     level_db: Level
 
     def __post_init__(self) -> None:
@@ -181,8 +181,8 @@ class Impairments:
             stream = _streams(seed)[0]
             beat = noisy_oscillator_beat(paths, radar, self.phase_noise, seed=stream, chirps=chirps)
         else:
-            beat = _clean_beat(paths, radar, chirps)
-        return self._after_mixing(beat, radar, seed, chirps)
+            beat = _ideal_beat(paths, radar, chirps)
+        return self._add_receiver_effects(beat, radar, seed, chirps)
 
     def apply(
         self, beat: Complex128[Tensor, "frame *chirp tx rx sample"], radar: Radar, *, seed: int
@@ -198,7 +198,7 @@ class Impairments:
             InputError: Phase noise, which each path has of its own; otherwise as ``record``.
         """
         self.check_applicable()
-        return self._after_mixing(beat, radar, seed, None)
+        return self._add_receiver_effects(beat, radar, seed, None)
 
     def check_applicable(self) -> None:
         """Raise if ``apply`` cannot add these impairments, because they need the paths."""
@@ -208,7 +208,7 @@ class Impairments:
                 "the delay of each path; use record(paths, radar, chirps=...), without retracing"
             )
 
-    def _after_mixing(
+    def _add_receiver_effects(
         self, beat: Tensor, radar: Radar, seed: int, chirps: Chirps | None
     ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
         streams = _streams(seed)
@@ -224,7 +224,7 @@ class Impairments:
                 residual = residual_phase(
                     self.phase_noise, radar, delay, seed=streams[0], chirps=chirps
                 )
-                direct = direct * _turn(residual).unsqueeze(-2)
+                direct = direct * _phasor(residual).unsqueeze(-2)
             beat = beat + direct.to(beat.device)
         if self.gain_std_db > 0 or self.phase_std > 0:
             factors = channel_errors(radar, self.gain_std_db, self.phase_std, seed=streams[1])
@@ -266,31 +266,31 @@ def noisy_oscillator_beat(
     Raises:
         InputError: As ``beat_signal`` and ``residual_phase``.
     """
-    waveform = _sampled_in_time(radar)
+    waveform = _require_time_samples(radar)
     check_paths(paths, radar, waveform)
 
     if len(paths) == 0:
-        return _clean_beat(paths, radar, chirps)
+        return _ideal_beat(paths, radar, chirps)
     first, last = (float(end) for end in paths.delay.detach().aminmax())
     highest = 0.5 / float(waveform.sample_times[1])
     intervals = math.ceil((last - first) * 2 * math.pi * highest / _DELAY_STEP)
     spacing = (last - first) / max(intervals, 1)
     place = (paths.delay - first) / spacing if intervals else torch.zeros_like(paths.delay)
 
-    def near(node: int) -> Tensor:
+    def beat_near_node(node: int) -> Tensor:
         """What the paths near one of the delays add."""
         weight = (1 - (place - node).abs()).clamp_min(0)
         chosen = weight > 0
-        part = paths.chosen(chosen)
+        part = paths.select(chosen)
         with warnings.catch_warnings():
             # All paths have been judged together.
             warnings.simplefilter("ignore", PhysicsWarning)
-            part = part.weighted(weight[chosen])
-            beat = _clean_beat(part, radar, chirps)
+            part = part.scale_fields(weight[chosen])
+            beat = _ideal_beat(part, radar, chirps)
         residual = residual_phase(noise, radar, first + node * spacing, seed=seed, chirps=chirps)
-        return beat * _turn(residual).unsqueeze(-2).to(beat.device)
+        return beat * _phasor(residual).unsqueeze(-2).to(beat.device)
 
-    return reduce(torch.add, map(near, range(intervals + 1)))
+    return reduce(torch.add, map(beat_near_node, range(intervals + 1)))
 
 
 def residual_phase(
@@ -317,7 +317,7 @@ def residual_phase(
     Raises:
         InputError: A waveform whose samples are not taken in time.
     """
-    waveform = _sampled_in_time(radar)
+    waveform = _require_time_samples(radar)
     transmitters, samples = radar.shape[1], waveform.samples
     if chirps is None:
         runs = (radar.frame_count, transmitters)
@@ -337,13 +337,13 @@ def _oscillator(
     samples: int,
 ) -> Float64[Tensor, "*run sample"]:
     """φ(t) − φ(t − τ) at the sampling rate, of independent runs at least so many samples long."""
-    length = _FINER * samples
+    length = _OSCILLATOR_OVERSAMPLING * samples
     spacing = 1 / (length * float(waveform.sample_times[1]))
     offsets = spacing * torch.arange(1, length // 2, dtype=torch.float64)
     generator = torch.Generator().manual_seed(seed)
     lines = torch.randn((*runs, len(offsets)), dtype=torch.complex128, generator=generator)
     lines = lines * (2 * spacing * noise.density(offsets)).sqrt()
-    lines = lines * (1 - _turn(-2 * math.pi * delay * offsets))
+    lines = lines * (1 - _phasor(-2 * math.pi * delay * offsets))
     # Re Σ lines exp(2πj f t): a real inverse FFT, but for its factor 2 / length and f = 0.
     return torch.fft.irfft(torch.nn.functional.pad(lines, (1, 1)) * (0.5 * length), length)
 
@@ -358,9 +358,9 @@ def leakage_signal(leakage: Leakage, radar: Radar) -> Complex128[Tensor, " sampl
     Raises:
         InputError: The radar has no samples.
     """
-    waveform, delay = sampled(radar), leakage.delay
+    waveform, delay = require_sampled_waveform(radar), leakage.delay
     cycles = (waveform.frequencies - 0.5 * waveform.residual_slope * delay) * delay
-    return 10 ** (leakage.level_db / 20) * _turn(2 * math.pi * cycles)
+    return 10 ** (leakage.level_db / 20) * _phasor(2 * math.pi * cycles)
 
 
 def channel_errors(
@@ -397,7 +397,7 @@ def quantize(
     Raises:
         InputError: A gradient is asked for, or samples that are not taken in time.
     """
-    _sampled_in_time(radar)
+    _require_time_samples(radar)
     if beat.requires_grad:
         raise InputError(
             "expected a beat signal without a gradient, got one that carries it; codes are "
@@ -417,16 +417,16 @@ def quantize(
     return torch.view_as_complex(codes.clamp(lowest, highest) * adc.step)
 
 
-def _clean_beat(paths: Paths, radar: Radar, chirps: Chirps | None) -> Tensor:
+def _ideal_beat(paths: Paths, radar: Radar, chirps: Chirps | None) -> Tensor:
     return beat_signal(paths, radar) if chirps is None else moving_beat(paths, radar, chirps)
 
 
-def _turn(phase: Tensor) -> Tensor:
+def _phasor(phase: Tensor) -> Tensor:
     return torch.polar(torch.ones_like(phase), phase)
 
 
-def _sampled_in_time(radar: Radar) -> FMCW | SteppedFrequency:
-    waveform = sampled(radar)
+def _require_time_samples(radar: Radar) -> FMCW | SteppedFrequency:
+    waveform = require_sampled_waveform(radar)
     if isinstance(waveform, FMCW | SteppedFrequency):
         return waveform
     raise InputError(

@@ -15,22 +15,22 @@ from torch import Tensor
 
 from invertwin.channel import Paths
 from invertwin.errors import InputError
-from invertwin.radar.radar import Radar, sampled
-from invertwin.radar.signal.chirps import Chirps, Train, sample_interval
+from invertwin.radar.radar import Radar, require_sampled_waveform
+from invertwin.radar.signal.chirps import Chirps, ChirpTrain, sample_interval
 from invertwin.radar.signal.range_profile import beat_signal, check_paths
 from invertwin.scene.scene import Scene
 
-_OFF = 1e-7  # m: a polynomial of time is the place
+_TRAJECTORY_TOLERANCE = 1e-7  # m: a polynomial of time is the place
 _DEGREES = (4, 8, 16, 32, 64)
-_BETWEEN = (0.109, 0.317, 0.489, 0.683, 0.947)  # shares of the time at which it is tried
+_CHECK_SHARES = (0.109, 0.317, 0.489, 0.683, 0.947)  # shares of the time at which it is tried
 
 
-class Blocks:
+class VisibilityKeyframes:
     """Ramps by points that are seen at the middle of several loops and follow their surfaces.
 
     Args:
         motion: The scene at any time [s].
-        traced: Its paths of one bounce, without boundary paths.
+        trace: Its paths of one bounce, without boundary paths.
         radar: What records.
         chirps: When.
         loops: For which one trace serves.
@@ -39,57 +39,66 @@ class Blocks:
     def __init__(
         self,
         motion: Callable[[float], Scene],
-        traced: Callable[[Scene], Paths],
+        trace: Callable[[Scene], Paths],
         radar: Radar,
         chirps: Chirps,
         loops: int,
     ) -> None:
-        self.motion, self.traced, self.radar, self.loops = motion, traced, radar, loops
+        self.motion, self.trace, self.radar, self.loops = motion, trace, radar, loops
         self.starts = chirps.times(radar.shape[1])
-        self.last = (sampled(radar).samples - 1) * sample_interval(sampled(radar))
+        self.last = (require_sampled_waveform(radar).samples - 1) * sample_interval(
+            require_sampled_waveform(radar)
+        )
         self.number, self.still, self.train = -1, torch.zeros(0), None
 
-    def ramp(self, start: float, senders: list[int]) -> Tensor:
+    def simulate_ramp(self, start: float, transmitters: list[int]) -> Tensor:
         """Signals of one ramp [frame, sender, rx, sample].
 
         Args:
             start: Its first sample [s].
-            senders: Transmitters that send then.
+            transmitters: Transmitters that send then.
         """
         loop = int((self.starts.amin(1) <= start).sum()) - 1
         if loop // self.loops != self.number:
             self.number = loop // self.loops
-            self._begin()
-        still = self.still[:, senders]
-        return still if self.train is None else still + self.train.ramp(start, senders)
+            self._start_keyframe()
+        still = self.still[:, transmitters]
+        return (
+            still if self.train is None else still + self.train.simulate_ramp(start, transmitters)
+        )
 
-    def _begin(self) -> None:
+    def _start_keyframe(self) -> None:
         own = self.starts[self.number * self.loops : (self.number + 1) * self.loops]
         begin, end = float(own.min()), float(own.max()) + self.last
         scene = self.motion(0.5 * (begin + end))
-        paths = self.traced(scene)
-        check_paths(paths, self.radar, sampled(self.radar))
+        paths = self.trace(scene)
+        check_paths(paths, self.radar, require_sampled_waveform(self.radar))
         assert paths.face is not None
-        assert paths.share is not None
+        assert paths.barycentric is not None
         corners = torch.cat(
-            [i.mesh.faces + n for i, n in zip(scene.objects.values(), _offsets(scene), strict=True)]
+            [
+                i.mesh.faces + n
+                for i, n in zip(scene.objects.values(), _vertex_offsets(scene), strict=True)
+            ]
         )[paths.face]
-        vertices = _Course(self.motion, scene, begin, end)
+        vertices = _VertexTrajectories(self.motion, scene, begin, end)
         moves = vertices.moves[corners].any(1)
-        self.still = beat_signal(paths.chosen(~moves), self.radar)
+        self.still = beat_signal(paths.select(~moves), self.radar)
         rows = torch.nonzero(moves)[:, 0]
-        own_corners, share = corners[rows], paths.share[rows]
+        own_corners, share = corners[rows], paths.barycentric[rows]
         weights = torch.cat([1 - share.sum(1, keepdim=True), share], dim=1)
         nodes = torch.einsum("kpcx,pc->kpx", vertices.nodes[:, own_corners], weights)
         self.train = None
         if len(rows):
-            moving = paths.chosen(rows)
-            here = vertices.mixed(nodes, 0.5 * (begin + end))
+            moving = paths.select(rows)
+            here = vertices.interpolate(nodes, 0.5 * (begin + end))
             moving = replace(moving, first=here, last=here, velocity=None)
-            self.train = Train(moving, self.radar, lambda time: vertices.mixed(nodes, time))
+            self.train = ChirpTrain(
+                moving, self.radar, lambda time: vertices.interpolate(nodes, time)
+            )
 
 
-class _Course:
+class _VertexTrajectories:
     """Where all vertices of a scene are over some time: a polynomial through Chebyshev's nodes.
 
     Nodes are doubled until it meets the true places between them.
@@ -104,16 +113,19 @@ class _Course:
     ) -> None:
         def vertices(time: float) -> Tensor:
             other = motion(time)
-            displacements(scene, other)
+            vertex_displacements(scene, other)
             return torch.cat([item.vertices for item in other.objects.values()]).double()
 
-        tried = [begin + share * (end - begin) for share in _BETWEEN]
+        tried = [begin + share * (end - begin) for share in _CHECK_SHARES]
         known = [(time, vertices(time)) for time in tried]
         for degree in _DEGREES:
             angles = torch.arange(degree + 1, dtype=torch.float64) * math.pi / degree
             self.places = begin + 0.5 * (1 - angles.cos()) * (end - begin)
             self.nodes = torch.stack([vertices(time) for time in self.places.tolist()])
-            if all(float((self.mixed(self.nodes, t) - v).abs().max()) < _OFF for t, v in known):
+            if all(
+                float((self.interpolate(self.nodes, t) - v).abs().max()) < _TRAJECTORY_TOLERANCE
+                for t, v in known
+            ):
                 break
         else:
             raise InputError(
@@ -122,7 +134,7 @@ class _Course:
             )
         self.moves = ((self.nodes - self.nodes[:1]).abs() > 0).flatten(2).any(2).any(0)
 
-    def mixed(self, nodes: Tensor, time: float) -> Tensor:
+    def interpolate(self, nodes: Tensor, time: float) -> Tensor:
         """Values at a time of what is known at the nodes.
 
         Args:
@@ -140,13 +152,13 @@ class _Course:
         return torch.tensordot(weights / weights.sum(), nodes, dims=1)
 
 
-def _offsets(scene: Scene) -> list[int]:
+def _vertex_offsets(scene: Scene) -> list[int]:
     """Number of the first vertex of every object."""
     counts = [len(item.vertices) for item in scene.objects.values()]
     return [sum(counts[:number]) for number in range(len(counts))]
 
 
-def displacements(scene: Scene, other: Scene) -> dict[str, Tensor]:
+def vertex_displacements(scene: Scene, other: Scene) -> dict[str, Tensor]:
     """How far the vertices of one instant are away at another [m], by object.
 
     Args:

@@ -124,15 +124,17 @@ class NonUniformSum(torch.autograd.Function):
     def forward(
         ctx: Any,
         coefficient: Complex128[Tensor, " path"],
-        rest: Float64[Tensor, "sum path"],
-        turns: Float64[Tensor, " path"],
+        offset_cycles: Float64[Tensor, "sum path"],
+        step_cycles: Float64[Tensor, " path"],
         samples: int,
         tolerance: float,
     ) -> Complex128[Tensor, "sum sample"]:
-        ctx.save_for_backward(coefficient, rest, turns)
-        ctx.save_for_forward(coefficient, rest, turns)
+        ctx.save_for_backward(coefficient, offset_cycles, step_cycles)
+        ctx.save_for_forward(coefficient, offset_cycles, step_cycles)
         ctx.samples, ctx.tolerance = samples, tolerance
-        return _transform(1, turns, coefficient.conj() * _phasor(rest), samples, tolerance)
+        return _transform(
+            1, step_cycles, coefficient.conj() * _phasor(offset_cycles), samples, tolerance
+        )
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -141,7 +143,7 @@ class NonUniformSum(torch.autograd.Function):
         grad, phasor = grad_outputs[0], _phasor(rest)
         with_turns = ctx.needs_input_grad[2]
         if with_turns:
-            grad = torch.cat([grad, grad * _places(ctx.samples, turns)])
+            grad = torch.cat([grad, grad * _centred_indices(ctx.samples, turns)])
         # Multiplied with the conjugate phasors: the gradients with respect to conj(a).
         sums = _transform(2, turns, grad, ctx.samples, ctx.tolerance).unflatten(0, (-1, len(rest)))
         sums = sums * phasor.conj()
@@ -161,7 +163,7 @@ class NonUniformSum(torch.autograd.Function):
         sums = _transform(1, turns, change, samples, ctx.tolerance)
         if tangents[2] is not None:
             turned = _transform(1, turns, strengths * tangents[2], samples, ctx.tolerance)
-            sums = sums + 2j * math.pi * _places(samples, turns) * turned
+            sums = sums + 2j * math.pi * _centred_indices(samples, turns) * turned
         return sums
 
 
@@ -171,15 +173,17 @@ def _phasor(cycles: Tensor) -> Tensor:
     return torch.polar(torch.ones_like(phase), phase)
 
 
-def _places(samples: int, like: Tensor) -> Tensor:
+def _centred_indices(samples: int, like: Tensor) -> Tensor:
     return torch.arange(samples, dtype=like.dtype, device=like.device) - samples // 2
 
 
-def _transform(kind: int, turns: Tensor, values: Tensor, samples: int, tolerance: float) -> Tensor:
+def _transform(
+    kind: int, step_cycles: Tensor, values: Tensor, samples: int, tolerance: float
+) -> Tensor:
     """Type 1 (paths to samples) with exp(+j…), type 2 (samples to paths) with exp(−j…)."""
-    if len(turns) == 0:
+    if len(step_cycles) == 0:
         return values.new_zeros(len(values), samples if kind == 1 else 0)
-    rate = (2 * math.pi) * (turns - turns.round()).detach().contiguous()
+    rate = (2 * math.pi) * (step_cycles - step_cycles.round()).detach().contiguous()
     values = values.detach().resolve_conj().contiguous()
     task = (kind, (samples,), len(values), tolerance, 1 if kind == 1 else -1)
     library = _cufinufft() if values.is_cuda else None

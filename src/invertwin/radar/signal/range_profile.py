@@ -10,10 +10,10 @@ from torch import Tensor
 from invertwin.channel import Grid, Paths
 from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.radar.radar import Radar, checked_beat, sampled
+from invertwin.radar.radar import Radar, checked_beat, require_sampled_waveform
 from invertwin.radar.signal.nufft import beat_of_delays
 from invertwin.radar.waveform import PhysicsWarning, SampledWaveform, unit_window
-from invertwin.runtime.progress import told
+from invertwin.runtime.progress import track
 
 _STANDARD_TEMPERATURE = 290.0  # K, at which noise figures are defined
 
@@ -51,7 +51,7 @@ def beat_signal(
     Raises:
         InputError: The radar has no samples, the paths carry power only, or a frame is missing.
     """
-    waveform = sampled(radar)
+    waveform = require_sampled_waveform(radar)
     check_paths(paths, radar, waveform)
     device = paths.delay.device
     tx, rx = (places.to(device) for places in radar.elements())
@@ -59,8 +59,8 @@ def beat_signal(
     order = torch.argsort(paths.frame, stable=True)
     counts = torch.bincount(paths.frame, minlength=radar.frame_count).tolist()
     frames: list[Tensor] = []
-    for frame, rows in told(list(enumerate(torch.split(order, counts))), "beat signals"):
-        own = paths.chosen(rows)
+    for frame, rows in track(list(enumerate(torch.split(order, counts))), "beat signals"):
+        own = paths.select(rows)
         first, last = own.first, own.last
         # What remains of the delay without the segments to the antennas.
         inner = (
@@ -120,7 +120,7 @@ def add_noise(
     if snr_db is not None:
         power = float(beat.detach().abs().square().mean()) * 10 ** (-snr_db / 10)
     elif noise_figure_db is not None and radar is not None:
-        rate = sampled(radar).noise_bandwidth
+        rate = require_sampled_waveform(radar).noise_bandwidth
         factor = 10 ** (noise_figure_db / 10)
         power = BOLTZMANN * _STANDARD_TEMPERATURE * factor * rate / transmit_power
     else:
@@ -150,7 +150,7 @@ def range_profile(
     Raises:
         InputError: The signal does not fit the radar.
     """
-    waveform = sampled(radar)
+    waveform = require_sampled_waveform(radar)
     window = unit_window(radar.window, waveform.samples)
     tapered = checked_beat(beat, radar) * window.to(beat.device, beat.real.dtype)
     bins = fft_bins(waveform, grid)
@@ -175,7 +175,7 @@ def check_paths(paths: Paths, radar: Radar, waveform: SampledWaveform) -> None:
             "expected field paths, got power paths, which have no phase; use trace_field, or "
             "the surrogate for power"
         )
-    if radar.biased:
+    if radar.has_range_bias:
         raise InputError(
             f"expected range_bias 0 for exact signals, got {radar.range_bias}; fit a range bias "
             "with a surrogate"

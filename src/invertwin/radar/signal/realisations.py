@@ -8,13 +8,15 @@ from torch import Tensor
 
 from invertwin.channel import Paths
 from invertwin.radar.aperture import aperture
-from invertwin.radar.radar import Radar, sampled
+from invertwin.radar.radar import Radar, require_sampled_waveform
 
-_CELLS = 4  # per resolution cell and axis: less than a tenth of a percent of the power is lost
-_SAME = 1e-7  # m: points this near are one point
+_CELLS_PER_RESOLUTION = (
+    4  # per resolution cell and axis: less than a tenth of a percent of the power is lost
+)
+_POINT_TOLERANCE = 1e-7  # m: points this near are one point
 
 
-class Looks:
+class SpeckleRealisations:
     """What a radar might record of a scene, quickly: a look costs a few matrix products.
 
     Every point of a rough surface has a random amplitude, circular and Gaussian, which is the same
@@ -27,17 +29,20 @@ class Looks:
     """
 
     def __init__(self, paths: Paths, radar: Radar) -> None:
-        waveform, array, link = sampled(radar), aperture(radar), radar.link()
+        waveform, array, link = require_sampled_waveform(radar), aperture(radar), radar.link()
         self._shape, self._array = radar.shape, array
         places = torch.cat([paths.first, paths.last], dim=1)
         mixed = places @ torch.sqrt(torch.tensor([2.0, 3, 5, 7, 11, 13], dtype=torch.float64))
-        points, self._point = torch.unique((mixed / _SAME).round(), return_inverse=True)
+        points, self._point = torch.unique((mixed / _POINT_TOLERANCE).round(), return_inverse=True)
         self._count = len(points)
-        u, v = paths.cosines(link).unbind(1)
+        u, v = paths.direction_cosines(link).unbind(1)
         bias = torch.as_tensor(radar.range_bias).detach()
         ranges = paths.range - radar.origins[paths.frame] + bias
         steps = (waveform.range_resolution, *radar.beamwidth)
-        axes = [_axis(x, step / _CELLS) for x, step in zip((ranges, u, v), steps, strict=True)]
+        axes = [
+            _bin_axis(x, step / _CELLS_PER_RESOLUTION)
+            for x, step in zip((ranges, u, v), steps, strict=True)
+        ]
         (ranges, rows), (u, columns), (v, layers) = axes
         self._cells = len(ranges), len(u), len(v)
         self._cell = (rows * len(u) + columns) * len(v) + layers
@@ -70,7 +75,7 @@ class Looks:
         return torch.stack(frames).unflatten(1, self._shape[1:])
 
 
-def _axis(values: Float64[Tensor, " n"], step: float) -> tuple[Float[Tensor, " cell"], Tensor]:
+def _bin_axis(values: Float64[Tensor, " n"], step: float) -> tuple[Float[Tensor, " cell"], Tensor]:
     """The cells that hold some values: their centres, and the number of each value's cell."""
     number = (values / step).round().long()
     least = number.min() if len(values) else number.new_zeros(())

@@ -37,8 +37,8 @@ def range_point_spread(
     return waveform.range_response(distance, window)
 
 
-def interpolated(
-    places: Float64[Tensor, "*point"],
+def interpolate_response(
+    offsets: Float64[Tensor, "*point"],
     cell: float,
     response: Callable[[Float64[Tensor, " entry"]], Float64[Tensor, " entry"]],
 ) -> Float64[Tensor, "*point"]:
@@ -48,12 +48,12 @@ def interpolated(
     sum over samples. The error is below 1e-5 of the peak.
 
     Args:
-        places: Where it is asked for, either side of its peak.
+        offsets: Where it is asked for, either side of its peak.
         cell: Its width.
         response: A symmetric function of places.
     """
     step = cell / _TABLE
-    distance = places.abs() / step
+    distance = offsets.abs() / step
     last = int(distance.detach().max()) + 3 if distance.numel() else 3
     table = response(torch.arange(-1, last + 1, dtype=torch.float64) * step)
     index = distance.detach().floor().to(torch.int64)
@@ -100,11 +100,11 @@ def array_point_spread(
         du: Offsets in u.
         dv: Offsets in v.
     """
-    response = array.steering(du, array.x) @ _weights(array) @ array.steering(dv, array.y).T
+    response = array.steering(du, array.x) @ _array_weights(array) @ array.steering(dv, array.y).T
     return response.abs().square()
 
 
-def array_spread_at(
+def paired_array_spread(
     array: Aperture, du: Float64[Tensor, " point"], dv: Float64[Tensor, " point"]
 ) -> Float64[Tensor, " point"]:
     """Power of a point target at pairs of offsets in u and v from its direction, peak 1.
@@ -115,11 +115,11 @@ def array_spread_at(
         dv: Offset in v of each point.
     """
     along, up = array.steering(du, array.x), array.steering(dv, array.y)
-    response = ((along @ _weights(array)) * up).sum(1)
+    response = ((along @ _array_weights(array)) * up).sum(1)
     return response.real.square() + response.imag.square()
 
 
-def _weights(array: Aperture) -> Tensor:
+def _array_weights(array: Aperture) -> Tensor:
     """Of places, with a sum of 1."""
     weight = array.counts * array.x_taper[:, None] * array.y_taper[None]
     return (weight / weight.sum()).to(torch.complex128)

@@ -13,11 +13,11 @@ from invertwin.radar.aperture import aperture
 from invertwin.radar.processing.doppler import velocity_span
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
-from invertwin.radar.surrogate.point_spread import interpolated
+from invertwin.radar.surrogate.point_spread import interpolate_response
 from invertwin.radar.waveform import FMCW, SteppedFrequency, Waveform, unit_window
 
 
-def moving_power(
+def range_doppler_power(
     paths: Paths,
     velocities: Float64[Tensor, "path 3"],
     radar: Radar,
@@ -57,12 +57,16 @@ def moving_power(
         "velocities, one per path,",
         "evaluate them at the paths' points",
     )
-    direction, own_rates = _seen(paths, velocities, radar)
+    direction, own_rates = _directions_and_rates(paths, velocities, radar)
     off = own_rates - rates[:, None]
     doppler = _doppler_response(off / velocity_span(radar, chirps), chirps, window)
-    shown = paths.range - radar.origins[paths.frame] + own_rates * _coupling(radar.waveform)
+    shown = (
+        paths.range
+        - radar.origins[paths.frame]
+        + own_rates * _range_doppler_coupling(radar.waveform)
+    )
     spread = _range_spread(shown, radar, grid)
-    steered = _steered(direction, radar, grid)
+    steered = _beam_weights(direction, radar, grid)
     starts = 4 * math.pi / radar.waveform.wavelength * chirps.times(len(steered))[0]
     frames = []
     for index in range(radar.frame_count):
@@ -77,7 +81,7 @@ def moving_power(
     return torch.stack(frames)
 
 
-def _seen(paths: Paths, velocities: Tensor, radar: Radar) -> tuple[Tensor, Tensor]:
+def _directions_and_rates(paths: Paths, velocities: Tensor, radar: Radar) -> tuple[Tensor, Tensor]:
     """Unit directions in the radar frame, and range rates [m/s]."""
     link = radar.link()
     away_tx = torch.nn.functional.normalize(paths.first - link.tx[paths.frame], dim=1)
@@ -88,7 +92,7 @@ def _seen(paths: Paths, velocities: Tensor, radar: Radar) -> tuple[Tensor, Tenso
     return local, 0.5 * (velocities * (away_tx + away_rx)).sum(1)
 
 
-def _coupling(waveform: Waveform) -> float:
+def _range_doppler_coupling(waveform: Waveform) -> float:
     """How far a range rate shifts the range that a ramp shows: f/S [s]."""
     if isinstance(waveform, FMCW):
         return waveform.center_frequency / waveform.slope
@@ -101,7 +105,7 @@ def _range_spread(
     ranges: Float64[Tensor, " path"], radar: Radar, grid: Grid
 ) -> Float64[Tensor, "range path"]:
     off = grid.ranges[:, None] - ranges
-    return interpolated(
+    return interpolate_response(
         off,
         radar.waveform.range_resolution,
         lambda places: radar.waveform.range_response(places, radar.window),
@@ -116,10 +120,10 @@ def _doppler_response(cycles: Tensor, chirps: Chirps, window: str) -> Tensor:
         turns = 2j * math.pi * places[:, None] * torch.arange(chirps.count)
         return (turns.exp() @ weight).abs().square()
 
-    return interpolated(cycles, 1 / chirps.count, response)
+    return interpolate_response(cycles, 1 / chirps.count, response)
 
 
-def _steered(
+def _beam_weights(
     direction: Tensor, radar: Radar, grid: Grid
 ) -> Complex128[Tensor, "tx path direction"]:
     """What the elements of each transmitter add to the beams, by a path of unit field."""

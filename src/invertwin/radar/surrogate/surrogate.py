@@ -16,13 +16,13 @@ from invertwin.channel import (
     Grid,
     Link,
     Sampling,
+    as_absorbers,
+    combine_coherently,
     deposit_batch,
     deposit_paths,
     deposit_power,
-    interference,
     trace_target,
     use_backend,
-    without_echoes,
 )
 from invertwin.checks import check_fields
 from invertwin.errors import InputError
@@ -33,8 +33,8 @@ from invertwin.radar.surrogate.point_spread import (
     airy,
     airy_radii,
     array_point_spread,
-    array_spread_at,
-    interpolated,
+    interpolate_response,
+    paired_array_spread,
     range_point_spread,
 )
 from invertwin.radar.waveform import PhysicsWarning, Waveform
@@ -82,11 +82,11 @@ class Surrogate:
         check_fields(self)
 
     @property
-    def widened(self) -> bool:
+    def has_blur(self) -> bool:
         """Whether there are extra widths."""
         return self.range_width > 0 or self.angle_width > 0
 
-    def narrowed(self, share: float) -> "Surrogate":
+    def scale_blur(self, share: float) -> "Surrogate":
         """With this share of the extra widths.
 
         Args:
@@ -116,11 +116,11 @@ class Surrogate:
             InputError: The map does not have the grid's shape.
         """
         _check_map(deposit, grid)
-        sigmas = self._extra(radar, grid)
+        sigmas = self._blur_sigmas(radar, grid)
         _warn_if_coarse(radar, grid, sigmas)
         for kernel in self._kernels(radar, grid):
             offset = None
-            if kernel.dims == (1,) and radar.biased:
+            if kernel.dims == (1,) and radar.has_range_bias:
                 offset = torch.as_tensor(radar.range_bias) / grid.range_step
             deposit = kernel.apply(deposit, [sigmas[dim] for dim in kernel.dims], offset)
         return deposit
@@ -139,9 +139,9 @@ class Surrogate:
             InputError: The map does not have the grid's shape.
         """
         _check_map(power, grid)
-        for dim, sigma in self._extra(radar, grid).items():
+        for dim, sigma in self._blur_sigmas(radar, grid).items():
             if (count := grid.shape[dim - 1]) > 1 and sigma > 0:
-                power = _flat(dim, count).apply(power, [sigma])
+                power = _identity_kernel(dim, count).apply(power, [sigma])
         return power
 
     def spread(
@@ -161,10 +161,10 @@ class Surrogate:
             u, v: Offsets in direction.
         """
 
-        def along(places: Tensor) -> Tensor:
+        def range_spread(places: Tensor) -> Tensor:
             return range_point_spread(radar.waveform, places, radar.window, self.range_kernel)
 
-        power = interpolated(ranges, radar.waveform.range_resolution, along)
+        power = interpolate_response(ranges, radar.waveform.range_resolution, range_spread)
         u, v = u * (grid.u_count > 1), v * (grid.v_count > 1)
         if grid.u_count == grid.v_count == 1:
             return power
@@ -175,9 +175,9 @@ class Surrogate:
             near = away == 0  # a root of zero has no derivative
             away = torch.where(near, 0.0, torch.where(near, 1.0, away).sqrt())
             return power * airy(2 * math.pi / array.wavelength * away)
-        return power * array_spread_at(array, u, v)
+        return power * paired_array_spread(array, u, v)
 
-    def _kernels(self, radar: Radar, grid: Grid) -> "tuple[_Kernel, ...]":
+    def _kernels(self, radar: Radar, grid: Grid) -> "tuple[_SurrogateKernel, ...]":
         resolved = grid.u_count > 1 or grid.v_count > 1
         return _kernels(
             self.range_kernel,
@@ -189,7 +189,7 @@ class Surrogate:
             grid,
         )
 
-    def _extra(self, radar: Radar, grid: Grid) -> dict[int, float]:
+    def _blur_sigmas(self, radar: Radar, grid: Grid) -> dict[int, float]:
         """Standard deviation of the extra Gaussian along each map dimension, in bins."""
         u, v = radar.beamwidth
         return {
@@ -211,7 +211,7 @@ SURROGATES = MappingProxyType(
 """What a ``surrogate`` argument may name; "exact" means exact signals, as None does."""
 
 
-def chosen_surrogate(surrogate: Surrogate | str | None) -> Surrogate | None:
+def resolve_surrogate(surrogate: Surrogate | str | None) -> Surrogate | None:
     """The surrogate meant by a ``surrogate`` argument; None = exact signals.
 
     Raises:
@@ -261,11 +261,11 @@ def surrogate_spectrum(
         InputError: See ``deposit_power`` and ``trace_target``.
     """
     link = radar.link()
-    parts = _targets(scene, radar, grid, surrogate, sampling, coherent, stretch)
+    parts = _deposit_targets(scene, radar, grid, surrogate, sampling, coherent, stretch)
     if set(scene.objects) - set(coherent):
         if reference is not None:
-            reference = without_echoes(reference[0], coherent), reference[1]
-        rest = without_echoes(scene, coherent)
+            reference = as_absorbers(reference[0], coherent), reference[1]
+        rest = as_absorbers(scene, coherent)
         parts.append(
             deposit_power(
                 rest, link, grid, sampling=sampling, seed=seed, scheme=scheme, reference=reference
@@ -274,7 +274,7 @@ def surrogate_spectrum(
     return surrogate.shape(torch.stack(parts).sum(0), radar, grid).clamp_min(0.0)
 
 
-def _targets(
+def _deposit_targets(
     scene: Scene,
     radar: Radar,
     grid: Grid,
@@ -292,7 +292,7 @@ def _targets(
     with use_backend(sampling.backend):
         for name in names:
             fields = trace_target(scene, name, link, sampling=sampling, stretch=stretch)
-            powers = interference(fields, link, overlap, stretch=stretch)
+            powers = combine_coherently(fields, link, overlap, stretch=stretch)
             deposits.append(deposit_paths(powers, link, grid))
     return deposits
 
@@ -322,11 +322,13 @@ def surrogate_spectra(
     Raises:
         InputError: See ``deposit_batch`` and ``trace_target``.
     """
-    rest = [without_echoes(scene, coherent) for scene in scenes]
+    rest = [as_absorbers(scene, coherent) for scene in scenes]
     deposit = deposit_batch(rest, radar.link(), grid, sampling=sampling, seed=seed)
     if coherent:
         targets = [
-            torch.stack(_targets(scene, radar, grid, surrogate, sampling, coherent, stretch)).sum(0)
+            torch.stack(
+                _deposit_targets(scene, radar, grid, surrogate, sampling, coherent, stretch)
+            ).sum(0)
             for scene in scenes
         ]
         deposit = deposit + torch.stack(targets)
@@ -335,7 +337,7 @@ def surrogate_spectra(
 
 
 @dataclass(frozen=True, eq=False)
-class _Kernel:
+class _SurrogateKernel:
     """A convolution along one map dimension, or two at once, as its transfer function.
 
     Attributes:
@@ -356,22 +358,22 @@ class _Kernel:
             if sigma > 0:
                 transfer = transfer * torch.exp(-2 * (math.pi * sigma * frequency).square())
         if len(self.dims) > 1:
-            return self._by_fft(power, transfer)
+            return self._apply_by_fft(power, transfer)
         if offset is not None:
             ramp = _frequencies(self.counts)[0] * (-2 * math.pi * offset.cpu().double())
             transfer = transfer * torch.polar(torch.ones_like(ramp), ramp)
-        return self._by_matrix(power, transfer)
+        return self._apply_by_matrix(power, transfer)
 
-    def _by_fft(self, power: Tensor, transfer: Tensor) -> Tensor:
-        size = [_padded(count) for count in self.counts]
+    def _apply_by_fft(self, power: Tensor, transfer: Tensor) -> Tensor:
+        size = [_fft_length(count) for count in self.counts]
         spectrum = torch.fft.rfftn(power, size, self.dims)
         full = torch.fft.irfftn(spectrum * transfer.to(spectrum.real), size, self.dims)
         return full[..., : self.counts[0], : self.counts[1]]
 
-    def _by_matrix(self, power: Tensor, transfer: Tensor) -> Tensor:
+    def _apply_by_matrix(self, power: Tensor, transfer: Tensor) -> Tensor:
         # At these sizes a Toeplitz matrix per axis is some 30 times faster than a padded FFT.
         (dim,), (count,) = self.dims, self.counts
-        taps = torch.fft.irfft(transfer, _padded(count)).to(power)
+        taps = torch.fft.irfft(transfer, _fft_length(count)).to(power)
         lags = taps.roll(count - 1)[: 2 * count - 1]
         matrix = lags.flip(0).unfold(0, count, 1).flip(0)
         if dim == power.ndim - 1:
@@ -389,27 +391,27 @@ def _kernels(
     window: str,
     array: Aperture | None,
     grid: Grid,
-) -> tuple[_Kernel, ...]:
+) -> tuple[_SurrogateKernel, ...]:
     """The kernels without extra widths; cached, since an optimisation asks again each step."""
     spread = range_point_spread(
         waveform, _lags(grid.range_count) * grid.range_step, window, range_kernel
     )
-    kernels = [_compensated((1,), (grid.range_count,), spread)]
+    kernels = [_compensate_spline((1,), (grid.range_count,), spread)]
     if array is None:
         return tuple(kernels)
     array.check_resolved(grid)
     du, dv = _lags(grid.u_count) * grid.u_step, _lags(grid.v_count) * grid.v_step
     zero = torch.zeros(1, dtype=torch.float64)
     counts = grid.u_count, grid.v_count
-    if grid.u_count > 1 and grid.v_count > 1 and (angle_kernel == "airy" or not array.separable):
+    if grid.u_count > 1 and grid.v_count > 1 and (angle_kernel == "airy" or not array.is_separable):
         spread = _angle_spread(angle_kernel, radii, array, du, dv)
-        return (*kernels, _compensated((2, 3), counts, spread))
+        return (*kernels, _compensate_spline((2, 3), counts, spread))
     if grid.u_count > 1:
         spread = _angle_spread(angle_kernel, radii, array, du, zero)[:, 0]
-        kernels.append(_compensated((2,), counts[:1], spread))
+        kernels.append(_compensate_spline((2,), counts[:1], spread))
     if grid.v_count > 1:
         spread = _angle_spread(angle_kernel, radii, array, zero, dv)[0]
-        kernels.append(_compensated((3,), counts[1:], spread))
+        kernels.append(_compensate_spline((3,), counts[1:], spread))
     return tuple(kernels)
 
 
@@ -422,7 +424,9 @@ def _angle_spread(
     return airy(wavenumber * torch.hypot(radii[0] * du[:, None], radii[1] * dv[None]))
 
 
-def _compensated(dims: tuple[int, ...], counts: tuple[int, ...], spread: Tensor) -> _Kernel:
+def _compensate_spline(
+    dims: tuple[int, ...], counts: tuple[int, ...], spread: Tensor
+) -> _SurrogateKernel:
     """Kernel of a point spread tabulated at lags, less the blur of the quadratic B-spline.
 
     At the highest frequency the B-spline's transform is sinc³(1/2) = 0.26, so the division is
@@ -431,14 +435,14 @@ def _compensated(dims: tuple[int, ...], counts: tuple[int, ...], spread: Tensor)
     transfer = torch.fft.rfftn(spread).real
     for frequency in _frequencies(counts):
         transfer = transfer / torch.sinc(frequency) ** 3
-    return _Kernel(dims, counts, transfer)
+    return _SurrogateKernel(dims, counts, transfer)
 
 
-def _flat(dim: int, count: int) -> _Kernel:
-    return _Kernel((dim,), (count,), torch.ones_like(_frequencies((count,))[0]))
+def _identity_kernel(dim: int, count: int) -> _SurrogateKernel:
+    return _SurrogateKernel((dim,), (count,), torch.ones_like(_frequencies((count,))[0]))
 
 
-def _padded(count: int) -> int:
+def _fft_length(count: int) -> int:
     """A fast FFT length that holds all lags between ``count`` bins, so that nothing wraps."""
     need = 2 * max(count, _MIN_EXTENT)
     octave = 1 << (need - 1).bit_length() - 4
@@ -447,12 +451,12 @@ def _padded(count: int) -> int:
 
 def _lags(count: int) -> Float64[Tensor, " lag"]:
     """Offsets in bins, in the order of an FFT."""
-    return torch.fft.fftfreq(_padded(count), d=1 / _padded(count), dtype=torch.float64)
+    return torch.fft.fftfreq(_fft_length(count), d=1 / _fft_length(count), dtype=torch.float64)
 
 
 def _frequencies(counts: tuple[int, ...]) -> list[Tensor]:
     """Cycles per bin of a real FFT, shaped to broadcast along each dimension."""
-    *full, half = (_padded(count) for count in counts)
+    *full, half = (_fft_length(count) for count in counts)
     axes = [torch.fft.fftfreq(size, dtype=torch.float64)[:, None] for size in full]
     return [*axes, torch.fft.rfftfreq(half, dtype=torch.float64)]
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from invertwin.checks import checked_number
 from invertwin.constants import SPEED_OF_LIGHT, VACUUM_PERMITTIVITY
-from invertwin.scene.material.values import Value, checked_value, evaluated
+from invertwin.scene.material.values import Value, checked_value, evaluate_value
 
 LEAST_COSINE = 1e-9
 """Grazing incidence on ε = 1 is 0/0; this shift is far below rounding elsewhere."""
@@ -27,7 +27,7 @@ class FieldCoefficients(NamedTuple):
     transmission_s: Complex128[Tensor, "*angle"]
     transmission_p: Complex128[Tensor, "*angle"]
 
-    def mirroring(self, share: Float64[Tensor, "*#angle"]) -> "FieldCoefficients":
+    def scale_reflection(self, share: Float64[Tensor, "*#angle"]) -> "FieldCoefficients":
         """The same with a share of the reflected field."""
         return self._replace(
             reflection_s=share * self.reflection_s, reflection_p=share * self.reflection_p
@@ -52,9 +52,9 @@ def complex_permittivity(
     checked_value(conductivity, "conductivity")
     checked_value(loss_tangent, "loss_tangent")
     checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-    real = evaluated(permittivity)
-    loss = evaluated(conductivity) / (2 * math.pi * frequency * VACUUM_PERMITTIVITY)
-    real, loss = torch.broadcast_tensors(real, loss + real * evaluated(loss_tangent))
+    real = evaluate_value(permittivity)
+    loss = evaluate_value(conductivity) / (2 * math.pi * frequency * VACUUM_PERMITTIVITY)
+    real, loss = torch.broadcast_tensors(real, loss + real * evaluate_value(loss_tangent))
     return torch.complex(real, -loss)
 
 

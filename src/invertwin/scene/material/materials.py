@@ -27,24 +27,24 @@ from invertwin.scene.material.fresnel import (
 )
 from invertwin.scene.material.itu import Itu
 from invertwin.scene.material.roughness import (
-    MIRROR_LOBE_WIDTH,
     ROUGH_LOBE_WIDTH,
     ROUGH_SCATTERING,
+    SPECULAR_LOBE_WIDTH,
     EffectiveRoughness,
     lobe_exponent,
     specular_weights,
 )
-from invertwin.scene.material.slab import Sheet, sheet_coefficients, slab_tables
-from invertwin.scene.material.surface import ANGLE_COUNT, Material, Skin, Surface
-from invertwin.scene.material.values import RANGES, Value, checked_value, evaluated, row_count
+from invertwin.scene.material.slab import SlabLayer, sheet_coefficients, slab_tables
+from invertwin.scene.material.surface import ANGLE_COUNT, Material, ScatteringLaw, SmoothInterface
+from invertwin.scene.material.values import RANGES, Value, checked_value, evaluate_value, row_count
 
 AnyMedium = TypeVar("AnyMedium", bound="Medium")
 _SAFE_POWER = 1e-30  # below it a reflectance is zero, and its root has no derivative
 _COSINES = torch.linspace(0, 1, ANGLE_COUNT, dtype=torch.float64)
-_MIRROR = torch.ones_like(_COSINES)
+_FULL_REFLECTANCE = torch.ones_like(_COSINES)
 
 
-class _Values:
+class _MaterialRecord:
     """Checks the fields of a dataclass by name, and knows for how many triangles they are."""
 
     def __new__(cls, *values: object, **named: object) -> Any:
@@ -74,7 +74,7 @@ class _Values:
 
 
 @dataclass(frozen=True)
-class Medium(_Values):
+class Medium(_MaterialRecord):
     """A dielectric, by numbers or from the ITU table.
 
     Attributes:
@@ -117,12 +117,12 @@ class Medium(_Values):
         if isinstance(sigma, Itu):
             sigma, sigma_slope = sigma.conductivity(frequency), sigma.coefficients(frequency).d
         epsilon = complex_permittivity(real, sigma, frequency, self.loss_tangent)
-        polarised = evaluated(real) * (1 - 1j * evaluated(self.loss_tangent))
+        polarised = evaluate_value(real) * (1 - 1j * evaluate_value(self.loss_tangent))
         dispersion = real_slope * polarised + (sigma_slope - 1) * (epsilon - polarised)
         return epsilon, dispersion
 
 
-def held_by(material: Any, layer: int | None, name: str) -> Any:
+def select_layer(material: Any, layer: int | None, name: str) -> Any:
     """What holds the values: the material, or one of its layers.
 
     Args:
@@ -145,7 +145,7 @@ def held_by(material: Any, layer: int | None, name: str) -> Any:
 
 
 @dataclass(frozen=True)
-class PerfectConductor(_Values, Material):
+class PerfectConductor(_MaterialRecord, Material):
     """A smooth perfect conductor: nothing is absorbed, nothing is scattered diffusely.
 
     Field paths treat it with physical optics. Power paths cannot see a mirror from a point
@@ -158,18 +158,20 @@ class PerfectConductor(_Values, Material):
         InputError: a width outside its range.
     """
 
-    lobe_width: Annotated[Value, RADIANS] = MIRROR_LOBE_WIDTH
+    lobe_width: Annotated[Value, RADIANS] = SPECULAR_LOBE_WIDTH
     coherent: ClassVar[bool] = True
 
-    def surface(self, frequency: float) -> Surface:
+    def scattering_law(self, frequency: float) -> ScatteringLaw:
         """The reflectance at `frequency` [Hz], here the same at every frequency."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
         nothing = torch.zeros((), dtype=torch.float64)
-        return Surface(_MIRROR, *specular_weights(nothing, lobe_exponent(self.lobe_width)))
+        return ScatteringLaw(
+            _FULL_REFLECTANCE, *specular_weights(nothing, lobe_exponent(self.lobe_width))
+        )
 
 
 @dataclass(frozen=True)
-class RoughConductor(_Values, EffectiveRoughness, Material):
+class RoughConductor(_MaterialRecord, EffectiveRoughness, Material):
     """A perfect conductor with a rough surface: all power comes back, spread by the roughness.
 
     Its fields are those of `EffectiveRoughness`; a rough surface scatters by default.
@@ -177,15 +179,15 @@ class RoughConductor(_Values, EffectiveRoughness, Material):
 
     scattering: Value = field(default=ROUGH_SCATTERING, kw_only=True)
 
-    def surface(self, frequency: float) -> Surface:
+    def scattering_law(self, frequency: float) -> ScatteringLaw:
         """The reflectance at `frequency` [Hz], here the same at every frequency."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-        return Surface(_MIRROR, *self.weights(), **self.turned)
+        return ScatteringLaw(_FULL_REFLECTANCE, *self.weights(), **self.depolarisation_terms)
 
-    def skin(self, frequency: float) -> Skin | None:
+    def smooth_interface(self, frequency: float) -> SmoothInterface | None:
         """What the surface does to fields at `frequency` [Hz]."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-        return self.skin_of(None)
+        return self.make_interface(None)
 
 
 @dataclass(frozen=True)
@@ -206,12 +208,14 @@ class RoughDielectric(Medium, Material):
     lobe_width: Annotated[Value, RADIANS] = ROUGH_LOBE_WIDTH
     depolarisation: Value = 0.0
 
-    def surface(self, frequency: float) -> Surface:
+    def scattering_law(self, frequency: float) -> ScatteringLaw:
         """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon = self.complex_permittivity(frequency)
-        weights = specular_weights(evaluated(self.diffuse), lobe_exponent(self.lobe_width))
+        weights = specular_weights(evaluate_value(self.diffuse), lobe_exponent(self.lobe_width))
         amplitude = fresnel_amplitude(epsilon[..., None], _COSINES)
-        return Surface(amplitude, *weights, depolarisation=evaluated(self.depolarisation))
+        return ScatteringLaw(
+            amplitude, *weights, depolarisation=evaluate_value(self.depolarisation)
+        )
 
 
 @dataclass(frozen=True)
@@ -227,15 +231,15 @@ class Dielectric(Medium, EffectiveRoughness, Material):
 
     scattering: Value = field(default=ROUGH_SCATTERING, kw_only=True)
 
-    def surface(self, frequency: float) -> Surface:
+    def scattering_law(self, frequency: float) -> ScatteringLaw:
         """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon = self.complex_permittivity(frequency)
         amplitude = fresnel_amplitude(epsilon[..., None], _COSINES)
-        return Surface(amplitude, *self.weights(), **self.turned)
+        return ScatteringLaw(amplitude, *self.weights(), **self.depolarisation_terms)
 
-    def skin(self, frequency: float) -> Skin | None:
+    def smooth_interface(self, frequency: float) -> SmoothInterface | None:
         """What the surface does to fields at `frequency` [Hz]."""
-        return self.skin_of(self.complex_permittivity(frequency))
+        return self.make_interface(self.complex_permittivity(frequency))
 
 
 @dataclass(frozen=True)
@@ -250,21 +254,21 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
             `EffectiveRoughness`, of what the outside reflects.
     """
 
-    def surface(self, frequency: float) -> Surface:
+    def scattering_law(self, frequency: float) -> ScatteringLaw:
         """What one face does at `frequency` [Hz]; differentiable with respect to all values."""
         epsilon = self.complex_permittivity(frequency)
-        return Surface(
+        return ScatteringLaw(
             fresnel_amplitude(epsilon[..., None], _COSINES),
             *self.weights(),
             refraction=fresnel_transmittance(epsilon[..., None], _COSINES),
             index=refractive_index(epsilon),
             attenuation=attenuation(epsilon, frequency),
-            **self.turned,
+            **self.depolarisation_terms,
         )
 
-    def skin(self, frequency: float) -> Skin | None:
+    def smooth_interface(self, frequency: float) -> SmoothInterface | None:
         """What the outer face does to fields at `frequency` [Hz]."""
-        return self.skin_of(self.complex_permittivity(frequency))
+        return self.make_interface(self.complex_permittivity(frequency))
 
 
 @dataclass(frozen=True)
@@ -278,11 +282,11 @@ class Layer(Medium):
 
     thickness: Value = field(kw_only=True)
 
-    def sheet(self, frequency: float) -> Sheet:
+    def sheet(self, frequency: float) -> SlabLayer:
         """The layer as numbers at `frequency` [Hz], for `slab_tables`."""
         epsilon, dispersion = self._epsilon(frequency)
-        return Sheet(
-            epsilon[..., None], dispersion[..., None], evaluated(self.thickness)[..., None]
+        return SlabLayer(
+            epsilon[..., None], dispersion[..., None], evaluate_value(self.thickness)[..., None]
         )
 
 
@@ -298,17 +302,17 @@ class Slab(Layer, EffectiveRoughness, Material):
             those of `EffectiveRoughness`, of what it reflects.
     """
 
-    def surface(self, frequency: float) -> Surface:
+    def scattering_law(self, frequency: float) -> ScatteringLaw:
         """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
-        return _slab_surface([self], self, frequency)
+        return _slab_scattering_law([self], self, frequency)
 
-    def skin(self, frequency: float) -> Skin | None:
+    def smooth_interface(self, frequency: float) -> SmoothInterface | None:
         """What the sheet does to fields at `frequency` [Hz]."""
-        return self.skin_of(self.complex_permittivity(frequency), self.thickness)
+        return self.make_interface(self.complex_permittivity(frequency), self.thickness)
 
 
 @dataclass(frozen=True)
-class Multilayer(_Values, EffectiveRoughness, Material):
+class Multilayer(_MaterialRecord, EffectiveRoughness, Material):
     """A thin sheet of several layers in air, meshed as an open surface.
 
     Attributes:
@@ -339,39 +343,45 @@ class Multilayer(_Values, EffectiveRoughness, Material):
             named |= {f"layers[{k}].{name}": getattr(layer, name) for name in _value_names(layer)}
         return row_count(named)
 
-    def surface(self, frequency: float) -> Surface:
+    def scattering_law(self, frequency: float) -> ScatteringLaw:
         """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
-        return _slab_surface(self.layers, self, frequency)
+        return _slab_scattering_law(self.layers, self, frequency)
 
     def coefficients(
         self, frequency: float, cosine: Float64[Tensor, " n"], triangle: Int64[Tensor, " n"]
     ) -> FieldCoefficients:
         """Coherent fields that the stack reflects and lets through, about its middle."""
-        layers = [_of_triangles(layer.sheet(frequency), triangle) for layer in self.layers]
-        kept = self.skin_of(None).rows(triangle).kept(frequency, cosine)
-        return sheet_coefficients(layers, cosine, frequency).mirroring(kept)
+        layers = [_select_triangles(layer.sheet(frequency), triangle) for layer in self.layers]
+        kept = (
+            self.make_interface(None)
+            .select_triangles(triangle)
+            .coherent_reflection(frequency, cosine)
+        )
+        return sheet_coefficients(layers, cosine, frequency).scale_reflection(kept)
 
-    def incoherent(self, frequency: float) -> Surface:
+    def incoherent_law(self, frequency: float) -> ScatteringLaw:
         """What it does beside mirroring. See `Material.incoherent`."""
-        return self.surface(frequency).less_mirror(self.skin_of(None), frequency)
+        return self.scattering_law(frequency).without_specular(self.make_interface(None), frequency)
 
 
 def _value_names(holder: object) -> list[str]:
     return [entry.name for entry in fields(holder) if entry.name in RANGES]  # type: ignore[arg-type]
 
 
-def _of_triangles(sheet: Sheet, triangle: Tensor) -> Sheet:
+def _select_triangles(sheet: SlabLayer, triangle: Tensor) -> SlabLayer:
     """A layer with one value per row of triangles."""
     values = (value[..., 0] for value in sheet)
-    return Sheet(*(value[triangle] if value.ndim else value for value in values))
+    return SlabLayer(*(value[triangle] if value.ndim else value for value in values))
 
 
-def _slab_surface(
+def _slab_scattering_law(
     layers: Sequence[Layer], roughness: EffectiveRoughness, frequency: float
-) -> Surface:
+) -> ScatteringLaw:
     tables = slab_tables([layer.sheet(frequency) for layer in layers], _COSINES, frequency)
     # The root's derivative is infinite at zero, where the amplitude has none.
     seen = tables.reflectance > _SAFE_POWER
     amplitude = torch.where(seen, torch.where(seen, tables.reflectance, 1.0).sqrt(), 0.0)
     through = {"transmittance": tables.transmittance, "extra_length": tables.extra_length}
-    return Surface(amplitude, *roughness.weights(), **through, **roughness.turned)
+    return ScatteringLaw(
+        amplitude, *roughness.weights(), **through, **roughness.depolarisation_terms
+    )

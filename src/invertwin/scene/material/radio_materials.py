@@ -20,7 +20,7 @@ _NUMBERS = {
 }
 
 
-def stated_material(element: ElementTree.Element) -> Material | None:
+def read_radio_material(element: ElementTree.Element) -> Material | None:
     """The material that a `bsdf` of a scene file states; None if it is one of a camera's.
 
     The pattern of what Sionna scatters, and its depolarisation, are left out.

@@ -19,17 +19,17 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.scene.material.surface import LOBE_COUNT, Skin
-from invertwin.scene.material.values import Value, checked_value, evaluated
+from invertwin.scene.material.surface import LOBE_COUNT, SmoothInterface
+from invertwin.scene.material.values import Value, checked_value, evaluate_value
 
-MIRROR_LOBE_WIDTH = math.radians(5.0)
+SPECULAR_LOBE_WIDTH = math.radians(5.0)
 ROUGH_LOBE_WIDTH = math.radians(20.0)
 ROUGH_SCATTERING = 0.4
 """S of building walls, as measured (Degli-Esposti et al. 2007)."""
 
 
-class Weights(NamedTuple):
-    """The part of a `Surface` that says where the reflected power goes."""
+class LobeWeights(NamedTuple):
+    """The part of a `ScatteringLaw` that says where the reflected power goes."""
 
     diffuse: Float64[Tensor, "*row"]
     lobes: Float64[Tensor, "*row 3"]
@@ -45,7 +45,7 @@ def lobe_exponent(width: Value) -> Float64[Tensor, "*row"]:
         InputError: a width outside [3.4e-4, π].
     """
     checked_value(width, "lobe_width")
-    return -math.log(2) / (2 * torch.log1p(-2 * torch.sin(evaluated(width) / 8) ** 2))
+    return -math.log(2) / (2 * torch.log1p(-2 * torch.sin(evaluate_value(width) / 8) ** 2))
 
 
 def slope_exponent(rms_slope: Value) -> Float64[Tensor, "*row"]:
@@ -61,7 +61,7 @@ def slope_exponent(rms_slope: Value) -> Float64[Tensor, "*row"]:
         InputError: a slope outside its range.
     """
     checked_value(rms_slope, "rms_slope")
-    return evaluated(rms_slope) ** -2
+    return evaluate_value(rms_slope) ** -2
 
 
 def lobe_integral(exponent: Float64[Tensor, "*row"]) -> Float64[Tensor, "*row"]:
@@ -72,7 +72,7 @@ def lobe_integral(exponent: Float64[Tensor, "*row"]) -> Float64[Tensor, "*row"]:
 
 def specular_weights(
     diffuse: Float64[Tensor, "*#row"], exponent: Float64[Tensor, "*#row"]
-) -> Weights:
+) -> LobeWeights:
     """Weights of a Lambertian part, with the rest in the specular lobe.
 
     Args:
@@ -82,7 +82,7 @@ def specular_weights(
     diffuse, exponent = torch.broadcast_tensors(diffuse, exponent)
     none = diffuse.new_zeros((*diffuse.shape, LOBE_COUNT - 1))
     weight = (1 - diffuse) / lobe_integral(exponent)
-    return Weights(
+    return LobeWeights(
         diffuse,
         torch.cat([weight[..., None], none], dim=-1),
         torch.cat([exponent[..., None], none], dim=-1),
@@ -117,34 +117,38 @@ class EffectiveRoughness:
     rms_height: Value = 0.0
     depolarisation: Value = 0.0
 
-    def skin_of(self, permittivity: Tensor | None, thickness: Value = math.inf) -> Skin:
+    def make_interface(
+        self, permittivity: Tensor | None, thickness: Value = math.inf
+    ) -> SmoothInterface:
         """What the surface does to fields: the share 1 − S² of the power stays coherent.
 
         Args:
             permittivity: complex and relative; None of a conductor.
             thickness: of a sheet [m].
         """
-        coherent = (1 - evaluated(self.scattering) ** 2).sqrt()
-        return Skin(permittivity, evaluated(thickness), coherent, evaluated(self.rms_height))
+        coherent = (1 - evaluate_value(self.scattering) ** 2).sqrt()
+        return SmoothInterface(
+            permittivity, evaluate_value(thickness), coherent, evaluate_value(self.rms_height)
+        )
 
     @property
-    def turned(self) -> dict[str, Tensor]:
-        """The part of a `Surface` that says what changes its polarisation."""
-        return {"depolarisation": evaluated(self.depolarisation)}
+    def depolarisation_terms(self) -> dict[str, Tensor]:
+        """The part of a `ScatteringLaw` that says what changes its polarisation."""
+        return {"depolarisation": evaluate_value(self.depolarisation)}
 
-    def weights(self) -> Weights:
+    def weights(self) -> LobeWeights:
         """Weights and exponents of the Lambertian part and the three lobes."""
-        scattered = evaluated(self.scattering) ** 2
-        lambertian, directive = evaluated(self.lambertian), evaluated(self.directive)
+        scattered = evaluate_value(self.scattering) ** 2
+        lambertian, directive = evaluate_value(self.lambertian), evaluate_value(self.directive)
         directed = scattered * (1 - lambertian)
         shares = (1 - scattered, directed * directive, directed * (1 - directive))
         exponents = (
             slope_exponent(self.rms_slope),
-            evaluated(self.directive_exponent),
-            evaluated(self.backscatter_exponent),
+            evaluate_value(self.directive_exponent),
+            evaluate_value(self.backscatter_exponent),
         )
         diffuse, *rows = torch.broadcast_tensors(scattered * lambertian, *shares, *exponents)
         exponent = torch.stack(rows[LOBE_COUNT:], dim=-1)
-        return Weights(
+        return LobeWeights(
             diffuse, torch.stack(rows[:LOBE_COUNT], dim=-1) / lobe_integral(exponent), exponent
         )

@@ -34,7 +34,7 @@ from invertwin.errors import InputError
 from invertwin.scene.material.fresnel import LEAST_COSINE, FieldCoefficients
 
 
-class Sheet(NamedTuple):
+class SlabLayer(NamedTuple):
     """One layer as numbers: each 0-d or one per triangle with a last axis of 1 for the angles.
 
     Attributes:
@@ -71,26 +71,26 @@ class _Response(NamedTuple):
 
 
 def slab_coefficients(
-    layers: Sequence[Sheet], cos_theta: Float64[Tensor, "*angle"], frequency: float
+    layers: Sequence[SlabLayer], cos_theta: Float64[Tensor, "*angle"], frequency: float
 ) -> FieldCoefficients:
     """Complex field coefficients of a stack of layers in air, for both polarisations.
 
     The transmission is from the entry face to the exit face, at the same place along them.
 
     Args:
-        layers: those of ``Layer.sheet``, in the order in which the wave meets them.
+        layers: those of ``DisplayLayer.sheet``, in the order in which the wave meets them.
         cos_theta: cosine of the angle of incidence, in [0, 1].
         frequency: [Hz].
 
     Raises:
         InputError: no layers, or layers without a frequency.
     """
-    s, p = _both(layers, cos_theta, frequency)
+    s, p = _both_polarisations(layers, cos_theta, frequency)
     return FieldCoefficients(s.reflection, p.reflection, s.transmission, p.transmission)
 
 
 def sheet_coefficients(
-    layers: Sequence[Sheet], cos_theta: Float64[Tensor, "*angle"], frequency: float
+    layers: Sequence[SlabLayer], cos_theta: Float64[Tensor, "*angle"], frequency: float
 ) -> FieldCoefficients:
     """Coefficients of a stack for rays that take its mesh for a sheet without thickness.
 
@@ -116,7 +116,7 @@ def sheet_coefficients(
 
 
 def slab_tables(
-    layers: Sequence[Sheet], cos_theta: Float64[Tensor, "*angle"], frequency: float
+    layers: Sequence[SlabLayer], cos_theta: Float64[Tensor, "*angle"], frequency: float
 ) -> SlabTables:
     """Reflectance, transmittance and extra length of a stack of layers in air.
 
@@ -131,7 +131,7 @@ def slab_tables(
     Raises:
         InputError: no layers.
     """
-    responses = _both(layers, cos_theta, frequency)
+    responses = _both_polarisations(layers, cos_theta, frequency)
     s, p = responses
     wave_number = 2 * math.pi * frequency / SPEED_OF_LIGHT
     through_air = sum(layer.thickness for layer in layers) * cos_theta
@@ -147,13 +147,13 @@ def slab_tables(
     )
 
 
-def _both(
-    layers: Sequence[Sheet], cos_theta: Tensor, frequency: float
+def _both_polarisations(
+    layers: Sequence[SlabLayer], cos_theta: Tensor, frequency: float
 ) -> tuple[_Response, _Response]:
     if not layers:
         raise InputError("expected at least one layer, got none; give the layers of the slab")
     for layer in layers:
-        if not isinstance(layer, Sheet):
+        if not isinstance(layer, SlabLayer):
             raise InputError(
                 f"expected layers at a frequency, got {type(layer).__name__}; give layer.sheet(f)"
             )
@@ -165,7 +165,7 @@ def _both(
 
 
 def _response(
-    layers: Sequence[Sheet], cosine: Tensor, frequency: float, *, parallel: bool
+    layers: Sequence[SlabLayer], cosine: Tensor, frequency: float, *, parallel: bool
 ) -> _Response:
     """The stack's coefficients: of tangential E (perpendicular) or H (parallel)."""
     wave_number = 2 * math.pi * frequency / SPEED_OF_LIGHT
@@ -184,7 +184,7 @@ def _response(
     media.append(media[0])
     total = _interface(media[-2], media[-1])
     for k in reversed(range(len(layers))):
-        total = _in_front(_interface(media[k], media[k + 1]), phases[k], total)
+        total = _prepend_layer(_interface(media[k], media[k + 1]), phases[k], total)
     return total
 
 
@@ -201,7 +201,7 @@ def _interface(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> _
     )
 
 
-def _in_front(face: _Response, phase: tuple[Tensor, Tensor], rest: _Response) -> _Response:
+def _prepend_layer(face: _Response, phase: tuple[Tensor, Tensor], rest: _Response) -> _Response:
     """A layer, entered through `face`, in front of the rest of the stack."""
     delta, delta_slope = phase
     once = torch.exp(-1j * delta)

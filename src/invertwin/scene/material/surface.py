@@ -1,6 +1,6 @@
 """What a surface does to the power that meets it: the one thing the ray kernel knows of a material.
 
-Every material hands the ray kernel the same small set of numbers, a `Surface`, so that a new
+Every material hands the ray kernel the same small set of numbers, a `ScatteringLaw`, so that a new
 material needs no kernel code. What is reflected follows the distribution
 
     f_r(ωi, ωo) = A(cosθi) A(cosθo) [ diffuse/π + Σ_l lobes_l ((1 + cosψ_l)/2)^exponents_l ],
@@ -33,7 +33,7 @@ from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
-from invertwin.scene.material.slab import Sheet, sheet_coefficients
+from invertwin.scene.material.slab import SlabLayer, sheet_coefficients
 
 ANGLE_COUNT = 256
 """Nodes of the tables over the angle of incidence, at cosθ = linspace(0, 1, 256)."""
@@ -42,16 +42,16 @@ LOBE_COUNT = 3
 _SCALARS = ("diffuse", "index", "attenuation", "depolarisation")  # the other fields are tables
 
 
-_NONE = torch.zeros(LOBE_COUNT, dtype=torch.float64)
-_DARK = torch.zeros(ANGLE_COUNT, dtype=torch.float64)
-_WHOLE = torch.ones(ANGLE_COUNT, dtype=torch.float64)
+_NO_LOBES = torch.zeros(LOBE_COUNT, dtype=torch.float64)
+_ZERO_TABLE = torch.zeros(ANGLE_COUNT, dtype=torch.float64)
+_UNIT_TABLE = torch.ones(ANGLE_COUNT, dtype=torch.float64)
 _COSINES = torch.linspace(0, 1, ANGLE_COUNT, dtype=torch.float64)
-_ZERO, _ONE = _DARK[0], torch.ones((), dtype=torch.float64)
+_ZERO, _ONE = _ZERO_TABLE[0], torch.ones((), dtype=torch.float64)
 _INFINITE = torch.full((), torch.inf, dtype=torch.float64)
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class ScatteringLaw:
     """What the ray kernel needs to know of a material at one frequency (see the module text).
 
     Tables run over cosθ = linspace(0, 1, 256) of the angle of incidence from outside. `*row` is
@@ -77,15 +77,15 @@ class Surface:
 
     amplitude: Float64[Tensor, "*#row 256"]
     diffuse: Float64[Tensor, "*#row"]
-    lobes: Float64[Tensor, "*#row 3"] = _NONE
-    exponents: Float64[Tensor, "*#row 3"] = _NONE
-    transmittance: Float64[Tensor, "*#row 256"] = _DARK
-    extra_length: Float64[Tensor, "*#row 256"] = _DARK
-    refraction: Float64[Tensor, "*#row 256"] = _DARK
+    lobes: Float64[Tensor, "*#row 3"] = _NO_LOBES
+    exponents: Float64[Tensor, "*#row 3"] = _NO_LOBES
+    transmittance: Float64[Tensor, "*#row 256"] = _ZERO_TABLE
+    extra_length: Float64[Tensor, "*#row 256"] = _ZERO_TABLE
+    refraction: Float64[Tensor, "*#row 256"] = _ZERO_TABLE
     index: Float64[Tensor, "*#row"] = _ONE
     attenuation: Float64[Tensor, "*#row"] = _ZERO
     depolarisation: Float64[Tensor, "*#row"] = _ZERO
-    spread: Float64[Tensor, "*#row 256"] = _WHOLE
+    spread: Float64[Tensor, "*#row 256"] = _UNIT_TABLE
 
     def __post_init__(self) -> None:
         """Give all fields the same rows."""
@@ -98,7 +98,7 @@ class Surface:
         for name, values in given.items():
             object.__setattr__(self, name, values.expand((*row, *widths[name])))
 
-    def scaled(self, share: Float64[Tensor, "*row"]) -> "Surface":
+    def scale(self, share: Float64[Tensor, "*row"]) -> "ScatteringLaw":
         """The surface with this share of what it scatters.
 
         Args:
@@ -106,7 +106,7 @@ class Surface:
         """
         return replace(self, diffuse=self.diffuse * share, lobes=self.lobes * share[..., None])
 
-    def less_mirror(self, skin: "Skin", frequency: float) -> "Surface":
+    def without_specular(self, interface: "SmoothInterface", frequency: float) -> "ScatteringLaw":
         """The surface without what `skin` keeps together in the mirror direction.
 
         Of the specular lobe's power the share 1 − exp(−(2kσ cosθ)²) is left: what heights take off
@@ -115,10 +115,10 @@ class Surface:
         like a Gaussian of the lobe's variance 2/p, where it is above the horizon.
 
         Args:
-            skin: what the surface does to fields.
+            interface: what the surface does to fields.
             frequency: [Hz].
         """
-        height = skin.rms_height
+        height = interface.rms_height
         if not bool((height > 0).any()):
             return replace(self, lobes=self.lobes * self.lobes.new_tensor([0.0, 1.0, 1.0]))
         k = 2 * math.pi * frequency / SPEED_OF_LIGHT
@@ -131,29 +131,31 @@ class Surface:
         return replace(self, spread=torch.where(lit, torch.where(lit, share, 1.0).sqrt(), 0.0))
 
 
-class Skin(NamedTuple):
+class SmoothInterface(NamedTuple):
     """What a smooth surface does to fields, with one value or one per triangle each.
 
     Attributes:
         permittivity: complex relative permittivity; None of a perfect conductor.
         thickness: of a sheet about the surface [m]; infinite for a body.
-        coherent: share of the reflected field that stays in the mirror direction, in [0, 1].
+        coherence: share of the reflected field that stays in the mirror direction, in [0, 1].
         rms_height: of the roughness [m].
     """
 
     permittivity: Tensor | None
     thickness: Tensor
-    coherent: Tensor
+    coherence: Tensor
     rms_height: Tensor
 
-    def rows(self, triangle: Int64[Tensor, " n"]) -> "Skin":
+    def select_triangles(self, triangle: Int64[Tensor, " n"]) -> "SmoothInterface":
         """The values of some triangles; values for all triangles stay."""
         epsilon, *others = (
             value if value is None or not value.ndim else value[triangle] for value in self
         )
-        return Skin(epsilon, *others)  # type: ignore[arg-type]
+        return SmoothInterface(epsilon, *others)  # type: ignore[arg-type]
 
-    def kept(self, frequency: float, cosine: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
+    def coherent_reflection(
+        self, frequency: float, cosine: Float64[Tensor, " n"]
+    ) -> Float64[Tensor, " n"]:
         """Share of the mirrored field that stays coherent: roughness spreads phases by 2kσ cosθ.
 
         Args:
@@ -161,7 +163,7 @@ class Skin(NamedTuple):
             cosine: of the angle of incidence.
         """
         k = 2 * math.pi * frequency / SPEED_OF_LIGHT
-        return self.coherent * torch.exp(-0.5 * (2 * k * self.rms_height * cosine) ** 2)
+        return self.coherence * torch.exp(-0.5 * (2 * k * self.rms_height * cosine) ** 2)
 
 
 class Material(ABC):
@@ -178,12 +180,12 @@ class Material(ABC):
         """The number of triangles that its values are for; None if they hold for any."""
         return None
 
-    def skin(self, frequency: float) -> Skin | None:
+    def smooth_interface(self, frequency: float) -> SmoothInterface | None:
         """What the surface does to fields at `frequency` [Hz]; None if it is only rough.
 
         A coherent material is a perfect conductor, unless it says otherwise.
         """
-        return Skin(None, _INFINITE, _ONE, _ZERO) if self.coherent else None
+        return SmoothInterface(None, _INFINITE, _ONE, _ZERO) if self.coherent else None
 
     def coefficients(
         self, frequency: float, cosine: Float64[Tensor, " n"], triangle: Int64[Tensor, " n"]
@@ -198,29 +200,29 @@ class Material(ABC):
             cosine: of the angles of incidence, in [0, 1].
             triangle: the triangle of the object's mesh that is met, for values per triangle.
         """
-        skin = self.skin(frequency)
+        skin = self.smooth_interface(frequency)
         one = torch.ones_like(cosine).to(torch.complex128)
         if skin is None:
             return FieldCoefficients(0 * one, 0 * one, 0 * one, 0 * one)
-        skin = skin.rows(triangle)
-        kept = skin.kept(frequency, cosine)
+        skin = skin.select_triangles(triangle)
+        kept = skin.coherent_reflection(frequency, cosine)
         if skin.permittivity is None:
             return FieldCoefficients(-kept * one, kept * one, 0 * one, 0 * one)
         if bool(torch.isfinite(skin.thickness).all()):
             none = torch.zeros_like(skin.permittivity)  # dispersion, of which nothing here depends
-            sheet = Sheet(skin.permittivity, none, skin.thickness)
+            sheet = SlabLayer(skin.permittivity, none, skin.thickness)
             found = sheet_coefficients([sheet], cosine, frequency)
         else:
             half = fresnel_coefficients(skin.permittivity, cosine)
             found = half._replace(transmission_s=0 * one, transmission_p=0 * one)
-        return found.mirroring(kept)
+        return found.scale_reflection(kept)
 
     @abstractmethod
-    def surface(self, frequency: float) -> Surface:
+    def scattering_law(self, frequency: float) -> ScatteringLaw:
         """What the surface does at `frequency` [Hz]; its values keep their gradients."""
 
-    def incoherent(self, frequency: float) -> Surface:
+    def incoherent_law(self, frequency: float) -> ScatteringLaw:
         """What it does beside mirroring: `surface` without what `coefficients` reflect."""
-        skin = self.skin(frequency)
-        surface = self.surface(frequency)
-        return surface if skin is None else surface.less_mirror(skin, frequency)
+        skin = self.smooth_interface(frequency)
+        surface = self.scattering_law(frequency)
+        return surface if skin is None else surface.without_specular(skin, frequency)

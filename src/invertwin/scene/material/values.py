@@ -12,7 +12,7 @@ from torch import Tensor
 
 from invertwin.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.errors import InputError
-from invertwin.limits import Among
+from invertwin.limits import AllowedValues
 from invertwin.scene.mesh import Mesh, checked_faces
 
 
@@ -54,7 +54,7 @@ class Texture:
         object.__setattr__(self, "uv", uv.detach())
 
     @classmethod
-    def over(cls, image: ArrayLike, mesh: Mesh) -> "Texture":
+    def from_projection(cls, image: ArrayLike, mesh: Mesh) -> "Texture":
         """Lay an image over a mesh, as seen along its z axis.
 
         The left and right borders are at the least and largest x of the mesh, bottom and top at
@@ -105,7 +105,7 @@ Value = float | ArrayLike | Texture
 """A number or 0-d tensor for the whole object, one number per triangle [f], or a texture."""
 
 
-class Range(NamedTuple):
+class ValueRange(NamedTuple):
     """What a value is called in messages, and the numbers it may take."""
 
     what: str
@@ -114,25 +114,25 @@ class Range(NamedTuple):
     open_low: bool = False
 
 
-RANGES: Mapping[str, Range] = {
-    "permittivity": Range("relative permittivity", 1.0),
-    "conductivity": Range("conductivity [S/m]", 0.0),
-    "loss_tangent": Range("loss tangent", 0.0),
-    "thickness": Range("thickness [m]", 0.0),
-    "diffuse": Range("diffuse fraction", 0.0, 1.0),
-    "lobe_width": Range("lobe width [rad]", 3.4e-4, math.pi),
-    "scattering": Range("scattering coefficient", 0.0, 1.0),
-    "rms_slope": Range("rms slope", 1e-4, 1.0),
-    "rms_height": Range("rms height [m]", 0.0),
-    "lambertian": Range("Lambertian share", 0.0, 1.0),
-    "directive": Range("directive share", 0.0, 1.0),
-    "directive_exponent": Range("exponent of the directive lobe", 0.0, 1e8),
-    "depolarisation": Range("depolarisation", 0.0, 0.25),
-    "backscatter_exponent": Range("exponent of the backscattering lobe", 0.0, 1e8),
+RANGES: Mapping[str, ValueRange] = {
+    "permittivity": ValueRange("relative permittivity", 1.0),
+    "conductivity": ValueRange("conductivity [S/m]", 0.0),
+    "loss_tangent": ValueRange("loss tangent", 0.0),
+    "thickness": ValueRange("thickness [m]", 0.0),
+    "diffuse": ValueRange("diffuse fraction", 0.0, 1.0),
+    "lobe_width": ValueRange("lobe width [rad]", 3.4e-4, math.pi),
+    "scattering": ValueRange("scattering coefficient", 0.0, 1.0),
+    "rms_slope": ValueRange("rms slope", 1e-4, 1.0),
+    "rms_height": ValueRange("rms height [m]", 0.0),
+    "lambertian": ValueRange("Lambertian share", 0.0, 1.0),
+    "directive": ValueRange("directive share", 0.0, 1.0),
+    "directive_exponent": ValueRange("exponent of the directive lobe", 0.0, 1e8),
+    "depolarisation": ValueRange("depolarisation", 0.0, 0.25),
+    "backscatter_exponent": ValueRange("exponent of the backscattering lobe", 0.0, 1e8),
 }  # The kernel's float32 holds lobes down to an rms slope of 1e-4.
 """Every value of the library's materials by the name of its field."""
 
-MaterialValue = Annotated[str, Among(tuple(RANGES))]
+MaterialValue = Annotated[str, AllowedValues(tuple(RANGES))]
 
 
 def checked_value(value: object, name: str) -> Value:
@@ -147,25 +147,25 @@ def checked_value(value: object, name: str) -> Value:
     """
     span = RANGES[name]
     if isinstance(value, Texture):
-        _checked_ends(value.image, span)
+        _check_bounds(value.image, span)
         return value
     if isinstance(value, list | tuple | np.ndarray) or (isinstance(value, Tensor) and value.ndim):
         do = "give one number, one per triangle, or a Texture"
         row = checked_tensor(value, (None,), span.what, do)
         if not len(row):
             raise InputError(f"expected {span.what} of some triangles, got none; {do}")
-        _checked_ends(row, span)
+        _check_bounds(row, span)
         return row
     checked_number(value, span.what, span.low, span.high, open_low=span.open_low)
     return value  # type: ignore[return-value]
 
 
-def _checked_ends(numbers: Tensor, span: Range) -> None:
+def _check_bounds(numbers: Tensor, span: ValueRange) -> None:
     for end in (numbers.detach().min(), numbers.detach().max()):
         checked_number(end, span.what, span.low, span.high, open_low=span.open_low)
 
 
-def evaluated(value: Value) -> Float64[Tensor, "*row"]:
+def evaluate_value(value: Value) -> Float64[Tensor, "*row"]:
     """The value as a tensor: 0-d, or one number per triangle."""
     if isinstance(value, Texture):
         return value.values

@@ -12,7 +12,9 @@ from invertwin.scene.people.body import BodyTemplate
 
 _STEP = 0.05  # of a phenotype, either side, for its direction
 # Anny's people face −y, z up; ours face −z, y up.
-_TURN = torch.tensor([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
+_ANNY_TO_BODY_AXES = torch.tensor(
+    [[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64
+)
 
 
 def load_anny(
@@ -75,4 +77,4 @@ def _rest(model: Any, values: Mapping[str, float]) -> tuple[Tensor, Tensor]:
     with torch.no_grad():
         found = model(pose_parameters=None, phenotype_kwargs=given)
     rest, places = (found[name][0].double() for name in ("rest_vertices", "rest_bone_heads"))
-    return rest @ _TURN.T, places @ _TURN.T
+    return rest @ _ANNY_TO_BODY_AXES.T, places @ _ANNY_TO_BODY_AXES.T

@@ -12,15 +12,15 @@ from torch import Tensor, nn
 
 from invertwin.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.errors import InputError
-from invertwin.scene.mesh import Mesh, joined
+from invertwin.scene.mesh import Mesh, merge_meshes
 from invertwin.scene.parameters import Entries, ObjectModule, axes_mask, free_part
 from invertwin.scene.pose import rotation_angle, rotation_from_vector
-from invertwin.storage.untrusted import read_arrays, reader
+from invertwin.storage.untrusted import read_arrays, safe_reader
 
 _DO = "give arrays of one template"
-_ALONE = 0.95  # share of a vertex that a joint moves nearly alone
+_SINGLE_JOINT_WEIGHT = 0.95  # share of a vertex that a joint moves nearly alone
 _EXACT = 1e-12  # m, where they may end
-_REFINED = 4  # Newton steps of least squares
+_MAX_REFINEMENTS = 4  # Newton steps of least squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,15 +147,15 @@ class BodyTemplate:
         Raises:
             InputError: no such joint, or not three finite numbers.
         """
-        return Mesh(self.posed(rotation_from_vector(self.rotations(turns)))[0], self.faces)
+        return Mesh(self.apply_pose(rotation_from_vector(self.rotations(turns)))[0], self.faces)
 
-    def scaled(self, factor: float) -> "BodyTemplate":
+    def scale(self, factor: float) -> "BodyTemplate":
         """The body in another size."""
         given = ("vertices", "joints", "shape_directions", "joint_directions", "pose_directions")
         values = {name: getattr(self, name) for name in given}
         return replace(self, **{n: v if v is None else v * factor for n, v in values.items()})
 
-    def rotations_of(self, vertices: Float64[Tensor, "v 3"]) -> Float64[Tensor, "j 3"]:
+    def estimate_rotations(self, vertices: Float64[Tensor, "v 3"]) -> Float64[Tensor, "j 3"]:
         """Rotation vectors of all joints that a posed skin shows [rad], the inverse of `posed`.
 
         Least squares over the vertices; joints that move nothing are left at rest. The skin is of
@@ -165,13 +165,13 @@ class BodyTemplate:
             InputError: other vertices than the template's.
         """
         given = checked_tensor(vertices, tuple(self.vertices.shape), "vertices [m]", _DO).detach()
-        turns = self._rigid_turns(given)
+        turns = self._estimate_rigid_rotations(given)
 
         def skin(flat: Tensor) -> Tensor:
-            return self.posed(rotation_from_vector(flat.reshape(-1, 3)))[0].flatten()
+            return self.apply_pose(rotation_from_vector(flat.reshape(-1, 3)))[0].flatten()
 
         with torch.no_grad():
-            for _ in range(_REFINED):
+            for _ in range(_MAX_REFINEMENTS):
                 miss = given.flatten() - skin(turns.flatten())
                 if float(miss.abs().max()) < _EXACT:
                     break
@@ -180,12 +180,12 @@ class BodyTemplate:
                 turns = turns + change.reshape(-1, 3)
         return turns
 
-    def _rigid_turns(self, given: Tensor) -> Tensor:
+    def _estimate_rigid_rotations(self, given: Tensor) -> Tensor:
         """Rotation vectors, roughly, from the vertices that one joint moves nearly alone."""
         frames: list[Rotation] = []
         for joint, parent in enumerate(self.parents):
             frames.append(frames[parent] if joint else Rotation.identity())
-            own = self.weights[:, joint] > _ALONE
+            own = self.weights[:, joint] > _SINGLE_JOINT_WEIGHT
             if int(own.sum()) >= 3:
                 rest, now = ((p[own] - p[own].mean(0)).numpy() for p in (self.vertices, given))
                 frames[joint] = Rotation.align_vectors(now, rest)[0]
@@ -193,7 +193,7 @@ class BodyTemplate:
         turns = [frames[0], *(frames[parent].inv() * frame for parent, frame in pairs)]
         return torch.from_numpy(np.stack([turn.as_rotvec() for turn in turns]))
 
-    def posed(
+    def apply_pose(
         self, rotations: Float64[Tensor, "j 3 3"], shape: Float64[Tensor, " n"] | None = None
     ) -> tuple[Float64[Tensor, "v 3"], Float64[Tensor, "j 3"]]:
         """Vertices and joints [m] after every joint has turned relative to its parent.
@@ -270,12 +270,12 @@ class SkinnedBody(ObjectModule):
         self.rotation = nn.Parameter(turns.detach().clone())
         self.shape = nn.Parameter(given.detach().clone(), requires_grad=shapes > 0)
 
-    def reshaped(self, mesh: Mesh) -> Mesh:
+    def update_mesh(self, mesh: Mesh) -> Mesh:
         """The template's skin as it is posed, whatever was there before."""
-        return Mesh(self._posed()[0], self.template.faces)
+        return Mesh(self._apply_pose()[0], self.template.faces)
 
     @classmethod
-    def of(
+    def from_mesh(
         cls, object: str, template: BodyTemplate, mesh: Mesh, joints: Mapping[str, str]
     ) -> "SkinnedBody":
         """The body from the joint angles that a mesh of it shows; its shape is the template's.
@@ -291,11 +291,11 @@ class SkinnedBody(ObjectModule):
         """
         for name in joints:
             template.joint(name)
-        found = cls(object, template, template.rotations_of(mesh.vertices), joints=joints)
+        found = cls(object, template, template.estimate_rotations(mesh.vertices), joints=joints)
         found.shape.requires_grad_(False)
         return found
 
-    def turned(self, mesh: Mesh, angle: float, generator: torch.Generator) -> Mesh:
+    def perturb_joints(self, mesh: Mesh, angle: float, generator: torch.Generator) -> Mesh:
         """A mesh of the body with every free joint turned by `angle` [rad], about random axes.
 
         Args:
@@ -303,7 +303,7 @@ class SkinnedBody(ObjectModule):
             angle: rad.
             generator: of the axes.
         """
-        turns = self.template.rotations_of(mesh.vertices)
+        turns = self.template.estimate_rotations(mesh.vertices)
         rotations = rotation_from_vector(turns)
         for joint in self._joints.values():
             free = self._free[joint]
@@ -315,24 +315,24 @@ class SkinnedBody(ObjectModule):
                 if int(free.sum()) == 1
                 else rotation_from_vector(change) @ rotations[joint]
             )
-        return Mesh(self.template.posed(rotations)[0], mesh.faces)
+        return Mesh(self.template.apply_pose(rotations)[0], mesh.faces)
 
-    def joint_errors(self, found: Mesh, truth: Mesh) -> dict[str, float]:
+    def joint_errors(self, estimate: Mesh, truth: Mesh) -> dict[str, float]:
         """Angles [rad] by which the free joints of two meshes of the body differ, by name.
 
         Args:
-            found, truth: the result, and what it should be.
+            estimate, truth: the result, and what it should be.
         """
         a, b = (
-            rotation_from_vector(self.template.rotations_of(mesh.vertices.detach()))
-            for mesh in (found, truth)
+            rotation_from_vector(self.template.estimate_rotations(mesh.vertices.detach()))
+            for mesh in (estimate, truth)
         )
         angles = rotation_angle(a.mT @ b).tolist()
         return {name: angles[joint] for name, joint in self._joints.items()}
 
     def joints(self) -> Float64[Tensor, "j 3"]:
         """Present places of the joints in the object's frame [m]."""
-        return self._posed()[1]
+        return self._apply_pose()[1]
 
     def values(self) -> dict[str, Tensor]:
         """Rotations [rad] of the free joints and shape coordinates, by name."""
@@ -350,9 +350,9 @@ class SkinnedBody(ObjectModule):
         joints = enumerate(self.template.names)
         return {name: Entries("rotation", k) for k, name in joints if self._free[k].any()}
 
-    def _posed(self) -> tuple[Tensor, Tensor]:
+    def _apply_pose(self) -> tuple[Tensor, Tensor]:
         rotations = rotation_from_vector(free_part(self.rotation, self._free))
-        return self.template.posed(rotations, self.shape)
+        return self.template.apply_pose(rotations, self.shape)
 
 
 def articulated_template(
@@ -374,7 +374,7 @@ def articulated_template(
         )
     sizes = [len(part.vertices) for part in parts]
     owner = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor(sizes))
-    whole = joined(parts)
+    whole = merge_meshes(parts)
     return BodyTemplate(
         whole.vertices,
         whole.faces,
@@ -384,7 +384,7 @@ def articulated_template(
     )
 
 
-@reader("a body model")
+@safe_reader("a body model")
 def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
     """A body in the layout of SMPL's ``.npz`` files, which users obtain under its own licence.
 

@@ -32,7 +32,7 @@ from invertwin.scene.scene import Object
 
 _HARMONICS = 7
 _SAMPLES = 512  # of a cycle, from which harmonics are found
-_FASTEST = 3.0  # relative speed
+_MAX_RELATIVE_SPEED = 3.0  # relative speed
 _HANGING = math.radians(80.0)  # from the rest pose, in which arms are held out
 _ADULT_LEG = 0.84  # m, of ``person`` of 1.75 m; the source states shifts for adults in metres
 JOINTS = (
@@ -48,13 +48,14 @@ class Walking:
     """A person who walks straight ahead, along −z of the object's frame, or on the spot.
 
     The object's pose places the pelvis as of a person who stands; ``standing_height`` says how
-    high that is. ``InMotion`` applies it.
+    high that is. ``MovingScene`` applies it.
 
     Attributes:
         body: With the joints of ``person``.
         speed: Mean speed [m/s].
         phase: Where the cycle is at time 0, in cycles; 0: the right foot lands.
-        on_spot: Stay where the object is, such as one that ``Along`` carries at that speed.
+        on_spot: Stay where the object is, such as one that ``TrajectoryMotion`` carries at that
+            speed.
 
     Raises:
         InputError: A body without these joints, or a speed of more than three leg lengths a
@@ -69,7 +70,7 @@ class Walking:
     def __post_init__(self) -> None:
         check_joints(self.body)
         checked_number(self.phase, "phase [cycles]", -math.inf)
-        fastest = _FASTEST * leg_length(self.body)
+        fastest = _MAX_RELATIVE_SPEED * leg_length(self.body)
         checked_number(self.speed, "walking speed [m/s]", 0.0, fastest, open_low=True)
 
     @property
@@ -91,10 +92,12 @@ class Walking:
         v, curves = self.relative_speed, _curves(self.relative_speed)
         found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
         cycle = math.cos(2 * math.pi * phase)
-        yaw, roll = math.radians(4.0 * v) * cycle, -_at(curves["tilt"], phase)
-        pelvis = about("y", yaw) @ about("z", roll)
+        yaw, roll = math.radians(4.0 * v) * cycle, -_evaluate_series(curves["tilt"], phase)
+        pelvis = rotation_about_axis("y", yaw) @ rotation_about_axis("z", roll)
         lean = math.radians(_swing(v, 8.0)) * (math.sin(2 * math.pi * (2 * phase - 0.1)) - 1)
-        chest = about("y", -_at(curves["thorax"], phase)) @ about("x", lean)
+        chest = rotation_about_axis(
+            "y", -_evaluate_series(curves["thorax"], phase)
+        ) @ rotation_about_axis("x", lean)
         found[self.body.joint("pelvis")] = pelvis
         found[self.body.joint("chest")] = pelvis.T @ chest
         for side, later in (("right", 0.0), ("left", 0.5)):
@@ -102,16 +105,16 @@ class Walking:
             swing = 9.88 * v
             arm = math.radians(3.0 - swing / 2 - swing * math.cos(2 * math.pi * own))
             turns = {
-                "hip": about("x", _at(curves["hip"], own)),
-                "knee": about("x", -_at(curves["knee"], own)),
-                "shoulder": about("x", arm) @ hanging(side),
-                "elbow": bent_elbow(side, _at(curves["elbow"], own)),
+                "hip": rotation_about_axis("x", _evaluate_series(curves["hip"], own)),
+                "knee": rotation_about_axis("x", -_evaluate_series(curves["knee"], own)),
+                "shoulder": rotation_about_axis("x", arm) @ hanging_arm_rotation(side),
+                "elbow": elbow_rotation(side, _evaluate_series(curves["elbow"], own)),
             }
             for name, turn in turns.items():
                 found[self.body.joint(f"{side}_{name}")] = turn
         return found
 
-    def shift(self, phase: float) -> Float64[Tensor, "3"]:
+    def pelvis_offset(self, phase: float) -> Float64[Tensor, "3"]:
         """How far the pelvis is from where it moves evenly, x, y and z [m].
 
         Args:
@@ -133,7 +136,7 @@ class Walking:
         """
         phase = self.phase + time / self.period
         way = 0.0 if self.on_spot else self.speed * time
-        shift = self.shift(phase) + torch.tensor([0.0, 0.0, -way], dtype=torch.float64)
+        shift = self.pelvis_offset(phase) + torch.tensor([0.0, 0.0, -way], dtype=torch.float64)
         return self.rotations(phase), shift
 
     def __call__(self, item: Object, time: float) -> Object:
@@ -143,7 +146,7 @@ class Walking:
             item: At the place where the person stands at time 0.
             time: [s].
         """
-        return posed(item, self.body, *self.posture(time))
+        return pose_object(item, self.body, *self.posture(time))
 
 
 def standing_height(body: BodyTemplate) -> float:
@@ -172,7 +175,7 @@ def check_joints(body: BodyTemplate) -> None:
         )
 
 
-def posed(
+def pose_object(
     item: Object, body: BodyTemplate, rotations: Float64[Tensor, "j 3 3"], shift: Tensor
 ) -> Object:
     """An object as the skin of a body, moved in its own frame.
@@ -183,11 +186,11 @@ def posed(
         rotations: Of every joint in the frame of its parent.
         shift: [m].
     """
-    mesh = Mesh(body.posed(rotations)[0], body.faces)
+    mesh = Mesh(body.apply_pose(rotations)[0], body.faces)
     return replace(item, mesh=mesh, pose=compose(rigid(translation=shift), item.transform))
 
 
-def about(axis: str, angle: float) -> Float64[Tensor, "3 3"]:
+def rotation_about_axis(axis: str, angle: float) -> Float64[Tensor, "3 3"]:
     """Rotation about a coordinate axis.
 
     Args:
@@ -197,23 +200,23 @@ def about(axis: str, angle: float) -> Float64[Tensor, "3 3"]:
     return rotation_from_vector(torch.tensor([angle * (axis == name) for name in "xyz"]).double())
 
 
-def hanging(side: str) -> Float64[Tensor, "3 3"]:
+def hanging_arm_rotation(side: str) -> Float64[Tensor, "3 3"]:
     """Turn of a shoulder that lets the arm hang.
 
     Args:
         side: left or right.
     """
-    return about("z", _HANGING if side == "left" else -_HANGING)
+    return rotation_about_axis("z", _HANGING if side == "left" else -_HANGING)
 
 
-def bent_elbow(side: str, angle: float) -> Float64[Tensor, "3 3"]:
+def elbow_rotation(side: str, angle: float) -> Float64[Tensor, "3 3"]:
     """Turn of an elbow.
 
     Args:
         side: left or right.
         angle: By which it is bent [rad].
     """
-    return about("y", -angle if side == "left" else angle)
+    return rotation_about_axis("y", -angle if side == "left" else angle)
 
 
 def _swing(v: float, slope: float) -> float:
@@ -222,7 +225,7 @@ def _swing(v: float, slope: float) -> float:
     return slope * slow * (1 - slow)
 
 
-def _at(harmonics: np.ndarray, phase: float) -> float:
+def _evaluate_series(harmonics: np.ndarray, phase: float) -> float:
     """Value of a series [rad]."""
     turns = np.exp(2j * math.pi * phase * np.arange(len(harmonics)))
     return float(np.real(harmonics * turns).sum())
@@ -245,11 +248,11 @@ def _curves(v: float) -> dict[str, np.ndarray]:
     ]
     thorax = [(0.1, 4 / 3 * v), (0.4, -1.5 * v), (0.6, -4 / 3 * v), (0.9, 1.5 * v)]
     points = {"hip": hip, "knee": knee, "elbow": elbow, "thorax": thorax}
-    found = {name: _harmonics(_through(own)) for name, own in points.items()}
+    found = {name: _harmonics(_interpolate_cycle(own)) for name, own in points.items()}
     return found | {"tilt": _harmonics(lambda phase: 1.66 * v * _tilt(phase))}
 
 
-def _through(points: list[tuple[float, float]]) -> Callable[[np.ndarray], np.ndarray]:
+def _interpolate_cycle(points: list[tuple[float, float]]) -> Callable[[np.ndarray], np.ndarray]:
     """Monotone cubics through control points of a cycle, again and again [deg]."""
     from scipy.interpolate import PchipInterpolator  # slow to import, and few people walk
 

@@ -24,21 +24,21 @@ from invertwin.scene.people.body import BodyTemplate
 from invertwin.scene.people.gait import (
     Posture,
     Walking,
-    about,
-    bent_elbow,
     check_joints,
-    hanging,
-    posed,
+    elbow_rotation,
+    hanging_arm_rotation,
+    pose_object,
+    rotation_about_axis,
     standing_height,
 )
 from invertwin.scene.scene import Object
 
 _LEAN = math.radians(40.0)  # of the trunk, as the seat is reached
-_REACHED = 0.6  # share of the time after which the seat carries the person
+_SEAT_CONTACT_SHARE = 0.6  # share of the time after which the seat carries the person
 _LAP = (math.radians(25.0), math.radians(60.0))  # of shoulders and elbows, hands above the lap
 _THIGH = 0.088 / 0.42  # radius of a thigh over its length
-_MOST = math.radians(105.0)  # of the thighs, beyond which the seat is too low to sit on
-_RAISED = 0.8  # s, until the arm is up or down
+_MAX_THIGH_ANGLE = math.radians(105.0)  # of the thighs, beyond which the seat is too low to sit on
+_RAISE_DURATION = 0.8  # s, until the arm is up or down
 _WAVE = math.radians(30.0)  # of the forearm to both sides
 
 
@@ -48,7 +48,7 @@ class Sitting:
 
     Feet stay where they are; the seat is behind the person, who faces −z of the object's frame.
     The object's pose places the pelvis as of a person who stands; ``standing_height`` says how
-    high that is. ``InMotion`` applies it.
+    high that is. ``MovingScene`` applies it.
 
     Attributes:
         body: With the joints of ``person``.
@@ -73,7 +73,7 @@ class Sitting:
         checked_number(self.start, "start [s]", -math.inf)
         checked_number(self.duration, "duration [s]", 0.0, open_low=True)
         knee, thigh = self._leg()
-        low = knee + thigh * (math.cos(_MOST) - _THIGH)
+        low = knee + thigh * (math.cos(_MAX_THIGH_ANGLE) - _THIGH)
         checked_number(self.seat, "height of the seat [m]", low, knee + thigh * (1 - _THIGH))
 
     def posture(self, time: float) -> Posture:
@@ -85,19 +85,24 @@ class Sitting:
         share = (time - self.start) / self.duration
         u = 1 - share if self.rising else share
         knee, thigh = self._leg()
-        bent = math.acos((self.seat - knee) / thigh + _THIGH) * _least_jerk(u / _REACHED)
-        lean = _LEAN * (_least_jerk(u / _REACHED) - _least_jerk((u - _REACHED) / (1 - _REACHED)))
-        shoulder, elbow = (angle * _least_jerk(u) for angle in _LAP)
+        bent = math.acos((self.seat - knee) / thigh + _THIGH) * _minimum_jerk(
+            u / _SEAT_CONTACT_SHARE
+        )
+        lean = _LEAN * (
+            _minimum_jerk(u / _SEAT_CONTACT_SHARE)
+            - _minimum_jerk((u - _SEAT_CONTACT_SHARE) / (1 - _SEAT_CONTACT_SHARE))
+        )
+        shoulder, elbow = (angle * _minimum_jerk(u) for angle in _LAP)
         found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
-        pelvis = about("x", -lean / 2)
+        pelvis = rotation_about_axis("x", -lean / 2)
         found[self.body.joint("pelvis")] = pelvis
-        found[self.body.joint("chest")] = about("x", -lean / 2)
+        found[self.body.joint("chest")] = rotation_about_axis("x", -lean / 2)
         for side in ("left", "right"):
             turns = {
-                "hip": pelvis.T @ about("x", bent),
-                "knee": about("x", -bent),
-                "shoulder": about("x", lean + shoulder) @ hanging(side),
-                "elbow": bent_elbow(side, elbow),
+                "hip": pelvis.T @ rotation_about_axis("x", bent),
+                "knee": rotation_about_axis("x", -bent),
+                "shoulder": rotation_about_axis("x", lean + shoulder) @ hanging_arm_rotation(side),
+                "elbow": elbow_rotation(side, elbow),
             }
             for name, turn in turns.items():
                 found[self.body.joint(f"{side}_{name}")] = turn
@@ -112,7 +117,7 @@ class Sitting:
             item: At the place where the person stands.
             time: [s].
         """
-        return posed(item, self.body, *self.posture(time))
+        return pose_object(item, self.body, *self.posture(time))
 
     def _leg(self) -> tuple[float, float]:
         """Height of the knee above the sole, and length of the thigh [m]."""
@@ -124,7 +129,7 @@ class Sitting:
 class Waving:
     """A person who raises an arm, waves, and lowers it again.
 
-    ``InMotion`` applies it; the object's pose is that of a person who stands.
+    ``MovingScene`` applies it; the object's pose is that of a person who stands.
 
     Attributes:
         body: With the joints of ``person``.
@@ -152,7 +157,7 @@ class Waving:
             raise InputError(f"expected the side left or right, got {self.side!r}; choose one")
         checked_number(self.rate, "rate [1/s]", 0.0, open_low=True)
         checked_number(self.start, "start [s]", -math.inf)
-        checked_number(self.duration, "duration [s]", 2 * _RAISED)
+        checked_number(self.duration, "duration [s]", 2 * _RAISE_DURATION)
         if self.during is not None and self.during.body is not self.body:
             raise InputError(
                 "expected one body for waving and for what it does meanwhile, got two; give the "
@@ -165,17 +170,22 @@ class Waving:
         Args:
             time: [s].
         """
-        found, shift = self._rest(time)
+        found, shift = self._rest_rotations(time)
         since = time - self.start
-        up = _least_jerk(since / _RAISED) - _least_jerk(1 - (self.duration - since) / _RAISED)
+        up = _minimum_jerk(since / _RAISE_DURATION) - _minimum_jerk(
+            1 - (self.duration - since) / _RAISE_DURATION
+        )
         swing = _WAVE * math.sin(2 * math.pi * self.rate * since)
         sign = 1.0 if self.side == "right" else -1.0
         # Held out to the side, forearm upwards: the arm of the rest pose with a bent elbow.
         bent = sign * (math.pi / 2 + swing)
-        raised = {"shoulder": about("z", 0.0), "elbow": about("z", bent)}
+        raised = {
+            "shoulder": rotation_about_axis("z", 0.0),
+            "elbow": rotation_about_axis("z", bent),
+        }
         for name, turn in raised.items():
             row = self.body.joint(f"{self.side}_{name}")
-            found[row] = _part_of_the_way(found[row], turn, up)
+            found[row] = _interpolate_rotation(found[row], turn, up)
         return found, shift
 
     def __call__(self, item: Object, time: float) -> Object:
@@ -185,24 +195,24 @@ class Waving:
             item: At the place where the person stands.
             time: [s].
         """
-        return posed(item, self.body, *self.posture(time))
+        return pose_object(item, self.body, *self.posture(time))
 
-    def _rest(self, time: float) -> Posture:
+    def _rest_rotations(self, time: float) -> Posture:
         if self.during is not None:
             return self.during.posture(time)
         found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
         for side in ("left", "right"):
-            found[self.body.joint(f"{side}_shoulder")] = hanging(side)
+            found[self.body.joint(f"{side}_shoulder")] = hanging_arm_rotation(side)
         return found, torch.zeros(3, dtype=torch.float64)
 
 
-def _least_jerk(share: float) -> float:
+def _minimum_jerk(share: float) -> float:
     """From 0 to 1 over shares of the time from 0 to 1, at rest before and after."""
     u = min(max(share, 0.0), 1.0)
     return u**3 * (10 - 15 * u + 6 * u**2)
 
 
-def _part_of_the_way(first: Tensor, last: Tensor, share: float) -> Tensor:
+def _interpolate_rotation(first: Tensor, last: Tensor, share: float) -> Tensor:
     """A rotation between two, by a share of the angle between them."""
     from scipy.spatial.transform import Rotation
 

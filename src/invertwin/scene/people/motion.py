@@ -14,32 +14,32 @@ from invertwin.errors import InputError
 from invertwin.scene.pose import compose, rigid, rotation_from_vector
 from invertwin.scene.scene import Object, Scene
 
-Mover = Callable[[Object, float], Object]
+ObjectMotion = Callable[[Object, float], Object]
 """The object at a time [s], from the object as the scene has it."""
 
-_STILL = 1e-6  # m/s, of a level velocity that has no heading
+_MIN_HEADING_SPEED = 1e-6  # m/s, of a level velocity that has no heading
 
 
 @dataclass(frozen=True, eq=False)
-class InMotion:
+class MovingScene:
     """A scene some of whose objects move: call it with a time [s] to get the scene then.
 
     ``simulate_chirps`` takes it as it is. Triangles are the same at all times.
 
     Attributes:
         scene: Every object as its motion takes it up.
-        movers: By name, one motion or several, applied from first to last.
+        motions: By name, one motion or several, applied from first to last.
 
     Raises:
         InputError: A name that the scene does not have, or an object that has a velocity, too.
     """
 
     scene: Scene
-    movers: Mapping[str, Mover | Sequence[Mover]]
+    motions: Mapping[str, ObjectMotion | Sequence[ObjectMotion]]
 
     def __post_init__(self) -> None:
         checked_type(self.scene, Scene, "a scene", "build one with Scene({name: Object(...)})")
-        for name in self.movers:
+        for name in self.motions:
             if self.scene[name].velocity is not None:
                 raise InputError(
                     f"expected no velocity of {name!r} beside its motion, got one; "
@@ -52,8 +52,8 @@ class InMotion:
         Raises:
             InputError: A time at which a motion is not known.
         """
-        scene = self.scene.at(time)
-        for name, given in self.movers.items():
+        scene = self.scene.advance(time)
+        for name, given in self.motions.items():
             steps = (given,) if callable(given) else tuple(given)
             moved = reduce(lambda item, mover: mover(item, time), steps, scene[name])
             scene = Scene({**scene.objects, name: moved})
@@ -61,7 +61,7 @@ class InMotion:
 
 
 @dataclass(frozen=True, eq=False)
-class Turning:
+class AxisRotation:
     """An object that turns about an axis: a wheel, a fan, the crank of a pedal.
 
     Attributes:
@@ -101,21 +101,21 @@ class Turning:
 
 
 @dataclass(frozen=True, eq=False)
-class Spline:
+class SplineTrajectory:
     """A path through places at given times: a cubic with continuous accelerations.
 
     Its ends have no acceleration (natural spline).
 
     Attributes:
         times: When each place is reached, rising [s].
-        places: [time, 3] in the world [m].
+        positions: [time, 3] in the world [m].
 
     Raises:
         InputError: Fewer than two times, times that do not rise, or places that are not as many.
     """
 
     times: ArrayLike
-    places: ArrayLike
+    positions: ArrayLike
 
     def __post_init__(self) -> None:
         times = checked_tensor(self.times, (None,), "times [s]", "give one for each place")
@@ -125,7 +125,7 @@ class Spline:
                 "by time"
             )
         shape = (len(times), 3)
-        places = checked_tensor(self.places, shape, "places [m]", "give x, y, z for each time")
+        places = checked_tensor(self.positions, shape, "places [m]", "give x, y, z for each time")
         object.__setattr__(self, "times", times.detach())
         object.__setattr__(self, "places", places.detach())
         from scipy.interpolate import CubicSpline  # slow to import, and few paths are splines
@@ -166,15 +166,15 @@ class Spline:
 
 
 @dataclass(frozen=True, eq=False)
-class Along:
+class TrajectoryMotion:
     """An object that is carried along a path; its own pose counts from the path's place.
 
     Attributes:
-        path: Where to, when.
+        trajectory: Where to, when.
         heading: Turn the object about the vertical, so that its front, −z, looks where it goes.
     """
 
-    path: Spline
+    trajectory: SplineTrajectory
     heading: bool = False
 
     def __call__(self, item: Object, time: float) -> Object:
@@ -189,8 +189,8 @@ class Along:
         """
         turn = None
         if self.heading:
-            ahead = self.path.velocity(time)
-            if math.hypot(float(ahead[0]), float(ahead[2])) < _STILL:
+            ahead = self.trajectory.velocity(time)
+            if math.hypot(float(ahead[0]), float(ahead[2])) < _MIN_HEADING_SPEED:
                 raise InputError(
                     f"expected a level velocity for a heading, got {ahead.tolist()} m/s at "
                     f"{time:g} s; move its places, or leave out heading"
@@ -198,4 +198,6 @@ class Along:
             # −z turned about y by θ is (−sin θ, 0, −cos θ).
             angle = torch.atan2(-ahead[0], -ahead[2])
             turn = rotation_from_vector(torch.stack([0 * angle, angle, 0 * angle]))
-        return replace(item, pose=compose(item.transform, rigid(turn, self.path.position(time))))
+        return replace(
+            item, pose=compose(item.transform, rigid(turn, self.trajectory.position(time)))
+        )

@@ -42,7 +42,7 @@ _LIMBS = [
 ]
 _FILLET = 0.02  # m, over which parts run into each other
 _BLEND = 0.08  # m, over which the skin passes from one joint to the next
-_TALL = 1.75  # m
+_DEFAULT_HEIGHT = 1.75  # m
 
 
 def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
@@ -64,8 +64,8 @@ def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
     step = checked_number(spacing, "spacing of the triangles [m]", 0.01, 0.05)
     low = torch.tensor([-0.93, -1.0, -0.24], dtype=torch.float64)
     high = torch.tensor([0.93, 0.86, 0.18], dtype=torch.float64)
-    counts = ((high - low) * tall / _TALL / step).ceil().int() + 1
-    mesh = iso_surface(_distance, Lattice.between(low, high, counts.tolist()))
+    counts = ((high - low) * tall / _DEFAULT_HEIGHT / step).ceil().int() + 1
+    mesh = iso_surface(_distance, Lattice.from_bounds(low, high, counts.tolist()))
     names = list(_JOINTS)
     parents = [-1 if parent is None else names.index(parent) for parent, _ in _JOINTS.values()]
     joints = torch.tensor([place for _, place in _JOINTS.values()], dtype=torch.float64)
@@ -77,7 +77,7 @@ def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
         joints,
         names=tuple(names),
     )
-    return template.scaled(tall / _TALL)
+    return template.scale(tall / _DEFAULT_HEIGHT)
 
 
 def _parts() -> list[tuple[str, Tensor, Tensor, float, float]]:

@@ -32,7 +32,7 @@ class LatticeDeformation(ObjectModule):
 
     def __init__(self, object: str, low: Point, high: Point, counts: Counts = (4, 4, 4)) -> None:
         super().__init__(object)
-        self.lattice = Lattice.between(low, high, counts)
+        self.lattice = Lattice.from_bounds(low, high, counts)
         shape = [n + 2 for n in self.lattice.counts]
         self.offsets = nn.Parameter(torch.zeros(*shape, 3, dtype=torch.float64))
 
@@ -54,7 +54,7 @@ class LatticeDeformation(ObjectModule):
         index, t = self.lattice.cell(points)
         return tensor_product(self.offsets, index, _cubic_spline(t))
 
-    def reshaped(self, mesh: Mesh) -> Mesh:
+    def update_mesh(self, mesh: Mesh) -> Mesh:
         """The mesh deformed.
 
         Raises:

@@ -20,7 +20,7 @@ from invertwin.scene.shape_models.lattice import Lattice
 
 # Starts are kept this far above zero, in units of one over a node spacing: below, softplus is so
 # flat that a density could not come back.
-_FAINTEST = 1e-3
+_MIN_DENSITY = 1e-3
 
 
 class DensityGrid(ObjectModule):
@@ -54,14 +54,14 @@ class DensityGrid(ObjectModule):
     ) -> None:
         super().__init__(object)
         self.albedo = checked_number(albedo, "albedo", 0.0, open_low=True)
-        self.lattice = Lattice.between(low, high, density.shape)
+        self.lattice = Lattice.from_bounds(low, high, density.shape)
         given = Cloud(self.lattice.low, self.lattice.high, density, albedo).density.detach()
-        scaled = (given * self._unit).clamp_min(_FAINTEST)
+        scaled = (given * self._density_unit).clamp_min(_MIN_DENSITY)
         # log(exp(s) − 1), the inverse of softplus, without overflow.
         self.value = nn.Parameter(scaled + torch.log(-torch.expm1(-scaled)))
 
     @classmethod
-    def of_object(
+    def from_object(
         cls,
         object: str,
         low: Point,
@@ -88,13 +88,13 @@ class DensityGrid(ObjectModule):
         if item.cloud is not None:
             return cls(object, item.cloud.low, item.cloud.high, item.cloud.density.detach())
         if extinction is None:
-            return cls.even(object, low, high, counts)
-        lattice = Lattice.between(low, high, counts)
+            return cls.from_optical_depth(object, low, high, counts)
+        lattice = Lattice.from_bounds(low, high, counts)
         inside = -signed_distance(item.mesh, lattice.nodes.reshape(-1, 3)) / lattice.spacing.mean()
         return cls(object, low, high, extinction * (4 * inside).sigmoid().reshape(lattice.counts))
 
     @classmethod
-    def even(
+    def from_optical_depth(
         cls, object: str, low: ArrayLike, high: ArrayLike, counts: Sequence[int], depth: float = 0.5
     ) -> "DensityGrid":
         """Make a grid of one density σ, from ∫σ ds through the box along its longest side.
@@ -105,19 +105,19 @@ class DensityGrid(ObjectModule):
             counts: nodes along x, y and z.
             depth: ∫σ ds. Keep it small: an opaque cloud hides from the fit what lies behind.
         """
-        lattice = Lattice.between(low, high, counts)
+        lattice = Lattice.from_bounds(low, high, counts)
         whole = checked_number(depth, "optical depth", 0.0, open_low=True)
         density = whole / (lattice.high - lattice.low).max()
         return cls(object, low, high, density.expand(lattice.counts))
 
     @property
-    def _unit(self) -> float:
+    def _density_unit(self) -> float:
         return float(self.lattice.spacing.mean())
 
     @property
     def density(self) -> Float64[Tensor, "x y z"]:
         """Extinction at the nodes [1/m]."""
-        return softplus(self.value) / self._unit
+        return softplus(self.value) / self._density_unit
 
     def entries(self) -> dict[str, Entries]:
         """The logarithm of the density: its changes are relative ones of the density."""
@@ -180,7 +180,7 @@ def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
     return Mesh(cloud.low + places * cloud.spacing, torch.from_numpy(faces.astype("int64")))
 
 
-def without_clouds(scene: Scene) -> Scene:
+def replace_clouds(scene: Scene) -> Scene:
     """Replace every cloud of a scene by its surface, for exact signals and pictures.
 
     A cloud of one density has no such surface: its object keeps the mesh that marked its place.

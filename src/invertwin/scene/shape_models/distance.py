@@ -25,7 +25,7 @@ from invertwin.limits import NonNegative, Positive
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
 from invertwin.scene.shape_models.iso_surface import iso_surface
-from invertwin.scene.shape_models.lattice import Lattice, cubic
+from invertwin.scene.shape_models.lattice import Lattice, interpolate_cubic
 
 
 def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
@@ -55,13 +55,13 @@ class _Distance(ObjectModule):
 
     def __init__(self, object: str, low: ArrayLike, high: ArrayLike, counts: Sequence[int]) -> None:
         super().__init__(object)
-        self.lattice = Lattice.between(low, high, counts)
+        self.lattice = Lattice.from_bounds(low, high, counts)
 
     def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
         """The field at points in the object's frame [m]: negative inside."""
         raise NotImplementedError
 
-    def reshaped(self, mesh: Mesh) -> Mesh:
+    def update_mesh(self, mesh: Mesh) -> Mesh:
         """The present surface, meshed anew, whatever was there before.
 
         Raises:
@@ -106,7 +106,7 @@ class DistanceGrid(_Distance):
         self.value = nn.Parameter(self._smoother.power(1, given.detach()).clone())
 
     @classmethod
-    def sampled(
+    def from_function(
         cls,
         object: str,
         low: ArrayLike,
@@ -124,13 +124,13 @@ class DistanceGrid(_Distance):
             distance: signed distance [m] of points [p, 3], negative inside.
             smoothing: λ of the class.
         """
-        lattice = Lattice.between(low, high, counts)
+        lattice = Lattice.from_bounds(low, high, counts)
         with torch.no_grad():
             value = distance(lattice.nodes.reshape(-1, 3))
         return cls(object, low, high, value.reshape(lattice.counts), smoothing)
 
     @classmethod
-    def of_mesh(
+    def from_mesh(
         cls,
         object: str,
         low: Point,
@@ -151,7 +151,7 @@ class DistanceGrid(_Distance):
         Raises:
             InputError: what the class refuses.
         """
-        return cls.sampled(object, low, high, counts, partial(signed_distance, mesh), smooth)
+        return cls.from_function(object, low, high, counts, partial(signed_distance, mesh), smooth)
 
     @property
     def distances(self) -> Float64[Tensor, "x y z"]:
@@ -160,7 +160,7 @@ class DistanceGrid(_Distance):
 
     def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
         """The field at points in the object's frame [m]: negative inside."""
-        return cubic(self.distances, self.lattice, points)
+        return interpolate_cubic(self.distances, self.lattice, points)
 
 
 class GridSmoother:

@@ -13,9 +13,11 @@ from invertwin.scene.shape_models.lattice import Lattice
 
 Field = Callable[[Float64[Tensor, "p 3"]], Float64[Tensor, " p"]]
 
-_POLISH = 4  # Newton steps from marching cubes, whose error is of second order, to the field's zero
+_NEWTON_STEPS = (
+    4  # Newton steps from marching cubes, whose error is of second order, to the field's zero
+)
 _CHUNK = 65_536  # points of the field at a time
-_FLAT = 1e-6  # least slope of a distance, whose own is 1
+_MIN_GRADIENT = 1e-6  # least slope of a distance, whose own is 1
 
 
 def iso_surface(field: Field, lattice: Lattice) -> Mesh:
@@ -38,11 +40,11 @@ def iso_surface(field: Field, lattice: Lattice) -> Mesh:
     """
     with torch.no_grad():
         parts = [field(part).detach() for part in lattice.nodes.reshape(-1, 3).split(_CHUNK)]
-    points, faces, slope = surface_of(field, lattice, torch.cat(parts).reshape(lattice.counts))
-    return Mesh(follow(field, points, slope), faces)
+    points, faces, slope = extract_surface(field, lattice, torch.cat(parts).reshape(lattice.counts))
+    return Mesh(attach_shape_derivative(field, points, slope), faces)
 
 
-def surface_of(
+def extract_surface(
     field: Field, lattice: Lattice, values: Float64[Tensor, "x y z"]
 ) -> tuple[Float64[Tensor, "p 3"], Int64[Tensor, "t 3"], Float64[Tensor, "p 3"]]:
     """Places of vertices, triangles, and the field's slope there, all without derivatives.
@@ -64,12 +66,12 @@ def surface_of(
         values.detach().numpy(), 0.0, gradient_direction="descent", allow_degenerate=False
     )
     start = lattice.low + torch.from_numpy(corners).double() * lattice.spacing
-    points = _polished(field, start, lattice)
-    slope = _value_and_slope(field, points)[1]
+    points = _refine_vertices(field, start, lattice)
+    slope = _value_and_gradient(field, points)[1]
     return points, torch.from_numpy(faces.astype("int64")), slope
 
 
-def follow(
+def attach_shape_derivative(
     field: Field, points: Float64[Tensor, "p 3"], slope: Float64[Tensor, "p 3"]
 ) -> Float64[Tensor, "p 3"]:
     """Points of the surface as they are, with the derivative dV = −n df/|∇f|.
@@ -80,23 +82,23 @@ def follow(
         slope: the field's gradient there.
     """
     fixed = points.detach()
-    direction = slope / slope.square().sum(1, keepdim=True).clamp_min(_FLAT**2)
+    direction = slope / slope.square().sum(1, keepdim=True).clamp_min(_MIN_GRADIENT**2)
     value = field(fixed)
     return fixed - direction * (value - value.detach())[:, None]
 
 
-def _polished(field: Field, points: Tensor, lattice: Lattice) -> Tensor:
+def _refine_vertices(field: Field, points: Tensor, lattice: Lattice) -> Tensor:
     reach = 0.5 * float(lattice.spacing.min())
-    for _ in range(_POLISH):
-        value, slope = _value_and_slope(field, points)
-        step = slope * (value / slope.square().sum(1).clamp_min(_FLAT**2))[:, None]
+    for _ in range(_NEWTON_STEPS):
+        value, slope = _value_and_gradient(field, points)
+        step = slope * (value / slope.square().sum(1).clamp_min(_MIN_GRADIENT**2))[:, None]
         length = step.norm(dim=1, keepdim=True)
         points = points - step * (reach / length.clamp_min(reach))
         points = points.clamp(lattice.low, lattice.high)
     return points
 
 
-def _value_and_slope(field: Field, points: Tensor) -> tuple[Tensor, Tensor]:
+def _value_and_gradient(field: Field, points: Tensor) -> tuple[Tensor, Tensor]:
     """The field and its gradient in space, both without derivatives."""
     values, slopes = [], []
     for part in points.split(_CHUNK):

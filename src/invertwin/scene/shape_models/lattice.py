@@ -11,13 +11,13 @@ from invertwin.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.errors import InputError
 from invertwin.runtime.memory import require_at_most
 
-_MOST_NODES, _MOST_ALONG = 2e7, 2000
+_MAX_NODES, _MAX_NODES_PER_AXIS = 2e7, 2000
 _DO = "give x, y, z of the box's corners"
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Nodes of a box, corners included, as `between` makes them.
+    """Nodes of a box, corners included, as `interpolate_position` makes them.
 
     Attributes:
         low, high: corners of the box in the object's frame [m].
@@ -29,7 +29,7 @@ class Lattice:
     counts: tuple[int, int, int]
 
     @classmethod
-    def between(
+    def from_bounds(
         cls, low: ArrayLike, high: ArrayLike, counts: Sequence[int], *, sliced: bool = False
     ) -> "Lattice":
         """The lattice between two corners, given as any numbers.
@@ -55,8 +55,8 @@ class Lattice:
             )
         x, y, z = (checked_count(count, "nodes along an axis", 2) for count in counts)
         for count, most, where in (
-            (max(x, y, z), _MOST_ALONG, " along an axis"),
-            (0 if sliced else x * y * z, _MOST_NODES, ""),
+            (max(x, y, z), _MAX_NODES_PER_AXIS, " along an axis"),
+            (0 if sliced else x * y * z, _MAX_NODES, ""),
         ):
             require_at_most(
                 count, most, f"nodes of a grid{where}", "take fewer, wider apart", "counts"
@@ -107,7 +107,7 @@ def tensor_product(
     return torch.einsum("pi,pj,pk,pijk...->p...", weights[:, 0], weights[:, 1], weights[:, 2], near)
 
 
-def cubic(
+def interpolate_cubic(
     values: Float64[Tensor, "x y z"], lattice: Lattice, points: Float64[Tensor, "p 3"]
 ) -> Float64[Tensor, " p"]:
     """Interpolate at points by cubic convolution (Catmull–Rom), also outside the lattice.
@@ -118,11 +118,11 @@ def cubic(
         points: [m].
     """
     index, t = lattice.cell(points)
-    return tensor_product(_extended(values), index, _cubic_convolution(t))
+    return tensor_product(_extrapolate_boundary(values), index, _cubic_convolution(t))
 
 
-def cubic_slices(
-    values: Float64[Tensor, "x y z"], lattice: Lattice, wanted: Lattice
+def interpolate_cubic_slices(
+    values: Float64[Tensor, "x y z"], lattice: Lattice, target: Lattice
 ) -> Iterator[Float64[Tensor, "y z"]]:
     """Values at the nodes of another lattice by cubic convolution, one plane of x after another.
 
@@ -131,24 +131,26 @@ def cubic_slices(
     Args:
         values: at the nodes.
         lattice: the nodes.
-        wanted: nodes of the result.
+        target: nodes of the result.
     """
-    extended = _extended(values)
-    x, y, z = (_matrix(lattice, axis, places) for axis, places in enumerate(wanted.axes))
+    extended = _extrapolate_boundary(values)
+    x, y, z = (
+        _interpolation_matrix(lattice, axis, places) for axis, places in enumerate(target.axes)
+    )
     for weights in x:
         yield y @ torch.tensordot(weights, extended, dims=1) @ z.T
 
 
-def _matrix(lattice: Lattice, axis: int, places: Tensor) -> Tensor:
+def _interpolation_matrix(lattice: Lattice, axis: int, positions: Tensor) -> Tensor:
     """Weights [place, node] of a cubic convolution along one axis, of the extended nodes."""
     count = lattice.counts[axis]
-    place = (places - lattice.low[axis]) / lattice.spacing[axis]
+    place = (positions - lattice.low[axis]) / lattice.spacing[axis]
     index = place.floor().long().clamp(0, count - 2)
-    matrix = torch.zeros(len(places), count + 2, dtype=torch.float64)
+    matrix = torch.zeros(len(positions), count + 2, dtype=torch.float64)
     return matrix.scatter(1, index[:, None] + torch.arange(4), _cubic_convolution(place - index))
 
 
-def _extended(values: Tensor) -> Tensor:
+def _extrapolate_boundary(values: Tensor) -> Tensor:
     """One more node on every side, by a straight line through the last two."""
     for axis in range(3):
         first, second = values.narrow(axis, 0, 2).split(1, axis)

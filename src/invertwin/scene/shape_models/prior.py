@@ -14,9 +14,13 @@ from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
-from invertwin.scene.shape_models.iso_surface import follow, surface_of
-from invertwin.scene.shape_models.lattice import Lattice, cubic, cubic_slices
-from invertwin.storage.untrusted import read_arrays, reader
+from invertwin.scene.shape_models.iso_surface import attach_shape_derivative, extract_surface
+from invertwin.scene.shape_models.lattice import (
+    Lattice,
+    interpolate_cubic,
+    interpolate_cubic_slices,
+)
+from invertwin.storage.untrusted import read_arrays, safe_reader
 
 _MODEL = "vehicle_prior.npz"
 _FORMAT = "invertwin shape prior 1"
@@ -99,7 +103,7 @@ class ShapePrior:
         """
         if counts is None:
             counts = (((self.high - self.low) / _SPACING - 1e-9).ceil().int() + 1).tolist()
-        return Lattice.between(self.low, self.high, counts, sliced=sliced)
+        return Lattice.from_bounds(self.low, self.high, counts, sliced=sliced)
 
     def values(self, latent: Float64[Tensor, " k"]) -> Float64[Tensor, "x y z"]:
         """Signed distances at the decoder's nodes [m], negative inside.
@@ -108,7 +112,7 @@ class ShapePrior:
             InputError: a latent of another size, not finite, or out of range.
         """
         x, y, z = self.lattice.counts
-        half = self.decoder(self._checked(latent)).reshape(x, (y + 1) // 2, z)
+        half = self.decoder(self._check_latent(latent)).reshape(x, (y + 1) // 2, z)
         return torch.cat([half[:, 1:].flip(1), half], dim=1)
 
     def distance(
@@ -120,7 +124,7 @@ class ShapePrior:
             points: [m].
             latent: coordinates in standard deviations.
         """
-        return cubic(self.values(latent), self.lattice, points)
+        return interpolate_cubic(self.values(latent), self.lattice, points)
 
     def slices(
         self, latent: Float64[Tensor, " k"], counts: Sequence[int]
@@ -136,7 +140,9 @@ class ShapePrior:
         Raises:
             InputError: what `values` refuses, or fewer than two nodes along an axis.
         """
-        return cubic_slices(self.values(latent), self.lattice, self.nodes(counts, sliced=True))
+        return interpolate_cubic_slices(
+            self.values(latent), self.lattice, self.nodes(counts, sliced=True)
+        )
 
     def decode(
         self, latent: Float64[Tensor, " k"], counts: Sequence[int]
@@ -158,7 +164,12 @@ class ShapePrior:
         """
         values = self.values(latent)
         points, faces, slope = self._surface(values.detach(), self.nodes(counts))
-        return Mesh(follow(lambda at: cubic(values, self.lattice, at), points, slope), faces)
+        return Mesh(
+            attach_shape_derivative(
+                lambda at: interpolate_cubic(values, self.lattice, at), points, slope
+            ),
+            faces,
+        )
 
     def mean_mesh(self, counts: Sequence[int] | None = None) -> Mesh:
         """The surface of z = 0."""
@@ -174,19 +185,19 @@ class ShapePrior:
             file, format=_FORMAT, counts=np.array(self.lattice.counts), **box, **weights
         )
 
-    def _surface(self, values: Tensor, wanted: Lattice) -> tuple[Tensor, Tensor, Tensor]:
+    def _surface(self, values: Tensor, target: Lattice) -> tuple[Tensor, Tensor, Tensor]:
         """Vertices, triangles and the field's slope there; kept for derivatives that follow."""
         last = self._last
-        if last is None or last[0] != wanted.counts or not torch.equal(last[1], values):
+        if last is None or last[0] != target.counts or not torch.equal(last[1], values):
 
             def field(at: Tensor) -> Tensor:
-                return cubic(values, self.lattice, at)
+                return interpolate_cubic(values, self.lattice, at)
 
-            known = torch.stack(list(cubic_slices(values, self.lattice, wanted)))
-            last = self._last = wanted.counts, values, surface_of(field, wanted, known)
+            known = torch.stack(list(interpolate_cubic_slices(values, self.lattice, target)))
+            last = self._last = target.counts, values, extract_surface(field, target, known)
         return last[2]
 
-    def _checked(self, latent: Tensor) -> Tensor:
+    def _check_latent(self, latent: Tensor) -> Tensor:
         """The latent, if it is one that decodes."""
         do = f"give {self.latent_size} numbers in standard deviations"
         given = checked_tensor(latent, (self.latent_size,), "latent", do)
@@ -238,7 +249,7 @@ class PriorShape(ObjectModule):
         """The present field at points in the object's frame [m]: negative inside."""
         return self.prior.distance(points, self.latent)
 
-    def reshaped(self, mesh: Mesh) -> Mesh:
+    def update_mesh(self, mesh: Mesh) -> Mesh:
         """The decoded mesh, whatever was there before.
 
         Raises:
@@ -258,16 +269,16 @@ def load_prior(file: str | Path | None = None) -> ShapePrior:
     Raises:
         InputError: no such file, or not a prior.
     """
-    return _loaded() if file is None else _read(Path(file))
+    return _load_default_prior() if file is None else _read(Path(file))
 
 
 @cache
-def _loaded() -> ShapePrior:
+def _load_default_prior() -> ShapePrior:
     with resources.as_file(resources.files("invertwin.scene.geometry") / _MODEL) as file:
         return _read(file)
 
 
-@reader("a shape prior")
+@safe_reader("a shape prior")
 def _read(path: Path) -> ShapePrior:
     do = "give a file of invertwin train-prior"
     found = read_arrays(path, do)
@@ -284,4 +295,4 @@ def _read(path: Path) -> ShapePrior:
         raise InputError(f"expected a shape prior in {path.name}, got another file; {do}") from None
     if not all(bool(torch.isfinite(w).all()) for w in weights.values()):
         raise InputError(f"expected finite numbers in {path.name}, got NaN or infinity; {do}")
-    return ShapePrior(decoder, Lattice.between(low, high, [int(n) for n in counts]))
+    return ShapePrior(decoder, Lattice.from_bounds(low, high, [int(n) for n in counts]))

@@ -96,6 +96,6 @@ class LinearShape(ObjectModule):
         space.mesh(start.detach())
         self.latent = nn.Parameter(start.detach().clone())
 
-    def reshaped(self, mesh: Mesh) -> Mesh:
+    def update_mesh(self, mesh: Mesh) -> Mesh:
         """The space's mesh, whatever was there before."""
         return self.space.mesh(self.latent)

@@ -52,7 +52,7 @@ class SmoothVertices(ObjectModule):
         """Displacements of the vertices in the object's frame [m]."""
         return _Smoothed.apply(self.latent, self._smoother)  # type: ignore[return-value]
 
-    def reshaped(self, mesh: Mesh) -> Mesh:
+    def update_mesh(self, mesh: Mesh) -> Mesh:
         """The mesh with its vertices moved.
 
         Raises:

@@ -17,16 +17,16 @@ from invertwin.scene import (
     PerfectConductor,
     box,
     dihedral,
-    joined,
+    merge_meshes,
     plate,
     rigid,
     sphere,
 )
-from invertwin.signatures import aspects
+from invertwin.signatures import aspect_directions
 from scenes import float64
 
 METAL = PerfectConductor()
-TOWARDS = aspects([0.4, 2.5], 0.3)
+TOWARDS = aspect_directions([0.4, 2.5], 0.3)
 
 
 def metal(mesh: Mesh) -> Scene:
@@ -36,11 +36,11 @@ def metal(mesh: Mesh) -> Scene:
 def test_a_coarse_ball_is_that_of_mie():
 
     ball = sphere(0.5, 3)
-    target = meshed.SolvedMeshes(
+    target = meshed.EFIESolver(
         ball.vertices, ball.faces, torch.ones(len(ball.faces), dtype=torch.bool), TOWARDS[0]
     )
     k = 4.0
-    found = target.scattered(k, [(TOWARDS, TOWARDS)])
+    found = target.solve_scattering(k, [(TOWARDS, TOWARDS)])
     assert found is not None
     frequency = float64([k * SPEED_OF_LIGHT / (2 * math.pi)])
     truth = SphereSection(0.5).section(frequency, TOWARDS)[0]
@@ -60,7 +60,7 @@ def test_derivatives_are_those_of_the_solution(mesh):
 
     def power(vertices: Tensor) -> Tensor:
         scene = metal(Mesh(vertices, mesh.faces))
-        received = aspects([1.4, 2.0], 1.3)
+        received = aspect_directions([1.4, 2.0], 1.3)
         found = rcs(scene, TOWARDS, SPEED_OF_LIGHT, receivers=received)
         assert "rest" in found.parts
         return found.matrix.abs().square().flatten()
@@ -84,7 +84,7 @@ def test_derivatives_are_those_of_the_solution(mesh):
 @pytest.mark.filterwarnings("ignore::invertwin.errors.PhysicsWarning")
 def test_antennas_may_be_exchanged():
     bent = metal(dihedral(0.8, 1.4))
-    received = aspects([1.4, 2.0], 1.3)
+    received = aspect_directions([1.4, 2.0], 1.3)
     there = rcs(bent, TOWARDS, SPEED_OF_LIGHT, receivers=received).matrix
     back = rcs(bent, received, SPEED_OF_LIGHT, receivers=TOWARDS).matrix
     assert float((there - back.mT).abs().max()) < 1e-6 * float(there.abs().max())
@@ -95,21 +95,21 @@ def test_a_box_at_a_resonance_of_its_inside(monkeypatch):
     side = math.sqrt(5) / 2
     changes = []
     for places in (160, 0):
-        monkeypatch.setattr(meshed, "_PLACES", places or 160)
+        monkeypatch.setattr(meshed, "_MAX_INTERIOR_POINTS", places or 160)
         cube = box((side,) * 3)
         solid = torch.full((12,), places > 0)
-        target = meshed.SolvedMeshes(cube.vertices, cube.faces, solid, float64([0.0, 0.0, 1.0]))
-        mesh = target.pieces(2 * math.pi)
+        target = meshed.EFIESolver(cube.vertices, cube.faces, solid, float64([0.0, 0.0, 1.0]))
+        mesh = target.elements(2 * math.pi)
         assert mesh is not None
-        equations = [meshed._Equation(target, mesh, 2 * math.pi * f) for f in (0.999, 1.0)]
-        first, second = (equation.currents(TOWARDS) for equation in equations)
+        equations = [meshed._EFIEEquation(target, mesh, 2 * math.pi * f) for f in (0.999, 1.0)]
+        first, second = (equation.solve_currents(TOWARDS) for equation in equations)
         changes.append(float((second - first).abs().max() / first.abs().max()))
     assert changes[0] < 0.1 * changes[1]
 
 
 @pytest.mark.filterwarnings("ignore::invertwin.errors.PhysicsWarning")
 def test_what_crosses_is_left_to_bounces():
-    crossing = joined(
+    crossing = merge_meshes(
         [plate(0.8, 0.8), Mesh(plate(0.8, 0.8).vertices[:, [0, 2, 1]], plate(0.8, 0.8).faces)]
     )
     for mesh, edges in ((crossing, 2), (plate(9.0, 9.0), 2), (plate(0.8, 0.8), 0)):
@@ -142,7 +142,7 @@ def test_derivatives_of_seams_are_refused():
 
 
 def test_currents_that_do_not_keep_the_power_are_not_used(monkeypatch):
-    monkeypatch.setattr(meshed, "keeps_power", lambda *_: False)
+    monkeypatch.setattr(meshed, "conserves_power", lambda *_: False)
     with pytest.warns(PhysicsWarning, match="do not keep the power"):
-        found = rcs(metal(plate(0.8, 0.8)), aspects(0.4, 0.3), SPEED_OF_LIGHT)
+        found = rcs(metal(plate(0.8, 0.8)), aspect_directions(0.4, 0.3), SPEED_OF_LIGHT)
     assert "rest" not in found.parts

@@ -10,7 +10,7 @@ from scipy.special import spherical_jn, spherical_yn
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel import SphereSection, trace_signature
+from invertwin.channel import SphereSection, trace_far_field
 from invertwin.channel.rcs.moments import mfie as solved
 from invertwin.channel.rcs.moments import solver as currents
 from invertwin.constants import SPEED_OF_LIGHT
@@ -39,7 +39,7 @@ def parts_of(
     given: dict[str, Any] = {"depth": 1, "edges": 1, "tubes_per_wavelength": 4.0, "up": UP}
     frequency = size / RADIUS * SPEED_OF_LIGHT / (2 * math.pi)
     toward = normalize(torch.as_tensor(sent, dtype=torch.float64), dim=1)
-    found = trace_signature(scene, toward, received, float64([frequency]), **(given | options))
+    found = trace_far_field(scene, toward, received, float64([frequency]), **(given | options))
     return {name: part[0] for name, part in found.items()}
 
 
@@ -81,7 +81,7 @@ def test_a_ball_is_that_of_mie(size):
 
 def test_one_surface_alone_fails_at_a_resonance(monkeypatch):
     right = field_of(BALL, 4.4934, [[0.3, 0.5, 0.8]])
-    monkeypatch.setattr(solved, "_SHARE", 0j)
+    monkeypatch.setattr(solved, "_INNER_WEIGHT", 0j)
     alone = field_of(BALL, 4.4934, [[0.3, 0.5, 0.8]])
     assert float((alone - right).abs().max() / right.abs().max()) > 0.1
 
@@ -110,7 +110,7 @@ def test_both_ways_of_solving_agree(monkeypatch):
     directions = [[0.3, 0.5, 0.8], [1.0, 0.1, 0.0]]
     found = []
     for worth in (0, 10**9):
-        monkeypatch.setattr(solved, "_WORTH", worth)
+        monkeypatch.setattr(solved, "_CELLS_PER_WAVE_DIRECT", worth)
         found.append(field_of(BALL, 5.0, directions))
     assert float((found[0] - found[1]).abs().max()) < 1e-4 * float(found[0].abs().max())
 
@@ -163,13 +163,13 @@ def test_a_thin_body_has_no_cells():
     """Its cells would have to be as small as it is thick."""
     flat = sphere(RADIUS, 4)
     disc = Mesh(flat.vertices * float64([1.0, 1.0, 0.02]), flat.faces)
-    bodies = solved.SolvedBodies(disc.vertices[disc.faces], UP)
-    assert bodies.scattered(50.0, [(UP[None], UP[None])]) is None
+    bodies = solved.MFIESolver(disc.vertices[disc.faces], UP)
+    assert bodies.solve_scattering(50.0, [(UP[None], UP[None])]) is None
 
 
 def test_frequencies_that_are_too_high_have_no_rest():
     frequencies = float64([5.0, 25.0]) / RADIUS * SPEED_OF_LIGHT / (2 * math.pi)
-    found = trace_signature(
+    found = trace_far_field(
         BALL,
         UP[None],
         None,
@@ -184,7 +184,7 @@ def test_frequencies_that_are_too_high_have_no_rest():
 
 
 def test_currents_that_do_not_keep_the_power_are_not_used(monkeypatch):
-    monkeypatch.setattr(currents, "_TRUSTED", 1e-9)
+    monkeypatch.setattr(currents, "_POWER_TOLERANCE", 1e-9)
     with pytest.warns(PhysicsWarning, match="do not keep the power"):
         found = parts_of(BALL, 5.0, [[0.3, 0.5, 0.8]])
     assert "rest" not in found

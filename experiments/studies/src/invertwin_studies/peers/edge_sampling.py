@@ -16,11 +16,11 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, differentiated
-from invertwin.channel.coherent.radar_equation import Place, radar_equation
+from invertwin.channel import Grid, Link, is_differentiated
+from invertwin.channel.coherent.radar_equation import MaterialPoints, radar_equation
 from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import mi
-from invertwin.channel.rays.ray_scene import RayScene, visible
+from invertwin.channel.rays.ray_scene import RayScene, is_visible
 from invertwin.channel.rays.scene_tables import Geometry, flatten
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
@@ -64,7 +64,7 @@ def edge_sampling_derivative(
         )
         moved, seen = direction(scene, radar, theta)
         link = seen.link()
-        if differentiated(link.tx) or differentiated(link.rotations):
+        if is_differentiated(link.tx) or is_differentiated(link.rotations):
             raise InputError(
                 "expected a parameter of an object for edge sampling, got one that moves the "
                 "radar; leave edge_sampling out"
@@ -115,7 +115,7 @@ def _echo(
     slope = (normal * ray).sum(1)
     reach = (normal * (p0 - origin)).sum(1) / slope
     ones = torch.ones_like(reach)
-    met = Place(origin + ray * reach[:, None], normal, ones, geometry.face_surface[face])
+    met = MaterialPoints(origin + ray * reach[:, None], normal, ones, geometry.face_surface[face])
     found = radar_equation(geometry, link, frame, [met])
     local = torch.einsum("nij,ni->nj", link.rotations[frame], ray)
     strength = found.power * reach.square() / slope.abs().clamp_min(1e-6)
@@ -178,7 +178,7 @@ def _edges(
     frame = torch.randint(link.frame_count, (count,), generator=generator)
     y0, y1 = ends[chosen, 0], ends[chosen, 1]
     point = y0 + (y1 - y0) * along
-    seen = visible(rays, link.tx[frame], _value(point))
+    seen = is_visible(rays, link.tx[frame], _value(point))
     frame, chosen, point = frame[seen], chosen[seen], point[seen]
     origin = link.tx[frame]
     away = point - origin
@@ -208,7 +208,9 @@ def _edges(
 def _hit(rays: RayScene, origin: Tensor, ray: Tensor) -> Tensor:
     """The triangle that each ray meets first; −1 = none."""
     aim = mi.Vector3f(*(to_float(ray[:, k]) for k in range(3)))
-    found = rays.scene.ray_intersect_preliminary(mi.Ray3f(rays.located(origin), aim), coherent=True)
+    found = rays.scene.ray_intersect_preliminary(
+        mi.Ray3f(rays.to_local_points(origin), aim), coherent=True
+    )
     face = to_torch(found.prim_index).long()
     return torch.where(to_torch(found.is_valid()).bool(), face, -1)
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from invertwin.capture import Capture, ChirpCapture
-from invertwin.cli.schema.recordings import recorded
+from invertwin.cli.schema.recordings import assign_board
 from invertwin.errors import InputError
 from invertwin.radar.boards import Mounting
-from invertwin.registry.section import InputPath, about
+from invertwin.registry.section import InputPath, prefix_errors
 from invertwin_studies.recordings import openradar, rail_sar
 
 _ORIGINALS = {
@@ -22,7 +22,7 @@ def rail_sar_data(folder: InputPath) -> Capture:
     Args:
         folder: path, from the run file's folder, then from INVERTWIN_DATA.
     """
-    with about("folder"):
+    with prefix_errors("folder"):
         return rail_sar.read(_holding(rail_sar.FILE, Path(folder)))
 
 
@@ -33,9 +33,9 @@ def openradar_data(folder: InputPath, board: Mounting | None = None) -> ChirpCap
         folder: path, from the run file's folder, then from INVERTWIN_DATA.
         board: whose elements recorded; the file does not say; without it xWR1642.
     """
-    with about("folder"):
+    with prefix_errors("folder"):
         chirps = openradar.read_chirps(_holding(openradar.FILE, Path(folder)))
-    return replace(recorded(chirps, board or Mounting("xWR1642")), moving=True)
+    return replace(assign_board(chirps, board or Mounting("xWR1642")), moving=True)
 
 
 def _holding(file: str, folder: Path) -> Path:

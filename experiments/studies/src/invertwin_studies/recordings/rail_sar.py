@@ -77,7 +77,7 @@ def read(
     clock_offset = meta["align_time_offset_s"] if clock_offset is None else clock_offset
     range_bias = meta["align_range_bias_m"] if range_bias is None else range_bias
     times = torch.from_numpy(clock[valid])
-    positions = track.at(times + clock_offset)
+    positions = track.interpolate(times + clock_offset)
     antenna = AntennaArray(torch.zeros(1, 3, dtype=torch.float64))
     rotation = torch.tensor(_ROTATION, dtype=torch.float64)
     return Capture.from_range_profile(

@@ -13,12 +13,12 @@ from jaxtyping import Float64, Int64
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, KDTree
 
-_ONE_PLACE = 1e-6  # of the size
-_APART = 8e-3  # of a side: what is nearer and not joined touches
-_FLAT = 1e-6  # height of a triangle over its longest side
-_SLACK = 1e-3  # of a side that a part may be longer
-_INSIDE = 0.5  # sides from the rim of a face to what is inside
-_EVENED = 4  # rounds
+_MERGE_TOLERANCE = 1e-6  # of the size
+_MIN_GAP = 8e-3  # of a side: what is nearer and not joined touches
+_MIN_FLATNESS = 1e-6  # height of a triangle over its longest side
+_LENGTH_SLACK = 1e-3  # of a side that a part may be longer
+_RIM_DISTANCE = 0.5  # sides from the rim of a face to what is inside
+_SMOOTHING_ROUNDS = 4  # rounds
 _BULGE = 1e-5  # of a side
 _PAIRS_AT_ONCE = 1 << 17
 
@@ -27,27 +27,27 @@ Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Conforming:
+class ConformingMesh:
     """Small triangles.
 
     Attributes:
-        parents: vertices of the given mesh that each vertex is a mean of.
-        shares: of these.
+        parent_vertices: vertices of the given mesh that each vertex is a mean of.
+        parent_weights: of these.
         faces: vertices of the triangles, in the order of the given faces.
-        origin: the given face of each triangle.
-        seams: whether given vertices at one place were joined.
+        parent_face: the given face of each triangle.
+        has_merged_vertices: whether given vertices at one place were joined.
     """
 
-    parents: Int64[np.ndarray, "vertex 3"]
-    shares: Float64[np.ndarray, "vertex 3"]
+    parent_vertices: Int64[np.ndarray, "vertex 3"]
+    parent_weights: Float64[np.ndarray, "vertex 3"]
     faces: Int64[np.ndarray, "face 3"]
-    origin: Int64[np.ndarray, " face"]
-    seams: bool
+    parent_face: Int64[np.ndarray, " face"]
+    has_merged_vertices: bool
 
 
-def conforming(
+def build_conforming_mesh(
     vertices: Float64[np.ndarray, "v 3"], faces: Int64[np.ndarray, "f 3"], side: float
-) -> Conforming | None:
+) -> ConformingMesh | None:
     """Triangles with sides of about a length; None where surfaces cross or touch without joining.
 
     Args:
@@ -55,15 +55,15 @@ def conforming(
         faces: their triangles.
         side: of the small triangles [m].
     """
-    joined, seams = _joined(vertices, faces)
+    joined, seams = _merge_vertices(vertices, faces)
     faces = joined[faces]
     corners = vertices[faces]
     longest = np.linalg.norm(np.roll(corners, -1, 1) - corners, axis=2).max(1)
-    area = np.linalg.norm(_normals(corners), axis=1)
-    kept = area > _FLAT * longest**2
+    area = np.linalg.norm(_double_area_vectors(corners), axis=1)
+    kept = area > _MIN_FLATNESS * longest**2
     numbers = np.flatnonzero(kept)
     faces = faces[kept]
-    if not len(faces) or not _fit(vertices, faces, _APART * side):
+    if not len(faces) or not _is_conforming(vertices, faces, _MIN_GAP * side):
         return None
     # Edges from the lower to the higher vertex, whatever the face.
     ends = np.stack([faces, np.roll(faces, -1, 1)], 2)
@@ -71,7 +71,7 @@ def conforming(
     edges, edge = np.unique(np.sort(ends, 2).reshape(-1, 2), axis=0, return_inverse=True)
     edge = edge.reshape(-1, 3)
     length = np.linalg.norm(vertices[edges[:, 1]] - vertices[edges[:, 0]], axis=1)
-    parts = np.maximum(1, np.ceil(length / side - _SLACK)).astype(np.int64)
+    parts = np.maximum(1, np.ceil(length / side - _LENGTH_SLACK)).astype(np.int64)
     first = len(vertices) + np.concatenate([[0], (parts - 1).cumsum()])
     every = np.arange(len(vertices))
     parents, shares = [np.stack([every] * 3, 1)], [np.eye(3)[np.zeros(len(vertices), int)]]
@@ -83,9 +83,9 @@ def conforming(
     triangles: list[Index] = []
     for number, face in enumerate(faces):
         mine = edge[number]
-        inner, local = _pattern(
+        inner, local = _triangulate_face(
             tuple(int(n) for n in parts[mine]),
-            _shape(vertices[face] / side),
+            _face_shape(vertices[face] / side),
         )
         rim: list[Index] = []
         for corner in range(3):
@@ -98,7 +98,7 @@ def conforming(
         triangles.append(places[local])
     origin = numbers.repeat([len(t) for t in triangles])
     used, small = np.unique(np.concatenate(triangles), return_inverse=True)
-    return Conforming(
+    return ConformingMesh(
         np.concatenate(parents)[used],
         np.concatenate(shares)[used],
         small.reshape(-1, 3),
@@ -107,28 +107,28 @@ def conforming(
     )
 
 
-def _normals(corners: Array) -> Array:
+def _double_area_vectors(corners: Array) -> Array:
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.asarray(normal, dtype=np.float64)
 
 
-def _joined(vertices: Array, faces: Index) -> tuple[Index, bool]:
+def _merge_vertices(vertices: Array, faces: Index) -> tuple[Index, bool]:
     """The first of all vertices at each one's place, and whether there are others."""
     used = np.unique(faces)
     joined = np.arange(len(vertices))
-    close = _ONE_PLACE * float(np.linalg.norm(np.ptp(vertices[used], axis=0)))
+    close = _MERGE_TOLERANCE * float(np.linalg.norm(np.ptp(vertices[used], axis=0)))
     pairs = KDTree(vertices[used]).query_pairs(close, output_type="ndarray")
     for low, high in pairs[np.lexsort(pairs.T)]:
         joined[used[high]] = joined[used[low]]
     return joined, bool(len(pairs))
 
 
-def _shape(corner: Array) -> tuple[float, float, float]:
+def _face_shape(corners: Array) -> tuple[float, float, float]:
     """The first side's length, and the last corner's place along it and beside it.
 
     Rounded: what is inside depends on corners in steps, alike in faces that are alike.
     """
-    base, other = corner[1] - corner[0], corner[2] - corner[0]
+    base, other = corners[1] - corners[0], corners[2] - corners[0]
     length = float(np.linalg.norm(base))
     along = float(base @ other) / length
     beside = math.sqrt(max(float(other @ other) - along**2, 0.0))
@@ -136,7 +136,9 @@ def _shape(corner: Array) -> tuple[float, float, float]:
 
 
 @lru_cache(maxsize=4096)
-def _pattern(parts: tuple[int, ...], shape: tuple[float, float, float]) -> tuple[Array, Index]:
+def _triangulate_face(
+    parts: tuple[int, ...], shape: tuple[float, float, float]
+) -> tuple[Array, Index]:
     """Shares of the vertices inside a face, and its triangles.
 
     Their vertices are those of the rim in turn, from the first corner on, and then those inside.
@@ -157,13 +159,13 @@ def _pattern(parts: tuple[int, ...], shape: tuple[float, float, float]) -> tuple
     outwards = (following - corner)[:, ::-1] * [1, -1]
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
     bulge = np.concatenate([4 * t * (1 - t) * u for t, u in zip(at, outwards, strict=True)])
-    inner = _lattice(corner, outwards)
+    inner = _interior_points(corner, outwards)
     count = len(rim)
-    for _ in range(_EVENED if len(inner) else 0):
+    for _ in range(_SMOOTHING_ROUNDS if len(inner) else 0):
         triangles = Delaunay(np.concatenate([rim + _BULGE * bulge, inner])).simplices.astype(
             np.int64
         )
-        inner = _evened(np.concatenate([rim, inner]), triangles)[count:]
+        inner = _smooth_points(np.concatenate([rim, inner]), triangles)[count:]
     triangles = Delaunay(np.concatenate([rim + _BULGE * bulge, inner])).simplices.astype(np.int64)
     places = np.concatenate([rim, inner])[triangles]
     first, second = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
@@ -174,34 +176,34 @@ def _pattern(parts: tuple[int, ...], shape: tuple[float, float, float]) -> tuple
     return shares.T.astype(np.float64), triangles
 
 
-def _lattice(corner: Array, outwards: Array) -> Array:
+def _interior_points(corners: Array, outwards: Array) -> Array:
     """Places with even distances inside a triangle, in rows along its longest side."""
-    lengths = np.linalg.norm(np.roll(corner, -1, 0) - corner, axis=1)
+    lengths = np.linalg.norm(np.roll(corners, -1, 0) - corners, axis=1)
     base = int(lengths.argmax())
-    start, inwards = corner[base], -outwards[base]
-    along = (corner[(base + 1) % 3] - start) / lengths[base]
-    height = float((corner[(base + 2) % 3] - start) @ inwards)
+    start, inwards = corners[base], -outwards[base]
+    along = (corners[(base + 1) % 3] - start) / lengths[base]
+    height = float((corners[(base + 2) % 3] - start) @ inwards)
     rows = max(1, round(height / math.sqrt(0.75)))
-    steps = max(1, math.ceil(lengths[base] - _SLACK))
+    steps = max(1, math.ceil(lengths[base] - _LENGTH_SLACK))
     i, j = np.meshgrid(np.arange(-1, steps + 2), np.arange(1, rows + 1), indexing="ij")
     across = (i + 0.5 * (j % 2)) * lengths[base] / steps
     spot = start + across.reshape(-1, 1) * along + (j.reshape(-1, 1) * height / rows) * inwards
-    inside = np.einsum("sex,ex->se", corner - spot[:, None], outwards).min(1) > _INSIDE
+    inside = np.einsum("sex,ex->se", corners - spot[:, None], outwards).min(1) > _RIM_DISTANCE
     return np.asarray(spot[inside], dtype=np.float64)
 
 
-def _evened(places: Array, triangles: Index) -> Array:
+def _smooth_points(points: Array, triangles: Index) -> Array:
     """Places moved to the middle of their neighbours."""
-    total, count = np.zeros_like(places), np.zeros(len(places))
+    total, count = np.zeros_like(points), np.zeros(len(points))
     for turn in range(3):
         for other in (1, 2):
             here, there = triangles[:, turn], triangles[:, (turn + other) % 3]
-            np.add.at(total, here, places[there])
+            np.add.at(total, here, points[there])
             np.add.at(count, here, 1)
     return np.asarray(total / np.maximum(count, 1)[:, None], dtype=np.float64)
 
 
-def _fit(vertices: Array, faces: Index, apart: float) -> bool:
+def _is_conforming(vertices: Array, faces: Index, min_gap: float) -> bool:
     """Whether triangles meet in common sides and corners only."""
     if len(np.unique(np.sort(faces, 1), axis=0)) < len(faces):
         return False
@@ -209,26 +211,30 @@ def _fit(vertices: Array, faces: Index, apart: float) -> bool:
     radius = np.linalg.norm(vertices[faces] - middle[:, None], axis=2).max(1)
     for some in np.array_split(np.arange(len(faces)), math.ceil(len(faces) ** 2 / (1 << 22))):
         distance = np.linalg.norm(middle[some, None] - middle, axis=2)
-        near = distance < radius[some, None] + radius + apart
+        near = distance < radius[some, None] + radius + min_gap
         near[np.arange(len(some)), some] = False
         one, other = np.nonzero(near)
         for rows in np.array_split(np.arange(len(one)), len(one) // _PAIRS_AT_ONCE + 1):
-            if _touch(vertices, faces[some[one[rows]]], faces[other[rows]], apart).any():
+            if _triangles_touch(
+                vertices, faces[some[one[rows]]], faces[other[rows]], min_gap
+            ).any():
                 return False
     return True
 
 
-def _touch(vertices: Array, one: Index, other: Index, apart: float) -> NDArray[np.bool_]:
+def _triangles_touch(
+    vertices: Array, one: Index, other: Index, min_gap: float
+) -> NDArray[np.bool_]:
     """Whether vertices or sides of triangles come near others that they do not belong to."""
     shared = (one[:, :, None] == other[:, None]).any(2)
     corners, beyond = vertices[one], vertices[other]
-    normal = _normals(beyond)
+    normal = _double_area_vectors(beyond)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     sides = np.roll(beyond, -1, 1) - beyond
     inwards = np.cross(normal[:, None], sides)
     height = np.einsum("pvx,px->pv", corners - beyond[:, :1], normal)
 
-    def over(points: Array) -> NDArray[np.bool_]:
+    def projects_inside(points: Array) -> NDArray[np.bool_]:
         return np.asarray(
             (
                 np.einsum("px,psx->ps", points, inwards) > np.einsum("psx,psx->ps", beyond, inwards)
@@ -237,26 +243,27 @@ def _touch(vertices: Array, one: Index, other: Index, apart: float) -> NDArray[n
 
     bad = np.zeros(len(one), dtype=bool)
     for v in range(3):
-        bad |= ~shared[:, v] & (np.abs(height[:, v]) < apart) & over(corners[:, v])
+        bad |= ~shared[:, v] & (np.abs(height[:, v]) < min_gap) & projects_inside(corners[:, v])
         w = (v + 1) % 3
         free = ~shared[:, v] & ~shared[:, w]
         fall = height[:, v] - height[:, w]
         at = height[:, v] / np.where(fall == 0, 1.0, fall)
         meets = corners[:, v] + at[:, None] * (corners[:, w] - corners[:, v])
-        bad |= free & (height[:, v] * height[:, w] < 0) & over(meets)
+        bad |= free & (height[:, v] * height[:, w] < 0) & projects_inside(meets)
         for s in range(3):
             e = (s + 1) % 3
             alone = ~((one[:, [v, w], None] == other[:, None, [s, e]]).any((1, 2)))
-            gap = _between(corners[:, v], corners[:, w], beyond[:, s], beyond[:, e])
-            bad |= alone & (gap < apart)
+            gap = _segment_distances(corners[:, v], corners[:, w], beyond[:, s], beyond[:, e])
+            bad |= alone & (gap < min_gap)
             # A corner that ends on a side, of which a neighbour is at the other end.
             bad |= ~shared[:, v] & (
-                _between(corners[:, v], corners[:, v], beyond[:, s], beyond[:, e]) < apart
+                _segment_distances(corners[:, v], corners[:, v], beyond[:, s], beyond[:, e])
+                < min_gap
             )
     return bad
 
 
-def _between(a: Array, b: Array, c: Array, d: Array) -> Array:
+def _segment_distances(a: Array, b: Array, c: Array, d: Array) -> Array:
     """Distances of the lines from a to b and from c to d (Ericson, Real-Time Collision Detection,
     §5.1.9)."""
     first, second, apart = b - a, d - c, a - c

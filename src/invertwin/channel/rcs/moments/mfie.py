@@ -23,84 +23,93 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from invertwin.channel.em.plane_waves import cross, dot, polarisations, turned
-from invertwin.channel.rcs.moments.solver import Currents, keeps_power
+from invertwin.channel.em.plane_waves import cross, dot, phasor, polarisations
+from invertwin.channel.rcs.moments.solver import CurrentSolver, conserves_power
 
-_PIECES = 4.0  # of a side of a cell over the longest side of its pieces
-_MANY = 40  # pieces of a cell with which centres are spread first
-_LEAN = 0.7  # cells' sides that normals at right angles are apart
-_NEIGHBOURS = 9
-_TURNED = 0.6  # cosine of neighbours' normals, below which an edge lies between
-_ASIDE = 1e-3  # of the size: nearer to the tangent plane, nothing faces a cell from within
+_PIECES_PER_SIDE = 4.0  # of a side of a cell over the longest side of its pieces
+_SEEDING_PIECES = 40  # pieces of a cell with which centres are spread first
+_NORMAL_WEIGHT = 0.7  # cells' sides that normals at right angles are apart
+_NEIGHBOUR_COUNT = 9
+_MIN_NEIGHBOUR_COSINE = 0.6  # cosine of neighbours' normals, below which an edge lies between
+_TANGENT_TOLERANCE = (
+    1e-3  # of the size: nearer to the tangent plane, nothing faces a cell from within
+)
 
 Array = NDArray[np.float64]
-_ROWS_AT_ONCE = 1 << 20
-_SPREAD, _SETTLED = 20, 5  # rounds with some pieces, then with all
+_CELL_PAIRS_AT_ONCE = 1 << 20
+_SEEDING_ROUNDS, _FINAL_ROUNDS = 20, 5  # rounds with some pieces, then with all
 _CURVATURE_ROWS = 1 << 21
-_BURIED, _SOME = 0.35, 0.02  # off half a solid angle, and share of the surface where it may be
+_SOLID_ANGLE_TOLERANCE, _MAX_BURIED_SHARE = (
+    0.35,
+    0.02,
+)  # off half a solid angle, and share of the surface where it may be
 
 
-MOST = 6000
+MAX_CELLS = 6000
 """Cells up to which currents are solved: twice as many unknowns."""
-_INSIDE = 0.25  # wavelengths to the second surface,
-_OF_BALL = 0.8  # but less of the ball that fits in,
-_RESOLVED = 0.7  # and at least so many cells' sides
-_SHARE = 1j  # of the second equation
-_WIDTHS = ((0.25, 1.0), (0.05, 0.3))  # of how many cells the balls may be how many sides less
-_WORTH = 75  # cells per wave, below which the matrix is factorised
-_ROUNDS = 80
-_RESIDUAL = 3e-5  # of the right-hand side
+_MAX_INNER_DEPTH = 0.25  # wavelengths to the second surface,
+_INNER_DEPTH_SHARE = 0.8  # but less of the ball that fits in,
+_MIN_CELLS_PER_DEPTH = 0.7  # and at least so many cells' sides
+_INNER_WEIGHT = 1j  # of the second equation
+_WIDTH_QUANTILES = (
+    (0.25, 1.0),
+    (0.05, 0.3),
+)  # of how many cells the balls may be how many sides less
+_CELLS_PER_WAVE_DIRECT = 75  # cells per wave, below which the matrix is factorised
+_MAX_ITERATIONS = 80
+_MAX_RESIDUAL = 3e-5  # of the right-hand side
 
 
 @dataclass(frozen=True)
-class Cells:
+class SurfaceCells:
     """Patches of closed surfaces, one row each.
 
     Attributes:
         point: a place on the surface in the middle [m].
         normal: unit vectors outwards.
         area: [m²].
-        bend: how normals change along the surface, dn = B dx [1/m].
-        ball: radius of the ball inside that touches the surface there and nothing else [m].
+        curvature: how normals change along the surface, dn = B dx [1/m].
+        inscribed_radius: radius of the ball inside that touches the surface there and nothing
+            else [m].
         closed: whether the surfaces enclose bodies that do not overlap.
     """
 
     point: Float64[np.ndarray, "cell 3"]
     normal: Float64[np.ndarray, "cell 3"]
     area: Float64[np.ndarray, " cell"]
-    bend: Float64[np.ndarray, "cell 3 3"]
-    ball: Float64[np.ndarray, " cell"]
+    curvature: Float64[np.ndarray, "cell 3 3"]
+    inscribed_radius: Float64[np.ndarray, " cell"]
     closed: bool
 
     @property
-    def axes(self) -> Float64[np.ndarray, "cell 2 3"]:
+    def tangents(self) -> Float64[np.ndarray, "cell 2 3"]:
         """Unit vectors in the surface: t₁, t₂ with t₁ × t₂ = n."""
-        return _axes(self.normal)
+        return _tangent_axes(self.normal)
 
 
-def cells_of(corners: Float64[np.ndarray, "facet 3 3"], side: float) -> Cells:
+def build_cells(corners: Float64[np.ndarray, "facet 3 3"], side: float) -> SurfaceCells:
     """Even cells of triangles.
 
     Args:
         corners: of the triangles, whose normals point outwards [m].
         side: of a cell [m].
     """
-    place, normal, area = _pieces(corners, side / _PIECES)
-    owner = _gathered(np.concatenate([place, _LEAN * side * normal], 1), area, side)
+    place, normal, area = _subdivide_triangles(corners, side / _PIECES_PER_SIDE)
+    owner = _cluster_pieces(np.concatenate([place, _NORMAL_WEIGHT * side * normal], 1), area, side)
     count = int(owner.max()) + 1
     whole = np.bincount(owner, area, count).astype(np.float64)
-    middle = _mean(owner, area, place, whole)
-    towards = _mean(owner, area, normal, whole)
+    middle = _cell_means(owner, area, place, whole)
+    towards = _cell_means(owner, area, normal, whole)
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     # The middle of a bent patch lies beside the surface.
-    near = _nearest(place, middle)
+    near = _find_nearest(place, middle)
     off = np.einsum("cx,cx->c", place[near] - middle, normal[near])
     middle += (off / np.einsum("cx,cx->c", towards, normal[near]))[:, None] * towards
-    ball, closed = _surroundings(middle, towards, whole)
-    return Cells(middle, towards, whole, _bend(middle, towards), ball, closed)
+    ball, closed = _inscribed_radii(middle, towards, whole)
+    return SurfaceCells(middle, towards, whole, _estimate_curvature(middle, towards), ball, closed)
 
 
-def _pieces(corners: Array, longest: float) -> tuple[Array, Array, Array]:
+def _subdivide_triangles(corners: Array, longest: float) -> tuple[Array, Array, Array]:
     """Triangles halved until their sides are short: middles, normals, areas."""
     found: list[Array] = []
     while len(corners):
@@ -119,7 +128,7 @@ def _pieces(corners: Array, longest: float) -> tuple[Array, Array, Array]:
     return every.mean(1)[some], normal[some] / area[some, None], area[some]
 
 
-def _gathered(feature: Array, area: Array, side: float) -> NDArray[np.int64]:
+def _cluster_pieces(feature: Array, area: Array, side: float) -> NDArray[np.int64]:
     """The number of each piece's cell: Lloyd's rounds from centres drawn by area, always alike."""
     count = max(1, round(float(area.sum()) / side**2))
     draw = np.random.default_rng(0)
@@ -128,39 +137,39 @@ def _gathered(feature: Array, area: Array, side: float) -> NDArray[np.int64]:
     # One centre from each equal share of the area.
     chosen = order[np.searchsorted(share, (np.arange(count) + 0.5) / count)]
     centre = feature[np.unique(chosen)]
-    some = order[: _MANY * count]
-    rounds = [some] * _SPREAD + [order] * _SETTLED
+    some = order[: _SEEDING_PIECES * count]
+    rounds = [some] * _SEEDING_ROUNDS + [order] * _FINAL_ROUNDS
     for pieces in rounds:
-        owner = _nearest(centre, feature[pieces])
+        owner = _find_nearest(centre, feature[pieces])
         whole = np.bincount(owner, area[pieces], len(centre)).astype(np.float64)
         kept = whole > 0
-        centre = _mean(owner, area[pieces], feature[pieces], whole)[kept]
-    return np.unique(_nearest(centre, feature), return_inverse=True)[1]
+        centre = _cell_means(owner, area[pieces], feature[pieces], whole)[kept]
+    return np.unique(_find_nearest(centre, feature), return_inverse=True)[1]
 
 
-def _nearest(place: Array, to: Array, count: int = 1) -> NDArray[np.int64]:
+def _find_nearest(points: Array, queries: Array, count: int = 1) -> NDArray[np.int64]:
     """Numbers of the nearest places."""
-    return np.asarray(KDTree(place).query(to, k=count)[1], dtype=np.int64)
+    return np.asarray(KDTree(points).query(queries, k=count)[1], dtype=np.int64)
 
 
-def _mean(owner: NDArray[np.int64], area: Array, value: Array, whole: Array) -> Array:
+def _cell_means(owner: NDArray[np.int64], area: Array, value: Array, cell_area: Array) -> Array:
     """Means over cells; of empty ones zero."""
-    total = np.stack([np.bincount(owner, area * column, len(whole)) for column in value.T], 1)
-    return np.asarray(total / np.where(whole > 0, whole, 1.0)[:, None], dtype=np.float64)
+    total = np.stack([np.bincount(owner, area * column, len(cell_area)) for column in value.T], 1)
+    return np.asarray(total / np.where(cell_area > 0, cell_area, 1.0)[:, None], dtype=np.float64)
 
 
-def _axes(normal: Array) -> Array:
+def _tangent_axes(normal: Array) -> Array:
     aside = np.eye(3)[np.abs(normal).argmin(1)]
     first = np.cross(normal, aside)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.asarray(np.stack([first, np.cross(normal, first)], 1), dtype=np.float64)
 
 
-def _bend(point: Array, normal: Array) -> Array:
+def _estimate_curvature(point: Array, normal: Array) -> Array:
     """How normals turn towards neighbours on the same face, by least squares."""
-    near = _nearest(point, point, min(_NEIGHBOURS, len(point)))[:, 1:]
-    axes = _axes(normal)
-    same = np.einsum("ckx,cx->ck", normal[near], normal) > _TURNED
+    near = _find_nearest(point, point, min(_NEIGHBOUR_COUNT, len(point)))[:, 1:]
+    axes = _tangent_axes(normal)
+    same = np.einsum("ckx,cx->ck", normal[near], normal) > _MIN_NEIGHBOUR_COSINE
     away = np.einsum("cax,ckx->cka", axes, point[near] - point[:, None]) * same[..., None]
     turn = np.einsum("cax,ckx->cka", axes, normal[near] - normal[:, None]) * same[..., None]
     square = np.einsum("cka,ckb->cab", away, away)
@@ -172,11 +181,11 @@ def _bend(point: Array, normal: Array) -> Array:
     return np.asarray(axes.transpose(0, 2, 1) @ even @ axes, dtype=np.float64)
 
 
-def _surroundings(point: Array, normal: Array, area: Array) -> tuple[Array, bool]:
+def _inscribed_radii(point: Array, normal: Array, area: Array) -> tuple[Array, bool]:
     """Radii of touching balls, and whether the solid angle inside is half of all, as it should."""
     count = len(point)
     ball, angle = np.full(count, np.inf), np.zeros(count)
-    least = _ASIDE * float(np.ptp(point, axis=0).max())
+    least = _TANGENT_TOLERANCE * float(np.ptp(point, axis=0).max())
     for rows in np.array_split(np.arange(count), math.ceil(count**2 / _CURVATURE_ROWS)):
         away = point - point[rows, None]
         square = np.einsum("rcx,rcx->rc", away, away)
@@ -186,19 +195,19 @@ def _surroundings(point: Array, normal: Array, area: Array) -> tuple[Array, bool
         seen = np.einsum("rcx,cx->rc", away, normal) * area
         # The cell itself is seen edge-on: zero over something.
         angle[rows] = (seen / np.maximum(square, least**2) ** 1.5).sum(1) / (4 * math.pi)
-    wrong = np.abs(angle - 0.5) > _BURIED
-    return ball, bool(area[wrong].sum() < _SOME * area.sum())
+    wrong = np.abs(angle - 0.5) > _SOLID_ANGLE_TOLERANCE
+    return ball, bool(area[wrong].sum() < _MAX_BURIED_SHARE * area.sum())
 
 
-class SolvedBodies(Currents[Cells]):
-    """Closed conductors whose currents are solved on cells, see ``Currents``.
+class MFIESolver(CurrentSolver[SurfaceCells]):
+    """Closed conductors whose currents are solved on cells, see ``CurrentSolver``.
 
     Args:
         corners: of the triangles of closed bodies, normals outwards [m].
         up: V lies in a plane with this unit vector.
     """
 
-    LEAST = 250
+    MIN_SQUARES = 250
 
     def __init__(self, corners: Float64[Tensor, "facet 3 3"], up: Float64[Tensor, "3"]) -> None:
         self.corners, self.up = corners.numpy(), up
@@ -206,64 +215,78 @@ class SolvedBodies(Currents[Cells]):
         normals = np.cross(sides[:, 0], sides[:, 1])
         super().__init__(float(np.linalg.norm(normals, axis=1).sum() / 2))
 
-    def cut(self, side: float) -> Cells | None:
+    def build_elements(self, side: float) -> SurfaceCells | None:
         """Cells that a thin body's width holds, if they are not too many."""
-        if self.area / side**2 > MOST:
+        if self.area / side**2 > MAX_CELLS:
             return None
-        cells = cells_of(self.corners, side)
-        width = min(float(np.quantile(cells.ball, share)) / least for share, least in _WIDTHS)
+        cells = build_cells(self.corners, side)
+        width = min(
+            float(np.quantile(cells.inscribed_radius, share)) / least
+            for share, least in _WIDTH_QUANTILES
+        )
         if width < side:
-            if self.area / width**2 > MOST:
+            if self.area / width**2 > MAX_CELLS:
                 return None
-            cells = cells_of(self.corners, width)
+            cells = build_cells(self.corners, width)
         return cells if cells.closed else None
 
-    def equation(self, pieces: Cells, wave_number: float, waves: int) -> "_Equation":
-        """See ``Currents.equation``."""
-        return _Equation(pieces, wave_number, self.up, waves)
+    def assemble_equation(
+        self, elements: SurfaceCells, wave_number: float, wave_count: int
+    ) -> "_MFIEEquation":
+        """See ``CurrentSolver.equation``."""
+        return _MFIEEquation(elements, wave_number, self.up, wave_count)
 
 
-class _Equation:
+class _MFIEEquation:
     """The integral equation of cells at one frequency: [t₁ of all cells, t₂ of all cells]."""
 
     def __init__(
-        self, cells: Cells, wave_number: float, up: Float64[Tensor, "3"], waves: int
+        self, cells: SurfaceCells, wave_number: float, up: Float64[Tensor, "3"], wave_count: int
     ) -> None:
         self.k, self.up = wave_number, up
-        self.direct = waves * _WORTH > len(cells.point)
+        self.use_direct_solver = wave_count * _CELLS_PER_WAVE_DIRECT > len(cells.point)
         self.origin = torch.from_numpy(cells.point.mean(0))
         self.point = torch.from_numpy(cells.point) - self.origin
-        self.normal, self.axes = torch.from_numpy(cells.normal), torch.from_numpy(cells.axes)
-        self.area, self.bend = torch.from_numpy(cells.area), torch.from_numpy(cells.bend)
-        ball = torch.from_numpy(cells.ball)
-        self.gap = (_OF_BALL * ball).clamp_max(_INSIDE * 2 * math.pi / wave_number)
-        self.share = _SHARE * (self.gap >= _RESOLVED * self.area.sqrt())
+        self.normal, self.tangents = (
+            torch.from_numpy(cells.normal),
+            torch.from_numpy(cells.tangents),
+        )
+        self.area, self.curvature = torch.from_numpy(cells.area), torch.from_numpy(cells.curvature)
+        ball = torch.from_numpy(cells.inscribed_radius)
+        self.inner_depth = (_INNER_DEPTH_SHARE * ball).clamp_max(
+            _MAX_INNER_DEPTH * 2 * math.pi / wave_number
+        )
+        self.inner_weight = _INNER_WEIGHT * (
+            self.inner_depth >= _MIN_CELLS_PER_DEPTH * self.area.sqrt()
+        )
 
     @cached_property
     def matrix(self) -> Complex64[Tensor, "unknown unknown"]:
         """``J/2 − n × ∫ ∇G × J`` on the surface and inside."""
         count = len(self.point)
         matrix = torch.zeros(2, count, 2, count, dtype=torch.complex64)
-        point, normal, axes = (x.float() for x in (self.point, self.normal, self.axes))
+        point, normal, axes = (x.float() for x in (self.point, self.normal, self.tangents))
         weight = self.area.float() / (4 * math.pi)
-        for rows in torch.arange(count).split(max(1, _ROWS_AT_ONCE // count)):
+        for rows in torch.arange(count).split(max(1, _CELL_PAIRS_AT_ONCE // count)):
             away = point[rows, None] - point
             height = dot(away, normal[rows, None])
             square = dot(away, away)
-            strength = _gradient(self.k, square, weight)
+            strength = _greens_gradient(self.k, square, weight)
             strength[torch.arange(len(rows)), rows] = 0
-            inner = square - 2 * self.gap[rows, None].float() * height
-            inner = (inner + self.gap[rows, None].float() ** 2).clamp_min(1e-20)
-            second = self.share[rows, None].to(torch.complex64) * _gradient(self.k, inner, weight)
+            inner = square - 2 * self.inner_depth[rows, None].float() * height
+            inner = (inner + self.inner_depth[rows, None].float() ** 2).clamp_min(1e-20)
+            second = self.inner_weight[rows, None].to(torch.complex64) * _greens_gradient(
+                self.k, inner, weight
+            )
             both = strength + second
-            lower = strength * height + second * (height - self.gap[rows, None].float())
+            lower = strength * height + second * (height - self.inner_depth[rows, None].float())
             for a in (0, 1):
                 along = both * dot(away, axes[rows, None, a])
                 for b in (0, 1):
                     lean = normal[rows] @ axes[:, b].T
                     matrix[a, rows, b] = lower * (axes[rows, a] @ axes[:, b].T) - along * lean
         # The cell itself, as a disc that is bent as the surface is; half of J is the jump.
-        own = self.axes @ self.bend @ self.axes.mT
+        own = self.tangents @ self.curvature @ self.tangents.mT
         trace = own.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
         radius = (self.area / math.pi).sqrt()[:, None, None]
         own = torch.eye(2, dtype=torch.float64) / 2 + radius / 4 * (
@@ -281,40 +304,40 @@ class _Equation:
         lower, pivots = torch.linalg.lu_factor(self.matrix)
         return lower, pivots
 
-    def currents(
-        self, towards: Float64[Tensor, "aspect 3"]
+    def solve_currents(
+        self, transmitters: Float64[Tensor, "aspect 3"]
     ) -> Complex128[Tensor, "cell aspect 2 3"]:
         """η J of plane waves of 1 V/m.
 
         Args:
-            towards: the antennas.
+            transmitters: the antennas.
         """
-        direction = -towards
-        columns = self._incident(direction, polarisations(towards, self.up))
+        direction = -transmitters
+        columns = self._excitation(direction, polarisations(transmitters, self.up))
         wave = -self.k * self.point @ direction.T
-        inner = self.k * self.gap[:, None] * (self.normal @ direction.T)
-        phase = turned(wave) * (1 + self.share[:, None] * turned(inner))
-        columns = columns * phase[None, :, :, None] * self._phase(towards)[:, None]
+        inner = self.k * self.inner_depth[:, None] * (self.normal @ direction.T)
+        phase = phasor(wave) * (1 + self.inner_weight[:, None] * phasor(inner))
+        columns = columns * phase[None, :, :, None] * self._origin_phase(transmitters)[:, None]
         shape = columns.shape
         right = columns.reshape(shape[0] * shape[1], -1).to(torch.complex64)
-        if self.direct:
+        if self.use_direct_solver:
             solution = torch.linalg.lu_solve(*self.factors, right)
         else:
-            solution = _least_residual(self.matrix, right)
+            solution = _solve_gmres(self.matrix, right)
         found = solution.view(shape).to(torch.complex128)
-        return torch.einsum("icat,icx->catx", found, self.axes.mT.permute(2, 0, 1) + 0j)
+        return torch.einsum("icat,icx->catx", found, self.tangents.mT.permute(2, 0, 1) + 0j)
 
-    def _incident(self, direction: Tensor, field: Tensor) -> Tensor:
+    def _excitation(self, direction: Tensor, field: Tensor) -> Tensor:
         """n × H along both axes of every cell, without phases: [axis, cell, aspect, field]."""
         magnetic = cross(direction[:, None], field)
-        along = cross(self.axes, self.normal[:, None])
+        along = cross(self.tangents, self.normal[:, None])
         return torch.einsum("cix,atx->icat", along, magnetic)
 
-    def _phase(self, towards: Tensor) -> Tensor:
+    def _origin_phase(self, directions: Tensor) -> Tensor:
         """Of the cells' middle against the world's origin."""
-        return turned(self.k * (towards @ self.origin))
+        return phasor(self.k * (directions @ self.origin))
 
-    def received(
+    def far_field(
         self,
         current: Complex128[Tensor, "cell aspect 2 3"],
         transmitters: Float64[Tensor, "aspect 3"],
@@ -326,28 +349,30 @@ class _Equation:
             current: η J of the transmitters' waves.
             transmitters, receivers: where these are.
         """
-        phase = turned(self.k * (self.point @ receivers.T)) * self.area[:, None]
+        phase = phasor(self.k * (self.point @ receivers.T)) * self.area[:, None]
         total = torch.einsum("ca,catx->atx", phase, current)
-        field = -1j * self.k / (4 * math.pi) * self._phase(receivers)[:, None, None] * total
+        field = -1j * self.k / (4 * math.pi) * self._origin_phase(receivers)[:, None, None] * total
         seen = polarisations(receivers, self.up).to(torch.complex128)
         return torch.einsum("arx,atx->art", seen, field)
 
-    def keeps_power(self, current: Tensor, towards: Tensor) -> bool:
+    def conserves_power(self, current: Tensor, transmitters: Tensor) -> bool:
         """Whether the first wave's currents send out as much power as they take from the wave."""
         flowing = current[:, 0] * self.area[:, None, None]
-        sent = polarisations(towards[:1], self.up)[0]
-        return keeps_power(self.k, self.point + self.origin, flowing, -towards[0], sent)
+        sent = polarisations(transmitters[:1], self.up)[0]
+        return conserves_power(self.k, self.point + self.origin, flowing, -transmitters[0], sent)
 
 
-def _least_residual(
+def _solve_gmres(
     matrix: Complex64[Tensor, "n n"], right: Complex64[Tensor, "n column"]
 ) -> Complex64[Tensor, "n column"]:
     """Solutions of all columns at once by generalised minimal residuals (Saad and Schultz 1986)."""
     size = right.norm(dim=0)
     basis = [right / size]
-    upper = torch.zeros(_ROUNDS + 1, _ROUNDS, right.shape[1], dtype=torch.complex128)
+    upper = torch.zeros(
+        _MAX_ITERATIONS + 1, _MAX_ITERATIONS, right.shape[1], dtype=torch.complex128
+    )
     share = upper[:0]
-    for last in range(1, _ROUNDS + 1):
+    for last in range(1, _MAX_ITERATIONS + 1):
         new = matrix @ basis[-1]
         for i, vector in enumerate(basis):
             along = (vector.conj() * new).sum(0)
@@ -359,13 +384,13 @@ def _least_residual(
         first = torch.zeros(len(system), last + 1, 1, dtype=torch.complex128)
         first[:, 0] = 1
         share = torch.linalg.lstsq(system, first).solution
-        if float((system @ share - first).norm(dim=1).max()) < _RESIDUAL:
+        if float((system @ share - first).norm(dim=1).max()) < _MAX_RESIDUAL:
             break
     weights = share[..., 0].T.to(torch.complex64) * size
     return torch.stack([w * v for w, v in zip(weights, basis, strict=False)]).sum(0)
 
 
-def _gradient(k: float, square: Tensor, weight: Tensor) -> Tensor:
+def _greens_gradient(k: float, square: Tensor, weight: Tensor) -> Tensor:
     """∇G = (r − r′) times this, G = exp(−jkR)/4πR, in single precision."""
     distance = square.clamp_min(1e-20).sqrt()
     turn = k * distance

@@ -15,36 +15,36 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel.em.plane_waves import turned
+from invertwin.channel.em.plane_waves import phasor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import PhysicsWarning
 
-_PER_WAVELENGTH = 7.0  # sides of a piece
-_ALIKE = 1.25  # ratio of frequencies that share pieces
+_ELEMENTS_PER_WAVELENGTH = 7.0  # sides of a piece
+_REUSE_RATIO = 1.25  # ratio of frequencies that share pieces
 _ASPECTS_AT_ONCE = 64
-_TRUSTED = 0.05  # share of the power that may get lost or be won
+_POWER_TOLERANCE = 0.05  # share of the power that may get lost or be won
 
-Pieces = TypeVar("Pieces")
+Elements = TypeVar("Pieces")
 
 
 @runtime_checkable
-class Equation(Protocol):
+class CurrentEquation(Protocol):
     """An integral equation at one frequency."""
 
-    def currents(self, towards: Float64[Tensor, "aspect 3"]) -> Tensor:
+    def solve_currents(self, transmitters: Float64[Tensor, "aspect 3"]) -> Tensor:
         """η J of plane waves of 1 V/m, V and H, that come from unit vectors."""
         ...
 
-    def keeps_power(self, current: Tensor, towards: Tensor) -> bool:
+    def conserves_power(self, current: Tensor, transmitters: Tensor) -> bool:
         """Whether the first wave's currents send out as much power as they take from the wave.
 
         Args:
             current: as ``currents`` gives it.
-            towards: where the waves come from.
+            transmitters: where the waves come from.
         """
         ...
 
-    def received(
+    def far_field(
         self, current: Tensor, transmitters: Tensor, receivers: Tensor
     ) -> Complex128[Tensor, "aspect 2 2"]:
         """S of currents.
@@ -56,105 +56,110 @@ class Equation(Protocol):
         ...
 
 
-class Currents(ABC, Generic[Pieces]):
+class CurrentSolver(ABC, Generic[Elements]):
     """Conductors whose currents are solved, at the frequencies at which they are small.
 
     Attributes:
         area: of all surfaces [m²].
     """
 
-    LEAST: ClassVar[int]
+    MIN_SQUARES: ClassVar[int]
     """Squares of a piece's side in the area, however small the conductors are."""
 
     def __init__(self, area: float) -> None:
         self.area = area
-        self._known: tuple[float, Pieces | None] = (math.inf, None)
+        self._cached: tuple[float, Elements | None] = (math.inf, None)
 
     @abstractmethod
-    def cut(self, side: float) -> Pieces | None:
+    def build_elements(self, side: float) -> Elements | None:
         """Pieces of about a side's length [m]; None where there are too many, or none hold."""
 
     @abstractmethod
-    def equation(self, pieces: Pieces, wave_number: float, waves: int) -> Equation:
+    def assemble_equation(
+        self, elements: Elements, wave_number: float, wave_count: int
+    ) -> CurrentEquation:
         """The equation of pieces at one frequency.
 
         Args:
-            pieces: as ``cut`` gives them.
+            elements: as ``cut`` gives them.
             wave_number: k [1/m].
-            waves: for how many it is to be solved.
+            wave_count: for how many it is to be solved.
         """
 
-    def serves(self, wave_number: float) -> bool:
+    def supports(self, wave_number: float) -> bool:
         """Whether pieces hold the conductors, and are not too many.
 
         Args:
             wave_number: k [1/m].
         """
-        return self.pieces(wave_number) is not None
+        return self.elements(wave_number) is not None
 
-    def pieces(self, wave_number: float) -> Pieces | None:
+    def elements(self, wave_number: float) -> Elements | None:
         """Pieces for a wave; those of the last one where they are about as fine as needed.
 
         Args:
             wave_number: k [1/m].
         """
         wavelength = 2 * math.pi / wave_number
-        needed = min(wavelength / _PER_WAVELENGTH, math.sqrt(self.area / self.LEAST))
-        side, known = self._known
-        if side <= needed <= side * _ALIKE:
+        needed = min(wavelength / _ELEMENTS_PER_WAVELENGTH, math.sqrt(self.area / self.MIN_SQUARES))
+        side, known = self._cached
+        if side <= needed <= side * _REUSE_RATIO:
             return known
-        found = self.cut(needed)
+        found = self.build_elements(needed)
         if found is not None:
-            self._known = (needed, found)
+            self._cached = (needed, found)
         return found
 
-    def scattered(
-        self, wave_number: float, ways: Sequence[tuple[Tensor, Tensor]]
+    def solve_scattering(
+        self, wave_number: float, antenna_pairs: Sequence[tuple[Tensor, Tensor]]
     ) -> list[Complex128[Tensor, "aspect 2 2"]] | None:
         """S of the whole field for each way; None where the conductors are too large for it.
 
         Args:
             wave_number: k [1/m].
-            ways: unit vectors from the scene to transmitters and to receivers, [aspect, 3] each.
+            antenna_pairs: unit vectors from the scene to transmitters and to receivers, [aspect,
+                3] each.
 
         Raises:
             InputError: derivatives that the solver does not have.
         """
-        pieces = self.pieces(wave_number)
+        pieces = self.elements(wave_number)
         if pieces is None:
             return None
-        equation = self.equation(pieces, wave_number, 2 * sum(len(way[0]) for way in ways))
+        equation = self.assemble_equation(
+            pieces, wave_number, 2 * sum(len(way[0]) for way in antenna_pairs)
+        )
         found: list[Tensor] = []
-        for transmitters, receivers in ways:
+        for transmitters, receivers in antenna_pairs:
             parts: list[Tensor] = []
             for some in torch.arange(len(transmitters)).split(_ASPECTS_AT_ONCE):
-                current = equation.currents(transmitters[some])
-                if not parts and not equation.keeps_power(current, transmitters[some]):
-                    _warn_of_power(wave_number)
+                current = equation.solve_currents(transmitters[some])
+                if not parts and not equation.conserves_power(current, transmitters[some]):
+                    _warn_power_balance(wave_number)
                     return None
-                parts.append(equation.received(current, transmitters[some], receivers[some]))
+                parts.append(equation.far_field(current, transmitters[some], receivers[some]))
             found.append(torch.cat(parts))
         return found
 
 
-def keeps_power(
+def conserves_power(
     wave_number: float,
     point: Float64[Tensor, "point 3"],
-    flowing: Complex128[Tensor, "point 2 3"],
+    current_moments: Complex128[Tensor, "point 2 3"],
     direction: Float64[Tensor, "3"],
-    field: Float64[Tensor, "2 3"],
+    incident_field: Float64[Tensor, "2 3"],
 ) -> bool:
     """Whether currents send out as much power as they take from a wave.
 
     Args:
         wave_number: k [1/m].
         point: where they flow [m].
-        flowing: η J dA there, for both polarisations.
+        current_moments: η J dA there, for both polarisations.
         direction: d of the wave.
-        field: E at the world's origin.
+        incident_field: E at the world's origin.
     """
-    phase = turned(-wave_number * point @ direction)
-    taken = torch.einsum("c,ctx,tx->t", phase.conj(), flowing, field + 0j)
+    phase = phasor(-wave_number * point @ direction)
+    taken = torch.einsum("c,ctx,tx->t", phase.conj(), current_moments, incident_field + 0j)
     place = point - point.mean(0)
     extent = float(place.norm(dim=1).max())
     level, share = np.polynomial.legendre.leggauss(math.ceil(wave_number * extent) + 12)
@@ -163,14 +168,14 @@ def keeps_power(
     for z, weight in zip(level, share * math.pi / len(level), strict=True):
         flat = math.sqrt(1 - z**2)
         ways = torch.stack([flat * turns.cos(), flat * turns.sin(), torch.full_like(turns, z)], 1)
-        wave = turned(wave_number * (ways @ place.T))
-        sent = wave_number / (4 * math.pi) * torch.einsum("sc,ctx->stx", wave, flowing)
+        wave = phasor(wave_number * (ways @ place.T))
+        sent = wave_number / (4 * math.pi) * torch.einsum("sc,ctx->stx", wave, current_moments)
         along = torch.einsum("stx,sx->st", sent, ways + 0j)
         given += weight * (sent.abs().square().sum((0, 2)) - along.abs().square().sum(0))
-    return bool(((given / taken.real - 1).abs() < _TRUSTED).all())
+    return bool(((given / taken.real - 1).abs() < _POWER_TOLERANCE).all())
 
 
-def _warn_of_power(wave_number: float) -> None:
+def _warn_power_balance(wave_number: float) -> None:
     """Say that solved currents are not used."""
     warnings.warn(
         f"at {wave_number * SPEED_OF_LIGHT / (2 * math.pi) / 1e9:.4g} GHz solved currents do not "

@@ -14,7 +14,7 @@ from annotated_types import Ge, Gt, Le
 from invertwin.capture import Capture
 from invertwin.limits import Angle, Positive
 from invertwin.radar import FMCW, Radar, SampledWaveform
-from invertwin.scene import AntennaArray, Material, Mesh, Object, Surface, sphere
+from invertwin.scene import AntennaArray, Material, Mesh, Object, ScatteringLaw, sphere
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Foliage(Material):
     share: Annotated[float | torch.Tensor, Gt(0), Le(1)]
     coherent: ClassVar[bool] = False
 
-    def surface(self, frequency: float) -> Surface:
+    def scattering_law(self, frequency: float) -> ScatteringLaw:
         share = torch.as_tensor(self.share, dtype=torch.float64)
         amplitude = share.sqrt() * torch.ones(256, dtype=torch.float64)
-        return Surface(amplitude, torch.ones((), dtype=torch.float64))
+        return ScatteringLaw(amplitude, torch.ones((), dtype=torch.float64))
 
 
 def bush(radius: Positive, lean: Angle = 0.0) -> Mesh:
