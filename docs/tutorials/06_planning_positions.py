@@ -76,4 +76,4 @@ assert all(one.error_bars.deviations["box.x"] < 1.02 * now.deviations["box.x"] f
 
 # %% [markdown]
 # `invertwin plan run.toml` does this from a run file, and with `fits` compares the plan with fits of as many simulated
-# recordings ([run files](../run_files.md#how-sure-and-from-where)).
+# recordings ([run files](../run_files.md#error-bars-ambiguities-and-planning)).
