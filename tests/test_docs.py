@@ -19,7 +19,10 @@ from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.run_file import load_run, validate_run
 from invertwin.registry.kinds import PLUGINS
 from invertwin_studies.recordings import rail_sar
+from pages import start_page_runner
 from public_names import ROOMS, cells, documented, menu, shown
+
+pytestmark = pytest.mark.docs
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
@@ -32,6 +35,12 @@ EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
 NAME = re.compile(r"`(invertwin(?:_studies)?(?:\.\w+)+)`")
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
 RUN_FILE = re.compile(r"\b(?:experiments|examples|benchmarks|tests)/[\w/*.]*\w")
+CHECK_EXAMPLES = """
+from pathlib import Path
+from public_names import failures
+if failures(Path({page!r})):
+    raise AssertionError("examples of the page do not give what it says")
+"""
 WRITES = {
     "01_simulate.py": ["simulate.png"],
     "02_reconstruct.py": ["twin.ply"],
@@ -39,6 +48,13 @@ WRITES = {
     "04_own_mesh_and_board.py": ["ball.ply", "ball.nc", "ball.png"],
     "06_coverage.py": ["coverage.png"],
 }
+
+
+@pytest.fixture(scope="session")
+def page_runner():
+    """One process for all pages; README and examples start as a user starts them, in their own."""
+    with start_page_runner() as runner:
+        yield runner
 
 
 def run(arguments, folder):
@@ -83,17 +99,17 @@ def test_the_readme_is_short():
 @pytest.mark.parametrize(
     "page", [p for p in WITH_PYTHON if p.name not in NEEDS_DATA], ids=lambda page: page.name
 )
-def test_snippets_of_a_page_run(page, tmp_path):
-    run(["-c", "\n".join(cells(page))], tmp_path)
+def test_snippets_of_a_page_run(page, page_runner, tmp_path):
+    page_runner.run("\n".join(cells(page)), tmp_path)
     assert not list(tmp_path.iterdir()), "a snippet leaves a file behind"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
-def test_tutorials_hold(page, tmp_path):
+def test_tutorials_hold(page, page_runner, tmp_path):
     """Every tutorial checks a value itself."""
     assert "\nassert " in page.read_text()
-    run(["-c", "\n".join(cells(page))], tmp_path)
+    page_runner.run("\n".join(cells(page)), tmp_path)
     assert not list(tmp_path.iterdir()), "a tutorial leaves a file behind"
 
 
@@ -107,9 +123,9 @@ def test_tutorials_have_a_picture_and_use_public_names(page):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", REFERENCE, ids=lambda page: page.stem)
-def test_examples_of_the_reference_hold(page, tmp_path):
+def test_examples_of_the_reference_hold(page, page_runner, tmp_path):
     """Every output is as the page says."""
-    run([str(REPOSITORY / "docs" / "public_names.py"), str(page)], tmp_path)
+    page_runner.run(CHECK_EXAMPLES.format(page=str(page)), tmp_path)
     assert not list(tmp_path.iterdir()), "an example leaves a file behind"
 
 

@@ -11,6 +11,8 @@ import pytest
 
 from invertwin.capture import Capture
 
+pytestmark = pytest.mark.docs
+
 PLUGIN = Path(__file__).with_name("example_plugin")
 SCENE = """
 [scene.hedge]
