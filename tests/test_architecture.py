@@ -1,6 +1,7 @@
 """The one-way arrows between the rooms, read from the source with ast."""
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -258,3 +259,20 @@ def test_a_planted_violation_is_caught(tmp_path, file, source, complaint):
     (package / file).parent.mkdir(exist_ok=True)
     (package / file).write_text(source)
     assert any(complaint in problem for problem in violations(package)), violations(package)
+
+
+def test_the_table_of_contributing_has_every_room_below_those_it_imports():
+    text = (PACKAGE.parents[1] / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rows = [line for line in text.splitlines() if line.startswith("| `")]
+    place = {
+        name: n
+        for n, row in enumerate(rows)
+        for name in re.findall(r"`(\w+)(?:/|\.py)`", row.split("|")[1])
+    }
+    assert set(place) == set(ALLOWED) - {"__init__", "__main__"}
+    for room, below in ALLOWED.items():
+        for other in below - {"__init__"} if room in place else ():
+            assert place[other] <= place[room], f"{room} stands above {other}"
+    for room, folders in INSIDE.items():
+        named = set(re.findall(r"`(\w+)/`", rows[place[room]]))
+        assert set(folders) <= named, f"{room}/: {sorted(set(folders) - named)} are not in its row"
