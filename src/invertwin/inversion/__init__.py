@@ -1,4 +1,4 @@
-"""From observed maps to the scene: observations, loss, schedule, fit; and gradient checks."""
+"""Inversion: observations, losses, schedules, fits, confidence and gradient checks."""
 
 from invertwin.inversion.callbacks import Checkpoint as Checkpoint
 from invertwin.inversion.callbacks import Report as Report

@@ -26,10 +26,10 @@ from invertwin.storage.untrusted import convert_read_errors
 
 @dataclass(frozen=True)
 class Report(Callback):
-    """Calls a function with the row of every step.
+    """Call a function with the row of every step.
 
     Attributes:
-        function: Takes the row: ``step``, ``stage``, ``loss``, ``values``.
+        function: receives the row: ``step``, ``stage``, ``loss``, ``values``.
     """
 
     function: Callable[[dict[str, Any]], None]
@@ -41,20 +41,21 @@ class Report(Callback):
 
 @dataclass(frozen=True)
 class Watch(Callback):
-    """Adds numbers about the twin to rows, such as its distance from a known truth.
+    """Add metrics of the present scene to the rows of a fit, such as its distance from a known
+    truth.
 
-    They do not change the fit.
+    The metrics do not change the fit.
 
     Attributes:
-        function: Scene → numbers by name.
-        every: Steps from one call to the next.
+        function: maps a scene to numbers by name.
+        every: number of steps between two evaluations.
     """
 
     function: Callable[[Scene], dict[str, float]]
     every: int = 10
 
     def annotate(self, fit: Fit) -> dict[str, Any]:
-        """The numbers of the present twin."""
+        """Return the metrics of the present scene."""
         if fit.progress.step % self.every:
             return {}
         try:
@@ -66,16 +67,17 @@ class Watch(Callback):
 
 @dataclass(frozen=True)
 class Checkpoint(Callback):
-    """Writes the state of the fit to a file, atomically, and can go on from it.
+    """Write the state of a fit to a file atomically, and resume from it.
 
     Stages before the last one have files of their own: ``fit_stage0.pt`` beside ``fit.pt``. A
-    checkpoint knows its fit by content: a changed model, loss, regulariser, scene, material or
-    datum is refused, and a loss function of one's own is recognised in a new process.
+    checkpoint identifies its fit by a fingerprint of its content: a changed model, loss,
+    regulariser, scene, material or datum is refused, and a user's loss function is recognised in a
+    new process.
 
     Attributes:
-        file: The checkpoint file.
-        every: Steps from one file to the next.
-        resume: Go on from the file if it is there.
+        file: the checkpoint file.
+        every: number of steps between two writes.
+        resume: whether to resume from the file if it exists.
     """
 
     file: str | Path
@@ -83,7 +85,7 @@ class Checkpoint(Callback):
     resume: bool = False
 
     def begin(self, fit: Fit) -> None:
-        """Go on from the file.
+        """Resume from the file.
 
         Raises:
             InputError: A file that cannot be read, or of another fit.
@@ -107,8 +109,8 @@ class Checkpoint(Callback):
             self.end(fit)
 
     def end(self, fit: Fit) -> None:
-        """Write the file. If the process is killed, the last whole file is left."""
-        data = io.BytesIO()  # torch would tell of a full disk in its own words
+        """Write the file. If the process is killed, the last complete file remains."""
+        data = io.BytesIO()  # so that a full disk raises an error of this package
         torch.save(fit.state(), data)
         with replace_file(self._path(fit)) as part:
             part.write_bytes(data.getbuffer())
@@ -119,20 +121,20 @@ class Checkpoint(Callback):
 
 
 def stage_checkpoint_path(file: Path, stage: int) -> Path:
-    """The checkpoint of a stage that is not the last.
+    """Return the checkpoint path of a stage that is not the last.
 
     Args:
-        file: Checkpoint of the last stage.
-        stage: Number of the stage, from 0.
+        file: checkpoint path of the last stage.
+        stage: number of the stage, from 0.
     """
     return file.with_name(f"{file.stem}_stage{stage}{file.suffix}")
 
 
 @contextmanager
 def defer_interrupt() -> Generator[Callable[[], None]]:
-    """Ctrl-C waits for the end of the step, when nothing is half done; a second one does not.
+    """Defer Ctrl-C to the end of the step; a second Ctrl-C interrupts at once.
 
-    Gives a function that raises KeyboardInterrupt if one is due.
+    Yields a function that raises KeyboardInterrupt if an interrupt is pending.
     """
     due = False
 
@@ -145,7 +147,7 @@ def defer_interrupt() -> Generator[Callable[[], None]]:
         raise_if_interrupted()
         due = True
 
-    # Another handler, or another thread than the main one, is not ours to change.
+    # Keep foreign handlers; only the main thread may set one.
     ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not ours or threading.current_thread() is not threading.main_thread():
         yield raise_if_interrupted
@@ -162,15 +164,15 @@ def defer_interrupt() -> Generator[Callable[[], None]]:
 def report_progress(
     name: str, steps: int, console: Console | None = None
 ) -> Generator[list[Report]]:
-    """Progress with the loss and the first parameters: a bar, or lines where nothing can draw one.
+    """Show progress with the loss and the first parameters: a bar, or lines without a terminal.
 
-    Give ``reconstruct`` the callbacks that the block gets. Ctrl-C, or a notebook's stop, waits for
-    the end of the step, so that nothing is half done; a ``Checkpoint`` beside them goes on.
+    Pass the yielded callbacks to ``reconstruct``. Ctrl-C, or a notebook's stop, takes effect at the
+    end of the step; a ``Checkpoint`` in the same list can then resume.
 
     Args:
-        name: Of the fit.
-        steps: Of all its stages.
-        console: Where; None = where the program runs.
+        name: name of the fit, shown before the bar.
+        steps: total number of steps of all stages.
+        console: console to print on; None = standard output.
     """
     console = console or Console()
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

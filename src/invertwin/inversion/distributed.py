@@ -1,4 +1,4 @@
-"""Losses of many views, shared among processes: each works on some, and all get the mean."""
+"""Mean loss over views, distributed over processes with ``torch.distributed``."""
 
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -14,20 +14,20 @@ _ViewItem = TypeVar("_View")
 def mean_over_views(
     loss: Callable[[_ViewItem], Tensor], views: Sequence[_ViewItem], module: nn.Module
 ) -> float:
-    """The mean of a loss over views; its derivative is added to the parameters' ``grad``.
+    """Compute the mean of a loss over views, and add its gradient to the parameters' ``grad``.
 
-    Where ``torch.distributed`` is initialised, process r of n works on views r, r + n, …, and
-    every process gets the mean of all and the same derivative, in one exchange. It is that of one
-    process but for the order of sums, if what is random in a view goes by the view and not by the
-    process. An optimiser then takes the same step in every process.
+    Where ``torch.distributed`` is initialised, process r of n works on views r, r + n, …, and every
+    process obtains the mean over all views and the same gradient in one all-reduce. It equals that
+    of a single process up to the order of summation, if random numbers are seeded per view and not
+    per process. An optimiser then takes the same step in every process.
 
     Args:
-        loss: Of a view, a number. It depends on the parameters of the module.
-        views: All of them, the same in every process.
-        module: Its parameters that require a derivative.
+        loss: maps a view to a scalar that depends on the parameters of the module.
+        views: all views, the same list in every process.
+        module: module with the parameters to differentiate with respect to.
 
     Returns:
-        The mean.
+        The mean loss.
 
     Raises:
         InputError: No views, or no parameters.
@@ -35,8 +35,7 @@ def mean_over_views(
     free = [parameter for parameter in module.parameters() if parameter.requires_grad]
     if not views or not free:
         raise InputError(
-            f"expected views and parameters to differentiate by, got {len(views)} and {len(free)}; "
-            "give both"
+            f"expected views and free parameters, got {len(views)} and {len(free)}; give both"
         )
     rank, count = 0, 1
     if distributed.is_available() and distributed.is_initialized():
@@ -46,18 +45,18 @@ def mean_over_views(
     for view in views[rank::count]:
         value = loss(view) / len(views)
         total += value.detach()
-        # Each view by itself: what its derivative needs is free before the next one begins.
+        # One graph per view: its memory is freed before the next view.
         parts = torch.autograd.grad(value, free, allow_unused=True, materialize_grads=True)
         for own, part in zip(sums, parts, strict=True):
             own += part
     if count > 1:
         sums, total = _sum_over_processes(sums, total)
-    torch.autograd.backward(free, sums)  # of parameters themselves: adds the sums
+    torch.autograd.backward(free, sums)  # adds the sums to ``grad``
     return float(total)
 
 
 def _sum_over_processes(parts: list[Tensor], total: Tensor) -> tuple[list[Tensor], Tensor]:
-    """Both, summed over all processes."""
+    """Sum gradients and loss over all processes."""
     flat = torch.cat([total.reshape(1), *(part.double().flatten() for part in parts)])
     distributed.all_reduce(flat)
     pieces = flat[1:].split([part.numel() for part in parts])

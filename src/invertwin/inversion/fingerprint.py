@@ -1,4 +1,4 @@
-"""Fingerprints of fits: equal in every process, different after every change."""
+"""Fingerprints of fits: equal in every process, different after any change."""
 
 import hashlib
 import inspect
@@ -12,20 +12,20 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-_PROJECTIONS = 6  # of a tensor onto fixed waves: one changed number changes them
-_ROUNDING_TOLERANCE = 1e-5  # of a tensor's norm: what another order of additions may change
+_PROJECTIONS = 6  # projections of a tensor onto fixed waves: one changed number changes them
+_ROUNDING_TOLERANCE = 1e-5  # relative to a tensor's norm: tolerance for another order of additions
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
-# Code of classes from here belongs to a version, not to a fit.
+# Classes of these packages are identified by name; their code belongs to a version, not a fit.
 _LIBRARIES = ("builtins", "collections", "functools", "invertwin", "numpy", "torch", "typing")
 
 
 class Fingerprint:
-    """The digest of values by their content.
+    """Digest of values by their content.
 
-    Dataclasses, modules and objects count by class and fields, functions by their code and what
-    they use from around them, tensors of numbers by projections that tolerate rounding. A class
-    of one's own counts with the code of its methods. No address of a value takes part, so that a
-    function of one's own has the same fingerprint in a new process.
+    Dataclasses, modules and objects count by class and fields, functions by their code and the
+    globals and closures that they use, numeric tensors by projections that tolerate rounding.
+    User-defined classes count with the code of their methods. No memory address takes part, so that
+    a user's function has the same fingerprint in a new process.
     """
 
     def __init__(self, *values: Any) -> None:
@@ -37,11 +37,11 @@ class Fingerprint:
             self._add(value)
 
     def content(self) -> dict[str, Any]:
-        """Plain values for a checkpoint."""
+        """Return the fingerprint as plain values for a checkpoint."""
         return {"digest": self._hash.hexdigest(), "numbers": list(self._numbers)}
 
     def matches(self, stored: Any) -> bool:
-        """Whether kept content is of equal values, but for rounding."""
+        """Return whether stored content belongs to equal values, up to rounding."""
         if not isinstance(stored, dict) or stored.get("digest") != self._hash.hexdigest():
             return False
         pairs = zip(stored["numbers"], self._numbers, strict=True)
@@ -128,16 +128,16 @@ class Fingerprint:
         numbers = torch.view_as_real(flat).reshape(-1) if flat.is_complex() else flat
         numbers = torch.nan_to_num(numbers.double())
         norm = float(numbers.norm())
-        place = torch.arange(len(numbers), dtype=torch.float64)
+        index = torch.arange(len(numbers), dtype=torch.float64)
         waves = [
-            float((numbers * torch.cos((0.7 + k) * place + k)).sum()) for k in range(_PROJECTIONS)
+            float((numbers * torch.cos((0.7 + k) * index + k)).sum()) for k in range(_PROJECTIONS)
         ]
         # In units of the norm, so that one tolerance serves all of them.
         self._numbers += [math.log(norm) if norm > 0 else -1e9, *(w / (norm or 1.0) for w in waves)]
 
 
 def _is_foreign(value: Any, function: types.FunctionType) -> bool:
-    """Whether a global name stands for something that is not the function's own."""
+    """Return whether a global value is defined outside the function's module."""
     if isinstance(value, types.FunctionType):
         return value.__module__ != function.__module__
     return isinstance(value, type | types.ModuleType | types.BuiltinFunctionType)

@@ -1,4 +1,4 @@
-"""One stage of a fit: a model predicts, a loss compares, an optimiser steps."""
+"""One stage of a fit: predict maps, compare them by a loss, update the parameters."""
 
 import copy
 import math
@@ -28,32 +28,27 @@ from invertwin.seeds import derive_seed
 Status = Literal["converged", "budget", "diverged"]
 
 _MAX_RELATIVE_LOSS = 1e3  # times the first loss
-_MAX_LOSS_INCREASE = (
-    1.1  # times the loss of the first parameters, all widths at their end: more than noise
-)
+_MAX_LOSS_INCREASE = 1.1  # final over initial loss, both without blur: more than noise
 _CONVERGENCE_WINDOW = 20  # steps over which convergence is judged
-_FRAME_SEED_KEY = 2**16  # keys of the seeds that choose frames, beyond those of observations
-# What optimisers remember of a parameter.
+_FRAME_SEED_KEY = 2**16  # seed keys that select frames, beyond those of observations
+# State that an optimiser stores for a parameter.
 _OPTIMIZER_STATE_KEYS: dict[type[torch.optim.Optimizer], set[str]] = {
     torch.optim.Adam: {"step", "exp_avg", "exp_avg_sq"},
     torch.optim.SGD: {"momentum_buffer"},
 }
-_UNBLURRED_SEED_KEY, _REALISATION_SEED_KEY = (
-    2**17,
-    2**17 + 1,
-)  # keys of seeds, beyond those of stages
+_UNBLURRED_SEED_KEY, _REALISATION_SEED_KEY = 2**17, 2**17 + 1  # seed keys beyond those of stages
 
 
 @dataclass(frozen=True)
 class FitProgress:
-    """How far a fit has come: all that a checkpoint holds besides parameters and optimiser.
+    """Progress of a fit: the content of a checkpoint besides parameters and optimiser.
 
     Attributes:
-        first: The parameters at the start.
-        step: Steps done.
-        history: One row a step.
-        best: Step, loss and parameters of the lowest loss.
-        ended: The status, once the fit has ended.
+        first: initial parameters by name.
+        step: number of completed steps.
+        history: one row per step.
+        best: step, loss and parameters of the lowest loss.
+        ended: final status, once the fit has ended.
     """
 
     __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
@@ -69,21 +64,21 @@ _PROGRESS_ADAPTER = TypeAdapter(FitProgress)
 
 
 class Callback:
-    """Something that watches a fit. Every method does nothing unless it is overridden."""
+    """Observer of a fit. Every method does nothing unless overridden."""
 
     def begin(self, fit: "Fit") -> None:
         """Called before the first step of every stage."""
 
     def annotate(self, fit: "Fit") -> dict[str, Any]:
-        """Numbers that join the row of the step that was just done."""
+        """Return values to add to the row of the completed step."""
         return {}
 
     def step(self, fit: "Fit", row: dict[str, Any]) -> None:
         """Called after every step.
 
         Args:
-            fit: The stage.
-            row: Its complete row of the step.
+            fit: the running stage.
+            row: complete row of the step.
         """
 
     def end(self, fit: "Fit") -> None:
@@ -91,17 +86,17 @@ class Callback:
 
 
 class Fit:
-    """The state of one stage of a fit.
+    """One stage of a fit and its state.
 
     Attributes:
         scene: The scene before any module is applied.
-        observations: With prepared models.
+        observations: observations with prepared models.
         unknowns: Modules of the scene, applied in order.
-        sensor_unknowns: Modules of the sensor of every observation.
-        stage: Its schedule.
+        sensor_unknowns: modules of the sensor of each observation.
+        stage: schedule of the stage.
         number: Number of the stage, from 0.
         is_last: Whether it is the last stage.
-        progress: How far it has come.
+        progress: progress so far.
     """
 
     def __init__(
@@ -119,10 +114,11 @@ class Fit:
         """Prepare a stage.
 
         Args:
-            scene, observations, unknowns, sensor_unknowns, stage: As the attributes.
-            settings: What all stages have in common.
-            rates: Learning rates of single parameters.
-            stage_position: Number of the stage, steps before it, whether it is the last one.
+            scene, observations, unknowns, sensor_unknowns, stage: as the attributes.
+            settings: settings common to all stages.
+            rates: learning rates of single parameters.
+            stage_position: number of the stage, number of steps before it, whether it is the last
+                one.
         """
         self.scene, self.stage = scene, stage
         self.number, self._before, self.is_last = stage_position
@@ -153,7 +149,7 @@ class Fit:
                 "expected smooth models such as SurrogateMap with kind 'gauss_newton', got "
                 f"{type(rough[0]).__name__}; use 'adam'"
             )
-        # Before the models draw anything: what is drawn follows from the rest.
+        # Before models draw random numbers, which follow from the rest.
         self.fingerprint = Fingerprint(
             (stage_position, stage, settings, self.modules, scene),
             [
@@ -169,7 +165,7 @@ class Fit:
         self.progress = FitProgress(self.parameters())
 
     def run(self, callbacks: Sequence[Callback]) -> Status:
-        """Take all steps, watched by the callbacks, and return how the fit has ended."""
+        """Run all steps with the callbacks, and return the final status."""
         for callback in callbacks:
             callback.begin(self)
         if self.progress.ended is None:
@@ -182,7 +178,7 @@ class Fit:
         return self.progress.ended
 
     def apply_modules(self) -> tuple[Scene, list[Any]]:
-        """The scene and all sensors under the present parameters."""
+        """Return the scene and all sensors under the present parameters."""
         scene = self.scene
         for module in self.unknowns:
             scene = module(scene)
@@ -195,14 +191,14 @@ class Fit:
         return scene, sensors
 
     def twin(self) -> Scene:
-        """The scene under the present parameters, without derivatives."""
+        """Return the scene under the present parameters, without derivatives."""
         with torch.no_grad():
             return self.apply_modules()[0]
 
     def maps(self, step: int) -> MapPairs:
-        """The predicted and the observed map of every observation, blurred alike.
+        """Return the predicted and the observed map of every observation, equally blurred.
 
-        The same number of a step gives the same random numbers.
+        Equal step numbers use equal random numbers.
         """
         scene, sensors = self.apply_modules()
         share = max(0.0, 1 - step / self.stage.blur_end)
@@ -214,18 +210,18 @@ class Fit:
             model = model.scale_blur(share)
             key = (self.number, step, k) if model.redraws else (k,)
             seed = derive_seed(self._settings.seed, *key)
-            # On a core that is idle while the prediction's kernels are prepared.
+            # On a core that is idle while the kernels of the prediction are compiled.
             with ThreadPoolExecutor(1) as beside:
                 blurred = beside.submit(model.blur_observed, observed, sensor)
                 pairs.append((model.predict(scene, sensor, seed), blurred.result()))
         return pairs
 
     def unblurred_maps(self, seed_number: int, **sampling_changes: Any) -> MapPairs:
-        """The predicted and the observed map of every observation, with all frames, not blurred.
+        """Return predicted and observed maps with all frames and without blur.
 
         Args:
-            seed_number: Other numbers have other random numbers.
-            sampling_changes: Fields of the models' ``sampling`` in place of their own.
+            seed_number: index of the random numbers.
+            sampling_changes: fields of the models' ``sampling`` to replace.
         """
         scene, sensors = self.apply_modules()
         pairs = []
@@ -237,7 +233,7 @@ class Fit:
         return pairs
 
     def loss_at_start(self) -> float:
-        """The loss without extra widths at the parameters that the stage began with."""
+        """Return the loss without blur at the initial parameters of the stage."""
         present = self.parameters()
         self.modules.load_state_dict(self.progress.first)
         try:
@@ -249,10 +245,10 @@ class Fit:
             self.modules.load_state_dict(present)
 
     def realisations(self, seed_number: int) -> list[Callable[[int, float], Tensor] | None]:
-        """What every sensor might have recorded of the twin, see ``ForwardModel.looks``.
+        """Return functions that simulate recordings of the twin, see ``ForwardModel.realisations``.
 
         Args:
-            seed_number: Other numbers have other points on surfaces.
+            seed_number: index of the random points on surfaces.
         """
         with torch.no_grad():
             scene, sensors = self.apply_modules()
@@ -266,40 +262,41 @@ class Fit:
             ]
 
     def penalty(self) -> Tensor:
-        """What the regularisers add to the loss."""
+        """Return the sum of the regularisers."""
         scene, total = self.apply_modules()[0], torch.zeros((), dtype=torch.float64)
         for term in self._settings.regularizers:
             total = total + term(scene)
         return total
 
     def evaluate(self, step: int) -> Tensor:
-        """The loss with the random numbers of a step."""
+        """Return the loss with the random numbers of a step."""
         value = self.objective(self.maps(step))
         return value + self.penalty() if self._settings.regularizers else value
 
     def parameters(self) -> dict[str, Tensor]:
-        """A copy of the present parameters."""
+        """Return a copy of the present parameters."""
         return {k: v.detach().clone() for k, v in self.modules.state_dict().items()}
 
     def copy(self) -> "Fit":
-        """The same fit with parameters of its own, which are as they are now."""
+        """Return a copy of the fit with its own parameters, at their present values."""
         other = copy.copy(self)
         own = (self.unknowns, self.sensor_unknowns, self.modules)
         other.unknowns, other.sensor_unknowns, other.modules = copy.deepcopy(own)
         return other
 
     def gauss_newton_step(self, optimizer: GaussNewton, step: int) -> float:
-        """The loss before a Gauss–Newton step with the random numbers of a step.
+        """Take a Gauss–Newton step with the random numbers of a step, and return the loss before
+        it.
 
         Args:
-            optimizer: Of the modules of this fit.
-            step: Its number.
+            optimizer: Gauss–Newton optimiser of this fit's modules.
+            step: number of the step.
         """
         penalty = self.penalty if self._settings.regularizers else None
         return optimizer.step(partial(self.maps, step), penalty)
 
     def state(self) -> dict[str, Any]:
-        """All that is needed to go on later."""
+        """Return the state of the fit for a checkpoint."""
         return {
             "modules": self.modules.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -308,9 +305,10 @@ class Fit:
         }
 
     def restore(self, state: dict[str, Any]) -> bool:
-        """Go on from a ``state`` of this fit; of another fit, change nothing and return False.
+        """Restore a ``state`` of this fit; for a state of another fit, change nothing and return
+        False.
 
-        A state whose fingerprint fits and whose content does not raises what comes of it.
+        A state with a matching fingerprint and corrupt content raises an error.
         """
         if not self.fingerprint.matches(state.get("fingerprint")):
             return False
@@ -327,7 +325,7 @@ class Fit:
         return True
 
     def is_unblurred(self, step: int) -> bool:
-        """Whether the extra widths are zero from the step of this number on."""
+        """Return whether the added blur is zero from this step on."""
         return step >= self.stage.blur_end or not any(m.has_blur for m in self._models)
 
     def _update_progress(self, **changes: Any) -> None:
@@ -336,7 +334,7 @@ class Fit:
     def _select_frames(
         self, number: int, step: int, sensor: Any, observed: Tensor
     ) -> tuple[Any, Tensor]:
-        """The frames of one observation that a step compares."""
+        """Select the frames of one observation that a step compares."""
         fitted = np.array(
             [n for n in range(len(observed)) if n not in self._held_out_frames(len(observed))]
         )
@@ -350,12 +348,12 @@ class Fit:
         return sensor.frames(chosen.tolist()), observed.index_select(0, torch.from_numpy(chosen))
 
     def _held_out_frames(self, count: int) -> range:
-        """Numbers of the frames that are held out, of so many."""
+        """Return the indices of the held-out frames among ``count`` frames."""
         every = self.stage.held_out
         return range(0) if every is None else range(every - 1, count, every)
 
     def _selection_loss(self) -> float:
-        """The loss that tells whether the fit is better than its start."""
+        """Return the loss that decides whether the fit is better than its start."""
         if self.stage.held_out is None:
             return float(self.evaluate(self.stage.steps))
         held = [(self._held_out_frames(len(b)), a, b) for a, b in self.unblurred_maps(0)]
@@ -369,7 +367,7 @@ class Fit:
             try:
                 number = self._take_step(step)
             except InputError:
-                if self.progress.best is None:  # not lost on the way, but wrong from the start
+                if self.progress.best is None:  # the initial parameters are invalid
                     raise
                 number = math.nan
             if _has_diverged(number, self.progress.history):
@@ -394,7 +392,7 @@ class Fit:
         return "converged" if self._has_converged(max(stage.tolerance, 1e-3)) else "budget"
 
     def _take_step(self, step: int) -> float:
-        """The loss of the present parameters, which then take a step down."""
+        """Take one step, and return the loss before it."""
         if isinstance(self.optimizer, GaussNewton):
             return self.gauss_newton_step(self.optimizer, step)
         self.optimizer.zero_grad()
@@ -408,7 +406,7 @@ class Fit:
         return number
 
     def _keep_if_better(self, loss: float, parameters: dict[str, Tensor]) -> None:
-        """Remember the best parameters; a loss without extra widths beats any with them."""
+        """Keep the best parameters; a loss without blur takes precedence over one with blur."""
         best, step = self.progress.best, self.progress.step
         if best is not None:
             first = self.is_unblurred(step) and not self.is_unblurred(best[0])
@@ -417,7 +415,7 @@ class Fit:
         self._update_progress(best=(step, loss, parameters))
 
     def _select_best(self, status: Status) -> Status:
-        """The status: ``diverged`` if the fit ends worse than it began; the best is kept."""
+        """Load the best parameters, and return ``diverged`` if the fit ends worse than it began."""
         best = self.progress.best
         if best is None:
             return status
@@ -436,14 +434,14 @@ class Fit:
         if math.isfinite(last) and last <= _MAX_LOSS_INCREASE * losses["first"]:
             self.modules.load_state_dict(ends["last"])
             return status
-        # A loss on the way was that of frames that are fitted, which says nothing of the others.
+        # Losses of steps are of the fitted frames only; recompute on the selection frames.
         kept = min(("first", "best"), key=lambda name: losses[name])
         self.modules.load_state_dict(ends[kept])
         self._update_progress(best=(self.progress.step, losses[kept], ends[kept]))
         return "diverged"
 
     def _has_converged(self, tolerance: float) -> bool:
-        """Whether the loss, averaged over two windows without extra widths, no longer falls."""
+        """Return whether the unblurred loss, averaged over two windows, no longer falls."""
         rows = [row["loss"] for row in self.progress.history[-2 * _CONVERGENCE_WINDOW :]]
         if len(rows) < 2 * _CONVERGENCE_WINDOW or not self.is_unblurred(
             self.progress.step - 2 * _CONVERGENCE_WINDOW
@@ -455,18 +453,18 @@ class Fit:
 
 @dataclass(frozen=True)
 class FitSettings:
-    """What all stages of a fit have in common. See :func:`invertwin.reconstruct`."""
+    """Settings common to all stages of a fit. See :func:`invertwin.reconstruct`."""
 
-    loss: Callable[[Tensor, Tensor], Tensor]  # of a predicted and an observed map
-    optimizer: Optimizer  # of stages without one of their own
-    regularizers: tuple[Regularizer, ...]  # of the scene, beside those of its unknowns
-    seed: int  # of all random numbers
+    loss: Callable[[Tensor, Tensor], Tensor]  # (predicted map, observed map) → number
+    optimizer: Optimizer  # default optimiser of stages
+    regularizers: tuple[Regularizer, ...]  # terms of the loss, besides those of the unknowns
+    seed: int  # seed of all random numbers
 
 
 def _restore_optimizer(
     optimizer: torch.optim.Optimizer | GaussNewton, state: dict[str, Any]
 ) -> None:
-    """Give an optimiser back what it knew of every parameter; its settings are those of the fit."""
+    """Restore the state of an optimiser for every parameter; its settings are those of the fit."""
     if isinstance(optimizer, GaussNewton):
         optimizer.load_state_dict(state)
         return
@@ -500,7 +498,9 @@ def _has_diverged(loss: float, history: list[dict[str, Any]]) -> bool:
 
 
 def _parameter_values(modules: nn.ModuleList) -> dict[str, Any]:
-    """Parameters by name as plain numbers; long ones (vertices) are left to the checkpoint."""
+    """Return the named parameters as plain numbers; long ones (vertices) are in the checkpoint
+    only.
+    """
     rows: dict[str, Any] = {}
     for module in modules:
         for name, value in getattr(module, "values", dict)().items():

@@ -1,4 +1,4 @@
-"""Gauss–Newton for few parameters, each with a forward-mode derivative of the map."""
+"""Gauss–Newton with forward-mode derivatives of the map with respect to each parameter."""
 
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -16,42 +16,39 @@ from invertwin.checks import checked_count
 from invertwin.errors import InputError
 from invertwin.inversion.loss import MapPairs, Objective, SpectrumLoss
 
-_MAX_PARAMETERS = 64  # parameters; each costs a derivative of the map per step
-_MAX_DAMPING_TRIALS = 4  # dampings of one step
-_DAMPING_DECREASE, _DAMPING_INCREASE = (
-    0.3,
-    4.0,
-)  # of the damping after a step that helped, and after one that did not
-_MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e3  # of the damping
-_LOSS_TOLERANCE = 1e-3  # of the loss: the noise of two evaluations on the same samples
+_MAX_PARAMETERS = 64  # each parameter costs a derivative of the map per step
+_MAX_DAMPING_TRIALS = 4  # trials of one step with increasing damping
+_DAMPING_DECREASE, _DAMPING_INCREASE = 0.3, 4.0  # after an accepted and after a rejected step
+_MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e3
+_LOSS_TOLERANCE = 1e-3  # relative noise of two evaluations on equal samples
 
 
 class GaussNewton:
     """Levenberg–Marquardt steps on the loss of power maps.
 
-    The step d solves ``(H + μ D) d = −g`` with no number beyond ``reach``: g the gradient of the
-    loss with all its terms, in reverse mode; H the loss's Gauss–Newton matrix from derivatives of
-    the map with respect to every parameter, in forward mode with silhouettes; D the diagonal of H,
-    at least its mean. A step that raises the loss, on the same samples, is taken back and tried
-    again with more damping μ.
+    The step d solves ``(H + μ D) d = −g`` within the trust region ``trust_radius``: g the gradient
+    of the loss with all its terms, in reverse mode; H the loss's Gauss–Newton matrix from
+    derivatives of the map with respect to every parameter, in forward mode with silhouettes; D the
+    diagonal of H, at least its mean. A step that raises the loss, on the same samples, is rejected
+    and retried with more damping μ.
 
     Source: the Levenberg–Marquardt method.
-    Differs from the source: g and H are estimates from samples. D keeps parameters that the data
-    hardly determine from drifting with the noise. H may serve several steps.
+    Differs from the source: g and H are estimates from samples. D keeps weakly determined
+    parameters from drifting with the noise. H may serve several steps.
 
     Args:
-        modules: what is fitted.
-        objective: how maps are compared, of `SpectrumLoss` only.
-        reach: the longest change of one parameter in a step, in its unit.
-        trust_radii: the reach of single parameters, in place of `reach`.
-        damping: μ at the first step.
-        every: steps from one H to the next; those between take the last one.
+        modules: modules to fit.
+        objective: loss of the maps, of `SpectrumLoss` only.
+        trust_radius: largest change of one parameter in a step, in its unit.
+        trust_radii: trust radii of single parameters, in place of `trust_radius`.
+        damping: μ of the first step.
+        curvature_every: number of steps that reuse one H.
 
     Attributes:
         damping: present μ.
 
     Raises:
-        InputError: no parameters, more than 64, another loss, or a reach, damping or number
+        InputError: no parameters, more than 64, another loss, or a trust radius, damping or number
             of steps that is not positive.
     """
 
@@ -79,8 +76,9 @@ class GaussNewton:
                 )
         if not self._slots or not (trust_radius > 0 and damping > 0):
             raise InputError(
-                f"expected parameters to fit, reach > 0 and damping > 0, got {len(self._slots)}, "
-                f"{trust_radius} and {damping}; a reach of 0.3 suits metres and radians"
+                "expected parameters to fit, trust_radius > 0 and damping > 0, got "
+                f"{len(self._slots)}, {trust_radius} and {damping}; a radius of 0.3 suits metres "
+                "and radians"
             )
         self.objective, self.damping = objective, damping
         own = dict(trust_radii or {})
@@ -91,19 +89,19 @@ class GaussNewton:
             ]
         )
         self.every = checked_count(curvature_every, "steps from one curvature to the next", 1)
-        self._known: tuple[Tensor, Tensor] | None = None  # H, and of which parameters
-        self._age = 0  # steps that H has served
+        self._known: tuple[Tensor, Tensor] | None = None  # H, and the mask of its parameters
+        self._age = 0  # number of steps with the present H
 
     def step(
         self, maps: Callable[[], MapPairs], penalty: Callable[[], Tensor] | None = None
     ) -> float:
-        """Do one step, and return the loss before it.
+        """Take one step, and return the loss before it.
 
         Args:
-            maps: gives the predicted and the observed map of every observation under the present
-                parameters; the same samples each time it is called within one step.
-            penalty: gives a differentiable term added to the loss, as a regulariser does. It
-                takes part in g, and by its own second derivatives in H.
+            maps: returns the predicted and the observed map of every observation under the present
+                parameters, with equal samples in every call within one step.
+            penalty: returns a differentiable term of the loss, such as regularisers. It enters g,
+                and through its own second derivatives H.
 
         Raises:
             InputError: a parameter without effect on the loss, or more than 64 that matter.
@@ -123,7 +121,7 @@ class GaussNewton:
         before = float(value.detach())
         if not bool(torch.isfinite(slope).all()) or before != before:
             return float("nan")
-        # Along a parameter that the module holds fixed, the derivative is zero to the last bit.
+        # The derivative with respect to a fixed coordinate is exactly zero.
         free = slope != 0
         if int(free.sum()) > _MAX_PARAMETERS:
             raise InputError(
@@ -151,22 +149,21 @@ class GaussNewton:
                 self.damping = max(self.damping * _DAMPING_DECREASE, _MIN_DAMPING)
                 return before
             self.damping *= _DAMPING_INCREASE
-        # Samples are others in the next step: what failed on these may be right on those, with a
-        # curvature of theirs.
+        # The next step draws other samples, on which a new curvature may succeed.
         self._known = None
         self.damping = min(given * _DAMPING_INCREASE, _MAX_DAMPING)
         self._set_parameters(start, torch.zeros(int(free.sum()), dtype=torch.float64), free)
         return before
 
     def state_dict(self) -> dict[str, Any]:
-        """What a checkpoint needs besides the parameters."""
+        """Return the state for a checkpoint, besides the parameters."""
         kept: dict[str, Any] = {"damping": self.damping, "age": self._age}
         if self._known is not None:
             kept["curvature"], kept["free"] = self._known
         return kept
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` gave."""
+        """Restore a state from `state_dict`."""
         self.damping = float(state["damping"])
         self._age = int(state.get("age", 0))
         self._known = None
@@ -177,20 +174,19 @@ class GaussNewton:
             self._known = curvature, free
 
     def zero_grad(self) -> None:
-        """Do nothing: gradients are not kept in the parameters."""
+        """Do nothing: gradients are not stored in the parameters."""
 
     def _solve_step(
         self, curvature: Tensor, gradient: Tensor, trust_radius: Tensor
     ) -> Float64[Tensor, " p"]:
-        """The minimum of the damped quadratic model within the reach of every parameter."""
+        """Minimise the damped quadratic model within the trust radius of every parameter."""
         own = curvature.diagonal()
-        # What the data hardly tell is damped as much as what they tell on average: noise would
-        # carry it away otherwise.
+        # Weakly determined parameters get the mean damping; noise would move them otherwise.
         scale = own.clamp_min(float(own.mean()))
         model = curvature + torch.diag(self.damping * scale)
         change, free = torch.zeros_like(gradient), torch.ones_like(gradient, dtype=torch.bool)
         while bool(free.any()):
-            # What is at its limit stays there, the others make the best of it.
+            # Fix parameters at their limit, and minimise over the others.
             rest = gradient[free] + model[free][:, ~free] @ change[~free]
             change[free] = -torch.linalg.solve(model[free][:, free], rest)
             beyond = free & (change.abs() > trust_radius)
@@ -201,7 +197,7 @@ class GaussNewton:
         return change
 
     def _set_parameters(self, start: list[Tensor], change: Tensor, free: Tensor) -> None:
-        """Set the parameters to where they were, plus a change of the free ones."""
+        """Set the parameters to ``start`` plus a change of the free ones."""
         whole = torch.zeros(free.shape, dtype=torch.float64)
         whole[free] = change
         with torch.no_grad():
@@ -264,7 +260,7 @@ def dual_parameters(
 def _evaluate_loss(
     objective: Objective, maps: Callable[[], MapPairs], penalty: Callable[[], Tensor] | None
 ) -> float:
-    """The loss with its term; infinite for parameters that the scene refuses."""
+    """Evaluate the loss with its penalty; infinite for parameters outside their bounds."""
     with torch.no_grad():
         try:
             return float(objective(maps())) + (0.0 if penalty is None else float(penalty()))
@@ -273,11 +269,11 @@ def _evaluate_loss(
 
 
 def no_effect_error(module: nn.Module, name: str) -> InputError:
-    """Make the error for a parameter that the loss does not depend on.
+    """Build the error for a parameter without effect on the loss.
 
     Args:
-        module: It has the parameter.
-        name: Of the parameter.
+        module: module that owns the parameter.
+        name: name of the parameter.
     """
     return InputError(
         f"expected parameters that change the map, got {name} of {type(module).__name__}, which "
@@ -287,19 +283,19 @@ def no_effect_error(module: nn.Module, name: str) -> InputError:
 
 
 def _flatten(parts: Sequence[Tensor]) -> Float64[Tensor, " q"]:
-    """All numbers of some tensors one after the other."""
+    """Concatenate the entries of tensors."""
     return torch.cat([part.flatten().double() for part in parts])
 
 
 def penalty_curvature(
     penalty: Callable[[], Tensor], parameters: list[nn.Parameter], free: Bool[Tensor, " q"]
 ) -> Float64[Tensor, "p p"]:
-    """Second derivatives of a term of the loss, as far as they are positive.
+    """Compute the positive part of the Hessian of a penalty.
 
     Args:
-        penalty: The term.
-        parameters: By what it is differentiated.
-        free: Which of their numbers count.
+        penalty: returns the term of the loss.
+        parameters: parameters to differentiate with respect to.
+        free: mask of the free entries of all parameters [q].
     """
     count, value = int(free.sum()), penalty()
     total = torch.zeros(count, count, dtype=torch.float64)

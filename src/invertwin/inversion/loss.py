@@ -1,4 +1,4 @@
-"""How far a predicted power map is from an observed one."""
+"""Losses between predicted and observed power maps."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,50 +14,50 @@ from torch import Tensor
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 
-_MIN_POSITIVE = 1e-38  # keeps logarithms finite
-_GAIN_STEPS = 8  # at most; three or four do
-_GAIN_TOLERANCE = 1e-3  # of the gain: a step this small is the last, and leaves less than 1e-5
-_BINS_PER_BLOCK = 2**16  # bins that are worked on at a time: what they need stays in a core's cache
+_MIN_POSITIVE = 1e-38  # lower limit of logarithms
+_GAIN_STEPS = 8  # maximum number of iterations; three or four suffice
+_GAIN_TOLERANCE = (
+    1e-3  # relative step of the gain at which the iteration ends; the remaining error is below 1e-5
+)
+_BINS_PER_BLOCK = 2**16  # bins per block, so that the working set fits a core's cache
 
 LOSS_KINDS = ("mse", "likelihood", "heavy_tailed")
 BACKGROUNDS = ("none", "level", "static")
 PowerArray = TypeVar("Power", Tensor, NDArray[np.float32])
-_PowerBlock = tuple[
-    Tensor, Tensor, Tensor
-]  # of a simulated map, what it holds of power, the measured
+_PowerBlock = tuple[Tensor, Tensor, Tensor]  # simulated map, its positive part, measured power
 MapPairs = Sequence[tuple[Tensor, Tensor]]
 """The predicted and the observed map of every observation."""
 
 
 def relative_error(simulated: Tensor, measured: Tensor) -> Tensor:
-    """``mean|a − b|² / mean|b|²`` of maps of any form, also of complex signals.
+    """Return ``mean|a − b|² / mean|b|²`` of maps of any shape, also of complex signals.
 
     Args:
-        simulated: a.
-        measured: b.
+        simulated: a [*].
+        measured: b [*].
     """
     return (simulated - measured).abs().square().mean() / measured.abs().square().mean()
 
 
 def speckle_divergence(ratio: Tensor, degrees: float = math.inf) -> Tensor:
-    """How much less likely the power of speckle is than if it were its mean.
+    """Compute the negative log-likelihood of speckle power relative to that of its mean.
 
-    Exponential power whose mean is μ times an inverse gamma variable of ν degrees, q times its
-    μ: the negative logarithm of the density is log μ + (ν + 1) log(1 + q / ν) but for a constant.
-    For ν → ∞ it is that of fully developed speckle, log μ + q, under which a few echoes that the
-    model does not hold outweigh all others: they count by q; else they count by its logarithm.
+    Power q μ is exponentially distributed, and its mean is μ times an inverse gamma variable of ν
+    degrees of freedom: the negative log density is log μ + (ν + 1) log(1 + q / ν) up to a constant.
+    For ν → ∞ it is that of fully developed speckle, log μ + q, under which a few unmodelled echoes
+    outweigh all others: they contribute q, and for finite ν its logarithm.
 
     Args:
         ratio: q, power over its mean.
-        degrees: ν.
+        degrees: ν, degrees of freedom.
 
     Returns:
         The divergence: 0 for q = 1, positive elsewhere.
 
     Source: Conte and Longo, "Characterisation of radar clutter as a spherically invariant random
     process", IEE Proceedings F 134, 1987.
-    Differs from the source: the mean over textures is that of ν degrees about a mean that is
-    modelled, not of a fitted K distribution.
+    Differs from the source: the texture has ν degrees of freedom about a modelled mean; no K
+    distribution is fitted.
     """
     if math.isinf(degrees):
         return ratio - ratio.log() - 1
@@ -66,11 +66,11 @@ def speckle_divergence(ratio: Tensor, degrees: float = math.inf) -> Tensor:
 
 
 def speckle_weight(ratio: PowerArray, degrees: float) -> PowerArray:
-    """By how much less a bin counts in slopes than under plain speckle: (ν + 1) / (ν + q).
+    """Compute the weight of a bin in gradients relative to plain speckle: (ν + 1) / (ν + q).
 
     Args:
         ratio: q, power over its mean.
-        degrees: ν.
+        degrees: ν, degrees of freedom.
     """
     return (degrees + 1) / (degrees + ratio)
 
@@ -79,28 +79,28 @@ def speckle_weight(ratio: PowerArray, degrees: float) -> PowerArray:
 class SpectrumLoss:
     """Multiscale difference of power maps.
 
-    a, b are the simulated and the measured map; each level pools the bins of the one before in
-    pairs, and the loss is the mean over levels. The unknown overall gain g ≥ 0 minimises the loss
-    in closed form (``mse``) or by a short fixed-point iteration (the others); being a
-    minimiser, it needs no derivative.
+    a, b are the simulated and the measured map; each level pools pairs of bins of the previous one,
+    and the loss is the mean over levels. The unknown overall gain g ≥ 0 minimises the loss in
+    closed form (``mse``) or by a short fixed-point iteration (the others); as a minimiser, it needs
+    no derivative.
 
     Attributes:
-        kind: ``mse``: ``mean((g a − b)²) / mean(b²)``. ``likelihood``: the Itakura–Saito
-            divergence ``mean(q − log q − 1)``, ``q = (b + n) / (g a + n)``, which is the
-            likelihood of fully developed speckle (power with an exponential distribution, or
-            gamma after averaging). It weighs weak and strong echoes by their information, so that
-            the speckle of a bright wall does not drown a dim object. ``heavy_tailed``: the same
-            for speckle whose mean is itself uncertain (``speckle_divergence``), so that echoes
-            that the scene does not hold count by the logarithm of q, not by q. It suits measured
-            data.
-        levels: Number of resolutions.
+        kind: ``mse``: ``mean((g a − b)²) / mean(b²)``. ``likelihood``: the Itakura–Saito divergence
+            ``mean(q − log q − 1)``, ``q = (b + n) / (g a + n)``, which is the likelihood of fully
+            developed speckle (power with an exponential distribution, or gamma after averaging). It
+            weighs weak and strong echoes by their information, so that the speckle of a strong
+            reflector does not mask a weak one. ``heavy_tailed``: the same for speckle with an
+            uncertain mean (``speckle_divergence``), so that unmodelled echoes contribute the
+            logarithm of q, not q. It suits measured data.
+        levels: number of resolutions.
         gain: ``fitted``, or ``one`` for calibrated data.
-        background: ``mse`` only. What is taken out of both maps first, again in closed form:
-            nothing, one common ``level``, or the ``static`` part, the mean over frames of every
-            bin (what clutter removal did to the data).
-        floor: Not for ``mse``. n over the mean of b: noise and sidelobes below this do not
-            count.
-        degrees: ``heavy_tailed`` only. ν: about how many looks the mean of a bin is known by.
+        background: ``mse`` only. Background to remove from both maps first, in closed form:
+            nothing, one common ``level``, or the ``static`` part, the mean over frames of every bin
+            (as clutter removal does).
+        floor: not for ``mse``. n over the mean of b: noise and sidelobes below it have little
+            weight.
+        degrees: ``heavy_tailed`` only. ν: equivalent number of looks that determine the mean of a
+            bin.
 
     Source: §4.2 of the paper (multiscale MSE).
     Differs from the source: the gain and the background are not parameters of the descent; the
@@ -139,20 +139,20 @@ class SpectrumLoss:
             )
         if not self.degrees > 0:
             raise InputError(
-                f"expected degrees > 0, got {self.degrees}; 4 suits echoes that are not all known"
+                f"expected degrees > 0, got {self.degrees}; 4 suits data with unmodelled echoes"
             )
 
     @property
     def _tail_degrees(self) -> float:
-        """ν of the speckle."""
+        """Degrees of freedom ν of the speckle."""
         return self.degrees if self.kind == "heavy_tailed" else math.inf
 
     def _weight_power(self, power: Tensor, inverse: Tensor | float = 1.0) -> Tensor:
-        """Power as it counts in slopes, see ``speckle_weight``; all of it under plain speckle.
+        """Weight power for gradients, see ``speckle_weight``; plain speckle has weight one.
 
         Args:
-            power: Measured.
-            inverse: One over its mean.
+            power: measured power.
+            inverse: one over its mean.
         """
         if self.kind == "likelihood":
             return power
@@ -163,7 +163,7 @@ class SpectrumLoss:
         simulated: Float[Tensor, "frame *map"],
         measured: Float[Tensor, "frame *map"],
     ) -> Float[Tensor, ""]:
-        """The loss: 0 for equal maps, 1 for an empty simulated map under ``mse``.
+        """Return the loss: 0 for equal maps, 1 for an empty simulated map under ``mse``.
 
         Raises:
             InputError: Different shapes, or a measured map that is zero everywhere.
@@ -186,15 +186,16 @@ class SpectrumLoss:
         measured: Float[Tensor, "frame *map"],
         tangents: Float[Tensor, "p frame *map"],
     ) -> Float[Tensor, "p p"]:
-        """The Gauss–Newton matrix of the loss: its second derivatives but for those of the map.
+        """Compute the Gauss–Newton matrix of the loss: its Hessian without second derivatives of
+        the map.
 
         Under ``mse`` it is twice the matrix of squared residuals, else the Fisher information of
-        the speckle. A fitted gain is eliminated: what it can explain tells nothing
-        about the parameters.
+        the speckle. A fitted gain is eliminated by a Schur complement.
 
         Args:
-            simulated, measured: The maps.
-            tangents: Derivatives of the simulated map with respect to p parameters.
+            simulated, measured: maps [frame, *map].
+            tangents: derivatives of the simulated map with respect to p parameters [p, frame,
+                *map].
         """
         pairs = self._pyramid(simulated.detach(), measured)
         # The derivative of a map with respect to the logarithm of its gain is the map.
@@ -223,11 +224,11 @@ class SpectrumLoss:
         return own
 
     def fitted_gain(self, simulated: Tensor, measured: Tensor) -> float:
-        """What the simulated map is multiplied by to be nearest to the measured one.
+        """Return the gain of the simulated map that minimises the loss.
 
         Args:
-            simulated: Power.
-            measured: Power.
+            simulated: power [frame, *map].
+            measured: power [frame, *map].
         """
         unit, scale = self._normalisations(simulated, measured)
         pairs = self._pyramid(simulated.detach(), measured)
@@ -236,7 +237,7 @@ class SpectrumLoss:
         return float(self._optimal_gain(pairs) * scale / unit)
 
     def _normalisations(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
-        """What the simulated and the measured map are divided by."""
+        """Return the divisors of the simulated and the measured map."""
         scale = _mean_magnitude(measured)
         if not scale > 0:
             raise InputError("expected a measured map with power in it, got zeros; check the grid")
@@ -244,14 +245,14 @@ class SpectrumLoss:
         return torch.where(unit > 0, unit, 1.0), scale
 
     def _resolutions(self, power: Tensor) -> list[Tensor]:
-        """A map at all resolutions."""
+        """Return a map at all resolutions."""
         found = [power]
         while len(found) < self.levels:
             found.append(halve_resolution(found[-1]))
         return found
 
     def _pyramid(self, simulated: Tensor, measured: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Both maps at all resolutions, in units near one."""
+        """Return both maps at all resolutions, in units near one."""
         unit, scale = self._normalisations(simulated, measured)
         both = (
             self._resolutions(simulated / unit),
@@ -260,7 +261,7 @@ class SpectrumLoss:
         return list(zip(*both, strict=True))
 
     def _optimal_gain(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
-        """The gain that minimises the loss."""
+        """Return the gain that minimises the loss."""
         gain = torch.ones(())
         if self.gain == "one":
             return gain
@@ -274,7 +275,9 @@ class SpectrumLoss:
             return gain * self._likelihood_gain([self._split_blocks(*pair) for pair in pairs])
 
     def _split_blocks(self, a: Tensor, b: Tensor, scale: Any = 1.0) -> list[_PowerBlock]:
-        """What both maps hold of power, the measured one in its unit with the floor added."""
+        """Return the positive parts of both maps in blocks, the measured one scaled and with the
+        floor added.
+        """
         columns = (x.detach().flatten().split(_BINS_PER_BLOCK) for x in (a, b))
         return [
             (x, x.clamp_min(0.0), (y.to(x) / scale).clamp_min_(0.0).add_(self.floor))
@@ -282,13 +285,15 @@ class SpectrumLoss:
         ]
 
     def _likelihood_gain(self, levels: list[list[_PowerBlock]], unit: float = 1.0) -> float:
-        """The gain of a likelihood over the unit, by a secant on its logarithm."""
+        """Return the gain of a likelihood in units of ``unit``, by a secant method on its
+        logarithm.
+        """
         if self.gain == "one":
             return 1.0 / unit
         floor = torch.as_tensor(self.floor).to(levels[0][0][0])
         counts = [sum(len(a) for a, *_ in blocks) for blocks in levels]
         place, slope = -math.log(unit), 1.0
-        # The coarse maps are quick, and their gain is nearly that of all.
+        # Start with the coarse maps, which are fast and have nearly the final gain.
         for first in (1, 0):
             step, before = 0.0, 0.0
             for _ in range(_GAIN_STEPS):
@@ -317,13 +322,13 @@ class SpectrumLoss:
         return torch.stack(terms).mean()
 
     def _divergence(self, simulated: Tensor, measured: Tensor) -> Tensor:
-        # torch has no public name for this question.
+        # torch has no public function for this.
         transformed = torch._C._are_functorch_transforms_active()  # pyright: ignore[reportPrivateUsage]
         if not transformed:
             return _ScalarWithGradient.apply(
                 simulated, *self._divergence_and_gradient(simulated, measured)
             )
-        # Such as a second derivative.
+        # For example a second derivative.
         pairs = self._pyramid(simulated, measured)
         gain = self._optimal_gain(pairs)
         ratios = [
@@ -338,9 +343,9 @@ class SpectrumLoss:
     def _divergence_and_gradient(
         self, simulated: Tensor, measured: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The divergence, and its derivative with respect to the simulated map.
+        """Compute the divergence and its derivative with respect to the simulated map.
 
-        The maps are large, and torch's own derivative keeps and reads each of them several times.
+        The maps are large, and autograd would store and read each of them several times.
         """
         unit, scale = self._normalisations(simulated, measured)
         maps = [self._resolutions(power) for power in (simulated.detach(), measured)]
@@ -351,12 +356,12 @@ class SpectrumLoss:
             factor = gain / (power.numel() * self.levels)
             own = torch.empty_like(power, memory_format=torch.contiguous_format)
             slopes = own.flatten().split(_BINS_PER_BLOCK)
-            for (a, lit, data), out in zip(blocks, slopes, strict=True):
-                inverse = lit.mul_(gain).add_(self.floor).reciprocal_()
+            for (a, shown, data), out in zip(blocks, slopes, strict=True):
+                inverse = shown.mul_(gain).add_(self.floor).reciprocal_()
                 ratio = data.mul_(inverse)
                 value += float(speckle_divergence(ratio, self._tail_degrees).sum()) / power.numel()
                 inverse.addcmul_(inverse, self._weight_power(ratio), value=-1).mul_(factor)
-                # What is below zero counts as zero, and has no derivative; a dark bin has one.
+                # Negative bins count as zero without a derivative; a bin of zero power has one.
                 least = -torch.finfo(a.dtype).tiny
                 torch.ops.aten.threshold_backward(inverse, a, least, grad_input=out)
             slope = own if slope is None else _add_pooling_adjoint(slope, own)
@@ -372,11 +377,11 @@ class SpectrumLoss:
 
 
 class _ScalarWithGradient(torch.autograd.Function):
-    """A number whose derivative with respect to a map is known."""
+    """Scalar with a precomputed derivative with respect to a map."""
 
     @staticmethod
     def forward(ctx: Any, power: Tensor, value: Tensor, gradient: Tensor) -> Tensor:
-        """The number, of a map."""
+        """Return the value."""
         ctx.save_for_backward(gradient)
         ctx.save_for_forward(gradient)
         return value.clone()
@@ -401,8 +406,8 @@ class CorrelationLoss:
     """One minus Pearson's correlation of two power maps; no gain or offset changes it.
 
     Attributes:
-        scale: ``magnitude`` (square root of power), ``power``, or ``level`` (dB, no lower than
-            40 dB below the map's own peak).
+        scale: ``magnitude`` (square root of power), ``power``, or ``level`` (dB, clipped 40 dB
+            below the peak of each map).
 
     Raises:
         InputError: An unknown scale.
@@ -420,10 +425,10 @@ class CorrelationLoss:
     def __call__(
         self, simulated: Float[Tensor, "*map"], measured: Float[Tensor, "*map"]
     ) -> Float64[Tensor, ""]:
-        """The loss: 0 for maps of one pattern, 1 for unrelated ones.
+        """Return the loss: 0 for proportional maps, 1 for uncorrelated ones.
 
         Args:
-            simulated, measured: Power.
+            simulated, measured: power [*map].
 
         Raises:
             InputError: Maps of different shapes.
@@ -443,10 +448,10 @@ class CorrelationLoss:
         return 1 - rows[0] @ rows[1]
 
 
-_MIN_RELATIVE_POWER = 1e-4  # of the peak: below it levels are noise
-_SQRT_OFFSET = 1e-12  # of the peak: keeps the derivative of a magnitude finite
+_MIN_RELATIVE_POWER = 1e-4  # relative to the peak: lower levels are noise
+_SQRT_OFFSET = 1e-12  # relative to the peak: keeps the derivative of a magnitude finite
 _SCALE_TRANSFORMS: dict[str, Callable[[Tensor], Tensor]] = {
-    # An interpolated response may fall a little below zero.
+    # An interpolated response may be slightly negative.
     "magnitude": lambda share: (share.clamp(min=0) + _SQRT_OFFSET).sqrt(),
     "power": lambda share: share,
     "level": lambda share: share.clamp(min=_MIN_RELATIVE_POWER).log(),
@@ -455,17 +460,17 @@ _SCALE_TRANSFORMS: dict[str, Callable[[Tensor], Tensor]] = {
 
 @dataclass(frozen=True)
 class Objective:
-    """The weighted mean of the losses of all observations.
+    """Weighted mean of the losses of all observations.
 
     Attributes:
-        losses, weights: One per observation.
+        losses, weights: one per observation.
     """
 
     losses: tuple[Callable[[Tensor, Tensor], Tensor], ...]
     weights: tuple[float, ...]
 
     def __call__(self, maps: MapPairs) -> Float[Tensor, ""]:
-        """The loss of the maps of all observations."""
+        """Return the loss of the maps of all observations."""
         terms = [
             weight * loss(*pair)
             for loss, weight, pair in zip(self.losses, self.weights, maps, strict=True)
@@ -475,12 +480,11 @@ class Objective:
     def curvature(
         self, maps: MapPairs, tangents: Sequence[Float[Tensor, "p *map"]]
     ) -> Float[Tensor, "p p"]:
-        """The Gauss–Newton matrix of the mean.
+        """Compute the Gauss–Newton matrix of the weighted mean.
 
         Args:
-            maps: Predicted and observed maps.
-            tangents: For every observation, derivatives of its predicted map with respect to p
-                parameters.
+            maps: predicted and observed maps.
+            tangents: derivatives of each predicted map with respect to p parameters [p, *map].
         """
         total = torch.zeros((), dtype=torch.float64)
         for loss, weight, pair, rows in zip(self.losses, self.weights, maps, tangents, strict=True):
@@ -490,17 +494,17 @@ class Objective:
 
 
 def _mean_magnitude(power: Tensor) -> Tensor:
-    """The mean of the absolute values, detached."""
+    """Return the mean of the absolute values, detached."""
     return power.detach().abs().mean()
 
 
 def halve_resolution(power: Tensor) -> Tensor:
-    """Half the resolution along every axis that has two bins or more.
+    """Average pairs of bins along every axis of at least two bins.
 
     Args:
-        power: [frame, …].
+        power: map [frame, …].
     """
-    # Axis by axis, since whole rows are added quickly: half the time of ``avg_pool3d``.
+    # Axis by axis: adding whole rows takes half the time of ``avg_pool3d``.
     share = 1.0
     for dim in range(1, power.ndim):
         if half := power.shape[dim] // 2:
@@ -510,7 +514,7 @@ def halve_resolution(power: Tensor) -> Tensor:
 
 
 def _add_pooling_adjoint(coarse: Tensor, power: Tensor) -> Tensor:
-    """The adjoint of pooling, added to a map of twice the resolution."""
+    """Add the adjoint of pooling to a map of twice the resolution."""
     for dim in reversed(range(2, power.ndim)):
         if power.shape[dim] > 1:
             coarse = (0.5 * coarse).repeat_interleave(2, dim)

@@ -1,4 +1,4 @@
-"""How near a found object is to the true one: place, turn, size; surfaces, volume, holes."""
+"""Errors of a reconstruction: pose, scale, surface distance, volume and topology."""
 
 import math
 from collections.abc import Sequence
@@ -22,25 +22,26 @@ from invertwin.scene.material.values import Value, evaluate_value
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Object
 
-SURFACE_POINT_COUNT = 20_000  # of each surface
+SURFACE_POINT_COUNT = 20_000  # points on each surface
 VOXEL_EDGE = 0.02  # [m]
 _MAX_VOXELS = 200_000_000
-_VOXELS_PER_CHUNK = 4_000_000  # voxels at a time
+_VOXELS_PER_CHUNK = 4_000_000  # voxels per chunk
 
 
 @dataclass(frozen=True)
 class ShapeMetrics:
-    """How close a found surface is to the true one.
+    """Similarity of a reconstructed surface and the true one.
 
     Attributes:
         chamfer: mean of both directions of the distance to the closest point [m], not squared.
-            Points are drawn at random, so equal surfaces of area A are ½ √(A / points) apart.
-        fscore: harmonic mean of precision and recall, by threshold [m]. Precision is the part of
-            the found surface within the threshold of the true one; recall is the reverse.
+            Points are sampled at random, so equal surfaces of area A have ½ √(A / points).
+        fscore: harmonic mean of precision and recall for each threshold [m]. Precision is the
+            fraction of the reconstructed surface within the threshold of the true one; recall is
+            the reverse.
         normal_consistency: mean of both directions of |n · n′| at closest points: 1 for equal
             surfaces, 0.5 for normals that are independent of each other.
-        iou: volume of the intersection over that of the union; None if a mesh is not watertight,
-            or if the volume was left out.
+        iou: volume of the intersection over that of the union; None if a mesh is not watertight, or
+            if the volume was not computed.
     """
 
     chamfer: float
@@ -51,11 +52,11 @@ class ShapeMetrics:
 
 @dataclass(frozen=True)
 class TopologyCounts:
-    """Number of parts and holes of a closed surface.
+    """Numbers of components and holes of a closed surface.
 
     Attributes:
-        components: connected parts of the surface; the wall of a cavity is one too.
-        euler_number: vertices − edges + triangles: 2 for every part, minus 2 for every hole
+        components: connected components of the surface; the wall of a cavity is one too.
+        euler_number: vertices − edges + triangles: 2 for every component, minus 2 for every hole
             through it.
     """
 
@@ -65,12 +66,12 @@ class TopologyCounts:
 
 @dataclass(frozen=True)
 class PoseError:
-    """How one object differs from where it really is.
+    """Pose error of one object with respect to the truth.
 
     Attributes:
-        offset: of its centre [m].
-        rotation: rotation vector that remains, in the world [rad].
-        scale: size over the true one.
+        offset: offset of its centre [m].
+        rotation: remaining rotation vector in world axes [rad].
+        scale: estimated size over the true one.
     """
 
     offset: Float64[Tensor, "3"]
@@ -79,7 +80,7 @@ class PoseError:
 
     @property
     def angle(self) -> float:
-        """Of the turn [rad]."""
+        """Angle of the rotation [rad]."""
         return float(self.rotation.norm())
 
     @property
@@ -89,13 +90,13 @@ class PoseError:
 
 
 def pose_error(found: Object, truth: Object) -> PoseError | None:
-    """The similarity transform that remains between two copies of an object.
+    """Compute the similarity transform between two copies of an object.
 
     Least squares over the vertices (Umeyama), so it does not depend on how the pose is
-    parameterised. None for other triangles: no vertex is another one's copy.
+    parameterised. Returns None for meshes with different triangles.
 
     Args:
-        found, truth: the result, and where it really is.
+        found, truth: estimated and true object.
     """
     same = found.vertices.shape == truth.vertices.shape
     if not same or not torch.equal(found.mesh.faces, truth.mesh.faces):
@@ -105,29 +106,30 @@ def pose_error(found: Object, truth: Object) -> PoseError | None:
     u, values, vt = torch.linalg.svd(b0.T @ a0)
     sign = torch.ones(3, dtype=torch.float64)
     sign[2] = torch.det(u @ vt).sign()
-    turn = u @ torch.diag(sign) @ vt
+    rotation = u @ torch.diag(sign) @ vt
     scale = float(b0.square().sum() / (values * sign).sum())
     offset = found.center.detach() - truth.center.detach()
-    vector = torch.from_numpy(Rotation.from_matrix(turn.T.numpy()).as_rotvec())
+    vector = torch.from_numpy(Rotation.from_matrix(rotation.T.numpy()).as_rotvec())
     return PoseError(offset, vector, 1 / scale if scale else math.nan)
 
 
 def axis_error(found: Object, truth: Object, axis: ArrayLike) -> tuple[float, float]:
-    """Distance of the origins of two poses [m], and angle between one axis of both [rad].
+    """Compute the distance of the origins of two poses [m] and the angle between one of their axes
+    [rad].
 
     Args:
-        found, truth: the result, and where it really is.
-        axis: in the object's frame, of any length.
+        found, truth: estimated and true object.
+        axis: axis in the object's frame, of any non-zero length.
 
     Raises:
-        InputError: an axis of no length.
+        InputError: an axis of length zero.
     """
     line = torch.as_tensor(axis, dtype=torch.float64)
     if line.shape != (3,) or not float(line.norm()) > 0:
         raise InputError(f"expected an axis of some length, got {axis}; give x, y, z")
     a, b = (item.transform.detach() for item in (found, truth))
     one, other = a[:3, :3] @ line, b[:3, :3] @ line
-    # The sine and the cosine: an arc cosine knows no angles below 1e-8.
+    # atan2 of sine and cosine: arccos does not resolve angles below 1e-8.
     angle = math.atan2(float(torch.linalg.cross(one, other).norm()), float(one @ other))
     return float((a[:3, 3] - b[:3, 3]).norm()), angle
 
@@ -144,20 +146,20 @@ def compare_shapes(
 ) -> ShapeMetrics:
     """Compare two meshes in one frame.
 
-    With `seen_from`, only what some radar position sees counts. On each surface these are the
-    points that the rest of the mesh does not hide; they are compared with the whole of the other
-    surface. In the volume these are the voxels whose closest surface point is seen.
+    With `seen_from`, only parts visible from some radar position count: on each surface the points
+    not occluded by the mesh, compared with the whole other surface; in the volume the voxels whose
+    closest surface point is visible.
 
     Args:
-        found, truth: the result, and what it should be.
-        seen_from: radar positions [n, 3] in the frame of the meshes (m); None counts everything.
-        thresholds: of the F-score [m].
-        count: points drawn on each surface.
-        voxel: edge of the voxels for the volume [m]; None leaves the volume out.
-        seed: of the points.
+        found, truth: estimated and true mesh.
+        seen_from: radar positions [n, 3] in the frame of the meshes [m]; None counts everything.
+        thresholds: thresholds of the F-score [m].
+        count: number of points sampled on each surface.
+        voxel: edge of the voxels of the volume [m]; None omits the volume.
+        seed: seed of the points.
 
     Raises:
-        InputError: meshes without area, nothing that is seen, or numbers that are not positive.
+        InputError: meshes without area, no visible points, or numbers that are not positive.
     """
     if not thresholds or any(not t > 0 for t in thresholds):
         raise InputError(f"expected thresholds > 0 [m], got {list(thresholds)}; give e.g. 0.02")
@@ -196,14 +198,15 @@ def compare_shapes(
 
 
 def volume_iou(found: Mesh, truth: Mesh, voxel: float = VOXEL_EDGE) -> float:
-    """Volume of the intersection of two closed meshes over that of their union, in voxels.
+    """Compute the volume of the intersection of two closed meshes over that of their union, in
+    voxels.
 
     A voxel is inside if the mesh winds around its centre, so overlapping closed parts count once
     and cavities are empty.
 
     Args:
-        found, truth: the result, and what it should be.
-        voxel: edge [m].
+        found, truth: estimated and true mesh.
+        voxel: edge of a voxel [m].
 
     Raises:
         InputError: a mesh that is not watertight, or voxels that are too many.
@@ -214,13 +217,13 @@ def volume_iou(found: Mesh, truth: Mesh, voxel: float = VOXEL_EDGE) -> float:
 
 
 def is_watertight(mesh: Mesh) -> bool:
-    """Whether every edge has two triangles, which run along it in opposite directions."""
+    """Return whether every edge has two triangles that traverse it in opposite directions."""
     solid = _to_trimesh(mesh)
     return bool(solid.is_watertight and solid.is_winding_consistent)
 
 
 def count_topology(mesh: Mesh) -> TopologyCounts:
-    """Number of parts and holes of a closed surface, whose triangles meet in shared vertices.
+    """Count components and holes of a closed surface whose triangles share vertices.
 
     Raises:
         InputError: a mesh that is not watertight.
@@ -238,13 +241,13 @@ def material_errors(
     frequency: float,
     layer: int | None = None,
 ) -> dict[str, float]:
-    """How far material values are from the true ones, relative to these, as ``<name>_error``.
+    """Compute relative errors of material values, as ``<name>_error``.
 
     Args:
-        values: their names; what one of the materials does not have is left out.
-        found, truth: the result, and what it should be.
-        frequency: at which values of the ITU table are compared [Hz].
-        layer: of multilayers, from 0; None = values of the materials themselves.
+        values: names of the values; those that one of the materials lacks are omitted.
+        found, truth: estimated and true material.
+        frequency: frequency at which values of the ITU table are compared [Hz].
+        layer: layer of multilayers, from 0; None = values of the materials themselves.
 
     Raises:
         InputError: no such layer.
@@ -266,13 +269,13 @@ def _evaluate_value(value: Value | Itu, name: str, frequency: float) -> Tensor:
 def sample_surface(
     mesh: Mesh, count: int, seed: int, stream: int = 0
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
-    """Points drawn uniformly over a surface [m], and the unit normals of their triangles.
+    """Sample points uniformly over a surface [m], with the unit normals of their triangles.
 
     Args:
         mesh: the surface.
         count: number of points.
-        seed: of the points.
-        stream: streams of one seed are independent.
+        seed: seed of the points.
+        stream: index of an independent stream of the seed.
 
     Raises:
         InputError: a surface without area.
@@ -302,7 +305,7 @@ def _shared_volume(
 ) -> float:
     edge = checked_number(voxel, "voxel [m]", 0.0, open_low=True)
     both = torch.cat([found.vertices, truth.vertices]).detach().numpy()
-    # Centres on a lattice of the frame, so that both meshes are cut alike wherever they are.
+    # Voxel centres on a lattice of the frame, so that both meshes are voxelised equally.
     first = np.floor(both.min(0) / edge).astype(np.int64)
     shape = np.ceil(both.max(0) / edge).astype(np.int64) - first
     if math.prod(map(int, shape)) > _MAX_VOXELS:
@@ -328,7 +331,7 @@ def _shared_volume(
 def _mark_inside_voxels(
     mesh: Mesh, first: np.ndarray, shape: np.ndarray, edge: float
 ) -> np.ndarray:
-    """Whether a closed mesh winds around the centres of voxels [x, y, z].
+    """Return whether a closed mesh winds around the centres of voxels [x, y, z].
 
     Source: Barill et al. 2018, "Fast winding numbers for soups and clouds".
     """
@@ -345,7 +348,7 @@ def _mark_inside_voxels(
 
 
 def _to_trimesh(mesh: Mesh) -> trimesh.Trimesh:
-    """The mesh for trimesh, without triangles that have shrunk to an edge."""
+    """Convert to trimesh, without degenerate triangles."""
     faces = mesh.faces.numpy()
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     return trimesh.Trimesh(mesh.vertices.detach().numpy(), faces, process=False)

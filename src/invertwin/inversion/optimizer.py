@@ -1,4 +1,4 @@
-"""How a gradient becomes a step: kind and rates."""
+"""Optimisers of a fit and their learning rates."""
 
 import math
 from collections.abc import Mapping
@@ -17,18 +17,19 @@ from invertwin.limits import Count, NonNegative, Positive
 
 @dataclass(frozen=True)
 class Optimizer:
-    """How a gradient becomes a step.
+    """Kind of optimiser and its learning rates.
 
     Attributes:
         kind: ``adam``, ``sgd`` with momentum, or ``gauss_newton`` for few parameters.
-        rate: Learning rate at the first step; parameters are in metres and radians. For
-            Gauss–Newton, a rate is the longest change of a parameter in a step; it does not fall.
-        rotation_rate: Rate of parameters named ``rotation``; None = ``rate``.
-        final_rate: What ``rate`` has fallen to at the last step, along a cosine; None = ``rate`` /
-            20. The rates of all parameters fall alike.
-        momentum: Momentum of SGD.
-        curvature_every: For Gauss–Newton, steps from one curvature to the next. Derivatives of the
-            map with respect to every parameter cost most of a step.
+        rate: learning rate at the first step; parameters are in metres and radians. For
+            Gauss–Newton it is the trust radius, the largest change of a parameter in a step, and
+            does not fall.
+        rotation_rate: rate of parameters named ``rotation``; None = ``rate``.
+        final_rate: ``rate`` at the last step, after a cosine decay; None = ``rate`` / 20. The rates
+            of all parameters fall by the same factor.
+        momentum: momentum of SGD.
+        curvature_every: for Gauss–Newton, number of steps that reuse one curvature. The derivatives
+            of the map with respect to every parameter dominate the cost of a step.
     """
 
     kind: Literal["adam", "sgd", "gauss_newton"] = "adam"
@@ -47,12 +48,12 @@ class Optimizer:
         objective: Objective,
         rates: Mapping[nn.Parameter, float] | None = None,
     ) -> torch.optim.Optimizer | GaussNewton:
-        """The optimiser of the modules' parameters that require a gradient.
+        """Build the optimiser of the modules' parameters that require a gradient.
 
         Args:
-            modules: What is fitted.
-            objective: How maps are compared.
-            rates: Rates of single parameters, in place of this optimiser's.
+            modules: modules to fit.
+            objective: loss of the maps.
+            rates: rates of single parameters, in place of this optimiser's.
 
         Raises:
             InputError: Gauss–Newton without a ``SpectrumLoss``, or for many parameters.
@@ -84,8 +85,8 @@ class Optimizer:
         """Set the learning rates.
 
         Args:
-            optimizer: From ``build``.
-            progress: Share of the steps that are done.
+            optimizer: optimiser from ``build``.
+            progress: fraction of the steps that are done, in [0, 1].
         """
         if isinstance(optimizer, GaussNewton):
             return

@@ -1,4 +1,4 @@
-"""Find the parameters of a scene that explain what one or several sensors have observed."""
+"""Reconstruction: find the scene parameters that explain observations of one or several sensors."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,20 +30,20 @@ from invertwin.scene.shape_models.density import replace_clouds
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """The outcome of :func:`reconstruct`.
+    """Result of :func:`reconstruct`.
 
     Attributes:
-        scene: The twin.
-        sensors: The sensors of all observations with what was fitted of them.
-        parameters: The fitted modules: those of the scene, then those of the sensors.
-        history: One row a step: ``step``, ``stage``, ``loss``, ``values`` (parameters by name).
+        scene: the fitted scene (twin).
+        sensors: sensors of all observations with their fitted parameters.
+        parameters: fitted modules: those of the scene, then those of the sensors.
+        history: one row per step: ``step``, ``stage``, ``loss``, ``values`` (parameters by name).
         status: ``converged`` (the loss no longer falls), ``budget`` (all steps done), or
-            ``diverged`` (not finite, or worse than the start; then the better of the best state
-            and the start is kept).
-            Why the fit stopped: whether it is right is the matter of ``judge_fit``.
-        steps: Steps done.
-        loss: Final loss; if the fit diverged, that of the best state, without extra widths.
-        result: Maps at the end, and looks at the twin.
+            ``diverged`` (not finite, or worse than the start; then the better of the best state and
+            the start is kept). It states why the fit stopped; ``verdict`` assesses whether it is
+            right.
+        steps: number of completed steps.
+        loss: final loss; if the fit diverged, the unblurred loss of the best state.
+        result: final maps and simulated realisations of them.
     """
 
     scene: Scene
@@ -57,24 +57,24 @@ class Reconstruction:
 
     @cached_property
     def is_uninformative(self) -> bool:
-        """Whether the twin shows next to nothing of what was observed, as in ``judge_fit``.
+        """Whether the twin explains next to none of the observed power, as in ``judge_fit``.
 
-        A fitted gain of zero has no gradient, so such a fit stays where it began.
+        A fitted gain of zero has no gradient, so such a fit stays at its start.
         """
         return min(explained_fractions(self.result)) < MIN_EXPLAINED_FRACTION
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
-        """The error bars of the parameters, computed when they are first asked for.
+        """Error bars of the parameters, computed at first access.
 
         Raises:
-            InputError: See :class:`invertwin.inversion.confidence.uncertainty.Evidence`.
+            InputError: See :class:`invertwin.inversion.confidence.uncertainty.CovarianceEstimator`.
         """
         return CovarianceEstimator(self.result).error_bars()
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Whether the twin is to be believed, computed when it is first asked for."""
+        """Goodness of fit and ambiguities, computed at first access."""
         return judge_fit(self.result)
 
 
@@ -90,26 +90,26 @@ def reconstruct(
     callbacks: Sequence[Callback] = (),
     seed: int = 0,
 ) -> Reconstruction:
-    """Find the parameters of a scene whose predicted maps equal the observed ones.
+    """Find the parameters of a scene whose predicted maps match the observed ones.
 
-    In every step the models predict maps of the scene as the parameters have it, the loss compares
-    them with the observed maps, and the optimiser follows its gradient, silhouettes included.
-    Extra widths of the models blur both maps; they fall to zero over the first part of a stage.
+    In every step the models predict maps of the present scene, the loss compares them with the
+    observed maps, and the optimiser follows its gradient, silhouettes included. The models may blur
+    both maps; the blur is annealed to zero over the first part of a stage.
 
     Args:
-        scene: Starting scene.
-        observations: What was observed, by one or several sensors.
-        parameters: Modules Scene → Scene, applied in order; an :class:`UnknownShape` has a rate and
-            regularisers of its own. Give them by name if stages choose among them.
-        loss: How maps are compared: (predicted, observed) → a number. None = ``SpectrumLoss()``.
-        optimizer: Kind and rates.
-        schedule: A ``Schedule``, or stages that follow each other.
-        regularizers: Functions Scene → number, added to the loss.
-        callbacks: What watches the fit: ``Report``, ``Watch``, ``Checkpoint``.
-        seed: Seed of all random numbers; the same seed gives the same fit.
+        scene: initial scene.
+        observations: data of one or several sensors, with their forward models.
+        parameters: modules Scene → Scene, applied in order; an :class:`Unknown` has its own rate
+            and regularisers. Pass a mapping by name if stages select among them.
+        loss: (predicted, observed) → number. None = ``SpectrumLoss()``.
+        optimizer: kind of optimiser and rates.
+        schedule: a ``Schedule``, or consecutive stages.
+        regularizers: functions Scene → number, added to the loss.
+        callbacks: observers of the fit: ``Report``, ``Watch``, ``Checkpoint``.
+        seed: seed of all random numbers; equal seeds give equal fits.
 
     Source: §4.2 of the paper.
-    Differs from the source: Adam and Gauss–Newton beside SGD; annealed widths; several sensors.
+    Differs from the source: Adam and Gauss–Newton beside SGD; annealed blur; several sensors.
 
     Raises:
         InputError: Nothing to fit, a map of zeros, an unknown name in a stage, a checkpoint of
@@ -136,7 +136,7 @@ def reconstruct(
     free = _FreeParameters([modules, *sensor_modules])
     for number, stage in enumerate(stages):
         if fit is not None and stage.rebuilds_modules:
-            # What was a cloud goes on as a mesh.
+            # Clouds continue as meshes.
             begun = replace_clouds(fit.twin())
             for name, change in stage.remesh.items():
                 begun = begun.replace(name, mesh=change(begun[name].mesh))
@@ -189,15 +189,15 @@ def prepare_fit(
     regularizers: Sequence[Regularizer] = (),
     seed: int = 0,
 ) -> Fit:
-    """A fit that has not begun, to look at where it stands. The arguments are `reconstruct`'s.
+    """Prepare a fit without running it, to evaluate its maps and loss. See `reconstruct`.
 
     Args:
-        scene: Where it stands.
-        observations: What was observed.
-        parameters: Modules Scene → Scene.
-        loss: How maps are compared.
-        regularizers: Added to the loss.
-        seed: Of all random numbers.
+        scene: scene at which the fit stands.
+        observations: data with their forward models.
+        parameters: modules Scene → Scene.
+        loss: (predicted, observed) → number.
+        regularizers: functions Scene → number, added to the loss.
+        seed: seed of all random numbers.
     """
     modules, terms = _build_modules(scene, name_unknowns(parameters))
     of_sensors = [_build_modules(o.sensor, name_unknowns(o.parameters)) for o in observations]
@@ -215,7 +215,7 @@ def prepare_fit(
 
 
 def _stage_models(stage: Stage, observations: Sequence[Observation]) -> Sequence[ForwardModel]:
-    """The forward model of every observation in a stage."""
+    """Return the forward model of every observation in a stage."""
     if stage.models and len(stage.models) != len(observations):
         raise InputError(
             f"expected a model for each of {len(observations)} observations in a stage, got "
@@ -227,7 +227,7 @@ def _stage_models(stage: Stage, observations: Sequence[Observation]) -> Sequence
 def _build_modules(
     target: Any, unknowns: Mapping[str, Unknown]
 ) -> tuple[dict[str, nn.Module], list[Any]]:
-    """Modules of a scene or a sensor by name, each for what those before leave, and their terms."""
+    """Build the modules of a scene or a sensor by name, each for the result of its predecessors."""
     modules: dict[str, nn.Module] = {}
     terms: list[Regularizer] = []
     last = max((k for k, item in enumerate(unknowns.values()) if item.depends_on_target), default=0)
@@ -242,7 +242,7 @@ def _build_modules(
 
 
 class _FreeParameters:
-    """Which parameters are free: those that were so at first, of the unknowns of a stage."""
+    """Free parameters of each stage, among those that initially require a gradient."""
 
     def __init__(self, groups: Sequence[Mapping[str, nn.Module]]) -> None:
         self._modules = {name: module for group in groups for name, module in group.items()}
@@ -251,14 +251,14 @@ class _FreeParameters:
         }
 
     def apply(self, stage: Stage) -> None:
-        """Free the unknowns of a stage, and hold the others."""
+        """Free the unknowns of a stage, and freeze the others."""
         for name, module in self._modules.items():
             for parameter in module.parameters():
                 wanted = not stage.unknowns or name in stage.unknowns
                 parameter.requires_grad_(self._first[parameter] and wanted)
 
     def learning_rates(self, unknowns: Mapping[str, Unknown]) -> dict[nn.Parameter, float]:
-        """Learning rates of single parameters."""
+        """Return the learning rates of single parameters."""
         found = {}
         for name, module in self._modules.items():
             rate = unknowns[name].rate

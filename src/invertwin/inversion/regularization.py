@@ -1,4 +1,4 @@
-"""Regularisers: neighbouring vertices move alike, and latents stay likely under their prior."""
+"""Regularisers: Laplacian smoothness of displacements, and prior probability of latents."""
 
 from collections.abc import Callable
 
@@ -14,19 +14,19 @@ Regularizer = Callable[[Scene], Float64[Tensor, ""]]
 
 
 class Laplacian:
-    """Dirichlet energy of an object's displacement from its first shape.
+    """Dirichlet energy of an object's displacement from its initial shape.
 
-    ``(weight/2) Σ_edges w_e |d_i − d_j|²`` with cotangent weights of the first shape; d are the
+    ``(weight/2) Σ_edges w_e |d_i − d_j|²`` with cotangent weights of the initial shape; d are the
     vertices' displacements in the object's frame, over the mean edge length.
 
     Source: §4.2 of the paper (λ L θ; its gradient is weight · L d).
-    Differs from the source: the energy is that of the displacement, so that the first shape is
-    not itself smoothed away.
+    Differs from the source: the energy is that of the displacement, so that the initial shape is
+    not smoothed.
 
     Args:
-        scene: With the first shape.
-        object: Name of the object.
-        weight: Of the energy.
+        scene: scene with the initial shape.
+        object: name of the object.
+        weight: weight of the energy.
     """
 
     def __init__(self, scene: Scene, object: str, weight: float) -> None:
@@ -36,16 +36,16 @@ class Laplacian:
         self.edges, self.weights, self.unit = cotangent_edges(mesh)
 
     def __call__(self, scene: Scene) -> Float64[Tensor, ""]:
-        """The energy of the scene's present shape.
+        """Return the energy of the scene's present shape.
 
         Raises:
-            InputError: A shape of other vertices.
+            InputError: A mesh with another number of vertices.
         """
         found = len(scene[self.object].mesh.vertices)
         if found != len(self.start):
             raise InputError(
-                f"expected the {len(self.start)} vertices of the first shape of {self.object} for "
-                f"its Laplacian, got {found}; give one shape of each object"
+                f"expected the {len(self.start)} vertices of the initial shape of {self.object} "
+                f"for its Laplacian, got {found}; give one shape of each object"
             )
         moved = (scene[self.object].mesh.vertices - self.start) / self.unit
         jump = moved[self.edges[:, 0]] - moved[self.edges[:, 1]]
@@ -53,11 +53,11 @@ class Laplacian:
 
 
 class LatentNorm:
-    """The term ½ weight |z|²: the negative logarithm of a latent's prior probability.
+    """Penalty ½ weight |z|²: negative log prior probability of a latent.
 
     Args:
-        module: It has the parameter ``latent``, such as `PriorShape` or `LinearShape`.
-        weight: Factor of ½ |z|².
+        module: module with the parameter ``latent``, such as `PriorShape` or `LinearShape`.
+        weight: factor of ½ |z|².
     """
 
     def __init__(self, module: nn.Module, weight: float) -> None:
@@ -69,12 +69,12 @@ class LatentNorm:
         self.module, self.weight = module, weight
 
     def __call__(self, scene: Scene) -> Float64[Tensor, ""]:
-        """The term at the module's present latent."""
+        """Return the penalty at the module's present latent."""
         return 0.5 * self.weight * self.module.latent.square().sum()  # type: ignore[union-attr]
 
 
 def cotangent_edges(mesh: Mesh) -> tuple[Tensor, Float64[Tensor, " edge"], float]:
-    """Edges, their cotangent weights (at least 0.01), and the mean edge length [m]."""
+    """Compute edges, their cotangent weights (at least 0.01), and the mean edge length [m]."""
     positions = mesh.vertices.detach()
     corners = positions[mesh.faces]
     pairs, weights = [], []

@@ -1,4 +1,4 @@
-"""How long a fit lasts, and which unknowns are free in each of its stages."""
+"""Schedules of a fit: number of steps, blur, and free unknowns of each stage."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
@@ -15,17 +15,17 @@ from invertwin.scene.mesh import Mesh
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long a fit lasts.
+    """Number of steps of a fit, and its annealing.
 
     Attributes:
-        steps: Budget.
-        annealing: Share of the steps with extra widths.
-        frames_per_step: Random frames of every observation in a step; None = all.
-        held_out: Every so manieth frame of every observation is held out: it is not fitted, but
-            judges. A fit that explains these frames worse than its start has diverged, and keeps
-            the start. None = no frame.
-        tolerance: Once the widths are zero, the fit stops when the loss has fallen by less than
-            this share over 20 steps; 0 = it uses the whole budget.
+        steps: budget of steps.
+        annealing: fraction of the steps with blur.
+        frames_per_step: number of random frames of every observation in a step; None = all.
+        held_out: every n-th frame of every observation is held out for validation. A fit that
+            explains these frames worse than its start has diverged, and keeps the start. None = no
+            frame.
+        tolerance: without blur, the fit stops when the loss has fallen by less than this fraction
+            over 20 steps; 0 = use the whole budget.
     """
 
     steps: Count = 200
@@ -37,22 +37,22 @@ class Schedule:
 
     @property
     def blur_end(self) -> float:
-        """The step from which there are no extra widths: the last one at the latest."""
+        """First step without blur: the last step at the latest."""
         return max(1.0, min(self.annealing * self.steps, self.steps - 1))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stage(Schedule):
-    """A part of a fit. It goes on from where the stage before has ended.
+    """Part of a fit. It continues from the end of the previous stage.
 
     Attributes:
-        unknowns: Names of those that are free; the others keep their values. Empty = all.
-        rebuild: Begin from the twin of the stage before, with new modules of these unknowns only:
-            for another kind of shape, or a finer mesh.
-        remesh: For every object named here, a function of its mesh that is applied before modules
-            are made anew.
-        optimizer: Optimizer of this stage; None = the one of the whole fit.
-        models: Of the observations in this stage, in their order; empty = their own.
+        unknowns: names of the free unknowns; the others keep their values. Empty = all.
+        rebuild: start from the twin of the previous stage with new modules of these unknowns only:
+            for another shape model, or a finer mesh.
+        remesh: for every object named here, a function of its mesh that is applied before modules
+            are rebuilt.
+        optimizer: optimiser of this stage; None = that of the whole fit.
+        models: forward models of the observations in this stage, in their order; empty = their own.
     """
 
     unknowns: tuple[str, ...] = ()
@@ -63,18 +63,18 @@ class Stage(Schedule):
 
     @property
     def rebuilds_modules(self) -> bool:
-        """Whether modules are made anew."""
+        """Whether modules are rebuilt."""
         return self.rebuild or bool(self.remesh)
 
 
 def make_stages(
     schedule: Schedule | Sequence[Schedule] | None, names: Sequence[str]
 ) -> list[Stage]:
-    """The schedule as stages.
+    """Convert a schedule to stages.
 
     Args:
-        schedule: One part or several; None = one with the defaults.
-        names: Names of all unknowns of the scene.
+        schedule: one part or several; None = one with the defaults.
+        names: names of all unknowns of the scene.
 
     Raises:
         InputError: No stages, an unknown name, or an unknown that an earlier stage has dropped.
@@ -96,7 +96,7 @@ def make_stages(
         gone = [name for name in stage.unknowns if name not in kept]
         if gone:
             raise InputError(
-                f"expected parameters that a stage before has kept, got {gone[0]!r} in stage "
+                f"expected parameters that the previous stage has kept, got {gone[0]!r} in stage "
                 f"{number + 1}; rebuild it there"
             )
     return stages

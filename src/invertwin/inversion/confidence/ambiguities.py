@@ -1,4 +1,4 @@
-"""Rivals of a twin: the same object turned so that it looks much the same."""
+"""Ambiguities of a fit: rotated poses of an object that explain the data nearly as well."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -20,35 +20,28 @@ from invertwin.scene.pose import quaternion_from_vector
 from invertwin.scene.remeshing import closest_points
 from invertwin.scene.scene import Object, Scene, displace
 
-REJECTION_ZSCORE = 2.33  # standard deviations: one right rival in a hundred is rejected
-SAME_POSE_DISTANCE, SAME_POSE_ANGLE = 0.03, 0.1  # m and rad: ends as near are one
-_SYMMETRY_ORDERS = (
-    4,
-    3,
-)  # of a whole turn: the first after which the object nearly keeps its shape
-_SIMILAR_DISTANCE, _EQUAL_DISTANCE = (
-    0.07,
-    0.002,
-)  # of the diagonal: distance of surfaces much alike, of one surface
-_CLEAR_ZSCORE = 5.0  # standard deviations of a loss: so large a difference needs no looks
-_SURFACE_POINT_COUNT = 1_000  # of each surface
-_REFIT_STEPS, _REFIT_TRUST_RADIUS, _REFIT_BLUR = (
+REJECTION_ZSCORE = 2.33  # standard deviations: one true ambiguity in a hundred is rejected
+SAME_POSE_DISTANCE, SAME_POSE_ANGLE = 0.03, 0.1  # m and rad: closer results are one
+_SYMMETRY_ORDERS = 4, 3  # rotational symmetries in the order of testing
+_SIMILAR_DISTANCE, _EQUAL_DISTANCE = 0.07, 0.002  # surface distances relative to the diagonal
+_CLEAR_ZSCORE = 5.0  # standard deviations of a loss: a larger difference needs no realisations
+_SURFACE_POINT_COUNT = 1_000  # points on each surface
+_REFIT_STEPS, _REFIT_TRUST_RADIUS = (
     6,
     0.1,
-    0.4,
-)  # of a rival's fit: Gauss–Newton, its first share of widths
+)  # Gauss–Newton steps from a rotated pose + _REFIT_BLUR = 0.4  # initial fraction of the blur
 
 
 @dataclass(frozen=True, eq=False)
 class Ambiguity:
-    """Another end that the data may or may not tell from that of a fit.
+    """Another result of a fit that the data may not distinguish from the first.
 
     Attributes:
-        result: With the rival's own maps and looks.
-        score: How unlikely the difference of both losses is, were the rival right, in standard
-            deviations over looks at it; None where there are no looks.
-        has_lower_loss: Whether its loss is the lower one.
-        description: How it differs, in words.
+        result: maps and realisations of the other result.
+        score: significance of the difference of both losses under the hypothesis that the other
+            result is true, in standard deviations over its realisations; None without realisations.
+        has_lower_loss: whether its loss is the lower one.
+        description: difference in words.
     """
 
     result: FitResult
@@ -58,15 +51,15 @@ class Ambiguity:
 
     @property
     def is_rejected(self) -> bool:
-        """Whether the data speak against the rival."""
+        """Whether the data reject the other result."""
         return not self.has_lower_loss and self.score is not None and self.score >= REJECTION_ZSCORE
 
 
 def find_ambiguities(result: FitResult) -> Iterator[Ambiguity]:
-    """The twin with an object turned, fitted again, unless that leads back to the same place.
+    """Refit the twin from rotated poses of each object, and return the results at other poses.
 
     Args:
-        result: Of a fit.
+        result: result of the fit.
     """
     twin = result.fit.twin()
     for number, module in enumerate(result.fit.unknowns):
@@ -75,19 +68,20 @@ def find_ambiguities(result: FitResult) -> Iterator[Ambiguity]:
             if found is not None and not are_same_poses(found.twin(), twin, [_object_name(module)]):
                 other = FitResult(found)
                 better = found.objective(other.maps) < result.fit.objective(result.maps)
-                told = describe_difference(twin, found.twin(), [_object_name(module)])
-                yield Ambiguity(other, difference_score(result, other), bool(better), told)
+                text = describe_difference(twin, found.twin(), [_object_name(module)])
+                yield Ambiguity(other, difference_score(result, other), bool(better), text)
 
 
 def candidate_rotations(module: nn.Module, twin: Scene) -> Iterator[Float64[Tensor, "3"]]:
-    """Rotation vectors after which an object may look much the same, as far as it may turn.
+    """Return rotation vectors under which an object keeps a similar shape, within its free
+    rotations.
 
-    Half turns are always among them; quarters or thirds if the object nearly keeps its shape.
-    What brings it back exactly is not.
+    They always include half turns, and quarter or third turns if the object nearly keeps its shape.
+    Exact symmetries are excluded.
 
     Args:
-        module: What is fitted of the object.
-        twin: The scene that it makes.
+        module: pose that is fitted to the object.
+        twin: scene with the fitted pose.
     """
     if not isinstance(module, Pose) or not module.rotation.requires_grad:
         return
@@ -120,17 +114,18 @@ def candidate_rotations(module: nn.Module, twin: Scene) -> Iterator[Float64[Tens
 
 
 def difference_score(best: FitResult, other: FitResult) -> float | None:
-    """How unlikely the difference of two losses is, were the other end right.
+    """Compute the significance of the difference of two losses, assuming that the other result is
+    true.
 
-    Speckle that both losses share cancels in their difference.
+    Common speckle cancels in the difference of the losses.
 
     Args:
-        best: The end with the lower loss.
-        other: Another end of the same data.
+        best: result with the lower loss.
+        other: another result of the same data.
 
     Returns:
-        Standard deviations over looks at the twin of the other end, or a lower bound of them
-        where they are many; None where there are no looks.
+        Standard deviations over realisations of the other result, or a lower bound if it is large;
+        None without realisations.
     """
 
     def difference(observed: Sequence[Tensor]) -> float:
@@ -142,20 +137,20 @@ def difference_score(best: FitResult, other: FitResult) -> float | None:
 
     found = difference([b for _, b in best.maps])
     if best.realisation_statistics is not None:
-        # Of looks the difference is below zero, and it scatters less than a loss does.
+        # The difference of realisations is negative, and scatters less than a loss.
         least = found / float(torch.tensor(best.realisation_statistics.losses).std())
         if least > _CLEAR_ZSCORE:
             return least
-    drawn = [difference(look) for look in other.realisations()]
+    drawn = [difference(sample) for sample in other.realisations()]
     return zscore(found, drawn) if drawn else None
 
 
 def are_same_poses(first: Scene, second: Scene, names: Sequence[str]) -> bool:
-    """Whether objects stand alike: in one pose, or in poses that look alike.
+    """Return whether objects have equal poses, or poses related by a symmetry.
 
     Args:
-        first, second: The scenes.
-        names: Of the objects.
+        first, second: the scenes.
+        names: names of the objects.
     """
     for name in names:
         a, b = first[name], second[name]
@@ -168,14 +163,14 @@ def are_same_poses(first: Scene, second: Scene, names: Sequence[str]) -> bool:
 
 
 def describe_difference(best: Scene, other: Scene, names: Sequence[str]) -> str:
-    """How one end differs from another, in words.
+    """Describe the pose difference of two results in words.
 
     Args:
-        best: The one.
-        other: The other.
-        names: Of the objects that may differ.
+        best: scene of the first result.
+        other: scene of the other result.
+        names: names of the objects that may differ.
     """
-    told = []
+    texts = []
     for name in names:
         off = pose_error(other[name], best[name])
         if off is not None:
@@ -185,20 +180,20 @@ def describe_difference(best: Scene, other: Scene, names: Sequence[str]) -> str:
                 f"{name} {turned if off.angle > SAME_POSE_ANGLE else ''}moved by "
                 f"{off.distance:.3f} m"
             )
-            told.append(far)
-    return ", ".join(told) or "another shape"
+            texts.append(far)
+    return ", ".join(texts) or "another shape"
 
 
 def _have_same_surface(first: Object, second: Object) -> bool:
-    """Whether two objects with nearly one centre have one surface."""
+    """Return whether two objects with nearly equal centres have equal surfaces."""
     a, b = _world_mesh(first), _world_mesh(second)
     a = Mesh(a.vertices - first.center.detach() + second.center.detach(), a.faces)
-    # A turn that counts as none moves points so far.
+    # Displacement of points by the largest rotation that counts as none.
     return _surface_distance(a, b) < 0.13 * SAME_POSE_ANGLE
 
 
 def _refit(fit: Fit, number: int, rotation: Tensor) -> Fit | None:
-    """A fit that goes on from where an object is turned; None where Gauss–Newton cannot."""
+    """Refit from a rotated pose of an object; None if Gauss–Newton does not apply."""
     found = fit.copy()
     _rotate_pose(found.unknowns[number], rotation)
     first, last = (1 - _REFIT_BLUR) * fit.stage.blur_end, fit.stage.steps
@@ -213,7 +208,7 @@ def _refit(fit: Fit, number: int, rotation: Tensor) -> Fit | None:
 
 @torch.no_grad()
 def _rotate_pose(module: nn.Module, rotation: Tensor) -> None:
-    """Turn what a pose has placed about its own centre."""
+    """Rotate the pose of an object about its own centre."""
     assert isinstance(module, Pose)
     halves = module.rotation.new_tensor([1.0, 0.5, 0.5, 0.5])
     (w, *_), (a, *_) = (q := quaternion_from_vector(rotation)), (p := module.rotation * halves)
@@ -229,7 +224,7 @@ def _world_mesh(item: Object) -> Mesh:
 
 
 def _surface_distance(first: Mesh, second: Mesh) -> float:
-    """Root mean square distance of points of each surface from the other, over the diagonal."""
+    """Compute the root mean square distance of two surfaces relative to the diagonal."""
     squares = [
         np.square(points - closest_points(other, points)).sum(1).mean()
         for own, other in ((first, second), (second, first))

@@ -1,4 +1,4 @@
-"""What a radar will tell about the parameters, before it has recorded anything."""
+"""Planned error bars: uncertainty of a fit before a measurement."""
 
 import math
 from dataclasses import dataclass
@@ -16,19 +16,18 @@ from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.runtime.progress import track
 
-_DESCENT_STEPS, _TRUST_RADIUS = 5, 0.1  # of a fit that begins at the truth
+_DESCENT_STEPS, _TRUST_RADIUS = 5, 0.1  # descent from the truth
 
 
 @dataclass(frozen=True)
 class CandidatePosition:
-    """What one more position of the radar would tell.
+    """Information gained by one more position of the radar.
 
     Attributes:
-        frame: Number of its frame.
-        deviation_ratio: Its standard deviations over those without it, geometric mean over all
-            directions of
-            the parameters.
-        error_bars: Error bars with it.
+        frame: index of its frame.
+        deviation_ratio: standard deviations with it over those without, geometric mean over all
+            directions of the parameters.
+        error_bars: error bars with it.
     """
 
     frame: int
@@ -37,19 +36,19 @@ class CandidatePosition:
 
 
 def plan_error_bars(fit: Fit, candidates: int = 0) -> tuple[Uncertainty, list[CandidatePosition]]:
-    """Error bars of a fit that ends at the truth, and what further frames would add.
+    """Compute error bars of a fit that ends at the truth, and the gain of further frames.
 
     Args:
-        fit: It stands at the truth; its data are one simulated recording, which tells gain and
-            noise. See ``prepare_fit``.
-        candidates: The last frames of its only observation, so many, are not there yet: each is
-            tried by itself.
+        fit: fit at the truth, see ``prepare_fit``; its data are one simulated recording, which
+            determines gain and noise.
+        candidates: number of final frames of its only observation that are candidates, each
+            evaluated alone.
 
     Returns:
         Error bars without the candidates, and the candidates, the best first.
 
     Raises:
-        InputError: Candidates for several observations; see ``Evidence``.
+        InputError: Candidates for several observations; see ``CovarianceEstimator``.
     """
     end = FitResult(fit)
     evidence = CovarianceEstimator(end)
@@ -73,13 +72,13 @@ def plan_error_bars(fit: Fit, candidates: int = 0) -> tuple[Uncertainty, list[Ca
 
 
 def fit_errors(fit: Fit) -> dict[str, float]:
-    """How far a fit that begins at the truth leaves it, by the names of error bars.
+    """Compute the errors of a fit that starts at the truth, by the names of error bars.
 
-    It descends without extra widths; so the spread over recordings is that of the nearest
-    minimum, which error bars state.
+    The descent is unblurred, so that the spread over recordings is that of the nearest minimum, as
+    error bars state it.
 
     Args:
-        fit: It stands at the truth, and does not any more afterwards.
+        fit: fit at the truth; its parameters change.
     """
     found = list(iterate_coordinates(fit.modules))
     before = {name: p.detach().clone() for name, p in fit.modules.named_parameters()}

@@ -1,4 +1,4 @@
-"""How the data of a fit would scatter if its twin were right: looks at the twin itself."""
+"""Results of fits, and realisations of the data under the hypothesis that the twin is true."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -14,19 +14,20 @@ from invertwin.inversion.loss import MapPairs, SpectrumLoss, halve_resolution
 from invertwin.runtime.progress import track
 from invertwin.seeds import derive_seed
 
-_REALISATION_COUNT = 64  # they tell a standard deviation to 9 %
-_NOISE_BIN_FRACTION = 0.2  # the share of bins, the darkest, in which noise is measured
-_POOLING_LEVELS = 2  # times that bins are joined in pairs where residuals are looked at
+_REALISATION_COUNT = 64  # determines a standard deviation to 9 %
+_NOISE_BIN_FRACTION = 0.2  # weakest fraction of bins, in which noise is estimated
+_POOLING_LEVELS = 2  # halvings of the resolution for residuals
 
 
 @dataclass(frozen=True, eq=False)
 class RealisationStatistics:
-    """What the loss of a fit is on looks at its own twin.
+    """Losses, gradients and coarse maps of simulated realisations of a twin.
 
     Attributes:
-        losses: Of every look.
-        gradients: For every look, the derivatives of the loss by the map of every observation.
-        coarse_maps: For every look, the coarse map of every observation, see ``coarse_maps``.
+        losses: loss of each realisation.
+        gradients: for each realisation, derivatives of the loss with respect to the map of each
+            observation.
+        coarse_maps: for each realisation, the coarse map of each observation, see ``coarsen_map``.
     """
 
     losses: list[float]
@@ -35,11 +36,11 @@ class RealisationStatistics:
 
 
 class FitResult:
-    """The end of a fit: its maps, and looks at its twin.
+    """Predicted and observed maps of a finished fit, and simulated realisations of them.
 
     Args:
-        fit: A fit that has ended.
-        maps, realisations: Those of some frames only, in place of its own.
+        fit: a finished fit.
+        maps, realisations: maps and realisations of selected frames, in place of the fit's own.
     """
 
     def __init__(
@@ -53,11 +54,11 @@ class FitResult:
     def select_frames(
         self, indices: Sequence[int], realisations: Sequence[list[Tensor]]
     ) -> "FitResult":
-        """The same for some frames of every observation.
+        """Return the result for selected frames of every observation.
 
         Args:
-            indices: Their numbers.
-            realisations: Those of all frames.
+            indices: indices of the frames.
+            realisations: realisations of all frames.
         """
         maps = [(a[indices], b[indices]) for a, b in self.maps]
         return FitResult(
@@ -66,7 +67,7 @@ class FitResult:
 
     @cached_property
     def maps(self) -> MapPairs:
-        """The predicted and the observed map of every observation, sharp and with all frames."""
+        """Predicted and observed map of every observation, unblurred and with all frames."""
         if self._maps is not None:
             return self._maps
         with torch.no_grad():
@@ -75,7 +76,7 @@ class FitResult:
 
     @cached_property
     def gains(self) -> list[float]:
-        """What every predicted map is multiplied by; zero where it shows next to nothing."""
+        """Gain of every predicted map; zero if it explains next to nothing."""
         found = []
         for loss, (predicted, observed) in zip(self.fit.objective.losses, self.maps, strict=True):
             law = loss if isinstance(loss, SpectrumLoss) else SpectrumLoss("likelihood")
@@ -85,7 +86,7 @@ class FitResult:
 
     @cached_property
     def realisation_statistics(self) -> RealisationStatistics | None:
-        """Looks at the twin; None where a model gives none, or a gain is zero."""
+        """Statistics of realisations; None for models without them, or if a gain is zero."""
         found = RealisationStatistics([], [], [])
         for seen in self.realisations():
             loss, slopes = self.loss_gradients(
@@ -97,7 +98,7 @@ class FitResult:
         return found if found.losses else None
 
     def realisations(self) -> Iterator[list[Tensor]]:
-        """Maps of every observation as recordings of the twin would show them, with noise."""
+        """Simulate maps of every observation as recordings of the twin, with noise."""
         if self._looks is not None:
             yield from self._looks
             return
@@ -114,10 +115,10 @@ class FitResult:
             ]
 
     def loss_gradients(self, maps: MapPairs) -> tuple[float, list[Tensor]]:
-        """The loss, and its derivative by every predicted map.
+        """Compute the loss and its derivative with respect to every predicted map.
 
         Args:
-            maps: Predicted and observed.
+            maps: predicted and observed maps.
         """
         with torch.enable_grad():
             attached = [(a.detach().requires_grad_(), b) for a, b in maps]
@@ -126,10 +127,10 @@ class FitResult:
 
 
 def coarsen_map(power: Tensor) -> Tensor:
-    """A map with bins joined four by four along every axis, its mean over frames.
+    """Average a map over blocks of four bins along every axis and over frames.
 
     Args:
-        power: [frame, …].
+        power: map [frame, …].
     """
     for _ in range(_POOLING_LEVELS):
         power = halve_resolution(power)
@@ -137,18 +138,18 @@ def coarsen_map(power: Tensor) -> Tensor:
 
 
 def zscore(value: float, samples: Sequence[float]) -> float:
-    """How many standard deviations a number is above the mean of others.
+    """Compute the deviation of a value from the mean of samples in their standard deviations.
 
     Args:
-        value: The number.
-        samples: The others.
+        value: the value.
+        samples: the samples.
     """
     others = torch.tensor(samples, dtype=torch.float64)
     return (value - float(others.mean())) / max(float(others.std()), 1e-30)
 
 
 def _estimate_noise(predicted: Tensor, observed: Tensor, gain: float, holds_fields: bool) -> float:
-    """Mean noise in a bin, in units of the predicted map: what its darkest bins hold beyond it."""
+    """Estimate the mean noise per bin from the weakest bins, in units of the predicted map."""
     flat: Any = predicted.flatten()
     dark = flat.abs().argsort()[: max(1, math.ceil(_NOISE_BIN_FRACTION * len(flat)))]
     rest = observed.flatten()[dark] / gain - flat[dark]

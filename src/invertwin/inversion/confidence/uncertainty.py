@@ -1,4 +1,4 @@
-"""How sure a fit is: error bars from the statistics of the data, and what is not observed."""
+"""Error bars of a fit from the statistics of its data, and unobserved parameters."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -19,37 +19,37 @@ from invertwin.inversion.loss import SpectrumLoss
 from invertwin.runtime.progress import track
 from invertwin.scene.parameters import Coordinate, Entries
 
-_MAX_COORDINATES = 64  # coordinates; each costs derivatives of the map
-_MIN_INFORMATION_FRACTION = 0.5  # of the information that the noise of the derivatives feigns
-_UNOBSERVED_VARIANCE_RATIO = (
-    20.0  # times the variance of the best known coordinate, in spans: not observed
+_MAX_COORDINATES = 64  # each coordinate costs derivatives of the map
+_MIN_INFORMATION_FRACTION = (
+    0.5  # relative to the apparent information due to noise of the derivatives
 )
-_UNOBSERVED_VARIANCE = 25.0  # spans squared: not observed, however the others are
-_MIN_NAMED_COMPONENT = 0.3  # of a direction: smaller components are not named
-_WEAK_VARIANCE = 1 / 16  # spans squared: worse known, a direction is looked at where errors matter
-_PROFILE_DISTANCE = 2.0  # spans: where
-_PROFILE_REFITS = 3  # Gauss–Newton steps of the others there
-_MIN_LOSS_RISE = 1e-3  # of the rise: so much at least
+_UNOBSERVED_VARIANCE_RATIO = 20.0  # times the smallest variance in spans: not observed
+_UNOBSERVED_VARIANCE = 25.0  # spans squared: not observed in any case
+_MIN_NAMED_COMPONENT = 0.3  # smaller components of a direction are not named
+_WEAK_VARIANCE = 1 / 16  # spans squared: directions with more variance are profiled
+_PROFILE_DISTANCE = 2.0  # spans: displacement of a profiled direction
+_PROFILE_REFITS = 3  # Gauss–Newton steps of the other coordinates
+_MIN_LOSS_RISE = 1e-3  # lower limit of the rise of the loss, relative to the quadratic model
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """The error bars of a fit.
+    """Error bars of a fit.
 
-    They hold what speckle and noise do to the estimate, near the minimum that was found. A wrong
-    minimum, a wrong model or a wrong start are the matter of the verdict. A direction that is known
-    to a quarter of its span at best has the error bar of the loss two spans away, where this rises
-    less than the curvature at the minimum says.
+    They state the effect of speckle and noise on the estimate near its minimum. The verdict
+    assesses wrong minima, models and starts. A direction that is known to a quarter of its span at
+    best has the error bar of the loss profile two spans away, if the profile rises less than the
+    curvature at the minimum predicts.
 
     Attributes:
-        names: Of the coordinates, such as "letter.x".
-        units: Of the coordinates: "m", "rad", or empty.
-        covariance: Of the estimates. What is not observed has a large variance, not an infinite
-            one: at least as large as it says.
-        unobserved: A sentence for every direction that the data do not tell. It begins with the
-            names of its coordinates.
-        count: Of the looks, or of the frames, from whose scatter the covariance is estimated.
-        source: Whether these are ``looks`` at the twin or ``frames`` of the data.
+        names: names of the coordinates, such as "letter.x".
+        units: units of the coordinates: "m", "rad", or empty.
+        covariance: covariance of the estimates. An unobserved direction has a large, finite
+            variance: a lower bound.
+        unobserved: a sentence for every unobserved direction. It begins with the names of its
+            coordinates.
+        count: number of realisations, or of frames, from whose scatter the covariance is estimated.
+        source: ``looks`` (realisations of the twin) or ``frames`` of the data.
     """
 
     names: tuple[str, ...]
@@ -61,7 +61,7 @@ class Uncertainty:
 
     @property
     def deviations(self) -> dict[str, float]:
-        """One standard deviation of every coordinate, in its unit."""
+        """Standard deviation of every coordinate, in its unit."""
         return dict(zip(self.names, self.covariance.diagonal().sqrt().tolist(), strict=True))
 
     @property
@@ -71,30 +71,31 @@ class Uncertainty:
         return self.covariance * scale * scale[:, None]
 
     def interval(self, level: float = 0.95) -> dict[str, float]:
-        """How far the truth is from the estimate at most, with this probability.
+        """Return the half width of the confidence interval of every coordinate, in its unit.
 
         Args:
-            level: The probability.
+            level: confidence level.
         """
-        # Student's law, since the variance is itself an estimate.
+        # Student's t distribution, since the variance is an estimate.
         factor = float(stats.t.ppf(0.5 + 0.5 * level, self.count - 1))
         return {name: factor * value for name, value in self.deviations.items()}
 
 
 class CovarianceEstimator:
-    """What the maps at the end of a fit, and looks at its twin, tell about its parameters.
+    """Covariance of the fitted parameters from the final maps and simulated realisations.
 
-    ``Cov θ = H⁻¹ Cov(g) H⁻¹``: H the Gauss–Newton matrix of the loss, g its gradient on looks at
-    the twin with other speckle and noise, both with a gain fitted anew. Derivatives of the map are
-    taken in forward mode at the end of the fit, twice with other samples: their noise would feign
-    information. Where a model gives no looks, Cov(g) is the scatter of the frames of the data,
-    as if no two frames shared speckle.
+    ``Cov θ = H⁻¹ Cov(g) H⁻¹``: H the Gauss–Newton matrix of the loss, g its gradient on
+    realisations of the twin with independent speckle and noise, both with a refitted gain.
+    Derivatives of the map are taken in forward mode at the end of the fit, twice with independent
+    samples, to remove the apparent information of their noise. For models without realisations,
+    Cov(g) is the scatter over frames of the data, assuming independent speckle in each frame.
 
     Source: the sandwich covariance of estimators; derivations §16.
-    Differs from the source: Cov(g) by draws, so that correlated bins and frames count rightly.
+    Differs from the source: Cov(g) from realisations, which accounts for correlated bins and
+    frames.
 
     Args:
-        result: Of the fit.
+        result: result of the fit.
 
     Raises:
         InputError: More than 64 coordinates, or a loss that is no ``SpectrumLoss``.
@@ -108,12 +109,12 @@ class CovarianceEstimator:
             raise InputError(
                 f"expected a SpectrumLoss and at most {_MAX_COORDINATES} parameters for error "
                 f"bars, got "
-                f"{type(others[0]).__name__ if others else len(found)}; they are not known for "
-                "this fit"
+                f"{type(others[0]).__name__ if others else len(found)}; error bars are not "
+                "available"
             )
         self._end = result
         first, second = (map_derivatives(fit, found, number) for number in (0, 1))
-        # What nothing depends on is held fixed, unless it has a meaning of its own.
+        # Coordinates without effect are dropped, unless they have a span.
         moves = [any(bool(rows[k].any()) for rows in first) for k in range(len(found))]
         kept = [k for k, c in enumerate(found) if moves[k] or math.isfinite(c.span)]
         self._kept, self._found = kept, [found[k] for k in kept]
@@ -125,14 +126,14 @@ class CovarianceEstimator:
     def error_bars(
         self, frames: Sequence[int] | None = None, realisations: Sequence[Any] = ()
     ) -> Uncertainty:
-        """The error bars.
+        """Compute the error bars.
 
         Args:
-            frames: Numbers of those that count; None = all.
-            realisations: At all frames, where only some count.
+            frames: indices of the frames to use; None = all.
+            realisations: realisations of all frames, if ``frames`` selects some.
 
         Raises:
-            InputError: A single frame of a model without looks.
+            InputError: A single frame of a model without realisations.
         """
         end, found, rows = self._end, self._found, self._rows
         if frames is not None:
@@ -149,8 +150,8 @@ class CovarianceEstimator:
             count, by = min(len(b) for _, b in end.maps), "frames"
             if count < 2:
                 raise InputError(
-                    "expected looks at the twin or several frames for error bars, got one frame "
-                    "of a model without looks; they are not known for this fit"
+                    "expected a model with realisations or several frames for error bars, got one "
+                    "frame of a model without realisations; error bars are not available"
                 )
             scatter, chance = (
                 _frame_covariance(end.loss_gradients(end.maps)[1], some) for some in rows
@@ -175,7 +176,7 @@ class CovarianceEstimator:
         )
 
     def _widen_covariance(self, covariance: Tensor, spans: Tensor) -> Tensor:
-        """The covariance, in units of the spans, with what the loss says far off in weak ways."""
+        """Widen weak directions of the covariance (in spans) by profiles of the loss."""
         fit, known = self._end.fit, torch.tensor([math.isfinite(c.span) for c in self._found])
         pairs = zip(*_eigen_rows(covariance[known][:, known]), strict=True)
         weak = [(float(error), axis) for error, axis in pairs if _WEAK_VARIANCE < error < 1]
@@ -186,26 +187,26 @@ class CovarianceEstimator:
         own = fit.objective.curvature([(a, a) for a in target], self._rows[0])
         inverse = torch.linalg.pinv(own * spans * spans[:, None], hermitian=True)
         for error, axis in weak:
-            way = torch.zeros(len(spans), dtype=torch.float64)
-            way[known] = axis
-            said = 0.5 * _PROFILE_DISTANCE**2 / float(way @ inverse @ way)
+            vector = torch.zeros(len(spans), dtype=torch.float64)
+            vector[known] = axis
+            predicted = 0.5 * _PROFILE_DISTANCE**2 / float(vector @ inverse @ vector)
             rise = min(
-                self._profile_loss(far * way, spans, target)
+                self._profile_loss(far * vector, spans, target)
                 for far in (_PROFILE_DISTANCE, -_PROFILE_DISTANCE)
             )
-            more = error * (said / max(rise, _MIN_LOSS_RISE * said) - 1)
-            covariance = covariance + max(more, 0.0) * way * way[:, None]
+            more = error * (predicted / max(rise, _MIN_LOSS_RISE * predicted) - 1)
+            covariance = covariance + max(more, 0.0) * vector * vector[:, None]
         return covariance
 
     def _profile_loss(self, displacement: Tensor, spans: Tensor, target: list[Tensor]) -> float:
-        """The loss where the twin is moved and all other coordinates make the best of it.
+        """Minimise the loss over all other coordinates at a displacement of the twin.
 
-        It is infinite where the scene refuses the move.
+        It is infinite for displacements out of bounds.
 
         Args:
-            displacement: In units of the spans.
-            spans: Of the coordinates.
-            target: What stands for the data: the twin's own maps.
+            displacement: displacement in units of the spans [p].
+            spans: spans of the coordinates [p].
+            target: maps that stand for the data: those of the twin itself.
         """
         fit, least = self._end.fit.copy(), math.inf
 
@@ -215,7 +216,7 @@ class CovarianceEstimator:
 
         across = torch.linalg.svd(displacement[None])[2][
             1:
-        ]  # the ways that are perpendicular to the move
+        ]  # directions perpendicular to the displacement
         for step in range(_PROFILE_REFITS + 1):
             with torch.no_grad():
                 for change, coordinate in zip((displacement * spans).tolist(), here(), strict=True):
@@ -238,11 +239,11 @@ class CovarianceEstimator:
 
 
 def iterate_coordinates(module: nn.Module, path: str = "") -> Iterator[Coordinate]:
-    """What a module and its parts find, with parameters by their whole name.
+    """Yield the coordinates of a module and its children, with qualified parameter names.
 
     Args:
-        module: What is fitted.
-        path: Name of the module, with a dot at its end.
+        module: module to fit.
+        path: qualified name of the module, with a trailing dot.
     """
     if hasattr(module, "coordinates"):
         for own in module.coordinates():  # type: ignore[operator]
@@ -258,24 +259,24 @@ def iterate_coordinates(module: nn.Module, path: str = "") -> Iterator[Coordinat
         parameter = module.get_parameter(entry.parameter)
         part = parameter.detach()[entry.index]
         for number in range(part.numel() if parameter.requires_grad else 0):
-            one = torch.zeros_like(part)
-            one.view(-1)[number] = 1.0
+            unit = torch.zeros_like(part)
+            unit.view(-1)[number] = 1.0
             tangent = torch.zeros_like(parameter.detach())
-            tangent[entry.index] = one / entry.slope
-            shown = prefix + name + (f"[{number}]" if part.numel() > 1 else "")
-            yield Coordinate(shown, "", {path + entry.parameter: tangent})
+            tangent[entry.index] = unit / entry.slope
+            label = prefix + name + (f"[{number}]" if part.numel() > 1 else "")
+            yield Coordinate(label, "", {path + entry.parameter: tangent})
     for name, child in module.named_children():
         if not any(whole.startswith(f"{name}.") for whole in held):
             yield from iterate_coordinates(child, f"{path}{name}.")
 
 
 def map_derivatives(fit: Fit, coordinates: Sequence[Coordinate], seed_number: int) -> list[Tensor]:
-    """For every observation the derivatives of its predicted map [coordinate, …].
+    """Compute derivatives of each predicted map with respect to coordinates [coordinate, …].
 
     Args:
-        fit: At its end.
-        found: What the maps are derived by.
-        seed_number: Other numbers have other random numbers.
+        fit: fit at its end.
+        coordinates: coordinates to differentiate with respect to.
+        seed_number: index of the random numbers.
     """
     rows: list[list[Tensor]] = []
     for coordinate in track(coordinates, "derivatives"):
@@ -291,7 +292,7 @@ def map_derivatives(fit: Fit, coordinates: Sequence[Coordinate], seed_number: in
 def _gradient_covariance(
     loss_gradients: Sequence[Sequence[Tensor]], map_derivatives: Sequence[Tensor]
 ) -> Tensor:
-    """Covariance of the gradient over draws."""
+    """Estimate the covariance of the gradient over realisations."""
     flat = [part.flatten(1) for part in map_derivatives]
     scores = torch.stack(
         [
@@ -305,7 +306,7 @@ def _gradient_covariance(
 def _frame_covariance(
     loss_gradients: Sequence[Tensor], map_derivatives: Sequence[Tensor]
 ) -> Tensor:
-    """Covariance of the gradient from the scatter of the terms of single frames."""
+    """Estimate the covariance of the gradient from the scatter of the terms of single frames."""
     total = torch.zeros((), dtype=torch.float64)
     for slope, own in zip(loss_gradients, map_derivatives, strict=True):
         scores = torch.einsum("pfn,fn->pf", own.flatten(2), slope.flatten(1)).double()
@@ -314,7 +315,7 @@ def _frame_covariance(
 
 
 def _penalty_curvature(fit: Fit, coordinates: Sequence[Coordinate]) -> Tensor:
-    """Second derivatives of the regularisers along the coordinates."""
+    """Compute second derivatives of the regularisers along the coordinates."""
     free = {n: p for n, p in fit.modules.named_parameters() if p.requires_grad}
     tangents = (
         torch.stack(
@@ -337,7 +338,9 @@ def _penalty_curvature(fit: Fit, coordinates: Sequence[Coordinate]) -> Tensor:
 def _sandwich_covariance(
     curvature: Tensor, curvature_bias: Tensor, scatter: Tensor, scatter_bias: Tensor
 ) -> Tensor:
-    """The sandwich, in units of the spans; directions without information get large errors."""
+    """Compute the sandwich covariance in units of the spans; uninformed directions get large
+    errors.
+    """
     values, axes = torch.linalg.eigh(curvature)
     least = _MIN_INFORMATION_FRACTION * (axes.T @ curvature_bias @ axes).diagonal().clamp_min(1e-30)
     seen = values > least
@@ -352,7 +355,9 @@ def _sandwich_covariance(
 
 
 def _describe_unobserved(coordinates: Sequence[Coordinate], covariance: Tensor) -> Iterator[str]:
-    """Says which directions are more uncertain than their spans, and far more than the best."""
+    """Yield sentences about directions that are more uncertain than their spans and the best
+    direction.
+    """
     known = [k for k, c in enumerate(coordinates) if math.isfinite(c.span)]
     own = covariance[known][:, known]
     for error, axis in zip(*_eigen_rows(own), strict=True):
@@ -370,20 +375,20 @@ def _describe_unobserved(coordinates: Sequence[Coordinate], covariance: Tensor) 
             mixed = " ".join(f"{float(axis[k]):+.2f} {coordinates[known[k]].name}" for k in parts)
             yield f"{names}: not observed along {mixed}, in units of their spans"
             continue
-        alone = coordinates[known[parts[0]]]
+        single = coordinates[known[parts[0]]]
         shares = {
             coordinates[k].name: float(
-                error * alone.span**2 / (covariance[k, k] * coordinates[k].span ** 2)
+                error * single.span**2 / (covariance[k, k] * coordinates[k].span ** 2)
             )
             for k in known
-            if coordinates[k].unit == alone.unit and coordinates[k].name != alone.name
+            if coordinates[k].unit == single.unit and coordinates[k].name != single.name
         }
         best = max(shares, key=lambda name: shares[name], default=None)
-        told = "" if best is None else f"; {1 / shares[best]:.1g} of the information of {best}"
-        yield f"{names}: not observed{told}"
+        ending = "" if best is None else f"; {1 / shares[best]:.1g} of the information of {best}"
+        yield f"{names}: not observed{ending}"
 
 
 def _eigen_rows(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Eigenvalues, and eigenvectors as rows."""
+    """Return eigenvalues, and eigenvectors as rows."""
     values, vectors = torch.linalg.eigh(matrix)
     return values, vectors.T

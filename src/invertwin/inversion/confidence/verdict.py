@@ -1,4 +1,4 @@
-"""Whether a fit is to be believed: apart from why it stopped."""
+"""Verdict of a fit: goodness of fit and ambiguities, independent of the stopping reason."""
 
 import contextlib
 import math
@@ -19,36 +19,33 @@ VerdictWord = Literal[
 ]
 
 MIN_EXPLAINED_FRACTION = 1e-3
-"""Of the observed power: a twin that explains less shows nothing."""
-_INCONSISTENT_ZSCORE = 3.5  # standard deviations of the loss on looks at the twin
-_MARKED_BIN_ZSCORE = 5.0  # the same of a coarse bin
-_DEPTH_ZSCORE = 3.0  # standard deviations by which more bounces must lower the loss to be named
-_MAX_LOSS_RATIO = 1.02  # times the loss of the start: more than the noise of samples
+"""Minimum explained fraction of the observed power; a smaller one is uninformative."""
+_INCONSISTENT_ZSCORE = 3.5  # standard deviations of the loss over realisations
+_MARKED_BIN_ZSCORE = 5.0  # standard deviations of a coarse bin
+_DEPTH_ZSCORE = 3.0  # standard deviations by which more bounces must lower the loss
+_MAX_LOSS_RATIO = 1.02  # final over initial loss: more than the noise of samples
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Whether the data look like recordings of the twin.
+    """Goodness of fit, and ambiguous results.
 
-    A wrong minimum may look right by itself, such as a letter that is turned by half a turn. So
-    the twin is turned in all ways that leave it much the same, fitted again and compared. Other
-    minima are found from several starts (``search``).
+    A wrong minimum may fit well, such as a letter rotated by half a turn. So the twin is rotated by
+    all near symmetries, refitted and compared. Multi-start fits find other minima (``search``).
 
     Attributes:
-        word: ``consistent``: nothing speaks against the twin. ``inconsistent``: the data do not
-            look like recordings of it. ``ambiguous``: another end explains them as well.
-            ``at a bound``: a value is at the end of its range.
-            ``worse``: the fit is worse than its start. ``lost``: the twin shows next to nothing of
-            what was observed, so nothing tells the fit where to go. ``make_shape_model``: the
-            model gives no
-            looks to compare with.
-        excess: The loss of the data above the mean of that of looks at the twin, in their standard
-            deviations; None where there are none.
-        structure: The same of the mean square of ``residuals``, which speckle hardly moves.
-        reasons: What speaks against the twin, in sentences.
-        residuals: For every observation how far its coarse map, summed over frames, is from that
-            of looks, in their standard deviations; beyond 5 is marked in the report.
-        ambiguities: Ends that look much like this one, with how far the data speak against them.
+        word: ``consistent``: no evidence against the twin. ``inconsistent``: the data differ from
+            realisations of the twin. ``ambiguous``: another result explains them as well. ``at a
+            bound``: a value is at the end of its range. ``worse``: the fit is worse than its start.
+            ``lost``: uninformative start; the twin explains next to none of the observed power.
+            ``unknown``: the model has no realisations to compare with.
+        excess: loss of the data above the mean loss of realisations, in their standard deviations;
+            None without realisations.
+        structure: the same for the mean square of ``residuals``, which is robust to speckle.
+        reasons: evidence against the twin, in sentences.
+        residuals: for every observation the deviation of its coarse map, summed over frames, from
+            realisations, in their standard deviations; the report marks values beyond 5.
+        ambiguities: similar results, with their significance.
     """
 
     word: VerdictWord
@@ -60,15 +57,15 @@ class Verdict:
 
     @property
     def is_consistent(self) -> bool:
-        """Whether nothing speaks against the twin."""
+        """Whether there is no evidence against the twin."""
         return self.word == "consistent"
 
 
 def judge_fit(result: FitResult) -> Verdict:
-    """Judge the end of a fit.
+    """Assess the result of a fit.
 
     Args:
-        result: Of the fit.
+        result: result of the fit.
     """
     fit, explained = result.fit, explained_fractions(result)
     if min(explained) < MIN_EXPLAINED_FRACTION:
@@ -114,10 +111,10 @@ def judge_fit(result: FitResult) -> Verdict:
 
 
 def explained_fractions(result: FitResult) -> list[float]:
-    """For every observation, how much of its power the twin explains.
+    """Return the explained fraction of the observed power of every observation.
 
     Args:
-        result: Of the fit.
+        result: result of the fit.
     """
     return [
         gain * float(a.abs().mean()) / max(float(b.abs().mean()), 1e-300)
@@ -130,7 +127,7 @@ def _format_score(ambiguity: Ambiguity) -> str:
 
 
 def _test_deeper_paths(result: FitResult, limit: float) -> Iterator[str]:
-    """Says so if one bounce more explains the data better."""
+    """Yield a sentence if one more bounce explains the data better."""
     sampling = getattr(result.fit.observations[0].model, "sampling", None)
     if isinstance(sampling, Sampling):
         depth = sampling.depth + 1
@@ -145,7 +142,7 @@ def _smallest_number(values: list[float]) -> int:
 
 
 def _coarse_residuals(result: FitResult) -> tuple[list[Tensor], float]:
-    """For every observation, coarse bins in standard deviations of looks; how large they are."""
+    """Compute coarse residuals in standard deviations, and their significance."""
     assert result.realisation_statistics is not None
     found, squares = [], []
     looks = zip(*result.realisation_statistics.coarse_maps, strict=True)
@@ -153,7 +150,7 @@ def _coarse_residuals(result: FitResult) -> tuple[list[Tensor], float]:
         drawn = torch.stack(maps)
         mean, spread = drawn.mean(0), drawn.std(0).clamp_min(1e-30)
         found.append((coarsen_map(observed) / gain - mean) / spread)
-        # A look is part of its own mean, the data are not.
+        # A realisation is part of its own mean, the data are not.
         count = len(drawn)
         own = ((drawn - mean) / spread).square() * ((count + 1) / (count - 1))
         squares.append((found[-1].square().mean(), own.flatten(1).mean(1)))
@@ -162,7 +159,7 @@ def _coarse_residuals(result: FitResult) -> tuple[list[Tensor], float]:
 
 
 def _describe_residual(number: int, residual: Tensor, holds_fields: bool) -> str:
-    """What a residual map shows."""
+    """Describe a residual map in words."""
     more, less = (
         int((residual > _MARKED_BIN_ZSCORE).sum()),
         int((residual < -_MARKED_BIN_ZSCORE).sum()),

@@ -1,4 +1,4 @@
-"""Is the gradient right? Automatic derivatives of a whole map against central differences."""
+"""Gradient check: automatic derivatives of a whole map against central differences."""
 
 import math
 import time
@@ -21,20 +21,20 @@ from invertwin.scene.scene import Scene
 from invertwin.seeds import derive_seed
 
 _MIN_PAIRS = 4
-_MIN_RELATIVE_CHANGE = 1e-3  # relative change of a gradient that is none
+_MIN_RELATIVE_CHANGE = 1e-3  # smaller relative changes of a gradient count as none
 
 
 @dataclass(frozen=True)
 class GradcheckSettings:
-    """How sharp a gradient check is.
+    """Settings of a gradient check.
 
     Attributes:
-        repeats: Derivatives averaged, with different seeds.
-        step: ε of the differences; ε/2 is evaluated too, and 4ε and 8ε for the order.
-        difference_samples: Samples for one end of a pair.
-        noise: ‖standard error‖₁/‖g_FD‖₁ below which no more pairs are added.
-        max_pairs: Most pairs; the report says what was reached.
-        scheme: How the differences sample surfaces: "rays" from the antenna, or by "area".
+        repeats: number of derivatives to average, with different seeds.
+        step: step ε of the differences; ε/2 is evaluated too, and 4ε and 8ε for the order.
+        difference_samples: number of samples for one end of a pair.
+        noise: target ‖standard error‖₁/‖g_FD‖₁ of the mean of all pairs.
+        max_pairs: maximum number of pairs; the report states the noise reached.
+        scheme: surface sampling of the differences: "rays" from the antenna, or by "area".
     """
 
     repeats: Count = 4
@@ -47,13 +47,13 @@ class GradcheckSettings:
 
 @dataclass(frozen=True)
 class GradientAgreement:
-    """How close a gradient map is to the differences.
+    """Agreement of a gradient map with the differences.
 
     Attributes:
         relative_l1: ‖g − g_FD‖₁ / ‖g_FD‖₁.
         relative_l2: ‖g − g_FD‖₂ / ‖g_FD‖₂.
-        correlation: Pearson, over bins.
-        order: Observed order of ‖FD(ε) − g‖ in ε, from the two large steps: 2 for a right
+        correlation: Pearson correlation over bins.
+        order: observed order of ‖FD(ε) − g‖ in ε, from the two large steps: 2 for a correct
             gradient, 0 for a wrong one.
     """
 
@@ -65,19 +65,19 @@ class GradientAgreement:
 
 @dataclass(frozen=True)
 class GradientReport:
-    """The outcome of :func:`gradcheck`.
+    """Result of :func:`gradcheck`.
 
     Attributes:
         full: Agreement with boundary paths.
         interior: Agreement without boundary paths; equal to ``full`` if the model has none.
-        no_interior_edges: With boundary paths, but without those of the shadows that surfaces
-            cast on each other; None for paths of one bounce, which have none.
-        no_contact: With boundary paths, but without those of the curves in which surfaces cross or
-            touch; None where surfaces do not meet.
-        difference_noise: ‖standard error‖₁ / ‖g_FD‖₁; 0 where maps do not depend on the seed.
-        step_agreement: ‖FD(ε) − FD(ε/2)‖₁ / ‖FD(ε)‖₁ (holds the noise of both).
+        no_interior_edges: agreement with boundary paths, except those of shadows that surfaces cast
+            on each other; None for paths of one bounce, which have none.
+        no_contact: agreement with boundary paths, except those of the curves in which surfaces
+            intersect or touch; None without such curves.
+        difference_noise: ‖standard error‖₁ / ‖g_FD‖₁; 0 if maps do not depend on the seed.
+        step_agreement: ‖FD(ε) − FD(ε/2)‖₁ / ‖FD(ε)‖₁ (includes the noise of both).
         pairs: Number of independent difference pairs.
-        value, gradient, interior_gradient, difference: The map and its derivatives.
+        value, gradient, interior_gradient, difference: the map and its derivatives.
     """
 
     full: GradientAgreement
@@ -107,22 +107,22 @@ def gradcheck(
 ) -> GradientReport:
     """Compare the derivative of a map with central differences that have converged.
 
-    The parameters of the module move along the tangent: p + θ · tangent. The differences use
-    common random numbers: both ends of a pair draw the same numbers, with probabilities fixed at
-    θ = 0, and every pair draws others. Pairs are added until the standard error of their mean is
-    small enough. One pair serves where maps do not depend on the seed.
+    The parameters of the module move along the tangent: p + θ · tangent. The differences use common
+    random numbers: both ends of a pair draw the same numbers, with probabilities fixed at θ = 0,
+    and every pair draws others. Pairs are added until the standard error of their mean is small
+    enough. One pair suffices if maps do not depend on the seed.
 
     Args:
-        model: What predicts the map; its ``sampling`` is that of one derivative.
-        module: A module that could be fitted; θ = 0 is the module as it is.
-        tangent: Changes of its values by name, such as ``{"rotation": [0, 1, 0]}``, or of its only
-            parameter; see ``invertwin.inversion.gradcheck.tangents.changes_of``.
-        scene: What the module is applied to, or sees.
-        sensor: What sees the scene.
-        acts_on: Whether the module maps the scene or the sensor.
-        settings: How sharp the check is.
-        seed: Of all random numbers.
-        progress: Called with one line now and then.
+        model: forward model; its ``sampling`` is that of one derivative.
+        module: module to differentiate with respect to; θ = 0 is its present state.
+        tangent: changes of its values by name, such as ``{"rotation": [0, 1, 0]}``, or of its only
+            parameter; see ``parameter_changes``.
+        scene: scene that the module maps, or that the sensor observes.
+        sensor: sensor that observes the scene.
+        acts_on: "scene" or "sensor": the argument that the module maps.
+        settings: accuracy of the check.
+        seed: seed of all random numbers.
+        progress: callback for occasional lines of text.
 
     Raises:
         InputError: A tangent that does not fit the module, a model whose derivatives have no
@@ -214,7 +214,7 @@ def _average_differences(
     settings: GradcheckSettings,
     progress: Callable[[str], None] | None,
 ) -> tuple[Tensor, float]:
-    """Difference pairs, as many as the noise asks for, and the noise of their mean."""
+    """Return difference pairs until the noise target is met, and the noise of their mean."""
     pairs: list[Tensor] = []
     reached, begin = math.inf, time.monotonic()
     while len(pairs) < settings.max_pairs and (len(pairs) < _MIN_PAIRS or reached > settings.noise):
@@ -222,7 +222,7 @@ def _average_differences(
         if len(pairs) >= 2:
             reached = _relative_noise(torch.stack(pairs))
             if progress:
-                # Noise falls with the root of the number of pairs.
+                # Noise falls with the square root of the number of pairs.
                 enough = len(pairs) * (reached / max(settings.noise, 1e-9)) ** 2
                 count = min(settings.max_pairs, max(_MIN_PAIRS, math.ceil(enough)))
                 left = (time.monotonic() - begin) / len(pairs) * max(count - len(pairs), 0)

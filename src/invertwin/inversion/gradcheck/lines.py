@@ -1,4 +1,4 @@
-"""A line through the parameters of a module: what a gradient check moves along."""
+"""Lines through the parameters of a module: paths of gradient checks and loss landscapes."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -13,22 +13,22 @@ from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.observation import Observation
 from invertwin.scene.mesh import Mesh
 
-_NEWTON_STEPS = 8  # steps along a normal, onto the zero of the changed field
-_SURFACE_TOLERANCE = 1e-9  # m, how near a point is to that zero
+_NEWTON_STEPS = 8  # steps along a normal to the zero of the changed field
+_SURFACE_TOLERANCE = 1e-9  # residual distance to that zero [m]
 
 
 class ParameterLine:
-    """The parameters of a module, moved by θ times a tangent."""
+    """Parameters of a module, displaced by θ times a tangent."""
 
     def __init__(
         self, module: nn.Module, tangent: Mapping[str, ParameterChange], target: Any
     ) -> None:
-        """Move the parameters of a module.
+        """Define the line.
 
         Args:
-            module: Maps the target.
-            tangent: Changes of its values by name, see ``parameter_changes``.
-            target: The scene or the sensor that the module maps.
+            module: module that maps the target.
+            tangent: changes of its values by name, see ``parameter_changes``.
+            target: scene or sensor that the module maps.
 
         Raises:
             InputError: A name or a shape that the module does not have.
@@ -38,29 +38,27 @@ class ParameterLine:
         self._start = {name: value.detach() for name, value in module.named_parameters()}
 
     def evaluate(self, theta: Tensor) -> Any:
-        """The module's result at a scalar θ, which may carry a derivative."""
+        """Return the module's result at a scalar θ, which may carry a derivative."""
         moved = {n: self._start[n] + theta * change for n, change in self._tangent.items()}
         return torch.func.functional_call(self._module, self._start | moved, (self._target,))
 
     def evaluate_end(self, theta: float) -> Any:
-        """The module's result at θ, one end of a difference."""
+        """Return the module's result at θ, one end of a difference."""
         return self.evaluate(torch.tensor(theta, dtype=torch.float64))
 
 
 class DistanceFieldLine(ParameterLine):
-    """A line of a signed distance, whose differences keep the triangles of θ = 0.
+    """Line of a signed distance whose differences keep the triangles of θ = 0.
 
-    Differences with common random numbers need triangles that stay the same ones, so ends are not
-    meshed anew: the points of the first mesh follow the changed field's zero along their normals.
-    Derivatives go through the module as it is, its marching cubes included.
+    Differences with common random numbers require fixed triangles, so the ends are not remeshed:
+    the vertices of the first mesh follow the zero of the changed field along their normals.
+    Derivatives pass through the module, its marching cubes included.
     """
 
     def __init__(
         self, module: nn.Module, tangent: Mapping[str, ParameterChange], target: Any
     ) -> None:
-        """Move a module with an ``object`` and its ``distance`` at points; see
-        ``ParameterLine``.
-        """
+        """Define the line of a module with an ``object`` and a ``distance`` method."""
         super().__init__(module, tangent, target)
         self._field, self._object = _DistanceModule(module), str(module.object)
         with torch.no_grad():
@@ -70,23 +68,22 @@ class DistanceFieldLine(ParameterLine):
         self._normals = slope / slope.norm(dim=1, keepdim=True)
 
     def evaluate_end(self, theta: float) -> Any:
-        """The scene with the first mesh moved onto the changed surface. See
-        ``ParameterLine.end``.
-        """
-        places = self._mesh.vertices.detach()
+        """Return the scene with the first mesh moved onto the changed surface."""
+        positions = self._mesh.vertices.detach()
         for _ in range(_NEWTON_STEPS):
-            found, slope = self._distance_and_gradient(theta, places)
-            places = places - self._normals * (found / (slope * self._normals).sum(1))[:, None]
-        found, _ = self._distance_and_gradient(theta, places)
+            found, slope = self._distance_and_gradient(theta, positions)
+            distance = found / (slope * self._normals).sum(1)
+            positions = positions - self._normals * distance[:, None]
+        found, _ = self._distance_and_gradient(theta, positions)
         if not bool(found.abs().max() < _SURFACE_TOLERANCE):
             raise InputError(
                 "expected a surface that follows θ along its normals, got points that do not meet "
                 f"it at θ = {theta:.3g}; take a smaller step"
             )
-        return self._scene.replace(self._object, mesh=Mesh(places, self._mesh.faces))
+        return self._scene.replace(self._object, mesh=Mesh(positions, self._mesh.faces))
 
     def _distance_and_gradient(self, theta: float, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """The changed distance at points, and its gradient there."""
+        """Return the changed distance at points, and its spatial gradient."""
         at = positions.detach().requires_grad_()
         moved = {
             f"shape.{name}": self._start[name] + theta * change
@@ -101,12 +98,12 @@ class DistanceFieldLine(ParameterLine):
 def make_line(
     module: nn.Module, tangent: Mapping[str, ParameterChange] | Tensor, target: Any
 ) -> ParameterLine:
-    """The line of a module's parameters along a tangent.
+    """Return the line of a module's parameters along a tangent.
 
     Args:
-        module: Maps the target.
-        tangent: Changes of its values by name, see ``parameter_changes``, or of its only parameter.
-        target: The scene or the sensor that the module maps.
+        module: module that maps the target.
+        tangent: changes of its values by name, see ``parameter_changes``, or of its only parameter.
+        target: scene or sensor that the module maps.
 
     Raises:
         InputError: A tangent that does not fit the module's parameters.
@@ -126,19 +123,20 @@ def make_line(
 def evaluate_losses(
     line: ParameterLine, offsets: Iterable[float], observation: Observation, *, seed: int = 0
 ) -> Tensor:
-    """The loss of one observation along a line of scenes: its loss landscape.
+    """Evaluate the loss of one observation along a line of scenes: its loss landscape.
 
-    All scenes have the random numbers of the line's start: the same points on surfaces, and the
-    same rough points where the model has them.
+    All scenes share the random numbers of the start of the line: the same points on surfaces, and
+    the same rough points of coherent models.
 
     Args:
-        line: Of a module that maps the scene, see ``make_line``.
-        offsets: θ of every scene.
-        observation: Its loss may return several numbers; without one it is ``SpectrumLoss``.
-        seed: Of all random numbers.
+        line: line of a module that maps the scene, see ``make_line``.
+        offsets: θ of each scene.
+        observation: the observation. Its loss may return several numbers; the default is
+            ``SpectrumLoss``.
+        seed: seed of all random numbers.
 
     Returns:
-        Losses [offset], or [offset, number].
+        Losses [offset] or [offset, number].
     """
     sensor, loss = observation.sensor, observation.loss or SpectrumLoss()
     with torch.no_grad():
@@ -152,7 +150,7 @@ def evaluate_losses(
 
 
 class _DistanceModule(nn.Module):
-    """A module whose call is the distance of a shape."""
+    """Module whose call returns the signed distance of a shape."""
 
     def __init__(self, shape: nn.Module) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""How the parameters of a module change with a scalar θ, from numbers as a user writes them."""
+"""Tangents of a module's parameters with respect to a scalar θ, from user input."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from invertwin.scene.shape_models.lattice import Lattice
 
 @dataclass(frozen=True)
 class GaussianBump:
-    """A round bump over the nodes of a grid: ``height · exp(−|x − center|² / (2 width²))``.
+    """Gaussian bump over the nodes of a grid: ``height · exp(−|x − center|² / (2 width²))``.
 
     Attributes:
-        center: in the object's frame [m].
+        center: position in the object's frame [m].
         width: standard deviation [m].
-        height: change in the middle; three numbers where every node has three.
+        height: peak change; three numbers for vector-valued nodes.
     """
 
     center: Point
@@ -28,11 +28,12 @@ class GaussianBump:
     height: float | Sequence[float] = 1.0
 
     def evaluate(self, lattice: Lattice, shape: Sequence[int]) -> Tensor:
-        """The change of every entry of a parameter.
+        """Return the change of every entry of a parameter.
 
         Args:
-            lattice: Nodes of the module.
-            shape: Of the parameter. It may have nodes beyond the lattice, as many on every side.
+            lattice: nodes of the module.
+            shape: shape of the parameter. It may have the same number of nodes beyond the lattice
+                on every side.
         """
         beyond = (shape[0] - lattice.counts[0]) / 2 * lattice.spacing
         nodes = Lattice.from_bounds(lattice.low - beyond, lattice.high + beyond, shape[:3]).nodes
@@ -43,22 +44,22 @@ class GaussianBump:
 
 
 ParameterChange = float | ArrayLike | GaussianBump
-"""One number for all entries, all entries, the first ones of a row, or a bump over a grid."""
+"""One number for all entries, an array of all entries, the leading entries of a row, or a bump."""
 
 
 def parameter_changes(
     module: nn.Module, tangent: Mapping[str, ParameterChange]
 ) -> dict[str, Tensor]:
-    """Changes of a module's parameters, by name, for θ = 1.
+    """Return the changes of a module's parameters by name for θ = 1.
 
-    A tangent names parameters, or what the module calls some of their entries (see ``Entries``):
-    the ``rotation`` [rad] of a ``Pose``, the joints of a ``SkinnedBody`` [rad], the
-    ``log_density`` of a ``DensityGrid``, the values of ``MaterialValues``.
+    A tangent names parameters, or named entries of them (see ``Entries``): the ``rotation`` [rad]
+    of a ``Pose``, the joints of a ``SkinnedBody`` [rad], the ``log_density`` of a ``DensityGrid``,
+    the values of ``MaterialValues``.
 
     Args:
-        module: What is moved.
-        tangent: How fast the named values change with θ. A list may be shorter than a row of
-            entries; what it leaves out does not change.
+        module: module to displace.
+        tangent: rates of the named values with respect to θ. A list may be shorter than a row of
+            entries; the remaining entries do not change.
 
     Raises:
         InputError: A name or a shape that the module does not have.
@@ -84,7 +85,7 @@ def parameter_changes(
 
 
 def _entry_changes(change: ParameterChange, part: Tensor | None, lattice: Lattice | None) -> Tensor:
-    """How fast every one of some entries changes; None stands for unknown ones."""
+    """Return the rate of change of named entries; ``part`` is None for unknown names."""
     if isinstance(change, GaussianBump):
         if lattice is None or part is None or part.ndim < 3:
             raise InputError("expected numbers, got a bump; bumps are for the nodes of a grid")

@@ -1,7 +1,7 @@
-"""First guesses of pose, size and density by conventional processing.
+"""Initial estimates of pose, size and density from detections and backprojection.
 
-Detected points or backprojected echoes show where an object is. A rectangle in the ground plane
-shows how it stands. The fit does the rest. Nothing here is differentiable.
+Detections or backprojected power give the position of an object, a rectangle in the ground plane
+its heading. The fit refines them. Not differentiable.
 """
 
 import math
@@ -28,16 +28,16 @@ from invertwin.runtime.memory import require_at_most
 from invertwin.scene import DensityGrid, Object, Scene, rigid, rotation_from_vector
 from invertwin.scene.shape_models.lattice import Lattice
 
-_YAW_COUNT = 91  # yaws that a rectangle is tried at, over a quarter turn
-_TRIMMED_FRACTION = 0.02  # share of the points beyond a side of a rectangle
-_MAX_NODES_PER_SIDE = 1e6  # along a side of an image; the lattice has its own limits
-_CFAR_RANK = 0.25  # of the training cells: most of them may hold the target itself
-_POINTS_PER_CHUNK = 20_000  # points of an image at a time
+_YAW_COUNT = 91  # candidate yaws of a rectangle over a quarter turn
+_TRIMMED_FRACTION = 0.02  # fraction of the points beyond a side of a rectangle
+_MAX_NODES_PER_SIDE = 1e6  # nodes along a side of an image; the lattice has its own limits
+_CFAR_RANK = 0.25  # rank among the training cells, most of which may contain the target
+_POINTS_PER_CHUNK = 20_000  # points of an image per chunk
 
 
 @dataclass(frozen=True)
 class Ground:
-    """The ground plane, by the world axis that points up."""
+    """Ground plane, defined by the upward world axis."""
 
     up: Literal["y", "z"] = "y"
 
@@ -46,7 +46,7 @@ class Ground:
 
     @property
     def up_axis(self) -> int:
-        """Index of the axis that points up."""
+        """Index of the upward axis."""
         return "xyz".index(self.up)
 
     @property
@@ -56,11 +56,11 @@ class Ground:
 
     @property
     def yaw_sign(self) -> float:
-        """1 if a positive yaw turns the first axis of the plane towards the second, else −1."""
+        """1 if a positive yaw turns the first axis of the plane to the second, else −1."""
         return -1.0 if self.up == "y" else 1.0
 
     def yaw_rotation(self, yaw: float) -> Float64[Tensor, "3 3"]:
-        """The rotation by a yaw [rad] about the axis that points up."""
+        """Return the rotation by a yaw [rad] about the upward axis."""
         vector = torch.zeros(3, dtype=torch.float64)
         vector[self.up_axis] = yaw
         return rotation_from_vector(vector)
@@ -71,13 +71,12 @@ _DEFAULT_GROUND = Ground()
 
 @dataclass(frozen=True, eq=False)
 class GroundRectangle:
-    """An object on the ground, seen from above.
+    """Rectangle of an object on the ground.
 
     Attributes:
-        center: middle of the points' extents [m], world.
-        yaw: turn about the vertical of its sides against the world's axes [rad], in [0, π/2) from
-            a fit.
-        size: extents along its first and second side [m].
+        center: middle of the points' extents in world axes [m].
+        yaw: rotation of its sides about the vertical [rad], in [0, π/2) from a fit.
+        size: side lengths along its first and second axis [m].
     """
 
     center: Float64[Tensor, "3"]
@@ -93,7 +92,7 @@ def detect_echoes(
     Along an axis that the grid does not resolve, points lie in the radar's middle plane.
 
     Args:
-        capture: the data.
+        capture: recorded data.
         grid: bins of its maps.
         low, high: opposite corners of the box [m].
         false_alarm: probability that a cell of noise is detected.
@@ -130,13 +129,12 @@ def backproject_power(
     """Backproject power to points of the world, with the spreading loss removed.
 
     The mean over frames of the maps at the point's range and direction, times the fourth power of
-    its distance; where no direction is resolved, the coherent sum over the frames
-    (``backproject``).
+    its distance; without resolved directions, the coherent sum over frames (``backproject``).
 
     Args:
-        capture: the data.
+        capture: recorded data.
         grid: bins of its maps.
-        points: positions in the world [m].
+        points: positions in world axes [*point, 3] [m].
     """
     flat = points.reshape(-1, 3)
     if grid.u_count == grid.v_count == 1:
@@ -161,14 +159,14 @@ def find_bright_nodes(
     step: float,
     fraction: float = 0.3,
 ) -> Float64[Tensor, "point 3"]:
-    """Find the nodes of a backprojected image that are nearly as bright as its strongest one.
+    """Find the nodes of a backprojected image above a fraction of its maximum.
 
     Args:
-        capture: the data.
+        capture: recorded data.
         grid: bins of its maps.
         low, high: opposite corners of the image in the world [m].
-        step: distance of neighbouring nodes, about [m].
-        fraction: least brightness of a node, relative to the strongest.
+        step: approximate distance of neighbouring nodes [m].
+        fraction: minimum brightness of a node relative to the maximum.
 
     Raises:
         InputError: a box without volume or echoes, or a step that is not positive.
@@ -182,30 +180,30 @@ def find_bright_nodes(
     counts = [max(2, round(float(side) / width) + 1) for side in size]
     nodes = Lattice.from_bounds(low, high, counts).nodes
     if (height := _unresolved_height(capture.radar(), grid)) is not None:
-        # Nothing tells heights apart: the plane in the middle stands for all.
+        # Heights are not resolved: use the plane in the middle.
         nodes = nodes.mean(height, keepdim=True)
     image = _require_echoes(backproject_power(capture, grid, nodes))
     return nodes[image >= fraction * image.max()]
 
 
 def label_groups(points: Float64[Tensor, "point axis"], gap: float) -> Int64[Tensor, " point"]:
-    """Number the groups of points that are linked by steps of at most a gap.
+    """Label the groups of points linked by steps of at most a gap.
 
     Args:
-        points: [m], or in units of the gap.
+        points: positions [point, axis] [m], or in units of the gap.
         gap: longest step between linked points.
     """
     tree = KDTree(points.numpy())
-    # Distances of zero are no entries: every point is linked to itself by being a node.
+    # Distances of zero are no entries of the sparse matrix; each point is a node anyway.
     _, label = connected_components(tree.sparse_distance_matrix(tree, gap), directed=False)
     return torch.from_numpy(label.astype("int64"))
 
 
 def find_largest_group(points: Float64[Tensor, "point 3"], gap: float) -> Float64[Tensor, "part 3"]:
-    """Find the largest set of points that are linked by steps of at most a gap [m].
+    """Find the largest set of points linked by steps of at most a gap [m].
 
     Args:
-        points: [m].
+        points: positions [point, 3] [m].
         gap: longest step between linked points [m].
     """
     labels = label_groups(points, gap)
@@ -221,19 +219,19 @@ def fit_rectangle(
 ) -> GroundRectangle:
     """Fit a rectangle in the ground plane to points on its near sides, an L shape.
 
-    Every yaw of a quarter turn is tried; the best one has most points close to the two sides
+    A search over the yaws of a quarter turn maximises the closeness of the points to the two sides
     that face the radar, Σ 1/max(distance, resolution).
 
     Source: Zhang et al., Efficient L-shape fitting for vehicle detection using laser scanners,
     2017, the closeness criterion.
-    Differs from the source: the sides are those that face the radar, and leave out a fiftieth of
-    the points, since radar detections scatter.
+    Differs from the source: only the sides that face the radar count, and they exclude a fiftieth
+    of the points, since radar detections scatter.
 
     Args:
-        points: positions in the world [m].
-        radar: its positions tell which sides are near.
-        ground: the plane.
-        resolution: distance below which points are on a side [m].
+        points: positions in world axes [point, 3] [m].
+        radar: radar whose positions determine the near sides.
+        ground: ground plane.
+        resolution: distance below which points count as on a side [m].
 
     Raises:
         InputError: fewer than three points.
@@ -247,7 +245,7 @@ def fit_rectangle(
         offsets = (points - found.center) @ axes
         away = (radar.positions.detach().mean(0) - found.center) @ axes
         half = torch.tensor(found.size).double() / 2
-        # The side that faces the radar; where it looks along the side, the nearer of both.
+        # The side that faces the radar, or the nearer one for a radar in line with both.
         near = half - offsets * torch.where(away < 0, -1.0, 1.0)
         nearest = torch.minimum(half - offsets, half + offsets)
         sides = torch.where(away.abs() > half, near, nearest).abs().amin(1)
@@ -264,8 +262,8 @@ def principal_rectangle(
     """Fit a rectangle along the points' principal axes in the ground plane.
 
     Args:
-        points: [m].
-        ground: the plane.
+        points: positions [point, 3] [m].
+        ground: ground plane.
     """
     flat = points[:, ground.plane_axes]
     _, axes = torch.linalg.eigh(torch.cov(flat.T))
@@ -276,25 +274,25 @@ def principal_rectangle(
 
 
 def estimate_position(points: Float64[Tensor, "point 3"]) -> Float64[Tensor, "3"]:
-    """Guess a position [m]: the median of the points along each axis."""
+    """Estimate a position [m]: the median of the points along each axis."""
     return points.median(0).values
 
 
 def candidate_poses(
     item: Object, rectangle: GroundRectangle, radar: Radar, *, ground: Ground = _DEFAULT_GROUND
 ) -> list[Float64[Tensor, "4 4"]]:
-    """List the four poses in which an object of known size stands in a rectangle.
+    """Return the four poses of an object of known size in a rectangle.
 
-    Its upright attitude and its height are kept. Each side that faces the radar is put where the
-    rectangle has it, so that the hidden part of the object lies behind; along an axis on which
-    the radar faces no side, the middles agree. A rectangle does not tell front from back, nor
-    always length from width: ``select_pose`` chooses.
+    Its upright attitude and its height are kept. Sides that face the radar are aligned with the
+    rectangle, so that the hidden part of the object lies behind; along an axis without such a side
+    the middles agree. A rectangle does not distinguish front from back, nor always length from
+    width: ``select_pose`` selects.
 
     Args:
-        item: the object; its present pose gives attitude and height.
-        rectangle: the rectangle.
-        radar: its positions.
-        ground: the plane.
+        item: object whose present pose gives attitude and height.
+        rectangle: rectangle around its points.
+        radar: radar with its positions.
+        ground: ground plane.
     """
     center = item.center.detach()
     start = item.transform.detach()
@@ -305,14 +303,14 @@ def candidate_poses(
     away = (where - rectangle.center) @ axes
     poses = []
     for quarter in range(4):
-        turn = ground.yaw_rotation(rectangle.yaw + quarter * math.pi / 2)
-        own = (level @ turn.T) @ axes
-        # Where the object's middle lies when its near side is the rectangle's.
+        rotation = ground.yaw_rotation(rectangle.yaw + quarter * math.pi / 2)
+        own = (level @ rotation.T) @ axes
+        # Middle of the object whose near side is that of the rectangle.
         near = torch.where(away > 0, half - own.amax(0), -half - own.amin(0))
         middle = -0.5 * (own.amax(0) + own.amin(0))
-        place = rectangle.center + axes @ torch.where(away.abs() > half, near, middle)
-        place[ground.up_axis] = center[ground.up_axis]
-        poses.append(rigid(turn, place - turn @ center) @ start)
+        position = rectangle.center + axes @ torch.where(away.abs() > half, near, middle)
+        position[ground.up_axis] = center[ground.up_axis]
+        poses.append(rigid(rotation, position - rotation @ center) @ start)
     return poses
 
 
@@ -329,17 +327,17 @@ def select_pose(
     samples: int = 100_000,
     seed: int = 0,
 ) -> tuple[Scene, list[float]]:
-    """Choose the pose whose simulated map is nearest to the data; also return all losses.
+    """Select the pose whose simulated map is nearest to the data; also return all losses.
 
     Args:
-        scene: with the object anywhere.
-        name: the object.
-        poses: the poses to choose from.
+        scene: scene with the object at any pose.
+        name: name of the object.
+        poses: candidate poses.
         radar: radar of the capture.
-        capture: the data.
-        grid: bins that are compared.
-        loss: (simulated, measured) → a number.
-        surrogate: kernels; extra widths make the choice robust.
+        capture: recorded data.
+        grid: bins to compare.
+        loss: (simulated, measured) → number.
+        surrogate: kernels; added widths make the selection robust.
         samples: number of rays of one simulation.
         seed: seed of the samples.
 
@@ -347,7 +345,7 @@ def select_pose(
         InputError: no poses.
     """
     if not poses:
-        raise InputError("expected at least one pose, got none; use guess_poses")
+        raise InputError("expected at least one pose, got none; use candidate_poses")
     measured = surrogate.blur(capture.spectrum(grid).float(), radar, grid)
     scenes = [scene.replace(name, pose=pose) for pose in poses]
     losses = []
@@ -368,14 +366,14 @@ def select_pose(
 def estimate_scale(
     item: Object, rectangle: GroundRectangle, *, ground: Ground = _DEFAULT_GROUND
 ) -> float:
-    """Guess a scale: the longer side of a rectangle over that of an object.
+    """Estimate a scale: the longer side of a rectangle over that of an object.
 
-    The longer side is the one that is seen from most places; the other often hides its far end.
+    The longer side is visible from most positions; the far end of the other is often hidden.
 
     Args:
-        item: the object.
+        item: object of known shape.
         rectangle: rectangle around its points.
-        ground: the plane.
+        ground: ground plane.
     """
     extent = item.vertices.detach()[:, ground.plane_axes]
     longest = float((extent.amax(0) - extent.amin(0)).max())
@@ -393,16 +391,16 @@ def estimate_density(
     *,
     depth: float = 1.0,
 ) -> DensityGrid:
-    """Guess a density in proportion to the backprojected echoes.
+    """Estimate a density proportional to the backprojected power.
 
     Args:
-        capture: the data.
+        capture: recorded data.
         grid: bins of its maps.
-        item: the object; its pose carries the box.
+        item: object whose pose carries the box.
         name: name of the object.
         low, high: opposite corners of the box in the object's frame [m].
-        counts: nodes along x, y and z.
-        depth: ∫σ ds of a way of one node spacing at the strongest echo.
+        counts: number of nodes along x, y and z.
+        depth: optical depth ∫σ ds over one node spacing at the strongest echo.
 
     Raises:
         InputError: no echoes in the box.
@@ -417,7 +415,7 @@ def estimate_density(
 
 
 def _bounding_rectangle(points: Tensor, yaw: float, ground: Ground) -> GroundRectangle:
-    """The rectangle of a yaw around all but the outermost points."""
+    """Return the rectangle at a yaw around all but the outermost points."""
     axes = ground.yaw_rotation(yaw)[:, ground.plane_axes]
     middle = points.median(0).values
     places = (points - middle) @ axes
@@ -430,7 +428,7 @@ def _bounding_rectangle(points: Tensor, yaw: float, ground: Ground) -> GroundRec
 
 
 def _incoherent_power(maps: Tensor, radar: Radar, grid: Grid, points: Tensor) -> Tensor:
-    """Mean over frames of the maps at the points, times R⁴."""
+    """Return the mean over frames of the maps at the points, times R⁴."""
     link, origins = radar.link(), radar.origins
     total = torch.zeros(len(points), dtype=torch.float64)
     for frame in range(radar.frame_count):
@@ -451,14 +449,14 @@ def _incoherent_power(maps: Tensor, radar: Radar, grid: Grid, points: Tensor) ->
 
 
 def _unresolved_height(radar: Radar, grid: Grid) -> int | None:
-    """The world axis nearest to the radar's y axis, where directions have one axis at most."""
+    """Return the world axis nearest to the radar's y axis, if directions have at most one axis."""
     if grid.u_count > 1 and grid.v_count > 1:
         return None
     return int(radar.link().rotations.detach()[0, :, 1].abs().argmax())
 
 
 def _require_echoes(image: Tensor) -> Tensor:
-    """An image, if there is something in it."""
+    """Return an image, or raise an error if it is zero."""
     if not float(image.max()) > 0:
         raise InputError("expected echoes in the box, got none; move the box into the grid")
     return image

@@ -1,4 +1,4 @@
-"""Where an object stands by conventional processing, for a fit to start there."""
+"""Initial pose of an object by conventional processing."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -29,19 +29,19 @@ from invertwin.scene.mesh import Mesh
 from invertwin.scene.pose import rigid
 from invertwin.scene.scene import Scene
 
-# Wide enough for a guess that is off by a cell, sharp enough to tell front from back.
+# Wide enough for an error of a cell, narrow enough to distinguish front from back.
 _POSE_SURROGATE = Surrogate(range_width=1.0, angle_width=0.5)
 
 
 @dataclass(frozen=True)
 class InitialEstimate:
-    """A scene with an object where conventional processing has found it.
+    """Scene with an object at its estimated pose.
 
     Attributes:
-        scene: The scene.
-        detection_count: Number of echoes that the object was found by.
-        losses: Losses of the poses that were tried, where there were several.
-        rectangle_size: Size of the rectangle around the echoes, where one was fitted [m].
+        scene: scene with the object at its estimated pose.
+        detection_count: number of echoes used.
+        losses: losses of the candidate poses, if there are several.
+        rectangle_size: size of the fitted rectangle around the echoes [m], if any.
     """
 
     scene: Scene
@@ -52,19 +52,19 @@ class InitialEstimate:
 
 @dataclass(frozen=True)
 class InitialPoseEstimator:
-    """How an object is found by conventional processing.
+    """Settings of the initial pose of an object by conventional processing.
 
     Attributes:
-        low: m, corner of the box of the world that is searched; needed unless the pose is known
-        high: m, its opposite corner
-        method: points = of a CFAR detector; image = backprojected power
-        pose: how it stands: the near sides of a rectangle, principal axes, no turn, or as the
-            scene says: then its density alone is guessed
-        scale: size from the rectangle, too
-        up: world axis of heights
-        false_alarm: of a cell of noise, for points
-        step: m, of the image
-        gap: m; echoes with wider gaps between them are not of one object
+        low: corner of the search box in the world [m]; required unless the pose is known
+        high: opposite corner [m]
+        method: points = CFAR detections; image = backprojected power
+        pose: estimated attitude: near sides of a rectangle, principal axes, position only, or known
+            pose with an unknown density
+        scale: whether the size is estimated from the rectangle
+        up: upward world axis
+        false_alarm: false-alarm probability of a cell, for points
+        step: node spacing of the image [m]
+        gap: maximum gap between echoes of one object [m]
 
     Raises:
         InputError: A box that is missing, or not needed.
@@ -99,15 +99,15 @@ class InitialPoseEstimator:
         loss: Callable[[Tensor, Tensor], Tensor],
         seed: int = 0,
     ) -> InitialEstimate:
-        """Put an object where its echoes are.
+        """Estimate the pose of an object from its echoes.
 
         Args:
-            scene: With the object anywhere.
-            name: Of the object.
-            capture: The data.
-            grid: Bins of its maps.
-            loss: How maps are compared, where several poses are tried.
-            seed: Of their simulation.
+            scene: scene with the object at any pose.
+            name: name of the object.
+            capture: recorded data.
+            grid: bins of its maps.
+            loss: loss for the selection among several poses.
+            seed: seed of their simulation.
 
         Raises:
             InputError: No echoes, or too few points.

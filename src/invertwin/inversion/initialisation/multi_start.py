@@ -1,4 +1,4 @@
-"""Several minima: fits from many starts, and which of their ends the data tell apart."""
+"""Multi-start fits, and ambiguities among their results."""
 
 import copy
 import math
@@ -35,23 +35,24 @@ from invertwin.scene.scene import Object, Scene, displace
 from invertwin.seeds import derive_seed
 
 _MAX_POSES = 1e4
-_FULL_FIT_COUNT = 4  # full fits of the best starts
-_SCREENING_DIVISOR = 8  # samples of a screened start: a share of those of a fit
-_SAME_START_DISTANCE, _SAME_START_ANGLE = 0.1, 0.35  # m and rad: of starts as near one is enough
+_FULL_FIT_COUNT = 4  # number of full fits from the best starts
+_SCREENING_DIVISOR = 8  # samples of a fit over those of a screened start
+_SAME_START_DISTANCE, _SAME_START_ANGLE = 0.1, 0.35  # m and rad: closer starts are fitted once
 
 
 @dataclass(frozen=True)
 class Search:
-    """What fits from many starts have found.
+    """Result of a multi-start fit.
 
     Attributes:
-        best: The fit with the lowest loss.
-        minima: All ends that differ, the best first.
-        rivals: For every end how unlikely the difference of its loss and the best one's is, were it
-            right, in standard deviations over looks at its twin. None where there are no looks.
-        ambiguities: A sentence for every end that the data do not reject.
-        best_number: Of the best fit, as ``callbacks`` got it.
-        objects: Names of those with several starts.
+        best: fit with the lowest loss.
+        minima: all distinct results, the best first.
+        scores: for every result the significance of its difference in loss from the best, assuming
+            that it is true, in standard deviations over its realisations; None without
+            realisations.
+        ambiguities: a sentence for every result that the data do not reject.
+        best_number: index of the best fit, as passed to ``callbacks``.
+        objects: names of the objects with several starts.
     """
 
     best: Reconstruction
@@ -62,7 +63,7 @@ class Search:
     objects: tuple[str, ...]
 
     def to_metrics(self) -> dict[str, Any]:
-        """The other ends as numbers: how they differ from the best, loss, score."""
+        """Return the other results as numbers: pose difference, loss, score."""
         best = self.best.scene
         ends = [
             {
@@ -83,23 +84,23 @@ def pose_grid(
     turns: Count = 4,
     axis: Point = (0.0, 1.0, 0.0),
 ) -> Iterator[Object]:
-    """An object on a coarse grid over a box of poses, as copies of it.
+    """Yield copies of an object on a grid over a box of poses.
 
     Args:
-        item: The object.
-        low: m, corner of the box of its centre
-        high: m, the opposite corner
-        step: m, from one place to the next at most
-        turns: about the axis at every place, evenly spread over a whole one
-        axis: of the turns, in the world
+        item: object to copy.
+        low: corner of the box of its centre [m]
+        high: opposite corner [m]
+        step: maximum spacing of positions [m]
+        turns: number of rotations per position, evenly spaced over a full turn
+        axis: axis of the rotations in world axes
     """
     if not all(a <= b for a, b in zip(low, high, strict=True)):
         raise InputError(
             f"expected a box with low <= high, got {list(low)} and {list(high)}; exchange them"
         )
-    places = math.prod(1 + float(b - a) / step for a, b in zip(low, high, strict=True)) * turns
+    total = math.prod(1 + float(b - a) / step for a, b in zip(low, high, strict=True)) * turns
     require_at_most(
-        places, _MAX_POSES, "poses", "give metres, a larger step, or fewer turns", "step"
+        total, _MAX_POSES, "poses", "give metres, a larger step, or fewer turns", "step"
     )
     axes = [
         torch.linspace(a, b, 1 + math.ceil((b - a) / step - 1e-9), dtype=torch.float64)
@@ -123,25 +124,25 @@ def search(
     callbacks: Callable[[int], Sequence[Callback]] = lambda _: (),
     seed: int = 0,
 ) -> Search:
-    """Fit from many starts, and say which ends the data tell apart.
+    """Fit from many starts, and report the results that the data do not distinguish.
 
-    All starts are compared at the first, widest blur; the best four are fitted. Then the best end
-    is turned as ``rivals.turns`` says, by half a turn first, and fitted again.
-    Ends that differ are compared in pairs with looks at the twin of the worse one: speckle that
-    both losses share cancels in their difference.
+    All starts are screened at the initial, widest blur; the best four are fitted. Then the best
+    result is rotated by ``candidate_rotations``, half turns first, and refitted. Distinct results
+    are compared in pairs with realisations of the worse one: common speckle cancels in the
+    difference of the losses.
 
     Args:
-        scene: As known. The other arguments are those of ``reconstruct``.
-        observations: What was observed.
-        parameters: Unknowns of the scene; every fit takes a copy.
-        starts: By the name of an object, the poses in which it may begin: given ones, random ones
-            from ``sample_nearby_poses``, or those of ``pose_grid``.
-        loss: How maps are compared.
-        optimizer: Kind and rates.
-        schedule: Of every fit.
-        regularizers: Added to the loss.
-        callbacks: For the number of a fit, from 0, what watches it.
-        seed: Of all random numbers.
+        scene: known scene. The other arguments are those of ``reconstruct``.
+        observations: data with their forward models.
+        parameters: unknowns of the scene; every fit takes a copy.
+        starts: initial poses by object name, for example from ``sample_nearby_poses`` or
+            ``pose_grid``.
+        loss: (predicted, observed) → number.
+        optimizer: kind of optimiser and rates.
+        schedule: schedule of every fit.
+        regularizers: functions Scene → number, added to the loss.
+        callbacks: maps the index of a fit, from 0, to its callbacks.
+        seed: seed of all random numbers.
 
     Raises:
         InputError: No starts; see ``reconstruct``.
@@ -181,19 +182,19 @@ def search(
         None if k == 0 else difference_score(ends[0].result, end.result)
         for k, end in enumerate(ends)
     ]
-    told = tuple(
+    texts = tuple(
         f"{describe_difference(ends[0].scene, end.scene, names)} explains the data nearly as "
         f"well: z = {z:.1f}"
         for end, z in zip(ends, rivals, strict=True)
         if z is not None and z < REJECTION_ZSCORE
     )
-    return Search(ends[0], ends, rivals, told, found.index(ends[0]), tuple(names))
+    return Search(ends[0], ends, rivals, texts, found.index(ends[0]), tuple(names))
 
 
 def _make_screening_loss(
     observations: Sequence[Observation], loss: Callable[[Tensor, Tensor], Tensor], seed: int
 ) -> Callable[[Scene], float]:
-    """The loss of a scene at the widest blur."""
+    """Return the function that computes the loss of a scene at the widest blur."""
     objective = Objective(
         tuple(o.loss or loss for o in observations), tuple(o.weight for o in observations)
     )
@@ -204,15 +205,15 @@ def _make_screening_loss(
         with torch.no_grad():
             drawn = zip(models, observations, strict=True)
             maps = [model.predict(scene, o.sensor, seed) for model, o in drawn]
-            lit = all(bool(power.any()) for power in maps)
+            visible = all(bool(power.any()) for power in maps)
             pairs = list(zip(maps, blurred, strict=True))
-            return float(objective(pairs)) if lit else math.inf
+            return float(objective(pairs)) if visible else math.inf
 
     return score
 
 
 def _reduce_samples(model: ForwardModel) -> ForwardModel:
-    """The model with few samples: enough for a blurred map."""
+    """Return the model with the reduced samples of a blurred map."""
     sampling = getattr(model, "sampling", None)
     if not isinstance(sampling, Sampling):
         return model
@@ -226,7 +227,7 @@ def _unblurred_loss(found: Reconstruction) -> float:
 
 
 def _rotated_starts(found: Reconstruction) -> Iterator[Scene]:
-    """The twin with an object turned so that it looks much the same."""
+    """Yield the twin with an object rotated by a near symmetry."""
     none = torch.zeros(3, dtype=torch.float64)
     for module in found.parameters:
         for turn in candidate_rotations(module, found.scene):
@@ -235,7 +236,7 @@ def _rotated_starts(found: Reconstruction) -> Iterator[Scene]:
 
 
 def _select_distinct_starts(scenes: Sequence[Scene], names: Sequence[str]) -> list[Scene]:
-    """The first scenes, without those that a better one stands for."""
+    """Return the first scenes, without those near a better one."""
     kept: list[Scene] = []
     for scene in scenes:
         if len(kept) == _FULL_FIT_COUNT:
@@ -246,7 +247,7 @@ def _select_distinct_starts(scenes: Sequence[Scene], names: Sequence[str]) -> li
 
 
 def _are_near(first: Scene, second: Scene, names: Sequence[str]) -> bool:
-    """Whether one start stands for another."""
+    """Return whether two starts are close enough to fit once."""
     offs = [pose_error(first[name], second[name]) for name in names]
     return all(
         o and o.distance < _SAME_START_DISTANCE and o.angle < _SAME_START_ANGLE for o in offs

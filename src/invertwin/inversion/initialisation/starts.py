@@ -1,4 +1,4 @@
-"""Where fits start: random poses about a known one."""
+"""Start poses of fits: given poses, and random poses about a known one."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -30,16 +30,16 @@ def sample_nearby_poses(
     rotation_axis: Float64[Tensor, "3"] | None = None,
     generator: torch.Generator,
 ) -> Iterator[Object]:
-    """Random poses about the pose of an object, as copies of it.
+    """Yield copies of an object at random poses about its pose.
 
     Args:
-        item: The object where it is.
-        count: of starts
-        distance: m, least and most
-        angle: least and most
-        axes: of the offset
-        rotation_axis: without it any axis
-        generator: Of the random numbers. They are drawn copy by copy.
+        item: object at its known pose.
+        count: number of starts
+        distance: minimum and maximum offset [m]
+        angle: minimum and maximum rotation
+        axes: world axes of the offset
+        rotation_axis: axis of the rotation; None = random axis
+        generator: random number generator, used copy by copy.
     """
     require_at_most(count, _MAX_COPIES, "poses", "lower count", "count")
 
@@ -60,17 +60,17 @@ def sample_nearby_poses(
         yield displace(item, offset, draw_uniform(*angle) * about)
 
 
-def place_at_poses(
+def position_at_poses(
     item: Object,
     positions: Annotated[Sequence[Point], MinLen(1)],
     rotations: Annotated[Sequence[Point], RADIANS] = (),
 ) -> Iterator[Object]:
-    """An object in given poses, as copies of it.
+    """Yield copies of an object at given poses.
 
     Args:
-        item: The object.
-        positions: m, of its origin
-        rotations: rotation vectors, one for each position; without them as it is turned
+        item: object to copy.
+        positions: positions of its origin [m]
+        rotations: rotation vectors, one for each position; empty = keep its rotation
 
     Raises:
         InputError: Not as many rotations as positions.
@@ -80,7 +80,7 @@ def place_at_poses(
             f"expected one rotation for each of {len(positions)} positions, got {len(rotations)}; "
             "give one each, or none"
         )
-    turns = [rotation_from_vector(torch.as_tensor(r, dtype=torch.float64)) for r in rotations]
-    turns = turns or [item.transform[:3, :3]] * len(positions)
-    for turn, place in zip(turns, positions, strict=True):
-        yield replace(item, pose=rigid(turn, torch.as_tensor(place, dtype=torch.float64)))
+    matrices = [rotation_from_vector(torch.as_tensor(r, dtype=torch.float64)) for r in rotations]
+    matrices = matrices or [item.transform[:3, :3]] * len(positions)
+    for matrix, position in zip(matrices, positions, strict=True):
+        yield replace(item, pose=rigid(matrix, torch.as_tensor(position, dtype=torch.float64)))
