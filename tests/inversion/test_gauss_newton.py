@@ -217,7 +217,7 @@ def test_bad_input(unchecked):
     many.translation = nn.Parameter(torch.zeros(65, dtype=torch.float64))
     with pytest.raises(InputError, match="expected a SpectrumLoss for Gauss–Newton, got function"):
         GaussNewton(model, alone(lambda a, b: a))  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="reach > 0"):
+    with pytest.raises(InputError, match="trust_radius > 0"):
         GaussNewton(model, alone(SpectrumLoss()), trust_radius=0.0)
     with pytest.raises(InputError, match="got 0,"):
         GaussNewton(nn.ReLU(), alone(SpectrumLoss()))

@@ -356,8 +356,8 @@ class SpectrumLoss:
             factor = gain / (power.numel() * self.levels)
             own = torch.empty_like(power, memory_format=torch.contiguous_format)
             slopes = own.flatten().split(_BINS_PER_BLOCK)
-            for (a, shown, data), out in zip(blocks, slopes, strict=True):
-                inverse = shown.mul_(gain).add_(self.floor).reciprocal_()
+            for (a, predicted, data), out in zip(blocks, slopes, strict=True):
+                inverse = predicted.mul_(gain).add_(self.floor).reciprocal_()
                 ratio = data.mul_(inverse)
                 value += float(speckle_divergence(ratio, self._tail_degrees).sum()) / power.numel()
                 inverse.addcmul_(inverse, self._weight_power(ratio), value=-1).mul_(factor)

@@ -29,7 +29,8 @@ _SURFACE_POINT_COUNT = 1_000  # points on each surface
 _REFIT_STEPS, _REFIT_TRUST_RADIUS = (
     6,
     0.1,
-)  # Gauss–Newton steps from a rotated pose + _REFIT_BLUR = 0.4  # initial fraction of the blur
+)  # Gauss–Newton steps from a rotated pose
+_REFIT_BLUR = 0.4  # initial fraction of the blur
 
 
 @dataclass(frozen=True, eq=False)

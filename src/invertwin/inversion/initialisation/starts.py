@@ -60,7 +60,7 @@ def sample_nearby_poses(
         yield displace(item, offset, draw_uniform(*angle) * about)
 
 
-def position_at_poses(
+def place_at_poses(
     item: Object,
     positions: Annotated[Sequence[Point], MinLen(1)],
     rotations: Annotated[Sequence[Point], RADIANS] = (),
