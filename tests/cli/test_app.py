@@ -65,6 +65,7 @@ def test_version(monkeypatch, capsys):
     assert capsys.readouterr().out.startswith("invertwin ")
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_simulate_then_reconstruct_from_the_saved_capture(run_file, monkeypatch, capsys):
     assert call(monkeypatch, "simulate", run_file) == 0

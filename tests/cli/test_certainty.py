@@ -24,6 +24,7 @@ def test_a_run_states_verdict_and_error_bars(run_file, monkeypatch, capsys):
     assert "Error bars" in (run_file.parent / "out" / "report.html").read_text()
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_a_search_about_a_bad_start_finds_the_right_place(run_file, monkeypatch, capsys):
     search = """

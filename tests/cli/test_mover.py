@@ -47,6 +47,7 @@ def write(tmp_path, monkeypatch):
     return write
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_a_twin_of_the_recording_is_nearer_to_it_than_a_point(
     write, data_folder, tmp_path, monkeypatch

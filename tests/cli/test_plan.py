@@ -15,6 +15,7 @@ kind = "likelihood"
 """
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_a_plan_states_error_bars_and_ranks_positions(run_file, monkeypatch, capsys):
     run_file.write_text(PLANE + PLAN)

@@ -91,6 +91,7 @@ def test_several_targets_have_a_table_each(repository, tmp_path):
     run("rcs", *files, "-o", tmp_path / "out", "--overwrite")
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_the_measured_plate(repository, tmp_path, data_folder):
     run("rcs", repository / "experiments" / "rcs" / "austin_plate.toml", "-o", tmp_path / "out")

@@ -5,6 +5,7 @@ import pytest
 from cli.small import call, read_metrics
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_permittivity_of_a_wall_beside_a_panel(repository, tmp_path, monkeypatch):
     text = (repository / "experiments" / "wall_material.toml").read_text(encoding="utf-8")

@@ -37,6 +37,7 @@ def test_a_rival_widens_the_place_and_shares_the_kinds():
     assert hung["z"] == pytest.approx(math.hypot(0.003, 0.3**2 / (2 * 1.8)))
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_a_box_is_surely_a_box():
     search = search_of(Scene({"box": thing(box((0.5, 0.8, 0.3)), (0.0, 0.1), 0.4, 0.4)}))

@@ -160,6 +160,7 @@ def test_materials_without_a_diffuse_share_are_refused(frame):
 
 
 @pytest.mark.filterwarnings("ignore:the triangles of ball turn")
+@pytest.mark.claim
 @pytest.mark.slow
 def test_a_twin_finds_place_and_motion_in_exact_signals():
     """A ball that fills several range cells, at mean power: 12 looks of other phases."""

@@ -71,6 +71,7 @@ def room() -> Twin:
     return twin(capture, low=(-1.2, -1.2), high=(1.2, 1.2), level=0.0)
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_what_stands_in_a_room_is_found(room: Twin):
     assert len(room.objects) == 2

@@ -151,6 +151,7 @@ def test_a_person_is_no_box():
     assert rotate_headed_shapes(before, math.pi, Ground()) == []
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_a_car_is_a_vehicle():
     """Its form is that of another generator of cars, and unknown to the search."""

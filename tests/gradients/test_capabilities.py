@@ -586,18 +586,20 @@ def test_the_table_is_whole():
 
 
 def selected(word: str, *, bounces: bool = False) -> list[Any]:
-    slow = {"pose", "scale", "vertices", "radar position"}
     return [
-        pytest.param(
-            *cell,
-            id=re.sub(r"\W+", "_", " ".join(cell)),
-            marks=pytest.mark.slow
-            if bounces or (cell[1] == "coherent" and cell[0] in slow)
-            else (),
-        )
+        pytest.param(*cell, id=re.sub(r"\W+", "_", " ".join(cell)), marks=marks_of(cell))
         for cell, said in CELLS.items()
         if said == word and cell[1].startswith("bounces") == bounces
     ]
+
+
+def marks_of(cell: tuple[str, str]) -> list[pytest.MarkDecorator]:
+    """The marks of a cell's test; one of two bounces stands for all in `make test`."""
+    parameter, mechanism = cell
+    if cell == ("translation", "bounces boundary"):
+        return [pytest.mark.slow, pytest.mark.claim]
+    many = mechanism == "coherent" and parameter in {"pose", "scale", "vertices", "radar position"}
+    return [pytest.mark.slow] if many or mechanism.startswith("bounces") else []
 
 
 @pytest.mark.parametrize(("parameter", "mechanism"), selected("supported"))

@@ -13,6 +13,7 @@ from scenes import radar, thing
 LOW, HIGH = [-0.35, -0.3, -0.3], [0.35, 0.3, 0.3]
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_gradient_by_densities_is_that_of_converged_differences():
     """A soft ball in front of a wall; its densities change at random."""

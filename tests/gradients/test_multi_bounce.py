@@ -26,6 +26,7 @@ def checked(name: str, samples: int, boundary_samples: int, pairs: int) -> Gradi
     )
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_two_bounces_need_the_shadows_that_surfaces_cast_on_each_other():
     found = checked("two_bounce", 400_000, 200_000, pairs=12)
@@ -45,6 +46,7 @@ def test_a_target_that_leaves_a_shadow_has_its_whole_gradient():
     assert found.interior.relative_l1 > 0.5
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_what_a_board_covers_comes_through_it_late_and_weak():
     """Its edge sweeps over a target, which is seen on either side of it."""

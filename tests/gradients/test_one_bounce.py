@@ -48,7 +48,9 @@ def test_gradient_is_that_of_converged_differences(file):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], ids="xy")
+@pytest.mark.parametrize(
+    "axis", [pytest.param((1.0, 0.0, 0.0), marks=pytest.mark.claim), (0.0, 1.0, 0.0)], ids="xy"
+)
 def test_a_fine_mesh_keeps_its_silhouette(axis):
     """Triangles nearly edge-on beside a silhouette must not block its own boundary rays."""
     ball = thing(sphere(0.2, 5), (0.05, 0.02, 1.1))

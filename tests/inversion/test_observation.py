@@ -81,7 +81,9 @@ def place_of(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "steps"), [("adam", 50), ("gauss_newton", 8)])
+@pytest.mark.parametrize(
+    ("kind", "steps"), [("adam", 50), pytest.param("gauss_newton", 8, marks=pytest.mark.claim)]
+)
 def test_two_ranges_find_what_each_alone_cannot(seen, kind, steps):
     """A range pins one coordinate to 0.4 cells; two at right angles pin both.
 

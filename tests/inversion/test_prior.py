@@ -60,6 +60,7 @@ def nearest(mesh: Mesh) -> tuple[Mesh, Mesh]:
     return search(True), search(False)
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_cars_of_another_source_are_within_reach(data_folder):
     """The learned linear space of vehicles was used neither in training nor for the generator."""

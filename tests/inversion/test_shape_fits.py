@@ -77,6 +77,7 @@ def wide() -> Capture:
     return recorded(placed(space().mesh(float64([2.0]))))
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_a_wide_box_is_found_in_the_space(wide):
     start = placed(box(0.1))

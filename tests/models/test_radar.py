@@ -154,6 +154,7 @@ def recorded(scene: Scene, device: Radar, looks: int) -> torch.Tensor:
     return torch.stack(maps).mean(0)
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_power_in_motion_is_the_mean_of_recordings():
     """The plate at rest is in neither map, and the mover has one place, rate and power in both."""

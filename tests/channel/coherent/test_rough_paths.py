@@ -84,6 +84,7 @@ def test_paths_carry_the_power_of_the_map(front):
         assert abs(float(ratio.mean()) - 1) < 4 * error + 0.01
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_mean_power_of_rough_path_fields_is_the_power_map():
     """E|S|² over phases, within four standard errors of at most 5 %: the phases are independent."""

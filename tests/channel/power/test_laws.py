@@ -105,6 +105,7 @@ def test_a_white_sphere_conserves_power(tx, rx):
     assert (found.mean(0) - 1.001).abs().max() < 8e-3
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_two_bounces_fall_with_the_square_of_each_leg():
     """Small plates that face each other at 45°: P = (λ/4π)² (A/2π)² / (r₁ r₁₂ r₂)²."""

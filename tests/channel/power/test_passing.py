@@ -152,6 +152,7 @@ def test_what_has_passed_a_body_is_late_and_spread_from_nearer():
     assert length - straight == pytest.approx((INDEX - 1) * THICK, abs=0.004)
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_a_wall_is_seen_through_a_body_and_back():
     """The echo of five points: (n−1)d further away, and as strong as one from d − d/n nearer."""

@@ -49,6 +49,7 @@ def test_errors_are_those_that_speckle_allows():
     assert (found.count, found.source) == (64, "looks")
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_stated_errors_hold():
     """Over 60 recordings: 95 % of errors within the intervals, and as wide as stated."""

@@ -266,6 +266,7 @@ def test_frames_and_empty_frames(point_paths):
     assert not moving_beat(replace(none, velocity=none.first), radar, CHIRPS).any()
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_gradients_of_moving_points(point_paths):
     """In places, velocities and coefficients, at a low carrier where differences are accurate."""

@@ -110,6 +110,7 @@ def test_world_and_frames_turn_with_the_radar():
     assert not there[0].any()
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     radar = make_radar()

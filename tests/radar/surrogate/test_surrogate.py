@@ -127,6 +127,7 @@ def test_a_pulse_of_ones_own(linear):
     assert (shaped - expected).abs().max() < 0.02
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_mean_over_phase_seeds(linear, point_paths):
     """The mean by brute force: 400 draws of the phases of one cloud, one per frame."""
@@ -349,6 +350,7 @@ def test_impulse_is_a_gaussian_pulse():
     assert half_width(maps[0][0, :, 0, 0], grid.range_step) == pytest.approx(cell, rel=0.02)
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 def test_exact_signals_of_a_scene_agree_with_the_surrogate(mimo):
     """Ray-traced: the rough points' exact spectra, summed in power, are the surrogate's map."""

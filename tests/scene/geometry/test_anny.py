@@ -78,6 +78,7 @@ def test_without_anny_the_message_says_how_to_get_it(monkeypatch):
         load_anny()
 
 
+@pytest.mark.claim
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("anny") is None, reason="needs the extra anny")
 def test_skinning_is_that_of_anny_itself():
