@@ -1,8 +1,8 @@
 # %% [markdown]
 # # First twin
 #
-# A box stands in front of a wall. We know its size, but not where it is. A radar looks at it from eight places, and
-# a fit finds the place from the recording.
+# A box stands in front of a wall. Its size is known, its position is not. A radar observes it from eight positions,
+# and a fit estimates the position from the recording.
 
 # %%
 # %matplotlib inline
@@ -21,8 +21,8 @@ truth = iw.Scene({"crate": crate, "wall": wall})
 
 # %% [markdown]
 # ## The radar
-# Two transmitters and eight receivers make a row of sixteen virtual antennas. The radar stands at eight places.
-# `grid` says which ranges and directions the map has.
+# Two transmitters and eight receivers make a row of sixteen virtual antennas. The radar has eight positions. `grid`
+# defines the ranges and directions of the map.
 
 # %%
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=128)
@@ -46,8 +46,8 @@ capture = iw.Capture.from_beat(recorded.beat, radar)
 
 # %% [markdown]
 # ## The start
-# We guess that the box is 25 cm away from where it is. The model predicts the mean of the map over all speckle. At
-# first it is blurred, so that the fit finds its way from far; the blur is taken away step by step.
+# The initial estimate is 25 cm from the true position. The model predicts the mean of the map over all speckle. At
+# first it is blurred, which widens the basin of attraction; the blur is removed step by step.
 
 # %%
 start = truth.replace("crate", pose=rigid(translation=[0.0, 0.0, 2.35]))
@@ -64,7 +64,7 @@ fit = iw.reconstruct(
 )
 
 # %% [markdown]
-# ## What was found
+# ## The result
 # The maps of start and end beside the recording:
 
 # %%
@@ -77,7 +77,7 @@ maps |= {
 iw.plotting.spectrum(maps, grid)
 
 # %% [markdown]
-# How far off, and how sure the fit is of it:
+# The error, and the error bars of the fit:
 
 # %%
 miss = (fit.scene["crate"].center - truth["crate"].center).norm()
@@ -85,5 +85,5 @@ print(f"{100 * miss:.1f} cm off; standard deviations {fit.uncertainty.deviations
 assert miss < 0.02
 
 # %% [markdown]
-# Try: a start that is 60 cm off, a smaller bandwidth, or `axes="xyz"`. A row of antennas hardly sees height, and
-# `fit.uncertainty.unobserved` says so.
+# Try: a start that is 60 cm off, a smaller bandwidth, or `axes="xyz"`. A row of antennas hardly resolves height, and
+# `fit.uncertainty.unobserved` lists it.

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Your own board
 #
-# A recording of a board is an array of numbers. A short description says which board it was and how it was set. Then
-# invertwin reads it, shows it and lists what it sees. Here the array is simulated, so that we know what is there.
+# A recording of a board is an array of numbers. A short description states the board and its settings. Then invertwin
+# reads it, draws it and lists its detections. Here the array is simulated, so that the truth is known.
 
 # %%
 # %matplotlib inline
@@ -17,8 +17,8 @@ from invertwin.radar import Chirps, board, detect_points, doppler_maps
 from invertwin.scene import RoughDielectric, rigid, sphere
 
 # %% [markdown]
-# ## What stands before the board
-# A ball rests, and a ball comes nearer at 2 m/s. The board is an xWR1642: two transmitters take turns, and with four
+# ## The scene before the board
+# One ball rests, and one approaches at 2 m/s. The board is an xWR1642: two transmitters take turns, and with four
 # receivers they are a row of eight virtual antennas.
 
 # %%
@@ -39,8 +39,7 @@ print(tuple(beat.shape), "frame, chirp, transmitter, receiver, sample")
 
 # %% [markdown]
 # ## The file and its description
-# A recording of yours would be such an array already. Slope, sample rate and the other settings are those that the
-# board was given.
+# Your recording would be such an array already. Slope, sample rate and the other settings are those of the board.
 
 # %%
 DESCRIPTION = """
@@ -66,9 +65,9 @@ with tempfile.TemporaryDirectory() as folder:
 assert isinstance(recording, ChirpCapture)
 
 # %% [markdown]
-# ## What it shows
-# Range against range rate, then range against direction of everything and of what moves. What comes nearer has a
-# negative range rate.
+# ## Range, range rate and direction
+# Range against range rate, then range against direction of all echoes and of moving targets. An approaching target
+# has a negative range rate.
 
 # %%
 seen = recording.radar()
@@ -77,8 +76,8 @@ maps = doppler_maps(recording.beat, seen, grid, recording.chirps)
 iw.plotting.range_doppler(maps)
 
 # %% [markdown]
-# ## What is there
-# A list of points: range, range rate, direction and place.
+# ## Detections
+# A list of points: range, range rate, direction and position.
 
 # %%
 points = detect_points(recording.beat, seen, grid, recording.chirps, frame=0)
@@ -87,8 +86,8 @@ for number in points.power.argsort(descending=True)[:4].tolist():
     print(f"{points.velocity[number]:+.1f} m/s at x = {x:+.2f} m, z = {z:.2f} m")
 
 # %% [markdown]
-# The nearest side of each ball is found. Both range rates are right to a tenth of a metre a second; that of the moving
-# ball is 2 m/s times the cosine of its direction.
+# The nearest side of each ball is found. Both range rates are right to a tenth of a metre a second; that of the
+# moving ball is 2 m/s times the cosine of its direction.
 
 # %%
 moving = points.velocity < -1.0
@@ -99,5 +98,5 @@ assert points.velocity[~moving].abs().max() < 0.15
 
 # %% [markdown]
 # The command line does the same, and warns of faults of the recording: `invertwin look adc.toml`. Raw files of a
-# DCA1000 need no array: `invertwin look adc.bin --config bench.cfg --board xWR1642`
-# ([measured data](../measured_data.md#a-board-of-your-own)).
+# DCA1000 need no array: `invertwin look adc.bin --config bench.cfg --board xWR1642` ([measured
+# data](../measured_data.md#a-board-of-your-own)).

@@ -2,7 +2,7 @@
 # # Your own mesh
 #
 # A shape may come from any program that writes OBJ, PLY, STL or glTF. Here another library makes a file in
-# millimetres, and we look at what the radar sees of it.
+# millimetres, and a radar observes it.
 
 # %%
 # %matplotlib inline
@@ -25,7 +25,7 @@ from invertwin.scene import (
 # %% [markdown]
 # ## A file
 # A mug: a tube with a bottom, 92 mm high. It has many narrow triangles: on a smooth metal, coarse facets would glint
-# like a disco ball, and a warning says so.
+# like a disco ball, and a warning is issued.
 
 # %%
 tube = trimesh.creation.annulus(r_min=36.0, r_max=40.0, height=90.0, sections=512)
@@ -38,8 +38,8 @@ with tempfile.TemporaryDirectory() as folder:
 print(mug.summary())
 
 # %% [markdown]
-# Without `unit` the mug would be 92 m high, and `load_mesh` would warn. The file has z up, the radar frame has y up. A
-# pose turns the mug upright and puts it 1.5 m away: first a rotation about x, then a translation.
+# Without `unit` the mug would be 92 m high, and `load_mesh` would warn. The file has z up, the radar frame has y up.
+# A pose rotates the mug upright and puts it 1.5 m away: first a rotation about x, then a translation.
 
 # %%
 upright = rotation_from_vector(torch.tensor([-math.pi / 2, 0.0, 0.0]))
@@ -49,7 +49,7 @@ height = scene["mug"].vertices[:, 1]
 assert abs(float(height.max() - height.min()) - 0.092) < 1e-6
 
 # %% [markdown]
-# ## What a radar sees
+# ## Its echo
 # Metal is smooth, so exact signals need many samples and no random surface.
 
 # %%
@@ -76,8 +76,8 @@ assert abs(float(grid.u[column]) - 0.2 / axis) < 0.05
 
 # %% [markdown]
 # ## Rough, not smooth
-# Painted with something rough, the mug has speckle, and the mean over all speckle is smooth. Fits use this mean. Their
-# unknown may be the pose of the mesh, its size, its material, or every vertex of it.
+# With rough paint, the mug has speckle, and the mean over all speckle is smooth. Fits use this mean. Their unknown
+# may be the pose of the mesh, its size, its material, or every vertex of it.
 
 # %%
 painted = scene.replace("mug", material=RoughDielectric(permittivity=4.0))

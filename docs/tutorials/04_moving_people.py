@@ -20,9 +20,9 @@ from invertwin.scene import (
 )
 
 # %% [markdown]
-# ## A body that walks
-# `person` is a body with joints. `Walking` turns the joints as people do at a given speed. `MovingScene` makes a scene
-# that is a function of time.
+# ## A walking body
+# `person` is a body with joints. `Walking` rotates the joints as people do at a given speed. `MovingScene` makes a
+# scene that is a function of time.
 
 # %%
 body = person(spacing=0.05)
@@ -55,7 +55,7 @@ beat = iw.simulate_chirps(
 # %% [markdown]
 # ## Speeds over time
 # Each chirp becomes a range profile. The bins that hold the person are summed, and a short Fourier transform over the
-# chirps shows the range rates of each moment. Negative ones come nearer.
+# chirps shows the range rates of each moment. Negative ones approach.
 
 # %%
 grid = radar.grid(range_min=2.5, range_max=6.0)

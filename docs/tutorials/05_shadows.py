@@ -1,9 +1,9 @@
 # %% [markdown]
-# # What the gradient knows about shadows
+# Shadows in the gradient
 #
-# A plate moves in front of a wall, and its shadow moves over the wall. The echo of the wall changes where the edge of
-# the shadow passes. The code of a ray tracer cannot be differentiated there, since its rays are drawn at fixed places.
-# invertwin adds paths that graze the edges, so its derivative has this change.
+# A plate moves in front of a wall, and its shadow moves over the wall. The echo of the wall changes where the shadow
+# boundary passes. Automatic differentiation of a ray tracer misses this change, since its rays are sampled at fixed
+# points. invertwin adds paths that graze the edges, so its derivative includes it.
 
 # %%
 # %matplotlib inline
@@ -29,9 +29,9 @@ grid = radar.grid(range_min=1.8, range_max=3.8, u_max=0.5)
 
 # %% [markdown]
 # ## Three derivatives of one map
-# θ moves the plate to the right, in metres. `gradcheck` computes the derivative of every bin of the map in three ways:
-# by the difference of two maps, which is the truth; by invertwin; and by invertwin without boundary paths, which is
-# what automatic differentiation of a ray tracer gives.
+# θ moves the plate to the right, in metres. `gradcheck` computes the derivative of every bin of the map by three
+# methods: the difference of two maps, which is the truth; invertwin; and invertwin without boundary paths, which
+# equals automatic differentiation of a ray tracer.
 
 # %%
 rays = iw.Sampling(depth=1, samples=400_000, boundary_samples=100_000)
@@ -51,7 +51,7 @@ shown = {
 iw.plotting.gradient(shown, grid, power=report.value)
 
 # %% [markdown]
-# In the last picture the wall does not change at all: its own points stand still, and nothing else is left.
+# In the last picture the wall does not change at all: its own points are at rest, and visibility is fixed.
 
 # %%
 print(

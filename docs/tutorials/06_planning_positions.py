@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Planning positions
 #
-# Before anything is recorded, the simulation tells how sure a fit will be, and which further position of the radar
-# would help most.
+# Before anything is recorded, the simulation predicts the error bars of a fit, and the most useful further position
+# of the radar.
 
 # %%
 # %matplotlib inline
@@ -13,8 +13,9 @@ from invertwin.inversion import plan_error_bars, prepare_fit
 from invertwin.scene import RoughDielectric, Translation, box, linear_array, rigid
 
 # %% [markdown]
-# ## What is planned
-# A box, of which x and z are unknown. The radar has two positions so far, close to each other. Four more are possible.
+# ## The plan
+# A box, of which x and z are unknown. The radar has two positions so far, close to each other. Four more are
+# possible.
 
 # %%
 paint = RoughDielectric(permittivity=4.0)
@@ -34,8 +35,8 @@ grid = radar.grid(range_min=1.0, range_max=3.6, u_max=0.6)
 
 # %% [markdown]
 # ## Error bars before the recording
-# One simulated recording tells gain and noise. The fit stands at the truth, and `plan_error_bars` computes how far speckle and
-# noise would move it. The last four frames are candidates: each is tried by itself.
+# One simulated recording determines gain and noise. The fit starts at the truth, and `plan_error_bars` computes how
+# far speckle and noise would move it. The last four frames are candidates: each is tried separately.
 
 # %%
 few = iw.Sampling(depth=1, points_per_m2=2e3)
@@ -50,7 +51,7 @@ for one in added:
     print(f"with {possible[one.frame - len(here)]}: deviations times {one.deviation_ratio:.2f}")
 
 # %% [markdown]
-# Which position helps most is hard to guess: here it is not the farthest one. So it pays to compute it.
+# The most useful position is hard to guess: here it is not the farthest one. So it pays to compute it.
 
 # %%
 figure = Figure(figsize=(5, 3.4), layout="constrained")
@@ -75,5 +76,5 @@ assert added[0].deviation_ratio < 0.85
 assert all(one.error_bars.deviations["box.x"] < 1.02 * now.deviations["box.x"] for one in added)
 
 # %% [markdown]
-# `invertwin plan run.toml` does this from a run file, and with `fits` compares the plan with fits of as many simulated
-# recordings ([run files](../run_files.md#error-bars-ambiguities-and-planning)).
+# `invertwin plan run.toml` does this from a run file, and with `fits` compares the plan with fits of as many
+# simulated recordings ([run files](../run_files.md#error-bars-ambiguities-and-planning)).

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Corner reflectors and calibration
 #
-# A corner reflector sends waves back to where they come from, over a wide range of angles, and its strength has a
-# formula. So it is what one calibrates radars with. First its strength, then a board whose channels have errors.
+# A corner reflector returns waves to their source over a wide range of angles, and its cross-section has a closed
+# form. So it is the usual calibration target. First its cross-section, then a board whose channels have errors.
 
 # %%
 # %matplotlib inline
@@ -17,8 +17,8 @@ from invertwin.scene import PerfectConductor, linear_array, rigid, sphere, trihe
 from invertwin.signatures import aspect_directions, to_dbsm
 
 # %% [markdown]
-# ## Strength
-# A trihedral of three triangles with legs of 10 cm. After three bounces, all of the wave goes back. `theta` turns the
+# ## Cross-section
+# A trihedral of three triangles with legs of 10 cm. After three bounces, the whole wave returns. `theta` moves the
 # radar about the axis of the corner.
 
 # %%
@@ -41,8 +41,8 @@ assert abs(float(curves["three bounces"][20]) - formula) < 0.01
 
 # %% [markdown]
 # ## A board with errors
-# Lines to the antennas have different lengths, and amplifiers differ. Every channel is multiplied by a gain and a
-# phase that nobody knows, here drawn at random: 1 dB and 0.6 rad.
+# Lines to the antennas have different lengths, and amplifiers differ. Every channel is multiplied by an unknown gain
+# and phase, here random: 1 dB and 0.6 rad.
 
 # %%
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=1e9, duration=50e-6, samples=64)
@@ -63,8 +63,8 @@ measured = iw.Capture.from_beat(clean.beat * errors[None, :, :, None], radar)
 
 # %% [markdown]
 # ## The calibration
-# Something small and bright stands at a surveyed place, here a metal ball. Each channel is compared with the echo of
-# an ideal point there. The front of the ball, not its centre, is where the echo comes from.
+# A small bright target is placed at a surveyed position, here a metal ball. Each channel is compared with the echo of
+# an ideal point there. The echo comes from the front of the ball, not from its centre.
 
 # %%
 centre = torch.tensor(place, dtype=torch.float64)
@@ -79,7 +79,7 @@ maps = {
 iw.plotting.spectrum(maps, grid, relative=False)
 
 # %% [markdown]
-# The gains are right but for one common factor, which no echo tells apart from its own strength:
+# The gains are right up to one common factor, which cannot be distinguished from the strength of the echo:
 
 # %%
 ratio = calibration.gains / errors

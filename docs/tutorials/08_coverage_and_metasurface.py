@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Coverage and a metasurface
 #
-# A transmitter stands in a room behind a metal screen. A map shows where its power arrives. A metasurface on the wall,
-# a panel of small elements that turn the phase of what they scatter, sends power into the shadow.
+# A transmitter stands in a room behind a metal screen. A map shows its coverage. A metasurface on the wall, a panel
+# of small elements that shift the phase of the field they scatter, directs power into the shadow.
 
 # %%
 # %matplotlib inline
@@ -34,7 +34,7 @@ sender = Transmitters(torch.tensor([[0.6, 0.8, 1.2]]).double())
 
 # %% [markdown]
 # ## A map
-# Mean path gain of cells of 25 cm, 1.2 m above the floor: line of sight, and what walls and screen mirror once.
+# Mean path gain of cells of 25 cm, 1.2 m above the floor: line of sight, and single reflections by walls and screen.
 
 # %%
 plane = MapPlane.horizontal([0.05, 0.05], [5.9, 3.9], 1.2, 0.25)
@@ -45,7 +45,7 @@ iw.plotting.coverage(levels, plane, scene=scene, transmitters=sender)
 
 # %% [markdown]
 # ## A receiver in the shadow
-# It gets what the walls mirror. Without walls it would get nothing.
+# It receives reflections by the walls. Without walls it would receive nothing.
 
 # %%
 receiver = torch.tensor([[5.2, 0.6, 1.2]]).double()
@@ -56,8 +56,9 @@ before = iw.RadioMap(spot, PropagationSettings(5.0e9, depth=1), "gain").predict(
 
 # %% [markdown]
 # ## A panel on the wall
-# The panel hangs on the far wall, at y = 4 m, somewhere along a line. `PanelPlacement` focuses it from the transmitter on
-# the receiver. It is a torch module: its place on the wall, its yaw and all its phases can be fitted.
+# The panel hangs on the far wall, at y = 4 m, somewhere along a line. `PanelPlacement` focuses it from the
+# transmitter on the receiver. It is a torch module: its position on the wall, its yaw and all its phases can be
+# fitted.
 
 # %%
 wall = WallPath([[5.5, 3.95], [0.5, 3.95]], height=1.2)  # the room is on its left
@@ -78,8 +79,8 @@ for along, value in zip(places, after, strict=True):
     print(f"{along:.1f} m along the wall: {10 * float((value / before).log10()):+.1f} dB")
 
 # %% [markdown]
-# ## What it does to the room
-# The best of these places, as a map of points: bright where the panel sends.
+# ## Its effect on the room
+# The best of these positions, as a map of points: bright where the panel radiates.
 
 # %%
 best = places[int(after.argmax())]
@@ -103,5 +104,5 @@ print(f"the receiver gets {gained:.1f} dB more")
 assert gained > 3.0
 
 # %% [markdown]
-# `invertwin reconstruct experiments/metasurface.toml` searches place, yaw and phases for the worst receivers of a room
-# ([run files](../run_files.md#a-metasurface)).
+# `invertwin reconstruct experiments/metasurface.toml` searches position, yaw and phases for the worst receivers of a
+# room ([run files](../run_files.md#a-metasurface)).

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Camera and radar
 #
-# A camera sees outlines: it knows well where a thing is across its view, and badly how far. A radar knows ranges. One
-# fit takes both.
+# A camera sees outlines: it locates an object well across its view, and badly in depth. A radar measures ranges. One
+# fit uses both.
 
 # %%
 # %matplotlib inline
@@ -32,7 +32,7 @@ shown = {"photographed": mask[0], "at the start": masks.predict(start, camera, s
 iw.plotting.images({name: values.detach() for name, values in shown.items()})
 
 # %% [markdown]
-# The radar has one transmitter and four receivers: hardly a direction, but a range to a few centimetres.
+# The radar has one transmitter and four receivers: little resolution in direction, but a range to a few centimetres.
 
 # %%
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=128)
@@ -68,7 +68,7 @@ for name, seen in {
     print(f"{name:>6}: {x:+5.1f}, {y:+5.1f}, {z:+5.1f} cm off in x, y, z")
 
 # %% [markdown]
-# The camera is good across and worse in depth, the radar the other way round. Both together are good at all.
+# The camera is good across and worse in depth, the radar conversely. Both together are good in all directions.
 
 # %%
 across = {name: float(miss[:2].norm()) for name, miss in misses.items()}

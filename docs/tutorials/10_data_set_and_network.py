@@ -1,8 +1,8 @@
 # %% [markdown]
 # # A data set and a network
 #
-# A network that finds things in radar maps needs thousands of recordings with labels. Here a small one: 120
-# recordings with a crate at another place in each, and a network that learns where it is.
+# A network that detects objects in radar maps needs thousands of recordings with labels. Here is a small example: 120
+# recordings with a crate at another position in each, and a network that learns to locate it.
 
 # %%
 # %matplotlib inline
@@ -17,8 +17,8 @@ import invertwin as iw
 
 # %% [markdown]
 # ## A run file with distributions
-# The sections are those of one simulation. `[dataset]` says how many, and every `[[vary]]` names a key and how it is
-# drawn. A wrong key is an error before any work.
+# The sections are those of one simulation. `[dataset]` states the number of samples, and every `[[vary]]` names a key
+# and its distribution. A wrong key is an error before any work.
 
 # %%
 RUN = """
@@ -61,7 +61,7 @@ high = [0.9, 0.0, 3.4]
 
 # %%
 def example(sample: dict) -> tuple[torch.Tensor, torch.Tensor]:
-    """What the network takes: map in decibels, place of the crate (x, z)."""
+    """Return the input and target of the network: map in decibels, position of the crate (x, z)."""
     level = sample["map"][0, :, :, 0].clamp_min(1e-12).log10()
     crate = next(row for row in sample["labels"]["objects"] if row["name"] == "crate")
     return (level - level.max()).clamp_min(-3.0), torch.tensor(crate["oriented_box"]["center"])[
@@ -81,14 +81,14 @@ print(tuple(levels.shape), "samples, ranges, directions")
 
 # %% [markdown]
 # ## A network
-# Two layers. 100 samples teach it, 20 test it.
+# Two layers. 100 samples train it, 20 test it.
 
 # %%
 torch.manual_seed(1)
 network = torch.nn.Sequential(
     torch.nn.Flatten(), torch.nn.LazyLinear(32), torch.nn.ReLU(), torch.nn.Linear(32, 2)
 )
-network(levels[:1])  # now its first layer knows the size of a map
+network(levels[:1])  # sets the input size of the first layer
 middle = places[:100].mean(0)
 optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=0.1)
 for _ in range(200):
@@ -98,8 +98,8 @@ for _ in range(200):
     optimizer.step()
 
 # %% [markdown]
-# ## How good it is
-# On recordings that it has never seen. Guessing the middle is the yardstick.
+# ## Its error
+# On recordings that it has never seen. The baseline is the mean position.
 
 # %%
 with torch.no_grad():
@@ -122,5 +122,4 @@ figure
 assert error < 0.6 * guess
 
 # %% [markdown]
-# Next: [more about data sets](../datasets.md), and how a network
-# [adapts to a room by a twin](../adaptation.md).
+# Next: [more about data sets](../datasets.md), and how a network [adapts to a room by a twin](../adaptation.md).

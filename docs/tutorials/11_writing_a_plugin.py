@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Writing a plugin
 #
-# A plugin is a package of yours that adds materials, shapes, losses, models or commands to run files. Here we write one
-# with a material, and use it three ways: in Python, in a fit, in a run file.
+# A plugin is a package of yours that adds materials, shapes, losses, models or commands to run files. Here we write
+# one with a material, and use it in Python, in a fit, and in a run file.
 
 # %%
 # %matplotlib inline
@@ -21,10 +21,10 @@ from invertwin.scene import linear_array, rigid, sphere
 
 # %% [markdown]
 # ## A package with a material
-# Foliage sends back the same share of the power at every angle, equally in all directions. A material hands the ray
-# tracer a `Surface`: the square root of its reflectance over the angle, and how much of it is diffuse. The annotation
-# `Share` limits the value to 0 … 1, and the docstring explains the key of the run file. `register` gets a registry and
-# adds what the package offers.
+# Foliage returns the same share of the power at every angle, equally in all directions. A material hands the ray
+# tracer a `Surface`: the square root of its reflectance over the angle, and its diffuse share. The annotation `Share`
+# limits the value to 0 … 1, and the docstring explains the key of the run file. `register` gets a registry and adds
+# the contents of the package.
 
 # %%
 MODULE = '''
@@ -63,8 +63,8 @@ def register(registry: Registry) -> None:
 #     [project.entry-points."invertwin.plugins"]
 #     foliage = "foliage:register"
 #
-# `pip install` makes two things of it: the module, and a folder that says so. Here we write both by hand, into a folder
-# that Python looks into.
+# `pip install` creates the module and a folder with its metadata. Here we write both by hand, into a folder on
+# Python's path.
 
 # %%
 folder = tempfile.TemporaryDirectory()
@@ -79,7 +79,7 @@ sys.path.append(folder.name)
 from foliage import Foliage  # type: ignore  # noqa: E402
 
 # %% [markdown]
-# ## It works at once
+# ## Use in Python
 # Twice the share is twice the power.
 
 # %%
@@ -104,7 +104,7 @@ iw.plotting.spectrum({"a bush": thin}, grid)
 
 # %%
 class Thickness(torch.nn.Module):
-    """How much the bush reflects."""
+    """Reflected share of the power of the bush."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -117,7 +117,7 @@ class Thickness(torch.nn.Module):
         return {"bush.share": self.logit.detach().sigmoid()}
 
 
-places = radar.frames([0] * 12)  # twelve looks: each has other speckle below
+places = radar.frames([0] * 12)  # twelve frames: each has other speckle below
 recordings = [
     iw.simulate(
         scene, radar, grid, seed=look, sampling=iw.Sampling(depth=1, points_per_m2=2e3)
@@ -142,7 +142,7 @@ assert abs(share - 0.05) < 0.015
 
 # %% [markdown]
 # ## A run file that names it
-# The command line finds the plugin by itself. `check` says what a run needs, without running it.
+# The command line finds the plugin automatically. `check` estimates the resources of a run, without running it.
 
 # %%
 RUN = """
@@ -185,7 +185,7 @@ print(ended.stdout)
 assert ended.returncode == 0, ended.stderr
 
 # %% [markdown]
-# A wrong value is an error of one line that names its place:
+# A wrong value is an error of one line that names its key:
 
 # %%
 (site / "wrong.toml").write_text(RUN.replace("0.07", "7.0"))
