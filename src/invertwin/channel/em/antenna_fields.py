@@ -14,12 +14,13 @@ _UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)  # of the radar
 def antenna_fields(
     jones: Polarisation, rotation: Float64[Tensor, "row 3 3"], direction: Float64[Tensor, "row 3"]
 ) -> Complex128[Tensor, "row k 3"]:
-    """Unit fields in the world that an array's vectors send along unit vectors, or hear from there.
+    """Unit fields that an array's Jones vectors radiate along a direction, in world axes. By
+    reciprocity, also the fields that it receives from there.
 
     Args:
-        jones: of the array.
-        rotation: columns are the radar's axes.
-        direction: away from the antenna.
+        jones: Jones vectors of the array's elements.
+        rotation: rotation from the radar's axes to the world's; columns are the radar's axes.
+        direction: unit vectors away from the antenna, in world axes.
     """
     local = torch.einsum("nij,ni->nj", rotation, direction)
     axes = torch.einsum("nij,npj->npi", rotation, polarisations(-local, _UP))
@@ -33,21 +34,21 @@ def current_kernel(
     reverse_direction: Float64[Tensor, "row 3"],
     reverse_fields: Complex128[Tensor, "row r 3"],
 ) -> Complex128[Tensor, "row r t"]:
-    """What the current that a wave induces on a conductor sends: p · [n × (d × E)].
+    """Radiation kernel of the current that a wave induces on a conductor: p · [n × (d × E)].
 
-    The mean of both ways: of the current of the one wave seen by the other and the reverse.
+    Symmetrised for reciprocity: the mean over transmitter and receiver exchanged.
 
     Args:
-        normal: n, towards the source.
-        incident_direction: d, of the wave that arrives.
-        incident_fields: its fields E.
-        reverse_direction: d of the wave that the other antenna would send to this place.
-        reverse_fields: fields of that wave.
+        normal: unit normal n, towards the source.
+        incident_direction: direction d of the incident wave.
+        incident_fields: fields E of the incident wave, one per transmit vector.
+        reverse_direction: direction d of the wave that the receiver would radiate to this point.
+        reverse_fields: fields of that wave, one per receive vector.
     """
     n, d, b = normal[:, None], incident_direction[:, None], reverse_direction[:, None]
-    there = torch.linalg.cross(n.to(incident_fields.dtype), cross(d, incident_fields))
-    here = torch.linalg.cross(n.to(incident_fields.dtype), cross(b, reverse_fields))
-    return 0.5 * (reverse_fields @ there.mT + here @ incident_fields.mT)
+    forward = torch.linalg.cross(n.to(incident_fields.dtype), cross(d, incident_fields))
+    backward = torch.linalg.cross(n.to(incident_fields.dtype), cross(b, reverse_fields))
+    return 0.5 * (reverse_fields @ forward.mT + backward @ incident_fields.mT)
 
 
 def conductor_field(
@@ -55,26 +56,26 @@ def conductor_field(
     kernel: Complex128[Tensor, "row r t"],
     outgoing_cosine: Float64[Tensor, " row"],
 ) -> Complex128[Tensor, "row r t"]:
-    """Field coefficients per m² of a lit conductor: ``−(j/4π) √spread p · [n × (d × E)]``.
+    """Field coefficients per m² of an illuminated conductor: ``−(j/4π) √spread p · [n × (d × E)]``.
 
     Args:
-        spread: gains and 1/R² of both ways, without scattering.
+        spread: antenna gains and two-way spreading, without scattering.
         kernel: p · [n × (d × E)].
-        outgoing_cosine: cosine to where the wave goes to, zero behind the lit side.
+        outgoing_cosine: cosine of the scattering angle; ≤ 0 behind the illuminated side.
     """
-    lit = (outgoing_cosine > 0).to(spread)
-    return (-1j / (4 * torch.pi) * spread.sqrt() * lit)[:, None, None] * kernel
+    illuminated = (outgoing_cosine > 0).to(spread)
+    return (-1j / (4 * torch.pi) * spread.sqrt() * illuminated)[:, None, None] * kernel
 
 
 def combine_elements(
     link: Link, matrix: Complex128[Tensor, "row r t"]
 ) -> tuple[Complex128[Tensor, " row"], Complex128[Tensor, "row r t"] | None]:
-    """Coefficients of the mean elements, and the matrix where elements differ, as ``Paths`` wants.
+    """Coefficients for ``Paths``: of the mean elements, and the matrix where elements differ.
 
     Args:
-        link: Antennas.
-        matrix: Between the vectors of both arrays.
+        link: antennas.
+        matrix: coefficients between the Jones vectors of both arrays.
     """
-    sent, received = link.tx_jones.mean, link.rx_jones.mean
-    coefficient = torch.einsum("r,nrt,t->n", received, matrix, sent)
+    transmit, receive = link.tx_jones.mean, link.rx_jones.mean
+    coefficient = torch.einsum("r,nrt,t->n", receive, matrix, transmit)
     return coefficient, None if matrix.shape[1:] == (1, 1) else matrix

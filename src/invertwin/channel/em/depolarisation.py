@@ -1,10 +1,10 @@
-"""Polarisation of scattered power: how much of it antennas of given Jones vectors take.
+"""Depolarisation: fraction of scattered power that antennas of given Jones vectors receive.
 
-Every bounce keeps V and H, and turns handedness, as a mirror does. A depolarising surface moves the
-share χ of the power from V to H and from H to V, wherever these axes lie. In Stokes parameters,
-that multiplies linear polarisation by 1 − 2χ and circular polarisation by 1 − 4χ: scattering that
-favours no direction about the line of sight, and that is the same both ways. Of χ = 1/4, a cloud
-of thin wires, nothing circular is left.
+Every bounce preserves V and H and reverses the handedness, as a specular reflection does. A
+depolarising surface transfers the fraction χ of the power from V to H and from H to V, for any
+choice of these axes. In Stokes parameters, linear polarisation is multiplied by 1 − 2χ and circular
+polarisation by 1 − 4χ: scattering that is isotropic about the line of sight, and reciprocal. For χ
+= 1/4, a cloud of thin wires, no circular polarisation is left.
 """
 
 from collections.abc import Sequence
@@ -20,16 +20,16 @@ _LINEAR, _CIRCULAR = 2.0, 4.0
 _MATRICES = torch.tensor(
     [[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, 1], [-1, 0]]],
     dtype=torch.complex128,
-)  # a mirror, a dihedral, one that is rolled by 45°, and a turn by 90°
+)  # plane, dihedral, dihedral rolled by 45°, rotation by 90°
 _GOLDEN = 0.618_033_988_749_894_8
 
 
 class PolarisationShare(NamedTuple):
-    """A part of what antennas take: so much of a path's power × Π(1 − loss·χ) over its bounces.
+    """Term of the received power fraction: weight × Π(1 − loss·χ) over a path's bounces.
 
     Attributes:
-        odd, even: of paths with an odd and an even number of bounces.
-        loss: how fast depolarisation takes it.
+        odd, even: weight for paths with an odd and an even number of bounces.
+        loss: rate at which depolarisation reduces it.
     """
 
     odd: float
@@ -37,87 +37,88 @@ class PolarisationShare(NamedTuple):
     loss: float
 
     def for_bounces(self, bounces: int) -> float:
-        """That of paths of so many bounces."""
+        """Return the weight for paths with a given number of bounces."""
         return self.odd if bounces % 2 else self.even
 
 
 def polarisation_shares(link: Link, *, depolarising: bool) -> list[PolarisationShare]:
-    """What two antennas take of the power of paths: the sum of the shares.
+    """Terms whose sum is the fraction of a path's power that two antennas receive.
 
     ½(I I' + q q' ± u u' ∓ v v') in Stokes parameters of their mean elements, which is |rᵀ t|² after
     one bounce and |r₁t₁ − r₂t₂|² after two.
 
     Args:
         link: antennas.
-        depolarising: whether any surface depolarises.
+        depolarising: True if any surface depolarises.
 
     Raises:
         InputError: polarisations that depend on the direction.
     """
-    sent, received = (_stokes_parameters(j.vectors.mean(0)) for j in (link.tx_jones, link.rx_jones))
-    whole, q, u, v = (0.5 * s * r for s, r in zip(sent, received, strict=True))
-    parts = [
+    transmit, receive = (
+        _stokes_parameters(j.vectors.mean(0)) for j in (link.tx_jones, link.rx_jones)
+    )
+    whole, q, u, v = (0.5 * s * r for s, r in zip(transmit, receive, strict=True))
+    terms = [
         PolarisationShare(whole, whole, 0.0),
         PolarisationShare(q + u, q - u, _LINEAR),
         PolarisationShare(-v, v, _CIRCULAR),
     ]
     if depolarising:
-        return parts[:1] + [part for part in parts[1:] if part.odd or part.even]
-    return [PolarisationShare(sum(p.odd for p in parts), sum(p.even for p in parts), 0.0)]
+        return terms[:1] + [part for part in terms[1:] if part.odd or part.even]
+    return [PolarisationShare(sum(p.odd for p in terms), sum(p.even for p in terms), 0.0)]
 
 
 def received_power_fraction(
     link: Link, depolarisation: Sequence[Float64[Tensor, " row"]]
 ) -> Float64[Tensor, " row"]:
-    """What antennas take of the power of paths.
+    """Fraction of the power of paths that antennas receive.
 
     Args:
         link: antennas.
-        depolarisation: χ of every bounce in turn.
+        depolarisation: χ at each bounce, in the order of the path.
     """
     depolarised = any(bool(value.detach().any()) for value in depolarisation)
     total = torch.zeros_like(depolarisation[0])
     for share in polarisation_shares(link, depolarising=depolarised):
-        kept = torch.full_like(total, share.for_bounces(len(depolarisation)))
+        fraction = torch.full_like(total, share.for_bounces(len(depolarisation)))
         for value in depolarisation:
-            kept = kept * (1 - share.loss * value)
-        total = total + kept
+            fraction = fraction * (1 - share.loss * value)
+        total = total + fraction
     return total
 
 
 def random_scattering_matrix(
     depolarisation: Sequence[Float64[Tensor, " row"]], phase: Float64[Tensor, " row"]
 ) -> Complex128[Tensor, "#row 2 2"]:
-    """Fields between V and H of scatterers of random phase, received × sent, over their amplitude.
+    """Scattering matrices of random scatterers in V and H, receive × transmit, of unit amplitude.
 
-    Their mean power is that of ``polarisation_shares``: a mirror, dihedrals at two angles and a
-    turn, each
-    with its chance and a phase of its own, which is a hash of the first.
+    Their mean power is that of ``polarisation_shares``: a plane, dihedrals at two angles and a
+    rotation, each with its probability and a phase of its own, a hash of the path's phase.
 
     Args:
-        depolarisation: χ of every bounce in turn.
-        phase: of the paths [rad], which this does not contain.
+        depolarisation: χ at each bounce, in the order of the path.
+        phase: phases of the paths [rad]; the matrices do not contain them.
     """
-    # The matrix that keeps the polarisation comes first; that of a dihedral after two bounces.
+    # The matrix that preserves polarisation comes first; after two bounces that of a dihedral.
     order = (0, 1, 2, 3) if len(depolarisation) % 2 else (1, 0, 3, 2)
     if not any(bool(value.detach().any()) for value in depolarisation):
         return _MATRICES[order[0]][None]
     linear, circular = torch.ones_like(phase), torch.ones_like(phase)
     for value in depolarisation:
         linear, circular = linear * (1 - _LINEAR * value), circular * (1 - _CIRCULAR * value)
-    both = (1 + circular) / 4
-    aside, chances = (1 - circular) / 4, (both + linear / 2, both - linear / 2)
-    found = torch.zeros(len(phase), 2, 2, dtype=torch.complex128)
-    turns = phase.detach() / (2 * torch.pi)
+    mean = (1 + circular) / 4
+    rotated, probabilities = (1 - circular) / 4, (mean + linear / 2, mean - linear / 2)
+    total = torch.zeros(len(phase), 2, 2, dtype=torch.complex128)
+    cycles = phase.detach() / (2 * torch.pi)
     for number, (share, which) in enumerate(
-        zip((chances[0], aside, aside, chances[1]), order, strict=True)
+        zip((probabilities[0], rotated, rotated, probabilities[1]), order, strict=True)
     ):
-        lit = share.detach() > 1e-15
-        root = torch.where(lit, torch.where(lit, share, 1.0).sqrt(), 0.0)
-        # Digits of a phase far behind the point are as random as the phase.
-        own = 2 * torch.pi * ((turns * 1e6 * (number + _GOLDEN)) % 1) if number else 0 * turns
-        found = found + torch.polar(root, own)[:, None, None] * _MATRICES[which]
-    return found
+        positive = share.detach() > 1e-15
+        root = torch.where(positive, torch.where(positive, share, 1.0).sqrt(), 0.0)
+        # Late decimal digits of a phase are as random as the phase.
+        angle = 2 * torch.pi * ((cycles * 1e6 * (number + _GOLDEN)) % 1) if number else 0 * cycles
+        total = total + torch.polar(root, angle)[:, None, None] * _MATRICES[which]
+    return total
 
 
 def _stokes_parameters(vector: Complex128[Tensor, "2"]) -> tuple[float, float, float, float]:

@@ -1,7 +1,7 @@
-"""Solids of dielectric that waves enter, and where waves go there.
+"""Dielectric solids: media, wave vectors and refraction (Snell's law) at their faces.
 
 Convention exp(+jωt). A wave has the field E exp(−jk(K·x + c)) with K·K = ε, complex where it
-decays, and travels along the real part of K.
+decays, and propagates along the real part of K.
 """
 
 import cmath
@@ -18,22 +18,23 @@ from invertwin.checks import is_differentiated
 from invertwin.errors import InputError
 
 MIN_CHORD_AMPLITUDE = 1e-4
-"""Amplitude after the mean chord 4V/A of a body, below which nothing is followed inside."""
+"""Amplitude after the mean chord 4V/A of a body, below which no path is traced inside."""
 AIR = -1
-"""The medium outside."""
+"""Number of the medium outside of all bodies."""
 
 
 @dataclass(frozen=True)
 class DielectricSolids:
-    """Interiors that waves enter, at frequencies of one permittivity each.
+    """Dielectric bodies with transmitted waves, at frequencies of equal permittivity.
 
     Attributes:
-        owner: number of the object that each facet belongs to.
-        transparent: facets of bodies that waves enter.
-        conducting: facets of conductors.
-        permittivity: complex, relative, inside each object; 1 where waves do not enter.
-        wave_number: the least k of the frequencies [1/m], at which most is left.
-        names: of the objects.
+        owner: object number of each facet.
+        transparent: mask of facets of bodies that transmit.
+        conducting: mask of facets of conductors.
+        permittivity: complex relative permittivity inside each object; 1 where nothing is
+            transmitted.
+        wave_number: smallest k of the frequencies [1/m], at which attenuation is least.
+        names: object names, [object].
     """
 
     owner: Int64[Tensor, " facet"]
@@ -44,32 +45,32 @@ class DielectricSolids:
     names: Sequence[str]
 
     def permittivity_in(self, medium: Int64[Tensor, " row"]) -> Complex128[Tensor, " row"]:
-        """ε of media.
+        """Return the permittivity ε of media.
 
         Args:
-            medium: number of the object that waves are in; −1 = air.
+            medium: object number of the body around the wave; −1 = air.
         """
         found = self.permittivity[medium.clamp_min(0)]
         return torch.where(medium < 0, torch.ones_like(found), found)
 
     def medium_behind(self, facet: Tensor, medium: Tensor) -> Int64[Tensor, " row"]:
-        """The medium on the other side of faces of solids.
+        """Return the medium on the other side of faces of solids.
 
         Args:
-            facet: what is met.
-            medium: where the waves come from.
+            facet: facet numbers, [row].
+            medium: medium of the incident wave, [row].
         """
         return torch.where(medium < 0, self.owner[facet], AIR)
 
     def require_gaps(self, facet: Int64[Tensor, " row"], medium: Int64[Tensor, " row"]) -> None:
-        """Refuse surfaces inside a solid, of which the laws here do not hold.
+        """Raise an error for dielectrics inside or against a solid, which is not supported.
 
         Args:
-            facet: what is met.
-            medium: where.
+            facet: facet numbers.
+            medium: medium of the incident wave.
 
         Raises:
-            InputError: a dielectric within another one, or in touch with it.
+            InputError: a dielectric within another one, or in contact with it.
         """
         owner = self.owner[facet]
         wrong = (medium >= 0) & (owner != medium) & ~self.conducting[facet]
@@ -91,19 +92,18 @@ def group_solids(
     owner: Int64[Tensor, " facet"],
     names: Sequence[str],
 ) -> list[tuple[DielectricSolids | None, list[int]]]:
-    """Groups of frequencies in which waves are refracted alike, and what they enter there.
+    """Group frequencies with equal refraction, each with its dielectric solids.
 
-    A body is entered where it is closed, homogeneous, and leaves more than `MIN_CHORD_AMPLITUDE`
-    of a wave
-    along its mean chord 4V/A.
+    A body transmits if it is closed and homogeneous, and if more than `MIN_CHORD_AMPLITUDE` of a
+    wave is left after its mean chord 4V/A.
 
     Args:
-        interfaces: of the facets, for each frequency.
-        wave_numbers: k of the frequencies [1/m].
-        corners: of the facets [m].
-        closed: facets of closed bodies.
-        owner: the object of each facet.
-        names: of the objects.
+        interfaces: smooth interfaces of the facets, one table per frequency.
+        wave_numbers: wave number k per frequency [1/m].
+        corners: corners of the facets in world axes [m].
+        closed: mask of facets of closed bodies.
+        owner: object number of each facet.
+        names: object names, [object].
     """
     bodies = [torch.nonzero(owner == number)[:, 0] for number in range(len(names))]
     chords = [_mean_chord(corners.detach()[own]) for own in bodies]
@@ -113,43 +113,45 @@ def group_solids(
         key: list[object] = [f if is_differentiated(skin.permittivity) else None]
         for own, chord in zip(bodies, chords, strict=True):
             rows = skin.rows(own)
-            entered = bool(closed[own].all()) and is_homogeneous(rows) and not _is_opaque(rows)
+            transmits = bool(closed[own].all()) and is_homogeneous(rows) and not _is_opaque(rows)
             epsilon = complex(skin.permittivity[own[0]].detach())
-            left = math.exp(k * chord * cmath.sqrt(epsilon).imag)
-            key.append(epsilon if entered and left > MIN_CHORD_AMPLITUDE else None)
+            amplitude = math.exp(k * chord * cmath.sqrt(epsilon).imag)
+            key.append(epsilon if transmits and amplitude > MIN_CHORD_AMPLITUDE else None)
         groups.setdefault(tuple(key), []).append(f)
-    found: list[tuple[DielectricSolids | None, list[int]]] = []
+    groups_found: list[tuple[DielectricSolids | None, list[int]]] = []
     for alike, members in groups.items():
-        entered = torch.tensor([value is not None for value in alike[1:]])
-        if not bool(entered.any()):
-            found.append((None, members))
+        transmits = torch.tensor([value is not None for value in alike[1:]])
+        if not bool(transmits.any()):
+            groups_found.append((None, members))
             continue
         skin = interfaces[members[0]]
-        first = torch.stack([skin.permittivity[own[0]] for own in bodies])
-        epsilon = torch.where(entered, first, torch.ones_like(first))
-        least = min(wave_numbers[f] for f in members)
-        solids = DielectricSolids(owner, entered[owner], skin.conducting, epsilon, least, names)
-        found.append((solids, members))
-    return found
+        permittivities = torch.stack([skin.permittivity[own[0]] for own in bodies])
+        epsilon = torch.where(transmits, permittivities, torch.ones_like(permittivities))
+        smallest = min(wave_numbers[f] for f in members)
+        solids = DielectricSolids(
+            owner, transmits[owner], skin.conducting, epsilon, smallest, names
+        )
+        groups_found.append((solids, members))
+    return groups_found
 
 
 def is_homogeneous(interfaces: SmoothInterfaces) -> bool:
-    """Whether the permittivity of a surface is one; conductors and sheets count as such.
+    """Return True if a surface has one permittivity; conductors and sheets count as such.
 
     Args:
-        interfaces: of its facets.
+        interfaces: smooth interfaces of its facets.
     """
     epsilon = interfaces.permittivity.detach()
     return _is_opaque(interfaces) or bool((epsilon == epsilon[0]).all())
 
 
 def _is_opaque(interfaces: SmoothInterfaces) -> bool:
-    """Whether there is no dielectric body behind a surface."""
+    """Return True if there is no dielectric body behind a surface."""
     return bool((interfaces.conducting | torch.isfinite(interfaces.thickness)).any())
 
 
 def _mean_chord(corners: Tensor) -> float:
-    """4V/A [m] of a closed mesh."""
+    """Mean chord 4V/A of a closed mesh [m]."""
     a, b, c = (corners - corners[:1, :1]).unbind(1)
     volume = dot(a, cross(b, c)).sum() / 6
     area = cross(b - a, c - a).norm(dim=1).sum() / 2
@@ -159,32 +161,32 @@ def _mean_chord(corners: Tensor) -> float:
 def normal_component(
     permittivity: Complex128[Tensor, " row"], wave_vector: Tensor, normal: Vectors
 ) -> Complex128[Tensor, " row"]:
-    """q = √(ε − K_t·K_t), the part of K across a face behind it, K_t the part along the face.
+    """Normal component of K behind a face: q = √(ε − K_t·K_t), K_t the tangential part.
 
-    Where nothing passes but what decays from the face, q = −j|q|.
+    For evanescent waves, q = −j|q|.
 
     Args:
-        permittivity: ε behind the face.
-        wave_vector: K.
-        normal: of the face.
+        permittivity: relative permittivity ε behind the face.
+        wave_vector: K over k, [row, 3].
+        normal: unit normal of the face.
     """
-    along = wave_vector - dot(wave_vector, normal)[:, None] * normal
-    square = permittivity - dot(along, along)
+    tangential = wave_vector - dot(wave_vector, normal)[:, None] * normal
+    square = permittivity - dot(tangential, tangential)
     root = torch.sqrt(square)
-    wrong = (square.detach().real < 0) & (root.detach().imag > 0)
-    return torch.where(wrong, -root, root)
+    growing = (square.detach().real < 0) & (root.detach().imag > 0)
+    return torch.where(growing, -root, root)
 
 
 def refract_waves(
     permittivity: Complex128[Tensor, " row"], wave_vector: Tensor, normal: Vectors
 ) -> tuple[Complex128[Tensor, "row 3"], Bool[Tensor, " row"]]:
-    """K behind a face, whose part along the face is kept (Snell), and whether it goes on at all.
+    """Refract wave vectors by Snell's law; the mask is False for evanescent waves.
 
     Args:
-        permittivity: ε behind the face.
-        wave_vector: K before it.
-        normal: towards the source.
+        permittivity: relative permittivity ε behind the face.
+        wave_vector: K over k before the face, [row, 3].
+        normal: unit normal towards the source.
     """
     root = normal_component(permittivity, wave_vector, normal)
-    passed = wave_vector - (dot(wave_vector, normal) + root)[:, None] * normal
-    return passed, root.detach().real > root.detach().imag.abs()
+    refracted = wave_vector - (dot(wave_vector, normal) + root)[:, None] * normal
+    return refracted, root.detach().real > root.detach().imag.abs()

@@ -1,9 +1,9 @@
-"""The laws of polarised waves at smooth surfaces: reflection, currents, what these send out.
+"""Polarised plane waves at smooth surfaces: Fresnel reflection, currents and their radiation.
 
-Convention exp(+jωt). A plane wave travels along the unit vector d with the field
-E exp(−jk(d·x + c)) [V/m]. What a body scatters along the unit vector s is F exp(−jkr)/r far away;
-with a receiving polarisation p and an incident wave of 1 V/m, S = p·F and σ = 4π|S|².
-All functions work on rows; fields have one row for each polarisation of the incident wave.
+Convention exp(+jωt). A plane wave propagates along the unit vector d with the field E exp(−jk(d·x +
+c)) [V/m]. The far field that a body scatters along the unit vector s is F exp(−jkr)/r; with a
+receiving polarisation p and an incident wave of 1 V/m, S = p·F and σ = 4π|S|². All functions are
+batched over rows; fields have one row per polarisation of the incident wave.
 """
 
 import math
@@ -21,14 +21,14 @@ Vectors = Float64[Tensor, "*row 3"]
 
 
 class SmoothInterfaces(NamedTuple):
-    """What surfaces are made of at one frequency, one row a surface.
+    """Electrical properties of smooth interfaces at one frequency, one row a surface.
 
     Attributes:
-        conducting: perfect conductors; the other fields but the last do not count there.
+        conducting: mask of perfect conductors, for which only ``rms_height`` counts, [row].
         permittivity: complex relative permittivity.
-        thickness: of a sheet about the surface [m]; infinite for a body.
-        coherence: share of the reflected field that is not scattered, in [0, 1].
-        rms_height: of the roughness [m].
+        thickness: thickness of a sheet centred on the surface [m]; infinite for a body.
+        coherence: fraction of the reflected field that is not scattered diffusely, in [0, 1].
+        rms_height: RMS roughness height [m].
     """
 
     conducting: Tensor
@@ -38,15 +38,15 @@ class SmoothInterfaces(NamedTuple):
     rms_height: Float64[Tensor, " row"]
 
     def rows(self, index: Tensor) -> "SmoothInterfaces":
-        """Some rows."""
+        """Select rows."""
         return SmoothInterfaces(*(column[index] for column in self))
 
 
 def dot(first: Tensor, second: Tensor) -> Tensor:
-    """Scalar products of rows.
+    """Scalar products along the last axis.
 
     Args:
-        first, second: vectors, or fields and vectors.
+        first, second: vectors or complex fields, [..., 3].
     """
     # Three products are several times as fast as a sum over an axis of three.
     total, *others = (x * u for x, u in zip(first.unbind(-1), second.unbind(-1), strict=True))
@@ -56,10 +56,10 @@ def dot(first: Tensor, second: Tensor) -> Tensor:
 
 
 def cross(first: Tensor, second: Tensor) -> Tensor:
-    """Vector products of rows.
+    """Vector products along the last axis.
 
     Args:
-        first, second: vectors, or fields and vectors.
+        first, second: vectors or complex fields, [..., 3].
     """
     first, second = torch.broadcast_tensors(first, second)
     kind = torch.promote_types(first.dtype, second.dtype)
@@ -67,29 +67,29 @@ def cross(first: Tensor, second: Tensor) -> Tensor:
 
 
 def polarisations(direction: Vectors, up: Float64[Tensor, "3"]) -> Float64[Tensor, "*row 2 3"]:
-    """Unit vectors V and H of waves to or from antennas in some directions.
+    """Polarisation basis vectors V and H for given directions.
 
-    H = up × u and V = H × u: with up = z they are the unit vectors of θ and φ. Where the direction
-    is along ``up``, H is the axis that follows it (y for z).
+    H = up × u and V = H × u: with up = z they are the unit vectors of θ and φ. For directions along
+    ``up``, H is the axis that follows it cyclically (y for z).
 
     Args:
         direction: u, unit vectors from the target to the antenna.
-        up: unit vector.
+        up: unit vector of the vertical axis.
     """
-    flat = cross(up.expand_as(direction), direction)
-    aside = up.roll(1) - dot(up, up.roll(1)) * up
-    aside = normalize(cross(up, aside), dim=-1).expand_as(flat)
-    small = flat.norm(dim=-1, keepdim=True) < 1e-9
-    horizontal = normalize(torch.where(small, aside, flat), dim=-1)
+    transverse = cross(up.expand_as(direction), direction)
+    fallback = up.roll(1) - dot(up, up.roll(1)) * up
+    fallback = normalize(cross(up, fallback), dim=-1).expand_as(transverse)
+    parallel = transverse.norm(dim=-1, keepdim=True) < 1e-9
+    horizontal = normalize(torch.where(parallel, fallback, transverse), dim=-1)
     return torch.stack([cross(horizontal, direction), horizontal], dim=-2)
 
 
 def reflect_vectors(vector: Tensor, normal: Vectors) -> Tensor:
-    """A vector reflected by a plane: v − 2(n·v)n.
+    """Reflect vectors at planes: v − 2(n·v)n.
 
     Args:
-        vector: v.
-        normal: n.
+        vector: vectors v, [..., 3].
+        normal: unit normals n.
     """
     return vector - 2 * dot(normal, vector)[..., None] * normal
 
@@ -101,23 +101,23 @@ def reflect_field(
     direction: Vectors,
     field: Complex128[Tensor, "row 2 3"],
 ) -> Complex128[Tensor, "row 2 3"]:
-    """Coherently reflected field on the surface: of a conductor 2(n·E)n − E.
+    """Coherently reflected field on the surface; for a conductor 2(n·E)n − E.
 
-    A dielectric multiplies the parts of E across and in the plane of incidence by its coefficients.
-    Roughness multiplies the field by exp(−½(2kσ cosθ)²).
+    For a dielectric, the s and p components are multiplied by the Fresnel coefficients. Roughness
+    multiplies the field by exp(−½(2kσ cosθ)²).
 
     Args:
-        interfaces: one row each.
-        wave_number: k [1/m].
-        normal: towards the source.
-        direction: d of the incident wave.
-        field: E.
+        interfaces: smooth interfaces, one row each.
+        wave_number: wave number k [1/m].
+        normal: unit normal towards the source.
+        direction: direction d of the incident wave.
+        field: incident field E [V/m], one per polarisation.
     """
     cosine = -dot(normal, direction)
-    kept = interfaces.coherence * roughness_attenuation(interfaces, wave_number, 2 * cosine)
+    attenuation = interfaces.coherence * roughness_attenuation(interfaces, wave_number, 2 * cosine)
     return (
         _reflect_from_smooth(interfaces, wave_number, normal, direction, field)
-        * kept[:, None, None]
+        * attenuation[:, None, None]
     )
 
 
@@ -129,42 +129,44 @@ def radiate_field(
     field: Complex128[Tensor, "row 2 3"],
     scattered_direction: Vectors,
 ) -> Complex128[Tensor, "row 2 3"]:
-    """F per m² of a lit surface: what its currents send along ``towards``.
+    """Far field F per m² of an illuminated surface, radiated by its currents.
 
-    Currents of the reflected wave on the surface, ηJ = n × (d×E + d_r×E_r) and
-    M = −n × (E + E_r), send F = −(jk/4π) [ηJ − s × M] without its part along s. For a conductor
-    that is −(jk/2π) n × (d×E), every bounce with its own incident field. A sheet sends what its
-    polarisation current does: F = (k²/4π)(ε − 1) ∫ E_inside dx over its thickness. Roughness takes
-    exp(−½(kσ(cosθ + n·s))²) off: nothing straight on, where the shadow is.
+    Currents of the reflected wave on the surface, ηJ = n × (d×E + d_r×E_r) and M = −n × (E + E_r),
+    radiate F = −(jk/4π) [ηJ − s × M] without its part along s. For a conductor that is −(jk/2π) n ×
+    (d×E), every bounce with its own incident field. A sheet radiates as its polarisation current: F
+    = (k²/4π)(ε − 1) ∫ E_inside dx over its thickness. Roughness attenuates by exp(−½(kσ(cosθ +
+    n·s))²), which is 1 in the forward direction, in the shadow.
 
     Args:
         interfaces, wave_number, normal, direction, field: as in ``reflect_field``.
-        towards: s, to the receiver.
+        scattered_direction: unit vector s towards the receiver.
 
     Source: derivations §13 and §14; Balanis, Advanced Engineering Electromagnetics, §6.8.
     """
-    again = _reflect_from_smooth(interfaces, wave_number, normal, direction, field)
-    sent = radiate_currents(wave_number, normal, direction, field, again, scattered_direction)
+    reflected = _reflect_from_smooth(interfaces, wave_number, normal, direction, field)
+    radiated = radiate_currents(
+        wave_number, normal, direction, field, reflected, scattered_direction
+    )
     thin = torch.isfinite(interfaces.thickness) & ~interfaces.conducting
     if bool(thin.any()):
         sheet = _radiate_sheet(
             interfaces, wave_number, normal, direction, field, scattered_direction
         )
-        sent = torch.where(thin[:, None, None], sheet, sent)
+        radiated = torch.where(thin[:, None, None], sheet, radiated)
     leaving = dot(normal, scattered_direction)
-    kept = roughness_attenuation(interfaces, wave_number, leaving - dot(normal, direction))
-    kept = kept * torch.where(leaving > 0, interfaces.coherence, 1.0)
-    return project_transverse(sent * kept[:, None, None], scattered_direction)
+    attenuation = roughness_attenuation(interfaces, wave_number, leaving - dot(normal, direction))
+    attenuation = attenuation * torch.where(leaving > 0, interfaces.coherence, 1.0)
+    return project_transverse(radiated * attenuation[:, None, None], scattered_direction)
 
 
 def project_transverse(
     field: Complex128[Tensor, "row 2 3"], direction: Vectors
 ) -> Complex128[Tensor, "row 2 3"]:
-    """Fields without their part along a direction.
+    """Remove the longitudinal component of fields.
 
     Args:
-        field: F.
-        direction: s.
+        field: far fields F.
+        direction: unit vectors s.
     """
     s = direction[:, None]
     return field - dot(field, s.to(field.dtype))[..., None] * s
@@ -178,23 +180,25 @@ def radiate_currents(
     reflected_field: Complex128[Tensor, "row 2 3"],
     scattered_direction: Vectors,
 ) -> Complex128[Tensor, "row 2 3"]:
-    """−(jk/4π) [ηJ − s × M] per m² of the tangential fields of a wave and of its mirrored one.
+    """Radiation −(jk/4π) [ηJ − s × M] per m² of the currents of an incident and a reflected wave.
 
-    A wave along K, of which ηH = K × E, and its mirrored one have ηJ = n × (K×E + K_r×E_r) and
-    M = −n × (E + E_r). What lies along s is still in it.
+    A wave along K, with ηH = K × E, and its reflection have ηJ = n × (K×E + K_r×E_r) and M = −n ×
+    (E + E_r). The component along s is not removed.
 
     Args:
-        wave_number: k [1/m].
-        normal: n, on the side of the surface that sends.
-        wave_vector: K over k: a unit vector in air.
-        field, reflected_field: E and E_r.
-        scattered_direction: s, to the receiver.
+        wave_number: wave number k [1/m].
+        normal: unit normal n, on the radiating side of the surface.
+        wave_vector: K over k, [row, 3]; a unit vector in air.
+        field, reflected_field: incident field E and reflected field E_r [V/m].
+        scattered_direction: unit vector s towards the receiver.
 
     Source: derivations §13.
     """
     n, s = normal[:, None], scattered_direction[:, None]
-    onwards = reflect_vectors(wave_vector, normal)[:, None]
-    electric = cross(n, cross(wave_vector[:, None], field) + cross(onwards, reflected_field))
+    reflected_direction = reflect_vectors(wave_vector, normal)[:, None]
+    electric = cross(
+        n, cross(wave_vector[:, None], field) + cross(reflected_direction, reflected_field)
+    )
     magnetic = cross(s, cross(n, field + reflected_field))
     return -1j * wave_number / (4 * math.pi) * (electric + magnetic)
 
@@ -202,12 +206,12 @@ def radiate_currents(
 def roughness_attenuation(
     interfaces: SmoothInterfaces, wave_number: float, cosine_sum: Float64[Tensor, " row"]
 ) -> Float64[Tensor, " row"]:
-    """Share of the field that roughness leaves: phases spread by kσ(cosθ + cosθ').
+    """Rayleigh roughness factor of the coherent field, exp(−½(kσ(cosθ + cosθ'))²).
 
     Args:
-        interfaces: one row each.
-        wave_number: k [1/m].
-        cosine_sum: cosθ + cosθ', what a height changes of the way.
+        interfaces: smooth interfaces, one row each.
+        wave_number: wave number k [1/m].
+        cosine_sum: cosθ + cosθ', path length change per unit of height.
     """
     return torch.exp(-0.5 * (wave_number * interfaces.rms_height * cosine_sum) ** 2)
 
@@ -219,46 +223,46 @@ def _reflect_from_smooth(
     direction: Tensor,
     field: Tensor,
 ) -> Tensor:
-    """Reflected field of a surface without roughness."""
+    """Reflected field of a smooth surface."""
     n = normal[:, None]
-    whole = 2 * dot(n, field)[..., None] * n - field
+    conductor = 2 * dot(n, field)[..., None] * n - field
     if bool(interfaces.conducting.all()):
-        return whole
-    across, before, after = plane_of_incidence(normal, direction)
+        return conductor
+    unit_s, unit_p, reflected_p = plane_of_incidence(normal, direction)
     r_s, r_p = _coefficients(interfaces, wave_number, -dot(normal, direction))
-    part = r_s[:, None, None] * dot(across, field)[..., None] * across
-    part = part + r_p[:, None, None] * dot(before, field)[..., None] * after
-    return torch.where(interfaces.conducting[:, None, None], whole, part)
+    dielectric = r_s[:, None, None] * dot(unit_s, field)[..., None] * unit_s
+    dielectric = dielectric + r_p[:, None, None] * dot(unit_p, field)[..., None] * reflected_p
+    return torch.where(interfaces.conducting[:, None, None], conductor, dielectric)
 
 
 def orthogonal_unit_vectors(direction: Float64[Tensor, "*row 3"]) -> Float64[Tensor, "*row 3"]:
-    """A unit vector at a right angle to each direction, any that turns with it.
+    """Unit vectors orthogonal to given directions, otherwise arbitrary.
 
     Args:
-        direction: not zero.
+        direction: nonzero vectors.
     """
-    spare = torch.eye(3, dtype=direction.dtype)[direction.detach().abs().argmin(-1)]
-    return normalize(cross(direction, spare), dim=-1)
+    axis = torch.eye(3, dtype=direction.dtype)[direction.detach().abs().argmin(-1)]
+    return normalize(cross(direction, axis), dim=-1)
 
 
 def plane_of_incidence(normal: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit vectors of E across the plane of incidence (s), and in it (p) before and after a mirror.
+    """Unit vectors of s polarisation, and of p polarisation before and after a reflection.
 
     Args:
-        normal: of the surface, towards either side.
-        direction: d of the incident wave.
+        normal: unit normal of the surface, [row, 3], towards either side.
+        direction: direction d of the incident wave, [row, 3].
     """
-    across = cross(direction, normal)
-    # At normal incidence any axis serves.
-    steep = across.detach().norm(dim=-1, keepdim=True) < 1e-9
-    across = normalize(torch.where(steep, orthogonal_unit_vectors(normal), across), dim=-1)
-    onwards = reflect_vectors(direction, normal)
+    unit_s = cross(direction, normal)
+    # At normal incidence the axis is arbitrary.
+    is_normal = unit_s.detach().norm(dim=-1, keepdim=True) < 1e-9
+    unit_s = normalize(torch.where(is_normal, orthogonal_unit_vectors(normal), unit_s), dim=-1)
+    reflected = reflect_vectors(direction, normal)
     # A conductor has r_p = +1 between these two, r_s = −1.
-    return (across[:, None], cross(direction, across)[:, None], cross(onwards, across)[:, None])
+    return (unit_s[:, None], cross(direction, unit_s)[:, None], cross(reflected, unit_s)[:, None])
 
 
 def _interface_terms(interfaces: SmoothInterfaces, cosine: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """ε, q = √(ε − sin²θ) and the safe cosine; of conductors those of air."""
+    """ε, q = √(ε − sin²θ) and the cosine, bounded from below; for conductors those of air."""
     epsilon = torch.where(interfaces.conducting, 1.0 + 0j, interfaces.permittivity)
     cosine = cosine.clamp_min(LEAST_COSINE)
     return epsilon, torch.sqrt(epsilon - 1 + cosine**2), cosine
@@ -267,7 +271,7 @@ def _interface_terms(interfaces: SmoothInterfaces, cosine: Tensor) -> tuple[Tens
 def _coefficients(
     interfaces: SmoothInterfaces, wave_number: float, cosine: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Reflection coefficients r_s and r_p of bodies, and of sheets about their middle."""
+    """Reflection coefficients r_s and r_p of bodies, and of sheets referred to their mid-plane."""
     epsilon, root, cosine = _interface_terms(interfaces, cosine)
     r_s, r_p = _fresnel(epsilon, root, cosine)
     thin = torch.isfinite(interfaces.thickness)
@@ -284,7 +288,7 @@ def _coefficients(
 
 
 def _fresnel(epsilon: Tensor, root: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
-    """r_s and r_p of a half space."""
+    """Fresnel coefficients r_s and r_p of a half space."""
     parallel = epsilon * cosine
     return (cosine - root) / (cosine + root), (parallel - root) / (parallel + root)
 
@@ -297,39 +301,40 @@ def _radiate_sheet(
     field: Tensor,
     scattered_direction: Tensor,
 ) -> Tensor:
-    """F per m² of a sheet's polarisation current, before its part along s is taken off.
+    """Far field F per m² of a sheet's polarisation current, longitudinal component included.
 
-    Inside, waves go to and from the far face: E± exp(∓jkqζ) at the depth ζ, with q = √(ε − sin²θ).
+    Inside, waves propagate to and from the far face: E± exp(∓jkqζ) at the depth ζ, with q = √(ε −
+    sin²θ).
     """
     k, cosine = wave_number, -dot(normal, direction)
     epsilon, root, cosine = _interface_terms(interfaces, cosine)
     thickness = torch.where(torch.isfinite(interfaces.thickness), interfaces.thickness, 0.0)
-    across, before, _ = plane_of_incidence(normal, direction)
+    unit_s, unit_p, _ = plane_of_incidence(normal, direction)
     once = torch.exp(-1j * k * root * thickness)
-    along = direction + cosine[:, None] * normal  # sinθ times its unit vector
+    tangential = direction + cosine[:, None] * normal  # sinθ times its unit vector
     total = torch.zeros_like(field)
-    # The fields refer to the middle; the front face is met earlier and seen later.
+    # Fields refer to the mid-plane; the front face is reached earlier and seen later.
     front = torch.exp(1j * k * (cosine + dot(scattered_direction, normal)) * thickness / 2)
     r_s, r_p = _fresnel(epsilon, root, cosine)
-    parts = ((r_s, cosine + root, across), (r_p, epsilon * cosine + root, before))
+    parts = ((r_s, cosine + root, unit_s), (r_p, epsilon * cosine + root, unit_p))
     for r, both, unit in parts:
         t = 2 * cosine / both
         amplitude = dot(unit, field) * (t / (1 - r**2 * once**2))[:, None]
-        for way, strength in ((1.0, torch.ones_like(r)), (-1.0, -r * once**2)):
-            turn = k * (way * root + dot(scattered_direction, normal)) * thickness / 2
-            depth = thickness * _sinc(turn) * torch.exp(-1j * turn)
-            if unit is across:
-                vector = across.to(field.dtype)
+        for sign, strength in ((1.0, torch.ones_like(r)), (-1.0, -r * once**2)):
+            phase = k * (sign * root + dot(scattered_direction, normal)) * thickness / 2
+            depth = thickness * _sinc(phase) * torch.exp(-1j * phase)
+            if unit is unit_s:
+                vector = unit_s.to(field.dtype)
             else:
                 # E of a wave along (sinθ x, ∓q n) with its H across: H ∝ (1/ε)(along, q).
-                inner = along - way * root[:, None] * normal
-                vector = cross(inner, across[:, 0])[:, None]
+                inner = tangential - sign * root[:, None] * normal
+                vector = cross(inner, unit_s[:, 0])[:, None]
             total = total + vector * (amplitude * (strength * depth * front)[:, None])[..., None]
     return k**2 / (4 * math.pi) * (epsilon - 1)[:, None, None] * total
 
 
 def _sinc(x: Tensor) -> Tensor:
-    """sin(x)/x."""
+    """Return sin(x)/x."""
     small = x.abs() < 1e-6
     safe = torch.where(small, torch.ones_like(x), x)
     return torch.where(small, 1 - x**2 / 6, torch.sin(safe) / safe)
@@ -338,11 +343,11 @@ def _sinc(x: Tensor) -> Tensor:
 def parallelogram_integral(
     wave_vector: Vectors, first: Vectors, second: Vectors
 ) -> Float64[Tensor, " row"]:
-    """∫ exp(j w·x) over a parallelogram about the origin, over its area.
+    """Mean of exp(j w·x) over a parallelogram centred at the origin.
 
     Args:
         wave_vector: w [1/m].
-        first, second: its sides [m].
+        first, second: edge vectors of the parallelogram [m].
     """
     return _sinc(dot(wave_vector, first) / 2) * _sinc(dot(wave_vector, second) / 2)
 
@@ -350,34 +355,34 @@ def parallelogram_integral(
 def polygon_integral(
     polygon: Float64[Tensor, "row corner 3"], direction: Tensor
 ) -> Callable[[float], Complex128[Tensor, " row"]]:
-    """∫ exp(jk w·x) dA over flat polygons, exactly: a sum over their sides, by wave number k.
+    """Exact Fourier integral ∫ exp(jk w·x) dA over flat polygons, a function of wave number k.
 
     Args:
-        polygon: corners in order, about any point; some may coincide.
-        direction: w, real, or complex where a wave decays; what does not depend on k is computed
-            once.
+        polygon: corners in order, relative to any point [m]; some may coincide.
+        direction: w, [row, 3], real, or complex for decaying waves. Terms independent of k are
+            computed once.
 
     Source: Gordon, "Far-field approximations to the Kirchhoff-Helmholtz representations of
-    scattered fields", IEEE TAP 23, 1975. Near w ⊥ polygon the sum is 0/0; there two terms of the
-    series about the middle serve.
+    scattered fields", IEEE TAP 23, 1975. It is a sum over the sides; near w ⊥ polygon the sum is
+    0/0 and the series about the centroid to second order replaces it.
     """
     area = area_vector(polygon)
     size = area.norm(dim=-1)
     normal = area / size.clamp_min(1e-300)[:, None]
-    middle = polygon.mean(1)
-    flat = direction - dot(direction, normal)[:, None] * normal
-    square = dot(flat, flat)
-    corners = polygon - middle[:, None]
-    length = flat.detach().abs().square().sum(-1)
+    centroid = polygon.mean(1)
+    tangential = direction - dot(direction, normal)[:, None] * normal
+    square = dot(tangential, tangential)
+    corners = polygon - centroid[:, None]
+    length = tangential.detach().abs().square().sum(-1)
     largest = length * corners.detach().norm(dim=-1).amax(1) ** 2
     ends = corners.roll(-1, 1)
     sides = ends - corners
-    phase = dot(flat[:, None], corners + ends) / 2
-    share = dot(cross(sides, normal[:, None]), flat[:, None])
-    turn = dot(flat[:, None], sides) / 2
-    whole = dot(direction, middle)
-    # ∫(1 + jw·x − (w·x)²/2) by the triangles about the first corner.
-    first = dot(flat[:, None], corners)
+    phase = dot(tangential[:, None], corners + ends) / 2
+    side_factor = dot(cross(sides, normal[:, None]), tangential[:, None])
+    half_phase = dot(tangential[:, None], sides) / 2
+    centroid_phase = dot(direction, centroid)
+    # ∫(1 + jw·x − (w·x)²/2) over the fan of triangles at the first corner.
+    first = dot(tangential[:, None], corners)
     fan = torch.linalg.cross(
         corners[:, 1:-1] - corners[:, :1], corners[:, 2:] - corners[:, :1], dim=-1
     )
@@ -388,20 +393,20 @@ def polygon_integral(
     weight = weight.sum(1)
 
     def evaluate(k: float) -> Tensor:
-        broad = largest * k**2 < 1e-6
-        exact = (share * _sinc(k * turn) * phasor(k * phase)).sum(1)
-        exact = exact / torch.where(broad, torch.ones_like(square), square * k) / 1j
+        near_normal = largest * k**2 < 1e-6
+        exact = (side_factor * _sinc(k * half_phase) * phasor(k * phase)).sum(1)
+        exact = exact / torch.where(near_normal, torch.ones_like(square), square * k) / 1j
         series = weight + 1j * k * mean - k**2 * second / 2
-        return torch.where(broad, series, exact) * phasor(k * whole)
+        return torch.where(near_normal, series, exact) * phasor(k * centroid_phase)
 
     return evaluate
 
 
 def phasor(phase: Tensor) -> Tensor:
-    """exp(j phase).
+    """Return exp(j phase).
 
     Args:
-        phase: [rad], real or complex.
+        phase: phases [rad], any shape, real or complex.
     """
     if phase.is_complex():
         return torch.exp(1j * phase)
@@ -409,10 +414,10 @@ def phasor(phase: Tensor) -> Tensor:
 
 
 def area_vector(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tensor, "row 3"]:
-    """Area times unit normal [m²].
+    """Area vectors (area times unit normal) of polygons [m²].
 
     Args:
-        polygon: corners in order; some may coincide.
+        polygon: corners in order [m]; some may coincide.
     """
     spokes = polygon - polygon[:, :1]
     return torch.linalg.cross(spokes, spokes.roll(-1, 1), dim=-1).sum(1) / 2
@@ -423,12 +428,12 @@ def interpolate_vectors(
     corners: Float64[Tensor, "*#row 3 3"],
     points: Float64[Tensor, "*#row 3"],
 ) -> Float64[Tensor, "*row 3"]:
-    """Vectors at the corners of triangles, interpolated at points in these.
+    """Interpolate vectors given at the corners of triangles.
 
     Args:
-        values: At the corners.
-        corners: Of the triangles [m].
-        points: In them [m].
+        values: vectors at the corners.
+        corners: corners of the triangles [m].
+        points: points in the triangles [m].
     """
     return (barycentric_coordinates(corners, points)[..., None] * values).sum(-2)
 
@@ -439,8 +444,8 @@ def barycentric_coordinates(
     """Barycentric coordinates of points in triangles.
 
     Args:
-        corners: Of the triangles [m].
-        points: In them [m].
+        corners: corners of the triangles [m].
+        points: points in the triangles [m].
     """
     a, b, c = corners.unbind(-2)
     area = cross(b - a, c - a)

@@ -1,8 +1,9 @@
-"""Transition functions of diffraction: what an edge sends near the shadow of a straight wave.
+"""Transition functions of edge diffraction near shadow and reflection boundaries.
 
-With s² the phase by which the path over the edge is longer than the straight one, an endless edge
-sends g(s) = 2j exp(js²) ∫ exp(−jt²) dt from s to ∞; t² is the same phase of other points of the
-edge. The transition function of Kouyoumjian and Pathak is F(x) = √x g(√x). Convention exp(+jωt).
+With s² the phase by which the diffracted path is longer than the direct one, an infinite edge
+diffracts the field g(s) = 2j exp(js²) ∫ exp(−jt²) dt from s to ∞; t² is the same phase for other
+points of the edge. The transition function of Kouyoumjian and Pathak is F(x) = √x g(√x). Convention
+exp(+jωt).
 
 Source: derivations §9; Weideman, "Computation of the complex error function", SIAM J. Numer. Anal.
 31, 1994; Owen, "Tables for computing bivariate normal probabilities", Ann. Math. Stat. 27, 1956.
@@ -17,18 +18,18 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-_WEIDEMAN_TERMS = 40  # of Weideman's sum: 1e-14
-_QUADRATURE_POINTS = 24  # of either quadrature: 1e-14
-_CHAIN_POINTS = 48  # of that over a third edge
-_NEAR_LIMIT = 16.0  # s² + t² from which on the far quadrature serves
+_WEIDEMAN_TERMS = 40  # of Weideman's sum: error 1e-14
+_QUADRATURE_POINTS = 24  # of either quadrature: error 1e-14
+_CHAIN_POINTS = 48  # of the quadrature over a third edge
+_NEAR_LIMIT = 16.0  # s² + t² above which the far quadrature is used
 _EXP_J_PI_4 = complex(math.sqrt(0.5), math.sqrt(0.5))  # exp(jπ/4)
 _SQRT_PI = math.sqrt(math.pi)
-_DECAY_LIMIT = 6.0  # exp(−36) of the largest value, where an integral ends
-_ROWS_AT_ONCE = 1 << 13  # such pieces stay in the processor's cache: ten times as fast
+_DECAY_LIMIT = 6.0  # upper limit of integrals: exp(−36) of the largest value
+_ROWS_AT_ONCE = 1 << 13  # chunks that fit into the processor's cache: ten times as fast
 
 
 def _weideman_coefficients(terms: int) -> tuple[float, list[float]]:
-    """Scale and coefficients of the rational sum of w(z) = exp(−z²) erfc(−jz)."""
+    """Scale and coefficients of Weideman's rational sum for w(z) = exp(−z²) erfc(−jz)."""
     count = 2 * terms
     scale = math.sqrt(terms / math.sqrt(2))
     node = scale * np.tan(np.arange(-count + 1, count) * math.pi / count / 2)
@@ -38,7 +39,7 @@ def _weideman_coefficients(terms: int) -> tuple[float, list[float]]:
 
 
 def _graded_quadrature(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights from 0 to 1, closer together near 0: Gauss's of the cube root."""
+    """Nodes and weights on [0, 1], denser near 0: Gauss-Legendre in the cube root."""
     node, weight = np.polynomial.legendre.leggauss(count)
     root = (node + 1) / 2
     return root**3, 1.5 * weight * root**2
@@ -51,13 +52,13 @@ _LAGUERRE_RULE = tuple(zip(*np.polynomial.laguerre.laggauss(_QUADRATURE_POINTS),
 
 
 def transition(s: Float64[Tensor, "*row"]) -> Complex128[Tensor, "*row"]:
-    """g(s) = 2j exp(js²) ∫ exp(−jt²) dt from s to ∞ for s ≥ 0, and g(−s) = −g(s).
+    """Transition function g(s) = 2j exp(js²) ∫ exp(−jt²) dt from s to ∞ for s ≥ 0, odd in s.
 
-    Near zero it jumps by 2√π exp(jπ/4), as the straight wave does; far away it is 1/s. Its
+    At zero it jumps by 2√π exp(jπ/4), as the direct wave does; asymptotically it is 1/s. Its
     derivative is g′ = 2jsg − 2j on either side.
 
     Args:
-        s: any finite numbers.
+        s: signed square root of the phase difference [√rad].
     """
     return _TransitionFunction.apply(s)  # type: ignore[return-value]
 
@@ -65,11 +66,12 @@ def transition(s: Float64[Tensor, "*row"]) -> Complex128[Tensor, "*row"]:
 def end_transition(
     s: Float64[Tensor, "*#row"], t: Float64[Tensor, "*#row"]
 ) -> Complex128[Tensor, "*row"]:
-    """The part of g(s) that an edge beyond t sends: exp(jπ/4)/√π ∫ s exp(−jτ²)/(s² + τ²) dτ.
+    """Part of g(s) due to the edge beyond t: exp(jπ/4)/√π ∫ s exp(−jτ²)/(s² + τ²) dτ.
 
-    An edge whose ends are t₁ and t₂ away from the point of diffraction, counted outwards, sends
-    g(s) less the part beyond either end; t < 0 where that point lies beyond the end. Sums over the
-    edges of a plate have no jump, at its corners either: they are the Fresnel integral over it.
+    The field of an edge whose ends are t₁ and t₂ away from the diffraction point, positive
+    outwards, is g(s) less the part beyond either end; t < 0 if the point lies beyond the end. Sums
+    over the edges of a plate have no jump, not even at its corners: they are the Fresnel integral
+    over it.
 
     Args:
         s: as in ``transition``.
@@ -82,16 +84,16 @@ def end_transition(
 def edge_transition(
     s: Float64[Tensor, "*#row"], ends: Float64[Tensor, "*#row 2"] | None
 ) -> Complex128[Tensor, "*row"]:
-    """g(s) of an edge with two ends.
+    """Transition function of a finite edge.
 
     Args:
         s: as in ``transition``.
-        ends: t of both ends, as in ``end_transition``; None of an endless edge.
+        ends: t of both ends, as in ``end_transition``; None = infinite edge.
     """
-    sent = transition(s)
+    infinite = transition(s)
     if ends is None:
-        return sent
-    return sent - end_transition(s, ends[..., 0]) - end_transition(s, ends[..., 1])
+        return infinite
+    return infinite - end_transition(s, ends[..., 0]) - end_transition(s, ends[..., 1])
 
 
 def edge_transition_slope(
@@ -99,46 +101,46 @@ def edge_transition_slope(
     ends: Float64[Tensor, "*#row 2"] | None,
     value: Complex128[Tensor, "*row"],
 ) -> Complex128[Tensor, "*row"]:
-    """Derivative of ``edge_transition`` by s.
+    """Derivative of ``edge_transition`` with respect to s.
 
     Args:
-        s, ends: as there.
-        value: its value.
+        s, ends: as in ``edge_transition``.
+        value: value of ``edge_transition``.
     """
     slope = 2j * s * value - 2j
     for t in () if ends is None else ends.unbind(-1):
         size = _half_erfc(t.abs())
-        share = torch.where(t < 0, 1 - size, size)
+        fraction = torch.where(t < 0, 1 - size, size)
         square = (s * s + t * t).clamp_min(1e-300)
-        slope = slope + 2j * share - _EXP_J_PI_4 / _SQRT_PI * _phasor(-t * t) / square * t
+        slope = slope + 2j * fraction - _EXP_J_PI_4 / _SQRT_PI * _phasor(-t * t) / square * t
     return slope
 
 
 def corner_transition(
     s: Float64[Tensor, "*#row"], t: Float64[Tensor, "*#row"], coupling: Float64[Tensor, "*#row"]
 ) -> Complex128[Tensor, "*row"]:
-    """What two edges one after the other send: −4 ∫∫ exp(−j(2sx + 2ty + x² + y² − 2wxy)) dx dy.
+    """Double-diffraction transition function −4 ∫∫ exp(−j(2sx + 2ty + x² + y² − 2wxy)) dx dy.
 
-    Both integrals go from 0 to ∞, for s and t ≥ 0; for others, the function is −1 times that of
-    −s, t and −w. Without coupling it is g(s) g(t); far away it is 1/st.
+    Both integrals go from 0 to ∞, for s and t ≥ 0; otherwise, the function is −1 times that of −s,
+    t and −w. Without coupling it is g(s) g(t); asymptotically it is 1/st.
 
     Args:
-        s, t: as in ``transition``, of the path over both edges at either of them.
-        coupling: w, of −1 to 1: how much the way through one opening moves that through the other.
+        s, t: arguments of ``transition`` at either edge, for the path over both.
+        coupling: w in [−1, 1], the correlation of the two aperture integrals.
 
     Source: Capolino, Albani, Maci and Tiberio, "Double diffraction at a pair of coplanar skew
     edges", IEEE TAP 45, 1997, T(s, t, w)/st.
     """
-    sides = torch.where(s < 0, -1.0, 1.0), torch.where(t < 0, -1.0, 1.0)
-    s, t, side = s.abs(), t.abs(), sides[0] * sides[1]
+    signs = torch.where(s < 0, -1.0, 1.0), torch.where(t < 0, -1.0, 1.0)
+    s, t, sign = s.abs(), t.abs(), signs[0] * signs[1]
     s, t, _ = torch.broadcast_tensors(s, t, coupling)
-    w = side * coupling
+    w = sign * coupling
     root = torch.sqrt((1 - w) * (1 + w))
     parts = [
         _phasor(own * own) * end_transition((other + w * own) / root, own)
         for own, other in ((s, t), (t, s))
     ]
-    return (2j * _SQRT_PI * _EXP_J_PI_4.conjugate() * side / root) * (parts[0] + parts[1])
+    return (2j * _SQRT_PI * _EXP_J_PI_4.conjugate() * sign / root) * (parts[0] + parts[1])
 
 
 def chain_transition(
@@ -146,54 +148,54 @@ def chain_transition(
     outer: Sequence[Float64[Tensor, "term row"]],
     coupling: Sequence[Float64[Tensor, " row"]],
 ) -> Complex128[Tensor, "parity parity term term term row"]:
-    """What three edges send, of which one is coupled to both others: parts by parity in couplings.
+    """Triple-diffraction transition function, in parts by parity in the couplings.
 
-    The whole is −8j ∫∫∫ exp(−j(x² + y² + z² + 2rx + 2sy + 2tz − 2vxy − 2wxz)) from 0 to ∞, with
-    y and z of the outer edges. For every x, the integrals over y and z are functions of their own,
-    and that over x goes down from the real axis. Parts even (0) and odd (1) in v and w add up to
-    the whole; terms are in the order of the arguments. Without coupling it is g(r) g(s) g(t). Of
-    arguments up to 30 it is exact to 3e-5 of it, of arguments up to 3 to 1e-10.
+    One edge is coupled to both others. The whole is −8j ∫∫∫ exp(−j(x² + y² + z² + 2rx + 2sy + 2tz − 2vxy − 2wxz)) from 0 to ∞, with y
+    and z of the outer edges. For each x, the integrals over y and z have closed forms, and the
+    contour of x is rotated below the real axis. Parts even (0) and odd (1) in v and w add up to the
+    whole; terms are in the order of the arguments. Without coupling it is g(r) g(s) g(t). The
+    relative error is 3e-5 for arguments up to 30, and 1e-10 for arguments up to 3.
 
     Args:
         middle: r ≥ 0, as in ``transition``.
-        outer: s and t ≥ 0.
-        coupling: v and w, v² + w² < 1.
+        outer: s and t ≥ 0, of the outer edges.
+        coupling: v and w, with v² + w² < 1.
     """
-    left = (1 - coupling[0] ** 2 - coupling[1] ** 2).clamp_min(1e-9)
+    remainder = (1 - coupling[0] ** 2 - coupling[1] ** 2).clamp_min(1e-9)
     node, weight = (torch.tensor(values, dtype=torch.float64) for values in _GRADED_RULE)
-    reach = _DECAY_LIMIT / left.detach().sqrt()
-    x, step = reach[:, None] * node, reach[:, None] * weight
+    limit = _DECAY_LIMIT / remainder.detach().sqrt()
+    x, step = limit[:, None] * node, limit[:, None] * weight
     sides = []
     for values, w in zip(outer, coupling, strict=True):
         up, down = (
             _ShiftedTransition.apply(values[..., None], sign * w[:, None], x) for sign in (1, -1)
         )
         sides.append(torch.stack([up + down, up - down]) / 2)
-    falls = left[:, None] * x**2 + math.sqrt(2) * middle[..., None] * x
-    turns = -math.sqrt(2) * middle[..., None] * x
-    kernel = torch.polar(2 * step * (-falls).exp(), turns) * _EXP_J_PI_4
+    decay = remainder[:, None] * x**2 + math.sqrt(2) * middle[..., None] * x
+    phase = -math.sqrt(2) * middle[..., None] * x
+    kernel = torch.polar(2 * step * (-decay).exp(), phase) * _EXP_J_PI_4
     return torch.einsum("crx,parx,qbrx->pqcabr", kernel, sides[0], sides[1])
 
 
 def _apply_in_chunks(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
-    """A function of numbers of one shape, some rows at a time."""
+    """Evaluate an element-wise function in chunks."""
     pieces = zip(*(values.reshape(-1).split(_ROWS_AT_ONCE) for values in given), strict=True)
     return torch.cat([function(*piece) for piece in pieces]).reshape(given[0].shape)
 
 
 def _scaled_erfc(x: Tensor) -> Tensor:
-    """exp(jx²) erfc(exp(jπ/4) x) of x ≥ 0: w(exp(j3π/4) x) by Weideman's sum."""
-    turned = x * complex(-_EXP_J_PI_4.imag, -_EXP_J_PI_4.real)  # j exp(j3π/4) x
-    below = _SCALE - turned
-    ratio = (_SCALE + turned) / below
+    """Scaled erfc exp(jx²) erfc(exp(jπ/4) x) for x ≥ 0: w(exp(j3π/4) x) by Weideman's sum."""
+    rotated = x * complex(-_EXP_J_PI_4.imag, -_EXP_J_PI_4.real)  # j exp(j3π/4) x
+    denominator = _SCALE - rotated
+    ratio = (_SCALE + rotated) / denominator
     total = torch.zeros_like(ratio) + _COEFFICIENTS[0]
     for coefficient in _COEFFICIENTS[1:]:
         total = total * ratio + coefficient
-    return (2 * total / below + 1 / _SQRT_PI) / below
+    return (2 * total / denominator + 1 / _SQRT_PI) / denominator
 
 
 class _ShiftedTransition(torch.autograd.Function):
-    """exp(−w²x²) g(s − exp(−jπ/4) w x), where g is that of s ≥ 0 for all complex numbers."""
+    """exp(−w²x²) g(s − exp(−jπ/4) w x), with g continued analytically from s ≥ 0."""
 
     @staticmethod
     def forward(s: Tensor, w: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]
@@ -221,18 +223,18 @@ class _ShiftedTransition(torch.autograd.Function):
 
 
 def _evaluate_shifted(s: Tensor, shift: Tensor) -> Tensor:
-    """One-dimensional; beyond s = √2 shift by way of the function of −s."""
-    way = s - _EXP_J_PI_4.conjugate() * shift
-    over = shift * math.sqrt(2) > s
-    size = _scaled_erfc(torch.where(over, -way, way)) * torch.exp(-shift * shift)
-    turn = s * s - math.sqrt(2) * shift * s
-    straight = torch.exp(torch.complex(-math.sqrt(2) * shift * s * over, turn))
-    return _SQRT_PI * _EXP_J_PI_4 * torch.where(over, 2 * straight - size, size)
+    """Evaluate 1D arrays; beyond s = √2 shift through the function of −s."""
+    argument = s - _EXP_J_PI_4.conjugate() * shift
+    beyond = shift * math.sqrt(2) > s
+    size = _scaled_erfc(torch.where(beyond, -argument, argument)) * torch.exp(-shift * shift)
+    phase = s * s - math.sqrt(2) * shift * s
+    direct = torch.exp(torch.complex(-math.sqrt(2) * shift * s * beyond, phase))
+    return _SQRT_PI * _EXP_J_PI_4 * torch.where(beyond, 2 * direct - size, size)
 
 
 def _shifted_derivatives(s: Tensor, w: Tensor, x: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    way = s - _EXP_J_PI_4.conjugate() * w * x
-    by_s = 2j * way * value - 2j * torch.exp(-((w * x) ** 2))
+    argument = s - _EXP_J_PI_4.conjugate() * w * x
+    by_s = 2j * argument * value - 2j * torch.exp(-((w * x) ** 2))
     return by_s, -_EXP_J_PI_4.conjugate() * x * by_s - 2 * w * x * x * value
 
 
@@ -242,12 +244,12 @@ def _phasor(phase: Tensor) -> Tensor:
 
 
 def _half_erfc(x: Tensor) -> Tensor:
-    """½ erfc(exp(jπ/4) x) of x ≥ 0: the part of a straight wave that passes an edge."""
+    """½ erfc(exp(jπ/4) x) for x ≥ 0: fraction of a direct wave beyond a half plane."""
     return 0.5 * _phasor(-x * x) * _scaled_erfc(x)
 
 
 class _TransitionFunction(torch.autograd.Function):
-    """g(s)."""
+    """Transition function g(s) with first derivatives."""
 
     @staticmethod
     def forward(s: Tensor) -> Tensor:  # type: ignore[override]
@@ -271,7 +273,7 @@ class _TransitionFunction(torch.autograd.Function):
 
 
 class _TruncatedTransition(torch.autograd.Function):
-    """The part beyond t ≥ 0, odd in s."""
+    """Part of g(s) beyond t ≥ 0, odd in s."""
 
     @staticmethod
     def forward(s: Tensor, t: Tensor) -> Tensor:  # type: ignore[override]
@@ -301,7 +303,7 @@ class _TruncatedTransition(torch.autograd.Function):
 
 
 def _truncated_derivatives(s: Tensor, t: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives of the part beyond t by s and by t; finite at s = t = 0, where there are none."""
+    """Derivatives with respect to s and t of the part beyond t; finite at s = t = 0."""
     square = (s * s + t * t).clamp_min(1e-300)
     half = _apply_in_chunks(_half_erfc, t)
     front = _EXP_J_PI_4 / _SQRT_PI * _phasor(-t * t) / square
@@ -309,7 +311,7 @@ def _truncated_derivatives(s: Tensor, t: Tensor, value: Tensor) -> tuple[Tensor,
 
 
 def _evaluate_truncated(s: Tensor, t: Tensor) -> Tensor:
-    """The part beyond t ≥ 0 of s ≥ 0, in one dimension."""
+    """Part of g(s) beyond t ≥ 0 for s ≥ 0, of 1D arrays."""
     found = torch.empty(s.shape, dtype=torch.complex128)
     square = s * s + t * t
     for rule, rows in (
@@ -332,9 +334,9 @@ def _near_quadrature(s: Tensor, t: Tensor) -> Tensor:
 
 
 def _far_quadrature(s: Tensor, t: Tensor) -> Tensor:
-    """Down the steepest path, τ² = t² − jv; where s > t by way of the part with both exchanged.
+    """Integrate along the steepest-descent path τ² = t² − jv, with s and t exchanged for s > t.
 
-    The parts beyond (s, t) and (t, s) are those of a right angle: a product of two edges.
+    The parts beyond (s, t) and (t, s) add up to those of a right angle: a product of two edges.
     """
     low, high = torch.minimum(s, t), torch.maximum(s, t)
     total = torch.zeros(s.shape, dtype=torch.complex128)
@@ -342,6 +344,6 @@ def _far_quadrature(s: Tensor, t: Tensor) -> Tensor:
     for node, weight in _LAGUERRE_RULE:
         lower = torch.complex(square, torch.full_like(square, -node))
         total = total + weight / (torch.sqrt(lower) * (lower + low * low))
-    part = -0.5j * low * total * _phasor(-high * high)
-    both = 0.5 * math.pi * _scaled_erfc(s) * _scaled_erfc(t) * _phasor(-t * t)
-    return torch.where(s > t, both - part * _phasor(s * s - low * low), part)
+    truncated = -0.5j * low * total * _phasor(-high * high)
+    product = 0.5 * math.pi * _scaled_erfc(s) * _scaled_erfc(t) * _phasor(-t * t)
+    return torch.where(s > t, product - truncated * _phasor(s * s - low * low), truncated)

@@ -1,17 +1,17 @@
-"""What a wedge does to a wave that meets its edge: the uniform theory of diffraction, as dyads.
+"""Uniform theory of diffraction (UTD): dyadic diffraction coefficients of wedges.
 
-The field beyond an edge is that of geometric optics, switched hard at its shadow and reflection
-boundaries, plus what the edge sends: E(s) = A exp(−jks) D·E(Q). D jumps at every boundary by as
-much as geometric optics does, with the other sign, so that the sum is smooth; no boundary term is
-left over for derivatives. Convention exp(+jωt).
+The field beyond an edge is that of geometric optics, discontinuous at its shadow and reflection
+boundaries, plus the edge-diffracted field: E(s) = A exp(−jks) D·E(Q). D jumps at every boundary by
+as much as geometric optics does, with opposite sign, so that the sum is smooth and derivatives need
+no boundary term. Convention exp(+jωt).
 
 Source: derivations §9; Kouyoumjian and Pathak, "A uniform geometrical theory of diffraction for an
 edge in a perfectly conducting surface", Proc. IEEE 62, 1974; Luebbers, IEEE TAP 32, 1984.
 
 Differs from the source: each of the four cotangents and its transition function are one function
-that is finite on its boundary, and of an edge with ends. Faces that are no conductors reflect by
-dyads in the basis of the mirrored direction; D is the mean of both ways, so that it is reciprocal.
-The straight wave's terms of a sheet count by 1 − T.
+that is finite on its boundary, and holds for edges with ends. Faces that are not conductors reflect
+by dyads in the basis of the reflected direction; D is averaged over both directions of propagation,
+so that it is reciprocal. For a sheet, the terms of the direct wave are weighted by 1 − T.
 """
 
 import itertools
@@ -37,29 +37,29 @@ from invertwin.channel.em.wedges import Wedges, edge_axis
 from invertwin.scene.material.fresnel import FieldCoefficients
 
 _EXP_MINUS_J_PI_4 = complex(math.sqrt(0.5), -math.sqrt(0.5))  # exp(−jπ/4)
-_SHEET_TOLERANCE = 1e-6  # of an opening: both faces are those of one sheet
-_MIN_COUPLING = 1e-9  # couplings that count as none
-_SERIES_ANGLE = 1e-4  # rad from a boundary, within which a quotient is its series
+_SHEET_TOLERANCE = 1e-6  # of an opening: both faces belong to one sheet
+_MIN_COUPLING = 1e-9  # couplings below this are neglected
+_SERIES_ANGLE = 1e-4  # rad from a boundary, within which quotients are series
 _TERM_SIGNS = ((-1.0, 1.0), (-1.0, -1.0), (1.0, 1.0), (1.0, -1.0))
-"""By term: φ − φ′ or φ + φ′, and the sign of π beside it. The third is the face n, the last 0."""
+"""Signs by term: φ − φ′ or φ + φ′, and the sign of π. The third is for face n, the last face 0."""
 
 DyadDerivative = Literal["value", "in", "out"]
-"""The coefficient, or its derivative by the azimuth of incidence or of departure [1/rad]."""
+"""Coefficient, or derivative with respect to the azimuth of incidence or diffraction [1/rad]."""
 
 
 FaceCoefficients = Callable[[int, Float64[Tensor, " row"]], FieldCoefficients]
-"""Coefficients of the faces 0 and 1 (n) of some wedges, at cosines of the angle of incidence.
+"""Field coefficients of the faces 0 and 1 (n) of wedges, at cosines of the angle of incidence.
 
-Those of a sheet are about its middle, its transmission that of the straight path through air.
+Those of a sheet refer to its mid-plane, its transmission to the straight path through air.
 """
 
 
 def conductor_coefficients(face: int, cosine: Float64[Tensor, " row"]) -> FieldCoefficients:
-    """The faces of a perfect conductor.
+    """Field coefficients of perfectly conducting faces.
 
     Args:
-        face: 0 or 1.
-        cosine: of the angle of incidence.
+        face: number of the face, 0 or 1.
+        cosine: cosine of the angle of incidence.
     """
     one = torch.ones_like(cosine).to(torch.complex128)
     return FieldCoefficients(-one, one, 0 * one, 0 * one)
@@ -67,18 +67,18 @@ def conductor_coefficients(face: int, cosine: Float64[Tensor, " row"]) -> FieldC
 
 @dataclass(frozen=True)
 class EdgeDiffraction:
-    """Waves that turn at edges, one row each.
+    """Incidence and diffraction directions and angles at edges, one row each.
 
     Attributes:
-        wedges: whose edges they meet.
-        incident_direction: unit vectors of the waves before the edge.
-        diffracted_direction: after it.
-        azimuth_in, azimuth: φ′ and φ about the edge from the face 0, through the exterior [rad].
-        distance_parameter: distance parameter L, of a spherical wave s s′ sin²β/(s + s′) [m].
-        face_coefficients: what the wedges' faces do to waves.
-        end_parameters: by how much longer, as √phase, paths over the edge's ends are; None = no
-            ends.
-        absorbing: whether faces neither mirror nor let through, whatever they are.
+        wedges: diffracting wedges.
+        incident_direction: unit vectors of propagation before the edge.
+        diffracted_direction: unit vectors of propagation after the edge.
+        azimuth_in, azimuth: φ′ and φ about the edge, measured from face 0 through the exterior
+            [rad].
+        distance_parameter: distance parameter L [m]; for a spherical wave s s′ sin²β/(s + s′).
+        face_coefficients: reflection and transmission of the wedges' faces.
+        end_parameters: √phase by which paths over the edge's ends are longer; None = infinite edge.
+        absorbing: True for faces that neither reflect nor transmit, whatever their material.
     """
 
     wedges: Wedges
@@ -92,7 +92,7 @@ class EdgeDiffraction:
     absorbing: bool = False
 
     def reverse(self) -> "EdgeDiffraction":
-        """The same waves on their way back."""
+        """Return the same geometry with source and receiver exchanged."""
         return replace(
             self,
             incident_direction=-self.diffracted_direction,
@@ -103,19 +103,19 @@ class EdgeDiffraction:
 
     @property
     def sin_beta(self) -> Float64[Tensor, " row"]:
-        """Of the angle β between the waves and the edge."""
+        """sinβ, with β the angle between the incident wave and the edge."""
         return cross(edge_axis(self.wedges), self.incident_direction).norm(dim=1)
 
 
 def diffraction_dyad(
     diffraction: EdgeDiffraction, wave_number: float, order: DyadDerivative = "value"
 ) -> Tensor:
-    """One of ``diffraction_dyads``, [row, 3, 3].
+    """Diffraction dyad, one of ``diffraction_dyads``, [row, 3, 3].
 
     Args:
-        diffraction: the waves.
-        wave_number: k [1/m].
-        order: the dyad, or its derivative by an azimuth.
+        diffraction: edge diffraction geometry.
+        wave_number: wave number k [1/m].
+        order: the dyad, or its derivative with respect to an azimuth.
     """
     return diffraction_dyads(diffraction, wave_number, (order,))[0]
 
@@ -123,24 +123,24 @@ def diffraction_dyad(
 def diffraction_dyads(
     diffraction: EdgeDiffraction, wave_number: float, orders: Sequence[DyadDerivative]
 ) -> Complex128[Tensor, "order row 3 3"]:
-    """D of a wedge: E(s) = A exp(−jks) D·E(Q), with E in world coordinates, in √m.
+    """Diffraction dyads D of wedges: E(s) = A exp(−jks) D·E(Q), E in world axes [√m].
 
-    A = √(s′/(s(s + s′))) for a spherical wave. That of ``"in"``, times 1/(jk sinβ), is the slope
+    A = √(s′/(s(s + s′))) for a spherical wave. The order ``"in"``, times 1/(jk sinβ), is the slope
     dyad that acts on the derivative of E(Q) along φ′.
 
     Args:
-        diffraction: the waves.
-        wave_number: k [1/m].
-        orders: the dyad, or its derivatives by an azimuth.
+        diffraction: edge diffraction geometry.
+        wave_number: wave number k [1/m].
+        orders: the dyad, or its derivatives with respect to an azimuth.
     """
-    there = _directional_dyads(diffraction, wave_number, orders)
+    forward = _directional_dyads(diffraction, wave_number, orders)
     if diffraction.face_coefficients is conductor_coefficients or diffraction.absorbing:
-        return there
-    flipped: dict[DyadDerivative, DyadDerivative] = {"value": "value", "in": "out", "out": "in"}
-    back = _directional_dyads(
-        diffraction.reverse(), wave_number, [flipped[order] for order in orders]
+        return forward
+    exchanged: dict[DyadDerivative, DyadDerivative] = {"value": "value", "in": "out", "out": "in"}
+    backward = _directional_dyads(
+        diffraction.reverse(), wave_number, [exchanged[order] for order in orders]
     )
-    return (there + back.mT) / 2
+    return (forward + backward.mT) / 2
 
 
 def double_dyad(
@@ -149,20 +149,21 @@ def double_dyad(
     coupling: Float64[Tensor, " row"],
     wave_number: float,
 ) -> Complex128[Tensor, "row 3 3"]:
-    """Of two edges one after the other, in m: more than the product of both dyads.
+    """Double-diffraction dyads of two consecutive edges [m].
 
-    Where the second edge is in a transition region of the first, its field is no single wave. Each
-    pair of cotangents then has one transition function. Of what is alike on both sides of the way
-    between the edges it takes the values, of the rest the slopes.
+    They are not the product of both dyads: in a transition region of the first edge, its field at
+    the second is not a ray-optical wave. Each pair of cotangents therefore has one transition
+    function. Its part that is even about the line between the edges multiplies the values of the
+    cotangents, the odd part their slopes.
 
     Args:
-        first, second: the waves.
-        coupling: w of ``corner_transition``; > 0 where growing azimuths of departure from the
-            first edge and of incidence on the second are on the same side.
-        wave_number: k [1/m].
+        first, second: edge diffraction geometry at either edge.
+        coupling: w of ``corner_transition``; > 0 if the azimuths of diffraction at the first edge
+            and of incidence on the second grow to the same side.
+        wave_number: wave number k [1/m].
     """
     before, after = _couple_cotangents(first, wave_number), _couple_cotangents(second, wave_number)
-    # All pairs at once: [term of the first, of the second, row].
+    # All pairs: [term of the first edge, term of the second, row].
     w = before.sides[1][:, None, None] * after.sides[0][:, None] * coupling
     same, opposite = corner_transition(before.s[:, None], after.s, torch.stack([w, -w]))
     strength = before.value[:, None] * (same + opposite) * after.value
@@ -175,31 +176,32 @@ def triple_dyad(
     couplings: Float64[Tensor, "row 3 3"],
     wave_number: float,
 ) -> Complex128[Tensor, "row 3 3"]:
-    """Of three edges one after the other, in √m³: as ``double_dyad``, of triples of cotangents.
+    """Triple-diffraction dyads of three consecutive edges [√m³], from triples of cotangents.
 
-    One of the edges is coupled to both others; the least of the three couplings is left out. There
-    is none between parallel edges with another between them, nor between edges at right angles. A
-    cotangent of the edge in the middle that is uneven to both sides counts by its curvature.
+    As ``double_dyad``; one of the edges is coupled to both others, and the smallest of the three
+    couplings is neglected. It is zero between parallel edges with another edge between them, and
+    between edges at right angles. A cotangent of the middle edge that is odd to both sides
+    contributes by its curvature.
 
     Args:
-        diffractions: the waves.
-        couplings: w between edges, as in ``double_dyad``.
-        wave_number: k [1/m].
+        diffractions: edge diffraction geometry at the three edges.
+        couplings: w between pairs of edges, as in ``double_dyad``.
+        wave_number: wave number k [1/m].
     """
-    found = [_couple_cotangents(turn, wave_number) for turn in diffractions]
-    dyads = [_term_dyads(turn) for turn in diffractions]
-    least = torch.stack([couplings[:, a, b].abs() for a, b in ((1, 2), (0, 2), (0, 1))])
-    # Of edges that are all alike, either way takes the same one.
-    reach = torch.stack([turn.distance_parameter for turn in diffractions])
-    least = torch.where(least > _MIN_COUPLING, least, -reach).argmin(0)
+    cotangents = [_couple_cotangents(geometry, wave_number) for geometry in diffractions]
+    dyads = [_term_dyads(geometry) for geometry in diffractions]
+    smallest = torch.stack([couplings[:, a, b].abs() for a, b in ((1, 2), (0, 2), (0, 1))])
+    # For equal edges, both directions of propagation choose the same one.
+    reach = torch.stack([geometry.distance_parameter for geometry in diffractions])
+    smallest = torch.where(smallest > _MIN_COUPLING, smallest, -reach).argmin(0)
     total = torch.zeros(len(couplings), 3, 3, dtype=torch.complex128)
-    # The middle of the chain is the edge that takes no part in the least coupling.
+    # The middle of the chain is the edge without part in the smallest coupling.
     for center, (first, second, third) in enumerate(("cab", "acb", "abc")):
-        rows = torch.nonzero(least == center)[:, 0]
+        rows = torch.nonzero(smallest == center)[:, 0]
         if not len(rows):
             continue
         others = [edge for edge in range(3) if edge != center]
-        middle, *outer = (found[edge].rows(rows) for edge in (center, *others))
+        middle, *outer = (cotangents[edge].rows(rows) for edge in (center, *others))
         parts = chain_transition(
             middle.s.abs(),
             [edge.s.abs() for edge in outer],
@@ -208,25 +210,26 @@ def triple_dyad(
         strength = torch.zeros(parts.shape[2:], dtype=torch.complex128)
         for odd in itertools.product((0, 1), (0, 1)):
             weights = [middle.strength(sum(odd))]
-            for other, edge, uneven in zip(others, outer, odd, strict=True):
-                weights.append(edge.strength(uneven))
-                if uneven:
+            for other, edge, is_odd in zip(others, outer, odd, strict=True):
+                weights.append(edge.strength(is_odd))
+                if is_odd:
                     weights[0] = weights[0] * middle.sides[int(other > center), :, None]
                     weights[-1] = weights[-1] * edge.sides[int(other < center), :, None]
             strength = strength + parts[odd] * torch.einsum("cr,ar,br->cabr", *weights)
-        some = [dyad[:, rows] for dyad in dyads]
+        selected = [dyad[:, rows] for dyad in dyads]
         chain = f"cabr,{third}rij,{second}rjk,{first}rkl->ril"
-        total = total.index_add(0, rows, torch.einsum(chain, strength, *reversed(some)))
+        total = total.index_add(0, rows, torch.einsum(chain, strength, *reversed(selected)))
     return total
 
 
 class _CoupledCotangents(NamedTuple):
-    """Cotangents that meet those of other edges.
+    """Cotangent terms of one edge, coupled to those of other edges.
 
     Attributes:
-        value, slope, curve: strengths of 1/s, and by the root of −1/s² and 2/s³ in derivatives.
-        s: of ``transition``.
-        sides: 1 where s falls with the azimuth of incidence or of departure.
+        value, slope, curve: strengths of 1/s, and of −1/s² and 2/s³ in derivatives with respect to
+            s.
+        s: argument of ``transition``.
+        sides: 1 if s falls with the azimuth of incidence or of diffraction, else −1.
     """
 
     value: Complex128[Tensor, "term row"]
@@ -236,12 +239,12 @@ class _CoupledCotangents(NamedTuple):
     sides: Float64[Tensor, "2 term"]
 
     def rows(self, index: Tensor) -> "_CoupledCotangents":
-        """Some rows."""
+        """Select rows."""
         value, slope, curve, s = (column[:, index] for column in self[:4])
         return _CoupledCotangents(value, slope, curve, s, self.sides)
 
     def strength(self, order: int) -> Tensor:
-        """Of a derivative, for |s|: of −s, a function of both has the other sign, and −w."""
+        """Strength of a derivative as a function of |s|; odd orders keep their sign."""
         strength = (self.value, self.slope, self.curve)[order]
         return strength if order % 2 else torch.where(self.s < 0, -strength, strength)
 
@@ -252,20 +255,25 @@ def _couple_cotangents(diffraction: EdgeDiffraction, wave_number: float) -> _Cou
         torch.sqrt(2 * wave_number * diffraction.distance_parameter),
     )
     scale = -_dyad_scale(diffraction, wave_number) * root
-    found = []
+    columns = []
     for other, sign in _term_signs(diffraction):
         half = _half_boundary_angle(diffraction, other, sign)
-        near = half.abs() < _SERIES_ANGLE
-        safe = torch.where(near, torch.full_like(half, _SERIES_ANGLE), half)
-        ratio = torch.where(near, opening, torch.sin(safe) / torch.sin(safe / opening))
-        bent = torch.cos(half / opening)
+        is_near = half.abs() < _SERIES_ANGLE
+        safe = torch.where(is_near, torch.full_like(half, _SERIES_ANGLE), half)
+        ratio = torch.where(is_near, opening, torch.sin(safe) / torch.sin(safe / opening))
+        cosine = torch.cos(half / opening)
         s = root * torch.sin(half)
-        seen = scale * (edge_transition(s, diffraction.end_parameters) / transition(s))
-        curve = seen * ratio**3 * bent / opening**2
-        found.append(
-            (seen * _cotangent_quotient(half, opening), seen * ratio**2 / opening, curve, s)
+        finite_scale = scale * (edge_transition(s, diffraction.end_parameters) / transition(s))
+        curve = finite_scale * ratio**3 * cosine / opening**2
+        columns.append(
+            (
+                finite_scale * _cotangent_quotient(half, opening),
+                finite_scale * ratio**2 / opening,
+                curve,
+                s,
+            )
         )
-    value, slope, curve, s = (torch.stack(column) for column in zip(*found, strict=True))
+    value, slope, curve, s = (torch.stack(column) for column in zip(*columns, strict=True))
     sides = (
         torch.tensor([[sign * other, sign] for other, sign in _term_signs(diffraction)]).double().T
     )
@@ -276,32 +284,32 @@ def _directional_dyads(
     diffraction: EdgeDiffraction, wave_number: float, orders: Sequence[DyadDerivative]
 ) -> Tensor:
     weights = _term_coefficients(diffraction, wave_number, orders)[..., None, None]
-    straight, _, *mirrors = _directional_term_dyads(diffraction)
-    total = (weights[0] + weights[1]) * straight
-    for weight, mirror in zip(weights[2:], mirrors, strict=True):
-        total = total + weight * mirror
+    direct, _, *reflected = _directional_term_dyads(diffraction)
+    total = (weights[0] + weights[1]) * direct
+    for weight, dyad in zip(weights[2:], reflected, strict=True):
+        total = total + weight * dyad
     return total
 
 
 def _term_dyads(diffraction: EdgeDiffraction) -> Complex128[Tensor, "term row 3 3"]:
-    """What the terms multiply, the same on the way back."""
-    there = torch.stack(torch.broadcast_tensors(*_directional_term_dyads(diffraction)))
+    """Dyads of the cotangent terms, averaged over both directions of propagation."""
+    forward = torch.stack(torch.broadcast_tensors(*_directional_term_dyads(diffraction)))
     if diffraction.face_coefficients is conductor_coefficients or diffraction.absorbing:
-        return there
-    back = torch.stack(torch.broadcast_tensors(*_directional_term_dyads(diffraction.reverse())))
-    return (there + back.mT) / 2
+        return forward
+    backward = torch.stack(torch.broadcast_tensors(*_directional_term_dyads(diffraction.reverse())))
+    return (forward + backward.mT) / 2
 
 
 def _directional_term_dyads(diffraction: EdgeDiffraction) -> list[Complex128[Tensor, "row 3 3"]]:
     if diffraction.absorbing:
-        along = edge_axis(diffraction.wedges)
+        axis = edge_axis(diffraction.wedges)
         bases = (
-            _ray_fixed_basis(along, diffraction.diffracted_direction),
-            _ray_fixed_basis(along, diffraction.incident_direction),
+            _ray_fixed_basis(axis, diffraction.diffracted_direction),
+            _ray_fixed_basis(axis, diffraction.incident_direction),
         )
         return [_rotate_dyad(*bases, torch.eye(3, dtype=torch.complex128))] * 2
-    straight, *mirrors = _geometric_optics_dyads(diffraction)
-    return [straight, straight, *mirrors]
+    direct, *reflected = _geometric_optics_dyads(diffraction)
+    return [direct, direct, *reflected]
 
 
 def _term_signs(diffraction: EdgeDiffraction) -> tuple[tuple[float, float], ...]:
@@ -317,7 +325,7 @@ def _dyad_scale(diffraction: EdgeDiffraction, wave_number: float) -> Tensor:
 def _term_coefficients(
     diffraction: EdgeDiffraction, wave_number: float, orders: Sequence[DyadDerivative]
 ) -> Complex128[Tensor, "term order row"]:
-    """The four scalar coefficients, or their derivatives."""
+    """Scalar coefficients of the four terms, or their derivatives."""
     scale = _dyad_scale(diffraction, wave_number)
     root = torch.sqrt(2 * wave_number * diffraction.distance_parameter)
     found = []
@@ -329,7 +337,7 @@ def _term_coefficients(
 
 
 def _half_boundary_angle(diffraction: EdgeDiffraction, azimuth_sign: float, sign: float) -> Tensor:
-    """Half the angle δ past a boundary of β = φ ± φ′."""
+    """Half the angle δ past the boundary of β = φ ± φ′."""
     beta, full = (
         diffraction.azimuth + azimuth_sign * diffraction.azimuth_in,
         2 * math.pi * diffraction.wedges.opening,
@@ -339,17 +347,19 @@ def _half_boundary_angle(diffraction: EdgeDiffraction, azimuth_sign: float, sign
 
 
 def _cotangent_quotient(half: Tensor, opening: Tensor) -> Tensor:
-    """sin(δ/2)/tan(δ/2n)."""
+    """Return sin(δ/2)/tan(δ/2n)."""
     near = half.abs() < _SERIES_ANGLE
     safe = torch.where(near, torch.full_like(half, _SERIES_ANGLE), half)
-    bend = opening * (1 / 6 + 1 / (3 * opening**2))
-    return torch.where(near, opening - bend * half**2, torch.sin(safe) / torch.tan(safe / opening))
+    curvature = opening * (1 / 6 + 1 / (3 * opening**2))
+    return torch.where(
+        near, opening - curvature * half**2, torch.sin(safe) / torch.tan(safe / opening)
+    )
 
 
 def _cotangent(
     diffraction: EdgeDiffraction, azimuth_sign: float, sign: float, root: Tensor, with_slope: bool
 ) -> tuple[Tensor, Tensor]:
-    """cot((π ± β)/2n) F(kLa) in one, and its derivative by β where it is asked for.
+    """Product cot((π ± β)/2n) F(kLa) and, on request, its derivative with respect to β.
 
     With δ the angle past the boundary, it is −[sin(δ/2)/tan(δ/2n)] √(2kL) g(√(2kL) sin(δ/2)).
     """
@@ -359,46 +369,46 @@ def _cotangent(
     )
     quotient = _cotangent_quotient(half, opening)
     s = root * torch.sin(half)
-    sent = edge_transition(s, diffraction.end_parameters)
-    value = -quotient * root * sent
+    transition_value = edge_transition(s, diffraction.end_parameters)
+    value = -quotient * root * transition_value
     if not with_slope:
         return value, value
     near = half.abs() < _SERIES_ANGLE
     safe = torch.where(near, torch.full_like(half, _SERIES_ANGLE), half)
     sine, tangent = torch.sin(safe), torch.tan(safe / opening)
-    bend = opening * (1 / 6 + 1 / (3 * opening**2))
-    past = torch.cos(safe) / tangent - sine / (opening * torch.sin(safe / opening) ** 2)
-    past = torch.where(near, -2 * bend * half, past)
-    by_s = edge_transition_slope(s, diffraction.end_parameters, sent)
-    by_half = -root * (past * sent + quotient * by_s * root * torch.cos(half))
+    curvature = opening * (1 / 6 + 1 / (3 * opening**2))
+    slope = torch.cos(safe) / tangent - sine / (opening * torch.sin(safe / opening) ** 2)
+    slope = torch.where(near, -2 * curvature * half, slope)
+    by_s = edge_transition_slope(s, diffraction.end_parameters, transition_value)
+    by_half = -root * (slope * transition_value + quotient * by_s * root * torch.cos(half))
     return value, by_half * (-sign / 2)
 
 
 def _ray_fixed_basis(along: Tensor, direction: Tensor) -> Float64[Tensor, "row 2 3"]:
-    """β̂ and φ̂ of waves that leave an edge."""
+    """Ray-fixed basis β̂, φ̂ of waves that leave an edge."""
     across = normalize(cross(along, direction), dim=-1)
     return torch.stack([cross(across, direction), across], 1)
 
 
 def _geometric_optics_dyads(diffraction: EdgeDiffraction) -> list[Complex128[Tensor, "row 3 3"]]:
-    """What becomes of the field: less what passes straight on, reflected by the faces n and 0.
+    """Geometric-optics dyads: shadowed direct field, and reflections at the faces n and 0.
 
-    Each is the field of geometric optics, turned from its own direction about the edge.
+    Each is rotated from its own direction about the edge into the diffracted one.
     """
-    along, direction = edge_axis(diffraction.wedges), diffraction.incident_direction
-    leaving = _ray_fixed_basis(along, diffraction.diffracted_direction)
-    lost = torch.eye(3, dtype=torch.complex128) - _transmission_dyad(diffraction)
-    found = [_rotate_dyad(leaving, _ray_fixed_basis(along, direction), lost)]
+    axis, direction = edge_axis(diffraction.wedges), diffraction.incident_direction
+    basis = _ray_fixed_basis(axis, diffraction.diffracted_direction)
+    shadowed = torch.eye(3, dtype=torch.complex128) - _transmission_dyad(diffraction)
+    dyads = [_rotate_dyad(basis, _ray_fixed_basis(axis, direction), shadowed)]
     for face in (1, 0):
         normal = diffraction.wedges.normals[:, face]
-        across, before, after = (v[:, 0] for v in plane_of_incidence(normal, direction))
+        unit_s, unit_p, reflected_p = (v[:, 0] for v in plane_of_incidence(normal, direction))
         law = diffraction.face_coefficients(face, dot(normal, direction).abs())
-        mirror = _outer_product(law.reflection_s, across, across) + _outer_product(
-            law.reflection_p, after, before
+        reflection = _outer_product(law.reflection_s, unit_s, unit_s) + _outer_product(
+            law.reflection_p, reflected_p, unit_p
         )
-        onwards = reflect_vectors(direction, normal)
-        found.append(_rotate_dyad(leaving, _ray_fixed_basis(along, onwards), mirror))
-    return found
+        reflected = reflect_vectors(direction, normal)
+        dyads.append(_rotate_dyad(basis, _ray_fixed_basis(axis, reflected), reflection))
+    return dyads
 
 
 def _outer_product(strength: Tensor, left: Tensor, right: Tensor) -> Complex128[Tensor, "row 3 3"]:
@@ -406,21 +416,21 @@ def _outer_product(strength: Tensor, left: Tensor, right: Tensor) -> Complex128[
 
 
 def _rotate_dyad(leaving: Tensor, arriving: Tensor, law: Tensor) -> Complex128[Tensor, "row 3 3"]:
-    """A dyad whose fields are turned about the edge, from the arriving to the leaving basis."""
+    """Rotate the fields of a dyad about the edge, from the arriving to the leaving basis."""
     return (leaving.mT @ arriving).to(torch.complex128) @ law
 
 
 def _transmission_dyad(diffraction: EdgeDiffraction) -> Complex128[Tensor, "row 3 3"]:
-    """The dyad of the shadow: zero behind bodies; one sheet at its end, two at a crease."""
+    """Transmission dyad: zero behind bodies; one sheet at an open edge, two at a crease."""
     flat = (diffraction.wedges.opening > 2 - _SHEET_TOLERANCE)[:, None, None]
     total = torch.eye(3, dtype=torch.complex128)
     for face in (0, 1):
         normal = diffraction.wedges.normals[:, face]
-        across, before, _ = (
+        unit_s, unit_p, _ = (
             v[:, 0] for v in plane_of_incidence(normal, diffraction.incident_direction)
         )
         law = diffraction.face_coefficients(face, dot(normal, diffraction.incident_direction).abs())
-        through = _outer_product(law.transmission_s, across, across)
-        through = through + _outer_product(law.transmission_p, before, before)
+        through = _outer_product(law.transmission_s, unit_s, unit_s)
+        through = through + _outer_product(law.transmission_p, unit_p, unit_p)
         total = through if face == 0 else torch.where(flat, total, through @ total)
     return total
