@@ -591,5 +591,5 @@ def test_bad_input_is_told(options, message):
 
 def test_too_many_sequences_are_refused():
     ball = Scene({"ball": Object(sphere(0.5, 3), METAL)})
-    with pytest.raises(InputError, match="sequences to try one by one"):
+    with pytest.raises(InputError, match="sequences to test one by one"):
         trace(ball, [0, 0, 2], [0, 2, 0], depth=3, rays=None)

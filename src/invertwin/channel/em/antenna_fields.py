@@ -14,8 +14,9 @@ _UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)  # of the radar
 def antenna_fields(
     jones: Polarisation, rotation: Float64[Tensor, "row 3 3"], direction: Float64[Tensor, "row 3"]
 ) -> Complex128[Tensor, "row k 3"]:
-    """Unit fields that an array's Jones vectors radiate along a direction, in world axes. By
-    reciprocity, also the fields that it receives from there.
+    """Unit fields that an array's Jones vectors radiate along a direction, in world axes.
+
+    By reciprocity, also the fields that it receives from there.
 
     Args:
         jones: Jones vectors of the array's elements.

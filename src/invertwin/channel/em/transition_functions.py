@@ -150,11 +150,12 @@ def chain_transition(
 ) -> Complex128[Tensor, "parity parity term term term row"]:
     """Triple-diffraction transition function, in parts by parity in the couplings.
 
-    One edge is coupled to both others. The whole is −8j ∫∫∫ exp(−j(x² + y² + z² + 2rx + 2sy + 2tz − 2vxy − 2wxz)) from 0 to ∞, with y
-    and z of the outer edges. For each x, the integrals over y and z have closed forms, and the
-    contour of x is rotated below the real axis. Parts even (0) and odd (1) in v and w add up to the
-    whole; terms are in the order of the arguments. Without coupling it is g(r) g(s) g(t). The
-    relative error is 3e-5 for arguments up to 30, and 1e-10 for arguments up to 3.
+    One edge is coupled to both others. The whole is −8j ∫∫∫ exp(−j(x² + y² + z² + 2rx + 2sy + 2tz −
+    2vxy − 2wxz)) from 0 to ∞, with y and z of the outer edges. For each x, the integrals over y and
+    z have closed forms, and the contour of x is rotated below the real axis. Parts even (0) and odd
+    (1) in v and w add up to the whole; terms are in the order of the arguments. Without coupling it
+    is g(r) g(s) g(t). The relative error is 3e-5 for arguments up to 30, and 1e-10 for arguments up
+    to 3.
 
     Args:
         middle: r ≥ 0, as in ``transition``.

@@ -1,6 +1,6 @@
-"""Which surfaces a path may meet, and in which order: candidates for specular paths.
+"""Candidate sequences of surfaces for specular paths: exhaustive, or found by shooting rays.
 
-A step of a sequence is a plane and what happens there: 2·plane for a reflection, 2·plane + 1 for a
+A step of a sequence is a plane with an interaction: 2·plane for a reflection, 2·plane + 1 for a
 transmission.
 """
 
@@ -19,23 +19,22 @@ from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.specular.image_method import Planes
 from invertwin.errors import InputError
 
-if TYPE_CHECKING:  # walls know the planes that sequences are made of
+if TYPE_CHECKING:  # CandidateSurfaces holds the planes
     from invertwin.channel.specular.image_method import CandidateSurfaces
 
 _LANES = 1 << 20
-_MAX_SEQUENCES = 1_000_000  # sequences that are tried one by one
+_MAX_SEQUENCES = 1_000_000  # limit of the exhaustive search
 _GOLDEN = math.pi * (1 + math.sqrt(5))
 
 
 @dataclass(frozen=True)
 class CandidateSequences:
-    """Candidates by length.
+    """Candidate sequences by length.
 
     Attributes:
-        steps: For each number of steps from 1, the sequences, [sequence, step].
-        missed_fraction: Estimated share of directions whose sequences have not been found; None
-            if there are
-            no others.
+        steps: sequences of each length from 1, [sequence, step].
+        missed_fraction: estimated fraction of directions whose sequences were not found; None for
+            an exhaustive search.
     """
 
     steps: tuple[Tensor, ...]
@@ -44,11 +43,11 @@ class CandidateSequences:
 
 @dataclass(frozen=True)
 class FaceInteractions:
-    """What triangles can do to a ray.
+    """Possible interactions of triangles with rays.
 
     Attributes:
-        reflect: Whether they mirror it.
-        transmit: Whether they let it through.
+        reflect: mask of triangles that reflect.
+        transmit: mask of triangles that transmit.
     """
 
     reflect: Bool[Tensor, " f"]
@@ -58,15 +57,15 @@ class FaceInteractions:
 def enumerate_sequences(
     planes: Planes, interactions: FaceInteractions, depth: int
 ) -> CandidateSequences:
-    """All sequences of planes, no plane twice in a row.
+    """Enumerate all sequences of planes, no plane twice in a row.
 
     Args:
-        planes: Of the scene.
-        interactions: Of the triangles.
-        depth: Most steps.
+        planes: planes of the scene.
+        interactions: interactions of the triangles.
+        depth: maximum number of steps.
 
     Raises:
-        InputError: More than a million.
+        InputError: more than a million sequences.
     """
     known = planes.face_plane >= 0
     options = torch.cat(
@@ -78,7 +77,7 @@ def enumerate_sequences(
     count = sum(len(options) ** step for step in range(1, depth + 1))
     if count > _MAX_SEQUENCES:
         raise InputError(
-            f"expected at most {_MAX_SEQUENCES:,} sequences to try one by one, got {count:.3g} of "
+            f"expected at most {_MAX_SEQUENCES:,} sequences to test one by one, got {count:.3g} of "
             f"{len(planes)} planes and depth {depth}; give a number of rays, or a smaller depth"
         )
     found, last = [], torch.zeros(1, 0, dtype=torch.int64)
@@ -101,49 +100,48 @@ def shoot_sequences(
     rays: int,
     seed: int,
 ) -> CandidateSequences:
-    """The sequences that rays from some places follow.
+    """Find the sequences that rays from given origins follow (shooting rays).
 
-    Directions are those of a spiral of evenly spread points, turned at random for every place. At a
-    surface that mirrors and lets through, a ray goes on both ways. Of random directions, a sequence
-    that fills the solid angle Ω about the antenna is missed by all N with the probability
-    (1 − Ω/4π)^N < exp(−NΩ/4π); even directions miss less.
+    Directions form a golden spiral, rotated at random for every origin. At a surface that reflects
+    and transmits, a ray splits. A sequence that subtends the solid angle Ω at the antenna is missed
+    by all of N independent random directions with the probability (1 − Ω/4π)^N < exp(−NΩ/4π);
+    evenly spread directions miss less.
 
-    ``CandidateSequences.missed`` is the estimate of Good and Turing: sequences that one ray alone
-    has
-    followed, over the number of rays.
+    ``CandidateSequences.missed_fraction`` is the Good-Turing estimate: the number of sequences
+    followed by exactly one ray, over the number of rays.
 
     Args:
-        surfaces: What may be in the way.
-        planes: Of the scene, about the same origin.
-        interactions: Of the triangles.
-        origins: From where rays are shot [m].
-        depth: Most steps.
-        rays: How many from each place.
-        seed: Of the turns.
+        surfaces: candidate surfaces of the scene.
+        planes: planes of the scene, relative to the same origin.
+        interactions: interactions of the triangles.
+        origins: origins of the rays [m].
+        depth: maximum number of steps.
+        rays: number of rays from each origin.
+        seed: random seed of the rotations.
 
     Source: I. J. Good, "The population frequencies of species", Biometrika 40, 1953.
     """
     tables = _SequenceTracer(surfaces, planes, interactions)
-    # A ray may part at every step.
-    parts = 2 ** (depth if bool(interactions.transmit.any()) else 0)
-    chunk = max(1, _LANES // parts)
+    # A ray may split at every step.
+    branches = 2 ** (depth if bool(interactions.transmit.any()) else 0)
+    chunk = max(1, _LANES // branches)
     leaves = torch.zeros(0, depth, dtype=torch.int64)
     count = torch.zeros(0, dtype=torch.int64)
     none = torch.zeros(1, 0, dtype=torch.int64)
-    for number, place in enumerate(origins):
-        turn = _random_rotation(seed, number)
+    for number, origin in enumerate(origins):
+        rotation = _random_rotation(seed, number)
         for start in range(0, rays, chunk):
             index = torch.arange(start, min(start + chunk, rays))
-            directions = _spiral_directions(index, rays) @ turn.T
-            alike = torch.zeros(len(index), dtype=torch.int64)
-            row, times = tables.follow_rays(place, directions, depth, none, alike)
-            leaves, count = _merge_counts(torch.cat([leaves, row]), torch.cat([count, times]))
+            directions = _spiral_directions(index, rays) @ rotation.T
+            prefix_index = torch.zeros(len(index), dtype=torch.int64)
+            row, row_count = tables.follow_rays(origin, directions, depth, none, prefix_index)
+            leaves, count = _merge_counts(torch.cat([leaves, row]), torch.cat([count, row_count]))
     found: list[Tensor] = []
     for length in range(1, depth + 1):
         some = leaves[(leaves[:, length - 1] >= 0), :length]
         found.append(some.unique(dim=0) if len(some) else some)
-    missed = min(1.0, float((count == 1).sum()) / (rays * len(origins)))
-    return CandidateSequences(tuple(found), missed)
+    missed_fraction = min(1.0, float((count == 1).sum()) / (rays * len(origins)))
+    return CandidateSequences(tuple(found), missed_fraction)
 
 
 def shoot_sequences_from_edges(
@@ -155,24 +153,24 @@ def shoot_sequences_from_edges(
     depth: int,
     seed: int,
 ) -> list[Int64[Tensor, "sequence column"]]:
-    """The sequences that rays from edges follow: number of the edge, then steps; by length from 1.
+    """Find the sequences that rays from edges follow: edge number, then steps; by length from 1.
 
     Args:
-        surfaces: What may be in the way.
-        planes: Of the scene, about the same origin.
-        interactions: Of the triangles.
-        origins: Where rays start; their directions are random [m].
-        edge: Numbers of the edges there, from zero without gaps.
-        depth: Most steps.
-        seed: Of the directions.
+        surfaces: candidate surfaces of the scene.
+        planes: planes of the scene, relative to the same origin.
+        interactions: interactions of the triangles.
+        origins: origins of the rays, whose directions are random [m].
+        edge: edge number of each origin, from zero without gaps.
+        depth: maximum number of steps.
+        seed: random seed of the directions.
     """
     tables = _SequenceTracer(surfaces, planes, interactions)
-    parts = 2 ** (depth if bool(interactions.transmit.any()) else 0)
+    branches = 2 ** (depth if bool(interactions.transmit.any()) else 0)
     draws = np.random.default_rng(seed).standard_normal((len(origins), 3))
     directions = normalize(torch.from_numpy(draws), dim=1)
     prefix = torch.arange(int(edge.max()) + 1)[:, None]
     leaves = torch.zeros(0, depth + 1, dtype=torch.int64)
-    for some in torch.arange(len(origins)).split(max(1, _LANES // parts)):
+    for some in torch.arange(len(origins)).split(max(1, _LANES // branches)):
         rows, _ = tables.follow_rays(origins[some], directions[some], depth, prefix, edge[some])
         leaves = torch.cat([leaves, rows]).unique(dim=0)
     found: list[Tensor] = []
@@ -188,7 +186,7 @@ def _merge_counts(rows: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _spiral_directions(index: Tensor, count: int) -> Float64[Tensor, "n 3"]:
-    """Evenly spread directions: of a golden spiral."""
+    """Evenly spread directions of a golden spiral."""
     z = 1 - (2 * index.double() + 1) / count
     around = _GOLDEN * index.double()
     ring = (1 - z**2).clamp_min(0).sqrt()
@@ -202,7 +200,7 @@ def _random_rotation(seed: int, number: int) -> Float64[Tensor, "3 3"]:
 
 
 class _SequenceTracer:
-    """The scene as rays that follow sequences need it."""
+    """Traces rays through a scene and records the sequences of planes that they meet."""
 
     def __init__(
         self, surfaces: "CandidateSurfaces", planes: Planes, interactions: FaceInteractions
@@ -221,37 +219,40 @@ class _SequenceTracer:
         prefixes: Tensor,
         prefix_index: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Sequences of rays, filled up with −1, and how many rays follow each.
+        """Sequences of rays, padded with −1, and the number of rays that follow each.
 
-        They start from one place, or each from its own, with the rows ``number`` of ``known``.
+        Rays start from one position, or each from its own. They extend the rows ``prefix_index`` of
+        ``prefixes``.
         """
         local = (position - self.surfaces.origin).to(torch.float32)
         origin = local.expand(len(directions), 3)
         direction = directions.to(torch.float32)
-        # Sequences share their beginnings: each is the number of its parent, and one more step.
+        # Sequences are a tree: each is the number of its parent and one more step.
         ended: list[tuple[Tensor, Tensor]] = []
         width = prefixes.shape[1] + depth
         for step in range(depth):
             if step:
                 origin = origin + self.surfaces.margin * direction
-            face, place_hit, mirrored = self._intersect_rays(origin, direction)
+            face, place_hit, reflected = self._intersect_rays(origin, direction)
             hit = (face >= 0) & (self.planes.face_plane[face.clamp_min(0)] >= 0)
             ended.append((prefixes, prefix_index[~hit]))
-            prefix_index, face, place_hit, mirrored, direction = (
-                column[hit] for column in (prefix_index, face, place_hit, mirrored, direction)
+            prefix_index, face, place_hit, reflected, direction = (
+                column[hit] for column in (prefix_index, face, place_hit, reflected, direction)
             )
-            both = []
-            for powers, onwards, bit in (
-                (self.interactions.reflect, mirrored, 0),
+            branches = []
+            for mask, next_direction, bit in (
+                (self.interactions.reflect, reflected, 0),
                 (self.interactions.transmit, direction, 1),
             ):
-                goes = powers[face]
-                code = 2 * self.planes.face_plane[face[goes]] + bit
-                both.append((prefix_index[goes], code, place_hit[goes], onwards[goes]))
+                chosen = mask[face]
+                code = 2 * self.planes.face_plane[face[chosen]] + bit
+                branches.append(
+                    (prefix_index[chosen], code, place_hit[chosen], next_direction[chosen])
+                )
             stops = ~(self.interactions.reflect[face] | self.interactions.transmit[face])
             ended.append((prefixes, prefix_index[stops]))
             prefix_index, code, origin, direction = (
-                torch.cat(column) for column in zip(*both, strict=True)
+                torch.cat(column) for column in zip(*branches, strict=True)
             )
             options = 2 * len(self.planes)
             pair, prefix_index = (prefix_index * options + code).unique(return_inverse=True)
@@ -266,22 +267,22 @@ class _SequenceTracer:
         return torch.cat(rows), torch.cat(counts)
 
     def _intersect_rays(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The triangle that each ray meets (−1: none), where, and the mirrored direction."""
+        """Triangle that each ray hits (−1: none), the hit point, and the reflected direction."""
         if not len(origin):
             none = torch.zeros(0, 3)
             return torch.zeros(0, dtype=torch.int64), none, none
         start = mi.Point3f(*(to_float(origin[:, k].contiguous()) for k in range(3)))
-        way = mi.Vector3f(*(to_float(direction[:, k].contiguous()) for k in range(3)))
-        hit = self.surfaces.scene.ray_intersect_preliminary(mi.Ray3f(start, way))
+        ray_direction = mi.Vector3f(*(to_float(direction[:, k].contiguous()) for k in range(3)))
+        hit = self.surfaces.scene.ray_intersect_preliminary(mi.Ray3f(start, ray_direction))
         valid = hit.is_valid()
         face = dr.select(valid, mi.Int32(hit.prim_index), -1)
         plane = dr.gather(mi.UInt32, self.face_plane, hit.prim_index, valid)
         normal = dr.gather(mi.Vector3f, self.normal, plane, valid)
-        place = start + way * dr.select(valid, hit.t, 0.0)
-        mirrored = way - 2 * dr.dot(way, normal) * normal
-        dr.eval(face, place, mirrored)
+        point = start + ray_direction * dr.select(valid, hit.t, 0.0)
+        reflected = ray_direction - 2 * dr.dot(ray_direction, normal) * normal
+        dr.eval(face, point, reflected)
         found = to_torch(face).long()
-        return found, _stack_components(place), _stack_components(mirrored)
+        return found, _stack_components(point), _stack_components(reflected)
 
 
 def _stack_components(vector: object) -> Tensor:

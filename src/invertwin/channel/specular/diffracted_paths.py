@@ -1,8 +1,8 @@
 """Fields of diffracted paths of a scene, differentiable.
 
-Which paths there are is found by rays and is detached (``bends``). What they are worth is computed
-here from the vertices of the edges and of the triangles that they meet: diffraction between the
-images of the antennas, and the field, turned at every surface before and after.
+The search for paths uses rays and is detached (``diffraction_candidates``). Their fields are
+computed here from the vertices of the edges and triangles that they meet: diffraction between the
+images of the antennas, and a dyad for every surface before and after.
 
 Source: derivations §9 and §10.
 """
@@ -31,23 +31,23 @@ from invertwin.channel.specular.wedge_scene import WedgeScene, clamp_to_edge
 
 @dataclass(frozen=True)
 class DiffractedPaths:
-    """Diffracted paths with the same number of vertices, one row each.
+    """Fields of diffracted paths with equal numbers of vertices, one row each.
 
     Attributes:
-        tx, rx: numbers of the antennas.
-        edge: numbers of the edges, from the transmitter on.
-        points: where paths meet surfaces and edges: a point of the edge, its end where they turn
-            past it [m].
-        kinds: what happens there, by ``KINDS``.
-        faces: triangles; of an edge, that of its first face.
+        tx, rx: antenna numbers.
+        edge: edge numbers, from the transmitter on.
+        points: interaction points with surfaces and edges; diffraction points are clamped to the
+            edge [m].
+        kinds: interaction types, numbers of ``KINDS``.
+        faces: triangles; for an edge, that of its first face.
         directions: unit vectors of the legs, from the transmitter on.
-        length: of the path by these points [m].
-        transfer: E at the receiver of E at 1 m from the transmitter, without the phase of
-            ``length`` [1/m]; world coordinates, receive × transmit.
-        slopes: as ``transfer``, of derivatives of the transmitter's and of the receiver's field by
-            angles [rad] about ``axes``; zero of paths over more edges.
-        axes: unit vectors about which these angles turn, of transmitter and receiver.
-        corner: whether the first or the last edge is met in a corner, where its neighbour ends.
+        length: path length through these points [m].
+        transfer: E at the receiver over E at 1 m from the transmitter, without the phase of
+            ``length`` [1/m]; world axes, receive × transmit.
+        slopes: as ``transfer``, for derivatives of the transmitter's and the receiver's field with
+            respect to rotations about ``axes`` [rad]; zero for paths over several edges.
+        axes: unit vectors of these rotations, at transmitter and receiver.
+        corner: "first" or "last" if that edge is met in a corner, where its neighbour ends.
     """
 
     tx: Int64[Tensor, " row"]
@@ -71,13 +71,13 @@ def evaluate_diffracted_paths(
     rx: Float64[Tensor, "rx 3"],
     wave_number: float,
 ) -> DiffractedPaths:
-    """What paths round edges are worth.
+    """Evaluate the fields of diffracted paths.
 
     Args:
-        wedge_scene: the scene.
-        candidates: the paths, see ``find_diffraction_candidates``.
-        tx, rx: antennas [m].
-        wave_number: k [1/m].
+        wedge_scene: scene with sharp edges.
+        candidates: result of ``find_diffraction_candidates``.
+        tx, rx: antenna positions [m].
+        wave_number: wave number k [1/m].
     """
     source, target = tx[candidates.tx], rx[candidates.rx]
     legs = [
@@ -85,33 +85,35 @@ def evaluate_diffracted_paths(
         _AntennaLeg(wedge_scene, _reverse_legs(candidates.after), target),
     ]
     angles = face_azimuths(wedge_scene, candidates)
-    arrive, leave = ([None, *angles[..., 1].T], [*angles[..., 0].T, None])
+    incidence, departure = ([None, *angles[..., 1].T], [*angles[..., 0].T, None])
     edges = [
         wedge_scene.path_edge(row, pair, absorbing=candidates.absorbing)
-        for row, pair in zip(candidates.edge.T, zip(arrive, leave, strict=True), strict=True)
+        for row, pair in zip(candidates.edge.T, zip(incidence, departure, strict=True), strict=True)
     ]
-    sent = _edge_fields(candidates, edges, legs[0].image, legs[1].image, wave_number)
-    places = [clamp_to_edge(edge.wedges, sent.points[:, n]) for n, edge in enumerate(edges)]
-    stops = torch.stack([legs[0].image, *places, legs[1].image], 1)
-    pieces = stops[:, 1:] - stops[:, :-1]
-    length = pieces.norm(dim=2).sum(1)
-    # What the end of an edge sends has the delay of the path over that end.
-    later = wave_number * (length - sent.length)
-    turn = torch.polar(torch.ones_like(later), later)[:, None, None]
-    arriving = legs[0].dyad(sent.points[:, 0])
-    # Reciprocity: on its way out a wave is turned as one that comes in.
-    leaving = legs[1].dyad(sent.points[:, -1]).mT
-    slopes = torch.zeros_like(sent.transfer).expand(2, -1, -1, -1)
-    if sent.slopes is not None:
-        slopes = leaving @ (sent.slopes * turn) @ arriving
+    edge_fields = _edge_fields(candidates, edges, legs[0].image, legs[1].image, wave_number)
+    edge_points = [
+        clamp_to_edge(edge.wedges, edge_fields.points[:, n]) for n, edge in enumerate(edges)
+    ]
+    nodes = torch.stack([legs[0].image, *edge_points, legs[1].image], 1)
+    segments = nodes[:, 1:] - nodes[:, :-1]
+    length = segments.norm(dim=2).sum(1)
+    # The field of the end of an edge has the delay of the path over that end.
+    phase = wave_number * (length - edge_fields.length)
+    delay_phasor = torch.polar(torch.ones_like(phase), phase)[:, None, None]
+    arriving = legs[0].dyad(edge_fields.points[:, 0])
+    # Reciprocity: the dyad after the edges is the transpose of that towards them.
+    leaving = legs[1].dyad(edge_fields.points[:, -1]).mT
+    slopes = torch.zeros_like(edge_fields.transfer).expand(2, -1, -1, -1)
+    if edge_fields.slopes is not None:
+        slopes = leaving @ (edge_fields.slopes * delay_phasor) @ arriving
     axes = [
         leg.rotate_axis(-edge_axis(edges[n].wedges)) for leg, n in zip(legs, (0, -1), strict=True)
     ]
-    ways = [normalize(pieces, dim=2)[:, 1:-1]]
-    ways.insert(0, torch.stack(legs[0].directions(places[0]), 1))
-    ways.append(-torch.stack(legs[1].directions(places[-1]), 1).flip(1))
-    points = [legs[0].interaction_points(places[0]), torch.stack(places, 1)]
-    points.append(legs[1].interaction_points(places[-1]).flip(1))
+    directions = [normalize(segments, dim=2)[:, 1:-1]]
+    directions.insert(0, torch.stack(legs[0].directions(edge_points[0]), 1))
+    directions.append(-torch.stack(legs[1].directions(edge_points[-1]), 1).flip(1))
+    points = [legs[0].interaction_points(edge_points[0]), torch.stack(edge_points, 1)]
+    points.append(legs[1].interaction_points(edge_points[-1]).flip(1))
     kinds = [
         candidates.before.kinds,
         torch.full_like(candidates.edge, DIFFRACTION),
@@ -125,9 +127,9 @@ def evaluate_diffracted_paths(
         torch.cat(points, 1),
         torch.cat(kinds, 1),
         torch.cat([candidates.before.faces, first, candidates.after.faces], 1),
-        torch.cat(ways, 1),
+        torch.cat(directions, 1),
         length,
-        leaving @ (sent.transfer * turn) @ arriving,
+        leaving @ (edge_fields.transfer * delay_phasor) @ arriving,
         slopes.transpose(0, 1),
         torch.stack(axes, 1),
         candidates.corner,
@@ -141,7 +143,7 @@ def _edge_fields(
         return diffract_over_edges(edges, tx, rx, k, slopes=len(edges) == 1)
     if candidates.corner == "last":
         return diffract_round_corner(edges, candidates.end, candidates.between[:, -1], tx, rx, k)
-    # Reciprocity: the way back ends in the corner.
+    # Reciprocity: the reverse path ends in the corner.
     back = [replace(e, azimuth_in=e.azimuth, azimuth=e.azimuth_in) for e in reversed(edges)]
     found = diffract_round_corner(back, candidates.end, candidates.between[:, 0].flip(1), rx, tx, k)
     return replace(found, points=found.points.flip(1), transfer=found.transfer.mT)
@@ -152,7 +154,7 @@ def _reverse_legs(legs: PathLegs) -> PathLegs:
 
 
 class _AntennaLeg:
-    """Surfaces between an antenna and an edge, in this order, differentiable."""
+    """Unfolded leg: surfaces between an antenna and an edge, in this order, differentiable."""
 
     def __init__(self, wedge_scene: WedgeScene, legs: PathLegs, position: Tensor) -> None:
         corners = wedge_scene.vertices[wedge_scene.topology.faces[legs.faces]]
@@ -167,31 +169,31 @@ class _AntennaLeg:
 
     @property
     def image(self) -> Float64[Tensor, "row 3"]:
-        """Of the antenna, as the edge sees it."""
+        """Image of the antenna in all surfaces [m]."""
         return self.images[-1]
 
     def interaction_points(self, point: Tensor) -> Float64[Tensor, "row step 3"]:
-        """Where the way to a point meets the surfaces."""
+        """Interaction points of the path to a point [m]."""
         found = interaction_points(point, self.images, self.point, self.normal)
         return torch.stack(found, 1) if found else self.point
 
     def directions(self, point: Tensor) -> list[Tensor]:
-        """Unit vectors of the way to a point, from the antenna on."""
+        """Unit vectors of the path to a point, from the antenna on."""
         found = [normalize(point - self.image, dim=1)]
         for step in reversed(range(self.normal.shape[1])):
-            turned = reflect_vectors(found[0], self.normal[:, step])
-            found.insert(0, torch.where(self.legs.transmitted[:, step, None], found[0], turned))
+            reflected = reflect_vectors(found[0], self.normal[:, step])
+            found.insert(0, torch.where(self.legs.transmitted[:, step, None], found[0], reflected))
         return found
 
     def rotate_axis(self, axis: Tensor) -> Tensor:
-        """An axis of rotation near the edge, as it is near the antenna."""
+        """Transform an axis of rotation at the edge to the antenna."""
         for step in reversed(range(self.normal.shape[1])):
             back = -reflect_vectors(axis, self.normal[:, step])
             axis = torch.where(self.legs.transmitted[:, step, None], axis, back)
         return axis
 
     def dyad(self, point: Tensor) -> Complex128[Tensor, "row 3 3"]:
-        """E that arrives at a point, of E that leaves the antenna."""
+        """Dyads from E at the antenna to E at a point, without spreading."""
         ways = self.directions(point)
         total = torch.eye(3, dtype=torch.complex128).expand(len(point), 3, 3)
         for step, through in enumerate(self.legs.transmitted.unbind(1)):

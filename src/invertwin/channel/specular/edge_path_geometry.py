@@ -1,15 +1,15 @@
-"""Fields of point antennas by way of up to three edges: where paths turn, how long, how strong.
+"""Geometry and fields of diffracted paths over up to three edges between point antennas.
 
-A path over edges is as short as paths that touch these edges can be. Its amplitude spreads with the
-second derivatives H of its length by the places on the edges: over N edges
-``A = Π sinβ_i / (Π s_j √det H)``, of the unit of 1/length that a free path has. The distance
-parameter of an edge is that by which its field's step at a boundary is the whole field of the path
-that leaves this edge out: ``L = s s′ sin²β/(s + s′)`` of one edge.
+A diffracted path is the shortest path that touches its edges (Fermat's principle). Its amplitude
+spreads with the Hessian H of its length with respect to the positions along the edges: over N edges
+``A = Π sinβ_i / (Π s_j √det H)``, in 1/length as for a free path. The distance parameter of an edge
+is chosen such that the jump of its field at a boundary equals the field of the path without this
+edge: ``L = s s′ sin²β/(s + s′)`` for one edge.
 
-Waves spread across a path as a chain of springs: with S_i the length up to edge i and T that of
-all, openings at the edges have the covariances ``Σ_ij = cosγ_ij S_i (T − S_j)/T``, γ between the
-edges as seen along the way. With P = Σ⁻¹, ``L_i = sin²β_i/P_ii`` and the coupling of two edges
-is ``w_ij = ±P_ij/√(P_ii P_jj)``.
+Transverse displacements along a path follow the statistics of a chain of springs: with S_i the
+length up to edge i and T the total length, apertures at the edges have the covariances ``Σ_ij =
+cosγ_ij S_i (T − S_j)/T``, γ between the edges as seen along the path. With P = Σ⁻¹, ``L_i =
+sin²β_i/P_ii`` and the coupling of two edges is ``w_ij = ±P_ij/√(P_ii P_jj)``.
 
 Source: derivations §9; Capolino, Albani, Maci and Tiberio, "Double diffraction at a pair of
 coplanar skew edges", IEEE TAP 45, 1997.
@@ -35,28 +35,23 @@ from invertwin.channel.em.utd import (
 )
 from invertwin.channel.em.wedges import Wedges, edge_axis, exterior_azimuth
 
-_MAX_STEPS = 40  # of the search for the shortest path over two edges
-_LIFTS = (0.1, 0.01, 0.0)  # of the antennas' distance, one after the other
-_COARSE_TOLERANCE, _FINE_TOLERANCE = (
-    1e-3,
-    1e-13,
-)  # of the antennas' distance: by how much places may still move
-_SECOND_ORDER_PHASE = (
-    1e-6  # rad of phase, up to which a path over an end is as long as to second order
-)
-_MIN_LENGTH_FRACTION = 1e-9  # of a path's length: edges that touch there have no path between them
+_MAX_STEPS = 40  # of the search for the shortest path over several edges
+_LIFTS = (0.1, 0.01, 0.0)  # of the antennas' distance, in this order
+_COARSE_TOLERANCE, _FINE_TOLERANCE = 1e-3, 1e-13  # of the antennas' distance: convergence
+_SECOND_ORDER_PHASE = 1e-6  # rad, below which lengths over an end are of second order
+_MIN_LENGTH_FRACTION = 1e-9  # of a path's length; shorter legs join touching edges
 
 
 @dataclass(frozen=True)
 class PathEdge:
-    """An edge on paths' ways, one row each.
+    """Diffracting edge of a path, one row each.
 
     Attributes:
-        wedges: the edges with their faces.
-        face_coefficients: what these do to waves.
-        azimuth_in, azimuth: φ′ and φ where they are known, NaN elsewhere [rad]; None = nowhere.
-        infinite: take the edges as infinitely long.
-        absorbing: take the faces as such that neither mirror nor let through.
+        wedges: edges with their faces.
+        face_coefficients: field coefficients of the faces.
+        azimuth_in, azimuth: known φ′ and φ, NaN where unknown [rad]; None = unknown in all rows.
+        infinite: True for edges of infinite length.
+        absorbing: True for faces that neither reflect nor transmit.
     """
 
     wedges: Wedges
@@ -69,17 +64,17 @@ class PathEdge:
 
 @dataclass(frozen=True)
 class EdgePaths:
-    """Paths over edges, one row each.
+    """Diffracted paths, one row each.
 
     Attributes:
-        points: where they turn; beyond the end of an edge, on the line of the edge [m].
-        length: [m].
-        transfer: E at the receiver of E at 1 m from the transmitter, without the phase of the
-            length [1/m]; world coordinates, receive × transmit.
-        stationary: False where no such path exists: edges meet in the point where it would turn.
-        slopes: as ``transfer``, of ∂E/∂ψ at the transmitter, and for ∂E/∂ψ of what the receiver
-            would send; where they were asked for. ψ [rad] is the angle by which the ray at the
-            antenna turns about ``−edge_axis``, its field with it.
+        points: diffraction points; beyond the end of an edge, on the line of the edge [m].
+        length: path length [m].
+        transfer: E at the receiver over E at 1 m from the transmitter, without the phase of the
+            length [1/m]; world axes, receive × transmit.
+        stationary: False where no such path exists, since edges meet in the diffraction point.
+        slopes: as ``transfer``, for ∂E/∂ψ at the transmitter and, by reciprocity, at the receiver;
+            None unless requested. ψ [rad] rotates the ray at the antenna, with its field, about
+            ``−edge_axis``.
     """
 
     points: Float64[Tensor, "row edge 3"]
@@ -97,27 +92,27 @@ def diffract_over_edges(
     *,
     slopes: bool = False,
 ) -> EdgePaths:
-    """The diffracted field of one edge, or of two or three one after the other.
+    """Compute the diffracted field of one edge, or of two or three consecutive edges.
 
     Where two edges bound a face along which the path runs (``PathEdge.azimuth`` is then that of the
-    face), the next meets half the field of the one before.
+    face), half the field of the first is incident on the second.
 
     Args:
-        edges: one to three, in the order in which the wave meets them.
-        tx, rx: the antennas, or their images [m].
-        wave_number: k [1/m].
-        slopes: whether those are asked for; of one edge only.
+        edges: one to three edges, in the order of the path.
+        tx, rx: positions of the antennas, or of their images [m].
+        wave_number: wave number k [1/m].
+        slopes: True to compute slopes; for one edge only.
 
     Source: derivations §9; slopes are (1/jk sinβ) ∂D/∂φ′ ∂E/∂n′.
     """
     route = find_route(edges, tx, rx)
-    turns = route.edge_diffractions(wave_number)
+    diffractions = route.edge_diffractions(wave_number)
     orders: tuple[DyadDerivative, ...] = ("value", "in", "out") if slopes else ("value",)
-    transfer, *turned = transfer_dyads(route, turns, wave_number, orders)
+    transfer, *derivatives = transfer_dyads(route, diffractions, wave_number, orders)
     found = None
     if slopes:
-        scale = 1 / (1j * wave_number * turns[0].sin_beta[:, None] ** 2 * route.legs)
-        found = torch.stack(turned) * scale.T[..., None, None]
+        scale = 1 / (1j * wave_number * diffractions[0].sin_beta[:, None] ** 2 * route.legs)
+        found = torch.stack(derivatives) * scale.T[..., None, None]
     return EdgePaths(route.points, route.legs.sum(1), transfer, route.stationary, found)
 
 
@@ -127,19 +122,19 @@ def transfer_dyads(
     wave_number: float,
     orders: Sequence[DyadDerivative] = ("value",),
 ) -> list[Complex128[Tensor, "row 3 3"]]:
-    """E at the receiver, as in ``EdgePaths``, and its derivatives by azimuths at a single edge.
+    """Transfer dyads of ``EdgePaths``, or their derivatives with respect to azimuths at one edge.
 
     Args:
-        route: the paths.
-        diffractions: the waves at its edges.
-        wave_number: k [1/m].
-        orders: derivatives that are asked for; of several edges, the field alone.
+        route: geometry of the paths.
+        diffractions: diffraction geometry at its edges.
+        wave_number: wave number k [1/m].
+        orders: requested derivatives; for several edges, the value alone.
     """
     if len(diffractions) > 1:
         found = [_multiple_dyad(route, diffractions, wave_number)]
     else:
         found = list(diffraction_dyads(diffractions[0], wave_number, orders))
-    sines = torch.stack([turn.sin_beta for turn in diffractions]).prod(0)
+    sines = torch.stack([diffraction.sin_beta for diffraction in diffractions]).prod(0)
     amplitude = sines / (route.legs.prod(1) * route.spread)
     return [dyad * amplitude[:, None, None] for dyad in found]
 
@@ -147,11 +142,11 @@ def transfer_dyads(
 def diffraction_points(
     wedges: Wedges, tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
 ) -> tuple[Float64[Tensor, "row 3"], Bool[Tensor, " row"]]:
-    """Where paths over one edge turn, on its line, and whether such a path exists.
+    """Diffraction points of paths over one edge, on its line, and a mask of existing paths.
 
     Args:
-        wedges: one row each.
-        tx, rx: the antennas, or their images [m].
+        wedges: sharp edges, one row each.
+        tx, rx: positions of the antennas, or of their images [m].
     """
     axis = _normalise(wedges.end - wedges.start)
     points = wedges.start + _closest_offset(wedges.start, axis, tx, rx)[:, None] * axis
@@ -162,11 +157,11 @@ def diffraction_points(
 def multiple_diffraction_points(
     wedges: Sequence[Wedges], tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
 ) -> tuple[Float64[Tensor, "row edge 3"], Bool[Tensor, " row"]]:
-    """As ``diffraction_points``, of paths over several edges.
+    """As ``diffraction_points``, for paths over several edges.
 
     Args:
-        wedges: in the order of the path; one row each.
-        tx, rx: the antennas [m].
+        wedges: edges in the order of the path, one row each.
+        tx, rx: antenna positions [m].
     """
     route = find_route([PathEdge(each) for each in wedges], tx, rx)
     return route.points, route.stationary
@@ -174,14 +169,14 @@ def multiple_diffraction_points(
 
 @dataclass(frozen=True)
 class Route:
-    """The shortest path over edges.
+    """Shortest path over edges.
 
     Attributes:
-        edges: in order.
-        offsets: places of its points along the edges, from their starts [row, edge] [m].
-        vertices: of the path, antennas included [m].
-        hessian: second derivatives of the length by the offsets.
-        stationary: whether it is smooth there.
+        edges: edges in the order of the path.
+        offsets: positions of its points along the edges, from their starts, [row, edge] [m].
+        vertices: vertices of the path, antennas included [m].
+        hessian: second derivatives of the length with respect to the offsets [1/m].
+        stationary: True where the length is smooth and stationary.
     """
 
     edges: Sequence[PathEdge]
@@ -192,163 +187,177 @@ class Route:
 
     @property
     def points(self) -> Float64[Tensor, "row edge 3"]:
-        """Where it turns."""
+        """Diffraction points [m]."""
         return self.vertices[:, 1:-1]
 
     @property
     def legs(self) -> Float64[Tensor, "row leg"]:
-        """Lengths from point to point [m]."""
+        """Lengths of the legs [m]."""
         return (self.vertices[:, 1:] - self.vertices[:, :-1]).norm(dim=2)
 
     @property
     def spread(self) -> Tensor:
-        """√det H."""
+        """Spreading factor √det H."""
         return _determinant(self.hessian).clamp_min(1e-300).sqrt()
 
     @property
     def covariance(self) -> Float64[Tensor, "row edge edge"]:
-        """Σ of the openings at the edges, each where its azimuth of departure grows [m]."""
+        """Covariances Σ of the edges' apertures, towards growing azimuths of departure [m]."""
         legs = self.legs
         total, reached = legs.sum(1), legs.cumsum(1)
-        ways = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(1e-300)
+        directions = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(
+            1e-300
+        )
         count = len(self.edges)
         found = [[total] * count for _ in range(count)]
         axes = [edge_axis(edge.wedges) for edge in self.edges]
-        # Across every edge, before and after it.
-        into, out = (
-            [_normalise(cross(axis, ways[:, n + after])) for n, axis in enumerate(axes)]
+        # Orthogonal to every edge and to the path, before and after the edge.
+        incident, departing = (
+            [_normalise(cross(axis, directions[:, n + after])) for n, axis in enumerate(axes)]
             for after in (0, 1)
         )
         for a in range(count):
-            side = out[a]
+            lateral = departing[a]
             for b in range(a, count):
-                alike = torch.ones_like(total) if a == b else dot(side, into[b])
-                found[a][b] = found[b][a] = alike * reached[:, a] * (1 - reached[:, b] / total)
+                correlation = torch.ones_like(total) if a == b else dot(lateral, incident[b])
+                found[a][b] = found[b][a] = (
+                    correlation * reached[:, a] * (1 - reached[:, b] / total)
+                )
                 if a < b:
-                    # Over this edge the way turns about it.
-                    along = [cross(ways[:, b + n], each[b]) for n, each in enumerate((into, out))]
-                    side = dot(side, along[0])[:, None] * along[1] + alike[:, None] * out[b]
+                    # Diffraction rotates the path about this edge.
+                    transported = [
+                        cross(directions[:, b + n], each[b])
+                        for n, each in enumerate((incident, departing))
+                    ]
+                    lateral = (
+                        dot(lateral, transported[0])[:, None] * transported[1]
+                        + correlation[:, None] * departing[b]
+                    )
         return torch.stack([torch.stack(row, 1) for row in found], 1)
 
     def edge_diffractions(self, wave_number: float) -> list[EdgeDiffraction]:
-        """The waves at every edge.
+        """Return the diffraction geometry at every edge.
 
         Args:
-            wave_number: k [1/m].
+            wave_number: wave number k [1/m].
         """
         found, legs = [], self.legs
-        way = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(1e-300)
+        directions = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(
+            1e-300
+        )
         parameters = self._distance_parameters()
         for number, edge in enumerate(self.edges):
-            direction, towards = way[:, number], way[:, number + 1]
-            turn = EdgeDiffraction(
+            incident, diffracted = directions[:, number], directions[:, number + 1]
+            diffraction = EdgeDiffraction(
                 edge.wedges,
-                direction,
-                towards,
-                _azimuth(edge.wedges, -direction, edge.azimuth_in),
-                _azimuth(edge.wedges, towards, edge.azimuth),
-                parameters[:, number] * cross(edge_axis(edge.wedges), direction).square().sum(1),
+                incident,
+                diffracted,
+                _azimuth(edge.wedges, -incident, edge.azimuth_in),
+                _azimuth(edge.wedges, diffracted, edge.azimuth),
+                parameters[:, number] * cross(edge_axis(edge.wedges), incident).square().sum(1),
                 edge.face_coefficients,
                 None if edge.infinite else self.end_parameters(number, wave_number),
                 edge.absorbing,
             )
-            found.append(turn)
+            found.append(diffraction)
         return found
 
     def _distance_parameters(self) -> Float64[Tensor, "row edge"]:
-        """L/sin²β of the edges: 1/P_ii."""
+        """Distance parameters over sin²β: L/sin²β = 1/P_ii [m]."""
         minors, whole = _cofactors(self.covariance)
         own = torch.diagonal(minors, dim1=1, dim2=2)
         return whole.clamp_min(0)[:, None] / own.clamp_min(1e-300)
 
     @property
     def couplings(self) -> Float64[Tensor, "row edge edge"]:
-        """w_ij, > 0 where azimuths of departure from i and of incidence on j grow to one side."""
+        """Couplings w_ij, > 0 if azimuths of departure at i and incidence at j grow alike."""
         minors, _ = _cofactors(self.covariance)
         root = torch.diagonal(minors, dim1=1, dim2=2).clamp_min(1e-300).sqrt()
         return minors / (root[:, :, None] * root[:, None])
 
     def end_parameters(self, edge_index: int, wave_number: float) -> Float64[Tensor, "row 2"]:
-        """√phase by which paths over the ends of an edge are longer, < 0 past the end.
+        """Return √phase by which paths over the ends of an edge are longer, < 0 beyond the end.
 
-        The other edges' points follow.
+        The points on the other edges are re-optimised.
 
         Args:
-            edge_index: of the edge on the path.
-            wave_number: k [1/m].
+            edge_index: index of the edge on the path.
+            wave_number: wave number k [1/m].
         """
         past, root = self.end_distances(edge_index, wave_number)
         return past * root
 
     def end_distances(self, edge_index: int, wave_number: float) -> tuple[Tensor, Tensor]:
-        """How far the ends of an edge lie outwards of its point [m], and √phase over that [1/m].
+        """Return outward distances of an edge's ends [m], and √phase over them [1/m].
 
         Args:
-            edge_index: of the edge on the path.
-            wave_number: k [1/m].
+            edge_index: index of the edge on the path.
+            wave_number: wave number k [1/m].
         """
         wedges = self.edges[edge_index].wedges
         offset = self.offsets[:, edge_index]
-        past = torch.stack([offset, (wedges.end - wedges.start).norm(dim=1) - offset], 1)
+        distance = torch.stack([offset, (wedges.end - wedges.start).norm(dim=1) - offset], 1)
         if len(self.edges) == 1:
             axis = _normalise(wedges.end - wedges.start)
             point = self.vertices[:, 1]
-            excess = torch.zeros_like(past)
+            excess = torch.zeros_like(distance)
             for antenna in (self.vertices[:, 0], self.vertices[:, 2]):
-                along = dot(point - antenna, axis)
-                aside = cross(point - antenna, axis).norm(dim=1)
-                excess = excess + _excess(aside[:, None], along[:, None], past)
-            return past, (wave_number * excess).sqrt()
-        rest = [other for other in range(len(self.edges)) if other != edge_index]
-        other = _determinant(self.hessian[:, rest][:, :, rest])
-        stiff = self.spread**2 / other.clamp_min(1e-300)
-        bent = 0.5 * stiff[:, None] * past**2
+                axial = dot(point - antenna, axis)
+                radial = cross(point - antenna, axis).norm(dim=1)
+                excess = excess + _excess(radial[:, None], axial[:, None], distance)
+            return distance, (wave_number * excess).sqrt()
+        others = [number for number in range(len(self.edges)) if number != edge_index]
+        minor = _determinant(self.hessian[:, others][:, :, others])
+        stiffness = self.spread**2 / minor.clamp_min(1e-300)
+        second_order = 0.5 * stiffness[:, None] * distance**2
         excess = self._lengths_over_ends(edge_index) - self.legs.sum(1, keepdim=True)
-        near = wave_number * bent.detach() < _SECOND_ORDER_PHASE
-        ratio = torch.where(near, 1.0, excess / torch.where(near, 1.0, bent))
-        return past, (0.5 * wave_number * stiff[:, None] * ratio.clamp_min(0.0)).sqrt()
+        near = wave_number * second_order.detach() < _SECOND_ORDER_PHASE
+        ratio = torch.where(near, 1.0, excess / torch.where(near, 1.0, second_order))
+        return distance, (0.5 * wave_number * stiffness[:, None] * ratio.clamp_min(0.0)).sqrt()
 
     def _lengths_over_ends(self, edge_index: int) -> Float64[Tensor, "row 2"]:
-        """Lengths of the paths over the ends of one edge, shortest over the others."""
+        """Lengths of the shortest paths over either end of one edge."""
         wedges = self.edges[edge_index].wedges
         before = [edge.wedges for edge in self.edges[:edge_index]]
         after = [edge.wedges for edge in self.edges[edge_index + 1 :]]
         found = []
         for end in (wedges.start, wedges.end):
-            there = _shortest_length(before, self.vertices[:, 0], end)
-            found.append(there + _shortest_length(after, end, self.vertices[:, -1]))
+            first_part = _shortest_length(before, self.vertices[:, 0], end)
+            found.append(first_part + _shortest_length(after, end, self.vertices[:, -1]))
         return torch.stack(found, 1)
 
 
 def _shortest_length(wedges: Sequence[Wedges], first: Tensor, last: Tensor) -> Tensor:
-    """Of ways over edges without ends, differentiable once."""
+    """Length of the shortest path over infinite edges, differentiable once."""
     if not wedges:
         return (last - first).norm(dim=1)
     axes = [_normalise(each.end - each.start) for each in wedges]
     if len(wedges) == 1:
-        asides = [cross(point - wedges[0].start, axes[0]).norm(dim=1) for point in (first, last)]
-        return torch.hypot(asides[0] + asides[1], dot(last - first, axes[0]))
+        radial = [cross(point - wedges[0].start, axes[0]).norm(dim=1) for point in (first, last)]
+        return torch.hypot(radial[0] + radial[1], dot(last - first, axes[0]))
     starts, axis = torch.stack([each.start for each in wedges], 1), torch.stack(axes, 1)
     offsets = _minimise_length(starts.detach(), axis.detach(), first.detach(), last.detach())
-    stops = _path_vertices(starts, axis, offsets, first, last)
-    found = (stops[:, 1:] - stops[:, :-1]).norm(dim=2).sum(1)
-    # Where lines cross, the shortest way may go over their crossing, in which it is not smooth.
-    apart, both = starts[:, 1] - starts[:, 0], dot(axes[0], axes[1])
-    square = (1 - both**2).clamp_min(_MIN_LENGTH_FRACTION)
-    near = (
-        starts[:, 0] + (dot(apart, axes[0] - both[:, None] * axes[1]) / square)[:, None] * axes[0]
+    nodes = _path_vertices(starts, axis, offsets, first, last)
+    found = (nodes[:, 1:] - nodes[:, :-1]).norm(dim=2).sum(1)
+    # Where lines intersect, the shortest path may contain their intersection, where it is not
+    # smooth.
+    offset, cosine = starts[:, 1] - starts[:, 0], dot(axes[0], axes[1])
+    square = (1 - cosine**2).clamp_min(_MIN_LENGTH_FRACTION)
+    closest = (
+        starts[:, 0]
+        + (dot(offset, axes[0] - cosine[:, None] * axes[1]) / square)[:, None] * axes[0]
     )
     crossing = (
-        cross(near - starts[:, 1], axes[1]).detach().norm(dim=1)
+        cross(closest - starts[:, 1], axes[1]).detach().norm(dim=1)
         < _MIN_LENGTH_FRACTION * found.detach()
     )
-    over = (near - first).norm(dim=1) + (last - near).norm(dim=1)
-    found = torch.where(crossing & (over.detach() < found.detach()), over, found)
-    # A point on the line next to it needs no way there.
-    for side, place in ((0, first), (1, last)):
-        aside = cross(place - wedges[side].start, axes[side]).detach().norm(dim=1)
-        rest = _shortest_length([wedges[1 - side]], first, last)
-        found = torch.where(aside < _MIN_LENGTH_FRACTION * found.detach(), rest, found)
+    length_over = (closest - first).norm(dim=1) + (last - closest).norm(dim=1)
+    found = torch.where(crossing & (length_over.detach() < found.detach()), length_over, found)
+    # A point on the adjacent line has no distance to it.
+    for side, point in ((0, first), (1, last)):
+        distance = cross(point - wedges[side].start, axes[side]).detach().norm(dim=1)
+        remaining = _shortest_length([wedges[1 - side]], first, last)
+        found = torch.where(distance < _MIN_LENGTH_FRACTION * found.detach(), remaining, found)
     return found
 
 
@@ -356,7 +365,7 @@ _OUTWARDS = torch.tensor([-1.0, 1.0], dtype=torch.float64)
 
 
 def _excess(aside: Tensor, along: Tensor, past: Tensor) -> Tensor:
-    """[√(ρ² + (x + d)²) − √(ρ² + x²) − xd/√(ρ² + x²)]/d², also for d → 0."""
+    """Return [√(ρ² + (x + d)²) − √(ρ² + x²) − xd/√(ρ² + x²)]/d², also for d → 0."""
     moved = along + past * _OUTWARDS
     here, there = torch.hypot(aside, along), torch.hypot(aside, moved)
     return (aside**2 + here * there - along * moved) / (here * (here + there) ** 2)
@@ -374,11 +383,11 @@ def _azimuth(wedges: Wedges, direction: Tensor, known: Tensor | None) -> Tensor:
 def find_route(
     edges: Sequence[PathEdge], tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
 ) -> Route:
-    """Where paths turn: in closed form on one edge, by Newton's steps on more.
+    """Find the shortest path: in closed form over one edge, by Newton's method over more.
 
     Args:
-        edges: in the order of the path.
-        tx, rx: the antennas, or their images [m].
+        edges: edges in the order of the path.
+        tx, rx: positions of the antennas, or of their images [m].
     """
     starts = torch.stack([edge.wedges.start for edge in edges], 1)
     axes = torch.stack([_normalise(edge.wedges.end - edge.wedges.start) for edge in edges], 1)
@@ -386,7 +395,7 @@ def find_route(
         offsets = _closest_offset(starts[:, 0], axes[:, 0], tx, rx)[:, None]
     else:
         offsets = _minimise_length(starts.detach(), axes.detach(), tx.detach(), rx.detach())
-        # One more step, attached: it carries the derivatives of the places.
+        # One attached Newton step carries the derivatives of the offsets.
         vertices = _path_vertices(starts, axes, offsets, tx, rx)
         hessian = _length_hessian(vertices.detach(), axes.detach())
         offsets = offsets - _solve_tridiagonal(hessian, _length_gradient(vertices, axes))
@@ -400,14 +409,14 @@ def find_route(
 
 
 def _closest_offset(start: Tensor, axis: Tensor, first: Tensor, last: Tensor) -> Tensor:
-    """Where the shortest path between two points touches a line, from its start."""
-    along = [dot(point - start, axis) for point in (first, last)]
-    aside = [
-        (point - start - way[:, None] * axis).norm(dim=-1)
-        for point, way in zip((first, last), along, strict=True)
+    """Offset from a line's start at which the shortest path between two points touches it."""
+    axial = [dot(point - start, axis) for point in (first, last)]
+    radial = [
+        (point - start - offset[:, None] * axis).norm(dim=-1)
+        for point, offset in zip((first, last), axial, strict=True)
     ]
-    share = aside[0] / (aside[0] + aside[1]).clamp_min(1e-300)
-    return along[0] + (along[1] - along[0]) * share
+    fraction = radial[0] / (radial[0] + radial[1]).clamp_min(1e-300)
+    return axial[0] + (axial[1] - axial[0]) * fraction
 
 
 def _path_vertices(starts: Tensor, axes: Tensor, offsets: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
@@ -416,20 +425,20 @@ def _path_vertices(starts: Tensor, axes: Tensor, offsets: Tensor, tx: Tensor, rx
 
 
 def _length_gradient(vertices: Tensor, axes: Tensor) -> Tensor:
-    """Derivatives of the length by the offsets."""
-    way = vertices[:, 1:] - vertices[:, :-1]
-    way = way / way.norm(dim=2, keepdim=True).clamp_min(1e-300)
-    return dot(axes, way[:, :-1]) - dot(axes, way[:, 1:])
+    """Derivatives of the length with respect to the offsets."""
+    direction = vertices[:, 1:] - vertices[:, :-1]
+    direction = direction / direction.norm(dim=2, keepdim=True).clamp_min(1e-300)
+    return dot(axes, direction[:, :-1]) - dot(axes, direction[:, 1:])
 
 
 def _length_hessian(vertices: Tensor, axes: Tensor) -> Tensor:
-    """H of the length: of a leg (e_a·e_b − (e_a·u)(e_b·u))/s between both of its ends."""
-    way = vertices[:, 1:] - vertices[:, :-1]
-    legs = way.norm(dim=2).clamp_min(1e-300)
-    way = way / legs[..., None]
+    """Hessian of the length; a leg contributes (e_a·e_b − (e_a·u)(e_b·u))/s for its two ends."""
+    direction = vertices[:, 1:] - vertices[:, :-1]
+    legs = direction.norm(dim=2).clamp_min(1e-300)
+    direction = direction / legs[..., None]
 
     def entry(a: int, b: int, leg: int) -> Tensor:
-        first, second, u = axes[:, a], axes[:, b], way[:, leg]
+        first, second, u = axes[:, a], axes[:, b], direction[:, leg]
         return (dot(first, second) - dot(first, u) * dot(second, u)) / legs[:, leg]
 
     count = axes.shape[1]
@@ -443,7 +452,7 @@ def _length_hessian(vertices: Tensor, axes: Tensor) -> Tensor:
 
 
 def _determinant(matrix: Tensor) -> Tensor:
-    """Of tridiagonal symmetric ones."""
+    """Determinants of symmetric tridiagonal matrices."""
     before, last = torch.ones_like(matrix[:, 0, 0]), matrix[:, 0, 0]
     for n in range(1, matrix.shape[1]):
         step = matrix[:, n, n] * last - matrix[:, n - 1, n] ** 2 * before
@@ -452,7 +461,7 @@ def _determinant(matrix: Tensor) -> Tensor:
 
 
 def _cofactors(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """The signed minors of symmetric matrices of up to three rows, and the determinants."""
+    """Cofactors and determinants of symmetric matrices of up to three rows."""
     count = matrix.shape[1]
     if count == 1:
         return torch.ones_like(matrix), matrix[:, 0, 0]
@@ -465,7 +474,7 @@ def _cofactors(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _solve_tridiagonal(matrix: Tensor, right: Tensor) -> Tensor:
-    """H⁻¹ times a vector, of tridiagonal H ≥ 0."""
+    """Solve tridiagonal symmetric systems, H ≥ 0 (Thomas algorithm)."""
     count = matrix.shape[1]
     pivots, sides = [matrix[:, 0, 0].clamp_min(1e-300)], [right[:, 0]]
     for n in range(1, count):
@@ -479,11 +488,12 @@ def _solve_tridiagonal(matrix: Tensor, right: Tensor) -> Tensor:
 
 
 def _minimise_length(starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
-    """Places on edges of the shortest path: Newton's steps where they shorten it.
+    """Find offsets of the shortest path by Newton steps, where these shorten it.
 
-    The length is convex; elsewhere each place is moved to the shortest way between its neighbours.
-    That would stick where the edges' lines cross. So each edge and the receiver are lifted into a
-    fourth dimension first, above the edge before, and then let down.
+    The length is convex; elsewhere each point is moved to the shortest path between its neighbours.
+    That iteration would stall where the lines of the edges intersect. Each edge and the receiver
+    are therefore first shifted along a fourth dimension, above the previous edge, and then lowered
+    (continuation).
     """
     offsets = torch.zeros(starts.shape[:2], dtype=starts.dtype)
     size = (rx - tx).norm(dim=1)
@@ -504,9 +514,7 @@ def _minimise_length(starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Te
 def _iterate_offsets(
     offsets: Tensor, starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor, tolerance: float
 ) -> Tensor:
-    """``_minimise_length`` from given places on, until these move by a share of the antennas'
-    distance.
-    """
+    """Iterate offsets until they move by less than a fraction of the antennas' distance."""
 
     def length(at: Tensor) -> Tensor:
         points = _path_vertices(starts, axes, at, tx, rx)
@@ -514,44 +522,46 @@ def _iterate_offsets(
 
     found, rows = offsets, torch.arange(len(offsets))
     for _ in range(_MAX_STEPS):
-        points, place, moved = _path_vertices(starts, axes, offsets, tx, rx), tx, []
+        points, point, moved = _path_vertices(starts, axes, offsets, tx, rx), tx, []
         for n in range(starts.shape[1]):
-            moved.append(_closest_offset(starts[:, n], axes[:, n], place, points[:, n + 2]))
-            place = starts[:, n] + moved[-1][:, None] * axes[:, n]
-        turned = torch.stack(moved, 1)
-        points = _path_vertices(starts, axes, turned, tx, rx)
-        newton = turned - _solve_tridiagonal(
+            moved.append(_closest_offset(starts[:, n], axes[:, n], point, points[:, n + 2]))
+            point = starts[:, n] + moved[-1][:, None] * axes[:, n]
+        relaxed = torch.stack(moved, 1)
+        points = _path_vertices(starts, axes, relaxed, tx, rx)
+        newton = relaxed - _solve_tridiagonal(
             _length_hessian(points, axes), _length_gradient(points, axes)
         )
-        better = (length(newton) < length(turned))[:, None]
-        offsets, before = torch.where(better, newton, turned), offsets
+        better = (length(newton) < length(relaxed))[:, None]
+        offsets, before = torch.where(better, newton, relaxed), offsets
         found = found.index_copy(0, rows, offsets)
-        # Only those that still move go on.
-        on = (offsets - before).abs().amax(1) >= tolerance * (rx - tx).norm(dim=1)
-        if not bool(on.any()):
+        # Continue with rows that have not converged.
+        active = (offsets - before).abs().amax(1) >= tolerance * (rx - tx).norm(dim=1)
+        if not bool(active.any()):
             break
-        rows, offsets, starts, axes = rows[on], offsets[on], starts[on], axes[on]
-        tx, rx = tx[on], rx[on]
+        rows, offsets, starts, axes = rows[active], offsets[active], starts[active], axes[active]
+        tx, rx = tx[active], rx[active]
     return found
 
 
 def _multiple_dyad(
     route: Route, diffractions: Sequence[EdgeDiffraction], wave_number: float
 ) -> Tensor:
-    """The dyad of all edges; of those of a face with half the field, which is twice the incident.
+    """Dyads of several edges.
 
-    Two edges closer than half a wavelength are one thing, which two one after the other are not:
-    that grows without bound into the corner where they meet. There it is taken off, by x³/(1 + x³).
+    Along a face half the field counts, since it is twice the incident one.
+
+    Two edges closer than half a wavelength act as one diffractor, and double diffraction diverges
+    towards the corner where they meet. It is attenuated there by x³/(1 + x³).
     """
     couplings = route.couplings
     if len(diffractions) == 2:
         total = double_dyad(diffractions[0], diffractions[1], couplings[:, 0, 1], wave_number)
     else:
         total = triple_dyad(diffractions, couplings, wave_number)
-    share = torch.ones_like(couplings[:, 0, 0])
+    weight = torch.ones_like(couplings[:, 0, 0])
     for number, (one, other) in enumerate(pairwise(route.edges), start=1):
         if one.azimuth is not None and other.azimuth_in is not None:
-            share = torch.where(one.azimuth.isnan(), share, share / 2)
-        apart = (wave_number * route.legs[:, number] / torch.pi) ** 3
-        share = share * apart / (1 + apart)
-    return total * share[:, None, None]
+            weight = torch.where(one.azimuth.isnan(), weight, weight / 2)
+        separation = (wave_number * route.legs[:, number] / torch.pi) ** 3
+        weight = weight * separation / (1 + separation)
+    return total * weight[:, None, None]

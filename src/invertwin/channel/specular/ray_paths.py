@@ -1,4 +1,4 @@
-"""Paths between point antennas: what a trace returns, one row a path."""
+"""Table of ray paths between point antennas, the result of ``trace_paths``."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -10,45 +10,43 @@ from torch import Tensor
 from invertwin.constants import SPEED_OF_LIGHT
 
 KINDS = ("", "reflection", "transmission", "diffraction", "metasurface")
-"""What happens where a path meets a surface or an edge, by its number in ``RayPaths.kinds``."""
+"""Interaction types by their number in ``RayPaths.kinds``."""
 REFLECTION, TRANSMISSION, DIFFRACTION, METASURFACE = 1, 2, 3, 4
 
 
 @dataclass(frozen=True, eq=False)
 class RayPaths:
-    """Discrete paths between antennas: line of sight, mirrored, through sheets, round edges.
+    """Ray paths between antennas: line of sight, reflected, transmitted and diffracted.
 
-    Rows are in the order of transmitter, receiver and delay; a link may have any number, also none.
-    ``padded`` gives the same as a table with as many places for each link. Rows of vertices are
-    filled up behind the last one: with zeros, kind 0 and triangle −1.
+    Rows are sorted by transmitter, receiver and delay; a link may have any number, also none.
+    ``pad_links`` gives row numbers in a table with one row per link. Vertices are padded after the
+    last one: with zeros, kind 0 and triangle −1.
 
     The field at the receiver is ``coefficient`` times that of the transmitter, without the
     propagation phase: ``H(f) = Σ a exp(−j2πfτ)``. Rows and columns are V and H, the unit vectors of
-    θ and φ about the world's z axis: a column for the field that leaves along ``departure``, a row
-    for an antenna that looks along ``arrival``. λ/4πL is included, antennas are not.
+    θ and φ about the world's z axis: columns for the field radiated along ``departure``, rows for
+    the field received from ``arrival``. The factor λ/4πL is included, antenna patterns are not.
 
     Attributes:
-        counts: Number of transmitters and of receivers.
-        frequency: Of the coefficients [Hz].
-        tx, rx: Numbers of the antennas of each path.
-        delay: Length over c [s].
-        coefficient: a, receive × transmit polarisation.
-        departure, arrival: Unit vectors in the world that point away from the antennas, along the
-            path.
-        vertices: Where the path meets surfaces and edges, from the transmitter on [m].
-        kinds: What happens there, by ``KINDS``.
-        faces: Triangles that are met, numbered through all objects.
-        objects: Numbers of the objects that are met, in ``names``.
-        names: Of the objects of the scene.
-        doppler: Shift of the frequency by motion of antennas and objects [Hz]; positive where
-            the path gets shorter.
-        slopes: Of paths round one edge: a of the derivatives of the transmitter's field and of the
-            receiver's by an angle about ``axes``, in which the fields turn with the directions
-            [1/rad]; zero of all others. None = no path has any.
-        axes: Unit vectors of these rotations, at the transmitter and at the receiver.
-        missed_fraction: Of the directions of the antennas that rays were shot from, the share whose
-            sequences of surfaces no ray has followed: an estimate; None where all sequences have
-            been tried.
+        counts: number of transmitters and of receivers.
+        frequency: carrier frequency of the coefficients [Hz].
+        tx, rx: antenna numbers of each path.
+        delay: length over c [s].
+        coefficient: complex amplitudes a, receive × transmit polarisation.
+        departure, arrival: unit vectors in world axes away from the antennas, along the path.
+        vertices: interaction points with surfaces and edges, from the transmitter on [m].
+        kinds: interaction types, numbers of ``KINDS``.
+        faces: triangles of the interactions, numbered through all objects.
+        objects: objects of the interactions, numbers of ``names``.
+        names: names of the scene's objects.
+        doppler: Doppler shift due to motion of antennas and objects [Hz]; positive for decreasing
+            length.
+        slopes: slope amplitudes of paths over one edge [1/rad]: a for the derivatives of the
+            transmitter's and of the receiver's field with respect to a rotation about ``axes``, in
+            which the fields rotate with the directions; zero for other paths. None = no such path.
+        axes: unit vectors of these rotations, at the transmitter and at the receiver.
+        missed_fraction: estimated fraction of ray directions whose sequences of surfaces no ray has
+            followed; None for an exhaustive search.
     """
 
     counts: tuple[int, int]
@@ -74,68 +72,68 @@ class RayPaths:
 
     @property
     def length(self) -> Float64[Tensor, " path"]:
-        """[m]."""
+        """Path lengths [m]."""
         return SPEED_OF_LIGHT * self.delay
 
     @property
     def depth(self) -> Int64[Tensor, " path"]:
-        """How many surfaces and edges each path meets; 0 = line of sight."""
+        """Number of interactions of each path; 0 = line of sight."""
         return (self.kinds > 0).sum(1)
 
     @property
     def link(self) -> Int64[Tensor, " path"]:
-        """Number of the pair of antennas: receivers run fastest."""
+        """Number of the antenna pair; receivers vary fastest."""
         return self.tx * self.counts[1] + self.rx
 
     def select(self, rows: Bool[Tensor, " path"] | Int64[Tensor, " some"]) -> "RayPaths":
-        """Only some of the paths.
+        """Select paths.
 
         Args:
-            rows: A mask, or numbers of rows.
+            rows: mask or row numbers.
         """
         columns = {n: value[rows] for n, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(self, **columns)
 
     def select_link(self, tx: int, rx: int) -> "RayPaths":
-        """The paths of one link.
+        """Select the paths of one link.
 
         Args:
-            tx: Number of the transmitter.
-            rx: Number of the receiver.
+            tx: number of the transmitter.
+            rx: number of the receiver.
         """
         return self.select((self.tx == tx) & (self.rx == rx))
 
     def sort_rows(self) -> "RayPaths":
-        """The paths in the order of transmitter, receiver and delay."""
+        """Sort the paths by transmitter, receiver and delay."""
         by_delay = self.delay.detach().argsort(stable=True)
         return self.select(by_delay[self.link[by_delay].argsort(stable=True)])
 
     def pad_links(self) -> tuple[Int64[Tensor, "tx rx place"], Bool[Tensor, "tx rx place"]]:
-        """Row numbers by link, filled up with zeros, and which of them are paths.
+        """Row numbers by link, padded with zeros, and the mask of actual paths.
 
-        ``paths.delay[row]`` is then a table of delays; multiply by the mask what has to vanish.
+        ``paths.delay[row]`` is then a table of delays; multiply by the mask to clear the padding.
         """
         count = torch.bincount(self.link, minlength=self.counts[0] * self.counts[1])
         order = self.link.argsort(stable=True)
-        place = torch.arange(len(self)) - (count.cumsum(0) - count)[self.link[order]]
+        position = torch.arange(len(self)) - (count.cumsum(0) - count)[self.link[order]]
         shape = (len(count), int(count.max()) if len(count) else 0)
         row = torch.zeros(shape, dtype=torch.int64)
         filled = torch.zeros(shape, dtype=torch.bool)
-        row[self.link[order], place] = order
-        filled[self.link[order], place] = True
+        row[self.link[order], position] = order
+        filled[self.link[order], position] = True
         return row.unflatten(0, self.counts), filled.unflatten(0, self.counts)
 
     def reverse(self) -> "RayPaths":
-        """The same paths the other way, with transmitters and receivers exchanged."""
+        """Return the reciprocal paths, with transmitters and receivers exchanged."""
         depth = self.depth[:, None]
         width = torch.arange(self.kinds.shape[1])
         back = torch.where(width < depth, depth - 1 - width, width)
         rows = torch.arange(len(self))[:, None]
-        turned = {
+        reversed_columns = {
             n: getattr(self, n)[rows, back] for n in ("vertices", "kinds", "faces", "objects")
         }
         if self.slopes is not None and self.axes is not None:
-            turned |= {"slopes": self.slopes.mT.flip(1), "axes": self.axes.flip(1)}
+            reversed_columns |= {"slopes": self.slopes.mT.flip(1), "axes": self.axes.flip(1)}
         return replace(
             self,
             counts=self.counts[::-1],
@@ -144,7 +142,7 @@ class RayPaths:
             coefficient=self.coefficient.mT,
             departure=self.arrival,
             arrival=self.departure,
-            **turned,
+            **reversed_columns,
         ).sort_rows()
 
     def __add__(self, other: "RayPaths") -> "RayPaths":
@@ -152,10 +150,10 @@ class RayPaths:
 
 
 def join_ray_paths(parts: Sequence[RayPaths]) -> RayPaths:
-    """All paths of the same antennas and scene, in the order of ``RayPaths``.
+    """Concatenate paths of the same antennas and scene, sorted as ``RayPaths``.
 
     Args:
-        parts: At least one; they may have other numbers of vertices.
+        parts: at least one table; numbers of vertices may differ.
     """
     if any(part.slopes is not None for part in parts):
         parts = [_add_slopes(part) for part in parts]
@@ -174,7 +172,7 @@ def join_ray_paths(parts: Sequence[RayPaths]) -> RayPaths:
 
 
 def _add_slopes(paths: RayPaths) -> RayPaths:
-    """With slopes, zero if there are none."""
+    """Return paths with slopes, zero where there are none."""
     if paths.slopes is not None:
         return paths
     slopes = paths.coefficient.new_zeros(len(paths), 2, 2, 2)
@@ -190,11 +188,11 @@ def _pad_columns(value: Tensor, width: int, fill: float) -> Tensor:
 def match_rows(
     first: Int64[Tensor, " n"], second: Int64[Tensor, " m"], count: int
 ) -> tuple[Int64[Tensor, " pair"], Int64[Tensor, " pair"]]:
-    """Rows of all pairs with the same number, in the order of the first table's rows.
+    """Row pairs with equal numbers, in the order of the first table (inner join).
 
     Args:
-        first, second: the numbers, below ``count``.
-        count: how many numbers there are.
+        first, second: numbers below ``count``.
+        count: upper bound of the numbers.
     """
     order = second.argsort(stable=True)
     many = torch.bincount(second, minlength=count)

@@ -1,9 +1,9 @@
-"""Specular paths between antennas: geometry and polarised fields, differentiable.
+"""Paths between antennas by the image method and UTD: geometry and fields, differentiable.
 
-Which paths there are is found by rays and is detached (``image_positions``). What they are worth
-is computed
-here from the vertices of the triangles that they meet: the length to the image of the transmitter,
-and the field, turned from one plane of incidence to the next.
+The search for paths uses rays and is detached (``image_method``, ``diffraction_candidates``). Their
+delays and fields are computed here from the vertices of the triangles that they meet: the length is
+the distance to the image of the transmitter, and the polarisation basis is rotated from one plane
+of incidence to the next.
 
 Source: derivations §10.
 """
@@ -63,23 +63,23 @@ from invertwin.scene.scene import Scene
 
 _MAX_DEPTH, _MAX_EDGES = 6, 3
 _ROWS_AT_ONCE = 1 << 15
-_DIFFRACTED_ROWS_AT_ONCE = 1 << 13  # paths round edges, which hold more
+_DIFFRACTED_ROWS_AT_ONCE = 1 << 13  # diffracted paths need more memory a row
 _UP = (0.0, 0.0, 1.0)
 _VELOCITY_HINT = "give one vector, or one per antenna"
 
 
 @dataclass(frozen=True)
 class PathScene:
-    """Scene and antennas as paths are computed from them, differentiable.
+    """Scene and antennas in world axes, differentiable.
 
     Attributes:
-        scene: Its objects.
-        topology: Their triangles.
-        vertices: [m].
-        velocities: Of the vertices [m/s]; None = all at rest.
-        tx, rx: Antennas [m].
-        tx_velocity, rx_velocity: [m/s].
-        frequency: [Hz].
+        scene: objects of the scene.
+        topology: triangles of all objects.
+        vertices: vertex positions [m].
+        velocities: vertex velocities [m/s]; None = all at rest.
+        tx, rx: antenna positions [m].
+        tx_velocity, rx_velocity: antenna velocities [m/s].
+        frequency: carrier frequency [Hz].
     """
 
     scene: Scene
@@ -106,60 +106,69 @@ def trace_paths(
     tx_velocity: ArrayLike = (0.0, 0.0, 0.0),
     rx_velocity: ArrayLike = (0.0, 0.0, 0.0),
 ) -> RayPaths:
-    """Paths between point antennas: line of sight, mirrored, through sheets, and round edges.
+    """Trace paths between point antennas: line of sight, reflections, transmissions, diffraction.
 
-    Smooth surfaces mirror on both sides; sheets (``Slab``, ``Multilayer``) also let through, on a
+    Smooth surfaces reflect on both sides; sheets (``Slab``, ``Multilayer``) also transmit, along a
     straight line. Delays, directions, vertices, coefficients and Doppler shifts are differentiable
     with respect to the scene, its materials and the antennas, at fixed visibility. A link without a
     path has no rows. With ``edges``, sharp edges diffract by the uniform theory: the sum of all
-    paths then has no jump where one of them is lost, and derivatives by sizes and across shadows
-    are right.
+    paths is then continuous where one of them vanishes, and derivatives with respect to sizes and
+    across shadow boundaries are correct.
 
     Candidates are the sequences of surfaces that ``rays`` rays follow, shot from the side with
-    fewer antennas. A sequence that fills the solid angle Ω about such an antenna is missed with
-    less than the probability exp(−rays·Ω/4π); ``RayPaths.missed`` estimates what is missed in all.
-    With ``rays=None`` every sequence of planes is tried, and none is missed.
+    fewer antennas. A sequence that subtends the solid angle Ω at such an antenna is missed with a
+    probability below exp(−rays·Ω/4π); ``RayPaths.missed_fraction`` estimates the total. With
+    ``rays=None`` every sequence of planes is tested, and none is missed.
 
     Args:
-        scene: What is in the way.
-        tx: Transmitters, [3] or [tx, 3] in the world [m].
-        rx: Receivers, [3] or [rx, 3] [m].
-        frequency: Of the coefficients [Hz].
-        depth: Most surfaces that a path meets, 0 to 6; a sheet that it passes counts as one.
-        edges: Most edges that a path goes round, 0 to 3. Paths round one edge also meet up to
-            ``depth`` surfaces; round two, none.
-        rays: Shot from each antenna of the side with fewer, and from all edges together; None tries
-            every sequence.
-        seed: Of the rays' directions.
-        tx_velocity: Of the transmitters, one or one for each [m/s].
-        rx_velocity: Of the receivers [m/s].
+        scene: scene with surfaces.
+        tx: transmitter positions, [3] or [tx, 3], in world axes [m].
+        rx: receiver positions, [3] or [rx, 3], in world axes [m].
+        frequency: carrier frequency of the coefficients [Hz].
+        depth: maximum number of surfaces on a path, 0 to 6; a transmitting sheet counts as one.
+        edges: maximum number of edges on a path, 0 to 3. Paths over one edge also meet up to
+            ``depth`` surfaces; over two or three, none.
+        rays: number of rays from each antenna of the side with fewer, and from all edges together;
+            None tests every sequence.
+        seed: random seed of the rays' directions.
+        tx_velocity: velocities of the transmitters, [3] or [tx, 3] [m/s].
+        rx_velocity: velocities of the receivers, [3] or [rx, 3] [m/s].
 
     Raises:
-        InputError: Wrong shapes or numbers, a cloud, or too many sequences to try one by one.
+        InputError: wrong shapes or numbers, a cloud, or too many sequences to test one by one.
 
     Source: derivations §9 and §10.
     """
-    stage = prepare_path_scene(scene, tx, rx, frequency, tx_velocity, rx_velocity)
-    most = checked_count(depth, "depth", 0)
-    if most > _MAX_DEPTH:
+    path_scene = prepare_path_scene(scene, tx, rx, frequency, tx_velocity, rx_velocity)
+    limit = checked_count(depth, "depth", 0)
+    if limit > _MAX_DEPTH:
         raise InputError(
-            f"expected a depth of at most {_MAX_DEPTH}, got {most}; paths of more mirrors are weak"
+            f"expected a depth of at most {_MAX_DEPTH}, got {limit}; paths of more reflections "
+            "are weak"
         )
     if checked_count(edges, "edges", 0) > _MAX_EDGES:
         raise InputError(f"expected at most {_MAX_EDGES} edges on a path, got {edges}")
     if rays is not None and not 1 <= checked_count(rays, "rays", 1) <= MAX_COUNT:
         raise InputError(f"expected at most {MAX_COUNT:,} rays, got {rays}; shoot fewer")
     with tracing():
-        powers = face_interactions(stage)
-        # Discrete: to `torch.func`, tensors made on the way would be its own.
+        interactions = face_interactions(path_scene)
+        # Discrete: `torch.func` would claim the intermediate tensors.
         with _DisableFuncTorch():
-            walls = _candidate_surfaces(stage)
-            found, missed = _find_specular(stage, walls, powers, most, rays, seed)
-            bends = _find_diffracted(stage, walls, powers, edges, most, rays, seed) if edges else []
-        parts = [part for chains in found for part in evaluate_paths(stage, chains)]
-        around = _wedge_scene(stage, walls)
-        parts += [part for some in bends for part in _evaluate_diffracted(stage, around, some)]
-    return replace(join_ray_paths(parts), missed_fraction=missed)
+            surfaces = _candidate_surfaces(path_scene)
+            specular, missed = _find_specular(path_scene, surfaces, interactions, limit, rays, seed)
+            diffracted = (
+                _find_diffracted(path_scene, surfaces, interactions, edges, limit, rays, seed)
+                if edges
+                else []
+            )
+        paths = [part for group in specular for part in evaluate_paths(path_scene, group)]
+        wedge_scene = _wedge_scene(path_scene, surfaces)
+        paths += [
+            part
+            for candidates in diffracted
+            for part in _evaluate_diffracted(path_scene, wedge_scene, candidates)
+        ]
+    return replace(join_ray_paths(paths), missed_fraction=missed)
 
 
 def _candidate_surfaces(path_scene: PathScene) -> CandidateSurfaces:
@@ -176,7 +185,7 @@ def _find_diffracted(
     rays: int | None,
     seed: int,
 ) -> list[DiffractionCandidates]:
-    """Which paths go round edges."""
+    """Find the diffracted paths; detached."""
     bare = replace(
         _wedge_scene(path_scene, surfaces), vertices=strip_derivatives(path_scene.vertices)
     )
@@ -192,7 +201,7 @@ def _find_specular(
     rays: int | None,
     seed: int,
 ) -> tuple[list[SpecularPaths], float | None]:
-    """Which paths there are, and the share of directions that was missed."""
+    """Find the specular paths, and the estimated fraction of missed directions."""
     tx, rx = strip_derivatives(path_scene.tx), strip_derivatives(path_scene.rx)
     swapped = len(rx) < len(tx)
     sources, targets = (rx, tx) if swapped else (tx, rx)
@@ -208,7 +217,7 @@ def _find_specular(
     for steps in (torch.zeros(1, 0, dtype=torch.int64), *sequences.steps):
         for number, source in enumerate(sources) if len(steps) else ():
             found += find_paths_between(surfaces, steps, source, targets, number)
-    return [chains.reverse() if swapped else chains for chains in found], sequences.missed_fraction
+    return [group.reverse() if swapped else group for group in found], sequences.missed_fraction
 
 
 def prepare_path_scene(
@@ -219,16 +228,16 @@ def prepare_path_scene(
     tx_velocity: ArrayLike,
     rx_velocity: ArrayLike,
 ) -> PathScene:
-    """A scene and antennas as the search for paths needs them.
+    """Prepare a scene and antennas for the search for paths.
 
     Args:
-        scene: Surfaces only.
-        tx, rx: Places [antenna, 3] or [3] [m].
-        frequency: Of the carrier [Hz].
-        tx_velocity, rx_velocity: One for all, or one each [m/s].
+        scene: scene of surfaces only.
+        tx, rx: antenna positions, [antenna, 3] or [3] [m].
+        frequency: carrier frequency [Hz].
+        tx_velocity, rx_velocity: velocities, [3] for all or [antenna, 3] [m/s].
 
     Raises:
-        InputError: A cloud in the scene, or antennas of wrong shape.
+        InputError: a cloud in the scene, or antennas of wrong shape.
     """
     objects = scene.objects.values()
     clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
@@ -261,9 +270,11 @@ def prepare_path_scene(
 def _check_positions(positions: ArrayLike, what: str) -> Tensor:
     found = torch.as_tensor(positions, dtype=torch.float64)
     rows = found[None] if found.ndim == 1 else found
-    rows = checked_tensor(rows, (None, 3), f"{what} places [m]", "give x, y, z of each")
+    rows = checked_tensor(rows, (None, 3), f"{what} positions [m]", "give x, y, z of each")
     if not len(rows):
-        raise InputError(f"expected at least one place of {what}, got none; give x, y, z of each")
+        raise InputError(
+            f"expected at least one position of {what}, got none; give x, y, z of each"
+        )
     return rows
 
 
@@ -274,7 +285,7 @@ def _check_velocities(value: ArrayLike, count: int, what: str) -> Tensor:
 
 
 def face_interactions(path_scene: PathScene) -> FaceInteractions:
-    """Which triangles mirror, and which let through, at 45°."""
+    """Find the triangles that reflect, and those that transmit, at 45° incidence."""
     reflect, transmit = [], []
     for item in path_scene.scene.objects.values():
         count = len(item.mesh.faces)
@@ -299,7 +310,7 @@ def _wedge_scene(path_scene: PathScene, surfaces: CandidateSurfaces) -> WedgeSce
 def _evaluate_diffracted(
     path_scene: PathScene, wedge_scene: WedgeScene, candidates: DiffractionCandidates
 ) -> list[RayPaths]:
-    """Paths round edges in pieces, as in ``evaluate_paths``."""
+    """Evaluate diffracted paths in chunks, as ``evaluate_paths``."""
     rows = torch.arange(len(candidates.tx))
     some = (path_scene.vertices, path_scene.tx, path_scene.rx)
     heavy = len(rows) > _DIFFRACTED_ROWS_AT_ONCE and any(value.requires_grad for value in some)
@@ -339,12 +350,14 @@ def _evaluate_diffracted(
 def _diffracted_columns(
     path_scene: PathScene, wedge_scene: WedgeScene, candidates: DiffractionCandidates
 ) -> tuple[Tensor, ...]:
-    """As ``_columns``, and kinds, faces, slopes and axes, of paths round edges."""
+    """As ``_specular_columns``, and kinds, faces, slopes and axes of diffracted paths."""
     k = 2 * math.pi * path_scene.frequency / SPEED_OF_LIGHT
     found = evaluate_diffracted_paths(wedge_scene, candidates, path_scene.tx, path_scene.rx, k)
     departure, arrival = found.directions[:, 0], -found.directions[:, -1]
     up = torch.tensor(_UP, dtype=torch.float64)
-    sent, received = (polarisations(way, up).to(found.transfer) for way in (departure, arrival))
+    sent, received = (
+        polarisations(direction, up).to(found.transfer) for direction in (departure, arrival)
+    )
     matrix = torch.einsum("pri,pij,ptj->prt", received, found.transfer, sent)
     slopes = torch.einsum("pri,psij,ptj->psrt", received, found.slopes, sent)
     scale = SPEED_OF_LIGHT / path_scene.frequency / (4 * math.pi)
@@ -378,7 +391,7 @@ def _shortening_rate(
     vertices: Float64[Tensor, "path vertex 3"],
     faces: Int64[Tensor, "path vertex"],
 ) -> Float64[Tensor, " path"]:
-    """How fast paths get shorter [m/s]."""
+    """Rate at which path lengths decrease [m/s]."""
     rate = dot(directions[0], path_scene.tx_velocity[tx]) - dot(
         directions[-1], path_scene.rx_velocity[rx]
     )
@@ -393,11 +406,11 @@ def _shortening_rate(
 
 
 def evaluate_paths(path_scene: PathScene, specular_paths: SpecularPaths) -> list[RayPaths]:
-    """The paths in pieces; what derivatives need is computed again for each, not kept.
+    """Evaluate specular paths in chunks, with checkpointing where derivatives are needed.
 
     Args:
-        path_scene: Scene and antennas.
-        specular_paths: Which surfaces each path meets.
+        path_scene: scene and antennas.
+        specular_paths: triangles that each path meets.
     """
     rows = torch.arange(len(specular_paths.source))
     some = (path_scene.vertices, path_scene.tx, path_scene.rx)
@@ -437,7 +450,7 @@ def _assemble_paths(
 
 
 def _specular_columns(path_scene: PathScene, specular_paths: SpecularPaths) -> tuple[Tensor, ...]:
-    """Delay, coefficient, departure, arrival, vertices and Doppler shift of paths of one length."""
+    """Delay, coefficient, departure, arrival, vertices and Doppler shift of specular paths."""
     tx, rx = path_scene.tx[specular_paths.source], path_scene.rx[specular_paths.target]
     count, length = specular_paths.faces.shape
     corners = path_scene.vertices[path_scene.topology.faces[specular_paths.faces]]
@@ -481,7 +494,7 @@ def _transfer_matrix(
     normal: Tensor,
     cosine: list[Tensor],
 ) -> Complex128[Tensor, "path 2 2"]:
-    """Field over that of the transmitter, V and H at both ends, without the spreading."""
+    """Polarisation transfer matrix between V and H at both ends, without spreading."""
     up = torch.tensor(_UP, dtype=torch.float64)
     before = polarisations(directions[0], up)
     matrix = torch.eye(2, dtype=torch.complex128).expand(len(before), 2, 2)
@@ -500,27 +513,29 @@ def _transfer_matrix(
 
 
 def _change_of_basis(new: Tensor, old: Tensor) -> Tensor:
-    """Matrix from components along two unit vectors to those along two others."""
+    """Matrix from components along two unit vectors to components along two others."""
     return dot(new[:, :, None], old[:, None]).to(torch.complex128)
 
 
 def _face_coefficients(
     path_scene: PathScene, faces: Int64[Tensor, " n"], cosine: Float64[Tensor, " n"]
 ) -> FieldCoefficients:
-    """What triangles reflect and let through; every material is asked once."""
+    """Field coefficients of triangles, with one evaluation per material."""
     items = list(path_scene.scene.objects.values())
     owner = path_scene.topology.face_object[faces]
     first = torch.searchsorted(path_scene.topology.face_object, torch.arange(len(items)))
-    kinds: dict[int, int] = {}
-    alike = torch.tensor([kinds.setdefault(id(item.material), len(kinds)) for item in items])
+    numbers: dict[int, int] = {}
+    material_number = torch.tensor(
+        [numbers.setdefault(id(item.material), len(numbers)) for item in items]
+    )
     found = [torch.zeros(len(faces), dtype=torch.complex128) for _ in range(4)]
-    asked: set[int] = set()
+    evaluated: set[int] = set()
     for number, item in enumerate(items):
-        kind = int(alike[number])
-        if kind in asked:
+        kind = int(material_number[number])
+        if kind in evaluated:
             continue
-        asked.add(kind)
-        rows = torch.nonzero(alike[owner] == kind)[:, 0]
+        evaluated.add(kind)
+        rows = torch.nonzero(material_number[owner] == kind)[:, 0]
         if not len(rows):
             continue
         triangle = faces[rows] - first[owner[rows]]

@@ -1,4 +1,4 @@
-"""A scene as diffraction sees it: its sharp edges, and where waves reach them.
+"""Scene for diffraction: its sharp edges, and the points on them that rays can reach.
 
 Source: derivations §9.
 """
@@ -28,11 +28,11 @@ from invertwin.checks import strip_derivatives
 from invertwin.scene.material.fresnel import FieldCoefficients
 
 TriangleCoefficients = Callable[[Int64[Tensor, " n"], Float64[Tensor, " n"]], FieldCoefficients]
-"""What triangles reflect and let through at cosines of the angle of incidence, about the mesh."""
+"""Field coefficients of triangles at cosines of the angle of incidence, referred to the mesh."""
 
-_OFFSET_MARGINS = 10.0  # margins of the ray scene: how far aside of an edge rays to it end
+_OFFSET_MARGINS = 10.0  # margins of the ray scene: distance of rays' ends from an edge
 _GRAZING_TOLERANCE = 1e-9  # rad
-_EDGE_PIECES = 16  # of an edge, each free or covered as a whole
+_EDGE_PIECES = 16  # pieces of an edge, each open or covered as a whole
 _DETOUR_ANGLES = (
     0.1,
     0.26,
@@ -40,18 +40,18 @@ _DETOUR_ANGLES = (
     0.58,
     0.74,
     0.9,
-)  # corners of a way round an edge, in its exterior
+)  # corners of a detour round an edge, in its exterior
 
 
 @dataclass(frozen=True)
 class WedgeScene:
-    """A scene as diffraction sees it.
+    """Scene with sharp edges for diffraction.
 
     Attributes:
-        vertices: of all objects [m].
-        topology: their triangles.
-        surfaces: what rays meet.
-        coefficients: of the triangles.
+        vertices: vertex positions of all objects [m].
+        topology: triangles of the vertices.
+        surfaces: occluders and their planes.
+        coefficients: field coefficients of the triangles.
     """
 
     vertices: Float64[Tensor, "v 3"]
@@ -61,17 +61,17 @@ class WedgeScene:
 
     @cached_property
     def wedges(self) -> Wedges:
-        """Sharp edges, each as long as it goes straight on."""
+        """Sharp edges, with collinear edges merged."""
         return _sharp_edges(self.vertices, self.topology)
 
     @cached_property
     def detached_wedges(self) -> Wedges:
-        """The same, detached."""
+        """Detached sharp edges."""
         return _sharp_edges(strip_derivatives(self.vertices), self.topology)
 
     @property
     def ray_offset(self) -> float:
-        """How far aside of edges rays to them end [m]."""
+        """Distance of rays' ends from edges [m]."""
         return _OFFSET_MARGINS * self.surfaces.margin
 
     def path_edge(
@@ -81,12 +81,13 @@ class WedgeScene:
         *,
         absorbing: bool = False,
     ) -> PathEdge:
-        """Edges on paths' ways.
+        """Return edges for the evaluation of paths.
 
         Args:
             row: numbers of wedges.
-            known_azimuths: azimuths of incidence and of departure, where a path runs along a face.
-            absorbing: take the faces as such that neither mirror nor let through.
+            known_azimuths: azimuths of incidence and of diffraction, where a path runs along a
+                face.
+            absorbing: True for faces that neither reflect nor transmit.
         """
         wedges = self.wedges.rows(row)
 
@@ -98,46 +99,46 @@ class WedgeScene:
     def offset_points(
         self, row: Tensor, points: Float64[Tensor, "row 3"]
     ) -> Float64[Tensor, "row 3"]:
-        """Points a little off edges and their ends, to which rays can be cast; detached.
+        """Offset points from edges and their ends, as targets of rays; detached.
 
         Args:
             row: numbers of wedges.
-            points: on the lines of the edges [m].
+            points: points on the lines of the edges [m].
         """
         wedges = self.detached_wedges.rows(row)
         side = wedges.end - wedges.start
-        share = dot(strip_derivatives(points) - wedges.start, side) / dot(side, side)
+        fraction = dot(strip_derivatives(points) - wedges.start, side) / dot(side, side)
         inset = (self.ray_offset / side.norm(dim=1)).clamp(max=0.25)
-        share = torch.minimum(torch.maximum(share, inset), 1 - inset)
-        aside = normalize((wedges.normals - wedges.face_tangents).sum(1), dim=1)
-        return wedges.start + share[:, None] * side + self.ray_offset * aside
+        fraction = torch.minimum(torch.maximum(fraction, inset), 1 - inset)
+        outward = normalize((wedges.normals - wedges.face_tangents).sum(1), dim=1)
+        return wedges.start + fraction[:, None] * side + self.ray_offset * outward
 
     def is_diffracting(self, row: Tensor, points: Float64[Tensor, "row 3"]) -> Bool[Tensor, " row"]:
-        """Whether an edge is one there: nothing else fills part of its exterior.
+        """Test if an edge diffracts at a point: no other surface fills part of its exterior.
 
         Plates that meet in a seam, and a box on the floor, have edges that do not diffract.
 
         Args:
             row: numbers of wedges.
-            points: on the lines of the edges [m].
+            points: points on the lines of the edges [m].
         """
         wedges = self.detached_wedges.rows(row)
         side = wedges.end - wedges.start
-        share = dot(strip_derivatives(points) - wedges.start, side) / dot(side, side)
-        return self._is_piece_open[row, (share * _EDGE_PIECES).long().clamp(0, _EDGE_PIECES - 1)]
+        fraction = dot(strip_derivatives(points) - wedges.start, side) / dot(side, side)
+        return self._is_piece_open[row, (fraction * _EDGE_PIECES).long().clamp(0, _EDGE_PIECES - 1)]
 
     @cached_property
     def _is_piece_open(self) -> Bool[Tensor, "edge piece"]:
-        """Whether a ray can go round the middle of each piece of each edge."""
+        """Mask of edge pieces with an unobstructed detour round their middle."""
         wedges = self.detached_wedges
         share = (torch.arange(_EDGE_PIECES, dtype=torch.float64) + 0.5) / _EDGE_PIECES
-        places = wedges.start[:, None] + share[:, None] * (wedges.end - wedges.start)[:, None]
+        points = wedges.start[:, None] + share[:, None] * (wedges.end - wedges.start)[:, None]
         into, normal = wedges.face_tangents[:, 0], wedges.normals[:, 0]
         stops: list[Tensor] = []
         for part in _DETOUR_ANGLES:
             angle = (part * torch.pi * wedges.opening)[:, None]
-            aside = self.ray_offset * (angle.cos() * into + angle.sin() * normal)
-            stops.append((places + aside[:, None]).reshape(-1, 3))
+            offset = self.ray_offset * (angle.cos() * into + angle.sin() * normal)
+            stops.append((points + offset[:, None]).reshape(-1, 3))
         clear = torch.ones(len(stops[0]), dtype=torch.bool)
         none = torch.zeros(len(clear), 0, dtype=torch.int64)
         for start, end in pairwise(stops):
@@ -151,11 +152,11 @@ def _sharp_edges(vertices: Tensor, topology: Topology) -> Wedges:
 
 
 def is_exterior(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Bool[Tensor, " row"]:
-    """Which places lie outside of wedges that go on for ever; on a face is outside.
+    """Mask of points in the exterior of infinite wedges, faces included.
 
     Args:
-        wedges: one row each.
-        points: [m].
+        wedges: sharp edges, one row each.
+        points: positions, [row, 3] [m].
     """
     offset = (points - wedges.start).detach()
     angle = azimuth(wedges, offset, 0).detach()
@@ -163,17 +164,17 @@ def is_exterior(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Bool[Tensor
         angle < 2 * torch.pi - _GRAZING_TOLERANCE
     )
     axis = edge_axis(wedges).detach()
-    aside = offset - dot(offset, axis)[:, None] * axis
-    return ~inside & (aside.norm(dim=1) > 0)
+    radial = offset - dot(offset, axis)[:, None] * axis
+    return ~inside & (radial.norm(dim=1) > 0)
 
 
 def clamp_to_edge(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 3"]:
-    """The nearest points of edges to points on their lines.
+    """Clamp points on the lines of edges to the edges.
 
     Args:
-        wedges: one row each.
-        points: [m].
+        wedges: sharp edges, one row each.
+        points: positions, [row, 3] [m].
     """
     side = wedges.end - wedges.start
-    share = dot(points - wedges.start, side) / dot(side, side)
-    return wedges.start + share.clamp(0, 1)[:, None] * side
+    fraction = dot(points - wedges.start, side) / dot(side, side)
+    return wedges.start + fraction.clamp(0, 1)[:, None] * side
