@@ -169,7 +169,7 @@ class SilhouetteSampler:
             if rays.differentiated_objects is not None:
                 counts &= rays.differentiated_objects.has_edge(
                     edge
-                ) | rays.differentiated_objects.beyond(edge, origin, y0, y1)
+                ) | rays.differentiated_objects.may_receive_shadow(edge, origin, y0, y1)
             weight = dr.select(counts, seen * sides.contrast, 0.0)
             self.choice = DiscreteSampler(
                 balance_by_object(rays, edge, weight, receiver, len(antennas))
