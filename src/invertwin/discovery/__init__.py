@@ -1,4 +1,4 @@
-"""From a recording to a twin, with no start: which things there are, and how sure that is."""
+"""Automatic reconstruction: objects in a recording with uncertainties, without an initial guess."""
 
 from invertwin.discovery.movers import MovingTargetFit as MovingTargetFit
 from invertwin.discovery.movers import MovingTargetMaps as MovingTargetMaps

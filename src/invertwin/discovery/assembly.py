@@ -1,4 +1,4 @@
-"""A scene of simple shapes that explains recorded maps: how likely it is, and its joint fit."""
+"""Scenes of simple shapes: their likelihood for recorded maps, and their joint fit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar
 from invertwin.scene import Scene
 
-_LEARNING_RATE = 0.01  # of the optimiser, see the scales of ``PrimitiveModel``
+_LEARNING_RATE = 0.01  # learning rate in the parameter scales of ``PrimitiveModel``
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,9 +27,9 @@ class CoarseMaps:
     """Maps of nearly independent bins.
 
     Attributes:
-        power: The maps.
-        grid: Their bins.
-        loss: How unlikely they are.
+        power: observed maps [frame, range, u, v].
+        grid: bins of the maps.
+        loss: negative log-likelihood of maps.
     """
 
     power: Float64[Tensor, "frame some_range some_u some_v"]
@@ -39,17 +39,17 @@ class CoarseMaps:
 
 @dataclass(frozen=True, eq=False)
 class ShapeLikelihood:
-    """Maps, and what it takes to judge shapes by them.
+    """Observed maps and the model that determines the likelihood of shapes.
 
     Attributes:
-        model: Predicts maps.
-        radar: Recorded them.
-        power: The maps.
-        loss: How unlikely maps are.
-        bins_per_draw: How many bins are worth one.
-        ground: The plane on which things stand.
-        level: Its height [m].
-        seed: Of rays.
+        model: forward model of the maps.
+        radar: radar that recorded them.
+        power: observed maps [frame, range, u, v].
+        loss: negative log-likelihood of maps.
+        bins_per_draw: number of correlated bins per independent draw.
+        ground: ground plane.
+        level: height of the ground [m].
+        seed: seed of the rays.
     """
 
     model: SurrogateMap
@@ -64,10 +64,10 @@ class ShapeLikelihood:
     def unknowns(
         self, shapes: Sequence[ShapeParameters]
     ) -> dict[str, PrimitiveModel | OutlineModel]:
-        """Shapes as unknowns, by name.
+        """Return the shape models of shapes by name.
 
         Args:
-            shapes: The shapes.
+            shapes: shape parameters.
         """
         return {
             f"object_{number}": make_shape_model(
@@ -78,7 +78,7 @@ class ShapeLikelihood:
 
     @cached_property
     def coarse_maps(self) -> "CoarseMaps":
-        """The maps with one bin for each cell of range and direction."""
+        """Return the maps with one bin for each resolution cell of range and direction."""
         power, grid = thin_map(self.power, self.radar, self.model.grid)
         stride = round(grid.range_step / self.model.grid.range_step)
         return CoarseMaps(power, grid, replace(self.loss, level=self.loss.level[::stride]))
@@ -86,27 +86,27 @@ class ShapeLikelihood:
     def predict_coarse(
         self, shapes: Sequence[ShapeParameters]
     ) -> Float64[Tensor, "frame some_range some_u some_v"]:
-        """``predicted`` in the bins of ``coarsen_map``.
+        """Return ``predict`` in the bins of ``coarse_maps``.
 
         Args:
-            shapes: The shapes.
+            shapes: shape parameters.
         """
         return thin_map(self.predict(shapes).double(), self.radar, self.model.grid)[0]
 
     def build_scene(self, shapes: Sequence[ShapeParameters]) -> Scene:
-        """Shapes as a scene.
+        """Build the scene of shapes.
 
         Args:
-            shapes: The shapes.
+            shapes: shape parameters.
         """
         return Scene({name: one.item for name, one in self.unknowns(shapes).items()})
 
     @torch.no_grad()
     def predict(self, shapes: Sequence[ShapeParameters]) -> Float[Tensor, "frame range u v"]:
-        """The maps of shapes, without background.
+        """Predict the maps of shapes, without background.
 
         Args:
-            shapes: The shapes.
+            shapes: shape parameters.
         """
         if not shapes:
             return torch.zeros_like(self.power)
@@ -114,13 +114,13 @@ class ShapeLikelihood:
         return model.predict(self.build_scene(shapes), self.radar, self.seed)
 
     def log_likelihood_gains(self, shapes: Sequence[ShapeParameters]) -> Float64[Tensor, " frame"]:
-        """By how much shapes are likelier than the background alone, of every frame.
+        """Compute the log-likelihood of shapes over that of the background alone for every frame.
 
         Args:
-            shapes: The shapes.
+            shapes: shape parameters.
 
         Returns:
-            Logarithms of likelihood ratios, for as many draws as are independent.
+            Log-likelihood ratios [frame], scaled to independent draws.
         """
         rows = self._background_loss - self.loss.bin_losses(self.predict(shapes), self.power)
         return rows.flatten(1).double().sum(1) / self.bins_per_draw
@@ -131,14 +131,14 @@ class ShapeLikelihood:
 
     @property
     def independent_draws(self) -> float:
-        """How many independent draws the maps hold."""
+        """Number of independent draws in the maps."""
         return self.power.numel() / self.bins_per_draw
 
     def select_frames(self, indices: Sequence[int]) -> "ShapeLikelihood":
-        """Some frames.
+        """Return the likelihood of selected frames.
 
         Args:
-            indices: Of the frames.
+            indices: indices of the frames.
         """
         chosen = list(indices)
         sampling = self.model.sampling
@@ -154,11 +154,11 @@ class ShapeLikelihood:
     def fit(
         self, shapes: Sequence[ShapeParameters], steps: int
     ) -> tuple[list[ShapeParameters], Reconstruction]:
-        """Shapes after a joint fit of all their numbers.
+        """Fit all numbers of the shapes jointly.
 
         Args:
-            shapes: At the start.
-            steps: Of the fit.
+            shapes: initial shape parameters.
+            steps: number of steps.
         """
         unknowns = self.unknowns(shapes)
         found = reconstruct(
@@ -174,11 +174,11 @@ class ShapeLikelihood:
 
 
 def make_sampling(frames: int, rays: int) -> Sampling:
-    """Rays of a fit, an eighth as many on silhouettes.
+    """Return the sampling of a fit, with an eighth as many rays on silhouettes.
 
     Args:
-        frames: Of the recording.
-        rays: In each frame.
+        frames: number of frames of the recording.
+        rays: number of rays per frame.
     """
     count = frames * rays
     return Sampling(depth=1, samples=count, boundary_samples=max(1, count // 8), contacts=False)

@@ -1,4 +1,4 @@
-"""How sure shapes are: error bars, kinds and presence, from the scatter between frames."""
+"""Uncertainty of shapes: error bars, kinds and existence, from the scatter over frames."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,16 +17,15 @@ from invertwin.inversion.confidence.uncertainty import iterate_coordinates, map_
 def standard_deviations(
     likelihood: ShapeLikelihood, reconstruction: Reconstruction
 ) -> dict[str, float]:
-    """Standard deviations of all numbers of a joint fit, by name.
+    """Compute standard deviations of all numbers of a joint fit by name.
 
-    The larger of two: H⁻¹, H the information of heavy-tailed speckle, and H⁻¹ S H⁻¹, S the scatter
-    of single frames' gradients. The first is right if the shapes are, the second allows for shapes
-    that are not. A coordinate that the maps do not tell has the deviation of what is thought
-    beforehand, ten times an error that matters.
+    The larger of two covariances: H⁻¹, H the information of heavy-tailed speckle, and H⁻¹ S H⁻¹, S
+    the scatter of single frames' gradients. The first assumes correct shapes, the second allows for
+    model errors. An unobserved coordinate has its prior deviation, ten times its span.
 
     Args:
-        likelihood: Maps.
-        reconstruction: The fit.
+        likelihood: likelihood of the maps.
+        reconstruction: joint fit of the shapes.
     """
     fit = reconstruction.result.fit
     rows = list(iterate_coordinates(fit.modules))
@@ -39,7 +38,7 @@ def standard_deviations(
         map_derivatives(fit, rows, number)[0].detach().double() / mean for number in (0, 1)
     )
     flat = [part.flatten(2) for part in (first, second)]
-    # The product of two draws is free of the information that their noise feigns.
+    # The product of two independent draws is free of the apparent information of their noise.
     mixed = torch.einsum("pfn,qfn->pq", *flat)
     information = nu / (nu + 2) * 0.5 * (mixed + mixed.T) / likelihood.bins_per_draw
     slopes = (
@@ -48,7 +47,7 @@ def standard_deviations(
     )
     scatter = slopes @ slopes.T
     spans = torch.tensor([10 * row.span for row in rows], dtype=torch.float64)
-    # In units of the spans, with one unit known beforehand; noise must not make it negative.
+    # In units of the spans, with a prior of one unit; keep it positive despite noise.
     scaled = information * spans * spans[:, None]
     values, axes = torch.linalg.eigh(scaled)
     inverse = axes / (values.clamp_min(0.0) + 1.0) @ axes.T
@@ -58,11 +57,11 @@ def standard_deviations(
 
 
 def acceptance_probability(gains_with: Tensor, gains_without: Tensor) -> float:
-    """The probability that a change that frames speak for is right.
+    """Compute the probability that a model change supported by the frames is real.
 
     Args:
-        gains_with: Gains of all frames.
-        gains_without: Those without the change.
+        gains_with: log-likelihood gains of all frames with the change.
+        gains_without: log-likelihood gains of all frames without the change.
     """
     gain = gains_with - gains_without
     total = float(gain.sum())
@@ -75,11 +74,11 @@ def acceptance_probability(gains_with: Tensor, gains_without: Tensor) -> float:
 def existence_probabilities(
     likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters]
 ) -> list[float]:
-    """The probability of every shape that it is there.
+    """Compute the existence probability of every shape.
 
     Args:
-        likelihood: Maps.
-        shapes: All of them.
+        likelihood: likelihood of the maps.
+        shapes: all shapes.
     """
     together = likelihood.log_likelihood_gains(shapes)
     return [
@@ -92,11 +91,11 @@ def existence_probabilities(
 
 @dataclass(frozen=True)
 class ShapeHypothesis:
-    """What a shape may be.
+    """Hypothesis about the kind of a shape.
 
     Attributes:
-        shape: After a fit.
-        probability: Its probability.
+        shape: fitted shape parameters.
+        probability: its probability.
     """
 
     shape: ShapeParameters
@@ -106,14 +105,14 @@ class ShapeHypothesis:
 def find_hypotheses(
     likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters]
 ) -> list[list[ShapeHypothesis]]:
-    """What every shape may be, all others as they are; itself first.
+    """Return alternative hypotheses of every shape with all others fixed; the shape itself comes
+    first.
 
-    Other kinds, and others that look the other way, are fitted for a short while first, all shapes
-    together.
+    Other kinds and opposite headings are first fitted for a few steps, all shapes together.
 
     Args:
-        likelihood: Maps.
-        shapes: After their fit.
+        likelihood: likelihood of the maps.
+        shapes: fitted shapes.
     """
     together = likelihood.log_likelihood_gains(shapes)
     found = [[ShapeHypothesis(shape, 1.0)] for shape in shapes]
@@ -127,7 +126,7 @@ def find_hypotheses(
         for number, (start, new, old) in enumerate(zip(changed, fitted, shapes, strict=True)):
             if start is old:
                 continue
-            # A short fit stirs a shape up before it mends it.
+            # The first steps of a short fit may lower the likelihood.
             options = [
                 (likelihood.log_likelihood_gains([*shapes[:number], r, *shapes[number + 1 :]]), r)
                 for r in (start, new)
@@ -143,10 +142,10 @@ def find_hypotheses(
 
 
 def kind_probabilities(hypotheses: Sequence[ShapeHypothesis]) -> dict[str, float]:
-    """The probability of every kind.
+    """Return the probability of every kind.
 
     Args:
-        hypotheses: What a shape may be.
+        hypotheses: hypotheses of a shape.
     """
     found = dict[str, float]()
     for rival in hypotheses:
@@ -161,15 +160,15 @@ def widen_deviations(
     deviations: Mapping[str, float],
     hypotheses: Sequence[ShapeHypothesis],
 ) -> dict[str, float]:
-    """Standard deviations of a shape's place, with what its derivatives do not tell.
+    """Widen the standard deviations of a shape by errors that its derivatives do not show.
 
-    They do not tell where it would be if it were a rival; nor, of what may hang at any height near
-    the radar's, how its range grows with the square of its way up or down.
+    These are the displacement of other hypotheses, and for shapes of unknown height near the
+    radar's the change of range with the square of their height offset.
 
     Args:
-        likelihood: Maps.
-        deviations: Its deviations if it is what it is called.
-        hypotheses: What it may be, itself first.
+        likelihood: likelihood of the maps.
+        deviations: deviations given the best hypothesis.
+        hypotheses: hypotheses of the shape, the best first.
     """
     found, figure = dict(deviations), hypotheses[0].shape
     middle = shape_center(figure, likelihood.ground, likelihood.level)

@@ -1,4 +1,4 @@
-"""What was found in a recording: things with their errors, and what nothing is known of."""
+"""Results of automatic reconstruction: objects with uncertainties, and unobserved regions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,13 +17,13 @@ from invertwin.scene import Object, Scene
 
 @dataclass(frozen=True, eq=False)
 class ObjectTrack:
-    """Where a thing was, frame by frame.
+    """Positions of a moving object, frame by frame.
 
     Attributes:
-        times: After the start of the recording [s].
-        positions: [m].
-        velocities: Along the ground [m/s].
-        deviations: Standard deviation of every number at every time, by name, in SI units.
+        times: times after the start of the recording [s].
+        positions: positions in world axes [time, 3] [m].
+        velocities: velocities along the ground [m/s].
+        deviations: standard deviation of every number at every time, by name, in SI units.
     """
 
     times: Float64[Tensor, " time"]
@@ -32,7 +32,7 @@ class ObjectTrack:
     deviations: Mapping[str, Float64[Tensor, " time"]]
 
     def to_metrics(self) -> dict[str, Any]:
-        """The track as plain numbers."""
+        """Return the track as plain numbers."""
         return {
             "times_s": self.times.tolist(),
             "positions_m": self.positions.tolist(),
@@ -46,17 +46,17 @@ class DetectedObject:
     """One object of a twin.
 
     Attributes:
-        name: In the twin's scene.
-        kind: That of its figure, among ``discovery.KINDS``.
-        probabilities: Of every kind that was tried.
-        position: Its middle [m].
-        shape: All numbers of its shape; None = only a place is known.
-        deviations: Standard deviation of every number, by name, in SI units. Of a mover that was
-            not followed: ``range``, ``across`` the sight, and ``range_rate``.
-        existence_probability: Probability that it is there.
-        velocity: Along the line of sight, or along the ground if there is a track [m/s]; None =
-            it was found in what stands still.
-        track: Where it was before; None = it was not followed.
+        name: name in the twin's scene.
+        kind: kind of its shape, among ``discovery.KINDS``.
+        probabilities: probability of every kind that was tried.
+        position: centre [m].
+        shape: all shape parameters; None = only the position is known.
+        deviations: standard deviation of every number, by name, in SI units. For a moving target
+            without a track: ``range``, ``across`` the line of sight, and ``range_rate``.
+        existence_probability: probability that the object exists.
+        velocity: velocity along the line of sight, or along the ground with a track [m/s]; None =
+            static.
+        track: previous positions; None = not tracked.
     """
 
     name: str
@@ -70,7 +70,7 @@ class DetectedObject:
     track: ObjectTrack | None = None
 
     def to_metrics(self) -> dict[str, Any]:
-        """The thing as plain numbers."""
+        """Return the object as plain numbers."""
         found: dict[str, Any] = {
             "name": self.name,
             "kind": self.kind,
@@ -96,12 +96,12 @@ class DetectedObject:
 
 @dataclass(frozen=True, eq=False)
 class GroundImage:
-    """An image of the ground.
+    """Image of the ground.
 
     Attributes:
-        places: Along the two axes of the ground [m].
-        strength: Radar cross-section at every place, or brightness of a backprojected image.
-        view_counts: How many radar positions see each place; zero is "never seen".
+        positions: positions along the two axes of the ground [m].
+        strength: radar cross-section at every position, or brightness of a backprojected image.
+        view_counts: number of radar positions that see each position; zero is "never seen".
     """
 
     places: Float64[Tensor, "place 2"]
@@ -111,18 +111,19 @@ class GroundImage:
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """What a recording shows.
+    """Digital twin of a recording.
 
     Attributes:
-        objects: The surest first; things that move stand last.
-        ground: The plane of the picture.
+        objects: objects in order of existence probability; moving ones last.
+        ground: ground plane of the image.
         level: Height of the ground [m].
-        image: Where echoes come from, and what was never seen.
-        predicted: Maps of the things with the background; None where only places were found.
-        observed: Maps of the recording.
-        grid: Their bins.
-        notes: What to know of it, in sentences.
-        calibration: Of the channels, where the scene itself has told it; the maps have it applied.
+        image: image of the echoes and of unobserved regions.
+        predicted: predicted maps of the objects with the background; None if only positions were
+            found.
+        observed: maps of the recording.
+        grid: bins of the maps.
+        notes: remarks, in sentences.
+        calibration: channel calibration estimated from the scene itself, applied to the maps.
     """
 
     objects: tuple[DetectedObject, ...]
@@ -137,7 +138,9 @@ class Twin:
 
     @property
     def scene(self) -> Scene | None:
-        """The things that have a shape, of the nearest materials of the library; None = none."""
+        """Scene of the objects with a shape, with the nearest library materials; None if there are
+        none.
+        """
         objects: dict[str, Object] = {}
         for thing in self.objects:
             if thing.shape is not None:

@@ -1,4 +1,4 @@
-"""Shapes that an image suggests: bright places that belong together, and what could stand there."""
+"""Shape proposals from groups of bright image points."""
 
 import math
 from collections.abc import Sequence
@@ -11,10 +11,13 @@ from torch import Tensor
 from invertwin.discovery.shapes.primitives import SIZE_LIMITS, ShapeParameters
 from invertwin.inversion.initialisation.detections import Ground, label_groups
 
-_YAW_COUNT = 45  # yaws that a rectangle is tried at, over a quarter turn
-_TRIMMED_FRACTION = 0.05  # share of the weight beyond each side of a rectangle
+_YAW_COUNT = 45  # candidate yaws of a rectangle over a quarter turn
+_TRIMMED_FRACTION = 0.05  # fraction of the weight beyond each side of a rectangle
 _PERSON_SIZE = 0.66, 0.32, 1.75  # usual length, width and height [m]
-_MIN_PERSON_EXTENT, _PERSON_MARGIN = 0.12, 0.25  # of an extent, and beyond the usual one [m]
+_MIN_PERSON_EXTENT, _PERSON_MARGIN = (
+    0.12,
+    0.25,
+)  # minimum extent, and margin of the usual extents [m]
 MAX_CORNER_EXTENT = 0.15
 """Side of the largest group that may be a corner reflector [m]."""
 
@@ -22,18 +25,19 @@ MAX_CORNER_EXTENT = 0.15
 def bright_weights(
     strength: Float64[Tensor, " place"], fraction: float = 0.02
 ) -> Float64[Tensor, " chosen"]:
-    """Weights of places of an image; those that are too dim have none.
+    """Compute weights of image points; weak points have weight zero.
 
-    Sizes of echoes differ by orders of magnitude, but even a dim object is brighter than the grain
-    between objects. The reference is that of the brightest hundredth of what is lit at all.
+    Echo strengths differ by orders of magnitude, but even a weak object is stronger than the
+    speckle between objects. The reference level is that of the strongest hundredth of all non-zero
+    points.
 
     Args:
-        strength: The image.
-        fraction: Of the reference, below which a place is dark.
+        strength: image [point].
+        fraction: minimum strength relative to the reference.
     """
     order = strength.sort(descending=True).values
     total = order.cumsum(0)
-    # Half of all strength is in places brighter than this.
+    # Half of the total strength is in points above this level.
     typical = order[int((total < 0.5 * total[-1]).sum())]
     return torch.where(strength > fraction * typical, strength, 0.0)
 
@@ -41,12 +45,12 @@ def bright_weights(
 def group_bright_points(
     positions: Float64[Tensor, "place 2"], weight: Float64[Tensor, " place"], max_gap: float
 ) -> list[Float64[Tensor, " place"]]:
-    """Sets of bright places that are linked by steps of at most a gap, as weights of all places.
+    """Group bright points linked by steps of at most a gap; return their weights over all points.
 
     Args:
-        positions: On the ground [m].
-        weight: Of every place; zero is dark.
-        max_gap: Longest step [m].
+        positions: positions on the ground [point, 2] [m].
+        weight: weight of every point; zero is dark.
+        max_gap: longest step [m].
     """
     lit = weight.nonzero()[:, 0]
     if not len(lit):
@@ -64,15 +68,15 @@ def group_bright_points(
 def enclosing_rectangle(
     positions: Float64[Tensor, "place 2"], weight: Float64[Tensor, " place"], yaw: float
 ) -> tuple[Float64[Tensor, "2"], Float64[Tensor, "2"], float]:
-    """Middle [m], sides [m] and tightness of the rectangle of one turn about bright places.
+    """Return centre [m], sides [m] and tightness of the rectangle at a yaw around bright points.
 
     Args:
-        positions: On the ground [m].
-        weight: Of every place.
-        yaw: Of the first side, from the first axis towards the second [rad].
+        positions: positions on the ground [point, 2] [m].
+        weight: weight of every point.
+        yaw: yaw of the first side, from the first axis towards the second [rad].
 
     Returns:
-        The tightness is the mean over the weight of 1/(d + 3 cm), d the way to the nearest side.
+        The tightness is the weighted mean of 1/(d + 3 cm), d the distance to the nearest side.
     """
     c, s = math.cos(yaw), math.sin(yaw)
     own = torch.stack(
@@ -102,27 +106,27 @@ def propose_shapes(
     step: float,
     height: float,
 ) -> list[ShapeParameters]:
-    """What could stand where places are bright: boxes of two turns, round shapes, and what its
-    extent allows of people, vehicles and corner reflectors.
+    """Propose shapes for bright points: boxes of two yaws, round shapes, and people, vehicles and
+    corner reflectors that fit the extent.
 
     Args:
-        positions: On the ground [m].
-        weight: Of every place; zero is dark.
-        ground: The plane.
-        step: Of the image [m].
-        height: Of the radars above the ground, near which things are seen [m].
+        positions: positions on the ground [point, 2] [m].
+        weight: weight of every point.
+        ground: ground plane.
+        step: point spacing of the image [m].
+        height: height of the radars above the ground, at which objects are observed [m].
     """
-    lit = weight > 0
-    positions, weight = positions[lit], weight[lit].sqrt()  # less of glints
+    bright = weight > 0
+    positions, weight = positions[bright], weight[bright].sqrt()  # lower weight of glints
     turns = [k * 0.5 * math.pi / _YAW_COUNT for k in range(_YAW_COUNT)]
     tried = [(enclosing_rectangle(positions, weight, turn), turn) for turn in turns]
-    # The tightest, and the smallest: half a box is best enclosed, a whole one best outlined.
+    # The tightest suits a whole outline of a box, the smallest half an outline.
     tightest = max(tried, key=lambda one: one[0][2])
     smallest = min(tried, key=lambda one: float((one[0][1] + step).prod()))
     rows: list[ShapeParameters] = []
     chosen: Sequence[tuple[tuple[Tensor, Tensor, float], float]] = [tightest, smallest]
     for (middle, sides, _), turn in chosen:
-        # The image is about a step wider than what is there.
+        # The image is about one step wider than the object.
         length, width = (max(float(side), 0.02) for side in sides)
         x, y = middle.tolist()
         rows.append(
@@ -142,19 +146,19 @@ def propose_shapes(
 
 
 def propose_headings(shape: ShapeParameters) -> list[ShapeParameters]:
-    """A shape that looks eight ways.
+    """Return a shape at eight headings.
 
     Args:
-        shape: The shape.
+        shape: shape parameters.
     """
     return [replace(shape, yaw=k * math.pi / 4) for k in range(8)]
 
 
 def propose_people_and_vehicles(box: ShapeParameters) -> list[ShapeParameters]:
-    """People and vehicles of usual sizes that could be what a box surrounds.
+    """Propose people and vehicles of usual sizes that fit a box.
 
     Args:
-        box: The box.
+        box: box around the points.
     """
     long, short = max(box.length, box.width), min(box.length, box.width)
     rows: list[ShapeParameters] = []

@@ -1,4 +1,4 @@
-"""From a recording to a twin, with no start."""
+"""Automatic reconstruction of a recording, without an initial guess."""
 
 import math
 from collections.abc import Sequence
@@ -44,11 +44,11 @@ from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar, SampledWaveform
 from invertwin.scene import Scene
 
-_LEAKAGE_CELLS = 4  # range cells, in which transmitters leak into receivers
-_DEFAULT_RADAR_HEIGHT = 0.6  # of radars above a ground of which nothing is said [m]
-_FINAL_FIT_STEPS = 50  # of the last fit
-_MAX_IMAGE_POINTS = 40_000  # of an image at most
-_MIN_EXISTENCE_PROBABILITY = 0.05  # confidence of movers that are not worth a line
+_LEAKAGE_CELLS = 4  # range cells with leakage from transmitters to receivers
+_DEFAULT_RADAR_HEIGHT = 0.6  # default height of radars above the ground [m]
+_FINAL_FIT_STEPS = 50  # steps of the final fit
+_MAX_IMAGE_POINTS = 40_000  # maximum number of points of an image
+_MIN_EXISTENCE_PROBABILITY = 0.05  # less probable moving targets are dropped
 _HELD_OUT_EVERY = 4  # every fourth frame is held out, where there are twice as many
 
 
@@ -64,30 +64,30 @@ def twin(
     rays: int = 2000,
     seed: int = 0,
 ) -> Twin:
-    """Find what stands in a recording, with no start: shapes, places, sizes, and how sure they are.
+    """Reconstruct the objects in a recording without an initial guess, with uncertainties.
 
-    A sharp image shows where echoes come from. Bright places become shapes that stand on the
-    ground; all shapes are fitted together, and evidence decides which kinds there are, which
-    become one, and which are not there. Of recordings along a dense track of one channel, points
-    are found where echoes agree in phase. Of trains of chirps, what moves is found as well, and
-    followed where there are three frames or more with a known time between them. Where several
-    positions show that the phases of the channels are wrong, they are calibrated first.
+    A maximum-likelihood reflectivity image locates echoes. Groups of bright points become shapes on
+    the ground; all shapes are fitted jointly, and model evidence selects their kinds, mergers and
+    deaths. In recordings of one channel along a dense track, points are detected where echoes add
+    coherently. In chirp trains, moving targets are detected too, and tracked over three frames or
+    more with a known frame period. If several positions reveal phase errors of the channels, they
+    are calibrated first.
 
     Args:
-        recording: Of radars at known places.
-        low, high: Opposite corners of the part of the ground that is searched, along its two axes
-            [m]; None = all that is seen.
-        range_max: Farthest range that is looked at [m]; None = the last one with echoes.
-        ground: Which way is up; None = y.
-        level: Height of the ground [m]; None = 0.6 m below the radars.
-        height: Above the ground, at which the image is made [m]; None = that of the radars. Echoes
-            come from about this height where things are as tall as the radars stand; give less
-            where all things are lower.
-        rays: Of every frame in fits.
-        seed: Of rays.
+        recording: recording of radars at known positions.
+        low, high: opposite corners of the search region on the ground, along its two axes [m]; None
+            = the whole visible region.
+        range_max: maximum range [m]; None = the last range with echoes.
+        ground: ground plane with its upward axis; None = y.
+        level: height of the ground [m]; None = 0.6 m below the radars.
+        height: height of the image above the ground [m]; None = that of the radars. Echoes come
+            from about this height if objects are as tall as the radars; state less for lower
+            objects.
+        rays: number of rays per frame in fits.
+        seed: seed of the rays.
 
     Raises:
-        InputError: A region that no radar sees, or one that is too large for its resolution.
+        InputError: A region invisible to all radars, or too large for its resolution.
     """
     plane = ground or Ground()
     checked_count(rays, "rays", 100)
@@ -113,7 +113,7 @@ def twin(
         recording, capture = told.apply(recording), told.apply(capture)
     moving = _find_moving_targets(recording, range_max, plane)
     if is_dense_track(capture):
-        # Frames add up only where all of them have an echo.
+        # Average over frames, where all of them have an echo.
         far = torch.cdist(places, radar.positions.detach())
         places = places[(far.amin(1) > reach[0]) & (far.amax(1) < reach[1])]
         found, image = locate_coherent_points(
@@ -131,13 +131,13 @@ def twin(
 
 
 def average_chirps(recording: Capture | ChirpCapture) -> Capture:
-    """A recording with one signal a frame, in which what moves fades.
+    """Average the chirps of each frame, which attenuates moving targets.
 
-    It is the mean over the chirps, by Hann's window. Of a radar that itself moves by a quarter of a
-    wavelength or more in a frame, it is one chirp.
+    The mean over chirps has a Hann window. If the radar itself moves by a quarter of a wavelength
+    or more within a frame, one chirp is used.
 
     Args:
-        recording: Of any kind.
+        recording: recording of any kind.
     """
     if isinstance(recording, Capture):
         return recording
@@ -146,7 +146,7 @@ def average_chirps(recording: Capture | ChirpCapture) -> Capture:
     way = float(platform_velocities(recording).norm(dim=1).max()) * lasts
     if way > 0.25 * radar.waveform.wavelength:
         return recording.to_capture(chirps.count // 2)
-    # Of what moves by 2.5 bins of range rate a plain mean passes 1.7 % of the power, this 0.05 %.
+    # At 2.5 bins of range rate a plain mean passes 1.7 % of the power, this one 0.05 %.
     window = torch.hann_window(chirps.count + 2, periodic=False, dtype=recording.beat.real.dtype)
     window = window[1:-1]
     weights = (window / window.mean())[:, None, None, None]
@@ -156,7 +156,7 @@ def average_chirps(recording: Capture | ChirpCapture) -> Capture:
 def _find_moving_targets(
     recording: Capture | ChirpCapture, range_max: float | None, ground: Ground
 ) -> list[DetectedObject]:
-    """What moves in trains of chirps; it is followed where the time between frames is known."""
+    """Detect moving targets in chirp trains, and track them if the frame period is known."""
     if isinstance(recording, Capture) or recording.chirps.count == 1:
         return []
     radar = recording.radar()
@@ -193,7 +193,7 @@ def _find_static_objects(
     rays: int,
     seed: int,
 ) -> Twin:
-    """Shapes that explain the maps of a recording."""
+    """Find the shapes that explain the maps of a recording."""
     power = capture.spectrum(grid).detach().float()
     frames = radar.frame_count
     one = ShapeLikelihood(
@@ -270,12 +270,12 @@ def _find_static_objects(
 def _image_likelihood_gain(
     likelihood: ShapeLikelihood, response: ImageResponse, strength: Tensor
 ) -> float:
-    """By how much an image makes maps likelier than the background alone.
+    """Compute the log-likelihood of an image over that of the background alone.
 
     Args:
-        likelihood: Maps.
-        response: Of the image's places, to thinned maps.
-        strength: The image.
+        likelihood: likelihood of the maps.
+        response: response of the image points in thinned maps.
+        strength: image [point].
     """
     power, coarse, loss = (
         likelihood.coarse_maps.power,
@@ -289,7 +289,7 @@ def _image_likelihood_gain(
 
 
 def _sort_objects(things: list[DetectedObject]) -> tuple[DetectedObject, ...]:
-    """Things by confidence, those that move last."""
+    """Sort objects by existence probability, moving ones last."""
     return tuple(
         sorted(things, key=lambda one: (one.velocity is not None, -one.existence_probability))
     )
@@ -300,17 +300,18 @@ def _select_prefix(errors: dict[str, float], prefix: str) -> dict[str, float]:
 
 
 def _search_range(capture: Capture, range_max: float | None) -> tuple[float, float] | None:
-    """Ranges from the end of the leakage to the last echo and a little more; None without one [m].
+    """Return the ranges from the end of the leakage to just beyond the last echo [m]; None without
+    echoes.
 
     Args:
-        capture: The recording.
-        range_max: Farthest range that is looked at [m]; None = all of them.
+        capture: the recording.
+        range_max: maximum range [m]; None = all.
     """
     radar = capture.radar()
     waveform, cell = radar.waveform, radar.waveform.range_resolution
     first = _LEAKAGE_CELLS * cell
     if isinstance(waveform, SampledWaveform):
-        # The last cells of a period hold what leaks from its first.
+        # The last cells of a period hold leakage of its first cells.
         longest = 0.98 * waveform.max_range
     else:
         first, longest = (
@@ -325,7 +326,7 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
         )
     grid = radar.grid(first, limit)
     power = capture.spectrum(grid).detach().double()
-    # The level of pure noise: no quieter range is ever louder.
+    # Noise level: a running minimum over range.
     noise = float(estimate_background(power).min())
     strongest = power.amax((0, 2, 3)) / noise
     loud = (strongest > 2 * math.log(power.numel()) + 5).nonzero()[:, 0]
@@ -342,7 +343,7 @@ def _image_points(
     low: Sequence[float] | None,
     high: Sequence[float] | None,
 ) -> tuple[Float64[Tensor, "place 3"], float]:
-    """Places of an image on the ground that some radar sees [m], and their distance."""
+    """Return visible image points on the ground [m], and their distance."""
     axes = list(ground.plane_axes)
     at = radar.positions.detach()[:, axes]
     corners = [at.amin(0) - ranges[1], at.amax(0) + ranges[1]]
@@ -381,7 +382,7 @@ def _image_points(
 def _count_views(
     radar: Radar, positions: Float64[Tensor, "place 3"], scene: Scene | None
 ) -> Int64[Tensor, " place"]:
-    """How many positions of the radar see each place, past all things."""
+    """Count the radar positions that see each point past all objects."""
     total = torch.zeros(len(positions), dtype=torch.int64)
     for place, axis in _boresights(radar):
         way = positions - place
@@ -398,6 +399,6 @@ def _count_views(
 
 
 def _boresights(radar: Radar) -> list[tuple[Tensor, Tensor]]:
-    """Place and boresight of every frame."""
+    """Return position and boresight of every frame."""
     axes = radar.link().rotations.detach()[:, :, 2]
     return list(zip(radar.positions.detach(), axes, strict=True))

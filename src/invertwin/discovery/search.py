@@ -1,4 +1,4 @@
-"""Which shapes there are: births from what is unexplained, other kinds, mergers, and deaths."""
+"""Model search over shapes: births from residual images, kinds, mergers, splits and deaths."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -23,28 +23,28 @@ from invertwin.discovery.shapes.primitives import ShapeParameters, corner_direct
 from invertwin.discovery.shapes.prisms import PrismParameters, prism_contour
 from invertwin.inversion.initialisation.detections import Ground
 
-_MAX_SHAPES = 24  # objects
-_BIRTH_ROUNDS = 3  # of births
-_MAX_MERGE_GAP = 0.5  # gap between what may be one [m]
-_MAX_EVIDENCE_DEFICIT = 100.0  # evidence that a fit may gain
-_SLIM_FRACTION = 0.4  # of a side: how wide the slimmer half of a shape is at first
-_MIN_SPLIT_SIZE = 0.25  # side of the smallest shape that may be two [m]
-_SHORT_FIT_STEPS, _LONG_FIT_STEPS = 25, 50  # steps of fits
-_CORNERS_PER_ROUND = 4  # corner reflectors of a round
-_MIN_CORNER_COSINE = 0.8  # cosine off the way a corner opens, up to which it is bright
-_MAX_FAILED_GROUPS = 3  # groups in a row that explain nothing
-_MIN_GROUP_FRACTION = 1e-3  # of all strength: dimmer groups wait for the next round
+_MAX_SHAPES = 24  # maximum number of objects
+_BIRTH_ROUNDS = 3  # rounds of births
+_MAX_MERGE_GAP = 0.5  # gap between shapes that may merge [m]
+_MAX_EVIDENCE_DEFICIT = 100.0  # evidence that a fit may recover
+_SLIM_FRACTION = 0.4  # initial width of the slimmer half of a split, relative to a side
+_MIN_SPLIT_SIZE = 0.25  # minimum side of a shape that may split [m]
+_SHORT_FIT_STEPS, _LONG_FIT_STEPS = 25, 50  # steps of short and long fits
+_CORNERS_PER_ROUND = 4  # corner reflectors per round
+_MIN_CORNER_COSINE = 0.8  # minimum cosine to the axis of a corner reflector
+_MAX_FAILED_GROUPS = 3  # consecutive groups without a gain
+_MIN_GROUP_FRACTION = 1e-3  # relative to the total strength: weaker groups wait for the next round
 
 
 @dataclass(frozen=True, eq=False)
 class ImageGrid:
-    """The places of an image on the ground, with their responses.
+    """Image points on the ground with their responses.
 
     Attributes:
-        positions: On the ground [m].
-        step: Between neighbours [m].
-        response: Of the places, to thinned maps.
-        height: Of the radars above the ground [m].
+        positions: positions on the ground [point, 2] [m].
+        step: distance of neighbours [m].
+        response: response of the points in thinned maps.
+        height: height of the radars above the ground [m].
     """
 
     positions: Float64[Tensor, "place 2"]
@@ -54,26 +54,26 @@ class ImageGrid:
 
 
 def count_parameters(shape: ShapeParameters) -> int:
-    """How many numbers a shape has.
+    """Return the number of free parameters of a shape.
 
     Args:
-        shape: The shape.
+        shape: shape parameters.
     """
     return 7 if shape.is_rectangular else 5
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeSearch:
-    """A search for the shapes that explain maps.
+    """Search for the shapes that explain maps.
 
-    Evidence is the logarithm of the likelihood less half the logarithm of the number of draws for
-    every free number, on the frames that are fitted; on frames that are held out, a change must
-    not be for the worse either.
+    Evidence is the log-likelihood of the fitted frames minus half the logarithm of the number of
+    draws per free parameter (BIC); a change must not lower the likelihood of held-out frames
+    either.
 
     Attributes:
-        fitted_frames: The frames that are fitted.
-        held_out_frames: Those that are held out; None = too few frames to hold some out.
-        image_grid: Of the image.
+        fitted_frames: likelihood of the fitted frames.
+        held_out_frames: likelihood of the held-out frames; None = too few frames.
+        image_grid: points of the image.
 
     Source of the penalty: Schwarz, "Estimating the dimension of a model", 1978.
     """
@@ -84,14 +84,14 @@ class ShapeSearch:
 
     @property
     def ground(self) -> Ground:
-        """The plane."""
+        """Ground plane."""
         return self.fitted_frames.ground
 
     def evidence(self, shapes: Sequence[ShapeParameters]) -> float:
-        """Of shapes, on the fitted frames.
+        """Compute the evidence of shapes on the fitted frames.
 
         Args:
-            shapes: What there may be.
+            shapes: candidate shapes.
         """
         count = sum(count_parameters(shape) for shape in shapes)
         return float(
@@ -99,11 +99,11 @@ class ShapeSearch:
         ) - 0.5 * count * math.log(self.fitted_frames.independent_draws)
 
     def is_better(self, new: Sequence[ShapeParameters], old: Sequence[ShapeParameters]) -> bool:
-        """Whether shapes are to be preferred.
+        """Return whether new shapes are preferred to old ones.
 
         Args:
-            new: What there may be.
-            old: What was thought so far.
+            new: new shapes.
+            old: present shapes.
         """
         if self.evidence(new) <= self.evidence(old):
             return False
@@ -115,14 +115,14 @@ class ShapeSearch:
 
     @cached_property
     def first_image(self) -> Float64[Tensor, " place"]:
-        """Where echoes come from, while nothing is known."""
+        """Reflectivity image without any known shape."""
         return self.residual_image([])
 
     def residual_image(self, shapes: Sequence[ShapeParameters]) -> Float64[Tensor, " place"]:
-        """What shapes leave unexplained, as an image.
+        """Compute the reflectivity image of the residual of shapes.
 
         Args:
-            shapes: What is known already.
+            shapes: known shapes.
         """
         one = self.fitted_frames
         coarse = one.coarse_maps
@@ -132,7 +132,7 @@ class ShapeSearch:
         )
 
     def run(self) -> list[ShapeParameters]:
-        """The shapes."""
+        """Run the search and return the shapes."""
         shapes, before = list[ShapeParameters](), 0
         for _ in range(_BIRTH_ROUNDS):
             born = self.propose_births(shapes)
@@ -154,13 +154,13 @@ class ShapeSearch:
         return self.prune(shapes)
 
     def propose_births(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
-        """What could explain the rest, where it is bright.
+        """Propose shapes at bright groups of the residual image.
 
         Args:
-            shapes: What is known already.
+            shapes: known shapes.
         """
         strength = self.residual_image(shapes) if shapes else self.first_image
-        # What a point's own kind of image cannot tell from speckle is left alone.
+        # Skip groups that the residual image does not distinguish from speckle.
         weight = bright_weights(strength)
         parts = group_bright_points(self.image_grid.positions, weight, 3.5 * self.image_grid.step)
         total = float(strength.sum())
@@ -175,17 +175,17 @@ class ShapeSearch:
                 known.append(one)
                 born.append((part, one))
             elif (vain := vain + 1) == _MAX_FAILED_GROUPS:
-                break  # dimmer groups tell no more
+                break  # weaker groups add nothing
         found = [one for _, one in self.unite_groups(shapes, born)]
         return found + self.propose_corners([*shapes, *found])
 
     def propose_corners(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
-        """Corner reflectors that explain what only some directions see.
+        """Propose corner reflectors for echoes that only some directions observe.
 
-        An image of places that reflect alike in all directions does not show them.
+        An image of isotropic reflectors does not show them.
 
         Args:
-            shapes: What is known already.
+            shapes: known shapes.
         """
         one, lattice = self.fitted_frames, self.image_grid
         power, loss = one.coarse_maps.power, one.coarse_maps.loss
@@ -221,7 +221,7 @@ class ShapeSearch:
             known = [*shapes, *found]
             new = self.select_best(known, options)
             for _ in range(2):
-                # Narrow in place and heading, so that a fit would start beside its minimum.
+                # The minimum is narrow in position and heading: refine the start of the fit.
                 new = self.select_best(known, perturb_shape(new, lattice.step))
             if self.evidence([*known, new]) <= self.evidence(known):
                 break
@@ -233,13 +233,13 @@ class ShapeSearch:
     def unite_groups(
         self, shapes: Sequence[ShapeParameters], born: Sequence[tuple[Tensor, ShapeParameters]]
     ) -> list[tuple[Tensor, ShapeParameters]]:
-        """Groups and their shapes, with one box for two groups where that is likelier.
+        """Return groups and their shapes, with one box for two groups where that is more likely.
 
-        Two far ends of a box are often bright, and nothing between them.
+        Often only the two far ends of a box are bright.
 
         Args:
-            shapes: What is known already.
-            born: Groups of the image, and what stands there.
+            shapes: known shapes.
+            born: groups of the image, and their proposed shapes.
         """
         found, tried = list(born), set[tuple[int, int]]()
         while True:
@@ -266,10 +266,10 @@ class ShapeSearch:
         return float(torch.cdist(places[first > 0], places[second > 0]).min())
 
     def propose_for_group(self, group: Tensor) -> list[ShapeParameters]:
-        """What could stand where a group of places is bright.
+        """Propose shapes for a group of bright points.
 
         Args:
-            group: Strength of every place [m²], zero outside the group.
+            group: strength of every point [m²], zero outside the group.
         """
         lattice = self.image_grid
         rows = propose_shapes(
@@ -283,27 +283,27 @@ class ShapeSearch:
     def select_best(
         self, known: Sequence[ShapeParameters], candidates: Iterable[ShapeParameters]
     ) -> ShapeParameters:
-        """The likeliest of some shapes, beside others.
+        """Select the candidate of highest likelihood, given other shapes.
 
         Args:
-            known: The others.
-            candidates: To choose from.
+            known: other shapes.
+            candidates: candidate shapes.
         """
         return max(candidates, key=lambda one: self.evidence([*known, one]))
 
     def refine(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
-        """Shapes after a short fit.
+        """Refine shapes by a short fit.
 
         Args:
-            shapes: At its start.
+            shapes: initial shapes.
         """
         return self.fitted_frames.fit(shapes, _SHORT_FIT_STEPS)[0]
 
     def prune(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
-        """Shapes without those that evidence does not speak for, the weakest first.
+        """Remove shapes without supporting evidence, the weakest first.
 
         Args:
-            shapes: All of them.
+            shapes: all shapes.
         """
         found: list[ShapeParameters] = [*shapes]
         while found:
@@ -317,18 +317,18 @@ class ShapeSearch:
         return found
 
     def select_kinds(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
-        """Shapes, each of the kind that is likeliest, after a fit as every kind.
+        """Select the most likely kind of every shape, after a fit as every kind.
 
         Args:
-            shapes: After a fit.
+            shapes: fitted shapes.
         """
         return self.select_likeliest(shapes, propose_kinds(self.fitted_frames, shapes))
 
     def select_headings(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
-        """Shapes, with people and vehicles turned as is likeliest, after a fit of every turn.
+        """Select the most likely heading of people and vehicles, after a fit of every rotation.
 
         Args:
-            shapes: After a fit.
+            shapes: fitted shapes.
         """
         turns = (0.5 * math.pi, math.pi, 1.5 * math.pi)
         others = [rotate_headed_shapes(shapes, turn, self.ground) for turn in turns]
@@ -337,11 +337,11 @@ class ShapeSearch:
     def select_likeliest(
         self, shapes: Sequence[ShapeParameters], alternatives: Sequence[Sequence[ShapeParameters]]
     ) -> list[ShapeParameters]:
-        """Every shape as it is, or as it is in other lists after a fit, whichever is likelier.
+        """Select every shape from alternative lists after a fit, whichever is most likely.
 
         Args:
-            shapes: After a fit.
-            alternatives: Lists of as many shapes, which start fits.
+            shapes: fitted shapes.
+            alternatives: lists of as many shapes, initial values of fits.
         """
         fitted = [self.refine(rows) for rows in alternatives]
         found = list(shapes)
@@ -352,13 +352,13 @@ class ShapeSearch:
         return found
 
     def select_heights(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
-        """Shapes of the likeliest heights.
+        """Select the most likely heights of shapes.
 
-        What is above the radars has nearly the same ranges as what is below, so that a height may
-        rest in a minimum of its own.
+        Points above and below the radars have nearly equal ranges, so that the likelihood has
+        several minima in height.
 
         Args:
-            shapes: After a fit.
+            shapes: fitted shapes.
         """
         found = list(shapes)
         for number, shape in enumerate(found):
@@ -377,12 +377,12 @@ class ShapeSearch:
         return found
 
     def split_shapes(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
-        """Shapes, with two boxes in place of one shape where that is likelier.
+        """Replace shapes by two boxes where that is more likely.
 
-        Two things that touch are one group of the image, and one shape at first.
+        Two touching objects form one group of the image, and one shape at first.
 
         Args:
-            shapes: After a fit.
+            shapes: fitted shapes.
         """
         found, tried = list(shapes), 0
         while tried < len(found):
@@ -393,7 +393,7 @@ class ShapeSearch:
                 continue
             pairs = propose_splits(shape, self.ground)
             pair = max(pairs, key=lambda two, rest=rest: self.evidence([*rest, *two]))
-            # Cuts are many enough for the right one to be likelier before any fit.
+            # The cuts are dense enough for the right one to be more likely before a fit.
             if self.evidence([*rest, *pair]) < self.evidence(found):
                 continue
             new = self.refine([*rest, *pair])
@@ -402,10 +402,10 @@ class ShapeSearch:
         return found
 
     def merge_shapes(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
-        """Shapes, with one box, person or vehicle in place of two shapes where that is likelier.
+        """Replace two shapes by one box, person or vehicle where that is more likely.
 
         Args:
-            shapes: After a fit.
+            shapes: fitted shapes.
         """
         found, tried = list(shapes), set[tuple[ShapeParameters, ShapeParameters]]()
         while True:
@@ -430,17 +430,17 @@ class ShapeSearch:
                 found = new
 
 
-_HEIGHT_FACTORS = (0.4, 0.55, 0.75, 1.35, 2.0)  # of a height that are tried
+_HEIGHT_FACTORS = (0.4, 0.55, 0.75, 1.35, 2.0)  # candidate heights relative to the present one
 _BOX_YAWS = tuple(k * math.pi / 16 for k in range(8))
 
 
 def mean_rcs(shape: ShapeParameters) -> float:
-    """Radar cross-section of a shape of brightness 1, roughly, as a mean over directions [m²].
+    """Approximate the mean radar cross-section over directions of a shape of brightness 1 [m²].
 
-    A matte surface of area A seen aslant has 4 A cos²θ, half of it on average.
+    A matte surface of area A at incidence angle θ has 4 A cos²θ, half of it on average.
 
     Args:
-        shape: The shape.
+        shape: shape parameters.
     """
     if shape.kind == "corner":
         return 0.5 * shape.length**2  # an eighth of its peak
@@ -452,11 +452,11 @@ def mean_rcs(shape: ShapeParameters) -> float:
 def propose_kinds(
     likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters]
 ) -> list[list[ShapeParameters]]:
-    """Shapes as other kinds, each time all that could be of that kind, before any fit.
+    """Convert all eligible shapes to each other kind, before any fit.
 
     Args:
-        likelihood: Maps, which tell how a shape with a heading looks best.
-        shapes: As they are.
+        likelihood: likelihood that selects the heading of a shape.
+        shapes: present shapes.
     """
     found = [
         [convert_kind(shape, kind) for shape in shapes] for kind in ("box", "cylinder", "sphere")
@@ -483,12 +483,12 @@ def propose_kinds(
 def rotate_headed_shapes(
     shapes: Sequence[ShapeParameters], rotation: float, ground: Ground
 ) -> list[ShapeParameters]:
-    """Shapes, with people and vehicles turned; empty if there are none.
+    """Rotate people and vehicles; empty if there are none.
 
     Args:
-        shapes: As they are.
-        rotation: About the vertical [rad].
-        ground: The plane.
+        shapes: present shapes.
+        rotation: rotation about the vertical [rad].
+        ground: ground plane.
     """
     fronts = [shape.kind in ("person", "vehicle") for shape in shapes]
     pairs = zip(shapes, fronts, strict=True)
@@ -497,7 +497,7 @@ def rotate_headed_shapes(
 
 
 def _propose_headed_shapes(shape: ShapeParameters) -> list[ShapeParameters]:
-    """What has a heading, and could be in place of a shape; as bright in all."""
+    """Propose shapes with a heading in place of a shape, of equal total brightness."""
     if shape.kind == "prism":
         return []
     box = shape if shape.is_rectangular else convert_kind(shape, "box")
@@ -507,17 +507,17 @@ def _propose_headed_shapes(shape: ShapeParameters) -> list[ShapeParameters]:
         rows += propose_headings(ShapeParameters("corner", shape.position, height=middle))
     strength = shape.brightness * mean_rcs(shape)
     found = [replace(row, brightness=strength / mean_rcs(row)) for row in rows]
-    # What is bright on one side only looked dim as something round.
+    # A shape that is bright on one side only was fitted as a weak round one.
     more = [row for row in found if row.kind == "corner"]
     return found + [replace(r, brightness=r.brightness * by) for r in more for by in (4.0, 16.0)]
 
 
 def perturb_shape(shape: ShapeParameters, step: float) -> list[ShapeParameters]:
-    """A shape, moved, turned, lifted, or brighter or dimmer by a little.
+    """Return a shape displaced, rotated, lifted, or changed in brightness by a small step.
 
     Args:
-        shape: As it is.
-        step: Along the ground [m].
+        shape: present shape.
+        step: displacement along the ground [m].
     """
     x, y = shape.position
     moves = [(x + a * step, y + b * step) for a in (-1, 0, 1) for b in (-1, 0, 1)]
@@ -530,11 +530,11 @@ def perturb_shape(shape: ShapeParameters, step: float) -> list[ShapeParameters]:
 
 
 def convert_kind(shape: ShapeParameters, kind: str) -> ShapeParameters:
-    """A shape of another kind, of about the same size.
+    """Convert a shape to another kind of about the same size.
 
     Args:
-        shape: As it is.
-        kind: Which it is to be.
+        shape: present shape.
+        kind: new kind.
     """
     if shape.kind in (kind, "prism"):
         return shape
@@ -555,12 +555,12 @@ def convert_kind(shape: ShapeParameters, kind: str) -> ShapeParameters:
 
 
 def enclosing_box(shapes: Sequence[ShapeParameters], yaw: float, ground: Ground) -> ShapeParameters:
-    """A box about shapes.
+    """Return a box around shapes.
 
     Args:
-        shapes: Which are to be one.
-        yaw: Of the box [rad].
-        ground: The plane.
+        shapes: shapes to merge.
+        yaw: yaw of the box [rad].
+        ground: ground plane.
     """
     corners = torch.cat([outline_corners(shape, ground) for shape in shapes])
     c, s = math.cos(ground.yaw_sign * yaw), math.sin(ground.yaw_sign * yaw)
@@ -578,20 +578,22 @@ def enclosing_box(shapes: Sequence[ShapeParameters], yaw: float, ground: Ground)
 def propose_splits(
     shape: ShapeParameters, ground: Ground
 ) -> list[tuple[ShapeParameters, ShapeParameters]]:
-    """Two boxes in place of one shape: cut across either side at three places, one of them slim.
+    """Propose two boxes in place of one shape: cuts across either side at three positions, one box
+    slim.
 
     Args:
-        shape: Which is to be two.
-        ground: The plane.
+        shape: shape to split.
+        ground: ground plane.
 
     Returns:
-        For each cut both whole, and either one slim, along each edge or the middle of the shape.
+        For each cut both of full width, and either one slim, along each edge or the middle of the
+        shape.
     """
     box = enclosing_box((shape,), shape.yaw if shape.is_rectangular else 0.0, ground)
     c, s = math.cos(ground.yaw_sign * box.yaw), math.sin(ground.yaw_sign * box.yaw)
 
     def part(along: int, share: float, away: float, wide: float, off: float) -> ShapeParameters:
-        """A part of the box, its sides as shares of the whole's, its middle off by halves of it."""
+        """Return a part of the box; sides are fractions of the whole, offsets are in half sides."""
         sides, shift = [box.length, box.width], [0.0, 0.0]
         shift[along], shift[1 - along] = 0.5 * sides[along] * away, 0.5 * sides[1 - along] * off
         sides[along] *= share
@@ -615,11 +617,11 @@ def propose_splits(
 
 
 def shape_gap(first: ShapeParameters, second: ShapeParameters, ground: Ground) -> float:
-    """The gap between two shapes, to a few centimetres [m].
+    """Compute the gap between two shapes, to a few centimetres [m].
 
     Args:
-        first, second: The shapes.
-        ground: The plane.
+        first, second: shape parameters.
+        ground: ground plane.
     """
     share = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None, None]
     sides: list[Tensor] = []
@@ -632,12 +634,12 @@ def shape_gap(first: ShapeParameters, second: ShapeParameters, ground: Ground) -
 def outline_corners(
     shape: ShapeParameters, ground: Ground, count: int = 16
 ) -> Float64[Tensor, "corner 2"]:
-    """Corners of a shape on the ground [m], those of a polygon for shapes without any.
+    """Return the corners of a shape on the ground [m], or of a polygon for round shapes.
 
     Args:
-        shape: The shape.
-        ground: The plane.
-        count: Of the polygon's corners.
+        shape: shape parameters.
+        ground: ground plane.
+        count: number of corners of the polygon.
     """
     if isinstance(shape, PrismParameters):
         return prism_contour(shape)

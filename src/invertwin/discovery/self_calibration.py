@@ -1,4 +1,4 @@
-"""Calibration of the channels on a scene that nobody knows, by its own image."""
+"""Channel calibration on an unknown scene by its own image."""
 
 import math
 from dataclasses import replace
@@ -20,29 +20,31 @@ from invertwin.inversion import speckle_weight
 from invertwin.radar import Radar, range_profile
 from invertwin.radar.radar import require_sampled_waveform
 
-_CALIBRATION_ROUNDS = 2  # an image, then the channels that it tells
-_MAX_SWEEPS = 100  # over the channels, at most
-_MIN_PHASE_SPREAD = 10.0  # degrees of phase, root mean square: less is left as it is
-_MIN_POSITIONS = 8  # positions at least that are a range cell apart: they tell directions by ranges
+_CALIBRATION_ROUNDS = 2  # alternations of imaging and calibration
+_MAX_SWEEPS = 100  # maximum number of sweeps over the channels
+_MIN_PHASE_SPREAD = 10.0  # root mean square phase [°]: smaller errors are not corrected
+_MIN_POSITIONS = (
+    8  # minimum number of positions a range cell apart, which resolve directions by ranges
+)
 
 
 def calibrate_on_scene(
     capture: Capture, grid: Grid, positions: Float64[Tensor, "place 3"]
 ) -> ChannelCalibration | None:
-    """The gains of the channels under which a recording fits its own image best.
+    """Estimate the channel gains under which a recording fits its own image best.
 
-    The first image is made of ranges alone, which the phases of channels do not touch: many
-    positions of the radar tell where echoes come from. It predicts the covariance of the channels
-    in every range bin, which tells their gains by likelihood; the next image uses directions, too.
+    The first image uses ranges alone, which do not depend on channel phases: many positions of the
+    radar locate the echoes. It predicts the covariance of the channels in every range bin, which
+    determines their gains by maximum likelihood; the next image uses directions too.
 
     Args:
-        capture: Of several positions.
-        grid: Bins.
-        positions: Of the image [m].
+        capture: recording from several positions.
+        grid: bins of the maps.
+        positions: image points [point, 3] [m].
 
     Returns:
-        None where the channels agree, or where too few positions tell a wrong phase from another
-        direction.
+        Calibration; None if the channels agree, or if too few positions distinguish a phase error
+        from another direction.
     """
     radar = capture.radar()
     cells = (radar.positions.detach() / radar.waveform.range_resolution).round().unique(dim=0)
@@ -65,13 +67,14 @@ def calibrate_on_scene(
 
 
 def phase_spread(calibration: ChannelCalibration, radar: Radar) -> float:
-    """How far the phases of channels are apart, root mean square [°], but for a ramp.
+    """Compute the root mean square phase difference of channels [°], up to a ramp.
 
-    A ramp along the array is a turn of the radar, and may come of an image that is a little off.
+    A ramp along the array corresponds to a rotation of the radar, which a slightly displaced image
+    may cause.
 
     Args:
-        calibration: Of the channels.
-        radar: Its array and wavelength.
+        calibration: calibration of the channels.
+        radar: radar with its array and wavelength.
     """
     places = radar.virtual_positions[:, :2] / require_sampled_waveform(radar).wavelength
     extent = places.amax(0) - places.amin(0)
@@ -92,18 +95,18 @@ def phase_spread(calibration: ChannelCalibration, radar: Radar) -> float:
 def _estimate_gains(
     capture: Capture, range_grid: Grid, positions: Float64[Tensor, "place 3"], image: Tensor
 ) -> ChannelCalibration:
-    """Gains of the channels, of a known image.
+    """Estimate channel gains, given an image.
 
     With h = 1/g and D = diag(x), a range bin of channels x has the covariance R that the image
-    predicts, once D h replaces x. Minus the logarithm of its likelihood, summed over bins, is
-    hᴴ Q h − 2 N Σ log|h|, Q = Σ Dᴴ R⁻¹ D; one channel after the other minimises it in closed form.
-    Bins that the image does not explain count less, as heavy-tailed speckle does.
+    predicts, once D h replaces x. Minus the logarithm of its likelihood, summed over bins, is hᴴ Q
+    h − 2 N Σ log|h|, Q = Σ Dᴴ R⁻¹ D; one channel after the other minimises it in closed form. Bins
+    that the image does not explain have lower weights, as for heavy-tailed speckle.
 
     Args:
-        capture: Signals.
-        range_grid: Bins of range.
-        positions: Of the image [m].
-        image: Radar cross-section of every place [m²].
+        capture: signals.
+        range_grid: bins of range.
+        positions: image points [point, 3] [m].
+        image: radar cross-section of every point [m²].
     """
     radar = capture.radar()
     profile = range_profile(capture.beat.to(torch.complex128), radar, range_grid)
@@ -136,7 +139,7 @@ def _estimate_gains(
 def _channel_phasors(
     radar: Radar, positions: Float64[Tensor, "place 3"]
 ) -> list[Complex128[Tensor, "p c"]]:
-    """What the channels of every frame get from echoes at places."""
+    """Compute channel phasors of every frame for echoes at points."""
     found = []
     for place, axes in zip(radar.positions.detach(), radar.link().rotations.detach(), strict=True):
         seen = torch.nn.functional.normalize(positions - place, dim=1) @ axes
@@ -147,11 +150,11 @@ def _channel_phasors(
 
 
 def _minimise_gains(matrix: Complex128[Tensor, "c c"], draws: float) -> Complex128[Tensor, " c"]:
-    """The h that minimises hᴴ Q h − 2 N Σ log|h|.
+    """Minimise hᴴ Q h − 2 N Σ log|h| over h.
 
     Args:
-        matrix: Q, Hermitian.
-        draws: N.
+        matrix: Q, Hermitian [channel, channel].
+        draws: N, number of draws.
     """
     vectors = torch.linalg.eigh(matrix).eigenvectors
     h = vectors[:, 0] / vectors[:, 0].abs().clamp_min(1e-3)

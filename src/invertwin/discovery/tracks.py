@@ -1,4 +1,4 @@
-"""What moves, followed from frame to frame: place and velocity over time, with their errors."""
+"""Multi-target tracking: positions and velocities of moving targets, with uncertainties."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -14,17 +14,21 @@ from invertwin.discovery.imaging.point_detections import detect_moving_targets
 from invertwin.discovery.outcome import DetectedObject, ObjectTrack
 from invertwin.inversion.initialisation.detections import Ground
 
-_MAX_SQUARED_DISTANCE = 16.3  # squared distance in deviations of 0.1 % of three normal numbers
-_ACCELERATION_DEVIATION = 1.0  # acceleration that a mover may have [m/s²]
-_CROSS_RANGE_SPEED = 3.0  # velocity across the sight that a mover may have [m/s]
-_MIN_TRACK_FRAMES = 3  # frames of a track
-_MAX_MISSED_FRAMES = 3  # frames in which a mover may be missed
-_MIN_EXISTENCE_PROBABILITY = 0.1  # confidence of what may continue a track
+_MAX_SQUARED_DISTANCE = 16.3  # gate: 0.1 % quantile of χ² with three degrees of freedom
+_ACCELERATION_DEVIATION = 1.0  # standard deviation of the acceleration of a target [m/s²]
+_CROSS_RANGE_SPEED = 3.0  # standard deviation of the cross-range velocity [m/s]
+_MIN_TRACK_FRAMES = 3  # minimum number of frames of a track
+_MAX_MISSED_FRAMES = 3  # maximum number of missed frames
+_MIN_EXISTENCE_PROBABILITY = (
+    0.1  # minimum existence probability of detections that continue a track
+)
 
 
 @dataclass(frozen=True, eq=False)
 class _TrackMeasurement:
-    """What one frame says of a mover: z = H x + noise of covariance R, x = (place, velocity)."""
+    """Measurement of a target in one frame: z = H x + noise of covariance R, x = (position,
+    velocity).
+    """
 
     frame: int
     detection: DetectedObject
@@ -35,7 +39,7 @@ class _TrackMeasurement:
 
 @dataclass(eq=False)
 class _KalmanTrack:
-    """A mover that is followed: states after every frame, and before it."""
+    """Track of a target: Kalman states after and before every frame."""
 
     first_frame: int
     measurements: list[_TrackMeasurement]
@@ -47,19 +51,19 @@ class _KalmanTrack:
 def track_moving_targets(
     recording: ChirpCapture, grid: Grid, ground: Ground
 ) -> list[DetectedObject]:
-    """What moves, followed through all frames, the surest first; things are where they were last.
+    """Track moving targets through all frames, the most probable first, at their last positions.
 
-    Movers of a frame continue the tracks that they fit best, all together. A mover keeps its
-    velocity along the ground but for accelerations of about 1 m/s². States are smoothed: every
-    frame's says what all frames know of it.
+    Detections of a frame are assigned to tracks jointly (global nearest neighbour). A target keeps
+    its velocity along the ground up to accelerations of about 1 m/s². States are smoothed over all
+    frames.
 
     Source: Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and
     Navigation", 2001, chapters 6 and 8 (constant velocity, white acceleration; smoothing).
 
     Args:
-        recording: Trains of chirps with a known time from frame to frame.
-        grid: Bins of range and direction.
-        ground: The plane on which things move.
+        recording: chirp trains with a known frame period.
+        grid: bins of range and direction.
+        ground: ground plane of the motion.
     """
     assert recording.frame_period is not None
     step, spread = _motion_model(recording.frame_period)
@@ -85,7 +89,7 @@ def track_moving_targets(
 
 
 def _motion_model(period: float) -> tuple[Tensor, Tensor]:
-    """The step of a state from frame to frame, and what accelerations add to its covariance."""
+    """Return the transition matrix between frames, and the process noise covariance."""
     two = torch.eye(2, dtype=torch.float64)
     step = torch.eye(4, dtype=torch.float64)
     step[:2, 2:] = period * two
@@ -133,7 +137,7 @@ def _start_track(measurement: _TrackMeasurement) -> _KalmanTrack:
 def _update_tracks(
     active_tracks: Sequence[_KalmanTrack], measurements: Sequence[_TrackMeasurement]
 ) -> list[_TrackMeasurement]:
-    """Update paths by what fits them best, all together; return what continues one."""
+    """Update tracks by jointly assigned measurements; return the assigned ones."""
     away = torch.full(
         (len(active_tracks), len(measurements)), 2 * _MAX_SQUARED_DISTANCE, dtype=torch.float64
     )
@@ -169,7 +173,7 @@ def _update_tracks(
 def _to_detected_object(
     target_track: _KalmanTrack, transition: Tensor, period: float, ground: Ground
 ) -> DetectedObject:
-    """A smoothed path as a thing; the frames after it was last seen do not count."""
+    """Convert a smoothed track to an object; frames after its last detection are dropped."""
     count = target_track.measurements[-1].frame - target_track.first_frame + 1
     states = target_track.states[:count]
     for k in range(count - 2, -1, -1):

@@ -1,4 +1,4 @@
-"""Power of echoes that nobody has modelled exactly: its likelihood, and how many bins count."""
+"""Likelihood of echo power under an approximate model, and the effective number of bins."""
 
 import math
 from dataclasses import dataclass, replace
@@ -16,18 +16,18 @@ from invertwin.radar.waveform import unit_window
 
 TAIL_DEGREES = 4.0
 """Of the heavy-tailed speckle."""
-_MIN_POWER = 1e-30  # of power, to keep logarithms finite
-_BACKGROUND_QUANTILE = 0.25  # quantile of a range bin that is taken for background
+_MIN_POWER = 1e-30  # lower limit of power in logarithms
+_BACKGROUND_QUANTILE = 0.25  # quantile of a range bin that estimates the background
 
 
 def estimate_background(power: Float[Tensor, "frame range u v"]) -> Float64[Tensor, " range"]:
-    """The level of noise and of clutter that nothing explains, of every range bin.
+    """Estimate the level of noise and unmodelled clutter of every range bin.
 
     The lower quartile of exponentially distributed power is 0.288 of its mean. Objects that fill
-    less than three quarters of a range bin's directions, over all frames, do not raise it much.
+    less than three quarters of a range bin's directions, over all frames, hardly raise it.
 
     Args:
-        power: Measured maps.
+        power: measured maps [frame, range, u, v].
     """
     flat = power.detach().double().movedim(1, 0).flatten(1)
     level = torch.quantile(flat, _BACKGROUND_QUANTILE, dim=1) / -math.log(1 - _BACKGROUND_QUANTILE)
@@ -36,22 +36,22 @@ def estimate_background(power: Float[Tensor, "frame range u v"]) -> Float64[Tens
 
 
 def count_bins_per_draw(radar: Radar, grid: Grid) -> float:
-    """How many bins of a map are worth one that is independent of all others.
+    """Compute the number of correlated bins per independent draw of a map.
 
-    Fields of noise in bins that are l apart correlate as the windows do; powers correlate as the
-    square. The sum over all lags is the number of bins that share one draw.
+    Noise fields in bins of lag l are correlated by the windows; powers by the square. The sum over
+    all lags is the number of bins that share one draw.
 
     Args:
-        radar: Its windows count.
-        grid: Bins.
+        radar: radar with its windows.
+        grid: bins of the map.
     """
     total = 1.0
     for axis in map_axes(radar, grid):
         if axis.count > 1:
             lags = torch.arange(-axis.count + 1, axis.count, dtype=torch.float64)
-            # Of all pairs of bins of the axis, this share is so far apart.
+            # Fraction of the pairs of bins of the axis with this lag.
             share = 1 - lags.abs() / axis.count
-            # Noise is as strong in all samples, so that its field has the squares for weights.
+            # Noise has equal power in all samples, so that its weights are squared.
             power = replace(axis, weight=axis.weight.square()).response(lags)
             total *= float((share * power).sum())
     return total
@@ -59,12 +59,12 @@ def count_bins_per_draw(radar: Radar, grid: Grid) -> float:
 
 @dataclass(frozen=True, eq=False)
 class MapAxis:
-    """One axis of a map: what is summed to make its bins.
+    """One axis of a map: the sum that forms its bins.
 
     Attributes:
-        weight: The window over samples, or over virtual elements.
-        cycles: Turns of each per metre of range, or per unit of a direction cosine.
-        start, step, count: Of its bins.
+        weight: window over samples, or over virtual elements.
+        cycles: cycles of each sample per metre of range, or per unit of a direction cosine.
+        start, step, count: bins of the axis.
     """
 
     weight: Float64[Tensor, " sample"]
@@ -74,10 +74,10 @@ class MapAxis:
     count: int
 
     def response(self, lags: Float64[Tensor, " lag"]) -> Float64[Tensor, " lag"]:
-        """Power of a point of power one, some bins away from its place.
+        """Return the power of a unit point target at given lags.
 
         Args:
-            lags: In bins.
+            lags: lags from its position, in bins.
         """
         phase = 2 * math.pi * lags[:, None] * self.step * self.cycles
         field = torch.polar(self.weight.expand(len(lags), -1), phase).sum(1) / self.weight.sum()
@@ -85,11 +85,11 @@ class MapAxis:
 
 
 def map_axes(radar: Radar, grid: Grid) -> list[MapAxis]:
-    """The axes of a map: range, u and v.
+    """Return the axes of a map: range, u and v.
 
     Args:
-        radar: Its windows and its array count.
-        grid: Bins.
+        radar: radar with its windows and its array.
+        grid: bins of the map.
 
     Raises:
         InputError: A radar that does not sample its echoes.
@@ -107,14 +107,14 @@ def map_axes(radar: Radar, grid: Grid) -> list[MapAxis]:
 
 @dataclass(frozen=True, eq=False)
 class HeavyTailedLoss:
-    """How unlikely maps are, where single bins may be much brighter or dimmer than predicted.
+    """Negative log-likelihood of maps with heavy-tailed speckle.
 
-    The ``speckle_divergence`` of echoes whose mean is itself uncertain, with a background of its
-    own for every range bin.
+    The ``speckle_divergence`` of echoes with an uncertain mean, with a separate background in every
+    range bin.
 
     Attributes:
-        level: Background of every range bin, added to predicted maps.
-        degrees: Those of the mean.
+        level: background of every range bin, added to predicted maps.
+        degrees: degrees of freedom of the mean.
     """
 
     level: Float64[Tensor, " range"]
@@ -125,7 +125,7 @@ class HeavyTailedLoss:
         predicted: Float[Tensor, "frame range u v"],
         observed: Float[Tensor, "frame range u v"],
     ) -> Float[Tensor, ""]:
-        """The mean of ``rows`` over all bins."""
+        """Return the mean of ``bin_losses`` over all bins."""
         return self.bin_losses(predicted, observed).mean()
 
     def bin_losses(
@@ -133,12 +133,12 @@ class HeavyTailedLoss:
         predicted: Float[Tensor, "frame range u v"],
         observed: Float[Tensor, "frame range u v"],
     ) -> Float[Tensor, "frame range u v"]:
-        """How much less likely the power of every bin is than if it were its predicted mean.
+        """Compute the divergence of every bin from its predicted mean.
 
         Args:
-            predicted: Power without background.
-            observed: Measured power.
+            predicted: predicted power without background.
+            observed: measured power.
         """
-        # Power that is predicted is positive but for rounding.
+        # Predicted power is positive up to rounding.
         mean = predicted.clamp_min(0.0) + self.level.to(predicted)[:, None, None]
         return speckle_divergence(observed.to(predicted).clamp_min(_MIN_POWER) / mean, self.degrees)

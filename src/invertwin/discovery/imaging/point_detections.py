@@ -1,4 +1,4 @@
-"""Things of which only the place is found: movers, and points along a dense track."""
+"""Point detections without a shape: moving targets, and coherent points along a dense track."""
 
 import math
 from dataclasses import replace
@@ -15,26 +15,26 @@ from invertwin.inversion.initialisation.detections import label_groups
 from invertwin.radar import detect_points, noise_power, range_doppler, velocity_span
 from invertwin.radar.aperture import aperture
 
-_MAX_GROUP_CELLS = 3.0  # of range and rate between echoes of one mover
-_MIN_RELATIVE_PEAK = 0.1  # of the strongest: dimmer peaks may be sidelobes
-_TARGET_SIDELOBE_LEVEL = 3e-3  # of the strongest mover: dimmer ones may be its sidelobes
-_NO_SIDELOBE_LEVEL = 0.5  # of the strongest: brighter peaks are no sidelobes
-_DIRECTION_ERROR_BEAMS = 0.3  # of a beam: how well a direction is known
-_POINTS_PER_CHUNK = 20_000  # points of an image at a time
+_MAX_GROUP_CELLS = 3.0  # cells of range and rate between echoes of one target
+_MIN_RELATIVE_PEAK = 0.1  # relative to the strongest: weaker peaks may be sidelobes
+_TARGET_SIDELOBE_LEVEL = 3e-3  # relative to the strongest target: weaker ones may be its sidelobes
+_NO_SIDELOBE_LEVEL = 0.5  # relative to the strongest: stronger peaks are no sidelobes
+_DIRECTION_ERROR_BEAMS = 0.3  # standard deviation of a direction in beamwidths
+_POINTS_PER_CHUNK = 20_000  # points of an image per chunk
 
 
 def detect_moving_targets(
     recording: ChirpCapture, grid: Grid, frame: int = 0
 ) -> list[DetectedObject]:
-    """What moves in one frame, the strongest first, after the mean over the chirps is removed.
+    """Detect moving targets in one frame, the strongest first, after static clutter removal.
 
-    Echoes that are near in range and range rate are one thing; its strongest echo says where it is.
-    What has the range rate that the radar's own motion gives to things at rest is left out.
+    Echoes close in range and range rate form one target at the position of its strongest echo.
+    Echoes whose range rate equals that of static objects under the radar's own motion are excluded.
 
     Args:
-        recording: A train of chirps.
-        grid: Bins of range and direction.
-        frame: Which.
+        recording: chirp train.
+        grid: bins of range and direction.
+        frame: index of the frame.
     """
     if recording.chirps.count < 4:
         return []
@@ -47,7 +47,7 @@ def detect_moving_targets(
     origin, own_velocity = radar.positions[frame].detach(), platform_velocities(recording)[frame]
     aways = torch.nn.functional.normalize(points.position.detach().double() - origin, dim=1)
     rates = points.velocity + aways @ own_velocity
-    # What stands still has lost its mean only; a direction is known to a part of a beam.
+    # Clutter removal subtracts the mean only; a direction is known to a fraction of a beam.
     blur = (
         float(own_velocity.norm())
         * direction_cell(aperture(radar).x, radar)
@@ -64,7 +64,7 @@ def detect_moving_targets(
     where = torch.stack([points.range, rates], dim=1)[rows] / scales
     labels = label_groups(where, 1.0)
     flat = range_doppler(beat[frame : frame + 1], radar.frames([frame]), grid, chirps)
-    # Beams over all channels have this much less noise than one channel.
+    # Noise reduction of beams over all channels relative to one channel.
     noise = noise_power(flat.abs().square(), 1) / len(radar.virtual_positions)
     draws, top = flat.numel(), float(points.power[rows].max())
     found: list[DetectedObject] = []
@@ -72,7 +72,7 @@ def detect_moving_targets(
         own = rows[labels == number]
         best = own[points.power[own].argmax()]
         power = float(points.power[best])
-        # Power spread over a group tells the place to the width of the group.
+        # The extent of a group bounds the accuracy of its position.
         weight = points.power[own] / points.power[own].sum()
         spread = [
             float((weight * (values[own] - values[best]).square()).sum().sqrt())
@@ -105,10 +105,10 @@ def detect_moving_targets(
 
 
 def platform_velocities(recording: ChirpCapture) -> Float64[Tensor, "frame 3"]:
-    """Velocity of the radar in every frame, from where it was before and after [m/s].
+    """Estimate the radar velocity of every frame from the positions before and after [m/s].
 
     Args:
-        recording: Without a known time from frame to frame, its radar counts as at rest.
+        recording: without a known frame period, the radar counts as static.
     """
     places = recording.radar().positions.detach()
     if recording.frame_period is None or len(places) < 2:
@@ -118,10 +118,10 @@ def platform_velocities(recording: ChirpCapture) -> Float64[Tensor, "frame 3"]:
 
 
 def is_dense_track(capture: Capture) -> bool:
-    """Whether frames follow each other so closely that echoes add up in phase along the track.
+    """Return whether frames are dense enough for echoes to add coherently along the track.
 
     Args:
-        capture: The recording.
+        capture: the recording.
     """
     radar = capture.radar()
     if len(radar.virtual_positions) > 1 or radar.frame_count < 8:
@@ -133,15 +133,15 @@ def is_dense_track(capture: Capture) -> bool:
 def coherent_image(
     capture: Capture, positions: Float64[Tensor, "place 3"]
 ) -> tuple[Float64[Tensor, " place"], Float64[Tensor, " place"]]:
-    """The backprojected image along a track, and how well the frames agree.
+    """Compute the backprojected image along a track, and the coherence over frames.
 
     Args:
-        capture: The recording.
-        positions: In the world [m].
+        capture: the recording.
+        positions: image points in world axes [point, 3] [m].
 
     Returns:
-        Power with the spreading loss removed, and the share of all power that is in phase:
-        1 for a single point, about 1 over the number of frames for noise.
+        Power with the spreading loss removed, and the coherent fraction of the total power: 1 for a
+            single point, about 1 over the number of frames for noise.
     """
     count = capture.radar().frame_count
     parts = [
@@ -164,12 +164,14 @@ def _single_frame_power(capture: Capture, positions: Tensor, count: int) -> Tens
 def locate_coherent_points(
     capture: Capture, positions: Float64[Tensor, "place 3"], min_separation: float
 ) -> tuple[list[DetectedObject], Float64[Tensor, " place"]]:
-    """Points where the echoes of many frames agree in phase, the brightest first; and the image.
+    """Detect points with coherent echoes over many frames, the strongest first; also return the
+    image.
 
     Args:
-        capture: A recording along a dense track.
-        positions: Of the image, in the world [m].
-        min_separation: Peaks that are nearer to a brighter one are its sidelobes [m].
+        capture: recording along a dense track.
+        positions: image points in world axes [point, 3] [m].
+        min_separation: minimum distance of peaks; a peak closer to a stronger one is its sidelobe
+            [m].
     """
     image, agree = coherent_image(capture, positions)
     count = capture.radar().frame_count

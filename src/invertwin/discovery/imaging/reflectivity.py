@@ -1,4 +1,4 @@
-"""A sharp image of where echoes come from: the reflectivity that explains all maps together."""
+"""Maximum-likelihood reflectivity image of all maps."""
 
 from dataclasses import dataclass, replace
 
@@ -16,19 +16,19 @@ from invertwin.radar import Radar
 from invertwin.radar.aperture import aperture
 from invertwin.runtime.progress import track
 
-_MIN_RELATIVE_RESPONSE = 1e-3  # of a response, relative to its peak: less is left out
-_MIN_RESPONSE = 1e-30  # of a response: the place is out of sight [1/m²]
-_TABLE_STEPS_PER_BIN = 32  # entries of a kernel's table in one bin
-_MAX_MATRIX_ENTRIES = 8e7  # entries of the matrix: 8 bytes each
+_MIN_RELATIVE_RESPONSE = 1e-3  # relative to the peak of a response: smaller entries are dropped
+_MIN_RESPONSE = 1e-30  # smaller responses are invisible points [1/m²]
+_TABLE_STEPS_PER_BIN = 32  # entries of a kernel's table per bin
+_MAX_MATRIX_ENTRIES = 8e7  # entries of the matrix, 8 bytes each
 
 
 @dataclass(frozen=True, eq=False)
 class ImageResponse:
-    """What scatterers at some places add to all bins of all maps.
+    """Response of scatterers at image points in all bins of all maps.
 
     Attributes:
-        matrix: Power per radar cross-section [1/m²], bins by places, frames slowest.
-        shape: Of the maps.
+        matrix: power per radar cross-section [1/m²], bins × points, frames slowest.
+        shape: shape of the maps.
     """
 
     matrix: sparse.csr_matrix
@@ -37,20 +37,20 @@ class ImageResponse:
     def predict_maps(
         self, strength: Float64[Tensor, " place"]
     ) -> Float64[Tensor, "frame range u v"]:
-        """The maps of scatterers.
+        """Predict the maps of scatterers.
 
         Args:
-            strength: Radar cross-section of every place [m²].
+            strength: radar cross-section of every point [m²].
         """
         return torch.from_numpy(self.matrix @ strength.numpy()).reshape(self.shape)
 
     def average_over_bins(
         self, values: Float64[Tensor, "frame range u v"]
     ) -> Float64[Tensor, "frame place"]:
-        """The mean of values over the bins of every place, frame by frame.
+        """Average values over the bins of every point, frame by frame.
 
         Args:
-            values: Of all bins.
+            values: values of all bins.
         """
         bins = int(np.prod(self.shape[1:]))
         found = []
@@ -63,12 +63,13 @@ class ImageResponse:
 def thin_map(
     power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
 ) -> tuple[Float64[Tensor, "frame some_range some_u some_v"], Grid]:
-    """One bin of a map for each cell of range and direction: nearly independent ones.
+    """Select one bin of a map for each resolution cell of range and direction: nearly independent
+    bins.
 
     Args:
-        power: Maps.
-        radar: Its bandwidth and its array set the cells.
-        grid: Bins of the maps.
+        power: maps [frame, range, u, v].
+        radar: radar whose bandwidth and array determine the cells.
+        grid: bins of the maps.
     """
     array = aperture(radar)
     cells = [
@@ -94,11 +95,11 @@ def thin_map(
 
 
 def direction_cell(positions: Float64[Tensor, " place"], radar: Radar) -> float:
-    """Width of a beam of elements in direction cosines.
+    """Return the beamwidth of elements in direction cosines.
 
     Args:
-        positions: Of the elements along one axis [m].
-        radar: Its wavelength counts.
+        positions: positions of the elements along one axis [m].
+        radar: radar with its wavelength.
     """
     if len(positions) == 1:
         return 2.0
@@ -109,15 +110,15 @@ def direction_cell(positions: Float64[Tensor, " place"], radar: Radar) -> float:
 def compute_response(
     radar: Radar, grid: Grid, positions: Float64[Tensor, "place 3"]
 ) -> ImageResponse:
-    """The response of a radar to scatterers that reflect alike in all directions, in free space.
+    """Compute the response of a radar to isotropic scatterers in free space.
 
     Args:
-        radar: With its positions.
-        grid: Bins.
-        positions: In the world [m].
+        radar: radar with its positions.
+        grid: bins of the maps.
+        positions: image points in world axes [point, 3] [m].
 
     Raises:
-        InputError: More places than memory allows, or a radar of pulses.
+        InputError: More points than memory allows, or a pulsed radar.
     """
     link, shape = radar.link(), (radar.frame_count, *grid.shape)
     tables = [_AxisResponseTable.from_axis(axis) for axis in map_axes(radar, grid)]
@@ -170,10 +171,10 @@ def reconstruct_reflectivity(
     steps: int = 40,
     degrees: float = TAIL_DEGREES,
 ) -> Float64[Tensor, " place"]:
-    """The reflectivity under which the maps are likeliest, by multiplicative steps.
+    """Compute the maximum-likelihood reflectivity by multiplicative updates.
 
-    Each step multiplies the strength of a place by the root of how much brighter than predicted
-    its bins are. It never turns negative. Bins that are far too bright count less, as in
+    Each step multiplies the strength of a point by the square root of the ratio of observed to
+    predicted power in its bins, so that it stays positive. Outlier bins have lower weights, as in
     ``HeavyTailedLoss``.
 
     Source: Févotte, Bertin and Durrieu, "Nonnegative matrix factorization with the Itakura–Saito
@@ -181,14 +182,14 @@ def reconstruct_reflectivity(
     Differs from the source: the responses are known; speckle is heavy-tailed.
 
     Args:
-        response: Of the places.
-        power: Measured maps.
-        known_power: Power of what is known already, and of the background.
-        steps: How many.
-        degrees: Of the speckle.
+        response: response of the points.
+        power: measured maps.
+        known_power: power of known objects and of the background.
+        steps: number of steps.
+        degrees: degrees of freedom of the speckle.
 
     Returns:
-        Radar cross-section of every place [m²].
+        Radar cross-section of every point [m²].
     """
     matrix = response.matrix
     back = sparse.csc_matrix(matrix.T)
@@ -209,12 +210,12 @@ def reconstruct_reflectivity(
 
 @dataclass(frozen=True, eq=False)
 class _AxisResponseTable:
-    """The response along one axis of the map, in bins from its centre, as a table."""
+    """Tabulated response along one axis of the map, in bins from its centre."""
 
     start: float
     step: float
     count: int
-    offsets: np.ndarray  # bins that are reached
+    offsets: np.ndarray  # bins within the response
     table: np.ndarray
 
     @classmethod
@@ -229,7 +230,7 @@ class _AxisResponseTable:
             / _TABLE_STEPS_PER_BIN
         )
         power = axis.response(lags)
-        # Up to the first null: what lies beyond is below the background of most recordings.
+        # Up to the first null: sidelobes are below the background of most recordings.
         middle = 16 * _TABLE_STEPS_PER_BIN
         rising = (power[middle + 1 :] > power[middle:-1]).nonzero()
         reach = int(rising[0]) if len(rising) else middle
@@ -239,7 +240,7 @@ class _AxisResponseTable:
         return cls(start, step, count, np.arange(-half, half + 1), power.numpy())
 
     def near_bins(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Bins near places [place, n], and the response there."""
+        """Return the bins near positions [point, n], and the response there."""
         if self.count == 1:
             zero = np.zeros((len(positions), 1), dtype=np.int64)
             return zero, np.ones((len(positions), 1))

@@ -1,4 +1,4 @@
-"""Free outlines in place of simple shapes, where frames that were held out speak for them."""
+"""Free outlines in place of simple shapes, if held-out frames support them."""
 
 from collections.abc import Sequence
 
@@ -10,25 +10,25 @@ from invertwin.discovery.search import shape_gap
 from invertwin.discovery.shapes.primitives import ShapeParameters
 from invertwin.discovery.shapes.prisms import merge_into_prism
 
-_MAX_GAP_CELLS = 2.0  # cells of range between shapes that may be one
-_MIN_LENGTH_CELLS = 6.0  # cells of range along the longer side of a shape whose outline can be told
-_FIT_STEPS = 80  # of a fit
-_MIN_LOG_ODDS = 5.0  # logarithm of the odds for a free outline
-_REPLACEABLE_KINDS = ("box", "cylinder", "sphere")  # may be something else even alone
+_MAX_GAP_CELLS = 2.0  # range cells between shapes that may merge
+_MIN_LENGTH_CELLS = 6.0  # range cells along the longer side of a shape with a resolvable outline
+_FIT_STEPS = 80  # steps of a fit
+_MIN_LOG_ODDS = 5.0  # minimum log odds of a free outline
+_REPLACEABLE_KINDS = ("box", "cylinder", "sphere")  # kinds that a prism may replace even alone
 
 
 def fit_outlines(
     fitted: ShapeLikelihood, held: ShapeLikelihood, shapes: Sequence[ShapeParameters]
 ) -> list[ShapeParameters]:
-    """Shapes, with one prism in place of those that touch, or of one, where it is likelier.
+    """Replace touching shapes, or a single one, by one prism where that is more likely.
 
-    Simple shapes explain a thing of another form by several of them. A free outline explains
-    anything, noise as well: it is fitted to some frames and judged by others.
+    Several simple shapes may explain one object of another form. A free outline may also fit noise:
+    it is fitted to some frames and validated on others.
 
     Args:
-        fitted: Frames that are fitted.
-        held: Frames that judge.
-        shapes: After their fit.
+        fitted: likelihood of the fitted frames.
+        held: likelihood of the held-out frames.
+        shapes: fitted shapes.
     """
     cell = fitted.radar.waveform.range_resolution
     touching = _group_touching(fitted, shapes, _MAX_GAP_CELLS * cell)
@@ -54,7 +54,7 @@ def fit_outlines(
 def _group_touching(
     likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters], max_gap: float
 ) -> list[list[ShapeParameters]]:
-    """Shapes that hang together, nearer to each other than a gap [m]."""
+    """Group shapes connected by gaps smaller than a limit [m]."""
     count = len(shapes)
     near = np.zeros((count, count))
     for a in range(count):
@@ -65,7 +65,7 @@ def _group_touching(
 
 
 def _is_outline_candidate(group: Sequence[ShapeParameters], min_length: float) -> bool:
-    """Whether shapes that touch may be a prism, the larger of which is longer than least [m]."""
+    """Return whether touching shapes, the larger of a minimum length [m], may be a prism."""
     solid = _select_solid(group)
     large = any(max(one.length, one.width) > min_length for one in solid)
     return large and (len(group) > 1 or solid[0].kind in _REPLACEABLE_KINDS)

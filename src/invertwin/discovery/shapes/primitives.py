@@ -1,4 +1,4 @@
-"""Simple shapes that stand on the ground, with all their numbers free: what a twin is made of."""
+"""Parametric shapes on the ground: the primitives of an automatic twin."""
 
 import math
 from dataclasses import dataclass, replace
@@ -36,8 +36,8 @@ MAX_POINT_SIZE = 0.06
 """What is smaller than this is a point [m]."""
 CORNER_EXPONENT = 9.0
 """Power of the cosine with which the echo of a trihedral corner falls off the way it opens."""
-_CORNER_FALLOFF = CORNER_EXPONENT - 2  # beside the cos² of any plate
-_CORNER_PLATE_SIDE = 0.03  # side of the plate that stands for a corner reflector [m]
+_CORNER_FALLOFF = CORNER_EXPONENT - 2  # in addition to the cos² of any plate
+_CORNER_PLATE_SIDE = 0.03  # side of the plate that represents a corner reflector [m]
 _MIN_SIZES, _MAX_SIZES = (0.01, 0.01, 0.01), (10.0, 10.0, 10.0)
 SIZE_LIMITS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "person": ((0.4, 0.2, 1.2), (0.9, 0.5, 2.1)),
@@ -52,47 +52,47 @@ _RECTANGULAR_KINDS, _FREE_HEIGHT_KINDS = (
     ("wall", "box", "person", "vehicle"),
     ("sphere", "point", "corner"),
 )
-_MAX_DIELECTRIC_REFLECTANCE = 0.9  # of the reflectance of a material
+_MAX_DIELECTRIC_REFLECTANCE = 0.9  # larger reflectances are metal
 
 
 @dataclass(frozen=True, eq=False)
 class Matte(Material):
-    """A surface that scatters the same brightness everywhere, of any strength.
+    """Surface of constant brightness in all directions, of any strength.
 
-    An uncalibrated radar knows power only up to a factor, and corners focus: brightness may
-    exceed 1, which no rough surface does.
+    The power of an uncalibrated radar is known up to a factor, and corners focus: unlike that of a
+    rough surface, brightness may exceed 1.
 
     Attributes:
-        brightness: Scattered over incident power; of every triangle, or of all.
-        cosine_power: Power of the cosine of the angle of incidence with which it falls besides.
+        brightness: scattered over incident power; per triangle, or one number.
+        cosine_power: additional exponent of the cosine of the angle of incidence.
     """
 
     brightness: Tensor
     cosine_power: float = 0.0
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
-        """The same at every frequency [Hz]."""
+        """Return the law, equal at every frequency [Hz]."""
         cosine = torch.linspace(0, 1, 256, dtype=torch.float64)
         return ScatteringLaw(cosine ** (0.5 * self.cosine_power), self.brightness)
 
 
 @dataclass(frozen=True)
 class ShapeParameters:
-    """The numbers of a shape on the ground.
+    """Parameters of a shape on the ground.
 
     Attributes:
-        kind: Its shape. A wall is a thin box, a point a small sphere. A person stands with hanging
-            arms. A vehicle is a car of usual proportions. A corner is a bright plate that reflects
-            on one side: the way a corner reflector opens. A prism has vertical sides and any
-            outline, see ``PrismParameters``.
-        position: Along the two axes of the ground [m].
-        yaw: About the vertical, of all but round shapes [rad]. If it is 0, a vehicle looks along
-            x; a person and a corner look along −z where y is up, and along y where z is up.
-        length: Along its first axis; the diameter of round shapes [m].
-        width: Along its second axis, of shapes with a yaw and of prisms [m].
-        height: Of the shape, which stands on the ground; a sphere's and a corner's is that of its
-            middle [m].
-        brightness: See ``Matte``.
+        kind: kind of shape. A wall is a thin box, a point a small sphere. A person stands with
+            hanging arms. A vehicle is a car of usual proportions. A corner is a bright plate that
+            reflects on one side, towards the opening of a corner reflector. A prism has vertical
+            sides and any outline, see ``PrismParameters``.
+        position: position along the two axes of the ground [m].
+        yaw: rotation about the vertical, except for round shapes [rad]. At yaw 0, a vehicle faces
+            x; a person and a corner face −z if y is up, and y if z is up.
+        length: size along its first axis; the diameter of round shapes [m].
+        width: size along its second axis, of shapes with a yaw and of prisms [m].
+        height: height of the shape above the ground; for a sphere and a corner that of its centre
+            [m].
+        brightness: see ``Matte``.
     """
 
     kind: ShapeKind
@@ -108,22 +108,22 @@ class ShapeParameters:
 
     @property
     def is_rectangular(self) -> bool:
-        """Whether it fills a rectangle of the ground, with a yaw."""
+        """Whether its footprint is a rectangle with a yaw."""
         return self.kind in _RECTANGULAR_KINDS
 
     @property
     def has_yaw(self) -> bool:
-        """Whether its yaw means something."""
+        """Whether it has a yaw."""
         return self.is_rectangular or self.kind == "corner"
 
     @property
     def has_free_height(self) -> bool:
-        """Whether it need not stand on the ground."""
+        """Whether it may be above the ground."""
         return self.kind in _FREE_HEIGHT_KINDS
 
     @property
     def material(self) -> RoughDielectric | RoughConductor:
-        """The nearest material that a run file can name."""
+        """Nearest library material."""
         if self.brightness > _MAX_DIELECTRIC_REFLECTANCE:
             return RoughConductor()
         root = math.sqrt(max(self.brightness, 1e-6))
@@ -131,7 +131,7 @@ class ShapeParameters:
 
     @property
     def effective_kind(self) -> ShapeKind:
-        """The kind that its numbers speak of."""
+        """Kind according to its parameters."""
         long, short = max(self.length, self.width), min(self.length, self.width)
         if self.kind in ("wall", "box"):
             return "wall" if short < MAX_WALL_THICKNESS and long > 3 * short else "box"
@@ -141,23 +141,23 @@ class ShapeParameters:
 
 
 class UnknownShape(nn.Module):
-    """What all unknown things on the ground share.
+    """Common base of unknown shapes on the ground.
 
-    It brings its object with it: the scene needs none of that name.
+    It adds its object to the scene.
 
     Args:
-        name: Of the object.
-        ground: The plane, and which way is up.
-        level: Height of the ground [m].
-        place: To start with [m].
-        brightness: To start with, see ``Matte``.
+        name: name of the object.
+        ground: ground plane with its upward axis.
+        level: height of the ground [m].
+        position: initial position along the two axes of the ground [m].
+        brightness: initial brightness, see ``Matte``.
 
     Attributes:
-        place: Parameter [2], metres.
-        strength: Parameter, a tenth of the logarithm of the brightness.
+        place: parameter [2], position [m].
+        strength: parameter, a tenth of the logarithm of the brightness.
     """
 
-    # Scaled so that steps of one length suit all parameters.
+    # Scaled so that one learning rate suits all parameters.
     TURN_SCALE, SIZE_SCALE, STRENGTH_SCALE = 2.0, 3.0, 10.0
 
     def __init__(
@@ -176,24 +176,24 @@ class UnknownShape(nn.Module):
 
     @property
     def brightness(self) -> Float64[Tensor, ""]:
-        """See ``Matte``."""
+        """Brightness, see ``Matte``."""
         return (self.STRENGTH_SCALE * self.strength).exp()
 
     def mesh(self) -> Mesh:
-        """The surface in the world, differentiable by all parameters."""
+        """Return the surface in the world, differentiable with respect to all parameters."""
         raise NotImplementedError
 
     @property
     def item(self) -> Object:
-        """The object, differentiable by all parameters."""
+        """Return the object, differentiable with respect to all parameters."""
         return Object(self.mesh(), Matte(self.brightness))
 
     def forward(self, scene: Scene) -> Scene:
-        """The scene with the object in it, in place of one of the same name."""
+        """Return the scene with the object, in place of one of the same name."""
         return Scene({**scene.objects, self.object: self.item})
 
     def position_coordinates(self) -> list[Coordinate]:
-        """The two of its place."""
+        """Return the two coordinates of its position."""
         along = torch.eye(2, dtype=torch.float64)
         return [
             Coordinate(f"{self.object}.{'xyz'[axis]}", "m", {"place": row}, 0.1)
@@ -201,24 +201,24 @@ class UnknownShape(nn.Module):
         ]
 
     def brightness_coordinate(self) -> Coordinate:
-        """That of its brightness."""
+        """Return the coordinate of its brightness."""
         value = float(self.brightness.detach())
         slope = torch.tensor(1 / (self.STRENGTH_SCALE * value), dtype=torch.float64)
         return Coordinate(f"{self.object}.brightness", "", {"strength": slope}, value)
 
 
 class PrimitiveModel(UnknownShape):
-    """One shape on the ground as an unknown: place, turn, size and brightness.
+    """Primitive shape on the ground as an unknown: position, yaw, size and brightness.
 
     Args:
-        name: Of the object.
-        start: Its first numbers.
-        ground: The plane, and which way is up.
-        level: Height of the ground [m].
+        name: name of the object.
+        start: initial shape parameters.
+        ground: ground plane with its upward axis.
+        level: height of the ground [m].
 
     Attributes:
-        turn: Parameter, half the yaw.
-        size: Parameter, thirds of the logarithms of length, width and height; a sphere's last is
+        turn: parameter, half the yaw [rad].
+        size: parameter, thirds of the logarithms of length, width and height; a sphere's last is
             its height in m.
     """
 
@@ -241,13 +241,13 @@ class PrimitiveModel(UnknownShape):
 
     @property
     def sides(self) -> Float64[Tensor, "3"]:
-        """Length, width and height within bounds [m]; the last is none of a sphere's."""
+        """Return length, width and height within bounds [m]; the last is unused for a sphere."""
         low, high = (torch.tensor(v, dtype=torch.float64).log() for v in (self.low, self.high))
         return (self.SIZE_SCALE * self.size).clamp(low, high).exp()
 
     @property
     def shape(self) -> ShapeParameters:
-        """Its present numbers."""
+        """Return its present shape parameters."""
         length, width, height = self.sides.detach().tolist()
         x, y = self.place.detach().tolist()
         if self.round:
@@ -260,7 +260,7 @@ class PrimitiveModel(UnknownShape):
         )
 
     def mesh(self) -> Mesh:
-        """The shape in the world, differentiable by all parameters."""
+        """Return the shape in the world, differentiable with respect to all parameters."""
         unit = _unit_mesh(self.kind, self.ground.up)
         first, second = self.ground.plane_axes
         up = self.ground.up_axis
@@ -277,7 +277,7 @@ class PrimitiveModel(UnknownShape):
         local = unit.vertices * torch.stack(sides)
         yaw = self.TURN_SCALE * self.turn
         c, s = yaw.cos(), yaw.sin()
-        # The turn of ``Ground.turn``: about y it takes z towards x, about z it takes x towards y.
+        # As ``Ground.yaw_rotation``: about y from z to x, about z from x to y.
         sign = self.ground.yaw_sign
         columns = list(local.unbind(-1))
         a, b = columns[first], columns[second]
@@ -286,14 +286,14 @@ class PrimitiveModel(UnknownShape):
 
     @property
     def item(self) -> Object:
-        """The object, differentiable by all parameters."""
+        """Return the object, differentiable with respect to all parameters."""
         if self.kind == "corner":
             lit = self.brightness * _mark_front_triangles(self.ground.up)
             return Object(self.mesh(), Matte(lit, _CORNER_FALLOFF))
         return super().item
 
     def values(self) -> dict[str, Tensor]:
-        """What is fitted by name, in SI units."""
+        """Return the fitted values by name, in SI units."""
         found = self.shape
         numbers = {
             "place": found.position,
@@ -304,7 +304,7 @@ class PrimitiveModel(UnknownShape):
         return {f"{self.object}.{n}": torch.tensor(v) for n, v in numbers.items()}
 
     def coordinates(self) -> list[Coordinate]:
-        """Place, turn, size and brightness, as far as the shape has them."""
+        """Return position, yaw, size and brightness, as far as the shape has them."""
         zero, found = torch.zeros_like(self.size), self.shape
         rows = self.position_coordinates()
         sizes = {"length": (0, found.length), "height": (2, found.height)}
@@ -323,12 +323,12 @@ class PrimitiveModel(UnknownShape):
 
 
 def shape_center(shape: ShapeParameters, ground: Ground, level: float) -> Float64[Tensor, "3"]:
-    """The middle of a shape [m].
+    """Return the centre of a shape [m].
 
     Args:
-        shape: The shape.
-        ground: The plane.
-        level: Height of the ground [m].
+        shape: shape parameters.
+        ground: ground plane.
+        level: height of the ground [m].
     """
     place = torch.zeros(3, dtype=torch.float64)
     place[list(ground.plane_axes)] = torch.tensor(shape.position, dtype=torch.float64)
@@ -338,11 +338,11 @@ def shape_center(shape: ShapeParameters, ground: Ground, level: float) -> Float6
 
 
 def corner_direction(yaw: float, ground: Ground) -> Float64[Tensor, "2"]:
-    """The way along the ground that a corner opens.
+    """Return the direction along the ground in which a corner opens.
 
     Args:
-        yaw: Of the corner [rad].
-        ground: The plane.
+        yaw: yaw of the corner [rad].
+        ground: ground plane.
     """
     c, s = math.cos(ground.yaw_sign * yaw), math.sin(ground.yaw_sign * yaw)
     ahead = -1.0 if ground.up == "y" else 1.0
@@ -350,12 +350,12 @@ def corner_direction(yaw: float, ground: Ground) -> Float64[Tensor, "2"]:
 
 
 def rotate_shape(shape: ShapeParameters, rotation: float, ground: Ground) -> ShapeParameters:
-    """A shape that looks another way: turned about the mean of its surface, not about its middle.
+    """Rotate a shape about the mean of its surface, not about its centre.
 
     Args:
-        shape: The shape.
-        rotation: By which its yaw grows [rad].
-        ground: The plane.
+        shape: shape parameters.
+        rotation: increase of its yaw [rad].
+        ground: ground plane.
     """
     unit = _unit_mesh(shape.kind, ground.up).vertices.mean(0)[list(ground.plane_axes)]
     x, y = (unit * torch.tensor([shape.length, shape.width], dtype=torch.float64)).tolist()
@@ -370,7 +370,7 @@ def rotate_shape(shape: ShapeParameters, rotation: float, ground: Ground) -> Sha
 
 @cache
 def _unit_mesh(kind: str, up: str) -> Mesh:
-    """A shape of size one about the origin."""
+    """Return the mesh of a shape of unit size about the origin."""
     if kind in ("wall", "box"):
         return box(1.0)
     if kind in ("sphere", "point"):
@@ -378,7 +378,7 @@ def _unit_mesh(kind: str, up: str) -> Mesh:
     upright = {"person": _person_mesh, "vehicle": _vehicle_mesh, "corner": _corner_mesh}.get(
         kind, _cylinder_mesh
     )()
-    # About x by a quarter turn: y to z.
+    # Quarter rotation about x: y to z.
     return upright if up == "y" else Mesh(upright.vertices @ _Y_TO_Z_ROTATION, upright.faces)
 
 
@@ -390,7 +390,7 @@ def _cylinder_mesh() -> Mesh:
 
 
 def _person_mesh() -> Mesh:
-    """A person with hanging arms who looks along −z, stretched to a cube."""
+    """Return a person with hanging arms facing −z, stretched to a cube."""
     body = person(spacing=0.05)
     turns = torch.eye(3, dtype=torch.float64).repeat(len(body.names), 1, 1)
     for side in ("left", "right"):
@@ -401,7 +401,7 @@ def _person_mesh() -> Mesh:
 
 
 def _vehicle_mesh() -> Mesh:
-    """A car that looks along x: octagons above each other, between them its skin."""
+    """Return a car facing x: stacked octagonal layers joined by a skin."""
     sides = 8
     rings = torch.tensor(
         [_vehicle_layer(*layer) for layer in _VEHICLE_LAYERS], dtype=torch.float64
@@ -429,7 +429,7 @@ _VEHICLE_LAYERS = (
 
 
 def _vehicle_layer(high: float, rear: float, front: float, wide: float) -> list[list[float]]:
-    """Corners of one layer of a car: a rectangle whose corners are cut off."""
+    """Return the corners of one layer of a car: a rectangle with cut corners."""
     cut, aside = 0.07, 0.3 * wide
     rows = [(front, aside), (front - cut, 0.5 * wide), (rear + cut, 0.5 * wide), (rear, aside)]
     rows += [(x, -z) for x, z in reversed(rows)]
@@ -437,13 +437,13 @@ def _vehicle_layer(high: float, rear: float, front: float, wide: float) -> list[
 
 
 def _corner_mesh() -> Mesh:
-    """A plate that faces −z."""
+    """Return a plate that faces −z."""
     return box((1.0, 1.0, 0.1))
 
 
 @cache
 def _mark_front_triangles(up: str) -> Float64[Tensor, " triangle"]:
-    """1 for the triangles of a corner's plate that face the way it opens, else 0."""
+    """Return 1 for triangles of a corner's plate on its open side, else 0."""
     mesh = _unit_mesh("corner", up)
     ahead = mesh.vertices[:, 2] < 0 if up == "y" else mesh.vertices[:, 1] > 0
     return ahead[mesh.faces].all(1).double()

@@ -1,4 +1,4 @@
-"""Things whose outline on the ground is free: what no simple shape explains."""
+"""Prisms with a free outline on the ground."""
 
 import math
 from collections.abc import Sequence
@@ -15,19 +15,19 @@ from invertwin.scene import DistanceGrid, Mesh, iso_surface, signed_distance
 from invertwin.scene.parameters import Coordinate
 from invertwin.scene.shape_models.lattice import Lattice
 
-_SMOOTHING = 20.0  # of signed distances, see ``DistanceGrid``
-_MARGIN_NODES = 6  # nodes around what a prism starts from
-_MAX_NODES = 60  # along a side, at most
+_SMOOTHING = 20.0  # smoothing of signed distances, see ``DistanceGrid``
+_MARGIN_NODES = 6  # nodes around the initial outline
+_MAX_NODES = 60  # maximum number of nodes along a side
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PrismParameters(ShapeParameters):
-    """A thing with vertical sides, of any outline. It has no yaw.
+    """Shape with vertical sides and any outline, without a yaw.
 
     Attributes:
-        distances: Signed distances to the outline at nodes on the ground, negative inside [m].
-        spacing: Between nodes [m].
-        middle: Of the nodes, along the two axes of the ground [m].
+        distances: signed distances to the outline at nodes on the ground, negative inside [m].
+        spacing: node spacing [m].
+        middle: centre of the nodes along the two axes of the ground [m].
     """
 
     distances: Float64[Tensor, "a b"]
@@ -38,13 +38,13 @@ class PrismParameters(ShapeParameters):
 def merge_into_prism(
     shapes: Sequence[ShapeParameters], ground: Ground, level: float, spacing: float
 ) -> PrismParameters:
-    """One prism in place of some shapes: their union, of the largest one's height.
+    """Merge shapes into one prism: their union, with the height of the largest.
 
     Args:
-        shapes: The shapes.
-        ground: The plane.
-        level: Height of the ground [m].
-        spacing: Between nodes at least [m].
+        shapes: shapes to merge.
+        ground: ground plane.
+        level: height of the ground [m].
+        spacing: minimum node spacing [m].
     """
     up, axes = ground.up_axis, list(ground.plane_axes)
     with torch.no_grad():
@@ -79,18 +79,18 @@ def merge_into_prism(
 
 
 class OutlineModel(UnknownShape):
-    """A prism as an unknown: its outline, place, height and brightness.
+    """Prism as an unknown: outline, position, height and brightness.
 
     Args:
-        name: Of the object.
-        start: Its first numbers.
-        ground: The plane, and which way is up.
-        level: Height of the ground [m].
+        name: name of the object.
+        start: initial shape parameters.
+        ground: ground plane with its upward axis.
+        level: height of the ground [m].
 
     Attributes:
-        sides: Signed distances to the outline.
-        place: Parameter [2], middle of their nodes [m].
-        size: Parameter, a third of the logarithm of the height.
+        sides: signed distances to the outline.
+        place: parameter [2], centre of their nodes [m].
+        size: parameter, a third of the logarithm of the height.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class OutlineModel(UnknownShape):
         counts = torch.tensor(start.distances.shape, dtype=torch.float64)
         half = torch.ones(3, dtype=torch.float64)
         half[list(ground.plane_axes)] = 0.5 * start.spacing * (counts - 1)
-        # The same at two heights; half way between them both count alike, so that they stay alike.
+        # Equal distances at two heights keep the sides vertical.
         same = torch.stack([start.distances] * 2, dim=ground.up_axis)
         self.sides = DistanceGrid(name, (-half).tolist(), half.tolist(), same, _SMOOTHING)
         size = math.log(start.height) / self.SIZE_SCALE
@@ -109,12 +109,12 @@ class OutlineModel(UnknownShape):
 
     @property
     def height(self) -> Float64[Tensor, ""]:
-        """Of the prism [m]."""
+        """Height of the prism [m]."""
         return (self.SIZE_SCALE * self.size).exp()
 
     @property
     def shape(self) -> PrismParameters:
-        """Its present numbers."""
+        """Return its present shape parameters."""
         with torch.no_grad():
             sides = self.mesh().vertices[:, list(self.ground.plane_axes)]
             low, high = sides.amin(0), sides.amax(0)
@@ -134,7 +134,7 @@ class OutlineModel(UnknownShape):
         )
 
     def mesh(self) -> Mesh:
-        """The surface in the world, differentiable by all parameters."""
+        """Return the surface in the world, differentiable with respect to all parameters."""
         up, grid = self.ground.up_axis, self.sides.lattice
         low, high, counts = grid.low.clone(), grid.high.clone(), list(grid.counts)
         place = torch.zeros(3, dtype=torch.float64)
@@ -155,12 +155,12 @@ class OutlineModel(UnknownShape):
         return iso_surface(signed_distance_field, Lattice.from_bounds(at + low, at + high, counts))
 
     def values(self) -> dict[str, Tensor]:
-        """What is fitted by name, in SI units."""
+        """Return the fitted values by name, in SI units."""
         found = {"place": self.place, "height": self.height, "brightness": self.brightness}
         return {f"{self.object}.{name}": value.detach().clone() for name, value in found.items()}
 
     def coordinates(self) -> list[Coordinate]:
-        """Place, height and brightness; the outline moves as a whole."""
+        """Return position, height and brightness; the outline moves as a whole."""
         height = float(self.height.detach())
         slope = torch.tensor(1 / (self.SIZE_SCALE * height), dtype=torch.float64)
         tall = Coordinate(f"{self.object}.height", "m", {"size": slope}, 0.1)
@@ -170,13 +170,13 @@ class OutlineModel(UnknownShape):
 def make_shape_model(
     name: str, shape: ShapeParameters, ground: Ground, level: float
 ) -> PrimitiveModel | OutlineModel:
-    """A shape as an unknown.
+    """Build the module of an unknown shape.
 
     Args:
-        name: Of the object.
-        shape: Its first numbers.
-        ground: The plane.
-        level: Height of the ground [m].
+        name: name of the object.
+        shape: initial shape parameters.
+        ground: ground plane.
+        level: height of the ground [m].
     """
     if isinstance(shape, PrismParameters):
         return OutlineModel(name, shape, ground, level)
@@ -184,10 +184,10 @@ def make_shape_model(
 
 
 def prism_contour(prism: PrismParameters) -> Float64[Tensor, "corner 2"]:
-    """The longest closed line of a prism's outline on the ground [m].
+    """Return the longest closed contour of a prism's outline on the ground [m].
 
     Args:
-        prism: The prism.
+        prism: prism parameters.
     """
     lines = find_contours(prism.distances.numpy(), 0.0)
     longest = torch.from_numpy(max(lines, key=len)[:-1].copy())

@@ -26,10 +26,7 @@ _SYMMETRY_ORDERS = 4, 3  # rotational symmetries in the order of testing
 _SIMILAR_DISTANCE, _EQUAL_DISTANCE = 0.07, 0.002  # surface distances relative to the diagonal
 _CLEAR_ZSCORE = 5.0  # standard deviations of a loss: a larger difference needs no realisations
 _SURFACE_POINT_COUNT = 1_000  # points on each surface
-_REFIT_STEPS, _REFIT_TRUST_RADIUS = (
-    6,
-    0.1,
-)  # Gauss–Newton steps from a rotated pose
+_REFIT_STEPS, _REFIT_TRUST_RADIUS = 6, 0.1  # Gauss–Newton from a rotated pose
 _REFIT_BLUR = 0.4  # initial fraction of the blur
 
 
