@@ -116,7 +116,7 @@ def test_what_is_likelier_something_else_becomes_that(monkeypatch):
 @pytest.mark.slow
 def test_the_inside_of_a_box_is_never_seen(room: Twin):
     assert room.image is not None
-    inside = (room.image.places - torch.tensor([-0.35, 0.2])).norm(dim=1) < 0.1
+    inside = (room.image.positions - torch.tensor([-0.35, 0.2])).norm(dim=1) < 0.1
     assert int(inside.sum()) > 5
     assert int(room.image.view_counts[inside].max()) == 0
     assert int(room.image.view_counts.max()) > 4

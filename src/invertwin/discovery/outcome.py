@@ -104,9 +104,9 @@ class GroundImage:
         view_counts: number of radar positions that see each position; zero is "never seen".
     """
 
-    places: Float64[Tensor, "place 2"]
-    strength: Float64[Tensor, " place"]
-    view_counts: Int64[Tensor, " place"]
+    positions: Float64[Tensor, "point 2"]
+    strength: Float64[Tensor, " point"]
+    view_counts: Int64[Tensor, " point"]
 
 
 @dataclass(frozen=True, eq=False)

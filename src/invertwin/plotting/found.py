@@ -22,8 +22,8 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
     axes = figure.subplots()
     names = [f"{'xyz'[axis]} [m]" for axis in twin.ground.plane_axes]
     axes.set(xlabel=names[0], ylabel=names[1], aspect="equal", facecolor="black")
-    if twin.image is not None and len(twin.image.places):
-        places, strength = numbers(twin.image.places), numbers(twin.image.strength)
+    if twin.image is not None and len(twin.image.positions):
+        places, strength = numbers(twin.image.positions), numbers(twin.image.strength)
         # A single glint would leave all else dark.
         top = max(float(np.quantile(strength, 0.998)), 1e-300)
         level = np.clip(10 * np.log10(np.maximum(strength, 1e-30) / top), -dynamic_range, 0)

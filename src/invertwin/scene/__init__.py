@@ -1,4 +1,4 @@
-"""Scenes as plain torch values: meshes, materials, antennas, and what can be fitted in them."""
+"""Scenes as torch values: meshes, materials, antennas, and fitted parameters."""
 
 from invertwin.scene.antenna import AntennaArray as AntennaArray
 from invertwin.scene.antenna import Cosine as Cosine

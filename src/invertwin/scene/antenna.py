@@ -32,14 +32,16 @@ class Pattern(ABC):
 
     @abstractmethod
     def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Linear power gain towards unit vectors in the radar frame, differentiable by torch."""
+        """Return the linear power gain towards unit vectors in the radar frame, differentiable by
+        torch.
+        """
 
     @abstractmethod
     def table(self) -> Float64[Tensor, "n_cos n_phi"]:
-        """The gain on a grid: cosθ = linspace(−1, 1, n_cos), φ = −π + 2π i/n_phi, periodic.
+        """Return the gain on a grid: cosθ = linspace(−1, 1, n_cos), φ = −π + 2π i/n_phi, periodic.
 
-        Bilinear interpolation of it is the gain that ray kernels see. One row or column means that
-        the gain does not depend on that angle.
+        Ray kernels interpolate it bilinearly. A single row or column means that the gain does not
+        depend on that angle.
         """
 
 
@@ -48,11 +50,11 @@ class Isotropic(Pattern):
     """Gain 1 in every direction."""
 
     def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Linear power gain: 1."""
+        """Return the linear power gain, 1."""
         return torch.ones_like(direction[..., 0])
 
     def table(self) -> Float64[Tensor, "1 1"]:
-        """One node."""
+        """Return a single node."""
         return torch.ones(1, 1, dtype=torch.float64)
 
 
@@ -60,10 +62,10 @@ class Isotropic(Pattern):
 class Cosine(Pattern):
     """Gain 2(n+1) cosⁿθ in front of the antenna and 0 behind it; its integral is 4π.
 
-    The table departs from it by at most 1.2e-7 n(n−1) of the peak gain for n ≥ 1.
+    The table deviates from it by at most 1.2e-7 n(n−1) of the peak gain for n ≥ 1.
 
     Attributes:
-        exponent: n ≥ 0 of the power pattern.
+        exponent: exponent n ≥ 0 of the power pattern.
 
     Raises:
         InputError: a negative exponent.
@@ -75,18 +77,18 @@ class Cosine(Pattern):
         checked_number(self.exponent, "pattern exponent", 0.0)
 
     def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Linear power gain."""
+        """Return the linear power gain."""
         return self._gain_of_cosine(direction[..., 2])
 
     def table(self) -> Float64[Tensor, "2049 1"]:
-        """The gain over cosθ."""
+        """Return the gain over cosθ."""
         return self._gain_of_cosine(torch.linspace(-1, 1, COSINE_COUNT, dtype=torch.float64))[
             :, None
         ]
 
     def _gain_of_cosine(self, cosine: Tensor) -> Tensor:
         front = cosine > 0
-        # The power of a replaced value, since the gradient of 0ⁿ is infinite for n < 1.
+        # Replace zeros first, since the gradient of 0ⁿ is infinite for n < 1.
         power = torch.where(front, cosine, 1.0) ** self.exponent
         return torch.where(front, 2 * (self.exponent + 1) * power, 0.0)
 
@@ -96,8 +98,8 @@ class TabulatedPattern(Pattern):
     """A measured or simulated pattern.
 
     It is resampled once, linearly in the given angles, onto the grid of `table`; `gain`
-    interpolates that grid, so that torch and the ray kernels see one and the same pattern. The
-    grid's step in cosθ, 1/1024, is 2.5° at boresight and finer elsewhere.
+    interpolates that grid, so that torch and the ray kernels use the same pattern. The grid's step
+    in cosθ, 1/1024, is 2.5° at boresight and finer elsewhere.
 
     Attributes:
         theta: n ≥ 2 ascending angles to z [rad], from 0 to at most π; the gain beyond is 0.
@@ -141,11 +143,11 @@ class TabulatedPattern(Pattern):
         gain_db: Sequence[Sequence[float]],
         phi: Annotated[Sequence[float], MinLen(1), RADIANS] = (0.0,),
     ) -> "TabulatedPattern":
-        """A measured power pattern in decibels.
+        """Build a pattern from a measured power gain in decibels.
 
         Args:
             theta: angles to boresight, from 0 on [rad].
-            gain_db: one row per theta, one column per phi.
+            gain_db: power gain [dB], one row per theta, one column per phi.
             phi: angles about boresight [rad]; a single one means symmetric about boresight.
 
         Raises:
@@ -164,14 +166,14 @@ class TabulatedPattern(Pattern):
         return cls(angles, around, 10 ** (levels / 10))
 
     def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Linear power gain, bilinear between the nodes of `table`."""
+        """Return the linear power gain, bilinear between the nodes of `table`."""
         grid = self._grid.to(direction)
         x, y, z = direction.unbind(-1)
         height = (z.clamp(-1, 1) + 1) / 2 * (COSINE_COUNT - 1)
         row = height.detach().to(torch.int64).clamp(max=COSINE_COUNT - 2)
         up = height - row
         count = grid.shape[1]
-        # atan2 has no gradient on the axis itself; any φ serves there.
+        # atan2 has no gradient on the axis; φ is arbitrary there.
         on_axis = (x == 0) & (y == 0)
         azimuth = torch.atan2(y, torch.where(on_axis, 1.0, x))
         turn = (azimuth + torch.pi) / (2 * torch.pi) * count
@@ -183,22 +185,22 @@ class TabulatedPattern(Pattern):
         return torch.lerp(low, high, up)
 
     def table(self) -> Float64[Tensor, "2049 n_phi"]:
-        """The resampled gain."""
+        """Return the resampled gain."""
         return self._grid
 
 
 @dataclass(frozen=True, eq=False)
 class AntennaArray:
-    """Elements of one pattern at fixed positions.
+    """Antenna elements of one pattern at fixed positions.
 
     Attributes:
         positions: element positions in the radar frame [m].
         pattern: gain of every element.
         polarisation: "V", "H", "circular" (right-hand) or a Jones vector (V, H) of all elements or
-            of each. V lies in the plane of the direction and the radar's y axis, H across it. In
-            Python also a `JonesTable` over direction.
-        leakage: field of the orthogonal polarisation over that of the wanted one, of all elements
-            or of each. The gain holds both.
+            of each. V lies in the plane of the direction and the radar's y axis, H perpendicular to
+            it. In Python also a `JonesTable` over direction.
+        leakage: field of the orthogonal polarisation over that of the nominal one, of all elements
+            or of each. The gain includes both.
 
     Raises:
         InputError: no elements, wrong shape, NaN, positions that require grad, a pattern of
@@ -239,7 +241,7 @@ def linear_array(
     polarisation: Polarised = "V",
     leakage: float | ArrayLike = 0.0,
 ) -> AntennaArray:
-    """Elements in a row, centred at the origin of the radar frame.
+    """Build a row of elements, centred at the origin of the radar frame.
 
     Args:
         count: number of elements.
@@ -247,7 +249,7 @@ def linear_array(
         axis: direction of the row.
         pattern: gain of every element, isotropic by default.
         polarisation: "V", "H", "circular" or a Jones vector (V, H), see `AntennaArray`.
-        leakage: field of the orthogonal polarisation over that of the wanted one.
+        leakage: field of the orthogonal polarisation over that of the nominal one.
 
     Raises:
         InputError: no elements, a spacing that is not positive, or another axis.
@@ -265,14 +267,14 @@ def planar_array(
     polarisation: Polarised = "V",
     leakage: float | ArrayLike = 0.0,
 ) -> AntennaArray:
-    """Elements on a grid, centred at the origin of the radar frame; y runs fastest.
+    """Build a grid of elements, centred at the origin of the radar frame; y runs fastest.
 
     Args:
         count: elements along x, y.
         spacing: distance between neighbours along x, y [m].
         pattern: gain of every element, isotropic by default.
         polarisation: "V", "H", "circular" or a Jones vector (V, H), see `AntennaArray`.
-        leakage: field of the orthogonal polarisation over that of the wanted one.
+        leakage: field of the orthogonal polarisation over that of the nominal one.
 
     Raises:
         InputError: no elements, or a spacing that is not positive.
@@ -316,7 +318,7 @@ def _resample_gains(theta: Tensor, phi: Tensor, gains: Tensor) -> Tensor:
     cosine = np.linspace(-1, 1, COSINE_COUNT)
     given = gains.detach().numpy()
     if len(phi) > 1:
-        # A multiple of the given number, so that evenly spaced angles stay nodes.
+        # A multiple of the given number keeps evenly spaced angles as nodes.
         count = len(phi) * -(-360 // len(phi))
         around = -np.pi + 2 * np.pi * np.arange(count) / count
         known = phi.detach().numpy()

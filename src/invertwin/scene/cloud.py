@@ -1,4 +1,4 @@
-"""Clouds of soft point scatterers in a box, for objects whose surface is not known."""
+"""Clouds of point scatterers in a box, for objects with an unknown surface."""
 
 from dataclasses import dataclass
 
@@ -12,21 +12,21 @@ from invertwin.scene.shape_models.lattice import Lattice
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Point scatterers in a box. They dim the power that passes and scatter some of it back.
+    """Volume of point scatterers in a box, which attenuate and scatter power.
 
-    The density is the extinction σ: what passes a way s of it is exp(−∫σ ds) of the power. Each
-    volume dV scatters alike in all directions, with a radar cross section of albedo · σ dV.
-    Between the nodes the density is trilinear; outside of the box there is nothing.
+    The density is the extinction σ: the transmittance of a path of length s is exp(−∫σ ds). Each
+    volume dV scatters isotropically, with a radar cross section of albedo · σ dV. The density is
+    trilinear between the nodes and zero outside the box.
 
-    A half space of constant density returns albedo/(4π) · cosθ cosθ′/(cosθ + cosθ′) of what meets
-    it (Lommel–Seeliger): face on that is a diffuse surface of reflectance albedo/8, and thin
-    clouds, ∫σ ds ≪ 1, are linear in their density.
+    A half space of constant density scatters albedo/(4π) · cosθ cosθ′/(cosθ + cosθ′) of the
+    incident power (Lommel–Seeliger): at normal incidence a diffuse surface of reflectance albedo/8.
+    Thin clouds, ∫σ ds ≪ 1, are linear in their density.
 
     Attributes:
         low, high: corners of the box in the object's frame [m]; the outer nodes lie on its faces.
         density: extinction at the nodes [1/m], at least two along each axis; may carry gradients.
-        albedo: fraction of the extinction that is scattered, times a gain where it is above one; a
-            number, or a tensor without dimensions.
+        albedo: scattered fraction of the extinction, times a gain where it exceeds one; a number,
+            or a tensor without dimensions.
 
     Raises:
         InputError: wrong shapes, NaN, a negative value, or a box without volume.

@@ -1,4 +1,4 @@
-"""Read meshes and scene geometry from files, and write meshes to files."""
+"""Read meshes and scene geometry from files, and write them."""
 
 import math
 import warnings
@@ -32,26 +32,26 @@ from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, existing_file, safe_reader
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".inp")
-_CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # of shell elements, by the digit in their type
+_CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # corners of shell elements by the digit in their type
 Unit = Literal["m", "cm", "mm", "um", "in", "ft"]
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
-_LARGE = 100.0  # m
+_LARGE = 100.0  # size of a suspicious mesh [m]
 CONCRETE = RoughDielectric(permittivity=5.24)
 """Stands in for the materials of a scene file that nobody names (ITU-R P.2040 concrete)."""
 
 
 def load_mesh(file: str | Path, unit: Unit = "m") -> Mesh:
-    """A triangle mesh from a file; `Mesh.summary` says what came.
+    """Load a triangle mesh from a file; `Mesh.summary` describes it.
 
-    Vertices at equal positions are merged, vertices of no triangle are left out, the rest keep
-    their order. All parts of the file become one mesh (`load_parts` keeps them apart); axes are
-    taken as they are. A mesh of more than 100 m gets a warning: it may be in millimetres.
-    Of an Abaqus file (.inp) shell elements are read by their corners, in the coordinates in which
-    they are defined; quadrilaterals are split.
+    Vertices at equal positions are merged, unused vertices are dropped, the rest keep their order.
+    All parts of the file become one mesh (`load_parts` separates them); axes are kept. A mesh
+    larger than 100 m causes a warning, since it may be in millimetres. From an Abaqus file (.inp)
+    the corners of shell elements are read, in the coordinates of their definition; quadrilaterals
+    are split.
 
     Args:
-        file: OBJ, PLY, STL, glTF or Abaqus; its suffix tells the format.
-        unit: of the file's numbers
+        file: path of an OBJ, PLY, STL, glTF or Abaqus file; the suffix determines the format.
+        unit: length unit of the file
 
     Raises:
         InputError: no such file, another format, a broken file, no triangles, NaN, or another
@@ -61,20 +61,20 @@ def load_mesh(file: str | Path, unit: Unit = "m") -> Mesh:
 
 
 def load_parts(file: str | Path, unit: Unit = "m") -> dict[str, Mesh]:
-    """The parts of an OBJ, PLY, STL or glTF file, one for each name and material.
+    """Load the parts of an OBJ, PLY, STL or glTF file, one for each name and material.
 
-    Their names are those of the file, of its objects or, as in OBJ, of its materials; a further
-    part of the same name has a number. All are in the frame of the file.
+    Names are those of the file, of its objects or, in OBJ, of its materials; duplicates are
+    numbered. All parts are in the frame of the file.
 
     Args:
-        file: OBJ, PLY, STL or glTF; its suffix tells the format.
-        unit: of the file's numbers
+        file: path of an OBJ, PLY, STL or glTF file; the suffix determines the format.
+        unit: length unit of the file
 
     Raises:
-        InputError: what `load_mesh` refuses.
+        InputError: as `load_mesh`.
     """
 
-    whole = Path(file).name  # how nodes without a name of their own are called
+    whole = Path(file).name  # name of unnamed nodes
 
     def split_parts(scene: trimesh.Scene) -> dict[str, trimesh.Trimesh]:
         found: dict[str, trimesh.Trimesh] = {}
@@ -83,7 +83,7 @@ def load_parts(file: str | Path, unit: Unit = "m") -> dict[str, Mesh]:
             mesh = scene.geometry[name].copy()
             if isinstance(mesh, trimesh.Trimesh):
                 mesh.apply_transform(transform)
-                # In glTF a node has a name, and every part of it a material.
+                # In glTF a node has a name, and each of its parts a material.
                 material = getattr(getattr(mesh.visual, "material", None), "name", None)
                 named = "" if str(node).startswith(whole) else str(node)
                 label = ", ".join(dict.fromkeys(filter(None, (named, material)))) or str(node)
@@ -111,7 +111,7 @@ def _load_with(
             faces = np.asarray(part.faces, dtype=np.int64).reshape(-1, 3)
             found[name] = vertices * _METRES[unit], faces
     try:
-        # The first check sees the file as it is: merging would hide what is wrong with it.
+        # Check the raw file first: merging would hide its defects.
         for vertices, faces in found.values():
             Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
         meshes = {name: _merge_vertices(*part) for name, part in found.items()}
@@ -130,16 +130,16 @@ def _load_with(
 
 
 def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
-    """Write a mesh, or all objects of a scene, as PLY in float64 or as GLB in float32.
+    """Write a mesh, or all objects of a scene, as PLY (float64) or GLB (float32).
 
-    A GLB file keeps the objects apart, by name, and their materials: by the name of their class,
-    metallic or not. Scenes of Blender and other programs have both after an import.
+    A GLB file has the objects by name, and their materials by class name, metallic or not, which
+    Blender and other programs import.
 
-    The file appears complete or not at all: a failure leaves an existing one as it was.
+    The write is atomic: a failure leaves an existing file unchanged.
 
     Args:
-        path: the file, ending in .ply or .glb, in an existing folder.
-        shape: what to write.
+        path: output file, ending in .ply or .glb, in an existing folder.
+        shape: mesh or scene to write.
 
     Raises:
         InputError: another suffix, or no such folder.
@@ -174,16 +174,16 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
 def load_scene_xml(
     path: str | Path, materials: Mapping[str, Material] | None = None, default: Material = CONCRETE
 ) -> Scene:
-    """Read the geometry of a Mitsuba or Sionna scene file.
+    """Load the geometry of a Mitsuba or Sionna scene file.
 
     Shapes of type obj, ply, rectangle, cube and sphere become objects in world coordinates, named
     by their id (or their type and number). The radio materials of Sionna RT become sheets (`Slab`);
     sensors, emitters and appearance are ignored.
 
     Args:
-        path: the XML file; the mesh files it names are relative to it.
-        materials: material for each material id the shapes refer to, e.g. "mat-itu_concrete";
-            these take precedence over what the file states.
+        path: XML file; its mesh files are relative to it.
+        materials: material for each material id of the shapes, e.g. "mat-itu_concrete"; overrides
+            the file.
         default: material of all other shapes.
 
     Raises:
@@ -200,18 +200,18 @@ def load_scene_xml(
 
 
 def save_scene_xml(path: str | Path, scene: Scene) -> None:
-    """Write a scene for Sionna RT: an XML file, and a PLY mesh for each object beside it.
+    """Write a scene for Sionna RT: an XML file, and a PLY mesh for each object.
 
-    Meshes go into the folder `meshes` where the file is. Materials are `Slab` or
-    `PerfectConductor`; velocities are left out.
+    Meshes are written to the folder `meshes` beside the file. Materials must be `Slab` or
+    `PerfectConductor`; velocities are not stored.
 
     Args:
-        path: the file, ending in .xml, in an existing folder.
-        scene: what to write.
+        path: output file, ending in .xml, in an existing folder.
+        scene: scene to write.
 
     Raises:
-        InputError: another suffix, no such folder, or a material that Sionna RT does not have.
-        OSError: the file system refuses the write.
+        InputError: another suffix, no such folder, or a material without counterpart in Sionna RT.
+        OSError: the write fails.
     """
     file = Path(path)
     if file.suffix.lower() != ".xml":
@@ -247,7 +247,7 @@ def _load_trimesh_scene(path: Path) -> trimesh.Scene:
 
 
 def _abaqus(text: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of the nodes and shell elements of an Abaqus file."""
+    """Parse vertices and triangles of the shell elements of an Abaqus file."""
     nodes: dict[str, int] = {}
     places: list[list[float]] = []
     faces: list[list[int]] = []
@@ -258,7 +258,7 @@ def _abaqus(text: str) -> tuple[np.ndarray, np.ndarray]:
         if line.startswith("*"):
             keyword, *options = line[1:].upper().replace(" ", "").split(",")
             if keyword == "PART":
-                nodes = {}  # every part numbers its own
+                nodes = {}  # node numbers are local to a part
             kind = next((o[5:] for o in options if o.startswith("TYPE=")), "")
             corners, words = _count_corners(kind) if keyword == "ELEMENT" else 0, []
         elif keyword == "NODE":
@@ -268,7 +268,7 @@ def _abaqus(text: str) -> tuple[np.ndarray, np.ndarray]:
         elif keyword == "ELEMENT":
             words += [word.strip() for word in line.split(",") if word.strip()]
             if line.rstrip().endswith(","):
-                continue  # the element goes on
+                continue  # the element continues on the next line
             used = [nodes[word] for word in words[1 : 1 + corners]]
             faces += [[used[0], used[k], used[k + 1]] for k in range(1, len(used) - 1)]
             words = []
@@ -278,7 +278,9 @@ def _abaqus(text: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _count_corners(kind: str) -> int:
-    """Corners of an element type such as S3, STRI65, S4R, R3D3; 0 of other than shells."""
+    """Return the number of corners of an element type such as S3, STRI65, S4R, R3D3; 0 for
+    non-shells.
+    """
     if not kind.startswith(("S", "R3D", "M3D", "CPS", "CPE", "DS", "SFM3D")):
         raise ValueError(f"elements of type {kind}, no shells")
     digits = [c for c in kind.replace("R3D", "").replace("M3D", "") if c.isdigit()]
@@ -287,7 +289,7 @@ def _count_corners(kind: str) -> int:
 
 def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     used = np.unique(faces)
-    # Adding zero turns −0 into 0, which is the same place.
+    # Adding zero turns −0 into 0, the same position.
     _, first, group = np.unique(
         vertices[used] + 0.0, axis=0, return_index=True, return_inverse=True
     )
@@ -300,7 +302,7 @@ def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
 
 
 def _viewer_material(material: Material | None) -> PBRMaterial:
-    """What a viewer shows of a material: its name, and whether it is a metal."""
+    """Return the viewer's name of a material, and whether it is a metal."""
     metal = isinstance(material, PerfectConductor | RoughConductor)
     return PBRMaterial(
         name=type(material).__name__,
@@ -312,7 +314,7 @@ def _viewer_material(material: Material | None) -> PBRMaterial:
 
 
 def _ply(mesh: trimesh.Trimesh) -> bytes:
-    """PLY with all bits of the vertices, of which trimesh writes half."""
+    """Encode PLY in float64; trimesh writes float32."""
     vertices = np.asarray(mesh.vertices, dtype="<f8")
     faces = np.empty(len(mesh.faces), dtype=[("count", "<u1"), ("index", "<i4", 3)])
     faces["count"] = 3
@@ -415,7 +417,7 @@ def _center(shape: ElementTree.Element) -> Tensor:
 
 
 def _to_world(shape: ElementTree.Element) -> Tensor:
-    """The shape's transform: its steps act in the order written."""
+    """Return the transform of a shape; its steps apply in document order."""
     transform = torch.eye(4, dtype=torch.float64)
     for element in shape.findall("transform[@name='to_world']/*"):
         step = checked_tensor(_step(element), (4, 4), element.tag, "correct the scene file")
@@ -424,7 +426,7 @@ def _to_world(shape: ElementTree.Element) -> Tensor:
 
 
 def _step(element: ElementTree.Element) -> np.ndarray:
-    """The matrix of one step of a transform."""
+    """Return the matrix of one step of a transform."""
     if element.tag == "translate":
         return transformations.translation_matrix(_vector(element, 0.0))
     if element.tag == "scale":
@@ -447,7 +449,7 @@ def _step(element: ElementTree.Element) -> np.ndarray:
 
 
 def _vector(element: ElementTree.Element, missing: float) -> np.ndarray:
-    """Three numbers: from `value` (one stands for all three), or from x, y and z."""
+    """Parse three numbers from `value` (one is repeated), or from x, y and z."""
     if "value" in element.attrib:
         values = _numbers(element.attrib["value"], 1, 3)
         values = values * 3 if len(values) == 1 else values

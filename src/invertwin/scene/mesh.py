@@ -1,4 +1,4 @@
-"""Triangle meshes as plain tensors."""
+"""Triangle meshes as tensors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,13 +15,13 @@ from invertwin.errors import InputError
 
 @dataclass(frozen=True)
 class MeshSummary:
-    """What one wants to know of a mesh that one has loaded.
+    """Size and topology of a mesh.
 
     Attributes:
         extent: size of the bounding box along x, y and z [m].
-        triangles: their number.
-        open_edges: edges of one triangle only; a closed mesh has none.
-        nonmanifold_edges: edges of more than two triangles.
+        triangles: number of triangles.
+        open_edges: number of edges with one triangle; zero for a closed mesh.
+        nonmanifold_edges: number of edges with more than two triangles.
     """
 
     extent: tuple[float, float, float]
@@ -41,15 +41,15 @@ class MeshSummary:
 class Mesh:
     """A triangle mesh; its normals are (v1 − v0) × (v2 − v0).
 
-    Open and non-manifold meshes and triangles without area are accepted: the former have edges
-    with one or many faces, the latter never reflect anything. Arrays and lists are converted.
+    Open and non-manifold meshes are accepted, and so are degenerate triangles, which reflect
+    nothing. Arrays and lists are converted.
 
     Attributes:
-        vertices: positions in the object's frame [m]; may carry gradients.
-        faces: vertex indices of every triangle.
+        vertices: positions [v, 3] in the object's frame [m]; may carry gradients.
+        faces: vertex indices of every triangle [f, 3].
 
     Raises:
-        InputError: wrong shapes, NaN, nothing in it, or an index that points to no vertex.
+        InputError: wrong shapes, NaN, an empty mesh, or an index out of range.
     """
 
     vertices: Float64[Tensor, "v 3"]
@@ -63,7 +63,7 @@ class Mesh:
         object.__setattr__(self, "faces", checked_faces(self.faces, len(vertices)))
 
     def summary(self) -> "MeshSummary":
-        """Its size, and whether it is closed."""
+        """Return its size and topology."""
         places, faces = self.vertices.detach(), self.faces
         pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
         _, counts = pairs.sort(dim=1).values.unique(dim=0, return_counts=True)
@@ -72,21 +72,21 @@ class Mesh:
 
     @property
     def center(self) -> Float64[Tensor, "3"]:
-        """Middle of the bounding box [m]."""
+        """Centre of the bounding box [m]."""
         return (self.vertices.amin(0) + self.vertices.amax(0)) / 2
 
     @property
     def area(self) -> float:
-        """Of the surface [m²]; carries no gradient."""
+        """Surface area [m²], without gradient."""
         a, b, c = self.vertices.detach()[self.faces].unbind(1)
         return 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
 
 
 def merge_meshes(parts: Annotated[Sequence[Mesh], MinLen(1)]) -> Mesh:
-    """Several shapes as one rigid object of one material.
+    """Merge shapes into one rigid object of one material.
 
     Args:
-        parts: shapes, each placed within the object.
+        parts: shapes in the frame of the object.
     """
     starts = torch.tensor([0, *(len(part.vertices) for part in parts)]).cumsum(0)
     faces = [part.faces + int(start) for part, start in zip(parts, starts, strict=False)]
@@ -94,14 +94,14 @@ def merge_meshes(parts: Annotated[Sequence[Mesh], MinLen(1)]) -> Mesh:
 
 
 def checked_faces(faces: object, vertex_count: int) -> Tensor:
-    """`faces` as vertex indices [f, 3].
+    """Validate `faces` and return them as vertex indices [f, 3].
 
     Args:
         faces: tensor, array or nested sequence of integers.
-        vertex_count: number of vertices that they point to.
+        vertex_count: number of vertices.
 
     Raises:
-        InputError: wrong type or shape, none, or an index that points to no vertex.
+        InputError: wrong type or shape, no faces, or an index out of range.
     """
     try:
         indices = torch.as_tensor(faces)
@@ -110,7 +110,7 @@ def checked_faces(faces: object, vertex_count: int) -> Tensor:
             f"expected mesh faces as integers of shape [any, 3], got {type(faces).__name__}; "
             "give a tensor or array of vertex indices"
         ) from None
-    # An empty list becomes a float tensor: report it as what it is, a mesh without faces.
+    # An empty list becomes a float tensor: report a mesh without faces.
     if indices.numel() == 0 or vertex_count == 0:
         raise InputError(
             f"expected a mesh with triangles, got {vertex_count} vertices and no usable face; "

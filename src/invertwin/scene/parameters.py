@@ -1,7 +1,7 @@
-"""Modules Scene → Scene that can be fitted, and their composition.
+"""Differentiable parameters: modules Scene → Scene and their composition.
 
-Every module starts as the identity unless initial values are given, and composes with the others.
-Any torch module Scene → Scene serves as well.
+Every module is initially the identity unless initial values are given, and composes with the
+others. Any torch module Scene → Scene may be used as well.
 """
 
 import math
@@ -38,20 +38,23 @@ from invertwin.scene.pose import (
 from invertwin.scene.scene import Object, Scene
 
 ORIGIN = (0.0, 0.0, 0.0)
-_POSITION_SCALE, _ROTATION_SCALE = 0.1, 0.2  # m and rad: errors of a place and a turn that matter
+_POSITION_SCALE, _ROTATION_SCALE = (
+    0.1,
+    0.2,
+)  # m and rad: relevant errors of a position and a rotation
 _T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
 class Entries:
-    """Entries of a module's parameter that have a name, and perhaps a unit, of their own.
+    """Named entries of a module's parameter.
 
     A module lists them in ``entries()``, by name. Tangents of gradient checks may use the name.
 
     Attributes:
         parameter: name of the parameter.
-        index: which of its entries.
-        slope: how fast the named value grows with them.
+        index: index of its entries.
+        slope: derivative of the named value with respect to them.
     """
 
     parameter: str
@@ -61,15 +64,15 @@ class Entries:
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One number that a fit finds, as people speak of it.
+    """Scalar result of a fit in natural units.
 
-    A module lists them in ``iterate_coordinates()``; for others every entry of a parameter is one.
+    A module lists them in ``coordinates()``; for others every entry of a parameter is one.
 
     Attributes:
-        name: such as "letter.x".
-        unit: SI, or empty.
-        tangents: how the module's parameters change with it, by name.
-        span: an error that matters; infinite where none is known.
+        name: name, such as "letter.x".
+        unit: SI unit, or empty.
+        tangents: derivatives of the module's parameters with respect to it, by name.
+        span: relevant error; infinite if unknown.
     """
 
     name: str
@@ -79,7 +82,7 @@ class Coordinate:
 
 
 class ObjectModule(nn.Module):
-    """A module Scene → Scene that changes one object, its mesh unless it says otherwise.
+    """Module Scene → Scene that changes one object, by default its mesh.
 
     Attributes:
         object: name of the object.
@@ -93,25 +96,25 @@ class ObjectModule(nn.Module):
         self.object = object
 
     def update_mesh(self, mesh: Mesh) -> Mesh:
-        """The object's new mesh, given the one that it has before."""
+        """Return the object's new mesh, given its present one."""
         raise NotImplementedError
 
     def forward(self, scene: Scene) -> Scene:
-        """The scene with the object's mesh replaced."""
+        """Return the scene with the object's mesh replaced."""
         return scene.replace(self.object, mesh=self.update_mesh(scene[self.object].mesh))
 
     def values(self) -> dict[str, Tensor]:
-        """What is fitted by name, in SI units, for progress and reports."""
+        """Return the fitted values by name in SI units, for progress and reports."""
         return {f"{self.object}.{n}": getattr(self, n).detach().clone() for n in self.reported}
 
 
 class Translation(ObjectModule):
-    """Moves an object along the world axes.
+    """Translate an object along the world axes.
 
     Args:
         object: name of the object.
-        initial: [m].
-        axes: world axes along which the fit may move it; the others keep their values.
+        initial: initial translation [m].
+        axes: free world axes; the others keep their values.
 
     Attributes:
         translation: parameter [3], metres.
@@ -128,29 +131,29 @@ class Translation(ObjectModule):
         self._axes = axes_mask(axes)
 
     def forward(self, scene: Scene) -> Scene:
-        """The scene with the object moved."""
+        """Return the scene with the object moved."""
         motion = rigid(translation=free_part(self.translation, self._axes))
         return scene.replace(self.object, pose=compose(scene[self.object].transform, motion))
 
     def coordinates(self) -> list[Coordinate]:
-        """x, y and z of the object, as far as they are free."""
+        """Return the free coordinates among x, y and z."""
         return _translation_coordinates(self.object, self._axes)
 
 
 class RigidMotion(nn.Module):
-    """A translation and a rotation without singularities: quaternion ∝ (w, r/2).
+    """Translation and rotation without singularities: quaternion ∝ (w, r/2).
 
     Args:
-        translation: [m].
+        translation: initial translation [m].
         rotation: rotation vector of any angle [3] (rad), or q itself [4].
-        axes: world axes along which the fit may move it.
-        rotation_axes: components of the rotation vector that the fit may change.
+        axes: free world axes of the translation.
+        rotation_axes: free components of the rotation vector.
 
     Attributes:
         translation: parameter [3], metres.
-        rotation: parameter [4], q = (w, r) with the quaternion ∝ (w, r/2); near the identity
-            (1, 0, 0, 0), r is the rotation vector in the world [rad]. Any q but zero is a
-            rotation, and its derivative is finite everywhere.
+        rotation: parameter [4], q = (w, r) with the quaternion ∝ (w, r/2); near the identity (1, 0,
+            0, 0), r is the rotation vector in world axes [rad]. Any q but zero is a rotation, and
+            its derivative is finite everywhere.
 
     Raises:
         InputError: wrong shapes, NaN, q = 0, or an unknown axis.
@@ -171,30 +174,29 @@ class RigidMotion(nn.Module):
 
     @property
     def rotation_matrix(self) -> Float64[Tensor, "3 3"]:
-        """The rotation as a matrix."""
+        """Return the rotation as a matrix."""
         return rotation_from_quaternion(self._quaternion)
 
     @property
     def shift(self) -> Float64[Tensor, "3"]:
-        """The translation [m], with a derivative along the free axes."""
+        """Return the translation [m], with a derivative along the free axes."""
         return free_part(self.translation, self._axes)
 
     @property
     def _quaternion(self) -> Tensor:
-        # Halving r makes (1, r) the rotation vector r [rad] to first order, so that one learning
-        # rate in rad serves all components.
+        # Halving r makes (1, r) the rotation vector r [rad] to first order: one rate suits all.
         halves = self.rotation.new_tensor([1.0, 0.5, 0.5, 0.5])
         return free_part(self.rotation, self._rotation_axes) * halves
 
     def entries(self) -> dict[str, Entries]:
-        """The rotation vector [rad], to first order from the identity."""
+        """Return the rotation vector [rad], to first order about the identity."""
         return {"rotation": Entries("rotation", slice(1, None))}
 
     def named_coordinates(self, name: str) -> list[Coordinate]:
-        """x, y, z and the turns about these axes of the world: pitch, yaw, roll [rad].
+        """Return x, y, z and the rotations about these world axes: pitch, yaw, roll [rad].
 
         Args:
-            name: of what moves.
+            name: name of the moving object.
         """
         found = _translation_coordinates(name, self._axes)
         free = self._rotation_axes[1:]
@@ -208,7 +210,7 @@ class RigidMotion(nn.Module):
         return found
 
     def named_values(self, name: str) -> dict[str, Tensor]:
-        """Translation [m] and rotation vector [rad] of `name`, for progress and reports."""
+        """Return translation [m] and rotation vector [rad] of `name`, for progress and reports."""
         return {
             f"{name}.translation": self.translation.detach().clone(),
             f"{name}.rotation": vector_from_quaternion(self._quaternion.detach()),
@@ -216,10 +218,10 @@ class RigidMotion(nn.Module):
 
 
 class Pose(RigidMotion):
-    """Turns an object about its centre, then moves it along the world axes.
+    """Rotate an object about its centre, then translate it along the world axes.
 
     Args:
-        object: name of the object. The others are those of `RigidMotion`.
+        object: name of the object. The other arguments are those of `RigidMotion`.
     """
 
     def __init__(
@@ -234,27 +236,27 @@ class Pose(RigidMotion):
         self.object = object
 
     def forward(self, scene: Scene) -> Scene:
-        """The scene with the object moved."""
+        """Return the scene with the object moved."""
         before = scene[self.object]
         rotation, center = self.rotation_matrix, before.center
         motion = rigid(rotation, self.shift + center - rotation @ center)
         return scene.replace(self.object, pose=compose(before.transform, motion))
 
     def values(self) -> dict[str, Tensor]:
-        """Translation [m] and rotation vector [rad] by name, for progress and reports."""
+        """Return translation [m] and rotation vector [rad] by name, for progress and reports."""
         return self.named_values(self.object)
 
     def coordinates(self) -> list[Coordinate]:
-        """Place and turn of the object, as far as they are free."""
+        """Return the free coordinates of position and rotation."""
         return self.named_coordinates(self.object)
 
 
 class Scale(ObjectModule):
-    """Scales an object about its centre.
+    """Scale an object about its centre.
 
     Args:
         object: name of the object.
-        initial: factor.
+        initial: initial factor.
 
     Attributes:
         log_scale: parameter, natural logarithm of the factor.
@@ -272,21 +274,21 @@ class Scale(ObjectModule):
 
     @property
     def scale(self) -> Float64[Tensor, ""]:
-        """The factor."""
+        """Scale factor."""
         return self.log_scale.exp()
 
     def update_mesh(self, mesh: Mesh) -> Mesh:
-        """The mesh in its new size."""
+        """Return the scaled mesh."""
         return Mesh(mesh.center + (mesh.vertices - mesh.center) * self.scale, mesh.faces)
 
     def coordinates(self) -> list[Coordinate]:
-        """The factor."""
+        """Return the scale factor."""
         tangents = {"log_scale": 1 / self.scale.detach()}
         return [Coordinate(f"{self.object}.scale", "", tangents, 0.2)]
 
 
 class Vertices(ObjectModule):
-    """Moves every vertex of an object freely.
+    """Displace every vertex of an object freely.
 
     Args:
         object: name of the object.
@@ -307,7 +309,7 @@ class Vertices(ObjectModule):
         self.offsets = nn.Parameter(torch.zeros(rows, 3, dtype=torch.float64))
 
     def update_mesh(self, mesh: Mesh) -> Mesh:
-        """The mesh with its vertices moved.
+        """Return the mesh with its vertices displaced.
 
         Raises:
             InputError: another number of vertices.
@@ -321,23 +323,22 @@ class Vertices(ObjectModule):
 
 
 class MaterialValues(nn.Module):
-    """Replaces values of an object's material; they cannot leave their physical range.
+    """Replace values of an object's material, within their physical range.
 
-    A value that starts as one number is fitted as one, one that starts as a number per triangle
-    or as a `Texture` is fitted triangle by triangle or pixel by pixel.
+    A scalar initial value is fitted as a scalar, a value per triangle or a `Texture` per triangle
+    or per pixel.
 
     Args:
         object: name of the object.
-        layer: of a `Multilayer`, the layer whose values are meant; None for values of the
-            material itself.
-        start: by the names of `RANGES` of the materials, inside their ranges, ends
-            excluded: permittivity, conductivity [S/m], loss_tangent, thickness [m], diffuse,
-            lobe_width [rad], scattering, rms_slope, lambertian, directive, directive_exponent,
-            backscatter_exponent, rms_height [m], depolarisation.
+        layer: index of the layer of a `Multilayer`; None for values of the material itself.
+        start: initial values by the names of `RANGES`, strictly inside their ranges: permittivity,
+            conductivity [S/m], loss_tangent, thickness [m], diffuse, lobe_width [rad], scattering,
+            rms_slope, lambertian, directive, directive_exponent, backscatter_exponent, rms_height
+            [m], depolarisation.
 
     Attributes:
-        raw: unbounded parameters by field: for values with one limit, such as the permittivity,
-            the logarithm of what is above it; for values between two, the logit of their place.
+        raw: unbounded parameters by field: for one-sided ranges, such as the permittivity, the
+            logarithm of the excess; for two-sided ranges the logit of the relative position.
 
     Raises:
         InputError: none given, an unknown name, or a value at or beyond the end of its range.
@@ -369,17 +370,17 @@ class MaterialValues(nn.Module):
         item: Object,
         layer: Annotated[int, Ge(0)] | None = None,
     ) -> "MaterialValues":
-        """Values of an object's material, from those that it has.
+        """Start from the material values of an object.
 
         Args:
             object: name of the object.
-            values: names of those that are fitted.
+            values: names of the fitted values.
             item: the object.
-            layer: of a multilayer, from 0: the layer whose values they are.
+            layer: index of the layer of a multilayer, from 0.
 
         Raises:
             InputError: the material has no such value or layer, a value comes from the ITU table,
-                or it starts at the end of its range.
+                or it is at the end of its range.
         """
         try:
             holder = select_layer(item.material, layer, type(item.material).__name__)
@@ -390,7 +391,7 @@ class MaterialValues(nn.Module):
             raise InputError(str(error), f"values, material of {object}") from None
 
     def forward(self, scene: Scene) -> Scene:
-        """The scene with the material's values replaced.
+        """Return the scene with the material's values replaced.
 
         Raises:
             InputError: the object's material has no such value, or no such layer.
@@ -411,9 +412,9 @@ class MaterialValues(nn.Module):
         return scene.replace(self.object, material=changed)
 
     def values(self) -> dict[str, Tensor]:
-        """Material values in their own units by name, for progress and reports.
+        """Return material values in their own units by name, for progress and reports.
 
-        A texture is its image.
+        A texture is returned as its image.
         """
         where = self.object if self.layer is None else f"{self.object}.layers[{self.layer}]"
         return {
@@ -421,12 +422,12 @@ class MaterialValues(nn.Module):
         }
 
     def entries(self) -> dict[str, Entries]:
-        """The values in their own units."""
+        """Return the values in their own units."""
         slopes = {name: _bounded_slope(name, raw.detach()) for name, raw in self.raw.items()}
         return {name: Entries(f"raw.{name}", slope=slope) for name, slope in slopes.items()}
 
     def at_bounds(self) -> list[str]:
-        """Names of values next to an end of their range."""
+        """Return the names of values close to an end of their range."""
         places = {name: _bounded_slope(name, raw.detach()) for name, raw in self.raw.items()}
         spans = {name: RANGES[name].high - RANGES[name].low for name in places}
         near = {n: 1e-4 if math.isinf(span) else 0.01 * span for n, span in spans.items()}
@@ -439,9 +440,9 @@ class MaterialValues(nn.Module):
 
 
 class Compose(nn.Module):
-    """Applies several modules of the same kind, from first to last.
+    """Apply several modules of one kind, from first to last.
 
-    All map scenes, or all map radars.
+    All modules map scenes, or all map radars.
     """
 
     def __init__(self, *modules: nn.Module) -> None:
@@ -449,13 +450,13 @@ class Compose(nn.Module):
         self.parts = nn.ModuleList(modules)
 
     def forward(self, target: _T) -> _T:
-        """The scene, or the radar, after all modules."""
+        """Return the scene, or the radar, after all modules."""
         for part in self.parts:
             target = part(target)
         return target
 
     def values(self) -> dict[str, Tensor]:
-        """Values of all modules by name, for progress and reports."""
+        """Return the values of all modules by name, for progress and reports."""
         merged: dict[str, Tensor] = {}
         for part in self.parts:
             merged |= getattr(part, "values", dict)()
@@ -463,7 +464,7 @@ class Compose(nn.Module):
 
 
 def _initial_value(holder: Any, name: str) -> Value:
-    """The value of a material, or of a layer, from which a fit starts."""
+    """Return the initial value of a material or a layer."""
     if not hasattr(holder, name):
         raise InputError(f"expected values of {type(holder).__name__}, got {name}; remove it")
     value = getattr(holder, name)
@@ -476,7 +477,7 @@ def _initial_value(holder: Any, name: str) -> Value:
 
 
 def _to_bounded(name: str, raw: Tensor) -> Tensor:
-    """The value inside its range that an unbounded parameter stands for."""
+    """Map an unbounded parameter to the range of a value."""
     span = RANGES[name]
     if math.isinf(span.high):
         return span.low + raw.exp()
@@ -484,7 +485,7 @@ def _to_bounded(name: str, raw: Tensor) -> Tensor:
 
 
 def _bounded_slope(name: str, raw: Tensor) -> Tensor:
-    """The derivative of `_bounded` with respect to the parameter."""
+    """Return the derivative of `_to_bounded` with respect to the parameter."""
     span = RANGES[name]
     if math.isinf(span.high):
         return raw.exp()
@@ -493,7 +494,7 @@ def _bounded_slope(name: str, raw: Tensor) -> Tensor:
 
 
 def _to_unbounded(name: str, value: Tensor) -> Tensor:
-    """The parameter that `_bounded` maps to `value`."""
+    """Map a value to the unbounded parameter, the inverse of `_to_bounded`."""
     span = RANGES[name]
     ends = (value == span.low) | (value == span.high)
     if bool(ends.any()):
@@ -507,7 +508,7 @@ def _to_unbounded(name: str, value: Tensor) -> Tensor:
 
 
 def _translation_coordinates(name: str, mask: Tensor) -> list[Coordinate]:
-    """The coordinates of a translation along the axes that are free."""
+    """Return the coordinates of a translation along the free axes."""
     axes = zip("xyz", torch.diag(mask), mask, strict=True)
     return [
         Coordinate(f"{name}.{axis}", "m", {"translation": along}, _POSITION_SCALE)
@@ -517,7 +518,7 @@ def _translation_coordinates(name: str, mask: Tensor) -> list[Coordinate]:
 
 
 def axes_mask(axes: str) -> Tensor:
-    """1 for the axes that are named, 0 for the others.
+    """Return 1 for the named axes, 0 for the others.
 
     Raises:
         InputError: an unknown axis.
@@ -528,17 +529,17 @@ def axes_mask(axes: str) -> Tensor:
 
 
 def free_part(parameter: Tensor, mask: Tensor) -> Tensor:
-    """The parameter, with no derivative where it is held.
+    """Return the parameter without derivatives of its fixed entries.
 
     Args:
-        parameter: Values.
-        mask: 1 where the fit may change them, 0 where it may not.
+        parameter: values [*].
+        mask: 1 for free entries, 0 for fixed ones.
     """
     return parameter * mask + parameter.detach() * (1 - mask)
 
 
 def _vector(value: ArrayLike, what: str) -> Tensor:
-    # A copy: the optimiser changes the parameter in place, and the given values are not its own.
+    # A copy, since the optimiser changes the parameter in place.
     return checked_tensor(value, (3,), what, "give x, y, z").detach().clone()
 
 

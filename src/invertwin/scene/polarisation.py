@@ -1,8 +1,9 @@
-"""Polarisation: Jones vectors over V and H, of waves and of antennas that send and receive them.
+"""Polarisation: Jones vectors over V and H of waves and antennas.
 
-V and H of a direction are unit vectors across it. About an axis, V lies in the plane of the axis
-and the direction, H across that plane: V is the field of a short dipole along the axis. A receiver
-takes p · E of a field E, without a conjugate, so that an antenna has one vector for both ways.
+V and H of a direction are unit vectors perpendicular to it. With respect to an axis, V lies in the
+plane of the axis and the direction, H is perpendicular to that plane: V is the field of a short
+dipole along the axis. A receiver measures p · E of a field E, without a conjugate, so that an
+antenna has one vector for transmission and reception.
 """
 
 import math
@@ -29,13 +30,13 @@ _DETACHED = "polarisations cannot be fitted: detach them"
 def jones_basis(
     polarisation: str | ArrayLike,
 ) -> Complex128[Tensor, "2 2"]:
-    """The polarisation and the one orthogonal to it, of unit length, as columns over (V, H).
+    """Return a polarisation and the orthogonal one, of unit length, as columns over (V, H).
 
     Args:
         polarisation: a name of ``JONES``, or two complex numbers.
 
     Raises:
-        InputError: another name, or no two numbers with a length.
+        InputError: an unknown name, or not two numbers of non-zero length.
     """
     if isinstance(polarisation, str):
         if polarisation not in JONES:
@@ -54,10 +55,10 @@ def jones_basis(
 
 
 def orthogonal_vectors(vector: Complex128[Tensor, "*row 2"]) -> Complex128[Tensor, "*row 2"]:
-    """The Jones vectors orthogonal to others, as long as they are.
+    """Return the Jones vectors orthogonal to others, of equal length.
 
     Args:
-        vector: over (V, H).
+        vector: Jones vectors over (V, H) [*, 2].
     """
     first, second = vector.unbind(-1)
     return torch.stack([-second.conj(), first.conj()], -1)
@@ -65,19 +66,19 @@ def orthogonal_vectors(vector: Complex128[Tensor, "*row 2"]) -> Complex128[Tenso
 
 @dataclass(frozen=True, eq=False)
 class JonesTable:
-    """A measured or simulated polarisation over direction, bilinear between angles.
+    """Measured or simulated polarisation over direction, bilinear between angles.
 
-    Only the direction of a vector counts: what an antenna sends and receives in all is its
-    pattern's gain. Beyond the last θ its vector holds.
+    Vectors are normalised: the magnitude is the gain of the pattern. Beyond the last θ its vector
+    applies.
 
     Attributes:
         theta: n ≥ 2 ascending angles to boresight [rad], from 0.
         phi: m ascending angles around boresight [rad], spanning less than 2π; m = 1 for vectors
             that do not depend on it.
-        vectors: over (V, H) of each direction, about the radar's y axis.
+        vectors: Jones vectors (V, H) of each direction, about the radar's y axis [n, m, 2].
 
     Raises:
-        InputError: wrong shapes, angles that do not ascend, a vector of no length, derivatives.
+        InputError: wrong shapes, angles that do not ascend, a vector of length zero, derivatives.
     """
 
     theta: Float64[Tensor, " n"]
@@ -106,13 +107,13 @@ class JonesTable:
             object.__setattr__(self, name, value)
 
     def vector(self, direction: Float64[Tensor, "row 3"]) -> Complex128[Tensor, "row 2"]:
-        """Unit Jones vectors towards unit vectors in the radar frame.
+        """Return unit Jones vectors towards unit vectors in the radar frame.
 
         Args:
-            direction: away from the antenna.
+            direction: unit vectors pointing away from the antenna [*, 3].
         """
         x, y, z = direction.unbind(-1)
-        # Neither the radius nor atan2 has a gradient on the axis itself; any φ serves there.
+        # Neither the radius nor atan2 has a gradient on the axis; φ is arbitrary there.
         on_axis = (x == 0) & (y == 0)
         radius = torch.where(on_axis, 0.0, torch.where(on_axis, 1.0, x**2 + y**2).sqrt())
         row, up = _locate_nodes(self.theta, torch.atan2(radius, z))
@@ -129,7 +130,7 @@ class JonesTable:
 
 
 def _locate_nodes(nodes: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
-    """The node before each place, and how far on the way to the next it is."""
+    """Return the node before each position, and the fraction of the step to the next one."""
     position = torch.minimum(position, nodes[-1])
     low = torch.searchsorted(nodes, position.detach(), right=True).clamp(1, len(nodes) - 1) - 1
     return low, (position - nodes[low]) / (nodes[low + 1] - nodes[low])
@@ -137,11 +138,11 @@ def _locate_nodes(nodes: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class Polarisation:
-    """What the elements of an array send and receive: mixtures of one or two Jones vectors.
+    """Polarisations of the elements of an array: mixtures of one or two Jones vectors.
 
     Attributes:
-        base: the vectors [k, 2] over (V, H), or a table of the first; the second is orthogonal.
-        mixtures: share of each vector in every element; k = 1 where all elements are alike.
+        base: vectors [k, 2] over (V, H), or a table of the first; the second is orthogonal.
+        mixtures: coefficient of each vector in every element; k = 1 if all elements are equal.
     """
 
     base: Complex128[Tensor, "k 2"] | JonesTable
@@ -153,17 +154,17 @@ class Polarisation:
         leakage: complex | ArrayLike,
         elements: int,
     ) -> "Polarisation":
-        """That of an array.
+        """Build the polarisation of an array.
 
         Args:
             polarisation: a name of ``JONES``, a vector (V, H) for all elements or one for each, or
                 a table.
-            leakage: field of the orthogonal polarisation over that of the wanted one, of all
+            leakage: field of the orthogonal polarisation over that of the nominal one, of all
                 elements or of each.
-            elements: how many there are.
+            elements: number of elements.
 
         Raises:
-            InputError: another name, vectors of no length, or another number of them.
+            InputError: an unknown name, vectors of length zero, or another number of them.
         """
         share = _leakage(leakage, elements)
         if isinstance(polarisation, JonesTable):
@@ -183,12 +184,12 @@ class Polarisation:
 
     @property
     def mean(self) -> Complex128[Tensor, " k"]:
-        """The mixture of the mean element."""
+        """Mixture of the mean element."""
         return self.mixtures.mean(0)
 
     @property
     def vectors(self) -> Complex128[Tensor, "element 2"]:
-        """The vectors of all elements; of a table none, see ``towards``.
+        """Return the vectors of all elements; not defined for a table, see ``evaluate``.
 
         Raises:
             InputError: they depend on the direction.
@@ -201,10 +202,10 @@ class Polarisation:
         return self.mixtures @ self.base
 
     def evaluate(self, direction: Float64[Tensor, "row 3"]) -> Complex128[Tensor, "#row k 2"]:
-        """The vectors that elements mix, one row where they are the same everywhere.
+        """Return the basis vectors, one row if they do not depend on direction.
 
         Args:
-            direction: unit vectors in the radar frame, away from the antenna.
+            direction: unit vectors in the radar frame, away from the antenna [*, 3].
         """
         if not isinstance(self.base, JonesTable):
             return self.base[None]
@@ -212,10 +213,10 @@ class Polarisation:
         return torch.stack([first, orthogonal_vectors(first)], 1)[:, : self.mixtures.shape[1]]
 
     def equals(self, other: "Polarisation") -> bool:
-        """Whether the mean elements of two arrays are alike, and all others like them.
+        """Return whether all elements of two arrays have one common polarisation.
 
         Args:
-            other: that of another array.
+            other: polarisation of the other array.
         """
         if isinstance(self.base, JonesTable) or isinstance(other.base, JonesTable):
             same = self.base is other.base
@@ -241,7 +242,7 @@ def _leakage(value: complex | ArrayLike, elements: int) -> Tensor:
 
 
 def _vectors(polarisation: object, elements: int) -> Tensor | None:
-    """Unit vectors of the elements, where there is one for each."""
+    """Return unit vectors of the elements, if there is one for each."""
     if isinstance(polarisation, str):
         return None
     try:

@@ -1,4 +1,4 @@
-"""Rotations and rigid transforms as matrices, differentiable and without singularities."""
+"""Rotations and rigid transforms as matrices, differentiable and free of singularities."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -12,19 +12,19 @@ from invertwin.errors import InputError
 
 
 def quaternion_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
-    """Unit quaternion (w, x, y, z) of a rotation vector [rad] (axis times angle).
+    """Return the unit quaternion (w, x, y, z) of a rotation vector [rad] (axis times angle).
 
-    Its first derivative is right everywhere, at the zero vector too.
+    Its first derivative is correct everywhere, including the zero vector.
     """
     angle = torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
-    # sin(a/2)/a written as a sinc, which is smooth at a = 0.
+    # sin(a/2)/a as a sinc, smooth at a = 0.
     scaled = 0.5 * torch.sinc(angle / (2 * torch.pi)) * vector
     return torch.cat([torch.cos(angle / 2), scaled], dim=-1)
 
 
 def vector_from_quaternion(quaternion: Float[Tensor, "4"]) -> Float[Tensor, "3"]:
-    """Rotation vector [rad] of at most π in length of a quaternion (w, x, y, z), not zero."""
-    # A quaternion and its negative are the same rotation; w ≥ 0 is the shorter way round.
+    """Return the rotation vector [rad] of length up to π of a non-zero quaternion (w, x, y, z)."""
+    # A quaternion and its negative are the same rotation; w ≥ 0 is the shorter one.
     sign = torch.where(quaternion[0] < 0, -1.0, 1.0)
     unit = quaternion * sign / torch.linalg.vector_norm(quaternion)
     sine = torch.linalg.vector_norm(unit[1:])
@@ -33,10 +33,10 @@ def vector_from_quaternion(quaternion: Float[Tensor, "4"]) -> Float[Tensor, "3"]
 
 
 def rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrix of a quaternion (w, x, y, z) of any length but zero.
+    """Return the rotation matrix of a quaternion (w, x, y, z) of any non-zero length.
 
     Raises:
-        InputError: a quaternion of length zero, which is no rotation.
+        InputError: a quaternion of length zero.
     """
     if not bool((quaternion.detach().abs().amax(-1) > 0).all()):
         raise InputError(
@@ -54,12 +54,12 @@ def rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Ten
 
 
 def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrix of a rotation vector [rad] (axis times angle)."""
+    """Return the rotation matrix of a rotation vector [rad] (axis times angle)."""
     return rotation_from_quaternion(quaternion_from_vector(vector))
 
 
 def rotation_angle(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
-    """Angle of a rotation matrix in [0, π] rad, accurate at both ends."""
+    """Return the angle of a rotation matrix in [0, π] rad, accurate at both ends."""
     skew = rotation - rotation.transpose(-1, -2)
     sine = torch.linalg.vector_norm(
         torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1), dim=-1
@@ -71,11 +71,11 @@ def rotation_angle(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*bat
 def rigid(
     rotation: Float[Tensor, "3 3"] | None = None, translation: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Float[Tensor, "4 4"]:
-    """Make the matrix of the transform x → rotation x + translation [m].
+    """Return the matrix of the transform x → rotation x + translation [m].
 
     Args:
-        rotation: matrix; None = no rotation.
-        translation: [m].
+        rotation: rotation matrix [3, 3]; None = identity.
+        translation: translation [3] [m].
 
     Raises:
         InputError: wrong shapes, or NaN.
@@ -90,11 +90,11 @@ def rigid(
 def look_at(
     positions: Float[Tensor, "n 3"] | Sequence[Sequence[float]], target: ArrayLike
 ) -> Float64[Tensor, "n 3 3"]:
-    """Make rotations whose boresight (third column) points at a target, x level, y upwards.
+    """Return rotations whose boresight (third column) points at a target, x level, y upwards.
 
     Args:
-        positions: positions of the radar [m].
-        target: what it looks at [m].
+        positions: positions of the radar [*, 3] [m].
+        target: target point [3] [m].
 
     Raises:
         InputError: wrong shapes, NaN, or a target straight above or below a position.
@@ -114,5 +114,5 @@ def look_at(
 
 
 def compose(*transforms: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """The transform that applies the given ones from first to last."""
+    """Compose transforms from first to last."""
     return reduce(lambda first, second: second @ first, transforms)

@@ -1,9 +1,9 @@
 """Remesh surfaces between the stages of a fit.
 
-Remeshing is written out here because no library (in 2026) serves all platforms: gpytoolbox has
-no wheels for Linux on ARM, pymeshlab is GPL, trueform is for noncommercial use, pyacvd needs VTK
-and keeps neither borders nor topology, and MMG (mmgpy) leaves edges of 1.8 times the target length,
-and folds a box unless its ridges are frozen.
+No library (in 2026) serves all platforms: gpytoolbox has no wheels for Linux on ARM, pymeshlab is
+GPL, trueform is for noncommercial use, pyacvd needs VTK and keeps neither borders nor topology, and
+MMG (mmgpy) leaves edges of 1.8 times the target length, and folds a box unless its ridges are
+frozen.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,27 +18,27 @@ from invertwin.errors import InputError
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.mesh import Mesh
 
-_MAX_TRIANGLES = 1e6  # each is moved by itself
-_REMESHING_ROUNDS = 5  # of split, collapse, flip, relax; the lengths settle within these
+_MAX_TRIANGLES = 1e6  # limit of the loops over single triangles
+_REMESHING_ROUNDS = 5  # rounds of split, collapse, flip, relax; the lengths converge within these
 _SPLIT_FACTOR, _COLLAPSE_FACTOR = (
     4 / 3,
     4 / 5,
-)  # of the target: edges that are split, edges that are collapsed
-_MIN_FLIP_COSINE = 0.5  # least cosine between two triangles whose edge is flipped: corners stay
+)  # split and collapse limits relative to the target length
+_MIN_FLIP_COSINE = 0.5  # minimum cosine between two triangles of a flipped edge: creases stay
 
 
 def remesh(mesh: Mesh, edge_length: float) -> Mesh:
-    """Remesh a surface with edges of about one length; topology and borders stay.
+    """Remesh a surface with edges of nearly one length; topology and borders are preserved.
 
-    Too long edges are split, too short ones collapsed, others flipped where vertices then have
-    closer to six neighbours, and vertices moved along the surface to the middle of theirs.
-    Details finer than the target length are lost. Vertices of borders, and of edges with more than
-    two triangles, stay.
+    Long edges are split, short ones collapsed, others flipped to bring valences closer to six, and
+    vertices moved along the surface to the centre of their neighbours. Details finer than the
+    target length are lost. Vertices of borders, and of edges with more than two triangles, are
+    fixed.
 
     Source: Botsch and Kobbelt 2004, "A Remeshing Approach to Multiresolution Modeling".
 
     Args:
-        mesh: the surface; derivatives end here.
+        mesh: surface; derivatives end here.
         edge_length: target length [m].
 
     Raises:
@@ -55,14 +55,14 @@ def remesh(mesh: Mesh, edge_length: float) -> Mesh:
 
 
 def require_edge_length(mesh: Mesh, edge_length: float) -> float:
-    """Return an edge length, if a surface can be remeshed with it.
+    """Validate an edge length for remeshing a surface.
 
     Args:
         mesh: the surface.
         edge_length: target length [m].
 
     Raises:
-        InputError: what `remesh` refuses.
+        InputError: as `remesh`.
     """
     length = checked_number(edge_length, "edge length [m]", 0.0, open_low=True)
     area = mesh.area
@@ -74,11 +74,11 @@ def require_edge_length(mesh: Mesh, edge_length: float) -> float:
 
 
 def closest_points(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """Closest points of a surface [p, 3].
+    """Return the closest points of a surface [p, 3].
 
     Args:
         mesh: the surface.
-        points: positions in the mesh's frame [p, 3], metres.
+        points: positions in the mesh's frame [p, 3] [m].
     """
     return np.asarray(igl.point_mesh_squared_distance(points, *_mesh_arrays(mesh))[2])
 
@@ -88,13 +88,13 @@ def _mesh_arrays(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _EditableMesh:
-    """Triangles that change: which are around every vertex, and where the vertices are."""
+    """Editable triangles with vertex positions and vertex–triangle incidence."""
 
     def __init__(self, mesh: Mesh) -> None:
-        self.places = list(mesh.vertices.detach().numpy().copy())
+        self.positions = list(mesh.vertices.detach().numpy().copy())
         rows = [tuple(face) for face in mesh.faces.tolist() if len(set(face)) == 3]
         self.faces: dict[int, tuple[int, int, int]] = dict(enumerate(rows))
-        self.around: list[set[int]] = [set() for _ in self.places]
+        self.around: list[set[int]] = [set() for _ in self.positions]
         self.next = len(rows)
         for number, face in self.faces.items():
             for vertex in face:
@@ -103,21 +103,21 @@ class _EditableMesh:
         self.fixed = set(edges[counts != 2].ravel().tolist())
 
     def to_mesh(self) -> Mesh:
-        """What there is now, without vertices that no triangle has."""
+        """Return the present mesh without unused vertices."""
         used, faces = np.unique(np.array(list(self.faces.values())), return_inverse=True)
         return Mesh(
-            torch.from_numpy(np.array(self.places)[used]),
+            torch.from_numpy(np.array(self.positions)[used]),
             torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)),
         )
 
     def split(self, longest: float) -> None:
-        """Halve edges until none is longer."""
+        """Halve edges until none exceeds a length."""
         while True:
             found = False
             for a, b in self._sorted_edges(lambda length: length > longest, -1):
                 found = True
-                middle = len(self.places)
-                self.places.append(0.5 * (self.places[a] + self.places[b]))
+                middle = len(self.positions)
+                self.positions.append(0.5 * (self.positions[a] + self.positions[b]))
                 self.around.append(set())
                 both = self.around[a] & self.around[b]
                 if len(both) != 2:
@@ -131,7 +131,7 @@ class _EditableMesh:
                 return
 
     def collapse(self, shortest: float, longest: float) -> None:
-        """Merge the ends of short edges, where the surface stays a surface."""
+        """Collapse short edges that keep the surface manifold."""
         for a, b in self._sorted_edges(lambda length: length < shortest, 1):
             both = self.around[a] & self.around[b]
             if len(both) != 2 or a in self.fixed or b in self.fixed:
@@ -140,8 +140,8 @@ class _EditableMesh:
             thirds = here & there
             if len(thirds) != 2 or any(len(self.around[t]) < 4 for t in thirds):
                 continue
-            middle = 0.5 * (self.places[a] + self.places[b])
-            ring = np.array([self.places[v] for v in (here | there) - {a, b}])
+            middle = 0.5 * (self.positions[a] + self.positions[b])
+            ring = np.array([self.positions[v] for v in (here | there) - {a, b}])
             if ((ring - middle) ** 2).sum(1).max() > longest**2:
                 continue
             rest = (self.around[a] | self.around[b]) - both
@@ -153,10 +153,10 @@ class _EditableMesh:
                 face = self.faces[number]
                 self._remove(number)
                 self._add(_replace_vertex(face, b, a))
-            self.places[a] = middle
+            self.positions[a] = middle
 
     def flip(self) -> None:
-        """Turn edges where that brings the numbers of neighbours closer to six."""
+        """Flip edges that bring valences closer to six."""
         for a, b in self._edges()[0].tolist():
             both = list(self.around[a] & self.around[b])
             if len(both) != 2:
@@ -186,26 +186,26 @@ class _EditableMesh:
             self._add((d, b, c))
 
     def relax(self, onto: Mesh) -> None:
-        """Move vertices along the surface to the middle of their neighbours."""
-        places, faces = np.array(self.places), np.array(list(self.faces.values()))
-        a, b, c = places[faces].transpose(1, 0, 2)
-        normals = np.zeros_like(places)
+        """Move vertices along the surface to the centre of their neighbours."""
+        positions, faces = np.array(self.positions), np.array(list(self.faces.values()))
+        a, b, c = positions[faces].transpose(1, 0, 2)
+        normals = np.zeros_like(positions)
         for corner in faces.T:
             np.add.at(normals, corner, np.cross(b - a, c - a))
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         ends = self._edges()[0]
         one, other = np.concatenate([ends, ends[:, ::-1]]).T
-        middle, count = np.zeros_like(places), np.bincount(one, minlength=len(places))
-        np.add.at(middle, one, places[other])
-        step = middle / np.maximum(count, 1)[:, None] - places
+        middle, count = np.zeros_like(positions), np.bincount(one, minlength=len(positions))
+        np.add.at(middle, one, positions[other])
+        step = middle / np.maximum(count, 1)[:, None] - positions
         step -= (step * normals).sum(1, keepdims=True) * normals
         free = np.array([bool(ring) for ring in self.around])
         free[list(self.fixed)] = False
-        places[free] = closest_points(onto, (places + step)[free])
-        self.places = list(places)
+        positions[free] = closest_points(onto, (positions + step)[free])
+        self.positions = list(positions)
 
     def _edges(self) -> tuple[np.ndarray, np.ndarray]:
-        """Edges as pairs of vertices, and how many triangles each has."""
+        """Return edges as pairs of vertices, and their number of triangles."""
         faces = np.array(list(self.faces.values()))
         pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
         return np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)
@@ -213,14 +213,14 @@ class _EditableMesh:
     def _sorted_edges(
         self, is_selected: Callable[[Any], Any], order: int
     ) -> Iterator[tuple[int, int]]:
-        """Edges of chosen lengths, by length, that are still there when their turn comes."""
-        edges, places = self._edges()[0], np.array(self.places)
-        length = np.linalg.norm(places[edges[:, 0]] - places[edges[:, 1]], axis=1)
+        """Yield selected edges by length, if they still exist."""
+        edges, positions = self._edges()[0], np.array(self.positions)
+        length = np.linalg.norm(positions[edges[:, 0]] - positions[edges[:, 1]], axis=1)
         rows = np.nonzero(is_selected(length))[0]
         for row in rows[np.argsort(order * length[rows], kind="stable")]:
             a, b = edges[row].tolist()
             if self.around[a] & self.around[b] and is_selected(
-                np.linalg.norm(self.places[a] - self.places[b])
+                np.linalg.norm(self.positions[a] - self.positions[b])
             ):
                 yield a, b
 
@@ -228,9 +228,9 @@ class _EditableMesh:
         return {v for number in self.around[vertex] for v in self.faces[number]} - {vertex}
 
     def _would_fold(self, numbers: set[int], moved: tuple[int, int], position: np.ndarray) -> bool:
-        """Whether a triangle would turn over, or lose its area, with two vertices at a place."""
+        """Return whether a triangle would flip or degenerate with two vertices at a position."""
         rows = np.array([self.faces[number] for number in numbers])
-        before = np.array([[self.places[v] for v in row] for row in rows.tolist()])
+        before = np.array([[self.positions[v] for v in row] for row in rows.tolist()])
         after = before.copy()
         after[np.isin(rows, moved)] = position
         old, new = (np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]) for c in (before, after))
@@ -238,7 +238,7 @@ class _EditableMesh:
         return bool(((old * new).sum(1) <= 0.2 * sizes).any())
 
     def _normal(self, face: tuple[int, int, int]) -> np.ndarray:
-        a, b, c = (self.places[v] for v in face)
+        a, b, c = (self.positions[v] for v in face)
         return np.cross(b - a, c - a)
 
     def _add(self, face: tuple[int, int, int]) -> None:
@@ -258,5 +258,5 @@ def _replace_vertex(face: tuple[int, int, int], old: int, new: int) -> tuple[int
 
 
 def _has_directed_edge(face: tuple[int, int, int], a: int, b: int) -> bool:
-    """Whether a triangle runs from a to b."""
+    """Return whether a triangle contains the directed edge from a to b."""
     return (a, b) in ((face[0], face[1]), (face[1], face[2]), (face[2], face[0]))

@@ -1,4 +1,4 @@
-"""A furnished room of named objects, for radars that stand inside."""
+"""Furnished room of named objects, for indoor radars."""
 
 from collections.abc import Sequence
 
@@ -13,13 +13,13 @@ from invertwin.scene.pose import rigid
 from invertwin.scene.scene import Object
 from invertwin.scene.shapes import box
 
-_TOP = 0.03  # m, of boards
-_LEG = 0.05  # m, of legs
+_TOP = 0.03  # thickness of boards [m]
+_LEG = 0.05  # width of legs [m]
 _SHELF_BOARDS = 5
 _FURNITURE = ("table", "chair_1", "chair_2", "shelf", "sofa")
 
-# ITU-R P.2040 states all of these to 100 GHz. It has no upholstery: the board of suspended
-# ceilings, of ε' 1.5, is nearest to foam and cloth.
+# All of them are in ITU-R P.2040 up to 100 GHz. Upholstery is not; the board of suspended
+# ceilings, of ε' 1.5, is closest to foam and cloth.
 _ITU = {
     "floor": "concrete",
     "ceiling": "ceiling_board",
@@ -39,20 +39,20 @@ def room(
     *,
     furniture: Sequence[str] = _FURNITURE,
 ) -> dict[str, Object]:
-    """Make a closed room with furniture: objects by name, for ``Scene({**room(), …})``.
+    """Build a closed room with furniture: objects by name, for ``Scene({**room(), …})``.
 
     The floor is the plane y = 0, with y up. The room reaches from −width/2 to width/2 along x and
-    from 0 to depth along z; a radar at (0, 1, 0.1) that looks along z sees it all. The middle
-    stays free, at least 0.5 m to either side of x = 0. The same numbers give the same room.
+    from 0 to depth along z; a radar at (0, 1, 0.1) facing z observes all of it. The middle is free,
+    at least 0.5 m to either side of x = 0. The room is deterministic.
 
     Walls, ceiling and floor are sheets of plasterboard, ceiling board and concrete; the table
     and the chairs are of wood, the shelf of chipboard (ITU-R P.2040-3). All have rough surfaces.
 
     Args:
-        width: Along x, at least 4 [m].
-        depth: Along z, at least 4 [m].
-        height: Along y, at least 2.1 [m].
-        furniture: What of table, chair_1, chair_2, shelf and sofa stands in it.
+        width: size along x, at least 4 [m].
+        depth: size along z, at least 4 [m].
+        height: size along y, at least 2.1 [m].
+        furniture: names among table, chair_1, chair_2, shelf and sofa.
 
     Raises:
         InputError: A room that is too small for its furniture, or other furniture.
@@ -78,7 +78,7 @@ def room(
         "wall_left": _panel([-w / 2, h / 2, d / 2], [0, h / 2, 0], [0, 0, d / 2]),
         "wall_right": _panel([w / 2, h / 2, d / 2], [0, 0, d / 2], [0, h / 2, 0]),
     }
-    # Pieces stand a little off walls, which they would touch else.
+    # Keep a small gap between furniture and walls.
     placed = {
         "table": (_table(0.8, 0.74, 1.4), [w / 2 - 0.85, d / 2]),
         "chair_1": (_chair(), [w / 2 - 0.85, d / 2 - 1.0]),
@@ -98,14 +98,14 @@ def _material(name: str) -> RoughDielectric:
 
 
 def _panel(middle: Sequence[float], first: Sequence[float], second: Sequence[float]) -> Mesh:
-    """A rectangle of two half sides that faces along first × second."""
+    """Return a rectangle with two half sides that faces along first × second."""
     m, a, b = (torch.tensor(value, dtype=torch.float64) for value in (middle, first, second))
     corners = torch.stack([m - a - b, m + a - b, m + a + b, m - a + b])
     return Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]))
 
 
 def _boxes(*parts: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Mesh:
-    """Boxes by size and middle."""
+    """Return boxes by size and centre."""
     meshes = [(box(size), torch.tensor(middle, dtype=torch.float64)) for size, middle in parts]
     return merge_meshes([Mesh(mesh.vertices + middle, mesh.faces) for mesh, middle in meshes])
 
@@ -113,7 +113,7 @@ def _boxes(*parts: tuple[tuple[float, float, float], tuple[float, float, float]]
 def _legs(
     x: float, z: float, top: float
 ) -> list[tuple[tuple[float, float, float], tuple[float, float, float]]]:
-    """Four legs that end a hair below what they carry."""
+    """Return four legs that end just below the top."""
     high = top - 1e-3
     places = [(sx * x, sz * z) for sx in (-1, 1) for sz in (-1, 1)]
     return [((_LEG, high, _LEG), (px, 1e-3 + high / 2, pz)) for px, pz in places]
@@ -125,7 +125,7 @@ def _table(x: float, y: float, z: float) -> Mesh:
 
 
 def _chair(*, is_reversed: bool = False) -> Mesh:
-    """A chair whose back is at −z, or at z."""
+    """Return a chair whose back is at −z, or at z."""
     back = 0.19 if is_reversed else -0.19
     return _boxes(
         ((0.42, _TOP, 0.42), (0, 0.45, 0)),
@@ -135,7 +135,7 @@ def _chair(*, is_reversed: bool = False) -> Mesh:
 
 
 def _shelf(x: float, y: float, z: float) -> Mesh:
-    """A back, two sides and boards between them, open to −z."""
+    """Return a back, two sides and boards between them, open to −z."""
     inner = x - 2 * _TOP - 2e-3
     step = (y - _TOP - 2e-3) / (_SHELF_BOARDS - 1)
     levels = [2e-3 + _TOP / 2 + step * number for number in range(_SHELF_BOARDS)]
@@ -145,7 +145,7 @@ def _shelf(x: float, y: float, z: float) -> Mesh:
 
 
 def _sofa() -> Mesh:
-    """A seat, a back at −x and two arms, 1.9 m along z."""
+    """Return a seat, a back at −x and two arms, 1.9 m along z."""
     return _boxes(
         ((0.66, 0.42, 1.58), (0.09, 0.212, 0.0)),
         ((0.18, 0.82, 1.9), (-0.34, 0.412, 0.0)),

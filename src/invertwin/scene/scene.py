@@ -21,16 +21,16 @@ from invertwin.scene.pose import compose, rigid, rotation_from_vector
 
 @dataclass(frozen=True, eq=False)
 class Object:
-    """A mesh with a material, placed in the world.
+    """Mesh with a material, at a pose in the world.
 
     Attributes:
-        mesh: the shape, in the object's own frame.
-        material: what its surface does to the waves.
+        mesh: shape in the object's own frame.
+        material: electromagnetic material of the surface.
         pose: rigid transform from the object's frame to the world; None is the identity.
-        velocity: world velocity [m/s] of the whole object [3] or of each vertex [v, 3];
-            None is at rest.
-        cloud: where given, power paths see this density, in the object's frame, instead of the
-            mesh, which then only marks the place: poses turn about its middle.
+        velocity: world velocity [m/s] of the whole object [3] or of each vertex [v, 3]; None =
+            static.
+        cloud: density for power paths, in the object's frame, in place of the mesh, which then only
+            defines the position: poses rotate about its centre.
 
     Raises:
         InputError: wrong types or shapes, NaN, or a pose that is not rigid.
@@ -67,7 +67,7 @@ class Object:
 
     @property
     def transform(self) -> Float64[Tensor, "4 4"]:
-        """The pose as a matrix, also when it is None."""
+        """Pose as a matrix, also if it is None."""
         return torch.eye(4, dtype=torch.float64) if self.pose is None else self.pose
 
     @property
@@ -81,32 +81,32 @@ class Object:
 
     @property
     def center(self) -> Float64[Tensor, "3"]:
-        """World position [m] of the middle of the mesh's bounding box in the object's frame.
+        """World position [m] of the centre of the mesh's bounding box in the object's frame.
 
-        Rotations and scalings act about it. Differentiable like `free_vertices`.
+        Rotations and scalings act about it. Differentiable like `vertices`.
         """
         center = self.mesh.center
         return center if self.pose is None else _transform_points(center[None], self.pose)[0]
 
     def advance(self, time: float) -> "Object":
-        """The object after it has moved with its velocity for `time` [s]; the result is at rest."""
+        """Return the object displaced by its velocity for `time` [s], at rest."""
         checked_number(time, "time [s]", -torch.inf)
         if self.velocity is None:
             return self
         if self.velocity.ndim == 1:
             motion = rigid(translation=self.velocity * time)
             return replace(self, pose=compose(self.transform, motion), velocity=None)
-        # Velocities are world vectors; row vectors times R turn them into the object's frame.
+        # Velocities are world vectors; row vectors times R are in the object's frame.
         offsets = self.velocity * time @ self.transform[:3, :3]
         mesh = Mesh(self.mesh.vertices + offsets, self.mesh.faces)
         return replace(self, mesh=mesh, velocity=None)
 
 
 def transform_vertices(objects: Sequence[Object]) -> list[Float64[Tensor, "v 3"]]:
-    """The ``free_vertices`` of many objects; those of as many vertices are placed at once.
+    """Return the ``vertices`` of many objects; objects with equal vertex counts are batched.
 
     Args:
-        objects: any number.
+        objects: any number of objects.
     """
     found: dict[int, Tensor] = {}
     alike: dict[int, list[int]] = {}
@@ -128,10 +128,10 @@ def _transform_points(points: Float64[Tensor, "*n v 3"], pose: Float64[Tensor, "
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Objects by name; a frozen value.
+    """Frozen collection of objects by name.
 
     Attributes:
-        objects: the objects in the order given (a read-only mapping).
+        objects: objects in their order (a read-only mapping).
 
     Raises:
         InputError: no objects, an empty name, or a value that is not an Object.
@@ -159,14 +159,14 @@ class Scene:
         object.__setattr__(self, "objects", MappingProxyType(dict(self.objects)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # The read-only view of the mapping can be neither copied nor pickled by itself.
+        # A read-only mapping view can be neither copied nor pickled.
         return type(self), (dict(self.objects),)
 
     def __getitem__(self, name: str) -> Object:
-        """The object of that name.
+        """Return the object of a name.
 
         Raises:
-            InputError: there is none.
+            InputError: no object of that name.
         """
         if name not in self.objects:
             raise InputError(
@@ -181,10 +181,10 @@ class Scene:
         return tuple(self.objects)
 
     def replace(self, name: str, **changes: Any) -> "Scene":
-        """A scene in which some fields of one object differ.
+        """Return a scene with some fields of one object replaced.
 
         Args:
-            name: the object.
+            name: name of the object.
             changes: new values of `mesh`, `material`, `pose`, `velocity` or `cloud`.
 
         Raises:
@@ -206,18 +206,18 @@ class Scene:
         return Scene({**self.objects, name: changed})
 
     def advance(self, time: float) -> "Scene":
-        """The scene after all objects moved with their velocities for `time` [s]."""
+        """Return the scene with all objects displaced by their velocities for `time` [s]."""
         return Scene({name: value.advance(time) for name, value in self.objects.items()})
 
 
 def warn_if_purely_specular(scene: Scene, frequency: float) -> None:
-    """Warn where no surface scatters: a radar sees a mirror only where it stands upright to it.
+    """Warn if no surface scatters: a radar receives specular reflections at normal incidence only.
 
-    Scenes of perfect conductors and clouds alone are meant to be what they are.
+    Scenes of perfect conductors and clouds alone cause no warning.
 
     Args:
-        scene: What is seen.
-        frequency: [Hz].
+        scene: observed scene.
+        frequency: carrier frequency [Hz].
     """
     bodies = [item for item in scene.objects.values() if item.cloud is None]
     rough = [item for item in bodies if not item.material.coherent]
@@ -262,12 +262,12 @@ def _checked_pose(pose: object) -> Tensor:
 def displace(
     item: Object, offset: Float64[Tensor, "3"], rotation: Float64[Tensor, "3"] | None = None
 ) -> Object:
-    """An object that is turned about its centre and moved.
+    """Return an object rotated about its centre and translated.
 
     Args:
-        item: The object.
-        offset: Of its centre [m].
-        rotation: Rotation vector [rad]; None = no turn.
+        item: object to displace.
+        offset: displacement of its centre [3] [m].
+        rotation: rotation vector [3] [rad]; None = no rotation.
     """
     turn = rotation_from_vector(torch.zeros_like(offset) if rotation is None else rotation)
     motion = rigid(turn, offset + item.center - turn @ item.center)

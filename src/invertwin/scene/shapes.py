@@ -1,4 +1,4 @@
-"""Built-in meshes, all centred at the origin, with outward normals."""
+"""Built-in meshes, centred at the origin, with outward normals."""
 
 import math
 from collections.abc import Sequence
@@ -17,12 +17,12 @@ from invertwin.limits import Angle, Count, Positive
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.mesh import Mesh
 
-_MAX_TRIANGLES = 1e7  # of one shape
-_MAX_LETTERS = 100  # whose outlines are joined one by one
+_MAX_TRIANGLES = 1e7  # triangles of one shape
+_MAX_LETTERS = 100  # outlines are merged one by one
 
 
 def plate(width: Positive, height: Positive, divisions: Count = 1) -> Mesh:
-    """A rectangle in the plane z = 0 that faces −z.
+    """Build a rectangle in the plane z = 0 that faces −z.
 
     Args:
         width: size along x [m].
@@ -36,13 +36,13 @@ def plate(width: Positive, height: Positive, divisions: Count = 1) -> Mesh:
     n = checked_count(divisions, "divisions", 1)
     _require_triangles(2 * n**2, "divisions")
     points, faces = _lattice(n)
-    # The lattice faces +z; turning every triangle makes it face −z.
+    # The lattice faces +z; reversed triangles face −z.
     plane = (points / n - 0.5) * size
     return _mesh(np.column_stack([plane, np.zeros(len(plane))]), faces[:, ::-1])
 
 
 def box(size: Positive | Sequence[Positive], divisions: Count = 1) -> Mesh:
-    """A closed box.
+    """Build a closed box.
 
     Args:
         size: edge length [m], one number or one for each of x, y, z.
@@ -62,24 +62,24 @@ def box(size: Positive | Sequence[Positive], divisions: Count = 1) -> Mesh:
     corners, triangles = [], []
     for axis in range(3):
         for level, turn in ((0, -1), (n, 1)):
-            # Cyclic axes keep the lattice's orientation: +axis on the far side, turned on the near.
+            # Cyclic axes keep the orientation: +axis on the far side, reversed on the near one.
             side = np.empty((len(points), 3), dtype=np.int64)
             side[:, [(axis + 1) % 3, (axis + 2) % 3, axis]] = np.column_stack(
                 [points, np.full(len(points), level)]
             )
             triangles.append(faces[:, ::turn] + len(corners) * len(points))
             corners.append(side)
-    # Integer corners are equal exactly where sides meet, so merging leaves no seam.
+    # Integer corners are exactly equal at shared edges, so merging leaves no seam.
     unique, index = np.unique(np.concatenate(corners), axis=0, return_inverse=True)
     return _mesh((unique / n - 0.5) * extent, index.ravel()[np.concatenate(triangles)])
 
 
 def sphere(radius: Positive, subdivisions: Annotated[int, Ge(0), Le(8)] = 4) -> Mesh:
-    """An icosphere with 20·4^subdivisions triangles and its vertices on the sphere.
+    """Build an icosphere with 20·4^subdivisions triangles and its vertices on the sphere.
 
     Args:
-        radius: [m].
-        subdivisions: how often every triangle of the icosahedron is split into four.
+        radius: radius [m].
+        subdivisions: number of times that every triangle of the icosahedron is split into four.
 
     Raises:
         InputError: a radius that is not positive, or a negative count.
@@ -95,12 +95,12 @@ def sphere(radius: Positive, subdivisions: Annotated[int, Ge(0), Le(8)] = 4) -> 
 def cylinder(
     radius: Positive, height: Positive, sections: Annotated[int, Ge(3), Le(10_000)] = 32
 ) -> Mesh:
-    """A closed upright cylinder, its axis along y.
+    """Build a closed upright cylinder with its axis along y.
 
     Args:
-        radius: [m].
-        height: Size along y [m].
-        sections: Number of flat sides around it.
+        radius: radius [m].
+        height: size along y [m].
+        sections: number of flat sides.
 
     Raises:
         InputError: a size that is not positive, or fewer than three sides.
@@ -108,15 +108,14 @@ def cylinder(
     sizes = _length(radius, "cylinder radius [m]"), _length(height, "cylinder height [m]")
     count = checked_count(sections, "sections", 3)
     tube = trimesh.creation.cylinder(sizes[0], sizes[1], sections=count)
-    # Turned about x: z to y.
+    # Rotation about x: z to y.
     return _mesh(tube.vertices[:, [0, 2, 1]] * [1, 1, -1], tube.faces)
 
 
 def dihedral(edge: Positive, opening: Angle = math.pi / 2) -> Mesh:
-    """Two square plates that meet on the y axis and open to −z, at a right angle or another.
+    """Build two square plates that meet on the y axis and open to −z.
 
-    Its boresight is −z. At a right angle every wave it returns after two bounces has the range of
-    the y axis.
+    Its boresight is −z. At a right angle every double-bounce echo has the range of the y axis.
 
     Args:
         edge: edge length of the plates [m].
@@ -134,11 +133,11 @@ def dihedral(edge: Positive, opening: Angle = math.pi / 2) -> Mesh:
 
 
 def trihedral(edge: Positive) -> Mesh:
-    """A corner reflector: three right-angled triangles with the apex at the origin, open to −z.
+    """Build a corner reflector: three right-angled triangles with the apex at the origin, open to
+    −z.
 
-    Its boresight is −z, one of the inner edges lies in the half plane x = 0, y > 0, and every wave
-    it returns after three bounces has the range of the apex. Its peak radar cross-section is
-    4π edge⁴/3λ².
+    Its boresight is −z, one of the inner edges lies in the half plane x = 0, y > 0, and every
+    triple-bounce echo has the range of the apex. Its peak radar cross-section is 4π edge⁴/3λ².
 
     Args:
         edge: length of the three inner edges [m].
@@ -148,7 +147,7 @@ def trihedral(edge: Positive) -> Mesh:
     """
     length = _length(edge, "trihedral edge [m]")
     angle = np.radians([90.0, 210.0, 330.0])
-    # Three perpendicular unit vectors make the same angle with their mean: cosine 1/√3.
+    # Cosine of the angle between three perpendicular unit vectors and their mean: 1/√3.
     tips = np.column_stack([np.cos(angle), np.sin(angle), np.full(3, -math.sqrt(0.5))])
     vertices = np.concatenate([np.zeros((1, 3)), tips * length * math.sqrt(2 / 3)])
     return _mesh(vertices, np.array([(0, 2, 1), (0, 3, 2), (0, 1, 3)]))
@@ -160,10 +159,10 @@ def text(
     depth: Positive = 0.12,
     max_edge: Positive = 0.06,
 ) -> Mesh:
-    """Extruded bold text, watertight, readable from −z with x to the right and y up.
+    """Build extruded bold text, watertight, readable from −z with x to the right and y up.
 
     Args:
-        text: one line of text.
+        text: line of text.
         size: height of its bounding box along y [m].
         depth: thickness along z [m].
         max_edge: longest edge of a triangle [m].
@@ -178,7 +177,7 @@ def text(
     count = len(plane)
     front = np.column_stack([plane, np.full(count, -thickness / 2)])
     back = np.column_stack([plane, np.full(count, thickness / 2)])
-    # Open edges, which have one triangle, in its direction.
+    # Open edges in the direction of their triangle.
     flat = trimesh.Trimesh(front, cap, process=False)
     open_edges = trimesh.grouping.group_rows(flat.edges_sorted, require_count=1)
     start, end = flat.edges[np.sort(open_edges)].T
@@ -197,7 +196,7 @@ def _require_triangles(count: float, at: str, do: str = "") -> None:
 
 
 def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    # Copies, because reversed views have negative strides that torch does not take.
+    # Copies, since torch does not accept the negative strides of reversed views.
     return Mesh(
         torch.from_numpy(np.array(vertices, dtype=np.float64)),
         torch.from_numpy(np.array(faces, dtype=np.int64)),
@@ -205,7 +204,7 @@ def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
 
 
 def _lattice(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Integer points (i, j) of an n × n grid and its triangles, counter-clockwise."""
+    """Return integer points (i, j) of an n × n grid and its triangles, counter-clockwise."""
     points = np.stack(np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij"), -1)
     index = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
     a, b, c, d = (
@@ -219,9 +218,9 @@ def _lattice(n: int) -> tuple[np.ndarray, np.ndarray]:
 def _triangulate_outline(
     string: str, height: float, thickness: float, longest: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points [p, 2] and counter-clockwise triangles that fill the outline of a text."""
+    """Triangulate the outlines of a text: points [p, 2] and counter-clockwise triangles."""
     require_at_most(len(string), _MAX_LETTERS, "letters", "give a shorter text", "text")
-    # Imported here: only text needs these two, and matplotlib alone takes half a second.
+    # Local imports: only text needs these two, and matplotlib alone takes half a second.
     import matplotlib
     import shapely
     from matplotlib.font_manager import FontProperties
@@ -238,11 +237,11 @@ def _triangulate_outline(
             f"expected characters of the font DejaVu Sans, got {string!r} with "
             f"{''.join(unknown)}; use others"
         )
-    # Curves are cut into chords about one unit long, so the size sets how fine they are.
+    # Curves are split into chords about one unit long, so the size sets their resolution.
     path = TextPath((0, 0), string, size=100, prop=FontProperties(fname=font))
     loops = [np.asarray(loop) for loop in path.to_polygons()]
     rings = [shapely.Polygon(loop) for loop in loops if len(loop) >= 4]
-    # A ring inside another is a hole, a ring inside a hole is filled again.
+    # A ring inside another is a hole, a ring inside a hole is filled.
     outline = reduce(shapely.symmetric_difference, rings)
     left, bottom, right, top = outline.bounds
     scale = height / (top - bottom)
@@ -254,7 +253,7 @@ def _triangulate_outline(
     pieces = 2 * (outline.length / longest + len(loops)) * thin
     _require_triangles(pieces, "max_edge", "give sizes in metres, or larger edges")
     fine = shapely.segmentize(outline, longest)
-    # The triangulation wants one polygon at a time, and returns rings of four points.
+    # The triangulation takes one polygon at a time, and returns rings of four points.
     triangles = np.concatenate(
         [
             shapely.get_coordinates(shapely.constrained_delaunay_triangles(part)).reshape(-1, 4, 2)
@@ -264,7 +263,7 @@ def _triangulate_outline(
     side, other = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     clockwise = side[:, 0] * other[:, 1] < side[:, 1] * other[:, 0]
     triangles[clockwise] = triangles[clockwise, ::-1]
-    # Corners are copies of the outline's points, hence equal to the last bit where they meet.
+    # Corners are copies of the outline's points, hence exactly equal at shared vertices.
     points, index = np.unique(triangles.reshape(-1, 2), axis=0, return_inverse=True)
     return points, index.reshape(-1, 3)
 
@@ -272,7 +271,7 @@ def _triangulate_outline(
 def _split_long_edges(
     vertices: np.ndarray, faces: np.ndarray, longest: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Halve all edges above a length until none is left; the mesh stays watertight.
+    """Halve all edges above a length; the mesh stays watertight.
 
     Every triangle splits by the pattern of its own long edges, and both neighbours of an edge see
     the same midpoint, so no crack appears.
@@ -292,9 +291,9 @@ def _split_long_edges(
 
 
 def _split(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Split triangles at the given midpoints of their edges 01, 12, 20 (−1: not split)."""
+    """Split triangles at given midpoints of their edges 01, 12, 20 (−1: not split)."""
     count = (middle >= 0).sum(axis=1)
-    # Turn each triangle so that one split edge comes first, or the one whole edge comes last.
+    # Permute each triangle so that one split edge comes first, or the one whole edge last.
     first = np.where(
         count == 1, np.argmax(middle >= 0, axis=1), (np.argmin(middle, axis=1) + 1) % 3
     )
