@@ -1,9 +1,10 @@
-"""How much of each cell of a flat panel a place sees: lit fractions, differentiable.
+"""Partial visibility: fractions of a flat panel's cells that observers see, differentiable.
 
 The shadow of a scene on the plane of a panel ends at the projections of silhouette edges. A cell
-that such a line cuts is lit in part: ``clamp(s/w + 1/2, 0, 1)``, with s the distance of its centre
-from the line, positive in the light, and w its width across the line. Rays say which side is lit,
-and are detached; s carries the derivatives by the place, by the panel and by the vertices.
+that such a line crosses is partly illuminated: ``clamp(s/w + 1/2, 0, 1)``, with s the distance of
+its centre from the line, positive on the illuminated side, and w its width across the line. Rays
+determine the illuminated side, and are detached; s carries the derivatives with respect to the
+observer, the panel and the vertices.
 
 Source: derivations §12.
 """
@@ -22,10 +23,10 @@ from invertwin.checks import strip_derivatives
 from invertwin.errors import InputError
 from invertwin.scene import Scene
 
-_PAIRS_AT_ONCE = 1 << 21  # of edges and places, or of edges and cells, at a time
-_MAX_EDGE_LEVEL = 0.999  # of the way up to the place: edges above it cast no shadow onto the panel
-_RAY_OFFSET = 1e-4  # of the way to an edge: how far aside rays pass it
-_COPLANAR_TOLERANCE = 1e-9  # of lengths: an apex in the plane of a place and an edge
+_PAIRS_AT_ONCE = 1 << 21  # edges × observers, or edges × cells, per chunk
+_MAX_EDGE_LEVEL = 0.999  # of the observer's height; higher edges cast no shadow
+_RAY_OFFSET = 1e-4  # of the distance: lateral offset of rays past an edge
+_COPLANAR_TOLERANCE = 1e-9  # of lengths: an apex in the plane of observer and edge
 
 
 @dataclass(frozen=True)
@@ -33,10 +34,10 @@ class PanelCells:
     """Equal rectangular cells of a flat panel.
 
     Attributes:
-        center: of the panel [m].
-        axes: columns are the panel's x and y axes and its normal, in the world.
+        center: centre of the panel in world axes [m].
+        axes: panel axes x, y and normal as columns, in world axes.
         offsets: centres of the cells along x and y [m].
-        size: of a cell along x and y [m].
+        size: size of a cell along x and y [m].
     """
 
     center: Float64[Tensor, "3"]
@@ -46,25 +47,25 @@ class PanelCells:
 
     @property
     def centers(self) -> Float64[Tensor, "cell 3"]:
-        """Centres of the cells in the world [m]."""
+        """Centres of the cells in world axes [m]."""
         return self.center + self.offsets @ self.axes[:, :2].T
 
     @property
     def radius(self) -> float:
-        """From the centre to the farthest corner [m]."""
+        """Distance from the centre to the farthest corner [m]."""
         half = 0.5 * torch.tensor(self.size, dtype=torch.float64)
         return float((strip_derivatives(self.offsets).abs() + half).norm(dim=1).max())
 
 
 @dataclass(frozen=True)
 class _ShadowingEdges:
-    """Edges that may end shadows, one row for each place that they may shade.
+    """Edges that may cast shadow boundaries, one row per edge and observer.
 
     Attributes:
-        observer: number of the place.
-        ends: numbers of the vertices.
-        apex: a vertex of a triangle beside the edge, on the dark side.
-        interval: part of the edge whose shadow is counted, from 0 to 1.
+        observer: number of the observer.
+        ends: numbers of the end vertices.
+        apex: vertex of an adjacent triangle, on the shadowed side.
+        interval: part of the edge that casts the shadow, from 0 to 1.
     """
 
     observer: Int64[Tensor, " row"]
@@ -73,7 +74,7 @@ class _ShadowingEdges:
     interval: Float64[Tensor, "row 2"]
 
     def select(self, index: Tensor) -> "_ShadowingEdges":
-        """Some rows."""
+        """Select rows."""
         return _ShadowingEdges(*(column[index] for column in vars(self).values()))
 
 
@@ -85,17 +86,17 @@ def visible_fractions(
     blur: float = 0.0,
     boundary: bool = True,
 ) -> Float64[Tensor, "place cell"]:
-    """The fraction of each cell that a place sees, in front of the panel.
+    """Compute the fraction of each cell that observers in front of the panel see.
 
-    All surfaces of the scene block, sheets too. Fractions of cells that a single straight line cuts
-    along the panel's axes are exact.
+    All surfaces of the scene are opaque, sheets included. Fractions of cells that a single straight
+    line crosses along the panel's axes are exact.
 
     Args:
-        scene: what is in the way; the panel is no part of it.
-        observers: [m].
-        cells: of the panel.
-        blur: added to the width over which shadows end [m]; 0 = that of a cell.
-        boundary: False leaves out of derivatives that shadows move.
+        scene: occluders, without the panel.
+        observers: positions of the observers in world axes [m].
+        cells: cells of the panel.
+        blur: width added to that of shadow boundaries [m]; 0 = width of a cell.
+        boundary: False omits the derivatives due to moving shadows.
 
     Raises:
         InputError: a cloud among the objects.
@@ -109,71 +110,86 @@ def visible_fractions(
     topology = topology_of([item.mesh for item in items])
     vertices = torch.cat([item.vertices for item in items])
     with tracing():
-        rays = Occluders(strip_derivatives(vertices), topology, strip_derivatives(cells.center))
-        still = PanelCells(
+        occluders = Occluders(
+            strip_derivatives(vertices), topology, strip_derivatives(cells.center)
+        )
+        detached_cells = PanelCells(
             strip_derivatives(cells.center),
             strip_derivatives(cells.axes),
             strip_derivatives(cells.offsets),
             cells.size,
         )
-        spots = strip_derivatives(observers)
+        detached_observers = strip_derivatives(observers)
         edges = _find_silhouette_edges(
-            strip_derivatives(vertices), topology, spots, still, still.radius + blur
+            strip_derivatives(vertices),
+            topology,
+            detached_observers,
+            detached_cells,
+            detached_cells.radius + blur,
         )
-        edges = _select_visible_edges(rays, strip_derivatives(vertices), spots, still, edges)
-        lit = _test_cell_centers(rays, spots, still, edges, strip_derivatives(vertices))
+        edges = _select_visible_edges(
+            occluders, strip_derivatives(vertices), detached_observers, detached_cells, edges
+        )
+        is_center_visible = _test_cell_centers(
+            occluders, detached_observers, detached_cells, edges, strip_derivatives(vertices)
+        )
         row, cell = _match_cells_to_edges(
-            edges, lit, (strip_derivatives(vertices), spots, still), blur
+            edges,
+            is_center_visible,
+            (strip_derivatives(vertices), detached_observers, detached_cells),
+            blur,
         )
-    found = lit.to(torch.float64)
+    fractions = is_center_visible.to(torch.float64)
     if not len(row):
-        return found
-    moved = (
-        (vertices, observers, cells) if boundary else (strip_derivatives(vertices), spots, still)
+        return fractions
+    geometry = (
+        (vertices, observers, cells)
+        if boundary
+        else (strip_derivatives(vertices), detached_observers, detached_cells)
     )
     edges = edges.select(row)
-    offsets = moved[2].offsets[cell]
-    distance, across = _shadow_distances(_project_edges(edges, *moved), offsets)
-    span = torch.tensor(cells.size, dtype=torch.float64)
-    share = distance / ((across.abs() * span).sum(-1) + blur) + 0.5
-    return found.index_put((edges.observer, cell), share.clamp(0.0, 1.0))
+    offsets = geometry[2].offsets[cell]
+    distance, normal = _shadow_distances(_project_edges(edges, *geometry), offsets)
+    cell_size = torch.tensor(cells.size, dtype=torch.float64)
+    fraction = distance / ((normal.abs() * cell_size).sum(-1) + blur) + 0.5
+    return fractions.index_put((edges.observer, cell), fraction.clamp(0.0, 1.0))
 
 
 def _find_silhouette_edges(
     vertices: Tensor, topology: Topology, observers: Tensor, cells: PanelCells, reach: float
 ) -> _ShadowingEdges:
-    """Silhouette edges whose shadows end within reach of the panel's centre."""
+    """Find silhouette edges whose shadow boundaries lie within reach of the panel's centre."""
     normal = cells.axes[:, 2]
     found: list[_ShadowingEdges] = []
     count = len(topology.edges)
-    for some in torch.arange(len(observers)).split(max(1, _PAIRS_AT_ONCE // max(1, count))):
+    for rows in torch.arange(len(observers)).split(max(1, _PAIRS_AT_ONCE // max(1, count))):
         start, end = vertices[topology.edges].unbind(1)
-        spot = observers[some, None]
-        plane = cross(start - spot, (end - start).expand(len(some), -1, -1))
+        observer = observers[rows, None]
+        plane = cross(start - observer, (end - start).expand(len(rows), -1, -1))
         sides = []
         for apex in topology.edge_apexes.T:
             offset = vertices[apex.clamp_min(0)] - start
             side = dot(plane, offset.expand_as(plane))
-            near = side.abs() <= _COPLANAR_TOLERANCE * plane.norm(dim=-1) * offset.norm(dim=-1)
-            side = torch.where(near | (apex < 0), 0.0, side.sign())
+            coplanar = side.abs() <= _COPLANAR_TOLERANCE * plane.norm(dim=-1) * offset.norm(dim=-1)
+            side = torch.where(coplanar | (apex < 0), 0.0, side.sign())
             sides.append(side)
         table = torch.stack(sides)
         silhouette = (table.sum(0).abs() == table.abs().sum(0)) & (table.abs().sum(0) > 0)
-        # Which part of the edge lies between the panel's plane and the place.
-        height = (spot - cells.center) @ normal
-        rise = torch.stack([(end_ - cells.center) @ normal for end_ in (start, end)])
-        level = rise[:, None] / torch.where(height > 0, height, torch.inf)[None]
+        # Part of the edge between the panel's plane and the observer.
+        height = (observer - cells.center) @ normal
+        heights = torch.stack([(end_ - cells.center) @ normal for end_ in (start, end)])
+        level = heights[:, None] / torch.where(height > 0, height, torch.inf)[None]
         first, slope = level[0], level[1] - level[0]
         safe = torch.where(slope == 0, 1.0, slope)
         bounds = torch.stack([-first / safe, (_MAX_EDGE_LEVEL - first) / safe])
         inside = (first >= 0) & (first <= _MAX_EDGE_LEVEL)
         low = torch.where(slope == 0, torch.where(inside, 0.0, 1.0), bounds.amin(0)).clamp_min(0)
         high = torch.where(slope == 0, torch.where(inside, 1.0, 0.0), bounds.amax(0)).clamp_max(1)
-        place, edge = torch.nonzero(silhouette & (height > 0) & (low < high)).T
-        chosen = table.abs()[:, place, edge].argmax(0)
-        share = torch.stack([low[place, edge], high[place, edge]], 1)
-        apex = topology.edge_apexes[edge, chosen]
-        found.append(_ShadowingEdges(some[place], topology.edges[edge], apex, share))
+        observer_row, edge = torch.nonzero(silhouette & (height > 0) & (low < high)).T
+        side_number = table.abs()[:, observer_row, edge].argmax(0)
+        interval = torch.stack([low[observer_row, edge], high[observer_row, edge]], 1)
+        apex = topology.edge_apexes[edge, side_number]
+        found.append(_ShadowingEdges(rows[observer_row], topology.edges[edge], apex, interval))
     edges = _ShadowingEdges(
         *(torch.cat(c) for c in zip(*(vars(f).values() for f in found), strict=True))
     )
@@ -185,28 +201,28 @@ def _find_silhouette_edges(
 def _project_edges(
     edges: _ShadowingEdges, vertices: Tensor, observers: Tensor, cells: PanelCells
 ) -> Float64[Tensor, "row 3 2"]:
-    """Projections of both ends and of the apex's side onto the panel's plane, along its axes [m].
+    """Project both ends of edges onto the panel's plane, with a point on the shadowed side [m].
 
-    The last one is a point beside the line on the dark side: the apex may have no projection.
+    The third point lies beside the line on the shadowed side: the apex may have no projection.
     """
-    spot = observers[edges.observer]
+    observer = observers[edges.observer]
     ends = vertices[edges.ends]
     side = ends[:, 1] - ends[:, 0]
     points = ends[:, :1] + edges.interval[:, :, None] * side[:, None]
-    way = _edge_ray_fractions(edges, vertices, observers, cells)
-    cast = spot[:, None] + (points - spot[:, None]) / way[..., None]
-    flat = (cast - cells.center) @ cells.axes[:, :2]
-    # The plane of place and edge cuts the panel's plane in the line; its normal tells the side.
-    plane = cross(points[:, 0] - spot, points[:, 1] - spot)
-    dark = dot(plane, vertices[edges.apex] - ends[:, 0]).detach().sign()
-    toward = dark[:, None] * (plane @ cells.axes[:, :2])
-    return torch.cat([flat, (flat[:, 0] + toward)[:, None]], 1)
+    fraction = _edge_ray_fractions(edges, vertices, observers, cells)
+    projection = observer[:, None] + (points - observer[:, None]) / fraction[..., None]
+    planar = (projection - cells.center) @ cells.axes[:, :2]
+    # The normal of the plane of observer and edge determines the shadowed side.
+    plane = cross(points[:, 0] - observer, points[:, 1] - observer)
+    sign = dot(plane, vertices[edges.apex] - ends[:, 0]).detach().sign()
+    shadow_side = sign[:, None] * (plane @ cells.axes[:, :2])
+    return torch.cat([planar, (planar[:, 0] + shadow_side)[:, None]], 1)
 
 
 def _edge_ray_fractions(
     edges: _ShadowingEdges, vertices: Tensor, observers: Tensor, cells: PanelCells
 ) -> Float64[Tensor, "row 2"]:
-    """Where ends of edges lie on the way from their places to the panel's plane: 0 to 1."""
+    """Positions of edge ends between observer and panel's plane, from 0 to 1."""
     normal = cells.axes[:, 2]
     height = (observers[edges.observer] - cells.center) @ normal
     ends = ((vertices[edges.ends] - cells.center) @ normal) / height[:, None]
@@ -216,58 +232,60 @@ def _edge_ray_fractions(
 def _shadow_distances(
     shadows: Float64[Tensor, "row 3 2"], points: Float64[Tensor, "row 2"]
 ) -> tuple[Float64[Tensor, " row"], Float64[Tensor, "row 2"]]:
-    """How far points are from the ends of shadows, positive in the light, and unit normals.
+    """Distances of points from shadow boundaries, positive outside the shadow, and unit normals.
 
     Args:
-        shadows: from ``_project_edges``.
-        points: a point each, in the panel's plane [m].
+        shadows: result of ``_project_edges``.
+        points: one point a row, in the panel's plane [m].
     """
     start, end, dark = shadows.unbind(1)
     side = end - start
     length = side.norm(dim=1).clamp_min(1e-300)
-    across = torch.stack([side[:, 1], -side[:, 0]], 1) / length[:, None]
-    across = across * -((dark - start) * across).sum(1).detach().sign()[:, None]
+    normal = torch.stack([side[:, 1], -side[:, 0]], 1) / length[:, None]
+    normal = normal * -((dark - start) * normal).sum(1).detach().sign()[:, None]
     offset = points - start
-    aside = (offset * across).sum(1)
-    along = (offset * side).sum(1) / length
-    beyond = along - along.clamp_min(0).minimum(length)
-    past = beyond.detach() != 0
-    # Past the end of an edge its shadow is a corner.
-    far = torch.where(past, aside.square() + beyond.square(), 1.0).sqrt()
-    sign = torch.where(aside.detach() < 0, -1.0, 1.0)
-    return torch.where(past, sign * far, aside), across
+    distance = (offset * normal).sum(1)
+    projection = (offset * side).sum(1) / length
+    beyond = projection - projection.clamp_min(0).minimum(length)
+    is_beyond = beyond.detach() != 0
+    # Beyond the end of an edge the shadow has a corner.
+    corner_distance = torch.where(is_beyond, distance.square() + beyond.square(), 1.0).sqrt()
+    sign = torch.where(distance.detach() < 0, -1.0, 1.0)
+    return torch.where(is_beyond, sign * corner_distance, distance), normal
 
 
 def _select_visible_edges(
     rays: Occluders, vertices: Tensor, observers: Tensor, cells: PanelCells, edges: _ShadowingEdges
 ) -> _ShadowingEdges:
-    """Edges that nothing hides from their places, where their shadows are nearest to the panel.
+    """Keep edges visible from their observers, at the point whose shadow is nearest to the panel.
 
-    On the panel itself nothing else may shade the lit side of the line.
+    On the panel itself, no other surface may shadow the illuminated side of the line.
     """
     if not len(edges.observer):
         return edges
     shadows = _project_edges(edges, vertices, observers, cells)
     start, end, _ = shadows.unbind(1)
     side = end - start
-    along = (-(start * side).sum(1) / side.square().sum(1).clamp_min(1e-300)).clamp(0, 1)
-    nearest = start + along[:, None] * side
-    _, across = _shadow_distances(shadows, nearest)
-    spot = observers[edges.observer]
+    fraction = (-(start * side).sum(1) / side.square().sum(1).clamp_min(1e-300)).clamp(0, 1)
+    nearest = start + fraction[:, None] * side
+    _, normal = _shadow_distances(shadows, nearest)
+    observer = observers[edges.observer]
     foot = cells.center + nearest @ cells.axes[:, :2].T
-    step = _RAY_OFFSET * (foot - spot).norm(dim=1, keepdim=True) * (across @ cells.axes[:, :2].T)
-    # Where the edge lies on the way from the place to its shadow.
+    step = (
+        _RAY_OFFSET * (foot - observer).norm(dim=1, keepdim=True) * (normal @ cells.axes[:, :2].T)
+    )
+    # Position of the edge between the observer and its shadow.
     first, last = _edge_ray_fractions(edges, vertices, observers, cells).unbind(1)
-    until = 1 / ((1 - along) / first + along / last)
-    until = torch.where(nearest.norm(dim=1) <= cells.radius, 1.0, until)
-    free = is_visible(rays, spot, spot + until[:, None] * (foot + step - spot))
-    return edges.select(torch.nonzero(free)[:, 0])
+    limit = 1 / ((1 - fraction) / first + fraction / last)
+    limit = torch.where(nearest.norm(dim=1) <= cells.radius, 1.0, limit)
+    visible = is_visible(rays, observer, observer + limit[:, None] * (foot + step - observer))
+    return edges.select(torch.nonzero(visible)[:, 0])
 
 
 def _test_cell_centers(
     rays: Occluders, observers: Tensor, cells: PanelCells, edges: _ShadowingEdges, vertices: Tensor
 ) -> Bool[Tensor, "place cell"]:
-    """Whether places see the centres of cells: all are tried where a shadow may end among them."""
+    """Test if observers see the centres of cells, all of them where a shadow boundary may cross."""
     none = torch.zeros(len(edges.observer), 2, dtype=torch.float64)
     distance, _ = _shadow_distances(_project_edges(edges, vertices, observers, cells), none)
     mixed = torch.zeros(len(observers), dtype=torch.bool)
@@ -288,30 +306,30 @@ def _match_cells_to_edges(
     projection_args: tuple[Tensor, Tensor, PanelCells],
     blur: float,
 ) -> tuple[Int64[Tensor, " cut"], Int64[Tensor, " cut"]]:
-    """Which cells the end of a shadow cuts: rows of edges, and cells.
+    """Match cells to the shadow boundaries that cross them: rows of edges, and cells.
 
-    Of several lines the nearest counts that has the cell's centre on the side that rays find.
+    Of several lines, the nearest with the cell's centre on the side found by rays is chosen.
     """
     cells, count = projection_args[2], is_visible.shape[1]
-    span = torch.tensor(cells.size, dtype=torch.float64)
+    cell_size = torch.tensor(cells.size, dtype=torch.float64)
     best = torch.full_like(is_visible, torch.inf, dtype=torch.float64).ravel()
-    held: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-    for some in torch.arange(len(edges.observer)).split(max(1, _PAIRS_AT_ONCE // count)):
-        own = edges.select(some)
-        shadows = _project_edges(own, *projection_args).repeat_interleave(count, 0)
-        distance, across = _shadow_distances(shadows, cells.offsets.repeat(len(some), 1))
-        reach = 0.5 * ((across.abs() * span).sum(1) + blur)
-        where = (own.observer[:, None] * count + torch.arange(count)).ravel()
-        agrees = (distance >= 0) == is_visible.ravel()[where]
+    parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+    for rows in torch.arange(len(edges.observer)).split(max(1, _PAIRS_AT_ONCE // count)):
+        chunk = edges.select(rows)
+        shadows = _project_edges(chunk, *projection_args).repeat_interleave(count, 0)
+        distance, normal = _shadow_distances(shadows, cells.offsets.repeat(len(rows), 1))
+        reach = 0.5 * ((normal.abs() * cell_size).sum(1) + blur)
+        pixel = (chunk.observer[:, None] * count + torch.arange(count)).ravel()
+        agrees = (distance >= 0) == is_visible.ravel()[pixel]
         near = torch.nonzero(agrees & (distance.abs() < reach))[:, 0]
-        held.append((some[near // count], near % count, where[near], distance[near].abs()))
-    if not held:
+        parts.append((rows[near // count], near % count, pixel[near], distance[near].abs()))
+    if not parts:
         return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
-    row, cell, where, far = (torch.cat(column) for column in zip(*held, strict=True))
-    best = best.scatter_reduce(0, where, far, "amin")
-    nearest = torch.nonzero(far <= best[where])[:, 0]
-    # Of lines that are as near as each other, the first.
-    order = nearest[where[nearest].argsort(stable=True)]
+    row, cell, pixel, distance_abs = (torch.cat(column) for column in zip(*parts, strict=True))
+    best = best.scatter_reduce(0, pixel, distance_abs, "amin")
+    nearest = torch.nonzero(distance_abs <= best[pixel])[:, 0]
+    # Of equally near lines, the first.
+    order = nearest[pixel[nearest].argsort(stable=True)]
     first = torch.ones(len(order), dtype=torch.bool)
-    first[1:] = where[order][1:] != where[order][:-1]
+    first[1:] = pixel[order][1:] != pixel[order][:-1]
     return row[order[first]], cell[order[first]]

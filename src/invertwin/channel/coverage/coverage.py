@@ -1,7 +1,7 @@
-"""Specular power on a surface: at points of it, and what moves where beams end on it.
+"""Coverage: specular power on a receiving surface, with boundary paths for its derivatives.
 
 The mean over an area is that of points spread over it, plus boundary paths: zero in value, with the
-derivative that the moving rims of lit regions have (``shadow_edges``).
+derivative due to the moving boundaries of illuminated regions (``shadow_boundaries``).
 
 Source: derivations §10 and §11.
 """
@@ -44,10 +44,10 @@ from invertwin.checks import ArrayLike, is_differentiated, strip_derivatives
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
 
-_POINTS_AT_ONCE = 1 << 13  # points
+_POINTS_AT_ONCE = 1 << 13
 
-#: Takes paths and the places of their transmitters and receivers; returns what each path adds,
-#: ``[path, amount]``.
+#: Function of paths and of the positions of their transmitters and receivers; returns the values
+#: that each path contributes, ``[path, amount]``.
 PathMeasure = Callable[[RayPaths, Tensor, Tensor], Tensor]
 
 
@@ -56,10 +56,10 @@ class CoverageBoundaryPaths:
     """Boundary paths that end on the surface.
 
     Attributes:
-        tx: Transmitters.
-        point: Where on the surface [m].
-        face: Triangle of the surface.
-        amount: What each adds to the integral over the surface; zero in value.
+        tx: transmitter numbers.
+        point: positions on the surface [m].
+        face: triangles of the surface.
+        amount: contributions to the integral over the surface; zero in value.
     """
 
     tx: Int64[Tensor, " row"]
@@ -70,11 +70,11 @@ class CoverageBoundaryPaths:
 
 @dataclass(frozen=True)
 class CoverageTrace:
-    """What specular paths bring to a surface.
+    """Specular coverage of a surface.
 
     Attributes:
-        amount: At the points.
-        boundary_paths: Boundary paths.
+        amount: sums of path values at the points.
+        boundary_paths: boundary paths to the surface.
     """
 
     amount: Float64[Tensor, "tx point amount"]
@@ -83,7 +83,7 @@ class CoverageTrace:
 
 @dataclass(frozen=True)
 class _PointBatch:
-    """Paths to some points: the first point, how many, and chains."""
+    """Paths to a batch of points: first point, number of points, and the paths."""
 
     begin: int
     count: int
@@ -104,38 +104,43 @@ def trace_coverage(
     boundary_samples: int,
     seed: int,
 ) -> CoverageTrace:
-    """What specular paths bring to points of a surface, and to the rims of lit regions on it.
+    """Trace specular paths to points of a surface, and to boundaries of illumination on it.
 
     Args:
-        scene: What is in the way.
-        tx: Transmitters [tx, 3] in the world [m].
-        surface: The surface, in the world; it hides nothing.
-        points: On the surface [m].
-        frequency: Of the coefficients [Hz].
-        measure: What a path adds.
-        value_count: Numbers that a path adds.
-        depth: Most surfaces that a path meets.
-        rays: Shot from each transmitter to find sequences of surfaces; None tries every one.
-        boundary_samples: Points on edges, for each transmitter; 0 leaves boundary paths out. Only
-            derivatives by places use them.
-        seed: Of rays and edge points.
+        scene: scene with surfaces.
+        tx: transmitter positions, [tx, 3], in world axes [m].
+        surface: receiving surface, in world axes; it occludes nothing.
+        points: points on the surface [m].
+        frequency: carrier frequency [Hz].
+        measure: values that a path contributes.
+        value_count: number of values per path.
+        depth: maximum number of surfaces on a path.
+        rays: number of rays from each transmitter to find sequences of surfaces; None tests every
+            one.
+        boundary_samples: number of points on edges, for each transmitter; 0 leaves boundary paths
+            out. Only derivatives with respect to positions use them.
+        seed: random seed of rays and edge points.
     """
-    stage = prepare_path_scene(scene, tx, points, frequency, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    path_scene = prepare_path_scene(scene, tx, points, frequency, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     with tracing():
-        trace = _CoverageTracer(stage, surface, measure, value_count, depth, rays, seed)
-        amount = trace.sum_paths(stage, trace.find_paths(strip_derivatives(stage.rx)))
-        crossings: list[CoverageBoundaryPaths] = []
-        moved = is_differentiated(stage.vertices)
-        if boundary_samples and (moved or is_differentiated(stage.tx)):
-            crossings += trace.trace_illumination_boundaries(stage, boundary_samples, seed)
-            crossings += (
-                trace.trace_intersection_curves(stage, boundary_samples, seed) if moved else []
+        tracer = _CoverageTracer(path_scene, surface, measure, value_count, depth, rays, seed)
+        amount = tracer.sum_paths(path_scene, tracer.find_paths(strip_derivatives(path_scene.rx)))
+        boundary_paths: list[CoverageBoundaryPaths] = []
+        vertices_move = is_differentiated(path_scene.vertices)
+        if boundary_samples and (vertices_move or is_differentiated(path_scene.tx)):
+            boundary_paths += tracer.trace_illumination_boundaries(
+                path_scene, boundary_samples, seed
             )
-    return CoverageTrace(amount, tuple(crossings))
+            boundary_paths += (
+                tracer.trace_intersection_curves(path_scene, boundary_samples, seed)
+                if vertices_move
+                else []
+            )
+    return CoverageTrace(amount, tuple(boundary_paths))
 
 
 class _CoverageTracer:
-    """Which paths there are, and what they are worth."""
+    """Finds specular paths to a receiving surface and sums their values."""
 
     def __init__(
         self,
@@ -149,7 +154,7 @@ class _CoverageTracer:
     ) -> None:
         self.measure, self.value_count, self.depth = measure, value_count, depth
         self.tx, self.powers = strip_derivatives(stage.tx), face_interactions(stage)
-        # Discrete: to `torch.func`, tensors made on the way would be its own.
+        # Discrete: `torch.func` would claim the intermediate tensors.
         with _DisableFuncTorch():
             places = strip_derivatives(surface.vertices)
             self.candidate_surfaces = CandidateSurfaces(
@@ -171,7 +176,7 @@ class _CoverageTracer:
             self.sequences = tuple(steps for steps in found if len(steps))
 
     def find_paths(self, points: Tensor) -> list[_PointBatch]:
-        """The paths to points, some of the points at a time."""
+        """Find the paths to points, in batches of points."""
         every = (torch.zeros(1, 0, dtype=torch.int64), *self.sequences)
         with _DisableFuncTorch():
             return [
@@ -196,31 +201,37 @@ class _CoverageTracer:
             ]
 
     def sum_paths(
-        self, stage: PathScene, parts: list[_PointBatch]
+        self, stage: PathScene, batches: list[_PointBatch]
     ) -> Float64[Tensor, "tx point amount"]:
-        """What paths bring to points; a derivative computes the paths again, and keeps none."""
-        again = stage.vertices.requires_grad or stage.tx.requires_grad
+        """Sum the values of paths at points; derivatives recompute the paths (checkpointing)."""
+        recompute = stage.vertices.requires_grad or stage.tx.requires_grad
         found: list[Tensor] = []
-        for some in parts:
-            rx = stage.rx[some.begin : some.begin + some.count]
-            here = replace(stage, rx=rx, rx_velocity=torch.zeros_like(rx))
+        for batch in batches:
+            rx = stage.rx[batch.begin : batch.begin + batch.count]
+            receivers_scene = replace(stage, rx=rx, rx_velocity=torch.zeros_like(rx))
 
-            def total(here: PathScene = here, some: _PointBatch = some) -> Tensor:
-                sums = torch.zeros(len(self.tx) * some.count, self.value_count, dtype=torch.float64)
-                for part in some.paths:
-                    paths = join_ray_paths(evaluate_paths(here, part))
-                    sums = sums.index_add(0, paths.link, self.measure(paths, here.tx, here.rx))
-                return sums.unflatten(0, (len(self.tx), some.count))
+            def total(
+                receivers_scene: PathScene = receivers_scene, batch: _PointBatch = batch
+            ) -> Tensor:
+                sums = torch.zeros(
+                    len(self.tx) * batch.count, self.value_count, dtype=torch.float64
+                )
+                for part in batch.paths:
+                    paths = join_ray_paths(evaluate_paths(receivers_scene, part))
+                    sums = sums.index_add(
+                        0, paths.link, self.measure(paths, receivers_scene.tx, receivers_scene.rx)
+                    )
+                return sums.unflatten(0, (len(self.tx), batch.count))
 
-            found.append(checkpoint(total, use_reentrant=False) if again else total())
+            found.append(checkpoint(total, use_reentrant=False) if recompute else total())
         return torch.cat(found, 1)
 
     def trace_illumination_boundaries(
         self, stage: PathScene, samples: int, seed: int
     ) -> list[CoverageBoundaryPaths]:
-        """Boundary paths to rims: what each path would bring, times the rim's rate."""
+        """Boundary paths to illumination boundaries: path values times the boundary's area rate."""
         with _DisableFuncTorch():
-            met = sample_illumination_boundaries(
+            samples_by_length = sample_illumination_boundaries(
                 self.candidate_surfaces,
                 self.receiving_surface,
                 self.tx,
@@ -230,60 +241,63 @@ class _CoverageTracer:
                 samples=samples,
                 seed=seed,
             )
-        crossings: list[CoverageBoundaryPaths] = []
-        for some in met:
-            found = evaluate_illumination_boundary(
+        boundary_paths: list[CoverageBoundaryPaths] = []
+        for boundary_samples in samples_by_length:
+            boundary = evaluate_illumination_boundary(
                 self.candidate_surfaces,
                 self.receiving_surface.corners,
-                some,
+                boundary_samples,
                 stage.tx,
                 stage.vertices,
             )
-            here = _detach_stage(stage, found.point)
+            detached = _detach_stage(stage, boundary.point)
             with torch.no_grad():
-                paths = join_ray_paths(evaluate_paths(here, found.paths))
-                brought = strip_derivatives(self.measure(paths, here.tx, here.rx))
+                paths = join_ray_paths(evaluate_paths(detached, boundary.paths))
+                values = strip_derivatives(self.measure(paths, detached.tx, detached.rx))
             # One path a row, in another order.
-            amount = torch.zeros_like(brought).index_copy(0, paths.rx, brought)
-            crossings.append(
+            amount = torch.zeros_like(values).index_copy(0, paths.rx, values)
+            boundary_paths.append(
                 CoverageBoundaryPaths(
-                    found.paths.source, found.point, found.face, amount * found.area_rate[:, None]
+                    boundary.paths.source,
+                    boundary.point,
+                    boundary.face,
+                    amount * boundary.area_rate[:, None],
                 )
             )
-        return crossings
+        return boundary_paths
 
     def trace_intersection_curves(
         self, stage: PathScene, samples: int, seed: int
     ) -> list[CoverageBoundaryPaths]:
-        """Boundary paths where the scene cuts the screen: the jump of power, times the rate."""
+        """Boundary paths where the scene intersects the surface: jump of values times area rate."""
         with _DisableFuncTorch():
-            both = topology_of(self.meshes)
-            cuts = sample_intersection_curves(
-                self.candidate_surfaces, self.receiving_surface, both, samples, seed
+            joint_topology = topology_of(self.meshes)
+            curve_points = sample_intersection_curves(
+                self.candidate_surfaces, self.receiving_surface, joint_topology, samples, seed
             )
-            if not len(cuts.face):
+            if not len(curve_points.face):
                 return []
-            away = SIDE_OFFSET * self.candidate_surfaces.margin * cuts.across
-            points = torch.cat([cuts.point + away, cuts.point - away])
+            offset = SIDE_OFFSET * self.candidate_surfaces.margin * curve_points.across
+            points = torch.cat([curve_points.point + offset, curve_points.point - offset])
         with torch.no_grad():
-            here = _detach_stage(stage, points)
-            beside, behind = strip_derivatives(self.sum_paths(here, self.find_paths(points))).chunk(
-                2, 1
-            )
-        rate = intersection_area_rates(self.candidate_surfaces, cuts, stage.vertices)
+            detached = _detach_stage(stage, points)
+            outer, inner = strip_derivatives(
+                self.sum_paths(detached, self.find_paths(points))
+            ).chunk(2, 1)
+        rate = intersection_area_rates(self.candidate_surfaces, curve_points, stage.vertices)
         count = len(self.tx)
         return [
             CoverageBoundaryPaths(
                 torch.arange(count).repeat_interleave(len(rate)),
-                cuts.point.repeat(count, 1),
-                cuts.receiving_face.repeat(count),
-                ((behind - beside) * rate[:, None]).flatten(0, 1),
+                curve_points.point.repeat(count, 1),
+                curve_points.receiving_face.repeat(count),
+                ((inner - outer) * rate[:, None]).flatten(0, 1),
             )
         ]
 
 
 def _detach_stage(stage: PathScene, points: Tensor) -> PathScene:
-    """The stage without derivatives of places, with other receivers."""
+    """Replace the receivers and detach all positions."""
     return replace(
         stage,
         vertices=strip_derivatives(stage.vertices),
@@ -296,15 +310,15 @@ def _detach_stage(stage: PathScene, points: Tensor) -> PathScene:
 
 @dataclass(frozen=True)
 class IntersectionCurvePoints:
-    """Points on curves where the scene cuts a screen; detached.
+    """Points on intersection curves of the scene with a receiving surface; detached.
 
     Attributes:
-        point: The points [m].
-        face: Triangles of the scene.
-        receiving_face: Triangles of the screen.
-        across: Unit vectors in the screen across the curve, to the side of the normal.
-        normal: Of the scene's triangles.
-        weight: Length of curve that a point stands for, over n·aside [m].
+        point: the points [m].
+        face: triangles of the scene.
+        receiving_face: triangles of the receiving surface.
+        across: unit vectors in the surface across the curve, to the side of the normal.
+        normal: unit normals of the scene's triangles.
+        weight: length of curve per point, over n·across [m].
     """
 
     point: Float64[Tensor, "row 3"]
@@ -322,35 +336,35 @@ def sample_intersection_curves(
     samples: int,
     seed: int,
 ) -> IntersectionCurvePoints:
-    """Points spread evenly over all curves where the scene cuts a screen.
+    """Sample points evenly on the intersection curves of the scene with a receiving surface.
 
     Args:
-        candidate_surfaces: The scene.
-        receiving_surface: The screen.
-        joint_topology: The scene's triangles, and those of the screen after them.
-        samples: Points.
-        seed: Of the points.
+        candidate_surfaces: surfaces of the scene.
+        receiving_surface: the receiving surface.
+        joint_topology: triangles of the scene, followed by those of the receiving surface.
+        samples: number of points.
+        seed: random seed of the points.
     """
     vertices = candidate_surfaces.exact_vertices + candidate_surfaces.origin
     corners = vertices[candidate_surfaces.topology.faces]
-    face, on_screen = find_overlapping_pairs(corners, receiving_surface.corners)
+    face, receiving_face = find_overlapping_pairs(corners, receiving_surface.corners)
     points = torch.cat([vertices, receiving_surface.vertices])
-    met = intersect_triangles(points, joint_topology, face, on_screen + len(corners))
-    span = met.end - met.start
-    row, along, weight = sample_along_curves(span.norm(dim=1), samples, seed)
-    face, on_screen = met.first[row], met.second[row] - len(corners)
+    segments = intersect_triangles(points, joint_topology, face, receiving_face + len(corners))
+    span = segments.end - segments.start
+    row, fraction, weight = sample_along_curves(span.norm(dim=1), samples, seed)
+    face, receiving_face = segments.first[row], segments.second[row] - len(corners)
     normal, up = (
         _triangle_normals(corners[face]),
-        _triangle_normals(receiving_surface.corners[on_screen]),
+        _triangle_normals(receiving_surface.corners[receiving_face]),
     )
-    aside = normalize(normal - dot(normal, up)[:, None] * up, dim=1)
+    across = normalize(normal - dot(normal, up)[:, None] * up, dim=1)
     return IntersectionCurvePoints(
-        met.start[row] + along[:, None] * span[row],
+        segments.start[row] + fraction[:, None] * span[row],
         face,
-        on_screen,
-        aside,
+        receiving_face,
+        across,
         normal,
-        weight * span[row].norm(dim=1) / dot(normal, aside),
+        weight * span[row].norm(dim=1) / dot(normal, across),
     )
 
 
@@ -359,12 +373,12 @@ def intersection_area_rates(
     points: IntersectionCurvePoints,
     vertices: Float64[Tensor, "v 3"],
 ) -> Float64[Tensor, " row"]:
-    """Area that the side of the normal loses, of each point's share; zero in value, attached [m²].
+    """Rates of the area lost on the side of the normal; zero in value, with derivatives [m²].
 
     Args:
-        candidate_surfaces: The scene.
-        points: The points.
-        vertices: Of the scene in the world, attached [m].
+        candidate_surfaces: surfaces of the scene.
+        points: points on the intersection curves.
+        vertices: vertex positions in world axes, with derivatives [m].
     """
     corners = vertices[candidate_surfaces.topology.faces[points.face]]
     a, b, c = strip_derivatives(corners).unbind(1)

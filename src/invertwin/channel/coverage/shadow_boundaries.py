@@ -1,12 +1,13 @@
-"""Edges of beams on a surface: where the power of specular paths jumps, and how fast that moves.
+"""Shadow and reflection boundaries on a receiving surface, and their velocity with respect to θ.
 
-On a surface, the paths of one sequence of mirrors and sheets light a region. Its rim is drawn by
-edges of the scene: those that end a mirror or a sheet, and those that hide. A ray from the
-transmitter to a point of an edge goes on at both sides of the edge, and every path that only one of
-the sides has adds its power times the speed at which the rim sweeps over the surface.
+The paths of one sequence of reflections and transmissions illuminate a region of a surface. Its
+boundary is cast by edges of the scene: those of the reflecting surfaces and sheets, and those of
+occluders. A ray from the transmitter to a point of an edge continues on both sides of the edge, and
+every path that exists on one side only contributes its power times the velocity at which the
+boundary moves over the surface.
 
-With S the last image of the transmitter and y the last image of the edge point, the rim is where
-the line from S through y meets the surface: ``ΔI = f · T · (x_c − x_m)``, value zero.
+With S the last image of the transmitter and y the last image of the edge point, the boundary lies
+where the line from S through y intersects the surface: ``ΔI = f · T · (x_c − x_m)``, value zero.
 
 Source: derivations §3 and §11, for specular paths.
 """
@@ -34,18 +35,18 @@ from invertwin.channel.specular.image_method import (
 )
 from invertwin.checks import strip_derivatives
 
-SIDE_OFFSET = 10.0  # margins between where power jumps and the two sides that are compared
-_MIN_COSINE = 1e-4  # least cosine between a ray and the normal of the surface that it lights
-_MAX_SURFACE_HITS = 64  # triangles of the surface that a straight piece of a path meets
+SIDE_OFFSET = 10.0  # margins between a boundary and the points compared on its two sides
+_MIN_COSINE = 1e-4  # of the angle between a ray and the normal of the receiving surface
+_MAX_SURFACE_HITS = 64  # triangles of the surface on one segment of a path
 
 
 class ReceivingSurface(Occluders):
-    """A surface that receives power at all its points and hides nothing.
+    """Surface that receives power at all its points and occludes nothing.
 
     Args:
-        vertices: World positions, detached [m].
-        topology: Their triangles.
-        origin: The local origin, that of the scene [m].
+        vertices: vertex positions in world axes, detached [m].
+        topology: triangles of the vertices.
+        origin: local origin, that of the scene [m].
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class ReceivingTriangles:
     """Triangles of the scene itself that receive power.
 
     Attributes:
-        is_receiving: Which of them do.
+        is_receiving: mask of triangles that receive.
     """
 
     is_receiving: Bool[Tensor, " f"]
@@ -69,14 +70,15 @@ class ReceivingTriangles:
 
 @dataclass(frozen=True)
 class IlluminationBoundary:
-    """Points on rims of lit regions, of paths with one number of steps.
+    """Points on boundaries of illuminated regions, of paths with equal numbers of steps.
 
     Attributes:
-        paths: The paths from transmitters to the rims; row i ends at rim point i.
-        place: Rim points on the surface, detached [m].
-        face: Triangle of the surface.
-        area_rate: Area newly lit, of the sample's share of the rim [m²]; zero in value, attached.
-        edge_point: Number of the edge point that draws each.
+        paths: paths from transmitters to the boundaries; row i ends at point i.
+        point: boundary points on the surface, detached [m].
+        face: triangle of the surface.
+        area_rate: area newly illuminated along the sample's part of the boundary [m²]; zero in
+            value, with derivatives.
+        edge_point: number of the edge point that casts each.
     """
 
     paths: SpecularPaths
@@ -91,10 +93,10 @@ class _EdgeSamples:
     """Points on edges, one row each; detached.
 
     Attributes:
-        first, second: Vertices at the ends.
-        fraction: Place from the first to the second, 0 to 1.
-        weight: One over samples × probability per ``fraction``.
-        faces: Triangles at the edge (−1: none).
+        first, second: vertices at the ends.
+        fraction: position from the first to the second, 0 to 1.
+        weight: reciprocal of samples × probability per ``fraction``.
+        faces: triangles at the edge (−1: none).
     """
 
     first: Tensor
@@ -109,17 +111,17 @@ class _EdgeSamples:
 
 @dataclass(frozen=True)
 class _RaysPastEdges:
-    """Rays that go on past an edge, one row each; detached.
+    """Rays that continue past an edge, one row each; detached.
 
     Attributes:
-        origin, direction: Of the ray, about the local origin [m]; the direction of unit length.
-        min_distance: Length from which on the surface counts [m]: on the first leg, that to the
+        origin, direction: ray origin relative to the local origin [m], and unit direction.
+        min_distance: distance beyond which the surface receives [m]: on the first leg, that to the
             edge.
-        source: Transmitter.
-        edge_point: Of the edge point.
-        side: Unit vector from the edge to the ray.
-        steps_before_edge: Steps before the edge.
-        faces, through: Steps so far, filled up with −1.
+        source: number of the transmitter.
+        edge_point: number of the edge point.
+        side: unit vector from the edge to the ray.
+        steps_before_edge: number of steps before the edge.
+        faces, through: steps so far, padded with −1.
     """
 
     origin: Tensor
@@ -143,12 +145,12 @@ def _concatenate_rays(parts: Sequence[_RaysPastEdges]) -> _RaysPastEdges:
 
 @dataclass(frozen=True)
 class IlluminationBoundarySamples:
-    """Points on rims of lit regions, of paths with one number of steps; detached.
+    """Points on boundaries of illuminated regions, of paths with equal numbers of steps; detached.
 
     Attributes:
-        edges: Points on edges that draw the rims.
-        rays: Last legs of the paths.
-        face: Triangle of the surface.
+        edges: points on edges that cast the boundaries.
+        rays: last legs of the paths.
+        face: triangle of the surface.
     """
 
     edges: _EdgeSamples
@@ -167,17 +169,17 @@ def sample_illumination_boundaries(
     samples: int,
     seed: int,
 ) -> list[IlluminationBoundarySamples]:
-    """Points on the rims of all regions that specular paths light on a surface.
+    """Sample points on the boundaries of regions that specular paths illuminate on a surface.
 
     Args:
-        candidate_surfaces: The scene.
-        receiver: Where power is received.
-        tx: Transmitters in the world, detached [m].
-        sequences: Candidates for what lies between transmitter and edge, by length from 1.
-        powers: Of the triangles.
-        depth: Most steps of a path.
-        samples: Points on edges, for each transmitter.
-        seed: Of the points.
+        candidate_surfaces: surfaces of the scene.
+        receiver: surface or triangles that receive power.
+        tx: transmitter positions in world axes, detached [m].
+        sequences: candidate sequences from transmitter to edge, by length from 1.
+        powers: interactions of the triangles.
+        depth: maximum number of steps of a path.
+        samples: number of points on edges, for each transmitter.
+        seed: random seed of the points.
     """
     found: list[IlluminationBoundarySamples] = []
     for number, source in enumerate(tx):
@@ -185,23 +187,28 @@ def sample_illumination_boundaries(
         if not len(edges.fraction):
             continue
         ends = [candidate_surfaces.exact_vertices[vertex] for vertex in (edges.first, edges.second)]
-        y = torch.lerp(ends[0], ends[1], edges.fraction[:, None])
-        chains = [
-            some
+        edge_points = torch.lerp(ends[0], ends[1], edges.fraction[:, None])
+        paths = [
+            part
             for steps in (torch.zeros(1, 0, dtype=torch.int64), *sequences)
-            for some in find_paths_between(
-                candidate_surfaces, steps, source, y + candidate_surfaces.origin, number
+            for part in find_paths_between(
+                candidate_surfaces, steps, source, edge_points + candidate_surfaces.origin, number
             )
         ]
-        met: dict[int, list[tuple[_RaysPastEdges, Tensor]]] = {}
-        for some in chains:
+        by_length: dict[int, list[tuple[_RaysPastEdges, Tensor]]] = {}
+        for part in paths:
             for legs in _launch_past_edges(
-                candidate_surfaces, source - candidate_surfaces.origin, y, ends, some, depth
+                candidate_surfaces,
+                source - candidate_surfaces.origin,
+                edge_points,
+                ends,
+                part,
+                depth,
             ):
                 for last, face in _follow_rays(candidate_surfaces, receiver, legs, powers, depth):
-                    met.setdefault(last.faces.shape[1], []).append((last, face))
-        for some in met.values():
-            legs, faces = zip(*some, strict=True)
+                    by_length.setdefault(last.faces.shape[1], []).append((last, face))
+        for part in by_length.values():
+            legs, faces = zip(*part, strict=True)
             found.append(
                 IlluminationBoundarySamples(edges, _concatenate_rays(legs), torch.cat(faces))
             )
@@ -211,42 +218,42 @@ def sample_illumination_boundaries(
 def _sample_edges(
     candidate_surfaces: CandidateSurfaces, samples: int, seed: int, number: int
 ) -> _EdgeSamples:
-    """Points spread evenly over all edges at which anything can end."""
+    """Sample points evenly on all edges that can cast a boundary."""
     topology, planes = candidate_surfaces.topology, candidate_surfaces.planes.face_plane
-    beside = topology.edge_faces
-    # Triangles in one plane of one object are one surface.
-    plane = torch.where(beside >= 0, planes[beside.clamp_min(0)], -1)
-    flat = (plane == plane[:, :1]).all(1) & (beside >= 0).all(1) & (beside.shape[1] > 1)
+    edge_faces = topology.edge_faces
+    # Coplanar triangles of one object are one surface.
+    plane = torch.where(edge_faces >= 0, planes[edge_faces.clamp_min(0)], -1)
+    flat = (plane == plane[:, :1]).all(1) & (edge_faces >= 0).all(1) & (edge_faces.shape[1] > 1)
     edge = torch.nonzero(~flat)[:, 0]
     ends = candidate_surfaces.exact_vertices[topology.edges[edge]]
-    row, along, weight = sample_along_curves(
+    row, fraction, weight = sample_along_curves(
         (ends[:, 1] - ends[:, 0]).norm(dim=1), samples, seed, number
     )
     chosen = edge[row]
     first, second = topology.edges[chosen].unbind(1)
-    return _EdgeSamples(first, second, along, weight, topology.edge_faces[chosen])
+    return _EdgeSamples(first, second, fraction, weight, topology.edge_faces[chosen])
 
 
 def sample_along_curves(
     length: Float64[Tensor, " n"], samples: int, *seeds: int
 ) -> tuple[Int64[Tensor, " row"], Float64[Tensor, " row"], Float64[Tensor, " row"]]:
-    """Points spread evenly over curves: the curve, place along it from 0 to 1, and weight.
+    """Sample points evenly on curves: number of the curve, position from 0 to 1, and weight.
 
-    The weight is one over samples × probability per place.
+    The weight is the reciprocal of samples × probability per position.
 
     Args:
-        length: Of the curves.
-        samples: Points; none where there are no curves.
-        seeds: Of the points.
+        length: lengths of the curves [m].
+        samples: number of points; without curves there are none.
+        seeds: random seeds of the points.
     """
     total = length.cumsum(0)
     if not len(length) or not total[-1] > 0:
         return torch.zeros(0, dtype=torch.int64), length[:0], length[:0]
     jitter = np.random.default_rng(np.random.SeedSequence(seeds)).random(samples)
-    spot = (torch.arange(samples) + torch.from_numpy(jitter)) / samples * total[-1]
-    row = torch.searchsorted(total, spot, right=True).clamp_max(len(length) - 1)
-    along = 1 - (total[row] - spot) / length[row]
-    return row, along.clamp(0.0, 1.0), total[-1] / (samples * length[row])
+    cumulative = (torch.arange(samples) + torch.from_numpy(jitter)) / samples * total[-1]
+    row = torch.searchsorted(total, cumulative, right=True).clamp_max(len(length) - 1)
+    fraction = 1 - (total[row] - cumulative) / length[row]
+    return row, fraction.clamp(0.0, 1.0), total[-1] / (samples * length[row])
 
 
 def _launch_past_edges(
@@ -257,11 +264,11 @@ def _launch_past_edges(
     chains: SpecularPaths,
     depth: int,
 ) -> Iterator[_RaysPastEdges]:
-    """Rays past edges, one at each side, from the last mirror or sheet before them."""
+    """Launch rays past edges, one on each side, from the last surface before them."""
     planes, count = candidate_surfaces.planes, chains.faces.shape[1]
     plane = planes.face_plane[chains.faces]
     if count:
-        # A step in a plane that holds the edge point is one at the edge: the rays past it take it.
+        # A step in a plane that contains the edge point is left to the rays past the edge.
         last = plane[:, -1]
         height = dot(edge_points[chains.target] - planes.point[last], planes.normal[last]).abs()
         rows = torch.nonzero(height > SIDE_OFFSET * candidate_surfaces.margin)[:, 0]
@@ -272,19 +279,19 @@ def _launch_past_edges(
     point, normal, target = planes.point[plane], planes.normal[plane], edge_points[chains.target]
     image = image_positions(source.expand(len(target), 3), point, normal, chains.transmitted)[-1]
     edge = normalize(ends[1][chains.target] - ends[0][chains.target], dim=1)
-    across = cross(normalize(target - image, dim=1), edge)
-    clear = torch.nonzero(across.norm(dim=1) > _MIN_COSINE)[:, 0]
-    across = normalize(across, dim=1)
-    for side in (across, -across):
+    sideways = cross(normalize(target - image, dim=1), edge)
+    valid = torch.nonzero(sideways.norm(dim=1) > _MIN_COSINE)[:, 0]
+    sideways = normalize(sideways, dim=1)
+    for side in (sideways, -sideways):
         offset = target + SIDE_OFFSET * candidate_surfaces.margin * side - image
         length = offset.norm(dim=1)
         direction = offset / length[:, None]
         origin, start = image, torch.zeros_like(length)
         if count:
-            falls = dot(direction, normal[:, -1])
-            start = dot(point[:, -1] - image, normal[:, -1]) / falls
-            lift = candidate_surfaces.margin * falls.sign()
-            origin = image + start[:, None] * direction + lift[:, None] * normal[:, -1]
+            slope = dot(direction, normal[:, -1])
+            start = dot(point[:, -1] - image, normal[:, -1]) / slope
+            offset_length = candidate_surfaces.margin * slope.sign()
+            origin = image + start[:, None] * direction + offset_length[:, None] * normal[:, -1]
         yield _RaysPastEdges(
             origin,
             direction,
@@ -295,7 +302,7 @@ def _launch_past_edges(
             torch.full_like(chains.source, count),
             pad(chains.faces, (0, depth - count), value=-1),
             pad(chains.transmitted, (0, depth - count), value=False),
-        ).select(clear)
+        ).select(valid)
 
 
 def _follow_rays(
@@ -305,50 +312,50 @@ def _follow_rays(
     powers: FaceInteractions,
     depth: int,
 ) -> Iterator[tuple[_RaysPastEdges, Tensor]]:
-    """Where rays meet the surface, and by which steps: legs with the triangle of the surface."""
+    """Follow rays through the scene to the surface: last legs with the triangle that they hit."""
     step = int(rays.steps_before_edge[0]) if len(rays.edge_point) else depth
     while len(rays.edge_point):
         face, distance = _intersect_rays(candidate_surfaces, rays.origin, rays.direction)
         for rows, triangle in _find_received(receiver, rays, face, distance):
-            some = rays.select(rows)
-            steps = {"faces": some.faces[:, :step], "through": some.through[:, :step]}
-            yield replace(some, **steps), triangle
+            part = rays.select(rows)
+            steps = {"faces": part.faces[:, :step], "through": part.through[:, :step]}
+            yield replace(part, **steps), triangle
         if step == depth:
             return
-        known = (face >= 0) & (candidate_surfaces.planes.face_plane[face.clamp_min(0)] >= 0)
-        onwards: list[_RaysPastEdges] = []
-        for passes, able in ((False, powers.reflect), (True, powers.transmit)):
-            rows = torch.nonzero(known & able[face.clamp_min(0)])[:, 0]
-            some, hit = rays.select(rows), face[rows]
+        has_plane = (face >= 0) & (candidate_surfaces.planes.face_plane[face.clamp_min(0)] >= 0)
+        branches: list[_RaysPastEdges] = []
+        for passes, mask in ((False, powers.reflect), (True, powers.transmit)):
+            rows = torch.nonzero(has_plane & mask[face.clamp_min(0)])[:, 0]
+            part, hit = rays.select(rows), face[rows]
             normal = candidate_surfaces.planes.normal[candidate_surfaces.planes.face_plane[hit]]
-            place = some.origin + distance[rows, None] * some.direction
-            way = some.direction if passes else reflect_vectors(some.direction, normal)
-            lift = candidate_surfaces.margin * dot(way, normal).sign()
-            faces, through = some.faces.clone(), some.through.clone()
+            hit_point = part.origin + distance[rows, None] * part.direction
+            next_direction = part.direction if passes else reflect_vectors(part.direction, normal)
+            ray_offset = candidate_surfaces.margin * dot(next_direction, normal).sign()
+            faces, through = part.faces.clone(), part.through.clone()
             faces[:, step], through[:, step] = hit, passes
-            onwards.append(
+            branches.append(
                 replace(
-                    some,
-                    origin=place + lift[:, None] * normal,
-                    direction=way,
-                    min_distance=some.min_distance - distance[rows],
+                    part,
+                    origin=hit_point + ray_offset[:, None] * normal,
+                    direction=next_direction,
+                    min_distance=part.min_distance - distance[rows],
                     faces=faces,
                     through=through,
                 )
             )
-        rays = _concatenate_rays(onwards)
+        rays = _concatenate_rays(branches)
         step += 1
 
 
 def _intersect_rays(
     occluders: Occluders, origin: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The triangle that each ray meets (−1: none), and how far away [m] (else infinite)."""
-    start, way = (
+    """Triangle that each ray hits (−1: none), and its distance [m] (infinite without a hit)."""
+    start, ray_direction = (
         kind(*(to_float(values[:, k].to(torch.float32)) for k in range(3)))
         for kind, values in ((mi.Point3f, origin), (mi.Vector3f, direction))
     )
-    hit = occluders.scene.ray_intersect_preliminary(mi.Ray3f(start, way))
+    hit = occluders.scene.ray_intersect_preliminary(mi.Ray3f(start, ray_direction))
     face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
     distance = dr.select(hit.is_valid(), hit.t, dr.inf)
     dr.eval(face, distance)
@@ -361,7 +368,7 @@ def _find_received(
     face: Tensor,
     distance: Tensor,
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Rows and triangles that receive power on the way to the next wall, or where it is met."""
+    """Rows and triangles that receive power on a segment, or at its end."""
     if isinstance(receiver, ReceivingSurface):
         yield from _find_surface_hits(receiver, rays, distance)
         return
@@ -374,20 +381,24 @@ def _find_received(
 def _find_surface_hits(
     receiver: ReceivingSurface, rays: _RaysPastEdges, max_distance: Tensor
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Rows and triangles of the surface that they cross, past the edge and before the next wall."""
-    rows, at = torch.arange(len(rays.edge_point)), rays.min_distance.clamp_min(0.0)
+    """Rows and triangles of surface crossings past the edge and before the next surface."""
+    rows, distance_along = torch.arange(len(rays.edge_point)), rays.min_distance.clamp_min(0.0)
     for _ in range(_MAX_SURFACE_HITS):
-        ahead = torch.nonzero(at < max_distance[rows])[:, 0]
+        ahead = torch.nonzero(distance_along < max_distance[rows])[:, 0]
         if not len(ahead):
             return
-        rows, at = rows[ahead], at[ahead]
+        rows, distance_along = rows[ahead], distance_along[ahead]
         origin, direction = rays.origin[rows], rays.direction[rows]
-        face, distance = _intersect_rays(receiver, origin + at[:, None] * direction, direction)
-        at = at + distance
-        met = torch.nonzero((face >= 0) & (at < max_distance[rows]))[:, 0]
-        rows, at = rows[met], at[met]
-        yield rows, face[met]
-        at = at + RAY_EPSILON * (1 + at + origin[met].norm(dim=1))
+        face, distance = _intersect_rays(
+            receiver, origin + distance_along[:, None] * direction, direction
+        )
+        distance_along = distance_along + distance
+        is_hit = torch.nonzero((face >= 0) & (distance_along < max_distance[rows]))[:, 0]
+        rows, distance_along = rows[is_hit], distance_along[is_hit]
+        yield rows, face[is_hit]
+        distance_along = distance_along + RAY_EPSILON * (
+            1 + distance_along + origin[is_hit].norm(dim=1)
+        )
 
 
 def evaluate_illumination_boundary(
@@ -397,57 +408,67 @@ def evaluate_illumination_boundary(
     tx: Float64[Tensor, "tx 3"],
     vertices: Float64[Tensor, "v 3"],
 ) -> IlluminationBoundary:
-    """Points on rims, with the speeds of the rims.
+    """Evaluate boundary points and the velocities of the boundaries.
 
     Args:
-        candidate_surfaces: The scene.
-        receiving_corners: Corners of the triangles where power is received, attached where they
-            move [m].
-        samples: The points.
-        tx: Transmitters in the world, attached [m].
-        vertices: Of the scene in the world, attached [m].
+        candidate_surfaces: surfaces of the scene.
+        receiving_corners: corners of the receiving triangles, with derivatives where they move [m].
+        samples: boundary samples.
+        tx: transmitter positions in world axes, with derivatives [m].
+        vertices: vertex positions in world axes, with derivatives [m].
     """
     legs, edges = samples.rays, samples.edges.select(samples.rays.edge_point)
     corners = vertices[candidate_surfaces.topology.faces[legs.faces]]
     sides = corners[..., 1:, :] - corners[..., :1, :]
     normal = normalize(cross(sides[..., 0, :], sides[..., 1, :]), dim=-1)
     point = corners[..., 0, :]
-    seen = image_positions(tx[legs.source], point, normal, legs.through)[-1]
-    # Only what follows the edge mirrors it.
-    kept = legs.through | (torch.arange(legs.faces.shape[1]) < legs.steps_before_edge[:, None])
+    image = image_positions(tx[legs.source], point, normal, legs.through)[-1]
+    # Only surfaces after the edge reflect the edge point.
+    is_unreflected = legs.through | (
+        torch.arange(legs.faces.shape[1]) < legs.steps_before_edge[:, None]
+    )
     y0, y1 = vertices[edges.first], vertices[edges.second]
-    y = image_positions(torch.lerp(y0, y1, edges.fraction[:, None]), point, normal, kept)[-1]
+    y = image_positions(torch.lerp(y0, y1, edges.fraction[:, None]), point, normal, is_unreflected)[
+        -1
+    ]
     receiving = receiving_corners[samples.face]
     p0, p1, p2 = receiving.unbind(1)
     up = normalize(cross(p1 - p0, p2 - p0), dim=1)
-    ray = y - seen
-    stretch = dot(p0 - seen, up) / dot(ray, up)
-    rim = seen + stretch[:, None] * ray
-    material = interpolate_vectors(receiving, strip_derivatives(receiving), strip_derivatives(rim))
+    ray = y - image
+    scale = dot(p0 - image, up) / dot(ray, up)
+    boundary = image + scale[:, None] * ray
+    material = interpolate_vectors(
+        receiving, strip_derivatives(receiving), strip_derivatives(boundary)
+    )
 
     up = strip_derivatives(up)
-    fixed = strip_derivatives(ray), strip_derivatives(stretch), strip_derivatives(normal)
-    edge, aside = (
-        _project_shift(v, fixed, kept, up) for v in (strip_derivatives(y1 - y0), legs.side)
+    fixed = strip_derivatives(ray), strip_derivatives(scale), strip_derivatives(normal)
+    edge, side_shift = (
+        _project_shift(v, fixed, is_unreflected, up)
+        for v in (strip_derivatives(y1 - y0), legs.side)
     )
     outwards = cross(up, edge)
-    outwards = outwards * -dot(outwards, aside).sign()[:, None]
-    rate = dot(outwards, rim - material) * edges.weight
-    steep = dot(fixed[0], up).abs() > _MIN_COSINE * fixed[0].norm(dim=1)
-    rows = torch.nonzero(steep)[:, 0]
-    chains = SpecularPaths(
+    outwards = outwards * -dot(outwards, side_shift).sign()[:, None]
+    rate = dot(outwards, boundary - material) * edges.weight
+    is_valid = dot(fixed[0], up).abs() > _MIN_COSINE * fixed[0].norm(dim=1)
+    rows = torch.nonzero(is_valid)[:, 0]
+    paths = SpecularPaths(
         legs.source[rows], torch.arange(len(rows)), legs.faces[rows], legs.through[rows]
     )
     return IlluminationBoundary(
-        chains, strip_derivatives(rim)[rows], samples.face[rows], rate[rows], legs.edge_point[rows]
+        paths,
+        strip_derivatives(boundary)[rows],
+        samples.face[rows],
+        rate[rows],
+        legs.edge_point[rows],
     )
 
 
 def _project_shift(
     vector: Tensor, fixed: tuple[Tensor, ...], is_transmission: Tensor, up: Tensor
 ) -> Tensor:
-    """How a rim point shifts on the surface when the edge point is shifted; detached."""
-    ray, stretch, normal = fixed
-    for step, stays in enumerate(is_transmission.unbind(1)):
-        vector = torch.where(stays[:, None], vector, reflect_vectors(vector, normal[:, step]))
-    return stretch[:, None] * (vector - ray * (dot(up, vector) / dot(up, ray))[:, None])
+    """Shift of a boundary point on the surface per shift of the edge point; detached."""
+    ray, scale, normal = fixed
+    for step, transmitted in enumerate(is_transmission.unbind(1)):
+        vector = torch.where(transmitted[:, None], vector, reflect_vectors(vector, normal[:, step]))
+    return scale[:, None] * (vector - ray * (dot(up, vector) / dot(up, ray))[:, None])
