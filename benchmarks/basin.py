@@ -173,7 +173,7 @@ class Task:
             )
             reconstruct(
                 self.scene,
-                Observation(model, radar, Capture.from_beat(self.beat, radar)),
+                Observation(model, Capture.from_beat(self.beat, radar)),
                 module,
                 loss=LOSS,
                 optimizer=Optimizer(rate=stage.rate, final_rate=stage.final_rate),

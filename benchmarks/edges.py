@@ -37,10 +37,11 @@ from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.interior_silhouettes import InteriorSilhouetteSampler
 from invertwin.channel.power.random_walk import RandomWalk
 from invertwin.channel.rays.arrays import from_points
-from invertwin.channel.rays.backend import mi, torch_threads
+from invertwin.channel.rays.backend import mi
 from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.radar import FMCW, Radar
+from invertwin.runtime.concurrency import torch_threads
 from invertwin.scene import AntennaArray, Isotropic, Mesh, Object, RoughDielectric, Scene
 from invertwin.scene.antenna import linear_array
 from invertwin.scene.shapes import plate, sphere

@@ -63,7 +63,7 @@ def fitted(optimizer: Optimizer, depth: int, seed: int, steps: int) -> Tensor:
     model = iw.SurrogateMap(grid, iw.Surrogate(range_width=3.0, angle_width=1.0), sampling)
     found = iw.reconstruct(
         scene.replace("ball", pose=rigid(translation=[0.15, 0.0, 2.15])),
-        iw.Observation(model, radar, iw.Capture.from_beat(data.beat, radar)),
+        iw.Observation(model, data.capture),
         Translation("ball", axes="xz"),  # a row of antennas does not tell y
         loss=iw.SpectrumLoss(kind="likelihood"),
         optimizer=optimizer,

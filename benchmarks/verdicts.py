@@ -136,7 +136,7 @@ class Trial:
         points = iw.Sampling(depth=1, points_per_m2=4e3)
         data = iw.simulate(self.truth, sensor, grid, seed=self.number, sampling=points, snr_db=20.0)
         capture = iw.Capture.from_beat(data.beat, sensor)
-        seen = iw.Observation(iw.SurrogateMap(grid, WIDTHS, SAMPLING), sensor, capture)
+        seen = iw.Observation(iw.SurrogateMap(grid, WIDTHS, SAMPLING), capture, sensor=sensor)
         known = self.truth.replace("object", pose=self.start.transform)
         pose = Pose("object", axes="xz", rotation_axes="y")
         fit = iw.reconstruct(known, seen, pose, seed=self.number, **FIT)

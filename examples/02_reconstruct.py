@@ -47,11 +47,11 @@ with torch.no_grad():
     sparse = iw.Sampling(depth=1, points_per_m2=3e3)
     recorded = iw.simulate(hidden(start), radar, grid, seed=1, sampling=sparse, snr_db=20.0)
 
-unknown, capture = OnTheFloor(0.0, 0.0, 0.0), iw.Capture.from_beat(recorded.beat, radar)
+unknown = OnTheFloor(0.0, 0.0, 0.0)
 kernels = iw.Surrogate(range_width=3.0, angle_width=1.5)  # extra widths, annealed to zero
 model = iw.SurrogateMap(grid, kernels, iw.Sampling(depth=1, samples=100_000))
-seen, loss = iw.Observation(model, radar, capture), iw.SpectrumLoss(kind="likelihood")
-fit = iw.reconstruct(start, seen, [unknown], loss=loss, schedule=iw.Schedule(steps=60), seed=1)
+seen = iw.Observation(model, recorded.capture)
+fit = iw.reconstruct(start, seen, [unknown], schedule=iw.Schedule(steps=60), seed=1)
 
 for name, theta in ("start", torch.zeros(3)), ("found", unknown.theta.detach()):
     x, z, yaw = (theta - hidden.theta.detach()).tolist()

@@ -35,10 +35,10 @@ receivers = iw.scene.AntennaArray(receivers.positions - torch.tensor([0.0, 0.01,
 radar = iw.Radar(transmitters, receivers, chirp, positions=[[0.0, 0.0, 0.0]])
 grid = radar.grid(range_min=0.5, range_max=4.0)
 
-sampling = iw.Sampling(depth=1, samples=400_000)
+sampling = iw.Sampling(depth=1)
 simulated = iw.simulate(scene, radar, grid, seed=1, sampling=sampling, noise_figure_db=15.0)
 # ADC samples of a real board go the same way: complex [frame, tx, rx, sample].
-capture = iw.Capture.from_beat(simulated.beat, radar)
+capture = simulated.capture
 capture.save(folder / "ball.nc")
 
 loaded = iw.Capture.load(folder / "ball.nc")

@@ -76,7 +76,7 @@ def fit(
         callbacks.append(Checkpoint(checkpoint, checkpoint_every, resume))
     return reconstruct(
         scene,
-        Observation(model, radar, capture, parameters=of_radar),
+        Observation(model, capture, sensor=radar, parameters=of_radar),
         parameters,
         schedule=schedule if stages is None else stages,
         callbacks=callbacks,

@@ -42,7 +42,7 @@ grid = radar.grid(range_min=1.4, range_max=3.6, u_max=0.6)
 # %%
 few = iw.Sampling(depth=1, points_per_m2=2e3)
 recorded = iw.simulate(truth, radar, grid, seed=1, sampling=few, snr_db=20.0)
-capture = iw.Capture.from_beat(recorded.beat, radar)
+capture = recorded.capture
 
 # %% [markdown]
 # ## The start
@@ -56,9 +56,8 @@ rays = iw.Sampling(depth=1, samples=50_000, boundary_samples=8_000)
 model = iw.SurrogateMap(grid, blur, rays)
 fit = iw.reconstruct(
     start,
-    iw.Observation(model, radar, capture),
+    iw.Observation(model, capture),
     Translation("crate", axes="xz"),
-    loss=iw.SpectrumLoss(kind="likelihood"),
     schedule=iw.Schedule(steps=50),
     seed=1,
 )

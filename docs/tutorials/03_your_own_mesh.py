@@ -61,7 +61,7 @@ radar = iw.Radar(
     [[0.0, 0.0, 0.0]],
 )
 grid = radar.grid(range_min=1.0, range_max=2.2, u_max=0.5)
-data = iw.simulate(scene, radar, grid, seed=1, sampling=iw.Sampling(depth=1, samples=400_000))
+data = iw.simulate(scene, radar, grid, seed=1, sampling=iw.Sampling(depth=1))
 iw.plotting.spectrum(data.spectrum, grid)
 
 # %% [markdown]

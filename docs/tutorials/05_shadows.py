@@ -72,9 +72,9 @@ assert float(behind) < 0.05
 # %%
 few = iw.Sampling(depth=1, points_per_m2=2e3)
 data = iw.simulate(scene, radar, grid, seed=1, sampling=few)
-capture = iw.Capture.from_beat(data.beat, radar)
+capture = data.capture
 model = iw.SurrogateMap(grid, iw.Surrogate(range_width=2.0, angle_width=1.0), rays)
-seen = iw.Observation(model, radar, capture, loss=iw.SpectrumLoss(kind="likelihood"))
+seen = iw.Observation(model, capture)
 line = make_line(Translation("plate"), {"translation": [1.0, 0.0, 0.0]}, scene)
 shifts = torch.linspace(-0.4, 0.4, 9)
 losses = evaluate_losses(line, shifts.tolist(), seen, seed=1)

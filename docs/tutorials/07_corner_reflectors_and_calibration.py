@@ -56,7 +56,11 @@ grid = radar.grid(range_min=1.5, range_max=3.0, u_max=0.8)
 place = [0.5, 0.0, 2.2]
 ball = iw.Object(sphere(0.05, 5), PerfectConductor(), rigid(translation=place))
 clean = iw.simulate(
-    iw.Scene({"ball": ball}), radar, grid, seed=1, sampling=iw.Sampling(depth=1, samples=100_000)
+    iw.Scene({"ball": ball}),
+    radar,
+    grid,
+    seed=1,
+    sampling=iw.Sampling(depth=1, conductor_samples=100_000),
 )
 errors = channel_errors(radar, gain_std_db=1.0, phase_std=0.6, seed=3)
 measured = iw.Capture.from_beat(clean.beat * errors[None, :, :, None], radar)

@@ -44,18 +44,18 @@ grid = radar.grid(range_min=2.0, range_max=4.0, u_max=0.6)
 data = iw.simulate(
     truth, radar, grid, seed=1, sampling=iw.Sampling(depth=1, points_per_m2=3e3), snr_db=15.0
 )
-capture = iw.Capture.from_beat(data.beat, radar)
+capture = data.capture
 
 # %% [markdown]
 # ## Three fits
-# By the mask alone, by the radar alone, and by both. An `Observation` joins a model, a sensor and its data; a list of
-# them is one fit.
+# By the mask alone, by the radar alone, and by both. An `Observation` joins a model and the data of a sensor; a list of
+# them is one fit. A capture has its radar; a mask does not have its camera, so it is given.
 
 # %%
-by_camera = iw.Observation(masks, camera, mask, loss=iw.SpectrumLoss(gain="one"))
+by_camera = iw.Observation(masks, mask, sensor=camera, loss=iw.SpectrumLoss("mse", gain="one"))
 rays = iw.Sampling(depth=1, samples=40_000, boundary_samples=8_000)
 model = iw.SurrogateMap(grid, iw.Surrogate(range_width=3.0, angle_width=1.0), rays)
-by_radar = iw.Observation(model, radar, capture, loss=iw.SpectrumLoss(kind="likelihood"))
+by_radar = iw.Observation(model, capture)
 misses = {}
 for name, seen in {
     "camera": [by_camera],

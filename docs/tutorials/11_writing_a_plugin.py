@@ -128,7 +128,7 @@ capture = iw.Capture.from_beat(torch.cat(recordings), places)
 unknown = Thickness()
 fit = iw.reconstruct(
     scene,
-    iw.Observation(model, places, capture),
+    iw.Observation(model, capture, sensor=places),
     unknown,
     loss=iw.SpectrumLoss(kind="likelihood", gain="one"),
     optimizer=Optimizer(rate=0.1),  # of the logit

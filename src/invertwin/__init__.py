@@ -16,11 +16,13 @@ import sys
 
 import lazy_loader
 
+from invertwin.deprecation import rename_attributes
 from invertwin.runtime import doctor, threads
 
 __version__ = "0.4.0"
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+rename_attributes(__name__, {"MotionMap": "RangeDopplerMap"})
 
 # Libraries read how many threads to start while they are being loaded.
 threads.set_thread_environment()

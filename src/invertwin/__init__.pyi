@@ -4,6 +4,7 @@ from . import datasets as datasets
 from . import discovery as discovery
 from . import inversion as inversion
 from . import links as links
+from . import models as models
 from . import plotting as plotting
 from . import radar as radar
 from . import scene as scene
@@ -28,9 +29,17 @@ from .models.radio import RadioMap as RadioMap
 from .radar.radar import Radar as Radar
 from .radar.surrogate.surrogate import Surrogate as Surrogate
 from .radar.waveform import FMCW as FMCW
+from .scene.antenna import linear_array as linear_array
 from .scene.files import load_mesh as load_mesh
+from .scene.material.materials import PerfectConductor as PerfectConductor
+from .scene.material.materials import RoughDielectric as RoughDielectric
+from .scene.parameters import Translation as Translation
+from .scene.pose import rigid as rigid
 from .scene.scene import Object as Object
 from .scene.scene import Scene as Scene
+from .scene.shapes import box as box
+from .scene.shapes import plate as plate
+from .scene.shapes import text as text
 from .signatures import rcs as rcs
 from .simulation import simulate as simulate
 from .simulation import simulate_chirps as simulate_chirps

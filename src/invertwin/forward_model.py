@@ -8,12 +8,25 @@ recording to a map of the same shape; a loss compares the two. A model of one's 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
+from types import FunctionType
 from typing import Any, ClassVar, Literal
 
 from jaxtyping import Float
 from torch import Tensor
 
+from invertwin.deprecation import warn_renamed
 from invertwin.scene.scene import Scene
+
+# Names of version 0.3. A subclass that defines one overrides the method of the new name.
+_RENAMED_METHODS = {
+    "blurred": "blur_observed",
+    "looks": "realisations",
+    "narrowed": "scale_blur",
+    "prepared": "prepare",
+    "sampled_by": "with_sampling",
+    "widened": "has_blur",
+}
+_RENAMED_FLAGS = {"fields": "holds_fields", "random": "is_random", "smooth": "is_smooth"}
 
 
 class ForwardModel(ABC):
@@ -27,13 +40,26 @@ class ForwardModel(ABC):
         is_random: Whether maps depend on the seed. Of a model whose maps do not, gradient checks
             take
             one derivative and one pair of differences.
-        holds_fields: Whether maps hold parts of fields, of either sign, not power.
+        holds_fields: True if maps hold parts of fields or levels, of either sign, not power.
+            They are compared by squares, not by the likelihood of speckle.
+        needs_sensor: False for a model that predicts without a sensor.
     """
 
     redraws: ClassVar[bool] = True
     is_smooth: ClassVar[bool] = True
     is_random: ClassVar[bool] = True
     holds_fields: ClassVar[bool] = False
+    needs_sensor: ClassVar[bool] = True
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Adopt methods and flags that a subclass defines by their names of version 0.3."""
+        super().__init_subclass__(**options)
+        own = dict(vars(cls))
+        for old, new in (_RENAMED_METHODS | _RENAMED_FLAGS).items():
+            kinds = (FunctionType, property, *((bool,) if old in _RENAMED_FLAGS else ()))
+            if new not in own and isinstance(own.get(old), kinds):
+                warn_renamed(f"{cls.__qualname__}.{old}", f"{cls.__qualname__}.{new}")
+                setattr(cls, new, own[old])
 
     @abstractmethod
     def predict(self, scene: Scene, sensor: Any, seed: int) -> Float[Tensor, "frame *map"]:

@@ -13,8 +13,14 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel import is_differentiated, trace_far_field
-from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.channel import trace_far_field
+from invertwin.checks import (
+    ArrayLike,
+    checked_count,
+    checked_number,
+    checked_tensor,
+    is_differentiated,
+)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive

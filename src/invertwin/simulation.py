@@ -2,18 +2,19 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Complex128, Float
 from torch import Tensor
 
+from invertwin.capture.capture import Capture
 from invertwin.channel import (
     Grid,
     Paths,
     Sampling,
     Speckle,
     draw_speckle,
-    torch_threads,
     trace_field,
 )
 from invertwin.checks import checked_count, checked_type
@@ -30,6 +31,7 @@ from invertwin.radar.signal.chirps import (
 from invertwin.radar.signal.impairments import Impairments
 from invertwin.radar.signal.keyframes import VisibilityKeyframes, vertex_displacements
 from invertwin.radar.signal.range_profile import add_noise, beat_signal, check_paths
+from invertwin.runtime.concurrency import torch_threads
 from invertwin.scene.scene import Scene, warn_if_purely_specular
 
 # Motion over half a ramp is straight where it bends by less than this, in wavelengths.
@@ -38,17 +40,24 @@ _STRAIGHT_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Simulation:
-    """What a radar would record.
+    """Simulated signals of a radar.
 
     Attributes:
         spectrum: Power per bin, received over transmitted.
         paths: Field paths.
         beat: Beat signal of every virtual channel.
+        radar: The radar that records them.
     """
 
     spectrum: Float[Tensor, "frame range u v"]
     paths: Paths
     beat: Complex128[Tensor, "frame tx rx sample"]
+    radar: Radar
+
+    @cached_property
+    def capture(self) -> Capture:
+        """The beat signal as a recording of the radar, as measured data are."""
+        return Capture.from_beat(self.beat, self.radar)
 
 
 def simulate(
@@ -106,7 +115,7 @@ def simulate(
         beat = beat_signal(paths, radar)
         if noisy:
             beat = add_noise(beat, radar, snr_db=snr_db, noise_figure_db=noise_figure_db, seed=seed)
-    return Simulation(exact_spectrum(beat, radar, grid), paths, beat)
+    return Simulation(exact_spectrum(beat, radar, grid), paths, beat, radar)
 
 
 def simulate_chirps(

@@ -176,7 +176,7 @@ def test_a_twin_finds_place_and_motion_in_exact_signals():
     mean = torch.stack([near.observe(record) for record in records]).mean(0)
     fit = reconstruct(
         scene,
-        Observation(near, RADAR, mean),
+        Observation(near, mean, sensor=RADAR),
         body,
         loss=CorrelationLoss(),
         optimizer=Optimizer(rate=0.05),
@@ -208,4 +208,4 @@ def test_a_body_that_leaves_the_view_is_an_error(frame):
         body.size.add_(float64(math.nan, 0.0, 0.0))
     near = WHOLE.crop_around(echo.range, echo.range_rate, 4, RADAR)
     with pytest.raises(InputError):
-        reconstruct(scene, Observation(near, RADAR, frame), body, schedule=Schedule(1))
+        reconstruct(scene, Observation(near, frame, sensor=RADAR), body, schedule=Schedule(1))

@@ -40,7 +40,9 @@ def test_a_report_gets_complete_rows_whatever_the_order(case):
     found = reconstruct(
         case.scene,
         Observation(
-            SurrogateMap(case.grid, sampling=Sampling(1, 2_000, 500)), case.radar, case.capture
+            SurrogateMap(case.grid, sampling=Sampling(1, 2_000, 500)),
+            case.capture,
+            sensor=case.radar,
         ),
         case.parameters(),
         optimizer=settings["optimizer"],
@@ -126,7 +128,7 @@ def test_a_fit_of_anything_else_is_not_gone_on_with(case, tmp_path):
         now = same | changes
         return reconstruct(
             now["scene"],
-            Observation(now["model"], case.radar, now["capture"], weight=now["weight"]),
+            Observation(now["model"], now["capture"], sensor=case.radar, weight=now["weight"]),
             Vertices("plate", 4),
             loss=now["loss"],
             regularizers=now["regularizers"],

@@ -48,7 +48,7 @@ def test_loss_is_positive_and_knows_no_units(kind, seed):
 
 def test_empty_simulation_costs_one():
     _, b = maps()
-    assert float(SpectrumLoss()(torch.zeros_like(b), b)) == pytest.approx(1)
+    assert float(SpectrumLoss("mse")(torch.zeros_like(b), b)) == pytest.approx(1)
     assert torch.isfinite(SpectrumLoss(kind="likelihood")(torch.zeros_like(b), b))
 
 
@@ -56,10 +56,10 @@ def test_empty_simulation_costs_one():
 def test_background_is_taken_out(background):
     a, b = maps()
     added = torch.full_like(b[:1], 0.7) if background == "level" else maps(5)[0][:1]
-    loss = SpectrumLoss(background=background)
+    loss = SpectrumLoss("mse", background=background)
     assert float(loss(a, b + added)) == pytest.approx(float(loss(a, b)), rel=1e-9)
     assert float(loss(a, a + added)) < 1e-12
-    assert float(SpectrumLoss()(a, a + added)) > 1e-3
+    assert float(SpectrumLoss("mse")(a, a + added)) > 1e-3
 
 
 @pytest.mark.parametrize(
@@ -69,8 +69,9 @@ def test_background_is_taken_out(background):
         {"kind": "likelihood"},
         {"kind": "heavy_tailed"},
         {"gain": "one"},
-        {"background": "level"},
-        {"background": "static"},
+        {"kind": "mse", "gain": "one"},
+        {"kind": "mse", "background": "level"},
+        {"kind": "mse", "background": "static"},
         {"levels": 1},
     ],
     ids=str,

@@ -60,7 +60,7 @@ def seen() -> dict[str, Observation]:
             drawn = Sampling(depth=1, points_per_m2=5_000.0)
             beat = simulate(true, looks, grid, sampling=drawn, seed=3).beat
             model = SurrogateMap(grid, Surrogate(range_width=2.0), SAMPLING)
-            found[name] = Observation(model, looks, Capture.from_beat(beat, looks))
+            found[name] = Observation(model, Capture.from_beat(beat, looks))
     return found
 
 
@@ -123,8 +123,8 @@ def absolute(one: Tensor, other: Tensor) -> Tensor:
 def test_the_loss_is_the_weighted_mean_of_the_losses():
     """Each in its own way, on numbers that can be checked by hand."""
     observations = [
-        Observation(Level(), float64(1.0), [1.0, 0.0, 2.0], weight=3.0),
-        Observation(Level(), float64(2.0), [1.0, 0.0, -1.0], weight=1.0, loss=absolute),
+        Observation(Level(), [1.0, 0.0, 2.0], sensor=float64(1.0), weight=3.0),
+        Observation(Level(), [1.0, 0.0, -1.0], sensor=float64(2.0), weight=1.0, loss=absolute),
     ]
     fit = reconstruct(
         scene(), observations, Translation("ball"), loss=squared, schedule=Schedule(1)
@@ -137,8 +137,8 @@ def test_weights_say_whom_to_believe():
 
     def found(weight: float) -> float:
         observations = [
-            Observation(Level(), float64(1.0), [1.0, 0.0, 0.0], weight=weight),
-            Observation(Level(), float64(1.0), [0.0, 0.0, 0.0]),
+            Observation(Level(), [1.0, 0.0, 0.0], sensor=float64(1.0), weight=weight),
+            Observation(Level(), [0.0, 0.0, 0.0], sensor=float64(1.0)),
         ]
         fit = reconstruct(
             scene(),
@@ -167,8 +167,8 @@ class Gain(nn.Module):
 
 def test_an_unknown_of_a_sensor_changes_that_sensor_alone():
     observations = [
-        Observation(Level(), float64(1.0), [1.0, 0.0, 0.0]),
-        Observation(Level(), float64(1.0), [3.0, 0.0, 0.0], parameters={"gain": Gain()}),
+        Observation(Level(), [1.0, 0.0, 0.0], sensor=float64(1.0)),
+        Observation(Level(), [3.0, 0.0, 0.0], sensor=float64(1.0), parameters={"gain": Gain()}),
     ]
     fit = reconstruct(
         scene(),
@@ -195,13 +195,13 @@ def test_a_model_of_ones_own_derives_from_forward_model(unchecked):
             return torch.zeros(1)
 
     with pytest.raises(InputError, match=r"got Looks; .*derive a class from ForwardModel"):
-        Observation(Looks(), None, None)  # type: ignore[arg-type]
+        Observation(Looks(), None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("weight", [0.0, -1.0, float("nan")])
 def test_weights_are_positive(weight):
     with pytest.raises(InputError, match="expected a weight > 0"):
-        Observation(Level(), float64(1.0), [0.0, 0.0, 0.0], weight=weight)
+        Observation(Level(), [0.0, 0.0, 0.0], sensor=float64(1.0), weight=weight)
 
 
 def test_no_observation_is_refused():
@@ -275,7 +275,7 @@ def frames(case: Any, count: int) -> tuple[list[list[float]], Any]:
             return super().predict(scene, sensor, seed)
 
     few = Sampling(depth=1, samples=1_000, boundary_samples=100)
-    one = Observation(Spy(case.grid, sampling=few), case.radar, case.capture)
+    one = Observation(Spy(case.grid, sampling=few), case.capture, sensor=case.radar)
     fit = reconstruct(
         case.scene,
         [one, one],
@@ -298,7 +298,7 @@ def test_an_observed_map_is_compared_as_it_is(case):
     few = Sampling(depth=1, samples=1_000, boundary_samples=100)
     model = SurrogateMap(case.grid, sampling=few)
     first, second = (
-        Observation(model, case.radar, data).observed_map()
+        Observation(model, data, sensor=case.radar).observed_map()
         for data in (case.capture, model.observe(case.capture))
     )
     assert relative(second, first) == 0

@@ -477,7 +477,7 @@ def test_exact_signals_as_the_model(case):
     speckle = draw_speckle(case.scene, case.radar.link(), drawn, derive_seed(3, 0))
     second = reconstruct(
         case.scene,
-        Observation(ExactMap(case.grid, drawn, speckle), case.radar, case.capture),
+        Observation(ExactMap(case.grid, drawn, speckle), case.capture, sensor=case.radar),
         case.parameters(),
         optimizer=settings["optimizer"],
         schedule=Schedule(FAST["steps"]),

@@ -78,7 +78,7 @@ def fit(folder, callbacks=(), steps=6):
     begun = scene().replace(EVIL, pose=rigid(translation=torch.tensor([0.1, 0.0, 2.05]).double()))
     return capture, reconstruct(
         begun,
-        Observation(model, radar(), capture),
+        Observation(model, capture, sensor=radar()),
         [Translation(EVIL)],
         schedule=Schedule(steps=steps),
         callbacks=[*callbacks, Checkpoint(folder / "fit.pt", every=1, resume=True)],

@@ -123,7 +123,7 @@ def view(seed: int) -> View:
         iw.Scene({**around, "crate": begun}),
         scale,
         photograph(truth, camera, seed=seed, wrong_labels=0.1),
-        iw.Capture.from_beat(recorded.beat, radar),
+        recorded.capture,
     )
 
 
@@ -140,14 +140,12 @@ def observations(seen: View, sensors: str) -> list[iw.Observation]:
     found = {
         "camera": iw.Observation(
             SilhouetteMap(("crate",)),
-            camera,
             seen.picture.mask("crate"),
+            sensor=camera,
             weight=MASK_WEIGHT,
-            loss=iw.SpectrumLoss(gain="one", levels=4),
+            loss=iw.SpectrumLoss("mse", gain="one", levels=4),
         ),
-        "radar": iw.Observation(
-            model, radar, seen.capture, loss=iw.SpectrumLoss(kind="likelihood", levels=2)
-        ),
+        "radar": iw.Observation(model, seen.capture, sensor=radar, loss=iw.SpectrumLoss(levels=2)),
     }
     return list(found.values()) if sensors == "both" else [found[sensors]]
 

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.channel import is_differentiated
 from invertwin.checks import (
     ArrayLike,
     checked_count,
     checked_number,
     checked_tensor,
+    is_differentiated,
     strip_derivatives,
 )
 from invertwin.errors import InputError

@@ -30,3 +30,16 @@ from invertwin.capture.readers.touchstone import Touchstone as Touchstone
 from invertwin.capture.readers.touchstone import load_rcs as load_rcs
 from invertwin.capture.readers.touchstone import load_touchstone as load_touchstone
 from invertwin.capture.track import Track as Track
+from invertwin.deprecation import rename_attributes
+
+rename_attributes(
+    __name__,
+    {
+        "MeasuredSection": "MeasuredRcs",
+        "Messages": "BagMessages",
+        "faults_of": "find_faults",
+        "load_section": "load_rcs",
+        "settings_of": "make_settings",
+        "shown_ranges": "search_ranges",
+    },
+)

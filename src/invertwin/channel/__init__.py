@@ -10,7 +10,6 @@ from invertwin.channel.coherent.field import trace_field as trace_field
 from invertwin.channel.coherent.power_paths import trace_power as trace_power
 from invertwin.channel.coherent.speckle import Speckle as Speckle
 from invertwin.channel.coherent.speckle import draw_speckle as draw_speckle
-from invertwin.channel.coherent.speckle import resolve_densities as resolve_densities
 from invertwin.channel.coverage.coverage import trace_coverage as trace_coverage
 from invertwin.channel.coverage.single_scattering import (
     trace_single_scattering as trace_single_scattering,
@@ -25,8 +24,6 @@ from invertwin.channel.power.clouds import deposit_density as deposit_density
 from invertwin.channel.power.deposit import deposit_batch as deposit_batch
 from invertwin.channel.power.deposit import deposit_power as deposit_power
 from invertwin.channel.rays.backend import backend as backend
-from invertwin.channel.rays.backend import torch_threads as torch_threads
-from invertwin.channel.rays.backend import tracer_lock as tracer_lock
 from invertwin.channel.rays.backend import use_backend as use_backend
 from invertwin.channel.rays.ray_scene import visible_points as visible_points
 from invertwin.channel.rays.visibility import DiscontinuityCurves as DiscontinuityCurves
@@ -41,7 +38,6 @@ from invertwin.channel.rcs.closed_forms import (
 )
 from invertwin.channel.rcs.closed_forms import TrihedralSection as TrihedralSection
 from invertwin.channel.rcs.far_field import trace_far_field as trace_far_field
-from invertwin.channel.sampling import ALL_OTHERS as ALL_OTHERS
 from invertwin.channel.sampling import Densities as Densities
 from invertwin.channel.sampling import Sampling as Sampling
 from invertwin.channel.specular.point_targets import trace_point_targets as trace_point_targets
@@ -49,4 +45,25 @@ from invertwin.channel.specular.ray_paths import KINDS as KINDS
 from invertwin.channel.specular.ray_paths import METASURFACE as METASURFACE
 from invertwin.channel.specular.ray_paths import RayPaths as RayPaths
 from invertwin.channel.specular.trace_paths import trace_paths as trace_paths
-from invertwin.checks import is_differentiated as is_differentiated
+from invertwin.deprecation import rename_attributes
+
+rename_attributes(
+    __name__,
+    {
+        "Curves": "DiscontinuityCurves",
+        "Pattern": "GainPattern",
+        "REST": "channel.sampling.ALL_OTHERS",
+        "Sight": "ViewpointScene",
+        "alone": "runtime.concurrency.tracer_lock",
+        "densities_of": "channel.sampling.resolve_densities",
+        "differentiated": "checks.is_differentiated",
+        "interference": "combine_coherently",
+        "lit_fractions": "visible_fractions",
+        "torch_threads": "runtime.concurrency.torch_threads",
+        "trace_chains": "trace_facet_paths",
+        "trace_echoes": "trace_point_targets",
+        "trace_scattered": "trace_single_scattering",
+        "trace_signature": "trace_far_field",
+        "without_echoes": "as_absorbers",
+    },
+)

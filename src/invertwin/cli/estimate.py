@@ -8,7 +8,8 @@ from typing import Any
 import torch
 
 from invertwin.capture import Capture
-from invertwin.channel import Grid, resolve_densities
+from invertwin.channel import Grid
+from invertwin.channel.sampling import resolve_densities
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.cli.schema.signature import count_values

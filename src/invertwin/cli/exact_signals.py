@@ -66,7 +66,7 @@ def _require_simulated_data(run: RunFile) -> SimulatedData:
 def _make_sampling(data: SimulatedData, depth: int) -> Sampling:
     return Sampling(
         depth=depth,
-        samples=data.samples,
+        conductor_samples=data.samples,
         boundary_samples=0,
         boundary=False,
         points_per_m2=data.points_per_m2,

@@ -13,3 +13,14 @@ from invertwin.datasets.labels import radar_labels as radar_labels
 from invertwin.datasets.labels import triangle_visibility as triangle_visibility
 from invertwin.datasets.reader import SampleDataset as SampleDataset
 from invertwin.datasets.shards import DatasetManifest as DatasetManifest
+from invertwin.deprecation import rename_attributes
+
+rename_attributes(
+    __name__,
+    {
+        "KEPT": "UNCHANGED",
+        "Manifest": "DatasetManifest",
+        "Samples": "SampleDataset",
+        "seen_triangles": "triangle_visibility",
+    },
+)

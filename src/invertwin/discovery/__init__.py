@@ -1,5 +1,6 @@
 """Automatic reconstruction: objects in a recording with uncertainties, without an initial guess."""
 
+from invertwin.deprecation import rename_attributes
 from invertwin.discovery.movers import MovingTargetFit as MovingTargetFit
 from invertwin.discovery.movers import MovingTargetMaps as MovingTargetMaps
 from invertwin.discovery.movers import detect_strongest_target as detect_strongest_target
@@ -15,3 +16,16 @@ from invertwin.discovery.recordings import twin as twin
 from invertwin.discovery.shapes.primitives import SHAPE_KINDS as SHAPE_KINDS
 from invertwin.discovery.shapes.primitives import PrimitiveModel as PrimitiveModel
 from invertwin.discovery.shapes.primitives import ShapeParameters as ShapeParameters
+
+rename_attributes(
+    __name__,
+    {
+        "Figure": "ShapeParameters",
+        "KINDS": "SHAPE_KINDS",
+        "Picture": "GroundImage",
+        "Primitive": "PrimitiveModel",
+        "Thing": "DetectedObject",
+        "Track": "ObjectTrack",
+        "still_capture": "average_chirps",
+    },
+)

@@ -163,7 +163,7 @@ class ShapeLikelihood:
         unknowns = self.unknowns(shapes)
         found = reconstruct(
             self.build_scene(shapes),
-            Observation(self.model, self.radar, self.power),
+            Observation(self.model, self.power, sensor=self.radar),
             unknowns,
             loss=self.loss,
             optimizer=Optimizer("adam", rate=_LEARNING_RATE),

@@ -1,5 +1,6 @@
 """Inversion: observations, losses, schedules, fits, confidence and gradient checks."""
 
+from invertwin.deprecation import rename_attributes
 from invertwin.inversion.callbacks import Checkpoint as Checkpoint
 from invertwin.inversion.callbacks import Report as Report
 from invertwin.inversion.callbacks import Watch as Watch
@@ -50,3 +51,34 @@ from invertwin.inversion.schedule import Stage as Stage
 from invertwin.scene.remeshing import remesh as remesh
 from invertwin.scene.remeshing import require_edge_length as require_edge_length
 from invertwin.scene.scene import displace as displace
+
+rename_attributes(
+    __name__,
+    {
+        "Agreement": "GradientAgreement",
+        "Bump": "GaussianBump",
+        "Check": "GradcheckSettings",
+        "Echo": "discovery.DetectedEcho",
+        "FirstPose": "InitialPoseEstimator",
+        "Guess": "InitialEstimate",
+        "MoverMaps": "discovery.MovingTargetMaps",
+        "MoverTwin": "discovery.MovingTargetFit",
+        "MovingBody": "discovery.MovingBody",
+        "Residual": "PoseError",
+        "Topology": "TopologyCounts",
+        "displaced": "displace",
+        "fit_at": "prepare_fit",
+        "line_of": "make_line",
+        "losses_along": "evaluate_losses",
+        "nearby": "sample_nearby_poses",
+        "of_point": "discovery.point_response",
+        "planned": "plan_error_bars",
+        "posed": "place_at_poses",
+        "remeshed": "remesh",
+        "require_edge": "require_edge_length",
+        "residual": "pose_error",
+        "strongest_mover": "discovery.detect_strongest_target",
+        "topology": "count_topology",
+        "watched": "report_progress",
+    },
+)

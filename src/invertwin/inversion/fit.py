@@ -13,15 +13,15 @@ import torch
 from pydantic import ConfigDict, TypeAdapter
 from torch import Tensor, nn
 
-from invertwin.channel import torch_threads
 from invertwin.errors import InputError
 from invertwin.inversion.fingerprint import Fingerprint
 from invertwin.inversion.gauss_newton import GaussNewton, no_effect_error
-from invertwin.inversion.loss import MapPairs, Objective
+from invertwin.inversion.loss import MapPairs, Objective, resolve_loss
 from invertwin.inversion.observation import Observation
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Stage
+from invertwin.runtime.concurrency import torch_threads
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derive_seed
 
@@ -128,7 +128,10 @@ class Fit:
         self._settings = settings
         self.observations = list(observations)
         self._observed = [observation.observed_map().detach() for observation in observations]
-        losses = tuple(o.loss or settings.loss for o in observations)
+        losses = tuple(
+            resolve_loss(o.model, o.loss or settings.loss, observed)
+            for o, observed in zip(observations, self._observed, strict=True)
+        )
         self.objective = Objective(losses, tuple(o.weight for o in observations))
         free = [p for p in self.modules.parameters() if p.requires_grad]
         if not free or stage.steps < 1:
@@ -455,7 +458,7 @@ class Fit:
 class FitSettings:
     """Settings common to all stages of a fit. See :func:`invertwin.reconstruct`."""
 
-    loss: Callable[[Tensor, Tensor], Tensor]  # (predicted map, observed map) → number
+    loss: Callable[[Tensor, Tensor], Tensor] | None  # (predicted map, observed map) → number
     optimizer: Optimizer  # default optimiser of stages
     regularizers: tuple[Regularizer, ...]  # terms of the loss, besides those of the unknowns
     seed: int  # seed of all random numbers

@@ -11,10 +11,10 @@ from jaxtyping import Bool, Float64
 from torch import Tensor, nn
 from torch.autograd import grad
 
-from invertwin.channel import tracer_lock
 from invertwin.checks import checked_count
 from invertwin.errors import InputError
 from invertwin.inversion.loss import MapPairs, Objective, SpectrumLoss
+from invertwin.runtime.concurrency import tracer_lock
 
 _MAX_PARAMETERS = 64  # each parameter costs a derivative of the map per step
 _MAX_DAMPING_TRIALS = 4  # trials of one step with increasing damping

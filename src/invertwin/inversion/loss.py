@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.forward_model import ForwardModel
 from invertwin.limits import Count, Positive
 
 _MIN_POSITIVE = 1e-38  # lower limit of logarithms
@@ -19,6 +20,7 @@ _GAIN_STEPS = 8  # maximum number of iterations; three or four suffice
 _GAIN_TOLERANCE = (
     1e-3  # relative step of the gain at which the iteration ends; the remaining error is below 1e-5
 )
+_MAX_NEGATIVE = 0.1  # of the peak: less is rounding or interpolation of power
 _BINS_PER_BLOCK = 2**16  # bins per block, so that the working set fits a core's cache
 
 LOSS_KINDS = ("mse", "likelihood", "heavy_tailed")
@@ -85,13 +87,14 @@ class SpectrumLoss:
     no derivative.
 
     Attributes:
-        kind: ``mse``: ``mean((g a − b)²) / mean(b²)``. ``likelihood``: the Itakura–Saito divergence
-            ``mean(q − log q − 1)``, ``q = (b + n) / (g a + n)``, which is the likelihood of fully
-            developed speckle (power with an exponential distribution, or gamma after averaging). It
-            weighs weak and strong echoes by their information, so that the speckle of a strong
-            reflector does not mask a weak one. ``heavy_tailed``: the same for speckle with an
-            uncertain mean (``speckle_divergence``), so that unmodelled echoes contribute the
-            logarithm of q, not q. It suits measured data.
+        kind: ``likelihood``: the Itakura–Saito divergence ``mean(q − log q − 1)``,
+            ``q = (b + n) / (g a + n)``, which is the likelihood of fully developed speckle (power
+            with an exponential distribution, or gamma after averaging). It weighs weak and strong
+            echoes by their information, so that the speckle of a strong reflector does not mask a
+            weak one. ``heavy_tailed``: the same for speckle with an uncertain mean
+            (``speckle_divergence``), so that unmodelled echoes contribute the logarithm of q, not
+            q. It suits measured data. ``mse``: ``mean((g a − b)²) / mean(b²)``, also for maps that
+            are not power.
         levels: number of resolutions.
         gain: ``fitted``, or ``one`` for calibrated data.
         background: ``mse`` only. Background to remove from both maps first, in closed form:
@@ -110,7 +113,7 @@ class SpectrumLoss:
         InputError: No levels, an unknown choice, or a background with a likelihood.
     """
 
-    kind: Literal["mse", "likelihood", "heavy_tailed"] = "mse"
+    kind: Literal["mse", "likelihood", "heavy_tailed"] = "likelihood"
     levels: Count = 3
     gain: Literal["fitted", "one"] = "fitted"
     background: Literal["none", "level", "static"] = "none"
@@ -135,7 +138,8 @@ class SpectrumLoss:
         if self.kind != "mse" and (self.background != "none" or not self.floor > 0):
             raise InputError(
                 f"expected no background and floor > 0 with kind {self.kind!r}, got "
-                f"{self.background!r} and {self.floor}; the floor stands for a background"
+                f"{self.background!r} and {self.floor}; the floor stands for a background, or give "
+                'kind="mse"'
             )
         if not self.degrees > 0:
             raise InputError(
@@ -396,6 +400,43 @@ class _ScalarWithGradient(torch.autograd.Function):
     def jvp(ctx: Any, *tangents: Any) -> Tensor:  # type: ignore[override]
         (slope,) = ctx.saved_tensors
         return (slope * tangents[0]).sum()
+
+
+def resolve_loss(
+    model: ForwardModel,
+    loss: Callable[[Tensor, Tensor], Tensor] | None,
+    observed: Tensor | None = None,
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return the loss for the maps of a model: the given one, or the default.
+
+    The default is the likelihood of speckle for power, and squares of levels or fields as they
+    are, of one resolution, for models with ``holds_fields``.
+
+    Args:
+        model: Forward model whose maps are compared.
+        loss: The given loss; None = the default.
+        observed: Observed map, which a likelihood expects to be power.
+
+    Raises:
+        InputError: A likelihood of maps that do not hold power.
+    """
+    if loss is None:
+        loss = SpectrumLoss("mse", levels=1, gain="one") if model.holds_fields else SpectrumLoss()
+    if isinstance(loss, SpectrumLoss) and loss.kind != "mse":
+        expected = f"expected power for a SpectrumLoss of kind {loss.kind!r}"
+        if model.holds_fields:
+            raise InputError(
+                f"{expected}, got the fields or levels of a {type(model).__name__}; give "
+                'SpectrumLoss("mse", levels=1, gain="one")'
+            )
+        if observed is not None and (
+            observed.is_complex() or float(observed.min()) < -_MAX_NEGATIVE * float(observed.max())
+        ):
+            raise InputError(
+                f'{expected}, got a map of complex or negative values; give SpectrumLoss("mse"), '
+                "or a loss that suits them"
+            )
+    return loss
 
 
 CorrelationScale = Literal["magnitude", "power", "level"]

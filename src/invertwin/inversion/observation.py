@@ -1,4 +1,4 @@
-"""The two inputs of a fit: what was observed, and what is unknown."""
+"""The two inputs of a fit: observations and unknowns."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -6,16 +6,18 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from invertwin.deprecation import warn_renamed
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.regularization import Regularizer
 
 Loss = Callable[[Tensor, Tensor], Tensor]
+_FROM_DATA: Any = object()  # a sensor that is not given
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """A module that is fitted, with settings of its own.
+    """A fitted module with settings of its own.
 
     Attributes:
         module: The module, or a function that makes it for the scene (or sensor) as it stands
@@ -31,7 +33,7 @@ class Unknown:
 
     @property
     def depends_on_target(self) -> bool:
-        """Whether it must know what the unknowns before it make of the scene (or sensor)."""
+        """True if the module depends on the scene (or sensor) that earlier unknowns return."""
         return not isinstance(self.module, nn.Module) or self.regularize is not None
 
     def build_module(self, target: Any) -> nn.Module:
@@ -60,39 +62,76 @@ def name_unknowns(unknowns: Unknowns, prefix: str = "") -> dict[str, Unknown]:
     }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Observation:
-    """What one sensor has observed, and the model that explains it.
+    """Data of one sensor, and the model that predicts them.
 
     Attributes:
         model: Forward model, such as ``SurrogateMap``, or one's own that derives from
             ``ForwardModel``.
-        sensor: What recorded the data, such as a ``Radar``.
-        data: A recording that ``model.observe`` understands, or its map.
-        weight: Weight of its loss in the mean over all observations.
+        data: A recording that ``model.observe`` takes, or a map of it.
+        sensor: The sensor that recorded the data, such as a ``Radar`` or a ``Camera``. It may be
+            left out where the recording has a radar, as a ``Capture`` does.
+        weight: Weight of the loss in the mean over all observations, > 0.
         parameters: Unknowns of the sensor: modules sensor → sensor, such as ``RangeBias``.
-        loss: How maps are compared, in place of the loss of the fit.
+        loss: Loss (predicted, observed) → a number, in place of the loss of the fit.
 
     Raises:
-        InputError: A weight that is not positive, or a model that is no ``ForwardModel``.
+        InputError: No sensor, a weight that is not positive, or a model that is no
+            ``ForwardModel``.
     """
 
     model: ForwardModel
-    sensor: Any
     data: Any
-    weight: float = 1.0
-    parameters: Unknowns = ()
-    loss: Loss | None = None
+    sensor: Any
+    weight: float
+    parameters: Unknowns
+    loss: Loss | None
 
-    def __post_init__(self) -> None:
-        if not self.weight > 0:
-            raise InputError(f"expected a weight > 0, got {self.weight}; leave the observation out")
-        if not isinstance(self.model, ForwardModel):
+    def __init__(
+        self,
+        model: ForwardModel,
+        data: Any,
+        *deprecated: Any,
+        sensor: Any = _FROM_DATA,
+        weight: float = 1.0,
+        parameters: Unknowns = (),
+        loss: Loss | None = None,
+    ) -> None:
+        """Combine a model with data; see the class for the arguments."""
+        if deprecated:
+            warn_renamed("Observation(model, sensor, data)", "Observation(model, data, sensor=...)")
+            sensor = data
+            data, weight, parameters, loss = (
+                *deprecated,
+                *(weight, parameters, loss)[len(deprecated) - 1 :],
+            )
+        if not isinstance(model, ForwardModel):
             raise InputError(
-                f"expected a forward model, got {type(self.model).__name__}; give one such as "
+                f"expected a forward model, got {type(model).__name__}; give one such as "
                 "SurrogateMap(grid), or derive a class from ForwardModel"
             )
+        if sensor is _FROM_DATA:
+            sensor = _sensor_of_recording(data, model)
+        if not weight > 0:
+            raise InputError(f"expected a weight > 0, got {weight}; leave the observation out")
+        values = (model, data, sensor, weight, parameters, loss)
+        for name, value in zip(self.__dataclass_fields__, values, strict=True):
+            object.__setattr__(self, name, value)
 
     def observed_map(self) -> Tensor:
-        """The data in the form of the model's maps."""
+        """Return the data in the form of the model's maps."""
         return self.data if isinstance(self.data, Tensor) else self.model.observe(self.data)
+
+
+def _sensor_of_recording(data: Any, model: ForwardModel) -> Any:
+    """Return the radar of a recording; None for models without a sensor."""
+    radar = getattr(data, "radar", None)
+    if radar is not None:
+        return radar() if callable(radar) else radar
+    if model.needs_sensor:
+        raise InputError(
+            f"expected a recording that has its radar, got {type(data).__name__}; give "
+            "Observation(model, data, sensor=...)"
+        )
+    return None

@@ -19,7 +19,6 @@ from invertwin.inversion.confidence.verdict import (
     judge_fit,
 )
 from invertwin.inversion.fit import Callback, Fit, FitSettings, Status
-from invertwin.inversion.loss import SpectrumLoss
 from invertwin.inversion.observation import Observation, Unknown, Unknowns, name_unknowns
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.regularization import Regularizer
@@ -101,7 +100,8 @@ def reconstruct(
         observations: data of one or several sensors, with their forward models.
         parameters: modules Scene → Scene, applied in order; an :class:`Unknown` has its own rate
             and regularisers. Pass a mapping by name if stages select among them.
-        loss: (predicted, observed) → number. None = ``SpectrumLoss()``.
+        loss: (predicted, observed) → number. None = ``SpectrumLoss()``, and
+            ``SpectrumLoss("mse", levels=1, gain="one")`` for levels and fields.
         optimizer: kind of optimiser and rates.
         schedule: a ``Schedule``, or consecutive stages.
         regularizers: functions Scene → number, added to the loss.
@@ -121,9 +121,7 @@ def reconstruct(
     unknowns = name_unknowns(parameters)
     own = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(watched)]
     names = [*unknowns, *(name for found in own for name in found)]
-    settings = FitSettings(
-        loss or SpectrumLoss(), optimizer or Optimizer(), tuple(regularizers), seed
-    )
+    settings = FitSettings(loss, optimizer or Optimizer(), tuple(regularizers), seed)
     stages = make_stages(schedule, names)
     made = [_build_modules(o.sensor, found) for o, found in zip(watched, own, strict=True)]
     sensor_modules = [found for found, _ in made]
@@ -208,7 +206,7 @@ def prepare_fit(
         list(modules.values()),
         [list(found.values()) for found, _ in of_sensors],
         stage=Stage(),
-        settings=FitSettings(loss or SpectrumLoss(), Optimizer(), (*regularizers, *terms), seed),
+        settings=FitSettings(loss, Optimizer(), (*regularizers, *terms), seed),
         rates={},
         stage_position=(0, 0, True),
     )

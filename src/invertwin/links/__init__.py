@@ -1,5 +1,6 @@
 """What paths between antennas add up to: responses, OFDM channels, spreads, radio maps."""
 
+from invertwin.deprecation import rename_attributes
 from invertwin.links.cells import CellSampling as CellSampling
 from invertwin.links.cells import MapMesh as MapMesh
 from invertwin.links.cells import MapPlane as MapPlane
@@ -25,3 +26,16 @@ from invertwin.links.spreads import delay_spread as delay_spread
 from invertwin.links.spreads import rician_factor as rician_factor
 from invertwin.links.transmitters import TransmitterPosition as TransmitterPosition
 from invertwin.links.transmitters import Transmitters as Transmitters
+
+rename_attributes(
+    __name__,
+    {
+        "PlacedPanel": "PanelPlacement",
+        "Places": "ReceiverLocations",
+        "Points": "ReceiverPoints",
+        "Received": "LinkStatistics",
+        "Reception": "PropagationSettings",
+        "Terminals": "AntennaMount",
+        "ray_paths_of": "ray_paths_from_sionna",
+    },
+)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from annotated_types import Ge
@@ -237,6 +237,15 @@ class ExactMap(ForwardModel):
     def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
         """The measured power spectrum of a capture."""
         return recording.spectrum(self.grid).to(torch.float32)
+
+    def with_sampling(self, **changes: Any) -> "ForwardModel":
+        """Return the model with other fields of its ``sampling``.
+
+        ``samples`` is the work for a map in every model; here it is that of conductors.
+        """
+        if "samples" in changes:
+            changes["conductor_samples"] = changes.pop("samples")
+        return super().with_sampling(**changes)
 
     def prepare(self, scene: Scene, sensor: Radar, seed: int) -> "ExactMap":
         """The model with rough points that stay while the scene moves."""

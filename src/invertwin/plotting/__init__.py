@@ -5,6 +5,7 @@ changes: save it with ``figure.savefig(path)`` or show it in a notebook. The tur
 animation and comes as the bytes of a GIF.
 """
 
+from invertwin.deprecation import rename_attributes
 from invertwin.plotting.coverage import coverage as coverage
 from invertwin.plotting.curves import convergence as convergence
 from invertwin.plotting.curves import count_minima as count_minima
@@ -32,3 +33,15 @@ from invertwin.plotting.signatures import rcs_derivatives as rcs_derivatives
 from invertwin.plotting.signatures import rcs_image as rcs_image
 from invertwin.plotting.signatures import rcs_profile as rcs_profile
 from invertwin.plotting.turntable import turntable as turntable
+
+rename_attributes(
+    __name__,
+    {
+        "Panel": "MapPanel",
+        "focused": "rcs_image",
+        "located": "transmitter_fits",
+        "profile": "rcs_profile",
+        "sections": "rcs_curves",
+        "slopes": "rcs_derivatives",
+    },
+)

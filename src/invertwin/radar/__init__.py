@@ -1,5 +1,6 @@
 """Channel to radar data: exact signals and their smooth surrogate, in plain torch."""
 
+from invertwin.deprecation import rename_attributes
 from invertwin.radar.boards import BOARDS as BOARDS
 from invertwin.radar.boards import Board as Board
 from invertwin.radar.boards import board as board
@@ -66,3 +67,16 @@ from invertwin.radar.waveform import PhysicsWarning as PhysicsWarning
 from invertwin.radar.waveform import SampledWaveform as SampledWaveform
 from invertwin.radar.waveform import SteppedFrequency as SteppedFrequency
 from invertwin.radar.waveform import Waveform as Waveform
+
+rename_attributes(
+    __name__,
+    {
+        "RadarPath": "RadarTrajectory",
+        "chosen_surrogate": "resolve_surrogate",
+        "peak_of": "find_peak",
+        "points_csv": "format_points_csv",
+        "points_of": "detect_points",
+        "sharp_map": "high_resolution_map",
+        "snapshots_of": "doppler_snapshots",
+    },
+)

@@ -12,8 +12,8 @@ from annotated_types import Ge, Gt, Le
 from jaxtyping import Complex, Complex128, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, Paths, is_differentiated
-from invertwin.checks import ArrayLike, check_fields, check_shape, checked_tensor
+from invertwin.channel import Grid, Link, Paths
+from invertwin.checks import ArrayLike, check_fields, check_shape, checked_tensor, is_differentiated
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import MAX_COUNT, AllowedValues

@@ -1,5 +1,6 @@
 """Scenes as torch values: meshes, materials, antennas, and fitted parameters."""
 
+from invertwin.deprecation import rename_attributes
 from invertwin.scene.antenna import AntennaArray as AntennaArray
 from invertwin.scene.antenna import Cosine as Cosine
 from invertwin.scene.antenna import Isotropic as Isotropic
@@ -92,3 +93,17 @@ from invertwin.scene.shapes import plate as plate
 from invertwin.scene.shapes import sphere as sphere
 from invertwin.scene.shapes import text as text
 from invertwin.scene.shapes import trihedral as trihedral
+
+rename_attributes(
+    __name__,
+    {
+        "Along": "TrajectoryMotion",
+        "InMotion": "MovingScene",
+        "Mover": "ObjectMotion",
+        "Spline": "SplineTrajectory",
+        "Surface": "ScatteringLaw",
+        "Table": "TabulatedPattern",
+        "Turning": "AxisRotation",
+        "joined": "merge_meshes",
+    },
+)

@@ -1,5 +1,6 @@
 """Three-dimensional displays: in a browser that answers, and on a page that stands alone."""
 
+from invertwin.deprecation import rename_attributes
 from invertwin.viewer.display import Display as Display
 from invertwin.viewer.display import DisplayLayer as DisplayLayer
 from invertwin.viewer.display import DisplayMaps as DisplayMaps
@@ -24,3 +25,19 @@ from invertwin.viewer.page import view_html as view_html
 from invertwin.viewer.panels import MEASURED as MEASURED
 from invertwin.viewer.panels import SIMULATED as SIMULATED
 from invertwin.viewer.server import Viewer as Viewer
+
+rename_attributes(
+    __name__,
+    {
+        "Body": "DisplayMesh",
+        "Guard": "AccessGuard",
+        "Layer": "DisplayLayer",
+        "Link": "InteractiveSensor",
+        "Maps": "DisplayMaps",
+        "Step": "DisplayStep",
+        "body_of": "display_mesh",
+        "display_of": "build_display",
+        "policy": "content_security_policy",
+        "show_scene": "show",
+    },
+)

@@ -7,10 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invertwin.channel import Grid, Paths, Sampling, torch_threads, trace_power
+from invertwin.channel import Grid, Paths, Sampling, trace_power
 from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar
+from invertwin.runtime.concurrency import torch_threads
 from invertwin.scene import Mesh, Scene, compose
 from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.viewer.display import DisplayMesh

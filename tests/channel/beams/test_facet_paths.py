@@ -53,7 +53,7 @@ def test_polygons_agree_with_sampled_rays(turn):
     scene = corner(rigid(rotation_from_vector(float64(turn)), float64([0.004, -0.003, 0.002])))
     far = link(2 * PLACES, wavelength=WAVELENGTH)
     sampled = trace_field(
-        scene, far, sampling=Sampling(depth=3, samples=60_000, boundary=False), seed=1
+        scene, far, sampling=Sampling(depth=3, conductor_samples=60_000, boundary=False), seed=1
     )
     ratio = fields(trace_facet_paths(scene, far, 3)) / fields(sampled)
     assert (20 * ratio.abs().log10()).abs().max() < 0.2
@@ -120,7 +120,7 @@ def test_chains_are_polarised(pair):
     pose = rigid(rotation_from_vector(float64([0.0, 0.0, 0.3])), float64([0.0, 0.0, 0.0]))
     scene = Scene({"a": Object(dihedral(0.05), PerfectConductor(), pose)})
     sampled = trace_field(
-        scene, far, sampling=Sampling(depth=2, samples=60_000, boundary=False), seed=1
+        scene, far, sampling=Sampling(depth=2, conductor_samples=60_000, boundary=False), seed=1
     )
     ratio = fields(trace_facet_paths(scene, far, 2)) / fields(sampled)
     assert float((ratio[0] - 1).abs()) < 0.05  # the other places are off its lobe

@@ -38,7 +38,10 @@ def cross_section(scene: Scene, distance: float, wavelength: float, samples: int
     """σ [m²] of a target at the origin, seen from −z."""
     antennas = link(((0.0, 0.0, -distance),), wavelength=wavelength)
     paths = trace_field(
-        scene, antennas, sampling=Sampling(depth=1, samples=samples, boundary_samples=0), seed=1
+        scene,
+        antennas,
+        sampling=Sampling(depth=1, conductor_samples=samples, boundary_samples=0),
+        seed=1,
     )
     power = response(paths, antennas).abs().square()
     return float(power * (4 * math.pi) ** 3 * distance**4 / wavelength**2)
@@ -75,7 +78,10 @@ def test_a_large_plate_reflects_with_minus_one():
     scene = Scene({"mirror": thing(plate(8.0, 8.0), (0, 0, distance), material=METAL)})
     found = response(
         trace_field(
-            scene, antennas, sampling=Sampling(depth=1, samples=300_000, boundary_samples=0), seed=0
+            scene,
+            antennas,
+            sampling=Sampling(depth=1, conductor_samples=300_000, boundary_samples=0),
+            seed=0,
         ),
         antennas,
     )
@@ -89,7 +95,10 @@ def test_phase_holds_at_long_range():
     scene = Scene({"plate": thing(plate(0.3, 0.2), (40.0, -30.0, 193.6), (0.1, 0.4, 0.2), METAL)})
     antennas = link(((0.01, 0.02, 0.03),), ((-0.2, 0.1, 0.0),), shared=True)
     paths = trace_field(
-        scene, antennas, sampling=Sampling(depth=1, samples=500, boundary_samples=0), seed=0
+        scene,
+        antennas,
+        sampling=Sampling(depth=1, conductor_samples=500, boundary_samples=0),
+        seed=0,
     )
     points = paths.first.numpy().astype(np.longdouble)
     corners = scene["plate"].vertices.numpy().astype(np.longdouble)
@@ -112,7 +121,10 @@ def test_fields_are_reciprocal(material):
     found = [
         response(
             trace_field(
-                scene, a, sampling=Sampling(depth=1, samples=20_000, boundary_samples=0), seed=4
+                scene,
+                a,
+                sampling=Sampling(depth=1, conductor_samples=20_000, boundary_samples=0),
+                seed=4,
             ),
             a,
         )
@@ -192,7 +204,9 @@ def test_rough_points_stay_on_their_surface():
     paths = trace_field(
         Scene({"wall": scene["wall"]}),
         antennas,
-        sampling=Sampling(depth=1, samples=100_000, boundary_samples=0, points_per_m2=500.0),
+        sampling=Sampling(
+            depth=1, conductor_samples=100_000, boundary_samples=0, points_per_m2=500.0
+        ),
         seed=2,
     )
     first, second = (paths.first[paths.frame == frame] for frame in range(2))
@@ -224,7 +238,7 @@ def test_mean_power_of_rough_fields_is_the_power_map(density):
                 scene,
                 antennas,
                 sampling=Sampling(
-                    depth=1, samples=100_000, boundary_samples=0, points_per_m2=density
+                    depth=1, conductor_samples=100_000, boundary_samples=0, points_per_m2=density
                 ),
                 seed=seed,
             ),
@@ -297,21 +311,25 @@ def test_a_mixed_scene_holds_both_kinds():
     paths = trace_field(
         scene,
         link(),
-        sampling=Sampling(depth=1, samples=1_000, boundary_samples=0, points_per_m2=500.0),
+        sampling=Sampling(
+            depth=1, conductor_samples=1_000, boundary_samples=0, points_per_m2=500.0
+        ),
         seed=0,
     )
     assert paths.kind == "field"
     alone = trace_field(
         Scene({"wall": scene["wall"]}),
         link(),
-        sampling=Sampling(depth=1, samples=1_000, boundary_samples=0),
+        sampling=Sampling(depth=1, conductor_samples=1_000, boundary_samples=0),
         seed=0,
     )
     assert alone.kind == "coherent"
     rough = trace_field(
         Scene({"occluder": scene["occluder"]}),
         link(),
-        sampling=Sampling(depth=1, samples=100_000, boundary_samples=0, points_per_m2=500.0),
+        sampling=Sampling(
+            depth=1, conductor_samples=100_000, boundary_samples=0, points_per_m2=500.0
+        ),
         seed=0,
     )
     assert rough.kind == "rough"
@@ -329,7 +347,7 @@ def test_rough_derivatives_with_boundary_are_refused():
                 scene,
                 antennas,
                 sampling=Sampling(
-                    depth=1, samples=100_000, boundary_samples=0, points_per_m2=100.0
+                    depth=1, conductor_samples=100_000, boundary_samples=0, points_per_m2=100.0
                 ),
                 seed=0,
             )
@@ -337,7 +355,11 @@ def test_rough_derivatives_with_boundary_are_refused():
             scene,
             antennas,
             sampling=Sampling(
-                depth=1, samples=100_000, boundary_samples=0, boundary=False, points_per_m2=100.0
+                depth=1,
+                conductor_samples=100_000,
+                boundary_samples=0,
+                boundary=False,
+                points_per_m2=100.0,
             ),
             seed=0,
         )
@@ -349,7 +371,10 @@ def test_silhouettes_without_samples_are_refused():
     metal = occluder(wall=METAL, occluder=METAL)
     for call in (
         lambda: trace_field(
-            metal, link(shift), sampling=Sampling(depth=1, samples=100, boundary_samples=0), seed=0
+            metal,
+            link(shift),
+            sampling=Sampling(depth=1, conductor_samples=100, boundary_samples=0),
+            seed=0,
         ),
         lambda: trace_power(
             occluder(),

@@ -21,7 +21,7 @@ EDGE, DISTANCE = 0.05, 20.0
 def paths_of(
     scene: Scene, antennas: Link, depth: int = 3, samples: int = 20_000, seed: int = 1
 ) -> Paths:
-    sampling = Sampling(depth=depth, samples=samples, boundary_samples=0, boundary=False)
+    sampling = Sampling(depth=depth, conductor_samples=samples, boundary_samples=0, boundary=False)
     return trace_field(scene, antennas, sampling=sampling, seed=seed)
 
 

@@ -50,7 +50,7 @@ def response(mesh: Mesh, between: Link, turn: float = 0.0, depth: int = 2) -> co
 
 def traced(scene: Scene, between: Link, depth: int = 2, samples: int = 20_000) -> Paths:
     sampling = Sampling(
-        depth=depth, samples=samples, boundary_samples=0, boundary=False, rough_paths=4000
+        depth=depth, conductor_samples=samples, boundary_samples=0, boundary=False, rough_paths=4000
     )
     return trace_field(scene, between, sampling=sampling, seed=1)
 
@@ -130,7 +130,7 @@ def test_both_ways_are_equal(pair, places):
     turned = thing(trihedral(EDGE), turn=(0.1, 0.2, 0.4), material=METAL)
     # Few rays, of which none grazes an edge: there rounding decides who sees what.
     ways = [
-        complex(summed(traced(Scene({"a": turned}), way, depth=3, samples=2000)))
+        complex(summed(traced(Scene({"a": turned}), way, depth=3, conductor_samples=2000)))
         for way in (there, back)
     ]
     assert ways[0] == pytest.approx(ways[1], rel=1e-6)

@@ -29,7 +29,9 @@ def test_fields_pass_sheets_as_power_does():
         field = trace_field(
             scene,
             antennas,
-            sampling=Sampling(depth=1, samples=100_000, boundary_samples=0, points_per_m2=1e4),
+            sampling=Sampling(
+                depth=1, conductor_samples=100_000, boundary_samples=0, points_per_m2=1e4
+            ),
             seed=1,
         )
         power = trace_power(
@@ -54,6 +56,6 @@ def test_a_moving_silhouette_of_a_coherent_field_past_a_sheet_is_refused():
         trace_field(
             Scene({"board": board, "mirror": mirror}),
             link(),
-            sampling=Sampling(depth=1, samples=100_000, boundary_samples=100),
+            sampling=Sampling(depth=1, conductor_samples=100_000, boundary_samples=100),
             seed=1,
         )

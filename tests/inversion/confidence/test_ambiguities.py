@@ -93,7 +93,7 @@ def test_a_turn_that_explains_the_data_as_well_makes_the_verdict_ambiguous():
     assert look is not None
     found = reconstruct(
         scene,
-        Observation(model, None, look(0, 0.0)),
+        Observation(model, look(0, 0.0), sensor=None),
         Pose("ball", axes="", rotation_axes="y"),
         loss=LAW,
         optimizer=Optimizer("gauss_newton", rate=0.1),
@@ -118,7 +118,7 @@ def test_a_position_alone_has_no_rivals():
     assert look is not None
     found = reconstruct(
         scene,
-        Observation(model, None, look(0, 0.0)),
+        Observation(model, look(0, 0.0), sensor=None),
         Translation("ball", axes="x"),
         loss=LAW,
         optimizer=Optimizer("gauss_newton", rate=0.1),

@@ -29,7 +29,7 @@ def fitted(model: Blob, seed: int = 0, axes: str = "x", loss: Any = LAW) -> Reco
     assert look is not None
     return reconstruct(
         scene(0.05),
-        Observation(model, None, look(seed, 0.0)),
+        Observation(model, look(seed, 0.0), sensor=None),
         Translation("ball", axes=axes),
         loss=loss,
         optimizer=Optimizer("gauss_newton", rate=0.1),
@@ -113,7 +113,7 @@ def test_a_mixed_direction_is_named_with_its_parts():
     assert look is not None
     found = reconstruct(
         scene(),
-        Observation(Blob(), None, look(0, 0.0)),
+        Observation(Blob(), look(0, 0.0), sensor=None),
         Mixed(),
         loss=LAW,
         optimizer=Optimizer("gauss_newton", rate=0.1),

@@ -15,7 +15,7 @@ from scenes import thing
 def fitted(data: Tensor, start: float = 0.05, model: Blob | None = None) -> Reconstruction:
     return reconstruct(
         scene(start),
-        Observation(model or Blob(), None, data),
+        Observation(model or Blob(), data, sensor=None),
         Translation("ball", axes="x"),
         loss=LAW,
         optimizer=Optimizer("gauss_newton", rate=0.1),

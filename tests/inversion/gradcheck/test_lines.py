@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from invertwin.capture import Capture
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.inversion import Observation
@@ -125,18 +124,18 @@ def test_losses_along_a_line_are_least_at_the_truth():
     drawn = Sampling(depth=1, samples=20_000, points_per_m2=2e3, boundary=False)
     model = SurrogateMap(grid, Surrogate("gaussian", range_width=3.0, angle_width=2.0), drawn)
     sharp = model.scale_blur(0.0).predict(SCENE, device, 1)
-    losses = evaluate_losses(line, offsets, Observation(model, device, sharp), seed=2)
+    losses = evaluate_losses(line, offsets, Observation(model, sharp, sensor=device), seed=2)
     assert (losses.diff() > 0).tolist() == [False, False, True, True]
     assert float(losses[2]) < 0.02 * float(losses.max())
     data = simulate(SCENE, device, grid, seed=3, sampling=drawn)
     for channels in ((slice(None), slice(None)), (slice(1), slice(1, 3))):
         exact, beat = BeatMap(grid, drawn, channels=channels), data.beat[:, *channels]
         assert beat.shape[2] == (2 if channels[1].start else 4)
-        seen = Observation(exact, device, beat, loss=relative_error)
+        seen = Observation(exact, beat, sensor=device, loss=relative_error)
         losses = evaluate_losses(line, offsets, seen, seed=3)
         assert float(losses[2]) < 1e-20
         assert float(losses[[0, 1, 3, 4]].min()) > 0.5
-    capture = Capture.from_beat(data.beat, device)
+    capture = data.capture
     assert torch.allclose(exact.observe(capture), beat)
 
 

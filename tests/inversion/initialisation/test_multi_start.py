@@ -35,7 +35,7 @@ def found(model: Blob, places: list[float], seed: int = 0) -> Search:
     starts = [scene(x)["ball"] for x in places]
     return search(
         scene(),
-        Observation(model, None, look(seed, 0.0)),
+        Observation(model, look(seed, 0.0), sensor=None),
         Translation("ball", axes="x"),
         {"ball": starts},
         loss=LAW,
@@ -85,7 +85,7 @@ def test_half_turns_are_tried_without_being_asked():
     assert look is not None
     result = search(
         bar,
-        Observation(Needle(), None, look(0, 0.0)),
+        Observation(Needle(), look(0, 0.0), sensor=None),
         Pose("ball", axes="", rotation_axes="y"),
         {"ball": [bar["ball"]]},
         loss=LAW,
@@ -124,7 +124,7 @@ def test_random_starts_serve_as_well():
     assert look is not None
     result = search(
         scene(),
-        Observation(Blob(), None, look(0, 0.0)),
+        Observation(Blob(), look(0, 0.0), sensor=None),
         Translation("ball", axes="x"),
         {"ball": starts},
         loss=LAW,

@@ -102,7 +102,7 @@ def _losses(
     capture = Capture.from_beat(measured, radar)
     sampling = Sampling(depth=1, samples=settings.samples)
     model = SurrogateMap(grid, build.build_section(run, "surrogate"), sampling)
-    smooth = Observation(model, radar, capture, loss=build.build_section(run, "loss"))
+    smooth = Observation(model, capture, sensor=radar, loss=build.build_section(run, "loss"))
     first = radar.frames([0])
     views = _views(settings, first, grid)
 
@@ -115,7 +115,7 @@ def _losses(
     x = np.linspace(-settings.span, settings.span, settings.points)
     far = np.linspace(-settings.wide_span, settings.wide_span, settings.wide_points)
     exact = evaluate_exact_losses(
-        run, line, x, Observation(BeatMap(grid), first, measured[:1], loss=errors)
+        run, line, x, Observation(BeatMap(grid), measured[:1], sensor=first, loss=errors)
     )
     near = {name: (x, exact[:, k]) for k, name in enumerate(views)}
     near["surrogate"] = (x, evaluate_losses(line, x, smooth, seed=run.seed).numpy())

@@ -54,7 +54,9 @@ def trace_multibounce_paths(rays: RayScene, sampling: Sampling, seed: int) -> li
     """
     geometry = rays.geometry
     smooth = torch.tensor(geometry.coherent)[geometry.face_object]
-    points = sample_surface_points(face_areas(geometry) * smooth, sampling.samples, seed)
+    points = sample_surface_points(
+        face_areas(geometry) * smooth, sampling.count_conductor_samples(), seed
+    )
     link = rays.link
     same = torch.equal(link.tx, link.rx) and link.tx_jones.equals(link.rx_jones)
     found: list[Paths] = []

@@ -1,7 +1,6 @@
 """Rough points: fixed material points whose phases give a rough surface its speckle."""
 
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,38 +10,8 @@ from invertwin.channel.coherent.radar_equation import SurfacePaths
 from invertwin.channel.coherent.rough_paths import draw_rough_paths
 from invertwin.channel.paths import Link
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.sampling import ALL_OTHERS, Densities, Sampling
-from invertwin.errors import InputError
+from invertwin.channel.sampling import Densities, Sampling, resolve_densities
 from invertwin.scene.scene import Scene
-
-
-def resolve_densities(scene: Scene, points_per_m2: Densities) -> dict[str, float]:
-    """Points per m² of every rough object.
-
-    Args:
-        scene: Surfaces.
-        points_per_m2: One number, or numbers by name.
-
-    Raises:
-        InputError: A name that the scene does not have, or a rough object without a number.
-    """
-    rough = [name for name, item in scene.objects.items() if not item.material.coherent]
-    if not isinstance(points_per_m2, Mapping):
-        return dict.fromkeys(rough, points_per_m2)
-    unknown = [name for name in points_per_m2 if name not in (*scene.names, ALL_OTHERS)]
-    if unknown:
-        raise InputError(
-            f"expected points_per_m2 of objects of the scene ({', '.join(scene.names)}), or of "
-            f'"{ALL_OTHERS}" for all others, got {unknown[0]!r}; use one of these names'
-        )
-    found = {name: points_per_m2.get(name, points_per_m2.get(ALL_OTHERS)) for name in rough}
-    missing = [name for name, density in found.items() if density is None]
-    if missing:
-        raise InputError(
-            f"expected points_per_m2 of every rough object, got none of {', '.join(missing)}; "
-            f'add them, or "{ALL_OTHERS}" for all that are not named'
-        )
-    return {name: density for name, density in found.items() if density is not None}
 
 
 def draw_rough_points(scene: Scene, points_per_m2: Densities, seed: int) -> SurfacePaths:

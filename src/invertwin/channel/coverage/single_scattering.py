@@ -37,7 +37,7 @@ from invertwin.channel.coverage.shadow_boundaries import (
 )
 from invertwin.channel.em.plane_waves import dot
 from invertwin.channel.paths import Link
-from invertwin.channel.rays.backend import torch_threads, tracing
+from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.intersections import find_intersection_curves
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry, flatten
@@ -58,6 +58,7 @@ from invertwin.channel.specular.trace_paths import (
 from invertwin.checks import ArrayLike, is_differentiated, strip_derivatives
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.runtime.concurrency import torch_threads
 from invertwin.scene import Isotropic
 from invertwin.scene.scene import Scene
 

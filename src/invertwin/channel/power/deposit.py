@@ -23,13 +23,14 @@ from invertwin.channel.power.trace import (
     differentiable_tables,
     strip_scene_derivatives,
 )
-from invertwin.channel.rays.backend import backend, dr, mi, torch_threads, tracing
+from invertwin.channel.rays.backend import backend, dr, mi, tracing
 from invertwin.channel.rays.batching import arrange_scenes
 from invertwin.channel.rays.scene_tables import Geometry, flatten, require_silhouette_samples
 from invertwin.channel.sampling import Sampling
 from invertwin.checks import is_differentiated, strip_derivatives
 from invertwin.errors import InputError
 from invertwin.limits import MAX_COUNT
+from invertwin.runtime.concurrency import torch_threads
 from invertwin.scene.scene import Object, Scene
 
 

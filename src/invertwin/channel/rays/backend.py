@@ -16,10 +16,9 @@ import torch
 
 from invertwin.errors import InputError
 from invertwin.runtime import doctor, threads
+from invertwin.runtime.concurrency import tracer_lock
 
 VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
-tracer_lock = threading.RLock()
-"""Held while rays are traced, or a level of forward-mode derivatives is open."""
 
 
 class _ThreadState(threading.local):
@@ -123,21 +122,6 @@ def _after_fork() -> None:
 
 
 os.register_at_fork(after_in_child=_after_fork)
-
-
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Keep torch to so many threads inside a ``with`` block.
-
-    Between torch's operations its threads spin for a while, on the cores that trace rays. So torch
-    gets one thread for small work, and half of the cores where torch and rays work in turns.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @cache

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import torch
 
-from invertwin.channel import Sampling, resolve_densities
+from invertwin.channel import Sampling
+from invertwin.channel.sampling import resolve_densities
 from invertwin.cli.estimate import (
     ResourceEstimate,
     SensorSetup,

@@ -169,7 +169,7 @@ def _rcs_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _Gradch
             curves, *places, f"∂σ, σ in m² [{_derivative_unit(settings)}]"
         )
 
-    return _GradcheckTarget(RcsMap(compute_rcs), None, None, draw)
+    return _GradcheckTarget(RcsMap(compute=compute_rcs), None, None, draw)
 
 
 def _radio_map_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _GradcheckTarget:

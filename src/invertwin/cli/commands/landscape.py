@@ -32,13 +32,13 @@ def plot_landscape(problem: Problem, console: Console) -> tuple[Figure, dict[str
     fine = np.linspace(-table.exact_span, table.exact_span, table.exact_points)
     wide = np.linspace(-table.span, table.span, table.points)
     model, first = BeatMap(sight.grid, channels=(slice(1), slice(1))), sight.radar.frames([0])
-    beat = Observation(model, first, sight.capture.beat[:1, :1, :1], loss=relative_error)
+    beat = Observation(model, sight.capture.beat[:1, :1, :1], sensor=first, loss=relative_error)
     with count_progress(console, "loss landscape, exact signal", len(fine)) as advance:
         exact = evaluate_exact_losses(run, line, fine, beat, advance)
     model, loss = make_models(problem)[0], build.build_section(run, "loss")
     smooth = {}
     for name, share in (("first widths", 1.0), ("no extra width", 0.0)):
-        seen = Observation(model.scale_blur(share), sight.radar, sight.capture, loss=loss)
+        seen = Observation(model.scale_blur(share), sight.capture, sensor=sight.radar, loss=loss)
         with count_progress(console, f"loss landscape, {name}", len(wide)) as advance:
             losses = evaluate_losses(
                 line, iterate_and_advance(wide, advance), seen, seed=run.seed

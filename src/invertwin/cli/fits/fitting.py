@@ -75,7 +75,7 @@ def calibrate_problem(
         with report_progress("calibration", schedule.steps, console) as shown:
             found = reconstruct(
                 Scene({table.object: target}),
-                Observation(model, sight.radar, sight.capture, parameters=[bias, clock]),
+                Observation(model, sight.capture, sensor=sight.radar, parameters=[bias, clock]),
                 [],
                 loss=build.build_section(run, "loss"),
                 optimizer=build.build_section(own.run, "optimizer"),

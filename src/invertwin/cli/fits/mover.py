@@ -172,7 +172,7 @@ def _fitted(
     with report_progress(name, settings.steps, console) as callbacks:
         found = reconstruct(
             scene,
-            Observation(near, radar, recording),
+            Observation(near, recording, sensor=radar),
             body,
             loss=CorrelationLoss(),
             optimizer=build.build_section(run, "optimizer"),

@@ -326,7 +326,11 @@ def make_sampling(run: RunFile) -> Sampling:
     """How the model of a fit samples paths."""
     settings = require_settings(run)
     counts = {name: getattr(settings, name) for name in SamplingBase.made_from}
-    return Sampling(**counts, points_per_m2=rough_point_densities(run))
+    return Sampling(
+        **counts,
+        conductor_samples=settings.samples,
+        points_per_m2=rough_point_densities(run),
+    )
 
 
 def rough_point_densities(run: RunFile) -> Densities:
@@ -389,7 +393,15 @@ def make_observations(problem: Problem) -> list[Observation]:
             unknowns[f"{name}.{kind}" if name else kind] = (
                 RangeBias() if kind == "range_bias" else ClockOffset(sight.capture.positions)
             )
-        found.append(Observation(model, sight.radar, sight.capture, sight.weight, unknowns))
+        found.append(
+            Observation(
+                model,
+                sight.capture,
+                sensor=sight.radar,
+                weight=sight.weight,
+                parameters=unknowns,
+            )
+        )
     return found
 
 

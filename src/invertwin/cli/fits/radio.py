@@ -279,7 +279,7 @@ def _fit(
     sensor = replace(heard.sensor, positions=places)
     return reconstruct(
         heard.scene,
-        Observation(stages[-1].models[0], sensor, heard.levels, parameters=own),
+        Observation(stages[-1].models[0], heard.levels, sensor=sensor, parameters=own),
         unknowns,
         loss=build.build_section(run, "loss"),
         schedule=stages,

@@ -48,7 +48,7 @@ class SearchTable(ConstructorTable):
 
 def register(registry: Registry) -> None:
     """Add losses, optimizers and models beside the surrogate's; others come from plugins."""
-    registry.groups["loss"] = KindGroup(default="mse")
+    registry.groups["loss"] = KindGroup(default="likelihood")
     registry.groups["optimizer"] = KindGroup(default="adam")
     registry.groups["model"] = KindGroup()
     registry.groups["search"] = KindGroup(base=SearchTable)

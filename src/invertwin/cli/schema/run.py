@@ -9,7 +9,7 @@ from annotated_types import MinLen
 from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
-from invertwin.channel import ALL_OTHERS
+from invertwin.channel.sampling import ALL_OTHERS
 from invertwin.cli.schema.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.schema.dataset import DatasetTable
 from invertwin.cli.schema.fit_tables import SurrogateTable
@@ -197,9 +197,11 @@ class _RunFile(Section):
     @classmethod
     def _set_level_loss(cls, data: Any) -> Any:
         """Received levels [dB] are compared as they are, at one resolution, unless said else."""
-        read = data.get("data") if isinstance(data, dict) and "loss" not in data else None
+        read = data.get("data") if isinstance(data, dict) else None
         if isinstance(read, dict) and read.get("kind") in ("received", "received_file"):
-            return data | {"loss": {"levels": 1, "gain": "one"}}
+            given = data.get("loss", {"levels": 1, "gain": "one"})
+            if isinstance(given, dict):
+                return data | {"loss": {"kind": "mse", **given}}
         return data
 
     @model_validator(mode="after")

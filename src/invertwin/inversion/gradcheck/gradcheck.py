@@ -11,12 +11,12 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.channel import tracer_lock
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.gradcheck.lines import make_line
 from invertwin.inversion.gradcheck.tangents import ParameterChange
 from invertwin.limits import Count, NonNegative, Positive
+from invertwin.runtime.concurrency import tracer_lock
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derive_seed
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.tangents import ParameterChange, parameter_changes
-from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.loss import resolve_loss
 from invertwin.inversion.observation import Observation
 from invertwin.scene.mesh import Mesh
 
@@ -131,14 +131,14 @@ def evaluate_losses(
     Args:
         line: line of a module that maps the scene, see ``make_line``.
         offsets: θ of each scene.
-        observation: the observation. Its loss may return several numbers; the default is
-            ``SpectrumLoss``.
+        observation: the observation. Its loss may return several numbers; None = the default of
+            ``reconstruct``.
         seed: seed of all random numbers.
 
     Returns:
         Losses [offset] or [offset, number].
     """
-    sensor, loss = observation.sensor, observation.loss or SpectrumLoss()
+    sensor, loss = observation.sensor, resolve_loss(observation.model, observation.loss)
     with torch.no_grad():
         observed, start = observation.observed_map(), line.evaluate_end(0.0)
         observed = observation.model.blur_observed(observed, sensor)

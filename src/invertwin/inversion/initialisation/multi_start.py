@@ -22,7 +22,7 @@ from invertwin.inversion.confidence.ambiguities import (
     difference_score,
 )
 from invertwin.inversion.fit import Callback
-from invertwin.inversion.loss import Objective, SpectrumLoss
+from invertwin.inversion.loss import Objective, resolve_loss
 from invertwin.inversion.metrics import pose_error
 from invertwin.inversion.observation import Observation, Unknowns
 from invertwin.inversion.optimizer import Optimizer
@@ -152,15 +152,14 @@ def search(
     if not begun:
         raise InputError("expected at least one start, got none; give poses of an object")
     watched = [observations] if isinstance(observations, Observation) else list(observations)
-    rule = loss or SpectrumLoss()
-    screened = sorted(begun, key=_make_screening_loss(watched, rule, seed))
+    screened = sorted(begun, key=_make_screening_loss(watched, loss, seed))
 
     def fit(start: Scene, number: int) -> Reconstruction:
         return reconstruct(
             start,
             [replace(o, parameters=copy.deepcopy(o.parameters)) for o in watched],
             copy.deepcopy(parameters),
-            loss=rule,
+            loss=loss,
             optimizer=optimizer,
             schedule=schedule,
             regularizers=regularizers,
@@ -192,11 +191,12 @@ def search(
 
 
 def _make_screening_loss(
-    observations: Sequence[Observation], loss: Callable[[Tensor, Tensor], Tensor], seed: int
+    observations: Sequence[Observation], loss: Callable[[Tensor, Tensor], Tensor] | None, seed: int
 ) -> Callable[[Scene], float]:
     """Return the function that computes the loss of a scene at the widest blur."""
     objective = Objective(
-        tuple(o.loss or loss for o in observations), tuple(o.weight for o in observations)
+        tuple(resolve_loss(o.model, o.loss or loss) for o in observations),
+        tuple(o.weight for o in observations),
     )
     blurred = [o.model.blur_observed(o.observed_map(), o.sensor) for o in observations]
     models = [_reduce_samples(o.model) for o in observations]

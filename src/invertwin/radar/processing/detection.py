@@ -13,8 +13,8 @@ from scipy.special import gammaincc, gammaincinv
 from scipy.stats import beta, f
 from torch import Tensor
 
-from invertwin.channel import Grid, is_differentiated
-from invertwin.checks import check_shape
+from invertwin.channel import Grid
+from invertwin.checks import check_shape, is_differentiated
 from invertwin.errors import InputError
 from invertwin.radar.processing.doppler import velocity_axis, velocity_span
 from invertwin.radar.radar import Radar

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel import Paths, tracer_lock
+from invertwin.channel import Paths
 from invertwin.checks import check_fields
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -22,6 +22,7 @@ from invertwin.radar.signal.nufft import (
 )
 from invertwin.radar.signal.range_profile import beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, SampledWaveform, SteppedFrequency
+from invertwin.runtime.concurrency import tracer_lock
 from invertwin.runtime.progress import track
 
 # Largest error of interpolating a path's phase factor between the instants of a ramp.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Float32, Float64
@@ -24,7 +24,7 @@ from invertwin.channel import (
     trace_target,
     use_backend,
 )
-from invertwin.checks import check_fields
+from invertwin.checks import check_fields, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.aperture import Aperture, aperture
@@ -42,6 +42,7 @@ from invertwin.scene.scene import Scene
 
 # Kernels are tabulated at least this far out, so that short grids do not truncate them.
 _MIN_EXTENT = 64
+_DEFAULT_ANGLE_WIDTH = 1.5  # beamwidths of blur for an initial direction of unknown error
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,52 @@ class Surrogate:
 
     def __post_init__(self) -> None:
         check_fields(self)
+
+    @classmethod
+    def for_start_error(
+        cls,
+        error: float,
+        radar: Radar,
+        *,
+        distance: float | None = None,
+        degrees: float | None = None,
+        **kernels: Any,
+    ) -> "Surrogate":
+        """Return a surrogate whose blur is as wide as the error of an initial estimate.
+
+        A fit finds an object from further away the wider the blur is, and takes longer. A
+        standard deviation equal to the error suffices.
+
+        Args:
+            error: Distance of the initial position from the true one [m].
+            radar: The radar, whose range cells and beamwidths the widths are counted in.
+            distance: Distance of the object from the radar [m], at which the error is seen under
+                an angle.
+            degrees: Error in direction [°], in place of the angle at that distance. Where neither
+                is given, directions are blurred by 1.5 beamwidths.
+            kernels: Kernels, as for ``Surrogate``.
+
+        Raises:
+            InputError: A negative error, a distance or a direction out of range, or both.
+        """
+        checked_number(error, "error of the start [m]", 0.0)
+        if distance is not None and degrees is not None:
+            raise InputError(
+                "expected a distance or an error in degrees, got both; the distance gives the "
+                "angle of the error"
+            )
+        angle_width = _DEFAULT_ANGLE_WIDTH
+        if distance is not None:
+            degrees = math.degrees(
+                math.atan2(error, checked_number(distance, "distance [m]", 0.0, open_low=True))
+            )
+        if degrees is not None:
+            sine = math.sin(
+                math.radians(checked_number(degrees, "error in direction [°]", 0.0, 90))
+            )
+            angle_width = sine / min(radar.beamwidth)
+        range_width = error / radar.waveform.range_resolution
+        return cls(range_width=range_width, angle_width=angle_width, **kernels)
 
     @property
     def has_blur(self) -> bool:

@@ -16,12 +16,13 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, is_differentiated
+from invertwin.channel import Grid, Link
 from invertwin.channel.coherent.radar_equation import MaterialPoints, radar_equation
 from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import mi
 from invertwin.channel.rays.ray_scene import RayScene, is_visible
 from invertwin.channel.rays.scene_tables import Geometry, flatten
+from invertwin.checks import is_differentiated
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate.surrogate import Surrogate

@@ -57,7 +57,7 @@ class MusicMap:
         paths = trace_field(
             scene,
             seen.link(),
-            sampling=Sampling(depth=1, samples=_SAMPLES, boundary=False),
+            sampling=Sampling(depth=1, conductor_samples=_SAMPLES, boundary=False),
             seed=self.seed,
             speckle=self.speckle,
         )
