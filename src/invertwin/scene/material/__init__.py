@@ -1,5 +1,6 @@
-"""Materials: what a surface reflects, scatters and lets through.
+"""Materials: reflection, scattering and transmission of surfaces.
 
-`surface` what the ray kernel is told; `materials` the classes that users build; `fresnel`, `slab`,
-`roughness` their physics; `itu` the table of P.2040; `values` what a material value may be.
+`surface` defines the inputs of the ray kernel; `materials` the user classes; `fresnel`, `slab` and
+`roughness` their physics; `itu` the table of P.2040; `values` the types and ranges of material
+values.
 """

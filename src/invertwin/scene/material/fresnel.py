@@ -1,4 +1,4 @@
-"""Half spaces: complex permittivity, and what one interface reflects and lets through."""
+"""Half spaces: complex permittivity, Fresnel reflection and transmission."""
 
 import math
 from typing import NamedTuple
@@ -28,7 +28,7 @@ class FieldCoefficients(NamedTuple):
     transmission_p: Complex128[Tensor, "*angle"]
 
     def scale_reflection(self, share: Float64[Tensor, "*#angle"]) -> "FieldCoefficients":
-        """The same with a share of the reflected field."""
+        """Return the coefficients with the reflected field scaled."""
         return self._replace(
             reflection_s=share * self.reflection_s, reflection_p=share * self.reflection_p
         )
@@ -37,13 +37,13 @@ class FieldCoefficients(NamedTuple):
 def complex_permittivity(
     permittivity: Value, conductivity: Value, frequency: float, loss_tangent: Value = 0.0
 ) -> Shaped[Tensor, "*row"]:
-    """Relative complex permittivity ε = ε' (1 − j tanδ) − jσ/(ωε0) for exp(+jωt).
+    """Compute the relative complex permittivity ε = ε' (1 − j tanδ) − jσ/(ωε0) for exp(+jωt).
 
     Args:
         permittivity: real part ε' ≥ 1.
-        conductivity: σ [S/m].
-        frequency: [Hz].
-        loss_tangent: tanδ of losses other than by σ, taken as independent of frequency.
+        conductivity: conductivity σ [S/m].
+        frequency: frequency [Hz].
+        loss_tangent: tanδ of losses other than σ, independent of frequency.
 
     Raises:
         InputError: ε' < 1, σ < 0, tanδ < 0, or a frequency that is not positive.
@@ -61,7 +61,7 @@ def complex_permittivity(
 def fresnel_coefficients(
     permittivity: Shaped[Tensor, "*#angle"], cos_theta: Float[Tensor, "*#angle"]
 ) -> FieldCoefficients:
-    """Complex field coefficients of the surface of a half space, for waves from air.
+    """Compute the complex field coefficients of a half space for waves from air.
 
     r_s = (c − s)/(c + s), r_p = (εc − s)/(εc + s), t_s = 2c/(c + s), t_p = 2√ε c/(εc + s), with
     c = cosθ and s² = ε − 1 + c². Source: Fresnel.
@@ -84,11 +84,11 @@ def fresnel_coefficients(
 def fresnel_amplitude(
     permittivity: Shaped[Tensor, "*#angle"], cos_theta: Float[Tensor, "*#angle"]
 ) -> Float[Tensor, "*angle"]:
-    """Square root of the unpolarised Fresnel power reflectance of a half space.
+    """Compute the square root of the unpolarised Fresnel power reflectance of a half space.
 
-    The textbook coefficients, multiplied out so that the factor ε − 1 stands alone:
-    r_s = −(ε−1)/(c+s)² and r_p = (ε−1)((ε+1)c² − 1)/(εc+s)² with c = cosθ, s² = ε − 1 + c².
-    The amplitude and its gradient then stay finite at grazing incidence and for ε → 1.
+    Fresnel coefficients with the factor ε − 1 extracted: r_s = −(ε−1)/(c+s)² and r_p =
+    (ε−1)((ε+1)c² − 1)/(εc+s)² with c = cosθ, s² = ε − 1 + c². The amplitude and its gradient then
+    stay finite at grazing incidence and for ε → 1.
 
     Args:
         permittivity: complex relative permittivity; broadcasts with the angles.
@@ -108,7 +108,7 @@ def fresnel_amplitude(
 def fresnel_reflectance(
     permittivity: Shaped[Tensor, "*#angle"], cos_theta: Float[Tensor, "*#angle"]
 ) -> Float[Tensor, "*angle"]:
-    """Unpolarised Fresnel power reflectance (|r_s|² + |r_p|²)/2 of a half space.
+    """Compute the unpolarised Fresnel power reflectance (|r_s|² + |r_p|²)/2 of a half space.
 
     Args:
         permittivity: complex relative permittivity; broadcasts with the angles.
@@ -120,8 +120,8 @@ def fresnel_reflectance(
 def fresnel_transmittance(
     permittivity: Shaped[Tensor, "*#angle"], cos_theta: Float[Tensor, "*#angle"]
 ) -> Float[Tensor, "*angle"]:
-    """Unpolarised share of the power that the surface of a half space lets in: what it does not
-    reflect. The same share passes the other way, at the angle that Snell's law gives.
+    """Compute the unpolarised power transmittance of a half space, one minus its reflectance. It is
+    equal in the reverse direction at the refracted angle.
 
     Args:
         permittivity: complex relative permittivity; broadcasts with the angles.
@@ -131,15 +131,15 @@ def fresnel_transmittance(
 
 
 def refractive_index(permittivity: Shaped[Tensor, "*row"]) -> Float64[Tensor, "*row"]:
-    """Real part n of √ε. Rays bend by it: sinθ = n sinθ'."""
+    """Return the real refractive index n of √ε, of Snell's law sinθ = n sinθ'."""
     return torch.sqrt(permittivity).real
 
 
 def attenuation(permittivity: Shaped[Tensor, "*row"], frequency: float) -> Float64[Tensor, "*row"]:
-    """Power lost per metre [1/m] inside a medium: −2 (ω/c₀) Im √ε.
+    """Compute the power attenuation per metre [1/m] of a medium: −2 (ω/c₀) Im √ε.
 
     Args:
-        permittivity: complex, relative.
-        frequency: [Hz].
+        permittivity: complex relative permittivity.
+        frequency: frequency [Hz].
     """
     return -4 * math.pi * frequency / SPEED_OF_LIGHT * torch.sqrt(permittivity).imag

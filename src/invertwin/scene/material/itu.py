@@ -11,11 +11,11 @@ from invertwin.errors import InputError
 
 
 class OutsideTableWarning(UserWarning):
-    """A material at a frequency for which its table states no values."""
+    """Warning about a material outside the frequency range of its table."""
 
 
 class Coefficients(NamedTuple):
-    """ε' = a f^b and σ = c f^d [S/m], f in GHz, stated from `low` to `high` [GHz]."""
+    """Coefficients of ε' = a f^b and σ = c f^d [S/m], f in GHz, from `low` to `high` [GHz]."""
 
     low: float
     high: float
@@ -57,10 +57,10 @@ _warned: set[str] = set()
 
 @dataclass(frozen=True)
 class Itu:
-    """The permittivity or conductivity of a material of the table, at the frequency of the radar.
+    """Permittivity or conductivity of a material of the table at the frequency of the radar.
 
-    Stands in a material's `permittivity` or `conductivity` in place of a number; the constructor
-    `itu` of the materials sets both.
+    It replaces the number in a material's `permittivity` or `conductivity`; the constructor `itu`
+    of the materials sets both.
 
     Attributes:
         name: one of `ITU_MATERIALS`.
@@ -80,9 +80,10 @@ class Itu:
         raise InputError(f"expected a material of ITU-R P.2040, got {self.name!r}; {do}")
 
     def coefficients(self, frequency: float) -> Coefficients:
-        """The entry of the table for `frequency` [Hz]; outside all, the nearest, with a warning.
+        """Return the entry of the table for `frequency` [Hz]; outside all, the nearest, with a
+        warning.
 
-        The warning (`OutsideTableWarning`) comes once for every material.
+        The warning (`OutsideTableWarning`) is issued once per material.
 
         Raises:
             InputError: a frequency that is not positive.
@@ -102,11 +103,11 @@ class Itu:
         return found
 
     def permittivity(self, frequency: float) -> float:
-        """Real part ε' of the relative permittivity at `frequency` [Hz]."""
+        """Return the real part ε' of the relative permittivity at `frequency` [Hz]."""
         entry = self.coefficients(frequency)
         return entry.a * (frequency / 1e9) ** entry.b
 
     def conductivity(self, frequency: float) -> float:
-        """Conductivity σ [S/m] at `frequency` [Hz]."""
+        """Return the conductivity σ [S/m] at `frequency` [Hz]."""
         entry = self.coefficients(frequency)
         return entry.c * (frequency / 1e9) ** entry.d

@@ -1,8 +1,8 @@
-"""The materials that come with the library.
+"""Materials of the library.
 
 Every value may be a number, one number per triangle of the mesh, or a `Texture`, and may carry
-gradients; permittivity and conductivity may also follow the ITU table (`Itu`). A value outside of
-its range raises `InputError`.
+gradients; permittivity and conductivity may also be entries of the ITU table (`Itu`). A value out
+of range raises `InputError`.
 """
 
 from collections.abc import Sequence
@@ -39,16 +39,16 @@ from invertwin.scene.material.surface import ANGLE_COUNT, Material, ScatteringLa
 from invertwin.scene.material.values import RANGES, Value, checked_value, evaluate_value, row_count
 
 AnyMedium = TypeVar("AnyMedium", bound="Medium")
-_SAFE_POWER = 1e-30  # below it a reflectance is zero, and its root has no derivative
+_SAFE_POWER = 1e-30  # smaller reflectances are zero, without derivative of their root
 _COSINES = torch.linspace(0, 1, ANGLE_COUNT, dtype=torch.float64)
 _FULL_REFLECTANCE = torch.ones_like(_COSINES)
 
 
 class _MaterialRecord:
-    """Checks the fields of a dataclass by name, and knows for how many triangles they are."""
+    """Dataclass with validated fields and a common number of triangles."""
 
     def __new__(cls, *values: object, **named: object) -> Any:
-        """Refuse values that the material does not have, before Python does so in its own words."""
+        """Reject unknown fields with an error of this package."""
         names = {entry.name: entry.kw_only for entry in fields(cls)}  # type: ignore[arg-type]
         bare = [name for name, by_name in names.items() if not by_name]
         others = [repr(value) for value in values[len(bare) :]]
@@ -69,17 +69,17 @@ class _MaterialRecord:
 
     @property
     def faces(self) -> int | None:
-        """The number of triangles that the values are for; None if they hold for any."""
+        """Number of triangles of the values; None if they hold for any."""
         return row_count({name: getattr(self, name) for name in _value_names(self)})
 
 
 @dataclass(frozen=True)
 class Medium(_MaterialRecord):
-    """A dielectric, by numbers or from the ITU table.
+    """Dielectric, by numbers or from the ITU table.
 
     Attributes:
         permittivity: relative permittivity ε' ≥ 1.
-        conductivity: σ [S/m] ≥ 0.
+        conductivity: conductivity σ ≥ 0 [S/m].
         loss_tangent: tanδ ≥ 0 of other losses: ε = ε' (1 − j tanδ) − jσ/(ωε0).
 
     Raises:
@@ -92,7 +92,7 @@ class Medium(_MaterialRecord):
 
     @classmethod
     def itu(cls: type[AnyMedium], name: str, **values: object) -> AnyMedium:
-        """Permittivity and conductivity of ITU-R P.2040 at the frequency of the radar.
+        """Return the material with permittivity and conductivity of ITU-R P.2040.
 
         Args:
             name: e.g. "concrete"; all are in `ITU_MATERIALS`.
@@ -104,12 +104,12 @@ class Medium(_MaterialRecord):
         return cls(permittivity=Itu(name), conductivity=Itu(name), **values)  # type: ignore[arg-type]
 
     def complex_permittivity(self, frequency: float) -> Shaped[Tensor, "*row"]:
-        """ε at `frequency` [Hz]. Warns (`OutsideTableWarning`) outside the ITU table."""
+        """Return ε at `frequency` [Hz]. Warns (`OutsideTableWarning`) outside the ITU table."""
         return self._epsilon(frequency)[0]
 
     def _epsilon(self, frequency: float) -> tuple[Tensor, Tensor]:
-        """ε and its dispersion ω dε/dω."""
-        # A power law f^b has the logarithmic slope b; σ/ω falls by one order more.
+        """Return ε and its dispersion ω dε/dω."""
+        # A power law f^b has the logarithmic derivative b, and σ/ω that of σ minus one.
         real, real_slope = self.permittivity, 0.0
         if isinstance(real, Itu):
             real, real_slope = real.permittivity(frequency), real.coefficients(frequency).b
@@ -123,12 +123,12 @@ class Medium(_MaterialRecord):
 
 
 def select_layer(material: Any, layer: int | None, name: str) -> Any:
-    """What holds the values: the material, or one of its layers.
+    """Return the holder of material values: the material, or one of its layers.
 
     Args:
-        material: such as a `Multilayer`.
-        layer: from 0; None = the material itself.
-        name: what the material is called in the error.
+        material: material such as a `Multilayer`.
+        layer: index of the layer, from 0; None = the material itself.
+        name: name of the material in the error.
 
     Raises:
         InputError: no such layer.
@@ -146,10 +146,10 @@ def select_layer(material: Any, layer: int | None, name: str) -> Any:
 
 @dataclass(frozen=True)
 class PerfectConductor(_MaterialRecord, Material):
-    """A smooth perfect conductor: nothing is absorbed, nothing is scattered diffusely.
+    """Smooth perfect conductor without absorption and diffuse scattering.
 
-    Field paths treat it with physical optics. Power paths cannot see a mirror from a point
-    antenna, so there it is a narrow lobe around the mirror direction.
+    Field paths use physical optics. Random power paths never hit an exact specular direction, so
+    there it is a narrow lobe around that direction.
 
     Attributes:
         lobe_width: full width at half maximum of that lobe [rad], in [3.4e-4, π].
@@ -162,7 +162,7 @@ class PerfectConductor(_MaterialRecord, Material):
     coherent: ClassVar[bool] = True
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
-        """The reflectance at `frequency` [Hz], here the same at every frequency."""
+        """Return the scattering law, equal at every `frequency` [Hz]."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
         nothing = torch.zeros((), dtype=torch.float64)
         return ScatteringLaw(
@@ -172,7 +172,7 @@ class PerfectConductor(_MaterialRecord, Material):
 
 @dataclass(frozen=True)
 class RoughConductor(_MaterialRecord, EffectiveRoughness, Material):
-    """A perfect conductor with a rough surface: all power comes back, spread by the roughness.
+    """Perfect conductor with a rough surface, which scatters all power.
 
     Its fields are those of `EffectiveRoughness`; a rough surface scatters by default.
     """
@@ -180,28 +180,29 @@ class RoughConductor(_MaterialRecord, EffectiveRoughness, Material):
     scattering: Value = field(default=ROUGH_SCATTERING, kw_only=True)
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
-        """The reflectance at `frequency` [Hz], here the same at every frequency."""
+        """Return the scattering law, equal at every `frequency` [Hz]."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
         return ScatteringLaw(_FULL_REFLECTANCE, *self.weights(), **self.depolarisation_terms)
 
     def smooth_interface(self, frequency: float) -> SmoothInterface | None:
-        """What the surface does to fields at `frequency` [Hz]."""
+        """Return the coherent interface at `frequency` [Hz]."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
         return self.make_interface(None)
 
 
 @dataclass(frozen=True)
 class RoughDielectric(Medium, Material):
-    """A rough half space in two values: Fresnel reflectance, spread diffusely and into a lobe.
+    """Rough half space with two roughness values: Fresnel reflectance, split into a diffuse part
+    and a lobe.
 
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`.
         diffuse: fraction of the reflected power in the Lambertian part, in [0, 1]; the rest goes
             into the lobe.
-        lobe_width: full width at half maximum of the lobe around the mirror direction [rad],
-            in [3.4e-4, π].
-        depolarisation: share of the scattered power that goes from V to H and from H to V, in
-            [0, 1/4]; 1/4 is a cloud of thin wires.
+        lobe_width: full width at half maximum of the lobe around the specular direction [rad], in
+            [3.4e-4, π].
+        depolarisation: fraction of the scattered power converted between V and H, in [0, 1/4]; 1/4
+            is a cloud of thin wires.
     """
 
     diffuse: Value = 1.0
@@ -209,7 +210,7 @@ class RoughDielectric(Medium, Material):
     depolarisation: Value = 0.0
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
-        """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
+        """Return the scattering law at `frequency` [Hz], differentiable w.r.t. all values."""
         epsilon = self.complex_permittivity(frequency)
         weights = specular_weights(evaluate_value(self.diffuse), lobe_exponent(self.lobe_width))
         amplitude = fresnel_amplitude(epsilon[..., None], _COSINES)
@@ -220,9 +221,9 @@ class RoughDielectric(Medium, Material):
 
 @dataclass(frozen=True)
 class Dielectric(Medium, EffectiveRoughness, Material):
-    """A half space with effective roughness: what enters it does not come back.
+    """Half space with effective roughness; the refracted power is lost.
 
-    In `invertwin.rcs` a closed mesh of it is a solid, which waves go through where losses let them.
+    In `invertwin.rcs` a closed mesh of it is a penetrable solid.
 
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
@@ -232,22 +233,22 @@ class Dielectric(Medium, EffectiveRoughness, Material):
     scattering: Value = field(default=ROUGH_SCATTERING, kw_only=True)
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
-        """The reflectance at `frequency` [Hz]; differentiable with respect to all values."""
+        """Return the scattering law at `frequency` [Hz], differentiable w.r.t. all values."""
         epsilon = self.complex_permittivity(frequency)
         amplitude = fresnel_amplitude(epsilon[..., None], _COSINES)
         return ScatteringLaw(amplitude, *self.weights(), **self.depolarisation_terms)
 
     def smooth_interface(self, frequency: float) -> SmoothInterface | None:
-        """What the surface does to fields at `frequency` [Hz]."""
+        """Return the coherent interface at `frequency` [Hz]."""
         return self.make_interface(self.complex_permittivity(frequency))
 
 
 @dataclass(frozen=True)
 class RefractingBody(Medium, EffectiveRoughness, Material):
-    """A solid body with a closed mesh, which rays enter and leave by Snell's law.
+    """Solid body with a closed mesh, which rays enter and leave by Snell's law.
 
-    Each face lets in what it does not reflect; on the way through, power is lost by absorption.
-    The direction follows the real part of √ε, which holds where losses per wavelength are small.
+    Each face transmits the power it does not reflect; inside, power is absorbed. The direction
+    follows the real part of √ε, which is valid for small losses per wavelength.
 
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
@@ -255,7 +256,9 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
     """
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
-        """What one face does at `frequency` [Hz]; differentiable with respect to all values."""
+        """Return the scattering law of one face at `frequency` [Hz]; differentiable with respect to
+        all values.
+        """
         epsilon = self.complex_permittivity(frequency)
         return ScatteringLaw(
             fresnel_amplitude(epsilon[..., None], _COSINES),
@@ -267,23 +270,23 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
         )
 
     def smooth_interface(self, frequency: float) -> SmoothInterface | None:
-        """What the outer face does to fields at `frequency` [Hz]."""
+        """Return the coherent interface of the outer face at `frequency` [Hz]."""
         return self.make_interface(self.complex_permittivity(frequency))
 
 
 @dataclass(frozen=True)
 class Layer(Medium):
-    """One layer of a slab.
+    """Layer of a slab.
 
     Attributes:
         permittivity, conductivity, loss_tangent: see `Medium`.
-        thickness: [m] ≥ 0.
+        thickness: thickness ≥ 0 [m].
     """
 
     thickness: Value = field(kw_only=True)
 
     def sheet(self, frequency: float) -> SlabLayer:
-        """The layer as numbers at `frequency` [Hz], for `slab_tables`."""
+        """Return the layer as numbers at `frequency` [Hz], for `slab_tables`."""
         epsilon, dispersion = self._epsilon(frequency)
         return SlabLayer(
             epsilon[..., None], dispersion[..., None], evaluate_value(self.thickness)[..., None]
@@ -292,10 +295,10 @@ class Layer(Medium):
 
 @dataclass(frozen=True)
 class Slab(Layer, EffectiveRoughness, Material):
-    """A thin sheet of one layer in air, meshed as an open surface: it reflects and lets through.
+    """Thin sheet of one layer in air, meshed as an open surface, which reflects and transmits.
 
-    Reflections within the sheet are part of its coefficients, at the radar's centre frequency. What
-    passes goes straight on and is late by the sheet's group delay.
+    Multiple reflections in the sheet are part of its coefficients, at the radar's centre frequency.
+    Transmitted paths are straight and delayed by the sheet's group delay.
 
     Attributes:
         permittivity, conductivity, loss_tangent, thickness: see `Layer`; the other fields are
@@ -303,22 +306,24 @@ class Slab(Layer, EffectiveRoughness, Material):
     """
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
-        """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
+        """Return the scattering law of the sheet at `frequency` [Hz]; differentiable with respect
+        to all values.
+        """
         return _slab_scattering_law([self], self, frequency)
 
     def smooth_interface(self, frequency: float) -> SmoothInterface | None:
-        """What the sheet does to fields at `frequency` [Hz]."""
+        """Return the coherent interface of the sheet at `frequency` [Hz]."""
         return self.make_interface(self.complex_permittivity(frequency), self.thickness)
 
 
 @dataclass(frozen=True)
 class Multilayer(_MaterialRecord, EffectiveRoughness, Material):
-    """A thin sheet of several layers in air, meshed as an open surface.
+    """Thin sheet of several layers in air, meshed as an open surface.
 
     Attributes:
-        layers: from the first face to the last. Both sides of the mesh reflect as the first face
-            does, which is exact for stacks without losses and for symmetric ones; what passes is
-            the same from both sides.
+        layers: layers from the first face to the last. Both sides of the mesh reflect as the first
+            face does, which is exact for lossless and for symmetric stacks; the transmission is
+            equal from both sides.
         scattering, rms_slope, lambertian, directive, directive_exponent, backscatter_exponent: see
             `EffectiveRoughness`.
     """
@@ -337,20 +342,22 @@ class Multilayer(_MaterialRecord, EffectiveRoughness, Material):
 
     @property
     def faces(self) -> int | None:
-        """The number of triangles that the values are for; None if they hold for any."""
+        """Number of triangles of the values; None if they hold for any."""
         named = {name: getattr(self, name) for name in _value_names(self)}
         for k, layer in enumerate(self.layers):
             named |= {f"layers[{k}].{name}": getattr(layer, name) for name in _value_names(layer)}
         return row_count(named)
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
-        """What the sheet does at `frequency` [Hz]; differentiable with respect to all values."""
+        """Return the scattering law of the sheet at `frequency` [Hz]; differentiable with respect
+        to all values.
+        """
         return _slab_scattering_law(self.layers, self, frequency)
 
     def coefficients(
         self, frequency: float, cosine: Float64[Tensor, " n"], triangle: Int64[Tensor, " n"]
     ) -> FieldCoefficients:
-        """Coherent fields that the stack reflects and lets through, about its middle."""
+        """Return the coherent field coefficients of the stack, about its middle."""
         layers = [_select_triangles(layer.sheet(frequency), triangle) for layer in self.layers]
         kept = (
             self.make_interface(None)
@@ -360,7 +367,7 @@ class Multilayer(_MaterialRecord, EffectiveRoughness, Material):
         return sheet_coefficients(layers, cosine, frequency).scale_reflection(kept)
 
     def incoherent_law(self, frequency: float) -> ScatteringLaw:
-        """What it does beside mirroring. See `Material.incoherent`."""
+        """Return the scattering law without specular reflection. See `Material.incoherent_law`."""
         return self.scattering_law(frequency).without_specular(self.make_interface(None), frequency)
 
 
@@ -369,7 +376,7 @@ def _value_names(holder: object) -> list[str]:
 
 
 def _select_triangles(sheet: SlabLayer, triangle: Tensor) -> SlabLayer:
-    """A layer with one value per row of triangles."""
+    """Return a layer with one value per row of triangles."""
     values = (value[..., 0] for value in sheet)
     return SlabLayer(*(value[triangle] if value.ndim else value for value in values))
 
@@ -378,7 +385,7 @@ def _slab_scattering_law(
     layers: Sequence[Layer], roughness: EffectiveRoughness, frequency: float
 ) -> ScatteringLaw:
     tables = slab_tables([layer.sheet(frequency) for layer in layers], _COSINES, frequency)
-    # The root's derivative is infinite at zero, where the amplitude has none.
+    # The derivative of the root is infinite at zero; the amplitude has none there.
     seen = tables.reflectance > _SAFE_POWER
     amplitude = torch.where(seen, torch.where(seen, tables.reflectance, 1.0).sqrt(), 0.0)
     through = {"transmittance": tables.transmittance, "extra_length": tables.extra_length}

@@ -1,6 +1,6 @@
-"""Materials in the scene files of Sionna RT.
+"""Materials in scene files of Sionna RT.
 
-Sionna takes every surface for a sheet of some thickness in air, a ``Slab``.
+Sionna treats every surface as a sheet of some thickness in air, a ``Slab``.
 """
 
 import math
@@ -11,7 +11,7 @@ from invertwin.scene.material.itu import Itu
 from invertwin.scene.material.materials import PerfectConductor, Slab
 from invertwin.scene.material.surface import Material
 
-_THICKNESS = 0.1  # m, where a file says nothing
+_THICKNESS = 0.1  # default thickness [m]
 _NUMBERS = {
     "relative_permittivity": "permittivity",
     "conductivity": "conductivity",
@@ -21,15 +21,15 @@ _NUMBERS = {
 
 
 def read_radio_material(element: ElementTree.Element) -> Material | None:
-    """The material that a `bsdf` of a scene file states; None if it is one of a camera's.
+    """Read the material of a `bsdf` of a scene file; None for one of a camera.
 
-    The pattern of what Sionna scatters, and its depolarisation, are left out.
+    Sionna's scattering pattern and its depolarisation are ignored.
 
     Args:
-        element: the `bsdf`.
+        element: `bsdf` element.
 
     Raises:
-        InputError: a value that is no number, out of range, or an unknown ITU material.
+        InputError: a value that is not a number, out of range, or an unknown ITU material.
     """
     kind = element.get("type")
     values = {"thickness": _THICKNESS} | _numbers(element)
@@ -43,16 +43,16 @@ def read_radio_material(element: ElementTree.Element) -> Material | None:
 
 
 def radio_bsdf(material: Material, name: str) -> ElementTree.Element:
-    """A `bsdf` of a scene file that Sionna RT reads as this material.
+    """Build a `bsdf` of a scene file for Sionna RT.
 
     A perfect conductor becomes ITU's metal.
 
     Args:
         material: a `Slab` of numbers or of the ITU table, or a `PerfectConductor`.
-        name: its id.
+        name: id of the material.
 
     Raises:
-        InputError: another material, which Sionna has no words for.
+        InputError: another material, without counterpart in Sionna.
     """
     if isinstance(material, PerfectConductor):
         material = Slab.itu("metal", thickness=_THICKNESS)

@@ -1,14 +1,14 @@
-"""Roughness: how the reflected power is split between a mirror-like lobe and others.
+"""Roughness: distribution of the reflected power over a specular lobe and others.
 
-Effective roughness: the part 1 − S² of the reflected power stays about the mirror direction, in a
-glossy lobe. The slopes of the surface set the width of this lobe. The part S² is scattered: into a
-Lambertian part, a directive lobe about the mirror direction, and a lobe back to the source.
+Effective roughness: the fraction 1 − S² of the reflected power is in a lobe about the specular
+direction, whose width depends on the slopes of the surface. The fraction S² is scattered: into a
+Lambertian part, a directive lobe about the specular direction, and a backscattering lobe.
 
 Source: Degli-Esposti et al., "Measurement and modelling of scattering from buildings", 2007.
 
 Differs from the source: weights are normalised by the lobes' integrals at normal incidence, where
-these are largest, instead of at every angle, and the reflectance enters as sqrt(R(θi) R(θo)); the
-pattern is then reciprocal. The specular part has a width.
+these are largest, instead of at every angle, and the reflectance enters as sqrt(R(θi) R(θo)), which
+makes the pattern reciprocal. The specular part has a width.
 """
 
 import math
@@ -29,7 +29,7 @@ ROUGH_SCATTERING = 0.4
 
 
 class LobeWeights(NamedTuple):
-    """The part of a `ScatteringLaw` that says where the reflected power goes."""
+    """Directional part of a `ScatteringLaw`."""
 
     diffuse: Float64[Tensor, "*row"]
     lobes: Float64[Tensor, "*row 3"]
@@ -37,9 +37,9 @@ class LobeWeights(NamedTuple):
 
 
 def lobe_exponent(width: Value) -> Float64[Tensor, "*row"]:
-    """Exponent p of a lobe ((1 + cosψ)/2)^p with the given full width at half maximum [rad].
+    """Return the exponent p of a lobe ((1 + cosψ)/2)^p with a full width at half maximum [rad].
 
-    From cos^2p(width/4) = 1/2; log1p keeps narrow lobes accurate.
+    It solves cos^2p(width/4) = 1/2; log1p keeps narrow lobes accurate.
 
     Raises:
         InputError: a width outside [3.4e-4, π].
@@ -49,9 +49,9 @@ def lobe_exponent(width: Value) -> Float64[Tensor, "*row"]:
 
 
 def slope_exponent(rms_slope: Value) -> Float64[Tensor, "*row"]:
-    """Exponent of the lobe that a surface of small facets makes: p = 1/m², m the rms slope.
+    """Return the lobe exponent of a surface of small facets: p = 1/m², m the rms slope.
 
-    A facet tilted by β reflects by 2β off the mirror direction, where the lobe is cos^2p(β); for
+    A facet tilted by β reflects at 2β from the specular direction, where the lobe is cos^2p(β); for
     gentle slopes that is exp(−tan²β/m²), the distribution of Gaussian slopes (Beckmann).
 
     Args:
@@ -65,7 +65,7 @@ def slope_exponent(rms_slope: Value) -> Float64[Tensor, "*row"]:
 
 
 def lobe_integral(exponent: Float64[Tensor, "*row"]) -> Float64[Tensor, "*row"]:
-    """∫ ((1 + cosθ)/2)^p cosθ dω over the half space: the lobe's power at normal incidence."""
+    """Compute ∫ ((1 + cosθ)/2)^p cosθ dω over the half space: the power at normal incidence."""
     p = exponent
     return 4 * math.pi * (p + torch.exp2(-(p + 1))) / ((p + 1) * (p + 2))
 
@@ -73,10 +73,10 @@ def lobe_integral(exponent: Float64[Tensor, "*row"]) -> Float64[Tensor, "*row"]:
 def specular_weights(
     diffuse: Float64[Tensor, "*#row"], exponent: Float64[Tensor, "*#row"]
 ) -> LobeWeights:
-    """Weights of a Lambertian part, with the rest in the specular lobe.
+    """Return the weights of a Lambertian part, with the rest in the specular lobe.
 
     Args:
-        diffuse: Lambertian part, 0 to 1.
+        diffuse: weight of the Lambertian part, 0 to 1.
         exponent: exponent of the specular lobe.
     """
     diffuse, exponent = torch.broadcast_tensors(diffuse, exponent)
@@ -91,21 +91,21 @@ def specular_weights(
 
 @dataclass(frozen=True, kw_only=True)
 class EffectiveRoughness:
-    """How the reflected power is spread. Values may be per triangle, a texture, and be fitted.
+    """Effective roughness of a surface. Values may be per triangle, textures, and fitted.
 
     Attributes:
-        scattering: S in [0, 1]; the share S² of the reflected power is scattered.
-        rms_slope: root mean square slope of the surface, in [1e-4, 1]; it makes the width of the
-            lobe that holds the rest (`slope_exponent`).
-        lambertian: share of the scattered power that goes in all directions alike, in [0, 1].
-        directive: share Λ of the rest that goes into the directive lobe about the mirror direction;
-            what is left goes back towards the source. In [0, 1].
+        scattering: S in [0, 1]; the fraction S² of the reflected power is scattered.
+        rms_slope: root mean square slope of the surface, in [1e-4, 1]; it determines the width of
+            the specular lobe (`slope_exponent`).
+        lambertian: Lambertian fraction of the scattered power, in [0, 1].
+        directive: fraction Λ of the rest in the directive lobe about the specular direction; the
+            remainder is backscattered. In [0, 1].
         directive_exponent: α_R of the directive lobe, ((1 + cosψ)/2)^α_R.
         backscatter_exponent: α_i of the backscattering lobe.
-        rms_height: of the roughness [m]: takes exp(−½(2kσ cosθ)²) off coherent fields (`skin`).
-            Power maps do not see it.
-        depolarisation: share of the scattered power that goes from V to H and from H to V, in
-            [0, 1/4]; 1/4 is a cloud of thin wires. Coherent fields do not see it.
+        rms_height: rms height of the roughness [m]: attenuates coherent fields by exp(−½(2kσ
+            cosθ)²) (`smooth_interface`). Power maps ignore it.
+        depolarisation: fraction of the scattered power converted between V and H, in [0, 1/4]; 1/4
+            is a cloud of thin wires. Coherent fields ignore it.
     """
 
     scattering: Value = 0.0
@@ -120,11 +120,11 @@ class EffectiveRoughness:
     def make_interface(
         self, permittivity: Tensor | None, thickness: Value = math.inf
     ) -> SmoothInterface:
-        """What the surface does to fields: the share 1 − S² of the power stays coherent.
+        """Return the coherent interface, which keeps the fraction 1 − S² of the power.
 
         Args:
-            permittivity: complex and relative; None of a conductor.
-            thickness: of a sheet [m].
+            permittivity: complex relative permittivity; None for a conductor.
+            thickness: thickness of a sheet [m].
         """
         coherent = (1 - evaluate_value(self.scattering) ** 2).sqrt()
         return SmoothInterface(
@@ -133,11 +133,11 @@ class EffectiveRoughness:
 
     @property
     def depolarisation_terms(self) -> dict[str, Tensor]:
-        """The part of a `ScatteringLaw` that says what changes its polarisation."""
+        """Return the depolarisation part of a `ScatteringLaw`."""
         return {"depolarisation": evaluate_value(self.depolarisation)}
 
     def weights(self) -> LobeWeights:
-        """Weights and exponents of the Lambertian part and the three lobes."""
+        """Return weights and exponents of the Lambertian part and the three lobes."""
         scattered = evaluate_value(self.scattering) ** 2
         lambertian, directive = evaluate_value(self.lambertian), evaluate_value(self.directive)
         directed = scattered * (1 - lambertian)

@@ -1,4 +1,4 @@
-"""Sheets of layers in air: what they reflect, what they let through, and how much later.
+"""Layered sheets in air: reflectance, transmittance and group delay.
 
 A plane wave in layer j has the normal wave number k s_j, s_j² = ε_j − sin²θ, and crosses it with
 the phase δ_j = k s_j d_j. With u_j = s_j for perpendicular and s_j/ε_j for parallel polarisation,
@@ -7,13 +7,13 @@ front of a stack (r', t') makes
 
     r = (r_i + x)/(1 + r_i x),   t = t_i t' e^(−jδ)/(1 + r_i x),   x = r' e^(−2jδ).
 
-This is the transfer matrix's product in a form that holds only decaying exponentials, so that thick
-lossy layers neither overflow nor cancel.
+This form of the transfer-matrix product contains only decaying exponentials, so that thick lossy
+layers neither overflow nor cancel.
 
-Where the phase lives: the transmission coefficient carries the whole propagation through the
-thickness, from the entry face to the exit face. The ray's geometric length is that of the straight
-line, which crosses the same sheet of air, d cosθ of phase. What is left, the extra length, is the
-group delay of their ratio, times c₀:
+Phase convention: the transmission coefficient includes the propagation through the thickness, from
+the entry face to the exit face. The ray's geometric length is that of the straight line, which
+crosses the same thickness of air, d cosθ of phase. The extra length is the group delay of their
+ratio, times c₀:
 
     extra = −c₀ ∂(arg t)/∂ω − d cosθ,
 
@@ -35,12 +35,12 @@ from invertwin.scene.material.fresnel import LEAST_COSINE, FieldCoefficients
 
 
 class SlabLayer(NamedTuple):
-    """One layer as numbers: each 0-d or one per triangle with a last axis of 1 for the angles.
+    """Layer as numbers: each 0-d or one per triangle with a last axis of 1 for the angles.
 
     Attributes:
         permittivity: complex relative permittivity ε.
         dispersion: ω dε/dω.
-        thickness: [m].
+        thickness: thickness [m].
     """
 
     permittivity: Tensor
@@ -49,7 +49,7 @@ class SlabLayer(NamedTuple):
 
 
 class SlabTables(NamedTuple):
-    """Power coefficients of a slab, mean of both polarisations, and the length it adds [m]."""
+    """Power coefficients of a slab, averaged over both polarisations, and its extra length [m]."""
 
     reflectance: Float64[Tensor, "*angle"]
     transmittance: Float64[Tensor, "*angle"]
@@ -60,7 +60,7 @@ class _Response(NamedTuple):
     """Reflection and transmission of a stack for one polarisation.
 
     `slope` of a value is its derivative ω d/dω; that of the transmission is of its logarithm, which
-    stays finite where nothing gets through.
+    is finite for vanishing transmission.
     """
 
     reflection: Tensor
@@ -73,14 +73,14 @@ class _Response(NamedTuple):
 def slab_coefficients(
     layers: Sequence[SlabLayer], cos_theta: Float64[Tensor, "*angle"], frequency: float
 ) -> FieldCoefficients:
-    """Complex field coefficients of a stack of layers in air, for both polarisations.
+    """Compute complex field coefficients of a stack of layers in air, for both polarisations.
 
-    The transmission is from the entry face to the exit face, at the same place along them.
+    The transmission is from the entry face to the exit face, at equal lateral positions.
 
     Args:
-        layers: those of ``DisplayLayer.sheet``, in the order in which the wave meets them.
+        layers: layers from ``Layer.sheet``, in the order of incidence.
         cos_theta: cosine of the angle of incidence, in [0, 1].
-        frequency: [Hz].
+        frequency: frequency [Hz].
 
     Raises:
         InputError: no layers, or layers without a frequency.
@@ -92,16 +92,16 @@ def slab_coefficients(
 def sheet_coefficients(
     layers: Sequence[SlabLayer], cos_theta: Float64[Tensor, "*angle"], frequency: float
 ) -> FieldCoefficients:
-    """Coefficients of a stack for rays that take its mesh for a sheet without thickness.
+    """Compute coefficients of a stack for rays that treat its mesh as a sheet without thickness.
 
     The mesh is the middle of the stack, and the length of a ray is that of the straight line
     through air. The stack begins d/2 before the mesh, so that both coefficients of
     ``slab_coefficients`` gain the factor exp(+jkd cosθ).
 
     Args:
-        layers: the layers in the order in which the wave meets them.
+        layers: layers in the order of incidence.
         cos_theta: cosine of the angle of incidence, in [0, 1].
-        frequency: [Hz].
+        frequency: frequency [Hz].
 
     Raises:
         InputError: no layers.
@@ -118,15 +118,15 @@ def sheet_coefficients(
 def slab_tables(
     layers: Sequence[SlabLayer], cos_theta: Float64[Tensor, "*angle"], frequency: float
 ) -> SlabTables:
-    """Reflectance, transmittance and extra length of a stack of layers in air.
+    """Compute reflectance, transmittance and extra length of a stack of layers in air.
 
     Power coefficients are the mean of both polarisations; so is the extra length, weighted by the
-    power that each lets through. Differentiable with respect to the layers' values.
+    transmitted power of each. Differentiable with respect to the layers' values.
 
     Args:
-        layers: the layers in the order in which the wave meets them.
+        layers: layers in the order of incidence.
         cos_theta: cosine of the angle of incidence, in [0, 1].
-        frequency: [Hz].
+        frequency: frequency [Hz].
 
     Raises:
         InputError: no layers.
@@ -138,7 +138,7 @@ def slab_tables(
     extra_s, extra_p = (
         -response.transmission_slope.imag / wave_number - through_air for response in responses
     )
-    # The share of s in the power let through, from logarithms: both powers may underflow.
+    # Fraction of s in the transmitted power, from logarithms: both powers may underflow.
     share = torch.sigmoid(s.log_power - p.log_power)
     return SlabTables(
         (_power(s.reflection) + _power(p.reflection)) / 2,
@@ -167,7 +167,7 @@ def _both_polarisations(
 def _response(
     layers: Sequence[SlabLayer], cosine: Tensor, frequency: float, *, parallel: bool
 ) -> _Response:
-    """The stack's coefficients: of tangential E (perpendicular) or H (parallel)."""
+    """Return the stack's coefficients of tangential E (perpendicular) or H (parallel)."""
     wave_number = 2 * math.pi * frequency / SPEED_OF_LIGHT
     air = cosine.to(torch.complex128)
     media, phases = [(air, torch.zeros_like(air))], []
@@ -202,7 +202,7 @@ def _interface(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> _
 
 
 def _prepend_layer(face: _Response, phase: tuple[Tensor, Tensor], rest: _Response) -> _Response:
-    """A layer, entered through `face`, in front of the rest of the stack."""
+    """Add a layer, entered through `face`, in front of the rest of the stack."""
     delta, delta_slope = phase
     once = torch.exp(-1j * delta)
     x = rest.reflection * once**2

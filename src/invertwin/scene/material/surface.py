@@ -1,24 +1,24 @@
-"""What a surface does to the power that meets it: the one thing the ray kernel knows of a material.
+"""Scattering laws: the material inputs of the ray kernel.
 
-Every material hands the ray kernel the same small set of numbers, a `ScatteringLaw`, so that a new
-material needs no kernel code. What is reflected follows the distribution
+Every material provides the same small set of numbers, a `ScatteringLaw`, so that a new material
+needs no kernel code. Its BRDF is
 
     f_r(ωi, ωo) = A(cosθi) A(cosθo) [ diffuse/π + Σ_l lobes_l ((1 + cosψ_l)/2)^exponents_l ],
 
-with A the tabulated amplitude. The lobes are a specular one and a directive one about the mirror
-direction of ωi, cosψ = 2 (n·ωi)(n·ωo) − ωi·ωo, and a backscattering one about ωi itself,
-cosψ = ωi·ωo; all directions point away from the surface. The distribution is reciprocal, and
-reflects at most what came in: each weight is the lobe's share of the power divided by its integral
-at normal incidence, where the integral is largest (the lobe and the cosine share their axis).
-The specular lobe is also multiplied by two roots of a share, `spread(cosθi) spread(cosθo)`: what a
-smooth surface mirrors as one wave is no part of what it scatters (`Material.incoherent`).
+with A the tabulated amplitude. The lobes are a specular one and a directive one about the specular
+direction of ωi, cosψ = 2 (n·ωi)(n·ωo) − ωi·ωo, and a backscattering one about ωi itself, cosψ =
+ωi·ωo; all directions point away from the surface. The BRDF is reciprocal and conserves energy: each
+weight is the lobe's fraction of the power divided by its integral at normal incidence, where the
+integral is largest (the lobe and the cosine share their axis). The specular lobe is also multiplied
+by two roots of a fraction, `spread(cosθi) spread(cosθo)`: the coherent reflection of a smooth
+surface is no part of its scattered power (`Material.incoherent_law`).
 
-What passes goes straight through a sheet (`transmittance`, longer by `extra_length`) or is
+Transmitted power passes straight through a sheet (`transmittance`, longer by `extra_length`) or is
 refracted into a solid body (`refraction`, `index`, `attenuation`).
 
 Differs from the source: the paper leaves the scattering model open. Here the reflectance R of the
-mean plane enters as sqrt(R(θi) R(θo)), which keeps reciprocity, so that a surface sends back R on
-average and R exactly where both angles agree.
+mean plane enters as sqrt(R(θi) R(θo)), which keeps reciprocity: a surface reflects R on average,
+and exactly R where both angles agree.
 """
 
 import math
@@ -52,27 +52,27 @@ _INFINITE = torch.full((), torch.inf, dtype=torch.float64)
 
 @dataclass(frozen=True, eq=False)
 class ScatteringLaw:
-    """What the ray kernel needs to know of a material at one frequency (see the module text).
+    """Material inputs of the ray kernel at one frequency (see the module text).
 
     Tables run over cosθ = linspace(0, 1, 256) of the angle of incidence from outside. `*row` is
-    empty for one value per object, or the number of triangles for values per triangle; a field
-    with one value is repeated for all rows of the others. The defaults are those of a Lambertian
-    surface that lets nothing through.
+    empty for one value per object, or the number of triangles for values per triangle; a field with
+    one value is repeated for all rows of the others. The defaults are those of an opaque Lambertian
+    surface.
 
     Attributes:
         amplitude: square root of the power reflectance, mean of both polarisations.
         diffuse: weight of the Lambertian part.
         lobes: weights of the specular, directive and backscattering lobe, each already divided by
             the lobe's integral.
-        exponents: their exponents.
-        transmittance: share of the power that passes straight through a sheet; 0 if opaque.
-        extra_length: what passing adds to the straight path through air [m].
-        refraction: share of the power that one interface lets into a solid body; 0 if the surface
-            is not the skin of a refracting body.
+        exponents: exponents of the lobes.
+        transmittance: power transmittance of a sheet; 0 if opaque.
+        extra_length: extra path length of the transmission relative to air [m].
+        refraction: power transmittance of one interface of a solid body; 0 if the surface does not
+            bound a refracting body.
         index: real refractive index of that body, else 1.
         attenuation: power attenuation in that body [1/m], else 0.
-        depolarisation: share of the scattered power that goes from V to H and from H to V.
-        spread: root of the share of the specular lobe that is scattered; 1 = all of it.
+        depolarisation: fraction of the scattered power converted between V and H.
+        spread: root of the scattered fraction of the specular lobe; 1 = all of it.
     """
 
     amplitude: Float64[Tensor, "*#row 256"]
@@ -88,10 +88,10 @@ class ScatteringLaw:
     spread: Float64[Tensor, "*#row 256"] = _UNIT_TABLE
 
     def __post_init__(self) -> None:
-        """Give all fields the same rows."""
+        """Broadcast all fields to equal rows."""
         given = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         widths = {n: v.shape[v.ndim - (n not in _SCALARS) :] for n, v in given.items()}
-        # NumPy's: torch's takes seconds where it is first called.
+        # NumPy's function: the first call of torch's takes seconds.
         row = np.broadcast_shapes(
             *(values.shape[: values.ndim - len(widths[n])] for n, values in given.items())
         )
@@ -99,24 +99,24 @@ class ScatteringLaw:
             object.__setattr__(self, name, values.expand((*row, *widths[name])))
 
     def scale(self, share: Float64[Tensor, "*row"]) -> "ScatteringLaw":
-        """The surface with this share of what it scatters.
+        """Return the law with the scattered power scaled.
 
         Args:
-            share: of each row.
+            share: factor of each row.
         """
         return replace(self, diffuse=self.diffuse * share, lobes=self.lobes * share[..., None])
 
     def without_specular(self, interface: "SmoothInterface", frequency: float) -> "ScatteringLaw":
-        """The surface without what `skin` keeps together in the mirror direction.
+        """Return the law without the coherent specular reflection of `interface`.
 
-        Of the specular lobe's power the share 1 − exp(−(2kσ cosθ)²) is left: what heights take off
-        the mirrored wave. A lobe that is normalised at normal incidence sends back less at other
-        angles. The share is divided by how much: the mean of cosθo, with cosθo spread about cosθ
-        like a Gaussian of the lobe's variance 2/p, where it is above the horizon.
+        The fraction 1 − exp(−(2kσ cosθ)²) of the specular lobe's power remains: the power that
+        rough heights remove from the coherent wave. A lobe normalised at normal incidence scatters
+        less at other angles. The fraction is divided by this loss: the mean of cosθo over a
+        Gaussian about cosθ of the lobe's variance 2/p, above the horizon.
 
         Args:
-            interface: what the surface does to fields.
-            frequency: [Hz].
+            interface: coherent interface of the surface.
+            frequency: frequency [Hz].
         """
         height = interface.rms_height
         if not bool((height > 0).any()):
@@ -127,18 +127,20 @@ class ScatteringLaw:
         at = _COSINES / width
         above = at * torch.special.ndtr(at) + torch.exp(-0.5 * at**2) / math.sqrt(2 * math.pi)
         share = share * above[..., -1:] / above
-        lit = share > 0  # a root of zero has no derivative
-        return replace(self, spread=torch.where(lit, torch.where(lit, share, 1.0).sqrt(), 0.0))
+        positive = share > 0  # a root of zero has no derivative
+        return replace(
+            self, spread=torch.where(positive, torch.where(positive, share, 1.0).sqrt(), 0.0)
+        )
 
 
 class SmoothInterface(NamedTuple):
-    """What a smooth surface does to fields, with one value or one per triangle each.
+    """Coherent interface of a surface, with one value or one per triangle each.
 
     Attributes:
-        permittivity: complex relative permittivity; None of a perfect conductor.
-        thickness: of a sheet about the surface [m]; infinite for a body.
-        coherence: share of the reflected field that stays in the mirror direction, in [0, 1].
-        rms_height: of the roughness [m].
+        permittivity: complex relative permittivity; None for a perfect conductor.
+        thickness: thickness of a sheet centred on the surface [m]; infinite for a body.
+        coherence: fraction of the reflected field in the specular direction, in [0, 1].
+        rms_height: rms height of the roughness [m].
     """
 
     permittivity: Tensor | None
@@ -147,7 +149,7 @@ class SmoothInterface(NamedTuple):
     rms_height: Tensor
 
     def select_triangles(self, triangle: Int64[Tensor, " n"]) -> "SmoothInterface":
-        """The values of some triangles; values for all triangles stay."""
+        """Return the values of some triangles; values for all triangles are kept."""
         epsilon, *others = (
             value if value is None or not value.ndim else value[triangle] for value in self
         )
@@ -156,18 +158,19 @@ class SmoothInterface(NamedTuple):
     def coherent_reflection(
         self, frequency: float, cosine: Float64[Tensor, " n"]
     ) -> Float64[Tensor, " n"]:
-        """Share of the mirrored field that stays coherent: roughness spreads phases by 2kσ cosθ.
+        """Return the coherent fraction of the reflected field: roughness spreads phases by 2kσ
+        cosθ.
 
         Args:
-            frequency: [Hz].
-            cosine: of the angle of incidence.
+            frequency: frequency [Hz].
+            cosine: cosine of the angle of incidence.
         """
         k = 2 * math.pi * frequency / SPEED_OF_LIGHT
         return self.coherence * torch.exp(-0.5 * (2 * k * self.rms_height * cosine) ** 2)
 
 
 class Material(ABC):
-    """What an object's surface does to the waves.
+    """Electromagnetic material of a surface.
 
     Attributes:
         coherent: True if field paths follow physical optics, False if the surface is rough.
@@ -177,28 +180,28 @@ class Material(ABC):
 
     @property
     def faces(self) -> int | None:
-        """The number of triangles that its values are for; None if they hold for any."""
+        """Number of triangles of its values; None if they hold for any."""
         return None
 
     def smooth_interface(self, frequency: float) -> SmoothInterface | None:
-        """What the surface does to fields at `frequency` [Hz]; None if it is only rough.
+        """Return the coherent interface at `frequency` [Hz]; None for a purely rough surface.
 
-        A coherent material is a perfect conductor, unless it says otherwise.
+        The default of a coherent material is a perfect conductor.
         """
         return SmoothInterface(None, _INFINITE, _ONE, _ZERO) if self.coherent else None
 
     def coefficients(
         self, frequency: float, cosine: Float64[Tensor, " n"], triangle: Int64[Tensor, " n"]
     ) -> FieldCoefficients:
-        """Coherent fields that the surface reflects and lets through, about the mesh.
+        """Return coherent field coefficients of reflection and transmission, about the mesh.
 
-        A sheet is centred on its mesh, as in ``sheet_coefficients``; a body lets nothing through;
-        a surface that is only rough does neither.
+        A sheet is centred on its mesh, as in ``sheet_coefficients``; a body does not transmit; a
+        purely rough surface has zero coefficients.
 
         Args:
-            frequency: [Hz].
-            cosine: of the angles of incidence, in [0, 1].
-            triangle: the triangle of the object's mesh that is met, for values per triangle.
+            frequency: frequency [Hz].
+            cosine: cosines of the angles of incidence, in [0, 1].
+            triangle: index of the triangle of the object's mesh, for values per triangle.
         """
         skin = self.smooth_interface(frequency)
         one = torch.ones_like(cosine).to(torch.complex128)
@@ -209,7 +212,7 @@ class Material(ABC):
         if skin.permittivity is None:
             return FieldCoefficients(-kept * one, kept * one, 0 * one, 0 * one)
         if bool(torch.isfinite(skin.thickness).all()):
-            none = torch.zeros_like(skin.permittivity)  # dispersion, of which nothing here depends
+            none = torch.zeros_like(skin.permittivity)  # dispersion, unused here
             sheet = SlabLayer(skin.permittivity, none, skin.thickness)
             found = sheet_coefficients([sheet], cosine, frequency)
         else:
@@ -219,10 +222,10 @@ class Material(ABC):
 
     @abstractmethod
     def scattering_law(self, frequency: float) -> ScatteringLaw:
-        """What the surface does at `frequency` [Hz]; its values keep their gradients."""
+        """Return the scattering law at `frequency` [Hz]; its values keep their gradients."""
 
     def incoherent_law(self, frequency: float) -> ScatteringLaw:
-        """What it does beside mirroring: `surface` without what `coefficients` reflect."""
+        """Return the scattering law without the coherent reflection of `coefficients`."""
         skin = self.smooth_interface(frequency)
         surface = self.scattering_law(frequency)
         return surface if skin is None else surface.without_specular(skin, frequency)

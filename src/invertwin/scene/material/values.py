@@ -1,4 +1,4 @@
-"""What a material value may be: a number, one per triangle, or a texture; and its range."""
+"""Types and ranges of material values: numbers, one per triangle, or textures."""
 
 import math
 from collections.abc import Mapping
@@ -18,11 +18,11 @@ from invertwin.scene.mesh import Mesh, checked_faces
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """Values over a surface from an image, read at the middle of every triangle.
+    """Values over a surface from an image, sampled at the centroid of every triangle.
 
-    The value is constant on each triangle, so detail finer than the mesh is lost: subdivide the
-    mesh for more. The image is interpolated bilinearly between pixel centres, and continued by its
-    border values outside. Values are differentiable with respect to the image.
+    The value is constant on each triangle, so detail finer than the mesh is lost unless the mesh is
+    subdivided. The image is interpolated bilinearly between pixel centres and clamped at its
+    border. Values are differentiable with respect to the image.
 
     Attributes:
         image: values by row and column, the top row first.
@@ -31,7 +31,7 @@ class Texture:
             pair per vertex instead.
 
     Args:
-        faces: vertex indices of the triangles [f, 3], where `uv` is per vertex.
+        faces: vertex indices of the triangles [f, 3], if `uv` is per vertex.
 
     Raises:
         InputError: wrong shapes, an empty image, NaN, or an index beyond the vertices.
@@ -55,14 +55,14 @@ class Texture:
 
     @classmethod
     def from_projection(cls, image: ArrayLike, mesh: Mesh) -> "Texture":
-        """Lay an image over a mesh, as seen along its z axis.
+        """Project an image onto a mesh along its z axis.
 
-        The left and right borders are at the least and largest x of the mesh, bottom and top at
-        the least and largest y, in the object's own frame.
+        The left and right borders are at the minimum and maximum x of the mesh, bottom and top at
+        the minimum and maximum y, in the object's own frame.
 
         Args:
             image: values of the pixels [row, column].
-            mesh: what it is laid over.
+            mesh: mesh to cover.
 
         Raises:
             InputError: a mesh without width or height, or a bad image.
@@ -79,7 +79,7 @@ class Texture:
 
     @property
     def values(self) -> Float64[Tensor, " f"]:
-        """The value of every triangle: the image at the mean of its corners' coordinates."""
+        """Return the value of every triangle: the image at the mean of its corners' coordinates."""
         rows, columns = self.image.shape
         u, v = self.uv.mean(1).unbind(-1)
         # Pixel centres lie half a pixel inside the border.
@@ -106,7 +106,7 @@ Value = float | ArrayLike | Texture
 
 
 class ValueRange(NamedTuple):
-    """What a value is called in messages, and the numbers it may take."""
+    """Name of a value in messages, and its range."""
 
     what: str
     low: float
@@ -136,11 +136,11 @@ MaterialValue = Annotated[str, AllowedValues(tuple(RANGES))]
 
 
 def checked_value(value: object, name: str) -> Value:
-    """Check the value of a field; lists and arrays become tensors.
+    """Validate the value of a field; lists and arrays become tensors.
 
     Args:
         value: a number, one per triangle, or a `Texture`.
-        name: a field of `RANGES`.
+        name: name of a field of `RANGES`.
 
     Raises:
         InputError: not a number, a row of numbers or a texture; NaN, or out of the field's range.
@@ -166,14 +166,14 @@ def _check_bounds(numbers: Tensor, span: ValueRange) -> None:
 
 
 def evaluate_value(value: Value) -> Float64[Tensor, "*row"]:
-    """The value as a tensor: 0-d, or one number per triangle."""
+    """Return the value as a tensor: 0-d, or one number per triangle."""
     if isinstance(value, Texture):
         return value.values
     return torch.as_tensor(value, dtype=torch.float64)
 
 
 def row_count(values: Mapping[str, object]) -> int | None:
-    """Count the triangles that values are for; None if they hold for a whole object.
+    """Count the triangles of values; None if they hold for a whole object.
 
     Raises:
         InputError: values for different numbers of triangles.

@@ -1,4 +1,4 @@
-"""The open body model Anny as a template: people of all ages and builds."""
+"""Body template of the open model Anny: people of all ages and builds."""
 
 import importlib
 from collections.abc import Mapping, Sequence
@@ -10,8 +10,8 @@ from torch import Tensor
 from invertwin.errors import InputError
 from invertwin.scene.people.body import BodyTemplate
 
-_STEP = 0.05  # of a phenotype, either side, for its direction
-# Anny's people face −y, z up; ours face −z, y up.
+_STEP = 0.05  # step of a phenotype for its central difference
+# Anny's bodies face −y, z up; here they face −z, y up.
 _ANNY_TO_BODY_AXES = torch.tensor(
     [[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64
 )
@@ -20,15 +20,15 @@ _ANNY_TO_BODY_AXES = torch.tensor(
 def load_anny(
     phenotypes: Mapping[str, float] | None = None, coordinates: Sequence[str] = ()
 ) -> BodyTemplate:
-    """Load a person of the model Anny (Apache-2.0), which the optional extra ``anny`` installs.
+    """Load a body of the model Anny (Apache-2.0), which the optional extra ``anny`` installs.
 
     The joints are its 104 bones by their names, such as ``upperarm01.L`` and ``lowerarm01.L``; the
-    rest pose is its own, turned so that the person faces −z, y up. The first use of Anny prepares
-    files for about a minute.
+    rest pose is Anny's, rotated to face −z, y up. The first use of Anny prepares files for about a
+    minute.
 
     Args:
-        phenotypes: by their names in Anny ("gender", "age", "muscle", "weight", "height",
-            "proportions"), from 0 to 1; those not given are 0.5.
+        phenotypes: values by their names in Anny ("gender", "age", "muscle", "weight", "height",
+            "proportions"), from 0 to 1; the default is 0.5.
         coordinates: phenotypes that become shape coordinates, as changes from the given values.
             They follow Anny's own blending to first order.
 
@@ -72,7 +72,7 @@ def load_anny(
 
 
 def _rest(model: Any, values: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-    """Skin and joints of the rest pose, in our axes."""
+    """Return skin and joints of the rest pose in this package's axes."""
     given = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
     with torch.no_grad():
         found = model(pose_parameters=None, phenotype_kwargs=given)

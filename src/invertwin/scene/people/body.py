@@ -1,4 +1,4 @@
-"""Bodies with joints: rigid parts or skin that follows a tree of them."""
+"""Articulated bodies: skin, or rigid parts, on a tree of joints."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,26 +18,27 @@ from invertwin.scene.pose import rotation_angle, rotation_from_vector
 from invertwin.storage.untrusted import read_arrays, safe_reader
 
 _DO = "give arrays of one template"
-_SINGLE_JOINT_WEIGHT = 0.95  # share of a vertex that a joint moves nearly alone
-_EXACT = 1e-12  # m, where they may end
+_SINGLE_JOINT_WEIGHT = 0.95  # skinning weight of a vertex dominated by one joint
+_EXACT = 1e-12  # tolerance of the Newton steps [m]
 _MAX_REFINEMENTS = 4  # Newton steps of least squares
 
 
 @dataclass(frozen=True, eq=False)
 class BodyTemplate:
-    """A mesh in its rest pose, its tree of joints, and how much each joint moves each vertex.
+    """Rest mesh, joint tree and skinning weights of a body.
 
     Attributes:
         vertices: rest positions [m].
         faces: vertex indices of every triangle.
-        weights: share of every joint in every vertex, rows that add up to 1.
-        parents: joint that each joint hangs on, always an earlier one; −1 for the first, the root.
+        weights: skinning weight of every joint in every vertex [v, j]; rows sum to 1.
+        parents: parent of each joint, always an earlier one; −1 for the first, the root.
         joints: rest positions of the joints [m].
-        shape_directions: how the vertices follow shape coordinates [m]; None: there are none.
-        joint_directions: how the joints follow them [m].
-        pose_directions: how the rest positions follow the rotations, last axis the elements of
-            R − I of all joints but the root's, row by row; None: they do not follow.
-        names: of the joints; empty where they have none.
+        shape_directions: derivatives of the vertices with respect to shape coordinates [m]; None:
+            no shape coordinates.
+        joint_directions: derivatives of the joints with respect to shape coordinates [m].
+        pose_directions: derivatives of the rest positions with respect to the elements of R − I of
+            all joints but the root, row by row; None: no pose correctives.
+        names: names of the joints; empty if unnamed.
 
     Raises:
         InputError: shapes that do not fit together, NaN, weights that are negative or do not add
@@ -106,7 +107,7 @@ class BodyTemplate:
         return 0 if self.shape_directions is None else self.shape_directions.shape[2]
 
     def joint(self, name: str | int) -> int:
-        """Number of a joint, given its name or its number.
+        """Return the index of a joint, given its name or its index.
 
         Raises:
             InputError: no such joint.
@@ -124,10 +125,11 @@ class BodyTemplate:
         return name
 
     def rotations(self, turns: Mapping[str, ArrayLike]) -> Float64[Tensor, "j 3"]:
-        """Rotation vectors of all joints, given those of some by name; the others are at rest.
+        """Return rotation vectors of all joints, given those of some by name; the others are at
+        rest.
 
         Args:
-            turns: rotation vectors in the frame of the joint's parent (rad).
+            turns: rotation vectors in the frame of the joint's parent [rad].
 
         Raises:
             InputError: no such joint, or not three finite numbers.
@@ -139,7 +141,7 @@ class BodyTemplate:
         return found
 
     def mesh(self, turns: Mapping[str, ArrayLike]) -> Mesh:
-        """The skin with some joints turned, the others at rest.
+        """Return the skin with some joints rotated, the others at rest.
 
         Args:
             turns: as in `rotations`.
@@ -150,19 +152,20 @@ class BodyTemplate:
         return Mesh(self.apply_pose(rotation_from_vector(self.rotations(turns)))[0], self.faces)
 
     def scale(self, factor: float) -> "BodyTemplate":
-        """The body in another size."""
+        """Return the scaled body."""
         given = ("vertices", "joints", "shape_directions", "joint_directions", "pose_directions")
         values = {name: getattr(self, name) for name in given}
         return replace(self, **{n: v if v is None else v * factor for n, v in values.items()})
 
     def estimate_rotations(self, vertices: Float64[Tensor, "v 3"]) -> Float64[Tensor, "j 3"]:
-        """Rotation vectors of all joints that a posed skin shows [rad], the inverse of `posed`.
+        """Estimate rotation vectors of all joints from a posed skin [rad], the inverse of
+        `apply_pose`.
 
-        Least squares over the vertices; joints that move nothing are left at rest. The skin is of
-        the template's own shape.
+        Least squares over the vertices; joints without vertices stay at rest. The skin has the
+        template's own shape.
 
         Raises:
-            InputError: other vertices than the template's.
+            InputError: another number of vertices than the template's.
         """
         given = checked_tensor(vertices, tuple(self.vertices.shape), "vertices [m]", _DO).detach()
         turns = self._estimate_rigid_rotations(given)
@@ -181,7 +184,7 @@ class BodyTemplate:
         return turns
 
     def _estimate_rigid_rotations(self, given: Tensor) -> Tensor:
-        """Rotation vectors, roughly, from the vertices that one joint moves nearly alone."""
+        """Estimate initial rotation vectors from vertices dominated by one joint."""
         frames: list[Rotation] = []
         for joint, parent in enumerate(self.parents):
             frames.append(frames[parent] if joint else Rotation.identity())
@@ -196,14 +199,14 @@ class BodyTemplate:
     def apply_pose(
         self, rotations: Float64[Tensor, "j 3 3"], shape: Float64[Tensor, " n"] | None = None
     ) -> tuple[Float64[Tensor, "v 3"], Float64[Tensor, "j 3"]]:
-        """Vertices and joints [m] after every joint has turned relative to its parent.
+        """Return vertices and joints [m] with every joint rotated relative to its parent.
 
         Linear blend skinning: ``x = Σ_j w_j (R_j (v − p_j) + t_j)``, R_j and t_j rotation and
-        place of joint j in the object's frame, p_j its rest position.
+        position of joint j in the object's frame, p_j its rest position.
 
         Args:
-            rotations: of every joint in the frame of its parent.
-            shape: shape coordinates; None is the template's own shape.
+            rotations: rotation matrices of every joint in the frame of its parent.
+            shape: shape coordinates; None = the template's own shape.
         """
         rest, places = self.vertices, self.joints
         if shape is not None and self.shape_directions is not None:
@@ -223,16 +226,15 @@ class BodyTemplate:
 
 
 class SkinnedBody(ObjectModule):
-    """Replaces an object's mesh by a body template with turned joints.
+    """Replace an object's mesh by a posed body template.
 
     Args:
         object: name of the object; its pose places the body.
-        template: the body.
-        rotation: rotation vectors [j, 3] (rad); None is the rest pose.
-        shape: shape coordinates [n]; None is zero.
-        joints: those that the fit may turn, by name or number, or a mapping from their names
-            to the components of the rotation vector that it may change, such as "y" for an
-            elbow; None is all.
+        template: body template.
+        rotation: initial rotation vectors [j, 3] [rad]; None = rest pose.
+        shape: initial shape coordinates [n]; None = zero.
+        joints: free joints, by name or index, or a mapping from their names to the free components
+            of the rotation vector, such as "y" for an elbow; None = all.
 
     Attributes:
         rotation: parameter [j, 3], rotation vector of every joint in the frame of its parent
@@ -271,19 +273,19 @@ class SkinnedBody(ObjectModule):
         self.shape = nn.Parameter(given.detach().clone(), requires_grad=shapes > 0)
 
     def update_mesh(self, mesh: Mesh) -> Mesh:
-        """The template's skin as it is posed, whatever was there before."""
+        """Return the posed skin of the template."""
         return Mesh(self._apply_pose()[0], self.template.faces)
 
     @classmethod
     def from_mesh(
         cls, object: str, template: BodyTemplate, mesh: Mesh, joints: Mapping[str, str]
     ) -> "SkinnedBody":
-        """The body from the joint angles that a mesh of it shows; its shape is the template's.
+        """Build the body from the joint angles of a posed mesh, with the template's shape.
 
         Args:
             object: name of the object.
-            template: the body.
-            mesh: with its triangles.
+            template: body template.
+            mesh: posed mesh with the template's triangles.
             joints: as in the class.
 
         Raises:
@@ -296,12 +298,13 @@ class SkinnedBody(ObjectModule):
         return found
 
     def perturb_joints(self, mesh: Mesh, angle: float, generator: torch.Generator) -> Mesh:
-        """A mesh of the body with every free joint turned by `angle` [rad], about random axes.
+        """Return a mesh of the body with every free joint rotated by `angle` [rad] about random
+        axes.
 
         Args:
-            mesh: of the body, as it is posed.
-            angle: rad.
-            generator: of the axes.
+            mesh: posed mesh of the body.
+            angle: rotation angle [rad].
+            generator: random number generator of the axes.
         """
         turns = self.template.estimate_rotations(mesh.vertices)
         rotations = rotation_from_vector(turns)
@@ -309,7 +312,7 @@ class SkinnedBody(ObjectModule):
             free = self._free[joint]
             axis = torch.randn(3, generator=generator, dtype=torch.float64) * free
             change = angle * axis / axis.norm()
-            # A hinge stays one: its angle changes, not its axis.
+            # A hinge keeps its axis.
             rotations[joint] = (
                 rotation_from_vector(turns[joint] + change)
                 if int(free.sum()) == 1
@@ -318,10 +321,10 @@ class SkinnedBody(ObjectModule):
         return Mesh(self.template.apply_pose(rotations)[0], mesh.faces)
 
     def joint_errors(self, estimate: Mesh, truth: Mesh) -> dict[str, float]:
-        """Angles [rad] by which the free joints of two meshes of the body differ, by name.
+        """Return the angles [rad] between the free joints of two meshes of the body, by name.
 
         Args:
-            estimate, truth: the result, and what it should be.
+            estimate, truth: estimated and true mesh.
         """
         a, b = (
             rotation_from_vector(self.template.estimate_rotations(mesh.vertices.detach()))
@@ -331,11 +334,11 @@ class SkinnedBody(ObjectModule):
         return {name: angles[joint] for name, joint in self._joints.items()}
 
     def joints(self) -> Float64[Tensor, "j 3"]:
-        """Present places of the joints in the object's frame [m]."""
+        """Return the present positions of the joints in the object's frame [m]."""
         return self._apply_pose()[1]
 
     def values(self) -> dict[str, Tensor]:
-        """Rotations [rad] of the free joints and shape coordinates, by name."""
+        """Return rotations [rad] of the free joints and shape coordinates, by name."""
         turns = self.rotation.detach().clone()
         named = {f"{self.object}.joint_rotation": turns}
         if self.template.names:
@@ -346,7 +349,7 @@ class SkinnedBody(ObjectModule):
         return named
 
     def entries(self) -> dict[str, Entries]:
-        """The rotation vectors [rad] of the free joints that have a name."""
+        """Return the rotation vectors [rad] of the named free joints."""
         joints = enumerate(self.template.names)
         return {name: Entries("rotation", k) for k, name in joints if self._free[k].any()}
 
@@ -358,11 +361,11 @@ class SkinnedBody(ObjectModule):
 def articulated_template(
     parts: Sequence[Mesh], parents: Sequence[int], joints: ArrayLike
 ) -> BodyTemplate:
-    """A body of rigid parts, part k turning about joint k.
+    """Build a body of rigid parts, part k rotating about joint k.
 
     Args:
         parts: a mesh for every joint, in the rest pose and one common frame.
-        parents: joint that each joint hangs on, −1 for the first.
+        parents: parent of each joint, −1 for the first.
         joints: rest positions [j, 3] of the joints [m].
 
     Raises:
@@ -386,14 +389,14 @@ def articulated_template(
 
 @safe_reader("a body model")
 def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
-    """A body in the layout of SMPL's ``.npz`` files, which users obtain under its own licence.
+    """Load a body in SMPL's ``.npz`` layout, which users obtain under its own licence.
 
     It reads ``v_template`` [v, 3], ``f``, ``weights`` [v, j], ``kintree_table`` [2, j],
     ``J_regressor`` [j, v], ``shapedirs`` [v, 3, n] and, if there, ``posedirs`` [v, 3, 9 (j − 1)].
 
     Args:
         file: path of the file.
-        shapes: shape coordinates that are kept, the first ones.
+        shapes: number of leading shape coordinates to keep.
 
     Raises:
         InputError: no such file, pickled objects in it, or arrays missing or of wrong shapes.
@@ -425,7 +428,7 @@ def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
         rest,
         torch.from_numpy(arrays["f"].astype(np.int64)),
         checked_tensor(arrays["weights"], (len(rest), count), "weights", _DO),
-        # The root's parent is a number without meaning, 2³² − 1 in most files.
+        # The parent of the root is arbitrary, 2³² − 1 in most files.
         (-1, *(int(parent) for parent in table[0, 1:])),
         regressor @ rest,
         directions,

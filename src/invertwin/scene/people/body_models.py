@@ -1,4 +1,4 @@
-"""Bodies with joints by the name of their model, or from a file."""
+"""Articulated bodies by the name of their model, or from a file."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -23,13 +23,13 @@ def body_template(
     height: Positive = 1.75,
     spacing: Positive = 0.03,
 ) -> BodyTemplate:
-    """The template of a body, y up, facing −z; arguments as in `body`.
+    """Return the template of a body, y up, facing −z; arguments as in `body`.
 
     Args:
         model: person or anny.
-        file: in place of a model.
-        height: m, of `person`.
-        spacing: m, of the corners of its triangles.
+        file: path of an SMPL file, in place of a model.
+        height: height of `person` [m].
+        spacing: vertex spacing [m].
     """
     if file is not None:
         return load_smpl(file)
@@ -43,15 +43,15 @@ def body(
     spacing: Positive = 0.03,
     angles: Annotated[Mapping[str, Point], RADIANS] = _AT_REST,
 ) -> Mesh:
-    """A body with joints and one skin, y up, facing −z, in the frame of its model.
+    """Build an articulated body with one skin, y up, facing −z, in the frame of its model.
 
     Args:
-        model: person = made of formulas, arms held out at rest; anny = of the extra `anny`.
-        file: SMPL's layout (.npz), in place of a model.
-        height: m, of `person`.
-        spacing: m, of the corners of its triangles.
-        angles: rotation vectors of joints by name, each in the frame of the joint before; others
-            at rest.
+        model: person = procedural, arms held out at rest; anny = from the extra `anny`.
+        file: path in SMPL's layout (.npz), in place of a model.
+        height: height of `person` [m].
+        spacing: vertex spacing [m].
+        angles: rotation vectors of joints by name, in the frame of the parent joint; others at
+            rest.
 
     Raises:
         InputError: a file is missing or broken, the extra `anny` is not installed, or no such

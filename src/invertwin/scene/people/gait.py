@@ -1,15 +1,15 @@
-"""A person who walks: joint angles by the walking speed, from a published model of gait.
+"""Walking people: joint angles as functions of the walking speed, from a published gait model.
 
 Source: R. Boulic, N. Magnenat-Thalmann, D. Thalmann, "A global human walking model with real-time
 kinematic personification", The Visual Computer 6, 1990, 344–358, as V. C. Chen's "The Micro-Doppler
 Effect in Radar" (2011) uses it for radar. All curves depend on the relative speed v, in leg lengths
 per second, and the phase of the cycle, which begins as the right foot lands.
 Differs from the source: curves through its control points are monotone cubics of which the first
-seven harmonics are kept. Beyond these gait has 0.3 % of its power (D. A. Winter, H. G. Sidwall,
-D. A. Hobson, "Measurement and reduction of noise in kinematics of locomotion", J. Biomechanics 7,
-1974, 157–159), and with them accelerations are continuous. The forward and sideways shifts of brisk
-walks are those of slow ones carried on, positive at v = 0.5; transcriptions of the source have a
-minus there, with which they would jump to the other side. Feet do not turn: bodies have no ankles.
+seven harmonics are kept. Beyond these gait has 0.3 % of its power (D. A. Winter, H. G. Sidwall, D.
+A. Hobson, "Measurement and reduction of noise in kinematics of locomotion", J. Biomechanics 7,
+1974, 157–159), and with them accelerations are continuous. The forward and sideways shifts of fast
+walks continue those of slow ones, positive at v = 0.5; transcriptions of the source have a minus
+there, which would be discontinuous. Bodies have no ankles, so feet do not rotate.
 """
 
 import math
@@ -31,10 +31,12 @@ from invertwin.scene.pose import compose, rigid, rotation_from_vector
 from invertwin.scene.scene import Object
 
 _HARMONICS = 7
-_SAMPLES = 512  # of a cycle, from which harmonics are found
-_MAX_RELATIVE_SPEED = 3.0  # relative speed
-_HANGING = math.radians(80.0)  # from the rest pose, in which arms are held out
-_ADULT_LEG = 0.84  # m, of ``person`` of 1.75 m; the source states shifts for adults in metres
+_SAMPLES = 512  # samples of a cycle for its harmonics
+_MAX_RELATIVE_SPEED = 3.0  # maximum relative speed
+_HANGING = math.radians(80.0)  # shoulder angle from the rest pose, in which arms are held out
+_ADULT_LEG = (
+    0.84  # leg length of ``person`` of 1.75 m [m]; the source states shifts for adults in metres
+)
 JOINTS = (
     *("pelvis", "chest", "left_shoulder", "left_elbow", "right_shoulder", "right_elbow"),
     *("left_hip", "left_knee", "right_hip", "right_knee"),
@@ -45,21 +47,20 @@ Posture = tuple[Float64[Tensor, "j 3 3"], Float64[Tensor, "3"]]
 
 @dataclass(frozen=True, eq=False)
 class Walking:
-    """A person who walks straight ahead, along −z of the object's frame, or on the spot.
+    """Person who walks straight ahead along −z of the object's frame, or on the spot.
 
-    The object's pose places the pelvis as of a person who stands; ``standing_height`` says how
-    high that is. ``MovingScene`` applies it.
+    The object's pose is that of the pelvis of a standing person, see ``standing_height``.
+    ``MovingScene`` applies the motion.
 
     Attributes:
-        body: With the joints of ``person``.
-        speed: Mean speed [m/s].
-        phase: Where the cycle is at time 0, in cycles; 0: the right foot lands.
-        on_spot: Stay where the object is, such as one that ``TrajectoryMotion`` carries at that
-            speed.
+        body: body template with the joints of ``person``.
+        speed: mean speed [m/s].
+        phase: phase of the cycle at time 0, in cycles; 0: the right foot lands.
+        on_spot: whether to stay in place, for example on a ``TrajectoryMotion`` of that speed.
 
     Raises:
-        InputError: A body without these joints, or a speed of more than three leg lengths a
-            second, which is none of walking.
+        InputError: A body without these joints, or a speed of more than three leg lengths per
+            second.
     """
 
     body: BodyTemplate
@@ -75,19 +76,19 @@ class Walking:
 
     @property
     def relative_speed(self) -> float:
-        """Leg lengths per second."""
+        """Speed in leg lengths per second."""
         return self.speed / leg_length(self.body)
 
     @property
     def period(self) -> float:
-        """Time of a cycle, two steps [s]: 1.346 / √v."""
+        """Period of a cycle, two steps [s]: 1.346 / √v."""
         return 1.346 / math.sqrt(self.relative_speed)
 
     def rotations(self, phase: float) -> Float64[Tensor, "j 3 3"]:
-        """Rotation of every joint in the frame of its parent.
+        """Return the rotation of every joint in the frame of its parent.
 
         Args:
-            phase: In cycles.
+            phase: phase in cycles.
         """
         v, curves = self.relative_speed, _curves(self.relative_speed)
         found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
@@ -115,10 +116,10 @@ class Walking:
         return found
 
     def pelvis_offset(self, phase: float) -> Float64[Tensor, "3"]:
-        """How far the pelvis is from where it moves evenly, x, y and z [m].
+        """Return the offset of the pelvis from uniform motion, x, y and z [m].
 
         Args:
-            phase: In cycles.
+            phase: phase in cycles.
         """
         v, scale = self.relative_speed, leg_length(self.body) / _ADULT_LEG
         support = 0.752 - 0.143 / self.period
@@ -129,10 +130,10 @@ class Walking:
         return scale * torch.tensor([side, rise, -ahead], dtype=torch.float64)
 
     def posture(self, time: float) -> Posture:
-        """Rotations of the joints in the frames of their parents, and the shift of the pelvis [m].
+        """Return joint rotations in the frames of their parents, and the shift of the pelvis [m].
 
         Args:
-            time: [s].
+            time: time [s].
         """
         phase = self.phase + time / self.period
         way = 0.0 if self.on_spot else self.speed * time
@@ -140,22 +141,22 @@ class Walking:
         return self.rotations(phase), shift
 
     def __call__(self, item: Object, time: float) -> Object:
-        """The object at a time [s].
+        """Return the object at a time [s].
 
         Args:
-            item: At the place where the person stands at time 0.
-            time: [s].
+            item: object at its position at time 0.
+            time: time [s].
         """
         return pose_object(item, self.body, *self.posture(time))
 
 
 def standing_height(body: BodyTemplate) -> float:
-    """Height of the origin of a body above the soles of its rest pose [m]."""
+    """Return the height of a body's origin above the soles of its rest pose [m]."""
     return -float(body.vertices[:, 1].min())
 
 
 def leg_length(body: BodyTemplate) -> float:
-    """Length of a leg [m]: twice the thigh, since the shank is as long within 1 %."""
+    """Return the leg length [m]: twice the thigh, since the shank is as long within 1 %."""
     hip, knee = (body.joints[body.joint(f"right_{name}")] for name in ("hip", "knee"))
     return 2 * float((knee - hip).norm())
 
@@ -164,7 +165,7 @@ def check_joints(body: BodyTemplate) -> None:
     """Raise unless a body has the joints of ``person``.
 
     Raises:
-        InputError: Others, or none with names.
+        InputError: Other joints, or unnamed ones.
     """
     checked_type(body, BodyTemplate, "a body", "make one with person()")
     missing = [name for name in JOINTS if name not in body.names]
@@ -178,62 +179,62 @@ def check_joints(body: BodyTemplate) -> None:
 def pose_object(
     item: Object, body: BodyTemplate, rotations: Float64[Tensor, "j 3 3"], shift: Tensor
 ) -> Object:
-    """An object as the skin of a body, moved in its own frame.
+    """Return an object with the posed skin of a body, moved in its own frame.
 
     Args:
-        item: The object.
-        body: The body.
-        rotations: Of every joint in the frame of its parent.
-        shift: [m].
+        item: object to pose.
+        body: body template.
+        rotations: rotation of every joint in the frame of its parent.
+        shift: translation of the pelvis [m].
     """
     mesh = Mesh(body.apply_pose(rotations)[0], body.faces)
     return replace(item, mesh=mesh, pose=compose(rigid(translation=shift), item.transform))
 
 
 def rotation_about_axis(axis: str, angle: float) -> Float64[Tensor, "3 3"]:
-    """Rotation about a coordinate axis.
+    """Return the rotation about a coordinate axis.
 
     Args:
-        axis: x, y or z.
-        angle: [rad].
+        axis: axis x, y or z.
+        angle: rotation angle [rad].
     """
     return rotation_from_vector(torch.tensor([angle * (axis == name) for name in "xyz"]).double())
 
 
 def hanging_arm_rotation(side: str) -> Float64[Tensor, "3 3"]:
-    """Turn of a shoulder that lets the arm hang.
+    """Return the shoulder rotation of a hanging arm.
 
     Args:
-        side: left or right.
+        side: side, left or right.
     """
     return rotation_about_axis("z", _HANGING if side == "left" else -_HANGING)
 
 
 def elbow_rotation(side: str, angle: float) -> Float64[Tensor, "3 3"]:
-    """Turn of an elbow.
+    """Return the rotation of an elbow.
 
     Args:
-        side: left or right.
-        angle: By which it is bent [rad].
+        side: side, left or right.
+        angle: flexion [rad].
     """
     return rotation_about_axis("y", -angle if side == "left" else angle)
 
 
 def _swing(v: float, slope: float) -> float:
-    """Parabola of slow walks, at its top from half a leg length per second on."""
+    """Evaluate the parabola of slow walks, constant above half a leg length per second."""
     slow = min(v, 0.5)
     return slope * slow * (1 - slow)
 
 
 def _evaluate_series(harmonics: np.ndarray, phase: float) -> float:
-    """Value of a series [rad]."""
+    """Evaluate a Fourier series [rad]."""
     turns = np.exp(2j * math.pi * phase * np.arange(len(harmonics)))
     return float(np.real(harmonics * turns).sum())
 
 
 @lru_cache(maxsize=32)
 def _curves(v: float) -> dict[str, np.ndarray]:
-    """Harmonics of the angles by name [rad]."""
+    """Return the harmonics of the angles by name [rad]."""
     slow, brisk = min(v, 0.5), min(max(v - 0.5, 0.0) / 0.8, 1.0)
     fast = max(v - 1.3, 0.0) / 1.7
     hip = [(0.9, 50 * slow + 6 * fast), (0.5, -30 * slow)]
@@ -253,8 +254,8 @@ def _curves(v: float) -> dict[str, np.ndarray]:
 
 
 def _interpolate_cycle(points: list[tuple[float, float]]) -> Callable[[np.ndarray], np.ndarray]:
-    """Monotone cubics through control points of a cycle, again and again [deg]."""
-    from scipy.interpolate import PchipInterpolator  # slow to import, and few people walk
+    """Interpolate control points of a cycle periodically by monotone cubics [deg]."""
+    from scipy.interpolate import PchipInterpolator  # slow to import, rarely used
 
     phases, values = np.array(sorted((phase % 1.0, value) for phase, value in points)).T
     more = np.concatenate([phases + turn for turn in (-1, 0, 1)])
@@ -262,7 +263,7 @@ def _interpolate_cycle(points: list[tuple[float, float]]) -> Callable[[np.ndarra
 
 
 def _tilt(phase: np.ndarray) -> np.ndarray:
-    """Fall of the pelvis towards the leg that swings, of amplitude 1."""
+    """Return the drop of the pelvis towards the swinging leg, of amplitude 1."""
     half = phase % 0.5
     fall = np.where(half < 0.15, np.cos(2 * np.pi * half / 0.3), 0.0)
     rise = np.where(half >= 0.15, -np.cos(2 * np.pi * (half - 0.15) / 0.7), 0.0)
@@ -270,7 +271,7 @@ def _tilt(phase: np.ndarray) -> np.ndarray:
 
 
 def _harmonics(curve: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """The first harmonics of a curve in degrees [rad]."""
+    """Return the first harmonics of a curve in degrees [rad]."""
     values = np.radians(curve(np.arange(_SAMPLES) / _SAMPLES))
     found = np.fft.rfft(values)[: _HARMONICS + 1] / _SAMPLES
     found[1:] *= 2

@@ -1,14 +1,13 @@
-"""People who sit down, stand up and wave: postures over time.
+"""Gestures: people who sit down, stand up and wave.
 
 Sources: A. Kralj, R. J. Jaeger, M. Munih, "Analysis of standing up and sitting down in humans:
-definitions and normative data presentation", J. Biomechanics 23, 1990, 1123–1138, for the order of
-what happens: the trunk leans until the seat carries the person, and is upright at the end.
-T. Flash, N. Hogan, "The coordination of arm movements", J. Neuroscience 5, 1985, 1688–1703: people
-move from rest to rest with the least jerk, along 10 u³ − 15 u⁴ + 6 u⁵. N. Hogan, D. Sternad, "On
-rhythmic and discrete movements", Exp. Brain Research 181, 2007, 13–30: what is repeated evenly is
-a sine.
-Differs from the source: angles between start and end are these curves, not those of measured
-people. Bodies have no ankles: shanks stay upright, and feet stay where they are.
+definitions and normative data presentation", J. Biomechanics 23, 1990, 1123–1138, for the sequence:
+the trunk leans until the seat carries the person, and is upright at the end. T. Flash, N. Hogan,
+"The coordination of arm movements", J. Neuroscience 5, 1985, 1688–1703: people move from rest to
+rest with minimum jerk, along 10 u³ − 15 u⁴ + 6 u⁵. N. Hogan, D. Sternad, "On rhythmic and discrete
+movements", Exp. Brain Research 181, 2007, 13–30: rhythmic motion is a sine.
+Differs from the source: angles between start and end follow these curves, not measured ones. Bodies
+have no ankles: shanks stay upright, and feet stay where they are.
 """
 
 import math
@@ -33,29 +32,29 @@ from invertwin.scene.people.gait import (
 )
 from invertwin.scene.scene import Object
 
-_LEAN = math.radians(40.0)  # of the trunk, as the seat is reached
-_SEAT_CONTACT_SHARE = 0.6  # share of the time after which the seat carries the person
-_LAP = (math.radians(25.0), math.radians(60.0))  # of shoulders and elbows, hands above the lap
+_LEAN = math.radians(40.0)  # lean of the trunk at seat contact
+_SEAT_CONTACT_SHARE = 0.6  # fraction of the duration at seat contact
+_LAP = (math.radians(25.0), math.radians(60.0))  # shoulders and elbows with hands above the lap
 _THIGH = 0.088 / 0.42  # radius of a thigh over its length
-_MAX_THIGH_ANGLE = math.radians(105.0)  # of the thighs, beyond which the seat is too low to sit on
-_RAISE_DURATION = 0.8  # s, until the arm is up or down
-_WAVE = math.radians(30.0)  # of the forearm to both sides
+_MAX_THIGH_ANGLE = math.radians(105.0)  # maximum thigh angle, which limits the seat height
+_RAISE_DURATION = 0.8  # duration of raising or lowering an arm [s]
+_WAVE = math.radians(30.0)  # swing of the forearm to either side
 
 
 @dataclass(frozen=True, eq=False)
 class Sitting:
-    """A person who sits down, or stands up: the same course backwards.
+    """Person who sits down, or stands up: the reverse motion.
 
-    Feet stay where they are; the seat is behind the person, who faces −z of the object's frame.
-    The object's pose places the pelvis as of a person who stands; ``standing_height`` says how
-    high that is. ``MovingScene`` applies it.
+    Feet are fixed; the seat is behind the person, who faces −z of the object's frame. The object's
+    pose is that of the pelvis of a standing person, see ``standing_height``. ``MovingScene``
+    applies the motion.
 
     Attributes:
-        body: With the joints of ``person``.
-        seat: Height of the seat above the floor [m].
-        start: When the motion begins [s].
-        duration: How long it takes [s].
-        rising: Stand up instead.
+        body: body template with the joints of ``person``.
+        seat: height of the seat above the floor [m].
+        start: start time [s].
+        duration: duration [s].
+        rising: whether to stand up instead.
 
     Raises:
         InputError: A body without these joints, a seat that is as high as the person's legs or too
@@ -77,10 +76,10 @@ class Sitting:
         checked_number(self.seat, "height of the seat [m]", low, knee + thigh * (1 - _THIGH))
 
     def posture(self, time: float) -> Posture:
-        """Rotations of the joints in the frames of their parents, and the shift of the pelvis [m].
+        """Return joint rotations in the frames of their parents, and the shift of the pelvis [m].
 
         Args:
-            time: [s].
+            time: time [s].
         """
         share = (time - self.start) / self.duration
         u = 1 - share if self.rising else share
@@ -111,33 +110,33 @@ class Sitting:
         return found, hip - pelvis @ hip + torch.tensor(away, dtype=torch.float64)
 
     def __call__(self, item: Object, time: float) -> Object:
-        """The object at a time [s].
+        """Return the object at a time [s].
 
         Args:
-            item: At the place where the person stands.
-            time: [s].
+            item: object at the position of the standing person.
+            time: time [s].
         """
         return pose_object(item, self.body, *self.posture(time))
 
     def _leg(self) -> tuple[float, float]:
-        """Height of the knee above the sole, and length of the thigh [m]."""
+        """Return the height of the knee above the sole, and the length of the thigh [m]."""
         hip, knee = (self.body.joints[self.body.joint(f"left_{name}")] for name in ("hip", "knee"))
         return float(knee[1]) + standing_height(self.body), float((hip - knee).norm())
 
 
 @dataclass(frozen=True, eq=False)
 class Waving:
-    """A person who raises an arm, waves, and lowers it again.
+    """Person who raises an arm, waves, and lowers it again.
 
-    ``MovingScene`` applies it; the object's pose is that of a person who stands.
+    ``MovingScene`` applies it; the object's pose is that of a standing person.
 
     Attributes:
-        body: With the joints of ``person``.
-        side: Of the arm: left or right.
-        rate: How often the forearm goes there and back [1/s].
-        start: When the arm begins to rise [s].
-        duration: Until it hangs again [s]; 0.8 s to raise it and 0.8 s to lower it are in it.
-        during: What the rest of the body does meanwhile; None: it stands.
+        body: body template with the joints of ``person``.
+        side: side of the arm, left or right.
+        rate: frequency of the forearm [Hz].
+        start: time at which the arm begins to rise [s].
+        duration: duration until it hangs again [s], including 0.8 s each to raise and to lower it.
+        during: simultaneous motion of the rest of the body; None = standing.
 
     Raises:
         InputError: A body without these joints or another body than that of ``during``, an unknown
@@ -165,10 +164,10 @@ class Waving:
             )
 
     def posture(self, time: float) -> Posture:
-        """Rotations of the joints in the frames of their parents, and the shift of the pelvis [m].
+        """Return joint rotations in the frames of their parents, and the shift of the pelvis [m].
 
         Args:
-            time: [s].
+            time: time [s].
         """
         found, shift = self._rest_rotations(time)
         since = time - self.start
@@ -189,11 +188,11 @@ class Waving:
         return found, shift
 
     def __call__(self, item: Object, time: float) -> Object:
-        """The object at a time [s].
+        """Return the object at a time [s].
 
         Args:
-            item: At the place where the person stands.
-            time: [s].
+            item: object at the position of the standing person.
+            time: time [s].
         """
         return pose_object(item, self.body, *self.posture(time))
 
@@ -207,13 +206,13 @@ class Waving:
 
 
 def _minimum_jerk(share: float) -> float:
-    """From 0 to 1 over shares of the time from 0 to 1, at rest before and after."""
+    """Minimum-jerk curve from 0 to 1 for fractions of the time from 0 to 1."""
     u = min(max(share, 0.0), 1.0)
     return u**3 * (10 - 15 * u + 6 * u**2)
 
 
 def _interpolate_rotation(first: Tensor, last: Tensor, share: float) -> Tensor:
-    """A rotation between two, by a share of the angle between them."""
+    """Interpolate between two rotations by a fraction of the angle between them."""
     from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_matrix((first.T @ last).numpy()).as_rotvec()

@@ -1,4 +1,4 @@
-"""Scenes in motion: what turns, follows a path or walks, as a function of time."""
+"""Moving scenes: rotation, trajectories and walking as functions of time."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -17,18 +17,18 @@ from invertwin.scene.scene import Object, Scene
 ObjectMotion = Callable[[Object, float], Object]
 """The object at a time [s], from the object as the scene has it."""
 
-_MIN_HEADING_SPEED = 1e-6  # m/s, of a level velocity that has no heading
+_MIN_HEADING_SPEED = 1e-6  # minimum horizontal speed that defines a heading [m/s]
 
 
 @dataclass(frozen=True, eq=False)
 class MovingScene:
-    """A scene some of whose objects move: call it with a time [s] to get the scene then.
+    """Scene with moving objects, a callable of time [s].
 
-    ``simulate_chirps`` takes it as it is. Triangles are the same at all times.
+    ``simulate_chirps`` accepts it. Triangles are equal at all times.
 
     Attributes:
-        scene: Every object as its motion takes it up.
-        motions: By name, one motion or several, applied from first to last.
+        scene: scene with every object at the start of its motion.
+        motions: one motion or several by object name, applied from first to last.
 
     Raises:
         InputError: A name that the scene does not have, or an object that has a velocity, too.
@@ -47,10 +47,10 @@ class MovingScene:
                 )
 
     def __call__(self, time: float) -> Scene:
-        """The scene at a time [s].
+        """Return the scene at a time [s].
 
         Raises:
-            InputError: A time at which a motion is not known.
+            InputError: A time outside a motion.
         """
         scene = self.scene.advance(time)
         for name, given in self.motions.items():
@@ -62,12 +62,12 @@ class MovingScene:
 
 @dataclass(frozen=True, eq=False)
 class AxisRotation:
-    """An object that turns about an axis: a wheel, a fan, the crank of a pedal.
+    """Object that rotates about an axis: a wheel, a fan, the crank of a pedal.
 
     Attributes:
-        axis: Direction of the axis in the object's own frame; turns are right-handed about it.
-        rate: Angular velocity [rad/s].
-        center: Place of the axis in that frame [m]; None is the middle of the mesh.
+        axis: direction of the axis in the object's own frame; rotation is right-handed.
+        rate: angular velocity [rad/s].
+        center: point on the axis in that frame [m]; None = centre of the mesh.
 
     Raises:
         InputError: An axis without a direction, or numbers that are not finite.
@@ -88,11 +88,11 @@ class AxisRotation:
             object.__setattr__(self, "center", given)
 
     def __call__(self, item: Object, time: float) -> Object:
-        """The object after it has turned for a time [s].
+        """Return the object rotated for a time [s].
 
         Args:
-            item: As it is at time 0.
-            time: [s].
+            item: object at time 0.
+            time: time [s].
         """
         turn = rotation_from_vector(torch.as_tensor(self.axis) * (self.rate * time))
         center = item.mesh.center if self.center is None else torch.as_tensor(self.center)
@@ -102,16 +102,16 @@ class AxisRotation:
 
 @dataclass(frozen=True, eq=False)
 class SplineTrajectory:
-    """A path through places at given times: a cubic with continuous accelerations.
+    """Trajectory through positions at given times: a cubic with continuous accelerations.
 
     Its ends have no acceleration (natural spline).
 
     Attributes:
-        times: When each place is reached, rising [s].
-        positions: [time, 3] in the world [m].
+        times: ascending times of the positions [s].
+        positions: positions [time, 3] in the world [m].
 
     Raises:
-        InputError: Fewer than two times, times that do not rise, or places that are not as many.
+        InputError: Fewer than two times, times that do not ascend, or another number of positions.
     """
 
     times: ArrayLike
@@ -128,30 +128,30 @@ class SplineTrajectory:
         places = checked_tensor(self.positions, shape, "places [m]", "give x, y, z for each time")
         object.__setattr__(self, "times", times.detach())
         object.__setattr__(self, "places", places.detach())
-        from scipy.interpolate import CubicSpline  # slow to import, and few paths are splines
+        from scipy.interpolate import CubicSpline  # slow to import
 
         curve = CubicSpline(times.detach().numpy(), places.detach().numpy(), bc_type="natural")
         object.__setattr__(self, "_curve", curve)
 
     def position(self, time: float) -> Float64[Tensor, "3"]:
-        """Place at a time [m].
+        """Return the position at a time [m].
 
         Args:
-            time: [s].
+            time: time [s].
 
         Raises:
-            InputError: A time before the first place or after the last.
+            InputError: A time before the first position or after the last.
         """
         return self._value(time, 0)
 
     def velocity(self, time: float) -> Float64[Tensor, "3"]:
-        """Derivative of the place with respect to time [m/s].
+        """Return the derivative of the position with respect to time [m/s].
 
         Args:
-            time: [s].
+            time: time [s].
 
         Raises:
-            InputError: A time before the first place or after the last.
+            InputError: A time before the first position or after the last.
         """
         return self._value(time, 1)
 
@@ -167,25 +167,26 @@ class SplineTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryMotion:
-    """An object that is carried along a path; its own pose counts from the path's place.
+    """Object carried along a trajectory; its pose is relative to the trajectory's position.
 
     Attributes:
-        trajectory: Where to, when.
-        heading: Turn the object about the vertical, so that its front, −z, looks where it goes.
+        trajectory: trajectory of the object.
+        heading: whether to rotate the object about the vertical, so that its front, −z, faces the
+            direction of motion.
     """
 
     trajectory: SplineTrajectory
     heading: bool = False
 
     def __call__(self, item: Object, time: float) -> Object:
-        """The object at a place of the path.
+        """Return the object at a position of the trajectory.
 
         Args:
-            item: With its pose relative to that place.
-            time: [s].
+            item: object with its pose relative to that position.
+            time: time [s].
 
         Raises:
-            InputError: A time outside the path; a heading where nothing moves sideways.
+            InputError: A time outside the trajectory; a heading without horizontal motion.
         """
         turn = None
         if self.heading:
@@ -195,7 +196,7 @@ class TrajectoryMotion:
                     f"expected a level velocity for a heading, got {ahead.tolist()} m/s at "
                     f"{time:g} s; move its places, or leave out heading"
                 )
-            # −z turned about y by θ is (−sin θ, 0, −cos θ).
+            # −z rotated about y by θ is (−sin θ, 0, −cos θ).
             angle = torch.atan2(-ahead[0], -ahead[2])
             turn = rotation_from_vector(torch.stack([0 * angle, angle, 0 * angle]))
         return replace(

@@ -1,4 +1,4 @@
-"""A standing person as a skinned body: one closed skin over eleven joints, made of formulas."""
+"""Procedural standing person as a skinned body: one closed skin over eleven joints."""
 
 import torch
 from jaxtyping import Float64
@@ -9,7 +9,7 @@ from invertwin.scene.people.body import BodyTemplate
 from invertwin.scene.shape_models.iso_surface import iso_surface
 from invertwin.scene.shape_models.lattice import Lattice
 
-# Joints of a person 1.75 m tall who stands with the arms held out, as [m] from the pelvis.
+# Joints of a standing person 1.75 m tall with arms held out, relative to the pelvis [m].
 _JOINTS: dict[str, tuple[str | None, tuple[float, float, float]]] = {
     "pelvis": (None, (0.0, 0.0, 0.0)),
     "chest": ("pelvis", (0.0, 0.22, 0.0)),
@@ -23,7 +23,7 @@ _JOINTS: dict[str, tuple[str | None, tuple[float, float, float]]] = {
     "right_hip": ("pelvis", (0.10, -0.06, 0.0)),
     "right_knee": ("right_hip", (0.10, -0.48, 0.0)),
 }
-# Cones with round ends: joint they belong to, both ends, both radii [m].
+# Cones with round ends: their joint, both ends, both radii [m].
 _CONES = [
     ("pelvis", (-0.06, -0.02, 0.0), (0.06, -0.02, 0.0), 0.115, 0.115),
     ("pelvis", (0.0, 0.0, 0.0), (0.0, 0.2, 0.0), 0.12, 0.115),
@@ -40,22 +40,21 @@ _LIMBS = [
     ("knee", (0.10, -0.48, 0.0), (0.10, -0.90, 0.0), 0.056, 0.04),
     ("knee", (0.10, -0.90, 0.02), (0.10, -0.92, -0.16), 0.045, 0.035),
 ]
-_FILLET = 0.02  # m, over which parts run into each other
-_BLEND = 0.08  # m, over which the skin passes from one joint to the next
+_FILLET = 0.02  # blending width between parts [m]
+_BLEND = 0.08  # width over which skinning weights change [m]
 _DEFAULT_HEIGHT = 1.75  # m
 
 
 def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
-    """Make a person who faces −z, y up, arms held out along ±x, in the frame of the pelvis.
+    """Build a person who faces −z, y up, arms held out along ±x, in the frame of the pelvis.
 
-    One closed skin around tapered cylinders that run into each other; its weights pass smoothly
-    from joint to joint. The joints are pelvis, chest, neck, and shoulder, elbow, hip and knee of
-    both sides, ``left_`` at −x; their axes are those of the object in the rest pose: elbows bend
-    about y, knees about x.
+    One closed skin around blended tapered cylinders; its weights are smooth between joints. The
+    joints are pelvis, chest, neck, and shoulder, elbow, hip and knee of both sides, ``left_`` at
+    −x; their axes are those of the object in the rest pose: elbows bend about y, knees about x.
 
     Args:
-        height: [m].
-        spacing: distance of neighbouring corners of the triangles [m].
+        height: height [m].
+        spacing: vertex spacing [m].
 
     Raises:
         InputError: a height or spacing out of range.
@@ -81,7 +80,7 @@ def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
 
 
 def _parts() -> list[tuple[str, Tensor, Tensor, float, float]]:
-    """All cones: joint, ends, radii."""
+    """Return all cones: joint, ends, radii."""
     parts = []
     for name, *ends, first, last in [*_CONES, *_LIMBS]:
         start, end = torch.tensor(ends, dtype=torch.float64)
@@ -95,20 +94,20 @@ def _parts() -> list[tuple[str, Tensor, Tensor, float, float]]:
 def _cone(
     points: Tensor, start: Tensor, end: Tensor, first: float, last: float
 ) -> Float64[Tensor, " p"]:
-    """Approximate distance to a cone with round ends, negative inside."""
+    """Return the approximate distance to a cone with round ends, negative inside."""
     axis = end - start
     share = ((points - start) @ axis / axis.square().sum()).clamp(0.0, 1.0)
     return (points - start - share[:, None] * axis).norm(dim=1) - (first + share * (last - first))
 
 
 def _distance(points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
-    """Approximate distance to the skin, negative inside: a soft minimum over the parts."""
+    """Return the approximate signed distance to the skin: a soft minimum over the parts."""
     found = torch.stack([_cone(points, *part[1:]) for part in _parts()])
     return -_FILLET * torch.logsumexp(-found / _FILLET, dim=0)
 
 
 def _weights(points: Float64[Tensor, "p 3"]) -> Float64[Tensor, "p j"]:
-    """Share of every joint, by the distances to the parts that hang on it."""
+    """Return skinning weights from the distances to the parts of each joint."""
     parts = _parts()
     nearest = []
     for name in _JOINTS:

@@ -1,1 +1,1 @@
-"""Shapes as unknowns: distances, densities, lattices, learned priors."""
+"""Shape models: distances, densities, lattices, learned priors."""

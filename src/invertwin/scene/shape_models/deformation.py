@@ -12,19 +12,19 @@ from invertwin.scene.shape_models.lattice import Lattice, tensor_product
 
 
 class LatticeDeformation(ObjectModule):
-    """Moves an object's points by cubic B-splines over a lattice of control points.
+    """Deform an object by cubic B-splines over a lattice of control points.
 
     The displacement field is twice continuously differentiable, whatever the mesh; equal offsets
-    everywhere are a translation by them.
+    are a translation.
 
     Args:
         object: name of the object.
-        low, high: opposite corners of a box that holds the object's mesh, in its frame [m].
-        counts: nodes of the lattice along x, y and z.
+        low, high: opposite corners of a box around the object's mesh, in its frame [m].
+        counts: number of lattice nodes along x, y and z.
 
     Attributes:
-        offsets: parameter [x+2, y+2, z+2, 3] in the object's frame, metres: those of the
-            lattice's nodes and of one more on every side.
+        offsets: parameter [x+2, y+2, z+2, 3] in the object's frame [m]: offsets of the lattice's
+            nodes and of one more on every side.
 
     Raises:
         InputError: a box without volume, or fewer than two nodes along an axis.
@@ -37,7 +37,7 @@ class LatticeDeformation(ObjectModule):
         self.offsets = nn.Parameter(torch.zeros(*shape, 3, dtype=torch.float64))
 
     def displacement(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, "p 3"]:
-        """Displacement [m] of points inside of the box, in the object's frame.
+        """Return the displacement [m] of points inside the box, in the object's frame.
 
         Raises:
             InputError: points outside of it.
@@ -55,20 +55,20 @@ class LatticeDeformation(ObjectModule):
         return tensor_product(self.offsets, index, _cubic_spline(t))
 
     def update_mesh(self, mesh: Mesh) -> Mesh:
-        """The mesh deformed.
+        """Return the deformed mesh.
 
         Raises:
-            InputError: it leaves the box.
+            InputError: the mesh leaves the box.
         """
         return Mesh(mesh.vertices + self.displacement(mesh.vertices), mesh.faces)
 
     def values(self) -> dict[str, Tensor]:
-        """Offsets [m] of the control points by name, for progress and reports."""
+        """Return offsets [m] of the control points by name, for progress and reports."""
         return {f"{self.object}.control_offsets": self.offsets.detach().clone()}
 
 
 def _cubic_spline(t: Tensor) -> Tensor:
-    """Weights of the four control points around places t in [0, 1] of a cell; they add up to 1."""
+    """Return weights of the four control points around positions t in [0, 1] of a cell; sum 1."""
     r = 1 - t
     inner = (3 * t**3 - 6 * t**2 + 4) / 6, (3 * r**3 - 6 * r**2 + 4) / 6
     return torch.stack([r**3 / 6, *inner, t**3 / 6], dim=-1)

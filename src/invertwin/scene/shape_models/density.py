@@ -1,4 +1,4 @@
-"""A density of soft scatterers on a grid: a shape that has no surface until it is meshed."""
+"""Density grid of point scatterers: a shape without a surface until meshed."""
 
 from collections.abc import Sequence
 
@@ -18,22 +18,21 @@ from invertwin.scene.scene import Object, Scene
 from invertwin.scene.shape_models.distance import signed_distance
 from invertwin.scene.shape_models.lattice import Lattice
 
-# Starts are kept this far above zero, in units of one over a node spacing: below, softplus is so
-# flat that a density could not come back.
+# Minimum initial density over the inverse node spacing: softplus is too flat below.
 _MIN_DENSITY = 1e-3
 
 
 class DensityGrid(ObjectModule):
-    """An object as a cloud of soft scatterers, given by densities at the nodes of a grid.
+    """Object as a cloud of point scatterers with densities at the nodes of a grid.
 
-    ``σ = softplus(value) / h``, with h the mean spacing of the nodes. At a value of 0 one cell
-    holds back half of the power. Learning rates of about 0.1 suit all grids.
+    ``σ = softplus(value) / h``, with h the mean spacing of the nodes. At a value of 0 one cell has
+    a transmittance of one half. Learning rates of about 0.1 suit all grids.
 
     Args:
-        object: name of the object; its mesh is not seen any more.
+        object: name of the object; its mesh is no longer used.
         low, high: opposite corners of the box in the object's frame [m].
-        density: extinction at the nodes [1/m], at least two along each axis. What is below
-            0.001 of one over a spacing starts there.
+        density: initial extinction at the nodes [1/m], at least two along each axis. The minimum is
+            0.001 of the inverse node spacing.
         albedo: see ``Cloud``.
 
     Attributes:
@@ -70,20 +69,19 @@ class DensityGrid(ObjectModule):
         item: Object,
         extinction: Positive | None = None,
     ) -> "DensityGrid":
-        """A cloud of soft scatterers. It starts as the echoes that [initial] finds, else as
-        `extinction` says. Rates of about 0.1 suit it. Measures and pictures show the surface where
-        the density is half of its maximum.
+        """Cloud of point scatterers. It starts from the echoes of [initial], else from
+        `extinction`.
 
         Args:
             object: name of the object.
             low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
-            item: the object; if it is a cloud already, this cloud is the start.
-            extinction: 1/m, of a cloud that fills the object's mesh; without it the whole box is
-                faint.
+            item: the object; an existing cloud is the start.
+            extinction: initial extinction within the object's mesh [1/m]; None = a weak density in
+                the whole box.
 
         Raises:
-            InputError: what the class refuses.
+            InputError: as the class.
         """
         if item.cloud is not None:
             return cls(object, item.cloud.low, item.cloud.high, item.cloud.density.detach())
@@ -97,13 +95,13 @@ class DensityGrid(ObjectModule):
     def from_optical_depth(
         cls, object: str, low: ArrayLike, high: ArrayLike, counts: Sequence[int], depth: float = 0.5
     ) -> "DensityGrid":
-        """Make a grid of one density σ, from ∫σ ds through the box along its longest side.
+        """Build a grid of one density σ from ∫σ ds through the box along its longest side.
 
         Args:
             object: name of the object.
             low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
-            depth: ∫σ ds. Keep it small: an opaque cloud hides from the fit what lies behind.
+            depth: optical depth ∫σ ds. Keep it small: an opaque cloud hides the volume behind it.
         """
         lattice = Lattice.from_bounds(low, high, counts)
         whole = checked_number(depth, "optical depth", 0.0, open_low=True)
@@ -120,20 +118,20 @@ class DensityGrid(ObjectModule):
         return softplus(self.value) / self._density_unit
 
     def entries(self) -> dict[str, Entries]:
-        """The logarithm of the density: its changes are relative ones of the density."""
+        """Return the logarithm of the density, whose changes are relative."""
         value = self.value.detach()
         return {"log_density": Entries("value", slope=value.sigmoid() / softplus(value))}
 
     @property
     def cloud(self) -> Cloud:
-        """The present cloud, in the object's frame."""
+        """Return the present cloud in the object's frame."""
         return Cloud(self.lattice.low, self.lattice.high, self.density, self.albedo)
 
     def forward(self, scene: Scene) -> Scene:
-        """The scene with the object seen as the present cloud.
+        """Return the scene with the object as the present cloud.
 
         Raises:
-            InputError: the mesh, which is seen no more, has derivatives to carry.
+            InputError: the unused mesh carries derivatives.
         """
         if scene[self.object].mesh.vertices.requires_grad:
             raise InputError(
@@ -143,7 +141,7 @@ class DensityGrid(ObjectModule):
         return scene.replace(self.object, cloud=self.cloud)
 
     def mesh(self, level: float | None = None) -> Mesh:
-        """The closed surface of equal density, see ``cloud_surface``.
+        """Return the closed surface of equal density, see ``cloud_surface``.
 
         Raises:
             InputError: no density, or all of it, is above the level.
@@ -155,8 +153,8 @@ def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
     """Mesh the closed surface of equal density by marching cubes, without gradients.
 
     Args:
-        cloud: the densities.
-        level: the density on it [1/m]; None = half of the mean of the densest hundredth of the
+        cloud: cloud with its density.
+        level: density of the surface [1/m]; None = half of the mean of the densest hundredth of the
             nodes.
 
     Raises:
@@ -171,7 +169,7 @@ def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
             f"expected a level between the densities {float(density.min()):.3g} and "
             f"{float(density.max()):.3g} [1/m], got {level:.3g}; give another"
         )
-    # A layer without density around closes what reaches the faces of the box.
+    # A layer of zero density closes the surface at the faces of the box.
     padded = nn.functional.pad(density, (1, 1, 1, 1, 1, 1))
     corners, faces, _, _ = marching_cubes(
         padded.numpy(), level, gradient_direction="ascent", allow_degenerate=False
@@ -181,9 +179,9 @@ def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
 
 
 def replace_clouds(scene: Scene) -> Scene:
-    """Replace every cloud of a scene by its surface, for exact signals and pictures.
+    """Replace every cloud of a scene by its surface, for exact signals and figures.
 
-    A cloud of one density has no such surface: its object keeps the mesh that marked its place.
+    A cloud of uniform density has no such surface: its object keeps its mesh.
     """
     for name, item in scene.objects.items():
         if item.cloud is not None:

@@ -1,4 +1,4 @@
-"""Signed distances, on a grid and as a neural field: shapes whose topology is free."""
+"""Signed distances on a grid and as a neural field: shapes of free topology."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -29,14 +29,14 @@ from invertwin.scene.shape_models.lattice import Lattice, interpolate_cubic
 
 
 def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
-    """Distance of points to a surface [m], negative where it winds around them.
+    """Compute the signed distance of points to a surface [m], negative inside (winding number).
 
-    Overlapping parts of a closed mesh count as their union. Across a hole in a mesh the sign
-    changes where half of the directions meet the surface.
+    Overlapping parts of a closed mesh count as their union. At a hole in a mesh the sign changes
+    where half of the solid angle meets the surface.
 
     Args:
         mesh: the surface.
-        points: positions in the mesh's frame [m].
+        points: positions in the mesh's frame [p, 3] [m].
     """
     if not len(points):
         return torch.zeros(0, dtype=torch.float64)
@@ -48,7 +48,7 @@ def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tenso
 
 
 class _Distance(ObjectModule):
-    """A field whose zero is the object's surface.
+    """Base of distance fields whose zero is the object's surface.
 
     The material must not have values per triangle, nor the object velocities per vertex.
     """
@@ -58,11 +58,11 @@ class _Distance(ObjectModule):
         self.lattice = Lattice.from_bounds(low, high, counts)
 
     def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
-        """The field at points in the object's frame [m]: negative inside."""
+        """Return the field at points in the object's frame [m]: negative inside."""
         raise NotImplementedError
 
     def update_mesh(self, mesh: Mesh) -> Mesh:
-        """The present surface, meshed anew, whatever was there before.
+        """Return the present surface, remeshed.
 
         Raises:
             InputError: no surface in the box.
@@ -71,17 +71,17 @@ class _Distance(ObjectModule):
 
 
 class DistanceGrid(_Distance):
-    """An object's surface as the zero of values at the nodes of a grid.
+    """Surface as the zero of signed distances at the nodes of a grid.
 
-    Between nodes the field is that of cubic convolution (Catmull–Rom): it has the nodes' values
-    and a continuous gradient. With smoothing λ the distances are ``(I + λL)⁻¹ value``, L the graph
-    Laplacian of the grid: rough parts of a gradient are held back, as by ``SmoothVertices``.
+    Between nodes the field is that of cubic convolution (Catmull–Rom): it has the nodes' values and
+    a continuous gradient. With smoothing λ the distances are ``(I + λL)⁻¹ value``, L the graph
+    Laplacian of the grid: rough components of a gradient are attenuated, as by ``SmoothVertices``.
 
     Args:
         object: name of the object.
         low, high: opposite corners of the grid in the object's frame [m].
         value: signed distances at the nodes [m], at least two along each axis.
-        smoothing: λ; detail of steps below about √λ spacings is held back.
+        smoothing: λ; detail below about √λ spacings is attenuated.
 
     Attributes:
         value: parameter [x, y, z], metres; without smoothing the distances, negative inside.
@@ -115,7 +115,7 @@ class DistanceGrid(_Distance):
         distance: Callable[[Tensor], Tensor],
         smoothing: float = 0.0,
     ) -> "DistanceGrid":
-        """A grid that holds a signed distance at its nodes.
+        """Build a grid from a function of signed distance.
 
         Args:
             object: name of the object.
@@ -139,35 +139,35 @@ class DistanceGrid(_Distance):
         mesh: Mesh,
         smooth: NonNegative = 0.0,
     ) -> "DistanceGrid":
-        """A signed distance on a grid, whose zero is the surface; starts as a mesh.
+        """Build a grid from the signed distance of a mesh.
 
         Args:
             object: name of the object.
             low, high: opposite corners of the box in the object's frame [m].
             counts: nodes along x, y and z.
-            mesh: in the object's frame.
+            mesh: initial mesh in the object's frame.
             smooth: λ of steps preconditioned by (I + λL)⁻²; 0 = no preconditioning.
 
         Raises:
-            InputError: what the class refuses.
+            InputError: as the class.
         """
         return cls.from_function(object, low, high, counts, partial(signed_distance, mesh), smooth)
 
     @property
     def distances(self) -> Float64[Tensor, "x y z"]:
-        """Signed distances at the nodes [m]."""
+        """Return signed distances at the nodes [m]."""
         return self._smoother.power(-1, self.value)
 
     def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
-        """The field at points in the object's frame [m]: negative inside."""
+        """Return the field at points in the object's frame [m]: negative inside."""
         return interpolate_cubic(self.distances, self.lattice, points)
 
 
 class GridSmoother:
-    """I + λL of a grid, L its graph Laplacian, by cosine transforms, which diagonalise it.
+    """Matrix I + λL of a grid, L its graph Laplacian, diagonalised by cosine transforms.
 
     Args:
-        shape: nodes along each axis.
+        shape: number of nodes along each axis.
         amount: λ.
     """
 
@@ -176,16 +176,16 @@ class GridSmoother:
         modes = [torch.arange(count, dtype=torch.float64) for count in shape]
         waves = [torch.cos(torch.pi * k * (k[:, None] + 0.5) / len(k)) for k in modes]
         self._waves = [wave / wave.norm(dim=0) for wave in waves]
-        # L adds up the second differences along the axes, and so do its eigenvalues.
+        # L is the sum of second differences along the axes, and so are its eigenvalues.
         x, y, z = (2 - 2 * torch.cos(torch.pi * k / len(k)) for k in modes)
         self._factors = 1 + amount * (x[:, None, None] + y[:, None] + z)
 
     def power(self, exponent: int, values: Tensor) -> Tensor:
-        """(I + λL)ⁿ times values at the nodes.
+        """Return (I + λL)ⁿ times values at the nodes.
 
         Args:
-            exponent: n.
-            values: [x, y, z].
+            exponent: exponent n.
+            values: values [x, y, z].
         """
         if self.amount == 0:
             return values
@@ -195,21 +195,21 @@ class GridSmoother:
 
 
 class NeuralDistance(_Distance):
-    """An object's surface as the zero of a small network of sines, a ball at the start.
+    """Surface as the zero of a small sine network, initially a sphere.
 
-    ``f(x) = |x − c| − r + h · net((x − c)/h)``, c and h the middle and the half diagonal of the
-    box; the network's last layer starts at zero.
+    ``f(x) = |x − c| − r + h · net((x − c)/h)``, c and h the centre and the half diagonal of the
+    box; the last layer is initially zero.
 
     Args:
         object: name of the object.
         low, high: opposite corners of the box in the object's frame [m].
         counts: nodes along x, y and z at which the field is meshed.
-        radius: radius of the ball [m].
-        width: sines of a layer.
-        depth: layers of sines.
-        frequency: of the first layer's sines, in radians over the box's half diagonal: higher
-            for finer detail.
-        seed: seed of the network's first weights.
+        radius: initial radius of the sphere [m].
+        width: number of sines per layer.
+        depth: number of layers of sines.
+        frequency: frequency of the first layer, in radians over the box's half diagonal: higher for
+            finer detail.
+        seed: seed of the initial weights.
 
     Attributes:
         layers: linear layers of the network, sin(frequency · layer) after the first, sin(layer)
@@ -250,7 +250,7 @@ class NeuralDistance(_Distance):
             self.layers.append(layer)
 
     def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
-        """The field at points in the object's frame [m]: negative inside."""
+        """Return the field at points in the object's frame [m]: negative inside."""
         center = (self.lattice.low + self.lattice.high) / 2
         half = float((self.lattice.high - self.lattice.low).norm()) / 2
         away = points - center

@@ -16,12 +16,12 @@ Field = Callable[[Float64[Tensor, "p 3"]], Float64[Tensor, " p"]]
 _NEWTON_STEPS = (
     4  # Newton steps from marching cubes, whose error is of second order, to the field's zero
 )
-_CHUNK = 65_536  # points of the field at a time
-_MIN_GRADIENT = 1e-6  # least slope of a distance, whose own is 1
+_CHUNK = 65_536  # points of the field per chunk
+_MIN_GRADIENT = 1e-6  # minimum gradient of a distance field, nominally 1
 
 
 def iso_surface(field: Field, lattice: Lattice) -> Mesh:
-    """Mesh the surface where a field is zero; the vertices follow the field.
+    """Mesh the zero surface of a field; the vertices follow the field.
 
     Values and topology are those of marching cubes, moved onto the field's zero; the derivative of
     a vertex V with unit normal n = ∇f/|∇f| is ``dV = −n df/|∇f|``, in reverse and in forward mode.
@@ -31,9 +31,9 @@ def iso_surface(field: Field, lattice: Lattice) -> Mesh:
     Source: f(V(θ), θ) = 0, differentiated along the normal; derivations §8.
 
     Args:
-        field: negative inside, positive outside; its parameters may carry gradients, and points
-            are given in the object's frame [m].
-        lattice: nodes on which the field is looked at; thinner parts are missed.
+        field: field, negative inside, positive outside; its parameters may carry gradients. Points
+            are in the object's frame [m].
+        lattice: nodes at which the field is sampled; thinner parts are missed.
 
     Raises:
         InputError: a field that is not finite, or has one sign at all nodes.
@@ -47,11 +47,11 @@ def iso_surface(field: Field, lattice: Lattice) -> Mesh:
 def extract_surface(
     field: Field, lattice: Lattice, values: Float64[Tensor, "x y z"]
 ) -> tuple[Float64[Tensor, "p 3"], Int64[Tensor, "t 3"], Float64[Tensor, "p 3"]]:
-    """Places of vertices, triangles, and the field's slope there, all without derivatives.
+    """Return vertex positions, triangles, and the field's gradient there, all without derivatives.
 
     Args:
-        field: the signed distance at points in the box.
-        lattice: nodes on which the field is known.
+        field: signed distance at points in the box.
+        lattice: nodes of the values.
         values: the field at the nodes.
     """
     if not bool(torch.isfinite(values).all()):
@@ -74,10 +74,10 @@ def extract_surface(
 def attach_shape_derivative(
     field: Field, points: Float64[Tensor, "p 3"], slope: Float64[Tensor, "p 3"]
 ) -> Float64[Tensor, "p 3"]:
-    """Points of the surface as they are, with the derivative dV = −n df/|∇f|.
+    """Attach the derivative dV = −n df/|∇f| to points of the surface.
 
     Args:
-        field: whose zero the points are on.
+        field: field whose zero contains the points.
         points: points of the surface [m].
         slope: the field's gradient there.
     """
@@ -99,7 +99,7 @@ def _refine_vertices(field: Field, points: Tensor, lattice: Lattice) -> Tensor:
 
 
 def _value_and_gradient(field: Field, points: Tensor) -> tuple[Tensor, Tensor]:
-    """The field and its gradient in space, both without derivatives."""
+    """Return the field and its spatial gradient, both without derivatives."""
     values, slopes = [], []
     for part in points.split(_CHUNK):
         place = part.detach().requires_grad_()

@@ -1,4 +1,4 @@
-"""Uniform nodes in an axis-aligned box, and values between them."""
+"""Uniform nodes in an axis-aligned box, and interpolation between them."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ _DO = "give x, y, z of the box's corners"
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Nodes of a box, corners included, as `interpolate_position` makes them.
+    """Nodes of a box, corners included, see `from_bounds`.
 
     Attributes:
         low, high: corners of the box in the object's frame [m].
-        counts: nodes along x, y and z.
+        counts: number of nodes along x, y and z.
     """
 
     low: Float64[Tensor, "3"]
@@ -32,12 +32,12 @@ class Lattice:
     def from_bounds(
         cls, low: ArrayLike, high: ArrayLike, counts: Sequence[int], *, sliced: bool = False
     ) -> "Lattice":
-        """The lattice between two corners, given as any numbers.
+        """Build the lattice between two corners.
 
         Args:
             low, high: opposite corners of the box [m].
-            counts: nodes along x, y and z.
-            sliced: whether nodes are visited in slices, so that any number of them has room.
+            counts: number of nodes along x, y and z.
+            sliced: whether nodes are processed in slices, without a limit of their number.
 
         Raises:
             InputError: a box without volume, fewer than two nodes along an axis, wrong shapes, or
@@ -70,19 +70,19 @@ class Lattice:
 
     @property
     def nodes(self) -> Float64[Tensor, "x y z 3"]:
-        """Places of all nodes [m]."""
+        """Positions of all nodes [m]."""
         return torch.stack(torch.meshgrid(*self.axes, indexing="ij"), dim=-1)
 
     @property
     def axes(self) -> list[Tensor]:
-        """Places of the nodes [m] along x, y and z."""
+        """Positions of the nodes [m] along x, y and z."""
         return [
             torch.linspace(float(a), float(b), n, dtype=torch.float64)
             for a, b, n in zip(self.low, self.high, self.counts, strict=True)
         ]
 
     def cell(self, points: Float64[Tensor, "p 3"]) -> tuple[Tensor, Tensor]:
-        """Cell of each point [p, 3], outside the nearest one, and the place in it in cells."""
+        """Return the cell of each point [p, 3], clamped, and the position within it in cells."""
         place = (points - self.low) / self.spacing
         last = torch.tensor(self.counts) - 2
         index = place.detach().floor().long().clamp_min(0).minimum(last)
@@ -94,10 +94,10 @@ def tensor_product(
     index: Int64[Tensor, "p 3"],
     weights: Float64[Tensor, "p 3 4"],
 ) -> Float64[Tensor, "p *rest"]:
-    """Σ weights of the 4 × 4 × 4 nodes that begin at `index`, times their values.
+    """Sum the 4 × 4 × 4 nodes from `index` with separable weights.
 
     Args:
-        values: at the nodes.
+        values: values at the nodes.
         index: first node of each point along every axis.
         weights: weights of four nodes along every axis.
     """
@@ -113,9 +113,9 @@ def interpolate_cubic(
     """Interpolate at points by cubic convolution (Catmull–Rom), also outside the lattice.
 
     Args:
-        values: at the nodes.
-        lattice: the nodes.
-        points: [m].
+        values: values at the nodes.
+        lattice: lattice of the nodes.
+        points: positions [p, 3] [m].
     """
     index, t = lattice.cell(points)
     return tensor_product(_extrapolate_boundary(values), index, _cubic_convolution(t))
@@ -124,14 +124,14 @@ def interpolate_cubic(
 def interpolate_cubic_slices(
     values: Float64[Tensor, "x y z"], lattice: Lattice, target: Lattice
 ) -> Iterator[Float64[Tensor, "y z"]]:
-    """Values at the nodes of another lattice by cubic convolution, one plane of x after another.
+    """Interpolate at the nodes of another lattice by cubic convolution, one plane of x at a time.
 
-    No more than a plane is held; weights along the axes are applied one axis after the other.
+    Only one plane is in memory; weights are applied axis by axis.
 
     Args:
-        values: at the nodes.
-        lattice: the nodes.
-        target: nodes of the result.
+        values: values at the nodes.
+        lattice: lattice of the nodes.
+        target: lattice of the result.
     """
     extended = _extrapolate_boundary(values)
     x, y, z = (
@@ -142,7 +142,7 @@ def interpolate_cubic_slices(
 
 
 def _interpolation_matrix(lattice: Lattice, axis: int, positions: Tensor) -> Tensor:
-    """Weights [place, node] of a cubic convolution along one axis, of the extended nodes."""
+    """Return weights [position, extended node] of a cubic convolution along one axis."""
     count = lattice.counts[axis]
     place = (positions - lattice.low[axis]) / lattice.spacing[axis]
     index = place.floor().long().clamp(0, count - 2)
@@ -151,7 +151,7 @@ def _interpolation_matrix(lattice: Lattice, axis: int, positions: Tensor) -> Ten
 
 
 def _extrapolate_boundary(values: Tensor) -> Tensor:
-    """One more node on every side, by a straight line through the last two."""
+    """Extend by one node on every side, linearly from the last two."""
     for axis in range(3):
         first, second = values.narrow(axis, 0, 2).split(1, axis)
         before, last = values.narrow(axis, -2, 2).split(1, axis)
@@ -160,7 +160,7 @@ def _extrapolate_boundary(values: Tensor) -> Tensor:
 
 
 def _cubic_convolution(t: Tensor) -> Tensor:
-    """Weights of the four nodes around places t in [0, 1] of a cell: 0, 1, 0, 0 at t = 0."""
+    """Return weights of four nodes around positions t in [0, 1]; 0, 1, 0, 0 at t = 0."""
     r = 1 - t
     inner = 2 - 5 * t**2 + 3 * t**3, 2 - 5 * r**2 + 3 * r**3
     return 0.5 * torch.stack([-t * r**2, *inner, -r * t**2], dim=-1)

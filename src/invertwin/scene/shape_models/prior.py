@@ -1,4 +1,4 @@
-"""A learned prior of shapes: a few numbers decode to a signed distance, which is meshed."""
+"""Learned shape prior: a short latent decodes to a signed distance, which is meshed."""
 
 from collections.abc import Iterator, Sequence
 from functools import cache
@@ -24,14 +24,14 @@ from invertwin.storage.untrusted import read_arrays, safe_reader
 
 _MODEL = "vehicle_prior.npz"
 _FORMAT = "invertwin shape prior 1"
-_SPACING = 0.1  # of the nodes at which shapes are meshed unless asked otherwise [m]
+_SPACING = 0.1  # default node spacing of meshed shapes [m]
 
 
 class Decoder(nn.Module):
-    """Latent → signed distance [m] at the nodes of half a grid, y ≥ 0; the other half mirrors it.
+    """Decoder of latents to signed distances [m] at the nodes of half a grid, y ≥ 0, mirrored.
 
-    ``d = mean + basis · (straight · z + leave · tanh(enter · z))``: a network of the latent weighs
-    learned fields, so that decoding costs one product with a matrix.
+    ``d = mean + basis · (straight · z + leave · tanh(enter · z))``: a network of the latent weights
+    learned fields, so that decoding costs one matrix product.
 
     Args:
         latent: number of coordinates.
@@ -48,21 +48,21 @@ class Decoder(nn.Module):
         self.basis = nn.Linear(features, nodes)
 
     def forward(self, latent: Float[Tensor, "*any latent"]) -> Float[Tensor, "*any nodes"]:
-        """Distances at the nodes, x slowest."""
+        """Return distances at the nodes, x slowest."""
         bent = self.leave(torch.tanh(self.enter(latent)))
         return self.basis(self.straight(latent) + bent)
 
 
 class ShapePrior:
-    """A family of shapes with mirror symmetry in y, decoded from latents of unit variance.
+    """Family of shapes with mirror symmetry in y, decoded from latents of unit variance.
 
-    Latents of the shapes it was trained on have zero mean and unit variance along each coordinate,
-    so ½ |z|² is the negative logarithm of their probability density, and z = 0 is the mean shape.
-    Coordinates come in order of how much they change.
+    Latents of the training shapes have zero mean and unit variance along each coordinate, so ½ |z|²
+    is their negative log prior probability, and z = 0 is the mean shape. Coordinates are ordered by
+    explained variation.
 
     Args:
-        decoder: the network.
-        lattice: its nodes, both halves.
+        decoder: decoder network.
+        lattice: nodes of both halves.
 
     Attributes:
         decoder: the network, float64, without gradients.
@@ -71,7 +71,7 @@ class ShapePrior:
         low, high: corners of the box that holds all shapes [m].
 
     Raises:
-        InputError: a network for another number of nodes, or nodes that do not mirror in y.
+        InputError: a network for another number of nodes, or nodes not symmetric in y.
     """
 
     limit = 6.0
@@ -92,11 +92,11 @@ class ShapePrior:
         self._last: tuple[tuple[int, ...], Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
 
     def nodes(self, counts: Sequence[int] | None = None, *, sliced: bool = False) -> Lattice:
-        """Nodes in the box, so many along x, y and z; None makes them about 0.1 m apart.
+        """Return nodes in the box; by default about 0.1 m apart.
 
         Args:
-            counts: Of nodes.
-            sliced: See `Lattice.between`.
+            counts: number of nodes along x, y and z.
+            sliced: see `Lattice.from_bounds`.
 
         Raises:
             InputError: fewer than two nodes along an axis.
@@ -106,7 +106,7 @@ class ShapePrior:
         return Lattice.from_bounds(self.low, self.high, counts, sliced=sliced)
 
     def values(self, latent: Float64[Tensor, " k"]) -> Float64[Tensor, "x y z"]:
-        """Signed distances at the decoder's nodes [m], negative inside.
+        """Return signed distances at the decoder's nodes [m], negative inside.
 
         Raises:
             InputError: a latent of another size, not finite, or out of range.
@@ -118,27 +118,27 @@ class ShapePrior:
     def distance(
         self, points: Float64[Tensor, "p 3"], latent: Float64[Tensor, " k"]
     ) -> Float64[Tensor, " p"]:
-        """The field at points in the shape's frame [m], negative inside.
+        """Return the field at points in the shape's frame [m], negative inside.
 
         Args:
-            points: [m].
-            latent: coordinates in standard deviations.
+            points: positions [p, 3] [m].
+            latent: latent coordinates in standard deviations.
         """
         return interpolate_cubic(self.values(latent), self.lattice, points)
 
     def slices(
         self, latent: Float64[Tensor, " k"], counts: Sequence[int]
     ) -> Iterator[Float64[Tensor, "y z"]]:
-        """The field at the nodes of a lattice in the box, plane after plane along x [m].
+        """Yield the field at the nodes of a lattice in the box, plane by plane along x [m].
 
-        Only one plane is held at a time.
+        Only one plane is in memory.
 
         Args:
-            latent: coordinates in standard deviations.
-            counts: nodes along x, y and z.
+            latent: latent coordinates in standard deviations.
+            counts: number of nodes along x, y and z.
 
         Raises:
-            InputError: what `values` refuses, or fewer than two nodes along an axis.
+            InputError: as `values`, or fewer than two nodes along an axis.
         """
         return interpolate_cubic_slices(
             self.values(latent), self.lattice, self.nodes(counts, sliced=True)
@@ -147,20 +147,20 @@ class ShapePrior:
     def decode(
         self, latent: Float64[Tensor, " k"], counts: Sequence[int]
     ) -> Float64[Tensor, "x y z"]:
-        """The whole field at the nodes of a lattice in the box [m].
+        """Return the whole field at the nodes of a lattice in the box [m].
 
         Args:
-            latent: coordinates in standard deviations.
-            counts: nodes along x, y and z.
+            latent: latent coordinates in standard deviations.
+            counts: number of nodes along x, y and z.
         """
         return torch.stack(list(self.slices(latent, counts)))
 
     def mesh(self, latent: Float64[Tensor, " k"], counts: Sequence[int] | None = None) -> Mesh:
-        """The surface of a latent, whose vertices follow it (see :func:`iso_surface`).
+        """Return the surface of a latent, whose vertices follow it (see :func:`iso_surface`).
 
         Args:
-            latent: coordinates in standard deviations.
-            counts: nodes along x, y and z at which the field is meshed, see `nodes`.
+            latent: latent coordinates in standard deviations.
+            counts: number of nodes along x, y and z, see `nodes`.
         """
         values = self.values(latent)
         points, faces, slope = self._surface(values.detach(), self.nodes(counts))
@@ -172,11 +172,11 @@ class ShapePrior:
         )
 
     def mean_mesh(self, counts: Sequence[int] | None = None) -> Mesh:
-        """The surface of z = 0."""
+        """Return the surface of z = 0."""
         return self.mesh(torch.zeros(self.latent_size, dtype=torch.float64), counts)
 
     def save(self, file: str | Path) -> None:
-        """Write the prior as a ``.npz`` of numbers, the network in half precision."""
+        """Write the prior as ``.npz``, with the network in half precision."""
         weights = {
             name: w.numpy().astype(np.float16) for name, w in self.decoder.state_dict().items()
         }
@@ -186,7 +186,7 @@ class ShapePrior:
         )
 
     def _surface(self, values: Tensor, target: Lattice) -> tuple[Tensor, Tensor, Tensor]:
-        """Vertices, triangles and the field's slope there; kept for derivatives that follow."""
+        """Return vertices, triangles and the field's gradient, cached for derivatives."""
         last = self._last
         if last is None or last[0] != target.counts or not torch.equal(last[1], values):
 
@@ -198,7 +198,7 @@ class ShapePrior:
         return last[2]
 
     def _check_latent(self, latent: Tensor) -> Tensor:
-        """The latent, if it is one that decodes."""
+        """Validate a latent."""
         do = f"give {self.latent_size} numbers in standard deviations"
         given = checked_tensor(latent, (self.latent_size,), "latent", do)
         most = float(given.detach().abs().max())
@@ -211,15 +211,15 @@ class ShapePrior:
 
 
 class PriorShape(ObjectModule):
-    """Replaces an object's mesh by one that a prior decodes, meshed anew at every step.
+    """Replace an object's mesh by a shape decoded from a prior, remeshed at every step.
 
     The material must not have values per triangle, nor the object velocities per vertex.
 
     Args:
         object: name of the object; its pose is kept.
-        prior: the prior; None is the packaged one of vehicles.
-        initial: coordinates in standard deviations; None is the mean shape.
-        counts: nodes along x, y and z at which the field is meshed; None = the prior's.
+        prior: shape prior; None = the packaged one of vehicles.
+        initial: initial coordinates in standard deviations; None = mean shape.
+        counts: number of nodes along x, y and z of the meshing; None = the prior's.
 
     Attributes:
         latent: parameter [k], in standard deviations.
@@ -246,25 +246,25 @@ class PriorShape(ObjectModule):
         self.latent = nn.Parameter(start.detach().clone())
 
     def distance(self, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
-        """The present field at points in the object's frame [m]: negative inside."""
+        """Return the present field at points in the object's frame [m]: negative inside."""
         return self.prior.distance(points, self.latent)
 
     def update_mesh(self, mesh: Mesh) -> Mesh:
-        """The decoded mesh, whatever was there before.
+        """Return the decoded mesh.
 
         Raises:
-            InputError: a latent that has run out of range.
+            InputError: a latent out of range.
         """
         return self.prior.mesh(self.latent, self.lattice.counts)
 
 
 def load_prior(file: str | Path | None = None) -> ShapePrior:
-    """Load a prior that `ShapePrior.save` or ``invertwin train-prior`` wrote.
+    """Load a prior of `ShapePrior.save` or ``invertwin train-prior``.
 
     Args:
-        file: the file; None is the prior of vehicles that comes with the package. It decodes
-            bodies without wheels: x ahead, y to the left, z up, the origin on the ground below the
-            middle of the wheelbase, metres.
+        file: path; None = the packaged prior of vehicles. It decodes bodies without wheels: x
+            ahead, y to the left, z up, the origin on the ground below the middle of the wheelbase,
+            metres.
 
     Raises:
         InputError: no such file, or not a prior.

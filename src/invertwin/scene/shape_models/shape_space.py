@@ -1,4 +1,4 @@
-"""Linear shape spaces: a mean, and the directions in which shapes of a kind differ."""
+"""Linear shape spaces: a mean shape and principal components."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from invertwin.scene.parameters import ObjectModule
 
 @dataclass(frozen=True, eq=False)
 class ShapeSpace:
-    """Meshes ``mean + Σ z_k σ_k component_k`` of the same triangles.
+    """Linear family of meshes ``mean + Σ z_k σ_k component_k`` with equal triangles.
 
     Attributes:
         mean: vertices of the mean shape [m].
@@ -48,7 +48,7 @@ class ShapeSpace:
             object.__setattr__(self, name, value)
 
     def mesh(self, latent: Float64[Tensor, " n"]) -> Mesh:
-        """The shape of the first n coordinates z, in standard deviations.
+        """Return the shape of the first n coordinates z, in standard deviations.
 
         Raises:
             InputError: more coordinates than the space has.
@@ -63,18 +63,18 @@ class ShapeSpace:
         return Mesh(self.mean + offsets, self.faces)
 
     def latent(self, vertices: Float64[Tensor, "v 3"]) -> Float64[Tensor, " k"]:
-        """The coordinates z of the shape that is closest to vertices in the space's order."""
+        """Return the coordinates z of the shape closest to vertices in the space's order."""
         basis = (self.components * self.deviations).flatten(0, 1)
         return torch.linalg.lstsq(basis, (vertices - self.mean).reshape(-1, 1)).solution[:, 0]
 
 
 class LinearShape(ObjectModule):
-    """Replaces an object's mesh by one of a linear shape space.
+    """Replace an object's mesh by one of a linear shape space.
 
     Args:
         object: name of the object; its pose is kept.
         space: the shape space.
-        initial: coordinates in standard deviations, or how many, from the mean shape.
+        initial: initial coordinates in standard deviations, or their number, from the mean shape.
 
     Attributes:
         latent: parameter [k], in standard deviations.
@@ -97,5 +97,5 @@ class LinearShape(ObjectModule):
         self.latent = nn.Parameter(start.detach().clone())
 
     def update_mesh(self, mesh: Mesh) -> Mesh:
-        """The space's mesh, whatever was there before."""
+        """Return the present mesh of the space."""
         return self.space.mesh(self.latent)

@@ -1,4 +1,4 @@
-"""Free vertices whose gradients are smoothed: large steps without crumpling."""
+"""Free vertices with smoothed gradients, for large steps without self-intersections."""
 
 from typing import Any
 
@@ -16,19 +16,19 @@ from invertwin.scene.parameters import ObjectModule
 
 
 class SmoothVertices(ObjectModule):
-    """Moves every vertex by ``(I + λL)⁻¹ u``, L the graph Laplacian of the mesh.
+    """Displace every vertex by ``(I + λL)⁻¹ u``, L the graph Laplacian of the mesh.
 
     A step of gradient descent on u is a step ``−η (I + λL)⁻² ∂loss/∂x`` of the vertices: rough
-    parts of the gradient are held back, and every shape can still be reached.
+    components of the gradient are attenuated, and every shape remains reachable.
 
     Source: Nicolet, Jacobson and Jakob 2021, "Large Steps in Inverse Rendering of Geometry".
     Differs from the source: u belongs to the displacement, not to the positions, so that zero is
-    the first shape; any optimiser may step u.
+    the initial shape; any optimiser may step u.
 
     Args:
         object: name of the object.
-        mesh: its mesh, whose edges say which vertices are neighbours.
-        smoothing: λ; detail below about √λ edge lengths is held back.
+        mesh: initial mesh, whose edges define neighbours.
+        smoothing: λ; detail below about √λ edge lengths is attenuated.
 
     Attributes:
         latent: parameter u [v, 3] in the object's frame, metres.
@@ -49,11 +49,11 @@ class SmoothVertices(ObjectModule):
 
     @property
     def offsets(self) -> Float64[Tensor, "v 3"]:
-        """Displacements of the vertices in the object's frame [m]."""
+        """Return displacements of the vertices in the object's frame [m]."""
         return _Smoothed.apply(self.latent, self._smoother)  # type: ignore[return-value]
 
     def update_mesh(self, mesh: Mesh) -> Mesh:
-        """The mesh with its vertices moved.
+        """Return the mesh with its vertices displaced.
 
         Raises:
             InputError: other triangles than those of the mesh this was created with.
@@ -68,7 +68,7 @@ class SmoothVertices(ObjectModule):
 
 
 class Smoother:
-    """The factorised matrix I + λL, symmetric and positive definite; copies factorise anew.
+    """Factorised matrix I + λL, symmetric and positive definite; copies refactorise.
 
     Args:
         faces: triangles [f, 3].
@@ -86,12 +86,12 @@ class Smoother:
         return type(self), self._given
 
     def solve(self, values: Tensor) -> Tensor:
-        """(I + λL)⁻¹ times columns, without derivatives."""
+        """Return (I + λL)⁻¹ times columns, without derivatives."""
         return torch.from_numpy(self._factors.solve(np.asfortranarray(values.detach().numpy())))
 
 
 def laplacian(faces: Tensor, count: int) -> csc_array:
-    """The graph Laplacian: degrees on the diagonal, −1 for every edge.
+    """Return the graph Laplacian: degrees on the diagonal, −1 for every edge.
 
     Args:
         faces: triangles [f, 3].
@@ -103,7 +103,7 @@ def laplacian(faces: Tensor, count: int) -> csc_array:
 
 
 class _Smoothed(torch.autograd.Function):
-    """(I + λL)⁻¹ u, with derivatives of any order in both modes.
+    """Product (I + λL)⁻¹ u, with derivatives of any order in both modes.
 
     The matrix is symmetric, so its adjoint is itself.
     """
