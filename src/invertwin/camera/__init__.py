@@ -1,4 +1,4 @@
-"""Pinhole cameras: silhouettes and depth, with the derivatives of their outlines."""
+"""Pinhole cameras: silhouettes and depth, with derivatives of their outlines."""
 
 from invertwin.camera.camera import Camera as Camera
 from invertwin.camera.camera import CameraPose as CameraPose

@@ -1,4 +1,4 @@
-"""Pinhole cameras: where they stand, and which pixel sees which direction."""
+"""Pinhole cameras: poses and projection."""
 
 import math
 from collections.abc import Sequence
@@ -24,19 +24,19 @@ _MAX_PIXELS = 1 << 26
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera without distortion, at one pose a frame.
+    """Pinhole camera without distortion, with one pose per frame.
 
-    Camera axes are those of OpenCV: x to the right of the image, y down, z forward. The pixel
-    [row, column] covers u from column to column + 1 and v from row to row + 1; a point (x, y, z)
-    in camera axes is seen at u = c_u + f x/z, v = c_v + f y/z. Rectify images of lenses that
-    distort.
+    Camera axes are those of OpenCV: x to the right of the image, y down, z forward. The pixel [row,
+    column] covers u from column to column + 1 and v from row to row + 1; a point (x, y, z) in
+    camera axes projects to u = c_u + f x/z, v = c_v + f y/z. Rectify distorted images.
 
     Attributes:
-        positions: Of the pinhole, [frame, 3] or [3] in the world [m]. Differentiable.
-        rotations: Columns are the camera's axes in the world, [frame, 3, 3] or [3, 3].
-        width, height: [pixel].
-        focal: f [pixel]. Differentiable.
-        centre: c_u, c_v [pixel]; None = the middle of the image. Differentiable.
+        positions: positions of the pinhole, [frame, 3] or [3] in the world [m]. Differentiable.
+        rotations: matrices whose columns are the camera's axes in the world, [frame, 3, 3] or [3,
+            3].
+        width, height: image size [pixel].
+        focal: focal length f [pixel]. Differentiable.
+        centre: principal point c_u, c_v [pixel]; None = the middle of the image. Differentiable.
 
     Raises:
         InputError: Wrong shapes or numbers, or rotations that are not orthonormal.
@@ -87,14 +87,14 @@ class Camera:
         field_of_view: float,
         up: ArrayLike = (0.0, 0.0, 1.0),
     ) -> "Camera":
-        """Cameras that look at a point, upright.
+        """Return upright cameras that look at a point.
 
         Args:
-            positions: [frame, 3] or [3] [m].
-            target: In the middle of the images [m].
-            width, height: [pixel].
-            field_of_view: Across the width [rad].
-            up: In the world; the image's upper side points there.
+            positions: positions [frame, 3] or [3] [m].
+            target: point in the middle of the images [3] [m].
+            width, height: image size [pixel].
+            field_of_view: horizontal field of view [rad].
+            up: upward direction in the world [3].
 
         Raises:
             InputError: Wrong numbers, or a camera that looks along ``up``.
@@ -114,10 +114,10 @@ class Camera:
         return Camera(places, rotations, width, height, width / (2 * math.tan(angle / 2)))
 
     def frames(self, indices: Sequence[int]) -> "Camera":
-        """Only some of the frames.
+        """Return the camera with selected frames.
 
         Args:
-            indices: Their numbers.
+            indices: indices of the frames.
         """
         rows = torch.as_tensor(indices)
         return replace(self, positions=self.positions[rows], rotations=self.rotations[rows])
@@ -125,11 +125,11 @@ class Camera:
     def transform_rigidly(
         self, rotation: Float64[Tensor, "3 3"], translation: Float64[Tensor, "3"]
     ) -> "Camera":
-        """All poses moved rigidly: turned about the mean position, then translated.
+        """Transform all poses rigidly: rotate about the mean position, then translate.
 
         Args:
-            rotation: World rotation matrix.
-            translation: World translation [m].
+            rotation: world rotation matrix [3, 3].
+            translation: world translation [3] [m].
         """
         middle = self.positions.mean(0)
         return replace(
@@ -139,7 +139,7 @@ class Camera:
         )
 
     def detach(self) -> "Camera":
-        """The same camera without derivatives."""
+        """Return the camera without derivatives."""
         values = {
             name: strip_derivatives(getattr(self, name))
             for name in ("positions", "rotations", "focal", "centre")
@@ -148,57 +148,57 @@ class Camera:
 
     @property
     def principal_point(self) -> Float64[Tensor, "2"]:
-        """c_u, c_v [pixel]."""
+        """Principal point c_u, c_v [pixel]."""
         return torch.as_tensor(self.centre)
 
     @property
     def is_differentiated(self) -> bool:
-        """Whether derivatives flow to any of its values."""
+        """Whether any of its values carries derivatives."""
         values = (self.positions, self.rotations, self.focal, self.centre)
         return any(is_differentiated(torch.as_tensor(value)) for value in values)
 
     def directions(self, pixels: Float64[Tensor, "n 2"], frame: int) -> Float64[Tensor, "n 3"]:
-        """What pixels see: ways in the world, one unit forward.
+        """Return viewing directions of pixels in world axes, one unit forward.
 
         Args:
-            pixels: u, v.
-            frame: Number of the pose.
+            pixels: image coordinates u, v [*, 2].
+            frame: index of the pose.
         """
         aside = (pixels - self.principal_point) / self.focal
         local = torch.cat([aside, torch.ones_like(aside[:, :1])], 1)
         return local @ self.rotations[frame].mT
 
     def to_camera_axes(self, points: Float64[Tensor, "n 3"], frame: int) -> Float64[Tensor, "n 3"]:
-        """World points in camera axes [m].
+        """Transform world points to camera axes [m].
 
         Args:
-            points: [m].
-            frame: Number of the pose.
+            points: positions [*, 3] [m].
+            frame: index of the pose.
         """
         return (points - self.positions[frame]) @ self.rotations[frame]
 
     def project(self, points: Float64[Tensor, "n 3"], frame: int) -> Float64[Tensor, "n 2"]:
-        """Where world points in front of the camera are seen: u, v [pixel].
+        """Project world points in front of the camera to u, v [pixel].
 
         Args:
-            points: [m].
-            frame: Number of the pose.
+            points: positions [*, 3] [m].
+            frame: index of the pose.
         """
         local = self.to_camera_axes(points, frame)
         return self.principal_point + self.focal * local[:, :2] / local[:, 2:]
 
 
 class CameraPose(RigidMotion):
-    """Turns and moves all poses of a camera together, as ``Camera.moved`` defines it."""
+    """Rigid transform of all poses of a camera, see ``Camera.transform_rigidly``."""
 
     def forward(self, camera: Camera) -> Camera:
-        """The moved camera."""
+        """Return the moved camera."""
         return camera.transform_rigidly(self.rotation_matrix, self.shift)
 
     def values(self) -> dict[str, Tensor]:
-        """Translation [m] and rotation vector [rad] by name, for progress and reports."""
+        """Return translation [m] and rotation vector [rad] by name, for progress and reports."""
         return self.named_values("camera")
 
     def coordinates(self) -> list[Coordinate]:
-        """Place and turn of the camera, as far as they are free."""
+        """Return the free coordinates of position and rotation."""
         return self.named_coordinates("camera")

@@ -1,9 +1,9 @@
-"""Images of a pinhole camera, with the derivatives that moving outlines have.
+"""Images of a pinhole camera, with derivatives of moving outlines.
 
-A pixel shows the mean over its area of what is seen there: whether a ray meets an object first, or
-how deep. Rays have fixed places in the image. Their derivative at fixed visibility is attached;
-where an outline sweeps over the image, ``ΔI = (f₋ − f₊) n·(x − x_m)`` is added, with x the
-projected point of the outline, n its normal in the image, and f what is seen at both of its sides.
+A pixel is the mean over its area of an indicator of the visible object, or of depth. Rays have
+fixed image positions. Their derivative at fixed visibility is attached; moving outlines add ``ΔI =
+(f₋ − f₊) n·(x − x_m)``, with x the projected point of the outline, n its normal in the image, and f
+the values on both of its sides.
 
 Source: derivations §3, on the image plane instead of a surface.
 """
@@ -24,9 +24,9 @@ from invertwin.errors import InputError
 from invertwin.limits import Count
 from invertwin.scene.scene import Scene
 
-_OUTLINE_OFFSET = 0.01  # pixel between an outline and the rays at its sides
-_MIN_OUTLINE_OFFSET = 2e-5  # rad: rays are float32
-_NEAR_PLANE = 1e-3  # m in front of the camera, where outlines begin
+_OUTLINE_OFFSET = 0.01  # distance of an outline and the rays on its sides [pixel]
+_MIN_OUTLINE_OFFSET = 2e-5  # minimum angle, since rays are float32 [rad]
+_NEAR_PLANE = 1e-3  # near clipping distance of outlines [m]
 _ROWS_AT_ONCE = 1 << 20
 _R2_STEPS = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
 """Steps of the sequence R2, which fills a square evenly: powers of the root of x³ = x + 1."""
@@ -37,12 +37,12 @@ RayValue = Callable[[ViewpointScene, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class ImageSampling:
-    """How images and their derivatives are sampled.
+    """Sampling of images and their derivatives.
 
     Attributes:
-        samples: Rays of a pixel.
-        outline_samples: Points of outlines for each pixel of their length.
-        boundary: False leaves out of derivatives that outlines move.
+        samples: number of rays per pixel.
+        outline_samples: number of outline points per pixel of their length.
+        boundary: whether derivatives include moving outlines.
     """
 
     samples: Count = 16
@@ -53,14 +53,14 @@ class ImageSampling:
 def silhouettes(
     scene: Scene, camera: Camera, objects: Sequence[str], sampling: ImageSampling, seed: int
 ) -> Float64[Tensor, "frame row column"]:
-    """Of every pixel the share in which one of some objects is seen first.
+    """Render the fraction of every pixel in which one of the objects is visible.
 
     Args:
-        scene: What is seen.
-        camera: Where it stands.
-        objects: Their names.
-        sampling: Of pixels and outlines.
-        seed: Of the rays' places in their pixels.
+        scene: scene to render.
+        camera: the camera.
+        objects: names of the objects.
+        sampling: sampling of pixels and outlines.
+        seed: seed of the ray positions in their pixels.
 
     Raises:
         InputError: A name that is not in the scene, or a cloud.
@@ -83,14 +83,14 @@ def silhouettes(
 def depths(
     scene: Scene, camera: Camera, far: float, sampling: ImageSampling, seed: int
 ) -> Float64[Tensor, "frame row column"]:
-    """The mean depth over every pixel: z in camera axes [m].
+    """Render the mean depth over every pixel: z in camera axes [m].
 
     Args:
-        scene: What is seen.
-        camera: Where it stands.
-        far: Depth where nothing is seen, or what is further away [m].
-        sampling: Of pixels and outlines.
-        seed: Of the rays' places in their pixels.
+        scene: scene to render.
+        camera: the camera.
+        far: depth of the background and of more distant points [m].
+        sampling: sampling of pixels and outlines.
+        seed: seed of the ray positions in their pixels.
 
     Raises:
         InputError: A cloud in the scene.
@@ -99,7 +99,7 @@ def depths(
     def evaluate_depth(sight: ViewpointScene, face: Tensor, depth: Tensor) -> Tensor:
         return depth.clamp_max(far)
 
-    # Where objects cross, depth has no jump.
+    # Depth is continuous at intersection curves.
     return _render_images(scene, camera, evaluate_depth, sampling, seed, crossings=False)
 
 
@@ -121,7 +121,7 @@ def _render_images(
 
 
 class _ImageRenderer:
-    """One image."""
+    """Renderer of one image."""
 
     def __init__(
         self,
@@ -143,7 +143,7 @@ class _ImageRenderer:
         self.fixed = camera.detach()
 
     def render(self, crossings: bool) -> Float64[Tensor, "row column"]:
-        """The mean over each pixel, with the derivative of outlines."""
+        """Return the mean over each pixel, with the derivative of outlines."""
         camera, count = self.camera, self.sampling.samples
         pixels = camera.width * camera.height
         total = torch.zeros(pixels, dtype=torch.float64)
@@ -151,7 +151,7 @@ class _ImageRenderer:
         for some in torch.arange(pixels * count).split(_ROWS_AT_ONCE):
             pixel = some // count
             corner = torch.stack([pixel % camera.width, pixel // camera.width], 1)
-            # Even over the pixel, at a shift of its own.
+            # Uniform over the pixel, with a random shift.
             inside = (shift[pixel] + (some % count)[:, None] * _R2_STEPS) % 1.0
             total = total.index_add(0, pixel, self.sample_image(corner + inside, camera) / count)
         if self.sampling.boundary and (self.sight.is_differentiated or camera.is_differentiated):
@@ -163,11 +163,11 @@ class _ImageRenderer:
     def sample_image(
         self, positions: Float64[Tensor, "n 2"], camera: Camera
     ) -> Float64[Tensor, " n"]:
-        """What single places of the image show.
+        """Evaluate the image at single points.
 
         Args:
-            positions: u, v.
-            camera: With derivatives, or without.
+            positions: image coordinates u, v [*, 2].
+            camera: camera with derivatives, or without.
         """
         face = self.sight.find_first_faces(self.fixed.directions(positions, self.number))
         rows = torch.nonzero(face >= 0)[:, 0]
@@ -178,7 +178,7 @@ class _ImageRenderer:
         return self.ray_value(self.sight, face, none.index_put((rows,), depth))
 
     def _outline_derivative(self, curves: DiscontinuityCurves) -> Float64[Tensor, " pixel"]:
-        """What outlines add to derivatives; zero in value."""
+        """Return the contribution of outlines to derivatives; zero in value."""
         camera, fixed, number = self.camera, self.fixed, self.number
         size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
         ends = torch.stack(
@@ -197,7 +197,7 @@ class _ImageRenderer:
         until = length.cumsum(0)
         row = torch.searchsorted(until, spot * until[-1], right=True).clamp_max(len(length) - 1)
         share = (1 - (until[row] - spot * until[-1]) / length[row]).clamp(0.0, 1.0)
-        # Even in the image is not even along the piece: 1/z is linear in the image.
+        # Uniform image positions are not uniform along the segment: 1/z is linear in the image.
         depth = [point[row, 2] for point in cut]
         share = share * depth[0] / torch.lerp(depth[1], depth[0], share)
         share = torch.lerp(low[piece][row], high[piece][row], share)
@@ -221,14 +221,14 @@ class _ImageRenderer:
 
 
 def _project_points(camera: Camera, local: Tensor) -> Tensor:
-    """u, v of points in camera axes."""
+    """Project points in camera axes to u, v."""
     return camera.principal_point + camera.focal * local[:, :2] / local[:, 2:]
 
 
 def _clip_segments(
     ends: Float64[Tensor, "2 piece 3"], camera: Camera, size: Tensor
 ) -> tuple[Float64[Tensor, " piece"], Float64[Tensor, " piece"]]:
-    """From where to where pieces are in front of the camera and inside its image, 0 to 1."""
+    """Return the interval of each segment in front of the camera and inside its image, 0 to 1."""
     x, y, z = ends.unbind(2)
     u, v = camera.principal_point
     planes = [

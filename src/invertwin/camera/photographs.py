@@ -1,7 +1,7 @@
-"""What a camera records: an object's label and one depth in every pixel, with errors.
+"""Simulated photographs: an object label and one depth in every pixel, with errors.
 
-This is data, not a model that is fitted: one ray meets the middle of each pixel, as labels and
-depth cameras have it, while ``silhouettes`` and ``depths`` are means over the pixels' areas.
+These are data, not a fitted model: one ray through the centre of each pixel, as for labels and
+depth cameras, while ``silhouettes`` and ``depths`` are means over the pixels' areas.
 """
 
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ class Photograph:
     """Labels and depths of a camera's frames.
 
     Attributes:
-        names: Of the objects.
-        labels: Number of the name in every pixel; −1 where nothing is seen.
-        depth: z in camera axes [m]; infinite where nothing is seen.
+        names: names of the objects.
+        labels: index of the name in every pixel; −1 for background.
+        depth: z in camera axes [m]; infinite for background.
     """
 
     names: tuple[str, ...]
@@ -32,10 +32,10 @@ class Photograph:
     depth: Float64[Tensor, "frame row column"]
 
     def mask(self, *objects: str) -> Float64[Tensor, "frame row column"]:
-        """1 in the pixels of some objects, 0 elsewhere.
+        """Return 1 in the pixels of some objects, 0 elsewhere.
 
         Args:
-            objects: Their names.
+            objects: names of the objects.
 
         Raises:
             InputError: A name that is not in the scene.
@@ -53,21 +53,21 @@ class Photograph:
 def photograph(
     scene: Scene, camera: Camera, *, seed: int, wrong_labels: float = 0.0, depth_noise: float = 0.0
 ) -> Photograph:
-    """Take labelled pictures and depth images of a scene.
+    """Simulate labelled pictures and depth images of a scene.
 
-    Labels err where segmentations do, at outlines: a share of the pixels there takes the label of a
-    neighbour. Depths err as those of two eyes or of structured light do, by the square of the
-    depth.
+    Label errors occur at outlines, as in segmentations: a fraction of the pixels there has the
+    label of a neighbour. Depth errors grow with the square of the depth, as for stereo and
+    structured light.
 
     Args:
-        scene: What is seen; surfaces only.
-        camera: Where it stands.
-        seed: Of the errors.
-        wrong_labels: Share of the pixels at outlines, 0 to 1.
-        depth_noise: Standard deviation of depths at 1 m [m].
+        scene: scene of surfaces only.
+        camera: the camera.
+        seed: seed of the errors.
+        wrong_labels: fraction of wrong pixels at outlines, 0 to 1.
+        depth_noise: standard deviation of depths at 1 m [m].
 
     Raises:
-        InputError: A cloud in the scene, or shares and deviations that are none.
+        InputError: A cloud in the scene, or fractions and deviations out of range.
 
     Source: K. Khoshelham, S. O. Elberink, "Accuracy and resolution of Kinect depth data", Sensors
     12 (2012), eq. 10: the error of a triangulated depth grows with its square.
@@ -104,10 +104,10 @@ def _render_labels(scene: Scene, camera: Camera, number: int) -> tuple[Tensor, T
 
 
 def _corrupt_labels(labels: Tensor, share: float, random: torch.Generator) -> Tensor:
-    """Labels of which some at outlines are a neighbour's."""
+    """Replace some labels at outlines by a neighbour's."""
     way = torch.randint(0, 4, labels.shape, generator=random)
     neighbour = torch.stack([labels.roll(by, axis) for axis in (1, 2) for by in (1, -1)])
-    # Images have no neighbours beyond their borders.
+    # Pixels at the border have no neighbours outside the image.
     for number, (axis, edge) in enumerate(((1, 0), (1, -1), (2, 0), (2, -1))):
         index = torch.tensor([edge % labels.shape[axis]])
         neighbour[number].index_copy_(axis, index, labels.index_select(axis, index))

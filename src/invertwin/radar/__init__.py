@@ -1,4 +1,4 @@
-"""Channel to radar data: exact signals and their smooth surrogate, in plain torch."""
+"""Radar data from paths: exact signals and their smooth surrogate, in plain torch."""
 
 from invertwin.deprecation import rename_attributes
 from invertwin.radar.boards import BOARDS as BOARDS

@@ -1,4 +1,4 @@
-"""The virtual array of a radar, sorted onto the distinct positions along its axes."""
+"""Virtual array of a radar on the distinct positions along its axes."""
 
 import math
 from dataclasses import dataclass
@@ -18,17 +18,17 @@ _FLATNESS = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Aperture:
-    """The virtual array on the grid of its distinct x and y positions.
+    """Virtual array on the grid of its distinct x and y positions.
 
     Attributes:
-        x: Distinct x positions [m].
-        y: Distinct y positions [m].
-        column: Index into ``x`` of each virtual element, TX-major.
-        row: Index into ``y`` of each virtual element.
+        x: distinct x positions [m].
+        y: distinct y positions [m].
+        column: index into ``x`` of each virtual element, TX-major.
+        row: index into ``y`` of each virtual element.
         x_taper: Window along x.
         y_taper: Window along y.
-        counts: Number of virtual elements at each place of the grid.
-        wavelength: [m].
+        counts: number of virtual elements at each position of the grid.
+        wavelength: wavelength [m].
     """
 
     x: Float64[Tensor, " x"]
@@ -42,12 +42,12 @@ class Aperture:
 
     @property
     def is_separable(self) -> bool:
-        """Whether the array is the product of a row and a column, so its response is too."""
+        """Whether the array, and so its response, is the product of a row and a column."""
         counts = self.counts
         return torch.equal(counts * counts.sum(), counts.sum(1)[:, None] * counts.sum(0)[None])
 
     def check_resolved(self, grid: Grid) -> None:
-        """Raise if the grid resolves only one axis of an array that is not separable."""
+        """Raise if the grid resolves only one axis of a non-separable array."""
         if not self.is_separable and (grid.u_count == 1 or grid.v_count == 1):
             raise InputError(
                 f"expected a grid that resolves u and v, got {grid.u_count} × {grid.v_count} bins; "
@@ -70,7 +70,9 @@ class Aperture:
         return weight / weight.sum()
 
     def plane(self, channels: Complex[Tensor, "*batch virtual"]) -> Complex[Tensor, "*batch x y"]:
-        """Channels on the grid of places; those at one place are averaged, empty places are 0."""
+        """Return channels on the grid of positions; co-located ones are averaged, empty positions
+        are 0.
+        """
         index = (self.column * len(self.y) + self.row).to(channels.device)
         plane = channels.new_zeros(*channels.shape[:-1], self.counts.numel())
         plane = plane.index_add(-1, index, channels).unflatten(-1, self.counts.shape)
@@ -79,11 +81,12 @@ class Aperture:
     def steering(
         self, cosines: Float64[Tensor, " node"], positions: Float64[Tensor, " place"]
     ) -> Complex[Tensor, "node place"]:
-        """Phasors exp(+jk u x), which undo the beat phase of an element at x for a source at u.
+        """Return phasors exp(+jk u x) that compensate the beat phase of an element at x for a
+        source at u.
 
         Args:
-            cosines: Direction cosines u.
-            positions: Positions x of the elements [m].
+            cosines: direction cosines u.
+            positions: positions x of the elements [m].
         """
         phase = 2 * math.pi / self.wavelength * cosines[:, None] * positions[None]
         return torch.polar(torch.ones_like(phase), phase)
@@ -95,23 +98,23 @@ class Aperture:
         x: Float64[Tensor, " element"],
         y: Float64[Tensor, " element"],
     ) -> Complex[Tensor, "direction element"]:
-        """``steering`` of elements in a plane towards all pairs of direction cosines, u slowest.
+        """Return ``steering`` of planar elements towards all pairs of direction cosines, u slowest.
 
         Args:
-            u: Direction cosines along x.
-            v: Direction cosines along y.
-            x: Positions of the elements along x [m].
-            y: Positions of the elements along y [m].
+            u: direction cosines along x.
+            v: direction cosines along y.
+            x: positions of the elements along x [m].
+            y: positions of the elements along y [m].
         """
         return (self.steering(u, x)[:, None] * self.steering(v, y)).flatten(0, 1)
 
 
 def aperture(radar: Radar) -> Aperture:
-    """The radar's virtual array, sorted onto its distinct positions.
+    """Return the radar's virtual array on its distinct positions.
 
     Raises:
-        InputError: The array is not flat in the radar's x-y plane, so that u and v alone do not
-            describe its response.
+        InputError: The array is not planar in the radar's x-y plane, so that u and v do not
+            determine its response.
     """
     places = radar.virtual_positions.cpu()
     key = tuple(tuple(place) for place in places.tolist())
@@ -143,13 +146,13 @@ def _aperture(key: tuple[tuple[float, ...], ...], wavelength: float, window: str
     )
 
 
-# Depth of an array along boresight, in wavelengths, that (u, v) steering may leave out.
+# Depth of an array along boresight, in wavelengths, that (u, v) steering may neglect.
 
 
 def _distinct_positions(
     positions: Float64[Tensor, " virtual"], wavelength: float
 ) -> tuple[Float64[Tensor, " place"], Int64[Tensor, " virtual"]]:
-    """Distinct positions to a thousandth of a wavelength, and which one each element has."""
+    """Return distinct positions to a thousandth of a wavelength, and the index of each element."""
     ordered, order = positions.sort()
     groups = torch.cat([torch.zeros(1), (ordered.diff() > 1e-3 * wavelength)]).cumsum(0).long()
     index = torch.empty_like(groups)

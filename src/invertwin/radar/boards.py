@@ -1,8 +1,8 @@
-"""Radar boards as people own them: where their antenna elements are.
+"""Radar boards: element positions of commercial evaluation modules.
 
-Element positions are the nominal ones of the layouts that TI and open code print, on a grid of half
-wavelengths at the frequency the board was drawn for. Electrical phase centres differ from them by
-fractions of a millimetre: estimate that from a reflector (`invertwin.capture.estimate_channels`).
+Element positions are nominal ones from layouts published by TI and in open code, on a grid of half
+wavelengths at the design frequency of the board. Electrical phase centres differ by fractions of a
+millimetre: estimate them with a reflector (`invertwin.capture.estimate_channels`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,29 +26,29 @@ ElementGrid = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(
 
 @dataclass(frozen=True)
 class Board:
-    """Where the elements of a board are, in half wavelengths.
+    """Element positions of a board in half wavelengths.
 
-    Columns (x) and rows (y) are those of the source. Only the columns of ``antGeometry0`` have the
-    other sign here, so that they grow with the numbers of the elements. For another board, make a
-    ``Board`` of your own.
+    Columns (x) and rows (y) are those of the source, except that the sign of the columns of
+    ``antGeometry0`` is reversed, so that they grow with the element numbers. Define other boards by
+    a new ``Board``.
 
-    Differs from the source: the sources count the columns and rows of TX and of RX each from an
-    origin of its own and do not say how far apart these are. Here TX and RX are each centred at
-    the origin of the radar frame, which shifts where the radar is by up to a centimetre or so.
+    Differs from the source: the sources count the columns and rows of TX and of RX from separate
+    origins of unknown distance. Here TX and RX are each centred at the origin of the radar frame,
+    which shifts the radar by up to about a centimetre.
 
     Attributes:
-        name: of the board.
+        name: name of the board.
         transmitters: (column, row) of TX1, TX2, … [λ/2].
         receivers: (column, row) of RX1, RX2, … [λ/2].
-        design_frequency: whose half wavelength is the unit [Hz]. Presets whose source names none
-            take the middle of the band (xWR1642, xWR1843, AWR2944), or that of their sister, the
-            IWR6843L of TI's SWRU585 (IWR6843ISK, IWR6843AOP).
-        source: where the numbers come from.
-        polarisation: of all elements, as in `AntennaArray`. The sources of the presets name none:
-            V is assumed.
+        design_frequency: frequency whose half wavelength is the unit [Hz]. Presets without one in
+            their source use the middle of the band (xWR1642, xWR1843, AWR2944), or that of a
+            similar board, the IWR6843L of TI's SWRU585 (IWR6843ISK, IWR6843AOP).
+        source: reference of the numbers.
+        polarisation: polarisation of all elements, as in `AntennaArray`. The sources of the presets
+            state none: V is assumed.
 
     Raises:
-        InputError: no elements, places that are not pairs of numbers, or a frequency that is not
+        InputError: no elements, positions that are not pairs of numbers, or a frequency that is not
             in Hz.
     """
 
@@ -69,7 +69,7 @@ class Board:
 
     @property
     def has_rows(self) -> bool:
-        """Whether it resolves elevation, so that the sign of elevation matters."""
+        """Whether the board resolves elevation, so that the sign of elevation matters."""
         return any(len({row for _, row in end}) > 1 for end in (self.transmitters, self.receivers))
 
     def arrays(
@@ -83,21 +83,21 @@ class Board:
         polarisation: Polarised | None = None,
         leakage: float | ArrayLike = 0.0,
     ) -> TxRxArrays:
-        """TX and RX elements in the radar frame (x right, y up, z boresight).
+        """Return TX and RX elements in the radar frame (x right, y up, z boresight).
 
-        Public sources disagree which way is up, for the xWR1843's middle transmitter for one, and
-        phases in some of them have the other sign. So the sign of elevation has no default where it
-        matters. To find it, place a reflector above the board: its spectrum must peak at v > 0.
-        Likewise for left and right.
+        Public sources disagree on the upward direction, for example for the xWR1843's middle
+        transmitter, and on the sign of phases. So the sign of elevation has no default where it
+        matters. To determine it, place a reflector above the board: its spectrum must peak at v >
+        0. Likewise for left and right.
 
         Args:
             elevation: +1 = rows grow upwards (y), −1 = downwards; required if the board has rows.
             azimuth: +1 = columns grow to the right (x), −1 = to the left.
-            transmitters: numbers from 1 of the elements in use, in this order; None = all.
-            receivers: the same for RX.
+            transmitters: numbers from 1 of the active elements, in this order; None = all.
+            receivers: numbers from 1 of the active RX elements; None = all.
             pattern: gain of every element, isotropic by default.
-            polarisation: of every element, the board's by default.
-            leakage: field of the orthogonal polarisation over that of the wanted one.
+            polarisation: polarisation of every element; None = the board's.
+            leakage: field of the orthogonal polarisation over that of the nominal one.
 
         Returns:
             transmitters, receivers.
@@ -143,16 +143,17 @@ class Board:
 
 @dataclass(frozen=True)
 class Mounting:
-    """A board as it is mounted, and which of its elements are in use.
+    """Mounted board with its active elements.
 
     Attributes:
-        board: where its elements are, or the name of a preset.
+        board: board, or name of a preset.
         elevation, azimuth: as in `Board.arrays`.
-        transmitters: numbers from 1 in the order of sending; None = all, or those of a recording.
+        transmitters: numbers from 1 in the order of transmission; None = all, or those of a
+            recording.
         receivers: numbers from 1, ascending; None = all, or those of a recording.
         pattern: gain of every element; None = isotropic.
-        polarisation: of every element; None = the board's.
-        leakage: field of the orthogonal polarisation over that of the wanted one.
+        polarisation: polarisation of every element; None = the board's.
+        leakage: field of the orthogonal polarisation over that of the nominal one.
     """
 
     board: Board | str
@@ -167,14 +168,16 @@ class Mounting:
     def arrays(
         self, transmitters: Sequence[int] | None = None, receivers: Sequence[int] | None = None
     ) -> TxRxArrays:
-        """TX (in the order of sending) and RX elements in use: its own, or those that recorded.
+        """Return active TX (in the order of transmission) and RX elements: its own, or those of a
+        recording.
 
         Args:
-            transmitters: numbers of those that recorded, in the order of sending.
-            receivers: numbers of those that recorded, ascending.
+            transmitters: numbers of the transmitters of the recording, in the order of
+                transmission.
+            receivers: numbers of the receivers of the recording, ascending.
 
         Raises:
-            InputError: what `Board.arrays` refuses, or elements both of its own and of a recording.
+            InputError: as `Board.arrays`, or active elements given both here and by a recording.
         """
         for name, recorded in (("transmitters", transmitters), ("receivers", receivers)):
             given = getattr(self, name)
@@ -282,11 +285,11 @@ BOARDS: Mapping[str, Board] = MappingProxyType({board.name: board for board in _
 def board(
     name: Annotated[str, AllowedValues(tuple(BOARDS))], design_frequency: Positive | None = None
 ) -> Board:
-    """A board that the library knows: a preset of `BOARDS`.
+    """Return a preset of `BOARDS`.
 
     Args:
-        name: of a preset; xWR serves AWR and IWR.
-        design_frequency: Hz, whose half wavelength is the unit; without it the preset's.
+        name: name of a preset; xWR covers AWR and IWR.
+        design_frequency: frequency whose half wavelength is the unit [Hz]; None = the preset's.
 
     Raises:
         InputError: an unknown name.

@@ -1,4 +1,4 @@
-"""Modules Radar → Radar that can be fitted: pose, path, range bias and clock offset."""
+"""Modules Radar → Radar that can be fitted: pose, trajectory, range bias and clock offset."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,34 +15,34 @@ from invertwin.scene.parameters import Coordinate, RigidMotion, axes_mask, free_
 
 
 class RadarPose(RigidMotion):
-    """Turns and moves all poses of a radar together, as `Radar.moved` defines it."""
+    """Rigid transform of all poses of a radar, see `Radar.transform_rigidly`."""
 
     def forward(self, radar: Radar) -> Radar:
-        """The moved radar."""
+        """Return the moved radar."""
         return radar.transform_rigidly(self.rotation_matrix, self.shift)
 
     def values(self) -> dict[str, Tensor]:
-        """Translation [m] and rotation vector [rad] by name, for progress and reports."""
+        """Return translation [m] and rotation vector [rad] by name, for progress and reports."""
         return self.named_values("radar")
 
     def coordinates(self) -> list[Coordinate]:
-        """Place and turn of the radar, as far as they are free."""
+        """Return the free coordinates of position and rotation."""
         return self.named_coordinates("radar")
 
 
 class RadarTrajectory(nn.Module):
-    """Refines the path of a radar by what odometry piles up: a random walk from the first frame.
+    """Correction of a radar trajectory by an odometry error: a random walk from the first frame.
 
         d(0) = 0,   d(k) = d(k−1) + drift · z_k
 
-    at `steps` + 1 knots at even numbers of frames, linear between them, in the world; z are
-    standard normal. So odometry itself is the prior: `inversion.LatentNorm(module, weight)` adds
-    ½ weight |z|² to the loss. Rotations and the range origin stay as recorded.
+    at `steps` + 1 knots at evenly spaced frames, linear between them, in the world; z are standard
+    normal. So the odometry is the prior: `inversion.LatentNorm(module, weight)` adds ½ weight |z|²
+    to the loss. Rotations and the range origin stay as recorded.
 
     Args:
-        steps: of the walk, at most one less than there are frames.
+        steps: number of steps of the walk, at most one less than the number of frames.
         drift: standard deviation of a step along each axis [m].
-        axes: world axes along which the fit may move it.
+        axes: free world axes.
 
     Attributes:
         latent: parameter [step, 3], z in standard deviations.
@@ -56,10 +56,10 @@ class RadarTrajectory(nn.Module):
         self._axes = axes_mask(axes)
 
     def displacements(self, frames: int) -> Float64[Tensor, "frame 3"]:
-        """How far the frames are from where odometry says [m].
+        """Return the displacements of the frames from odometry [m].
 
         Args:
-            frames: their number.
+            frames: number of frames.
 
         Raises:
             InputError: fewer frames than knots.
@@ -77,16 +77,18 @@ class RadarTrajectory(nn.Module):
         return (1 - share) * knots[before] + share * knots[before + 1]
 
     def forward(self, radar: Radar) -> Radar:
-        """The radar on the refined path."""
+        """Return the radar on the corrected trajectory."""
         return replace(radar, positions=radar.positions + self.displacements(radar.frame_count))
 
     def values(self) -> dict[str, Tensor]:
-        """Displacements of the knots after the first one [m] by name, for progress and reports."""
+        """Return displacements of the knots after the first one [m] by name, for progress and
+        reports.
+        """
         walk = (self.drift * self.latent.detach()).cumsum(0)
         return {"radar.displacements": walk}
 
     def coordinates(self) -> list[Coordinate]:
-        """Every step of the walk along the axes that are free."""
+        """Return every step of the walk along the free axes."""
         found = []
         for number in range(len(self.latent)):
             for column in torch.nonzero(self._axes)[:, 0].tolist():
@@ -98,7 +100,7 @@ class RadarTrajectory(nn.Module):
 
 
 class RangeBias(nn.Module):
-    """Adds a bias to all ranges that the surrogate shows.
+    """Bias of all ranges of the surrogate.
 
     Attributes:
         bias: parameter [m].
@@ -109,45 +111,45 @@ class RangeBias(nn.Module):
         self.bias = nn.Parameter(torch.tensor(initial, dtype=torch.float64))
 
     def forward(self, radar: Radar) -> Radar:
-        """The radar with the bias added to its own."""
+        """Return the radar with the bias added to its own."""
         return replace(radar, range_bias=radar.range_bias + self.bias)
 
     def values(self) -> dict[str, Tensor]:
-        """Bias [m] by name, for progress and reports."""
+        """Return the bias [m] by name, for progress and reports."""
         return {"range_bias": self.bias.detach().clone()}
 
     def coordinates(self) -> list[Coordinate]:
-        """The bias."""
+        """Return the bias."""
         return [Coordinate("range_bias", "m", {"bias": torch.ones_like(self.bias)})]
 
 
 class ClockOffset(nn.Module):
-    """Shifts the clock of the track against the radar's.
+    """Offset between the clocks of the track and the radar.
 
     Attributes:
         shift: parameter [s].
     """
 
     def __init__(self, positions: Callable[[Tensor], Tensor], initial: float = 0.0) -> None:
-        """Shift the clock, by `initial` at the start.
+        """Start from an offset `initial`.
 
         Args:
-            positions: positions [frame, 3] in metres at a shift of the clock [s], differentiable;
-                such as `Capture.positions`.
-            initial: [s].
+            positions: function of a clock shift [s] that returns positions [frame, 3] [m],
+                differentiable; such as `Capture.positions`.
+            initial: initial shift [s].
         """
         super().__init__()
         self._positions = positions
         self.shift = nn.Parameter(torch.tensor(initial, dtype=torch.float64))
 
     def forward(self, radar: Radar) -> Radar:
-        """The radar at its positions of the shifted times."""
+        """Return the radar at its positions at the shifted times."""
         return replace(radar, positions=self._positions(self.shift))
 
     def values(self) -> dict[str, Tensor]:
-        """Shift [s] by name, for progress and reports."""
+        """Return the shift [s] by name, for progress and reports."""
         return {"clock_shift": self.shift.detach().clone()}
 
     def coordinates(self) -> list[Coordinate]:
-        """The shift."""
+        """Return the shift."""
         return [Coordinate("clock_shift", "s", {"shift": torch.ones_like(self.shift)})]

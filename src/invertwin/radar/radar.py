@@ -1,4 +1,4 @@
-"""The radar: antenna arrays, a waveform and poses, and the bins they resolve."""
+"""Radar: antenna arrays, a waveform and poses, and the bins that they resolve."""
 
 import math
 import warnings
@@ -23,9 +23,9 @@ from invertwin.scene.antenna import AntennaArray
 
 Window = Annotated[str, AllowedValues(WINDOWS)]
 Cosine = Annotated[float, Gt(0), Le(1)]
-# Antennas closer than this see the same surfaces: one visibility test serves both.
+# Antennas closer than this share one visibility test.
 _SHARED_VISIBILITY_DISTANCE = 0.1
-# Arrays are built for λ/2 at some frequency of the band, not exactly at its centre.
+# Arrays have λ/2 at some frequency of the band, not exactly at its centre.
 _SPACING_TOLERANCE = 1.05
 _MAX_CHANNELS = 1e6
 
@@ -41,22 +41,23 @@ class Radar:
     Attributes:
         transmitters: Transmitting array.
         receivers: Receiving array.
-        waveform: ``FMCW``, ``SteppedFrequency``, ``OFDM``, ``Impulse`` or one's own.
+        waveform: ``FMCW``, ``SteppedFrequency``, ``OFDM``, ``Impulse`` or a subclass of
+            ``Waveform``.
         positions: World position of the radar in each frame [m]; may carry a gradient.
-        rotations: Orientation in each frame; None = axes of the world.
+        rotations: orientation in each frame; None = world axes.
         window: Taper of the samples before the range transform.
         array_window: Taper of the virtual array along x and along y.
-        shared_visibility: One visibility test for both antennas; None = when the phase centres
-            are at most 0.1 m apart.
-        range_bias: Moves everything that the surrogate shows to larger ranges [m]; may carry a
-            gradient. Exact signals refuse it.
-        range_origin: Range from which each frame counts its own [m], as motion compensation to a
-            scene centre leaves them, see ``centered``: an echo from R shows at R less it. None =
-            from the radar. It is a constant of the data: it stays where the positions are moved.
+        shared_visibility: one visibility test for both antennas; None = if the phase centres are at
+            most 0.1 m apart.
+        range_bias: bias of all ranges of the surrogate [m]; may carry a gradient. Exact signals
+            reject it.
+        range_origin: range from which each frame counts its own [m], as after motion compensation
+            to a scene centre, see ``center_on``: an echo from R appears at R minus the origin. None
+            = the radar. It is a constant of the data, independent of the positions.
 
     Raises:
-        InputError: Wrong shapes, values that are not finite, matrices that are not rotations,
-            unknown windows, separate visibility with several transmitters, or origins that carry
+        InputError: Wrong shapes, non-finite values, matrices that are not rotations, unknown
+            windows, separate visibility with several transmitters, or origins that carry
             derivatives.
     """
 
@@ -126,7 +127,7 @@ class Radar:
 
     @property
     def beamwidth(self) -> tuple[float, float]:
-        """One cell in u and in v, λ/D with D the virtual aperture."""
+        """Resolution cell in u and in v, λ/D with D the virtual aperture."""
         width, height = self.aperture
         return self.waveform.wavelength / width, self.waveform.wavelength / height
 
@@ -156,10 +157,10 @@ class Radar:
 
     @property
     def range_limits(self) -> tuple[float, float]:
-        """Ranges that samples tell apart, from the origin [m]: one unambiguous range of them.
+        """Limits of the unambiguous range interval, from the origin [m].
 
-        They begin half of it before the origin, but not behind the radar; without an origin they
-        are those from 0 on. A waveform without samples has no end.
+        With an origin the interval starts half its length before the origin, but not behind the
+        radar; without an origin it starts at 0. A waveform without samples has no upper limit.
         """
         nearest = 0.0 - float(self.origins.min())
         if not isinstance(self.waveform, SampledWaveform):
@@ -168,12 +169,12 @@ class Radar:
         return low, low + self.waveform.max_range
 
     def center_on(self, point: ArrayLike) -> "Radar":
-        """The radar of data that are motion compensated to a point, which has range 0 in them.
+        """Return the radar of data with motion compensation to a point, which has range 0 in them.
 
-        The origins are those of the positions as they are now, without derivatives.
+        The origins follow from the present positions, without derivatives.
 
         Args:
-            point: Centre of the scene in the world [m].
+            point: centre of the scene in the world [m].
         """
         center = checked_tensor(point, (3,), "the centre of the scene", "give [x, y, z] in metres")
         link = self.link()
@@ -181,7 +182,7 @@ class Radar:
         return replace(self, range_origin=0.5 * ways.detach())
 
     def link(self) -> Link:
-        """What the channel needs to know: phase centres, axes, patterns, polarisations."""
+        """Return the inputs of the channel: phase centres, axes, patterns, polarisations."""
         return Link(
             tx=self._world(self.transmitters.positions.mean(0, keepdim=True))[:, 0],
             rx=self._world(self.receivers.positions.mean(0, keepdim=True))[:, 0],
@@ -198,14 +199,14 @@ class Radar:
     def coefficient(
         self, paths: Paths, transmitter: int, receiver: int
     ) -> Complex128[Tensor, " path"]:
-        """Field coefficients of paths for one of the channels.
+        """Return field coefficients of paths for one of the channels.
 
         Args:
-            paths: Field paths.
-            transmitter, receiver: Numbers of the elements.
+            paths: field paths.
+            transmitter, receiver: indices of the elements.
 
         Raises:
-            InputError: Paths of antennas that mix other polarisations.
+            InputError: Paths of antennas with other polarisation bases.
         """
         if paths.matrix is None:
             return paths.coefficient
@@ -221,11 +222,11 @@ class Radar:
     def transform_rigidly(
         self, rotation: Float64[Tensor, "3 3"], translation: Float64[Tensor, "3"]
     ) -> "Radar":
-        """All poses moved rigidly: turned about the mean position, then translated.
+        """Transform all poses rigidly: rotate about the mean position, then translate.
 
         Args:
-            rotation: World rotation matrix.
-            translation: World translation [m].
+            rotation: world rotation matrix [3, 3].
+            translation: world translation [3] [m].
         """
         center = self.positions.mean(0)
         return replace(
@@ -235,11 +236,11 @@ class Radar:
         )
 
     def frames(self, indices: Sequence[int] | Int64[Tensor, " chosen"]) -> "Radar":
-        """The radar with only these poses."""
+        """Return the radar with selected poses."""
         chosen = torch.as_tensor(indices, dtype=torch.int64)
         if not len(chosen):
-            return replace(self, positions=self.positions[chosen])  # which explains itself
-        # A copy, since a fit asks at every step: what has been checked stays right.
+            return replace(self, positions=self.positions[chosen])  # raises the error
+        # Copy without validation, since a fit calls this in every step.
         radar = copy(self)
         object.__setattr__(radar, "positions", self.positions[chosen])
         object.__setattr__(radar, "rotations", self._rotations[chosen])
@@ -255,26 +256,26 @@ class Radar:
         v_max: Cosine = 1.0,
         oversample: Annotated[float, Ge(1)] = 2.0,
     ) -> Grid:
-        """Bins that hold the spectrum without loss.
+        """Return bins that sample the spectrum without loss.
 
         Ranges fall on the bins of a zero-padded FFT and are spaced by one range cell over
         ``oversample`` (2 = Nyquist of the power profile). Direction cosines are spaced by
         λ/(2·oversample·D), D the virtual aperture (1 = Nyquist of the power pattern), and end at
-        ±1. An axis along which the virtual array has no extent is not resolved.
+        ±1. An axis without extent of the virtual array is not resolved.
 
         Args:
-            range_min: First range to cover [m], of at least 0 without a range origin.
-            range_max: Last range to cover [m].
-            u_max: Direction cosine to the right; the map is as wide to the left.
-            v_max: Direction cosine up; the map is as high downwards.
-            oversample: Bins per resolution cell.
+            range_min: minimum range [m], at least 0 without a range origin.
+            range_max: maximum range [m].
+            u_max: maximum direction cosine to the right; the map is symmetric.
+            v_max: maximum direction cosine upwards; the map is symmetric.
+            oversample: bins per resolution cell.
 
         Raises:
             InputError: The limits are not increasing, out of bounds, or beyond the unambiguous
                 range.
         """
         low, high = self.range_limits
-        # The origins of recorded data are rounded, as limits are.
+        # The origins of recorded data are rounded, like the limits.
         least = low - 1e-9 * abs(low)
         if not least <= range_min < range_max < math.inf:
             raise InputError(
@@ -351,7 +352,7 @@ class Radar:
 
 
 def require_sampled_waveform(radar: Radar) -> SampledWaveform:
-    """Return the radar's waveform, if it has a beat signal."""
+    """Return the radar's waveform, or raise an error if it has no beat signal."""
     if isinstance(radar.waveform, SampledWaveform):
         return radar.waveform
     raise InputError(
@@ -363,14 +364,14 @@ def require_sampled_waveform(radar: Radar) -> SampledWaveform:
 def checked_beat(
     beat: Complex[Tensor, "frame tx rx sample"], radar: Radar
 ) -> Complex[Tensor, "frame tx rx sample"]:
-    """Return a beat signal, if it fits a radar.
+    """Validate the shape of a beat signal.
 
     Args:
-        beat: One signal per frame and channel.
-        radar: What recorded it.
+        beat: one signal per frame and channel.
+        radar: radar that recorded it.
 
     Raises:
-        InputError: It has another shape.
+        InputError: A beat signal of another shape.
     """
     expected = (*radar.shape, require_sampled_waveform(radar).samples)
     what = "a beat signal (frame, tx, rx, sample)"

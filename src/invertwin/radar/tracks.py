@@ -1,4 +1,4 @@
-"""Tracks of a radar: positions [frame, 3] along simple curves, one frame each."""
+"""Tracks of a radar: positions [frame, 3] along simple curves, one per frame."""
 
 import torch
 from jaxtyping import Float64
@@ -12,11 +12,11 @@ _MAX_POSITIONS = 1e6
 
 
 def line(start: Point, stop: Point, count: Count) -> Float64[Tensor, "frame 3"]:
-    """Positions at even distances on a line.
+    """Return equally spaced positions on a line.
 
     Args:
-        start, stop: m.
-        count: positions.
+        start, stop: end points [m].
+        count: number of positions.
     """
     first, last = _point(start), _point(stop)
     return first + _linspace(0.0, 1.0, count)[:, None] * (last - first)
@@ -25,13 +25,13 @@ def line(start: Point, stop: Point, count: Count) -> Float64[Tensor, "frame 3"]:
 def arc(
     center: Point, radius: Positive, start: Angle, stop: Angle, count: Count
 ) -> Float64[Tensor, "frame 3"]:
-    """A level arc about `center`; 0° is on its −z side, 90° on its +x side.
+    """Return a horizontal arc about `center`; 0° is on its −z side, 90° on its +x side.
 
     Args:
-        center, radius: m.
+        center, radius: centre [3] and radius [m].
         start: first angle; 0 is on the −z side of the centre.
         stop: last angle; 90° is on the +x side.
-        count: positions.
+        count: number of positions.
     """
     angle = _linspace(start, stop, count)
     around = torch.stack([angle.sin(), 0 * angle, -angle.cos()], dim=1)
@@ -41,12 +41,12 @@ def arc(
 def grid(
     center: Point, size: tuple[NonNegative, NonNegative], count: tuple[Count, Count]
 ) -> Float64[Tensor, "frame 3"]:
-    """An upright rectangle of positions in the x-y plane through `center`; y runs fastest.
+    """Return an upright rectangle of positions in the x-y plane through `center`; y runs fastest.
 
     Args:
-        center: m.
-        size: m along x, y.
-        count: positions along x, y.
+        center: centre [3] [m].
+        size: size along x, y [m].
+        count: number of positions along x, y.
     """
     _require_positions(count[0] * count[1])
     x, y = (

@@ -1,4 +1,4 @@
-"""Waveforms: what a radar transmits, and how it spreads a point target over range."""
+"""Waveforms and their range response."""
 
 # Fields of the base class may be properties of a waveform.
 # pyright: reportIncompatibleVariableOverride=false
@@ -23,13 +23,13 @@ SIGMA_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
 
 
 class Waveform(ABC):
-    """What any waveform must offer. Waveforms are hashable, so that kernels are cached.
+    """Base class of waveforms. Waveforms are hashable, so that kernels are cached.
 
     Attributes:
-        center_frequency, bandwidth: [Hz].
+        center_frequency, bandwidth: centre frequency and bandwidth [Hz].
 
     Raises:
-        InputError: A value is not positive or its unit is evidently wrong.
+        InputError: A value that is not positive, or of an implausible unit.
     """
 
     center_frequency: float
@@ -45,18 +45,18 @@ class Waveform(ABC):
 
     @property
     def range_resolution(self) -> float:
-        """One range cell, c/2B [m]."""
+        """Range resolution, c/2B [m]."""
         return SPEED_OF_LIGHT / (2 * self.bandwidth)
 
     @abstractmethod
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
     ) -> Float64[Tensor, " point"]:
-        """Power of a point target at a distance from its range, peak 1.
+        """Return the power of a point target at a distance from its range, peak 1.
 
         Args:
-            distance: Distance from the target's range [m].
-            window: Taper of the samples.
+            distance: distance from the target's range [m].
+            window: taper of the samples.
         """
 
 
@@ -70,8 +70,8 @@ class SampledWaveform(Waveform):
         start_frequency: Frequency of the first sample [Hz].
         samples: Number of frequencies.
         step: Frequency step from one sample to the next [Hz].
-        noise_bandwidth: Bandwidth B of the thermal noise in a sample, whose power is kT₀F · B over
-            the transmit power [Hz].
+        noise_bandwidth: bandwidth B of the thermal noise in a sample, of power kT₀F · B over the
+            transmit power [Hz].
     """
 
     start_frequency: float
@@ -81,7 +81,7 @@ class SampledWaveform(Waveform):
 
     @property
     def residual_slope(self) -> float:
-        """Slope of the residual video phase [Hz/s]; 0 unless the frequency moves in an echo."""
+        """Slope of the residual video phase [Hz/s]; 0 for constant-frequency samples."""
         return 0.0
 
     @property
@@ -97,11 +97,12 @@ class SampledWaveform(Waveform):
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
     ) -> Float64[Tensor, " point"]:
-        """Power |Σ w_n exp(2πj n d/R_max) / Σ w_n|² of a point target beside its range.
+        """Return |Σ w_n exp(2πj n d/R_max) / Σ w_n|², the power of a point target at range offset
+        d.
 
         Args:
-            distance: Distance d from the target's range [m].
-            window: Taper w of the samples.
+            distance: distance d from the target's range [m].
+            window: taper w of the samples.
         """
         weight = unit_window(window, self.samples).to(torch.complex128)
         cycles = distance[:, None] / self.max_range * torch.arange(self.samples)
@@ -116,8 +117,8 @@ class FMCW(SampledWaveform):
 
     Attributes:
         start_frequency: Frequency at t = 0 [Hz].
-        bandwidth: Bandwidth that is swept during ``duration`` [Hz].
-        duration: Sampled part of the ramp [s].
+        bandwidth: bandwidth swept during ``duration`` [Hz].
+        duration: sampled part of the ramp [s].
         samples: Samples per ramp.
     """
 
@@ -138,7 +139,7 @@ class FMCW(SampledWaveform):
 
     @property
     def residual_slope(self) -> float:
-        """The slope S: the ramp goes on while the echo is on its way [Hz/s]."""
+        """Slope S of the ramp, which continues during the echo delay [Hz/s]."""
         return self.slope
 
     @property
@@ -159,13 +160,13 @@ class FMCW(SampledWaveform):
 
 @dataclass(frozen=True)
 class SteppedFrequency(SampledWaveform):
-    """Tones one after the other, each measured once its echoes have settled.
+    """Consecutive tones, each measured after its echoes have settled.
 
     Attributes:
         start_frequency: Frequency of the first tone [Hz].
         step: Frequency step from one tone to the next [Hz].
         samples: Number of tones.
-        dwell: Time on each tone, over which its sample is averaged [s].
+        dwell: duration of each tone, over which its sample is averaged [s].
     """
 
     start_frequency: Frequency
@@ -196,9 +197,9 @@ class SteppedFrequency(SampledWaveform):
 
 @dataclass(frozen=True)
 class OFDM(SampledWaveform):
-    """Subcarriers sent at once; known symbols are divided out, one sample per subcarrier.
+    """Simultaneous subcarriers; known symbols are divided out, one sample per subcarrier.
 
-    On every subcarrier ``Y = H X``, since the cyclic prefix is taken as longer than the largest
+    On every subcarrier ``Y = H X``, since the cyclic prefix is assumed longer than the largest
     delay. All subcarriers have the same mean power, ``|X|² = 1``. In the library's sign the beat
     signal is ``conj(H)``, so that ``range_profile`` forms the usual inverse FFT of ``Y/X``.
 
@@ -240,11 +241,11 @@ class OFDM(SampledWaveform):
     def receive_symbols(
         self, beat: Complex[Tensor, "*batch sample"], symbols: Complex[Tensor, "*#batch sample"]
     ) -> Complex[Tensor, "*batch sample"]:
-        """Y = H X: what the receiver's FFT gives for these symbols.
+        """Return Y = H X, the receiver's FFT output for these symbols.
 
         Args:
-            beat: Signals from ``beat_signal``.
-            symbols: X, sent on each subcarrier.
+            beat: signals from ``beat_signal``.
+            symbols: transmitted symbols X of each subcarrier.
 
         Raises:
             InputError: Another number of symbols than subcarriers.
@@ -256,11 +257,11 @@ class OFDM(SampledWaveform):
         received_symbols: Complex[Tensor, "*batch sample"],
         symbols: Complex[Tensor, "*#batch sample"],
     ) -> Complex[Tensor, "*batch sample"]:
-        """conj(Y / X), the samples that ``range_profile`` takes.
+        """Return conj(Y / X), the samples of ``range_profile``.
 
         Args:
-            received_symbols: Y, what the receiver's FFT gives.
-            symbols: X, sent on each subcarrier.
+            received_symbols: receiver's FFT output Y.
+            symbols: transmitted symbols X of each subcarrier.
 
         Raises:
             InputError: Another number of symbols than subcarriers, or one that is zero.
@@ -284,13 +285,13 @@ class OFDM(SampledWaveform):
 
 @dataclass(frozen=True)
 class Impulse(Waveform):
-    """Pulse radar whose range profile is measured directly.
+    """Pulsed radar with a directly measured range profile.
 
-    The power of its pulse is taken as a Gaussian whose full width at half maximum is one range
-    cell c/2B. It has no beat signal, so only the surrogate can model it.
+    The power of its pulse is a Gaussian whose full width at half maximum is one range cell c/2B. It
+    has no beat signal, so only the surrogate can model it.
 
     Attributes:
-        center_frequency, bandwidth: [Hz].
+        center_frequency, bandwidth: centre frequency and bandwidth [Hz].
     """
 
     center_frequency: Frequency
@@ -299,25 +300,25 @@ class Impulse(Waveform):
     def range_response(
         self, distance: Float64[Tensor, " point"], window: str
     ) -> Float64[Tensor, " point"]:
-        """Power of the pulse beside the target's range, peak 1.
+        """Return the power of the pulse beside the target's range, peak 1.
 
         Args:
-            distance: Distance from the target's range [m].
-            window: Ignored: a pulse has no samples to taper.
+            distance: distance from the target's range [m].
+            window: ignored, since a pulse has no samples to taper.
         """
         return gaussian_response(self, distance)
 
 
 def taper(name: str, position: Float[Tensor, " element"], count: int) -> Float[Tensor, " element"]:
-    """Weights of a window by position, for samples and for arrays.
+    """Return the weights of a window by position, for samples and for arrays.
 
-    At ``count`` uniform positions "hamming" is the usual symmetric window; "hann" and
-    "blackman" leave out their zero end points, which would switch off the outermost elements.
+    At ``count`` uniform positions "hamming" is the usual symmetric window; "hann" and "blackman"
+    omit their zero end points, which would disable the outermost elements.
 
     Args:
-        name: One of ``WINDOWS``.
-        position: 0 at the first and 1 at the last place.
-        count: Number of distinct places.
+        name: one of ``WINDOWS``.
+        position: 0 at the first and 1 at the last position.
+        count: number of distinct positions.
 
     Raises:
         InputError: An unknown window.
@@ -337,11 +338,11 @@ def taper(name: str, position: Float[Tensor, " element"], count: int) -> Float[T
 
 
 def unit_window(name: str, count: int) -> Float64[Tensor, " sample"]:
-    """Taper of samples or chirps at equal steps, with a sum of 1.
+    """Return the taper of equally spaced samples or chirps, with a sum of 1.
 
     Args:
-        name: One of ``WINDOWS``.
-        count: Number of samples or chirps.
+        name: one of ``WINDOWS``.
+        count: number of samples or chirps.
 
     Raises:
         InputError: An unknown window.
@@ -353,11 +354,11 @@ def unit_window(name: str, count: int) -> Float64[Tensor, " sample"]:
 def gaussian_response(
     waveform: Waveform, distance: Float64[Tensor, " point"]
 ) -> Float64[Tensor, " point"]:
-    """Gaussian whose full width at half maximum is one range cell, peak 1.
+    """Return a Gaussian whose full width at half maximum is one range cell, peak 1.
 
     Args:
-        waveform: Waveform whose range cell counts.
-        distance: Distance from the peak [m].
+        waveform: waveform with the range cell.
+        distance: distance from the peak [m].
     """
     sigma = SIGMA_PER_FWHM * waveform.range_resolution
     return torch.exp(-0.5 * (distance / sigma).square())

@@ -1,4 +1,4 @@
-"""Images of beat signals by coherent summation, also in the near field and of moving radars."""
+"""Backprojection: images of beat signals by coherent summation, also in the near field."""
 
 import math
 
@@ -11,8 +11,8 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import Radar, checked_beat, require_sampled_waveform
 from invertwin.radar.waveform import unit_window
 
-# Linear interpolation between samples this much denser errs by (π/8)²/8 = 2 % at the very edge of a
-# critically sampled band, and quadratically less within it.
+# Oversampling of linear interpolation: the error is (π/8)²/8 = 2 % at the edge of a critically
+# sampled band, and decreases quadratically within it.
 UPSAMPLING = 8
 
 
@@ -23,18 +23,19 @@ def backproject_beat(
 
         I(p) = mean Σ w_n s[n] exp(−2πj (f_n τ − S τ²/2)) / Σ w_n
 
-    with τ from each TX element over p to each RX element in each pose: no plane waves, so it
-    focuses in the near field of the array and along the track of a moving radar. A point target
-    of coefficient a gives conj(a) at its place; points at rest add in phase, movers do not. τ is
-    counted from the radar's range origin. Delays are float64: at 10 km and 10 GHz phases are right
-    to 1e-9. Differentiable with respect to the signal, the points and the poses.
+    with τ from each TX element over p to each RX element in each pose: no plane-wave approximation,
+    so it focuses in the near field of the array and along the track of a moving radar. A point
+    target of coefficient a gives conj(a) at its position; static points add coherently, moving ones
+    do not. τ is counted from the radar's range origin. Delays are float64: at 10 km and 10 GHz
+    phases are accurate to 1e-9. Differentiable with respect to the signal, the points and the
+    poses.
 
     Source: the matched filter of the paper's eq:fmcw_if.
 
     Args:
-        beat: Beat signals of all frames.
-        radar: With the pose of each frame.
-        points: Positions in the world [m].
+        beat: beat signals of all frames.
+        radar: radar with the pose of each frame.
+        points: positions [*, 3] in world axes [m].
 
     Raises:
         InputError: The signal does not fit the radar, the radar has no beat signal, or a point
@@ -47,7 +48,7 @@ def backproject_beat(
     length = UPSAMPLING * waveform.samples
     window = unit_window(radar.window, waveform.samples).to(beat.device)
     tapered = checked_beat(beat, radar).to(torch.complex128) * window
-    # Samples counted from the middle one, so that the spectrum turns slowly between its bins.
+    # Samples are counted from the middle one, so that the phase varies slowly between bins.
     turn = torch.exp(2j * math.pi * middle / length * torch.arange(length))
     spectrum = torch.fft.fft(tapered, length) * turn.to(beat.device)
     spectrum = torch.cat([spectrum, spectrum[..., :1]], dim=-1)
@@ -65,7 +66,7 @@ def backproject_beat(
                 + middle * waveform.step
                 - 0.5 * waveform.residual_slope * delay
             )
-            # The whole cycles are 1e5 at 77 GHz and 200 m: reduced in float64.
+            # Reduce the 1e5 cycles at 77 GHz and 200 m in float64.
             phase = -2 * math.pi * (cycles - cycles.detach().round())
             image = image + (echo * torch.polar(torch.ones_like(phase), phase)).sum(0)
     channels = radar.frame_count * tx.shape[1] * rx.shape[1]
@@ -75,23 +76,23 @@ def backproject_beat(
 def pairwise_distances(
     positions: Float64[Tensor, "place 3"], points: Float64[Tensor, "point 3"]
 ) -> Float64[Tensor, "place point"]:
-    """Distances from every place to every point [m].
+    """Compute distances from every position to every point [m].
 
     Args:
-        places, points: [m].
+        positions, points: [*, 3] [m].
     """
-    # The matrix product that cdist takes by default cancels digits.
+    # The default matrix product of cdist loses digits by cancellation.
     return torch.cdist(positions, points, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def interpolate_samples(
     samples: Complex128[Tensor, "row sample"], index: Float64[Tensor, "row point"]
 ) -> Complex128[Tensor, "row point"]:
-    """Interpolate linearly along each row at an index that may have a fraction.
+    """Interpolate linearly along each row at a fractional index.
 
     Args:
-        samples: Rows of samples.
-        index: Place in each row, in samples; it may have a fraction.
+        samples: rows of samples.
+        index: fractional position in each row, in samples.
     """
     cell = index.detach().floor().clamp(0, samples.shape[1] - 2).long()
     before, after = samples.gather(1, cell), samples.gather(1, cell + 1)

@@ -14,19 +14,19 @@ from invertwin.radar.signal.range_profile import range_profile
 def beamform(
     profile: Complex[Tensor, "frame tx rx range"], radar: Radar, grid: Grid
 ) -> Float[Tensor, "frame range u v"]:
-    """Bartlett power spectrum at the grid's directions.
+    """Compute the Bartlett power spectrum at the grid's directions.
 
     Steering is exp(+jk(u x + v y)) on the beat signal, whose phase falls as the element moves
     towards the target. Normalised by the sum of the weights: a point target of |a|² peaks at
     |a|². Along an axis that the grid does not resolve, the power of the elements is averaged.
 
     Args:
-        profile: Range profiles from ``range_profile``.
-        radar: What recorded it.
-        grid: Bins of range and direction.
+        profile: range profiles from ``range_profile``.
+        radar: radar that recorded it.
+        grid: bins of range and direction.
 
     Raises:
-        InputError: The profile does not fit radar and grid, the array is not flat, or the grid
+        InputError: The profile does not fit radar and grid, the array is not planar, or the grid
             resolves only one axis of an array that is not the product of a row and a column.
     """
     what = "a profile (frame, tx, rx, range)"
@@ -47,11 +47,11 @@ def beamform(
 def exact_spectrum(
     beat: Complex[Tensor, "frame tx rx sample"], radar: Radar, grid: Grid
 ) -> Float[Tensor, "frame range u v"]:
-    """Power spectrum as a real radar forms it: ``range_profile``, then ``beamform``.
+    """Compute the power spectrum as a radar does: ``range_profile``, then ``beamform``.
 
     Args:
         beat: Beat signals.
-        radar: What recorded them.
+        radar: radar that recorded them.
         grid: Bins of range and direction.
     """
     return beamform(range_profile(beat, radar, grid), radar, grid)

@@ -1,4 +1,4 @@
-"""Find targets in power maps by a constant false-alarm rate. Nothing here is differentiable."""
+"""CFAR detection of targets in power maps. Not differentiable."""
 
 import math
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from invertwin.radar.processing.doppler import velocity_axis, velocity_span
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 
-_QUADRATURE = 4096  # nodes over the distribution of an order statistic
+_QUADRATURE = 4096  # quadrature nodes over the distribution of an order statistic
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +28,12 @@ class PointCloud:
     """Detected points, one row each.
 
     Attributes:
-        frame: Radar pose that sees the point.
-        range: R = L/2 [m].
-        velocity: Range rate, positive moves away [m/s].
+        frame: index of the radar pose of each point.
+        range: range R = L/2 [m].
+        velocity: range rate, positive for receding points [m/s].
         u, v: Direction cosines in the radar frame; 0 along an axis that is not resolved.
-        power: Power in the strongest direction, received over transmitted.
-        position: Position in the world, seen from the middle of the phase centres [m].
+        power: power in the strongest direction, received over transmitted.
+        position: position in the world [m], seen from the midpoint of the phase centres.
     """
 
     frame: Int64[Tensor, " point"]
@@ -58,22 +58,22 @@ def cell_averaging_cfar(
 ) -> Bool[Tensor, "*batch first second"]:
     """Detect cells whose power exceeds a multiple of the mean of their training cells.
 
-    The multiple makes the rate of false alarms exact for noise that is independent from cell to
-    cell. Its power is exponentially distributed for one look, such as a channel or a beam, or the
-    mean of several looks, such as the channels that a grid without directions averages. Tapers
-    correlate neighbours and raise the rate. Near the edges of the map fewer training cells are
-    left; the multiple follows their number.
+    The multiple makes the false-alarm rate exact for independent noise in all cells. Its power is
+    exponentially distributed for one look, such as a channel or a beam, or the mean of several
+    looks, such as the channels averaged by a grid without directions. Tapers correlate neighbours
+    and raise the rate. Near the edges of the map the multiple accounts for the smaller number of
+    training cells.
 
     Args:
-        power: Maps over the last two axes, such as range rate and range.
-        guard: Cells to either side along both axes that the target itself fills.
-        training: Cells beyond those to either side.
-        false_alarm: Probability that a cell of noise is detected.
-        looks: Independent looks in the mean that is a cell's power.
+        power: maps over the last two axes, such as range rate and range.
+        guard: number of guard cells to either side along both axes, which the target itself fills.
+        training: number of training cells beyond those to either side.
+        false_alarm: false-alarm probability of a cell of noise.
+        looks: number of independent looks averaged in a cell.
 
     Raises:
         InputError: Power with gradients (a detection has none), values that are negative or not
-            finite, no training cells left, or a number out of range.
+            finite, no training cells, or a number out of range.
     """
     band, count = _training_cells(power, guard, training, "cell_averaging_cfar")
     _check_rates(false_alarm, looks)
@@ -94,14 +94,14 @@ def ordered_statistics_cfar(
 ) -> Bool[Tensor, "*batch first second"]:
     """Detect cells whose power exceeds a multiple of one ranked training cell.
 
-    Other targets among the training cells hardly raise the threshold, as they do in the mean.
+    Unlike in the mean, other targets among the training cells hardly raise the threshold.
 
     Source: Rohling, Radar CFAR thresholding in clutter and multiple target situations, 1983.
 
     Args:
-        power: Maps over the last two axes, such as range rate and range.
+        power: maps over the last two axes, such as range rate and range.
         guard, training, false_alarm, looks: As in ``cell_averaging_cfar``.
-        rank: Place of the chosen cell in ascending order, as a part of their number.
+        rank: rank of the selected cell in ascending order, relative to their number.
 
     Raises:
         InputError: As ``cell_averaging_cfar``, or a rank outside (0, 1].
@@ -112,7 +112,7 @@ def ordered_statistics_cfar(
         raise InputError(f"expected a rank in (0, 1], got {rank:g}; 0.75 is usual")
     numbers, index = count.unique(return_inverse=True)
     places = (rank * numbers - 1e-9).ceil().long()
-    # What is no training cell is infinite, so last in order.
+    # Other cells are infinite, so last in order.
     level = band.sort(-1).values.take_along_dim((places - 1)[index][..., None], -1)[..., 0]
     pairs = zip(numbers.tolist(), places.tolist(), strict=True)
     factors = [_ordered_factor(n, place, false_alarm, looks) for n, place in pairs]
@@ -127,18 +127,18 @@ def point_cloud(
     chirps: Chirps,
     fold: Int64[Tensor, "frame velocity range"] | None = None,
 ) -> PointCloud:
-    """Make a point of each detected cell that is a local maximum over range rate and range.
+    """Return a point for each detected cell that is a local maximum over range rate and range.
 
-    A point has the strongest direction with u² + v² ≤ 1. Along each axis its place is refined by
+    A point has the strongest direction with u² + v² ≤ 1. Along each axis its position is refined by
     the parabola through the logarithms of the power at the peak and its two neighbours.
 
     Args:
-        power: Result of ``range_doppler_angle``.
-        detections: Cells that hold targets.
-        radar: With the poses of the frames.
+        power: power from ``range_doppler_angle``.
+        detections: mask of detected cells.
+        radar: radar with the poses of the frames.
         grid: Bins of the power.
-        chirps: Timing, for the range rates.
-        fold: What was given to ``range_doppler_angle``.
+        chirps: timing that determines the range rates.
+        fold: as passed to ``range_doppler_angle``.
 
     Raises:
         InputError: Power with gradients, or shapes that do not fit each other.
@@ -150,7 +150,7 @@ def point_cloud(
     count = power.shape[1]
     seen = _mask_visible_region(power, grid).flatten(3)
     strongest = seen.amax(-1)
-    # The ends of the axis of range rates are neighbours.
+    # The axis of range rates is periodic.
     ends = ("nearest", "wrap", "nearest")
     around = maximum_filter(strongest.numpy(), (1, 3, 3), mode=ends)  # type: ignore[arg-type]
     highest = strongest == torch.from_numpy(around)
@@ -173,16 +173,16 @@ def peaks(
     radar: Radar,
     grid: Grid,
 ) -> PointCloud:
-    """Make a point of each detected cell that is a local maximum over range and direction.
+    """Return a point for each detected cell that is a local maximum over range and direction.
 
-    Use it for frames without range rates, such as maps that are compared in a fit. Unlike in
-    ``point_cloud``, one range may hold many points, since the parts of a body at rest may differ in
-    direction alone. Places are refined as in ``point_cloud``; range rates are zero.
+    Use it for frames without range rates, such as the maps of a fit. Unlike in ``point_cloud``, one
+    range may have many points, since parts of a static body may differ in direction alone.
+    Positions are refined as in ``point_cloud``; range rates are zero.
 
     Args:
-        power: Result of ``exact_spectrum`` or ``Capture.spectrum``.
-        detections: Cells of the strongest elevation that hold targets.
-        radar: With the poses of the frames.
+        power: power from ``exact_spectrum`` or ``Capture.spectrum``.
+        detections: mask of detected cells at the strongest elevation.
+        radar: radar with the poses of the frames.
         grid: Bins of the power.
 
     Raises:
@@ -206,14 +206,14 @@ def _check_shapes(power: Tensor, detections: Tensor, expected: tuple[int, ...], 
 
 
 def _mask_visible_region(power: Tensor, grid: Grid) -> Tensor:
-    """The map with zeros where no direction exists."""
+    """Set cells with u² + v² > 1 to zero."""
     return power.masked_fill(grid.u[:, None].square() + grid.v.square() > 1, 0.0)
 
 
 def _refine_points(
     power: Tensor, cell: list[Tensor], rates: Tensor, radar: Radar, grid: Grid
 ) -> PointCloud:
-    """Points at the cells, their ranges and directions between the bins, and their places."""
+    """Return points at the cells with interpolated ranges, directions and positions."""
     moved = [_refinement(power, cell, axis, wrap=False) for axis in range(2, 5)]
     frame, _, place, u, v = cell
     ranges = grid.ranges[place] + moved[0] * grid.range_step
@@ -229,14 +229,14 @@ def world_positions(
     u: Float64[Tensor, " point"],
     v: Float64[Tensor, " point"],
 ) -> Float64[Tensor, "point 3"]:
-    """Positions in the world of points in front of the radar [m].
+    """Return world positions of points in front of the radar [m].
 
     Args:
-        radar: With the poses of the frames.
-        frame: The pose that sees each point.
-        ranges: From the middle of the phase centres [m].
-        u: Direction cosines along the radar's x.
-        v: Direction cosines along its y.
+        radar: radar with the poses of the frames.
+        frame: index of the pose of each point.
+        ranges: ranges from the midpoint of the phase centres [m].
+        u: direction cosines along the radar's x.
+        v: direction cosines along the radar's y.
     """
     ahead = (1 - u.square() - v.square()).clamp(min=0).sqrt()
     link = radar.link()
@@ -265,7 +265,7 @@ def _check_rates(false_alarm: float, looks: int) -> None:
 def _training_cells(
     power: Tensor, guard: tuple[int, int], training: tuple[int, int], name: str
 ) -> tuple[Float64[Tensor, "*batch first second cell"], Int64[Tensor, "*batch first second"]]:
-    """Power of each cell's training cells, infinite beyond the map, and their number."""
+    """Return the power of each cell's training cells, infinite beyond the map, and their number."""
     _refuse_gradients(power, name)
     values = power.to("cpu", torch.float64)
     if not (torch.isfinite(values).all() and (values >= 0).all()):
@@ -297,7 +297,7 @@ def _training_cells(
 
 @lru_cache(maxsize=1024)
 def _ordered_factor(cells: int, rank: int, false_alarm: float, looks: int) -> float:
-    """Multiple of the place-th of the cells that noise exceeds with the given probability."""
+    """Return the multiple of the ranked cell that noise exceeds with the given probability."""
     nodes = (np.arange(_QUADRATURE) + 0.5) / _QUADRATURE
     weights = beta.pdf(nodes, rank, cells - rank + 1)
     levels, weights = gammaincinv(looks, nodes), weights / weights.sum()
@@ -314,7 +314,7 @@ def _ordered_factor(cells: int, rank: int, false_alarm: float, looks: int) -> fl
 def _refinement(
     power: Float64[Tensor, "frame velocity range u v"], cell: list[Tensor], axis: int, wrap: bool
 ) -> Float64[Tensor, " point"]:
-    """Peak between the bins of one axis, in bins: within half a bin, 0 at an edge."""
+    """Return the sub-bin peak offset along one axis, within half a bin, 0 at an edge."""
     size = power.shape[axis]
     here = cell[axis]
 

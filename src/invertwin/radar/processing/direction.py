@@ -1,4 +1,4 @@
-"""Directions finer than a beam: Capon and MUSIC, differentiable with respect to the signal."""
+"""Super-resolution directions: Capon and MUSIC, differentiable with respect to the signal."""
 
 import math
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ from invertwin.errors import InputError
 from invertwin.radar.aperture import Aperture, aperture
 from invertwin.radar.radar import Radar
 
-# Gaps between signal and noise eigenvalues below this part of the largest one count as noise of
-# the arithmetic: there the derivative of the subspace is damped instead of unbounded.
+# Gaps between signal and noise eigenvalues below this fraction of the largest one are rounding
+# errors: there the derivative of the subspace is damped.
 _SMALLEST_GAP = 1e-8
-# Uniform means to this part of the spacing.
+# Tolerance of a uniform spacing, relative to it.
 _UNIFORMITY = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class _Snapshots:
-    """What the estimators see: snapshots of a (sub)array and where its elements are.
+    """Snapshots of a (sub)array and its element positions.
 
     Attributes:
-        values: One row per snapshot, elements as columns.
+        values: snapshots [snapshot, element].
         array: The whole virtual array.
         x, y: Positions of the elements in the radar frame [m].
     """
@@ -37,11 +37,11 @@ class _Snapshots:
     y: Float64[Tensor, " element"]
 
     def manifold(self, grid: Grid) -> Complex128[Tensor, "direction element"]:
-        """Beat phases across the array of a source in each direction: exp(−jk(ux + vy))."""
+        """Return beat phases across the array of a source in each direction: exp(−jk(ux + vy))."""
         return self.array.beams(grid.u, grid.v, self.x, self.y).conj().to(self.values.device)
 
     def covariance(self) -> Complex128[Tensor, "frame range element element"]:
-        """Mean of x xᴴ over the snapshots."""
+        """Return the mean of x xᴴ over the snapshots."""
         return self.values.mT @ self.values.conj() / self.values.shape[-2]
 
 
@@ -54,20 +54,21 @@ def capon(
     smoothing: tuple[int, int] | None = None,
     forward_backward: bool = False,
 ) -> Float64[Tensor, "frame range u v"]:
-    """Capon (minimum variance) power spectrum: 1 / aᴴ (R + δI)⁻¹ a.
+    """Compute the Capon (minimum variance) power spectrum: 1 / aᴴ (R + δI)⁻¹ a.
 
     A single point target of |a|² peaks at |a|² (1 + δ/elements) plus noise. The result is
     differentiable with respect to the profile.
 
     Args:
-        profile: Range profiles; snapshots are chirps, or one snapshot per Doppler bin with the
-            bins as frames: of movers, where transmitters take turns, after ``compensate_tdm``.
-        radar: Its array, without window; its poses are not used.
-        grid: Its directions.
+        profile: range profiles; snapshots are chirps, or one snapshot per Doppler bin with the bins
+            as frames: for moving targets under time-division multiplexing, after
+            ``compensate_tdm``.
+        radar: radar with its array, without window; its poses are unused.
+        grid: grid with its directions.
         loading: Diagonal loading δ in units of the mean power of an element.
-        smoothing: Elements of the subarrays along x and y over whose shifts the covariance is
-            averaged (spatial smoothing, which tells coherent targets apart); None = none.
-        forward_backward: Average with the array read backwards, which doubles the snapshots.
+        smoothing: elements of the subarrays along x and y over whose shifts the covariance is
+            averaged (spatial smoothing, which decorrelates coherent targets); None = none.
+        forward_backward: whether to average with the reversed array, which doubles the snapshots.
 
     Raises:
         InputError: The profile does not fit radar or grid, an axis of the array that the grid
@@ -79,7 +80,7 @@ def capon(
     covariance = snapshots.covariance()
     level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1)
     identity = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
-    # Empty bins have no scale; anything finite gives them the power zero.
+    # Empty bins have no scale; any finite value results in power zero.
     scale = torch.where(level > 0, level, 1.0)
     loaded = covariance / scale[..., None, None] + loading * identity
     manifold = snapshots.manifold(grid)
@@ -99,24 +100,26 @@ def music(
     smoothing: tuple[int, int] | None = None,
     forward_backward: bool = False,
 ) -> Float64[Tensor, "frame range u v"]:
-    """MUSIC pseudospectrum: elements / aᴴ E Eᴴ a, with E the noise subspace. It is at least 1.
+    """Compute the MUSIC pseudospectrum: elements / aᴴ E Eᴴ a, with E the noise subspace; at least
+    1.
 
     It is differentiable with respect to the profile. The derivative of the projector on the noise
-    subspace depends on the gap between signal and noise eigenvalues only. It is finite where
-    eigenvalues are equal within either set, and damped where the gap itself vanishes and the
-    subspace jumps.
+    subspace depends on the gap between signal and noise eigenvalues only. It is finite for equal
+    eigenvalues within either set, and damped where the gap vanishes and the subspace is
+    discontinuous.
 
     Args:
-        profile: Range profiles; snapshots are chirps or Doppler bins, see ``capon``.
-        radar: Its array, without window; its poses are not used.
-        grid: Its directions.
-        sources: How many in every bin, or the rule that counts them in each: ``mdl`` or ``aic``.
+        profile: range profiles; snapshots are chirps or Doppler bins, see ``capon``.
+        radar: radar with its array, without window; its poses are unused.
+        grid: grid with its directions.
+        sources: number of sources in every bin, or the criterion that estimates it: ``mdl`` or
+            ``aic``.
         smoothing: Elements of the subarrays along x and y; None = no smoothing, see ``capon``.
-        forward_backward: Average with the array read backwards, which doubles the snapshots.
+        forward_backward: whether to average with the reversed array, which doubles the snapshots.
 
     Raises:
-        InputError: As for ``capon``; an unknown rule; more sources than elements less one or
-            than the snapshots can show.
+        InputError: As for ``capon``; an unknown criterion; more sources than elements minus one or
+            than snapshots allow.
     """
     snapshots = _snapshots(profile, radar, grid, smoothing, forward_backward)
     covariance = snapshots.covariance()
@@ -133,13 +136,13 @@ def music(
                 "give more chirps or other smoothing"
             )
         count = torch.full(covariance.shape[:2], sources, device=covariance.device)
-    # Eigenvalues ascend: the signal's are the last.
+    # Eigenvalues ascend: those of the signal are last.
     order = torch.arange(elements, device=covariance.device)
     signal = order >= elements - count[..., None]
     projector = _SignalProjector.apply(covariance, signal)
     manifold = snapshots.manifold(grid)
     inside = torch.einsum("dm,frmn,dn->frd", manifold.conj(), projector, manifold).real
-    # What is left of a source without noise is rounding error.
+    # Without noise the remainder of a source is rounding error.
     outside = (1 - inside / elements).clamp(min=1e-15)
     return (1 / outside).unflatten(-1, (grid.u_count, grid.v_count))
 
@@ -147,7 +150,7 @@ def music(
 def source_count(
     eigenvalues: Float[Tensor, "*batch element"], snapshots: int, rule: str = "mdl"
 ) -> Int64[Tensor, "*batch"]:
-    """Count the sources from the eigenvalues of a covariance matrix.
+    """Estimate the number of sources from the eigenvalues of a covariance matrix.
 
     Minimises −N (M − k) log(geometric/arithmetic mean of the M − k smallest) plus, with
     d = k (2M − k), d for ``aic`` or d log(N)/2 for ``mdl``, over k = 0 … M − 1.
@@ -156,8 +159,8 @@ def source_count(
 
     Args:
         eigenvalues: M eigenvalues in any order.
-        snapshots: N, independent ones in the covariance.
-        rule: ``mdl`` (consistent) or ``aic`` (finds weaker sources, and some that are none).
+        snapshots: number N of independent snapshots.
+        rule: ``mdl`` (consistent) or ``aic`` (detects weaker sources, and some false ones).
 
     Raises:
         InputError: An unknown rule, or fewer snapshots than elements.
@@ -171,12 +174,12 @@ def source_count(
             f"got {snapshots}; give sources as a number, more chirps, or smaller smoothing"
         )
     values = eigenvalues.detach().to(torch.float64).sort(-1).values
-    # Below the rounding of the largest one, eigenvalues are noise of the arithmetic.
+    # Eigenvalues below the rounding of the largest one are numerical noise.
     floor = 1e-14 * values[..., -1:].clamp(min=torch.finfo(torch.float64).tiny)
     values = values.maximum(floor)
     remaining = torch.arange(1, elements + 1, dtype=torch.float64, device=values.device)
     spread = (values.cumsum(-1) / remaining).log() - values.log().cumsum(-1) / remaining
-    found = elements - remaining  # k of each entry
+    found = elements - remaining  # k for each entry
     freedom = found * (2 * elements - found)
     penalty = freedom if rule == "aic" else 0.5 * math.log(snapshots) * freedom
     cost = snapshots * remaining * spread + penalty
@@ -184,9 +187,9 @@ def source_count(
 
 
 class _SignalProjector(torch.autograd.Function):
-    """Projector on the chosen eigenvectors of Hermitian matrices.
+    """Projector on the selected eigenvectors of Hermitian matrices.
 
-    Its derivative in a direction D is Σ (vⱼvⱼᴴ D vᵢvᵢᴴ + h.c.)/(λᵢ − λⱼ) over pairs of i chosen
+    Its derivative in a direction D is Σ (vⱼvⱼᴴ D vᵢvᵢᴴ + h.c.)/(λᵢ − λⱼ) over pairs of i selected
     and j not: gaps within either set do not enter.
     """
 
@@ -217,11 +220,11 @@ class _SignalProjector(torch.autograd.Function):
 
 
 def _projector_change(values: Tensor, vectors: Tensor, chosen: Tensor, change: Tensor) -> Tensor:
-    """Derivative of the projector when the matrix changes by a Hermitian one."""
+    """Return the derivative of the projector along a Hermitian change of the matrix."""
     gap = values[..., :, None] - values[..., None, :]
     smallest = _SMALLEST_GAP * values.abs().amax(-1)[..., None, None]
     between = chosen[..., :, None] != chosen[..., None, :]
-    # Matrices of zeros have no scale; their derivative is taken as zero.
+    # Zero matrices have no scale; their derivative is set to zero.
     damped = gap / (gap.square() + smallest.square()).clamp(min=torch.finfo(gap.dtype).tiny)
     sign = torch.where(chosen[..., :, None], 1.0, -1.0)
     inner = (vectors.mH @ change @ vectors) * (between * sign * damped)
@@ -235,7 +238,9 @@ def _snapshots(
     smoothing: tuple[int, int] | None,
     forward_backward: bool,
 ) -> _Snapshots:
-    """Snapshots of the distinct elements, shifted subarrays and the reversed array included."""
+    """Return snapshots of the distinct elements, including shifted subarrays and the reversed
+    array.
+    """
     what, do = "a profile (frame, snapshot, tx, rx, range)", "use those of range_profile"
     check_shape(profile, (None, None, *radar.shape[1:], grid.range_count), what, do)
     if not profile.numel():

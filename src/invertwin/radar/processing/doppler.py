@@ -1,4 +1,4 @@
-"""Motion in the signal: range rates from many chirps, directions of movers, micro-Doppler."""
+"""Doppler processing: range rates, directions of moving targets, micro-Doppler."""
 
 import math
 from collections.abc import Sequence
@@ -23,9 +23,9 @@ class Spectrogram:
     """Power over time and range rate.
 
     Attributes:
-        power: Peaks at |a|² for a constant range rate.
-        times: Middle of each window after the first chirp [s].
-        velocities: Range rates, positive moves away [m/s].
+        power: power, with peaks at |a|² for a constant range rate.
+        times: centre of each window after the first chirp [s].
+        velocities: range rates, positive for receding targets [m/s].
     """
 
     power: Float[Tensor, "*batch time velocity"]
@@ -36,12 +36,13 @@ class Spectrogram:
 def velocity_axis(
     radar: Radar, chirps: Chirps, bins: int | None = None
 ) -> Float64[Tensor, " velocity"]:
-    """Range rates of the bins of ``range_doppler``, ascending, λf/2 [m/s]; positive moves away.
+    """Return the range rates of the bins of ``range_doppler``, ascending, λf/2 [m/s].
 
     Args:
-        radar: Its transmitters and wavelength.
-        chirps: Timing.
-        bins: Number of bins, at least that of chirps (None); range rate 0 is at ``bins // 2``.
+        radar: radar with its transmitters and wavelength.
+        chirps: chirp timing.
+        bins: number of bins, at least the number of chirps (None); range rate 0 is at ``bins //
+            2``.
     """
     bins = chirps.count if bins is None else bins
     places = (torch.arange(bins, dtype=torch.float64) - bins // 2) / bins
@@ -49,11 +50,11 @@ def velocity_axis(
 
 
 def velocity_span(radar: Radar, chirps: Chirps) -> float:
-    """Twice the maximum speed [m/s]; range rates that differ by it look alike.
+    """Return twice the maximum unambiguous speed [m/s], the period of range rates.
 
     Args:
-        radar: Its wavelength and transmitters.
-        chirps: Their interval and order.
+        radar: radar with its wavelength and transmitters.
+        chirps: interval and order of the chirps.
     """
     return 2 * chirps.max_speed(radar.waveform.wavelength, radar.shape[1])
 
@@ -71,16 +72,16 @@ def range_doppler(
 
     The bins are those of ``velocity_axis``: the beat phase of a target that moves away grows from
     chirp to chirp. The result is normalised by the sums of the windows, so a point target of
-    coefficient a peaks at |a|. Where transmitters take turns, movers gain phase between them;
-    ``compensate_tdm`` removes it.
+    coefficient a peaks at |a|. Under time-division multiplexing, moving targets gain phase between
+    transmitters; ``compensate_tdm`` removes it.
 
     Args:
-        beat: Chirps of every transmitter.
-        radar: With one pose per frame.
-        grid: Its ranges are used.
-        chirps: Timing.
-        window: Over the chirps, one of ``WINDOWS``.
-        bins: Number of range rates, at least that of chirps (None).
+        beat: signals of all chirps of every transmitter.
+        radar: radar with one pose per frame.
+        grid: grid with its ranges.
+        chirps: chirp timing.
+        window: taper over the chirps, one of ``WINDOWS``.
+        bins: number of range rates, at least the number of chirps (None).
 
     Raises:
         InputError: Signal, radar and chirps do not fit, an unknown window, or too few bins.
@@ -105,18 +106,18 @@ def compensate_tdm(
     chirps: Chirps,
     fold: int | Int64[Tensor, "frame velocity range"] = 0,
 ) -> Complex[Tensor, "frame velocity tx rx range"]:
-    """Remove the phase that movers gain until a later transmitter sends.
+    """Remove the phase that moving targets gain between time-multiplexed transmitters.
 
-    A chirp that starts t later has 2π f t more phase, with f the Doppler frequency. Beamforming
-    would take this for a direction. The phase depends on the true f, but a bin shows it modulo one
-    over the time from loop to loop: ``fold`` says by how many spans of the velocity axis a bin's
-    target is beyond it.
+    A chirp that starts t later has 2π f t more phase, with f the Doppler frequency, which biases
+    beamforming. The phase depends on the true f, which a bin determines modulo the inverse loop
+    time: ``fold`` is the number of spans of the velocity axis by which the target's range rate is
+    aliased.
 
     Args:
-        spectrum: Result of ``range_doppler``.
-        radar: Its transmitters take turns in their order.
-        chirps: Timing.
-        fold: One number for all bins, or one for each (``resolve_fold`` finds it).
+        spectrum: spectrum from ``range_doppler``.
+        radar: radar whose transmitters are multiplexed in time.
+        chirps: chirp timing.
+        fold: number of spans for all bins, or one per bin (see ``resolve_fold``).
 
     Raises:
         InputError: Another number of transmitters in the spectrum than in the radar.
@@ -141,18 +142,19 @@ def resolve_fold(
     chirps: Chirps,
     candidates: Sequence[int] = (0, -1, 1),
 ) -> Int64[Tensor, "frame velocity range"]:
-    """Find by how many spans each bin's target is beyond the velocity axis.
+    """Estimate the number of velocity spans by which each bin's target is aliased.
 
-    The right number makes all transmitters agree with the receivers on a direction, so it has the
-    highest Bartlett peak. Of equal candidates the first is taken. With N transmitters that take
-    turns, candidates that differ by N cannot be told apart. The result has no gradients.
+    The correct number makes the phases of all transmitters and receivers consistent with one
+    direction, so it maximises the Bartlett peak; ties resolve to the first candidate. With N
+    multiplexed transmitters, candidates that differ by N are indistinguishable. The result has no
+    gradients.
 
     Args:
-        spectrum: Result of ``range_doppler``, not compensated.
-        radar: With several transmitters.
-        grid: With the directions in which to look for the peak.
-        chirps: Timing.
-        candidates: Numbers of spans to choose from, the likeliest first.
+        spectrum: spectrum from ``range_doppler``, not compensated.
+        radar: radar with several transmitters.
+        grid: grid with the directions of the peak search.
+        chirps: chirp timing.
+        candidates: candidate numbers of spans, the most likely first.
 
     Raises:
         InputError: No candidates, or a spectrum that does not fit radar and grid.
@@ -165,7 +167,7 @@ def resolve_fold(
         )
         for fold in candidates
     ]
-    # Rounding errors must not decide between equals.
+    # Break ties independently of rounding errors.
     best = torch.stack(peaks)
     chosen = (best >= (1 - 1e-9) * best.amax(0)).to(torch.int64).argmax(0)
     return torch.tensor(list(candidates), device=chosen.device)[chosen]
@@ -181,18 +183,18 @@ def range_doppler_angle(
     bins: int | None = None,
     fold: int | Int64[Tensor, "frame velocity range"] = 0,
 ) -> Float[Tensor, "frame velocity range u v"]:
-    """Power over range rate, range and direction (Bartlett), with ``compensate_tdm``.
+    """Compute power over range rate, range and direction (Bartlett).
 
-    It is ``range_doppler``, ``compensate_tdm``, then ``beamform``.
+    It applies ``range_doppler``, ``compensate_tdm``, then ``beamform``.
 
     Args:
-        beat: Signals of trains of chirps.
-        radar: What recorded them.
+        beat: signals of chirp trains.
+        radar: radar that recorded them.
         grid: Bins of range and direction.
-        chirps: Their interval and order.
+        chirps: interval and order of the chirps.
         window: Taper along the chirps.
         bins: Number of range rates; None = number of chirps.
-        fold: How often each range rate has wrapped around, see ``compensate_tdm``.
+        fold: number of spans of aliasing, see ``compensate_tdm``.
 
     Raises:
         InputError: As these three.
@@ -210,15 +212,16 @@ def micro_doppler(
     step: int = 1,
     window: str = "hann",
 ) -> Spectrogram:
-    """Short-time Fourier transform over the chirps of one range bin (or any slow-time signal).
+    """Compute the short-time Fourier transform over the chirps of one range bin (or any slow-time
+    signal).
 
     Args:
-        signal: One value per chirp of one transmitter, such as a bin of the range profiles.
-        radar: Its transmitters and wavelength.
-        chirps: Timing; the signal may be of more or fewer of them.
-        length: Chirps in a window.
-        step: Chirps from the start of one window to that of the next.
-        window: One of ``WINDOWS``.
+        signal: one value per chirp of one transmitter, such as a bin of the range profiles.
+        radar: radar with its transmitters and wavelength.
+        chirps: chirp timing; the signal may have another number of chirps.
+        length: number of chirps in a window.
+        step: number of chirps between the starts of consecutive windows.
+        window: one of ``WINDOWS``.
 
     Raises:
         InputError: A window longer than the signal or of fewer than 2 chirps, a step below 1, or
@@ -253,5 +256,5 @@ def _doppler_transform(
 
 
 def _repeat_poses(radar: Radar, count: int) -> Radar:
-    """The radar with each pose as often as it has chirps or bins."""
+    """Return the radar with each pose repeated for its chirps or bins."""
     return radar.frames(torch.arange(radar.frame_count).repeat_interleave(count))

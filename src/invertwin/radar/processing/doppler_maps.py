@@ -1,4 +1,4 @@
-"""Maps of one frame of chirps over range, range rate and direction, and where they peak."""
+"""Maps of one frame of chirps over range, range rate and direction, and their peaks."""
 
 import math
 from dataclasses import dataclass
@@ -23,27 +23,27 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.runtime.progress import track
 
-# Bins of range rate on either side of zero where slow drift of what stands still is seen, and how
-# far below the still echo of its range such drift stays.
+# Range-rate bins on either side of zero with slow drift of static echoes, and the maximum level
+# of drift relative to the static echo at its range.
 _STATIC_BINS = 2
 _DRIFT_LEVEL = 1e-3
-# Bins of range rate of which one range alone tells its noise.
+# Minimum number of range-rate bins for a noise estimate per range.
 _OWN_NOISE = 16
-# Probability that noise alone is taken for something that moves, and the rounding of samples.
+# False-alarm probability of moving targets, and the rounding of samples.
 _FALSE_ALARM_RATE = 1e-3
 _ROUNDING = 1e-12
-_BINS_AT_ONCE = 2e7  # of range rate, range, u, v
+_BINS_AT_ONCE = 2e7  # bins of range rate, range, u, v per chunk
 
 
 @dataclass(frozen=True)
 class Peak:
-    """The strongest cell of a map.
+    """Strongest cell of a map.
 
     Attributes:
-        range: [m].
-        velocity: Range rate, positive moves away [m/s].
+        range: range [m].
+        velocity: range rate, positive for receding targets [m/s].
         u, v: Direction cosines to the right and up; 0 where not resolved.
-        power: Received over sent, or in squared counts.
+        power: received over transmitted power, or squared counts.
     """
 
     range: float
@@ -53,7 +53,7 @@ class Peak:
     power: float
 
     def metrics(self, name: str) -> dict[str, float]:
-        """Numbers for `metrics.json` whose keys start with a name."""
+        """Return numbers for `metrics.json` with keys that start with a name."""
         return {
             f"{name}_range_m": self.range,
             f"{name}_velocity_m_s": self.velocity,
@@ -66,17 +66,17 @@ class Peak:
 
 @dataclass(frozen=True, eq=False)
 class DopplerMaps:
-    """One frame of a chirp train.
+    """Maps of one frame of a chirp train.
 
     Attributes:
-        grid: Ranges and directions.
-        velocities: Range rates [m/s].
-        range_doppler: Mean power of the channels [velocity, range].
-        total_power: Power over range and direction, all range rates summed [range, u, v].
-        moving_power: Power over range and direction of the chirps without their mean, which is what
-            stands still [range, u, v]; None = nothing moves.
-        strongest_peak: The strongest cell of all.
-        moving_peak: The strongest cell that moves; None = nothing is above the noise.
+        grid: ranges and directions.
+        velocities: range rates [m/s].
+        range_doppler: mean power of the channels [velocity, range].
+        total_power: power over range and direction, summed over range rates [range, u, v].
+        moving_power: power over range and direction after static clutter removal (mean over chirps)
+            [range, u, v]; None = no moving target.
+        strongest_peak: strongest cell.
+        moving_peak: strongest moving cell; None = no cell above the noise.
     """
 
     grid: Grid
@@ -95,21 +95,20 @@ def doppler_maps(
     chirps: Chirps,
     frame: int = 0,
 ) -> DopplerMaps:
-    """Make range-Doppler and range-direction maps of one frame, with ``compensate_tdm``.
+    """Compute range-Doppler and range-direction maps of one frame, with ``compensate_tdm``.
 
-    Range rates are those of the unambiguous span. What moves is looked for in the chirps without
-    their mean, so that slow movers are kept too. Something moves where a cell of range rate and
-    range, its channels averaged, is above what noise reaches in any cell of the map with a
-    probability of 0.001. Noise has the median power of the map, or of its own range if that is
-    more, as phase noise makes it. Next to range rate zero, drift 30 dB below what stands still at
-    that range is no motion.
+    Range rates are those of the unambiguous span. Moving targets are detected in the chirps without
+    their mean, which preserves slow ones. A cell of range rate and range, averaged over channels,
+    is moving if it exceeds the level that noise reaches in any cell of the map with a probability
+    of 0.001. The noise has the median power of the map, or of its range if that is larger, as for
+    phase noise. Near range rate zero, drift 30 dB below the static echo at that range is ignored.
 
     Args:
-        beat: Chirps of every transmitter.
-        radar: With one pose per frame.
-        grid: Ranges and directions of the maps.
-        chirps: Timing.
-        frame: The frame that is shown.
+        beat: signals of all chirps of every transmitter.
+        radar: radar with one pose per frame.
+        grid: ranges and directions of the maps.
+        chirps: chirp timing.
+        frame: index of the frame.
 
     Raises:
         InputError: As ``range_doppler`` and ``beamform``.
@@ -136,7 +135,7 @@ def _sum_range_rates(
     chirps: Chirps,
     candidates: Bool[Tensor, "velocity range"],
 ) -> tuple[Float64[Tensor, "range u v"], Peak]:
-    """Power of all range rates over range and direction, and the strongest cell of some."""
+    """Sum power over all range rates, and return the strongest of the candidate cells."""
     cube = compensate_tdm(cube, radar, chirps)[0]
     velocities = velocity_axis(radar, chirps)
     chunk = max(1, int(_BINS_AT_ONCE / math.prod(grid.shape)))
@@ -157,7 +156,7 @@ def _sum_range_rates(
 def _detect_moving_cells(
     moving: Float[Tensor, "velocity range"], flat: Float[Tensor, "velocity range"], looks: int
 ) -> Bool[Tensor, "velocity range"]:
-    """Cells above what noise and drift explain."""
+    """Detect cells above noise and drift."""
     moving, middle = moving.double(), len(flat) // 2
     rows = [noise_power(row, looks) for row in moving.T] if len(flat) >= _OWN_NOISE else [0.0]
     level = torch.tensor(rows, dtype=torch.float64).clamp_min(noise_power(moving, looks))
@@ -175,15 +174,15 @@ def high_resolution_map(
     method: str,
     sources: int | None,
 ) -> Float[Tensor, "range u v"]:
-    """Capon or MUSIC over range and direction [range, u, v].
+    """Compute a Capon or MUSIC map over range and direction [range, u, v].
 
     Args:
-        profile: Range profiles of one frame; bins of range rate whose transmitters' turns are
-            compensated serve as snapshots, too.
-        radar: Its array.
-        grid: Directions.
+        profile: range profiles of one frame; range-rate bins after ``compensate_tdm`` are snapshots
+            too.
+        radar: radar with its array.
+        grid: grid with its directions.
         method: capon or music.
-        sources: Number of sources for music; None = they are counted in each range.
+        sources: number of sources for music; None = estimated in each range.
 
     Raises:
         InputError: As ``capon`` and ``music``.
@@ -203,14 +202,14 @@ def doppler_snapshots(
     chirps: Chirps,
     frame: int,
 ) -> Complex[Tensor, "velocity tx rx range"]:
-    """The bins of range rate of one frame as snapshots for `high_resolution_map`.
+    """Return the range-rate bins of one frame as snapshots for `high_resolution_map`.
 
     Args:
-        beat: Chirps of every transmitter.
-        radar: With one pose per frame.
-        grid: Its ranges are used.
-        chirps: Timing.
-        frame: The frame that is used.
+        beat: signals of all chirps of every transmitter.
+        radar: radar with one pose per frame.
+        grid: grid with its ranges.
+        chirps: chirp timing.
+        frame: index of the frame.
     """
     radar = radar.frames([frame])
     cube = range_doppler(beat[frame : frame + 1], radar, grid, chirps, window="rectangular")
@@ -218,12 +217,12 @@ def doppler_snapshots(
 
 
 def find_peak(spectrum: Float[Tensor, "range u v"], grid: Grid, velocity: float = 0.0) -> Peak:
-    """The strongest cell of a map of one range rate.
+    """Return the strongest cell of a map of one range rate.
 
     Args:
-        spectrum: Power.
+        spectrum: power [range, u, v].
         grid: Bins of the map.
-        velocity: The range rate [m/s].
+        velocity: range rate [m/s].
     """
     r, u, v = (int(index) for index in np.unravel_index(int(spectrum.argmax()), spectrum.shape))
     place = float(grid.ranges[r]), velocity, float(grid.u[u]), float(grid.v[v])

@@ -1,4 +1,4 @@
-"""Detected points as files that other programs open."""
+"""Export of detected points."""
 
 from pathlib import Path
 
@@ -10,14 +10,14 @@ from invertwin.storage.folders import replace_file
 
 
 def save_points(path: str | Path, points: PointCloud) -> None:
-    """Write points as PLY or as PCD, binary, one record for each, the strongest first.
+    """Write points as binary PLY or PCD, one record each, the strongest first.
 
     Fields are ``x``, ``y``, ``z`` in the world [m], ``range`` [m], ``velocity`` [m/s], ``u``,
-    ``v``, ``power`` [dB] and ``frame``, all as float32, which every reader of either format knows.
+    ``v``, ``power`` [dB] and ``frame``, all as float32, which all readers of either format support.
 
     Args:
-        path: The file, ending in .ply or .pcd, in an existing folder.
-        points: What to write.
+        path: output file, ending in .ply or .pcd, in an existing folder.
+        points: points to write.
 
     Raises:
         InputError: Another suffix, or no such folder.

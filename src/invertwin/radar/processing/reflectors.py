@@ -1,4 +1,4 @@
-"""Points of one frame: where reflectors are, several in one range too, without their sidelobes."""
+"""Reflectors of one frame, several per range, without their sidelobes."""
 
 import math
 from dataclasses import replace
@@ -29,14 +29,14 @@ from invertwin.radar.signal.range_profile import range_profile
 from invertwin.radar.waveform import unit_window
 from invertwin.runtime.progress import track
 
-# With fewer range rates the cells that train a threshold lie along range alone. Half of them may
-# then hold other reflectors.
+# With fewer range rates the training cells lie along range alone, and half of them may contain
+# other reflectors.
 _MIN_RATES_2D = 13
 _GUARD, _TRAINING, _RANK = (0, 4), (0, 16), 0.5
-# What stronger reflectors leave at a point, in power, below which it counts as their sidelobe.
+# Points below this factor of the sidelobe power of stronger reflectors are sidelobes.
 _ABOVE_SIDELOBES = 4.0
-# A further direction in one cell has at least this part of the strongest one's power: errors of
-# gains and phases of a board's channels leave that much.
+# Minimum relative power of a further direction in one cell: gain and phase errors of a board's
+# channels leave this residual.
 _MIN_RELATIVE_POWER = 0.1
 _FALSE_DIRECTION_RATE = 1e-3
 
@@ -48,19 +48,19 @@ def detect_points(
     chirps: Chirps | None,
     frame: int,
 ) -> PointCloud:
-    """Find the reflectors in one frame by a constant false-alarm rate.
+    """Detect the reflectors in one frame by CFAR.
 
-    Cells of range and range rate that stand out are points, unless the windows' sidelobes of
-    stronger points explain them. Directions of a cell are taken out one after the other, the
-    strongest first, all amplitudes fitted together, until noise is left or a tenth of the
-    strongest; so one range may hold several points.
+    Detected cells of range and range rate are points, unless they are sidelobes of stronger points.
+    Directions of a cell are extracted one by one, the strongest first, with a joint fit of all
+    amplitudes, until the residual is noise or a tenth of the strongest (orthogonal matching
+    pursuit); so one range may have several points.
 
     Args:
-        beat: Chirps of every transmitter, or one.
-        radar: With one pose per frame.
-        grid: Ranges and directions that are searched.
-        chirps: Timing; None = one chirp, whose points have the range rate NaN.
-        frame: The frame that is searched.
+        beat: signals of all chirps of every transmitter, or of one chirp.
+        radar: radar with one pose per frame.
+        grid: ranges and directions of the search.
+        chirps: chirp timing; None = one chirp, whose points have the range rate NaN.
+        frame: index of the frame.
     """
     radar, signal = radar.frames([frame]), beat[frame : frame + 1]
     if chirps is None:
@@ -93,7 +93,7 @@ def detect_points(
 
 
 def format_points_csv(points: PointCloud) -> str:
-    """One line per point, the strongest first."""
+    """Return one line per point, the strongest first."""
     lines = ["range_m,velocity_m_s,u,v,power_db,x_m,y_m,z_m"]
     for i in points.power.argsort(descending=True).tolist():
         level = 10 * math.log10(float(points.power[i]))
@@ -103,12 +103,12 @@ def format_points_csv(points: PointCloud) -> str:
 
 
 def noise_power(power: Float[Tensor, "*cell"], looks: int, empty: float = 0.5) -> float:
-    """Mean power of noise from a quantile of cells: the median, where half of them hold no signal.
+    """Estimate the mean noise power from a quantile of cells: the median if half of them are empty.
 
     Args:
-        power: Means of several looks.
-        looks: Independent looks in a mean.
-        empty: Share of cells without signal, the quantile.
+        power: power averaged over several looks.
+        looks: number of independent looks.
+        empty: fraction of cells without signal, the quantile.
     """
     level = float(power.double().flatten().kthvalue(math.ceil(empty * power.numel())).values)
     return level * looks / float(gammaincinv(looks, empty))
@@ -117,7 +117,7 @@ def noise_power(power: Float[Tensor, "*cell"], looks: int, empty: float = 0.5) -
 def _find_cells(
     flat: Float64[Tensor, "velocity range"], radar: Radar, grid: Grid, looks: int
 ) -> list[tuple[int, int]]:
-    """Bins of range rate and range that hold reflectors, the strongest first."""
+    """Return the range-rate and range bins of reflectors, the strongest first."""
     around = maximum_filter(flat.numpy(), 3, mode=("wrap", "nearest"))  # type: ignore[arg-type]
     found = _threshold_cells(flat, looks) & (flat == torch.from_numpy(around)) & (flat > 0)
     places = torch.nonzero(found)
@@ -151,9 +151,9 @@ def _threshold_cells(
 def _sidelobe_response(
     offsets: Int64[Tensor, "cell 2"], count: int, radar: Radar, grid: Grid
 ) -> Float64[Tensor, " cell"]:
-    """Highest power of a point in cells apart from its own, by the windows over chirps and samples.
+    """Return the highest sidelobe power of a point at given cell offsets, from the windows.
 
-    A point is up to half a bin beside the middle of its cell, where sidelobes are no longer zero.
+    A point is up to half a bin from the centre of its cell, where sidelobes are non-zero.
     """
     weight = unit_window("hamming", count).to(torch.complex128)
     beside = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
@@ -168,7 +168,7 @@ def _sidelobe_response(
 def _resolve_directions(
     cell: Complex128[Tensor, "tx rx"], radar: Radar, grid: Grid, noise: float
 ) -> list[list[float]]:
-    """Directions u, v and powers in one cell, the strongest first."""
+    """Return directions u, v and powers in one cell, the strongest first."""
     channels, left = cell.flatten(), cell
     one = replace(grid, range_start=0.0, range_count=1)
     seen = grid.u[:, None].square() + grid.v.square() <= 1
@@ -197,13 +197,13 @@ def _resolve_directions(
 
 
 def _share_beam(radar: Radar, one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Whether two directions are less than a beam apart."""
+    """Return whether two directions are less than a beamwidth apart."""
     du, dv = (abs(a - b) / w for a, b, w in zip(one, other, radar.beamwidth, strict=True))
     return math.hypot(du, dv) < 1
 
 
 def _plane_wave(radar: Radar, grid: Grid, u: float, v: float) -> Complex128[Tensor, " channel"]:
-    """Channels of an echo from a direction; along an axis that is not resolved, all alike."""
+    """Return the channels of a plane wave; an unresolved axis has no phase."""
     x, y, _ = radar.virtual_positions.T
     path = u * x * (grid.u_count > 1) + v * y * (grid.v_count > 1)
     phase = -2 * math.pi / radar.waveform.wavelength * path.double()
@@ -213,7 +213,7 @@ def _plane_wave(radar: Radar, grid: Grid, u: float, v: float) -> Complex128[Tens
 def _refine_direction(
     channels: Complex128[Tensor, " channel"], radar: Radar, grid: Grid, u: float, v: float
 ) -> tuple[float, float]:
-    """The direction near one of the grid in which the channels add up best."""
+    """Return the direction near one of the grid that maximises the coherent sum of the channels."""
     place = [u, v]
     for shrink in (1.0, 4.0):
         for axis, (count, width) in enumerate(
@@ -232,7 +232,9 @@ def _refine_direction(
 
 
 def _vertex(levels: Float64[Tensor, "3"]) -> float:
-    """Peak of the parabola through the logarithms of three levels: within half a step."""
+    """Return the peak offset of the parabola through the logarithms of three levels: within half a
+    step.
+    """
     before, middle, after = levels.clamp_min(torch.finfo(torch.float64).tiny).log().tolist()
     curvature = before - 2 * middle + after
     if curvature >= 0:

@@ -1,4 +1,4 @@
-"""Motion within a frame: the beat signal of a train of chirps."""
+"""Motion within a frame: beat signals of chirp trains."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ from invertwin.radar.waveform import FMCW, SampledWaveform, SteppedFrequency
 from invertwin.runtime.concurrency import tracer_lock
 from invertwin.runtime.progress import track
 
-# Largest error of interpolating a path's phase factor between the instants of a ramp.
+# Maximum interpolation error of a path's phase factor between the instants of a ramp.
 _INTERPOLATION_ERROR = 1e-6
 _MAX_INSTANTS = 33
 
@@ -34,18 +34,17 @@ PointTrajectory = Callable[[float], Float64[Tensor, "path 3"]]
 
 @dataclass(frozen=True)
 class Chirps:
-    """When the ramps of a frame start.
+    """Timing of the ramps of a frame.
 
     Attributes:
-        count: Chirps of each transmitter in a frame (loops).
-        interval: Time from the start of one ramp to the next, idle time included [s].
-        tdm: Transmitters take turns (time-division MIMO); else they send at once, told apart
-            by an ideal code.
-        order: Transmitters, counted from 0, in the order of their turns; None = 0, 1, 2, …
+        count: number of chirps of each transmitter in a frame (loops).
+        interval: time between the starts of consecutive ramps, idle time included [s].
+        tdm: time-division MIMO; else transmitters are simultaneous, separated by ideal codes.
+        order: transmitters, counted from 0, in the order of transmission; None = 0, 1, 2, …
 
     Raises:
-        InputError: No chirps, an interval that is not positive, an order that does not name
-            every transmitter once, or one of transmitters that send at once.
+        InputError: No chirps, an interval that is not positive, an order that does not name every
+            transmitter once, or one for simultaneous transmitters.
     """
 
     count: Count
@@ -70,7 +69,8 @@ class Chirps:
             )
 
     def times(self, transmitters: int) -> Float64[Tensor, "chirp tx"]:
-        """First sample of every ramp [s], the first one at 0; columns are the radar's elements.
+        """Return the first sample of every ramp [s], the first one at 0; columns are the radar's
+        elements.
 
         Raises:
             InputError: An order of another number of transmitters.
@@ -89,11 +89,11 @@ class Chirps:
         return times[:, torch.argsort(torch.tensor(self.order))]
 
     def max_speed(self, wavelength: float, transmitters: int) -> float:
-        """Range rate beyond which Doppler is ambiguous, λ/(4 T) [m/s].
+        """Return the maximum unambiguous range rate, λ/(4 T) [m/s].
 
         Args:
-            wavelength: [m].
-            transmitters: Number that take turns.
+            wavelength: wavelength [m].
+            transmitters: number of time-multiplexed transmitters.
         """
         turns = transmitters if self.tdm else 1
         return wavelength / (4 * self.interval * turns)
@@ -107,26 +107,26 @@ def moving_beat(
     trajectory: PointTrajectory | None = None,
     tolerance: float = 1e-9,
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
-    """Beat signals of a train of chirps, during which scattering points move.
+    """Compute beat signals of a chirp train with moving scattering points.
 
-    Every sample of every ramp has the delay of its own time, to each element. This is the delay of
-    the place where a point scattered what is received at that time. Delays are computed exactly at
-    three or more instants of a ramp, as many as leave an error of 1e-6 between them. Range
-    migration, acceleration and rotation are therefore exact within a ramp and from ramp to ramp.
-    Amplitudes and visibility are those of the start of the frame. Approaching points have
-    falling delays, so their beat phase falls from chirp to chirp by 4π v T/λ. Samples that are
-    not taken in time (OFDM) see the points where the symbol starts.
+    Every sample of every ramp has the delay at its own time, to each element, of the position of
+    the point at the time of scattering. Delays are exact at three or more instants of a ramp, as
+    many as limit the interpolation error to 1e-6. Range migration, acceleration and rotation are
+    therefore exact within a ramp and between ramps. Amplitudes and visibility are those of the
+    start of the frame. Approaching points have falling delays, so their beat phase falls from chirp
+    to chirp by 4π v T/λ. Samples that are not taken in time (OFDM) have the points at the start of
+    the symbol.
 
     Source: derivations §6.
-    Differs from the source: the paper's scenes stand still.
+    Differs from the source: the paper's scenes are static.
 
     Args:
-        paths: Paths that ``trace_field`` gives for a scene with velocities.
-        radar: One with samples, at rest within a frame.
-        chirps: Timing.
-        trajectory: World positions of the paths' points [m] at a time [s] after the start of the
-            frame, for motion that is not uniform; None = they move with their velocities.
-        tolerance: Relative error of the sums, see ``beat_signal``.
+        paths: paths from ``trace_field`` of a scene with velocities.
+        radar: radar with samples, static within a frame.
+        chirps: chirp timing.
+        trajectory: world positions of the paths' points [m] at a time [s] after the start of the
+            frame, for non-uniform motion; None = constant velocities.
+        tolerance: relative error of the sums, see ``beat_signal``.
 
     Raises:
         InputError: As ``beat_signal``; moving paths of several bounces; points so fast that a
@@ -151,12 +151,13 @@ def simulate_chirp_train(
     transmitters: int,
     ramp: Callable[[float, list[int]], Complex128[Tensor, "frame sender rx sample"]],
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
-    """Signals of all ramps of a train.
+    """Simulate the signals of all ramps of a train.
 
     Args:
-        chirps: When ramps start, and who sends.
+        chirps: timing and transmission order.
         transmitters: Number of transmitters.
-        ramp: Signals of one ramp, from its start [s] and the transmitters that send then.
+        ramp: function of the start [s] and the active transmitters that returns the signals of one
+            ramp.
     """
     rows = []
     for starts in track(chirps.times(transmitters).tolist(), "chirps"):
@@ -169,13 +170,14 @@ def simulate_chirp_train(
 
 
 def range_rate(paths: Paths, radar: Radar) -> Float64[Tensor, " path"]:
-    """Derivative of the paths' range R = L/2 with respect to time, by forward mode [m/s].
+    """Compute the derivative of the paths' range R = L/2 with respect to time, in forward mode
+    [m/s].
 
-    Positive moves away; the Doppler frequency is 2/λ times it.
+    It is positive for receding points; the Doppler frequency is 2/λ times it.
 
     Args:
-        paths: Paths of one bounce; the rate is zero where they carry no velocity.
-        radar: At rest.
+        paths: paths of one bounce; the rate is zero for paths without velocity.
+        radar: static radar.
     """
     if paths.velocity is None:
         return torch.zeros_like(paths.delay)
@@ -192,7 +194,7 @@ def range_rate(paths: Paths, radar: Radar) -> Float64[Tensor, " path"]:
 
 
 def sample_interval(waveform: SampledWaveform) -> float:
-    """Time from one sample to the next [s]; 0 where they are taken at once (OFDM)."""
+    """Return the sampling interval [s]; 0 for simultaneous samples (OFDM)."""
     if isinstance(waveform, FMCW | SteppedFrequency):
         return float(waveform.sample_times[1])
     return 0.0
@@ -200,13 +202,13 @@ def sample_interval(waveform: SampledWaveform) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ChirpTrain:
-    """Paths whose points move, and the ramps that see them.
+    """Paths with moving points, and the radar of a chirp train.
 
     Attributes:
-        paths: Their frames, coefficients, and delays at their first points.
-        radar: One with samples.
-        trajectory: Positions of the first points at a time; the last ones move with them.
-        tolerance: Relative error of the sums.
+        paths: paths with frames, coefficients, and delays at their first points.
+        radar: radar with samples.
+        trajectory: positions of the first points at a time; the last ones move with them.
+        tolerance: relative error of the sums.
     """
 
     paths: Paths
@@ -217,11 +219,11 @@ class ChirpTrain:
     def simulate_ramp(
         self, start: float, active_transmitters: Sequence[int]
     ) -> Complex128[Tensor, "frame sender rx sample"]:
-        """Record one ramp with all receivers.
+        """Simulate one ramp with all receivers.
 
         Args:
-            start: Start of the ramp [s].
-            active_transmitters: Transmitters that send at once.
+            start: start of the ramp [s].
+            active_transmitters: simultaneous transmitters.
         """
         paths, waveform = self.paths, require_sampled_waveform(self.radar)
         device = paths.delay.device
@@ -262,7 +264,7 @@ class ChirpTrain:
         return torch.stack([torch.stack(found) for found in signals], dim=1)
 
     def _points_at_instants(self, start: float, count: int) -> Float64[Tensor, "instant path 3"]:
-        """The points at the instants of a ramp."""
+        """Return the points at the instants of a ramp."""
         waveform = require_sampled_waveform(self.radar)
         interval = sample_interval(waveform)
         instants = ramp_instants(waveform.samples, count) if interval else torch.zeros(1)
@@ -271,7 +273,7 @@ class ChirpTrain:
     def _scattering_points(
         self, points: Float64[Tensor, "instant path 3"], receiver: Float64[Tensor, "3"]
     ) -> Float64[Tensor, "instant path 3"]:
-        """The points at the times when they scattered what is received at the instants."""
+        """Return the points at the scattering times of the signals received at the instants."""
         if len(points) == 1:
             return points
         waveform = require_sampled_waveform(self.radar)
@@ -292,7 +294,7 @@ def _segment_length(first: Tensor, span: Tensor, tx: Tensor, rx: Tensor) -> Tens
 
 
 def _count_instants(curvature: float) -> int:
-    """Count the instants of a ramp that follow phases which bend by this much at its ends [rad].
+    """Return the number of instants of a ramp for phases with this curvature at its ends [rad].
 
     Of exp(jψ) with ψ of second degree over [-1, 1], the power h = (count + 1)/2 is the first that a
     polynomial through the instants misses, by ψʰ/h! · 2^(1 − count).

@@ -1,9 +1,9 @@
-"""Impairments that a real front end adds to beat signals of frames or trains of chirps.
+"""Front-end impairments of beat signals of frames or chirp trains.
 
-Each impairment is off unless asked for.
+Each impairment is off by default.
 
-The order is that of the hardware: phase noise and leakage on the way to the mixer, gain and phase
-errors of the channels, thermal noise, then the converter.
+The order is that of the hardware: phase noise and leakage before the mixer, gain and phase errors
+of the channels, thermal noise, then the converter.
 """
 
 import math
@@ -28,25 +28,25 @@ from invertwin.radar.signal.chirps import Chirps, moving_beat
 from invertwin.radar.signal.range_profile import add_noise, beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, PhysicsWarning, SteppedFrequency
 
-# Phase of the highest offset between delays at which the residual is computed; linear between
-# them it is then off by less than 1 % there.
+# Phase step of the highest offset between delays of the residual: the error of linear
+# interpolation is below 1 %.
 _DELAY_STEP = 0.25
-# Offsets are this many times finer than one sweep resolves, so that noise does not repeat in it.
+# Frequency resolution relative to that of one sweep, so that noise is not periodic in it.
 _OSCILLATOR_OVERSAMPLING = 4
 
-Level = Annotated[float, Gt(-400), Lt(0)]  # dB below what is sent
+Level = Annotated[float, Gt(-400), Lt(0)]  # relative to the transmitted power [dB]
 
 
 @dataclass(frozen=True)
 class PhaseNoise:
-    """Phase noise of the oscillator that drives both transmitter and mixer.
+    """Phase noise of the oscillator of both transmitter and mixer.
 
-    Between the points the level is a straight line over the logarithm of the offset. Beyond the
-    first and the last of several points it is constant. A single point means −20 dB per decade.
+    The level is linear over the logarithm of the offset between the points, and constant beyond the
+    first and the last one. A single point means −20 dB per decade.
 
     Attributes:
-        offsets: Distances from the carrier, ascending [Hz].
-        levels: Single-sideband level L(f) at them [dBc/Hz].
+        offsets: ascending offsets from the carrier [Hz].
+        levels: single-sideband levels L(f) [dBc/Hz].
 
     Raises:
         InputError: Offsets that do not ascend from above zero, another number of levels, or
@@ -70,7 +70,7 @@ class PhaseNoise:
             )
 
     def density(self, offset: Float64[Tensor, " offset"]) -> Float64[Tensor, " offset"]:
-        """One-sided S_φ(f) = 2 · 10^(L/10) [rad²/Hz] at an offset f > 0 [Hz]."""
+        """Return the one-sided S_φ(f) = 2 · 10^(L/10) [rad²/Hz] at an offset f > 0 [Hz]."""
         if len(self.offsets) == 1:
             level = self.levels[0] - 20 * torch.log10(offset / self.offsets[0])
         else:
@@ -82,14 +82,14 @@ class PhaseNoise:
 
 @dataclass(frozen=True)
 class Leakage:
-    """Direct path from transmitters to receivers, the same in every channel.
+    """Direct path from transmitters to receivers, equal in every channel.
 
     Attributes:
-        delay: [s].
-        level_db: Received over transmitted power [dB].
+        delay: delay [s].
+        level_db: received over transmitted power [dB].
 
     Raises:
-        InputError: A delay that is not one of a board, or more received than sent.
+        InputError: A delay implausible for a board, or more received than transmitted power.
     """
 
     delay: Annotated[NonNegative, UsualValue("seconds", 1e-9, high=1e-6)]
@@ -101,12 +101,12 @@ class Leakage:
 
 @dataclass(frozen=True)
 class ADC:
-    """Converter of I and of Q: uniform steps, two's complement codes, clipped at the ends.
+    """Converter of I and Q: uniform steps, two's complement codes, clipping.
 
     Attributes:
-        bits: Resolution of each of the two, 2 to 32 bits.
-        full_scale: Amplitude that the most negative code stands for, in the units of the beat
-            signal, √(received over transmitted power).
+        bits: resolution of each of the two, 2 to 32 bits.
+        full_scale: amplitude of the most negative code, in the units of the beat signal, √(received
+            over transmitted power).
 
     Raises:
         InputError: Impossible bits or full scale.
@@ -120,13 +120,13 @@ class ADC:
 
     @property
     def step(self) -> float:
-        """One code, 2 · full_scale / 2^bits."""
+        """Step of one code, 2 · full_scale / 2^bits."""
         return 2 * self.full_scale / 2**self.bits
 
 
 @dataclass(frozen=True)
 class Impairments:
-    """The impairments of a recording. The defaults add none.
+    """Impairments of a recording. The defaults add none.
 
     Attributes:
         phase_noise: Phase noise of the common oscillator.
@@ -162,17 +162,18 @@ class Impairments:
     def record(
         self, paths: Paths, radar: Radar, *, seed: int, chirps: Chirps | None = None
     ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
-        """Record the paths, in single ramps or a train of chirps, with these impairments.
+        """Simulate the paths with these impairments, in single ramps or a chirp train.
 
         Each impairment draws from its own stream of the seed, so adding one does not change the
-        numbers of the others. Channel errors and leakage are the same in all chirps. Thermal noise
-        is new in every sample. The oscillator runs on through a train (``residual_phase``).
+        random numbers of the others. Channel errors and leakage are constant over chirps. Thermal
+        noise is independent in every sample. The oscillator is continuous over a train
+        (``residual_phase``).
 
         Args:
-            paths: Field paths.
-            radar: One with samples.
+            paths: field paths.
+            radar: radar with samples.
             seed: Seed of all random numbers.
-            chirps: Timing of a train, as for ``moving_beat``; None = one ramp a frame.
+            chirps: timing of a train, as for ``moving_beat``; None = one ramp per frame.
 
         Raises:
             InputError: As ``noisy_oscillator_beat``, ``add_noise`` and ``quantize``.
@@ -190,12 +191,12 @@ class Impairments:
         """Add all impairments except phase noise to a beat signal of frames or trains.
 
         Args:
-            beat: Without impairments.
-            radar: What records it.
+            beat: signal without impairments.
+            radar: radar that records it.
             seed: Seed of all random numbers.
 
         Raises:
-            InputError: Phase noise, which each path has of its own; otherwise as ``record``.
+            InputError: Phase noise, which depends on the paths; otherwise as ``record``.
         """
         self.check_applicable()
         return self._add_receiver_effects(beat, radar, seed, None)
@@ -248,20 +249,20 @@ def _streams(seed: int) -> list[int]:
 def noisy_oscillator_beat(
     paths: Paths, radar: Radar, noise: PhaseNoise, *, seed: int, chirps: Chirps | None = None
 ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
-    """Beat signal where one oscillator with phase noise φ transmits and mixes.
+    """Compute beat signals with one oscillator of phase noise φ for transmitter and mixer.
 
         s'[n] = Σ s_i[n] exp(j (φ(t_n) − φ(t_n − τ_i)))
 
-    with s_i the beat signal of one path. Noise that the echo and the mixer share cancels. The
-    factor is computed at delays so close that it is linear between them. In a train of chirps
-    this factor uses a path's delay τ at the start of the frame.
+    with s_i the beat signal of one path. Noise common to echo and mixer cancels. The factor is
+    computed at delays dense enough for linear interpolation. In a train of chirps this factor uses
+    a path's delay τ at the start of the frame.
 
     Args:
-        paths: Field paths.
+        paths: field paths.
         radar: An FMCW or stepped frequency radar.
-        noise: Its level.
-        seed: Seed of the noise, see ``residual_phase``.
-        chirps: Timing of a train; None = one ramp a frame.
+        noise: phase noise.
+        seed: seed of the noise, see ``residual_phase``.
+        chirps: timing of a train; None = one ramp per frame.
 
     Raises:
         InputError: As ``beat_signal`` and ``residual_phase``.
@@ -278,12 +279,12 @@ def noisy_oscillator_beat(
     place = (paths.delay - first) / spacing if intervals else torch.zeros_like(paths.delay)
 
     def beat_near_node(node: int) -> Tensor:
-        """What the paths near one of the delays add."""
+        """Return the contribution of the paths near one of the delays."""
         weight = (1 - (place - node).abs()).clamp_min(0)
         chosen = weight > 0
         part = paths.select(chosen)
         with warnings.catch_warnings():
-            # All paths have been judged together.
+            # All paths have been checked together.
             warnings.simplefilter("ignore", PhysicsWarning)
             part = part.scale_fields(weight[chosen])
             beat = _ideal_beat(part, radar, chirps)
@@ -296,23 +297,23 @@ def noisy_oscillator_beat(
 def residual_phase(
     noise: PhaseNoise, radar: Radar, delay: float, *, seed: int, chirps: Chirps | None = None
 ) -> Float64[Tensor, "frame *chirp tx sample"]:
-    """Phase noise left after mixing with an echo, φ(t_n) − φ(t_n − τ) [rad].
+    """Compute the phase noise after mixing with an echo, φ(t_n) − φ(t_n − τ) [rad].
 
     Its one-sided density is ``S_φ(f) · 4 sin²(πfτ)``. Offsets reach up to half the sampling
     rate, where the IF filter ends. The same seed gives the same φ at every delay.
 
     Single sweeps have independent φ in every frame and transmitter, without components slower than
-    four sweeps. In a train of chirps one oscillator runs through the frame, pauses included.
-    Transmitters in turn read φ at their own times; transmitters at once read the same φ. Slow
-    components are correlated from chirp to chirp, down to a frequency of 1 / (4 frames). The starts
-    of ramps are rounded to the sampling interval.
+    four sweeps. In a chirp train one oscillator runs through the frame, pauses included.
+    Time-multiplexed transmitters have φ at their own times; simultaneous transmitters share φ. Slow
+    components are correlated between chirps, down to a frequency of 1 / (4 frames). The starts of
+    ramps are rounded to the sampling interval.
 
     Args:
-        noise: Level of φ.
+        noise: phase noise φ.
         radar: An FMCW or stepped frequency radar.
-        delay: τ of the echo [s].
+        delay: delay τ of the echo [s].
         seed: Seed of φ, which is independent for each frame.
-        chirps: Timing of a train; None = one ramp a frame.
+        chirps: timing of a train; None = one ramp per frame.
 
     Raises:
         InputError: A waveform whose samples are not taken in time.
@@ -336,7 +337,7 @@ def _oscillator(
     runs: tuple[int, ...],
     samples: int,
 ) -> Float64[Tensor, "*run sample"]:
-    """φ(t) − φ(t − τ) at the sampling rate, of independent runs at least so many samples long."""
+    """Return φ(t) − φ(t − τ) at the sampling rate, for independent runs of a minimum length."""
     length = _OSCILLATOR_OVERSAMPLING * samples
     spacing = 1 / (length * float(waveform.sample_times[1]))
     offsets = spacing * torch.arange(1, length // 2, dtype=torch.float64)
@@ -344,16 +345,16 @@ def _oscillator(
     lines = torch.randn((*runs, len(offsets)), dtype=torch.complex128, generator=generator)
     lines = lines * (2 * spacing * noise.density(offsets)).sqrt()
     lines = lines * (1 - _phasor(-2 * math.pi * delay * offsets))
-    # Re Σ lines exp(2πj f t): a real inverse FFT, but for its factor 2 / length and f = 0.
+    # Re Σ lines exp(2πj f t): a real inverse FFT, up to its factor 2 / length and f = 0.
     return torch.fft.irfft(torch.nn.functional.pad(lines, (1, 1)) * (0.5 * length), length)
 
 
 def leakage_signal(leakage: Leakage, radar: Radar) -> Complex128[Tensor, " sample"]:
-    """Beat signal of the leakage alone, to be added to every channel.
+    """Return the beat signal of the leakage alone, to be added to every channel.
 
     Args:
-        leakage: Delay and level.
-        radar: One with samples.
+        leakage: delay and level.
+        radar: radar with samples.
 
     Raises:
         InputError: The radar has no samples.
@@ -369,7 +370,7 @@ def channel_errors(
     """Draw factors of the virtual channels, with normal gains in dB and normal phases.
 
     Args:
-        radar: Its arrays.
+        radar: radar with its arrays.
         gain_std_db: Standard deviation of the gain [dB].
         phase_std: Standard deviation of the phase [rad].
         seed: Seed of gains and phases.
@@ -387,15 +388,15 @@ def channel_errors(
 def quantize(
     beat: Complex[Tensor, "*batch sample"], radar: Radar, adc: ADC
 ) -> Complex[Tensor, "*batch sample"]:
-    """Round a beat signal to the converter's codes; what it clips is warned of.
+    """Quantise a beat signal to the converter's codes, with a warning about clipping.
 
     Args:
-        beat: Signal without a gradient.
+        beat: signal without a gradient.
         radar: An FMCW or stepped frequency radar.
         adc: Converter.
 
     Raises:
-        InputError: A gradient is asked for, or samples that are not taken in time.
+        InputError: A signal that requires a gradient, or samples that are not taken in time.
     """
     _require_time_samples(radar)
     if beat.requires_grad:

@@ -1,9 +1,9 @@
-"""Frames of a scene in motion, of which rays are traced only now and then.
+"""Chirp trains of moving scenes with ray tracing at keyframes only.
 
-What is seen at the middle of a few loops is taken as seen during all of them. Points stay on their
-triangles, so that delays are those of every sample, and so is Doppler. What stands still is summed
-once. A trace costs much more than a ramp of what moves: with one for 64 loops, a frame of a walking
-person in a room takes about a fortieth of the time.
+Visibility at the middle of a few loops is used for all of them. Points stay on their triangles, so
+that delays and Doppler are exact in every sample. Static paths are summed once. A trace costs much
+more than a ramp of the moving paths: with one for 64 loops, a frame of a walking person in a room
+takes about a fortieth of the time.
 """
 
 import math
@@ -20,20 +20,20 @@ from invertwin.radar.signal.chirps import Chirps, ChirpTrain, sample_interval
 from invertwin.radar.signal.range_profile import beat_signal, check_paths
 from invertwin.scene.scene import Scene
 
-_TRAJECTORY_TOLERANCE = 1e-7  # m: a polynomial of time is the place
+_TRAJECTORY_TOLERANCE = 1e-7  # tolerance of polynomial trajectories [m]
 _DEGREES = (4, 8, 16, 32, 64)
-_CHECK_SHARES = (0.109, 0.317, 0.489, 0.683, 0.947)  # shares of the time at which it is tried
+_CHECK_SHARES = (0.109, 0.317, 0.489, 0.683, 0.947)  # relative times of its check
 
 
 class VisibilityKeyframes:
-    """Ramps by points that are seen at the middle of several loops and follow their surfaces.
+    """Ramps from points visible at the middle of several loops, which follow their surfaces.
 
     Args:
-        motion: The scene at any time [s].
-        trace: Its paths of one bounce, without boundary paths.
-        radar: What records.
-        chirps: When.
-        loops: For which one trace serves.
+        motion: scene as a function of time [s].
+        trace: returns the one-bounce paths of a scene, without boundary paths.
+        radar: radar that records.
+        chirps: chirp timing.
+        loops: number of loops per trace.
     """
 
     def __init__(
@@ -52,11 +52,11 @@ class VisibilityKeyframes:
         self.number, self.still, self.train = -1, torch.zeros(0), None
 
     def simulate_ramp(self, start: float, transmitters: list[int]) -> Tensor:
-        """Signals of one ramp [frame, sender, rx, sample].
+        """Simulate the signals of one ramp [frame, transmitter, rx, sample].
 
         Args:
-            start: Its first sample [s].
-            transmitters: Transmitters that send then.
+            start: time of its first sample [s].
+            transmitters: active transmitters.
         """
         loop = int((self.starts.amin(1) <= start).sum()) - 1
         if loop // self.loops != self.number:
@@ -99,13 +99,13 @@ class VisibilityKeyframes:
 
 
 class _VertexTrajectories:
-    """Where all vertices of a scene are over some time: a polynomial through Chebyshev's nodes.
+    """Trajectories of all vertices over an interval: polynomials through Chebyshev nodes.
 
-    Nodes are doubled until it meets the true places between them.
+    The number of nodes is doubled until the interpolation error is within the tolerance.
 
     Attributes:
-        nodes: Vertices at the nodes [node, vertex, 3].
-        moves: Which vertices move.
+        nodes: vertices at the nodes [node, vertex, 3].
+        moves: mask of the moving vertices.
     """
 
     def __init__(
@@ -135,17 +135,17 @@ class _VertexTrajectories:
         self.moves = ((self.nodes - self.nodes[:1]).abs() > 0).flatten(2).any(2).any(0)
 
     def interpolate(self, nodes: Tensor, time: float) -> Tensor:
-        """Values at a time of what is known at the nodes.
+        """Interpolate values at the nodes at a time.
 
         Args:
-            nodes: [node, …].
-            time: [s].
+            nodes: values [node, …].
+            time: time [s].
         """
         apart = time - self.places
         exact = (apart == 0).nonzero()
         if len(exact):
             return nodes[int(exact[0, 0])]
-        # Barycentric weights of these nodes are ±1, half at the ends.
+        # Barycentric weights of these nodes are ±1, ±½ at the ends.
         weights = (-1.0) ** torch.arange(len(apart), dtype=torch.float64)
         weights[0], weights[-1] = 0.5 * weights[0], 0.5 * weights[-1]
         weights = weights / apart
@@ -153,17 +153,17 @@ class _VertexTrajectories:
 
 
 def _vertex_offsets(scene: Scene) -> list[int]:
-    """Number of the first vertex of every object."""
+    """Return the index of the first vertex of every object."""
     counts = [len(item.vertices) for item in scene.objects.values()]
     return [sum(counts[:number]) for number in range(len(counts))]
 
 
 def vertex_displacements(scene: Scene, other: Scene) -> dict[str, Tensor]:
-    """How far the vertices of one instant are away at another [m], by object.
+    """Return the displacements of the vertices between two instants [m], by object.
 
     Args:
-        scene: One instant.
-        other: Another.
+        scene: scene at one instant.
+        other: scene at another instant.
 
     Raises:
         InputError: Other objects or triangles.

@@ -1,4 +1,4 @@
-"""The beat signal of a channel: one non-uniform FFT, on the CPU or, where tensors are, on CUDA."""
+"""Beat signal of a channel: one non-uniform FFT, on the CPU or with CUDA."""
 
 import math
 from functools import cache, lru_cache
@@ -13,23 +13,24 @@ from torch import Tensor
 
 from invertwin.radar.waveform import SampledWaveform
 
-_SHARED_PATHS = 20_000  # sums of fewer paths are too short for several threads
+_SHARED_PATHS = 20_000  # minimum number of paths for several threads
 
 
 @cache
 def _cufinufft() -> ModuleType | None:
     try:
         return import_module("cufinufft")
-    except (ImportError, OSError):  # OSError: its CUDA libraries are not there
+    except (ImportError, OSError):  # OSError: missing CUDA libraries
         return None
 
 
 def ramp_instants(samples: int, count: int) -> Float64[Tensor, " instant"]:
-    """Where in a ramp delays are taken, in samples: its middle one, or Chebyshev–Lobatto points.
+    """Return the instants of a ramp for delays, in samples: its middle, or Chebyshev–Lobatto
+    points.
 
     Args:
-        samples: In a ramp.
-        count: 1, or odd and at least 3; then the first, middle and last are those of the ramp.
+        samples: number of samples in a ramp.
+        count: 1, or odd and at least 3; then the first, middle and last ones are those of the ramp.
     """
     if count == 1:
         return torch.tensor([float(samples // 2)], dtype=torch.float64)
@@ -39,7 +40,7 @@ def ramp_instants(samples: int, count: int) -> Float64[Tensor, " instant"]:
 
 @lru_cache(maxsize=32)
 def _interpolation(samples: int, count: int) -> Float64[Tensor, "instant sample"]:
-    """Lagrange's polynomials through the instants, at the samples (barycentric form)."""
+    """Return Lagrange polynomials through the instants, at the samples (barycentric form)."""
     apart = torch.arange(samples, dtype=torch.float64) - ramp_instants(samples, count)[:, None]
     there = apart.abs() < 1e-9
     terms = _weights(count)[:, None] / torch.where(there, 1.0, apart)
@@ -47,11 +48,11 @@ def _interpolation(samples: int, count: int) -> Float64[Tensor, "instant sample"
 
 
 def instants_derivative(samples: int, count: int) -> Float64[Tensor, "instant instant"]:
-    """Matrix of derivatives per sample at the instants, from values there.
+    """Return the matrix of derivatives per sample at the instants, from values there.
 
     Args:
-        samples: In a ramp.
-        count: Number of instants, as in ``ramp_instants``.
+        samples: number of samples in a ramp.
+        count: number of instants, as in ``ramp_instants``.
     """
     places, weight = ramp_instants(samples, count), _weights(count)
     apart = places[:, None] - places
@@ -72,18 +73,18 @@ def beat_of_delays(
     waveform: SampledWaveform,
     tolerance: float,
 ) -> Complex128[Tensor, " sample"]:
-    """Beat signal of one channel, from the paths' delays at some instants of the ramp.
+    """Compute the beat signal of one channel from the paths' delays at some instants of the ramp.
 
-    With one instant delays are constant, and the phase is a straight line over the samples. With
-    more, a path has its exact phase at every instant. What this phase has beyond a straight line
-    becomes a factor of each path: known at the instants, a polynomial between them. The sum is
-    then one non-uniform FFT for every instant, over the same rates.
+    With one instant delays are constant, and the phase is linear over the samples. With more, a
+    path has its exact phase at every instant. The nonlinear part of the phase is a factor of each
+    path: known at the instants, a polynomial between them. The sum is then one non-uniform FFT per
+    instant, over the same rates.
 
     Args:
         coefficient: a of the paths; the signal has its conjugate.
-        delay: At ``ramp_instants`` [s].
-        waveform: Frequencies of the samples.
-        tolerance: Relative error of the sums.
+        delay: delays at ``ramp_instants`` [s].
+        waveform: waveform with the frequencies of the samples.
+        tolerance: relative error of the sums.
     """
     count, samples = len(delay), waveform.samples
     instants = ramp_instants(samples, count).to(delay.device)
@@ -92,7 +93,7 @@ def beat_of_delays(
     if count == 1:
         turns = waveform.step * delay[0]
     else:
-        # Any line will do, since the rest takes up what it leaves; so it needs no gradient.
+        # The line is arbitrary, since the rest compensates it; so it needs no gradient.
         turns = ((cycles[-1] - cycles[0]) / (instants[-1] - instants[0])).detach()
     sums = NonUniformSum.apply(coefficient, cycles - place * turns, turns, samples, tolerance)
     if count == 1:
@@ -103,11 +104,11 @@ def beat_of_delays(
 def phase_cycles(
     delay: Float64[Tensor, "instant path"], waveform: SampledWaveform
 ) -> Float64[Tensor, "instant path"]:
-    """Phase of paths at ``ramp_instants``, ``f τ − S τ²/2`` [cycles].
+    """Return the phase of paths at ``ramp_instants``, ``f τ − S τ²/2`` [cycles].
 
     Args:
-        delay: At the instants [s].
-        waveform: Frequencies of the samples.
+        delay: delays at the instants [s].
+        waveform: waveform with the frequencies of the samples.
     """
     instants = ramp_instants(waveform.samples, len(delay)).to(delay.device)
     frequency = waveform.start_frequency + waveform.step * instants
@@ -115,9 +116,9 @@ def phase_cycles(
 
 
 class NonUniformSum(torch.autograd.Function):
-    """Σ_i conj(a_i) exp(2πj (rest_ki + (n − N//2) turns_i)), with derivatives in both modes.
+    """Sum Σ_i conj(a_i) exp(2πj (rest_ki + (n − N//2) turns_i)), with derivatives in both modes.
 
-    It keeps its real inputs only: the phasors of many channels would fill the memory.
+    Only the real inputs are saved: the phasors of many channels would fill the memory.
     """
 
     @staticmethod
@@ -144,7 +145,7 @@ class NonUniformSum(torch.autograd.Function):
         with_turns = ctx.needs_input_grad[2]
         if with_turns:
             grad = torch.cat([grad, grad * _centred_indices(ctx.samples, turns)])
-        # Multiplied with the conjugate phasors: the gradients with respect to conj(a).
+        # Gradients with respect to conj(a), with the conjugate phasors.
         sums = _transform(2, turns, grad, ctx.samples, ctx.tolerance).unflatten(0, (-1, len(rest)))
         sums = sums * phasor.conj()
         of_phase = (2 * math.pi) * (coefficient * sums).imag
@@ -168,7 +169,7 @@ class NonUniformSum(torch.autograd.Function):
 
 
 def _phasor(cycles: Tensor) -> Tensor:
-    # Reduced before the radians: at 77 GHz and 200 m there are 1e5 cycles.
+    # Reduce cycles before the conversion to radians: 1e5 at 77 GHz and 200 m.
     phase = (2 * math.pi) * (cycles - cycles.round())
     return torch.polar(torch.ones_like(phase), phase)
 
@@ -180,7 +181,7 @@ def _centred_indices(samples: int, like: Tensor) -> Tensor:
 def _transform(
     kind: int, step_cycles: Tensor, values: Tensor, samples: int, tolerance: float
 ) -> Tensor:
-    """Type 1 (paths to samples) with exp(+j…), type 2 (samples to paths) with exp(−j…)."""
+    """Run type 1 (paths to samples) with exp(+j…), or type 2 (samples to paths) with exp(−j…)."""
     if len(step_cycles) == 0:
         return values.new_zeros(len(values), samples if kind == 1 else 0)
     rate = (2 * math.pi) * (step_cycles - step_cycles.round()).detach().contiguous()

@@ -1,4 +1,4 @@
-"""Exact radar signal: paths to beat signal to range profile, as a real radar does it."""
+"""Exact radar signals: paths to beat signals to range profiles."""
 
 import math
 import warnings
@@ -15,7 +15,7 @@ from invertwin.radar.signal.nufft import beat_of_delays
 from invertwin.radar.waveform import PhysicsWarning, SampledWaveform, unit_window
 from invertwin.runtime.progress import track
 
-_STANDARD_TEMPERATURE = 290.0  # K, at which noise figures are defined
+_STANDARD_TEMPERATURE = 290.0  # reference temperature of noise figures [K]
 
 
 def beat_signal(
@@ -25,28 +25,28 @@ def beat_signal(
     tolerance: float = 1e-9,
     channels: tuple[slice, slice] = (slice(None), slice(None)),
 ) -> Complex128[Tensor, "frame tx rx sample"]:
-    """Beat (IF) signal of every TX and RX element: transmit × conj(receive).
+    """Compute the beat (IF) signal of every TX and RX element: transmit × conj(receive).
 
         s[n] = Σ conj(a) exp(2πj (f_n τ − S τ²/2))
 
-    with f_n the frequency of the sample (f0 + S t_n on an FMCW ramp), S the slope of the ramp
-    (0 where the frequency stands: stepped frequency, OFDM, whose s is conj(H)), and τ the delay
-    from the TX element over the path to the RX element: the path's own delay between the phase
-    centres, corrected by the exact lengths from its first and last vertex, so the near field
-    and multiple bounces are exact. The sum is a non-uniform FFT (type 1) in float64; its adjoint
-    (type 2) gives gradients with respect to the coefficient, delay, first and last vertex and
-    the radar's poses. With a range origin τ is the delay beyond the origin's: the reference, and
-    on a ramp its clock, come so much later; the origin has no derivative.
+    with f_n the frequency of the sample (f0 + S t_n on an FMCW ramp), S the slope of the ramp (0
+    where the frequency stands: stepped frequency, OFDM, whose s is conj(H)), and τ the delay from
+    the TX element over the path to the RX element: the path's own delay between the phase centres,
+    corrected by the exact lengths from its first and last vertex, so the near field and multiple
+    bounces are exact. The sum is a non-uniform FFT (type 1) in float64; its adjoint (type 2) gives
+    gradients with respect to the coefficient, delay, first and last vertex and the radar's poses.
+    With a range origin τ is the delay beyond the origin's: the reference, and on a ramp its clock,
+    are delayed by it; the origin has no derivative.
 
     Source: eq:fmcw_if of the paper; derivations §1 and §6.
-    Differs from the source: the coefficient is conj(a) and holds the path's phase φ (printed
+    Differs from the source: the coefficient is conj(a) and includes the path's phase φ (printed
     inside 2πj(…)).
 
     Args:
-        paths: Field paths; their frames index the radar's poses.
-        radar: One with samples: FMCW, stepped frequency, OFDM.
-        tolerance: Relative error of the sum.
-        channels: Transmitters and receivers whose signals are computed.
+        paths: field paths, whose frames index the radar's poses.
+        radar: radar with samples: FMCW, stepped frequency, OFDM.
+        tolerance: relative error of the sum.
+        channels: transmitters and receivers of the signals.
 
     Raises:
         InputError: The radar has no samples, the paths carry power only, or a frame is missing.
@@ -62,7 +62,7 @@ def beat_signal(
     for frame, rows in track(list(enumerate(torch.split(order, counts))), "beat signals"):
         own = paths.select(rows)
         first, last = own.first, own.last
-        # What remains of the delay without the segments to the antennas.
+        # Delay without the segments to the antennas.
         inner = (
             paths.delay[rows]
             - origin_delays[frame]
@@ -94,7 +94,7 @@ def add_noise(
     noise_figure_db: float | None = None,
     transmit_power: float = 0.01,
 ) -> Complex128[Tensor, "*batch sample"]:
-    """Beat signal, of frames or of trains of chirps, plus white complex Gaussian noise.
+    """Add white complex Gaussian noise to a beat signal of frames or chirp trains.
 
     Give either a signal-to-noise ratio or a noise figure. The power per sample is the mean
     signal power over ``snr_db``, or ``k T0 F b`` (T0 = 290 K, b the waveform's noise bandwidth,
@@ -102,12 +102,12 @@ def add_noise(
     over transmitted power.
 
     Args:
-        beat: Signal without noise.
-        radar: Needed with ``noise_figure_db`` for the noise bandwidth.
-        seed: The same seed gives the same noise.
-        snr_db: Mean signal over noise power in each sample [dB].
-        noise_figure_db: Of the receiver [dB].
-        transmit_power: Of one transmitter [W].
+        beat: signal without noise.
+        radar: radar, needed with ``noise_figure_db`` for the noise bandwidth.
+        seed: seed of the noise.
+        snr_db: mean signal over noise power in each sample [dB].
+        noise_figure_db: noise figure of the receiver [dB].
+        transmit_power: power of one transmitter [W].
 
     Raises:
         InputError: Not exactly one of the two levels, or no radar for the noise figure.
@@ -135,17 +135,17 @@ def add_noise(
 def range_profile(
     beat: Complex[Tensor, "frame tx rx sample"], radar: Radar, grid: Grid
 ) -> Complex[Tensor, "frame tx rx range"]:
-    """Windowed range transform at the grid's ranges.
+    """Compute the windowed range transform at the grid's ranges.
 
-    Normalised by the window's sum: a path of coefficient a peaks at |a|. Ranges on the bins of
-    a zero-padded FFT use it; others use the same sum as a matrix.
+    Normalised by the window's sum: a path of coefficient a peaks at |a|. Ranges on the bins of a
+    zero-padded FFT use an FFT; others use the same sum as a matrix product.
 
     Source: eq:fmcw_fft of the paper.
 
     Args:
-        beat: Beat signals.
-        radar: What recorded them.
-        grid: Bins, of which the ranges count.
+        beat: beat signals.
+        radar: radar that recorded them.
+        grid: grid with its ranges.
 
     Raises:
         InputError: The signal does not fit the radar.
@@ -157,18 +157,18 @@ def range_profile(
     if bins is None:
         return tapered @ _range_matrix(waveform, grid).to(beat.device, beat.dtype)
     length, first = bins
-    # A range beyond the unambiguous one shows what is one period nearer, one below 0 farther.
+    # Ranges outside the unambiguous interval are aliased.
     wanted = (first + torch.arange(grid.range_count, device=beat.device)) % length
     return torch.fft.fft(tapered, length)[..., wanted]
 
 
 def check_paths(paths: Paths, radar: Radar, waveform: SampledWaveform) -> None:
-    """Raise where the paths cannot be summed, warn where they appear at wrong ranges.
+    """Raise if the paths cannot be summed, warn if they are aliased in range.
 
     Args:
-        paths: To be summed.
-        radar: Its poses and range bias.
-        waveform: Its unambiguous range.
+        paths: paths to sum.
+        radar: radar with its poses and range bias.
+        waveform: waveform with its unambiguous range.
     """
     if paths.kind == "power":
         raise InputError(
@@ -206,11 +206,11 @@ def check_paths(paths: Paths, radar: Radar, waveform: SampledWaveform) -> None:
 
 
 def fft_bins(waveform: SampledWaveform, grid: Grid) -> tuple[int, int] | None:
-    """FFT length and first bin when all ranges are FFT bins, else None.
+    """Return the FFT length and first bin if all ranges are FFT bins, else None.
 
     Args:
-        waveform: What is sampled.
-        grid: Bins, of which the ranges count.
+        waveform: sampled waveform.
+        grid: grid with its ranges.
     """
     length = waveform.max_range / grid.range_step
     first = grid.range_start / grid.range_step

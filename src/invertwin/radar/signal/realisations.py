@@ -1,4 +1,4 @@
-"""Looks: recordings of one scene that differ in the phases of its rough surfaces."""
+"""Speckle realisations: recordings of one scene with other phases of its rough surfaces."""
 
 import math
 
@@ -13,19 +13,19 @@ from invertwin.radar.radar import Radar, require_sampled_waveform
 _CELLS_PER_RESOLUTION = (
     4  # per resolution cell and axis: less than a tenth of a percent of the power is lost
 )
-_POINT_TOLERANCE = 1e-7  # m: points this near are one point
+_POINT_TOLERANCE = 1e-7  # points closer than this are one [m]
 
 
 class SpeckleRealisations:
-    """What a radar might record of a scene, quickly: a look costs a few matrix products.
+    """Fast simulation of speckle realisations of a scene: a few matrix products each.
 
-    Every point of a rough surface has a random amplitude, circular and Gaussian, which is the same
-    in all frames. So frames share as much speckle as their poses are near. Points are gathered in
-    cells of range and direction, a quarter of the radar's own, with their exact phases.
+    Every point of a rough surface has a random circular Gaussian amplitude, equal in all frames, so
+    that frames of close poses have correlated speckle. Points are grouped in cells of range and
+    direction, a quarter of the radar's own, with their exact phases.
 
     Args:
-        paths: Field paths of rough surfaces, from ``trace_field``.
-        radar: What records them. Its range bias is added, ranges count from its origin.
+        paths: field paths of rough surfaces, from ``trace_field``.
+        radar: radar that records them. Its range bias is added, ranges count from its origin.
     """
 
     def __init__(self, paths: Paths, radar: Radar) -> None:
@@ -59,10 +59,10 @@ class SpeckleRealisations:
         self._up = array.steering(v, array.y).conj().to(torch.complex64)
 
     def beat(self, seed: int) -> Complex64[Tensor, "frame tx rx sample"]:
-        """The beat signals of one look, without noise.
+        """Return the beat signals of one realisation, without noise.
 
         Args:
-            seed: Of the look.
+            seed: seed of the realisation.
         """
         generator = torch.Generator().manual_seed(seed)
         drawn = torch.randn(self._count, dtype=torch.complex64, generator=generator)
@@ -76,7 +76,7 @@ class SpeckleRealisations:
 
 
 def _bin_axis(values: Float64[Tensor, " n"], step: float) -> tuple[Float[Tensor, " cell"], Tensor]:
-    """The cells that hold some values: their centres, and the number of each value's cell."""
+    """Return the centres of occupied cells, and the cell index of each value."""
     number = (values / step).round().long()
     least = number.min() if len(values) else number.new_zeros(())
     count = int(number.max() - least) + 1 if len(values) else 1

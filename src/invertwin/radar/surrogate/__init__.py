@@ -1,1 +1,1 @@
-"""The smooth radar model: point spreads and expected power."""
+"""Smooth radar model: point spreads and expected power."""

@@ -1,4 +1,4 @@
-"""Point spreads: how the power of one path lies over range and direction, peak 1."""
+"""Point spreads: power of one path over range and direction, peak 1."""
 
 import math
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from invertwin.radar.aperture import Aperture
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform, Waveform, gaussian_response
 
-_TABLE = 32  # entries per cell of a tabulated response
+_TABLE = 32  # table entries per cell of a response
 
 
 def range_point_spread(
@@ -22,12 +22,12 @@ def range_point_spread(
     window: str = "hamming",
     kernel: str = "response",
 ) -> Float64[Tensor, " point"]:
-    """Power of a point target at a distance from its range, peak 1.
+    """Return the power of a point target at a distance from its range, peak 1.
 
     Args:
-        waveform: Waveform of the radar.
-        distance: [m].
-        window: Taper of the samples.
+        waveform: waveform of the radar.
+        distance: distance from the target's range [m].
+        window: taper of the samples.
         kernel: "response", "gaussian" or "dirichlet", see ``Surrogate.range_kernel``.
     """
     if kernel == "gaussian":
@@ -42,15 +42,15 @@ def interpolate_response(
     cell: float,
     response: Callable[[Float64[Tensor, " entry"]], Float64[Tensor, " entry"]],
 ) -> Float64[Tensor, "*point"]:
-    """A response of this cell at many places, from a table: cubic, so with a smooth derivative.
+    """Interpolate a response at many offsets from a table: cubic, with a smooth derivative.
 
-    A third of a path's bins lie in the main lobe; each asked for by itself would cost its whole
-    sum over samples. The error is below 1e-5 of the peak.
+    A third of a path's bins lie in the main lobe; a direct evaluation costs a whole sum over
+    samples each. The error is below 1e-5 of the peak.
 
     Args:
-        offsets: Where it is asked for, either side of its peak.
-        cell: Its width.
-        response: A symmetric function of places.
+        offsets: offsets from the peak.
+        cell: width of a cell.
+        response: symmetric function of offsets.
     """
     step = cell / _TABLE
     distance = offsets.abs() / step
@@ -67,13 +67,14 @@ def interpolate_response(
 
 
 def dirichlet(waveform: Waveform, distance: Float64[Tensor, " point"]) -> Float64[Tensor, " point"]:
-    """Range response without a window, |sin(Nx) / (N sin x)|² with x = π d / R_max; peak 1.
+    """Return the range response without a window, |sin(Nx) / (N sin x)|² with x = π d / R_max; peak
+    1.
 
-    It repeats after the unambiguous range, as the spectrum of samples does.
+    Its period is the unambiguous range.
 
     Args:
-        waveform: One with samples.
-        distance: Distance from the target's range [m].
+        waveform: waveform with samples.
+        distance: distance from the target's range [m].
 
     Raises:
         InputError: A waveform without samples.
@@ -93,12 +94,12 @@ def dirichlet(waveform: Waveform, distance: Float64[Tensor, " point"]) -> Float6
 def array_point_spread(
     array: Aperture, du: Float64[Tensor, " u"], dv: Float64[Tensor, " v"]
 ) -> Float64[Tensor, "u v"]:
-    """Power of a point target at offsets in u and v from its direction, peak 1.
+    """Return the power of a point target at offsets in u and v from its direction, peak 1.
 
     Args:
-        array: The virtual array.
-        du: Offsets in u.
-        dv: Offsets in v.
+        array: virtual array.
+        du: offsets in u.
+        dv: offsets in v.
     """
     response = array.steering(du, array.x) @ _array_weights(array) @ array.steering(dv, array.y).T
     return response.abs().square()
@@ -107,12 +108,12 @@ def array_point_spread(
 def paired_array_spread(
     array: Aperture, du: Float64[Tensor, " point"], dv: Float64[Tensor, " point"]
 ) -> Float64[Tensor, " point"]:
-    """Power of a point target at pairs of offsets in u and v from its direction, peak 1.
+    """Return the power of a point target at pairs of offsets in u and v from its direction, peak 1.
 
     Args:
-        array: The virtual array.
-        du: Offset in u of each point.
-        dv: Offset in v of each point.
+        array: virtual array.
+        du: offset in u of each point.
+        dv: offset in v of each point.
     """
     along, up = array.steering(du, array.x), array.steering(dv, array.y)
     response = ((along @ _array_weights(array)) * up).sum(1)
@@ -120,17 +121,17 @@ def paired_array_spread(
 
 
 def _array_weights(array: Aperture) -> Tensor:
-    """Of places, with a sum of 1."""
+    """Return weights of the grid positions, with a sum of 1."""
     weight = array.counts * array.x_taper[:, None] * array.y_taper[None]
     return (weight / weight.sum()).to(torch.complex128)
 
 
 def airy_radii(radar: Radar, radius: float | None) -> tuple[float, float]:
-    """Half axes of the ellipse behind the Airy lobe [m].
+    """Return the half axes of the ellipse of the Airy lobe [m].
 
     Args:
-        radar: Its aperture.
-        radius: Radius of a disc instead [m]; None = the ellipse fills the aperture.
+        radar: radar with its aperture.
+        radius: radius of a disc instead [m]; None = the ellipse fills the aperture.
     """
     if radius is not None:
         return radius, radius
@@ -138,7 +139,8 @@ def airy_radii(radar: Radar, radius: float | None) -> tuple[float, float]:
 
 
 def airy(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
-    """Power pattern of an evenly lit disc, (2 J1(z)/z)² with z = k r |Δ(u, v)|; differentiable.
+    """Return the power pattern of a uniformly illuminated disc, (2 J1(z)/z)² with z = k r |Δ(u,
+    v)|; differentiable.
 
     Source: the spatial spectrum surrogate of the paper (§3.4.2); derivations §5.
     """
@@ -146,7 +148,7 @@ def airy(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
 
 
 def airy_field(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
-    """Field pattern of the same disc, 2 J1(z)/z; differentiable."""
+    """Return the field pattern of the same disc, 2 J1(z)/z; differentiable."""
     near = z.abs() < 1e-3
     away = torch.where(near, torch.ones_like(z), z)
     series = 1 - z.square() / 8 + z**4 / 192
@@ -154,9 +156,9 @@ def airy_field(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
 
 
 def bessel_j1(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
-    """Bessel function of the first kind and order one, with the gradient J0 − J1/z.
+    """Return the Bessel function of the first kind and order one, with the gradient J0 − J1/z.
 
-    ``torch.special.bessel_j1`` has none and says nothing.
+    ``torch.special.bessel_j1`` silently has none.
     """
     return _BesselJ1.apply(z)  # type: ignore[no-any-return]
 
@@ -164,7 +166,7 @@ def bessel_j1(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
 def normalized_gaussian(
     ranges: Float[Tensor, " path"], bins: Float[Tensor, " bin"], sigma: float
 ) -> Float[Tensor, "path bin"]:
-    """The paper's range kernel: a Gaussian around each path, normalised over the bins.
+    """Evaluate the paper's range kernel: a Gaussian around each path, normalised over the bins.
 
         G_f(R) = exp(−(R − D_f)²/2σ²) / Σ_j exp(−(R − D_j)²/2σ²)
 
@@ -173,12 +175,12 @@ def normalized_gaussian(
 
     Source: §3.4.1 of the paper; derivations §5.
     Differs from the source: the printed derivative ``G (D − τ)/σ² (1 − G)`` belongs to another
-    normalisation (4–28 % off here), and the delay there stands for the range R.
+    normalisation (4–28 % off here), and the delay there denotes the range R.
 
     Args:
-        ranges: R of each path [m].
-        bins: D_f, centres of the bins [m].
-        sigma: σ [m].
+        ranges: range R of each path [m].
+        bins: centres D_f of the bins [m].
+        sigma: standard deviation σ [m].
     """
     return torch.softmax(-0.5 * ((ranges[:, None] - bins[None]) / sigma).square(), dim=1)
 

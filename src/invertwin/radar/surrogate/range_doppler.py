@@ -1,4 +1,4 @@
-"""The smooth surrogate of range-Doppler-angle processing."""
+"""Smooth surrogate of range-Doppler-angle processing."""
 
 import math
 from itertools import combinations
@@ -27,25 +27,26 @@ def range_doppler_power(
     *,
     window: str = "hamming",
 ) -> Float64[Tensor, "frame velocity range u v"]:
-    """Expected power over range rate, range and direction, as ``range_doppler_angle`` shows it.
+    """Compute expected power over range rate, range and direction, as of ``range_doppler_angle``.
 
-    Every path is spread as exact signals spread a point in motion: by the power response of the
+    Every path is spread as exact signals spread a moving point: by the power response of the
     samples' window over range, by that of the chirps' window over range rate, and by Bartlett
-    beamforming of its plane wave. Transmitters in turn are compensated for the rate of the bin, not
-    for that of the point. A range rate shifts the range that a ramp shows. For independent random
-    phases, the mean of the exact power therefore equals this power. It is differentiable with
-    respect to paths and velocities. A range rate is that of half the length of the path.
+    beamforming of its plane wave. Time-multiplexed transmitters are compensated for the rate of the
+    bin, not for that of the point. Range-Doppler coupling shifts the range of a ramp. For
+    independent random phases, the mean of the exact power therefore equals this power. It is
+    differentiable with respect to paths and velocities. A range rate is that of half the length of
+    the path.
 
     Source: derivations §5 and §6.
 
     Args:
-        paths: One-bounce power paths, where the points are in the middle of the frame's chirps.
-        velocities: Velocities of their points in the world [m/s].
-        radar: What records.
-        grid: Ranges and directions.
-        chirps: Timing.
-        rates: Range rates to show, positive moves away [m/s]; any, not only those of bins.
-        window: Over the chirps, one of ``WINDOWS``.
+        paths: one-bounce power paths, with the points at the middle of the frame's chirps.
+        velocities: velocities of their points in the world [m/s].
+        radar: radar that records.
+        grid: ranges and directions.
+        chirps: chirp timing.
+        rates: range rates, positive for receding targets [m/s]; not restricted to bins.
+        window: taper over the chirps, one of ``WINDOWS``.
 
     Raises:
         InputError: Velocities that do not fit the paths, an unknown window, or a grid that the
@@ -82,7 +83,7 @@ def range_doppler_power(
 
 
 def _directions_and_rates(paths: Paths, velocities: Tensor, radar: Radar) -> tuple[Tensor, Tensor]:
-    """Unit directions in the radar frame, and range rates [m/s]."""
+    """Return unit directions in the radar frame, and range rates [m/s]."""
     link = radar.link()
     away_tx = torch.nn.functional.normalize(paths.first - link.tx[paths.frame], dim=1)
     away_rx = torch.nn.functional.normalize(paths.last - link.rx[paths.frame], dim=1)
@@ -93,7 +94,7 @@ def _directions_and_rates(paths: Paths, velocities: Tensor, radar: Radar) -> tup
 
 
 def _range_doppler_coupling(waveform: Waveform) -> float:
-    """How far a range rate shifts the range that a ramp shows: f/S [s]."""
+    """Return the range shift per range rate of a ramp: f/S [s]."""
     if isinstance(waveform, FMCW):
         return waveform.center_frequency / waveform.slope
     if isinstance(waveform, SteppedFrequency):
@@ -113,7 +114,7 @@ def _range_spread(
 
 
 def _doppler_response(cycles: Tensor, chirps: Chirps, window: str) -> Tensor:
-    """Power response |Σ w_n exp(2πj n x)|² of the chirps' window, x in cycles per loop."""
+    """Return the power response |Σ w_n exp(2πj n x)|² of the chirps' window, x in cycles/loop."""
     weight = unit_window(window, chirps.count).to(torch.complex128)
 
     def response(places: Tensor) -> Tensor:
@@ -126,7 +127,7 @@ def _doppler_response(cycles: Tensor, chirps: Chirps, window: str) -> Tensor:
 def _beam_weights(
     direction: Tensor, radar: Radar, grid: Grid
 ) -> Complex128[Tensor, "tx path direction"]:
-    """What the elements of each transmitter add to the beams, by a path of unit field."""
+    """Return the contributions of each transmitter's elements to the beams for a unit field."""
     array = aperture(radar)
     array.check_directions(grid)
     x, y = radar.virtual_positions[:, 0], radar.virtual_positions[:, 1]

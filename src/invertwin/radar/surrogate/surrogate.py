@@ -1,4 +1,4 @@
-"""The smooth surrogate of exact signals: deposited power, shaped by the radar's point spread."""
+"""Smooth surrogate of exact signals: deposited power, convolved with the point spread."""
 
 import math
 import warnings
@@ -40,34 +40,35 @@ from invertwin.radar.surrogate.point_spread import (
 from invertwin.radar.waveform import PhysicsWarning, Waveform
 from invertwin.scene.scene import Scene
 
-# Kernels are tabulated at least this far out, so that short grids do not truncate them.
+# Minimum extent of tabulated kernels, so that short grids do not truncate them.
 _MIN_EXTENT = 64
 _DEFAULT_ANGLE_WIDTH = 1.5  # beamwidths of blur for an initial direction of unknown error
 
 
 @dataclass(frozen=True)
 class Surrogate:
-    """How the power of one path spreads over the bins of a spectrum.
+    """Power point spread of one path over the bins of a spectrum.
 
-    "response" kernels are what exact signals show of a point target: the power response of
-    its sample window in range, of its weighted virtual array in direction. For random phases
-    the mean of the exact spectrum is therefore the surrogate's. The extra widths blur both the
-    simulated and the measured map; annealing them to zero widens the basin of attraction.
+    "response" kernels are those of exact signals: the power response of the sample window in range,
+    of the weighted virtual array in direction. For random phases the mean of the exact spectrum is
+    therefore the surrogate's. The added widths blur both the simulated and the measured map;
+    annealing them to zero widens the basin of attraction.
 
     Source: §3.4 of the paper; derivations §5.
     Differs from the source: power is spread, not a field with random phases, whose boundary
-    gradient has mean zero (docs/limitations.md); the Airy argument is k r |Δ(u, v)|,
-    which is shift invariant, not k r sin ψ; the Gaussian has peak 1, which inside of a grid is
+    gradient has mean zero (docs/limitations.md); the Airy argument is k r |Δ(u, v)|, which is shift
+    invariant, not k r sin ψ; the Gaussian has peak 1, which inside a grid is
     ``normalized_gaussian`` times a constant.
 
     Attributes:
         range_kernel: "response"; "gaussian" with a full width at half maximum of one range cell
-            c/2B; or "dirichlet", the response without a window. For an ``Impulse`` radar the
-            first two are one.
-        angle_kernel: "response", or "airy" (an evenly lit ellipse that fills the aperture).
-        range_width: Standard deviation of the extra Gaussian [range cells].
-        angle_width: Standard deviation of the extra Gaussian in u and v [beamwidths λ/D].
-        aperture_radius: Radius for "airy" [m]; None = half the virtual aperture along x and y.
+            c/2B; or "dirichlet", the response without a window. For an ``Impulse`` radar the first
+            two are equal.
+        angle_kernel: "response", or "airy" (a uniformly illuminated ellipse that fills the
+            aperture).
+        range_width: standard deviation of the added Gaussian [range cells].
+        angle_width: standard deviation of the added Gaussian in u and v [beamwidths λ/D].
+        aperture_radius: radius for "airy" [m]; None = half the virtual aperture along x and y.
 
     Raises:
         InputError: An unknown kernel, a negative width, or a radius that is not positive.
@@ -130,14 +131,14 @@ class Surrogate:
 
     @property
     def has_blur(self) -> bool:
-        """Whether there are extra widths."""
+        """Whether there is an added blur."""
         return self.range_width > 0 or self.angle_width > 0
 
     def scale_blur(self, share: float) -> "Surrogate":
-        """With this share of the extra widths.
+        """Return the surrogate with scaled added widths.
 
         Args:
-            share: 0 takes them away.
+            share: scale factor; 0 removes the blur.
         """
         widths = {"range_width": self.range_width * share, "angle_width": self.angle_width * share}
         return replace(self, **widths)
@@ -145,22 +146,22 @@ class Surrogate:
     def shape(
         self, deposit: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
     ) -> Float[Tensor, "frame range u v"]:
-        """Deposited power as the radar would show it on average over random phases.
+        """Convolve deposited power with the point spread: the radar's mean over random phases.
 
-        A convolution with the power point spread (peak 1), divided in the Fourier domain by the
-        transform sinc³ of the deposit's quadratic B-spline, so that the deposit adds no blur.
-        Nothing wraps around: what leaves the grid is lost. It is linear, so that derivatives are
-        shaped alike. The division leaves bins below zero, with two bins a cell by 4e-5 of the
-        peak for single points and 1.4e-3 for a small plate. On a coarser grid it is 3 % of the
-        peak, and maps are not the mean of exact spectra; it warns.
+        The convolution (peak 1) is divided in the Fourier domain by the transform sinc³ of the
+        deposit's quadratic B-spline, so that the deposit adds no blur. It is zero-padded, so power
+        outside the grid is lost, and linear, so derivatives are convolved equally. The division
+        causes negative bins: with two bins per cell 4e-5 of the peak for single points and 1.4e-3
+        for a small plate. On a coarser grid it is 3 % of the peak, and maps are not the mean of
+        exact spectra; a warning is issued.
 
         Args:
-            deposit: From ``deposit_power`` on the same grid.
-            radar: Its window, arrays, waveform and range bias.
+            deposit: deposited power from ``deposit_power`` on the same grid.
+            radar: radar with its window, arrays, waveform and range bias.
             grid: Bins.
 
         Raises:
-            InputError: The map does not have the grid's shape.
+            InputError: A map of another shape than the grid.
         """
         _check_map(deposit, grid)
         sigmas = self._blur_sigmas(radar, grid)
@@ -175,15 +176,15 @@ class Surrogate:
     def blur(
         self, power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
     ) -> Float[Tensor, "frame range u v"]:
-        """A measured spectrum with the extra Gaussian widths only; without widths it stays.
+        """Blur a measured spectrum with the added Gaussian widths only.
 
         Args:
-            power: Measured spectrum.
-            radar: Its range and angle cells.
+            power: measured spectrum.
+            radar: radar with its range and angle cells.
             grid: Bins.
 
         Raises:
-            InputError: The map does not have the grid's shape.
+            InputError: A map of another shape than the grid.
         """
         _check_map(power, grid)
         for dim, sigma in self._blur_sigmas(radar, grid).items():
@@ -199,13 +200,13 @@ class Surrogate:
         u: Float64[Tensor, " point"],
         v: Float64[Tensor, " point"],
     ) -> Float64[Tensor, " point"]:
-        """The point spread at offsets from its peak of 1, without extra widths.
+        """Return the point spread at offsets from its peak of 1, without added widths.
 
         Args:
-            radar: Its window, arrays and waveform.
-            grid: Axes of one bin have no spread.
-            ranges: Offsets in range [m].
-            u, v: Offsets in direction.
+            radar: radar with its window, arrays and waveform.
+            grid: grid whose axes of one bin have no spread.
+            ranges: offsets in range [m].
+            u, v: offsets in direction.
         """
 
         def range_spread(places: Tensor) -> Tensor:
@@ -237,7 +238,7 @@ class Surrogate:
         )
 
     def _blur_sigmas(self, radar: Radar, grid: Grid) -> dict[int, float]:
-        """Standard deviation of the extra Gaussian along each map dimension, in bins."""
+        """Return the standard deviation of the added Gaussian along each map dimension, in bins."""
         u, v = radar.beamwidth
         return {
             1: self.range_width * radar.waveform.range_resolution / grid.range_step,
@@ -259,7 +260,7 @@ SURROGATES = MappingProxyType(
 
 
 def resolve_surrogate(surrogate: Surrogate | str | None) -> Surrogate | None:
-    """The surrogate meant by a ``surrogate`` argument; None = exact signals.
+    """Return the surrogate of a ``surrogate`` argument; None = exact signals.
 
     Raises:
         InputError: A name that is not in ``SURROGATES``.
@@ -287,22 +288,22 @@ def surrogate_spectrum(
     coherent: Sequence[str] = (),
     stretch: float = 1.0,
 ) -> Float[Tensor, "frame range u v"]:
-    """Power spectrum of a scene, differentiable with respect to it: deposit, then shape.
+    """Compute the power spectrum of a scene, differentiable: deposit, then shape.
 
-    Power is never negative: what shaping leaves below zero counts as zero. Coherent targets are
-    deposited beside the rough power: all bounces of one target add in field, as far as they share
-    a cell, and targets add in power. In the rest of the scene they only cast shadows.
+    Negative bins after shaping are set to zero. Coherent targets are deposited in addition to the
+    rough power: all bounces of one target in one cell add coherently, and targets add in power. For
+    the rest of the scene they only cast shadows.
 
     Args:
-        scene: What is seen.
-        radar: Arrays, waveform and poses.
+        scene: scene to simulate.
+        radar: radar with arrays, waveform and poses.
         grid: Bins, see ``Radar.grid``.
-        surrogate: Kernels and their extra widths.
-        sampling: How many paths are drawn.
-        seed: Same seed, same spectrum.
+        surrogate: kernels and their added widths.
+        sampling: numbers of sampled paths.
+        seed: seed of the samples.
         scheme, reference: See ``deposit_power``.
-        coherent: Names of coherent targets, see ``trace_target``.
-        stretch: Wavelength of their phases in wavelengths of the radar.
+        coherent: names of coherent targets, see ``trace_target``.
+        stretch: wavelength of their phases in wavelengths of the radar.
 
     Raises:
         InputError: See ``deposit_power`` and ``trace_target``.
@@ -330,7 +331,7 @@ def _deposit_targets(
     names: Sequence[str],
     stretch: float,
 ) -> list[Float32[Tensor, "frame range u v"]]:
-    """Deposits of coherent targets."""
+    """Deposit coherent targets."""
     link, deposits = radar.link(), []
 
     def overlap(*gaps: Tensor) -> Tensor:
@@ -355,16 +356,16 @@ def surrogate_spectra(
     coherent: Sequence[str] = (),
     stretch: float = 1.0,
 ) -> Float[Tensor, "scene frame range u v"]:
-    """``surrogate_spectrum`` of many scenes at once, see ``deposit_batch``.
+    """Compute ``surrogate_spectrum`` of many scenes in one batch, see ``deposit_batch``.
 
     Args:
-        scenes: What is seen.
-        radar: Arrays, waveform and poses, the same for all scenes.
+        scenes: scenes to simulate.
+        radar: arrays, waveform and poses, common to all scenes.
         grid: Bins, see ``Radar.grid``.
-        surrogate: Kernels and their extra widths.
-        sampling: How many paths are drawn of each scene.
-        seed: Same seed and scenes, same spectra.
-        coherent, stretch: As of ``surrogate_spectrum``, in every scene.
+        surrogate: kernels and their added widths.
+        sampling: numbers of sampled paths of each scene.
+        seed: seed of the samples.
+        coherent, stretch: as in ``surrogate_spectrum``, in every scene.
 
     Raises:
         InputError: See ``deposit_batch`` and ``trace_target``.
@@ -385,13 +386,13 @@ def surrogate_spectra(
 
 @dataclass(frozen=True, eq=False)
 class _SurrogateKernel:
-    """A convolution along one map dimension, or two at once, as its transfer function.
+    """Convolution along one map dimension, or two at once, as its transfer function.
 
     Attributes:
-        dims: Dimensions of the map [frame, range, u, v].
-        counts: Bins along them.
-        transfer: Over the frequencies of a real FFT (the last dimension halved); real, since
-            every point spread is symmetric.
+        dims: dimensions of the map [frame, range, u, v].
+        counts: number of bins along them.
+        transfer: transfer function over the frequencies of a real FFT (the last dimension halved);
+            real, since every point spread is symmetric.
     """
 
     dims: tuple[int, ...]
@@ -399,7 +400,7 @@ class _SurrogateKernel:
     transfer: Float64[Tensor, "..."]
 
     def apply(self, power: Tensor, sigmas: list[float], offset: Tensor | None = None) -> Tensor:
-        """The map convolved, with extra Gaussian widths and a shift, both in bins."""
+        """Convolve the map, with added Gaussian widths and a shift, both in bins."""
         transfer = self.transfer
         for frequency, sigma in zip(_frequencies(self.counts), sigmas, strict=True):
             if sigma > 0:
@@ -418,14 +419,14 @@ class _SurrogateKernel:
         return full[..., : self.counts[0], : self.counts[1]]
 
     def _apply_by_matrix(self, power: Tensor, transfer: Tensor) -> Tensor:
-        # At these sizes a Toeplitz matrix per axis is some 30 times faster than a padded FFT.
+        # At these sizes a Toeplitz matrix per axis is about 30 times faster than a padded FFT.
         (dim,), (count,) = self.dims, self.counts
         taps = torch.fft.irfft(transfer, _fft_length(count)).to(power)
         lags = taps.roll(count - 1)[: 2 * count - 1]
         matrix = lags.flip(0).unfold(0, count, 1).flip(0)
         if dim == power.ndim - 1:
             return power @ matrix.T
-        first = power.transpose(1, dim)  # one large product a frame, not one a row
+        first = power.transpose(1, dim)  # one large product per frame, not one per row
         return (matrix @ first.flatten(2)).reshape(first.shape).transpose(1, dim)
 
 
@@ -439,7 +440,7 @@ def _kernels(
     array: Aperture | None,
     grid: Grid,
 ) -> tuple[_SurrogateKernel, ...]:
-    """The kernels without extra widths; cached, since an optimisation asks again each step."""
+    """Return the kernels without added widths, cached for the steps of a fit."""
     spread = range_point_spread(
         waveform, _lags(grid.range_count) * grid.range_step, window, range_kernel
     )
@@ -474,7 +475,7 @@ def _angle_spread(
 def _compensate_spline(
     dims: tuple[int, ...], counts: tuple[int, ...], spread: Tensor
 ) -> _SurrogateKernel:
-    """Kernel of a point spread tabulated at lags, less the blur of the quadratic B-spline.
+    """Build the kernel of a tabulated point spread divided by the blur of the quadratic B-spline.
 
     At the highest frequency the B-spline's transform is sinc³(1/2) = 0.26, so the division is
     bounded.
@@ -490,26 +491,26 @@ def _identity_kernel(dim: int, count: int) -> _SurrogateKernel:
 
 
 def _fft_length(count: int) -> int:
-    """A fast FFT length that holds all lags between ``count`` bins, so that nothing wraps."""
+    """Return a fast FFT length for all lags between ``count`` bins, without wrap-around."""
     need = 2 * max(count, _MIN_EXTENT)
     octave = 1 << (need - 1).bit_length() - 4
     return next(m * octave for m in (9, 10, 12, 16) if m * octave >= need)
 
 
 def _lags(count: int) -> Float64[Tensor, " lag"]:
-    """Offsets in bins, in the order of an FFT."""
+    """Return offsets in bins, in FFT order."""
     return torch.fft.fftfreq(_fft_length(count), d=1 / _fft_length(count), dtype=torch.float64)
 
 
 def _frequencies(counts: tuple[int, ...]) -> list[Tensor]:
-    """Cycles per bin of a real FFT, shaped to broadcast along each dimension."""
+    """Return cycles per bin of a real FFT, shaped to broadcast along each dimension."""
     *full, half = (_fft_length(count) for count in counts)
     axes = [torch.fft.fftfreq(size, dtype=torch.float64)[:, None] for size in full]
     return [*axes, torch.fft.rfftfreq(half, dtype=torch.float64)]
 
 
 def _warn_if_coarse(radar: Radar, grid: Grid, sigmas: dict[int, float]) -> None:
-    """Warn of axes with less than two bins a cell, where no extra width of a bin smooths them."""
+    """Warn about axes with less than two bins per cell and without an added width of a bin."""
     cells = radar.waveform.range_resolution, *(0.5 * width for width in radar.beamwidth)
     steps = grid.range_step, grid.u_step, grid.v_step
     axes = zip(("range", "u", "v"), cells, steps, grid.shape, sigmas.values(), strict=True)
