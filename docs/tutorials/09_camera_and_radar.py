@@ -8,7 +8,7 @@
 # %matplotlib inline
 import invertwin as iw
 from invertwin.camera import Camera, ImageSampling, photograph
-from invertwin.models.camera import SilhouetteMap
+from invertwin.models import SilhouetteMap
 from invertwin.scene import RoughDielectric, Translation, box, linear_array, rigid
 
 # %% [markdown]

@@ -22,7 +22,7 @@ from invertwin.scene import linear_array, rigid, sphere
 # %% [markdown]
 # ## A package with a material
 # Foliage returns the same share of the power at every angle, equally in all directions. A material hands the ray
-# tracer a `Surface`: the square root of its reflectance over the angle, and its diffuse share. The annotation `Share`
+# tracer a `ScatteringLaw`: the square root of its reflectance over the angle, and its diffuse share. The annotation `Share`
 # limits the value to 0 … 1, and the docstring explains the key of the run file. `register` gets a registry and adds
 # the contents of the package.
 
@@ -35,7 +35,7 @@ import torch
 
 from invertwin.limits import Share
 from invertwin.registry import Registry
-from invertwin.scene import Material, Surface
+from invertwin.scene import Material, ScatteringLaw
 
 @dataclass(frozen=True)
 class Foliage(Material):
@@ -48,10 +48,10 @@ class Foliage(Material):
     share: Share | torch.Tensor = 0.05
     coherent: ClassVar[bool] = False  # a rough surface
 
-    def surface(self, frequency: float) -> Surface:
+    def scattering_law(self, frequency: float) -> ScatteringLaw:
         share = torch.as_tensor(self.share, dtype=torch.float64)
         amplitude = share.sqrt() * torch.ones(256, dtype=torch.float64)
-        return Surface(amplitude, torch.ones((), dtype=torch.float64))
+        return ScatteringLaw(amplitude, torch.ones((), dtype=torch.float64))
 
 def register(registry: Registry) -> None:
     registry.add("material", "foliage", Foliage)
