@@ -1,8 +1,8 @@
-"""Radar signatures: what a target returns over aspect and frequency, as complex 2 × 2 matrices.
+"""Radar signatures: complex 2 × 2 scattering matrices of a target over aspect and frequency.
 
-The radar is far away. S is complex and polarised, σ = 4π|S|² is the radar cross-section. Phases
-refer to the world's origin. From sweeps of frequency come range profiles, from sweeps of frequency
-and aspect images.
+The radar is in the far field. S is complex and polarised, σ = 4π|S|² is the radar cross-section.
+Phases refer to the world's origin. Frequency sweeps give range profiles, sweeps of frequency and
+aspect give images.
 """
 
 import math
@@ -28,26 +28,24 @@ from invertwin.scene import Scene
 from invertwin.scene.polarisation import jones_basis
 
 _VALUES_PER_CHUNK = 1 << 22  # frequencies × aspects × points
-_SPACING_TOLERANCE = (
-    1e-3  # of a step, by which steps of frequencies may differ: those of float32 do
-)
+_SPACING_TOLERANCE = 1e-3  # relative difference of frequency steps, for float32 values
 
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """What a target returns: S of every frequency and aspect.
+    """Scattering matrices S of a target over frequency and aspect.
 
-    The first row and column of a matrix is the polarisation that was asked for, the second the
-    one orthogonal to it: ``matrix[..., 0, 0]`` is co-polar, ``matrix[..., 1, 0]`` is cross-polar.
+    The first row and column of a matrix belong to the requested polarisation, the second to the
+    orthogonal one: ``matrix[..., 0, 0]`` is co-polar, ``matrix[..., 1, 0]`` is cross-polar.
 
     Attributes:
-        parts: S [m] of each part of the field: ``order 1``, ``order 2`` … are physical optics after
-            as many meetings with surfaces, faces of solids from within included, ``edges 1`` fringe
-            currents, ``edges 2`` … waves that several edges of a plate diffract, ``rest`` what
-            these leave out of the solved field of small bodies.
-        frequencies: [Hz].
+        parts: S of each part of the field [m]: ``order 1``, ``order 2`` … are physical optics of
+            that number of interactions with surfaces, faces of solids from inside included, ``edges
+            1`` fringe currents, ``edges 2`` … multiple diffraction at edges of a plate, ``rest``
+            the residual of these parts from the method of moments for small bodies.
+        frequencies: frequencies [Hz].
         directions: unit vectors from the target to the transmitter.
-        receivers: unit vectors to the receiver.
+        receivers: unit vectors from the target to the receiver.
     """
 
     parts: Mapping[str, Complex128[Tensor, "frequency aspect 2 2"]]
@@ -57,7 +55,7 @@ class Signature:
 
     @property
     def matrix(self) -> Complex128[Tensor, "frequency aspect 2 2"]:
-        """S of the whole field [m], receive × transmit."""
+        """S of the total field [m], receive × transmit."""
         return torch.stack([*self.parts.values()]).sum(0)
 
     @property
@@ -73,13 +71,13 @@ class Signature:
     def range_profile(
         self, padding: Count = 4
     ) -> tuple[Float64[Tensor, " range"], Complex128[Tensor, "range aspect 2 2"]]:
-        """Ranges beyond the origin [m], and the profile: the amplitude S of what is there.
+        """Compute the range profile: ranges from the origin [m], and amplitudes S there.
 
-        A Hann window over the frequencies keeps sidelobes below −31 dB; a point keeps its S. The
-        range of two antennas is half the path.
+        A Hann window over the frequencies keeps sidelobes below −31 dB and preserves the S of a
+        point. The bistatic range is half the path.
 
         Args:
-            padding: how many times finer than the resolution c/2B the profile is.
+            padding: oversampling factor over the resolution c/2B.
 
         Raises:
             InputError: fewer than two frequencies, or uneven ones.
@@ -101,31 +99,31 @@ class Signature:
         order = torch.argsort(ranges)
         ranges = ranges[order]
         carrier = 4 * math.pi * float(self.frequencies[0]) / SPEED_OF_LIGHT * ranges
-        turn = torch.polar(torch.ones_like(carrier), carrier)
-        return ranges, profile[order] * turn[:, None, None, None]
+        carrier_phasor = torch.polar(torch.ones_like(carrier), carrier)
+        return ranges, profile[order] * carrier_phasor[:, None, None, None]
 
     def image(self, points: ArrayLike) -> Complex128[Tensor, "*grid 2 2"]:
-        """Focus the sweep on points: the mean of S exp(−jk(u_t + u_r)·x), Hann windows over both.
+        """Focus the sweep on points: the mean of S exp(−jk(u_t + u_r)·x), with Hann windows.
 
         Args:
-            points: places [..., 3] in the world [m]. Points further apart than the sweep resolves,
-                c/2B in range and λ/2 over its angle across, alias where it is coarse.
+            points: positions, [..., 3], in world axes [m]. Coarse sweeps alias outside the
+                unambiguous range and cross range.
         """
-        places = torch.as_tensor(points, dtype=torch.float64)
-        flat = places.reshape(-1, 3)
-        both = self.directions + self.receivers
+        positions = torch.as_tensor(points, dtype=torch.float64)
+        flat = positions.reshape(-1, 3)
+        direction_sum = self.directions + self.receivers
         weight = (
             _hann_window(len(self.frequencies))[:, None]
-            * _hann_window(len(both))
-            / (len(self.frequencies) * len(both))
+            * _hann_window(len(direction_sum))
+            / (len(self.frequencies) * len(direction_sum))
         )
         weighted = (self.matrix * weight[..., None, None]).reshape(-1, 4)
         k = 2 * math.pi * self.frequencies / SPEED_OF_LIGHT
         found = []
-        for some in flat.split(max(1, _VALUES_PER_CHUNK // len(weighted))):
-            phase = -(k[:, None, None] * (both @ some.T)).reshape(len(weighted), -1)
+        for chunk in flat.split(max(1, _VALUES_PER_CHUNK // len(weighted))):
+            phase = -(k[:, None, None] * (direction_sum @ chunk.T)).reshape(len(weighted), -1)
             found.append(torch.polar(torch.ones_like(phase), phase).T @ weighted)
-        return torch.cat(found).reshape(*places.shape[:-1], 2, 2)
+        return torch.cat(found).reshape(*positions.shape[:-1], 2, 2)
 
 
 def rcs(
@@ -141,52 +139,59 @@ def rcs(
     up: Sequence[float] = (0.0, 0.0, 1.0),
     boundary: bool = True,
 ) -> Signature:
-    """Compute the radar cross-section of smooth conductors and dielectrics, far away.
+    """Compute the radar cross-section of smooth conductors and dielectrics in the far field.
 
-    Scenes of at most 24 triangles are exact physical optics of every bounce; others are shot with
-    ray tubes. Waves go through closed bodies of dielectric, with bounces inside. Of small
-    conductors, currents are solved, and ``rest`` is what rays leave out. Scenes of at most 24
-    triangles are differentiable with respect to vertices, ``rest`` included.
+    Scenes of at most 24 triangles use beam tracing, exact physical optics of every bounce; others
+    use shooting and bouncing rays. Closed dielectric bodies transmit, with internal bounces. Small
+    conductors are solved by the method of moments, and ``rest`` is the residual of the rays. Scenes
+    of at most 24 triangles are differentiable with respect to vertices, ``rest`` included.
     Monostatic and bistatic results are reciprocal.
 
     Args:
-        scene: the target about the world's origin.
-        directions: from the target to the radar, or the transmitter: [aspect, 3], of any length.
-        frequencies: [Hz].
-        receivers: the same to the receiver, one for each direction; None = the transmitter.
-        polarisation: of the first row and column of the matrices: "V", "H", "circular" (right-hand)
-            or a Jones vector (V, H). V and H are the unit vectors of θ and φ about ``up``.
-        depth: most meetings with surfaces; the echo of a solid's back face leaves by the third.
-        edges: most diffractions of a wave by sharp edges of conductors: 0 is physical optics alone,
-            1 adds fringe currents, 2 the waves between the edges of a flat plate. From 1 on small
-            conductors are solved.
-        tubes_per_wavelength: at the highest frequency, for scenes of many triangles.
-        up: vertical axis.
-        boundary: False leaves out of derivatives what moving edges of beams and shadows change:
-            derivatives at fixed visibility, for ablation.
+        scene: target near the world's origin.
+        directions: vectors from the target to the radar or transmitter, [aspect, 3], of any length.
+        frequencies: a frequency or several [Hz].
+        receivers: vectors from the target to the receiver, [aspect, 3]; None = monostatic.
+        polarisation: polarisation of the first row and column of the matrices: "V", "H", "circular"
+            (right-hand) or a Jones vector (V, H). V and H are the unit vectors of θ and φ about
+            ``up``.
+        depth: maximum number of interactions with surfaces; the echo of a solid's back face needs
+            three.
+        edges: maximum number of diffractions at sharp edges of conductors: 0 is physical optics
+            alone, 1 adds fringe currents, 2 the waves between the edges of a flat plate. From 1 on,
+            small conductors are solved by the method of moments.
+        tubes_per_wavelength: density of ray tubes at the highest frequency, for scenes of many
+            triangles.
+        up: vertical axis, [3].
+        boundary: False omits the derivatives due to moving edges of beams and shadows: derivatives
+            at fixed visibility, for ablation.
 
     Raises:
         InputError: no direction or frequency, a rough surface, a cloud, derivatives of a scene of
-            more than 24 triangles or with respect to directions or frequencies, dielectrics that
-            touch or lie in each other.
+            more than 24 triangles or with respect to directions or frequencies, dielectrics in
+            contact with or inside each other.
 
     Source: derivations §4, §13, §14.
     """
-    sent = _check_directions(directions, "directions")
-    received = None if receivers is None else _check_directions(receivers, "receivers")
-    if received is not None and len(received) != len(sent):
+    transmitters = _check_directions(directions, "directions")
+    receiver_directions = None if receivers is None else _check_directions(receivers, "receivers")
+    if receiver_directions is not None and len(receiver_directions) != len(transmitters):
         raise InputError(
             f"expected {len(sent)} receivers, one for each direction, got {len(received)}"
         )
-    swept = checked_tensor(
+    sweep = checked_tensor(
         torch.atleast_1d(torch.as_tensor(frequencies, dtype=torch.float64)),
         (None,),
         "frequencies [Hz]",
         "give one or more",
     )
-    for frequency in swept.tolist():
+    for frequency in sweep.tolist():
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-    for value, what in ((sent, "directions"), (received, "receivers"), (swept, "frequencies")):
+    for value, what in (
+        (transmitters, "directions"),
+        (receiver_directions, "receivers"),
+        (sweep, "frequencies"),
+    ):
         if is_differentiated(value):
             raise InputError(
                 f"expected {what} without derivatives, got some that require grad; turn the scene "
@@ -195,9 +200,9 @@ def rcs(
     axis = checked_tensor(up, (3,), "up", "give a vector such as 0, 0, 1")
     parts = trace_far_field(
         scene,
-        sent,
-        received,
-        swept,
+        transmitters,
+        receiver_directions,
+        sweep,
         depth=checked_count(depth, "depth", 1),
         edges=checked_count(edges, "edges", 0),
         tubes_per_wavelength=checked_number(
@@ -207,18 +212,23 @@ def rcs(
         boundary=boundary,
     )
     basis = jones_basis(polarisation)
-    turned = {name: basis.T @ value @ basis for name, value in parts.items()}
-    return Signature(turned, swept, sent, sent if received is None else received)
+    rotated = {name: basis.T @ value @ basis for name, value in parts.items()}
+    return Signature(
+        rotated,
+        sweep,
+        transmitters,
+        transmitters if receiver_directions is None else receiver_directions,
+    )
 
 
 def aspect_directions(
     theta: float | Sequence[float] | Tensor, phi: float | Sequence[float] | Tensor
 ) -> Float64[Tensor, "aspect 3"]:
-    """Unit vectors at angles θ to z and φ from x towards y [rad]; one may be a single number.
+    """Compute unit vectors at angles θ to z and φ from x towards y.
 
     Args:
-        theta: one or several.
-        phi: one or as many.
+        theta: polar angles θ [rad], a number or [aspect].
+        phi: azimuth angles φ [rad], a number or [aspect].
     """
     t, p = torch.broadcast_tensors(
         *(torch.atleast_1d(torch.as_tensor(a, dtype=torch.float64)) for a in (theta, phi))
@@ -227,10 +237,10 @@ def aspect_directions(
 
 
 def to_dbsm(amplitude: Complex128[Tensor, "*any"]) -> Float64[Tensor, "*any"]:
-    """σ = 4π|S|² in dBsm.
+    """Compute σ = 4π|S|² in dBsm.
 
     Args:
-        amplitude: S [m].
+        amplitude: scattering amplitudes S [m].
     """
     return 10 * torch.log10((4 * math.pi * amplitude.abs() ** 2).clamp_min(1e-300))
 
@@ -244,6 +254,6 @@ def _check_directions(values: ArrayLike, what: str) -> Tensor:
 
 
 def _hann_window(count: int) -> Tensor:
-    """A Hann window of mean one; without zeros at its ends, so that short sweeps keep theirs."""
+    """Hann window of mean one, without zeros at its ends, so that short sweeps keep their ends."""
     window = torch.hann_window(count + 2, periodic=False, dtype=torch.float64)[1:-1]
     return window / window.mean()

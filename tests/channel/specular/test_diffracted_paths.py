@@ -43,7 +43,7 @@ def behind(around, rx):
     """The field behind a sheet: the straight wave, and what its edges send."""
     tx = TX.expand(len(rx), 3)
     with tracing():
-        lit = is_visible(around.walls, tx, rx)
+        lit = is_visible(around.surfaces, tx, rx)
         (sent,) = sent_by(around, TX[None], rx)
     length = (rx - tx).norm(dim=1)
     way = (rx - tx) / length[:, None]

@@ -79,8 +79,8 @@ class DielectricSolids:
             outer, inner = self.names[int(medium[row])], self.names[int(owner[row])]
             raise InputError(
                 f"expected air or conductors inside and against {outer}, got the dielectric "
-                f"{inner}; leave a gap between them, or make {outer} lossy or an open mesh, which "
-                "shows its front alone"
+                f"{inner}; leave a gap between them, or make {outer} lossy or an open mesh, of "
+                "which only the front face reflects"
             )
 
 

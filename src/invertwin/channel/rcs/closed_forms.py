@@ -1,7 +1,7 @@
-"""Radar cross-sections that are known otherwise: closed forms, a series, a method of moments.
+"""Radar cross-sections in closed form, by the Mie series, or by a 2D method of moments.
 
-Each is of the built-in shape of its name as it stands, unturned, and serves as an oracle. All but
-the sphere, which may be of a dielectric, are of conductors.
+Each belongs to the built-in shape of its name in its default pose, and serves as an oracle. All are
+perfect conductors, except the sphere, which may be dielectric.
 """
 
 import math
@@ -21,22 +21,22 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.limits import NonNegative, Positive
 from invertwin.scene.shapes import trihedral
 
-_SEGMENTS_PER_WAVELENGTH = 24  # segments of the method of moments
-_QUADRATURE_POINTS = 4  # of its quadrature on a segment
+_SEGMENTS_PER_WAVELENGTH = 24  # of the method of moments
+_QUADRATURE_POINTS = 4  # quadrature points per segment
 _EULER = math.exp(np.euler_gamma)
 
 
 class CrossSection(ABC):
-    """σ over frequency and direction."""
+    """Radar cross-section σ over frequency and direction."""
 
     @abstractmethod
     def section(
         self, frequencies: Float64[Tensor, " frequency"], directions: Float64[Tensor, "aspect 3"]
     ) -> Float64[Tensor, "frequency aspect"]:
-        """Monostatic σ [m²].
+        """Compute the monostatic σ [m²].
 
         Args:
-            frequencies: [Hz].
+            frequencies: frequencies [Hz].
             directions: unit vectors to the radar.
         """
 
@@ -50,15 +50,15 @@ class PlateSection(CrossSection):
     """Physical optics of a rectangle: 4πA²/λ² cos²θ with a sin(x)/x along each side.
 
     Attributes:
-        width: along x [m].
-        height: along y [m].
+        width: side along x [m].
+        height: side along y [m].
     """
 
     width: Positive
     height: Positive
 
     def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
-        """σ [m²]."""
+        """Compute σ [m²]."""
         wavelength = _wavelengths(frequencies)
         x, y, z = directions.T
         lobes = [
@@ -75,7 +75,7 @@ class _CornerPeak(CrossSection):
     _factor: ClassVar[float]
 
     def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
-        """σ [m²], that of boresight in all directions."""
+        """Compute σ [m²], with the boresight value in all directions."""
         peak = self._factor * math.pi * self.edge**4 / _wavelengths(frequencies) ** 2
         return peak.expand(-1, len(directions))
 
@@ -85,7 +85,7 @@ class DihedralSection(_CornerPeak):
     """Peak of two square plates at a right angle, two bounces at boresight: 8πa⁴/λ².
 
     Attributes:
-        edge: of the plates [m].
+        edge: side of the plates [m].
     """
 
     _factor = 8.0
@@ -96,7 +96,7 @@ class SquareTrihedralSection(_CornerPeak):
     """Peak of a corner of three squares, three bounces at boresight: 12πa⁴/λ².
 
     Attributes:
-        edge: of the squares [m].
+        edge: side of the squares [m].
     """
 
     _factor = 12.0
@@ -104,19 +104,19 @@ class SquareTrihedralSection(_CornerPeak):
 
 @dataclass(frozen=True)
 class TrihedralSection(CrossSection):
-    """Triple bounces of a triangular corner: 4πA²/λ², A the area that comes back (Siegel).
+    """Triple bounce of a triangular trihedral: 4πA²/λ², A the effective area (Siegel).
 
     With direction cosines l ≤ m ≤ n to the inner edges, A = a²·4lm/(l+m+n) where l + m ≤ n, else
     a²(l + m + n − 2/(l + m + n)): 4πa⁴/3λ² at boresight.
 
     Attributes:
-        edge: the three inner edges [m].
+        edge: length of the three inner edges [m].
     """
 
     edge: Positive
 
     def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
-        """σ [m²]."""
+        """Compute σ [m²]."""
         tips = trihedral(self.edge).vertices[1:] / self.edge
         low, middle, high = (directions @ tips.T).sort(dim=1).values.T
         total = low + middle + high
@@ -127,16 +127,16 @@ class TrihedralSection(CrossSection):
 
 @dataclass(frozen=True)
 class SphereSection(CrossSection):
-    """The Mie series of a sphere, of a perfect conductor or of a dielectric.
+    """Mie series of a perfectly conducting or dielectric sphere.
 
     ``S = (j/k) Σ (−1)ⁿ (n + ½) (b_n − a_n)`` at x = ka. With j, h = h⁽²⁾ and their (x j)′, (x h)′,
     ``a_n = (u j − (x j)′)/(u h − (x h)′)`` and ``b_n = (u j − ε (x j)′)/(u h − ε (x h)′)``, where
     u = (z j(z))′/j(z) at z = √ε x. A conductor has a_n = j/h and b_n = (x j)′/(x h)′.
 
     Attributes:
-        radius: [m].
-        permittivity: ε' of a dielectric ≥ 1; None = a perfect conductor.
-        loss_tangent: tanδ, ε = ε' (1 − j tanδ).
+        radius: radius of the sphere [m].
+        permittivity: relative permittivity ε' ≥ 1 of a dielectric; None = perfect conductor.
+        loss_tangent: loss tangent tanδ, ε = ε' (1 − j tanδ).
 
     Source: Bohren, Huffman, Absorption and Scattering of Light by Small Particles, §4.3.
     """
@@ -146,17 +146,17 @@ class SphereSection(CrossSection):
     loss_tangent: NonNegative = 0.0
 
     def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
-        """σ [m²], the same in all directions."""
+        """Compute σ [m²], equal in all directions."""
         found = 4 * math.pi * self.amplitude(frequencies).abs() ** 2
         return found[:, None].expand(-1, len(directions))
 
     def amplitude(
         self, frequencies: Float64[Tensor, " frequency"]
     ) -> Complex128[Tensor, " frequency"]:
-        """S [m] back to the radar, with the sphere's middle at the origin.
+        """Compute the backscattering amplitude S [m], with the sphere's centre at the origin.
 
         Args:
-            frequencies: [Hz].
+            frequencies: frequencies [Hz].
         """
         found = [self._amplitude_at(2 * math.pi * f / SPEED_OF_LIGHT) for f in frequencies.tolist()]
         return torch.tensor(found, dtype=torch.complex128)
@@ -179,7 +179,7 @@ class SphereSection(CrossSection):
 
 
 def _logarithmic_derivatives(z: complex, count: int) -> NDArray[np.complex128]:
-    """(z j_n(z))′/j_n(z) for n = 1 … count: downwards, which is stable and never overflows."""
+    """(z j_n(z))′/j_n(z) for n = 1 … count, by downward recurrence, which is stable."""
     last = max(count, math.ceil(abs(z))) + 16
     found = np.zeros(last + 1, dtype=np.complex128)
     for n in range(last, 0, -1):
@@ -189,13 +189,13 @@ def _logarithmic_derivatives(z: complex, count: int) -> NDArray[np.complex128]:
 
 @dataclass(frozen=True)
 class DihedralByMoments(CrossSection):
-    """A square dihedral from the exact field of an endless one: a method of moments in the plane.
+    """Square dihedral from the field of an infinite one, by a 2D method of moments.
 
-    σ = (2a²/λ) σ_2D, for directions across the y axis. The ends of the plates along y, which the
-    plane does not have, are left out.
+    σ = (2a²/λ) σ_2D, for directions orthogonal to the y axis. The ends of the plates along y are
+    not modelled in two dimensions.
 
     Attributes:
-        edge: of the plates [m].
+        edge: side of the plates [m].
         polarisation: "V" = E along y, "H" = H along y.
     """
 
@@ -203,7 +203,7 @@ class DihedralByMoments(CrossSection):
     polarisation: Literal["V", "H"] = "V"
 
     def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
-        """σ [m²]."""
+        """Compute σ [m²]."""
         rows = []
         flat = directions[:, [0, 2]].numpy()
         for frequency in frequencies.tolist():
@@ -215,7 +215,7 @@ class DihedralByMoments(CrossSection):
         return torch.stack(rows)
 
     def _nodes(self, wavelength: float) -> NDArray[np.float64]:
-        """Corners of the segments, from one free edge by the crease to the other."""
+        """End points of the segments, from one free edge through the crease to the other."""
         count = math.ceil(self.edge / wavelength * _SEGMENTS_PER_WAVELENGTH)
         along = np.linspace(-1, 1, 2 * count + 1) * self.edge / math.sqrt(2)
         return np.column_stack([along, -np.abs(along)])
@@ -224,12 +224,14 @@ class DihedralByMoments(CrossSection):
 def strip_section_tm(
     nodes: NDArray[np.float64], k: float, directions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """σ_2D [m] of a thin conductor, E along its axis: ∫ηJ k/4 H₀(k|r − r′|) dl′ = E, pulses.
+    """Compute σ_2D [m] of a thin conductor, E along its axis.
+
+    Solves ∫ηJ k/4 H₀(k|r − r′|) dl′ = E with pulses.
 
     Args:
-        nodes: corners of the segments in the plane [m].
+        nodes: end points of the segments in the plane [m].
         k: wave number [1/m].
-        directions: to the radar, unit vectors in the plane.
+        directions: unit vectors to the radar in the plane.
 
     Source: Harrington, Field Computation by Moment Methods, §3.2.
     """
@@ -243,16 +245,18 @@ def strip_section_tm(
 def strip_section_te(
     nodes: NDArray[np.float64], k: float, directions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """σ_2D [m] of a thin conductor, H along its axis: mixed potentials, triangles about each node.
+    """Compute σ_2D [m] of a thin conductor, H along its axis: mixed potentials, triangle basis.
 
     Args:
-        nodes, k, directions: as in ``strip_section_tm``.
+        nodes: end points of the segments in the plane [m].
+        k: wave number [1/m].
+        directions: unit vectors to the radar in the plane.
 
     Source: Harrington, Field Computation by Moment Methods, §3.3.
     """
     middle, length, tangent = _segments(nodes)
     green = _potentials(nodes, k)
-    # A triangle is half a pulse on either segment; its charge is +1/l on one, −1/l on the other.
+    # A triangle is half a pulse on either segment, with charges +1/l and −1/l.
     count = len(length) - 1
     pulse = np.zeros((count, len(length)))
     charge = np.zeros((count, len(length)))
@@ -273,14 +277,14 @@ def strip_section_te(
 def _segments(
     nodes: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Middles, lengths and tangents."""
+    """Midpoints, lengths and unit tangents of segments."""
     step = np.diff(nodes, axis=0)
     length = np.linalg.norm(step, axis=1)
     return (nodes[:-1] + nodes[1:]) / 2, length, step / length[:, None]
 
 
 def _potentials(nodes: NDArray[np.float64], k: float) -> NDArray[np.complex128]:
-    """∫ H₀(k|r_p − r′|)/4j dr′ over segment q at the middle of p; its own by the small argument."""
+    """∫ H₀(k|r_p − r′|)/4j dr′ over segment q at the midpoint of p; self terms by series."""
     middle, length, tangent = _segments(nodes)
     found = np.zeros((len(length), len(length)), dtype=np.complex128)
     for at, weight in zip(*roots_legendre(_QUADRATURE_POINTS), strict=True):

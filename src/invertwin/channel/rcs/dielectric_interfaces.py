@@ -1,7 +1,7 @@
-"""What waves do at the faces of solids, from outside and from within.
+"""Reflection and refraction at dielectric interfaces, from outside and from inside.
 
-The field is E exp(−jk(K·x + c)) with K·K = ε and ηH = K × E. What a closed body scatters is sent by
-the tangential fields on the outer side of its faces alone, as if in air.
+The field is E exp(−jk(K·x + c)) with K·K = ε and ηH = K × E. The field scattered by a closed body
+is radiated by the tangential fields on the outer side of its faces alone, in air.
 """
 
 from typing import NamedTuple
@@ -25,11 +25,11 @@ from invertwin.channel.em.plane_waves import (
 
 
 class InterfaceCoefficients(NamedTuple):
-    """What a face makes of waves.
+    """Reflected and transmitted fields of an interface (Fresnel coefficients applied).
 
     Attributes:
-        reflected: field that goes back.
-        transmitted: field that goes on.
+        reflected: reflected field [V/m].
+        transmitted: transmitted field [V/m].
     """
 
     reflected: Complex128[Tensor, "row 2 3"]
@@ -37,12 +37,12 @@ class InterfaceCoefficients(NamedTuple):
 
 
 class InterfaceFields(NamedTuple):
-    """What waves do at surfaces.
+    """Radiated, reflected and transmitted fields of illuminated surfaces.
 
     Attributes:
-        radiated: F per m², to a receiver outside.
-        reflected: field that goes back.
-        transmitted: field that goes on behind the surface.
+        radiated: far field F per m², towards a receiver outside.
+        reflected: reflected field [V/m].
+        transmitted: field transmitted behind the surface [V/m].
     """
 
     radiated: Complex128[Tensor, "row 2 3"]
@@ -57,34 +57,38 @@ def apply_fresnel(
     wave_vector: Tensor,
     field: Complex128[Tensor, "row 2 3"],
 ) -> InterfaceCoefficients:
-    """Fresnel's law for any plane wave, with total reflection, from either side.
+    """Apply the Fresnel equations to any plane wave, with total reflection, from either side.
 
-    The parts of E and H along the face are continuous. With p = −K·n and q = √(ε₂ − K_t·K_t), the
-    part of E along the face is mirrored as r E_t + g K_t (K_t·E_t), r = (p − q)/(p + q) and
-    g = 2(ε₂ − ε₁)/((ε₁q + ε₂p)(p + q)). That is r_s across the plane of incidence and r_p in it,
-    without a plane of incidence, which normal incidence and decaying waves do not have.
+    The tangential components of E and H are continuous. With p = −K·n and q = √(ε₂ − K_t·K_t), the
+    tangential component of E is reflected as r E_t + g K_t (K_t·E_t), r = (p − q)/(p + q) and g =
+    2(ε₂ − ε₁)/((ε₁q + ε₂p)(p + q)). That equals r_s and r_p, without the plane of incidence, which
+    is undefined for normal incidence and for evanescent waves.
 
     Args:
-        permittivity_in: ε₁, where the wave comes from.
-        permittivity_out: ε₂.
-        normal: n, towards the source.
-        wave_vector: K of the incident wave.
-        field: E on the face.
+        permittivity_in: relative permittivity ε₁ on the side of the source.
+        permittivity_out: relative permittivity ε₂ behind the face.
+        normal: unit normal n towards the source.
+        wave_vector: K over k of the incident wave, [row, 3].
+        field: incident field E on the face [V/m].
 
     Source: Balanis, Advanced Engineering Electromagnetics, §5.3.
     """
     p, q = -dot(wave_vector, normal), normal_component(permittivity_out, wave_vector, normal)
-    n, along = normal[:, None], (wave_vector + p[:, None] * normal)[:, None]
-    both, mixed = p + q, permittivity_in * q + permittivity_out * p
+    n, tangential_vector = normal[:, None], (wave_vector + p[:, None] * normal)[:, None]
+    total, mixed = p + q, permittivity_in * q + permittivity_out * p
     tangential = field - dot(n, field)[..., None] * n
-    share = dot(along, tangential)[..., None]
-    r = ((p - q) / both)[:, None, None]
-    g = (2 * (permittivity_out - permittivity_in) / (mixed * both))[:, None, None]
-    again = r * tangential + g * share * along
-    # K·E = 0 of each wave gives the parts across the face.
-    upright = ((permittivity_in * q - permittivity_out * p) / (mixed * p))[:, None, None] * share
-    through = (2 * permittivity_in / mixed)[:, None, None] * share
-    return InterfaceCoefficients(again - upright * n, tangential + again + through * n)
+    projection = dot(tangential_vector, tangential)[..., None]
+    r = ((p - q) / total)[:, None, None]
+    g = (2 * (permittivity_out - permittivity_in) / (mixed * total))[:, None, None]
+    reflected = r * tangential + g * projection * tangential_vector
+    # K·E = 0 for each wave determines the normal components.
+    normal_reflected = ((permittivity_in * q - permittivity_out * p) / (mixed * p))[
+        :, None, None
+    ] * projection
+    normal_transmitted = (2 * permittivity_in / mixed)[:, None, None] * projection
+    return InterfaceCoefficients(
+        reflected - normal_reflected * n, tangential + reflected + normal_transmitted * n
+    )
 
 
 def scatter_at_interfaces(
@@ -95,52 +99,64 @@ def scatter_at_interfaces(
     field: Complex128[Tensor, "row 2 3"],
     scattering_direction: Vectors,
 ) -> InterfaceFields:
-    """What waves do where they meet surfaces, from outside or from within.
+    """Compute radiated, reflected and transmitted fields at surfaces, from outside or inside.
 
-    From within, the outer side of a face sends by the parts of E and H along it, which are those
-    of the wave and its mirrored one inside. Conductors that are met inside send nothing: no wave
-    is on their other side.
+    From inside, the outer side of a face radiates by the tangential components of E and H, which
+    are those of the incident and the reflected wave inside. Conductors inside a solid radiate
+    nothing outwards.
 
     Args:
-        solids: what waves enter.
-        interfaces: of each facet.
-        wave_number: k [1/m].
-        patches: waves, and the patches that they meet.
-        field: E on the surface.
-        scattering_direction: s, to the receiver.
+        solids: dielectric solids.
+        interfaces: smooth interface of each patch.
+        wave_number: wave number k [1/m].
+        patches: illuminated patches with their waves.
+        field: incident field E on the surface [V/m].
+        scattering_direction: unit vectors s towards the receiver.
 
     Source: derivations §13 and §14.
     """
-    sent, again, passed = (torch.zeros_like(field) for _ in range(3))
-    outer, metal = patches.medium < 0, solids.conducting[patches.facet]
-    at = torch.nonzero(outer)[:, 0]
-    front = (interfaces.rows(at), wave_number, patches.normal[at], patches.direction[at], field[at])
-    sent = sent.index_copy(0, at, radiate_field(*front, scattering_direction[at]))
-    again = again.index_copy(0, at, reflect_field(*front))
-    at = torch.nonzero(~outer & metal)[:, 0]
-    n = patches.normal[at, None]
-    again = again.index_copy(0, at, 2 * dot(n, field[at])[..., None] * n - field[at])
-    at = torch.nonzero(outer & solids.transparent[patches.facet])[:, 0]
-    passed = passed.index_copy(
-        0, at, _refract_at_faces(solids, interfaces, wave_number, patches, field, at)[1]
+    radiated, reflected, transmitted = (torch.zeros_like(field) for _ in range(3))
+    outer, conducting = patches.medium < 0, solids.conducting[patches.facet]
+    rows = torch.nonzero(outer)[:, 0]
+    front = (
+        interfaces.rows(rows),
+        wave_number,
+        patches.normal[rows],
+        patches.direction[rows],
+        field[rows],
     )
-    at = torch.nonzero(~outer & ~metal)[:, 0]
-    back, through = _refract_at_faces(solids, interfaces, wave_number, patches, field, at)
-    n, s, wave, rough = (
-        patches.normal[at],
-        scattering_direction[at],
-        patches.wave_vector[at],
-        interfaces.rows(at),
+    radiated = radiated.index_copy(0, rows, radiate_field(*front, scattering_direction[rows]))
+    reflected = reflected.index_copy(0, rows, reflect_field(*front))
+    rows = torch.nonzero(~outer & conducting)[:, 0]
+    n = patches.normal[rows, None]
+    reflected = reflected.index_copy(0, rows, 2 * dot(n, field[rows])[..., None] * n - field[rows])
+    rows = torch.nonzero(outer & solids.transparent[patches.facet])[:, 0]
+    transmitted = transmitted.index_copy(
+        0, rows, _refract_at_faces(solids, interfaces, wave_number, patches, field, rows)[1]
     )
-    out = radiate_currents(wave_number, -n, wave, field[at], back, s)
+    rows = torch.nonzero(~outer & ~conducting)[:, 0]
+    reflected_inside, transmitted_outside = _refract_at_faces(
+        solids, interfaces, wave_number, patches, field, rows
+    )
+    n, s, wave, roughness = (
+        patches.normal[rows],
+        scattering_direction[rows],
+        patches.wave_vector[rows],
+        interfaces.rows(rows),
+    )
+    outer_radiation = radiate_currents(wave_number, -n, wave, field[rows], reflected_inside, s)
     p = -dot(wave, n).real
-    kept = [
-        roughness_attenuation(rough, wave_number, way)[:, None, None]
-        for way in (p + dot(n, s), 2 * p)
+    attenuations = [
+        roughness_attenuation(roughness, wave_number, cosine_sum)[:, None, None]
+        for cosine_sum in (p + dot(n, s), 2 * p)
     ]
-    sent = sent.index_copy(0, at, project_transverse(out, s) * kept[0])
+    radiated = radiated.index_copy(
+        0, rows, project_transverse(outer_radiation, s) * attenuations[0]
+    )
     return InterfaceFields(
-        sent, again.index_copy(0, at, back * kept[1]), passed.index_copy(0, at, through)
+        radiated,
+        reflected.index_copy(0, rows, reflected_inside * attenuations[1]),
+        transmitted.index_copy(0, rows, transmitted_outside),
     )
 
 
@@ -152,10 +168,10 @@ def _refract_at_faces(
     field: Tensor,
     rows: Tensor,
 ) -> InterfaceCoefficients:
-    """What faces of solids mirror, without roughness, and let through, of some rows."""
+    """Reflected (without roughness) and transmitted fields at faces of solids, of some rows."""
     n, wave, medium = patches.normal[rows], patches.wave_vector[rows], patches.medium[rows]
     behind = solids.permittivity_in(solids.medium_behind(patches.facet[rows], medium))
     found = apply_fresnel(solids.permittivity_in(medium), behind, n, wave, field[rows])
-    changed = -dot(wave, n) - normal_component(behind, wave, n)
-    kept = roughness_attenuation(interfaces.rows(rows), wave_number, changed.real)
-    return found._replace(transmitted=found.transmitted * kept[:, None, None])
+    height_phase = -dot(wave, n) - normal_component(behind, wave, n)
+    attenuation = roughness_attenuation(interfaces.rows(rows), wave_number, height_phase.real)
+    return found._replace(transmitted=found.transmitted * attenuation[:, None, None])

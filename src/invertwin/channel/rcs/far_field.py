@@ -1,10 +1,12 @@
-"""The far field that a smooth scene scatters: every bounce, edges, both polarisations, coherent.
+"""Coherent far field of smooth scenes: physical optics of every bounce (SBR), and edges (PTD).
 
-Each order is physical optics of its own incident field; all add in one field. In scenes of few flat
-facets light is clipped beams, in others ray tubes: the same integral over the same lit surface.
+Each order is physical optics of its own incident field; all orders add coherently. Scenes of few
+flat facets use beam tracing, others ray tubes (shooting and bouncing rays): the same integral over
+the same illuminated surface.
 
-Differs from the source: physical optics of separate antennas is not reciprocal. The result is the
-mean of both ways, which is. In one place it is the mean of both cross-polar terms.
+Differs from the source: bistatic physical optics is not reciprocal. The result is averaged over
+transmitter and receiver exchanged, which is reciprocal; in the monostatic case that averages both
+cross-polar terms.
 """
 
 import math
@@ -65,30 +67,30 @@ from invertwin.runtime.progress import track
 from invertwin.scene.material.fresnel import refractive_index
 from invertwin.scene.scene import Scene
 
-_MAX_SAGITTA = 1 / 50  # wavelengths that a facet may be off the curved surface
-_MIN_TURN_ANGLE = 1e-6  # rad that normals turn from facet to facet where a surface is curved
-_SEGMENTS_PER_WAVELENGTH = 2.0  # of an edge per wavelength; each is seen or not
-_MIN_EDGE_RUN = 2.0  # wavelengths that an edge which ends in a smooth surface runs on at least
-_EDGE_OFFSET = 1e-5  # of the scene's size: how far aside of an edge rays to it end
+_MAX_SAGITTA = 1 / 50  # wavelengths between a facet and the curved surface
+_MIN_TURN_ANGLE = 1e-6  # rad between adjacent normals of a curved surface
+_SEGMENTS_PER_WAVELENGTH = 2.0  # pieces of an edge, each visible or not
+_MIN_EDGE_RUN = 2.0  # wavelengths: least length of an edge that ends in a smooth surface
+_EDGE_OFFSET = 1e-5  # of the scene's size: distance of rays' ends from an edge
 _ROWS_AT_ONCE = 1 << 18
 
 _PatchOrders = tuple[Sequence[IlluminatedPatches], DielectricSolids | None, Sequence[int]]
-"""Patches of all orders, what waves enter, and numbers of the frequencies of which that holds."""
+"""Patches of all orders, dielectric solids, and indices of the frequencies for which they hold."""
 
 
 @dataclass(frozen=True)
 class _FarFieldTarget:
-    """A scene as the laws of waves see it.
+    """Scene as a target of plane waves.
 
     Attributes:
-        facets: its triangles.
-        topology: its edges.
-        vertices: [m].
-        occluders: what rays meet.
-        interfaces: of the triangles, for each frequency.
-        wave_numbers: k of the frequencies [1/m].
-        up: direction of V.
-        interiors: groups of frequencies, and what waves enter there.
+        facets: facets of all triangles.
+        topology: faces and edges.
+        vertices: vertex positions [m].
+        occluders: ray scene of the triangles.
+        interfaces: smooth interfaces of the triangles, per frequency.
+        wave_numbers: wave number k per frequency [1/m].
+        up: unit vector of the vertical axis, which defines V.
+        interiors: dielectric solids, each with the indices of its frequencies.
     """
 
     facets: Facets
@@ -102,33 +104,33 @@ class _FarFieldTarget:
 
     @property
     def wavelength(self) -> float:
-        """The shortest [m]."""
+        """Shortest wavelength [m]."""
         return 2 * math.pi / max(self.wave_numbers)
 
     @cached_property
     def smooth_faces(self) -> SmoothFaces:
-        """The facets as pieces of smooth faces."""
+        """Smooth faces that the facets approximate."""
         return group_smooth_faces(self.facets, self.topology.edge_faces)
 
     def max_refractive_index(self, number: int) -> float:
-        """The largest refractive index of waves inside an object; 1 where none enter."""
+        """Return the largest refractive index inside an object; 1 for opaque ones."""
         inside = [solids.permittivity[number] for solids, _ in self.interiors if solids is not None]
         return max([1.0, *(float(refractive_index(e.detach())) for e in inside)])
 
     @property
     def is_smooth_metal(self) -> bool:
-        """Whether all is smooth metal, of which fields do not depend on the frequency."""
+        """True if all objects are smooth metal, with fields independent of frequency."""
         first = self.interfaces[0]
         smooth = (first.coherence == 1) & (first.rms_height == 0)
         return bool((first.conducting & smooth).all())
 
     @property
     def is_closed(self) -> bool:
-        """Whether all is closed bodies, which have too many facets for beams."""
+        """True if all bodies are closed and have too many facets for beam tracing."""
         return len(self.facets.normal) > MAX_FACETS_BEAM_TRACING and bool(self.facets.solid.all())
 
     def is_unoccluded(self, points: Tensor, directions: Tensor) -> Tensor:
-        """Whether nothing lies between points and the far end of directions."""
+        """Test if rays from points along directions are unobstructed."""
         return is_visible(self.occluders, points, points + 3 * self.facets.size * directions)
 
 
@@ -144,62 +146,68 @@ def trace_far_field(
     up: Float64[Tensor, "3"],
     boundary: bool = True,
 ) -> dict[str, Complex128[Tensor, "frequency aspect 2 2"]]:
-    """Scattering amplitudes S of every part of the field, about the world's origin; σ = 4π|S|².
+    """Trace the far field: scattering amplitudes S of its parts, σ = 4π|S|².
+
+    Phases refer to the world's origin.
 
     Rows are the receiving, columns the transmitting polarisation, V and H of ``polarisations``. The
-    parts are ``order 1``, ``order 2`` and so on, ``edges 1``, ``edges 2``, and of small
-    conductors ``rest``, which is what these leave out of the solved field.
+    parts are ``order 1``, ``order 2`` and so on, ``edges 1``, ``edges 2``, and for small conductors
+    ``rest``, the residual of these parts from the method of moments.
 
     Args:
         scene: conductors and smooth dielectrics.
-        transmitters: unit vectors from the scene to the antenna.
-        receivers: the same; None = the transmitter receives.
-        frequencies: [Hz].
-        depth: most bounces.
-        edges: most diffractions of a wave by sharp edges of conductors; 0 leaves them out, and the
-            rest.
-        tubes_per_wavelength: at the highest frequency, where the scene has many triangles.
-        up: V lies in a plane with this unit vector.
-        boundary: False leaves out of derivatives what moving edges of beams change.
+        transmitters: unit vectors from the scene to the transmitters.
+        receivers: unit vectors from the scene to the receivers; None = monostatic.
+        frequencies: frequencies [Hz].
+        depth: maximum number of bounces.
+        edges: maximum number of diffractions at sharp edges of conductors; 0 omits them and the
+            residual.
+        tubes_per_wavelength: density of ray tubes at the highest frequency, for scenes of many
+            triangles.
+        up: unit vector of the vertical axis, in one plane with V.
+        boundary: False omits the derivatives due to moving edges of beams.
 
     Raises:
         InputError: a cloud, a rough surface, derivatives of a scene of many triangles, or of a
-            small one of which vertices lie at one place, a dielectric inside or in touch with
-            another one that waves enter, a conductor in touch with one of many triangles.
+            small one with coincident vertices, a dielectric inside or in contact with another
+            transmitting one, a conductor in contact with one of many triangles.
     """
     with tracing():
-        body = _build_target(scene, frequencies, up)
-        count = len(body.facets.normal)
-        if count > MAX_FACETS_BEAM_TRACING and is_differentiated(body.vertices):
+        target = _build_target(scene, frequencies, up)
+        count = len(target.facets.normal)
+        if count > MAX_FACETS_BEAM_TRACING and is_differentiated(target.vertices):
             raise InputError(
                 f"expected at most {MAX_FACETS_BEAM_TRACING} triangles for derivatives of a "
                 f"signature, got {count}: "
                 "ray tubes jump at edges; detach the scene, or fit with power paths"
             )
         if count > MAX_FACETS_BEAM_TRACING:
-            _check_inner_tubes(body)
+            _check_inner_tubes(target)
         spacing = (
-            None if count <= MAX_FACETS_BEAM_TRACING else body.wavelength / tubes_per_wavelength
+            None if count <= MAX_FACETS_BEAM_TRACING else target.wavelength / tubes_per_wavelength
         )
-        ways = [(transmitters, transmitters if receivers is None else receivers)]
+        antenna_pairs = [(transmitters, transmitters if receivers is None else receivers)]
         if receivers is not None:
-            ways.append((receivers, transmitters))
+            antenna_pairs.append((receivers, transmitters))
         found = [
-            _FarFieldTracer(body, *way).trace_parts(depth, edges, spacing, boundary) for way in ways
+            _FarFieldTracer(target, *pair).trace_parts(depth, edges, spacing, boundary)
+            for pair in antenna_pairs
         ]
-        # The mean of both ways between two antennas, or between polarisations of one.
+        # Reciprocity: mean over both directions, or over both cross-polar terms of one antenna.
         parts = {name: (found[0][name] + found[-1][name].mT) / 2 for name in found[0]}
-        solved = edges > 0 and body.is_smooth_metal
-        rest = (
-            _residual_field(body, ways, torch.stack([*parts.values()]).sum(0)) if solved else None
+        uses_moments = edges > 0 and target.is_smooth_metal
+        residual = (
+            _residual_field(target, antenna_pairs, torch.stack([*parts.values()]).sum(0))
+            if uses_moments
+            else None
         )
-        _warn_validity(scene, body, tubes_per_wavelength, spacing, rest is not None)
-        return parts if rest is None else parts | {"rest": rest}
+        _warn_validity(scene, target, tubes_per_wavelength, spacing, residual is not None)
+        return parts if residual is None else parts | {"rest": residual}
 
 
 @dataclass(frozen=True)
 class _FarFieldTracer:
-    """Waves from one set of directions, received in another."""
+    """Traces waves from one set of directions, received in another."""
 
     target: _FarFieldTarget
     transmitters: Tensor
@@ -208,13 +216,13 @@ class _FarFieldTracer:
     def trace_parts(
         self, depth: int, edges: int, tube_width: float | None, boundary: bool
     ) -> dict[str, Tensor]:
-        """All parts of the field."""
+        """Trace all parts of the field."""
         found = self._trace_bounces(depth, tube_width, boundary)
         return found | self._trace_edges(edges) if edges else found
 
     @property
     def _incident_fields(self) -> Tensor:
-        """Incident fields of 1 V/m, V and H, of every aspect."""
+        """Incident fields of 1 V/m, V and H, per aspect."""
         return polarisations(self.transmitters, self.target.up)
 
     def _zero_amplitudes(self) -> Tensor:
@@ -222,22 +230,22 @@ class _FarFieldTracer:
         return torch.zeros(shape, dtype=torch.complex128)
 
     def _add_received(self, total: Tensor, aspect: Tensor, radiated: Tensor) -> Tensor:
-        """A total with the parts of F that the receiving polarisations see added."""
-        seen = polarisations(self.receivers, self.target.up)[aspect]
-        return total.index_add(0, aspect, dot(seen[:, :, None], radiated[:, None]))
+        """Add the components of F along the receiving polarisations to a total."""
+        received = polarisations(self.receivers, self.target.up)[aspect]
+        return total.index_add(0, aspect, dot(received[:, :, None], radiated[:, None]))
 
     def _trace_bounces(
         self, depth: int, tube_width: float | None, boundary: bool
     ) -> dict[str, Tensor]:
-        """Physical optics of every order: of beams, or of tubes where a spacing is given."""
+        """Physical optics of every order, by beams or, with a tube width, by ray tubes."""
         orders = [list(self._zero_amplitudes()) for _ in range(depth)]
-        chains = (
+        groups = (
             self._trace_beam_orders(depth, boundary)
             if tube_width is None
             else self._trace_tube_orders(depth, tube_width)
         )
-        for chain, solids, members in chains:
-            self._add_orders(orders, chain, solids, members)
+        for patch_orders, solids, members in groups:
+            self._add_orders(orders, patch_orders, solids, members)
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
 
     def _add_orders(
@@ -247,45 +255,48 @@ class _FarFieldTracer:
         solids: DielectricSolids | None,
         frequency_indices: Sequence[int],
     ) -> None:
-        """Add what all patches send to the fields of their orders, at some frequencies."""
-        body = self.target
+        """Add the radiation of patches to the fields of their orders, at some frequencies."""
+        target = self.target
         currents: list[Tensor] = []
         integrals = [
-            bounce.phase_integral(self.receivers[bounce.aspect]) for bounce in patch_orders
+            patches.phase_integral(self.receivers[patches.aspect]) for patches in patch_orders
         ]
         for f in frequency_indices:
-            k = body.wave_numbers[f]
-            if not (body.is_smooth_metal and currents):
+            k = target.wave_numbers[f]
+            if not (target.is_smooth_metal and currents):
                 currents = self._patch_amplitudes(
-                    patch_orders, solids, body.interfaces[f], 1.0 if body.is_smooth_metal else k
+                    patch_orders, solids, target.interfaces[f], 1.0 if target.is_smooth_metal else k
                 )
             rows = zip(orders, patch_orders, integrals, currents, strict=False)
-            for order, bounce, integral, current in rows:
-                strength = integral(k) * (k if body.is_smooth_metal else 1.0)
-                sent = current * strength[:, None, None]
-                order[f] = order[f].index_add(0, bounce.aspect, sent)
+            for order, patches, integral, current in rows:
+                strength = integral(k) * (k if target.is_smooth_metal else 1.0)
+                radiated = current * strength[:, None, None]
+                order[f] = order[f].index_add(0, patches.aspect, radiated)
 
     def _trace_beam_orders(self, depth: int, boundary: bool) -> Iterator[_PatchOrders]:
-        """Few facets: clipped beams."""
+        """Trace few facets by clipped beams."""
         facets, incident = self.target.facets, -self.transmitters
         for solids, members in self.target.interiors:
             found = trace_beams(facets, incident, depth, boundary=boundary, solids=solids)
             yield list(found), solids, members
 
     def _trace_tube_orders(self, depth: int, tube_width: float) -> Iterator[_PatchOrders]:
-        """Many facets: tubes that begin as lit triangles."""
-        body = self.target
-        for lit in find_illuminated_triangles(
-            body.facets, body.is_unoccluded, -self.transmitters, tube_width
+        """Trace many facets by ray tubes that start as illuminated triangles."""
+        target = self.target
+        for illuminated in find_illuminated_triangles(
+            target.facets, target.is_unoccluded, -self.transmitters, tube_width
         ):
-            outside = [lit, *trace_tubes(body.facets, body.occluders, lit, tube_width, depth)]
-            for solids, members in body.interiors:
-                chain = outside
+            outside = [
+                illuminated,
+                *trace_tubes(target.facets, target.occluders, illuminated, tube_width, depth),
+            ]
+            for solids, members in target.interiors:
+                patch_orders = outside
                 if solids is not None:
-                    chain = trace_inner_tubes(
-                        body.smooth_faces, body.occluders, solids, outside, tube_width, depth
+                    patch_orders = trace_inner_tubes(
+                        target.smooth_faces, target.occluders, solids, outside, tube_width, depth
                     )
-                yield chain, solids, members
+                yield patch_orders, solids, members
 
     def _patch_amplitudes(
         self,
@@ -294,41 +305,48 @@ class _FarFieldTracer:
         interfaces: SmoothInterfaces,
         k: float,
     ) -> list[Tensor]:
-        """S per m² of all patches, order by order: [row, receive, transmit] each."""
+        """Amplitudes S per m² of all patches, order by order: [row, receive, transmit] each."""
         found: list[Tensor] = []
-        again = passed = torch.zeros(0)
-        for bounce in patch_orders:
+        reflected = transmitted = torch.zeros(0)
+        for patches in patch_orders:
             if not found:
-                field = self._incident_fields.to(torch.complex128)[bounce.aspect]
+                field = self._incident_fields.to(torch.complex128)[patches.aspect]
             elif solids is None:
-                field = again[bounce.parent]
+                field = reflected[patches.parent]
             else:
-                through = bounce.transmitted[:, None, None]
-                field = torch.where(through, passed[bounce.parent], again[bounce.parent])
-                field = field * bounce.spreading[:, None, None]
-            towards, own = self.receivers[bounce.aspect], interfaces.rows(bounce.facet)
+                is_transmitted = patches.transmitted[:, None, None]
+                field = torch.where(
+                    is_transmitted, transmitted[patches.parent], reflected[patches.parent]
+                )
+                field = field * patches.spreading[:, None, None]
+            receiver, patch_interfaces = (
+                self.receivers[patches.aspect],
+                interfaces.rows(patches.facet),
+            )
             if solids is None:
-                surface = (own, k, bounce.normal, bounce.direction, field)
-                sent, again = radiate_field(*surface, towards), reflect_field(*surface)
+                surface = (patch_interfaces, k, patches.normal, patches.direction, field)
+                radiated, reflected = radiate_field(*surface, receiver), reflect_field(*surface)
             else:
-                sent, again, passed = scatter_at_interfaces(solids, own, k, bounce, field, towards)
-            seen = polarisations(self.receivers, self.target.up)[bounce.aspect]
-            found.append(dot(seen[:, :, None], sent[:, None]))
+                radiated, reflected, transmitted = scatter_at_interfaces(
+                    solids, patch_interfaces, k, patches, field, receiver
+                )
+            received = polarisations(self.receivers, self.target.up)[patches.aspect]
+            found.append(dot(received[:, :, None], radiated[:, None]))
         return found
 
     def _trace_edges(self, max_diffractions: int) -> dict[str, Tensor]:
-        """What sharp edges of conductors add to physical optics."""
-        body = self.target
-        topology = body.topology
-        ends = body.vertices[topology.edges]
-        wedges = find_wedges(body.facets.corners, ends, topology.edge_faces)
-        wedges = wedges.rows(body.interfaces[0].conducting[wedges.faces[:, 0]])
-        wedges = wedges.rows(select_body_edges(wedges, body.wavelength * _MIN_EDGE_RUN))
+        """Contributions of sharp edges of conductors (PTD)."""
+        target = self.target
+        topology = target.topology
+        ends = target.vertices[topology.edges]
+        wedges = find_wedges(target.facets.corners, ends, topology.edge_faces)
+        wedges = wedges.rows(target.interfaces[0].conducting[wedges.faces[:, 0]])
+        wedges = wedges.rows(select_body_edges(wedges, target.wavelength * _MIN_EDGE_RUN))
         found = {"edges 1": self._fringe_amplitudes(wedges)}
         plates = find_plates(wedges) if max_diffractions > 1 else []
         totals = [list(self._zero_amplitudes()) for _ in range(2, max_diffractions + 1)]
         every = torch.arange(len(self.transmitters))
-        for f, k in enumerate(body.wave_numbers if plates else ()):
+        for f, k in enumerate(target.wave_numbers if plates else ()):
             several = trace_multiple_diffractions(
                 plates,
                 k,
@@ -336,53 +354,52 @@ class _FarFieldTracer:
                 self._incident_fields,
                 self.receivers,
                 max_diffractions,
-                body.is_unoccluded,
+                target.is_unoccluded,
             )
-            for total, sent in zip(totals, several, strict=True):
-                total[f] = self._add_received(total[f], every, sent)
+            for total, radiated in zip(totals, several, strict=True):
+                total[f] = self._add_received(total[f], every, radiated)
         return found | {f"edges {n}": torch.stack(t) for n, t in enumerate(totals, start=2)}
 
     def _fringe_amplitudes(self, wedges: Wedges) -> Tensor:
-        """First-order fringe currents of the parts of edges that both antennas see."""
-        body, total = self.target, list(self._zero_amplitudes())
-        wedges = _split_edges(wedges, body.wavelength / _SEGMENTS_PER_WAVELENGTH)
+        """First-order fringe currents of the edge pieces that both antennas see."""
+        target, total = self.target, list(self._zero_amplitudes())
+        wedges = _split_edges(wedges, target.wavelength / _SEGMENTS_PER_WAVELENGTH)
         count = len(wedges.start)
         left_out = 0
         some = torch.arange(len(self.transmitters))
         for aspects in some.split(max(1, _ROWS_AT_ONCE // max(1, count))) if count else ():
             aspect = aspects.repeat_interleave(count)
             row = torch.arange(count).repeat(len(aspects))
-            for way in (self.transmitters, self.receivers):
-                direction = way[aspect]
-                at = wedges.rows(row)
-                keep = is_outside_wedge(at, direction)
-                flat = keep & is_grazing_sheet(at, direction)
-                left_out += int(flat.sum())
-                aspect, row = aspect[keep & ~flat], row[keep & ~flat]
-            for way in (self.transmitters, self.receivers):
-                at = wedges.rows(row)
-                aside = (at.normals - at.face_tangents).sum(1)
-                middle = (at.start + at.end) / 2
-                middle = middle + _EDGE_OFFSET * body.facets.size * normalize(aside, dim=1)
-                seen = body.is_unoccluded(middle, way[aspect])
-                aspect, row = aspect[seen], row[seen]
-                if way is self.receivers:
+            for antennas in (self.transmitters, self.receivers):
+                direction = antennas[aspect]
+                pieces = wedges.rows(row)
+                keep = is_outside_wedge(pieces, direction)
+                grazing = keep & is_grazing_sheet(pieces, direction)
+                left_out += int(grazing.sum())
+                aspect, row = aspect[keep & ~grazing], row[keep & ~grazing]
+            for antennas in (self.transmitters, self.receivers):
+                pieces = wedges.rows(row)
+                outward = (pieces.normals - pieces.face_tangents).sum(1)
+                centre = (pieces.start + pieces.end) / 2
+                centre = centre + _EDGE_OFFSET * target.facets.size * normalize(outward, dim=1)
+                visible = target.is_unoccluded(centre, antennas[aspect])
+                aspect, row = aspect[visible], row[visible]
+                if antennas is self.receivers:
                     break
-            at = wedges.rows(row)
+            pieces = wedges.rows(row)
             d, s = -self.transmitters[aspect], self.receivers[aspect]
-            middle, side = (at.start + at.end) / 2, at.end - at.start
-            for f, k in enumerate(body.wave_numbers):
-                sent = fringe_field(at, k, d, self._incident_fields[aspect], s)
+            centre, side = (pieces.start + pieces.end) / 2, pieces.end - pieces.start
+            for f, k in enumerate(target.wave_numbers):
+                radiated = fringe_field(pieces, k, d, self._incident_fields[aspect], s)
                 wave = k * (s - d)
                 width = parallelogram_integral(wave, side, torch.zeros_like(side))
-                turn = dot(wave, middle)
-                scale = torch.polar(torch.ones_like(turn), turn) * width * side.norm(dim=1)
-                total[f] = self._add_received(total[f], aspect, sent * scale[:, None, None])
+                phase = dot(wave, centre)
+                scale = torch.polar(torch.ones_like(phase), phase) * width * side.norm(dim=1)
+                total[f] = self._add_received(total[f], aspect, radiated * scale[:, None, None])
         if left_out:
             warnings.warn(
                 f"edges of sheets within {math.degrees(MIN_EDGE_ANGLE):.0f}° of grazing are left "
-                f"out: "
-                "their fringe currents are not valid there, and physical optics is not either",
+                "out: their fringe currents are not valid there, and physical optics is not either",
                 PhysicsWarning,
                 stacklevel=2,
             )
@@ -390,7 +407,7 @@ class _FarFieldTracer:
 
 
 def _check_inner_tubes(target: _FarFieldTarget) -> None:
-    """Refuse what tubes inside of solids cannot do."""
+    """Raise an error for scenes that ray tubes inside solids do not support."""
     for solids, _ in target.interiors:
         if solids is None:
             continue
@@ -399,9 +416,8 @@ def _check_inner_tubes(target: _FarFieldTarget) -> None:
             raise InputError(
                 f"expected permittivities of {', '.join(names)} without derivatives in a scene of "
                 f"more than {MAX_FACETS_BEAM_TRACING} triangles, got some that require grad: ray "
-                f"tubes inside jump at "
-                "edges; detach them, use fewer triangles, or an open mesh, which shows its front "
-                "alone"
+                "tubes inside are discontinuous at edges; detach them, use fewer triangles, or an "
+                "open mesh, of which only the front face reflects"
             )
         require_separate_conductors(target.facets, solids)
 
@@ -409,33 +425,35 @@ def _check_inner_tubes(target: _FarFieldTarget) -> None:
 def _residual_field(
     target: _FarFieldTarget, antenna_pairs: Sequence[tuple[Tensor, Tensor]], modelled: Tensor
 ) -> Tensor | None:
-    """What bounces and edges leave out of the fields of small targets; of larger ones zero."""
-    meshes = EFIESolver(target.vertices, target.topology.faces, target.facets.solid, target.up)
-    cells = MFIESolver(target.facets.corners.detach(), target.up) if target.is_closed else None
-    rest: dict[int, Tensor] = {}
-    downwards = sorted(range(len(modelled)), key=lambda f: -target.wave_numbers[f])
-    for f in track(downwards, "frequencies"):
+    """Residual of rays and edges from the method of moments for small targets; zero for larger."""
+    efie = EFIESolver(target.vertices, target.topology.faces, target.facets.solid, target.up)
+    mfie = MFIESolver(target.facets.corners.detach(), target.up) if target.is_closed else None
+    residual: dict[int, Tensor] = {}
+    order = sorted(range(len(modelled)), key=lambda f: -target.wave_numbers[f])
+    for f in track(order, "frequencies"):
         k = target.wave_numbers[f]
-        solver = cells if cells is not None and cells.supports(k) else meshes
+        solver = mfie if mfie is not None and mfie.supports(k) else efie
         found = solver.solve_scattering(k, antenna_pairs)
         if found is not None:
-            rest[f] = (found[0] + found[-1].mT) / 2 - modelled[f]
-    if not rest:
+            residual[f] = (found[0] + found[-1].mT) / 2 - modelled[f]
+    if not residual:
         return None
-    return torch.stack([rest.get(f, torch.zeros_like(modelled[f])) for f in range(len(modelled))])
+    return torch.stack(
+        [residual.get(f, torch.zeros_like(modelled[f])) for f in range(len(modelled))]
+    )
 
 
 def _split_edges(wedges: Wedges, max_length: float) -> Wedges:
-    """Edges in equal pieces no longer than a length."""
+    """Split edges into equal pieces no longer than a length."""
     side = wedges.end - wedges.start
     pieces = (side.detach().norm(dim=1) / max_length).ceil().long().clamp_min(1)
     row = torch.repeat_interleave(pieces)
     number = torch.arange(len(row)) - (pieces.cumsum(0) - pieces)[row]
-    cut = wedges.rows(row)
+    rows = wedges.rows(row)
     low, high = (number / pieces[row])[:, None], ((number + 1) / pieces[row])[:, None]
-    columns = vars(cut) | {
-        "start": cut.start + low * side[row],
-        "end": cut.start + high * side[row],
+    columns = vars(rows) | {
+        "start": rows.start + low * side[row],
+        "end": rows.start + high * side[row],
     }
     return Wedges(**columns)
 
@@ -451,27 +469,31 @@ def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTar
     topology = topology_of([item.mesh for item in objects.values()])
     facets = build_facets(vertices, topology)
     occluders = Occluders(vertices, topology, vertices.detach().mean(0))
-    skins = [_smooth_interfaces(scene, topology, frequency) for frequency in frequencies.tolist()]
+    interfaces = [
+        _smooth_interfaces(scene, topology, frequency) for frequency in frequencies.tolist()
+    ]
     wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in frequencies.tolist()]
     owner, names = topology.face_object, list(objects)
-    entered = group_solids(skins, wave_numbers, facets.corners, facets.solid, owner, names)
-    return _FarFieldTarget(facets, topology, vertices, occluders, skins, wave_numbers, up, entered)
+    interiors = group_solids(interfaces, wave_numbers, facets.corners, facets.solid, owner, names)
+    return _FarFieldTarget(
+        facets, topology, vertices, occluders, interfaces, wave_numbers, up, interiors
+    )
 
 
 def _smooth_interfaces(scene: Scene, topology: Topology, frequency: float) -> SmoothInterfaces:
-    """The skins of all triangles."""
+    """Smooth interfaces of all triangles."""
     columns: list[list[Tensor]] = [[] for _ in SmoothInterfaces._fields]
     for name, item in scene.objects.items():
-        skin = item.material.smooth_interface(frequency)
-        if skin is None:
+        interface = item.material.smooth_interface(frequency)
+        if interface is None:
             raise InputError(
                 f"expected smooth surfaces in a signature, got {type(item.material).__name__} for "
                 f"{name}; give a PerfectConductor, RoughConductor, Dielectric, RefractingBody or "
                 "Slab"
             )
-        metal = torch.tensor(skin.permittivity is None)
-        epsilon = torch.ones(()) if skin.permittivity is None else skin.permittivity
-        values = (metal, epsilon.to(torch.complex128), *skin[1:])
+        conducting = torch.tensor(interface.permittivity is None)
+        epsilon = torch.ones(()) if interface.permittivity is None else interface.permittivity
+        values = (conducting, epsilon.to(torch.complex128), *interface[1:])
         for column, value in zip(columns, values, strict=True):
             column.append(value.expand(len(item.mesh.faces)))
     return SmoothInterfaces(*map(torch.cat, columns))
@@ -484,21 +506,23 @@ def _warn_validity(
     tube_width: float | None,
     has_residual: bool,
 ) -> None:
-    """Say where the physics ends."""
+    """Issue warnings where the model is outside its range of validity."""
     found: list[str] = []
     if tube_width is not None and density < 1:
         found.append(f"{density:g} tubes per wavelength are too few: use 1 or more, better 4")
     faces = target.topology.face_object
-    both = torch.nn.functional.pad(target.topology.edge_faces, (0, 1), value=-1)[:, :2]
-    both = torch.where(both >= 0, both, both[:, :1])  # an open edge does not turn
+    neighbours = torch.nn.functional.pad(target.topology.edge_faces, (0, 1), value=-1)[:, :2]
+    neighbours = torch.where(
+        neighbours >= 0, neighbours, neighbours[:, :1]
+    )  # an open edge has one normal
     normal = target.facets.normal.detach()
-    turn = 2 * torch.asin(
-        (0.5 * (normal[both[:, 0]] - normal[both[:, 1]]).norm(dim=1)).clamp_max(1)
+    angle = 2 * torch.asin(
+        (0.5 * (normal[neighbours[:, 0]] - normal[neighbours[:, 1]]).norm(dim=1)).clamp_max(1)
     )
     ends = target.vertices.detach()[target.topology.edges]
-    # A triangle of side ℓ whose neighbours turn by α is ℓα/√12 off the curved surface.
-    off = (ends[:, 1] - ends[:, 0]).norm(dim=1) * turn / math.sqrt(12)
-    smooth = (turn > _MIN_TURN_ANGLE) & (turn < MAX_SMOOTH_ANGLE)
+    # A triangle of side ℓ with angles α to its neighbours is ℓα/√12 off the curved surface.
+    sagittas = (ends[:, 1] - ends[:, 0]).norm(dim=1) * angle / math.sqrt(12)
+    smooth = (angle > _MIN_TURN_ANGLE) & (angle < MAX_SMOOTH_ANGLE)
     for number, name in enumerate(scene.objects):
         own = faces == number
         points = target.facets.corners.detach()[own].reshape(-1, 3)
@@ -506,25 +530,28 @@ def _warn_validity(
         if size < target.wavelength and not has_residual:
             found.append(
                 f"{name} is {size / target.wavelength:.2g} wavelengths large: physical optics is "
-                f"for "
-                "objects of several"
+                "for objects of several"
             )
-        mine = smooth & own[both[:, 0]]
-        # Inside, waves are shorter.
-        shorter = target.max_refractive_index(number)
-        sagitta = float(off[mine].median()) / target.wavelength if bool(mine.any()) else 0.0
-        if sagitta * shorter > _MAX_SAGITTA:
+        own_edges = smooth & own[neighbours[:, 0]]
+        # Wavelengths inside are shorter.
+        index = target.max_refractive_index(number)
+        sagitta = (
+            float(sagittas[own_edges].median()) / target.wavelength
+            if bool(own_edges.any())
+            else 0.0
+        )
+        if sagitta * index > _MAX_SAGITTA:
             found.append(
                 f"the facets of {name} are {sagitta * shorter:.2g} wavelengths off the curved "
                 "surface, more than 1/50: use a finer mesh"
             )
-        mixed = target.facets.solid[own].all() and not is_homogeneous(
+        is_mixed = target.facets.solid[own].all() and not is_homogeneous(
             target.interfaces[0].rows(own)
         )
-        if bool(mixed):
+        if bool(is_mixed):
             found.append(
-                f"{name} is closed and its permittivity differs between triangles: it shows its "
-                "front alone"
+                f"{name} is closed and its permittivity differs between triangles: only "
+                "its front face reflects"
             )
     for text in found:
         warnings.warn(text, PhysicsWarning, stacklevel=3)

@@ -1,8 +1,8 @@
-"""Flat plates: waves that several edges of one plate diffract, one after another.
+"""Multiple diffraction between the edges of flat plates.
 
-An edge sends a wave along the plate, strongest where H lies along the edge. It meets another edge
-head on and is diffracted again. Both sides of the plate carry it with opposite sign, so the half of
-a grazing wave that counts as incident counts twice.
+An edge diffracts a wave along the plate, strongest for H along the edge. At another edge it is
+diffracted again. Both sides of the plate carry it with opposite sign, so that the factor of one
+half for grazing incidence is compensated.
 
 Source: derivations §14; Ross, "Radar cross section of rectangular flat plates as a function of
 aspect angle", IEEE TAP 14, 1966.
@@ -19,11 +19,11 @@ from torch import Tensor
 from invertwin.channel.em.plane_waves import cross, dot, parallelogram_integral
 from invertwin.channel.em.wedges import MIN_EDGE_ANGLE, Wedges
 
-_SAMPLES_PER_EDGE = 16  # of the lit part of the last edge
+_SAMPLES_PER_EDGE = 16  # of the illuminated part of the last edge
 _TOLERANCE = 1e-6
 
 VisibilityTest = Callable[[Tensor, Tensor], Tensor]
-"""Points and unit vectors from them → whether nothing is in the way."""
+"""Function of points and unit directions; returns a mask of unobstructed rays."""
 
 
 def trace_multiple_diffractions(
@@ -35,19 +35,19 @@ def trace_multiple_diffractions(
     max_diffractions: int,
     is_visible: VisibilityTest,
 ) -> Iterator[Tensor]:
-    """F of two diffractions, of three, and so on, by sides of one plate; [row, 2, 3].
+    """Compute the far fields F of two diffractions, of three, and so on; [row, 2, 3] each.
 
-    A wave goes from side to side, but not between sides that share a corner: there it has no way
-    to become the wave of an edge, and what the corner itself does is not modelled.
+    A wave propagates from side to side of one plate, except between sides that share a corner: edge
+    diffraction does not apply there, and corner diffraction is not modelled.
 
     Args:
-        plates: sides of each, from ``find_plates``.
-        wave_number: k [1/m].
-        incident: d of each wave.
-        field: E.
-        scattering_direction: s, to the receiver.
-        max_diffractions: diffractions.
-        is_visible: tells what the source sees of an edge.
+        plates: sides of each plate, from ``find_plates``.
+        wave_number: wave number k [1/m].
+        incident: direction d of each wave.
+        field: incident field E [V/m].
+        scattering_direction: unit vectors s towards the receiver.
+        max_diffractions: maximum number of diffractions.
+        is_visible: visibility test of edge points from the source.
     """
     chains = [(sides, [side]) for sides in plates for side in range(len(sides.start))]
     for _ in range(2, max_diffractions + 1):
@@ -66,23 +66,27 @@ def trace_multiple_diffractions(
 
 
 def find_plates(wedges: Wedges) -> list[Wedges]:
-    """The sides of flat convex plates, found among open edges.
+    """Find the sides of flat convex plates among open edges.
 
     Args:
-        wedges: edges; those of solid bodies and creases are left out.
+        wedges: sharp edges; those of solid bodies and creases are left out.
     """
-    left = torch.nonzero(wedges.opening > 2 - _TOLERANCE)[:, 0].tolist()
+    remaining = torch.nonzero(wedges.opening > 2 - _TOLERANCE)[:, 0].tolist()
     found: list[Wedges] = []
-    while left:
-        plate, rest, grown = [left[0]], left[1:], True
-        while grown:
-            near = [
+    while remaining:
+        plate, others, has_grown = [remaining[0]], remaining[1:], True
+        while has_grown:
+            neighbours = [
                 e
-                for e in rest
+                for e in others
                 if any(_are_coplanar_neighbours(wedges, e, other) for other in plate)
             ]
-            plate, rest, grown = plate + near, [e for e in rest if e not in near], bool(near)
-        left = rest
+            plate, others, has_grown = (
+                plate + neighbours,
+                [e for e in others if e not in neighbours],
+                bool(neighbours),
+            )
+        remaining = others
         edges = wedges.rows(torch.tensor(plate))
         if _is_convex(edges):
             found.append(_merge_collinear_edges(edges))
@@ -90,35 +94,40 @@ def find_plates(wedges: Wedges) -> list[Wedges]:
 
 
 def _are_coplanar_neighbours(wedges: Wedges, one: int, other: int) -> bool:
-    """Whether two edges share a corner and a plane."""
+    """Test if two edges share a corner and a plane."""
     turn = cross(wedges.normals[one, 0], wedges.normals[other, 0]).norm()
     return bool(turn < _TOLERANCE) and _share_corner(wedges, one, other)
 
 
 def _share_corner(wedges: Wedges, one: int, other: int) -> bool:
-    """Whether two edges share a corner."""
+    """Test if two edges share a corner."""
     ends = [torch.stack([wedges.start[e], wedges.end[e]]) for e in (one, other)]
     gap = (ends[0][:, None] - ends[1][None]).norm(dim=2).min()
     return bool(gap < _TOLERANCE * (ends[0][1] - ends[0][0]).norm())
 
 
 def _is_convex(edges: Wedges) -> bool:
-    """Whether all edges lie on the inner side of each."""
+    """Test if all edges lie on the inner side of each."""
     middles = (edges.start + edges.end) / 2
     depth = (edges.face_tangents[:, :1] * (middles[None] - middles[:, None])).sum(2)
     return bool((depth > -_TOLERANCE * depth.abs().max()).all())
 
 
 def _merge_collinear_edges(edges: Wedges) -> Wedges:
-    """Edges of a convex plate with those of one line joined."""
-    inward, left, sides = edges.face_tangents[:, 0], list(range(len(edges.start))), []
-    while left:
-        own = [e for e in left if bool((inward[e] - inward[left[0]]).norm() < _TOLERANCE)]
-        left = [e for e in left if e not in own]
-        points = torch.cat([edges.start[own], edges.end[own]])
-        along = points @ (edges.end[own[0]] - edges.start[own[0]])
-        first = edges.rows(torch.tensor(own[:1]))
-        ends = {"start": points[along.argmin()][None], "end": points[along.argmax()][None]}
+    """Merge collinear edges of a convex plate."""
+    inward, remaining, sides = edges.face_tangents[:, 0], list(range(len(edges.start))), []
+    while remaining:
+        line = [
+            e for e in remaining if bool((inward[e] - inward[remaining[0]]).norm() < _TOLERANCE)
+        ]
+        remaining = [e for e in remaining if e not in line]
+        points = torch.cat([edges.start[line], edges.end[line]])
+        projection = points @ (edges.end[line[0]] - edges.start[line[0]])
+        first = edges.rows(torch.tensor(line[:1]))
+        ends = {
+            "start": points[projection.argmin()][None],
+            "end": points[projection.argmax()][None],
+        }
         sides.append(vars(first) | ends)
     return Wedges(**{name: torch.cat([side[name] for side in sides]) for name in sides[0]})
 
@@ -132,35 +141,36 @@ def _diffract_sequence(
     scattering_direction: Tensor,
     is_visible: VisibilityTest,
 ) -> Tensor:
-    """F of the waves that a sequence of edges diffracts."""
-    above = wedges.normals[sequence[0], 0]
-    ways, amplitude = _trace_along_plate(wedges, sequence, k, incident, field, above)
+    """Far field F of waves diffracted by a sequence of edges."""
+    plate_normal = wedges.normals[sequence[0], 0]
+    directions, amplitude = _trace_along_plate(wedges, sequence, k, incident, field, plate_normal)
     start, side = wedges.start[sequence[-1]], wedges.end[sequence[-1]] - wedges.start[sequence[-1]]
-    # Where rays left the edges before is linear along the last edge: its lit part is an interval.
-    ends = [_trace_back(wedges, sequence, ways, start + t * side) for t in (0.0, 1.0)]
+    # Departure points on previous edges are linear along the last one: its illuminated part is an
+    # interval.
+    ends = [_trace_back(wedges, sequence, directions, start + t * side) for t in (0.0, 1.0)]
     low, high = torch.zeros_like(ends[0].path_length), torch.ones_like(ends[0].path_length)
     for first, last, least, most in zip(
         (*ends[0].edge_fractions.T, *ends[0].segment_lengths.T),
         (*ends[1].edge_fractions.T, *ends[1].segment_lengths.T),
-        [0.0] * len(ways) + [_TOLERANCE * float(side.detach().norm())] * len(ways),
-        [1.0] * len(ways) + [math.inf] * len(ways),
+        [0.0] * len(directions) + [_TOLERANCE * float(side.detach().norm())] * len(directions),
+        [1.0] * len(directions) + [math.inf] * len(directions),
         strict=True,
     ):
         slope = last - first
         for bound, sign in ((least, 1.0), (most, -1.0)):
             safe = torch.where(slope.abs() > 1e-12, slope, torch.ones_like(slope))
-            at = (bound - first) / safe
+            crossing = (bound - first) / safe
             rising = sign * slope > 1e-12
             falling = sign * slope < -1e-12
             never = ~rising & ~falling & (sign * (first - bound) <= 0)
-            low = torch.where(rising, torch.maximum(low, at), low)
-            high = torch.where(falling, torch.minimum(high, at), high)
+            low = torch.where(rising, torch.maximum(low, crossing), low)
+            high = torch.where(falling, torch.minimum(high, crossing), high)
             high = torch.where(never, torch.full_like(high, -1.0), high)
     row = torch.nonzero(high - low > _TOLERANCE)[:, 0].repeat_interleave(_SAMPLES_PER_EDGE)
     size = (high - low)[row] / _SAMPLES_PER_EDGE
     begin = low[row] + size * (torch.arange(len(row)) % _SAMPLES_PER_EDGE)
     point = start + (begin + size / 2)[:, None] * side
-    # The mean of 1/√length over each piece, also where two edges meet.
+    # Mean of 1/√length over each piece, finite also where two edges meet.
     roots = [
         torch.lerp(ends[0].segment_lengths[row], ends[1].segment_lengths[row], t[:, None])
         .clamp_min(0)
@@ -168,24 +178,24 @@ def _diffract_sequence(
         for t in (begin, begin + size)
     ]
     spread = (2 / (roots[0] + roots[1]).clamp_min(1e-12)).prod(1)
-    ray = _trace_back(wedges, sequence, [way[row] for way in ways], point)
-    d, s, wave = incident[row], scattering_direction[row], ways[-1][row]
+    ray = _trace_back(wedges, sequence, [way[row] for way in directions], point)
+    d, s, wave = incident[row], scattering_direction[row], directions[-1][row]
     inward = wedges.face_tangents[sequence[-1], 0]
-    along = cross(inward, above).expand_as(s)
-    magnetic = dot(cross(wave, above.expand_as(wave)), along)
-    azimuth = torch.atan2(dot(s, above), dot(s, inward)) % (2 * math.pi)
-    sines = [(1 - dot(along, v) ** 2).clamp_min(1e-12).sqrt() for v in (wave, s)]
-    valid = dot(s, above).abs() > math.sin(MIN_EDGE_ANGLE)
+    axis = cross(inward, plate_normal).expand_as(s)
+    magnetic = dot(cross(wave, plate_normal.expand_as(wave)), axis)
+    azimuth = torch.atan2(dot(s, plate_normal), dot(s, inward)) % (2 * math.pi)
+    sines = [(1 - dot(axis, v) ** 2).clamp_min(1e-12).sqrt() for v in (wave, s)]
+    valid = dot(s, plate_normal).abs() > math.sin(MIN_EDGE_ANGLE)
     for sine in sines:
         valid &= sine > math.sin(MIN_EDGE_ANGLE)
     strength = magnetic / (2 * math.pi * sines[0] * sines[1] * torch.cos(azimuth / 2))
     strength = torch.where(valid & is_visible(ray.origin, -d), strength * spread, 0.0)
     piece = side * size[:, None]
     width = parallelogram_integral(k * (s - wave), piece, torch.zeros_like(piece))
-    turn = k * (dot(s, point) - dot(d, ray.origin) - ray.path_length)
-    scale = torch.polar(strength * width * piece.norm(dim=1), turn)
-    sent = scale[:, None, None] * amplitude[row][..., None] * cross(s, along)[:, None]
-    return torch.zeros(len(incident), 2, 3, dtype=torch.complex128).index_add(0, row, sent)
+    phase = k * (dot(s, point) - dot(d, ray.origin) - ray.path_length)
+    scale = torch.polar(strength * width * piece.norm(dim=1), phase)
+    radiated = scale[:, None, None] * amplitude[row][..., None] * cross(s, axis)[:, None]
+    return torch.zeros(len(incident), 2, 3, dtype=torch.complex128).index_add(0, row, radiated)
 
 
 def _trace_along_plate(
@@ -196,40 +206,40 @@ def _trace_along_plate(
     field: Tensor,
     plate_normal: Tensor,
 ) -> tuple[list[Tensor], Tensor]:
-    """Ways along the plate after each edge but the last; E after them without its spreading."""
-    ways: list[Tensor] = []
+    """Directions along the plate after each edge but the last, and field amplitudes there."""
+    directions: list[Tensor] = []
     wave, electric = incident, field
     amplitude = torch.ones(len(incident), 2, dtype=torch.complex128)
     for edge in sequence[:-1]:
         inward = wedges.face_tangents[edge, 0]
-        along = cross(inward, plate_normal).expand_as(wave)
-        cosine = dot(wave, along)
+        axis = cross(inward, plate_normal).expand_as(wave)
+        cosine = dot(wave, axis)
         sine = (1 - cosine**2).clamp_min(1e-12).sqrt()
-        magnetic = dot(cross(wave[:, None], electric), along[:, None])
+        magnetic = dot(cross(wave[:, None], electric), axis[:, None])
         valid = sine > math.sin(MIN_EDGE_ANGLE)
         azimuth = torch.zeros_like(cosine)
-        if not ways:
+        if not directions:
             azimuth = torch.atan2(-dot(wave, plate_normal), -dot(wave, inward)) % (2 * math.pi)
             valid &= dot(wave, plate_normal).abs() > math.sin(MIN_EDGE_ANGLE)
-        # The hard half plane at φ = 0: both of its terms are 1/cos(φ′/2).
+        # Hard half plane at φ = 0: both of its terms are 1/cos(φ′/2).
         hard = -((2 * math.pi * k) ** -0.5) / (sine * torch.cos(azimuth / 2)) * valid
-        wave = cosine[:, None] * along + sine[:, None] * inward
-        ways.append(wave)
+        wave = cosine[:, None] * axis + sine[:, None] * inward
+        directions.append(wave)
         electric = plate_normal.expand(len(wave), 1, 3)
-        turned = dot(cross(wave, plate_normal.expand_as(wave)), along)
+        normalisation = dot(cross(wave, plate_normal.expand_as(wave)), axis)
         phase = complex(math.cos(math.pi / 4), -math.sin(math.pi / 4))
-        amplitude = amplitude * magnetic * (hard / turned)[:, None] * phase
-    return ways, amplitude
+        amplitude = amplitude * magnetic * (hard / normalisation)[:, None] * phase
+    return directions, amplitude
 
 
 class _PlateRays(NamedTuple):
-    """Rays along a plate, followed back from the last edge.
+    """Rays along a plate, traced back from the last edge.
 
     Attributes:
-        origin: on the first edge [m].
-        path_length: length along the plate [m].
-        edge_fractions: where rays left each edge, 0 at its start and 1 at its end.
-        segment_lengths: between the edges [m].
+        origin: points on the first edge [m].
+        path_length: lengths along the plate [m].
+        edge_fractions: departure points on each edge, from 0 at its start to 1 at its end.
+        segment_lengths: lengths between the edges [m].
     """
 
     origin: Tensor
@@ -241,14 +251,16 @@ class _PlateRays(NamedTuple):
 def _trace_back(
     wedges: Wedges, sequence: list[int], directions: list[Tensor], point: Tensor
 ) -> _PlateRays:
-    places, lengths = [], []
-    at = point.expand_as(directions[0])
-    for edge, way in zip(sequence[-2::-1], directions[::-1], strict=True):
-        origin, inward = wedges.start[edge], wedges.face_tangents[edge, 0].expand_as(at)
+    fractions, lengths = [], []
+    point_on_edge = point.expand_as(directions[0])
+    for edge, direction in zip(sequence[-2::-1], directions[::-1], strict=True):
+        origin, inward = wedges.start[edge], wedges.face_tangents[edge, 0].expand_as(point_on_edge)
         sideways = wedges.end[edge] - origin
-        length = dot(at - origin, inward) / dot(way, inward)
-        at = at - length[:, None] * way
-        places.append(dot(at - origin, sideways.expand_as(at)) / dot(sideways, sideways))
+        length = dot(point_on_edge - origin, inward) / dot(direction, inward)
+        point_on_edge = point_on_edge - length[:, None] * direction
+        fractions.append(
+            dot(point_on_edge - origin, sideways.expand_as(point_on_edge)) / dot(sideways, sideways)
+        )
         lengths.append(length)
     between = torch.stack(lengths, 1)
-    return _PlateRays(at, between.sum(1), torch.stack(places, 1), between)
+    return _PlateRays(point_on_edge, between.sum(1), torch.stack(fractions, 1), between)

@@ -1,7 +1,7 @@
-"""Meshes: what a plane wave lights first, triangle by triangle.
+"""Shooting and bouncing rays: illuminated triangles of a mesh, and their reflected ray tubes.
 
-A triangle that is seen whole counts exactly. One that is seen in part is split in four until its
-pieces are as small as asked for; these are cut where light ends.
+A fully illuminated triangle is exact. A partly illuminated one is split in four down to a given
+size; the smallest pieces are cut along the shadow boundary.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,13 +14,11 @@ from invertwin.channel.beams.beam_tracing import Facets, IlluminatedPatches, pat
 from invertwin.channel.em.plane_waves import dot, reflect_vectors
 from invertwin.channel.rays.ray_scene import Occluders, find_next_surface
 
-_MAX_SIDE_RATIO = (
-    8.0  # times the smallest piece: larger triangles are split before they are looked at
-)
-_CORNER_INSET = 0.02  # from a corner to the middle, where a corner is looked at
-_BISECTIONS = 4  # of a side, to find where it is cut
+_MAX_SIDE_RATIO = 8.0  # times the smallest piece: larger triangles are split in advance
+_CORNER_INSET = 0.02  # fraction from a corner to the centre at which the corner is tested
+_BISECTIONS = 4  # bisection steps along a side
 _ROWS_AT_ONCE = 1 << 18
-_RAY_OFFSET = 2e-6  # of the scene's size: from how far above a surface rays start
+_RAY_OFFSET = 2e-6  # of the scene's size: offset of ray origins from a surface
 
 
 def find_illuminated_triangles(
@@ -29,25 +27,25 @@ def find_illuminated_triangles(
     incident: Float64[Tensor, "aspect 3"],
     min_side: float,
 ) -> Iterator[IlluminatedPatches]:
-    """Lit pieces of triangles, in parts of as many waves as memory holds.
+    """Find illuminated pieces of triangles, in batches of waves.
 
     Args:
-        facets: the triangles.
-        is_unoccluded: points and unit vectors → whether nothing is in the way.
-        incident: d of each wave.
-        min_side: side of a piece that is not split [m].
+        facets: facets of all triangles.
+        is_unoccluded: function of points and unit directions; returns a mask of unobstructed rays.
+        incident: direction d of each wave.
+        min_side: side below which pieces are not split [m].
     """
     number = torch.arange(len(facets.normal))
     corners = facets.corners.detach()
     while bool((large := _longest_sides(corners) > _MAX_SIDE_RATIO * min_side).any()):
         corners = torch.cat([corners[~large], _quarter_triangles(corners[large])])
         number = torch.cat([number[~large], number[large].repeat_interleave(4)])
-    for some in torch.arange(len(incident)).split(max(1, _ROWS_AT_ONCE // len(number))):
-        aspect = some.repeat_interleave(len(number))
-        row = torch.arange(len(number)).repeat(len(some))
+    for waves in torch.arange(len(incident)).split(max(1, _ROWS_AT_ONCE // len(number))):
+        aspect = waves.repeat_interleave(len(number))
+        row = torch.arange(len(number)).repeat(len(waves))
         facing = dot(facets.normal[number[row]].detach(), incident[aspect])
-        turned = (facing < 0) | ~facets.solid[number[row]]
-        keep = turned & (facing.abs() > 1e-9)
+        is_front = (facing < 0) | ~facets.solid[number[row]]
+        keep = is_front & (facing.abs() > 1e-9)
         yield _illuminate_triangles(
             facets,
             is_unoccluded,
@@ -91,29 +89,29 @@ def subdivide_triangles(
     classify: Callable[[Tensor, Tensor], Tensor],
     is_narrow: Callable[[Tensor, Tensor], Tensor],
 ) -> tuple[Int64[Tensor, " piece"], Float64[Tensor, "piece 3 3"], Int64[Tensor, " piece"]]:
-    """Pieces of triangles in each of which all points look alike.
+    """Subdivide triangles into pieces of uniform label.
 
     Args:
-        corners: Of the triangles.
-        classify: Rows and points of each [row, point, 3] → numbers of what is seen there [row,
-            point].
-        is_narrow: Rows and pieces → whether a piece is not split in four, but cut along a line.
+        corners: corners of the triangles [m].
+        classify: function of rows and their points [row, point, 3]; returns labels [row, point].
+        is_narrow: function of rows and pieces; returns a mask of pieces to cut along a line instead
+            of splitting in four.
 
     Returns:
-        For every piece: the row, its corners, the number.
+        Row, corners and label of every piece.
     """
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     row = torch.arange(len(corners))
     while True:
-        seen = classify(row, inset_points(corners))
-        whole = (seen == seen[:, :1]).all(1)
-        found.append((row[whole], corners[whole], seen[whole, 0]))
-        row, corners, seen = row[~whole], corners[~whole], seen[~whole]
+        labels = classify(row, inset_points(corners))
+        is_uniform = (labels == labels[:, :1]).all(1)
+        found.append((row[is_uniform], corners[is_uniform], labels[is_uniform, 0]))
+        row, corners, labels = row[~is_uniform], corners[~is_uniform], labels[~is_uniform]
         if not len(row):
             break
-        last = is_narrow(row, corners)
-        found += _split_triangles(row[last], corners[last], seen[last], classify)
-        row, corners = row[~last].repeat_interleave(4), _quarter_triangles(corners[~last])
+        narrow = is_narrow(row, corners)
+        found += _split_triangles(row[narrow], corners[narrow], labels[narrow], classify)
+        row, corners = row[~narrow].repeat_interleave(4), _quarter_triangles(corners[~narrow])
     pieces = zip(*found, strict=True)
     return torch.cat(next(pieces)), torch.cat(next(pieces)), torch.cat(next(pieces))
 
@@ -121,7 +119,7 @@ def subdivide_triangles(
 def _split_triangles(
     row: Tensor, corners: Tensor, labels: Tensor, classify: Callable[[Tensor, Tensor], Tensor]
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Triangles one corner of which sees something else, cut; others look as their middles do."""
+    """Cut triangles with one corner of another label; others take the label of their centre."""
     first, second, third = labels[:, 1:].unbind(1)
     pairs = (first == second).long() + (second == third).long() + (third == first).long()
     single = pairs != 1
@@ -131,42 +129,42 @@ def _split_triangles(
     row, labels = row[~single], labels[~single, 1:].gather(1, order)
     corners = corners[~single].gather(1, order[..., None].expand(-1, -1, 3))
     inner = inset_points(corners)[:, 1:]
-    # How far the sides that begin at the odd corner look as it does.
+    # Fraction of the sides from the odd corner with its label.
     low = torch.zeros(len(row), 2, dtype=torch.float64)
     for step in range(1, _BISECTIONS + 1):
         middle = low + 0.5**step
         points = inner[:, :1] + middle[..., None] * (inner[:, 1:] - inner[:, :1])
         low = torch.where(classify(row, points) == labels[:, :1], middle, low)
-    share = (low + 0.5 ** (_BISECTIONS + 1))[..., None]
+    fraction = (low + 0.5 ** (_BISECTIONS + 1))[..., None]
     a, b, c = corners.unbind(1)
-    p, q = (a[:, None] + share * (corners[:, 1:] - a[:, None])).unbind(1)
+    p, q = (a[:, None] + fraction * (corners[:, 1:] - a[:, None])).unbind(1)
     yield row, torch.stack([a, p, q], 1), labels[:, 0]
     for part in ((p, b, c), (p, c, q)):
         yield row, torch.stack(part, 1), labels[:, 1]
 
 
 def ray_offset(facets: Facets, normal: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 3"]:
-    """How far above a surface rays start.
+    """Offset of ray origins from a surface [m].
 
     Args:
-        facets: All triangles.
-        normal: Of the surface, towards the rays.
+        facets: facets of all triangles.
+        normal: unit normals of the surface, towards the rays.
     """
     return _RAY_OFFSET * facets.size * normal
 
 
 def inset_points(corners: Float64[Tensor, "row 3 3"]) -> Float64[Tensor, "row 4 3"]:
-    """The middle of each triangle, and a point near each corner.
+    """Centre of each triangle, and a point near each corner [m].
 
     Args:
-        corners: Of the triangles [m].
+        corners: corners of the triangles [m].
     """
-    middle = corners.mean(1, keepdim=True)
-    return torch.cat([middle, corners + _CORNER_INSET * (middle - corners)], 1)
+    centre = corners.mean(1, keepdim=True)
+    return torch.cat([centre, corners + _CORNER_INSET * (centre - corners)], 1)
 
 
 def _orient_normals(normal: Tensor, direction: Tensor) -> Tensor:
-    """Normals on the side that the wave comes from."""
+    """Orient normals towards the source of a wave."""
     return -dot(normal, direction).sign()[:, None] * normal
 
 
@@ -175,7 +173,7 @@ def _longest_sides(corners: Tensor) -> Tensor:
 
 
 def _quarter_triangles(corners: Float64[Tensor, "row 3 3"]) -> Float64[Tensor, "more 3 3"]:
-    """Each triangle in four alike."""
+    """Split each triangle into four similar ones."""
     a, b, c = corners.unbind(1)
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
@@ -189,19 +187,19 @@ def trace_tubes(
     min_tube_width: float,
     depth: int,
 ) -> Iterator[IlluminatedPatches]:
-    """Lit patches of the second order, of the third, and so on.
+    """Trace ray tubes: illuminated patches of the second order, of the third, and so on.
 
     Args:
-        facets: The triangles.
-        occluders: The same as rays see them.
-        first_order: Triangles that waves light first.
-        min_tube_width: Width of a tube that is not split [m].
-        depth: Most bounces.
+        facets: facets of all triangles.
+        occluders: ray scene of the triangles.
+        first_order: directly illuminated triangles.
+        min_tube_width: width below which tubes are not split [m].
+        depth: maximum number of bounces.
 
     Source: derivations §13.
 
-    Differs from the source: tubes begin as lit triangles and are cut between facets. On a square
-    grid they count whole or not at all.
+    Differs from the source: tubes start as illuminated triangles and are cut between facets,
+    instead of a square grid of tubes that count as a whole or not at all.
     """
     last = first_order
     for _ in range(1, depth):
@@ -214,32 +212,32 @@ def trace_tubes(
 def _trace_next_order(
     facets: Facets, occluders: Occluders, previous: IlluminatedPatches, min_tube_width: float
 ) -> IlluminatedPatches:
-    """What the tubes of one order meet next."""
-    ways = reflect_vectors(previous.direction, previous.normal)
+    """Trace the tubes of one order to their next surface."""
+    directions = reflect_vectors(previous.direction, previous.normal)
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
         starts = points + ray_offset(facets, previous.normal[row])[:, None]
-        ends = starts + 3 * facets.size * ways[row][:, None]
+        ends = starts + 3 * facets.size * directions[row][:, None]
         found, _ = find_next_surface(occluders, starts.flatten(0, 1), ends.flatten(0, 1))
         return found.view(starts.shape[:2])
 
     def is_narrow(row: Tensor, pieces: Tensor) -> Tensor:
-        d = ways[row][:, None]
-        across = pieces - dot(pieces, d)[..., None] * d
-        return (across.roll(-1, 1) - across).norm(dim=2).amax(1) <= min_tube_width
+        d = directions[row][:, None]
+        transverse = pieces - dot(pieces, d)[..., None] * d
+        return (transverse.roll(-1, 1) - transverse).norm(dim=2).amax(1) <= min_tube_width
 
-    before, corners, facet = subdivide_triangles(previous.polygon, hit_facets, is_narrow)
-    before, corners, facet = (x[facet >= 0] for x in (before, corners, facet))
-    normal, d = facets.normal[facet], ways[before]
+    parent, corners, facet = subdivide_triangles(previous.polygon, hit_facets, is_narrow)
+    parent, corners, facet = (x[facet >= 0] for x in (parent, corners, facet))
+    normal, d = facets.normal[facet], directions[parent]
     facing = dot(normal, d)
     keep = (facing.abs() > 1e-9) & ~(facets.solid[facet] & (facing > 0))
-    before, facet, corners, normal, d, facing = (
-        x[keep] for x in (before, facet, corners, normal, d, facing)
+    parent, facet, corners, normal, d, facing = (
+        x[keep] for x in (parent, facet, corners, normal, d, facing)
     )
-    # The ray tracer says which triangle; where on its plane is found in float64.
-    away = dot(normal[:, None], facets.corners[facet, :1] - corners) / facing[:, None]
-    polygon = corners + away[..., None] * d[:, None]
-    # Equal phases on the mirror.
-    offset = previous.phase_offset[before] + dot(previous.direction[before] - d, corners[:, 0])
+    # The ray tracer finds the triangle; the intersection with its plane is computed in float64.
+    distance = dot(normal[:, None], facets.corners[facet, :1] - corners) / facing[:, None]
+    polygon = corners + distance[..., None] * d[:, None]
+    # Phase matching on the reflecting face.
+    offset = previous.phase_offset[parent] + dot(previous.direction[parent] - d, corners[:, 0])
     normal = -facing.sign()[:, None] * normal
-    return patches_in_air(previous.aspect[before], facet, normal, d, offset, polygon, before)
+    return patches_in_air(previous.aspect[parent], facet, normal, d, offset, polygon, parent)

@@ -1,1 +1,1 @@
-"""The method of moments for small conductors."""
+"""Method of moments for small conductors."""

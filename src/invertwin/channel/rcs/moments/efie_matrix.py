@@ -1,12 +1,12 @@
-"""The electric field integral equation of conductors on triangles, open or closed.
+"""Electric field integral equation (EFIE) with RWG basis functions, for open and closed conductors.
 
-Currents flow across the sides of small triangles. Each side's function is linear on its two
-triangles; where more meet at a side, the first one has a function with each of the others. Products
-of the equation with the same functions make a symmetric matrix, so that fields are reciprocal.
-Integrals over triangles that are far apart are sums over points. Near ones have 1/R in closed form.
+Each basis function describes the current across a side of two triangles and is linear on both;
+where more triangles share a side, the first one has a function with each of the others. Galerkin
+testing gives a symmetric matrix, so that fields are reciprocal. Integrals over distant triangles
+use quadrature; near ones integrate 1/R in closed form.
 
-A closed body has resonances inside, at which the equation does not say which current flows. The
-field at places inside has to vanish too, which is added as least squares.
+At the interior resonances of a closed body the equation is singular. The condition that the field
+at interior points vanishes is added as least squares.
 
 Source: Rao, Wilton and Glisson, "Electromagnetic scattering by surfaces of arbitrary shape", IEEE
 TAP 30, 1982; Wilton et al., "Potential integrals for uniform and linear source distributions on
@@ -27,16 +27,16 @@ from torch.utils.checkpoint import checkpoint
 
 from invertwin.channel.em.plane_waves import cross, dot, phasor
 
-_NEAR_RATIO = 1.6  # of the radii of two triangles, up to which their distance counts as near
-_MAX_DOUBLE_UNKNOWNS = 2500  # unknowns up to which all is in double precision
+_NEAR_RATIO = 1.6  # distance of near triangles over the sum of their radii
+_MAX_DOUBLE_UNKNOWNS = 2500  # number of unknowns up to which double precision is used
 _ENTRIES_AT_ONCE = 1 << 22
 _PAIRS_AT_ONCE = 1 << 14
 _ASPECTS_AT_ONCE = 32
-_MIN_DISTANCE = 1e-12  # of the wavelength: nearer places are one
+_MIN_DISTANCE = 1e-12  # of 1/k: least distance of two points
 
 
 def _symmetric_quadrature(*orbits: tuple[float, float]) -> tuple[Tensor, Tensor]:
-    """Shares and weights of points: each orbit has one large or small share, and a weight."""
+    """Barycentric coordinates and weights of points, from the distinct coordinate of each orbit."""
     shares = [
         [far if turn == at else (1 - far) / 2 for at in range(3)]
         for far, _ in orbits
@@ -54,11 +54,11 @@ QUADRATURE_7 = _symmetric_quadrature(
 
 @dataclass(frozen=True)
 class RWGBasis:
-    """Where currents flow, one row for each side of triangles that it crosses.
+    """RWG (Rao-Wilton-Glisson) basis functions, one row each.
 
     Attributes:
-        face: from which triangle, and to which.
-        corner: of these, opposite to the side.
+        face: triangles that the current flows from and to.
+        corner: corners of these triangles opposite to the common side.
     """
 
     face: Int64[Tensor, "unknown 2"]
@@ -66,10 +66,10 @@ class RWGBasis:
 
 
 def build_rwg_basis(faces: Int64[np.ndarray, "face 3"]) -> RWGBasis:
-    """All functions of a mesh that fits together.
+    """Build all RWG basis functions of a conforming mesh.
 
     Args:
-        faces: vertices of the triangles.
+        faces: vertex numbers of the triangles.
     """
     ends = np.sort(np.stack([np.roll(faces, -1, 1), np.roll(faces, -2, 1)], 2).reshape(-1, 2), 1)
     order = np.lexsort(ends.T)
@@ -81,12 +81,12 @@ def build_rwg_basis(faces: Int64[np.ndarray, "face 3"]) -> RWGBasis:
 
 
 class EFIEMatrix:
-    """The equation of a mesh at one frequency.
+    """EFIE impedance matrix of a mesh at one frequency.
 
     Args:
-        faces: vertices of the triangles.
-        basis: where currents flow.
-        wave_number: k [1/m].
+        faces: vertex numbers of the triangles.
+        basis: RWG basis functions.
+        wave_number: wave number k [1/m].
     """
 
     def __init__(self, faces: Int64[Tensor, "face 3"], basis: RWGBasis, wave_number: float) -> None:
@@ -101,36 +101,36 @@ class EFIEMatrix:
         directions: Float64[Tensor, "aspect 3"],
         fields: Float64[Tensor, "aspect field 3"],
     ) -> Complex128[Tensor, "unknown aspect field"]:
-        """∫ f·E exp(jk u·x) of all functions f.
+        """Compute the excitation ∫ f·E exp(jk u·x) of all basis functions f.
 
         Args:
-            vertices: [m].
-            directions: u, unit vectors to where waves come from, or go to.
-            fields: E.
+            vertices: vertex positions [m].
+            directions: unit vectors u to the antennas.
+            fields: fields E of the waves [V/m].
         """
         corners = vertices[self.faces]
         shares, weights = QUADRATURE_7
-        middle = corners.mean(1)
-        beside = shares @ (corners - middle[:, None])
-        turn = self.k * ((beside + middle[:, None]) @ directions.T)
-        wave = phasor(turn) * weights[:, None] / 2
-        along = torch.einsum("fqa,fqx,atx->fat", wave, beside + 0j, fields + 0j)
-        level = torch.einsum("fvx,atx->fvat", corners - middle[:, None], fields)
-        local = along[:, None] - wave.sum(1)[:, None, :, None] * level
+        centroid = corners.mean(1)
+        offset = shares @ (corners - centroid[:, None])
+        phase = self.k * ((offset + centroid[:, None]) @ directions.T)
+        wave = phasor(phase) * weights[:, None] / 2
+        linear = torch.einsum("fqa,fqx,atx->fat", wave, offset + 0j, fields + 0j)
+        corner_fields = torch.einsum("fvx,atx->fvat", corners - centroid[:, None], fields)
+        local = linear[:, None] - wave.sum(1)[:, None, :, None] * corner_fields
         return self._combine_halves(local)
 
     def _combine_halves(self, local: Tensor) -> Tensor:
-        """Of functions, from what each corner's half of them has on every triangle."""
+        """Combine half functions, given per triangle and corner, to basis functions."""
         face, corner = self.basis.face, self.basis.corner
         return local[face[:, 0], corner[:, 0]] - local[face[:, 1], corner[:, 1]]
 
     def half_coefficients(
         self, current: Complex[Tensor, "unknown *column"]
     ) -> Complex[Tensor, "face 3 *column"]:
-        """How strong each corner's half is on every triangle.
+        """Coefficients of half functions per triangle and corner.
 
         Args:
-            current: across all sides.
+            current: coefficients of the basis functions.
         """
         face, corner = self.basis.face, self.basis.corner
         shape = (3 * len(self.faces), *current.shape[1:])
@@ -140,59 +140,59 @@ class EFIEMatrix:
         return found.view(len(self.faces), 3, *current.shape[1:])
 
     def near_pairs(self, vertices: Float64[Tensor, "v 3"]) -> Int64[Tensor, "pair 2"]:
-        """Pairs of triangles whose integrals are not sums over points, each with itself too.
+        """Find pairs of near triangles, each with itself included.
 
         Args:
-            vertices: [m].
+            vertices: vertex positions [m].
         """
         corners = vertices[self.faces]
-        middle = corners.mean(1)
-        radius = (corners - middle[:, None]).norm(dim=2).amax(1)
-        tree = KDTree(middle.numpy())
+        centroid = corners.mean(1)
+        radius = (corners - centroid[:, None]).norm(dim=2).amax(1)
+        tree = KDTree(centroid.numpy())
         pairs = tree.query_pairs(2 * _NEAR_RATIO * float(radius.max()), output_type="ndarray")
         pairs = torch.from_numpy(pairs.astype(np.int64))
-        apart = (middle[pairs[:, 0]] - middle[pairs[:, 1]]).norm(dim=1)
-        pairs = pairs[apart < _NEAR_RATIO * radius[pairs].sum(1)]
-        own = torch.arange(len(self.faces))[:, None].expand(-1, 2)
-        pairs = torch.cat([own, pairs, pairs.flip(1)])
+        distance = (centroid[pairs[:, 0]] - centroid[pairs[:, 1]]).norm(dim=1)
+        pairs = pairs[distance < _NEAR_RATIO * radius[pairs].sum(1)]
+        self_pairs = torch.arange(len(self.faces))[:, None].expand(-1, 2)
+        pairs = torch.cat([self_pairs, pairs, pairs.flip(1)])
         return pairs[(pairs[:, 0] * len(self.faces) + pairs[:, 1]).argsort()]
 
     def assemble(self, vertices: Float64[Tensor, "v 3"]) -> Complex[Tensor, "unknown unknown"]:
-        """Z: jk ∫∫ (f·f′ − ∇·f ∇·f′/k²) G of all functions.
+        """Assemble Z: jk ∫∫ (f·f′ − ∇·f ∇·f′/k²) G of all basis functions.
 
         Args:
-            vertices: [m], without derivatives.
+            vertices: vertex positions, detached [m].
         """
         pairs = self.near_pairs(vertices)
         total = self._far_interactions(vertices, pairs)
         face, corner = self.basis.face.numpy(), self.basis.corner.numpy()
-        every = np.arange(self.count)
-        row = np.concatenate([every, every])
-        spot = (3 * face + corner).T.ravel()
+        numbers = np.arange(self.count)
+        row = np.concatenate([numbers, numbers])
+        half_number = (3 * face + corner).T.ravel()
         sign = np.repeat([1.0, -1.0], self.count)
-        halves = csr_array((sign, (row, spot)), shape=(self.count, 3 * len(self.faces)))
+        halves = csr_array((sign, (row, half_number)), shape=(self.count, 3 * len(self.faces)))
         parts = torch.cat(
-            [self._near_interactions(vertices, some) for some in pairs.split(_PAIRS_AT_ONCE)]
+            [self._near_interactions(vertices, block) for block in pairs.split(_PAIRS_AT_ONCE)]
         ).numpy()
-        at = 3 * pairs.numpy()[:, :, None] + np.arange(3)
-        rows = np.broadcast_to(at[:, 0, :, None], parts.shape).ravel()
-        columns = np.broadcast_to(at[:, 1, None, :], parts.shape).ravel()
+        half_numbers = 3 * pairs.numpy()[:, :, None] + np.arange(3)
+        rows = np.broadcast_to(half_numbers[:, 0, :, None], parts.shape).ravel()
+        columns = np.broadcast_to(half_numbers[:, 1, None, :], parts.shape).ravel()
         local = coo_array((parts.ravel(), (rows, columns)), shape=(3 * len(self.faces),) * 2)
         close = (halves @ local.tocsr() @ halves.T).tocoo()
         close.sum_duplicates()
-        place = torch.from_numpy(close.row.astype(np.int64) * self.count + close.col)
-        total.view(-1)[place] += torch.from_numpy(close.data / 2).to(total.dtype)
-        # Each pair's integrals stand above or below, or half in both.
+        entry = torch.from_numpy(close.row.astype(np.int64) * self.count + close.col)
+        total.view(-1)[entry] += torch.from_numpy(close.data / 2).to(total.dtype)
+        # Each pair is stored above or below the diagonal, or half in both.
         size = max(1, _ENTRIES_AT_ONCE // self.count)
         for begin in range(0, self.count, size):
-            some = slice(begin, begin + size)
-            both = total[some, begin:] + total[begin:, some].mT
-            total[some, begin:] = both
-            total[begin:, some] = both.mT
+            block = slice(begin, begin + size)
+            symmetric = total[block, begin:] + total[begin:, block].mT
+            total[block, begin:] = symmetric
+            total[begin:, block] = symmetric.mT
         return total.mul_(1j * self.k)
 
     def _far_interactions(self, vertices: Tensor, pairs: Tensor) -> Tensor:
-        """Over jk, of one order of each two triangles that are not near."""
+        """Z/jk of distant triangles, one order of each pair."""
         count = len(self.faces)
         points, products = self._quadrature_points(vertices)
         points = points.to(self.real_dtype).reshape(-1, 3)
@@ -201,15 +201,15 @@ class EFIEMatrix:
         shape = (self.count, 3 * count)
         parts = []
         for part in products.numpy().transpose(3, 0, 1, 2).astype(points.numpy().dtype):
-            value, place = [], []
+            value, columns = [], []
             for half, sign in ((0, 1.0), (1, -1.0)):
                 value.append(sign * part[face[:, half], corner[:, half]])
-                place.append(3 * face[:, half, None] + np.arange(3))
+                columns.append(3 * face[:, half, None] + np.arange(3))
             row = np.repeat(np.arange(self.count), 3)
-            spots = (np.concatenate([row, row]), np.concatenate([p.ravel() for p in place]))
-            # Integers of 32 bits and single precision stay what they are.
+            indices = (np.concatenate([row, row]), np.concatenate([p.ravel() for p in columns]))
+            # Keep 32-bit integers and single precision.
             parts.append(
-                csr_array((np.concatenate([v.ravel() for v in value]), spots), shape=shape)
+                csr_array((np.concatenate([v.ravel() for v in value]), indices), shape=shape)
             )
         scale = [1.0, 1.0, 1.0, -1 / self.k**2]
         total = torch.zeros(self.count, self.count, dtype=self.complex_dtype)
@@ -217,93 +217,106 @@ class EFIEMatrix:
         size = max(1, _ENTRIES_AT_ONCE // (9 * count))
         for begin in range(0, count, size):
             end = min(begin + size, count)
-            aside = pairs[bounds[begin] : bounds[end]]
-            aside = aside[aside[:, 1] >= begin]
+            excluded = pairs[bounds[begin] : bounds[end]]
+            excluded = excluded[excluded[:, 1] >= begin]
             kernel = self._greens_function(points[3 * begin :], points[3 * begin : 3 * end])
             kernel[:, : 3 * (end - begin)] /= 2
             blocked = kernel.view(2, count - begin, 3, end - begin, 3)
-            blocked[:, aside[:, 1] - begin, :, aside[:, 0] - begin] = 0
+            blocked[:, excluded[:, 1] - begin, :, excluded[:, 0] - begin] = 0
             flat = kernel.permute(1, 0, 2).reshape(len(points) - 3 * begin, -1).numpy()
-            mine = np.flatnonzero(((face >= begin) & (face < end)).any(1))
-            found = torch.zeros(2 * self.count, len(mine), dtype=self.real_dtype)
-            for part, share in zip(parts, scale, strict=True):
-                sent = torch.from_numpy(part[:, 3 * begin :] @ flat)
-                left = part[mine, 3 * begin : 3 * end].toarray()
-                found.addmm_(sent.view(2 * self.count, -1), torch.from_numpy(left).T, alpha=share)
-            both = found.view(self.count, 2, len(mine)).permute(2, 0, 1).contiguous()
-            total[torch.from_numpy(mine)] += torch.view_as_complex(both)
+            rows = np.flatnonzero(((face >= begin) & (face < end)).any(1))
+            found = torch.zeros(2 * self.count, len(rows), dtype=self.real_dtype)
+            for part, weight in zip(parts, scale, strict=True):
+                radiated = torch.from_numpy(part[:, 3 * begin :] @ flat)
+                tested = part[rows, 3 * begin : 3 * end].toarray()
+                found.addmm_(
+                    radiated.view(2 * self.count, -1), torch.from_numpy(tested).T, alpha=weight
+                )
+            pair = found.view(self.count, 2, len(rows)).permute(2, 0, 1).contiguous()
+            total[torch.from_numpy(rows)] += torch.view_as_complex(pair)
         return total
 
     def _quadrature_points(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
-        """Three points of every triangle, and of its halves ∫ f and ∫ ∇·f there.
+        """Three quadrature points per triangle, with ∫ f and ∫ ∇·f of the half functions there.
 
         Returns:
-            [face, point, 3] and [face, corner, point, x y z and divergence].
+            Points [face, point, 3], and products [face, corner, point, (x, y, z, divergence)].
         """
         corners = vertices[self.faces]
-        middle = corners.mean(1)
+        centroid = corners.mean(1)
         shares, weights = QUADRATURE_3
-        beside = shares @ (corners - middle[:, None])
-        along = beside[:, None] - (corners - middle[:, None])[:, :, None]
-        whole = torch.ones_like(along[..., :1])
-        products = torch.cat([along / 2, whole], -1) * weights[:, None]
-        return beside + (middle - vertices.detach().mean(0))[:, None], products
+        offset = shares @ (corners - centroid[:, None])
+        linear = offset[:, None] - (corners - centroid[:, None])[:, :, None]
+        ones = torch.ones_like(linear[..., :1])
+        products = torch.cat([linear / 2, ones], -1) * weights[:, None]
+        return offset + (centroid - vertices.detach().mean(0))[:, None], products
 
     def _greens_function(self, points: Tensor, others: Tensor) -> Tensor:
-        """Real and imaginary part of G between places: [2, point, other]."""
+        """Real and imaginary part of the Green's function between points: [2, point, other]."""
         square = torch.zeros(len(points), len(others), dtype=points.dtype)
         for axis in range(3):
             square = square + (points[:, None, axis] - others[:, axis]).square()
-        apart = (square + (_MIN_DISTANCE / self.k) ** 2).sqrt()
-        turn, level = self.k * apart, 1 / (4 * math.pi * apart)
-        return torch.stack([turn.cos() * level, -turn.sin() * level])
+        distance = (square + (_MIN_DISTANCE / self.k) ** 2).sqrt()
+        phase, amplitude = self.k * distance, 1 / (4 * math.pi * distance)
+        return torch.stack([phase.cos() * amplitude, -phase.sin() * amplitude])
 
     def _near_interactions(self, vertices: Tensor, pairs: Tensor) -> Tensor:
-        """Over jk, of the halves on two triangles each: [pair, 3, 3].
+        """Z/jk of half functions on pairs of near triangles: [pair, 3, 3].
 
-        The other triangle's 1/R is integrated in closed form; what is left of G is smooth.
+        The 1/R of the source triangle is integrated in closed form; the remainder of G is smooth.
         """
-        here, there = (vertices[self.faces[pairs[:, side]]] for side in (0, 1))
-        centre, middle = here.mean(1), there.mean(1)
+        test, source = (vertices[self.faces[pairs[:, side]]] for side in (0, 1))
+        test_centroid, source_centroid = test.mean(1), source.mean(1)
         shares, weights = QUADRATURE_7
-        point = shares @ here
-        flat, sloped, _ = self._triangle_fields(there, point)
-        along = (point - centre[:, None])[:, None] - (here - centre[:, None])[:, :, None]
-        along = along * (weights / 4)[:, None]
-        offset = (there - middle[:, None]) + 0j
-        inner = sloped[:, :, None] - flat[..., None, None] * offset[:, None]
-        found = torch.einsum("piqx,pqjx->pij", along + 0j, inner)
-        return found - ((weights * flat).sum(1) / self.k**2)[:, None, None]
+        point = shares @ test
+        constant, linear, _ = self._triangle_fields(source, point)
+        test_linear = (point - test_centroid[:, None])[:, None] - (test - test_centroid[:, None])[
+            :, :, None
+        ]
+        test_linear = test_linear * (weights / 4)[:, None]
+        offset = (source - source_centroid[:, None]) + 0j
+        inner = linear[:, :, None] - constant[..., None, None] * offset[:, None]
+        found = torch.einsum("piqx,pqjx->pij", test_linear + 0j, inner)
+        return found - ((weights * constant).sum(1) / self.k**2)[:, None, None]
 
     def _triangle_fields(
         self, corners: Tensor, points: Tensor, *, gradient: bool = False
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Of triangles' even and linear currents (from their middle on) at points, over their area.
+        """Potentials of constant and linear currents on triangles, over their area.
 
-        1/R is integrated in closed form; what is left of exp(−jkR)/R is smooth.
+        Linear currents are x minus the centroid.
+
+        1/R is integrated in closed form; the remainder of exp(−jkR)/R is smooth.
 
         Returns:
-            [triangle, point], [triangle, point, 3], and the gradient of the first, if asked for.
+            Potentials [triangle, point] and [triangle, point, 3], and the gradient of the first, if
+            requested.
         """
-        middle = corners.mean(1)[:, None]
+        centroid = corners.mean(1)[:, None]
         shares, weights = QUADRATURE_7
-        spot = shares @ corners
+        nodes = shares @ corners
         level, first, slope = triangle_potentials(corners, points)
         double = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         scale = 1 / (2 * math.pi * double.norm(dim=1))[:, None]
-        away = points[:, :, None] - spot[:, None]
-        apart = (dot(away, away) + (_MIN_DISTANCE / self.k) ** 2).sqrt()
-        turn = self.k * apart
+        offset = points[:, :, None] - nodes[:, None]
+        distance = (dot(offset, offset) + (_MIN_DISTANCE / self.k) ** 2).sqrt()
+        phase = self.k * distance
         # exp(−jkR) − 1 without cancellation.
-        rest = torch.complex(-2 * (turn / 2).sin().square(), -turn.sin())
-        smooth = rest / (4 * math.pi * apart) * weights
-        flat = level * scale + smooth.sum(2)
-        sloped = (first + (points - middle) * level[..., None]) * scale[..., None]
-        sloped = sloped + torch.einsum("pqr,prx->pqx", smooth, (spot - middle) + 0j)
+        remainder = torch.complex(-2 * (phase / 2).sin().square(), -phase.sin())
+        smooth = remainder / (4 * math.pi * distance) * weights
+        constant = level * scale + smooth.sum(2)
+        linear = (first + (points - centroid) * level[..., None]) * scale[..., None]
+        linear = linear + torch.einsum("pqr,prx->pqx", smooth, (nodes - centroid) + 0j)
         if not gradient:
-            return flat, sloped, None
-        fall = -(1j * turn * phasor(-turn) + rest) / (4 * math.pi * apart**3) * weights
-        return flat, sloped, slope * scale[..., None] + (fall[..., None] * away).sum(2)
+            return constant, linear, None
+        slope_factor = (
+            -(1j * phase * phasor(-phase) + remainder) / (4 * math.pi * distance**3) * weights
+        )
+        return (
+            constant,
+            linear,
+            slope * scale[..., None] + (slope_factor[..., None] * offset).sum(2),
+        )
 
     def bilinear(
         self,
@@ -311,11 +324,11 @@ class EFIEMatrix:
         left: Complex128[Tensor, "unknown aspect p"],
         right: Complex128[Tensor, "unknown aspect q"],
     ) -> Complex128[Tensor, "aspect p q"]:
-        """Lᵀ Z R of each aspect's currents, with derivatives, block by block.
+        """Compute Lᵀ Z R of each aspect's currents, with derivatives, block by block.
 
         Args:
-            vertices: [m].
-            left, right: L and R.
+            vertices: vertex positions [m].
+            left, right: coefficients L and R of the basis functions.
         """
         pairs = self.near_pairs(vertices.detach())
         ends = (self.half_coefficients(left), self.half_coefficients(right))
@@ -336,7 +349,7 @@ class EFIEMatrix:
         scale = torch.complex(
             scale * products.new_tensor([1.0, 1, 1, 0]), scale * products.new_tensor([0.0, 0, 0, 1])
         )
-        # The divergence's share j/k, twice, makes −1/k².
+        # The factor j/k of the divergence, squared, is −1/k².
         strengths = [
             torch.einsum("fcqz,fcap->fqapz", products * scale, half)
             .flatten(0, 1)
@@ -350,72 +363,75 @@ class EFIEMatrix:
             points: Tensor, left_strengths: Tensor, right_strengths: Tensor, begin: int
         ) -> Tensor:
             end = min(begin + size, count)
-            aside = pairs[bounds[begin] : bounds[end]]
+            excluded = pairs[bounds[begin] : bounds[end]]
             mask = torch.ones(end - begin, count, dtype=points.dtype)
-            mask[aside[:, 0] - begin, aside[:, 1]] = 0
+            mask[excluded[:, 0] - begin, excluded[:, 1]] = 0
             mask = mask.repeat_interleave(3, 0).repeat_interleave(3, 1)
             kernel = self._greens_function(points[3 * begin : 3 * end], points) * mask
             kernel = torch.complex(kernel[0], kernel[1])
             field = (kernel @ right_strengths.flatten(1)).view(
                 len(kernel), *right_strengths.shape[1:]
             )
-            some = left_strengths[3 * begin : 3 * end]
-            return torch.einsum("eapz,eaqz->apq", some, field).to(torch.complex128)
+            block = left_strengths[3 * begin : 3 * end]
+            return torch.einsum("eapz,eaqz->apq", block, field).to(torch.complex128)
 
-        def near_block(vertices: Tensor, some: Tensor) -> Tensor:
-            local = self._near_interactions(vertices, some) / 2
-            here, there = some.unbind(1)
-            # The mean of both orders, as in the matrix.
-            field = torch.einsum("nij,njaq->niaq", local, right[there])
-            back = torch.einsum("nij,niaq->njaq", local, right[here])
-            found = torch.einsum("niap,niaq->apq", left[here], field)
-            return found + torch.einsum("njap,njaq->apq", left[there], back)
+        def near_block(vertices: Tensor, block: Tensor) -> Tensor:
+            local = self._near_interactions(vertices, block) / 2
+            test, source = block.unbind(1)
+            # Mean of both orders, as in the matrix.
+            field = torch.einsum("nij,njaq->niaq", local, right[source])
+            reciprocal = torch.einsum("nij,niaq->njaq", local, right[test])
+            found = torch.einsum("niap,niaq->apq", left[test], field)
+            return found + torch.einsum("njap,njaq->apq", left[source], reciprocal)
 
         total = torch.zeros(*left.shape[2:], right.shape[-1], dtype=torch.complex128)
         for begin in range(0, count, size):
             total = total + checkpoint(far_block, points, *strengths, begin, use_reentrant=False)
-        for some in pairs.split(_PAIRS_AT_ONCE):
-            total = total + checkpoint(near_block, vertices, some, use_reentrant=False)
+        for block in pairs.split(_PAIRS_AT_ONCE):
+            total = total + checkpoint(near_block, vertices, block, use_reentrant=False)
         return total
 
     def sample_currents(
         self, vertices: Float64[Tensor, "v 3"], current: Complex128[Tensor, "unknown column"]
     ) -> tuple[Float64[Tensor, "point 3"], Complex128[Tensor, "point column 3"]]:
-        """Places, and J dA there.
+        """Sample currents: points [m], and J dA there.
 
         Args:
-            vertices: [m].
-            current: across all sides.
+            vertices: vertex positions [m].
+            current: coefficients of the basis functions.
         """
         points, products = self._quadrature_points(vertices)
-        flowing = torch.einsum(
+        moments = torch.einsum(
             "fiqx,fic->fqcx", products[..., :3] + 0j, self.half_coefficients(current)
         )
-        return points.flatten(0, 1) + vertices.detach().mean(0), flowing.flatten(0, 1)
+        return points.flatten(0, 1) + vertices.detach().mean(0), moments.flatten(0, 1)
 
     def interior_field_matrix(
         self, vertices: Float64[Tensor, "v 3"], interior_points: Float64[Tensor, "place 3"]
     ) -> Complex128[Tensor, "row unknown"]:
-        """x, y and z of the field that must reach places for currents to cancel it there.
+        """Matrix from currents to the incident field that they cancel at interior points.
 
         Args:
-            vertices: [m].
-            interior_points: off the surface [m].
+            vertices: vertex positions [m].
+            interior_points: points off the surface [m].
+
+        Returns:
+            Rows are x, y and z of each point.
         """
         corners = vertices[self.faces]
         offset = corners - corners.mean(1)[:, None]
 
-        def evaluate_chunk(some: Tensor) -> Tensor:
-            points = some.expand(len(corners), -1, 3)
-            flat, sloped, charge = self._triangle_fields(corners, points, gradient=True)
+        def evaluate_chunk(chunk: Tensor) -> Tensor:
+            points = chunk.expand(len(corners), -1, 3)
+            constant, linear, charge = self._triangle_fields(corners, points, gradient=True)
             assert charge is not None
-            part = sloped[:, None] - flat[:, None, :, None] * offset[:, :, None]
+            part = linear[:, None] - constant[:, None, :, None] * offset[:, :, None]
             return self._combine_halves(0.5j * self.k * part + 1j / self.k * charge[:, None])
 
         size = max(1, (_ENTRIES_AT_ONCE >> 6) // len(corners))
         found = [
-            checkpoint(evaluate_chunk, some, use_reentrant=False)
-            for some in interior_points.split(size)
+            checkpoint(evaluate_chunk, chunk, use_reentrant=False)
+            for chunk in interior_points.split(size)
         ]
         return torch.cat(found, 1).flatten(1).T
 
@@ -425,44 +441,48 @@ def triangle_potentials(
 ) -> tuple[
     Float64[Tensor, "row point"], Float64[Tensor, "row point 3"], Float64[Tensor, "row point 3"]
 ]:
-    """Potentials 1/R of triangles in closed form.
+    """Integrate 1/R over triangles in closed form.
 
     Args:
-        corners: of the triangles.
-        points: x, on no side.
+        corners: corners of the triangles [m].
+        points: points x, on no side of a triangle [m].
 
     Returns:
-        ∫ 1/R dy, ∫ (y − x)/R dy, and the gradient of the first by x.
+        ∫ 1/R dy, ∫ (y − x)/R dy, and the gradient of the first with respect to x.
 
     Source: Wilton et al. 1984, with the logarithm as ln((R⁺ + R⁻ + L)/(R⁺ + R⁻ − L)), and the sum
     of arcs as the solid angle of Van Oosterom and Strackee.
     """
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = (normal / normal.norm(dim=1, keepdim=True))[:, None]
-    away = [corners[:, None, v] - points for v in range(3)]
-    far = [vector.norm(dim=-1) for vector in away]
-    height = -dot(away[0], normal)
-    level = torch.zeros_like(height)
+    offset = [corners[:, None, v] - points for v in range(3)]
+    distances = [vector.norm(dim=-1) for vector in offset]
+    height = -dot(offset[0], normal)
+    potential = torch.zeros_like(height)
     first = torch.zeros_like(points)
     slope = torch.zeros_like(points)
     for v in range(3):
         w = (v + 1) % 3
         side = (corners[:, w] - corners[:, v])[:, None]
         length = side.norm(dim=-1)
-        along = side / length[..., None]
-        outwards = cross(along, normal)
-        distance = dot(away[v], outwards)
-        both = far[v] + far[w]
-        logarithm = ((both + length) / (both - length)).log()
-        level = level + distance * logarithm
+        tangent = side / length[..., None]
+        outwards = cross(tangent, normal)
+        offset_in_plane = dot(offset[v], outwards)
+        total = distances[v] + distances[w]
+        logarithm = ((total + length) / (total - length)).log()
+        potential = potential + offset_in_plane * logarithm
         slope = slope - outwards * logarithm[..., None]
-        square = distance.square() + height.square()
-        ends = dot(away[w], along) * far[w] - dot(away[v], along) * far[v]
+        square = offset_in_plane.square() + height.square()
+        ends = dot(offset[w], tangent) * distances[w] - dot(offset[v], tangent) * distances[v]
         first = first + outwards * ((square * logarithm + ends) / 2)[..., None]
-    a, b, c = away
+    a, b, c = offset
     volume = dot(a, torch.linalg.cross(b, c))
-    base = far[0] * far[1] * far[2]
-    base = base + dot(a, b) * far[2] + dot(b, c) * far[0] + dot(c, a) * far[1]
+    base = distances[0] * distances[1] * distances[2]
+    base = base + dot(a, b) * distances[2] + dot(b, c) * distances[0] + dot(c, a) * distances[1]
     angle = 2 * torch.atan2(-volume, base)
-    level = level - height * angle
-    return level, first - normal * (height * level)[..., None], slope - normal * angle[..., None]
+    potential = potential - height * angle
+    return (
+        potential,
+        first - normal * (height * potential)[..., None],
+        slope - normal * angle[..., None],
+    )

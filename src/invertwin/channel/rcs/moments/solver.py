@@ -1,7 +1,7 @@
-"""What solvers of currents share: which frequencies they serve, how waves pass, and their trust.
+"""Method of moments for small conductors: common base of the solvers.
 
-Where a conductor is of few wavelengths, an integral equation says which currents flow. ``solved``
-has it for the cells of closed bodies, ``meshed`` for triangles of any kind.
+It selects the discretisation per frequency, solves in batches of waves, and checks the power
+balance. ``mfie`` solves closed bodies on cells, ``efie_solver`` open and closed ones on triangles.
 """
 
 import math
@@ -19,52 +19,52 @@ from invertwin.channel.em.plane_waves import phasor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import PhysicsWarning
 
-_ELEMENTS_PER_WAVELENGTH = 7.0  # sides of a piece
-_REUSE_RATIO = 1.25  # ratio of frequencies that share pieces
+_ELEMENTS_PER_WAVELENGTH = 7.0  # sides of an element
+_REUSE_RATIO = 1.25  # ratio of frequencies that share elements
 _ASPECTS_AT_ONCE = 64
-_POWER_TOLERANCE = 0.05  # share of the power that may get lost or be won
+_POWER_TOLERANCE = 0.05  # relative error of the power balance
 
-Elements = TypeVar("Pieces")
+Elements = TypeVar("Elements")
 
 
 @runtime_checkable
 class CurrentEquation(Protocol):
-    """An integral equation at one frequency."""
+    """Integral equation at one frequency."""
 
     def solve_currents(self, transmitters: Float64[Tensor, "aspect 3"]) -> Tensor:
-        """η J of plane waves of 1 V/m, V and H, that come from unit vectors."""
+        """Solve the currents η J of plane waves of 1 V/m, V and H, from given directions."""
         ...
 
     def conserves_power(self, current: Tensor, transmitters: Tensor) -> bool:
-        """Whether the first wave's currents send out as much power as they take from the wave.
+        """Test the power balance of the first wave's currents (optical theorem).
 
         Args:
-            current: as ``currents`` gives it.
-            transmitters: where the waves come from.
+            current: result of ``solve_currents``.
+            transmitters: unit vectors to the transmitters.
         """
         ...
 
     def far_field(
         self, current: Tensor, transmitters: Tensor, receivers: Tensor
     ) -> Complex128[Tensor, "aspect 2 2"]:
-        """S of currents.
+        """Compute the far-field amplitudes S of currents.
 
         Args:
-            current: of the transmitters' waves.
-            transmitters, receivers: where these are.
+            current: η J for the transmitters' waves.
+            transmitters, receivers: unit vectors to the antennas.
         """
         ...
 
 
 class CurrentSolver(ABC, Generic[Elements]):
-    """Conductors whose currents are solved, at the frequencies at which they are small.
+    """Method-of-moments solver of conductors, at frequencies at which they are small.
 
     Attributes:
-        area: of all surfaces [m²].
+        area: total area of all surfaces [m²].
     """
 
     MIN_SQUARES: ClassVar[int]
-    """Squares of a piece's side in the area, however small the conductors are."""
+    """Minimum number of squares of an element's side in the total area."""
 
     def __init__(self, area: float) -> None:
         self.area = area
@@ -72,33 +72,33 @@ class CurrentSolver(ABC, Generic[Elements]):
 
     @abstractmethod
     def build_elements(self, side: float) -> Elements | None:
-        """Pieces of about a side's length [m]; None where there are too many, or none hold."""
+        """Discretise with a side length [m]; None without a valid one of allowed size."""
 
     @abstractmethod
     def assemble_equation(
         self, elements: Elements, wave_number: float, wave_count: int
     ) -> CurrentEquation:
-        """The equation of pieces at one frequency.
+        """Assemble the integral equation at one frequency.
 
         Args:
-            elements: as ``cut`` gives them.
-            wave_number: k [1/m].
-            wave_count: for how many it is to be solved.
+            elements: result of ``build_elements``.
+            wave_number: wave number k [1/m].
+            wave_count: number of waves to solve for.
         """
 
     def supports(self, wave_number: float) -> bool:
-        """Whether pieces hold the conductors, and are not too many.
+        """Test if a valid discretisation of allowed size exists.
 
         Args:
-            wave_number: k [1/m].
+            wave_number: wave number k [1/m].
         """
         return self.elements(wave_number) is not None
 
     def elements(self, wave_number: float) -> Elements | None:
-        """Pieces for a wave; those of the last one where they are about as fine as needed.
+        """Return elements for a wave number; the previous ones are reused if fine enough.
 
         Args:
-            wave_number: k [1/m].
+            wave_number: wave number k [1/m].
         """
         wavelength = 2 * math.pi / wave_number
         needed = min(wavelength / _ELEMENTS_PER_WAVELENGTH, math.sqrt(self.area / self.MIN_SQUARES))
@@ -113,32 +113,32 @@ class CurrentSolver(ABC, Generic[Elements]):
     def solve_scattering(
         self, wave_number: float, antenna_pairs: Sequence[tuple[Tensor, Tensor]]
     ) -> list[Complex128[Tensor, "aspect 2 2"]] | None:
-        """S of the whole field for each way; None where the conductors are too large for it.
+        """Solve the total scattered field S per antenna pair; None if the conductors are too large.
 
         Args:
-            wave_number: k [1/m].
-            antenna_pairs: unit vectors from the scene to transmitters and to receivers, [aspect,
-                3] each.
+            wave_number: wave number k [1/m].
+            antenna_pairs: unit vectors from the scene to transmitters and to receivers, [aspect, 3]
+                each.
 
         Raises:
-            InputError: derivatives that the solver does not have.
+            InputError: derivatives that the solver does not support.
         """
-        pieces = self.elements(wave_number)
-        if pieces is None:
+        elements = self.elements(wave_number)
+        if elements is None:
             return None
         equation = self.assemble_equation(
-            pieces, wave_number, 2 * sum(len(way[0]) for way in antenna_pairs)
+            elements, wave_number, 2 * sum(len(pair[0]) for pair in antenna_pairs)
         )
         found: list[Tensor] = []
         for transmitters, receivers in antenna_pairs:
-            parts: list[Tensor] = []
-            for some in torch.arange(len(transmitters)).split(_ASPECTS_AT_ONCE):
-                current = equation.solve_currents(transmitters[some])
-                if not parts and not equation.conserves_power(current, transmitters[some]):
+            chunks: list[Tensor] = []
+            for rows in torch.arange(len(transmitters)).split(_ASPECTS_AT_ONCE):
+                current = equation.solve_currents(transmitters[rows])
+                if not chunks and not equation.conserves_power(current, transmitters[rows]):
                     _warn_power_balance(wave_number)
                     return None
-                parts.append(equation.far_field(current, transmitters[some], receivers[some]))
-            found.append(torch.cat(parts))
+                chunks.append(equation.far_field(current, transmitters[rows], receivers[rows]))
+            found.append(torch.cat(chunks))
         return found
 
 
@@ -149,38 +149,40 @@ def conserves_power(
     direction: Float64[Tensor, "3"],
     incident_field: Float64[Tensor, "2 3"],
 ) -> bool:
-    """Whether currents send out as much power as they take from a wave.
+    """Test if the power radiated by currents equals that extracted from the wave (optical theorem).
 
     Args:
-        wave_number: k [1/m].
-        point: where they flow [m].
+        wave_number: wave number k [1/m].
+        point: positions of the current moments [m].
         current_moments: η J dA there, for both polarisations.
-        direction: d of the wave.
-        incident_field: E at the world's origin.
+        direction: unit direction d of the wave.
+        incident_field: E at the world's origin, for both polarisations.
     """
     phase = phasor(-wave_number * point @ direction)
-    taken = torch.einsum("c,ctx,tx->t", phase.conj(), current_moments, incident_field + 0j)
-    place = point - point.mean(0)
-    extent = float(place.norm(dim=1).max())
-    level, share = np.polynomial.legendre.leggauss(math.ceil(wave_number * extent) + 12)
-    turns = 2 * math.pi * torch.arange(2 * len(level), dtype=torch.float64) / (2 * len(level))
-    given = torch.zeros(2, dtype=torch.float64)
-    for z, weight in zip(level, share * math.pi / len(level), strict=True):
-        flat = math.sqrt(1 - z**2)
-        ways = torch.stack([flat * turns.cos(), flat * turns.sin(), torch.full_like(turns, z)], 1)
-        wave = phasor(wave_number * (ways @ place.T))
-        sent = wave_number / (4 * math.pi) * torch.einsum("sc,ctx->stx", wave, current_moments)
-        along = torch.einsum("stx,sx->st", sent, ways + 0j)
-        given += weight * (sent.abs().square().sum((0, 2)) - along.abs().square().sum(0))
-    return bool(((given / taken.real - 1).abs() < _POWER_TOLERANCE).all())
+    extracted = torch.einsum("c,ctx,tx->t", phase.conj(), current_moments, incident_field + 0j)
+    offset = point - point.mean(0)
+    extent = float(offset.norm(dim=1).max())
+    nodes, node_weights = np.polynomial.legendre.leggauss(math.ceil(wave_number * extent) + 12)
+    azimuths = 2 * math.pi * torch.arange(2 * len(nodes), dtype=torch.float64) / (2 * len(nodes))
+    radiated = torch.zeros(2, dtype=torch.float64)
+    for z, weight in zip(nodes, node_weights * math.pi / len(nodes), strict=True):
+        ring = math.sqrt(1 - z**2)
+        directions = torch.stack(
+            [ring * azimuths.cos(), ring * azimuths.sin(), torch.full_like(azimuths, z)], 1
+        )
+        wave = phasor(wave_number * (directions @ offset.T))
+        field = wave_number / (4 * math.pi) * torch.einsum("sc,ctx->stx", wave, current_moments)
+        longitudinal = torch.einsum("stx,sx->st", field, directions + 0j)
+        radiated += weight * (field.abs().square().sum((0, 2)) - longitudinal.abs().square().sum(0))
+    return bool(((radiated / extracted.real - 1).abs() < _POWER_TOLERANCE).all())
 
 
 def _warn_power_balance(wave_number: float) -> None:
-    """Say that solved currents are not used."""
+    """Issue a warning that the method of moments is not used."""
     warnings.warn(
-        f"at {wave_number * SPEED_OF_LIGHT / (2 * math.pi) / 1e9:.4g} GHz solved currents do not "
-        "keep the power, so bounces and edges alone are counted; look for thin or touching parts "
-        "of the mesh",
+        f"at {wave_number * SPEED_OF_LIGHT / (2 * math.pi) / 1e9:.4g} GHz the currents of the "
+        "method of moments do not conserve power, so bounces and edges alone are used; look for "
+        "thin or touching parts of the mesh",
         PhysicsWarning,
         stacklevel=6,
     )
