@@ -26,7 +26,7 @@ def test_shadows_and_beams_that_sweep_over_cells(name):
     assert run.gradcheck is not None
     scene, model = build.scene(run), run.map.build()
     sampling = replace(model.places.sampling, points=64, edge_points=10_000)
-    model = replace(model, places=model.places.sampled(sampling))
+    model = replace(model, places=model.places.with_sampling(sampling))
     module, tangent = build.tangent(run, scene)
     report = gradcheck(
         model,

@@ -75,9 +75,9 @@ class EFIESolver(CurrentSolver[ConformingMesh]):
         """
         if is_differentiated(self.vertices) and elements.has_merged_vertices:
             raise InputError(
-                "expected meshes without coincident vertices for derivatives of a small target, got "
-                "some: currents end where they separate; merge the vertices, or give edges=0 for "
-                "physical optics alone"
+                "expected meshes without coincident vertices for derivatives of a small target, "
+                "got some: currents end where they separate; merge the vertices, or give edges=0 "
+                "for physical optics alone"
             )
         return _EFIEEquation(self, elements, wave_number)
 
