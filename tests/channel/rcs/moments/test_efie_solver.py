@@ -143,6 +143,6 @@ def test_derivatives_of_seams_are_refused():
 
 def test_currents_that_do_not_keep_the_power_are_not_used(monkeypatch):
     monkeypatch.setattr(meshed, "conserves_power", lambda *_: False)
-    with pytest.warns(PhysicsWarning, match="do not keep the power"):
+    with pytest.warns(PhysicsWarning, match="do not conserve power"):
         found = rcs(metal(plate(0.8, 0.8)), aspect_directions(0.4, 0.3), SPEED_OF_LIGHT)
     assert "rest" not in found.parts

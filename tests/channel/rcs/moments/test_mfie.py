@@ -185,6 +185,6 @@ def test_frequencies_that_are_too_high_have_no_rest():
 
 def test_currents_that_do_not_keep_the_power_are_not_used(monkeypatch):
     monkeypatch.setattr(currents, "_POWER_TOLERANCE", 1e-9)
-    with pytest.warns(PhysicsWarning, match="do not keep the power"):
+    with pytest.warns(PhysicsWarning, match="do not conserve power"):
         found = parts_of(BALL, 5.0, [[0.3, 0.5, 0.8]])
     assert "rest" not in found
