@@ -1,21 +1,35 @@
 """Boundary paths of one bounce in torch: how fast a shadow's edge moves over a surface."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.coherent.radar_equation import MaterialPoints, PathTransfer, radar_equation
 from invertwin.channel.paths import Paths
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.silhouettes import SilhouetteSample, SilhouetteSampler
+from invertwin.channel.power.silhouettes import SilhouetteSampler
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RayScene, is_visible
 from invertwin.channel.rays.scene_tables import interpolate_values
+
+
+@dataclass(frozen=True)
+class _EdgePoints:
+    """Silhouette samples as torch tensors, see ``SilhouetteSample``."""
+
+    is_receiver: Bool[Tensor, " n"] | bool
+    frame: Int64[Tensor, " n"]
+    first_vertex: Int64[Tensor, " n"]
+    second_vertex: Int64[Tensor, " n"]
+    face: Int64[Tensor, " n"]
+    side: Float64[Tensor, " n"]
+    edge_parameter: Float64[Tensor, " n"]
+    weight: Float64[Tensor, " n"]
 
 
 @dataclass(frozen=True)
@@ -38,7 +52,7 @@ class ProjectedSilhouettes:
     area_rate: Float64[Tensor, " n"]
 
 
-def project_silhouettes(rays: RayScene, points: SilhouetteSample) -> ProjectedSilhouettes:
+def project_silhouettes(rays: RayScene, points: "_EdgePoints") -> ProjectedSilhouettes:
     """Turn edge points into shadow points with the attached speed of the shadow's edge.
 
     ``T · (x_c − x_m)``: x_c is where the attached ray meets the attached plane behind the edge,
@@ -101,9 +115,15 @@ def trace_shadow_boundary_paths(
     if not sampler.size:
         return []
     drawn = sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress()
-    columns = {n: to_torch(column) for n, column in vars(drawn).items() if column is not False}
-    wide = {n: c.double() if c.is_floating_point() else c.long() for n, c in columns.items()}
-    edge = project_silhouettes(rays, replace(drawn, **wide))
+    receiver = drawn.is_receiver
+    indices = drawn.frame, drawn.first_vertex, drawn.second_vertex, drawn.face
+    numbers = drawn.side, drawn.edge_parameter, drawn.weight
+    points = _EdgePoints(
+        receiver if isinstance(receiver, bool) else to_torch(receiver).bool(),
+        *(to_torch(column).long() for column in indices),
+        *(to_torch(column).double() for column in numbers),
+    )
+    edge = project_silhouettes(rays, points)
     with torch.no_grad():
         echo = radar_equation(rays.geometry, rays.link, edge.frame, [edge.point])
     return [make_paths(edge, echo)]

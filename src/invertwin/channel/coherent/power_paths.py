@@ -14,7 +14,7 @@ from invertwin.channel.paths import Link, Paths, concatenate_paths
 from invertwin.channel.power.random_walk import PathRecords
 from invertwin.channel.power.trace import PowerTracer
 from invertwin.channel.rays.arrays import to_torch
-from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.backend import mi, tracing
 from invertwin.channel.rays.scene_tables import (
     Geometry,
     flatten,
@@ -91,7 +91,7 @@ def _boundary_paths(
 
 def _read_random_walk(trace: PowerTracer, records: PathRecords) -> Iterator[Paths]:
     """The paths of one point, of two and so on; the kernel says what arrives at the last point."""
-    vertices = [records.read_vertex(number) for number in range(records.depth)]
+    vertices = [records.read_vertex(mi.UInt32(number)) for number in range(records.depth)]
     face, b1, b2, throughput, seen = (
         torch.stack([to_torch(getattr(vertex, name)) for vertex in vertices], dim=1)
         for name in ("face", "b1", "b2", "throughput", "is_visible")

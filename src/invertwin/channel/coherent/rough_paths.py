@@ -30,6 +30,7 @@ from invertwin.channel.rays.arrays import (
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry, flatten
+from invertwin.channel.rays.surface_point import SurfacePoint
 from invertwin.runtime.progress import track
 from invertwin.scene.scene import Scene
 
@@ -139,16 +140,15 @@ class _RoughPathSampler:
         place, side = uniform_pair(index, self.seeds[0])
         face, pmf = self.faces.sample_pmf((mi.Float(lane) + place) / lanes)
         b = mi.warp.square_to_uniform_triangle(mi.Point2f(*uniform_pair(index, self.seeds[1])))
-        point = integrand.compute_interaction(self.inputs, face, b.x, b.y)
+        vertex = SurfacePoint(face, b.x, b.y)
+        point = integrand.compute_interaction(self.inputs, vertex)
         frame = dr.gather(mi.UInt32, to_index(self.frames), index % opaque(len(self.frames)))
         back, distance = integrand.direction_and_distance(
             point.position, self.inputs.antenna_position(frame, False)
         )
         turned = back - 2 * dr.dot(back, point.normal) * point.normal
         back = dr.select(side < _BACKSIDE_SHARE, turned, back)
-        state = walk.initial_state(
-            index, frame, face, b.x, b.y, back, dr.ones(mi.Float, lanes), distance
-        )
+        state = walk.initial_state(index, frame, vertex, back, dr.ones(mi.Float, lanes), distance)
         area = dr.gather(mi.Float, self.areas, face)
         state["weight"] = area / (
             pmf * lanes * dr.select(side < _BACKSIDE_SHARE, _BACKSIDE_SHARE, 1 - _BACKSIDE_SHARE)
@@ -175,19 +175,16 @@ class _RoughPathSampler:
     ) -> walk.PathState:
         """Lanes that go on from others; each has its own number, and so its own way."""
         at = to_index(parent)
-        columns = {
-            name: dr.gather(type(column), column, at)
-            if name != "back"
-            else mi.Vector3f(*(dr.gather(mi.Float, column[k], at) for k in range(3)))
-            for name, column in state.items()
-            if name in ("face", "b1", "b2", "back", "number")
-        }
-        return {
-            **state,
-            **columns,
-            "weight": to_float(weight),
-            "active": dr.full(mi.Bool, True, len(parent)),
-        }
+        incident = (dr.gather(mi.Float, state["incident"][k], at) for k in range(3))
+        return walk.update_state(
+            state,
+            **{n: dr.gather(type(state[n]), state[n], at) for n in ("face", "b1", "b2", "number")},
+            incident=mi.Vector3f(
+                *(dr.gather(mi.Float, state["incident"][k], at) for k in range(3))
+            ),
+            weight=to_float(weight),
+            active=dr.full(mi.Bool, True, len(parent)),
+        )
 
     def _selection_shares(self, paths: SurfacePaths, *, received: bool) -> Tensor:
         """How the draws are shared among paths: by their power, and by sequences of objects."""

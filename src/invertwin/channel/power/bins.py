@@ -5,6 +5,8 @@ the radar's point spread is a convolution of the grid afterwards. The B-spline i
 has continuous derivatives in range and direction.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,7 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from invertwin.channel.paths import Grid, Link, Paths
 from invertwin.channel.rays.arrays import to_float, to_index, to_torch, view_as_torch
-from invertwin.channel.rays.backend import backend, dr, mi, tracing
+from invertwin.channel.rays.backend import backend, dr, mi, mit, tracing
 
 # Bytes that copies of a map, one a thread, may take; beyond, additions are atomic.
 _MAX_COPY_BYTES = 2**28
@@ -26,24 +28,29 @@ _MAX_COPY_BYTES = 2**28
 # rounded less where each copy takes some. They fit a core's cache.
 _MAX_COPIED_VALUES, _MAX_COPIES = 2**16, 1024
 
+FourFloats = tuple[mit.Float, mit.Float, mit.Float, mit.Float]
+"""Derivatives with respect to, or of, the power, range, u and v of paths."""
+
 
 @dataclass(frozen=True)
 class PathContribution:
     """Received over transmitted power per sample, and where it falls."""
 
-    frame: Any  # radar pose
-    power: Any
-    range: Any  # half of the optical length [m]
-    u: Any  # direction cosines of arrival in the radar frame
-    v: Any
+    frame: mit.UInt32  # radar pose
+    power: mit.Float
+    range: mit.Float  # half of the optical length [m]
+    u: mit.Float  # direction cosines of arrival in the radar frame
+    v: mit.Float
 
     @property
-    def differentiable_values(self) -> tuple[Any, Any, Any, Any]:
+    def differentiable_values(self) -> FourFloats:
         """The four values that may carry derivatives."""
         return self.power, self.range, self.u, self.v
 
 
-def _axis_taps(coordinate: Any, start: float, step: float, count: int) -> list[tuple[Any, ...]]:
+def _axis_taps(
+    coordinate: mit.Float, start: float, step: float, count: int
+) -> list[tuple[mit.Int32, mit.Bool, mit.Float, mit.Float]]:
     """Bin, whether it is on the axis, weight and weight's derivative of each tap of one axis."""
     if count == 1:
         return [(mi.Int32(0), mi.Bool(True), mi.Float(1.0), mi.Float(0.0))]
@@ -72,7 +79,7 @@ class BinLayout:
     origin: Tensor | None = None
 
     @staticmethod
-    def from_link(grid: Grid, link: Link) -> "BinLayout":
+    def from_link(grid: Grid, link: Link) -> BinLayout:
         """That of the maps of an antenna.
 
         Args:
@@ -98,7 +105,7 @@ class BinLayout:
         count = rest.pop(self.strip_axis + 1)
         return *rest, count + 2, 4
 
-    def sum_strips(self, strips: Any) -> Float32[Tensor, "frame range u v"]:
+    def sum_strips(self, strips: mit.Float) -> Float32[Tensor, "frame range u v"]:
         """The map whose strips hold these amounts.
 
         Args:
@@ -109,7 +116,7 @@ class BinLayout:
         total = parts[..., 2:, 0] + parts[..., 1:-1, 1] + parts[..., :-2, 2]
         return total.movedim(-1, self.strip_axis + 1)
 
-    def expand_to_strips(self, bins: Float32[Tensor, "frame range u v"]) -> Any:
+    def expand_to_strips(self, bins: Float32[Tensor, "frame range u v"]) -> mit.Float:
         """The adjoint of ``summed``: every strip gets the values of its three bins.
 
         Args:
@@ -118,7 +125,7 @@ class BinLayout:
         rows = torch.nn.functional.pad(bins.movedim(self.strip_axis + 1, -1), (2, 3))
         return to_float(rows.unfold(-1, 4, 1))
 
-    def relative_range(self, path: PathContribution) -> Any:
+    def relative_range(self, path: PathContribution) -> mit.Float:
         """Ranges of paths from the origin of their frame (detached).
 
         Args:
@@ -134,16 +141,16 @@ class BinLayout:
 class _Strip:
     """Three bins side by side along the fine axis, and how paths fall on them (detached)."""
 
-    index: Any  # number of the strip
-    is_inside: Any  # whether its row is on the grid, and its middle at most one bin off it
-    transverse_weight: Any  # weight of the row
+    index: mit.UInt32  # number of the strip
+    is_inside: mit.Bool  # whether its row is on the grid, and its middle at most one bin off it
+    transverse_weight: mit.Float  # weight of the row
     transverse_derivatives: list[
-        Any
+        mit.Float
     ]  # its derivatives in range, u and v; along the fine axis the weight itself
-    weights: list[Any]  # of the three bins
-    weight_derivatives: list[Any]  # their derivatives along the fine axis
+    weights: list[mit.Float]  # of the three bins
+    weight_derivatives: list[mit.Float]  # their derivatives along the fine axis
 
-    def tap_derivatives(self, axis: int, strip_axis: int) -> list[Any]:
+    def tap_derivatives(self, axis: int, strip_axis: int) -> list[mit.Float]:
         """Derivatives of the three weights along an axis.
 
         Args:
@@ -181,14 +188,18 @@ def _iterate_strips(layout: BinLayout, path: PathContribution) -> Iterator[_Stri
         yield _Strip(
             index=mi.UInt32(row * length + middle + 1),
             is_inside=inside,
-            transverse_weight=math.prod(tap[2] for tap in taps),
+            transverse_weight=_multiply([tap[2] for tap in taps]),
             transverse_derivatives=[
-                math.prod(tap[3 if k == axis else 2] for k, tap in enumerate(taps))
+                _multiply([tap[3] if k == axis else tap[2] for k, tap in enumerate(taps)])
                 for axis in range(3)
             ],
             weights=[tap[2] for tap in along],
             weight_derivatives=[tap[3] for tap in along],
         )
+
+
+def _multiply(factors: list[mit.Float]) -> mit.Float:
+    return math.prod(factors)  # type: ignore[return-value]
 
 
 class BinAccumulator:
@@ -211,7 +222,7 @@ class BinAccumulator:
         copied = backend() == "cpu" and 4 * size * dr.thread_count() <= _MAX_COPY_BYTES
         self._mode = dr.ReduceMode.Expand if copied else dr.ReduceMode.Auto
 
-    def add(self, path: PathContribution, active: Any) -> None:
+    def add(self, path: PathContribution, active: mit.Bool | bool) -> None:
         """Add paths.
 
         Args:
@@ -222,7 +233,9 @@ class BinAccumulator:
             power = path.power * strip.transverse_weight
             self._scatter_strip([power * weight for weight in strip.weights], strip, active)
 
-    def add_tangent(self, path: PathContribution, tangents: tuple, active: Any) -> None:
+    def add_tangent(
+        self, path: PathContribution, tangents: FourFloats, active: mit.Bool | bool
+    ) -> None:
         """Add the derivative of paths' deposit, given those of power, range, u and v.
 
         Args:
@@ -240,7 +253,9 @@ class BinAccumulator:
                 values = [v + power * dot * s for v, s in zip(values, slopes, strict=True)]
             self._scatter_strip(values, strip, active)
 
-    def _scatter_strip(self, values: list[Any], strip: _Strip, active: Any) -> None:
+    def _scatter_strip(
+        self, values: list[mit.Float], strip: _Strip, active: mit.Bool | bool
+    ) -> None:
         amounts = mi.Vector4f(*values, 0.0)
         lane = dr.arange(mi.UInt32, dr.width(amounts, strip.index))
         place = strip.index + lane % self._copies * self._strip_count
@@ -252,8 +267,8 @@ class BinAccumulator:
 
 
 def gather_adjoint(
-    strip_gradient: Any, layout: BinLayout, path: PathContribution, active: Any
-) -> tuple[Any, Any, Any, Any]:
+    strip_gradient: mit.Float, layout: BinLayout, path: PathContribution, active: mit.Bool | bool
+) -> FourFloats:
     """The adjoint of the deposit: ∂loss/∂(power, range, u, v) of every path.
 
     Args:
@@ -316,9 +331,9 @@ class Splat(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
         with tracing(ctx.backend):
-            dots = tuple(
+            power, length, u, v = (
                 mi.Float(0.0) if tangent is None else to_float(tangent) for tangent in tangents[2:]
             )
             out = BinAccumulator(ctx.layout)
-            out.add_tangent(ctx.found, dots, True)
+            out.add_tangent(ctx.found, (power, length, u, v), True)
             return out.to_map()

@@ -1,88 +1,113 @@
-"""Boundary paths of any length: a shadow's edge, and the rest of the path on both sides of it.
+"""Boundary paths of any length: a point on a shadow boundary, and the rest of the path.
 
-Their value is zero; their derivative is the speed of the shadow's edge (attached) times what the
-path would carry (detached). Delay and direction do not move with θ.
+Their value is zero; their derivative is the velocity of the shadow boundary (attached) times the
+contribution of the path (detached). Delay and direction do not depend on θ.
 """
+
+from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from invertwin.channel.power import integrand
 from invertwin.channel.power import random_walk as walk
 from invertwin.channel.power.bins import PathContribution
 from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
-from invertwin.channel.power.interior_silhouettes import (
-    InteriorSilhouetteSample,
-    InteriorSilhouetteSampler,
-)
+from invertwin.channel.power.interior_silhouettes import InteriorSilhouetteSampler
 from invertwin.channel.power.intersection_curves import (
     IntersectionCurveSampler,
     IntersectionPoint,
+    PathVisitor,
     intersection_curve_paths,
 )
 from invertwin.channel.power.random_walk import PathState, RandomWalk
 from invertwin.channel.power.silhouettes import (
     SampleBatch,
-    ShadowBoundaryPoint,
     SilhouetteSample,
     SilhouetteSampler,
     shadow_speed,
 )
-from invertwin.channel.power.transmission import SegmentTransmission
 from invertwin.channel.rays.arrays import opaque
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.intersections import IntersectionCurves
 from invertwin.channel.rays.ray_scene import RayScene
+from invertwin.channel.rays.surface_point import SurfacePoint
 from invertwin.channel.sampling import Sampling
+
+_SECOND_PART_OFFSET = 1 << 30  # added to indices, so that both parts have their own random numbers
+
+
+class _Sampler(Protocol):
+    """Sampler of points of boundary paths."""
+
+    size: int
+
+    def draw(self, index: mit.UInt32) -> SampleBatch[Any]: ...
 
 
 @dataclass(frozen=True)
 class BoundaryPaths:
-    """Boundary paths that share the speeds of their shadow edges, one lane a speed.
+    """Boundary paths that share the velocities of their shadow boundaries, one lane each.
 
     Attributes:
-        speed: Area newly lit per unit of θ, over the sampling density; attached.
-        state: The paths at the shadow points, with unit speed.
-        run: Walks them, and shows each path and whether it exists to a visitor.
+        speed: illuminated area gained per unit of θ, over the sampling density; attached.
+        state: state of the paths at the shadow points, for unit velocity.
+        run: walk of the paths; calls a visitor with the state, each path, and the mask of lanes in
+            which it exists.
     """
 
-    speed: Any
+    speed: mit.Float
     state: PathState
-    run: Callable[[PathState, Callable[[PathState, PathContribution, Any], None]], PathState]
+    run: Callable[[PathState, PathVisitor], PathState]
 
-    def sum_weighted(self, gather: Callable[[PathContribution, Any], Any]) -> Any:
-        """Σ over a lane's paths of power × ``gather(path)``."""
+    def sum_weighted(self, gather: Callable[[PathContribution, mit.Bool], mit.Float]) -> mit.Float:
+        """Sum power × ``gather(path, exists)`` over the paths of each lane.
 
-        def visit(state: PathState, path: PathContribution, exists: Any) -> None:
+        Args:
+            gather: weight of a path.
+        """
+
+        def visit(state: PathState, path: PathContribution, exists: mit.Bool) -> None:
             amount = gather(path, exists) * path.power
             state["total"] = state["total"] + dr.select(exists, amount, 0.0)
 
-        state = dict(self.state)
+        state = self.state.copy()
         state["total"] = dr.zeros(mi.Float, dr.width(self.speed))
         with dr.suspend_grad():
             return self.run(state, visit)["total"]
 
-    def deposit(self, rate: Any, scatter: Callable[[PathContribution, Any], None]) -> None:
-        """Pass on every path with its power times a lane's rate.
+    def deposit(
+        self, rate: mit.Float, scatter: Callable[[PathContribution, mit.Bool], None]
+    ) -> None:
+        """Deposit every path, with its power times the rate of its lane.
 
         Args:
-            rate: Of each lane.
-            scatter: Takes a path and whether it exists.
+            rate: factor of each lane.
+            scatter: function of a path and of the mask of lanes in which it exists.
         """
-        state = dict(self.state)
+        state = self.state.copy()
         state["throughput"] = state["throughput"] * dr.detach(rate)
         with dr.suspend_grad():
             self.run(state, lambda _, path, exists: scatter(path, exists))
 
 
 class BoundarySamples:
-    """The points of all boundary paths: antenna segments, interior ones, contacts of surfaces.
+    """Points of all boundary paths: antenna silhouettes, interior silhouettes, intersection curves.
 
-    The first of each family are drawn at once, without waiting for them: this is prepared while
-    another kernel runs. They are given away once, so that they take no memory later; the rest, and
-    all of them when they are asked for again, are drawn anew, to the same points.
+    The first chunk of each family is launched at once, without waiting for it: it is prepared while
+    another kernel runs. It is returned once, so that it takes no memory later; the rest, and all of
+    them on a second request, are drawn anew, with the same points. If one visibility test serves
+    both antennas, a path of one vertex has one segment, not two.
+
+    Args:
+        rays: ray scene.
+        inputs: detached inputs.
+        sampling: number of points over all families, and most vertices of a path.
+        seed: seed of the points.
+        curves: intersection curves; None if surfaces cannot meet.
+        chunks: function that splits a number of samples into index arrays.
     """
 
     def __init__(
@@ -93,18 +118,8 @@ class BoundarySamples:
         seed: int,
         curves: IntersectionCurves | None = None,
         *,
-        chunks: Callable[[int], Iterator[Any]],
+        chunks: Callable[[int], Iterator[mit.UInt32]],
     ) -> None:
-        """Where both antennas share one visibility, a path of one vertex has one segment, not two.
-
-        Args:
-            rays: Rays and antennas.
-            inputs: Detached.
-            sampling: How many edge points over all families, and the most vertices of a path.
-            seed: Of the edge points.
-            curves: Where surfaces meet; None where they cannot.
-            chunks: Splits a number of samples into index arrays.
-        """
         self.depth = depth = sampling.depth
         samples = sampling.boundary_samples * rays.scene_count
         centres = ("tx",) if rays.link.shared_visibility and depth == 1 else ("tx", "rx")
@@ -116,7 +131,7 @@ class BoundarySamples:
         antennas = SilhouetteSampler(
             rays, inputs, centres, len(centres) * share, seed, has_close_surfaces=close
         )
-        self._samplers: list[Any] = [antennas]
+        self._samplers: list[_Sampler] = [antennas]
         self._path_builders: list[Callable[..., Iterator[BoundaryPaths]]] = [
             _antenna_silhouette_paths
         ]
@@ -141,7 +156,7 @@ class BoundarySamples:
     def iterate_families(
         self,
     ) -> list[Iterator[tuple[Callable[..., Iterator[BoundaryPaths]], Any]]]:
-        """What makes paths of the points, and the points, a chunk at a time."""
+        """Iterate over each family: the function that builds paths, and a chunk of points."""
         ahead, self._prefetched = self._prefetched, [[] for _ in self._samplers]
         first = [[drawn.compress() for drawn in family] for family in ahead]
         # Each sampler is bound here: a generator expression would draw all of them from the last.
@@ -161,15 +176,16 @@ class BoundarySamples:
 def trace_boundary_paths(
     rays: RayScene, inputs: Inputs, walker: RandomWalk, samples: BoundarySamples
 ) -> Iterator[BoundaryPaths]:
-    """The boundary paths through edge points.
+    """Trace the boundary paths through sampled points.
 
-    The first points are counted now, so that their paths are prepared while another kernel runs.
+    The first points are compressed now, so that their paths are prepared while another kernel
+    runs.
 
     Args:
-        rays: The scene and its antennas.
-        inputs: Attached tables.
-        walker: Continues the paths.
-        samples: On edges.
+        rays: ray scene.
+        inputs: attached inputs.
+        walker: random walk that extends the paths.
+        samples: points on edges and intersection curves.
     """
     families = samples.iterate_families()
 
@@ -184,7 +200,7 @@ def trace_boundary_paths(
 def _intersection_curve_paths(
     rays: RayScene, inputs: Inputs, walker: RandomWalk, points: IntersectionPoint, depth: int
 ) -> Iterator[BoundaryPaths]:
-    """Surfaces that meet: either hides what lies behind it of the other."""
+    """Third family: surfaces that meet, each of which hides what lies behind it."""
     return itertools.starmap(
         BoundaryPaths, intersection_curve_paths(rays, inputs, walker, points, depth)
     )
@@ -193,28 +209,26 @@ def _intersection_curve_paths(
 def _antenna_silhouette_paths(
     rays: RayScene, inputs: Inputs, walker: RandomWalk, samples: SilhouetteSample, depth: int
 ) -> Iterator[BoundaryPaths]:
-    """Family 1: the shadow that an edge casts from an antenna, then the path to the other one."""
+    """First family: the shadow that an edge casts from an antenna, and the path to the other."""
     at_receiver = samples.is_receiver
     fixed, frame = inputs.detach(), samples.frame
     shared = rays.link.shared_visibility
 
-    def locate_shadow() -> ShadowBoundaryPoint:
+    def locate_shadow() -> tuple[SurfacePoint, mit.Float]:
         return shadow_speed(inputs, samples, inputs.antenna_position(frame, at_receiver))
 
-    shadow = locate_shadow()
-    point = integrand.compute_interaction(fixed, samples.face, shadow.b1, shadow.b2)
-    back, distance = integrand.direction_and_distance(
+    shadow, speed = locate_shadow()
+    point = integrand.compute_interaction(fixed, shadow)
+    incident, distance = integrand.direction_and_distance(
         point.position, fixed.antenna_position(frame, at_receiver)
     )
-    seen = integrand.to_radar_frame(fixed, frame, -back)
-    throughput = fixed.scale * fixed.gain(frame, at_receiver, seen) / dr.square(distance)
+    departure = integrand.to_radar_frame(fixed, frame, -incident)
+    throughput = fixed.scale * fixed.gain(frame, at_receiver, departure) / dr.square(distance)
 
-    def run(
-        state: PathState, visit: Callable[[PathState, PathContribution, Any], None]
-    ) -> PathState:
+    def run(state: PathState, visit: PathVisitor) -> PathState:
         def visit_connection(state: PathState, point: SurfaceInteraction) -> None:
             to_receiver = state.get("to_receiver", True)
-            # What both antennas see of a single vertex is due to the transmitter's shadows alone.
+            # If one test serves both antennas, single vertices count in the transmitter's shadows.
             least = dr.select(to_receiver, 1, 2) if shared and to_receiver is not True else 1
             path, exists = walk.connect_path(
                 rays, fixed, state, point, to_receiver, min_vertices=least, shared_visibility=shared
@@ -223,89 +237,68 @@ def _antenna_silhouette_paths(
 
         return walker.run(state, depth, visit_connection)
 
-    for number, (sign, transmittance, extra) in enumerate(samples.sides(fixed)):
+    for number, (sign, passed) in enumerate(samples.sides(fixed)):
         state = walk.initial_state(
             samples.index,
             frame,
-            samples.face,
-            shadow.b1,
-            shadow.b2,
-            back,
-            throughput=throughput * transmittance * sign,
-            length=distance + extra,
-            transmission=SegmentTransmission(transmittance, extra)
-            if fixed.surfaces.has_sheets
-            else None,
+            shadow,
+            incident,
+            throughput=throughput * passed.transmittance * sign,
+            length=distance + passed.extra_length,
+            transmission=passed if fixed.surfaces.has_sheets else None,
         )
-        if at_receiver is not False:
-            state |= {"u": seen.x, "v": seen.y, "to_receiver": ~at_receiver}
-        # Anew for each side: a derivative taken uses the speed up.
-        speed = shadow.speed if number == 0 else locate_shadow().speed
-        yield BoundaryPaths(speed, state, run)
+        if not isinstance(at_receiver, bool):
+            state = walk.update_state(state, u=departure.x, v=departure.y, to_receiver=~at_receiver)
+        # Anew for each side: a derivative consumes the graph of the velocity.
+        yield BoundaryPaths(speed if number == 0 else locate_shadow()[1], state, run)
 
 
 def _interior_silhouette_paths(
-    rays: RayScene,
-    inputs: Inputs,
-    walker: RandomWalk,
-    samples: InteriorSilhouetteSample,
-    depth: int,
+    rays: RayScene, inputs: Inputs, walker: RandomWalk, samples: SilhouetteSample, depth: int
 ) -> Iterator[BoundaryPaths]:
-    """Family 2: a shadow that one surface point casts past an edge on another surface.
+    """Second family: a shadow that one surface point casts past an edge on another surface.
 
-    The part from the point behind has a drawn number of vertices; that from the shadow, all that
-    the depth leaves. Which of them ends at the receiver is drawn too: both orders are complete.
+    The part before the shadow has a random number of vertices, the part after it all that the depth
+    permits. A random bit decides which of them ends at the receiver: both orders are complete.
     """
-    fixed, points = inputs.detach(), samples.silhouette
-    source = samples.source
-    behind = integrand.compute_interaction(fixed, source.face, source.b1, source.b2)
+    fixed, source = inputs.detach(), samples.source
+    assert source is not None
+    behind = integrand.compute_interaction(fixed, source)
 
-    def locate_shadow() -> ShadowBoundaryPoint:
-        moving = integrand.compute_interaction(inputs, source.face, source.b1, source.b2)
-        return shadow_speed(inputs, points, moving.position)
+    def locate_shadow() -> tuple[SurfacePoint, mit.Float]:
+        moving = integrand.compute_interaction(inputs, source)
+        return shadow_speed(inputs, samples, moving.position)
 
-    shadow = locate_shadow()
-    ahead = integrand.compute_interaction(fixed, points.face, shadow.b1, shadow.b2)
+    shadow, speed = locate_shadow()
+    ahead = integrand.compute_interaction(fixed, shadow)
     to_behind, distance = integrand.direction_and_distance(ahead.position, behind.position)
-    inside = integrand.find_medium(fixed, ahead, behind, to_behind, mi.Bool(True))
+    medium = integrand.find_medium(fixed, ahead, behind, to_behind, mi.Bool(True))
     choices = opaque(depth - 1)
-    count = 1 + (points.index // 2) % choices
-    ends_at_receiver = (points.index % 2) == 1
-    kept = dr.exp(-inside.attenuation * distance)
+    count = 1 + (samples.index // 2) % choices
+    ends_at_receiver = (samples.index % 2) == 1
+    kept = dr.exp(-medium.attenuation * distance)
     throughput = fixed.scale * mi.Float(choices) * kept / dr.square(distance)
-    distance = inside.refractive_index * distance
-    lanes = dr.width(points.face)
-    zero = dr.zeros(mi.Float, lanes)
-    first = walk.initial_state(
-        points.index, points.frame, source.face, source.b1, source.b2, -to_behind,
-        throughput, zero,
-    )  # fmt: skip
+    distance = medium.refractive_index * distance
+    zero = dr.zeros(mi.Float, samples.size)
+    first = walk.initial_state(samples.index, samples.frame, source, -to_behind, throughput, zero)
     done = walker.trace_subpath(first, count, ends_at_receiver)
 
-    def run(
-        state: PathState, visit: Callable[[PathState, PathContribution, Any], None]
-    ) -> PathState:
+    def run(state: PathState, visit: PathVisitor) -> PathState:
         def visit_connection(state: PathState, point: SurfaceInteraction) -> None:
-            path, exists = walk.connect_path(rays, fixed, state, point, state["to_receiver"])
-            visit(state, path, exists)
+            visit(state, *walk.connect_path(rays, fixed, state, point, state["to_receiver"]))
 
         return walker.run(state, choices + 1 - count, visit_connection)
 
-    for number, (sign, transmittance, extra) in enumerate(points.sides(fixed)):
+    for number, (sign, passed) in enumerate(samples.sides(fixed)):
         state = walk.initial_state(
-            points.index + _SECOND_SIDE_OFFSET,
-            points.frame,
-            points.face,
-            shadow.b1,
-            shadow.b2,
+            samples.index + _SECOND_PART_OFFSET,
+            samples.frame,
+            shadow,
             to_behind,
-            throughput=done["amount"] * transmittance * sign,
-            length=done["so_far"] + distance + extra,
+            throughput=done["power"] * passed.transmittance * sign,
+            length=done["optical_length"] + distance + passed.extra_length,
         )
-        state |= {"u": done["u"], "v": done["v"], "to_receiver": ~ends_at_receiver}
-        state["earlier"] = count
-        speed = shadow.speed if number == 0 else locate_shadow().speed
-        yield BoundaryPaths(speed, state, run)
-
-
-_SECOND_SIDE_OFFSET = 1 << 30  # so that both sides of a segment draw their own numbers
+        state = walk.update_state(
+            state, u=done["u"], v=done["v"], to_receiver=~ends_at_receiver, previous_vertices=count
+        )
+        yield BoundaryPaths(speed if number == 0 else locate_shadow()[1], state, run)

@@ -4,6 +4,8 @@ No path is ever stored for torch: paths are walked, deposited and forgotten, or 
 while these fit the memory budget, and replayed for the derivative.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -23,7 +25,7 @@ from invertwin.channel.power.trace import (
     differentiable_tables,
     strip_scene_derivatives,
 )
-from invertwin.channel.rays.backend import backend, dr, mi, tracing
+from invertwin.channel.rays.backend import backend, dr, mi, mit, tracing
 from invertwin.channel.rays.batching import arrange_scenes
 from invertwin.channel.rays.scene_tables import Geometry, flatten, require_silhouette_samples
 from invertwin.channel.sampling import Sampling
@@ -280,7 +282,7 @@ def _pull_gradients(ctx: Any, names: tuple[str, ...], grad: Tensor) -> tuple[Ten
         inputs = trace.inputs(tables, joint_antennas=("tx" in tables) == ("rx" in tables))
         seed = ctx.layout.expand_to_strips(grad)
 
-        def gather(*path: Any) -> tuple[Any, Any, Any, Any]:
+        def gather(*path: Any) -> bins.FourFloats:
             return bins.gather_adjoint(seed, ctx.layout, *path)
 
         boundary = trace.trace_boundary(inputs)
@@ -323,7 +325,7 @@ def _push_tangents(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tenso
         return out.to_map()
 
 
-def _attach_tables(trace: PowerTracer, names: Iterable[str]) -> dict[str, Any]:
+def _attach_tables(trace: PowerTracer, names: Iterable[str]) -> dict[str, mit.Float]:
     """Copies of some of the kernel's tables that carry derivatives."""
     tables = {name: mi.Float(trace.fixed.table(name)) for name in names}
     dr.enable_grad(list(tables.values()))

@@ -4,6 +4,8 @@ Directions come from both ways, with the probability density of their mixture, s
 objects and narrow lobes are both found. Detached.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +14,7 @@ import torch
 from invertwin.channel.power.integrand import SurfaceInteraction
 from invertwin.channel.power.surface import ScatteringLawTables, gaussian, opaque_row
 from invertwin.channel.rays.arrays import to_float
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.bounding_spheres import sample_cap
 from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.scene import ScatteringLaw
@@ -37,10 +39,10 @@ class DirectionSample:
         target: The object of that group that it aims at, if any.
     """
 
-    omega: Any
-    lobe_density: Any
-    group: Any
-    target: Any
+    omega: mit.Vector3f
+    lobe_density: mit.Float
+    group: mit.UInt32
+    target: mit.UInt32
 
 
 class DirectionSampler:
@@ -60,7 +62,11 @@ class DirectionSampler:
         self._single_row = opaque_row(shares) if len(shares) == 1 else None
 
     def draw(
-        self, point: SurfaceInteraction, incident: Any, numbers: list[Any], scene: Any
+        self,
+        point: SurfaceInteraction,
+        incident: mit.Vector3f,
+        numbers: list[mit.Float],
+        scene: mit.UInt32,
     ) -> DirectionSample:
         """A direction from uniform numbers.
 
@@ -77,12 +83,13 @@ class DirectionSampler:
         if spheres.max_objects > 1:
             towards, rest = numbers[4] < _AIMED_FRACTION, numbers[5]
             first, groups = spheres.scene_groups(scene)
-            drawn = first + dr.minimum(mi.UInt32(numbers[4] / _AIMED_FRACTION * groups), groups - 1)
+            scaled: mit.Float = numbers[4] / _AIMED_FRACTION * groups  # type: ignore[operator]
+            drawn = first + dr.minimum(mi.UInt32(scaled), groups - 1)
             members = spheres.member_count(drawn)
             axis, height = mi.Vector3f(0, 0, 1), mi.Float(2.0)
             # One of the group that the point is outside of, if a few tries find one.
             for _ in range(_MAX_TRIES):
-                rest *= members
+                rest *= members  # type: ignore[operator]
                 number = dr.minimum(mi.UInt32(rest), members - 1)
                 rest -= number
                 place = drawn * spheres.group_size + number
@@ -100,8 +107,13 @@ class DirectionSampler:
         return DirectionSample(omega, density, group, aimed)
 
     def density(
-        self, point: SurfaceInteraction, sample: DirectionSample, face: Any, active: Any, scene: Any
-    ) -> Any:
+        self,
+        point: SurfaceInteraction,
+        sample: DirectionSample,
+        face: mit.UInt32,
+        active: mit.Bool,
+        scene: mit.UInt32,
+    ) -> mit.Float:
         """Probability per solid angle of a direction that ends on a triangle; 0 if it is void.
 
         Args:
@@ -122,15 +134,18 @@ class DirectionSampler:
         # Tries fail with the share of spheres that the point is inside of.
         failing = around / members
         tries: Any = sum(failing**k for k in range(_MAX_TRIES))
-        scattered = 1 - _AIMED_FRACTION + _AIMED_FRACTION / groups * failing**_MAX_TRIES
-        density = (
-            scattered * sample.lobe_density + _AIMED_FRACTION / groups * tries / members * found
-        )
+        share: mit.Float = _AIMED_FRACTION / groups  # type: ignore[operator]
+        scattered = 1 - _AIMED_FRACTION + share * failing**_MAX_TRIES
+        density = scattered * sample.lobe_density + share * tries / members * found
         return dr.select((sample.group == _NO_TARGET) | (sample.group == group), density, 0.0)
 
     def _sample_lobes(
-        self, point: SurfaceInteraction, incident: Any, facing: Any, numbers: list[Any]
-    ) -> Any:
+        self,
+        point: SurfaceInteraction,
+        incident: mit.Vector3f,
+        facing: mit.Vector3f,
+        numbers: list[mit.Float],
+    ) -> mit.Vector3f:
         omega = mi.Frame3f(facing).to_world(
             mi.warp.square_to_cosine_hemisphere(mi.Point2f(numbers[2], numbers[3]))
         )
@@ -156,7 +171,9 @@ class DirectionSampler:
             )
         return mi.Vector3f(omega)
 
-    def _refractive_indices(self, point: SurfaceInteraction, incident: Any) -> tuple[Any, Any, Any]:
+    def _refractive_indices(
+        self, point: SurfaceInteraction, incident: mit.Vector3f
+    ) -> tuple[mit.Float, mit.Float, mit.Float]:
         """Refractive index here and beyond, and variance of the refracted lobe."""
         body = self.surfaces.value("index", point.surface_row)
         outside = dr.dot(point.normal, incident) > 0
@@ -164,8 +181,8 @@ class DirectionSampler:
         return dr.select(outside, 1.0, body), dr.select(outside, body, 1.0), variance
 
     def _sample_refraction(
-        self, point: SurfaceInteraction, incident: Any, numbers: list[Any]
-    ) -> Any:
+        self, point: SurfaceInteraction, incident: mit.Vector3f, numbers: list[mit.Float]
+    ) -> mit.Vector3f:
         """A direction beyond the surface about Snell's; zero if there is none."""
         here, beyond, variance = self._refractive_indices(point, incident)
         spread = dr.sqrt(variance)
@@ -177,7 +194,9 @@ class DirectionSampler:
         z = -dr.mulsign(dr.sqrt(dr.maximum(rest, 0.0)), local.z)
         return dr.select(rest > 1e-6, frame.to_world(mi.Vector3f(x, y, z)), mi.Vector3f(0.0))
 
-    def _refraction_density(self, point: SurfaceInteraction, incident: Any, omega: Any) -> Any:
+    def _refraction_density(
+        self, point: SurfaceInteraction, incident: mit.Vector3f, omega: mit.Vector3f
+    ) -> mit.Float:
         here, beyond, variance = self._refractive_indices(point, incident)
         first, second = dr.dot(point.normal, incident), dr.dot(point.normal, omega)
         mismatch = here * (incident - point.normal * first) + beyond * (
@@ -187,8 +206,12 @@ class DirectionSampler:
         return dr.select(first * second < 0, lobe * dr.square(beyond) * dr.abs(second), 0.0)
 
     def _lobe_density(
-        self, point: SurfaceInteraction, incident: Any, facing: Any, omega: Any
-    ) -> Any:
+        self,
+        point: SurfaceInteraction,
+        incident: mit.Vector3f,
+        facing: mit.Vector3f,
+        omega: mit.Vector3f,
+    ) -> mit.Float:
         cosine = dr.dot(facing, omega)
         density = self._lobe_fraction(point, 0) * dr.maximum(cosine, 0.0) * dr.inv_pi
         for number, present in enumerate(self.surfaces.has_lobe):
@@ -203,7 +226,7 @@ class DirectionSampler:
             density += share * self._refraction_density(point, incident, omega)
         return density
 
-    def _lobe_fraction(self, point: SurfaceInteraction, number: int) -> Any:
+    def _lobe_fraction(self, point: SurfaceInteraction, number: int) -> mit.Float:
         if self._single_row is not None:
             return mi.Float(self._single_row[number])  # a copy, which callers may add to
         return dr.gather(

@@ -1,9 +1,9 @@
 """Discrete distributions on the GPU or CPU, sampled in proportion to tabulated weights."""
 
-from typing import Any
+from __future__ import annotations
 
 from invertwin.channel.rays.arrays import uniform_pair
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.ray_scene import RayScene
 
 _MIN_RESOLVED_PROBABILITY = (
@@ -15,19 +15,19 @@ _LAST_BELOW_ONE = 1 - 2.0**-24
 class DiscreteSampler:
     """Draws entries in proportion to weights, without reading any back."""
 
-    def __init__(self, weights: Any) -> None:
+    def __init__(self, weights: mit.Float) -> None:
         self.weights, self.sums = weights, dr.cumsum(weights)
         self.entries = dr.width(weights)
         self.total = dr.gather(mi.Float, self.sums, self.entries - 1)
 
-    def draw(self, number: Any) -> tuple[Any, Any, Any]:
+    def draw(self, number: mit.Float) -> tuple[mit.UInt32, mit.Float, mit.Float]:
         """Entry, the rest of the number within it, and probability: zero if there is no entry."""
         target = number * self.total
 
-        def is_below(at: Any) -> Any:
+        def is_below(at: mit.UInt32) -> mit.Bool:
             return dr.gather(mi.Float, self.sums, at) <= target
 
-        place: Any = dr.binary_search(0, self.entries - 1, is_below)
+        place: mit.UInt32 = dr.binary_search(0, self.entries - 1, is_below)
         weight = dr.gather(mi.Float, self.weights, place)
         last = dr.gather(mi.Float, self.sums, place) - weight
         rest = dr.clip((target - last) / weight, 0.0, _LAST_BELOW_ONE)
@@ -35,8 +35,12 @@ class DiscreteSampler:
 
 
 def balance_by_object(
-    rays: RayScene, edge: Any, weight: Any, receiver: Any, antenna_count: int
-) -> Any:
+    rays: RayScene,
+    edge: mit.UInt32,
+    weight: mit.Float,
+    receiver: mit.Bool | bool,
+    antenna_count: int,
+) -> mit.Float:
     """Weights of edges by which no object drowns another.
 
     An object gets the square root of the sum of its edges' weights, which is between a share by
@@ -61,11 +65,11 @@ def balance_by_object(
     scene = rays.object_scene(rows % objects)
     dr.scatter_add(sums, roots, rows // objects * rays.scene_count + scene)
     part = antenna * rays.scene_count + rays.edge_scene(edge)
-    share: Any = weight / (dr.gather(mi.Float, roots, row) * dr.gather(mi.Float, sums, part))
+    share: mit.Float = weight / (dr.gather(mi.Float, roots, row) * dr.gather(mi.Float, sums, part))
     return dr.select(weight > 0, share, 0.0)
 
 
-def balance_by_scene(rays: RayScene, scene: Any, weight: Any) -> Any:
+def balance_by_scene(rays: RayScene, scene: mit.UInt32, weight: mit.Float) -> mit.Float:
     """Weights of which all scenes have the same sum, if they have any.
 
     Args:
@@ -81,8 +85,12 @@ def balance_by_scene(rays: RayScene, scene: Any, weight: Any) -> Any:
 
 
 def sample_edge_point(
-    sampler: DiscreteSampler, index: Any, count: int, seed: Any, key: Any = None
-) -> tuple[Any, Any, Any]:
+    sampler: DiscreteSampler,
+    index: mit.UInt32,
+    count: int,
+    seed: mit.UInt32,
+    key: mit.UInt32 | tuple[mit.UInt32, mit.UInt32] | None = None,
+) -> tuple[mit.UInt32, mit.Float, mit.Float]:
     """Entry of the choice, place along its edge and probability, stratified over count.
 
     Args:

@@ -1,52 +1,54 @@
-"""What one vertex of a path contributes, in Dr.Jit: the integrand of the path integral.
+"""Integrand of the path integral at one vertex of a path, in Dr.Jit.
 
-Everything here is differentiable or not, as its ``Inputs`` are. The torch form of these formulas,
-in float64, is ``channel/coherent/radar_equation.py``; tests hold the two equal.
+Values carry derivatives if the ``Inputs`` do. The torch form of these formulas, in float64, is
+``channel/coherent/radar_equation.py``; tests hold the two equal.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from torch import Tensor
 
 from invertwin.channel.paths import GainPattern
 from invertwin.channel.power.surface import SCATTERING_TABLES, ScatteringLawTables
-from invertwin.channel.rays import arrays
+from invertwin.channel.rays import surface_point
 from invertwin.channel.rays.arrays import (
     from_points,
     gather_points,
-    interpolate_position,
     to_float,
     to_index,
     to_points,
     to_torch,
 )
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.ray_scene import RayScene
+from invertwin.channel.rays.surface_point import SurfacePoint, Triangle, interpolate_position
 
-#: The differentiable inputs of the kernel, in the order in which torch passes them.
+#: Differentiable inputs of the kernels, in the order of the arguments of the torch function.
 DIFFERENTIABLE = ("vertices", "tx", "rx", "rotations", *SCATTERING_TABLES)
 POINT_TABLES = DIFFERENTIABLE[:3]
 
 
-def to_table(name: str, values: Tensor) -> Any:
-    """A torch table as the kernel reads it.
+def to_table(name: str, values: Tensor) -> mit.Float:
+    """Convert a torch table to the layout of the kernels.
 
     Args:
-        name: Of the table.
-        values: The torch table.
+        name: name of the table, one of ``DIFFERENTIABLE``.
+        values: torch table.
     """
     return to_points(values) if name in POINT_TABLES else to_float(values)
 
 
-def from_table(name: str, values: Any, like: Tensor) -> Tensor:
-    """The torch form of an array that is laid out as one of the tables.
+def from_table(name: str, values: mit.Float, like: Tensor) -> Tensor:
+    """Convert a table of the kernels, or a derivative with respect to one, to torch.
 
     Args:
-        name: Of the table.
-        values: The array.
-        like: The torch table that it is laid out as.
+        name: name of the table, one of ``DIFFERENTIABLE``.
+        values: array in the layout of the table.
+        like: torch table of the shape and type that are returned.
     """
     flat = from_points(values) if name in POINT_TABLES else to_torch(values)
     return flat.reshape(like.shape).to(like)
@@ -54,30 +56,44 @@ def from_table(name: str, values: Any, like: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Flat Dr.Jit arrays; those named in ``DIFFERENTIABLE`` may carry derivatives."""
+    """Flat Dr.Jit arrays; those named in ``DIFFERENTIABLE`` may carry derivatives.
 
-    vertices: Any  # as ``to_points`` has them, about the local origin [m]
-    tx: Any  # place of the transmitter in every frame, likewise
-    rx: Any
-    rotations: Any  # of the radar in every frame
+    Attributes:
+        vertices: vertex positions about the local origin [m], see ``to_points``.
+        tx, rx: positions of the transmitter and the receiver in every frame, likewise.
+        rotations: rotation of the radar in every frame.
+        surfaces: tables of the scattering laws.
+        faces: vertex indices of every triangle.
+        face_surface: row of every triangle in the tables of surfaces.
+        triangles: ``RayScene.triangles``, used if the vertices carry no derivatives.
+        monostatic: True if both antennas are one.
+        tx_pattern, rx_pattern: antenna patterns.
+        scale: (λ/4π)² [m²].
+        coupling: polarisation factors of paths with an odd and an even number of bounces.
+    """
+
+    vertices: mit.Float
+    tx: mit.Float
+    rx: mit.Float
+    rotations: mit.Float
     surfaces: ScatteringLawTables
-    faces: Any  # vertices of every triangle
-    face_surface: Any  # row of every triangle's surface
-    triangles: Any  # ``RayScene.triangles``: what is read where vertices carry no derivatives
-    monostatic: bool  # both antennas are one
-    tx_pattern: "PatternTable"
-    rx_pattern: "PatternTable"
-    scale: float  # (λ/4π)²
-    coupling: tuple[float, float] = (1.0, 1.0)  # of paths with an odd, an even number of bounces
+    faces: mit.UInt32
+    face_surface: mit.UInt32
+    triangles: mit.Float
+    monostatic: bool
+    tx_pattern: PatternTable
+    rx_pattern: PatternTable
+    scale: float
+    coupling: tuple[float, float] = (1.0, 1.0)
 
     @staticmethod
-    def from_rays(rays: RayScene, *, monostatic: bool = False) -> "Inputs":
-        """Upload a scene and its antennas; positions are taken about the local origin.
+    def from_rays(rays: RayScene, *, monostatic: bool = False) -> Inputs:
+        """Upload a scene and its antennas; positions are about the local origin.
 
         Args:
-            rays: Scene and antennas.
-            monostatic: Spare one segment where both antennas are one, derivatives included: what
-                is due to ``rx`` is then due to ``tx``.
+            rays: ray scene.
+            monostatic: True to use one segment for both antennas if they are one; derivatives
+                with respect to ``rx`` then count as derivatives with respect to ``tx``.
         """
         link = rays.link
         return Inputs(
@@ -95,33 +111,35 @@ class Inputs:
             scale=(link.wavelength / (4 * np.pi)) ** 2,
         )
 
-    def table(self, name: str) -> Any:
-        """One of the differentiable inputs."""
+    def table(self, name: str) -> mit.Float:
+        """Return one of the differentiable inputs."""
         return self.surfaces.tables[name] if name in SCATTERING_TABLES else getattr(self, name)
 
-    def with_tables(self, tables: dict[str, Any]) -> "Inputs":
-        """With some of the differentiable inputs replaced."""
+    def with_tables(self, tables: dict[str, mit.Float]) -> Inputs:
+        """Replace some of the differentiable inputs."""
         rows = {name: table for name, table in tables.items() if name in SCATTERING_TABLES}
         others = {name: table for name, table in tables.items() if name not in SCATTERING_TABLES}
         surfaces = replace(self.surfaces, tables={**self.surfaces.tables, **rows})
         return replace(self, surfaces=surfaces, **others)
 
-    def detach(self) -> "Inputs":
-        """These values without derivatives."""
+    def detach(self) -> Inputs:
+        """Return these inputs without derivatives."""
         return self.with_tables({name: dr.detach(self.table(name)) for name in DIFFERENTIABLE})
 
-    def polarisation_factor(self, bounces: Any) -> Any:
-        """What the antennas' polarisations take of paths with so many bounces."""
+    def polarisation_factor(self, bounces: mit.UInt32) -> mit.Float:
+        """Compute the power factor of the antennas' polarisations from the number of bounces."""
         odd, even = self.coupling
         return mi.Float(odd) if odd == even else dr.select((bounces & 1) == 1, odd, even)
 
-    def antenna_position(self, frame: Any, receiver: Any, active: Any = True) -> Any:
-        """Position of the receiver or the transmitter (a Python bool, or one per lane).
+    def antenna_position(
+        self, frame: mit.UInt32, receiver: mit.Bool | bool, active: mit.Bool | bool = True
+    ) -> mit.Point3f:
+        """Look up the position of the receiver or the transmitter, about the local origin [m].
 
         Args:
-            frame: Radar pose.
-            receiver: Whether it is the receiver (a bool, or one per lane).
-            active: Lanes.
+            frame: radar poses.
+            receiver: True for the receiver (a bool, or one per lane).
+            active: mask of active lanes.
         """
         if receiver is True or receiver is False:
             table = self.rx if receiver and not self.monostatic else self.tx
@@ -132,13 +150,15 @@ class Inputs:
             self.antenna_position(frame, False, active),
         )
 
-    def gain(self, frame: Any, receiver: Any, direction: Any) -> Any:
-        """Linear power gain of the receiver or the transmitter towards a radar-frame direction.
+    def gain(
+        self, frame: mit.UInt32, receiver: mit.Bool | bool, direction: mit.Vector3f
+    ) -> mit.Float:
+        """Evaluate the linear power gain of the receiver or the transmitter.
 
         Args:
-            frame: Radar pose.
-            receiver: Whether it is the receiver (a bool, or one per lane).
-            direction: Unit direction in the radar frame.
+            frame: radar poses.
+            receiver: True for the receiver (a bool, or one per lane).
+            direction: unit directions in the radar frame.
         """
         if receiver is True or receiver is False:
             return (self.rx_pattern if receiver else self.tx_pattern).gain(direction)
@@ -147,21 +167,27 @@ class Inputs:
 
 @dataclass(frozen=True)
 class PatternTable:
-    """An antenna pattern as the kernel reads it: bilinear in cosθ and φ."""
+    """Antenna pattern on a grid, bilinear in cosθ and φ.
 
-    values: Any  # gains, row after row
-    shape: tuple[int, int]  # nodes in cosθ and φ
-    constant_gain: float | None  # the gain, where it is the same everywhere
+    Attributes:
+        values: linear power gains, row after row.
+        shape: numbers of nodes in cosθ and φ.
+        constant_gain: gain of a pattern of one node.
+    """
+
+    values: mit.Float
+    shape: tuple[int, int]
+    constant_gain: float | None
 
     @staticmethod
-    def from_pattern(pattern: GainPattern) -> "PatternTable":
+    def from_pattern(pattern: GainPattern) -> PatternTable:
         table = pattern.table()
         rows, columns = int(table.shape[0]), int(table.shape[1])
         constant = float(table.reshape(-1)[0]) if rows * columns == 1 else None
         return PatternTable(to_float(table), (rows, columns), constant)
 
-    def gain(self, direction: Any) -> Any:
-        """Linear power gain for a unit direction in the radar frame."""
+    def gain(self, direction: mit.Vector3f) -> mit.Float:
+        """Interpolate the linear power gain at unit directions in the radar frame."""
         if self.constant_gain is not None:
             return mi.Float(self.constant_gain)
         rows, columns = self.shape
@@ -183,39 +209,56 @@ class PatternTable:
         return rows_of_gain[0] + (rows_of_gain[1] - rows_of_gain[0]) * along
 
 
-def corners(inputs: Inputs, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
-    """Corners of triangles, attached.
+def corners(inputs: Inputs, face: mit.UInt32, active: mit.Bool | bool = True) -> Triangle:
+    """Gather the corners of triangles, attached.
 
     Args:
-        inputs: Tables of the kernel.
-        face: Triangle.
-        active: Lanes.
+        inputs: attached inputs.
+        face: triangle indices.
+        active: mask of active lanes.
     """
-    return arrays.corners(inputs.vertices, inputs.faces, face, active)
+    return surface_point.corners(inputs.vertices, inputs.faces, face, active)
 
 
-def edge_ends(inputs: Inputs, first: Any, second: Any) -> tuple[Any, Any]:
-    """Ends of edges, attached.
+def edge_ends(
+    inputs: Inputs, first: mit.UInt32, second: mit.UInt32
+) -> tuple[mit.Point3f, mit.Point3f]:
+    """Gather the ends of edges, attached.
 
     Args:
-        inputs: Tables of the kernel.
-        first, second: Vertices at the ends.
+        inputs: attached inputs.
+        first, second: vertex indices of the ends.
     """
     return gather_points(inputs.vertices, first), gather_points(inputs.vertices, second)
 
 
+class InteractionState(TypedDict):
+    """Detached surface interaction, as loops carry it."""
+
+    position: mit.Point3f
+    normal: mit.Vector3f
+    surface: mit.UInt32
+
+
 @dataclass(frozen=True)
 class SurfaceInteraction:
-    """A material point now; all but its surface is attached."""
+    """Location and orientation of a material point; all but its surface is attached.
 
-    position: Any  # about the local origin [m]
-    normal: Any  # of unit length
-    jacobian: Any  # area of its triangle over that area detached: one in value
-    surface_row: Any  # row of its surface
+    Attributes:
+        position: position about the local origin [m].
+        normal: unit normal.
+        jacobian: area of the triangle over its detached area: 1 in value.
+        surface_row: row in the tables of surfaces.
+    """
+
+    position: mit.Point3f
+    normal: mit.Vector3f
+    jacobian: mit.Float
+    surface_row: mit.UInt32
 
     @property
-    def detached_state(self) -> dict[str, Any]:
-        """What a loop carries of it, detached."""
+    def detached_state(self) -> InteractionState:
+        """Detached form for the state of a loop."""
         return {
             "position": mi.Point3f(dr.detach(self.position)),
             "normal": mi.Vector3f(dr.detach(self.normal)),
@@ -223,11 +266,11 @@ class SurfaceInteraction:
         }
 
     @staticmethod
-    def from_state(state: dict[str, Any]) -> "SurfaceInteraction":
-        """What a loop has carried.
+    def from_state(state: InteractionState) -> SurfaceInteraction:
+        """Restore an interaction from the state of a loop.
 
         Args:
-            state: As ``state`` has them, among others.
+            state: state with the keys of ``detached_state``.
         """
         return SurfaceInteraction(
             state["position"], state["normal"], mi.Float(1.0), state["surface"]
@@ -235,16 +278,16 @@ class SurfaceInteraction:
 
 
 def compute_interaction(
-    inputs: Inputs, face: Any, b1: Any, b2: Any, active: Any = True
+    inputs: Inputs, point: SurfacePoint, active: mit.Bool | bool = True
 ) -> SurfaceInteraction:
-    """Where a pair of barycentric coordinates lies now.
+    """Locate surface points.
 
     Args:
-        inputs: Tables of the kernel.
-        face: Triangle.
-        b1, b2: Barycentric coordinates.
-        active: Lanes.
+        inputs: inputs of the kernel.
+        point: surface points.
+        active: mask of active lanes.
     """
+    face, b1, b2 = point.face, point.b1, point.b2
     surface = dr.gather(mi.UInt32, inputs.face_surface, face, active)
     if not dr.grad_enabled(inputs.vertices):
         p0, first, second = (
@@ -264,166 +307,161 @@ def compute_interaction(
     )
 
 
-@dataclass(frozen=True)
-class SurfacePoint:
-    """A point of a surface.
-
-    Attributes:
-        face: Triangle.
-        b1, b2: Barycentric coordinates.
-    """
-
-    face: Any
-    b1: Any
-    b2: Any
-
-    def compute_interaction(self, inputs: Inputs, active: Any = True) -> SurfaceInteraction:
-        """Where it is.
-
-        Args:
-            inputs: Tables of the kernel.
-            active: Lanes.
-        """
-        return compute_interaction(inputs, self.face, self.b1, self.b2, active)
-
-
 def pull_interaction(
     inputs: Inputs,
-    face: Any,
-    b1: Any,
-    b2: Any,
-    active: Any,
-    position: Any,
-    normal: Any,
-    jacobian: Any,
+    point: SurfacePoint,
+    active: mit.Bool,
+    position: mit.Point3f,
+    normal: mit.Vector3f,
+    jacobian: mit.Float,
 ) -> None:
-    """The adjoint of ``compute_interaction``, written out: add to the gradient of the corners.
+    """Adjoint of ``compute_interaction``, written out: add to the gradient of the corners.
 
     Args:
-        inputs: Attached tables.
-        face: Triangle.
-        b1, b2: Barycentric coordinates.
-        active: Lanes.
-        position, normal, jacobian: Derivatives of the loss by what ``compute_interaction`` gives.
+        inputs: attached inputs.
+        point: surface points.
+        active: mask of active lanes.
+        position, normal, jacobian: derivatives of the loss with respect to the fields of the
+            interaction.
     """
+    b1, b2 = point.b1, point.b2
     first, second = (
-        dr.gather(mi.Vector4f, inputs.triangles, face * 3 + k, active).xyz for k in (1, 2)
+        dr.gather(mi.Vector4f, inputs.triangles, point.face * 3 + k, active).xyz for k in (1, 2)
     )
     crossed = dr.cross(first, second)
     scale = dr.rsqrt(dr.squared_norm(crossed))
     unit = crossed * scale
-    # By the cross product of the sides, then by these.
+    # With respect to the cross product of the sides, then with respect to the sides.
     turn = (normal + unit * (jacobian - dr.dot(unit, normal))) * scale
     by_first, by_second = dr.cross(second, turn), dr.cross(turn, first)
-    bars = (
-        position * (1 - b1 - b2) - by_first - by_second,
-        position * b1 + by_first,
-        position * b2 + by_second,
+    gradients = (
+        position * (1 - b1 - b2) - by_first - by_second,  # type: ignore[operator]
+        position * b1 + by_first,  # type: ignore[operator]
+        position * b2 + by_second,  # type: ignore[operator]
     )
     # Only the derivatives of this sum count: its value is never computed.
-    corner = corners(inputs, face, active)
-    dr.backward_from(sum(dr.dot(point, bar) for point, bar in zip(corner, bars, strict=True)))
+    triangle = corners(inputs, point.face, active)
+    dr.backward_from(sum(dr.dot(p, g) for p, g in zip(triangle, gradients, strict=True)))
 
 
-def direction_and_distance(start: Any, end: Any) -> tuple[Any, Any]:
-    """Unit direction and distance from one point to another.
+def direction_and_distance(start: mit.Point3f, end: mit.Point3f) -> tuple[mit.Vector3f, mit.Float]:
+    """Compute the unit direction and the distance [m] from one point to another.
 
     Args:
-        start, end: Of the segment.
+        start, end: ends of the segment.
     """
     offset = end - start
     distance = dr.norm(offset)
-    return offset / distance, distance
+    return offset / distance, distance  # type: ignore[return-value]
 
 
-def to_radar_frame(inputs: Inputs, frame: Any, direction: Any, active: Any = True) -> Any:
-    """World direction in the radar frame (the rotation's columns are the radar's axes).
+def to_radar_frame(
+    inputs: Inputs, frame: mit.UInt32, direction: mit.Vector3f, active: mit.Bool | bool = True
+) -> mit.Vector3f:
+    """Rotate world directions into the radar frame.
 
     Args:
-        inputs: Tables of the kernel.
-        frame: Radar pose.
-        direction: Unit direction in the world.
-        active: Lanes.
+        inputs: inputs of the kernel.
+        frame: radar poses.
+        direction: unit directions in the world.
+        active: mask of active lanes.
     """
     return project_to_axes(radar_axes(inputs, frame, active), direction)
 
 
-def radar_axes(inputs: Inputs, frame: Any, active: Any = True) -> list[Any]:
-    """Rows of the radar's rotation.
+def radar_axes(
+    inputs: Inputs, frame: mit.UInt32, active: mit.Bool | bool = True
+) -> list[mit.Vector3f]:
+    """Gather the rows of the radar's rotation, whose columns are the radar's axes.
 
     Args:
-        inputs: Tables of the kernel.
-        frame: Radar pose.
-        active: Lanes.
+        inputs: inputs of the kernel.
+        frame: radar poses.
+        active: mask of active lanes.
     """
     return [dr.gather(mi.Vector3f, inputs.rotations, frame * 3 + k, active) for k in range(3)]
 
 
-def project_to_axes(rows: list[Any], direction: Any) -> Any:
-    """World direction in the radar frame.
+def project_to_axes(rows: list[mit.Vector3f], direction: mit.Vector3f) -> mit.Vector3f:
+    """Rotate world directions into the radar frame.
 
     Args:
-        rows: Of the radar's rotation.
-        direction: Unit direction in the world.
+        rows: rows of the radar's rotation.
+        direction: unit directions in the world.
     """
     return mi.Vector3f(*(sum(rows[k][axis] * direction[k] for k in range(3)) for axis in range(3)))
 
 
 @dataclass(frozen=True)
 class SegmentMedium:
-    """What a segment runs through."""
+    """Medium of a segment.
 
-    refractive_index: Any  # refractive
-    attenuation: Any  # of power [1/m]
+    Attributes:
+        refractive_index: refractive index.
+        attenuation: power attenuation [1/m].
+    """
+
+    refractive_index: mit.Float
+    attenuation: mit.Float
 
 
 def find_medium(
     inputs: Inputs,
     start: SurfaceInteraction,
     end: SurfaceInteraction | None,
-    direction: Any,
-    active: Any,
+    direction: mit.Vector3f,
+    active: mit.Bool,
 ) -> SegmentMedium:
-    """The body inside of which a segment runs, if any: that of a skin it leaves or meets inside.
+    """Find the medium of segments: that of the refracting body whose interface they meet inside.
 
     Args:
-        inputs: Tables.
-        start: Where it starts.
-        end: Where it ends; None for an antenna.
-        direction: Unit direction from start to end.
-        active: Lanes.
+        inputs: inputs of the kernel.
+        start: surface interaction at the start.
+        end: surface interaction at the end; None for an antenna.
+        direction: unit directions from start to end.
+        active: mask of active lanes.
     """
     index, attenuation = mi.Float(1.0), mi.Float(0.0)
     ends = ((start, 1.0),) if end is None else ((start, 1.0), (end, -1.0))
-    for place, sign in ends if inputs.surfaces.has_refracting_bodies else ():
-        inside = active & (dr.detach(dr.dot(place.normal, direction)) * sign < 0)
-        inside &= inputs.surfaces.is_refracting(place.surface_row)
+    for point, sign in ends if inputs.surfaces.has_refracting_bodies else ():
+        inside = active & (dr.detach(dr.dot(point.normal, direction)) * sign < 0)
+        inside &= inputs.surfaces.is_refracting(point.surface_row)
         values = (
-            inputs.surfaces.value(n, place.surface_row, inside) for n in ("index", "attenuation")
+            inputs.surfaces.value(n, point.surface_row, inside) for n in ("index", "attenuation")
         )
         index, attenuation = (
-            dr.select(inside, value, so_far)
-            for value, so_far in zip(values, (index, attenuation), strict=True)
+            dr.select(inside, value, before)
+            for value, before in zip(values, (index, attenuation), strict=True)
         )
     return SegmentMedium(index, attenuation)
 
 
 @dataclass(frozen=True)
 class AntennaPose:
-    """An antenna that a path ends at. To look it up before a loop spares the loop doing so."""
+    """Pose of the antenna at the end of a path.
 
-    position: Any  # about the local origin [m]
-    axes: list[Any]  # rows of the radar's rotation
+    Attributes:
+        position: position about the local origin [m].
+        axes: rows of the radar's rotation.
+    """
+
+    position: mit.Point3f
+    axes: list[mit.Vector3f]
 
     @staticmethod
-    def look_up(inputs: Inputs, frame: Any, receiver: Any, active: Any = True) -> "AntennaPose":
-        """Look it up.
+    def look_up(
+        inputs: Inputs,
+        frame: mit.UInt32,
+        receiver: mit.Bool | bool,
+        active: mit.Bool | bool = True,
+    ) -> AntennaPose:
+        """Gather the pose; a loop need not do so if it is gathered before.
 
         Args:
-            inputs: Tables of the kernel.
-            frame: Radar pose.
-            receiver: Whether it is the receiver (a bool, or one per lane).
-            active: Lanes.
+            inputs: inputs of the kernel.
+            frame: radar poses.
+            receiver: True for the receiver (a bool, or one per lane).
+            active: mask of active lanes.
         """
         return AntennaPose(
             inputs.antenna_position(frame, receiver, active), radar_axes(inputs, frame, active)
@@ -432,43 +470,48 @@ class AntennaPose:
 
 @dataclass(frozen=True)
 class AntennaConnection:
-    """The last segment of a path, from a surface point to an antenna."""
+    """Last segment of a path, from a surface point to an antenna.
 
-    factor: Any  # f |cosθ| |cosθ'| G / R²
-    distance: Any  # R [m]
-    direction: Any  # direction of the point in the radar frame
+    Attributes:
+        factor: f |cosθ| |cosθ'| G / R².
+        distance: length R of the segment [m].
+        direction: unit direction of the point in the radar frame.
+    """
+
+    factor: mit.Float
+    distance: mit.Float
+    direction: mit.Vector3f
 
 
 def connect_antenna(
     inputs: Inputs,
-    frame: Any,
+    frame: mit.UInt32,
     point: SurfaceInteraction,
-    incident: Any,
-    receiver: Any = True,
-    active: Any = True,
+    incident: mit.Vector3f,
+    receiver: mit.Bool | bool = True,
+    active: mit.Bool | bool = True,
     *,
     is_same_antenna: bool = False,
     antenna: AntennaPose | None = None,
 ) -> AntennaConnection:
-    """Scatter what comes from ``incident`` towards an antenna; ``is_same_antenna`` if it lies
-    there.
+    """Evaluate the scattering from the incident direction towards an antenna.
 
     Args:
-        inputs: Tables of the kernel.
-        frame: Radar pose.
-        point: The vertex.
-        incident: Unit direction from where the path comes.
-        receiver: Whether the antenna is the receiver (a bool, or one per lane).
-        active: Lanes.
-        is_same_antenna: Whether the path comes from that very antenna.
-        antenna: The antenna, where it has been looked up.
+        inputs: inputs of the kernel.
+        frame: radar poses.
+        point: latest vertex.
+        incident: unit directions from the vertex to the one before, or to the first antenna.
+        receiver: True for the receiver (a bool, or one per lane).
+        active: mask of active lanes.
+        is_same_antenna: True if the path starts at that very antenna.
+        antenna: pose of the antenna, if it has been looked up.
     """
     antenna = antenna or AntennaPose.look_up(inputs, frame, receiver, active)
     to_antenna, distance = direction_and_distance(point.position, antenna.position)
-    seen = project_to_axes(antenna.axes, -to_antenna)
-    on = None if is_same_antenna else to_antenna
+    in_radar_frame = project_to_axes(antenna.axes, -to_antenna)
+    outgoing = None if is_same_antenna else to_antenna
     value = inputs.surfaces.evaluate_scattering(
-        point.surface_row, point.normal, incident, on, active
+        point.surface_row, point.normal, incident, outgoing, active
     )
-    gain = inputs.gain(frame, receiver, seen)
-    return AntennaConnection(value * gain / dr.square(distance), distance, seen)
+    gain = inputs.gain(frame, receiver, in_radar_frame)
+    return AntennaConnection(value * gain / dr.square(distance), distance, in_radar_frame)

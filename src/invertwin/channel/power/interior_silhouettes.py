@@ -1,70 +1,41 @@
 """Silhouette sampling between surfaces: edges that shadow one surface point from another."""
 
-from dataclasses import dataclass
-from typing import Any
+from __future__ import annotations
 
 from invertwin.channel.power.discrete import DiscreteSampler, balance_by_scene, sample_edge_point
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.mesh_folds import is_hidden_by_fold
 from invertwin.channel.power.silhouettes import (
-    _EDGE_OFFSET,
-    _MIN_OPENING,
-    _MISS_DISTANCE,
+    EDGE_OFFSET,
+    MIN_OPENING,
+    MISS_DISTANCE,
     SampleBatch,
     SilhouetteSample,
-    _classify_sides,
-    _is_not_grazing,
-    _trace_past_edge,
+    classify_sides,
+    is_not_grazing,
+    trace_past_edge,
 )
-from invertwin.channel.rays.arrays import (
-    gather_points,
-    interpolate_position,
-    scramble_seed,
-    uniform_pair,
-)
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.arrays import gather_points, scramble_seed, uniform_pair
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.differentiated_objects import NO_TARGET, DifferentiatedObjects
 from invertwin.channel.rays.ray_scene import RayScene
-
-
-@dataclass(frozen=True)
-class ShadowSource:
-    """A point from which a shadow is cast."""
-
-    face: Any  # triangle
-    b1: Any  # barycentric coordinates
-    b2: Any
-
-
-@dataclass(frozen=True)
-class InteriorSilhouetteSample:
-    """Points on edges with what lies on both sides of a tangential direction."""
-
-    silhouette: SilhouetteSample  # its weight holds the change of measure from directions to area
-    source: ShadowSource  # where the shadow is cast from
-
-    @property
-    def size(self) -> int:
-        """How many there are."""
-        return self.silhouette.size
+from invertwin.channel.rays.surface_point import face_normal, interpolate_position
 
 
 class InteriorSilhouetteSampler:
-    """Points and tangential directions on all edges that can hide one surface from another.
+    """Sampler of points and tangential directions on edges that shadow one surface from another.
 
-    Edges are weighted by their length, by the angle under which they hide (the opening between
-    their triangles' planes) and by how near they are to both antennas; directions are uniform
-    over those that are tangential.
+    Edges are weighted by their length, by their opening angle (the range of tangential directions)
+    and by the proximity to both antennas; directions are uniform over the tangential ones.
 
     Args:
-        rays: The scene and its antennas.
-        inputs: Detached tables.
-        samples: Points over all frames and scenes.
-        seed: Of the points.
-        importance_sampling: False takes edges by length alone and directions from the whole
-            sphere: what the
-            benchmark compares with.
-        has_close_surfaces: Whether other surfaces may be close to edges.
+        rays: ray scene.
+        inputs: detached inputs.
+        samples: number of points over all frames and scenes.
+        seed: seed of the points.
+        importance_sampling: False draws edges by length alone and directions from the whole
+            sphere, for comparison in benchmarks.
+        has_close_surfaces: True if other surfaces may be close to edges.
     """
 
     def __init__(
@@ -88,13 +59,16 @@ class InteriorSilhouetteSampler:
         y0, y1 = rays.exact_ends(edge)
         length = mi.Float(dr.norm(y1 - y0))
         _, span = self._tangential_azimuths(edge, y0, y1)
-        weight = dr.select(span > _MIN_OPENING, length, 0.0)
+        weight = dr.select(span > MIN_OPENING, length, 0.0)
         if importance_sampling:
             middle = mi.Point3f(0.5 * (y0 + y1))
             near, first = mi.Float(0.0), rays.edge_scene(edge) * rays.poses_per_scene
-            for look in range(min(rays.poses_per_scene, 8)):
-                at = first + look * rays.poses_per_scene // min(rays.poses_per_scene, 8)
-                legs = [dr.norm(middle - gather_points(t, at)) + length for t in (rays.tx, rays.rx)]
+            count = min(rays.poses_per_scene, 8)
+            for number in range(count):
+                pose = first + number * rays.poses_per_scene // count
+                legs = [
+                    dr.norm(middle - gather_points(t, pose)) + length for t in (rays.tx, rays.rx)
+                ]
                 near += 1 / (legs[0] * legs[1])
             weight *= span * near
         # Poses of the same number in all scenes share one choice of edges.
@@ -106,11 +80,13 @@ class InteriorSilhouetteSampler:
         self.transmission_seeds = scramble_seed(seed, 10), scramble_seed(seed, 11)
         self.aim_seeds = scramble_seed(seed, 12), scramble_seed(seed, 13)
 
-    def _tangential_azimuths(self, edge: Any, y0: Any, y1: Any) -> tuple[Any, Any]:
-        """Start and span of the tangential directions' azimuth about the edge, up to sign.
+    def _tangential_azimuths(
+        self, edge: mit.UInt32, y0: mit.Vector3d, y1: mit.Vector3d
+    ) -> tuple[mit.Float, mit.Float]:
+        """Compute start and span of the tangential directions' azimuth about the edge, up to sign.
 
-        Azimuths count from the first triangle of the edge. Two triangles at azimuths 0 and α
-        leave (α, π); one triangle leaves all; more are left to the test of sides.
+        Azimuths count from the first triangle of the edge. Two triangles at azimuths 0 and α leave
+        (α, π) free; one triangle leaves all directions; more are left to the test of sides.
         """
         topology = self.rays.topology
         along = dr.normalize(y1 - y0)
@@ -129,11 +105,11 @@ class InteriorSilhouetteSampler:
         for column in topology.device_edge_apexes[2:]:
             unsure |= dr.gather(mi.Int32, column, edge) >= 0
         if self.inputs.surfaces.has_sheets:
-            unsure |= self._is_transmissive(edge) & (span > _MIN_OPENING)
+            unsure |= self._is_transmissive(edge) & (span > MIN_OPENING)
         return dr.select(unsure, 0.0, start), dr.select(unsure, dr.pi, span)
 
-    def _is_transmissive(self, edge: Any) -> Any:
-        """Whether any triangle of an edge lets something through."""
+    def _is_transmissive(self, edge: mit.UInt32) -> mit.Bool:
+        """Compute the mask of edges of which any triangle transmits at normal incidence."""
         inputs, found = self.inputs, mi.Bool(False)
         for column in self.rays.topology.device_edge_faces:
             face = dr.gather(mi.UInt32, column, edge)
@@ -141,62 +117,68 @@ class InteriorSilhouetteSampler:
             found |= inputs.surfaces.interpolate_cosine("transmittance", row, mi.Float(1.0)) > 0
         return found
 
-    def _azimuth_axes(self, edge: Any, y0: Any, along: Any) -> tuple[Any, Any]:
+    def _azimuth_axes(
+        self, edge: mit.UInt32, y0: mit.Vector3d, along: mit.Vector3d
+    ) -> tuple[mit.Vector3d, mit.Vector3d]:
         topology = self.rays.topology
         apex = mi.UInt32(dr.maximum(dr.gather(mi.Int32, topology.device_edge_apexes[0], edge), 0))
         offset = self.rays.exact_vertex(apex) - y0
         x = dr.normalize(offset - along * dr.dot(along, offset))
         return x, dr.cross(along, x)
 
-    def draw(self, index: Any) -> SampleBatch:
-        """The samples of the given indices below ``size``; those that hide nothing are void."""
-        rays, topology = self.rays, self.rays.topology
-        look, within = index // self.samples_per_pose, index % self.samples_per_pose
+    def draw(self, index: mit.UInt32) -> SampleBatch[SilhouetteSample]:
+        """Draw the samples of given numbers; those without a shadow are void.
+
+        The weight of a sample holds the change of measure from directions to area.
+
+        Args:
+            index: sample numbers below ``size``.
+        """
+        rays, topology, moving = self.rays, self.rays.topology, self.rays.differentiated_objects
+        pose, within = index // self.samples_per_pose, index % self.samples_per_pose
         edge, along, pmf = sample_edge_point(
             self.choice, within, self.samples_per_pose, self.seeds[0], index
         )
-        frame = rays.edge_scene(edge) * rays.poses_per_scene + look
+        frame = rays.edge_scene(edge) * rays.poses_per_scene + pose
         first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0, y1 = rays.exact_ends(edge)
-        place = y0 + (y1 - y0) * mi.Float64(along)
+        exact_point = y0 + (y1 - y0) * mi.Float64(along)
         omega, density = self._sample_direction(index, edge, y0, y1)
-        if (
-            self.importance_sampling
-            and rays.differentiated_objects is not None
-            and rays.scene_count == 1
-        ):
+        if self.importance_sampling and moving is not None and rays.scene_count == 1:
             omega, density = self._aim_at_differentiated(
-                rays.differentiated_objects, index, edge, place, omega, density
+                moving, index, edge, exact_point, omega, density
             )
         exact = mi.Vector3d(omega)
-        sides = _classify_sides(rays, self.inputs, edge, exact)
-        aside = _EDGE_OFFSET * (dr.norm(place) + dr.norm(y1 - y0))
-        y, beside = mi.Point3f(place), mi.Point3f(place + sides.outward * aside)
+        sides = classify_sides(rays, self.inputs, edge, exact)
+        aside = EDGE_OFFSET * (dr.norm(exact_point) + dr.norm(y1 - y0))
+        y, beside = mi.Point3f(exact_point), mi.Point3f(exact_point + sides.outward * aside)
         valid = (pmf > 0) & sides.has_contrast
         hits = []
-        for sign, dice in zip((-1.0, 1.0), self.transmission_seeds, strict=True):
-            hit = _trace_past_edge(
+        for sign, seed in zip((-1.0, 1.0), self.transmission_seeds, strict=True):
+            hit = trace_past_edge(
                 rays, self.inputs, (edge, along), beside, omega * (sign * dr.norm(y)), valid,
-                (index, dice), has_close_surfaces=self.has_close_surfaces and sign > 0,
+                (index, seed), has_close_surfaces=self.has_close_surfaces and sign > 0,
             )  # fmt: skip
-            valid &= hit.valid & _is_not_grazing(rays, hit.face, omega, hit.valid)
-            valid &= rays.is_in_scene(frame, hit.face, hit.valid)
+            valid &= hit.valid & is_not_grazing(rays, hit.point.face, omega, hit.valid)
+            valid &= rays.is_in_scene(frame, hit.point.face, hit.valid)
             hits.append(hit)
-        if rays.differentiated_objects is not None:
-            moves = rays.differentiated_objects.has_edge(edge)
+        if moving is not None:
+            counts = moving.has_edge(edge)
             for hit in hits:
-                moves |= rays.differentiated_objects.has_face(hit.face, hit.valid)
-            valid &= moves
-        near = _MISS_DISTANCE * dr.norm(place)
-        valid &= ~is_hidden_by_fold(rays, edge, place, exact, sides.outward, aside, near, valid)
+                counts |= moving.has_face(hit.point.face, hit.valid)
+            valid &= counts
+        near = MISS_DISTANCE * dr.norm(exact_point)
+        valid &= ~is_hidden_by_fold(
+            rays, edge, exact_point, exact, sides.outward, aside, near, valid
+        )
         behind, ahead = hits
-        triangle = p0, p1, p2 = rays.corners(behind.face, valid)
-        b1, b2 = behind.b1, behind.b2
-        point = interpolate_position(triangle, b1, b2)
-        cosine = dr.abs(dr.dot(dr.normalize(dr.cross(p1 - p0, p2 - p0)), omega))
+        source = behind.point
+        triangle = rays.corners(source.face, valid)
+        point = interpolate_position(triangle, source.b1, source.b2)
+        cosine = dr.abs(dr.dot(face_normal(triangle), omega))
         measure = dr.squared_norm(point - y) / cosine
-        chance = behind.chance * ahead.chance
-        points = SilhouetteSample(
+        probability = behind.probability * ahead.probability
+        samples = SilhouetteSample(
             index,
             False,
             frame,
@@ -204,29 +186,25 @@ class InteriorSilhouetteSampler:
             second,
             sides.side,
             along,
-            ahead.face,
-            weight=measure / (pmf * density * self.samples_per_pose * chance),
-            transmittance=behind.transmittance * ahead.transmittance,
-            extra_length=behind.extra + ahead.extra,
-            open_transmittance=sides.open_transmittance,
-            open_extra_length=sides.open_extra_length,
-            covered_transmittance=sides.covered_transmittance,
-            covered_extra_length=sides.covered_extra_length,
+            ahead.point.face,
+            weight=measure / (pmf * density * self.samples_per_pose * probability),
+            transmission=behind.transmission.then(ahead.transmission),
+            open=sides.open,
+            covered=sides.covered,
+            source=source,
         )
-        return SampleBatch(
-            valid, (points, ShadowSource(behind.face, b1, b2)), InteriorSilhouetteSample
-        )
+        return SampleBatch(valid, samples)
 
     def _aim_at_differentiated(
         self,
         objects: DifferentiatedObjects,
-        index: Any,
-        edge: Any,
-        point: Any,
-        omega: Any,
-        density: Any,
-    ) -> tuple[Any, Any]:
-        """Half of the directions through edges at rest go where something moves."""
+        index: mit.UInt32,
+        edge: mit.UInt32,
+        point: mit.Vector3d,
+        omega: mit.Vector3f,
+        density: mit.Float,
+    ) -> tuple[mit.Vector3f, mit.Float]:
+        """Aim half of the directions through edges at rest at objects with derivatives."""
         still = ~objects.has_edge(edge)
         (coin, first), (second, third) = (uniform_pair(index, seed) for seed in self.aim_seeds)
         chosen, turned = still & (coin < 0.5), coin < 0.25
@@ -236,8 +214,10 @@ class InteriorSilhouetteSampler:
         mixed = 0.5 * (density + objects.line_density(at, line, aimed))
         return dr.select(chosen & turned, -line, line), dr.select(still, mixed, density)
 
-    def _sample_direction(self, index: Any, edge: Any, y0: Any, y1: Any) -> tuple[Any, Any]:
-        """A tangential direction and its probability per solid angle."""
+    def _sample_direction(
+        self, index: mit.UInt32, edge: mit.UInt32, y0: mit.Vector3d, y1: mit.Vector3d
+    ) -> tuple[mit.Vector3f, mit.Float]:
+        """Sample a tangential direction; return it and its probability per solid angle."""
         first, second = uniform_pair(index, self.seeds[1])
         if not self.importance_sampling:
             sphere = mi.warp.square_to_uniform_sphere(mi.Point2f(first, second))

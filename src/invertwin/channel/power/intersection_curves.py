@@ -1,23 +1,23 @@
-"""Boundary paths of the curves in which surfaces meet: what lies behind the other is hidden.
+"""Boundary paths at intersection curves, where each surface hides what lies behind it.
 
-With both unit normals turned to where a path comes from, each surface is seen on the side that the
-other's normal points to. As θ moves, the curve sweeps ``n_B · (x_A − x_B) / |n_A × n_B|`` of the
-surface A per metre, with the material points x_A and x_B of the curve's point; B likewise
+With both unit normals oriented towards the previous vertex, each surface is visible on the side to
+which the other's normal points. As θ changes, the curve sweeps ``n_B · (x_A − x_B) / |n_A × n_B|``
+of the surface A per metre, with the material points x_A and x_B at a point of the curve; B likewise
 (derivations §3). Any vertex of a path may lie on the curve.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
 
 from invertwin.channel.power import integrand
 from invertwin.channel.power import random_walk as walk
 from invertwin.channel.power.bins import PathContribution
 from invertwin.channel.power.discrete import DiscreteSampler, balance_by_scene, sample_edge_point
-from invertwin.channel.power.integrand import Inputs, SurfaceInteraction, SurfacePoint
+from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
 from invertwin.channel.power.random_walk import PathState, RandomWalk
-from invertwin.channel.power.silhouettes import SampleBatch, barycentric_coordinates
+from invertwin.channel.power.silhouettes import SampleBatch
 from invertwin.channel.power.transmission import (
     SegmentTransmission,
     trace_to_surface,
@@ -31,56 +31,57 @@ from invertwin.channel.rays.arrays import (
     to_points,
     uniform_pair,
 )
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.intersections import IntersectionCurves
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
+from invertwin.channel.rays.surface_point import SurfacePoint, barycentric_coordinates
 from invertwin.errors import InputError
 
-_CHECKED_POINTS = 65_536  # points that tell whether paths run between surfaces that meet
+_CHECKED_POINTS = 65_536  # points by which paths between surfaces that meet are detected
 _MIN_WEDGE_COSINE = -0.98  # least cosine between the normals of surfaces between which rays start
+_SUBPATH_OFFSET = 1 << 29  # added to indices, so that the second part has its own random numbers
 
-
-@dataclass(frozen=True)
-class IntersectionSample:
-    """What is drawn of points of the curve.
-
-    Attributes:
-        index: Number of the sample.
-        frame: Radar pose.
-        weight: One over (samples × probability per metre).
-        transmittance, extra_length: Of the sheets on the way to where the path comes from.
-    """
-
-    index: Any
-    frame: Any
-    weight: Any
-    transmittance: Any
-    extra_length: Any
+PathVisitor = Callable[[PathState, PathContribution, mit.Bool], None]
 
 
 @dataclass(frozen=True)
 class IntersectionPoint:
-    """Points of the curve.
+    """Samples of points on intersection curves.
 
     Attributes:
-        sample: What is drawn of them.
-        first, second: On either surface.
-        source: The surface points from which paths come, if not from an antenna.
+        index: sample numbers.
+        frame: radar poses.
+        weight: one over (samples × probability per metre).
+        transmission: transmission of the segment from the antenna or the source.
+        first, second: material points of the two surfaces.
+        source: previous surface point, for paths that do not come from an antenna.
     """
 
-    sample: IntersectionSample
+    index: mit.UInt32
+    frame: mit.UInt32
+    weight: mit.Float
+    transmission: SegmentTransmission
     first: SurfacePoint
     second: SurfacePoint
     source: SurfacePoint
 
     @property
     def size(self) -> int:
-        """How many there are."""
-        return dr.width(self.sample.index)
+        """Number of samples."""
+        return dr.width(self.index)
 
 
 class IntersectionCurveSampler:
-    """Points of the curves in which surfaces meet, and where paths come from that pass there."""
+    """Sampler of points on intersection curves and of the directions from which paths arrive.
+
+    Args:
+        rays: ray scene.
+        inputs: detached inputs.
+        curves: segments of the curves.
+        samples: number of points.
+        depth: most vertices of a path.
+        seed: seed of the points.
+    """
 
     def __init__(
         self,
@@ -91,16 +92,6 @@ class IntersectionCurveSampler:
         depth: int,
         seed: int,
     ) -> None:
-        """Prepare the choice of segments.
-
-        Args:
-            rays: The scene and its antennas.
-            inputs: Detached tables.
-            curves: Segments of the curves.
-            samples: How many points are drawn.
-            depth: Most vertices of a path.
-            seed: Of the points.
-        """
         self.rays, self.inputs, self.size, self.depth = rays, inputs, samples, depth
         ends = [(end - rays.origin).float() for end in (curves.start, curves.end)]
         self.ends = list(map(to_points, ends))
@@ -110,64 +101,71 @@ class IntersectionCurveSampler:
         self.first_frame = rays.object_scene(to_index(owner)) * rays.poses_per_scene
         entries = dr.arange(mi.UInt32, self.segments * rays.poses_per_scene)
         start, offset, frame = self._segment(entries)
-        legs = [dr.norm(start + 0.5 * offset - gather_points(t, frame)) for t in (rays.tx, rays.rx)]
+        middle = start + 0.5 * offset  # type: ignore[operator]
+        legs = [dr.norm(middle - gather_points(t, frame)) for t in (rays.tx, rays.rx)]
         weight = dr.norm(offset) / (legs[0] * legs[1])
         self.choice = DiscreteSampler(balance_by_scene(rays, rays.frame_scene(frame), weight))
         self.seeds = [scramble_seed(seed, stream) for stream in (12, 13, 14)]
 
-    def _segment(self, entry: Any) -> tuple[Any, Any, Any]:
+    def _segment(self, entry: mit.UInt32) -> tuple[mit.Point3f, mit.Vector3f, mit.UInt32]:
+        """Decode an entry: start and offset of the segment [m], and radar pose."""
         segment = entry % self.segments
         start, end = (gather_points(ends, segment) for ends in self.ends)
         frame = entry // self.segments
         if self.rays.scene_count > 1:
             frame += dr.gather(mi.UInt32, self.first_frame, segment)
-        return start, end - start, frame
+        return start, end - start, frame  # type: ignore[return-value]
 
-    def draw(self, index: Any) -> SampleBatch:
-        """The samples of the given indices below ``size``; those out of sight are void."""
+    def draw(self, index: mit.UInt32) -> SampleBatch[IntersectionPoint]:
+        """Draw the samples of given numbers; those that are not visible are void.
+
+        Args:
+            index: sample numbers below ``size``.
+        """
         rays, inputs, deep = self.rays, self.inputs, self.depth > 1
-        entry, along, chance = sample_edge_point(self.choice, index, self.size, self.seeds[0])
+        entry, along, probability = sample_edge_point(self.choice, index, self.size, self.seeds[0])
         start, offset, frame = self._segment(entry)
-        x, valid = start + offset * along, chance > 0
-        spots = []
+        x: mit.Point3f = start + offset * along  # type: ignore[operator]
+        valid = probability > 0
+        points = []
         for faces in self.faces:
             face = dr.gather(mi.UInt32, faces, entry % self.segments)
-            spots.append(SurfacePoint(face, *barycentric_coordinates(x, *rays.corners(face))))
-        places = [spot.place(inputs) for spot in spots]
-        normals = [place.normal for place in places]
+            points.append(SurfacePoint(face, *barycentric_coordinates(x, rays.corners(face))))
+        interactions = [integrand.compute_interaction(inputs, point) for point in points]
+        normals = [interaction.normal for interaction in interactions]
         count, receiver = decode_subpath(index, self.depth)
         antenna = inputs.antenna_position(frame, receiver)
-        way = dr.normalize(antenna - x)
+        incident = dr.normalize(antenna - x)
         if deep:
             numbers = mi.Point2f(*uniform_pair(index, self.seeds[1]))
             sphere = mi.Vector3f(mi.warp.square_to_uniform_sphere(numbers))
-            way = dr.select(count > 0, sphere, way)
-        origin = _offset_into_wedge(places[0], normals, way).position
-        seen = trace_transmission(rays, inputs, origin, antenna, valid & (count == 0))
-        exists, transmittance, extra = seen.transmittance > 0, seen.transmittance, seen.extra_length
+            incident = dr.select(count > 0, sphere, incident)
+        origin = _offset_into_wedge(interactions[0], normals, incident).position
+        transmission = trace_transmission(rays, inputs, origin, antenna, valid & (count == 0))
+        exists = transmission.transmittance > 0
         odds, source = mi.Float(1.0), SurfacePoint(mi.UInt32(0), mi.Float(0.0), mi.Float(0.0))
         if deep:
-            ray, key = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(way)), (index, self.seeds[2])
+            ray, key = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(incident)), (index, self.seeds[2])
             hit = trace_to_surface(rays, inputs, ray, valid & (count > 0), key, coherent=False)
-            met = hit.valid & rays.is_in_scene(frame, hit.face, hit.valid)
-            exists, odds, source = (
-                exists | met,
-                hit.probability,
-                SurfacePoint(hit.face, hit.b1, hit.b2),
-            )
-            transmittance = dr.select(count > 0, hit.transmittance, transmittance)
-            extra = dr.select(count > 0, hit.extra_length, extra)
-        weight = dr.norm(offset) / (chance * self.size * odds)
-        drawn = IntersectionSample(index, frame, weight, transmittance, extra)
-        return SampleBatch(valid & exists, (drawn, *spots, source), IntersectionPoint)
+            exists |= hit.valid & rays.is_in_scene(frame, hit.point.face, hit.valid)
+            odds, source = hit.probability, hit.point
+            transmission = dr.select(count > 0, hit.transmission, transmission)
+        weight = dr.norm(offset) / (probability * self.size * odds)
+        samples = IntersectionPoint(
+            index, frame, weight, transmission, points[0], points[1], source
+        )
+        return SampleBatch(valid & exists, samples)
 
 
-def decode_subpath(index: Any, depth: int) -> tuple[Any, Any]:
-    """How many surface points a path comes from, and whether it comes from the receiver.
+def decode_subpath(index: mit.UInt32, depth: int) -> tuple[mit.UInt32, mit.Bool | bool]:
+    """Decode the subpath before the curve from the number of a sample.
 
     Args:
-        index: Number of the sample.
-        depth: Most vertices of a path.
+        index: sample numbers.
+        depth: most vertices of a path.
+
+    Returns:
+        The number of surface points before the curve, and True if the path starts at the receiver.
     """
     if depth == 1:
         return mi.UInt32(0), False
@@ -175,9 +173,9 @@ def decode_subpath(index: Any, depth: int) -> tuple[Any, Any]:
 
 
 def _offset_into_wedge(
-    point: SurfaceInteraction, normals: Sequence[Any], direction: Any
+    point: SurfaceInteraction, normals: Sequence[mit.Vector3f], direction: mit.Vector3f
 ) -> SurfaceInteraction:
-    """The place a little off both surfaces, in the wedge between them that a direction leads to."""
+    """Move a point a little off both surfaces, into the wedge to which a direction leads."""
     first, second = (dr.mulsign(normal, dr.dot(normal, direction)) for normal in normals)
     step = (
         2
@@ -188,119 +186,196 @@ def _offset_into_wedge(
     return replace(point, position=point.position + (first + second) * step)
 
 
+class _IncidentSubpath:
+    """Part of paths from an antenna to a vertex on an intersection curve, detached.
+
+    Attributes:
+        interactions: interactions of the two surfaces.
+        count: number of surface points before the curve.
+        at_receiver: True if the path starts at the receiver.
+        other_end: True if the path ends at the receiver.
+        incident: unit direction from the curve to the previous vertex or the antenna.
+        throughput: product of the factors up to the curve.
+        length: optical length up to the curve [m].
+        keys: keys of the path state at the curve.
+    """
+
+    def __init__(
+        self, rays: RayScene, fixed: Inputs, walker: RandomWalk, points: IntersectionPoint,
+        depth: int,
+    ) -> None:  # fmt: skip
+        frame, index, added = points.frame, points.index, points.transmission.extra_length
+        self.rays, self.fixed, self.walker, self.depth = rays, fixed, walker, depth
+        self.points = points
+        self.interactions = [
+            integrand.compute_interaction(fixed, point) for point in (points.first, points.second)
+        ]
+        here = self.interactions[0]
+        self.count, self.at_receiver = count, at_receiver = decode_subpath(index, depth)
+        self.shared = rays.link.shared_visibility and depth == 1
+        self.other_end = True if isinstance(at_receiver, bool) else ~at_receiver
+        incident, distance = integrand.direction_and_distance(
+            here.position, fixed.antenna_position(frame, at_receiver)
+        )
+        departure = integrand.to_radar_frame(fixed, frame, -incident)
+        throughput = fixed.gain(frame, at_receiver, departure) / dr.square(distance)
+        length = distance + added
+        self.keys: dict[str, object] = {}
+        if depth > 1:
+            source, deep = integrand.compute_interaction(fixed, points.source, count > 0), count > 0
+            way, step = integrand.direction_and_distance(here.position, source.position)
+            medium = integrand.find_medium(fixed, here, source, way, deep)
+            odds = dr.abs(dr.dot(source.normal, way)) / (4 * dr.pi)
+            kept = dr.select(deep & (odds > 0), dr.exp(-medium.attenuation * step) / odds, 0.0)
+            first = walk.initial_state(
+                index, frame, points.source, -way, kept, medium.refractive_index * step + added
+            )
+            done = walker.trace_subpath(first, count, at_receiver)
+            incident = dr.select(deep, way, incident)
+            throughput = dr.select(deep, done["power"], throughput)
+            length = dr.select(deep, done["optical_length"], length)
+            self.keys = {
+                "to_receiver": self.other_end,
+                "u": dr.select(deep, done["u"], departure.x),
+                "v": dr.select(deep, done["v"], departure.y),
+                "previous_vertices": count,
+            }
+        self.incident, self.length = incident, length
+        self.throughput = throughput * (fixed.scale * depth * points.transmission.transmittance)
+
+    @property
+    def normals(self) -> list[mit.Vector3f]:
+        """Unit normals of the two surfaces."""
+        return [interaction.normal for interaction in self.interactions]
+
+
+@dataclass(frozen=True)
+class _CoveredSide:
+    """Paths that touch one surface at the curve, past the other surface.
+
+    Attributes:
+        subpath: part of the paths before the curve.
+        own, other: numbers of the surface that paths touch, and of the one that hides it.
+        sign: 1 for the side of the other surface that is open, −1 for the side behind it.
+    """
+
+    subpath: _IncidentSubpath
+    own: int
+    other: int
+    sign: float
+
+    @property
+    def facing(self) -> mit.Vector3f:
+        """Normal of the hiding surface, oriented towards the incident direction."""
+        hiding = self.subpath.interactions[self.other].normal
+        return dr.mulsign(hiding, dr.dot(hiding, self.subpath.incident))
+
+    def transmit(self, direction: mit.Vector3f) -> SegmentTransmission:
+        """Evaluate the transmission of the hiding surface, for directions that lead behind it.
+
+        Args:
+            direction: unit directions from the curve.
+        """
+        fixed, hiding = self.subpath.fixed, self.subpath.interactions[self.other]
+        cosine = dr.dot(self.facing * self.sign, direction)
+        if not fixed.surfaces.has_sheets:
+            return SegmentTransmission(dr.select(cosine > 0, 1.0, 0.0), mi.Float(0.0))
+        sheet = SegmentTransmission(
+            *fixed.surfaces.sheet_transmission(hiding.surface_row, dr.abs(cosine))
+        )
+        return dr.select(cosine > 0, SegmentTransmission.clear(), sheet)
+
+    def initial_state(self) -> PathState:
+        """Create the state of the paths at the curve, for unit velocity."""
+        before, points = self.subpath, self.subpath.points
+        passed = self.transmit(before.incident)
+        state = walk.initial_state(
+            points.index + _SUBPATH_OFFSET,
+            points.frame,
+            (points.first, points.second)[self.own],
+            before.incident,
+            throughput=before.throughput * passed.transmittance * self.sign,
+            length=before.length + passed.extra_length,
+            transmission=points.transmission if before.shared else None,
+        )
+        return walk.update_state(state, **before.keys)
+
+    def speed(self, inputs: Inputs) -> mit.Float:
+        """Compute the area that the curve sweeps per unit of θ, over the density; attached.
+
+        Args:
+            inputs: attached inputs.
+        """
+        points = self.subpath.points
+        spots = points.first, points.second
+        normals = self.subpath.normals
+        sine = dr.norm(dr.cross(normals[self.own], normals[self.other]))
+        offset = (
+            integrand.compute_interaction(inputs, spots[self.own]).position
+            - integrand.compute_interaction(inputs, spots[self.other]).position
+        )
+        return dr.dot(self.facing, offset) * (points.weight / sine)
+
+    def run(self, state: PathState, visit: PathVisitor) -> PathState:
+        """Connect the vertex at the curve to the antenna, and walk on from there.
+
+        Args:
+            state: state of the paths at the curve.
+            visit: function of the state, a path, and the mask of lanes in which it exists.
+        """
+        before, walker = self.subpath, self.subpath.walker
+        rays, fixed, depth = before.rays, before.fixed, before.depth
+        here, normals = before.interactions[self.own], before.normals
+        target = before.at_receiver if before.shared else before.other_end
+        end = fixed.antenna_position(before.points.frame, target)
+        onwards, _ = integrand.direction_and_distance(here.position, end)
+        point = _offset_into_wedge(here, normals, onwards)
+        path, exists = walk.connect_path(
+            rays, fixed, state, point, before.other_end, shared_visibility=before.shared
+        )
+        passed = self.transmit(onwards)
+        path = replace(
+            path,
+            power=path.power * passed.transmittance,
+            range=path.range + 0.5 * passed.extra_length,
+        )
+        visit(state, path, exists & (passed.transmittance > 0))
+        if depth == 1:
+            return state
+
+        def visit_connection(state: PathState, point: SurfaceInteraction) -> None:
+            visit(state, *walk.connect_path(rays, fixed, state, point, state["to_receiver"]))
+
+        state["active"] &= before.count + 1 < opaque(depth)
+        state = walker.step(state, _offset_into_wedge(here, normals, before.incident))
+        passed = self.transmit(-state["incident"])
+        state["active"] &= passed.transmittance > 0
+        state["throughput"] = state["throughput"] * passed.transmittance
+        state["length"] = state["length"] + passed.extra_length
+        return walker.run(state, opaque(depth) - before.count, visit_connection)
+
+
 def intersection_curve_paths(
     rays: RayScene, inputs: Inputs, walker: RandomWalk, points: IntersectionPoint, depth: int
-) -> Iterator[tuple[Any, PathState, Callable[..., PathState]]]:
-    """Speed, state and walk (see ``BoundaryPaths``) of the paths with a vertex on the curve.
+) -> Iterator[tuple[mit.Float, PathState, Callable[[PathState, PathVisitor], PathState]]]:
+    """Create the boundary paths with a vertex on an intersection curve.
 
     Args:
-        rays: The scene and its antennas.
-        inputs: Attached tables.
-        walker: Continues the paths.
-        points: Points of the curve.
-        depth: Most vertices of a path.
+        rays: ray scene.
+        inputs: attached inputs.
+        walker: random walk that extends the paths.
+        points: points on the curves.
+        depth: most vertices of a path.
+
+    Returns:
+        Velocity, initial state and walk of the paths of either surface, see ``BoundaryPaths``.
     """
-    fixed, drawn, spots = inputs.detach(), points.sample, (points.first, points.second)
-    frame, index = drawn.frame, drawn.index
-    places = [spot.compute_interaction(fixed) for spot in spots]
-    count, at_receiver = decode_subpath(index, depth)
-    shared = rays.link.shared_visibility and depth == 1
-    other_end = True if depth == 1 else ~at_receiver
-    back, distance = integrand.direction_and_distance(
-        places[0].position, fixed.antenna_position(frame, at_receiver)
-    )
-    seen = integrand.to_radar_frame(fixed, frame, -back)
-    throughput = fixed.gain(frame, at_receiver, seen) / dr.square(distance)
-    length, more = distance + drawn.extra_length, {}
-    if depth > 1:
-        source, deep = points.source.compute_interaction(fixed, count > 0), count > 0
-        way, step = integrand.direction_and_distance(places[0].position, source.position)
-        inside = integrand.find_medium(fixed, places[0], source, way, deep)
-        odds = dr.abs(dr.dot(source.normal, way)) / (4 * dr.pi)
-        kept = dr.select(deep & (odds > 0), dr.exp(-inside.attenuation * step) / odds, 0.0)
-        first = walk.initial_state(
-            index, frame, points.source.face, points.source.b1, points.source.b2, -way,
-            kept, inside.refractive_index * step + drawn.extra_length,
-        )  # fmt: skip
-        done = walker.trace_subpath(first, count, at_receiver)
-        back, throughput = dr.select(deep, way, back), dr.select(deep, done["amount"], throughput)
-        length = dr.select(deep, done["so_far"], length)
-        more = {
-            "to_receiver": other_end,
-            "u": dr.select(deep, done["u"], seen.x),
-            "v": dr.select(deep, done["v"], seen.y),
-            "earlier": count,
-        }
-    normals = [place.normal for place in places]
-    throughput *= fixed.scale * depth * drawn.transmittance
+    fixed = inputs.detach()
+    subpath = _IncidentSubpath(rays, fixed, walker, points, depth)
     for own, other in ((0, 1), (1, 0)):
-        here, hiding = places[own], places[other]
-        facing = dr.mulsign(hiding.normal, dr.dot(hiding.normal, back))
-        sine = dr.norm(dr.cross(here.normal, hiding.normal))
         for sign in (1.0, -1.0) if fixed.surfaces.has_sheets else (1.0,):
-            through = partial(_transmit_past_surface, fixed, hiding, facing * sign)
-
-            def run(
-                state: PathState,
-                visit: Callable[[PathState, PathContribution, Any], None],
-                here: SurfaceInteraction = here,
-                through: Callable[[Any], tuple[Any, Any]] = through,
-            ) -> PathState:
-                end = fixed.antenna_position(frame, at_receiver if shared else other_end)
-                onwards, _ = integrand.direction_and_distance(here.position, end)
-                point = _offset_into_wedge(here, normals, onwards)
-                path, exists = walk.connect_path(
-                    rays, fixed, state, point, other_end, shared_visibility=shared
-                )
-                let, longer = through(onwards)
-                path = replace(path, power=path.power * let, range=path.range + 0.5 * longer)
-                visit(state, path, exists & (let > 0))
-                if depth == 1:
-                    return state
-
-                def visit_connection(state: PathState, point: SurfaceInteraction) -> None:
-                    end = state["to_receiver"]
-                    visit(state, *walk.connect_path(rays, fixed, state, point, end))
-
-                state["active"] &= count + 1 < opaque(depth)
-                state = walker.step(state, _offset_into_wedge(here, normals, back))
-                let, longer = through(-state["back"])
-                state["active"] &= let > 0
-                state["throughput"] = state["throughput"] * let
-                state["length"] = state["length"] + longer
-                return walker.run(state, opaque(depth) - count, visit_connection)
-
-            let, longer = through(back)
-            state = walk.initial_state(
-                index + (1 << 29),
-                frame,
-                spots[own].face,
-                spots[own].b1,
-                spots[own].b2,
-                back,
-                throughput=throughput * let * sign,
-                length=length + longer,
-                transmission=SegmentTransmission(drawn.transmittance, drawn.extra_length)
-                if shared
-                else None,
-            )
-            apart = (
-                spots[own].compute_interaction(inputs).position
-                - spots[other].compute_interaction(inputs).position
-            )
-            speed = dr.dot(facing, apart) * (drawn.weight / sine)
-            yield speed, state | more, run
-
-
-def _transmit_past_surface(
-    fixed: Inputs, sheet: SurfaceInteraction, facing: Any, direction: Any
-) -> tuple[Any, Any]:
-    """What a surface lets through of a way to its back, and the length that this adds."""
-    cosine = dr.dot(facing, direction)
-    if not fixed.surfaces.has_sheets:
-        return dr.select(cosine > 0, 1.0, 0.0), mi.Float(0.0)
-    let, longer = fixed.surfaces.sheet_transmission(sheet.surface_row, dr.abs(cosine))
-    return dr.select(cosine > 0, 1.0, let), dr.select(cosine > 0, 0.0, longer)
+            side = _CoveredSide(subpath, own, other, sign)
+            yield side.speed(inputs), side.initial_state(), side.run
 
 
 def require_no_interreflection(
@@ -311,42 +386,42 @@ def require_no_interreflection(
     depth: int,
     seed: int,
 ) -> None:
-    """Refuse paths between surfaces that meet: the derivative of such paths does not converge.
+    """Refuse paths between surfaces that meet, whose derivative does not converge.
 
-    There are some wherever a path with one vertex less runs by way of the curve and both surfaces
+    Such paths exist if a path with one vertex less has a vertex on the curve and both surfaces
     scatter it.
 
     Args:
-        rays: The scene and its antennas.
-        fixed: Detached tables.
-        walker: Continues the paths.
-        curves: Where surfaces meet.
-        depth: Most vertices of a path.
-        seed: Of the points on the curve.
+        rays: ray scene.
+        fixed: detached inputs.
+        walker: random walk that extends the paths.
+        curves: intersection curves.
+        depth: most vertices of a path.
+        seed: seed of the points on the curves.
 
     Raises:
         InputError: There are such paths.
     """
-    looked_at = _CHECKED_POINTS * rays.scene_count
-    sampler = IntersectionCurveSampler(rays, fixed, curves, looked_at, depth - 1, seed)
-    found = sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress()
-    if not dr.width(found.sample.index):
+    samples = _CHECKED_POINTS * rays.scene_count
+    sampler = IntersectionCurveSampler(rays, fixed, curves, samples, depth - 1, seed)
+    points = sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress()
+    if not points.size:
         return
-    lit = [dr.zeros(mi.Bool, dr.width(found.sample.index)) for _ in range(2)]
 
-    for number, (_, state, run) in enumerate(
-        intersection_curve_paths(rays, fixed, walker, found, depth - 1)
-    ):
+    def record_existing(state: PathState, _: PathContribution, exists: mit.Bool) -> None:
+        state["exists"] = state["exists"] | exists
 
-        def visit(state: PathState, _: PathContribution, exists: Any) -> None:
-            state["lit"] = state["lit"] | exists
-
-        state["lit"] = dr.zeros(mi.Bool, dr.width(found.sample.index))
-        lit[number % 2] |= run(state, visit)["lit"]
-    both = lit[0] | lit[1] if fixed.surfaces.has_sheets else lit[0] & lit[1]
-    lanes = dr.compress(both)
+    scattered = [dr.zeros(mi.Bool, points.size) for _ in range(2)]
+    families = intersection_curve_paths(rays, fixed, walker, points, depth - 1)
+    for number, (_, state, run) in enumerate(families):
+        state["exists"] = dr.zeros(mi.Bool, points.size)
+        scattered[number % 2] |= run(state, record_existing)["exists"]
+    first, second = scattered
+    lanes = dr.compress(first | second if fixed.surfaces.has_sheets else first & second)
     if dr.width(lanes):
-        faces = [dr.gather(mi.UInt32, spot.face, lanes[0]) for spot in (found.first, found.second)]
+        faces = [
+            dr.gather(mi.UInt32, spot.face, lanes[0]) for spot in (points.first, points.second)
+        ]
         owners = [int(rays.topology.face_object[int(face[0])]) for face in faces]
         names = " and ".join(dict.fromkeys(rays.geometry.names[owner] for owner in owners))
         raise InputError(

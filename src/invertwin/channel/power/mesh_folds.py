@@ -1,9 +1,11 @@
 """Folds of a mesh that rays past its edges would miss: followed triangle by triangle in float64."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TypedDict
 
 from invertwin.channel.rays.arrays import opaque
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.intersections import PLANE_TOLERANCE
 from invertwin.channel.rays.ray_scene import RayScene
 
@@ -12,16 +14,36 @@ from invertwin.channel.rays.ray_scene import RayScene
 _MIN_FOLD_TRIANGLES, _MAX_FOLD_TRIANGLES = 8, 256
 
 
+class _FoldState(TypedDict):
+    """State of the loop over the triangles of a fold.
+
+    Attributes:
+        edge, face: edge crossed last and triangle entered.
+        going: lanes that continue.
+        found: lanes where the fold hides the ray.
+        count: number of triangles so far.
+        height, reach: height above the ray and distance along it at the last edge [m].
+    """
+
+    edge: mit.UInt32
+    face: mit.UInt32
+    going: mit.Bool
+    found: mit.Bool
+    count: mit.UInt32
+    height: mit.Float64
+    reach: mit.Float64
+
+
 def is_hidden_by_fold(
     rays: RayScene,
-    edge: Any,
-    point: Any,
-    direction: Any,
-    outward: Any,
-    clearance: Any,
-    start_distance: Any,
-    active: Any,
-) -> Any:
+    edge: mit.UInt32,
+    point: mit.Vector3d,
+    direction: mit.Vector3d,
+    outward: mit.Vector3d,
+    clearance: mit.Float64,
+    start_distance: mit.Float64,
+    active: mit.Bool,
+) -> mit.Bool:
     """Whether the mesh around an edge leads back into the way past it, where rays would miss it.
 
     Rays pass a little beside the edge and start a little off it, so they miss the folds of a fine
@@ -43,8 +65,8 @@ def is_hidden_by_fold(
     across, along = dr.cross(direction, outward), dr.normalize(direction)
     start, found = mi.UInt32(edge), mi.Bool(False)
 
-    def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
-        state = dict(state)
+    def body(state: _FoldState) -> tuple[_FoldState]:
+        state = state.copy()
         entry, face, going = state["edge"], state["face"], state["going"]
         corners = dr.gather(mi.Vector3u, topology.device_welded_faces, face, going)
         sides = dr.gather(mi.Vector3i, topology.device_face_edges, face, going)

@@ -1,14 +1,16 @@
-"""Paths over surface points, drawn vertex by vertex in one symbolic loop.
+"""Random walks over surface points, sampled vertex by vertex in one symbolic loop.
 
-The loop is compiled once for any depth, and keeps no vertex unless asked to: then it writes one
-`PathRecords` row a vertex, from which derivatives are replayed (``channel/power/replay.py``).
-Detached.
+The loop is compiled once for any depth. It stores no vertices unless records are requested: then
+it writes one row of `PathRecords` per vertex, from which derivatives are replayed
+(``channel/power/replay.py``). Detached.
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypedDict, cast
 
 from invertwin.channel.power import integrand
 from invertwin.channel.power.bins import PathContribution
@@ -20,70 +22,128 @@ from invertwin.channel.power.transmission import (
     trace_transmission,
 )
 from invertwin.channel.rays.arrays import opaque, scramble_seed, uniform_pair
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
+from invertwin.channel.rays.surface_point import SurfacePoint
 
-_MIN_SURVIVAL = 0.1  # of Russian roulette
-_MIN_ROULETTE_VERTICES = 3  # vertices after which it begins; shorter paths have less noise without
-_STREAM_STEP = 0x9E3779B9  # seeds of successive vertices
+_MIN_SURVIVAL = 0.1  # least survival probability of Russian roulette
+_MIN_ROULETTE_VERTICES = 3  # vertices before roulette begins; it adds noise to shorter paths
+_STREAM_STEP = 0x9E3779B9  # difference of the seeds of successive vertices
 
-#: A path at its latest vertex, one lane each: what the loop carries.
-PathState = dict[str, Any]
+
+class PathState(TypedDict):
+    """State of the loop over the vertices of paths, one lane a path.
+
+    The keys up to ``length`` are always present; the loop, its visitors and its callers add the
+    others, as they need them.
+
+    Attributes:
+        index: number of the path, which selects its random numbers.
+        number: number of vertices so far.
+        active: paths that continue.
+        frame: radar pose.
+        face, b1, b2: latest vertex: triangle and barycentric coordinates.
+        incident: unit direction from the latest vertex to the one before.
+        throughput: product of all factors up to the latest vertex, over the sampling density.
+        length: optical length up to the latest vertex [m].
+        transmittance, extra: transmission of the first segment: power factor and added length [m].
+        last: number of vertices at which a path ends.
+        position, normal, surface: location of the latest vertex (see ``SurfaceInteraction``).
+        weight: one over the probability of the path's points per area.
+        previous_vertices: vertices of the subpath that this one continues.
+        to_receiver: True for paths that end at the receiver.
+        u, v: direction cosines at the receiver, of paths that start there.
+        power, optical_length: result of ``trace_subpath``; the length in metres.
+        total: sum that a visitor forms.
+        exists: True once a visitor has met a path of the lane.
+        lane, count: lane of the path, and its recorded vertices.
+    """
+
+    index: mit.UInt32
+    number: mit.UInt32
+    active: mit.Bool
+    frame: mit.UInt32
+    face: mit.UInt32
+    b1: mit.Float
+    b2: mit.Float
+    incident: mit.Vector3f
+    throughput: mit.Float
+    length: mit.Float
+    transmittance: mit.Float
+    extra: mit.Float
+    last: mit.UInt32
+    position: mit.Point3f
+    normal: mit.Vector3f
+    surface: mit.UInt32
+    weight: mit.Float
+    previous_vertices: mit.UInt32
+    to_receiver: mit.Bool | bool
+    u: mit.Float
+    v: mit.Float
+    power: mit.Float
+    optical_length: mit.Float
+    total: mit.Float
+    exists: mit.Bool
+    lane: mit.UInt32
+    count: mit.UInt32
 
 
 def initial_state(
-    index: Any,
-    frame: Any,
-    face: Any,
-    b1: Any,
-    b2: Any,
-    incident: Any,
-    throughput: Any,
-    length: Any,
+    index: mit.UInt32,
+    frame: mit.UInt32,
+    point: SurfacePoint,
+    incident: mit.Vector3f,
+    throughput: mit.Float,
+    length: mit.Float,
     transmission: SegmentTransmission | None = None,
 ) -> PathState:
-    """The state at the first vertex.
-
-    A state with a ``weight`` also follows one over the probability of its points per area. One with
-    ``earlier`` continues paths that have had so many vertices.
+    """Create the state at the first vertex of paths.
 
     Args:
-        index: Number of the path.
-        frame: Radar pose.
-        face: Triangle.
-        b1, b2: Barycentric coordinates.
-        incident: Unit direction to where the path comes from.
-        throughput: All factors up to arriving here, over the probability of the samples.
-        length: Of the path so far [m].
-        transmission: What lies on the first segment, for antennas that share what they see.
+        index: path numbers, which select the random numbers.
+        frame: radar poses.
+        point: first vertices.
+        incident: unit directions from the vertex to the start of the path.
+        throughput: product of all factors up to the vertex, over the sampling density.
+        length: optical lengths up to the vertex [m].
+        transmission: transmission of the first segment, for antennas with one visibility test.
     """
     count = dr.width(index)
-    return {
+    state: dict[str, object] = {
         "index": index,
         "number": dr.full(mi.UInt32, 1, count),
         "active": throughput != 0,
         "frame": frame,
-        "face": face,
-        "b1": b1,
-        "b2": b2,
-        "back": mi.Vector3f(incident),
+        "face": point.face,
+        "b1": point.b1,
+        "b2": point.b2,
+        "incident": mi.Vector3f(incident),
         "throughput": throughput,
         "length": length,
-        **(
-            {}
-            if transmission is None
-            else {"transmittance": transmission.transmittance, "extra": transmission.extra_length}
-        ),
     }
+    if transmission is not None:
+        state["transmittance"] = transmission.transmittance
+        state["extra"] = transmission.extra_length
+    return cast(PathState, state)  # the other keys are added as they are needed
+
+
+def update_state(state: PathState, **changes: object) -> PathState:
+    """Copy a path state with some keys changed or added.
+
+    Args:
+        state: state of the loop.
+        changes: keys of `PathState` and their arrays.
+    """
+    return cast(PathState, {**state, **changes})
 
 
 class RandomWalk:
-    """Continues paths, and shows every vertex to a visitor.
+    """Random walk that extends paths and calls a visitor at every vertex.
 
     Args:
-        rays: The scene and its antennas.
-        inputs: Detached tables.
-        seed: Of the directions.
+        rays: ray scene.
+        inputs: detached inputs.
+        seed: seed of the directions.
     """
 
     def __init__(self, rays: RayScene, inputs: Inputs, seed: int) -> None:
@@ -93,18 +153,21 @@ class RandomWalk:
 
     @cached_property
     def direction_sampler(self) -> DirectionSampler:
-        """How paths go on; those of one bounce never ask."""
+        """Sampler of the directions after a vertex; paths of one bounce do not need it."""
         return DirectionSampler(self.rays, self.inputs.surfaces)
 
     def run(
-        self, state: PathState, depth: Any, visit: Callable[[PathState, SurfaceInteraction], None]
+        self,
+        state: PathState,
+        depth: mit.UInt32 | int,
+        visit: Callable[[PathState, SurfaceInteraction], None],
     ) -> PathState:
-        """Walk to the end of all paths; returns the last state.
+        """Walk to the end of all paths and return the last state.
 
         Args:
-            state: The first vertex.
-            depth: Most vertices (a number, or one per lane).
-            visit: Called at every vertex; may change what it put into the state itself.
+            state: state at the first vertex.
+            depth: most vertices of a path (a number, or one per lane).
+            visit: function of the state and the latest vertex; may change its own keys.
         """
         if isinstance(depth, int) and depth == 1:
             visit(state, self._compute_interaction(state))
@@ -112,22 +175,23 @@ class RandomWalk:
         directions = self.direction_sampler  # uploaded before the loop is recorded
         last = opaque(depth) if isinstance(depth, int) else depth
         lanes = dr.width(state["index"])
-        state = {**state, "last": mi.UInt32(last) + dr.zeros(mi.UInt32, lanes)}
-        # Carried, since a vertex is located where it is found.
-        state |= self._compute_interaction(state).detached_state
+        # The loop carries the position, since a vertex is located when it is sampled.
+        position = self._compute_interaction(state).detached_state
+        last = mi.UInt32(last) + dr.zeros(mi.UInt32, lanes)
+        state = update_state(state, last=last, **position)
 
         def extend(state: PathState) -> tuple[PathState]:
-            state = dict(state)
+            state = state.copy()
             self._extend(state, SurfaceInteraction.from_state(state), directions)
             return (state,)
 
         def stop(state: PathState) -> tuple[PathState]:
-            return ({**state, "active": mi.Bool(False)},)
+            return (update_state(state, active=mi.Bool(False)),)
 
         def body(state: PathState) -> tuple[PathState]:
-            state = dict(state)
+            state = state.copy()
             visit(state, SurfaceInteraction.from_state(state))
-            # Packets of paths that have come to their last vertex spare the next one.
+            # Packets of paths at their last vertex skip the next one.
             going = state["active"] & (state["number"] < state["last"])
             return dr.if_stmt((state,), going, extend, stop, mode="symbolic")
 
@@ -135,34 +199,41 @@ class RandomWalk:
         return state
 
     def step(self, state: PathState, point: SurfaceInteraction | None = None) -> PathState:
-        """One more vertex, outside any loop.
+        """Extend paths by one vertex, outside any loop.
 
         Args:
-            state: The path so far.
-            point: Its latest vertex, if not quite where the state has it.
+            state: state at the latest vertex.
+            point: latest vertex, if it differs from that of the state.
         """
-        state = {**state, "last": state["number"] + 1}
+        state = update_state(state, last=state["number"] + 1)
         self._extend(state, point or self._compute_interaction(state), self.direction_sampler)
         return state
 
-    def trace_subpath(self, first: PathState, count: Any, receiver: Any) -> PathState:
-        """The one path with ``count`` vertices that ends at an antenna: its amount and ``so_far``.
+    def trace_subpath(
+        self, first: PathState, count: mit.UInt32, receiver: mit.Bool | bool
+    ) -> PathState:
+        """Trace the one path of a given number of vertices that ends at an antenna.
 
         Args:
-            first: Paths at their first vertex.
-            count: Vertices, one number per lane.
-            receiver: Whether the path ends at the receiver; then ``u`` and ``v`` are set too.
+            first: state at the first vertex.
+            count: numbers of vertices, one per lane.
+            receiver: True for paths that end at the receiver; ``u`` and ``v`` are then set.
+
+        Returns:
+            The last state, with ``power`` and ``optical_length`` [m] of the path.
         """
         zero = dr.zeros(mi.Float, dr.width(first["index"]))
-        first = first | {"u": zero, "v": zero, "amount": zero, "so_far": zero, "here": receiver}
-        # What the antennas' polarisations take counts once, at the other end.
+        first = update_state(
+            first, u=zero, v=zero, power=zero, optical_length=zero, to_receiver=receiver
+        )
+        # The polarisation factor counts once, at the other end.
         inputs = replace(self.inputs, coupling=(1.0, 1.0))
 
         def record_last(state: PathState, point: SurfaceInteraction) -> None:
-            path, exists = connect_path(self.rays, inputs, state, point, state["here"])
+            path, exists = connect_path(self.rays, inputs, state, point, state["to_receiver"])
             last = exists & (state["number"] == state["last"])
-            state["amount"] = dr.select(last, path.power, state["amount"])
-            state["so_far"] = dr.select(last, 2 * path.range, state["so_far"])
+            state["power"] = dr.select(last, path.power, state["power"])
+            state["optical_length"] = dr.select(last, 2 * path.range, state["optical_length"])
             state["u"] = dr.select(last, path.u, state["u"])
             state["v"] = dr.select(last, path.v, state["v"])
 
@@ -171,23 +242,25 @@ class RandomWalk:
 
     def _compute_interaction(self, state: PathState) -> SurfaceInteraction:
         return integrand.compute_interaction(
-            self.inputs, state["face"], state["b1"], state["b2"], state["active"]
+            self.inputs, SurfacePoint(state["face"], state["b1"], state["b2"]), state["active"]
         )
 
     def _extend(
         self, state: PathState, point: SurfaceInteraction, direction_sampler: DirectionSampler
     ) -> None:
-        """Draw the next vertex into the state; paths that miss or are too long end."""
+        """Sample the next vertex into the state; paths that miss or are too long end."""
         active = state["active"] & (state["number"] < state["last"])
-        back = state["back"]
+        incident = state["incident"]
         scene = self.rays.frame_scene(state["frame"])
         numbers = self._uniform_numbers(state)
-        drawn = direction_sampler.draw(point, back, numbers, scene)
-        omega = drawn.omega
+        sample = direction_sampler.draw(point, incident, numbers, scene)
+        omega = sample.omega
         scattered = self.inputs.surfaces.evaluate_scattering(
-            point.surface_row, point.normal, back, mi.Vector3f(omega)
+            point.surface_row, point.normal, incident, mi.Vector3f(omega)
         )
-        ratio: Any = scattered / (drawn.lobe_density * dr.abs(dr.dot(point.normal, back)))
+        ratio: mit.Float = scattered / (
+            sample.lobe_density * dr.abs(dr.dot(point.normal, incident))
+        )
         survival = dr.select(
             state["number"] >= _MIN_ROULETTE_VERTICES,
             dr.minimum(dr.maximum(ratio, _MIN_SURVIVAL), 1.0),
@@ -199,30 +272,35 @@ class RandomWalk:
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega))
         key = state["index"], self.seed + (state["number"] * 5 + 4) * _STREAM_STEP
         hit = trace_to_surface(self.rays, self.inputs, ray, active, key, coherent=False)
-        active &= hit.valid & self.rays.is_in_scene(state["frame"], hit.face, active)
-        found = integrand.compute_interaction(self.inputs, hit.face, hit.b1, hit.b2, active)
+        active &= hit.valid & self.rays.is_in_scene(state["frame"], hit.point.face, active)
+        found = integrand.compute_interaction(self.inputs, hit.point, active)
         to_point, distance = integrand.direction_and_distance(found.position, point.position)
-        cosine: Any = dr.abs(dr.dot(found.normal, to_point))
+        cosine: mit.Float = dr.abs(dr.dot(found.normal, to_point))
         active &= (cosine > 1e-6) & (distance > 0)
-        inside = integrand.find_medium(self.inputs, point, found, -to_point, active)
-        density = direction_sampler.density(point, drawn, hit.face, active, scene)
+        medium = integrand.find_medium(self.inputs, point, found, -to_point, active)
+        density = direction_sampler.density(point, sample, hit.point.face, active, scene)
         active &= density > 0
         odds = density * survival * cosine * hit.probability
-        weight = scattered * hit.transmittance * dr.exp(-inside.attenuation * distance) / odds
+        weight = (
+            scattered
+            * hit.transmission.transmittance
+            * dr.exp(-medium.attenuation * distance)
+            / odds
+        )
         state["throughput"] = dr.select(active, state["throughput"] * weight, 0.0)
         if "weight" in state:
             state["weight"] = state["weight"] * dr.square(distance) / odds
-        state["face"], state["b1"], state["b2"] = hit.face, hit.b1, hit.b2
-        state |= found.detached_state
-        state["back"] = mi.Vector3f(to_point)
-        state["length"] = state["length"] + inside.refractive_index * distance + hit.extra_length
+        state["face"], state["b1"], state["b2"] = hit.point.face, hit.point.b1, hit.point.b2
+        state.update(found.detached_state)  # type: ignore[arg-type]
+        state["incident"] = mi.Vector3f(to_point)
+        state["length"] = (
+            state["length"] + medium.refractive_index * distance + hit.transmission.extra_length
+        )
         state["number"] = state["number"] + 1
         state["active"] = active
 
-    def _uniform_numbers(self, state: PathState) -> list[Any]:
-        """Six uniform numbers of this vertex; ``trace_to_surface`` has a stream of its own after
-        them.
-        """
+    def _uniform_numbers(self, state: PathState) -> list[mit.Float]:
+        """Draw six uniform numbers for this vertex; ``trace_to_surface`` has a later stream."""
         numbers = []
         for stream in range(3):
             seed = self.seed + (state["number"] * 5 + stream) * _STREAM_STEP
@@ -235,26 +313,29 @@ def connect_path(
     inputs: Inputs,
     state: PathState,
     point: SurfaceInteraction,
-    receiver: Any,
+    receiver: mit.Bool | bool,
     *,
-    min_vertices: Any = 1,
+    min_vertices: mit.UInt32 | int = 1,
     shared_visibility: bool = False,
     monostatic: bool = False,
     antenna: integrand.AntennaPose | None = None,
-) -> tuple[PathContribution, Any]:
-    """The path that ends at the latest vertex, and whether it exists.
+) -> tuple[PathContribution, mit.Bool]:
+    """Connect the latest vertex to an antenna.
 
     Args:
-        rays: Rays.
-        inputs: Detached.
-        state: The path so far.
-        point: Its latest vertex.
-        receiver: Whether the path ends at the receiver (a bool, or one per lane). Where it ends at
-            the transmitter, the state knows the receiver's direction ``u``, ``v``.
-        min_vertices: Fewest vertices of a path (a number, or one per lane).
-        shared_visibility: What the antenna at the start sees, the one at the end sees too.
-        monostatic: Both are one.
-        antenna: The antenna at the end, if it has been looked up.
+        rays: ray scene.
+        inputs: detached inputs.
+        state: state at the latest vertex.
+        point: latest vertex.
+        receiver: True for paths that end at the receiver (a bool, or one per lane). Paths that
+            end at the transmitter take the receiver's direction ``u``, ``v`` from the state.
+        min_vertices: fewest vertices of a path (a number, or one per lane).
+        shared_visibility: True if one visibility test serves both antennas.
+        monostatic: True if both antennas are one.
+        antenna: pose of the antenna at the end, if it has been looked up.
+
+    Returns:
+        The path that ends there, and the mask of lanes in which it exists.
     """
     antenna = antenna or integrand.AntennaPose.look_up(
         inputs, state["frame"], receiver, state["active"]
@@ -263,15 +344,16 @@ def connect_path(
         inputs,
         state["frame"],
         point,
-        state["back"],
+        state["incident"],
         receiver,
         is_same_antenna=monostatic,
         antenna=antenna,
     )
-    u, v = found.direction.x, found.direction.y
+    u: mit.Float = found.direction.x  # type: ignore[assignment]
+    v: mit.Float = found.direction.y  # type: ignore[assignment]
     if receiver is not True:
         u, v = dr.select(receiver, u, state["u"]), dr.select(receiver, v, state["v"])
-    bounces = state["number"] + state.get("earlier", 0)
+    bounces = state["number"] + state.get("previous_vertices", 0)
     power = state["throughput"] * found.factor * inputs.polarisation_factor(bounces)
     exists = state["active"] & (power != 0) & (state["number"] >= min_vertices)
     one, none = mi.Float(1.0), mi.Float(0.0)
@@ -287,42 +369,55 @@ def connect_path(
     )
 
 
-@dataclass(frozen=True)
-class PathVertex(integrand.SurfacePoint):
-    """One vertex of every path."""
+@dataclass
+class PathVertex(SurfacePoint):
+    """Vertex of paths.
 
-    throughput: Any  # all factors so far; zero where the path has ended before
-    is_visible: Any  # whether the vertex is connected to the receiver
+    Attributes:
+        throughput: product of all factors up to the vertex; zero if the path has ended before.
+        is_visible: True if the vertex is connected to the receiver; None if that is not known.
+    """
+
+    throughput: mit.Float
+    is_visible: mit.Bool | None
 
     @property
-    def exists(self) -> Any:
-        """Which paths come here."""
-        return self.throughput != 0
+    def exists(self) -> mit.Bool:
+        """Mask of the paths that have this vertex."""
+        return self.throughput != 0  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
 class PathRecords:
     """Vertices of paths.
 
-    What tells a vertex is written and read at once, as four numbers: triangle (its bits), two
-    barycentric coordinates, and the throughput, negative where the vertex is not seen. Of vertices
-    that a path never had, nothing is written.
+    A vertex is written and read as four numbers: triangle (its bits), two barycentric coordinates,
+    and the throughput, negative if the vertex is not visible. Vertices beyond the end of a path
+    are not written.
+
+    Attributes:
+        path_count: number of paths.
+        depth: most vertices of a path.
+        frame: radar pose of each path.
+        count: number of vertices of each path.
+        rows: four numbers each, [vertex × path], or four arrays for paths of one vertex.
+        length: optical length from the transmitter to each vertex [m], [vertex × path].
     """
 
-    path_count: int  # paths
-    depth: int  # vertices of a path
-    frame: Any  # radar pose of a lane
-    count: Any  # vertices of a lane
-    rows: Any  # four numbers each: [vertex × lane], or four arrays for paths of one vertex
-    length: Any  # from the transmitter to the vertex [m], [vertex × lane]
+    path_count: int
+    depth: int
+    frame: mit.UInt32
+    count: mit.UInt32
+    rows: mit.Float | mit.Vector4f
+    length: mit.Float
 
     @staticmethod
-    def from_single_vertex(state: PathState, is_visible: Any) -> "PathRecords":
-        """Records of paths of one vertex.
+    def from_single_vertex(state: PathState, is_visible: mit.Bool) -> PathRecords:
+        """Record paths of one vertex.
 
         Args:
-            state: The path so far.
-            is_visible: Whether the vertex is connected to the receiver.
+            state: state at the vertex.
+            is_visible: True if the vertex is connected to the receiver.
         """
         lanes = dr.width(state["index"])
         count = dr.ones(mi.UInt32, lanes)
@@ -331,12 +426,12 @@ class PathRecords:
         )
 
     @staticmethod
-    def allocate(state: PathState, depth: int) -> "PathRecords":
-        """Room for paths that start in this state.
+    def allocate(state: PathState, depth: int) -> PathRecords:
+        """Allocate records of paths.
 
         Args:
-            state: The path so far.
-            depth: Most vertices of a path.
+            state: state at the first vertex.
+            depth: most vertices of a path.
         """
         lanes = dr.width(state["index"])
         rows, length = dr.empty(mi.Float, 4 * lanes * depth), dr.empty(mi.Float, lanes * depth)
@@ -344,52 +439,52 @@ class PathRecords:
         return PathRecords(lanes, depth, state["frame"], count, rows, length)
 
     @property
-    def columns(self) -> list[Any]:
+    def columns(self) -> list[mit.UInt32 | mit.Float | mit.Vector4f]:
         """All arrays."""
         return [self.frame, self.count, self.rows, self.length]
 
-    def read_vertex(self, number: Any, active: Any = True) -> PathVertex:
-        """One vertex of every path.
+    def read_vertex(self, number: mit.UInt32, active: mit.Bool | bool = True) -> PathVertex:
+        """Read one vertex of every path.
 
         Args:
-            number: Of the vertex, from 0.
-            active: Lanes.
+            number: vertex numbers, from 0.
+            active: mask of active lanes.
         """
-        row = self.rows
+        row: Any = self.rows
         if self.depth > 1:
             there = active & (number < self.count)
             row = dr.gather(mi.Vector4f, self.rows, self._row_indices(number), there)
         face = dr.reinterpret_array(mi.UInt32, row.x)
         return PathVertex(face, row.y, row.z, dr.abs(row.w), row.w > 0)
 
-    def length_at(self, number: Any, active: Any) -> Any:
-        """Length of every path up to one of its vertices [m].
+    def length_at(self, number: mit.UInt32, active: mit.Bool) -> mit.Float:
+        """Read the optical length of every path up to one of its vertices [m].
 
         Args:
-            number: Of the vertex, from 0.
-            active: Paths that have it.
+            number: vertex numbers, from 0.
+            active: mask of paths that have the vertex.
         """
         if self.depth == 1:
             return self.length
         return dr.gather(mi.Float, self.length, self._row_indices(number), active)
 
-    def write(self, state: PathState, is_visible: Any) -> None:
-        """Store the latest vertex.
+    def write(self, state: PathState, is_visible: mit.Bool) -> None:
+        """Write the latest vertex.
 
         Args:
-            state: The path so far; ``count`` in it comes to be the number of its vertices.
-            is_visible: Whether the vertex is connected to the receiver.
+            state: state at the vertex; its ``count`` is set to the number of vertices.
+            is_visible: True if the vertex is connected to the receiver.
         """
         state["count"] = state["number"]
         at = (state["number"] - 1) * self.path_count + state["lane"]
         dr.scatter(self.rows, _pack_vertex(state, is_visible), at, state["active"])
         dr.scatter(self.length, state["length"], at, state["active"])
 
-    def _row_indices(self, number: Any) -> Any:
+    def _row_indices(self, number: mit.UInt32) -> mit.UInt32:
         return number * self.path_count + dr.arange(mi.UInt32, self.path_count)
 
 
-def _pack_vertex(state: PathState, is_visible: Any) -> Any:
+def _pack_vertex(state: PathState, is_visible: mit.Bool) -> mit.Vector4f:
     throughput = dr.select(is_visible, state["throughput"], -state["throughput"])
     face = dr.reinterpret_array(mi.Float, state["face"])
     return mi.Vector4f(face, state["b1"], state["b2"], throughput)

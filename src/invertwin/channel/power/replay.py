@@ -1,90 +1,131 @@
-"""Derivatives of paths, replayed vertex by vertex from their records.
+"""Path replay: derivatives of paths, vertex by vertex, from their records.
 
 In material form the vertices of a path are independent of each other: vertex k enters only with
-its neighbours. So the adjoint of a path and of all its beginnings is one sweep from its far end,
-which carries two sums, Σ C ∂L/∂C and Σ ∂L/∂R over the paths that go on beyond the vertex. Nothing
-but the records is stored, whatever the depth; the tangent is one sweep from the near end.
+its neighbours. The adjoint of a path and of all its prefixes is therefore one sweep from its far
+end, which carries two sums, Σ C ∂L/∂C and Σ ∂L/∂R, over the paths that continue beyond the vertex.
+Nothing but the records is stored, whatever the depth; the tangent is one sweep from the near end
+(path replay backpropagation, Vicini et al. 2021).
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TypeVar
 
 from invertwin.channel.power import integrand
-from invertwin.channel.power.bins import PathContribution
-from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
+from invertwin.channel.power.bins import FourFloats, PathContribution
+from invertwin.channel.power.integrand import Inputs, InteractionState, SurfaceInteraction
 from invertwin.channel.power.random_walk import PathRecords, PathVertex
 from invertwin.channel.power.transmission import (
+    Carry,
     SegmentTransmission,
     trace_transmission,
     visit_sheets,
 )
 from invertwin.channel.rays.arrays import opaque
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.ray_scene import RayScene
+from invertwin.channel.rays.surface_point import SurfacePoint
+
+Sums = tuple[mit.Float, mit.Float]
+Position = Callable[[], mit.Point3f]
+Gradient = TypeVar("Gradient")
 
 
 @dataclass(frozen=True)
 class _VertexFactors:
-    """The attached factors at one vertex; detached throughput and masks."""
+    """Factors of a path at one vertex.
 
-    active: Any
-    has_next: Any
-    is_visible: Any
-    throughput: Any
-    length: Any
-    frame: Any
-    incident_factor: Any  # gain at the start, 1/R² of the segment here, Jacobian
-    optical_length: Any  # optical length of the segment here
+    The masks, the throughput and the length are detached; the factors are attached.
+
+    Attributes:
+        active: mask of paths with this vertex.
+        has_next: mask of paths with a further vertex.
+        is_visible: mask of vertices that are connected to the receiver.
+        throughput: product of all factors up to the vertex.
+        length: optical length up to the vertex [m].
+        frame: radar poses.
+        incident_factor: gain at the start, 1/R² of the segment before the vertex, Jacobian.
+        optical_length: optical length of that segment [m].
+        connection: segment from the vertex to the receiver.
+        polarisation_factor: polarisation factor of the path that ends here.
+        scattering_factor: scattering towards the next vertex.
+        transmission: transmission of the connection.
+        shares_segment: mask of connections with the same transmission as the segment before.
+        endpoints: functions that locate the previous vertex, this one, and the receiver.
+    """
+
+    active: mit.Bool
+    has_next: mit.Bool
+    is_visible: mit.Bool
+    throughput: mit.Float
+    length: mit.Float
+    frame: mit.UInt32
+    incident_factor: mit.Float
+    optical_length: mit.Float
     connection: integrand.AntennaConnection
-    polarisation_factor: Any  # what the antennas' polarisations take of the path that ends here
-    scattering_factor: Any  # towards the next vertex
-    transmission: SegmentTransmission  # by the connection
-    shares_segment: Any  # whether the connection passes what the segment here passed
-    endpoints: tuple[
-        Callable[[], Any], Callable[[], Any], Callable[[], Any]
-    ]  # before, here, receiver
+    polarisation_factor: mit.Float
+    scattering_factor: mit.Float
+    transmission: SegmentTransmission
+    shares_segment: mit.Bool
+    endpoints: tuple[Position, Position, Position]
 
     def to_contribution(self) -> PathContribution:
-        """The path that ends here."""
-        found, passed = self.connection, self.transmission
-        power = self.throughput * found.factor * passed.transmittance * self.polarisation_factor
-        length = 0.5 * (self.length + found.distance + passed.extra_length)
-        return PathContribution(self.frame, power, length, found.direction.x, found.direction.y)
+        """Contribution of the path that ends at the vertex."""
+        end, passed = self.connection, self.transmission
+        power = self.throughput * end.factor * passed.transmittance * self.polarisation_factor
+        length = 0.5 * (self.length + end.distance + passed.extra_length)
+        u, v = end.direction.x, end.direction.y
+        return PathContribution(self.frame, power, length, u, v)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class _VertexNeighbours:
-    """A vertex and its neighbours on the path, as far as there are any."""
+    """Vertex and its neighbours on the path.
+
+    Attributes:
+        vertex: the vertex.
+        previous: vertex before; None on paths of one vertex.
+        has_next: mask of paths with a further vertex.
+        interaction: location of the vertex.
+        previous_interaction: location of the vertex before; None on paths of one vertex.
+        next_position: position of the next vertex; None on paths of one vertex.
+    """
 
     vertex: PathVertex
-    previous: PathVertex | None  # the vertex before; None on paths of one vertex
-    has_next: Any  # whether there is a next one
+    previous: PathVertex | None
+    has_next: mit.Bool
     interaction: SurfaceInteraction
     previous_interaction: SurfaceInteraction | None
-    next_position: Any  # position of the next vertex
+    next_position: mit.Point3f | None
 
     @staticmethod
-    def read(inputs: Inputs, records: PathRecords, number: Any, depth: Any) -> "_VertexNeighbours":
-        """Vertex ``number`` (from 0 to ``depth`` − 1) of every path, as attached as the inputs."""
-        own = records.read_vertex(number)
-        here = own.compute_interaction(inputs, own.exists)
-        if records.depth == 1:
-            return _VertexNeighbours(own, None, mi.Bool(False), here, None, None)
-        inner, follows = own.exists & (number > 0), own.exists & (number + 1 < depth)
-        earlier, later = (
-            records.read_vertex(number - 1, inner),
-            records.read_vertex(number + 1, follows),
-        )
-        goes_on = follows & later.exists
-        before, onward = (
-            earlier.compute_interaction(inputs, inner),
-            later.compute_interaction(inputs, goes_on),
-        )
-        return _VertexNeighbours(own, earlier, goes_on, here, before, onward.position)
+    def read(
+        inputs: Inputs, records: PathRecords, number: mit.UInt32, depth: mit.UInt32
+    ) -> _VertexNeighbours:
+        """Read a vertex of every path, attached if the inputs are.
 
-    def as_leaf_variables(self) -> "_VertexNeighbours":
-        """The same, but places with derivatives of their own."""
+        Args:
+            inputs: inputs of the kernel.
+            records: vertices of the paths.
+            number: vertex number, from 0 to ``depth`` − 1.
+            depth: most vertices of a path.
+        """
+        vertex = records.read_vertex(number)
+        here = integrand.compute_interaction(inputs, vertex, vertex.exists)
+        if records.depth == 1:
+            return _VertexNeighbours(vertex, None, mi.Bool(False), here, None, None)
+        inner, follows = vertex.exists & (number > 0), vertex.exists & (number + 1 < depth)
+        previous = records.read_vertex(number - 1, inner)
+        following = records.read_vertex(number + 1, follows)
+        has_next = follows & following.exists
+        before = integrand.compute_interaction(inputs, previous, inner)
+        after = integrand.compute_interaction(inputs, following, has_next)
+        return _VertexNeighbours(vertex, previous, has_next, here, before, after.position)
+
+    def as_leaf_variables(self) -> _VertexNeighbours:
+        """Copy the vertices, with positions that carry derivatives of their own."""
         assert self.previous_interaction is not None
         here = SurfaceInteraction(
             mi.Point3f(self.interaction.position),
@@ -95,21 +136,27 @@ class _VertexNeighbours:
         before = replace(
             self.previous_interaction, position=mi.Point3f(self.previous_interaction.position)
         )
-        onward = mi.Point3f(self.next_position)
-        dr.enable_grad(here.position, here.normal, here.jacobian, before.position, onward)
-        return replace(self, interaction=here, previous_interaction=before, next_position=onward)
+        after = mi.Point3f(self.next_position)
+        dr.enable_grad(here.position, here.normal, here.jacobian, before.position, after)
+        return replace(self, interaction=here, previous_interaction=before, next_position=after)
 
 
 @dataclass(frozen=True)
 class _AntennaPoses:
-    """Where paths start and end; looked up once where that carries no derivatives."""
+    """Poses of the antennas; looked up once unless they carry derivatives.
+
+    Attributes:
+        inputs: attached inputs.
+        frame: radar poses.
+        poses: transmitter and receiver, if looked up.
+    """
 
     inputs: Inputs
-    frame: Any
-    poses: tuple[integrand.AntennaPose, integrand.AntennaPose] | None  # transmitter and receiver
+    frame: mit.UInt32
+    poses: tuple[integrand.AntennaPose, integrand.AntennaPose] | None
 
     @staticmethod
-    def look_up(inputs: Inputs, frame: Any) -> "_AntennaPoses":
+    def look_up(inputs: Inputs, frame: mit.UInt32) -> _AntennaPoses:
         if any(dr.grad_enabled(inputs.table(name)) for name in ("tx", "rx", "rotations")):
             return _AntennaPoses(inputs, frame, None)
         first, second = (
@@ -117,7 +164,7 @@ class _AntennaPoses:
         )
         return _AntennaPoses(inputs, frame, (first, second))
 
-    def pose(self, receiver: bool, active: Any) -> integrand.AntennaPose:
+    def pose(self, receiver: bool, active: mit.Bool) -> integrand.AntennaPose:
         if self.poses is not None:
             return self.poses[receiver]
         return integrand.AntennaPose.look_up(self.inputs, self.frame, receiver, active)
@@ -128,36 +175,38 @@ def _evaluate_vertex(
     inputs: Inputs,
     records: PathRecords,
     antennas: _AntennaPoses,
-    number: Any,
+    number: mit.UInt32,
     neighbours: _VertexNeighbours,
 ) -> _VertexFactors:
-    """Evaluate vertex ``number`` of every path."""
+    """Evaluate the factors of every path at one vertex."""
     single, frame = neighbours.previous_interaction is None, records.frame
-    own, here, goes_on = neighbours.vertex, neighbours.interaction, neighbours.has_next
-    active = own.exists
+    vertex, here, has_next = neighbours.vertex, neighbours.interaction, neighbours.has_next
+    active = vertex.exists
     inner = mi.Bool(False) if single else active & (number > 0)
 
-    def previous_position(interaction: Callable[[], SurfaceInteraction | None]) -> Any:
+    def locate_previous(locate: Callable[[], SurfaceInteraction | None]) -> mit.Point3f:
         start = antennas.pose(False, active).position
-        earlier = interaction()
-        return start if earlier is None else dr.select(inner, earlier.position, start)
+        previous = locate()
+        return start if previous is None else dr.select(inner, previous.position, start)
 
-    before = previous_position(lambda: neighbours.previous_interaction)
-    back, distance = integrand.direction_and_distance(here.position, before)
-    optical, lost = distance, mi.Float(1.0)
+    before = locate_previous(lambda: neighbours.previous_interaction)
+    incident, distance = integrand.direction_and_distance(here.position, before)
+    optical, loss = distance, mi.Float(1.0)
     if inputs.surfaces.has_refracting_bodies and neighbours.previous_interaction is not None:
-        inside = integrand.find_medium(inputs, here, neighbours.previous_interaction, back, inner)
-        optical, lost = distance * inside.refractive_index, dr.exp(-inside.attenuation * distance)
+        medium = integrand.find_medium(
+            inputs, here, neighbours.previous_interaction, incident, inner
+        )
+        optical, loss = distance * medium.refractive_index, dr.exp(-medium.attenuation * distance)
     first = active if single else active & (number == 0)
-    seen_from_tx = integrand.project_to_axes(antennas.pose(False, first).axes, -back)
-    gain = dr.select(first, inputs.gain(frame, False, seen_from_tx), 1.0)
-    arriving = gain * here.jacobian * lost / dr.square(distance)
+    departure = integrand.project_to_axes(antennas.pose(False, first).axes, -incident)
+    gain = dr.select(first, inputs.gain(frame, False, departure), 1.0)
+    arriving = gain * here.jacobian * loss / dr.square(distance)
     receiver = antennas.pose(True, active)
     connection = integrand.connect_antenna(
         inputs,
         frame,
         here,
-        back,
+        incident,
         True,
         active,
         is_same_antenna=single and inputs.monostatic,
@@ -167,35 +216,36 @@ def _evaluate_vertex(
     if not single:
         start = antennas.pose(False, active).position
         direction, _ = integrand.direction_and_distance(
-            here.position, dr.select(goes_on, neighbours.next_position, start)
+            here.position, dr.select(has_next, neighbours.next_position, start)
         )
         scattered = inputs.surfaces.evaluate_scattering(
-            here.surface_row, here.normal, back, direction, goes_on
+            here.surface_row, here.normal, incident, direction, has_next
         )
-    seen = active & own.is_visible
-    twice, passed = mi.Bool(False), SegmentTransmission(mi.Float(1.0), mi.Float(0.0))
+    assert vertex.is_visible is not None
+    visible = active & vertex.is_visible
+    twice, passed = mi.Bool(False), SegmentTransmission.clear()
     if inputs.surfaces.has_sheets:
         twice = first if rays.link.shared_visibility else twice
-        end = dr.select(twice, before, receiver.position)
-        fixed = (dr.detach(here.position), dr.detach(end))
+        ends = dr.detach(here.position), dr.detach(dr.select(twice, before, receiver.position))
         with dr.suspend_grad():
-            passed = trace_transmission(rays, inputs.detach(), *fixed, seen)
+            passed = trace_transmission(rays, inputs.detach(), *ends, visible)
+
+    def locate_attached() -> SurfaceInteraction | None:
+        previous = neighbours.previous
+        return previous and integrand.compute_interaction(inputs, previous, inner)
+
     return _VertexFactors(
         transmission=passed,
         shares_segment=twice,
         endpoints=(
-            lambda: previous_position(
-                lambda: (
-                    neighbours.previous and neighbours.previous.compute_interaction(inputs, inner)
-                )
-            ),
-            lambda: own.compute_interaction(inputs, active).position,
+            lambda: locate_previous(locate_attached),
+            lambda: integrand.compute_interaction(inputs, vertex, active).position,
             lambda: antennas.pose(True, active).position,
         ),
         active=active,
-        has_next=goes_on,
-        is_visible=seen,
-        throughput=own.throughput,
+        has_next=has_next,
+        is_visible=visible,
+        throughput=vertex.throughput,
         length=records.length_at(number, active),
         frame=frame,
         incident_factor=arriving,
@@ -206,34 +256,179 @@ def _evaluate_vertex(
     )
 
 
-def _log_derivative_factor(active: Any, total: Any, value: Any) -> Any:
-    """total · dlog(value): what multiplies the attached value; zero where inactive."""
+def _log_derivative_factor(active: mit.Bool, total: mit.Float, value: mit.Float) -> mit.Float:
+    """total · dlog(value): the factor of the attached value; zero if inactive."""
     return dr.select(active, total / dr.detach(value), 0.0)
+
+
+@dataclass
+class _PendingVertex:
+    """Vertex whose gradient is complete except for the contribution of the vertex before it.
+
+    Not frozen, since loops of Dr.Jit assign their state field by field.
+
+    Attributes:
+        vertex: vertex that is evaluated next.
+        following: vertex after it, to which the gradients belong.
+        interaction: location of ``vertex``, detached.
+        next_position: position of ``following``, detached.
+        position, normal, jacobian: gradients with respect to the location of ``following``.
+        previous_position: gradient with respect to the position of ``vertex``.
+    """
+
+    vertex: PathVertex
+    following: PathVertex
+    interaction: InteractionState
+    next_position: mit.Point3f
+    position: mit.Point3f
+    normal: mit.Vector3f
+    jacobian: mit.Float
+    previous_position: mit.Point3f
+
+    @staticmethod
+    def initialise(inputs: Inputs, records: PathRecords, depth: mit.UInt32) -> _PendingVertex:
+        """State before the sweep: the last vertex, and no gradients.
+
+        Args:
+            inputs: detached inputs.
+            records: vertices of the paths.
+            depth: most vertices of a path.
+        """
+        lanes, last = records.path_count, records.read_vertex(depth - 1)
+        with dr.suspend_grad():
+            here = integrand.compute_interaction(inputs, last)
+        none = PathVertex(last.face, last.b1, last.b2, dr.zeros(mi.Float, lanes), None)
+        return _PendingVertex(
+            last,
+            none,
+            here.detached_state,
+            next_position=dr.zeros(mi.Point3f, lanes),
+            position=dr.zeros(mi.Point3f, lanes),
+            normal=dr.zeros(mi.Vector3f, lanes),
+            jacobian=dr.zeros(mi.Float, lanes),
+            previous_position=dr.zeros(mi.Point3f, lanes),
+        )
+
+    def read_neighbours(
+        self, inputs: Inputs, records: PathRecords, number: mit.UInt32
+    ) -> _VertexNeighbours:
+        """Collect the vertex and its neighbours; only the one before is read.
+
+        Args:
+            inputs: detached inputs.
+            records: vertices of the paths.
+            number: vertex number, from 0.
+        """
+
+        def read(number: mit.UInt32) -> tuple[PathVertex, InteractionState]:
+            previous = records.read_vertex(number - 1)
+            return previous, integrand.compute_interaction(inputs, previous).detached_state
+
+        def skip(_: mit.UInt32) -> tuple[PathVertex, InteractionState]:
+            # The first vertex has none before it: nothing is read.
+            lanes = records.path_count
+            face, zero = dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes)
+            vertex = PathVertex(face, zero, zero, zero, dr.zeros(mi.Bool, lanes))
+            return vertex, {
+                "position": dr.zeros(mi.Point3f, lanes),
+                "normal": dr.zeros(mi.Vector3f, lanes),
+                "surface": face,
+            }
+
+        previous, before = dr.if_stmt((number,), number > 0, read, skip, mode="symbolic")
+        return _VertexNeighbours(
+            self.vertex,
+            previous,
+            self.vertex.exists & self.following.exists,
+            SurfaceInteraction.from_state(self.interaction),
+            SurfaceInteraction.from_state(before),
+            self.next_position,
+        )
+
+    def advance(self, inputs: Inputs, neighbours: _VertexNeighbours) -> _PendingVertex:
+        """Add the gradient of ``following``, which is complete now, and move one vertex back.
+
+        Args:
+            inputs: attached inputs.
+            neighbours: leaf variables of the vertex, with gradients.
+        """
+        here, before = neighbours.interaction, neighbours.previous_interaction
+        previous, exists = neighbours.previous, neighbours.vertex.exists
+        assert before is not None
+        assert previous is not None
+
+        def gradient(value: Gradient, active: mit.Bool = exists) -> Gradient:
+            return dr.select(active, dr.grad(value), 0.0)
+
+        last = gradient(neighbours.next_position, neighbours.has_next)
+        assert last is not None
+        complete = replace(self, position=self.position + last)
+        complete.pull(inputs, neighbours.has_next)
+        return _PendingVertex(
+            previous,
+            replace(neighbours.vertex, is_visible=None),
+            before.detached_state,
+            next_position=dr.detach(here.position),
+            position=self.previous_position + gradient(here.position),  # type: ignore[arg-type]
+            normal=gradient(here.normal),
+            jacobian=gradient(here.jacobian),
+            previous_position=gradient(before.position),
+        )
+
+    def pull(self, inputs: Inputs, active: mit.Bool) -> None:
+        """Add the gradient of ``following`` to the gradient of the corners of its triangle.
+
+        Args:
+            inputs: attached inputs.
+            active: mask of paths that have this vertex.
+        """
+
+        def act(
+            face: mit.UInt32,
+            b1: mit.Float,
+            b2: mit.Float,
+            active: mit.Bool,
+            position: mit.Point3f,
+            normal: mit.Vector3f,
+            jacobian: mit.Float,
+        ) -> tuple[()]:
+            point = SurfacePoint(face, b1, b2)
+            with dr.resume_grad():
+                integrand.pull_interaction(inputs, point, active, position, normal, jacobian)
+            return ()
+
+        # Packets in which no path continues skip it.
+        point = self.following
+        gradients = self.position, self.normal, self.jacobian
+        known = point.face, point.b1, point.b2, mi.Bool(active), *gradients
+        dr.if_stmt(known, active, act, lambda *_: (), mode="symbolic")
 
 
 def pull(
     rays: RayScene,
     inputs: Inputs,
     records: PathRecords,
-    gather: Callable[[PathContribution, Any], tuple[Any, Any, Any, Any]],
+    gather: Callable[[PathContribution, mit.Bool], FourFloats],
 ) -> None:
     """Reverse mode: add to the gradients of the attached inputs.
 
     Args:
-        rays: The scene and its antennas.
-        inputs: Attached tables.
-        records: Vertices of the paths.
-        gather: Adjoints of paths: ∂loss/∂power, and power · ∂loss/∂(range, u, v).
+        rays: ray scene.
+        inputs: attached inputs.
+        records: vertices of the paths.
+        gather: adjoints of paths: ∂loss/∂power, and power · ∂loss/∂(range, u, v).
     """
     depth = opaque(records.depth)
     antennas = _AntennaPoses.look_up(inputs, records.frame)
-    # With neighbours, all that moves a vertex is summed before its triangle is asked.
+    # With neighbours, the gradient of a vertex is complete before its triangle is gathered.
     carried = records.depth > 1 and dr.grad_enabled(inputs.vertices)
     fixed = inputs.detach()
 
-    def sweep(number: Any, sums: Any, pending: Any) -> tuple[Any, Any]:
+    def sweep(
+        number: mit.UInt32, sums: Sums, pending: _PendingVertex | None
+    ) -> tuple[Sums, _PendingVertex | None]:
         power_sum, range_sum = sums
-        known = collect_neighbours(number, pending) if carried else None
+        known = pending.read_neighbours(fixed, records, number) if pending else None
         with dr.resume_grad():
             near = (
                 known.as_leaf_variables()
@@ -243,9 +438,10 @@ def pull(
             vertex = _evaluate_vertex(rays, inputs, records, antennas, number, near)
             path = vertex.to_contribution()
             power, length, u, v = (
-                dr.select(vertex.is_visible, bar, 0.0) for bar in gather(path, vertex.is_visible)
+                dr.select(vertex.is_visible, adjoint, 0.0)
+                for adjoint in gather(path, vertex.is_visible)
             )
-            later = (
+            after = (
                 _log_derivative_factor(vertex.has_next, power_sum, vertex.scattering_factor)
                 * vertex.scattering_factor
             )
@@ -253,173 +449,82 @@ def pull(
             ending += u * path.u + v * path.v
             power_sum = power_sum + dr.select(vertex.is_visible, power * dr.detach(path.power), 0.0)
             range_sum = range_sum + 0.5 * length
-            so_far = (
+            before = (
                 _log_derivative_factor(vertex.active, power_sum, vertex.incident_factor)
                 * vertex.incident_factor
             )
-            so_far += range_sum * vertex.optical_length
-            # What multiplies the attached values is zero where they do not count.
-            dr.backward_from(so_far + ending + later)
-            if carried:
-                pending = advance_pending(near, pending)
+            before += range_sum * vertex.optical_length
+            # The factors of the attached values are zero in lanes that do not count.
+            dr.backward_from(before + ending + after)
+            if pending:
+                pending = pending.advance(inputs, near)
         if inputs.surfaces.has_sheets:
-            pull_sheets(vertex, power * dr.detach(path.power), length, power_sum, range_sum)
+            own = power * dr.detach(path.power), 0.5 * length
+            _pull_sheets(rays, inputs, vertex, own, (power_sum, range_sum))
         return (power_sum, range_sum), pending
 
-    def collect_neighbours(number: Any, pending: Any) -> _VertexNeighbours:
-        """A vertex and its neighbours; only the one before has not been read yet."""
-        own, later = (
-            PathVertex(**pending[name], is_visible=pending["seen"]) for name in ("own", "later")
-        )
-        identity, seen, before = dr.if_stmt(
-            (number,), number > 0, read_previous, read_nothing, mode="symbolic"
-        )
-        here, goes_on = SurfaceInteraction.from_state(pending["here"]), own.exists & later.exists
-        earlier = PathVertex(**identity, is_visible=seen)
-        return _VertexNeighbours(
-            own, earlier, goes_on, here, SurfaceInteraction.from_state(before), pending["onward"]
-        )
-
-    def read_previous(number: Any) -> tuple[Any, ...]:
-        earlier = records.read_vertex(number - 1)
-        return (
-            _vertex_columns(earlier),
-            earlier.is_visible,
-            earlier.compute_interaction(fixed).detached_state,
-        )
-
-    def read_nothing(_: Any) -> tuple[Any, ...]:
-        # Before the first vertex there is none, which spares reading it.
-        lanes, zero = records.path_count, dr.zeros(mi.Float, records.path_count)
-        face = dr.zeros(mi.UInt32, lanes)
-        identity = {"face": face, "b1": zero, "b2": zero, "throughput": zero}
-        place = {
-            "position": dr.zeros(mi.Point3f, lanes),
-            "normal": dr.zeros(mi.Vector3f, lanes),
-            "surface": face,
-        }
-        return identity, dr.zeros(mi.Bool, lanes), place
-
-    def advance_pending(neighbours: _VertexNeighbours, pending: Any) -> Any:
-        """Ask the triangle of the next vertex, of which all is known now; this one waits."""
-        here, before, earlier = (
-            neighbours.interaction,
-            neighbours.previous_interaction,
-            neighbours.previous,
-        )
-        assert before is not None
-        assert earlier is not None
-
-        def select_gradient(value: Any, active: Any = neighbours.vertex.exists) -> Any:
-            return dr.select(active, dr.grad(value), 0.0)
-
-        position = pending["position"] + select_gradient(
-            neighbours.next_position, neighbours.has_next
-        )
-        pull_vertex(
-            PathVertex(**pending["later"], is_visible=None),
-            pending | {"position": position},
-            neighbours.has_next,
-        )
-        return {
-            "own": _vertex_columns(earlier),
-            "later": _vertex_columns(neighbours.vertex),
-            "seen": earlier.is_visible,
-            "here": before.detached_state,
-            "onward": dr.detach(here.position),
-            "position": pending["earlier"] + select_gradient(here.position),
-            "normal": select_gradient(here.normal),
-            "jacobian": select_gradient(here.jacobian),
-            "earlier": select_gradient(before.position),
-        }
-
-    def pull_vertex(vertex: PathVertex, pending: Any, active: Any) -> None:
-        bars = tuple(pending[name] for name in ("position", "normal", "jacobian"))
-
-        def act(*known: Any) -> tuple[()]:
-            with dr.resume_grad():
-                integrand.pull_interaction(inputs, *known)
-            return ()
-
-        # Packets of paths of which none goes on spare it.
-        known = vertex.face, vertex.b1, vertex.b2, mi.Bool(active), *bars
-        dr.if_stmt(known, active, act, lambda *_: (), mode="symbolic")
-
-    def initialise_pending() -> Any:
-        """Nothing is known but which vertex is the last."""
-        if not carried:
-            return ()
-        lanes, last = records.path_count, records.read_vertex(depth - 1)
-        with dr.suspend_grad():
-            here = last.compute_interaction(fixed)
-        none = PathVertex(last.face, last.b1, last.b2, dr.zeros(mi.Float, lanes), None)
-        return {
-            "own": _vertex_columns(last),
-            "later": _vertex_columns(none),
-            "seen": last.is_visible,
-            "here": here.detached_state,
-            "onward": dr.zeros(mi.Point3f, lanes),
-            "position": dr.zeros(mi.Point3f, lanes),
-            "normal": dr.zeros(mi.Vector3f, lanes),
-            "jacobian": dr.zeros(mi.Float, lanes),
-            "earlier": dr.zeros(mi.Point3f, lanes),
-        }
-
-    def pull_sheets(
-        vertex: _VertexFactors, power: Any, length: Any, power_sum: Any, range_sum: Any
-    ) -> None:
-        own = (
-            dr.select(vertex.is_visible, power, 0.0),
-            dr.select(vertex.is_visible, 0.5 * length, 0.0),
-        )
-        again = [dr.select(vertex.shares_segment, amount, 0.0) for amount in own]
-        weights = power_sum + again[0], range_sum + again[1]
-        segments = (
-            (vertex.endpoints[0], vertex.active, weights),
-            (vertex.endpoints[2], vertex.is_visible & ~vertex.shares_segment, own),
-        )
-        for start, active, (by_transmittance, by_extra) in segments:
-
-            def act(
-                _: Any, transmittance: Any, extra: Any, a: Any = by_transmittance, b: Any = by_extra
-            ) -> None:
-                known = dr.detach(transmittance) > 0
-                dr.backward_from(
-                    _log_derivative_factor(known, a, transmittance) * transmittance + b * extra
-                )
-
-            visit_sheets(rays, inputs, start, vertex.endpoints[1], active, {}, act)
-
-    pending = _sweep_vertices(rays, records, sweep, initialise_pending(), backwards=True)
-    if carried:
+    initial = _PendingVertex.initialise(fixed, records, depth) if carried else None
+    pending = _sweep_vertices(rays, records, sweep, initial, backwards=True)
+    if pending:
         with dr.resume_grad():
-            first = PathVertex(**pending["later"], is_visible=None)
-            pull_vertex(first, pending, first.exists)
+            pending.pull(inputs, pending.following.exists)
 
 
-def _vertex_columns(vertex: PathVertex) -> dict[str, Any]:
-    """What a loop carries of a vertex besides whether it is seen."""
-    return {name: getattr(vertex, name) for name in ("face", "b1", "b2", "throughput")}
+def _pull_sheets(
+    rays: RayScene, inputs: Inputs, vertex: _VertexFactors, own: Sums, sums: Sums
+) -> None:
+    """Add the gradients of the sheets on the segment before a vertex and on its connection.
+
+    Args:
+        rays: ray scene.
+        inputs: attached inputs.
+        vertex: factors at the vertex.
+        own: derivatives with respect to the logarithm of the power and to the length [m], of the
+            path that ends at the vertex.
+        sums: the same derivatives, summed over all paths that pass the segment before it.
+    """
+    own = tuple(dr.select(vertex.is_visible, amount, 0.0) for amount in own)  # type: ignore[assignment]
+    again = [dr.select(vertex.shares_segment, amount, 0.0) for amount in own]
+    segments = (
+        (vertex.endpoints[0], vertex.active, (sums[0] + again[0], sums[1] + again[1])),
+        (vertex.endpoints[2], vertex.is_visible & ~vertex.shares_segment, own),
+    )
+    for start, active, (by_transmittance, by_extra) in segments:
+
+        def act(
+            _: Carry,
+            transmittance: mit.Float,
+            extra: mit.Float,
+            a: mit.Float = by_transmittance,
+            b: mit.Float = by_extra,
+        ) -> None:
+            known = dr.detach(transmittance) > 0
+            dr.backward_from(
+                _log_derivative_factor(known, a, transmittance) * transmittance + b * extra
+            )
+
+        visit_sheets(rays, inputs, start, vertex.endpoints[1], active, {}, act)
 
 
 def push(
     rays: RayScene,
     inputs: Inputs,
     records: PathRecords,
-    scatter: Callable[[PathContribution, tuple[Any, Any, Any, Any], Any], None],
+    scatter: Callable[[PathContribution, FourFloats, mit.Bool], None],
 ) -> None:
-    """Forward mode: hand on every path with the derivatives of its power, range, u and v.
+    """Forward mode: scatter every path with the tangents of its power, range, u and v.
 
     Args:
-        rays: The scene and its antennas.
-        inputs: Attached tables.
-        records: Vertices of the paths.
-        scatter: Takes paths, the derivatives of their power, range, u and v, and which exist.
+        rays: ray scene.
+        inputs: attached inputs.
+        records: vertices of the paths.
+        scatter: function of paths, the tangents of their power, range, u and v, and the mask of
+            lanes in which they exist.
     """
     depth = opaque(records.depth)
     antennas = _AntennaPoses.look_up(inputs, records.frame)
 
-    def sweep(number: Any, sums: Any, pending: Any) -> tuple[Any, Any]:
+    def sweep(number: mit.UInt32, sums: Sums, pending: None) -> tuple[Sums, None]:
         growth, longer = sums
         with dr.resume_grad():
             near = _VertexNeighbours.read(inputs, records, number, depth)
@@ -434,18 +539,18 @@ def push(
                 path.v,
                 vertex.scattering_factor,
             )
-            # u and v also feed the pattern, so that by default their derivatives would be
-            # cleared once passed on.
-            dots = dr.forward_to(*values, flags=dr.ADFlag.ClearEdges)
-        arriving, segment, power, distance, u, v, scattered = (dr.detach(dot) for dot in dots)
+            # u and v also enter the pattern; by default their tangents would be cleared once
+            # propagated.
+            tangents = dr.forward_to(*values, flags=dr.ADFlag.ClearEdges)
+        arriving, segment, power, distance, u, v, scattered = map(dr.detach, tangents)
         growth = growth + _log_derivative_factor(vertex.active, arriving, vertex.incident_factor)
         longer = longer + dr.select(vertex.active, segment, 0.0)
         found, more, further = dr.detach(path.power), mi.Float(0.0), mi.Float(0.0)
         if inputs.surfaces.has_sheets:
-            by_segment = push_sheets(vertex.endpoints[0], vertex.endpoints[1], vertex.active)
-            by_end = push_sheets(
-                vertex.endpoints[2], vertex.endpoints[1], vertex.is_visible & ~vertex.shares_segment
-            )
+            before, here, receiver = vertex.endpoints
+            alone = vertex.is_visible & ~vertex.shares_segment
+            by_segment = _push_sheets(rays, inputs, before, here, vertex.active)
+            by_end = _push_sheets(rays, inputs, receiver, here, alone)
             growth, longer = growth + by_segment[0], longer + by_segment[1]
             more = by_end[0] + dr.select(vertex.shares_segment, by_segment[0], 0.0)
             further = by_end[1] + dr.select(vertex.shares_segment, by_segment[1], 0.0)
@@ -461,43 +566,57 @@ def push(
         )
         return (growth, longer), pending
 
-    def push_sheets(start: Any, end: Any, active: Any) -> tuple[Any, Any]:
-        def act(carry: dict[str, Any], transmittance: Any, extra: Any) -> None:
-            dots = dr.forward_to(transmittance, extra, flags=dr.ADFlag.ClearEdges)
-            known = dr.detach(transmittance) > 0
-            carry["growth"] = carry["growth"] + _log_derivative_factor(
-                known, dr.detach(dots[0]), transmittance
-            )
-            carry["longer"] = carry["longer"] + dr.detach(dots[1])
+    _sweep_vertices(rays, records, sweep, None)
 
-        carry: dict[str, Any] = {
-            name: dr.zeros(mi.Float, records.path_count) for name in ("growth", "longer")
-        }
-        done = visit_sheets(rays, inputs, start, end, active, carry, act)
-        return done["growth"], done["longer"]
 
-    _sweep_vertices(rays, records, sweep, ())
+def _push_sheets(
+    rays: RayScene, inputs: Inputs, start: Position, end: Position, active: mit.Bool
+) -> Sums:
+    """Compute the tangents of the logarithmic transmittance and of the extra length [m]."""
+
+    def act(carry: Carry, transmittance: mit.Float, extra: mit.Float) -> None:
+        tangents = dr.forward_to(transmittance, extra, flags=dr.ADFlag.ClearEdges)
+        known = dr.detach(transmittance) > 0
+        carry["growth"] = carry["growth"] + _log_derivative_factor(
+            known, dr.detach(tangents[0]), transmittance
+        )
+        carry["longer"] = carry["longer"] + dr.detach(tangents[1])
+
+    zero = {name: dr.zeros(mi.Float, dr.width(active)) for name in ("growth", "longer")}
+    done, _ = visit_sheets(rays, inputs, start, end, active, zero, act)
+    return done["growth"], done["longer"]
+
+
+Pending = TypeVar("Pending")
 
 
 def _sweep_vertices(
     rays: RayScene,
     records: PathRecords,
-    sweep: Callable[[Any, Any, Any], tuple[Any, Any]],
-    pending: Any,
+    sweep: Callable[[mit.UInt32, Sums, Pending], tuple[Sums, Pending]],
+    pending: Pending,
     *,
     backwards: bool = False,
-) -> Any:
-    """Carry two sums along all paths, vertex by vertex, from the near end or from the far one.
+) -> Pending:
+    """Carry two sums along all paths, vertex by vertex, from the near or the far end.
 
-    What else is to be carried is given, and returned as it is at the end.
+    Args:
+        rays: ray scene.
+        records: vertices of the paths.
+        sweep: function of the vertex number and of what is carried, which it returns.
+        pending: further state that is carried, and returned at the end.
+        backwards: True to begin at the far end.
     """
     last = opaque(records.depth - 1)
-    sums = tuple(dr.zeros(mi.Float, records.path_count) for _ in range(2))
+    zero: Sums = (
+        dr.zeros(mi.Float, records.path_count),
+        dr.zeros(mi.Float, records.path_count),
+    )
     with dr.suspend_grad():
         if records.depth == 1:
-            return sweep(mi.UInt32(0), sums, pending)[1]
+            return sweep(mi.UInt32(0), zero, pending)[1]
         state = rays.loop(
-            (dr.zeros(mi.UInt32, records.path_count), sums, pending),
+            (dr.zeros(mi.UInt32, records.path_count), zero, pending),
             lambda done, *_: done <= last,
             lambda done, *carried: (done + 1, *sweep(last - done if backwards else done, *carried)),
         )

@@ -1,12 +1,13 @@
-"""Where paths start: rays from the transmitter into the caps around objects, or points by area.
+"""Start points of paths: rays from the transmitter into caps around objects, or points by area.
 
-Everything here is detached: a sample is a place on the reference surface (triangle and
-barycentric coordinates), a frame, and one over its density. What depends on the scene's
-parameters is evaluated later, in material form (derivations §2).
+Detached: a sample is a material point (triangle and barycentric coordinates), a frame, and one
+over its density. Values that depend on the scene's parameters are evaluated later, in material
+form (derivations §2).
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -15,45 +16,50 @@ from invertwin.channel.power import integrand
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.transmission import (
     STRATIFIED_SHEETS,
+    SegmentTransmission,
     trace_to_surface,
     trace_transmission,
 )
 from invertwin.channel.rays.arrays import (
     gather_points,
-    interpolate_position,
     scramble_seed,
     to_float,
     to_points,
     uniform_pair,
 )
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.bounding_spheres import BoundingSpheres
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry
+from invertwin.channel.rays.surface_point import SurfacePoint, interpolate_position
 from invertwin.errors import InputError
 
 
 @dataclass(frozen=True)
 class StartPoints:
-    """Points on surfaces (Dr.Jit arrays)."""
+    """Samples of surface points.
 
-    frame: Any  # radar pose
-    face: Any  # triangle
-    b1: Any  # barycentric coordinates
-    b2: Any
-    weight: Any  # one over (samples × probability per area)
-    transmittance: Any  # of the sheets between transmitter and point
-    extra_length: Any  # length that these add [m]
+    Attributes:
+        frame: radar poses.
+        point: surface points.
+        weight: one over (samples × probability per area).
+        transmission: transmission of the segments from the transmitter.
+    """
+
+    frame: mit.UInt32
+    point: SurfacePoint
+    weight: mit.Float
+    transmission: SegmentTransmission
 
 
 class RaySampler:
-    """Rays from TX, the same number into the cap around each object, jittered on a grid.
+    """Rays from the transmitter, as many into the cap around each object, jittered on a grid.
 
     Args:
-        rays: The scene and its antennas.
-        samples: Rays over all frames and scenes, about.
-        seed: Of the rays.
-        reference: What the caps are around, instead of the scene; they are a tenth larger.
+        rays: ray scene.
+        samples: approximate number of rays over all frames and scenes.
+        seed: seed of the rays.
+        reference: geometry and antennas that define the caps instead of the scene, a tenth larger.
     """
 
     def __init__(
@@ -73,21 +79,21 @@ class RaySampler:
         self.size = blocks * self.rows * self.columns
         self.seed, self.transmission_seed = scramble_seed(seed, 0), scramble_seed(seed, 8)
 
-    def draw(self, index: Any, inputs: Inputs) -> StartPoints:
-        """The samples of the given indices below ``size``.
+    def draw(self, index: mit.UInt32, inputs: Inputs) -> StartPoints:
+        """Draw the samples of given numbers.
 
         Args:
-            index: Numbers below ``size``.
-            inputs: Detached tables.
+            index: sample numbers below ``size``.
+            inputs: detached inputs.
         """
         rays, per_block = self.rays, self.rows * self.columns
-        block, place = index // per_block, index % per_block
+        block, cell = index // per_block, index % per_block
         own, scene = self.spheres.table_entry(block % self.spheres.object_count)
         frame = scene * rays.poses_per_scene + block // self.spheres.object_count
         centre = gather_points(self.origins, frame)
         axis, height, _ = self.spheres.cap(own, centre)
         jitter = uniform_pair(index, self.seed)
-        column, row = place % self.columns, place // self.columns
+        column, row = cell % self.columns, cell // self.columns
         disk = mi.warp.square_to_uniform_disk_concentric(
             mi.Point2f(
                 (mi.Float(column) + jitter[0]) / self.columns,
@@ -104,29 +110,25 @@ class RaySampler:
         )
         density = per_block * (found + around / (4 * dr.pi))
         centre = gather_points(rays.tx, frame)
-        ray = mi.Ray3f(centre, direction)
-        key = index, self.transmission_seed
         hit = trace_to_surface(
             rays,
             inputs,
-            ray,
+            mi.Ray3f(centre, direction),
             mi.Bool(True),
-            key,
+            (index, self.transmission_seed),
             coherent=True,
             stratified_bits=_stratified_bits(column, row),
         )
-        point = integrand.compute_interaction(inputs, hit.face, hit.b1, hit.b2)
+        point = integrand.compute_interaction(inputs, hit.point)
         cosine = dr.maximum(dr.abs(dr.dot(point.normal, direction)), 1e-6)
         distance = dr.squared_norm(point.position - centre)
-        counts = hit.valid & (self.spheres.face_group(hit.face) == group)
+        counts = hit.valid & (self.spheres.face_group(hit.point.face) == group)
         weight = dr.select(counts, distance / (cosine * density * hit.probability), 0.0)
-        return StartPoints(
-            frame, hit.face, hit.b1, hit.b2, weight, hit.transmittance, hit.extra_length
-        )
+        return StartPoints(frame, hit.point, weight, hit.transmission)
 
 
-def _stratified_bits(column: Any, row: Any) -> Any:
-    """Bits by which a grid falls into halves that are as even as it is, and these again."""
+def _stratified_bits(column: mit.UInt32, row: mit.UInt32) -> mit.UInt32:
+    """Compute bits that split a grid into halves as even as itself, repeatedly."""
     bits = mi.UInt32(0)
     for k in range(STRATIFIED_SHEETS // 2):
         x, y = column >> k, row >> k
@@ -135,16 +137,16 @@ def _stratified_bits(column: Any, row: Any) -> Any:
 
 
 class AreaSampler:
-    """Points spread over all surfaces, with the probabilities per triangle of a reference scene.
+    """Points on all surfaces, with the probabilities per triangle of a reference scene.
 
-    A reference that does not follow the parameters keeps the point set under differences
-    (common random numbers) also when areas change.
+    A fixed reference keeps the points under finite differences (common random numbers) even if
+    areas change.
 
     Args:
-        rays: The scene and its antennas.
-        samples: Points over all frames, about.
-        seed: Of the points.
-        reference: Whose areas count; None = those of the scene.
+        rays: ray scene.
+        samples: approximate number of points over all frames.
+        seed: seed of the points.
+        reference: geometry (and antennas) whose areas count; None = the scene.
     """
 
     def __init__(
@@ -167,17 +169,17 @@ class AreaSampler:
         self.distribution = mi.DiscreteDistribution(to_float(areas / areas.mean()))
         self.seeds = scramble_seed(seed, 1), scramble_seed(seed, 2)
 
-    def draw(self, index: Any, inputs: Inputs) -> StartPoints:
-        """The samples of the given indices below ``size``.
+    def draw(self, index: mit.UInt32, inputs: Inputs) -> StartPoints:
+        """Draw the samples of given numbers.
 
         Args:
-            index: Numbers below ``size``.
-            inputs: Detached tables.
+            index: sample numbers below ``size``.
+            inputs: detached inputs.
         """
         rays = self.rays
-        frame, place = index // self.per_frame, index % self.per_frame
+        frame, number = index // self.per_frame, index % self.per_frame
         jitter, _ = uniform_pair(index, self.seeds[0])
-        uniform = (mi.Float(place) + jitter) / self.per_frame
+        uniform = (mi.Float(number) + jitter) / self.per_frame
         face, pmf = self.distribution.sample_pmf(uniform)
         b = mi.warp.square_to_uniform_triangle(mi.Point2f(*uniform_pair(index, self.seeds[1])))
         triangle = p0, p1, p2 = rays.corners(face)
@@ -187,4 +189,4 @@ class AreaSampler:
             rays, inputs, gather_points(rays.tx, frame), position, mi.Bool(True)
         )
         weight = dr.select(passed.transmittance > 0, area / (pmf * self.per_frame), 0.0)
-        return StartPoints(frame, face, b.x, b.y, weight, passed.transmittance, passed.extra_length)
+        return StartPoints(frame, SurfacePoint(face, b.x, b.y), weight, passed)

@@ -4,14 +4,15 @@ Everything here is differentiable or not, as the tables are. The same law in tor
 ``channel/coherent/radar_equation.py``; tests hold the two equal.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
 
 from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_float
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.scene import ScatteringLaw
 
@@ -26,16 +27,18 @@ _CONSTANT_COLUMNS = ("diffuse", "lobes", "exponents", "index", "attenuation")
 class ScatteringLawTables:
     """Rows of ``scene.material.Surface`` as flat Dr.Jit arrays, and what is known of all rows."""
 
-    tables: Mapping[str, Any]  # by the names of ``SCATTERING_TABLES``
+    tables: Mapping[str, mit.Float]  # by the names of ``SCATTERING_TABLES``
     cosine_count: int  # entries of a table over cosθ
     has_lobe: tuple[bool, ...]  # which lobes have weight anywhere
     has_sheets: bool  # whether something passes straight through any surface
     has_refracting_bodies: bool  # whether any surface is the skin of a refracting body
     has_spread: bool  # whether any specular lobe lacks what is mirrored
-    constants: Mapping[str, list[Any]]  # columns that are the same in all rows, and need no look-up
+    constants: Mapping[
+        str, list[mit.Float]
+    ]  # columns that are the same in all rows, and need no look-up
 
     @staticmethod
-    def from_geometry(geometry: Geometry) -> "ScatteringLawTables":
+    def from_geometry(geometry: Geometry) -> ScatteringLawTables:
         """Upload the surfaces of a scene."""
         rows = geometry.surfaces
         known = {}
@@ -53,7 +56,7 @@ class ScatteringLawTables:
             has_spread=geometry.has_spread,
         )
 
-    def value(self, name: str, row: Any, active: Any = True) -> Any:
+    def value(self, name: str, row: mit.UInt32, active: mit.Bool | bool = True) -> mit.Float:
         """A number of each row: ``diffuse``, ``index`` or ``attenuation``.
 
         Args:
@@ -63,7 +66,9 @@ class ScatteringLawTables:
         """
         return self._column(name, 0, 1, row, active)
 
-    def _column(self, name: str, number: int, count: int, row: Any, active: Any) -> Any:
+    def _column(
+        self, name: str, number: int, count: int, row: mit.UInt32, active: mit.Bool | bool
+    ) -> mit.Float:
         """One of the ``count`` numbers that a table has for every row."""
         if self._is_constant(name):
             return mi.Float(self.constants[name][number])
@@ -72,12 +77,14 @@ class ScatteringLawTables:
     def _is_constant(self, name: str) -> bool:
         return name in self.constants and not dr.grad_enabled(self.tables[name])
 
-    def _read(self, name: str, index: Any, active: Any) -> Any:
+    def _read(self, name: str, index: mit.UInt32, active: mit.Bool | bool) -> mit.Float:
         """Entries of a table; by all lanes where it has no derivatives, so that it is read once."""
         table = self.tables[name]
         return dr.gather(mi.Float, table, index, active if dr.grad_enabled(table) else True)
 
-    def interpolate_cosine(self, name: str, row: Any, cosine: Any, active: Any = True) -> Any:
+    def interpolate_cosine(
+        self, name: str, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool = True
+    ) -> mit.Float:
         """A table over cosθ, linear between its entries.
 
         Args:
@@ -94,7 +101,9 @@ class ScatteringLawTables:
         second = self._read(name, row * self.cosine_count + low + 1, active)
         return first + (second - first) * (t - mi.Float(low))
 
-    def sheet_transmission(self, row: Any, cosine: Any, active: Any = True) -> tuple[Any, Any]:
+    def sheet_transmission(
+        self, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool = True
+    ) -> tuple[mit.Float, mit.Float]:
         """Transmittance of a sheet, and the length [m] that it adds.
 
         Args:
@@ -108,8 +117,14 @@ class ScatteringLawTables:
         )
 
     def evaluate_lobe(
-        self, number: int, row: Any, normal: Any, incident: Any, outgoing: Any, active: Any = True
-    ) -> tuple[Any, Any]:
+        self,
+        number: int,
+        row: mit.UInt32,
+        normal: mit.Vector3f,
+        incident: mit.Vector3f,
+        outgoing: mit.Vector3f,
+        active: mit.Bool | bool = True,
+    ) -> tuple[mit.Float, mit.Float]:
         """``((1 + cosψ)/2)^p`` of one lobe, and its exponent p.
 
         By ``1 - |d|²/4``, d from the lobe's axis to the direction: a narrow lobe keeps its digits.
@@ -127,7 +142,7 @@ class ScatteringLawTables:
         exponent = self.exponent(number, row, active)
         return dr.exp(exponent * log_one_minus(0.25 * apart)), exponent
 
-    def exponent(self, number: int, row: Any, active: Any = True) -> Any:
+    def exponent(self, number: int, row: mit.UInt32, active: mit.Bool | bool = True) -> mit.Float:
         """Exponent of a lobe.
 
         Args:
@@ -138,8 +153,13 @@ class ScatteringLawTables:
         return self._column("exponents", number, 3, row, active)
 
     def evaluate_scattering(
-        self, row: Any, normal: Any, incident: Any, outgoing: Any, active: Any = True
-    ) -> Any:
+        self,
+        row: mit.UInt32,
+        normal: mit.Vector3f,
+        incident: mit.Vector3f,
+        outgoing: mit.Vector3f | None,
+        active: mit.Bool | bool = True,
+    ) -> mit.Float:
         """``f |cosθ| |cosθ'|`` between two unit directions that point away from the surface.
 
         On one side, ``f`` is the distribution of ``scene.material``; through the skin of a
@@ -175,14 +195,16 @@ class ScatteringLawTables:
             value = dr.select(dr.detach(product) < 0, through, value)
         return value
 
-    def _amplitude(self, row: Any, cosine: Any, active: Any) -> Any:
+    def _amplitude(self, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool) -> mit.Float:
         """Square root of the reflectance; from inside a body, that of the refracted angle."""
         if not self.has_refracting_bodies:
             return self.interpolate_cosine("amplitude", row, dr.abs(cosine), active)
         outer, total = self._outer_cosine(row, cosine, active)
         return dr.select(total, 1.0, self.interpolate_cosine("amplitude", row, outer, active))
 
-    def _outer_cosine(self, row: Any, cosine: Any, active: Any) -> tuple[Any, Any]:
+    def _outer_cosine(
+        self, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool
+    ) -> tuple[mit.Float, mit.Bool]:
         """Cosine on the outer side of a skin (Snell), and whether there is none."""
         inside = dr.detach(cosine) < 0
         index = self.value("index", row, active)
@@ -192,8 +214,13 @@ class ScatteringLawTables:
         return dr.select(inside, refracted, cosine), total
 
     def evaluate_refraction(
-        self, row: Any, normal: Any, incident: Any, outgoing: Any, active: Any
-    ) -> Any:
+        self,
+        row: mit.UInt32,
+        normal: mit.Vector3f,
+        incident: mit.Vector3f,
+        outgoing: mit.Vector3f,
+        active: mit.Bool | bool,
+    ) -> mit.Float:
         """``f |cosθ| |cosθ'|`` through the skin of a body, in a lobe about Snell's direction.
 
         ``f = n'² sqrt(T(θ) T(θ')) g(m)`` with the mismatch ``m = n d + n' d'`` of the directions'
@@ -221,7 +248,7 @@ class ScatteringLawTables:
         lobe = gaussian(mismatch, variance)
         return roots[0] * roots[1] * dr.square(index) * lobe * dr.abs(first * second)
 
-    def refraction_variance(self, row: Any, active: Any = True) -> Any:
+    def refraction_variance(self, row: mit.UInt32, active: mit.Bool | bool = True) -> mit.Float:
         """Variance of the refracted direction's tangential part: that of the specular lobe.
 
         Args:
@@ -231,13 +258,13 @@ class ScatteringLawTables:
         exponent = self.exponent(0, row, active)
         return 2 / dr.maximum(exponent, 1.0)
 
-    def is_refracting(self, row: Any) -> Any:
+    def is_refracting(self, row: mit.UInt32) -> mit.Bool:
         """Whether a surface is the skin of a refracting body."""
         last = (row + 1) * self.cosine_count - 1
         return dr.detach(dr.gather(mi.Float, self.tables["refraction"], last)) > 0
 
 
-def opaque_row(row: Tensor) -> list[Any]:
+def opaque_row(row: Tensor) -> list[mit.Float]:
     """The numbers of a table of one row, each for all lanes.
 
     Args:
@@ -246,7 +273,7 @@ def opaque_row(row: Tensor) -> list[Any]:
     return [opaque(float(number), "Float") for number in row.detach().ravel()]
 
 
-def log_one_minus(fraction: Any) -> Any:
+def log_one_minus(fraction: mit.Float) -> mit.Float:
     """log(1 − x), at least that of 1e-7, with the digits of a small x.
 
     Args:
@@ -256,7 +283,7 @@ def log_one_minus(fraction: Any) -> Any:
     return dr.select(dr.detach(fraction) < 0.01, series, dr.log(dr.maximum(1 - fraction, 1e-7)))
 
 
-def gaussian(mismatch: Any, variance: Any) -> Any:
+def gaussian(mismatch: mit.Vector3f, variance: mit.Float) -> mit.Float:
     """Density of a plane Gaussian at an offset from its centre.
 
     Args:

@@ -1,9 +1,10 @@
 """One tracing of a scene: paths walked into bins or records, and the boundary paths."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any
 
 from torch import Tensor
 
@@ -17,9 +18,8 @@ from invertwin.channel.power.intersection_curves import require_no_interreflecti
 from invertwin.channel.power.random_walk import PathRecords, PathState, RandomWalk
 from invertwin.channel.power.start_points import AreaSampler, RaySampler
 from invertwin.channel.power.surface import SCATTERING_TABLES
-from invertwin.channel.power.transmission import SegmentTransmission
 from invertwin.channel.rays.arrays import opaque
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.coplanar import warn_coplanar_surfaces
 from invertwin.channel.rays.intersections import find_intersection_curves
 from invertwin.channel.rays.ray_scene import RayScene
@@ -109,7 +109,7 @@ class PowerTracer:
         self.chunk = max(1, int(sampling.memory_budget) // per_lane)
 
     def inputs(
-        self, tables: dict[str, Any] | None = None, *, joint_antennas: bool = True
+        self, tables: dict[str, mit.Float] | None = None, *, joint_antennas: bool = True
     ) -> Inputs:
         """The kernel's inputs, with some arrays replaced by ones that carry derivatives.
 
@@ -142,7 +142,9 @@ class PowerTracer:
         for index in index_chunks(self.sampler.size, self.chunk):
             yield self._walk_paths(index, None, record=True)
 
-    def _walk_paths(self, index: Any, out: BinAccumulator | None, *, record: bool) -> PathRecords:
+    def _walk_paths(
+        self, index: mit.UInt32, out: BinAccumulator | None, *, record: bool
+    ) -> PathRecords:
         """Walk some paths into the bins, if given, and into records, if asked (else empty)."""
         depth, shared = self.sampling.depth, self.rays.link.shared_visibility
         one_place = depth == 1 and self.fixed.monostatic
@@ -170,23 +172,24 @@ class PowerTracer:
         done = self._walk.run(state, depth, visit)
         return replace(records, count=done["count"]) if looped else records
 
-    def _start_paths(self, index: Any) -> PathState:
+    def _start_paths(self, index: mit.UInt32) -> PathState:
         """Paths at their first vertex."""
-        drawn = self.sampler.draw(index, self.fixed)
-        tx = self.fixed.antenna_position(drawn.frame, False)
-        point = integrand.compute_interaction(self.fixed, drawn.face, drawn.b1, drawn.b2)
-        back, distance = integrand.direction_and_distance(point.position, tx)
-        gain = self.fixed.gain(
-            drawn.frame, False, integrand.to_radar_frame(self.fixed, drawn.frame, -back)
-        )
-        weight = drawn.weight * drawn.transmittance * self.fixed.scale * gain / dr.square(distance)
-        passed = SegmentTransmission(drawn.transmittance, drawn.extra_length)
+        start = self.sampler.draw(index, self.fixed)
+        tx, passed = self.fixed.antenna_position(start.frame, False), start.transmission
+        point = integrand.compute_interaction(self.fixed, start.point)
+        incident, distance = integrand.direction_and_distance(point.position, tx)
+        departure = integrand.to_radar_frame(self.fixed, start.frame, -incident)
+        gain = self.fixed.gain(start.frame, False, departure)
+        weight = start.weight * passed.transmittance * self.fixed.scale * gain / dr.square(distance)
         return walk.initial_state(
-            index, drawn.frame, drawn.face, drawn.b1, drawn.b2, back,
-            throughput=dr.select(drawn.weight > 0, weight, 0.0),
-            length=distance + drawn.extra_length,
+            index,
+            start.frame,
+            start.point,
+            incident,
+            throughput=dr.select(start.weight > 0, weight, 0.0),
+            length=distance + passed.extra_length,
             transmission=passed if self.fixed.surfaces.has_sheets else None,
-        )  # fmt: skip
+        )
 
     @cached_property
     def boundary_samples(self) -> BoundarySamples | None:
@@ -207,7 +210,7 @@ class PowerTracer:
         return trace_boundary_paths(self.rays, inputs, self._walk, self.boundary_samples)
 
 
-def index_chunks(size: int, chunk: int) -> Iterator[Any]:
+def index_chunks(size: int, chunk: int) -> Iterator[mit.UInt32]:
     """Index arrays that together count to ``size``; their offset is opaque (no recompilation).
 
     Args:

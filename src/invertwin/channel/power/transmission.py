@@ -1,179 +1,266 @@
-"""What a segment passes through: nothing, sheets that let part of the power through, or a wall.
+"""Transmission of path segments: clear, attenuated by sheets, or blocked.
 
-A sheet (a slab meshed as one surface) is passed straight on: power times its transmittance, length
-plus its extra (``scene.material.Surface``), any number of sheets one after another.
+A sheet (a slab meshed as one surface) transmits straight on: the power is multiplied by its
+transmittance, and the optical length grows by its extra length (``scene.material.Surface``). Any
+number of sheets may follow one another.
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TypedDict
 
 from invertwin.channel.power import integrand
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.rays.arrays import opaque, uniform_pair
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
+from invertwin.channel.rays.surface_point import SurfacePoint
 
-_MAX_SHEETS = 32  # surfaces that a segment may pass
-# Probability of passing a sheet on which the ray may end. It is not the transmittance: a
-# probability that follows the material would throw the dice anew under differences.
+_MAX_SHEETS = 32  # most surfaces on a segment
+# Probability of transmission through a sheet on which the ray may also end. It differs from the
+# transmittance: if it followed the material, finite differences would change the random numbers.
 _PASS_PROBABILITY = 0.5
-STRATIFIED_SHEETS = 6  # sheets
+STRATIFIED_SHEETS = 6  # sheets with stratified random decisions
+
+Carry = dict[str, mit.Float]
 
 
 @dataclass(frozen=True)
 class SegmentTransmission:
-    """What lies on a segment."""
+    """Transmission of a segment.
 
-    transmittance: Any  # 0 if blocked
-    extra_length: Any  # length that it adds [m]
+    Attributes:
+        transmittance: power factor; 0 if blocked.
+        extra_length: added optical length [m].
+    """
+
+    transmittance: mit.Float
+    extra_length: mit.Float
+
+    @staticmethod
+    def clear() -> SegmentTransmission:
+        """Transmission of a segment in free space."""
+        return SegmentTransmission(mi.Float(1.0), mi.Float(0.0))
+
+    def then(self, other: SegmentTransmission) -> SegmentTransmission:
+        """Transmission of this segment followed by another."""
+        return SegmentTransmission(
+            self.transmittance * other.transmittance, self.extra_length + other.extra_length
+        )
+
+
+class _SheetState(TypedDict):
+    """State of the loop over the sheets of a segment."""
+
+    at: mit.Float  # position along the segment, as a fraction of its length
+    count: mit.UInt32  # number of sheets so far
+    active: mit.Bool
+    carry: Carry  # arrays of the visitor
+
+
+class _SurfaceState(TypedDict):
+    """State of the loop over the sheets that a ray meets before it ends on a surface."""
+
+    going: mit.Bool
+    valid: mit.Bool
+    face: mit.UInt32
+    b1: mit.Float
+    b2: mit.Float
+    transmittance: mit.Float
+    extra: mit.Float
+    probability: mit.Float
+    origin: mit.Point3f
+    count: mit.UInt32
 
 
 def trace_transmission(
-    rays: RayScene, inputs: Inputs, start: Any, end: Any, active: Any
+    rays: RayScene, inputs: Inputs, start: mit.Point3f, end: mit.Point3f, active: mit.Bool
 ) -> SegmentTransmission:
-    """What gets from one point to another (their own surfaces excluded). Detached.
+    """Trace the transmission between two points (their own surfaces excluded). Detached.
 
     Args:
-        rays: The scene and its antennas.
-        inputs: Detached tables.
-        start, end: Points.
-        active: Lanes.
+        rays: ray scene.
+        inputs: detached inputs.
+        start, end: ends of the segment.
+        active: mask of active lanes.
     """
     if not inputs.surfaces.has_sheets:
         return SegmentTransmission(
             dr.select(rays.is_clear(start, end, active), 1.0, 0.0), mi.Float(0.0)
         )
     lanes = dr.width(active)
-    carry = {"transmittance": dr.ones(mi.Float, lanes), "extra": dr.zeros(mi.Float, lanes)}
+    initial = {"transmittance": dr.ones(mi.Float, lanes), "extra": dr.zeros(mi.Float, lanes)}
 
-    def act(carry: dict[str, Any], transmittance: Any, extra: Any) -> None:
+    def multiply(carry: Carry, transmittance: mit.Float, extra: mit.Float) -> None:
         carry["transmittance"] = carry["transmittance"] * transmittance
         carry["extra"] = carry["extra"] + extra
 
-    done = visit_sheets(rays, inputs, lambda: start, lambda: end, active, carry, act)
+    done, blocked = visit_sheets(
+        rays, inputs, lambda: start, lambda: end, active, initial, multiply
+    )
     return SegmentTransmission(
-        dr.select(active & ~done["active"], done["transmittance"], 0.0), done["extra"]
+        dr.select(active & ~blocked, done["transmittance"], 0.0), done["extra"]
     )
 
 
 def visit_sheets(
     rays: RayScene,
     inputs: Inputs,
-    start: Callable[[], Any],
-    end: Callable[[], Any],
-    active: Any,
-    carry: dict[str, Any],
-    visit: Callable[[dict[str, Any], Any, Any], None],
-) -> dict[str, Any]:
-    """Show every sheet between two attached points: ``act(carry, transmittance, extra)``, attached.
+    start: Callable[[], mit.Point3f],
+    end: Callable[[], mit.Point3f],
+    active: mit.Bool,
+    carry: Carry,
+    visit: Callable[[Carry, mit.Float, mit.Float], None],
+) -> tuple[Carry, mit.Bool]:
+    """Call a visitor at every sheet between two attached points.
 
-    The ends are functions, so that the loop over sheets gathers them anew: no derivative has to
-    cross the loop's border. Returns the carry, and as ``active`` where the way has no end.
+    The ends are functions, so that the loop over sheets gathers them anew: derivatives need not
+    cross the border of the loop.
 
     Args:
-        rays: The scene and its antennas.
-        inputs: Attached tables.
-        start: Gives the points at one end.
-        end: Gives those at the other.
-        active: Lanes.
-        carry: Arrays that the loop carries.
-        visit: Called with what the loop carries, a transmittance and an extra length.
+        rays: ray scene.
+        inputs: attached inputs.
+        start: function that returns the points at one end.
+        end: function that returns the points at the other end.
+        active: mask of active lanes.
+        carry: arrays that the loop carries for the visitor.
+        visit: function of the carried arrays, the attached transmittance of the sheet, and its
+            attached extra length [m].
+
+    Returns:
+        The carried arrays after the last sheet, and the mask of segments with more sheets than
+        are followed.
     """
     origin = dr.detach(start())
     offset = dr.detach(end()) - origin
     lanes, most = dr.width(active), opaque(_MAX_SHEETS)
-    state = {"at": dr.full(mi.Float, RAY_EPSILON, lanes), "count": dr.zeros(mi.UInt32, lanes)}
 
-    def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
-        state = dict(state)
-        at, active = state["at"], state["active"]
-        hit = rays.find_nearest(
-            mi.Ray3f(
-                mi.Point3f(origin + offset * at), mi.Vector3f(offset), 1 - RAY_EPSILON - at, 0.0, []
-            ),
-            active,
+    def body(state: _SheetState) -> tuple[_SheetState]:
+        at, carry = state["at"], state["carry"].copy()
+        ray = mi.Ray3f(
+            mi.Point3f(origin + offset * at), mi.Vector3f(offset), 1 - RAY_EPSILON - at, 0.0, []
         )
+        hit = rays.find_nearest(ray, state["active"])
         found = hit.valid
-        face = dr.select(found, hit.face, rays.fallback_face)
+        face = dr.select(found, hit.point.face, rays.fallback_face)
         with dr.resume_grad():
-            transmittance, extra = _sheet_transmission(inputs, face, start(), end(), found)
-            visit(state, dr.select(found, transmittance, 1.0), dr.select(found, extra, 0.0))
-        state["active"] = found & (dr.detach(transmittance) > 0)
-        state["at"] = dr.select(found, at + hit.t + RAY_EPSILON, at)
-        state["count"] = state["count"] + 1
-        return (state,)
+            sheet = _sheet_transmission(inputs, face, start(), end(), found)
+            visit(
+                carry,
+                dr.select(found, sheet.transmittance, 1.0),
+                dr.select(found, sheet.extra_length, 0.0),
+            )
+        following: _SheetState = {
+            "at": dr.select(found, at + hit.t + RAY_EPSILON, at),
+            "count": state["count"] + 1,
+            "active": found & (dr.detach(sheet.transmittance) > 0),
+            "carry": carry,
+        }
+        return (following,)
 
-    (state,) = rays.loop(
-        ({**state, "active": mi.Bool(active), **carry},),
-        lambda state: state["active"] & (state["count"] < most),
-        body,
-    )
-    return state
+    first: _SheetState = {
+        "at": dr.full(mi.Float, RAY_EPSILON, lanes),
+        "count": dr.zeros(mi.UInt32, lanes),
+        "active": mi.Bool(active),
+        "carry": carry,
+    }
+    (last,) = rays.loop((first,), lambda state: state["active"] & (state["count"] < most), body)
+    return last["carry"], last["active"]
 
 
 def _sheet_transmission(
-    inputs: Inputs, face: Any, start: Any, end: Any, active: Any
-) -> tuple[Any, Any]:
+    inputs: Inputs, face: mit.UInt32, start: mit.Point3f, end: mit.Point3f, active: mit.Bool
+) -> SegmentTransmission:
     p0, p1, p2 = integrand.corners(inputs, face, active)
     normal = dr.cross(p1 - p0, p2 - p0)
     offset = end - start
     cosine = dr.abs(dr.dot(normal, offset)) / (dr.norm(normal) * dr.norm(offset))
     row = dr.gather(mi.UInt32, inputs.face_surface, face, active)
-    return inputs.surfaces.sheet_transmission(row, cosine, active)
+    return SegmentTransmission(*inputs.surfaces.sheet_transmission(row, cosine, active))
 
 
 @dataclass(frozen=True)
 class SegmentHit:
-    """Where a ray ends.
+    """End of a ray on a surface.
 
     Attributes:
-        valid: Whether it meets a surface to end on.
-        face, b1, b2: Where.
-        transmittance, extra_length: Of the sheets that it passed.
-        probability: Probability of having passed those and ended on this one.
+        valid: mask of rays that end on a surface.
+        point: end point.
+        transmission: transmission of the sheets on the ray.
+        probability: probability of transmission through those sheets and of ending on this one.
     """
 
-    valid: Any
-    face: Any
-    b1: Any
-    b2: Any
-    transmittance: Any
-    extra_length: Any
-    probability: Any
+    valid: mit.Bool
+    point: SurfacePoint
+    transmission: SegmentTransmission
+    probability: mit.Float
 
 
 def trace_to_surface(
     rays: RayScene,
     inputs: Inputs,
-    ray: Any,
-    active: Any,
-    key: tuple[Any, Any],
+    ray: mit.Ray3f,
+    active: mit.Bool,
+    key: tuple[mit.UInt32, mit.UInt32],
     *,
     coherent: bool,
-    stratified_bits: Any = None,
+    stratified_bits: mit.UInt32 | None = None,
 ) -> SegmentHit:
-    """Follow a ray to a surface; every sheet on the way is passed or not by a throw of dice.
+    """Trace rays to a surface, with a random decision at every sheet whether the ray ends there.
 
     Args:
-        rays: Rays.
-        inputs: Detached.
-        ray: Origin and unit direction.
-        active: Lanes.
-        key: Index and seed of the dice.
-        coherent: Whether neighbouring rays are alike.
-        stratified_bits: Whether the first sheets are passed, a bit each, instead of dice: so that
-            those that
-            pass are spread as evenly as all.
+        rays: ray scene.
+        inputs: detached inputs.
+        ray: origins and unit directions.
+        active: mask of active lanes.
+        key: index and seed of the random numbers.
+        coherent: True if neighbouring rays are alike.
+        stratified_bits: decisions at the first sheets, one bit each, instead of random numbers:
+            the transmitted rays are then spread as evenly as all rays.
     """
     one = mi.Float(1.0)
     hit = rays.find_nearest(ray, active, coherent=coherent)
     if not inputs.surfaces.has_sheets:
-        face = dr.select(hit.valid, hit.face, rays.fallback_face)
-        b1, b2 = (dr.select(hit.valid, b, 0.25) for b in (hit.b1, hit.b2))
-        return SegmentHit(hit.valid, face, b1, b2, one, mi.Float(0.0), one)
+        face = dr.select(hit.valid, hit.point.face, rays.fallback_face)
+        b1, b2 = (dr.select(hit.valid, b, 0.25) for b in (hit.point.b1, hit.point.b2))
+        return SegmentHit(hit.valid, SurfacePoint(face, b1, b2), SegmentTransmission.clear(), one)
     lanes = max(dr.width(active), dr.width(ray.d))
-    state = {
+    index, seed = key
+
+    def body(state: _SurfaceState) -> tuple[_SurfaceState]:
+        state = state.copy()
+        going, origin = state["going"], state["origin"]
+        hit = rays.find_nearest(mi.Ray3f(origin, ray.d), going)
+        found = hit.valid
+        face = dr.select(found, hit.point.face, rays.fallback_face)
+        point: mit.Point3f = origin + ray.d * dr.select(found, hit.t, 0.0)  # type: ignore[operator]
+        sheet = _sheet_transmission(inputs, face, origin, origin + ray.d, found)  # type: ignore[operator]
+        probability = dr.select(sheet.transmittance > 0, _PASS_PROBABILITY, 0.0)
+        uniform, _ = uniform_pair(index, seed + state["count"] * 0x85EBCA6B)
+        if stratified_bits is not None:
+            bit = ((stratified_bits ^ seed) >> state["count"]) & 1
+            uniform = dr.select(state["count"] < STRATIFIED_SHEETS, mi.Float(bit), uniform)
+        passes = found & (uniform < probability)
+        ends = found & ~passes
+        state["face"] = dr.select(ends, face, state["face"])
+        state["b1"] = dr.select(ends, hit.point.b1, state["b1"])
+        state["b2"] = dr.select(ends, hit.point.b2, state["b2"])
+        state["valid"] = state["valid"] | ends
+        state["transmittance"] = dr.select(
+            passes, state["transmittance"] * sheet.transmittance, state["transmittance"]
+        )
+        state["extra"] = dr.select(passes, state["extra"] + sheet.extra_length, state["extra"])
+        odds = dr.select(passes, probability, dr.select(ends, 1 - probability, 1.0))
+        state["probability"] = state["probability"] * odds
+        step = RAY_EPSILON * (hit.t + dr.norm(point))
+        state["origin"] = dr.select(passes, point + ray.d * step, origin)
+        state["count"] = state["count"] + 1
+        state["going"] = passes & (state["count"] < _MAX_SHEETS)
+        return (state,)
+
+    first: _SurfaceState = {
         "going": hit.valid,
         "valid": dr.zeros(mi.Bool, lanes),
         "face": dr.zeros(mi.UInt32, lanes) + rays.fallback_face,
@@ -181,42 +268,14 @@ def trace_to_surface(
         "b2": dr.full(mi.Float, 0.25, lanes),
         "transmittance": dr.ones(mi.Float, lanes),
         "extra": dr.zeros(mi.Float, lanes),
-        "chance": dr.ones(mi.Float, lanes),
+        "probability": dr.ones(mi.Float, lanes),
         "origin": mi.Point3f(ray.o) + dr.zeros(mi.Point3f, lanes),
         "count": dr.zeros(mi.UInt32, lanes),
     }
-    index, seed = key
-
-    def body(state: dict[str, Any]) -> tuple[dict[str, Any]]:
-        state = dict(state)
-        going, origin = state["going"], state["origin"]
-        hit = rays.find_nearest(mi.Ray3f(origin, ray.d), going)
-        found = hit.valid
-        face = dr.select(found, hit.face, rays.fallback_face)
-        point = origin + ray.d * dr.select(found, hit.t, 0.0)
-        transmittance, extra = _sheet_transmission(inputs, face, origin, origin + ray.d, found)
-        chance = dr.select(transmittance > 0, _PASS_PROBABILITY, 0.0)
-        dice, _ = uniform_pair(index, seed + state["count"] * 0x85EBCA6B)
-        if stratified_bits is not None:
-            bit = ((stratified_bits ^ seed) >> state["count"]) & 1
-            dice = dr.select(state["count"] < STRATIFIED_SHEETS, mi.Float(bit), dice)
-        passes = found & (dice < chance)
-        ends = found & ~passes
-        for name, value in (("face", face), ("b1", hit.b1), ("b2", hit.b2)):
-            state[name] = dr.select(ends, value, state[name])
-        state["valid"] = state["valid"] | ends
-        state["transmittance"] = dr.select(
-            passes, state["transmittance"] * transmittance, state["transmittance"]
-        )
-        state["extra"] = dr.select(passes, state["extra"] + extra, state["extra"])
-        odds = dr.select(passes, chance, dr.select(ends, 1 - chance, 1.0))
-        state["chance"] = state["chance"] * odds
-        step = RAY_EPSILON * (hit.t + dr.norm(point))
-        state["origin"] = dr.select(passes, point + ray.d * step, origin)
-        state["count"] = state["count"] + 1
-        state["going"] = passes & (state["count"] < _MAX_SHEETS)
-        return (state,)
-
-    (state,) = rays.loop((state,), lambda state: state["going"], body)
-    names = ("valid", "face", "b1", "b2", "transmittance", "extra", "chance")
-    return SegmentHit(*(state[name] for name in names))
+    (last,) = rays.loop((first,), lambda state: state["going"], body)
+    return SegmentHit(
+        last["valid"],
+        SurfacePoint(last["face"], last["b1"], last["b2"]),
+        SegmentTransmission(last["transmittance"], last["extra"]),
+        last["probability"],
+    )

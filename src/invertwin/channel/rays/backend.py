@@ -10,13 +10,25 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from invertwin.errors import InputError
 from invertwin.runtime import doctor, threads
 from invertwin.runtime.concurrency import tracer_lock
+
+if TYPE_CHECKING:
+    import mitsuba as mit  # type: ignore[reportUnusedImport]
+else:
+
+    class _Untyped:
+        """Types that are not checked at run time: those of Mitsuba depend on the backend."""
+
+        def __getattr__(self, name: str) -> Any:
+            return Any
+
+    mit = _Untyped()
 
 VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
 

@@ -1,6 +1,8 @@
 """Spheres around objects as tables, so that kernels do not grow with the number of objects."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -8,9 +10,12 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_float, to_index
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import morton_order
+
+if TYPE_CHECKING:
+    from invertwin.channel.rays.ray_scene import RayScene
 
 _MAX_GROUP_SIZE = 8  # objects of a group
 _EMPTY_SPHERE = (0.0, 0.0, 0.0, -1.0)  # a sphere that nothing meets
@@ -24,7 +29,7 @@ class BoundingSpheres:
     their place in the table, group after group.
     """
 
-    def __init__(self, geometry: Geometry, origin: Float64[Tensor, "3"], margin: float) -> None:
+    def __init__(self, geometry: Geometry, origin: Float64[Tensor, 3], margin: float) -> None:
         """Surround the objects.
 
         Args:
@@ -58,7 +63,7 @@ class BoundingSpheres:
         self._table_indices = to_index(torch.from_numpy(place))
         self._owner = geometry.topology.device_face_object
         self._size = opaque(self.group_size)
-        self._scenes: dict[str, Any] | None = None
+        self._scenes: dict[str, mit.UInt32] | None = None
         if geometry.object_scene is not None:
             members = np.bincount(of_object)
             columns = {"place": places, "scene": scene[order], "first": first, "groups": groups}
@@ -67,7 +72,7 @@ class BoundingSpheres:
                 for name, column in {**columns, "members": members}.items()
             }
 
-    def table_entry(self, number: Any) -> tuple[Any, Any]:
+    def table_entry(self, number: mit.UInt32) -> tuple[mit.UInt32, mit.UInt32]:
         """Place in the table and scene of objects, in the order of the table.
 
         Args:
@@ -80,20 +85,20 @@ class BoundingSpheres:
         )
         return place, scene
 
-    def scene_groups(self, scene: Any) -> tuple[Any, Any]:
+    def scene_groups(self, scene: mit.UInt32) -> tuple[mit.UInt32, mit.UInt32]:
         """The first group of a scene, and how many it has.
 
         Args:
             scene: Number of the scene.
         """
         if self._scenes is None:
-            return 0, self.group_count
+            return 0, self.group_count  # type: ignore[return-value]
         first, groups = (
             dr.gather(mi.UInt32, self._scenes[name], scene) for name in ("first", "groups")
         )
         return first, groups
 
-    def member_count(self, group: Any) -> Any:
+    def member_count(self, group: mit.UInt32) -> mit.UInt32:
         """How many objects a group has.
 
         Args:
@@ -103,7 +108,7 @@ class BoundingSpheres:
             return dr.minimum(self.group_size, self.object_count - group * self.group_size)
         return dr.gather(mi.UInt32, self._scenes["members"], group)
 
-    def table_index(self, number: Any) -> Any:
+    def table_index(self, number: mit.UInt32) -> mit.UInt32:
         """Places of objects in the table.
 
         Args:
@@ -111,7 +116,9 @@ class BoundingSpheres:
         """
         return dr.gather(mi.UInt32, self._table_indices, number)
 
-    def cap(self, index: Any, point: Any) -> tuple[Any, Any, Any]:
+    def cap(
+        self, index: mit.UInt32, point: mit.Point3f
+    ) -> tuple[mit.Vector3f, mit.Float, mit.Bool]:
         """Axis and height 1 − cos of the cap of directions in which an object lies.
 
         Args:
@@ -128,7 +135,7 @@ class BoundingSpheres:
         axis = dr.select(outside, offset / distance, mi.Vector3f(0, 0, 1))
         return axis, dr.select(outside, _cap_height(radius / distance), 2.0), outside
 
-    def face_group(self, face: Any, active: Any = True) -> Any:
+    def face_group(self, face: mit.UInt32, active: mit.Bool | bool = True) -> mit.UInt32:
         """The group of a triangle's object.
 
         Args:
@@ -140,7 +147,13 @@ class BoundingSpheres:
         owner = dr.gather(mi.UInt32, self._owner, face, active)
         return dr.gather(mi.UInt32, self._group, owner, active)
 
-    def cap_density(self, index: Any, point: Any, direction: Any, target: Any) -> tuple[Any, Any]:
+    def cap_density(
+        self,
+        index: mit.UInt32,
+        point: mit.Point3f,
+        direction: mit.Vector3f,
+        target: mit.UInt32 | int,
+    ) -> tuple[mit.Float, mit.Bool]:
         """One over the solid angle of an object's cap, if that holds a direction, else 0.
 
         Args:
@@ -163,8 +176,14 @@ class BoundingSpheres:
         return dr.select(there & met & ~within, share, 0.0), there & within
 
     def group_density(
-        self, rays: Any, group: Any, point: Any, direction: Any, active: Any, target: Any
-    ) -> tuple[Any, Any]:
+        self,
+        rays: RayScene,
+        group: mit.UInt32,
+        point: mit.Point3f,
+        direction: mit.Vector3f,
+        active: mit.Bool,
+        target: mit.UInt32 | int,
+    ) -> tuple[mit.Float, mit.Float]:
         """Σ 1/(solid angle) over the caps of a group that hold a direction.
 
         Args:
@@ -182,7 +201,9 @@ class BoundingSpheres:
         start = group * self._size + dr.zeros(mi.UInt32, lanes)
         end = dr.select(active, start + self._size, 0)
 
-        def step(index: Any, total: Any, inside: Any) -> tuple[Any, Any, Any]:
+        def step(
+            index: mit.UInt32, total: mit.Float, inside: mit.Float
+        ) -> tuple[mit.UInt32, mit.Float, mit.Float]:
             share, within = self.cap_density(index, point, direction, target)
             return index + 1, total + share, inside + dr.select(within, 1.0, 0.0)
 
@@ -191,7 +212,7 @@ class BoundingSpheres:
         return state[1], state[2]
 
 
-def sample_cap(axis: Any, height: Any, numbers: list[Any]) -> Any:
+def sample_cap(axis: mit.Vector3f, height: mit.Float, numbers: list[mit.Float]) -> mit.Vector3f:
     """Uniform on the spherical cap of a height 1 − cos about an axis.
 
     Args:
@@ -205,7 +226,7 @@ def sample_cap(axis: Any, height: Any, numbers: list[Any]) -> Any:
     return dr.normalize(mi.Frame3f(axis).to_world(mi.Vector3f(c * sine, s * sine, 1 - depth)))
 
 
-def _cap_height(sine: Any) -> Any:
+def _cap_height(sine: mit.Float) -> mit.Float:
     square = dr.minimum(dr.square(sine), 1.0)
     return square / (1 + dr.sqrt(1 - square))
 

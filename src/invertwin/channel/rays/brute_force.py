@@ -4,14 +4,14 @@ A tree spends on a packet of rays as much as some dozens of tests that all lanes
 triangles that make a parallelogram, as those of a box's side, are one test.
 """
 
-from typing import Any
+from __future__ import annotations
 
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_index
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 
 #: Most tests of such a scene: with 24 paths take three quarters of their time, from 40 on more.
 MAX_TESTS = 24
@@ -32,7 +32,7 @@ class BruteForceIntersector:
     @staticmethod
     def build(
         vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]
-    ) -> "BruteForceIntersector | None":
+    ) -> BruteForceIntersector | None:
         """None where there are too many of them.
 
         Args:
@@ -66,7 +66,9 @@ class BruteForceIntersector:
         #: Of every test, for its near and its far half: the triangle, and which corner comes first.
         self._halves = to_index(rows)
 
-    def find_nearest(self, ray: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def find_nearest(
+        self, ray: mit.Ray3f, active: mit.Bool | bool
+    ) -> tuple[mit.Bool, mit.UInt32, mit.Float, mit.Float, mit.Float]:
         """The first triangle on a ray.
 
         Args:
@@ -97,7 +99,7 @@ class BruteForceIntersector:
         )
         return valid, half.x, b1, b2, far
 
-    def is_blocked(self, ray: Any, active: Any) -> Any:
+    def is_blocked(self, ray: mit.Ray3f, active: mit.Bool | bool) -> mit.Bool:
         """Whether any triangle is on a ray.
 
         Args:
@@ -106,15 +108,15 @@ class BruteForceIntersector:
         """
         blocked = mi.Bool(False)
         for number in range(self.test_count):
-            blocked |= self._intersect_patch(number, ray, ray.maxt)[3]
+            blocked |= self._intersect_patch(number, ray, mi.Float(ray.maxt))[3]
         return blocked & active
 
     def _intersect_patch(
-        self, number: int, ray: Any, max_distance: Any
-    ) -> tuple[Any, Any, Any, Any]:
+        self, number: int, ray: mit.Ray3f, max_distance: mit.Float
+    ) -> tuple[mit.Float, mit.Float, mit.Float, mit.Bool]:
         """Distance and coordinates where a ray meets a plane, and whether that is within."""
         corner, normal, first, second = self._patches[number]
-        origin = mi.Vector3f(ray.o - corner)
+        origin = mi.Vector3f(ray.o - corner)  # type: ignore[operator]
         along = -dr.dot(normal, origin) / dr.dot(normal, ray.d)
         place = dr.fma(ray.d, along, origin)
         u, v = dr.dot(first, place), dr.dot(second, place)
@@ -122,7 +124,7 @@ class BruteForceIntersector:
         return along, u, v, (along > 0) & (along < max_distance) & (u >= 0) & (v >= 0) & within
 
 
-def _opaque_vector(numbers: list[float]) -> Any:
+def _opaque_vector(numbers: list[float]) -> mit.Vector3f:
     return mi.Vector3f(*(opaque(number, "Float") for number in numbers))
 
 

@@ -1,14 +1,19 @@
 """Which shadows a derivative can move, in scenes of which a part stands still."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_index
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.bounding_spheres import sample_cap
+
+if TYPE_CHECKING:
+    from invertwin.channel.rays.ray_scene import RayScene
 
 NO_TARGET = 0xFFFFFFFF  # no place in a table
 _TOLERANCE = 1e-4  # of a distance: far more than rounding
@@ -25,13 +30,13 @@ class DifferentiatedObjects:
         rays: The ray scene whose kernels this is a part of.
     """
 
-    def __init__(self, differentiated: Bool[Tensor, " object"], rays: Any) -> None:
+    def __init__(self, differentiated: Bool[Tensor, " object"], rays: RayScene) -> None:
         self._rays = rays
         self._differentiated = to_index(differentiated)
         self._numbers = to_index(torch.nonzero(differentiated)[:, 0])
         self._count = opaque(int(differentiated.sum()))
 
-    def has_object(self, owner: Any, active: Any = True) -> Any:
+    def has_object(self, owner: mit.UInt32, active: mit.Bool | bool = True) -> mit.Bool:
         """Whether objects move.
 
         Args:
@@ -40,7 +45,7 @@ class DifferentiatedObjects:
         """
         return dr.gather(mi.UInt32, self._differentiated, owner, active) > 0
 
-    def has_face(self, face: Any, active: Any = True) -> Any:
+    def has_face(self, face: mit.UInt32, active: mit.Bool | bool = True) -> mit.Bool:
         """Whether triangles are parts of objects that move.
 
         Args:
@@ -50,7 +55,7 @@ class DifferentiatedObjects:
         owners = self._rays.topology.device_face_object
         return self.has_object(dr.gather(mi.UInt32, owners, face, active), active)
 
-    def has_edge(self, edge: Any) -> Any:
+    def has_edge(self, edge: mit.UInt32) -> mit.Bool:
         """Whether edges are parts of objects that move.
 
         Args:
@@ -58,7 +63,9 @@ class DifferentiatedObjects:
         """
         return self.has_object(dr.gather(mi.UInt32, self._rays.topology.device_edge_object, edge))
 
-    def sample_direction(self, point: Any, numbers: list[Any]) -> tuple[Any, Any]:
+    def sample_direction(
+        self, point: mit.Point3f, numbers: list[mit.Float]
+    ) -> tuple[mit.Vector3f, mit.UInt32]:
         """A direction to the sphere of an object that moves, and the object's place in the table.
 
         Args:
@@ -71,7 +78,9 @@ class DifferentiatedObjects:
         axis, height, _ = spheres.cap(aimed, point)
         return sample_cap(axis, height, numbers[1:]), aimed
 
-    def line_density(self, point: Any, direction: Any, target: Any) -> Any:
+    def line_density(
+        self, point: mit.Point3f, direction: mit.Vector3f, target: mit.UInt32
+    ) -> mit.Float:
         """Probability per solid angle of such directions, of which half are turned round.
 
         Args:
@@ -81,7 +90,7 @@ class DifferentiatedObjects:
         """
         rays, spheres = self._rays, self._rays.spheres
 
-        def step(number: Any, total: Any) -> tuple[Any, Any]:
+        def step(number: mit.UInt32, total: mit.Float) -> tuple[mit.UInt32, mit.Float]:
             at = spheres.table_index(dr.gather(mi.UInt32, self._numbers, number))
             ahead, within = spheres.cap_density(at, point, direction, target)
             behind, _ = spheres.cap_density(at, point, -direction, NO_TARGET)
@@ -96,7 +105,9 @@ class DifferentiatedObjects:
         )
         return state[1] / mi.Float(self._count)
 
-    def may_receive_shadow(self, edge: Any, origin: Any, y0: Any, y1: Any) -> Any:
+    def may_receive_shadow(
+        self, edge: mit.UInt32, origin: mit.Point3f, y0: mit.Vector3d, y1: mit.Vector3d
+    ) -> mit.Bool:
         """Whether shadows of edges may fall on an object that moves: its sphere is asked.
 
         Args:
@@ -116,7 +127,7 @@ class DifferentiatedObjects:
         near = dr.norm(first + along * foot)
         scene = rays.edge_scene(edge)
 
-        def step(number: Any, found: Any) -> tuple[Any, Any]:
+        def step(number: mit.UInt32, found: mit.Bool) -> tuple[mit.UInt32, mit.Bool]:
             owner = dr.gather(mi.UInt32, self._numbers, number)
             sphere = dr.gather(mi.Vector4f, spheres.table, spheres.table_index(owner))
             centre, radius = sphere.xyz - origin, sphere.w

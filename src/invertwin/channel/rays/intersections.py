@@ -176,7 +176,7 @@ def _trace_edges(
         lanes = dr.compress(hit.valid)
         if not dr.width(lanes):
             break
-        face = dr.gather(mi.UInt32, hit.face, lanes)
+        face = dr.gather(mi.UInt32, hit.point.face, lanes)
         edge, start, offset, at, until, step = (
             dr.gather(type(value), value, lanes)
             for value in (edge, mi.Point3f(start), mi.Vector3f(offset), at, until, step)

@@ -1,16 +1,18 @@
-"""What rays need: the ray scene and the antennas, in float32 about a local origin."""
+"""Ray scene: triangles and antennas in float32 about a local origin, and ray queries."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.paths import Link
-from invertwin.channel.rays import arrays
+from invertwin.channel.rays import surface_point
 from invertwin.channel.rays.arrays import (
     opaque,
     to_double,
@@ -19,85 +21,89 @@ from invertwin.channel.rays.arrays import (
     to_points,
     to_torch,
 )
-from invertwin.channel.rays.backend import backend, dr, mi, tracing
+from invertwin.channel.rays.backend import backend, dr, mi, mit, tracing
 from invertwin.channel.rays.bounding_spheres import BoundingSpheres
 from invertwin.channel.rays.brute_force import BruteForceIntersector
 from invertwin.channel.rays.differentiated_objects import DifferentiatedObjects
 from invertwin.channel.rays.scene_tables import Geometry
+from invertwin.channel.rays.surface_point import SurfacePoint, Triangle
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh
 
-# Offset along a ray, relative to its length: fifty float32 roundings of a coordinate, and small
-# enough that the dark side of a 0.3 m ball stays dark from a kilometre away.
+State = TypeVar("State", bound=tuple[object, ...])
+
+# Offset along a ray, relative to its length: fifty float32 roundings of a coordinate, and so small
+# that the shadowed side of a 0.3 m ball stays dark from a kilometre away.
 RAY_EPSILON = 3e-6
-_MIN_RELATIVE_AREA = 1e-3  # a triangle's area over its squared sides, below which it is one
+_MIN_RELATIVE_AREA = 1e-3  # least area over squared sides of a triangle that is not a sliver
 
 
 @dataclass(frozen=True)
 class RayIntersection:
-    """What a ray meets first.
+    """First intersection of rays with triangles.
 
     Attributes:
-        valid: Whether it meets anything; else the rest is not defined.
-        face: Triangle.
-        b1, b2: Barycentric coordinates.
-        t: How far along the ray, in lengths of its direction.
+        valid: mask of rays that meet a triangle; elsewhere the other fields are undefined.
+        point: intersection point.
+        t: distance along the ray, in lengths of its direction.
     """
 
-    valid: Any
-    face: Any
-    b1: Any
-    b2: Any
-    t: Any
+    valid: mit.Bool
+    point: SurfacePoint
+    t: mit.Float
 
 
 class Occluders:
     """Triangles that block rays, in float32 about a local origin.
 
     Args:
-        vertices: World positions [m].
-        topology: Their triangles.
-        origin: The local origin [m].
+        vertices: world positions [v, 3] in metres.
+        topology: connectivity of the triangles.
+        origin: local origin [3] in the world [m].
     """
 
     def __init__(
-        self, vertices: Float64[Tensor, "v 3"], topology: Topology, origin: Float64[Tensor, "3"]
+        self, vertices: Float64[Tensor, "v 3"], topology: Topology, origin: Float64[Tensor, 3]
     ) -> None:
         self.topology = topology
         self.origin = origin
         self.local_vertices = (vertices.detach() - origin).to(torch.float32)
-        #: The triangles by themselves, where they are so few that no tree is needed.
+        #: Brute-force intersector, for so few triangles that no BVH is needed.
         self.brute_force: BruteForceIntersector | None = None
 
     @property
     def scene(self) -> Any:
-        """Mitsuba's scene. Asked for anew: other rays on the same objects may have moved them."""
+        """Mitsuba's scene, looked up anew: other ray scenes of the objects may have moved them."""
         return self.topology.ray_scene(self.local_vertices)
 
-    def loop(self, state: Any, going: Callable[..., Any], step: Callable[..., Any]) -> Any:
+    def loop(
+        self, state: State, going: Callable[..., mit.Bool], step: Callable[..., State]
+    ) -> State:
         """Record a loop in which rays are cast; all loops of kernels over rays are made here.
 
-        A tree is built before: to build it while a loop is recorded aborts the process. The step
-        is not recorded a second time, which would gain the kernel nothing.
+        The BVH is built before: to build it while a loop is recorded aborts the process. The step
+        is recorded once only, since a second recording would gain the kernel nothing.
 
         Args:
-            state: What the loop carries, a tuple.
-            going: Takes the state; which lanes go on.
-            step: Takes the state and returns the next one.
+            state: tuple of arrays that the loop carries.
+            going: function of the state that returns the mask of lanes that continue.
+            step: function of the state that returns the next one.
         """
         if self.brute_force is None:
             _ = self.scene
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
             return dr.while_loop(state, going, step, mode="symbolic")
 
-    def is_clear(self, start: Any, end: Any, active: Any = True) -> Any:
-        """Whether nothing lies between two points (their own surfaces excluded).
+    def is_clear(
+        self, start: mit.Point3f, end: mit.Point3f, active: mit.Bool | bool = True
+    ) -> mit.Bool:
+        """Test whether segments are unobstructed (the surfaces of their ends excluded).
 
         Args:
-            start, end: Points.
-            active: Lanes.
+            start, end: ends of the segments.
+            active: mask of active lanes.
         """
         ray = mi.Ray3f(
             start + (end - start) * RAY_EPSILON, end - start, 1 - 2 * RAY_EPSILON, 0.0, []
@@ -106,33 +112,37 @@ class Occluders:
             return active & ~self.brute_force.is_blocked(ray, active)
         return active & ~self.scene.ray_test(ray, active)
 
-    def find_nearest(self, ray: Any, active: Any, *, coherent: bool = False) -> "RayIntersection":
-        """The first triangle on a ray.
+    def find_nearest(
+        self, ray: mit.Ray3f, active: mit.Bool, *, coherent: bool = False
+    ) -> RayIntersection:
+        """Find the first triangle on rays.
 
         Args:
-            ray: Origin, direction, and how far it goes.
-            active: Lanes.
-            coherent: Whether neighbouring rays are alike.
+            ray: origins, directions, and largest distances.
+            active: mask of active lanes.
+            coherent: True if neighbouring rays are alike.
         """
         if self.brute_force is not None:
-            return RayIntersection(*self.brute_force.find_nearest(ray, active))
+            valid, face, b1, b2, t = self.brute_force.find_nearest(ray, active)
+            return RayIntersection(valid, SurfacePoint(face, b1, b2), t)
         hit = self.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
         valid = active & hit.is_valid()
-        return RayIntersection(valid, hit.prim_index, hit.prim_uv.x, hit.prim_uv.y, hit.t)
+        point = SurfacePoint(hit.prim_index, hit.prim_uv.x, hit.prim_uv.y)
+        return RayIntersection(valid, point, hit.t)
 
-    def to_local_points(self, points: Float64[Tensor, "n 3"]) -> Any:
-        """World points as Dr.Jit points about the origin."""
+    def to_local_points(self, points: Float64[Tensor, "n 3"]) -> mit.Point3f:
+        """Convert world points [n, 3] to Dr.Jit points about the local origin."""
         local = (points.detach() - self.origin).to(torch.float32)
         return mi.Point3f(*(to_float(local[:, k]) for k in range(3)))
 
 
 class RayScene(Occluders):
-    """The triangles of a scene and the antennas that look at them.
+    """Triangles of a scene, and the antennas that see them.
 
     Args:
-        geometry: The scene.
-        link: The antennas; the local origin is the mean place of the transmitters.
-        differentiate_antennas: Whether derivatives may flow through the places of antennas.
+        geometry: scene as flat tables.
+        link: antennas; the local origin is the mean position of the transmitters.
+        differentiate_antennas: True if derivatives may flow through the antennas' positions.
     """
 
     def __init__(
@@ -140,7 +150,7 @@ class RayScene(Occluders):
     ) -> None:
         origin = link.tx.detach().mean(dim=0)
         super().__init__(geometry.vertices, geometry.topology, origin)
-        # A GPU walks trees in hardware.
+        # A GPU traverses a BVH in hardware.
         if backend() == "cpu":
             self.brute_force = BruteForceIntersector.build(
                 geometry.vertices.detach() - origin, geometry.faces
@@ -150,15 +160,15 @@ class RayScene(Occluders):
         self.vertices = to_points(self.local_vertices)
         self.tx = to_points(link.tx - origin)
         self.rx = to_points(link.rx - origin)
-        # Lanes without a hit are evaluated on a sound triangle, then masked: no NaN can leak.
+        # Lanes without a hit are evaluated on a valid triangle, then masked: no NaN can leak.
         self.fallback_face = opaque(_find_fallback_face(geometry))
         owners = geometry.object_scene
         self.scene_count = 1 if owners is None else int(owners.max()) + 1
-        #: Radar poses that look at one scene; those of the first scene come first.
+        #: Radar poses per scene; those of the first scene come first.
         self.poses_per_scene = link.frame_count // self.scene_count
         self._scene_of_object = None if owners is None else to_index(owners)
         some = any(geometry.differentiated) and not all(geometry.differentiated)
-        #: Objects that move where others and the antennas do not; None where that is not so.
+        #: Objects with derivatives, if others and the antennas have none; else None.
         self.differentiated_objects = None
         if some and not differentiate_antennas:
             self.differentiated_objects = DifferentiatedObjects(
@@ -167,12 +177,12 @@ class RayScene(Occluders):
 
     @cached_property
     def spheres(self) -> BoundingSpheres:
-        """Around the objects."""
+        """Bounding spheres of the objects."""
         return BoundingSpheres(self.geometry, self.origin, margin=1.001)
 
     @cached_property
-    def triangles(self) -> Any:
-        """Of every triangle a corner, two sides and the unit normal, as three rows of four numbers.
+    def triangles(self) -> mit.Float:
+        """Corner, two sides and unit normal of every triangle, as three rows of four numbers.
 
         Rows are (corner, normal's x), (side, its y), (side, its z): each is read as a whole.
         """
@@ -182,67 +192,69 @@ class RayScene(Occluders):
         return to_float(torch.cat([rows, normal[:, :, None]], dim=2))
 
     @cached_property
-    def exact_vertices(self) -> Any:
+    def exact_vertices(self) -> mit.Float64:
         """Vertices in float64, three numbers each."""
         return to_double(self.geometry.vertices.detach() - self.origin)
 
-    def exact_vertex(self, vertex: Any, active: Any = True) -> Any:
-        """Vertices in float64.
+    def exact_vertex(self, vertex: mit.UInt32, active: mit.Bool | bool = True) -> mit.Vector3d:
+        """Gather vertices in float64.
 
         Args:
-            vertex: Their numbers.
-            active: Lanes.
+            vertex: vertex indices.
+            active: mask of active lanes.
         """
         return dr.gather(mi.Vector3d, self.exact_vertices, vertex, active)
 
-    def exact_ends(self, edge: Any) -> tuple[Any, Any]:
-        """Both ends of edges in float64.
+    def exact_ends(self, edge: mit.UInt32) -> tuple[mit.Vector3d, mit.Vector3d]:
+        """Gather both ends of edges in float64.
 
         Args:
-            edge: Their numbers.
+            edge: edge indices.
         """
         first, second = self.topology.device_edges
         return tuple(
             self.exact_vertex(dr.gather(mi.UInt32, ends, edge)) for ends in (first, second)
         )  # type: ignore[return-value]
 
-    def object_scene(self, number: Any) -> Any:
-        """The scenes of objects.
+    def object_scene(self, number: mit.UInt32) -> mit.UInt32:
+        """Look up the scenes of objects.
 
         Args:
-            number: Of the objects.
+            number: object indices.
         """
         if self._scene_of_object is None:
             return mi.UInt32(0)
         return dr.gather(mi.UInt32, self._scene_of_object, number)
 
-    def edge_scene(self, edge: Any) -> Any:
-        """The scenes of edges.
+    def edge_scene(self, edge: mit.UInt32) -> mit.UInt32:
+        """Look up the scenes of edges.
 
         Args:
-            edge: Their numbers.
+            edge: edge indices.
         """
         if self._scene_of_object is None:
             return mi.UInt32(0)
         return self.object_scene(dr.gather(mi.UInt32, self.topology.device_edge_object, edge))
 
-    def frame_scene(self, frame: Any) -> Any:
-        """The scenes that radar poses look at.
+    def frame_scene(self, frame: mit.UInt32) -> mit.UInt32:
+        """Look up the scenes of radar poses.
 
         Args:
-            frame: Radar poses.
+            frame: radar poses.
         """
         return mi.UInt32(0) if self._scene_of_object is None else frame // self.poses_per_scene
 
-    def is_in_scene(self, frame: Any, face: Any, active: Any = True) -> Any:
-        """Whether triangles belong to the scene that a radar pose looks at.
+    def is_in_scene(
+        self, frame: mit.UInt32, face: mit.UInt32, active: mit.Bool | bool = True
+    ) -> mit.Bool:
+        """Test whether triangles belong to the scene of a radar pose.
 
-        A ray that leaves its scene ends for it, whatever it meets in another one.
+        A ray ends when it leaves its scene, whatever it meets in another one.
 
         Args:
-            frame: Radar pose.
-            face: Triangle.
-            active: Lanes.
+            frame: radar poses.
+            face: triangle indices.
+            active: mask of active lanes.
         """
         if self._scene_of_object is None:
             return mi.Bool(True)
@@ -250,18 +262,18 @@ class RayScene(Occluders):
         scene = dr.gather(mi.UInt32, self._scene_of_object, owner, active)
         return scene == self.frame_scene(frame)
 
-    def corners(self, face: Any, active: Any = True) -> tuple[Any, Any, Any]:
-        """Corners of triangles, detached.
+    def corners(self, face: mit.UInt32, active: mit.Bool | bool = True) -> Triangle:
+        """Gather the corners of triangles, detached.
 
         Args:
-            face: Triangle.
-            active: Lanes.
+            face: triangle indices.
+            active: mask of active lanes.
         """
-        return arrays.corners(self.vertices, self.topology.device_corners, face, active)
+        return surface_point.corners(self.vertices, self.topology.device_corners, face, active)
 
 
 def _find_fallback_face(geometry: Geometry) -> int:
-    """A triangle that is no sliver; the last answer while it stays one, which is quicker."""
+    """Find a triangle that is no sliver: the cached one if still valid, which is faster."""
     topology = geometry.topology
     if topology.fallback_face is not None:
         p0, p1, p2 = geometry.vertices.detach()[geometry.faces[topology.fallback_face]]
@@ -274,7 +286,7 @@ def _find_fallback_face(geometry: Geometry) -> int:
 
 
 def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:
-    """Areas of all triangles [m²], detached."""
+    """Compute the areas of all triangles [m²], detached."""
     p0, p1, p2 = (geometry.vertices.detach()[geometry.faces[:, k]] for k in range(3))
     areas = 0.5 * torch.linalg.cross(p1 - p0, p2 - p0).norm(dim=1)
     if not bool((areas > 0).any()):
@@ -285,11 +297,11 @@ def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:
 def is_visible(
     rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]
 ) -> Tensor:
-    """Whether nothing lies between pairs of world points (torch in, torch out).
+    """Test whether segments between world points are unobstructed.
 
     Args:
-        rays: What may be in the way.
-        start, end: Points.
+        rays: occluders.
+        start, end: ends of the segments, [n, 3] in the world [m].
     """
     if not len(start):
         return torch.zeros(0, dtype=torch.bool)
@@ -299,11 +311,14 @@ def is_visible(
 def find_next_surface(
     rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]
 ) -> tuple[Int64[Tensor, " n"], Float64[Tensor, " n"]]:
-    """First triangle between pairs of world points (−1: none), and how far along it lies.
+    """Find the first triangle between pairs of world points.
 
     Args:
-        rays: What may be in the way.
-        start, end: Points.
+        rays: occluders.
+        start, end: ends of the segments, [n, 3] in the world [m].
+
+    Returns:
+        Triangle indices (−1: none), and positions along the segments from 0 to 1.
     """
     if not len(start):
         return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
@@ -319,22 +334,22 @@ def find_next_surface(
 def visible_points(
     mesh: Mesh, points: Float64[Tensor, "n 3"], positions: ArrayLike
 ) -> Bool[Tensor, " n"]:
-    """Which points of a surface at least one position sees past the rest of the same mesh.
+    """Find the points of a surface that at least one position sees past the rest of the mesh.
 
     Args:
-        mesh: The surface; its triangles hide what is behind them.
-        points: On the surface [m], in the frame of the mesh.
-        positions: From where it is seen, [p, 3] in metres.
+        mesh: surface, which also occludes.
+        points: points on the surface [n, 3], in the frame of the mesh [m].
+        positions: positions of the viewers, [p, 3] in metres.
 
     Raises:
         InputError: Positions of another shape, or that are not finite.
     """
-    places = checked_tensor(positions, (None, 3), "radar positions [m]", "give x, y, z of each")
-    seen = torch.zeros(len(points), dtype=torch.bool)
+    viewers = checked_tensor(positions, (None, 3), "radar positions [m]", "give x, y, z of each")
+    visible = torch.zeros(len(points), dtype=torch.bool)
     with tracing():
-        rays = Occluders(mesh.vertices, topology_of([mesh]), places.detach().mean(dim=0))
-        for place in places:
-            hidden = torch.nonzero(~seen)[:, 0]
-            clear = is_visible(rays, points[hidden], place.expand(len(hidden), 3))
-            seen[hidden[clear]] = True
-    return seen
+        rays = Occluders(mesh.vertices, topology_of([mesh]), viewers.detach().mean(dim=0))
+        for viewer in viewers:
+            hidden = torch.nonzero(~visible)[:, 0]
+            clear = is_visible(rays, points[hidden], viewer.expand(len(hidden), 3))
+            visible[hidden[clear]] = True
+    return visible

@@ -1,5 +1,7 @@
 """Which triangles share which edges, and the ray tracer's copy of a flattened scene."""
 
+from __future__ import annotations
+
 import itertools
 from collections import OrderedDict
 from functools import cached_property
@@ -12,7 +14,7 @@ from torch import Tensor
 from torch._C import _DisableFuncTorch
 
 from invertwin.channel.rays.arrays import to_float, to_index, to_signed
-from invertwin.channel.rays.backend import VARIANTS, backend, mi
+from invertwin.channel.rays.backend import VARIANTS, backend, mi, mit
 from invertwin.checks import strip_derivatives
 from invertwin.scene.mesh import Mesh
 
@@ -115,12 +117,12 @@ class Topology:
         return float(self._facet_angles[number])
 
     @cached_property
-    def device_welded_faces(self) -> Any:
+    def device_welded_faces(self) -> mit.UInt32:
         """``welded`` as a flat array of the ray tracer."""
         return to_index(self.welded_faces)
 
     @cached_property
-    def device_face_edges(self) -> Any:
+    def device_face_edges(self) -> mit.Int32:
         """``face_edges`` as a flat array of the ray tracer."""
         return to_signed(self.face_edges)
 
@@ -166,7 +168,7 @@ class Topology:
         }
 
 
-_topologies: "OrderedDict[tuple, tuple[list[Tensor], Topology]]" = OrderedDict()
+_topologies: OrderedDict[tuple, tuple[list[Tensor], Topology]] = OrderedDict()
 
 
 def topology_of(meshes: list[Mesh]) -> Topology:
