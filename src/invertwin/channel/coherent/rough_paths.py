@@ -175,13 +175,11 @@ class _RoughPathSampler:
     ) -> walk.PathState:
         """Lanes that go on from others; each has its own number, and so its own way."""
         at = to_index(parent)
-        incident = (dr.gather(mi.Float, state["incident"][k], at) for k in range(3))
+        incident = [dr.gather(mi.Float, state["incident"][k], at) for k in range(3)]
         return walk.update_state(
             state,
             **{n: dr.gather(type(state[n]), state[n], at) for n in ("face", "b1", "b2", "number")},
-            incident=mi.Vector3f(
-                *(dr.gather(mi.Float, state["incident"][k], at) for k in range(3))
-            ),
+            incident=mi.Vector3f(*incident),
             weight=to_float(weight),
             active=dr.full(mi.Bool, True, len(parent)),
         )

@@ -1,6 +1,6 @@
-"""Paths into the bins of a map, in Dr.Jit, and the adjoint of doing so, written out.
+"""Deposit of paths into the bins of a map, in Dr.Jit, and its adjoint, written out.
 
-A path falls on the grid with quadratic B-spline weights, three taps an axis (derivations §5);
+A path is spread over the grid with quadratic B-spline weights, three bins an axis (derivations §5);
 the radar's point spread is a convolution of the grid afterwards. The B-spline is C¹, so the map
 has continuous derivatives in range and direction.
 """
@@ -22,10 +22,10 @@ from invertwin.channel.paths import Grid, Link, Paths
 from invertwin.channel.rays.arrays import to_float, to_index, to_torch, view_as_torch
 from invertwin.channel.rays.backend import backend, dr, mi, mit, tracing
 
-# Bytes that copies of a map, one a thread, may take; beyond, additions are atomic.
+# Most bytes of copies of a map, one per thread; larger maps use atomic additions.
 _MAX_COPY_BYTES = 2**28
-# Numbers up to which a map has further copies, and the most of them: sums of many amounts are
-# rounded less where each copy takes some. They fit a core's cache.
+# Size up to which a map has further copies, and the most copies: rounding errors are smaller if
+# each copy sums a part of the contributions. They fit a core's cache.
 _MAX_COPIED_VALUES, _MAX_COPIES = 2**16, 1024
 
 FourFloats = tuple[mit.Float, mit.Float, mit.Float, mit.Float]
@@ -34,24 +34,31 @@ FourFloats = tuple[mit.Float, mit.Float, mit.Float, mit.Float]
 
 @dataclass(frozen=True)
 class PathContribution:
-    """Received over transmitted power per sample, and where it falls."""
+    """Contribution of paths to the bins.
 
-    frame: mit.UInt32  # radar pose
+    Attributes:
+        frame: radar poses.
+        power: received over transmitted power per sample.
+        range: half of the optical length [m].
+        u, v: direction cosines of arrival in the radar frame.
+    """
+
+    frame: mit.UInt32
     power: mit.Float
-    range: mit.Float  # half of the optical length [m]
-    u: mit.Float  # direction cosines of arrival in the radar frame
+    range: mit.Float
+    u: mit.Float
     v: mit.Float
 
     @property
     def differentiable_values(self) -> FourFloats:
-        """The four values that may carry derivatives."""
+        """Power, range, u and v, which may carry derivatives."""
         return self.power, self.range, self.u, self.v
 
 
 def _axis_taps(
     coordinate: mit.Float, start: float, step: float, count: int
 ) -> list[tuple[mit.Int32, mit.Bool, mit.Float, mit.Float]]:
-    """Bin, whether it is on the axis, weight and weight's derivative of each tap of one axis."""
+    """Compute bin, mask of bins on the axis, weight, and derivative of the weight of each tap."""
     if count == 1:
         return [(mi.Int32(0), mi.Bool(True), mi.Float(1.0), mi.Float(0.0))]
     t = (dr.detach(coordinate) - start) * (1 / step)
@@ -59,20 +66,19 @@ def _axis_taps(
     d = t - nearest
     weights = 0.5 * dr.square(0.5 - d), 0.75 - dr.square(d), 0.5 * dr.square(0.5 + d)
     slopes = (d - 0.5) / step, -2 * d / step, (d + 0.5) / step
-    places = [mi.Int32(nearest) + offset for offset in (-1, 0, 1)]
-    inside = [(place >= 0) & (place < count) for place in places]
-    return list(zip(places, inside, weights, slopes, strict=True))
+    bins = [mi.Int32(nearest) + offset for offset in (-1, 0, 1)]
+    inside = [(index >= 0) & (index < count) for index in bins]
+    return list(zip(bins, inside, weights, slopes, strict=True))
 
 
 @dataclass(frozen=True)
 class BinLayout:
-    """The bins of a map, and the range from which each frame counts.
+    """Bins of a map, and the range origin of each frame.
 
     Attributes:
-        grid: Bins of one frame.
-        frames: Number of radar poses.
-        origin: Of every frame [m]; None = 0.
-    """
+        grid: bins of one frame.
+        frames: number of radar poses.
+        origin: range origin of every frame [m]; None = 0."""
 
     grid: Grid
     frames: int
@@ -80,57 +86,53 @@ class BinLayout:
 
     @staticmethod
     def from_link(grid: Grid, link: Link) -> BinLayout:
-        """That of the maps of an antenna.
+        """Create the layout of the maps of antennas.
 
         Args:
-            grid: Bins of one frame.
-            link: Antennas.
-        """
+            grid: bins of one frame.
+            link: antennas."""
         return BinLayout(grid, link.frame_count, link.range_origin)
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Frames, and bins along range, u and v."""
+        """Numbers of frames, and of bins along range, u and v."""
         return self.frames, *self.grid.shape
 
     @property
     def strip_axis(self) -> int:
-        """The axis of strips: the last one of range, u and v that has bins to choose from."""
+        """Axis of strips: the last one of range, u and v with more than one bin."""
         return max((axis for axis, count in enumerate(self.grid.shape) if count > 1), default=2)
 
     @property
     def strip_shape(self) -> tuple[int, ...]:
-        """The shape of an array of strips: the fine axis comes last, with one strip at each end."""
+        """Shape of an array of strips: the strip axis comes last, with one strip at each end."""
         rest = list(self.shape)
         count = rest.pop(self.strip_axis + 1)
         return *rest, count + 2, 4
 
     def sum_strips(self, strips: mit.Float) -> Float32[Tensor, "frame range u v"]:
-        """The map whose strips hold these amounts.
+        """Sum strips to the map.
 
         Args:
-            strips: A flat Dr.Jit array, one or more of the shape ``strips``.
-        """
+            strips: flat array, one or more of the shape ``strip_shape``."""
         parts = view_as_torch(strips).reshape(-1, *self.strip_shape)
         parts = parts[0] if len(parts) == 1 else parts.sum(0)
         total = parts[..., 2:, 0] + parts[..., 1:-1, 1] + parts[..., :-2, 2]
         return total.movedim(-1, self.strip_axis + 1)
 
     def expand_to_strips(self, bins: Float32[Tensor, "frame range u v"]) -> mit.Float:
-        """The adjoint of ``summed``: every strip gets the values of its three bins.
+        """Adjoint of ``sum_strips``: copy the values of its three bins to every strip.
 
         Args:
-            bins: A value for every bin.
-        """
+            bins: value of every bin."""
         rows = torch.nn.functional.pad(bins.movedim(self.strip_axis + 1, -1), (2, 3))
         return to_float(rows.unfold(-1, 4, 1))
 
     def relative_range(self, path: PathContribution) -> mit.Float:
-        """Ranges of paths from the origin of their frame (detached).
+        """Compute the ranges of paths from the origin of their frame [m] (detached).
 
         Args:
-            path: The paths.
-        """
+            path: contributions."""
         length = dr.detach(path.range)
         if self.origin is None:
             return length
@@ -139,24 +141,31 @@ class BinLayout:
 
 @dataclass(frozen=True)
 class _Strip:
-    """Three bins side by side along the fine axis, and how paths fall on them (detached)."""
+    """Strip of three adjacent bins along the strip axis, and the weights of paths (detached).
 
-    index: mit.UInt32  # number of the strip
-    is_inside: mit.Bool  # whether its row is on the grid, and its middle at most one bin off it
-    transverse_weight: mit.Float  # weight of the row
-    transverse_derivatives: list[
-        mit.Float
-    ]  # its derivatives in range, u and v; along the fine axis the weight itself
-    weights: list[mit.Float]  # of the three bins
-    weight_derivatives: list[mit.Float]  # their derivatives along the fine axis
+    Attributes:
+        index: strip number.
+        is_inside: mask of strips whose row is on the grid and whose centre is at most one bin off.
+        transverse_weight: weight of the row.
+        transverse_derivatives: its derivatives in range, u and v; along the strip axis the weight
+            itself.
+        weights: weights of the three bins.
+        weight_derivatives: their derivatives along the strip axis.
+    """
+
+    index: mit.UInt32
+    is_inside: mit.Bool
+    transverse_weight: mit.Float
+    transverse_derivatives: list[mit.Float]
+    weights: list[mit.Float]
+    weight_derivatives: list[mit.Float]
 
     def tap_derivatives(self, axis: int, strip_axis: int) -> list[mit.Float]:
-        """Derivatives of the three weights along an axis.
+        """Compute the derivatives of the three weights along an axis.
 
         Args:
             axis: 0 range, 1 u, 2 v.
-            strip_axis: That of the strips.
-        """
+            strip_axis: axis of the strips."""
         return [
             self.transverse_derivatives[axis] * w
             for w in (self.weight_derivatives if axis == strip_axis else self.weights)
@@ -164,7 +173,7 @@ class _Strip:
 
 
 def _iterate_strips(layout: BinLayout, path: PathContribution) -> Iterator[_Strip]:
-    """The strips that paths fall on: three for every other axis with bins to choose from."""
+    """Iterate over the strips of paths: three for every other axis with more than one bin."""
     grid, fine = layout.grid, layout.strip_axis
     counts = list(grid.shape)
     axes = [
@@ -183,8 +192,8 @@ def _iterate_strips(layout: BinLayout, path: PathContribution) -> Iterator[_Stri
     axes[fine], counts[fine] = [(mi.Int32(0), mi.Bool(True), one, one)], 1
     for taps in product(*axes):
         row, inside = mi.Int32(path.frame), near
-        for (place, on_axis, _, _), count in zip(taps, counts, strict=True):
-            row, inside = row * count + place, inside & on_axis
+        for (index, on_axis, _, _), count in zip(taps, counts, strict=True):
+            row, inside = row * count + index, inside & on_axis
         yield _Strip(
             index=mi.UInt32(row * length + middle + 1),
             is_inside=inside,
@@ -203,15 +212,14 @@ def _multiply(factors: list[mit.Float]) -> mit.Float:
 
 
 class BinAccumulator:
-    """A map that paths are added to.
+    """Map that paths are added to.
 
-    The three bins that lie side by side are added to at once, as one vector, to strips that
-    overlap; they are summed at the end. For maps that are not too large, Dr.Jit keeps a copy for
-    every thread, so that no addition need be atomic.
+    The three adjacent bins of a strip are added as one vector, to strips that overlap; the strips
+    are summed at the end. For small maps, Dr.Jit keeps a copy per thread, so that additions need
+    not be atomic.
 
     Args:
-        layout: Its bins.
-    """
+        layout: bins of the map."""
 
     def __init__(self, layout: BinLayout) -> None:
         self.layout = layout
@@ -226,9 +234,8 @@ class BinAccumulator:
         """Add paths.
 
         Args:
-            path: The paths.
-            active: Which paths exist.
-        """
+            path: contributions.
+            active: mask of paths that exist."""
         for strip in _iterate_strips(self.layout, path):
             power = path.power * strip.transverse_weight
             self._scatter_strip([power * weight for weight in strip.weights], strip, active)
@@ -236,21 +243,20 @@ class BinAccumulator:
     def add_tangent(
         self, path: PathContribution, tangents: FourFloats, active: mit.Bool | bool
     ) -> None:
-        """Add the derivative of paths' deposit, given those of power, range, u and v.
+        """Add the tangent of the deposit of paths.
 
         Args:
-            path: The paths.
-            tangents: Derivatives of power, range, u and v.
-            active: Which paths exist.
-        """
+            path: contributions.
+            tangents: tangents of power, range, u and v.
+            active: mask of paths that exist."""
         power = dr.detach(path.power)
-        dot_power, *moves = tangents
+        power_tangent, *others = tangents
         fine = self.layout.strip_axis
         for strip in _iterate_strips(self.layout, path):
-            values = [dot_power * strip.transverse_weight * weight for weight in strip.weights]
-            for axis, dot in enumerate(moves):
+            values = [power_tangent * strip.transverse_weight * weight for weight in strip.weights]
+            for axis, tangent in enumerate(others):
                 slopes = strip.tap_derivatives(axis, fine)
-                values = [v + power * dot * s for v, s in zip(values, slopes, strict=True)]
+                values = [v + power * tangent * s for v, s in zip(values, slopes, strict=True)]
             self._scatter_strip(values, strip, active)
 
     def _scatter_strip(
@@ -258,49 +264,47 @@ class BinAccumulator:
     ) -> None:
         amounts = mi.Vector4f(*values, 0.0)
         lane = dr.arange(mi.UInt32, dr.width(amounts, strip.index))
-        place = strip.index + lane % self._copies * self._strip_count
-        dr.scatter_add(self.values, amounts, place, strip.is_inside & active, mode=self._mode)
+        index = strip.index + lane % self._copies * self._strip_count
+        dr.scatter_add(self.values, amounts, index, strip.is_inside & active, mode=self._mode)
 
     def to_map(self) -> Float32[Tensor, "frame range u v"]:
-        """What all bins hold."""
+        """Sum all strips to the map."""
         return self.layout.sum_strips(self.values)
 
 
 def gather_adjoint(
     strip_gradient: mit.Float, layout: BinLayout, path: PathContribution, active: mit.Bool | bool
 ) -> FourFloats:
-    """The adjoint of the deposit: ∂loss/∂(power, range, u, v) of every path.
+    """Adjoint of the deposit: gather ∂loss/∂(power, range, u, v) of every path.
 
     Args:
-        strip_gradient: ∂loss/∂map, as ``BinLayout.spread`` has it.
-        layout: The bins.
-        path: The paths.
-        active: Which paths exist.
-    """
-    bars = [mi.Float(0.0) for _ in range(4)]
+        strip_gradient: ∂loss/∂map, see ``BinLayout.expand_to_strips``.
+        layout: bins of the map.
+        path: contributions.
+        active: mask of paths that exist."""
+    adjoints = [mi.Float(0.0) for _ in range(4)]
     for strip in _iterate_strips(layout, path):
         values = dr.gather(mi.Vector4f, strip_gradient, strip.index, strip.is_inside & active)
         factors = [[strip.transverse_weight * weight for weight in strip.weights]]
         factors += [strip.tap_derivatives(axis, layout.strip_axis) for axis in range(3)]
         for number, three in enumerate(factors):
-            bars[number] += sum(f * values[k] for k, f in enumerate(three))
+            adjoints[number] += sum(f * values[k] for k, f in enumerate(three))
     power = dr.detach(path.power)
-    return bars[0], bars[1] * power, bars[2] * power, bars[3] * power
+    return adjoints[0], adjoints[1] * power, adjoints[2] * power, adjoints[3] * power
 
 
 def deposit_paths(paths: Paths, link: Link, grid: Grid) -> Float32[Tensor, "frame range u v"]:
-    """The power of paths in every bin of a map, per frame; differentiable in both modes.
+    """Deposit the power of paths into the bins of a map, per frame; differentiable in both modes.
 
-    A path falls where ``deposit_power`` lets it fall: at half its length, and in the direction in
-    which the receiver sees its last point. Power may be below zero, such as that of interference.
+    Paths are deposited as by ``deposit_power``: at half their length, and in the direction in which
+    the receiver sees their last point. Power may be negative, such as that of interference.
 
     Args:
-        paths: With ``power``.
-        link: The antennas that they belong to.
-        grid: Bins.
+        paths: propagation paths with ``power``.
+        link: antennas of the paths.
+        grid: bins of one frame.
 
-    Source: derivations §5.
-    """
+    Source: derivations §5."""
     u, v = paths.direction_cosines(link).unbind(1)
     with tracing():
         return Splat.apply(
@@ -309,24 +313,24 @@ def deposit_paths(paths: Paths, link: Link, grid: Grid) -> Float32[Tensor, "fram
 
 
 class Splat(torch.autograd.Function):
-    """Points into the bins of a map, with the derivatives of this file in both modes."""
+    """Deposit of points into the bins of a map, with the derivatives of this file in both modes."""
 
     @staticmethod
     def forward(ctx: Any, layout: BinLayout, frame: Tensor, *columns: Tensor) -> Tensor:
         ctx.layout, ctx.backend = layout, backend()
         with tracing():
-            places = [to_float(column) for column in columns]
-            ctx.found = PathContribution(mi.Int32(to_index(frame)), *places)
+            values = [to_float(column) for column in columns]
+            ctx.path = PathContribution(mi.Int32(to_index(frame)), *values)
             out = BinAccumulator(layout)
-            out.add(ctx.found, True)
+            out.add(ctx.path, True)
             return out.to_map()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         with tracing(ctx.backend):
-            bars = gather_adjoint(ctx.layout.expand_to_strips(grad), ctx.layout, ctx.found, True)
-            return None, None, *(to_torch(bar).double() for bar in bars)
+            adjoints = gather_adjoint(ctx.layout.expand_to_strips(grad), ctx.layout, ctx.path, True)
+            return None, None, *(to_torch(adjoint).double() for adjoint in adjoints)
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
@@ -335,5 +339,5 @@ class Splat(torch.autograd.Function):
                 mi.Float(0.0) if tangent is None else to_float(tangent) for tangent in tangents[2:]
             )
             out = BinAccumulator(ctx.layout)
-            out.add_tangent(ctx.found, (power, length, u, v), True)
+            out.add_tangent(ctx.path, (power, length, u, v), True)
             return out.to_map()

@@ -1,8 +1,8 @@
-"""Power that clouds of soft scatterers send back, into the bins of a map: rays that fade.
+"""Power scattered by clouds of soft scatterers, deposited into the bins of a map.
 
 Geometry and transmittance are torch in float64, so that automatic differentiation in both modes
-gives their derivatives; only the deposit is a kernel. A cloud has no silhouette: its power is
-continuous in all that moves, so it needs no boundary terms.
+yields their derivatives; only the deposit is a kernel. A cloud has no silhouette: its power is
+continuous in all parameters, so it needs no boundary terms.
 """
 
 import math
@@ -26,37 +26,36 @@ from invertwin.errors import InputError
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.scene import Object
 
-_POINTS_PER_CHUNK = 262_144  # points at a time
-_MIN_COMPONENT = 1e-12  # least component of a direction: a ray along a face of the box
+_POINTS_PER_CHUNK = 262_144  # most points at a time
+_MIN_COMPONENT = 1e-12  # least component of a direction, for rays along a face of the box
 
 
 def deposit_density(
     item: Object, link: Link, grid: Grid, *, sampling: Sampling, seed: int
 ) -> Float32[Tensor, "frame range u v"]:
-    """Expected received over transmitted power of an object's cloud in every bin, per frame.
+    """Compute the expected received over transmitted power of a cloud in every bin, per frame.
 
         ∫ (λ/4π)² G_t G_r / (R_t R_r)² · (albedo/4π) σ exp(−∫_t σ ds − ∫_r σ ds) dV
 
-    where t and r are the ways through the cloud from both antennas to the point; one way serves
-    both where the link shares its visibility. Rays start at the transmitter, through points spread
-    evenly over the box. Along a ray every segment holds back 1 − exp(−σΔ) of what reaches it, so
-    that nothing is lost in opaque cells.
+    with the segments t and r through the cloud from the antennas to the point; one segment serves
+    both if the link shares its visibility. Rays start at the transmitter, through points spread
+    evenly over the box. Along a ray every segment scatters 1 − exp(−σΔ) of the power that reaches
+    it, so that opaque cells lose nothing.
     Differentiable in both modes with respect to densities, albedo, the object's pose and the
-    radar's poses and patterns. Meshes neither hide the cloud nor are hidden by it.
+    radar's poses and patterns. Meshes neither occlude the cloud nor are occluded by it.
 
     Source: the radiative transfer of single scattering; units of ``deposit_power``.
     Differs from the source: the paper has no densities.
 
     Args:
-        item: An object with a cloud.
-        link: Antennas, per frame.
-        grid: Bins.
-        sampling: How many points on rays, over all frames, and where they are traced.
-        seed: Same seed, same result (to 1e-6 relative: atomic additions reorder).
+        item: object with a cloud.
+        link: antennas, per frame.
+        grid: bins of one frame.
+        sampling: number of points on rays over all frames, and backend.
+        seed: seed; the same seed yields the same result to 1e-6 (atomic additions reorder).
 
     Raises:
-        InputError: An object without a cloud or in motion, an antenna
-            inside of the box.
+        InputError: An object without a cloud or in motion, or an antenna inside the box.
     """
     if item.cloud is None:
         raise InputError(
@@ -75,18 +74,17 @@ def deposit_density(
 
 @dataclass(frozen=True)
 class _CloudRays:
-    """Rays through a box: one row per ray, in the object's frame.
+    """Rays through the box of a cloud, one row each, in the object's frame.
 
     Attributes:
-        cloud: The density.
-        link: Antennas.
-        origins: Of the transmitter and the receiver of every frame.
-        rotation: Rotation of the object.
-        frame: Of every ray.
-        box_points: Point of the box that the ray meets.
-        jitter: Place of the points within their segments, in [0, 1).
-        steps: Segments of a ray.
-    """
+        cloud: density.
+        link: antennas.
+        origins: positions of the transmitter and the receiver in every frame [m].
+        rotation: rotation of the object.
+        frame: frame of every ray.
+        box_points: point of the box through which each ray passes [m].
+        jitter: position of the points within their segments, in [0, 1).
+        steps: segments of a ray."""
 
     cloud: Cloud
     link: Link
@@ -102,16 +100,16 @@ class _CloudRays:
         cloud = item.cloud
         assert cloud is not None
         pose = item.transform
-        turn = pose[:3, :3]
-        origins = tuple((places - pose[:3, 3]) @ turn for places in (link.tx, link.rx))
-        for places in origins:
-            inside = ((places > cloud.low) & (places < cloud.high)).all(1)
+        rotation = pose[:3, :3]
+        origins = tuple((antennas - pose[:3, 3]) @ rotation for antennas in (link.tx, link.rx))
+        for antennas in origins:
+            inside = ((antennas > cloud.low) & (antennas < cloud.high)).all(1)
             if bool(inside.any()):
                 raise InputError(
                     "expected the antennas outside of the cloud's box, got one inside of it in "
                     f"frame {int(inside.int().argmax())}; choose a smaller box"
                 )
-        # About one point per cell on the longest way through the box.
+        # About one point per cell on the longest ray through the box.
         steps = math.ceil(math.hypot(*(count - 1 for count in cloud.density.shape)))
         count = max(1, round(samples / (link.frame_count * steps)))
         # Consecutive rows of a Sobol sequence are well spread: every frame gets its own.
@@ -121,7 +119,7 @@ class _CloudRays:
             cloud=cloud,
             link=link,
             origins=(origins[0], origins[1]),
-            rotation=turn,
+            rotation=rotation,
             frame=torch.arange(link.frame_count).repeat_interleave(count),
             box_points=cloud.low + numbers[:, :3] * (cloud.high - cloud.low),
             jitter=numbers[:, 3],
@@ -129,10 +127,10 @@ class _CloudRays:
         )
 
     def contributions(self) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
-        """Frame, power, range, u and v of the points, so many at a time."""
+        """Iterate over frame, power, range, u and v of the points, chunk by chunk."""
         per_frame = len(self.frame) // self.link.frame_count
-        ways = 1 if self.link.shared_visibility else self.steps
-        width = max(1, _POINTS_PER_CHUNK // (self.steps * ways))
+        segments = 1 if self.link.shared_visibility else self.steps
+        width = max(1, _POINTS_PER_CHUNK // (self.steps * segments))
         for start in range(0, len(self.frame), width):
             part = slice(start, start + width)
             yield replace(
@@ -145,87 +143,85 @@ class _CloudRays:
     def _evaluate_points(self, per_frame: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         tx = self.origins[0][self.frame]
         offset = self.box_points - tx
-        way = offset / offset.norm(dim=1, keepdim=True)
-        near, far = self._clip_to_box(tx, way)
+        direction = offset / offset.norm(dim=1, keepdim=True)
+        near, far = self._clip_to_box(tx, direction)
         # Rays per steradian, of points spread evenly over the box: the chord's share of it.
         volume = (self.cloud.high - self.cloud.low).prod()
         weight = 3 * volume / ((far**3 - near**3) * per_frame)
         length = (far - near)[:, None] / self.steps
-        place = torch.arange(self.steps) + self.jitter[:, None]
-        distance = near[:, None] + place * length  # from the transmitter
-        points = tx[:, None] + distance[..., None] * way[:, None]
+        fraction = torch.arange(self.steps) + self.jitter[:, None]
+        distance = near[:, None] + fraction * length  # from the transmitter
+        points = tx[:, None] + distance[..., None] * direction[:, None]
         thickness = self._interpolate_density(points) * length
         before = thickness.cumsum(1) - thickness
         link, frame = self.link, self.frame[:, None].expand_as(distance)
         if link.shared_visibility:
-            ways = 2 * before
+            depths = 2 * before
         else:
-            # Back to the start of the segment, as far as the way to it is as dense: without this
-            # an opaque cell would count as if all came back from the point's depth in it.
-            ways = (
+            # From the start of the segment, at the density of the segment: otherwise an opaque cell
+            # would attenuate as if all its power were scattered at the point.
+            depths = (
                 before
                 + self._return_optical_depth(points, frame)
                 - self.jitter[:, None] * thickness
             )
-        held = -0.5 * torch.exp(-ways) * torch.expm1(-2 * thickness)
+        scattered = -0.5 * torch.exp(-depths) * torch.expm1(-2 * thickness)
         back = points - self.origins[1][self.frame][:, None]
-        return_way = back.norm(dim=2)
+        return_length = back.norm(dim=2)
         rotation = link.rotations[self.frame]
         towards = [
-            torch.einsum("rij,rkj->rki", rotation.mT @ self.rotation, direction)
-            for direction in (way[:, None], back / return_way[..., None])
+            torch.einsum("rij,rkj->rki", rotation.mT @ self.rotation, vector)
+            for vector in (direction[:, None], back / return_length[..., None])
         ]
         gain = link.tx_pattern.gain(towards[0]) * link.rx_pattern.gain(towards[1])
         scale = (link.wavelength / (4 * math.pi)) ** 2 * self.cloud.albedo / (4 * math.pi)
         (share,) = polarisation_shares(link, depolarising=False)
         scale = scale * share.for_bounces(1)
-        power = scale * weight[:, None] * gain * held / return_way.square()
-        total = 0.5 * (distance + return_way)
+        power = scale * weight[:, None] * gain * scattered / return_length.square()
+        total = 0.5 * (distance + return_length)
         columns = [power, total, towards[1][..., 0], towards[1][..., 1]]
         return frame.reshape(-1), *(column.reshape(-1) for column in columns)  # type: ignore[return-value]
 
     def _clip_to_box(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances at which rays that meet the box enter and leave it."""
+        """Compute the distances at which rays that meet the box enter and leave it."""
         slope = torch.where(direction.abs() < _MIN_COMPONENT, _MIN_COMPONENT, direction)
         first, second = (self.cloud.low - origin) / slope, (self.cloud.high - origin) / slope
         near = torch.minimum(first, second).amax(1).clamp_min(0.0)
         return near, torch.maximum(first, second).amin(1)
 
     def _return_optical_depth(self, points: Tensor, frame: Tensor) -> Tensor:
-        """∫σ ds from points to the receiver."""
+        """Integrate ∫σ ds from points to the receiver."""
         flat = points.reshape(-1, 3)
         rx = self.origins[1][frame.reshape(-1)]
         offset = flat - rx
         distance = offset.norm(dim=1)
-        way = offset / distance[:, None]
-        near, _ = self._clip_to_box(rx, way)
+        direction = offset / distance[:, None]
+        near, _ = self._clip_to_box(rx, direction)
         length = (distance - near)[:, None] / self.steps
         shift = self.jitter[:, None].expand(points.shape[:2]).reshape(-1, 1)
         depth = near[:, None] + (torch.arange(self.steps) + shift) * length
-        between = rx[:, None] + depth[..., None] * way[:, None]
+        between = rx[:, None] + depth[..., None] * direction[:, None]
         return (self._interpolate_density(between) * length).sum(1).reshape(points.shape[:2])
 
     def _interpolate_density(
         self, points: Float64[Tensor, "ray step 3"]
     ) -> Float64[Tensor, "ray step"]:
-        place = 2 * (points - self.cloud.low) / (self.cloud.high - self.cloud.low) - 1
-        found = _Trilinear.apply(self.cloud.density, place.reshape(-1, 3))
+        position = 2 * (points - self.cloud.low) / (self.cloud.high - self.cloud.low) - 1
+        found = _Trilinear.apply(self.cloud.density, position.reshape(-1, 3))
         return found.reshape(points.shape[:2])
 
 
 def _interpolate_trilinear(
     values: Float64[Tensor, "x y z"], positions: Float64[Tensor, "n 3"]
 ) -> Tensor:
-    """Values between the nodes of a grid that spans [-1, 1] along each axis."""
+    """Interpolate between the nodes of a grid that spans [-1, 1] along each axis."""
     nodes = positions.flip(-1)[None, :, None, None]  # grid_sample counts axes from the last one
     found = grid_sample(values[None, None], nodes, padding_mode="border", align_corners=True)
     return found.flatten()
 
 
 class _Trilinear(torch.autograd.Function):
-    """``_interpolate_trilinear`` with the derivative in forward mode that torch 2.13 does not
-    have.
-    """
+    """``_interpolate_trilinear`` with the forward-mode derivative that torch 2.13 lacks."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, positions: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
-"""Power paths straight into the bins of a map, with derivatives in both modes.
+"""Deposit of power paths into the bins of a map, with derivatives in both modes.
 
-No path is ever stored for torch: paths are walked, deposited and forgotten, or kept as records
-while these fit the memory budget, and replayed for the derivative.
+Paths are not stored for torch: they are sampled, deposited and discarded, or kept as records if
+these fit the memory budget, and replayed for the derivative.
 """
 
 from __future__ import annotations
@@ -46,24 +46,24 @@ def deposit_power(
     scheme: Literal["rays", "area"] = "rays",
     reference: tuple[Scene, Link] | None = None,
 ) -> Float32[Tensor, "frame range u v"]:
-    """Expected received over transmitted power in every bin of a map, per frame.
+    """Compute the expected received over transmitted power in every bin of a map, per frame.
 
-    ``∫ f dA₁ … dAₙ`` over all paths of up to ``depth`` surface points that see each other in
-    turn, with ``f`` the radar equation of the path: 1/R² for every segment, the scattering
-    distribution of the material and both cosines for every point.
+    ``∫ f dA₁ … dAₙ`` over all paths of up to ``depth`` mutually visible surface points, with ``f``
+    the radar equation of the path: 1/R² for every segment, the scattering distribution of the
+    material and both cosines for every point.
     Differentiable in both modes with respect to vertices, material values and radar poses;
-    moving silhouettes included unless ``boundary`` is off. Objects that are clouds add the power
-    of ``deposit_density``, each with all ``samples``. Antennas take what their polarisations and
-    the surfaces' depolarisation leave of a path (``channel.coupling``).
+    moving silhouettes included unless ``boundary`` is off. Clouds add the power of
+    ``deposit_density``, each with all ``samples``. The power is that which remains after the
+    antennas' polarisations and the surfaces' depolarisation (``channel.coupling``).
 
     Args:
-        scene: What is seen.
-        link: Antennas, per frame.
-        grid: Bins.
-        sampling: How many paths are drawn.
-        seed: Same seed, same result (to 1e-6 relative: atomic additions reorder).
+        scene: scene with surfaces, clouds, or both.
+        link: antennas, per frame.
+        grid: bins of one frame.
+        sampling: number of paths, their depth, and backend.
+        seed: seed; the same seed yields the same result to 1e-6 (atomic additions reorder).
         scheme: ``rays`` from the antenna into the caps around the objects, or ``area``.
-        reference: The scene and link that fix how samples are drawn (caps around objects, a tenth
+        reference: scene and link that define the sampling densities (caps around objects, a tenth
             larger, or triangle areas), so that differences in θ have common random numbers.
 
     Source: Eq. 7–8 of the paper in material form, derivations §2–3 and §5; interior segments
@@ -72,10 +72,9 @@ def deposit_power(
     not the divergence of Eq. 14.
 
     Raises:
-        InputError: No silhouette samples where a derivative needs them, an
-            antenna pattern that carries derivatives, objects in motion, an unknown backend, a
-            polarisation over direction.
-    """
+        InputError: No silhouette samples for a derivative that needs them, an antenna pattern that
+            carries derivatives, objects in motion, an unknown backend, a polarisation that depends
+            on direction."""
     if scheme not in ("rays", "area"):
         raise InputError(f"expected scheme 'rays' or 'area', got {scheme!r}; choose one")
     surfaces, clouds = _split_clouds(scene)
@@ -96,28 +95,27 @@ def deposit_power(
 def deposit_batch(
     scenes: Sequence[Scene], link: Link, grid: Grid, *, sampling: Sampling, seed: int
 ) -> Float32[Tensor, "scene frame range u v"]:
-    """``deposit_power`` of many scenes at once: one launch of the kernels serves all of them.
+    """Compute ``deposit_power`` of many scenes with one launch of the kernels.
 
-    For small numbers of samples a call is mostly launches, so that many scenes cost little more
-    than one. All scenes stand in one tree of triangles, each in a box of its own with antennas of
-    its own. No segment within a scene leaves its box, and what a ray meets in another box counts
-    as nothing: paths, boundary paths and derivatives (in both modes) are exactly those of
-    ``deposit_power``, with other random numbers. Coordinates count in float32 from the middle of
-    all boxes, so that roundings are those of a scene as large as the batch.
+    For small numbers of samples a call is dominated by launches, so that many scenes cost little
+    more than one. All scenes share one BVH, each in a box of its own with its own antennas. No
+    segment within a scene leaves its box, and intersections in other boxes are discarded: paths,
+    boundary paths and derivatives (in both modes) are exactly those of ``deposit_power``, with
+    other random numbers. Float32 coordinates are relative to the middle of all boxes, so that
+    rounding errors are those of a scene as large as the batch.
 
     Args:
-        scenes: What is seen. Every object of the batch gets as many samples as any other: scenes
-            of as many objects are sampled alike.
-        link: Antennas, per frame: the same for all scenes.
-        grid: Bins.
-        sampling: How many paths are drawn of each scene, on average.
-        seed: Same seed and scenes, same result; draws of one scene are independent of the others'.
+        scenes: scenes of surfaces. Every object of the batch gets the same number of samples:
+            scenes with as many objects are sampled alike.
+        link: antennas, per frame: the same for all scenes.
+        grid: bins of one frame.
+        sampling: number of paths of each scene, on average.
+        seed: seed; the same seed and scenes yield the same result, independent between scenes.
 
-    Source: as ``deposit_power``; ``rays.apart`` says why boxes keep scenes apart.
+    Source: as ``deposit_power``; ``rays.batching`` states why boxes separate scenes.
 
     Raises:
-        InputError: No scenes, clouds, more samples than numbers, or as of ``deposit_power``.
-    """
+        InputError: No scenes, clouds, more samples than numbers, or as of ``deposit_power``."""
     objects, owners = {}, []
     for number, scene in enumerate(scenes):
         clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
@@ -154,7 +152,7 @@ def _deposit_surfaces(
     scheme: str = "rays",
     reference: tuple[Geometry, Link] | None = None,
 ) -> list[Tensor]:
-    """Maps of the surfaces whose sum counts: one for every share of polarised power."""
+    """Compute the maps of the surfaces, one for every share of polarised power; they add up."""
     if sampling.boundary:
         require_silhouette_samples(geometry, link, sampling.boundary_samples)
     if any(is_differentiated(p.table()) for p in (link.tx_pattern, link.rx_pattern)):
@@ -162,14 +160,14 @@ def _deposit_surfaces(
             "expected an antenna pattern without derivatives, got one that carries them; "
             "power paths do not differentiate patterns: detach its values"
         )
-    turned = geometry.surfaces.depolarisation
-    depolarised = is_differentiated(turned) or bool(turned.any())
+    depolarisation = geometry.surfaces.depolarisation
+    depolarised = is_differentiated(depolarisation) or bool(depolarisation.any())
     antennas_move = is_differentiated(link.tx) or is_differentiated(link.rx)
     maps = []
     for share in polarisation_shares(link, depolarising=depolarised):
         lossy = geometry
         if share.loss:
-            surfaces = geometry.surfaces.scale(1 - share.loss * turned)
+            surfaces = geometry.surfaces.scale(1 - share.loss * depolarisation)
             lossy = replace(geometry, surfaces=surfaces)
         with _DisableFuncTorch():
             bare = strip_scene_derivatives(lossy, link)
@@ -189,18 +187,17 @@ def _sum_maps(maps: list[Tensor]) -> Tensor:
 
 
 def _split_clouds(scene: Scene) -> tuple[Scene | None, list[Object]]:
-    """The surfaces of a scene, if any, and its clouds."""
+    """Split a scene into its surfaces, if any, and its clouds."""
     clouds = [item for item in scene.objects.values() if item.cloud is not None]
     surfaces = {name: item for name, item in scene.objects.items() if item.cloud is None}
     return (Scene(surfaces) if surfaces else None), clouds
 
 
 class _Deposit(torch.autograd.Function):
-    """∂map/∂(vertices, poses, materials), forward and backward.
+    """Map of a scene, with ∂map/∂(vertices, poses, materials) in both modes.
 
-    The derivative of the deposit itself is written out, and that of a path replayed from its
-    records; Dr.Jit differentiates the smooth geometry at one vertex.
-    """
+    The derivative of the deposit itself is written out, and that of a path is replayed from its
+    records; Dr.Jit differentiates the smooth geometry at one vertex."""
 
     @staticmethod
     def forward(
@@ -209,7 +206,7 @@ class _Deposit(torch.autograd.Function):
         out = bins.BinAccumulator(layout)
         trace.last_records = trace.deposit(out, record=derivative)
         if derivative:
-            _ = trace.boundary_samples  # prepared while the paths are walked
+            _ = trace.boundary_samples  # prepared while the paths are traced
         return out.to_map()
 
     @staticmethod
@@ -239,7 +236,7 @@ class _Deposit(torch.autograd.Function):
 
 
 class _Linear(torch.autograd.Function):
-    """A linear map of plain tensors, one after another where ``torch.func`` asks for many."""
+    """Linear map of plain tensors, applied one by one for the batches of ``torch.func``."""
 
     @staticmethod
     def forward(act: Callable[..., Any], *values: Tensor) -> Any:
@@ -275,7 +272,7 @@ class _Linear(torch.autograd.Function):
 
 
 def _pull_gradients(ctx: Any, names: tuple[str, ...], grad: Tensor) -> tuple[Tensor, ...]:
-    """Gradients with respect to some tables."""
+    """Pull the gradient of the map back to some tables."""
     trace: PowerTracer = ctx.trace
     with tracing(ctx.backend), torch_threads(1):
         tables = _attach_tables(trace, names)
@@ -289,7 +286,7 @@ def _pull_gradients(ctx: Any, names: tuple[str, ...], grad: Tensor) -> tuple[Ten
         for records in [trace.last_records] if trace.last_records else trace.iterate_records():
             replay.pull(trace.rays, inputs, records, gather)
             dr.eval([dr.grad(table) for table in tables.values()])
-            del records  # before the next ones are made
+            del records  # before the next ones are allocated
         for paths in boundary:
             total = paths.sum_weighted(lambda *path: gather(*path)[0])
             if dr.grad_enabled(paths.speed):
@@ -300,7 +297,7 @@ def _pull_gradients(ctx: Any, names: tuple[str, ...], grad: Tensor) -> tuple[Ten
 
 
 def _push_tangents(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tensor:
-    """The map's derivative along tangents of some tables."""
+    """Push tangents of some tables forward to the map."""
     trace: PowerTracer = ctx.trace
     with tracing(ctx.backend), torch_threads(1):
         given = dict(zip(names, tangents, strict=True))
@@ -326,7 +323,7 @@ def _push_tangents(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tenso
 
 
 def _attach_tables(trace: PowerTracer, names: Iterable[str]) -> dict[str, mit.Float]:
-    """Copies of some of the kernel's tables that carry derivatives."""
+    """Copy some of the kernel's tables and enable their derivatives."""
     tables = {name: mi.Float(trace.fixed.table(name)) for name in names}
     dr.enable_grad(list(tables.values()))
     return tables

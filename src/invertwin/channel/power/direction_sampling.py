@@ -1,7 +1,7 @@
-"""Where a path goes on from a surface: towards other objects, or along the lobes of the surface.
+"""Sampling of directions from a surface: towards other objects, or along the surface's lobes.
 
-Directions come from both ways, with the probability density of their mixture, so that small bright
-objects and narrow lobes are both found. Detached.
+Directions are drawn from both, with the probability density of their mixture, so that small bright
+objects and narrow lobes are both sampled. Detached.
 """
 
 from __future__ import annotations
@@ -19,25 +19,22 @@ from invertwin.channel.rays.bounding_spheres import sample_cap
 from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.scene import ScatteringLaw
 
-_AIMED_FRACTION = 0.5  # share of the directions that aim at other objects, where there are some
+_AIMED_FRACTION = 0.5  # share of the directions that aim at other objects, if there are any
 
-
-_MAX_TRIES = 4  # to find an object that the point is outside of
+_MAX_TRIES = 4  # random choices of an object whose bounding sphere excludes the point
 _NO_TARGET = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
 class DirectionSample:
-    """A unit direction, and what its probability depends on.
+    """Sampled unit directions.
 
     Attributes:
-        omega: The direction.
-        lobe_density: Its probability per solid angle among those along the lobes; infinite where
-            total
+        omega: directions.
+        lobe_density: probability density per solid angle of the lobes alone; infinite if total
             reflection leaves no direction.
-        group: The group of objects that it is for, if any: it is void where it ends elsewhere.
-        target: The object of that group that it aims at, if any.
-    """
+        group: group of objects at which it aims, if any: it is void if it ends elsewhere.
+        target: object of that group at which it aims, if any."""
 
     omega: mit.Vector3f
     lobe_density: mit.Float
@@ -46,12 +43,11 @@ class DirectionSample:
 
 
 class DirectionSampler:
-    """Draws directions on the side of a surface from which it is lit.
+    """Sampler of directions on the illuminated side of a surface.
 
     Args:
-        rays: Objects to aim at.
-        surfaces: Their lobes.
-    """
+        rays: ray scene with the objects to aim at.
+        surfaces: scattering laws of the surfaces."""
 
     def __init__(self, rays: RayScene, surfaces: ScatteringLawTables) -> None:
         self.rays, self.spheres = rays, rays.spheres
@@ -68,14 +64,13 @@ class DirectionSampler:
         numbers: list[mit.Float],
         scene: mit.UInt32,
     ) -> DirectionSample:
-        """A direction from uniform numbers.
+        """Sample a direction.
 
         Args:
-            point: The vertex.
-            incident: Unit direction from where the path comes.
-            numbers: Six uniform numbers; the second is left to others.
-            scene: Whose objects are aimed at.
-        """
+            point: latest vertex.
+            incident: unit directions to the vertex before.
+            numbers: six uniform numbers; the second is reserved for Russian roulette.
+            scene: scenes whose objects are aimed at."""
         facing = mi.Normal3f(dr.mulsign(point.normal, dr.dot(point.normal, incident)))
         omega = self._sample_lobes(point, incident, facing, numbers)
         group, aimed = mi.UInt32(_NO_TARGET), mi.UInt32(_NO_TARGET)
@@ -87,23 +82,23 @@ class DirectionSampler:
             drawn = first + dr.minimum(mi.UInt32(scaled), groups - 1)
             members = spheres.member_count(drawn)
             axis, height = mi.Vector3f(0, 0, 1), mi.Float(2.0)
-            # One of the group that the point is outside of, if a few tries find one.
+            # An object of the group whose sphere excludes the point, if a few tries find one.
             for _ in range(_MAX_TRIES):
                 rest *= members  # type: ignore[operator]
                 number = dr.minimum(mi.UInt32(rest), members - 1)
                 rest -= number
-                place = drawn * spheres.group_size + number
-                direction, cap, outside = spheres.cap(place, point.position)
+                index = drawn * spheres.group_size + number
+                direction, cap, outside = spheres.cap(index, point.position)
                 taken = towards & outside & (aimed == _NO_TARGET)
                 axis, height = dr.select(taken, direction, axis), dr.select(taken, cap, height)
-                aimed = dr.select(taken, place, aimed)
+                aimed = dr.select(taken, index, aimed)
             omega = dr.select(aimed != _NO_TARGET, sample_cap(axis, height, numbers[2:4]), omega)
             group = dr.select(towards, drawn, _NO_TARGET)
         density = self._lobe_density(point, incident, facing, omega)
         if self.surfaces.has_refracting_bodies:
-            lost = dr.squared_norm(omega) < 0.5
-            omega = dr.select(lost, mi.Vector3f(facing), omega)
-            density = dr.select(lost, dr.inf, density)
+            invalid = dr.squared_norm(omega) < 0.5
+            omega = dr.select(invalid, mi.Vector3f(facing), omega)
+            density = dr.select(invalid, dr.inf, density)
         return DirectionSample(omega, density, group, aimed)
 
     def density(
@@ -114,15 +109,17 @@ class DirectionSampler:
         active: mit.Bool,
         scene: mit.UInt32,
     ) -> mit.Float:
-        """Probability per solid angle of a direction that ends on a triangle; 0 if it is void.
+        """Evaluate the probability density per solid angle of a direction that ends on a triangle.
 
         Args:
-            point: The vertex.
-            sample: The direction.
-            face: The triangle, in that scene.
-            active: Lanes.
-            scene: Whose objects were aimed at.
-        """
+            point: vertex at which the direction was sampled.
+            sample: sampled direction.
+            face: triangle on which it ends.
+            active: mask of active lanes.
+            scene: scenes whose objects were aimed at.
+
+        Returns:
+            The density, 0 for directions that are void."""
         spheres = self.spheres
         if spheres.max_objects == 1:
             return sample.lobe_density
@@ -131,7 +128,7 @@ class DirectionSampler:
             self.rays, group, point.position, sample.omega, active, sample.target
         )
         members, (_, groups) = mi.Float(spheres.member_count(group)), spheres.scene_groups(scene)
-        # Tries fail with the share of spheres that the point is inside of.
+        # A try fails with the share of spheres that contain the point.
         failing = around / members
         tries: Any = sum(failing**k for k in range(_MAX_TRIES))
         share: mit.Float = _AIMED_FRACTION / groups  # type: ignore[operator]
@@ -149,14 +146,14 @@ class DirectionSampler:
         omega = mi.Frame3f(facing).to_world(
             mi.warp.square_to_cosine_hemisphere(mi.Point2f(numbers[2], numbers[3]))
         )
-        mirror = 2 * dr.dot(incident, facing) * facing - incident
+        specular = 2 * dr.dot(incident, facing) * facing - incident
         limit = self._lobe_fraction(point, 0)
         for number, present in enumerate(self.surfaces.has_lobe):
             if not present:
                 continue
-            axis = mi.Vector3f(incident if number == 2 else mirror)
+            axis = mi.Vector3f(incident if number == 2 else specular)
             exponent = self.surfaces.exponent(number, point.surface_row)
-            # Height of the cap that a lobe ((1 + cosψ)/2)^p fills to the share of the number.
+            # Height of the cap with that share of a lobe ((1 + cosψ)/2)^p.
             fall = dr.log(dr.maximum(1 - numbers[2], 1e-9)) / (exponent + 1)
             series = -fall * (1 + fall * (1 / 2 + fall / 6))  # a narrow lobe keeps its digits
             height = 2 * dr.select(fall > -0.01, series, 1 - dr.exp(fall))
@@ -174,7 +171,7 @@ class DirectionSampler:
     def _refractive_indices(
         self, point: SurfaceInteraction, incident: mit.Vector3f
     ) -> tuple[mit.Float, mit.Float, mit.Float]:
-        """Refractive index here and beyond, and variance of the refracted lobe."""
+        """Look up the refractive index here and beyond, and the variance of the refracted lobe."""
         body = self.surfaces.value("index", point.surface_row)
         outside = dr.dot(point.normal, incident) > 0
         variance = self.surfaces.refraction_variance(point.surface_row)
@@ -183,7 +180,7 @@ class DirectionSampler:
     def _sample_refraction(
         self, point: SurfaceInteraction, incident: mit.Vector3f, numbers: list[mit.Float]
     ) -> mit.Vector3f:
-        """A direction beyond the surface about Snell's; zero if there is none."""
+        """Sample a direction beyond the surface about Snell's; zero if there is none."""
         here, beyond, variance = self._refractive_indices(point, incident)
         spread = dr.sqrt(variance)
         gauss = mi.warp.square_to_std_normal(mi.Point2f(numbers[2], numbers[3])) * spread
@@ -235,16 +232,16 @@ class DirectionSampler:
 
 
 def _lobe_fractions(surfaces: ScatteringLaw) -> torch.Tensor:
-    """Share of each part of a surface in what it scatters; Lambertian if it scatters nothing."""
+    """Compute the share of each part of a scattering law; Lambertian if it scatters nothing."""
     exponents = surfaces.exponents.detach()
     wide = 4 * torch.pi * (exponents + torch.exp2(-(exponents + 1)))
     integrals = wide / ((exponents + 1) * (exponents + 2))
     lobes = surfaces.lobes.detach() * integrals
     diffuse = surfaces.diffuse.detach()[:, None]
     total = diffuse + lobes.sum(1, keepdim=True)
-    # Something of the cosine stays in, so that the density never vanishes where f does not.
+    # A part of the cosine is kept, so that the density never vanishes where f does not.
     parts = torch.cat([diffuse + 0.05 * (total + (total == 0)), lobes], dim=1)
-    # What is reflected at normal incidence against what is refracted there.
+    # Reflected power at normal incidence against refracted power.
     reflected = surfaces.amplitude.detach()[:, -1:].square()
     parts = parts * torch.where(surfaces.refraction.any(1, keepdim=True), reflected, 1.0)
     parts = torch.cat([parts, surfaces.refraction.detach()[:, -1:]], dim=1)

@@ -6,14 +6,16 @@ from invertwin.channel.rays.arrays import uniform_pair
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.ray_scene import RayScene
 
-_MIN_RESOLVED_PROBABILITY = (
-    5e-5  # chance of an edge from which float32 resolves a sample's place within it
-)
+# Probability of an edge above which float32 resolves the position of a sample within it.
+_MIN_RESOLVED_PROBABILITY = 5e-5
 _LAST_BELOW_ONE = 1 - 2.0**-24
 
 
 class DiscreteSampler:
-    """Draws entries in proportion to weights, without reading any back."""
+    """Sampler of entries in proportion to weights, without reading any back.
+
+    Args:
+        weights: weights of the entries."""
 
     def __init__(self, weights: mit.Float) -> None:
         self.weights, self.sums = weights, dr.cumsum(weights)
@@ -21,17 +23,23 @@ class DiscreteSampler:
         self.total = dr.gather(mi.Float, self.sums, self.entries - 1)
 
     def draw(self, number: mit.Float) -> tuple[mit.UInt32, mit.Float, mit.Float]:
-        """Entry, the rest of the number within it, and probability: zero if there is no entry."""
+        """Sample an entry.
+
+        Args:
+            number: uniform numbers.
+
+        Returns:
+            The entry, the rest of the number within it, and its probability: 0 if there is none."""
         target = number * self.total
 
         def is_below(at: mit.UInt32) -> mit.Bool:
             return dr.gather(mi.Float, self.sums, at) <= target
 
-        place: mit.UInt32 = dr.binary_search(0, self.entries - 1, is_below)
-        weight = dr.gather(mi.Float, self.weights, place)
-        last = dr.gather(mi.Float, self.sums, place) - weight
+        entry: mit.UInt32 = dr.binary_search(0, self.entries - 1, is_below)
+        weight = dr.gather(mi.Float, self.weights, entry)
+        last = dr.gather(mi.Float, self.sums, entry) - weight
         rest = dr.clip((target - last) / weight, 0.0, _LAST_BELOW_ONE)
-        return place, rest, dr.select(weight > 0, weight / self.total, 0.0)
+        return entry, rest, dr.select(weight > 0, weight / self.total, 0.0)
 
 
 def balance_by_object(
@@ -41,18 +49,17 @@ def balance_by_object(
     receiver: mit.Bool | bool,
     antenna_count: int,
 ) -> mit.Float:
-    """Weights of edges by which no object drowns another.
+    """Balance the weights of edges between objects.
 
     An object gets the square root of the sum of its edges' weights, which is between a share by
-    size and one share for each. Both antennas get the same sum, and so do all scenes.
+    size and equal shares. Both antennas get the same sum, and so do all scenes.
 
     Args:
-        rays: The scene.
-        edge: Edges.
-        weight: Of each, by itself.
-        receiver: Whether it is the receiver's silhouette.
-        antenna_count: 2 if there are silhouettes of a receiver, else 1.
-    """
+        rays: ray scene.
+        edge: edge indices.
+        weight: weights of the edges.
+        receiver: True for silhouettes as the receiver sees them.
+        antenna_count: 2 if the receiver has silhouettes of its own, else 1."""
     objects = len(rays.geometry.names)
     antenna = dr.select(receiver, mi.UInt32(1), 0)
     row = dr.gather(mi.UInt32, rays.topology.device_edge_object, edge) + antenna * objects
@@ -70,13 +77,12 @@ def balance_by_object(
 
 
 def balance_by_scene(rays: RayScene, scene: mit.UInt32, weight: mit.Float) -> mit.Float:
-    """Weights of which all scenes have the same sum, if they have any.
+    """Scale weights so that all scenes have the same sum, if they have any weight.
 
     Args:
-        rays: The scenes.
-        scene: Of each weight.
-        weight: The weights.
-    """
+        rays: ray scene.
+        scene: scene of each weight.
+        weight: weights."""
     if rays.scene_count == 1:
         return weight
     totals = dr.zeros(mi.Float, rays.scene_count)
@@ -91,15 +97,17 @@ def sample_edge_point(
     seed: mit.UInt32,
     key: mit.UInt32 | tuple[mit.UInt32, mit.UInt32] | None = None,
 ) -> tuple[mit.UInt32, mit.Float, mit.Float]:
-    """Entry of the choice, place along its edge and probability, stratified over count.
+    """Sample an edge and a position along it, stratified over all samples.
 
     Args:
-        sampler: Of edges.
-        index: Number of the sample.
-        count: Of samples.
-        seed: Of the numbers.
-        key: What the numbers belong to, if not the index.
-    """
+        sampler: sampler of edges.
+        index: sample numbers.
+        count: number of samples.
+        seed: seed of the random numbers.
+        key: key of the random numbers, if other than the index.
+
+    Returns:
+        The entry, the position along its edge from 0 to 1, and the probability of the entry."""
     jitter, along = uniform_pair(index if key is None else key, seed)
-    place, rest, chance = sampler.draw((mi.Float(index) + jitter) / count)
-    return place, dr.select(chance > _MIN_RESOLVED_PROBABILITY, rest, along), chance
+    entry, rest, probability = sampler.draw((mi.Float(index) + jitter) / count)
+    return entry, dr.select(probability > _MIN_RESOLVED_PROBABILITY, rest, along), probability

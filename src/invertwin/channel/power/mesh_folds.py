@@ -1,4 +1,4 @@
-"""Folds of a mesh that rays past its edges would miss: followed triangle by triangle in float64."""
+"""Mesh folds beside an edge that rays would miss, followed triangle by triangle in float64."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.intersections import PLANE_TOLERANCE
 from invertwin.channel.rays.ray_scene import RayScene
 
-# Of a mesh, so many triangles are looked at from an edge on, and more until rays that pass beside
-# the edge clear them, up to so many.
+# Fewest triangles that are followed from an edge, and most of them: beyond the fewest, a fold is
+# followed until rays beside the edge clear it.
 _MIN_FOLD_TRIANGLES, _MAX_FOLD_TRIANGLES = 8, 256
 
 
@@ -44,23 +44,22 @@ def is_hidden_by_fold(
     start_distance: mit.Float64,
     active: mit.Bool,
 ) -> mit.Bool:
-    """Whether the mesh around an edge leads back into the way past it, where rays would miss it.
+    """Test whether the mesh around an edge folds back into the path of a ray past it.
 
     Rays pass a little beside the edge and start a little off it, so they miss the folds of a fine
-    mesh. So the curve in which the mesh meets the plane through ray and edge's height is followed
-    from the edge both ways, in float64. Where it comes to the height of the ray further off, the
-    ray meets it, and the edge's shadow falls on it.
+    mesh. Therefore the curve in which the mesh meets the plane through the ray and the outward
+    direction is followed from the edge to both sides, in float64. If it reaches the height of the
+    ray further off, the ray meets it there, and the edge's shadow falls on it.
 
     Args:
-        rays: Rays.
-        edge: Edges.
-        point: Points on them, float64.
-        direction: Directions of rays past them, float64.
-        outward: Unit directions off the edge's own triangles; zero where there are some all round.
-        clearance: How far beside the edge rays pass [m].
-        start_distance: How far off the edge they start [m].
-        active: Lanes.
-    """
+        rays: ray scene.
+        edge: edge indices.
+        point: points on the edges, float64.
+        direction: directions of the rays past them, float64.
+        outward: unit directions off the edge's own triangles; zero if these are all around.
+        clearance: distance beside the edge at which rays pass [m].
+        start_distance: distance off the edge at which they start [m].
+        active: mask of active lanes."""
     topology, most = rays.topology, opaque(_MAX_FOLD_TRIANGLES)
     across, along = dr.cross(direction, outward), dr.normalize(direction)
     start, found = mi.UInt32(edge), mi.Bool(False)

@@ -1,6 +1,6 @@
-"""What a surface does to a path, in Dr.Jit: tables of ``scene.material.Surface`` and their law.
+"""Scattering laws in Dr.Jit: tables of ``scene.material.Surface``, and their evaluation.
 
-Everything here is differentiable or not, as the tables are. The same law in torch, float64, is
+Values carry derivatives if the tables do. The same law in torch, float64, is
 ``channel/coherent/radar_equation.py``; tests hold the two equal.
 """
 
@@ -16,7 +16,7 @@ from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.scene import ScatteringLaw
 
-#: Names of a surface's tables that kernels read; depolarisation scales others (``deposit_power``).
+#: Tables of a surface in kernels; depolarisation scales them before (``deposit_power``).
 SCATTERING_TABLES = tuple(
     field.name for field in fields(ScatteringLaw) if field.name != "depolarisation"
 )
@@ -25,21 +25,32 @@ _CONSTANT_COLUMNS = ("diffuse", "lobes", "exponents", "index", "attenuation")
 
 @dataclass(frozen=True)
 class ScatteringLawTables:
-    """Rows of ``scene.material.Surface`` as flat Dr.Jit arrays, and what is known of all rows."""
+    """Rows of ``scene.material.Surface`` as flat Dr.Jit arrays, and properties of all rows.
 
-    tables: Mapping[str, mit.Float]  # by the names of ``SCATTERING_TABLES``
-    cosine_count: int  # entries of a table over cosθ
-    has_lobe: tuple[bool, ...]  # which lobes have weight anywhere
-    has_sheets: bool  # whether something passes straight through any surface
-    has_refracting_bodies: bool  # whether any surface is the skin of a refracting body
-    has_spread: bool  # whether any specular lobe lacks what is mirrored
-    constants: Mapping[
-        str, list[mit.Float]
-    ]  # columns that are the same in all rows, and need no look-up
+    Attributes:
+        tables: tables by the names of ``SCATTERING_TABLES``.
+        cosine_count: entries of a table over cosθ.
+        has_lobe: for each lobe, True if any row gives it weight.
+        has_sheets: True if any surface transmits straight on.
+        has_refracting_bodies: True if any surface is the interface of a refracting body.
+        has_spread: True if any specular lobe lacks the power of a specular reflection.
+        constants: columns that are equal in all rows, which need no look-up.
+    """
+
+    tables: Mapping[str, mit.Float]
+    cosine_count: int
+    has_lobe: tuple[bool, ...]
+    has_sheets: bool
+    has_refracting_bodies: bool
+    has_spread: bool
+    constants: Mapping[str, list[mit.Float]]
 
     @staticmethod
     def from_geometry(geometry: Geometry) -> ScatteringLawTables:
-        """Upload the surfaces of a scene."""
+        """Upload the surfaces of a scene.
+
+        Args:
+            geometry: scene as flat tables."""
         rows = geometry.surfaces
         known = {}
         if len(rows.diffuse) == 1:
@@ -57,19 +68,18 @@ class ScatteringLawTables:
         )
 
     def value(self, name: str, row: mit.UInt32, active: mit.Bool | bool = True) -> mit.Float:
-        """A number of each row: ``diffuse``, ``index`` or ``attenuation``.
+        """Look up a number of each row: ``diffuse``, ``index`` or ``attenuation``.
 
         Args:
-            name: Of the table.
-            row: Row of the surface.
-            active: Lanes.
-        """
+            name: name of the table.
+            row: rows of the surfaces.
+            active: mask of active lanes."""
         return self._column(name, 0, 1, row, active)
 
     def _column(
         self, name: str, number: int, count: int, row: mit.UInt32, active: mit.Bool | bool
     ) -> mit.Float:
-        """One of the ``count`` numbers that a table has for every row."""
+        """Look up one of the ``count`` numbers of a table for every row."""
         if self._is_constant(name):
             return mi.Float(self.constants[name][number])
         return self._read(name, row * count + number, active)
@@ -78,21 +88,20 @@ class ScatteringLawTables:
         return name in self.constants and not dr.grad_enabled(self.tables[name])
 
     def _read(self, name: str, index: mit.UInt32, active: mit.Bool | bool) -> mit.Float:
-        """Entries of a table; by all lanes where it has no derivatives, so that it is read once."""
+        """Gather entries of a table; by all lanes if it has no derivatives, to gather it once."""
         table = self.tables[name]
         return dr.gather(mi.Float, table, index, active if dr.grad_enabled(table) else True)
 
     def interpolate_cosine(
         self, name: str, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool = True
     ) -> mit.Float:
-        """A table over cosθ, linear between its entries.
+        """Interpolate a table over cosθ linearly.
 
         Args:
-            name: Of the table.
-            row: Of the surface.
-            cosine: Of the angle of incidence, at least 0.
-            active: Lanes.
-        """
+            name: name of the table.
+            row: rows of the surfaces.
+            cosine: cosine of the angle of incidence, at least 0.
+            active: mask of active lanes."""
         if self._is_constant(name):
             return mi.Float(self.constants[name][0])
         t = dr.minimum(cosine, 1.0) * (self.cosine_count - 1)
@@ -104,13 +113,12 @@ class ScatteringLawTables:
     def sheet_transmission(
         self, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool = True
     ) -> tuple[mit.Float, mit.Float]:
-        """Transmittance of a sheet, and the length [m] that it adds.
+        """Interpolate the transmittance of a sheet and its extra length [m].
 
         Args:
-            row: Row of the surface.
-            cosine: Of the angle of incidence.
-            active: Lanes.
-        """
+            row: rows of the surfaces.
+            cosine: cosine of the angle of incidence.
+            active: mask of active lanes."""
         return tuple(  # type: ignore[return-value]
             self.interpolate_cosine(name, row, cosine, active)
             for name in ("transmittance", "extra_length")
@@ -125,31 +133,30 @@ class ScatteringLawTables:
         outgoing: mit.Vector3f,
         active: mit.Bool | bool = True,
     ) -> tuple[mit.Float, mit.Float]:
-        """``((1 + cosψ)/2)^p`` of one lobe, and its exponent p.
+        """Evaluate ``((1 + cosψ)/2)^p`` of one lobe; return it and its exponent p.
 
-        By ``1 - |d|²/4``, d from the lobe's axis to the direction: a narrow lobe keeps its digits.
+        Computed as ``1 - |d|²/4``, with d from the lobe's axis to the direction, so that a narrow
+        lobe keeps its digits.
 
         Args:
             number: 0 specular, 1 directive, 2 backscattering.
-            row: Of the surface.
-            normal: Unit normal.
-            incident: Where the path comes from.
-            outgoing: Where it goes on.
-            active: Lanes.
-        """
+            row: rows of the surfaces.
+            normal: unit normals.
+            incident: unit directions to the previous vertex.
+            outgoing: unit directions to the next vertex.
+            active: mask of active lanes."""
         axis = incident if number == 2 else normal * (2 * dr.dot(normal, incident)) - incident
         apart = dr.squared_norm(outgoing - axis)
         exponent = self.exponent(number, row, active)
         return dr.exp(exponent * log_one_minus(0.25 * apart)), exponent
 
     def exponent(self, number: int, row: mit.UInt32, active: mit.Bool | bool = True) -> mit.Float:
-        """Exponent of a lobe.
+        """Look up the exponent of a lobe.
 
         Args:
             number: 0 specular, 1 directive, 2 backscattering.
-            row: Of the surface.
-            active: Lanes.
-        """
+            row: rows of the surfaces.
+            active: mask of active lanes."""
         return self._column("exponents", number, 3, row, active)
 
     def evaluate_scattering(
@@ -160,18 +167,17 @@ class ScatteringLawTables:
         outgoing: mit.Vector3f | None,
         active: mit.Bool | bool = True,
     ) -> mit.Float:
-        """``f |cosθ| |cosθ'|`` between two unit directions that point away from the surface.
+        """Evaluate ``f |cosθ| |cosθ'|`` between unit directions that point away from the surface.
 
-        On one side, ``f`` is the distribution of ``scene.material``; through the skin of a
-        refracting body, ``refracted``.
+        On one side, ``f`` is the distribution of ``scene.material``; through the interface of a
+        refracting body, see ``evaluate_refraction``.
 
         Args:
-            row: Of the surface.
-            normal: Unit normal.
-            incident: Where the path comes from.
-            outgoing: Where it goes on; None where both directions are one.
-            active: Lanes.
-        """
+            row: rows of the surfaces.
+            normal: unit normals.
+            incident: unit directions to the previous vertex.
+            outgoing: unit directions to the next vertex; None if both directions are one.
+            active: mask of active lanes."""
         first = dr.dot(normal, incident)
         low = self._amplitude(row, first, active)
         if outgoing is None:
@@ -196,7 +202,7 @@ class ScatteringLawTables:
         return value
 
     def _amplitude(self, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool) -> mit.Float:
-        """Square root of the reflectance; from inside a body, that of the refracted angle."""
+        """Look up the root of the reflectance; inside a body, at the refracted angle."""
         if not self.has_refracting_bodies:
             return self.interpolate_cosine("amplitude", row, dr.abs(cosine), active)
         outer, total = self._outer_cosine(row, cosine, active)
@@ -205,7 +211,7 @@ class ScatteringLawTables:
     def _outer_cosine(
         self, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool
     ) -> tuple[mit.Float, mit.Bool]:
-        """Cosine on the outer side of a skin (Snell), and whether there is none."""
+        """Compute the cosine on the outer side of an interface (Snell), and the total reflections."""
         inside = dr.detach(cosine) < 0
         index = self.value("index", row, active)
         square = 1 - dr.square(index) * (1 - dr.square(cosine))
@@ -221,18 +227,18 @@ class ScatteringLawTables:
         outgoing: mit.Vector3f,
         active: mit.Bool | bool,
     ) -> mit.Float:
-        """``f |cosθ| |cosθ'|`` through the skin of a body, in a lobe about Snell's direction.
+        """Evaluate ``f |cosθ| |cosθ'|`` through the interface of a body.
 
-        ``f = n'² sqrt(T(θ) T(θ')) g(m)`` with the mismatch ``m = n d + n' d'`` of the directions'
-        tangential parts and a Gaussian ``g`` of the variance of the specular lobe: ``f / n'²`` is
-        reciprocal, and a lobe within the propagating directions passes T.
+        ``f = n'² sqrt(T(θ) T(θ')) g(m)`` is a lobe about Snell's direction, with the mismatch
+        ``m = n d + n' d'`` of the directions' tangential parts and a Gaussian ``g`` of the variance
+        of the specular lobe: ``f / n'²`` is reciprocal, and a lobe within the propagating directions
+        transmits T.
 
         Args:
-            row: Row of the surface.
-            normal: Unit normal.
-            incident, outgoing: Unit directions of the path, away from the surface.
-            active: Lanes.
-        """
+            row: rows of the surfaces.
+            normal: unit normals.
+            incident, outgoing: unit directions of the path, away from the surface.
+            active: mask of active lanes."""
         first, second = dr.dot(normal, incident), dr.dot(normal, outgoing)
         inner = self.value("index", row, active)
         variance = self.refraction_variance(row, active)
@@ -240,7 +246,7 @@ class ScatteringLawTables:
         for direction, cosine in ((incident, first), (outgoing, second)):
             outer, total = self._outer_cosine(row, cosine, active)
             passing = self.interpolate_cosine("refraction", row, outer, active)
-            # A root of zero has no derivative: opaque surfaces take part as well.
+            # A root of zero has no derivative, and opaque surfaces are evaluated as well.
             open_ = ~total & (dr.detach(passing) > 0)
             roots.append(dr.select(open_, dr.sqrt(dr.select(open_, passing, 1.0)), 0.0))
             index = dr.select(dr.detach(cosine) < 0, inner, 1.0)
@@ -249,45 +255,46 @@ class ScatteringLawTables:
         return roots[0] * roots[1] * dr.square(index) * lobe * dr.abs(first * second)
 
     def refraction_variance(self, row: mit.UInt32, active: mit.Bool | bool = True) -> mit.Float:
-        """Variance of the refracted direction's tangential part: that of the specular lobe.
+        """Compute the variance of the refracted direction's tangential part.
+
+        It is that of the specular lobe.
 
         Args:
-            row: Row of the surface.
-            active: Lanes.
-        """
+            row: rows of the surfaces.
+            active: mask of active lanes."""
         exponent = self.exponent(0, row, active)
         return 2 / dr.maximum(exponent, 1.0)
 
     def is_refracting(self, row: mit.UInt32) -> mit.Bool:
-        """Whether a surface is the skin of a refracting body."""
+        """Test whether surfaces are interfaces of refracting bodies.
+
+        Args:
+            row: rows of the surfaces."""
         last = (row + 1) * self.cosine_count - 1
         return dr.detach(dr.gather(mi.Float, self.tables["refraction"], last)) > 0
 
 
 def opaque_row(row: Tensor) -> list[mit.Float]:
-    """The numbers of a table of one row, each for all lanes.
+    """Upload the numbers of a table of one row, each as an opaque scalar.
 
     Args:
-        row: The table.
-    """
+        row: table of one row."""
     return [opaque(float(number), "Float") for number in row.detach().ravel()]
 
 
 def log_one_minus(fraction: mit.Float) -> mit.Float:
-    """log(1 − x), at least that of 1e-7, with the digits of a small x.
+    """Compute log(1 − x), bounded below by log(1e-7), accurate for small x.
 
     Args:
-        fraction: x, from 0 to 1.
-    """
+        fraction: x, from 0 to 1."""
     series = -fraction * (1 + fraction * (1 / 2 + fraction / 3))
     return dr.select(dr.detach(fraction) < 0.01, series, dr.log(dr.maximum(1 - fraction, 1e-7)))
 
 
 def gaussian(mismatch: mit.Vector3f, variance: mit.Float) -> mit.Float:
-    """Density of a plane Gaussian at an offset from its centre.
+    """Evaluate the density of a plane Gaussian.
 
     Args:
-        mismatch: Offset from the centre.
-        variance: Along each axis.
-    """
+        mismatch: offset from the centre.
+        variance: variance along each axis."""
     return dr.exp(-dr.squared_norm(mismatch) / (2 * variance)) / (2 * dr.pi * variance)

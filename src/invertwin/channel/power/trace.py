@@ -1,4 +1,4 @@
-"""One tracing of a scene: paths walked into bins or records, and the boundary paths."""
+"""Tracing of a scene: random walks into bins or records, and boundary paths."""
 
 from __future__ import annotations
 
@@ -27,27 +27,25 @@ from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.sampling import Sampling
 from invertwin.checks import strip_derivatives
 
-_BYTES_PER_VERTEX = 20  # one record: triangle, two barycentrics, throughput, length
+_BYTES_PER_VERTEX = 20  # triangle, two barycentric coordinates, throughput, length
 
 
 def differentiable_tables(geometry: Geometry, link: Link) -> list[Tensor]:
-    """What a map can be differentiated with respect to, in the kernel's order.
+    """List the tables with respect to which a map is differentiable, in the kernel's order.
 
     Args:
-        geometry: The scene.
-        link: Antennas.
-    """
+        geometry: scene as flat tables.
+        link: antennas."""
     owners = {"vertices": geometry, **dict.fromkeys(SCATTERING_TABLES, geometry.surfaces)}
     return [getattr(owners.get(name, link), name) for name in DIFFERENTIABLE]
 
 
 def strip_scene_derivatives(geometry: Geometry, link: Link) -> tuple[Geometry, Link]:
-    """Plain numbers, also within the transforms of ``torch.func``.
+    """Strip all derivatives, also within the transforms of ``torch.func``.
 
     Args:
-        geometry: The scene.
-        link: Antennas.
-    """
+        geometry: scene as flat tables.
+        link: antennas."""
     tables = dict(
         zip(
             DIFFERENTIABLE,
@@ -64,7 +62,17 @@ def strip_scene_derivatives(geometry: Geometry, link: Link) -> tuple[Geometry, L
 
 
 class PowerTracer:
-    """The detached half of a call: which paths there are. Every call gives the same ones."""
+    """Detached part of a call: the paths. Every call yields the same ones.
+
+    Args:
+        geometry: scene as flat tables.
+        link: antennas.
+        sampling: numbers of paths.
+        seed: seed of all random numbers.
+        scheme: sampling of the start points, see ``deposit_power``.
+        reference: reference scene of the start points, see ``deposit_power``.
+        coupling: polarisation factors of paths with an odd and an even number of bounces.
+        differentiate_antennas: True if derivatives may flow through the antennas' positions."""
 
     def __init__(
         self,
@@ -78,25 +86,13 @@ class PowerTracer:
         coupling: tuple[float, float] = (1.0, 1.0),
         differentiate_antennas: bool = True,
     ) -> None:
-        """Upload a scene and prepare the samplers.
-
-        Args:
-            geometry: The scene.
-            link: Antennas.
-            sampling: How many paths are drawn.
-            seed: Of all random numbers.
-            scheme: Where paths start, see ``deposit_power``.
-            reference: What fixes how starts are drawn, see ``deposit_power``.
-            coupling: Factors of paths with an odd and an even number of bounces.
-            differentiate_antennas: Whether derivatives may flow through the places of antennas.
-        """
         self.sampling, self.seed = sampling, seed
-        self.last_records: PathRecords | None = None  # the last paths, where they fit
+        self.last_records: PathRecords | None = None  # the last paths, if they fit
         self.rays = RayScene(geometry, link, differentiate_antennas=differentiate_antennas)
         sampler = RaySampler if scheme == "rays" else AreaSampler
         self.sampler = sampler(self.rays, sampling.samples * self.rays.scene_count, seed, reference)
-        one_place = bool((link.tx == link.rx).all())
-        self.fixed = replace(Inputs.from_rays(self.rays, monostatic=one_place), coupling=coupling)
+        monostatic = bool((link.tx == link.rx).all())
+        self.fixed = replace(Inputs.from_rays(self.rays, monostatic=monostatic), coupling=coupling)
         self._walk = RandomWalk(self.rays, self.fixed, seed)
         warn_coplanar_surfaces(self.rays)
         edges = sampling.boundary and sampling.contacts and sampling.boundary_samples
@@ -111,12 +107,11 @@ class PowerTracer:
     def inputs(
         self, tables: dict[str, mit.Float] | None = None, *, joint_antennas: bool = True
     ) -> Inputs:
-        """The kernel's inputs, with some arrays replaced by ones that carry derivatives.
+        """Build the kernel's inputs, with some tables replaced by ones that carry derivatives.
 
         Args:
-            tables: By name.
-            joint_antennas: Whether antennas at one place also move as one.
-        """
+            tables: replaced tables by name.
+            joint_antennas: True if antennas at one position also move as one."""
         attached = self.fixed.with_tables(tables or {})
         return replace(attached, monostatic=joint_antennas and self.fixed.monostatic)
 
@@ -124,9 +119,8 @@ class PowerTracer:
         """Walk all paths into the bins.
 
         Args:
-            out: The bins.
-            record: Whether to record the paths, which is done if all fit in one chunk.
-        """
+            out: accumulator of the map.
+            record: True to record the paths, provided that all fit in one chunk."""
         record = record and self.sampler.size <= self.chunk
         records = None
         for index in index_chunks(self.sampler.size, self.chunk):
@@ -138,16 +132,16 @@ class PowerTracer:
         return records
 
     def iterate_records(self) -> Iterator[PathRecords]:
-        """The vertices of all paths, a chunk at a time."""
+        """Iterate over the vertices of all paths, a chunk at a time."""
         for index in index_chunks(self.sampler.size, self.chunk):
             yield self._walk_paths(index, None, record=True)
 
     def _walk_paths(
         self, index: mit.UInt32, out: BinAccumulator | None, *, record: bool
     ) -> PathRecords:
-        """Walk some paths into the bins, if given, and into records, if asked (else empty)."""
+        """Walk some paths into the bins, if given, and into records, if requested (else empty)."""
         depth, shared = self.sampling.depth, self.rays.link.shared_visibility
-        one_place = depth == 1 and self.fixed.monostatic
+        monostatic = depth == 1 and self.fixed.monostatic
         state = self._start_paths(index)
         state["lane"] = dr.arange(mi.UInt32, dr.width(index))
         looped = record and depth > 1
@@ -158,7 +152,7 @@ class PowerTracer:
             nonlocal records
             found, exists = walk.connect_path(
                 self.rays, self.fixed, state, point, True,
-                shared_visibility=shared, monostatic=one_place, antenna=receiver,
+                shared_visibility=shared, monostatic=monostatic, antenna=receiver,
             )  # fmt: skip
             if out is not None:
                 out.add(found, exists)
@@ -173,7 +167,7 @@ class PowerTracer:
         return replace(records, count=done["count"]) if looped else records
 
     def _start_paths(self, index: mit.UInt32) -> PathState:
-        """Paths at their first vertex."""
+        """Create the state of paths at their first vertex."""
         start = self.sampler.draw(index, self.fixed)
         tx, passed = self.fixed.antenna_position(start.frame, False), start.transmission
         point = integrand.compute_interaction(self.fixed, start.point)
@@ -193,31 +187,33 @@ class PowerTracer:
 
     @cached_property
     def boundary_samples(self) -> BoundarySamples | None:
-        """The edge points of the boundary paths; the first are being drawn when this returns."""
+        """Points of the boundary paths; the first chunks are launched when this returns."""
         sampling = self.sampling
         if not (sampling.boundary and sampling.boundary_samples):
             return None
-        # Nothing that refers to this object: records would stay until garbage is collected.
+        # No reference to this object: records would stay until garbage is collected.
         return BoundarySamples(
             self.rays, self.fixed, sampling, self.seed, self.curves,
             chunks=partial(index_chunks, chunk=self.chunk),
         )  # fmt: skip
 
     def trace_boundary(self, inputs: Inputs) -> Iterator[BoundaryPaths]:
-        """Boundary paths of all segments, a chunk at a time."""
+        """Trace the boundary paths of all families, a chunk at a time.
+
+        Args:
+            inputs: attached inputs."""
         if self.boundary_samples is None:
             return iter(())
         return trace_boundary_paths(self.rays, inputs, self._walk, self.boundary_samples)
 
 
 def index_chunks(size: int, chunk: int) -> Iterator[mit.UInt32]:
-    """Index arrays that together count to ``size``; their offset is opaque (no recompilation).
+    """Split indices into chunks; their offset is opaque (no recompilation).
 
     Args:
-        size: How many there are in all.
-        chunk: Most of them at a time.
-    """
-    # Of one size but for the last, so that a chunk takes the memory of the one before.
+        size: number of indices.
+        chunk: most indices at a time."""
+    # Equal sizes but for the last, so that a chunk reuses the memory of the one before.
     chunk = max(1, -(-size // max(1, -(-size // chunk))))
     for start in range(0, size, chunk):
         yield dr.arange(mi.UInt32, min(chunk, size - start)) + opaque(start)
