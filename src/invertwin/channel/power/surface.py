@@ -211,7 +211,7 @@ class ScatteringLawTables:
     def _outer_cosine(
         self, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool
     ) -> tuple[mit.Float, mit.Bool]:
-        """Compute the cosine on the outer side of an interface (Snell), and the total reflections."""
+        """Compute the cosine outside an interface (Snell), and the mask of total reflections."""
         inside = dr.detach(cosine) < 0
         index = self.value("index", row, active)
         square = 1 - dr.square(index) * (1 - dr.square(cosine))
@@ -231,8 +231,8 @@ class ScatteringLawTables:
 
         ``f = n'² sqrt(T(θ) T(θ')) g(m)`` is a lobe about Snell's direction, with the mismatch
         ``m = n d + n' d'`` of the directions' tangential parts and a Gaussian ``g`` of the variance
-        of the specular lobe: ``f / n'²`` is reciprocal, and a lobe within the propagating directions
-        transmits T.
+        of the specular lobe: ``f / n'²`` is reciprocal, and a lobe within the propagating
+        directions transmits T.
 
         Args:
             row: rows of the surfaces.
