@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -14,11 +15,21 @@ from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import morton_order
 
-if TYPE_CHECKING:
-    from invertwin.channel.rays.ray_scene import RayScene
-
 _MAX_GROUP_SIZE = 8  # objects of a group
 _EMPTY_SPHERE = (0.0, 0.0, 0.0, -1.0)  # a sphere that nothing meets
+
+
+State = TypeVar("State", bound=tuple[object, ...])
+
+
+class LoopRecorder(Protocol):
+    """Ray scene as the loops over its objects see it."""
+
+    def loop(
+        self, state: State, going: Callable[..., mit.Bool], step: Callable[..., State]
+    ) -> State:
+        """Record a loop, see ``Occluders.loop``."""
+        ...
 
 
 class BoundingSpheres:
@@ -177,7 +188,7 @@ class BoundingSpheres:
 
     def group_density(
         self,
-        rays: RayScene,
+        rays: LoopRecorder,
         group: mit.UInt32,
         point: mit.Point3f,
         direction: mit.Vector3f,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from jaxtyping import Bool
@@ -10,13 +10,30 @@ from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_index
 from invertwin.channel.rays.backend import dr, mi, mit
-from invertwin.channel.rays.bounding_spheres import sample_cap
-
-if TYPE_CHECKING:
-    from invertwin.channel.rays.ray_scene import RayScene
+from invertwin.channel.rays.bounding_spheres import BoundingSpheres, LoopRecorder, sample_cap
+from invertwin.channel.rays.topology import Topology
 
 NO_TARGET = 0xFFFFFFFF  # no place in a table
 _TOLERANCE = 1e-4  # of a distance: far more than rounding
+
+
+class _Objects(LoopRecorder, Protocol):
+    """Ray scene as differentiated objects see it."""
+
+    topology: Topology
+
+    @property
+    def spheres(self) -> BoundingSpheres:
+        """Bounding spheres of the objects."""
+        ...
+
+    def object_scene(self, number: mit.UInt32) -> mit.UInt32:
+        """Look up the scenes of objects."""
+        ...
+
+    def edge_scene(self, edge: mit.UInt32) -> mit.UInt32:
+        """Look up the scenes of edges."""
+        ...
 
 
 class DifferentiatedObjects:
@@ -30,7 +47,7 @@ class DifferentiatedObjects:
         rays: The ray scene whose kernels this is a part of.
     """
 
-    def __init__(self, differentiated: Bool[Tensor, " object"], rays: RayScene) -> None:
+    def __init__(self, differentiated: Bool[Tensor, " object"], rays: _Objects) -> None:
         self._rays = rays
         self._differentiated = to_index(differentiated)
         self._numbers = to_index(torch.nonzero(differentiated)[:, 0])

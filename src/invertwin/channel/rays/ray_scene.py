@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float64, Int64
@@ -22,7 +22,7 @@ from invertwin.channel.rays.arrays import (
     to_torch,
 )
 from invertwin.channel.rays.backend import backend, dr, mi, mit, tracing
-from invertwin.channel.rays.bounding_spheres import BoundingSpheres
+from invertwin.channel.rays.bounding_spheres import BoundingSpheres, State
 from invertwin.channel.rays.brute_force import BruteForceIntersector
 from invertwin.channel.rays.differentiated_objects import DifferentiatedObjects
 from invertwin.channel.rays.scene_tables import Geometry
@@ -31,8 +31,6 @@ from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh
-
-State = TypeVar("State", bound=tuple[object, ...])
 
 # Offset along a ray, relative to its length: fifty float32 roundings of a coordinate, and so small
 # that the shadowed side of a 0.3 m ball stays dark from a kilometre away.
