@@ -23,7 +23,6 @@ from scenes import float64, occluder, radar, relative, thing
 FEW = Sampling(points_per_m2=200.0)
 
 
-@pytest.mark.claim
 @pytest.mark.slow
 def test_exact_signals_and_surrogate_have_one_shape_and_one_unit():
     """Averaged over speckle, the exact spectrum is the surrogate's."""
