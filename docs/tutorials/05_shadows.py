@@ -1,5 +1,5 @@
 # %% [markdown]
-# Shadows in the gradient
+# # Shadows in the gradient
 #
 # A plate moves in front of a wall, and its shadow moves over the wall. The echo of the wall changes where the shadow
 # boundary passes. Automatic differentiation of a ray tracer misses this change, since its rays are sampled at fixed
