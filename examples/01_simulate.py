@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 import invertwin as iw
-from invertwin.scene import RoughDielectric, linear_array, plate, rigid, rotation_from_vector, text
+from invertwin.scene import rotation_from_vector
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples")
 folder.mkdir(parents=True, exist_ok=True)
@@ -17,20 +17,20 @@ folder.mkdir(parents=True, exist_ok=True)
 
 def at(x: float, y: float, z: float, yaw: float = 0.0) -> torch.Tensor:
     """A pose: position [m] and turn about the vertical [rad]."""
-    return rigid(rotation_from_vector(torch.tensor([0.0, yaw, 0.0])), torch.tensor([x, y, z]))
+    return iw.rigid(rotation_from_vector(torch.tensor([0.0, yaw, 0.0])), torch.tensor([x, y, z]))
 
 
 # The radar sits at the origin and looks along z; x is right, y is up.
-paint = RoughDielectric(permittivity=4.0)
+paint = iw.RoughDielectric(permittivity=4.0)
 scene = iw.Scene(
     {
-        "letter": iw.Object(text("A", size=0.6), paint, at(0.3, 0.0, 2.5, yaw=0.3)),
-        "wall": iw.Object(plate(3.0, 2.4), paint, at(0.0, 0.0, 3.3)),
+        "letter": iw.Object(iw.text("A", size=0.6), paint, at(0.3, 0.0, 2.5, yaw=0.3)),
+        "wall": iw.Object(iw.plate(3.0, 2.4), paint, at(0.0, 0.0, 3.3)),
     }
 )
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=50e-6, samples=128)
 half = chirp.wavelength / 2
-radar = iw.Radar(linear_array(2, 16 * half), linear_array(16, half), chirp, [[0.0, 0.0, 0.0]])
+radar = iw.Radar(iw.linear_array(2, 16 * half), iw.linear_array(16, half), chirp, [[0.0, 0.0, 0.0]])
 grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.6)
 
 # Exact signals: fields of fixed scatterers, beat signals, window, FFT, beamforming. The

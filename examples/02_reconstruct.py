@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 import invertwin as iw
-from invertwin.scene import RoughDielectric, compose, plate, rigid, rotation_from_vector, text
+from invertwin.scene import compose, rotation_from_vector
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples")
 folder.mkdir(parents=True, exist_ok=True)
@@ -28,18 +28,18 @@ class OnTheFloor(torch.nn.Module):
         x, z, yaw = self.theta
         zero = torch.zeros_like(x)
         turn = rotation_from_vector(torch.stack([zero, yaw, zero]))
-        pose = compose(rigid(turn, torch.stack([x, zero, z])), scene["letter"].transform)
+        pose = compose(iw.rigid(turn, torch.stack([x, zero, z])), scene["letter"].transform)
         return scene.replace("letter", pose=pose)
 
 
-paint = RoughDielectric(permittivity=4.0)
-letter = iw.Object(text("A"), paint, rigid(translation=[0.0, 0.0, 2.5]))
-wall = iw.Object(plate(3.0, 2.4), paint, rigid(translation=[0.0, 0.0, 3.3]))
+paint = iw.RoughDielectric(permittivity=4.0)
+letter = iw.Object(iw.text("A"), paint, iw.rigid(translation=[0.0, 0.0, 2.5]))
+wall = iw.Object(iw.plate(3.0, 2.4), paint, iw.rigid(translation=[0.0, 0.0, 3.3]))
 start = iw.Scene({"letter": letter, "wall": wall})
 hidden = OnTheFloor(x=0.25, z=-0.15, yaw=0.3)
 
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=50e-6, samples=128)
-row, half = iw.scene.linear_array, chirp.wavelength / 2
+row, half = iw.linear_array, chirp.wavelength / 2
 looks = [[x, y, 0.0] for x in (-0.6, -0.2, 0.2, 0.6) for y in (-0.4, 0.4)]
 radar = iw.Radar(row(2, 16 * half), row(16, half), chirp, looks)  # 2 × 16 at eight places
 grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.6)

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 import invertwin as iw
-from invertwin.scene import Cosine, PerfectConductor, linear_array, rigid, save_mesh, sphere
+from invertwin.scene import Cosine, save_mesh, sphere
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples")
 folder.mkdir(parents=True, exist_ok=True)
@@ -22,14 +22,14 @@ else:  # no mesh given: make one, as another program would
     save_mesh(file, sphere(0.1, subdivisions=5))
 
 # OBJ, PLY, STL or glTF; metres. The file's origin goes to (0.4, 0, 2) m.
-ball = iw.Object(iw.load_mesh(file), PerfectConductor(), rigid(translation=[0.4, 0.0, 2.0]))
+ball = iw.Object(iw.load_mesh(file), iw.PerfectConductor(), iw.rigid(translation=[0.4, 0.0, 2.0]))
 scene = iw.Scene({"ball": ball})
 
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=60e-6, samples=256)
 wavelength = chirp.wavelength
 patch = Cosine(exponent=3.0)  # power pattern of one antenna; ~75° between half-power points
-transmitters = linear_array(2, 2 * wavelength, pattern=patch)
-receivers = linear_array(4, wavelength / 2, pattern=patch)
+transmitters = iw.linear_array(2, 2 * wavelength, pattern=patch)
+receivers = iw.linear_array(4, wavelength / 2, pattern=patch)
 # Arrays are given about their own centre; on the board they lie side by side.
 receivers = iw.scene.AntennaArray(receivers.positions - torch.tensor([0.0, 0.01, 0.0]), patch)
 radar = iw.Radar(transmitters, receivers, chirp, positions=[[0.0, 0.0, 0.0]])

@@ -11,24 +11,24 @@ from torch.func import jvp
 
 import invertwin as iw
 from invertwin.links import CellSampling, MapPlane, PropagationSettings, Transmitters
-from invertwin.scene import PerfectConductor, Slab, box, rigid, rotation_from_vector
+from invertwin.scene import Slab, rotation_from_vector
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples")
 folder.mkdir(parents=True, exist_ok=True)
 
 
 def at(x: float, y: float, z: float, yaw: float = 0.0) -> torch.Tensor:
-    return rigid(rotation_from_vector(torch.tensor([0.0, 0.0, yaw])), torch.tensor([x, y, z]))
+    return iw.rigid(rotation_from_vector(torch.tensor([0.0, 0.0, yaw])), torch.tensor([x, y, z]))
 
 
 concrete, board = Slab.itu("concrete", thickness=0.2), Slab.itu("chipboard", thickness=0.018)
 cupboard = at(3.2, 2.3, 0.96, yaw=0.3)
 scene = iw.Scene(
     {
-        "room": iw.Object(box([8.0, 6.0, 2.7]), concrete, at(4.0, 3.0, 1.35)),
-        "cupboard": iw.Object(box([1.2, 0.5, 1.9]), PerfectConductor(), cupboard),
-        "shelf": iw.Object(box([0.4, 2.0, 2.0]), board, at(6.1, 4.4, 1.01)),
-        "table": iw.Object(box([1.6, 0.8, 0.04]), board, at(1.6, 4.6, 0.75)),
+        "room": iw.Object(iw.box([8.0, 6.0, 2.7]), concrete, at(4.0, 3.0, 1.35)),
+        "cupboard": iw.Object(iw.box([1.2, 0.5, 1.9]), iw.PerfectConductor(), cupboard),
+        "shelf": iw.Object(iw.box([0.4, 2.0, 2.0]), board, at(6.1, 4.4, 1.01)),
+        "table": iw.Object(iw.box([1.6, 0.8, 0.04]), board, at(1.6, 4.6, 0.75)),
     }
 )
 mast, reception = (

@@ -7,16 +7,15 @@
 # %%
 # %matplotlib inline
 import invertwin as iw
-from invertwin.scene import RoughDielectric, Translation, box, linear_array, plate, rigid
 
 # %% [markdown]
 # ## The scene
 # The radar is at the origin. x is right, y is up, and z points away from the radar. All lengths are in metres.
 
 # %%
-paint = RoughDielectric(permittivity=4.0)
-crate = iw.Object(box((0.4, 0.4, 0.3)), paint, rigid(translation=[0.2, 0.0, 2.2]))
-wall = iw.Object(plate(3.0, 2.0), paint, rigid(translation=[0.0, 0.0, 3.2]))
+paint = iw.RoughDielectric(permittivity=4.0)
+crate = iw.Object(iw.box((0.4, 0.4, 0.3)), paint, iw.rigid(translation=[0.2, 0.0, 2.2]))
+wall = iw.Object(iw.plate(3.0, 2.0), paint, iw.rigid(translation=[0.0, 0.0, 3.2]))
 truth = iw.Scene({"crate": crate, "wall": wall})
 
 # %% [markdown]
@@ -27,8 +26,8 @@ truth = iw.Scene({"crate": crate, "wall": wall})
 # %%
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=128)
 radar = iw.Radar(
-    linear_array(2, 4 * chirp.wavelength),
-    linear_array(8, chirp.wavelength / 2),
+    iw.linear_array(2, 4 * chirp.wavelength),
+    iw.linear_array(8, chirp.wavelength / 2),
     chirp,
     positions=[[x, y, 0.0] for x in (-0.6, -0.2, 0.2, 0.6) for y in (-0.2, 0.2)],
 )
@@ -50,14 +49,14 @@ capture = recorded.capture
 # first it is blurred, which widens the basin of attraction; the blur is removed step by step.
 
 # %%
-start = truth.replace("crate", pose=rigid(translation=[0.0, 0.0, 2.35]))
+start = truth.replace("crate", pose=iw.rigid(translation=[0.0, 0.0, 2.35]))
 blur = iw.Surrogate(range_width=3.0, angle_width=1.5)
 rays = iw.Sampling(depth=1, samples=50_000, boundary_samples=8_000)
 model = iw.SurrogateMap(grid, blur, rays)
 fit = iw.reconstruct(
     start,
     iw.Observation(model, capture),
-    Translation("crate", axes="xz"),
+    iw.Translation("crate", axes="xz"),
     schedule=iw.Schedule(steps=50),
     seed=1,
 )

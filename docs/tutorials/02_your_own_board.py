@@ -14,7 +14,7 @@ import numpy as np
 import invertwin as iw
 from invertwin.capture import ChirpCapture, read
 from invertwin.radar import Chirps, board, detect_points, doppler_maps
-from invertwin.scene import RoughDielectric, rigid, sphere
+from invertwin.scene import sphere
 
 # %% [markdown]
 # ## The scene before the board
@@ -22,9 +22,9 @@ from invertwin.scene import RoughDielectric, rigid, sphere
 # receivers they are a row of eight virtual antennas.
 
 # %%
-foam = RoughDielectric(permittivity=4.0)
-still = iw.Object(sphere(0.15), foam, rigid(translation=[0.8, 0.0, 2.5]))
-comes = iw.Object(sphere(0.15), foam, rigid(translation=[-0.4, 0.0, 3.5]), [0.0, 0.0, -2.0])
+foam = iw.RoughDielectric(permittivity=4.0)
+still = iw.Object(sphere(0.15), foam, iw.rigid(translation=[0.8, 0.0, 2.5]))
+comes = iw.Object(sphere(0.15), foam, iw.rigid(translation=[-0.4, 0.0, 3.5]), [0.0, 0.0, -2.0])
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=1.536e9, duration=25.6e-6, samples=128)
 transmitters, receivers = board("xWR1642").arrays()
 radar = iw.Radar(transmitters, receivers, chirp, positions=[[0.0, 0.0, 0.0]])

@@ -14,13 +14,7 @@ import torch
 import trimesh
 
 import invertwin as iw
-from invertwin.scene import (
-    PerfectConductor,
-    RoughDielectric,
-    linear_array,
-    rigid,
-    rotation_from_vector,
-)
+from invertwin.scene import rotation_from_vector
 
 # %% [markdown]
 # ## A file
@@ -43,8 +37,8 @@ print(mug.summary())
 
 # %%
 upright = rotation_from_vector(torch.tensor([-math.pi / 2, 0.0, 0.0]))
-pose = rigid(upright, torch.tensor([0.2, 0.0, 1.5]))
-scene = iw.Scene({"mug": iw.Object(mug, PerfectConductor(), pose)})
+pose = iw.rigid(upright, torch.tensor([0.2, 0.0, 1.5]))
+scene = iw.Scene({"mug": iw.Object(mug, iw.PerfectConductor(), pose)})
 height = scene["mug"].vertices[:, 1]
 assert abs(float(height.max() - height.min()) - 0.092) < 1e-6
 
@@ -55,8 +49,8 @@ assert abs(float(height.max() - height.min()) - 0.092) < 1e-6
 # %%
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=50e-6, samples=128)
 radar = iw.Radar(
-    linear_array(2, 8 * chirp.wavelength),
-    linear_array(16, chirp.wavelength / 2),
+    iw.linear_array(2, 8 * chirp.wavelength),
+    iw.linear_array(16, chirp.wavelength / 2),
     chirp,
     [[0.0, 0.0, 0.0]],
 )
@@ -80,7 +74,7 @@ assert abs(float(grid.u[column]) - 0.2 / axis) < 0.05
 # may be the pose of the mesh, its size, its material, or every vertex of it.
 
 # %%
-painted = scene.replace("mug", material=RoughDielectric(permittivity=4.0))
+painted = scene.replace("mug", material=iw.RoughDielectric(permittivity=4.0))
 mean = iw.SurrogateMap(grid, sampling=iw.Sampling(depth=1)).predict(painted, radar, seed=1)
 iw.plotting.spectrum({"rough, on average": mean}, grid)
 

@@ -9,15 +9,7 @@
 import invertwin as iw
 from invertwin.plotting import MapPanel
 from invertwin.radar import Chirps, micro_doppler, range_profile
-from invertwin.scene import (
-    MovingScene,
-    RoughDielectric,
-    Walking,
-    linear_array,
-    person,
-    rigid,
-    standing_height,
-)
+from invertwin.scene import MovingScene, Walking, person, standing_height
 
 # %% [markdown]
 # ## A walking body
@@ -26,8 +18,8 @@ from invertwin.scene import (
 
 # %%
 body = person(spacing=0.05)
-skin = RoughDielectric(permittivity=8.0)
-place = rigid(translation=[0.0, standing_height(body), 5.0])
+skin = iw.RoughDielectric(permittivity=8.0)
+place = iw.rigid(translation=[0.0, standing_height(body), 5.0])
 scene = iw.Scene({"person": iw.Object(body.mesh({}), skin, place)})
 walk = MovingScene(scene, {"person": Walking(body, speed=1.0)})
 step = walk(1.0)["person"].center - walk(0.0)["person"].center
@@ -40,7 +32,7 @@ assert abs(float(step[2]) + 1.0) < 0.1
 
 # %%
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=0.5e9, duration=30e-6, samples=64)
-antenna = linear_array(1, chirp.wavelength / 2)
+antenna = iw.linear_array(1, chirp.wavelength / 2)
 radar = iw.Radar(antenna, antenna, chirp, positions=[[0.0, 1.0, 0.0]])
 train = Chirps(count=3072, interval=0.25e-3)
 beat = iw.simulate_chirps(

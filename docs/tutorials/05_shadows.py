@@ -11,20 +11,19 @@ import torch
 
 import invertwin as iw
 from invertwin.inversion import GradcheckSettings, evaluate_losses, make_line
-from invertwin.scene import RoughDielectric, Translation, linear_array, plate, rigid
 
 # %% [markdown]
 # ## The scene
 # The wall is bright behind the plate, so the shadow matters.
 
 # %%
-paint, dark = RoughDielectric(permittivity=5.0), RoughDielectric(permittivity=2.0)
-front = iw.Object(plate(0.5, 0.5), dark, rigid(translation=[0.1, 0.0, 2.2]))
-wall = iw.Object(plate(3.0, 2.0), paint, rigid(translation=[0.0, 0.0, 3.2]))
+paint, dark = iw.RoughDielectric(permittivity=5.0), iw.RoughDielectric(permittivity=2.0)
+front = iw.Object(iw.plate(0.5, 0.5), dark, iw.rigid(translation=[0.1, 0.0, 2.2]))
+wall = iw.Object(iw.plate(3.0, 2.0), paint, iw.rigid(translation=[0.0, 0.0, 3.2]))
 scene = iw.Scene({"plate": front, "wall": wall})
 chirp = iw.FMCW(start_frequency=76e9, bandwidth=2e9, duration=50e-6, samples=128)
-row = linear_array(16, chirp.wavelength / 2)
-radar = iw.Radar(linear_array(1, 1.0), row, chirp, positions=[[0.0, 0.0, 0.0]])
+row = iw.linear_array(16, chirp.wavelength / 2)
+radar = iw.Radar(iw.linear_array(1, 1.0), row, chirp, positions=[[0.0, 0.0, 0.0]])
 grid = radar.grid(range_min=1.8, range_max=3.8, u_max=0.5)
 
 # %% [markdown]
@@ -37,7 +36,7 @@ grid = radar.grid(range_min=1.8, range_max=3.8, u_max=0.5)
 rays = iw.Sampling(depth=1, samples=400_000, boundary_samples=100_000)
 report = iw.gradcheck(
     iw.SurrogateMap(grid, sampling=rays),
-    Translation("plate"),
+    iw.Translation("plate"),
     {"translation": [1.0, 0.0, 0.0]},
     scene=scene,
     sensor=radar,
@@ -75,7 +74,7 @@ data = iw.simulate(scene, radar, grid, seed=1, sampling=few)
 capture = data.capture
 model = iw.SurrogateMap(grid, iw.Surrogate(range_width=2.0, angle_width=1.0), rays)
 seen = iw.Observation(model, capture)
-line = make_line(Translation("plate"), {"translation": [1.0, 0.0, 0.0]}, scene)
+line = make_line(iw.Translation("plate"), {"translation": [1.0, 0.0, 0.0]}, scene)
 shifts = torch.linspace(-0.4, 0.4, 9)
 losses = evaluate_losses(line, shifts.tolist(), seen, seed=1)
 iw.plotting.convergence(losses.tolist())

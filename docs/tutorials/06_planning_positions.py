@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 import invertwin as iw
 from invertwin.inversion import plan_error_bars, prepare_fit
-from invertwin.scene import RoughDielectric, Translation, box, linear_array, rigid
 
 # %% [markdown]
 # ## The plan
@@ -18,16 +17,16 @@ from invertwin.scene import RoughDielectric, Translation, box, linear_array, rig
 # possible.
 
 # %%
-paint = RoughDielectric(permittivity=4.0)
+paint = iw.RoughDielectric(permittivity=4.0)
 truth = iw.Scene(
-    {"box": iw.Object(box((0.3, 0.3, 0.3)), paint, rigid(translation=[0.1, 0.0, 2.5]))}
+    {"box": iw.Object(iw.box((0.3, 0.3, 0.3)), paint, iw.rigid(translation=[0.1, 0.0, 2.5]))}
 )
 here = [[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]]
 possible = [[0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [-0.8, 0.0, 0.0], [0.0, 0.0, 1.0]]
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=128)
 radar = iw.Radar(
-    linear_array(2, 4 * chirp.wavelength),
-    linear_array(8, chirp.wavelength / 2),
+    iw.linear_array(2, 4 * chirp.wavelength),
+    iw.linear_array(8, chirp.wavelength / 2),
     chirp,
     positions=here + possible,
 )
@@ -44,7 +43,7 @@ recorded = iw.simulate(truth, radar, grid, seed=1, sampling=few, snr_db=20.0)
 model = iw.SurrogateMap(grid, sampling=iw.Sampling(depth=1, samples=40_000, boundary_samples=8_000))
 seen = iw.Observation(model, recorded.capture)
 likely = iw.SpectrumLoss(kind="likelihood")
-at_truth = prepare_fit(truth, [seen], Translation("box", axes="xz"), loss=likely, seed=1)
+at_truth = prepare_fit(truth, [seen], iw.Translation("box", axes="xz"), loss=likely, seed=1)
 now, added = plan_error_bars(at_truth, candidates=len(possible))
 print("two positions:", {name: f"{100 * value:.1f} cm" for name, value in now.deviations.items()})
 for one in added:

@@ -13,7 +13,7 @@ import torch
 import invertwin as iw
 from invertwin.capture import estimate_channels
 from invertwin.radar import channel_errors
-from invertwin.scene import PerfectConductor, linear_array, rigid, sphere, trihedral
+from invertwin.scene import sphere, trihedral
 from invertwin.signatures import aspect_directions, to_dbsm
 
 # %% [markdown]
@@ -22,7 +22,7 @@ from invertwin.signatures import aspect_directions, to_dbsm
 # radar about the axis of the corner.
 
 # %%
-corner = iw.Scene({"corner": iw.Object(trihedral(0.1), PerfectConductor())})
+corner = iw.Scene({"corner": iw.Object(trihedral(0.1), iw.PerfectConductor())})
 degrees = torch.linspace(160.0, 200.0, 41, dtype=torch.float64)
 found = iw.rcs(corner, aspect_directions(torch.deg2rad(degrees), math.pi / 2), [77e9])
 curves = {
@@ -47,14 +47,14 @@ assert abs(float(curves["three bounces"][20]) - formula) < 0.01
 # %%
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=1e9, duration=50e-6, samples=64)
 radar = iw.Radar(
-    linear_array(2, 4 * chirp.wavelength),
-    linear_array(8, chirp.wavelength / 2),
+    iw.linear_array(2, 4 * chirp.wavelength),
+    iw.linear_array(8, chirp.wavelength / 2),
     chirp,
     [[0.0, 0.0, 0.0]],
 )
 grid = radar.grid(range_min=1.5, range_max=3.0, u_max=0.8)
 place = [0.5, 0.0, 2.2]
-ball = iw.Object(sphere(0.05, 5), PerfectConductor(), rigid(translation=place))
+ball = iw.Object(sphere(0.05, 5), iw.PerfectConductor(), iw.rigid(translation=place))
 clean = iw.simulate(
     iw.Scene({"ball": ball}),
     radar,

@@ -18,7 +18,7 @@ from invertwin.links import (
     Transmitters,
     WallPath,
 )
-from invertwin.scene import PerfectConductor, Slab, box, rigid
+from invertwin.scene import Slab
 
 # %% [markdown]
 # ## The room
@@ -26,9 +26,13 @@ from invertwin.scene import PerfectConductor, Slab, box, rigid
 
 # %%
 room = iw.Object(
-    box([6.0, 4.0, 2.7]), Slab.itu("concrete", thickness=0.2), rigid(translation=[3.0, 2.0, 1.35])
+    iw.box([6.0, 4.0, 2.7]),
+    Slab.itu("concrete", thickness=0.2),
+    iw.rigid(translation=[3.0, 2.0, 1.35]),
 )
-screen = iw.Object(box([0.1, 2.2, 2.0]), PerfectConductor(), rigid(translation=[3.0, 1.2, 1.0]))
+screen = iw.Object(
+    iw.box([0.1, 2.2, 2.0]), iw.PerfectConductor(), iw.rigid(translation=[3.0, 1.2, 1.0])
+)
 scene = iw.Scene({"room": room, "screen": screen})
 sender = Transmitters(torch.tensor([[0.6, 0.8, 1.2]]).double())
 

@@ -9,18 +9,17 @@
 import invertwin as iw
 from invertwin.camera import Camera, ImageSampling, photograph
 from invertwin.models import SilhouetteMap
-from invertwin.scene import RoughDielectric, Translation, box, linear_array, rigid
 
 # %% [markdown]
 # ## A crate before both
 # Camera and radar are at the origin and look along z.
 
 # %%
-paint = RoughDielectric(permittivity=4.0)
+paint = iw.RoughDielectric(permittivity=4.0)
 truth = iw.Scene(
-    {"crate": iw.Object(box((0.4, 0.4, 0.4)), paint, rigid(translation=[0.2, 0.1, 3.0]))}
+    {"crate": iw.Object(iw.box((0.4, 0.4, 0.4)), paint, iw.rigid(translation=[0.2, 0.1, 3.0]))}
 )
-start = truth.replace("crate", pose=rigid(translation=[0.1, 0.0, 3.15]))
+start = truth.replace("crate", pose=iw.rigid(translation=[0.1, 0.0, 3.15]))
 
 camera = Camera.look_at(
     [[0.0, 0.0, 0.0]], [0.0, 0.0, 3.0], width=48, height=36, field_of_view=0.7, up=[0.0, 1.0, 0.0]
@@ -37,7 +36,7 @@ iw.plotting.images({name: values.detach() for name, values in shown.items()})
 # %%
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=128)
 radar = iw.Radar(
-    linear_array(1, 1.0), linear_array(4, chirp.wavelength / 2), chirp,
+    iw.linear_array(1, 1.0), iw.linear_array(4, chirp.wavelength / 2), chirp,
     positions=[[x, y, 0.0] for x in (-0.05, 0.05) for y in (-0.05, 0.05)],
 )  # fmt: skip
 grid = radar.grid(range_min=2.0, range_max=4.0, u_max=0.6)
@@ -62,7 +61,9 @@ for name, seen in {
     "radar": [by_radar],
     "both": [by_camera, by_radar],
 }.items():
-    fit = iw.reconstruct(start, seen, Translation("crate"), schedule=iw.Schedule(steps=40), seed=1)
+    fit = iw.reconstruct(
+        start, seen, iw.Translation("crate"), schedule=iw.Schedule(steps=40), seed=1
+    )
     misses[name] = fit.scene["crate"].center - truth["crate"].center
     x, y, z = (100 * misses[name]).tolist()
     print(f"{name:>6}: {x:+5.1f}, {y:+5.1f}, {z:+5.1f} cm off in x, y, z")

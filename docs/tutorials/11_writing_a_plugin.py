@@ -17,7 +17,7 @@ import torch
 
 import invertwin as iw
 from invertwin.inversion import Optimizer
-from invertwin.scene import linear_array, rigid, sphere
+from invertwin.scene import sphere
 
 # %% [markdown]
 # ## A package with a material
@@ -83,11 +83,11 @@ from foliage import Foliage  # type: ignore  # noqa: E402
 # Twice the share is twice the power.
 
 # %%
-bush = iw.Object(sphere(0.3), Foliage(0.05), rigid(translation=[0.0, 0.0, 2.0]))
+bush = iw.Object(sphere(0.3), Foliage(0.05), iw.rigid(translation=[0.0, 0.0, 2.0]))
 scene = iw.Scene({"bush": bush})
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=128)
 radar = iw.Radar(
-    linear_array(1, 1.0), linear_array(16, chirp.wavelength / 2), chirp, [[0.0, 0.0, 0.0]]
+    iw.linear_array(1, 1.0), iw.linear_array(16, chirp.wavelength / 2), chirp, [[0.0, 0.0, 0.0]]
 )
 grid = radar.grid(range_min=1.4, range_max=2.4, u_max=0.4)
 model = iw.SurrogateMap(grid, sampling=iw.Sampling(depth=1, samples=50_000, boundary_samples=5_000))

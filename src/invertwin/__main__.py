@@ -1,4 +1,4 @@
-"""Where the command line begins: an interruption is one line, also while modules are imported."""
+"""Entry point of the command line. An interruption prints one line, also during imports."""
 
 from invertwin.errors import exit_on_interrupt
 

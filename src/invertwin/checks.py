@@ -232,7 +232,7 @@ def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]
 
 
 def is_differentiated(value: Tensor | None) -> bool:
-    """Whether derivatives flow through a tensor, in reverse or in forward mode."""
+    """Return True if derivatives flow through a tensor, in reverse or in forward mode."""
     if value is None:
         return False
     return value.requires_grad or forward_ad.unpack_dual(value).tangent is not None

@@ -11,7 +11,7 @@ _MAX_LENGTH = 8_000  # characters of a line
 
 
 class InputError(ValueError):
-    """What was expected, what came, and what to do, in one line.
+    """Bad input, in one line: expected value, given value, remedy.
 
     The command line prints it without a traceback and exits with code 2.
     """

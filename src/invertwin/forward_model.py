@@ -30,7 +30,7 @@ _RENAMED_FLAGS = {"fields": "holds_fields", "random": "is_random", "smooth": "is
 
 
 class ForwardModel(ABC):
-    """What a sensor would show of a scene.
+    """Model of the map that a sensor measures of a scene.
 
     Attributes:
         redraws: Whether a fit gives the model another seed at every step. False for a model
@@ -101,7 +101,7 @@ class ForwardModel(ABC):
     def realisations(
         self, scene: Scene, sensor: Any, seed: int
     ) -> Callable[[int, float], Tensor] | None:
-        """What the sensor might have recorded of a scene: other speckle and noise each time.
+        """Return a source of simulated recordings, each with its own speckle and noise.
 
         The error bars of a fit and the test of its goodness draw from it.
 
@@ -135,7 +135,7 @@ class ForwardModel(ABC):
 
     @property
     def has_blur(self) -> bool:
-        """Whether the model has extra widths."""
+        """True if the model blurs its maps."""
         return False
 
     def scale_blur(self, fraction: float) -> "ForwardModel":

@@ -198,6 +198,7 @@ def rcs(
                 "instead, or detach them"
             )
     axis = checked_tensor(up, (3,), "up", "give a vector such as 0, 0, 1")
+    tubes = checked_number(tubes_per_wavelength, "tubes per wavelength", 0.0, open_low=True)
     parts = trace_far_field(
         scene,
         transmitters,
@@ -205,9 +206,7 @@ def rcs(
         sweep,
         depth=checked_count(depth, "depth", 1),
         edges=checked_count(edges, "edges", 0),
-        tubes_per_wavelength=checked_number(
-            tubes_per_wavelength, "tubes per wavelength", 0.0, open_low=True
-        ),
+        tubes_per_wavelength=tubes,
         up=axis / axis.norm(),
         boundary=boundary,
     )

@@ -186,15 +186,12 @@ def simulate_chirps(
             blocks = VisibilityKeyframes(motion, trace_instant, radar, chirps, visibility_every)
             beat = simulate_chirp_train(chirps, radar.shape[1], blocks.simulate_ramp)
         return beat if impairments is None else impairments.apply(beat, radar, seed=seed)
-    half = (
-        0.5
-        * (require_sampled_waveform(radar).samples - 1)
-        * sample_interval(require_sampled_waveform(radar))
-    )
+    waveform = require_sampled_waveform(radar)
+    half = 0.5 * (waveform.samples - 1) * sample_interval(waveform)
 
     def simulate_ramp(start: float, senders: list[int]) -> Tensor:
         paths, places = _trace_ramp(motion, start + half, half, trace_instant, radar)
-        check_paths(paths, radar, require_sampled_waveform(radar))
+        check_paths(paths, radar, waveform)
         return ChirpTrain(paths, radar, places).simulate_ramp(start, senders)
 
     beat = simulate_chirp_train(chirps, radar.shape[1], simulate_ramp)

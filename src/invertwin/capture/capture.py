@@ -206,7 +206,7 @@ class Capture:
 
     @property
     def clock_offset(self) -> float:
-        """How far the track's clock is ahead of the radar's [s]."""
+        """Time by which the track's clock is ahead of the radar's [s]."""
         return float(self.dataset.attrs.get("clock_offset", 0.0))
 
     @property

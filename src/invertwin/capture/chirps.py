@@ -113,7 +113,7 @@ class ChirpSettings:
 
     @property
     def chirps(self) -> Chirps:
-        """When the ramps of a frame start.
+        """Timing of the ramps of a frame.
 
         For the transmitters of `ChirpData`, which are in the order of sending already.
         """

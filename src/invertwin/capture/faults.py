@@ -26,7 +26,7 @@ _STRONGEST_RATES = 3  # strongest range rates of a frame in which a pattern is l
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a recording.
+    """A fault of a recording.
 
     Attributes:
         name: ``complex only by type``, ``detect_ghosts``, ``dropped samples``, ``phase break``,
@@ -183,7 +183,7 @@ def detect_lost_samples(
 
 
 def _zero_run_lengths(zero: Bool[Tensor, "row sample"]) -> Int64[Tensor, "row sample"]:
-    """How many zeros in a row end at each sample."""
+    """Lengths of the runs of zeros that end at each sample."""
     place = torch.arange(1, zero.shape[1] + 1)
     return place - torch.where(zero, 0, place).cummax(1).values
 
@@ -500,7 +500,7 @@ def _limit_samples(
 
 
 def _is_analytic(beat: Complex[Tensor, "frame chirp tx rx sample"]) -> bool:
-    """Whether samples were real ones: no power in the farther half of the unambiguous range."""
+    """Return True for real samples: no power in the farther half of the unambiguous range."""
     count = beat.shape[-1]
     power = torch.fft.fft(beat[:1]).abs().square().flatten(0, 3).sum(0)
     return bool(power[count // 2 + 1 :].sum() < _WINDOW_FLOOR * power.sum())

@@ -1,4 +1,4 @@
-"""What values of a run file may be drawn from."""
+"""Distributions of the values of a run file."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -188,7 +188,7 @@ class Choice(Distribution):
 
 @dataclass(frozen=True)
 class Presence(Distribution):
-    """Whether a key or a table, such as an object, is there.
+    """The presence of a key or a table, such as an object, with a probability.
 
     Attributes:
         probability: That it is.

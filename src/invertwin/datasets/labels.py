@@ -1,4 +1,4 @@
-"""What is in a scene, as labels of a recording: classes, boxes, poses, what is seen."""
+"""Labels of a recording: classes, boxes, poses and visible triangles of objects."""
 
 import math
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ def object_labels(
     classes: Mapping[str, str],
     joints: Mapping[str, Mapping[str, Tensor]],
 ) -> list[dict[str, Any]]:
-    """What JSON holds of every object, in the order of the scene; world frame, SI units.
+    """Labels of every object for JSON, in the order of the scene; world frame, SI units.
 
     A row has ``name``, ``class``, ``pose`` (4 × 4, from the object's frame to the world), ``box``
     (``low`` and ``high`` corner along the world's axes), ``oriented_box`` (``center``, ``size`` and
@@ -66,7 +66,7 @@ def object_labels(
 
 
 def radar_labels(radar: Radar) -> dict[str, Any]:
-    """Where the radar is in every frame: ``positions`` [m] and ``rotations`` in the world.
+    """Poses of the radar in every frame: ``positions`` [m] and ``rotations`` in the world.
 
     The columns of a rotation are the radar's axes: right, up, boresight.
     """

@@ -36,14 +36,14 @@ class Shard(BaseModel):
 
 
 class ArrayInfo(BaseModel):
-    """What an array of every sample is."""
+    """Name, type and shape of an array of every sample."""
 
     dims: list[str]
     unit: str
 
 
 class DatasetManifest(BaseModel):
-    """What a folder of shards holds."""
+    """Contents of a folder of shards."""
 
     format: str
     samples: int  # of the whole data set
@@ -122,7 +122,7 @@ def shard_ranges(samples: int, size: int, part: tuple[int, int]) -> list[tuple[i
 
 
 def locate_members(path: Path) -> dict[int, dict[str, tuple[int, int]]]:
-    """Where the files of every sample of a shard lie: first byte and size, by number and name.
+    """Locate the files of every sample of a shard: first byte and size, by number and name.
 
     Args:
         path: The tar file.

@@ -1,4 +1,4 @@
-"""What paths between antennas add up to: responses, OFDM channels, spreads, radio maps."""
+"""Propagation paths between antennas as responses, OFDM channels, spreads and radio maps."""
 
 from invertwin.deprecation import rename_attributes
 from invertwin.links.cells import CellSampling as CellSampling

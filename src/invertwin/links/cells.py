@@ -38,7 +38,7 @@ from invertwin.scene.scene import Scene
 
 @dataclass(frozen=True)
 class CellSampling:
-    """How many points a map of cells takes.
+    """Numbers of sample points in the cells of a map.
 
     Attributes:
         points: In a cell, at least; a cell has the next square number of them.
@@ -117,7 +117,7 @@ class Cells(ReceiverLocations):
     @property
     @abstractmethod
     def areas(self) -> Float64[Tensor, " cell"]:
-        """Of the cells [m²]."""
+        """Areas of the cells [m²]."""
 
     def link_statistics(
         self, scene: Scene, sensor: Transmitters, propagation: PropagationSettings, seed: int
@@ -266,7 +266,7 @@ class MapPlane(Cells):
 
     @property
     def areas(self) -> Float64[Tensor, " cell"]:
-        """Of the cells [m²]."""
+        """Areas of the cells [m²]."""
         cells = self.count[0] * self.count[1]
         return (self._normal.norm() / cells).expand(cells)
 
@@ -341,7 +341,7 @@ class MapMesh(Cells):
 
     @property
     def areas(self) -> Float64[Tensor, " cell"]:
-        """Of the cells [m²]."""
+        """Areas of the cells [m²]."""
         a, b, c = self.mesh.vertices[self.mesh.faces].unbind(1)
         return torch.linalg.cross(b - a, c - a).norm(dim=1) / 2
 

@@ -1,4 +1,4 @@
-"""Where a radio map is asked for, as one value: points."""
+"""Receiver locations of a radio map, as one value: points."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from invertwin.scene.scene import Scene
 
 
 class ReceiverLocations(ABC):
-    """Where a ``RadioMap`` is asked for.
+    """Receiver locations of a ``RadioMap``.
 
     Attributes:
         is_random: Whether a seed draws points.
@@ -26,13 +26,13 @@ class ReceiverLocations(ABC):
     @property
     @abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """Of a map of one transmitter."""
+        """Shape of the map of one transmitter."""
 
     @abstractmethod
     def link_statistics(
         self, scene: Scene, sensor: Transmitters, propagation: PropagationSettings, seed: int
     ) -> LinkStatistics:
-        """What arrives there.
+        """Compute gain and delay spread at the locations.
 
         Args:
             scene: What is in the way.
@@ -82,5 +82,5 @@ class ReceiverPoints(ReceiverLocations):
     def link_statistics(
         self, scene: Scene, sensor: Transmitters, propagation: PropagationSettings, seed: int
     ) -> LinkStatistics:
-        """What arrives at the points. See ``Places.received``."""
+        """Compute gain and delay spread at the points."""
         return propagation.link_statistics(scene, sensor, self.positions, seed)

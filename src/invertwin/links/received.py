@@ -1,4 +1,4 @@
-"""What receivers get of transmitters: path gain and delay spread of many links at once.
+"""Path gain and delay spread of many links at once.
 
 Powers of paths may add, or their fields. The mean over a band stands between: fields of paths add
 whose delays differ by less than 1/B, powers of the others,
@@ -39,7 +39,7 @@ _DEFAULT = AntennaMount()
 
 @dataclass(frozen=True, eq=False)
 class LinkStatistics:
-    """What arrives at places, for every transmitter.
+    """Path gain and delay spread at receiver locations, for every transmitter.
 
     Attributes:
         gain: Received over sent power.
@@ -52,7 +52,7 @@ class LinkStatistics:
 
 @dataclass(frozen=True, eq=False)
 class PropagationSettings:
-    """How paths between transmitters and receivers are found, and how they add up.
+    """Settings of the search for propagation paths and of the sum over them.
 
     Attributes:
         frequency: The carrier [Hz].
@@ -119,7 +119,7 @@ class PropagationSettings:
     def link_statistics(
         self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
     ) -> LinkStatistics:
-        """What receivers get at points. Memory does not grow with their number, but for results.
+        """Compute gain and delay spread at points, in memory independent of their number.
 
         Args:
             scene: What is in the way.
@@ -207,7 +207,7 @@ class PropagationSettings:
     def rough_moments(
         self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
     ) -> Float64[Tensor, "tx place 3"]:
-        """What rough surfaces scatter to receivers: sums of ``moments``, 0 where it is left out.
+        """Sums of ``moments`` over paths that rough surfaces scatter; 0 if these are left out.
 
         Args:
             scene: What scatters.

@@ -36,7 +36,7 @@ def _isotropic_element() -> AntennaArray:
 
 @dataclass(frozen=True, eq=False)
 class AntennaMount:
-    """What stands at the places of transmitters, or of receivers: the same array at each.
+    """Antenna array mounted at each position of transmitters, or of receivers.
 
     V and H of the array's polarisation are about its y axis. By default a terminal is one isotropic
     element for V, and y is the world's z axis.
@@ -126,7 +126,7 @@ class AntennaMount:
     def element_advances(
         self, direction: Float64[Tensor, "path 3"], index: Int64[Tensor, " path"]
     ) -> Float64[Tensor, "path element"]:
-        """How much shorter the path is for each element than for the place itself [m].
+        """Path length to the position of the array minus that to each element [m].
 
         Args:
             direction: Unit vectors in the world, away from the terminal.
@@ -172,7 +172,7 @@ def path_amplitudes(
 def _slope_diffraction(
     paths: RayPaths, slopes: Tensor, axes: Tensor, tx: AntennaMount, rx: AntennaMount
 ) -> Tensor:
-    """What edges add where the antennas' fields are uneven across the rays."""
+    """Slope diffraction: the contribution of edges to fields that vary across the rays."""
     rows = torch.nonzero(axes.detach().flatten(1).abs().amax(1) > 0)[:, 0]
     k = 2 * math.pi * paths.frequency / SPEED_OF_LIGHT
     ways, places = (paths.departure[rows], paths.arrival[rows]), (paths.tx[rows], paths.rx[rows])

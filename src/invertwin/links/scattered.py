@@ -1,4 +1,4 @@
-"""What rough surfaces scatter from transmitters to receivers: powers without phases.
+"""Incoherent scattering by rough surfaces from transmitters to receivers.
 
 Mirrored paths hold what smooth surfaces keep together (``trace_paths``). What they lose by their
 roughness goes everywhere, by ``Material.incoherent``: the lobes of ``EffectiveRoughness``, of which
@@ -117,7 +117,7 @@ def _received_power(
     rx_paths: RayPaths,
     cross_polar: Float64[Tensor, " pair"],
 ) -> Float64[Tensor, " pair"]:
-    """What antennas take of the power that points scatter, V and H about the world's z axis.
+    """Power received from scattering points, V and H about the world's z axis.
 
     In Stokes parameters, as ``channel.coupling`` has it for one bounce: ``½(I I' + (1 − 2χ)(q q' +
     u u') − (1 − 4χ) v v')``, here of the fields that ways bring to the points.
@@ -178,7 +178,7 @@ def _delay_moments(power: Float64[Tensor, "place bin"], grid: Grid, link: Link) 
 
 @dataclass(frozen=True)
 class _IncoherentMaterial(Material):
-    """What a material scatters, without what ``trace_paths`` mirrors at it."""
+    """Scattering of a material without the specular reflection that ``trace_paths`` finds."""
 
     base: Material
 

@@ -1,4 +1,4 @@
-"""How power is spread over delays and directions."""
+"""Spreads of power over delays and directions."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""What sends: transmitters with their places, antennas and powers, and modules that move them."""
+"""Transmitters with positions, antennas and powers, and modules that move them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -118,7 +118,7 @@ class TransmitterPosition(nn.Module):
 
     @property
     def position(self) -> Float64[Tensor, "3"]:
-        """Where the transmitter is [m]."""
+        """Position of the transmitter [m]."""
         if self._box is not None:
             with torch.no_grad():
                 self.raw_position.data.clamp_(*self._box)

@@ -96,7 +96,7 @@ class RangeDopplerMap(ForwardModel):
     def predict_paths(
         self, paths: Paths, radar: Radar
     ) -> Float[Tensor, "frame velocity range u v"]:
-        """What moving paths look like in this map. See ``range_doppler_power``.
+        """Compute the map of moving paths. See ``range_doppler_power``.
 
         Args:
             paths: With velocities.

@@ -79,7 +79,7 @@ class FacetMap(ForwardModel):
 
     @property
     def has_blur(self) -> bool:
-        """Whether there are extra widths."""
+        """True if the surrogate blurs maps."""
         return self.surrogate.has_blur
 
     def scale_blur(self, fraction: float) -> "FacetMap":

@@ -193,7 +193,7 @@ class SurrogateMap(ForwardModel):
 
     @property
     def has_blur(self) -> bool:
-        """Whether the surrogate has extra widths, or targets a longer wavelength."""
+        """True if the surrogate blurs maps, or targets have a longer wavelength."""
         return self.kernels.has_blur or self.stretch > 1
 
     def scale_blur(self, fraction: float) -> "SurrogateMap":

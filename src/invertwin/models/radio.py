@@ -61,7 +61,7 @@ QUANTITIES = ("received_power", "path_gain", "gain", "sinr", "delay_spread")
 
 @dataclass(frozen=True, eq=False)
 class RadioMap(ForwardModel):
-    """What receivers at known places get of transmitters: a map for each of these.
+    """Levels or gains at known receiver locations, a map for each transmitter.
 
     Levels are in decibels; compare them by ``SpectrumLoss(levels=1, gain="one")``, with
     ``background="level"`` where the sent power is not known. A floor is added to every gain, so
@@ -187,7 +187,7 @@ class RadioMap(ForwardModel):
 
     @property
     def is_random(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether points are drawn, as those of cells are, or scattered paths."""
+        """True if points of cells or scattered paths are drawn at random."""
         return self.places.is_random or self.propagation.rough is not None
 
     def for_differences(

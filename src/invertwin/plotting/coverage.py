@@ -106,7 +106,7 @@ def _project_to_plane(plane: MapPlane, points: Tensor) -> NDArray[Any]:
 
 
 def _names(plane: MapPlane) -> list[str]:
-    """Of both axes."""
+    """Names of both axes."""
     found = []
     for axis, words in zip(_axes(plane), ("along the first side", "across it"), strict=True):
         world = [

@@ -1,4 +1,4 @@
-"""What all figures share: colours, numbers of tensors, PNG bytes."""
+"""Common parts of figures: colours, numbers of tensors, PNG bytes."""
 
 import io
 from typing import Any

@@ -1,4 +1,4 @@
-"""What a twin of a recording shows of the ground: echoes, things, and what was never seen."""
+"""Ground plan of a twin: echoes, detected objects, and unobserved areas."""
 
 import math
 

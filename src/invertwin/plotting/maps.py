@@ -168,7 +168,7 @@ def gradient(
 
 
 def residuals(residual: Float[Tensor, "range u v"], grid: Grid, *, marked: float = 5.0) -> Figure:
-    """How far data are from what a twin would show, in standard deviations of its recordings.
+    """Plot residuals of data from a twin, in standard deviations of its recordings.
 
     Of the direction that is not shown, the largest counts. Bins beyond ``marked`` are framed: red
     ones hold more power than the twin explains, blue ones less.

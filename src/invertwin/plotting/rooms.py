@@ -92,7 +92,7 @@ def transmitter_fits(
     positions: Mapping[str, Float64[Tensor, "place 3"]],
     fits: Float64[Tensor, "fit 2 3"],
 ) -> Figure:
-    """Where fits of a transmitter began and ended, on a floor plan.
+    """Plot starts and ends of fits of a transmitter on a floor plan.
 
     Args:
         scene: Its objects are cut at the height.

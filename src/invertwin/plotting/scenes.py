@@ -186,7 +186,7 @@ def _draw_marks(positions: NDArray) -> dict[str, Any]:
 def _legend(
     figure: Figure, names: Mapping[str, str], outlined: bool, positions: NDArray | None
 ) -> None:
-    """Which colour is what, over all scenes."""
+    """Add the legend of colours above all scenes."""
     labels = {("other objects" if c == _BACKGROUND else name): c for name, c in names.items()}
     handles: list[Patch | Line2D] = [
         Patch(color=c, label=legible(name)) for name, c in labels.items()

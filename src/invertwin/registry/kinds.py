@@ -1,4 +1,4 @@
-"""What run files may name: constructors by group and kind, sections, commands; also of plugins.
+"""Registry of run files: constructors by group and kind, sections, commands; also of plugins.
 
 A constructor is a class or a function. Its signature, its annotations and its docstring become a
 table of the run file: keys, defaults, limits and their meaning are stated there and nowhere else.
@@ -66,7 +66,7 @@ class ConstructorTable(Section):
     made_from: ClassVar[Mapping[str, tuple[str | None, Any]]] = {}  # name → key, annotation
 
     def build(self, given: Mapping[type, object] | None = None, /, **more: Any) -> Any:
-        """What the constructor makes of the table.
+        """Build the value of a table by its constructor.
 
         Args:
             given: Values of its arguments that no run file can hold, by their type.
@@ -110,7 +110,7 @@ class _EmptyGroupTable(Section):
 
 
 class ValueFormat(NamedTuple):
-    """How a type of the library is written in a run file.
+    """Notation of a library type in a run file.
 
     Attributes:
         table: Name of an argument, whether it is an angle → what pydantic checks.
@@ -363,7 +363,7 @@ class Registry:
         return kind, key(words, default, validate_default=isinstance(default, str))
 
     def run_file_type(self, hint: Any, name: str) -> Any:
-        """What a run file may say for an argument.
+        """Return the type of an argument in run files.
 
         Args:
             hint: Annotation of the argument.
@@ -408,7 +408,7 @@ class Registry:
         return hint
 
     def convert_value(self, value: Any, hint: Any, name: str, given: Mapping[type, object]) -> Any:
-        """What the constructor gets for a value of the run file.
+        """Convert a value of the run file to the argument of the constructor.
 
         Args:
             value: What was read.
@@ -537,7 +537,7 @@ def _allowed_letters(hint: Any) -> str:
 
 
 def _is_array(kind: Any) -> bool:
-    """Whether it stands for rows of numbers, as `ArrayLike` has them."""
+    """Return True for rows of numbers, as `ArrayLike` has them."""
     return kind is Sequence or getattr(kind, "__name__", "") in ("Tensor", "ndarray")
 
 
@@ -560,7 +560,7 @@ def _constructor_hints(make: Any) -> dict[str, Any]:
 
 
 def _argument_docs(make: Any) -> dict[str, str]:
-    """What `Attributes:` and `Args:` say of each name, bases first."""
+    """Return the descriptions in `Attributes:` and `Args:` by name, bases first."""
     found: dict[str, str] = {}
     owners = reversed(make.__mro__[:-1]) if isinstance(make, type) else [make]
     for owner in owners:

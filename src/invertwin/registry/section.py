@@ -1,4 +1,4 @@
-"""What every table of a run file is made of: numbers, paths, and tables with known keys only.
+"""Parts of the tables of a run file: numbers, paths, and tables with known keys only.
 
 Nothing here imports torch, so that the command line can say what it offers without it.
 """

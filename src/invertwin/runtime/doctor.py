@@ -119,7 +119,7 @@ class LlvmLibrary:
 
 @dataclass(frozen=True)
 class LlvmProbeResult:
-    """What came of running a kernel with a candidate.
+    """Result of a test kernel with a candidate library.
 
     Attributes:
         usable: The kernel ran and gave the right numbers.
@@ -433,7 +433,7 @@ def _probe_cached(path: str, probe: Callable[[str], LlvmProbeResult]) -> LlvmPro
 
 
 def cache_folder() -> Path:
-    """Where what can be found again is kept on disk; it may not exist."""
+    """Return the folder of caches on disk; it may not exist."""
     root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     return Path(root, "invertwin")
 

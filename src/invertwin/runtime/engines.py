@@ -123,7 +123,7 @@ def _processes(workers: int) -> Iterator[tuple[int, Any, Any]]:
 
 @contextmanager
 def _single_threaded_children() -> Iterator[None]:
-    """What is started in the block has one thread: libraries read that while they are loaded."""
+    """Limit processes started in the block to one thread; libraries read that at import."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
     try:

@@ -1,25 +1,25 @@
-"""Memory: how much is free, and refusing what does not fit before any of it is taken."""
+"""Free memory, and checks that work fits into it before any is taken."""
 
 import math
 import os
 import sys
 from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from invertwin.errors import InputError
+from invertwin.runtime.control_groups import group_folders
 
 _DEFAULT_MEMORY = 16e9  # where the system does not say
 _UNLIMITED = 1 << 60  # larger limits are none
-_GROUPS = Path("/sys/fs/cgroup")
 
 
 def free_memory() -> float:
-    """Bytes that this process may still take, of the machine, of its group, of its limit."""
+    """Return the bytes that machine, control groups and limits leave to this process."""
     return max(0.0, min((_machine_memory(), *_control_group_memory(), *_process_memory())))
 
 
 def peak_memory() -> float | None:
-    """Most bytes that this process has held at a time; None where the system does not say."""
+    """Return the peak memory of this process [B]; None where the system does not say."""
     # First, since Linux's getrusage counts the parent's size when this process was started.
     if (held := _read_stated_bytes("/proc/self/status", "VmHWM")) is not None:
         return held
@@ -33,13 +33,13 @@ def peak_memory() -> float | None:
 
 
 def require_memory(needed: float, what: str, do: str, at: str = "") -> None:
-    """Refuse what does not fit into the memory that is free.
+    """Raise unless work fits into the free memory.
 
     Args:
-        needed: Bytes.
-        what: What needs them.
-        do: What the user can do.
-        at: The argument to lower.
+        needed: Required memory [B].
+        what: Name of the work, for the error.
+        do: Remedy, for the error.
+        at: Argument to lower.
 
     Raises:
         InputError: More than is free.
@@ -54,14 +54,14 @@ def require_memory(needed: float, what: str, do: str, at: str = "") -> None:
 
 
 def require_at_most(count: float, maximum: float, what: str, do: str, at: str = "") -> None:
-    """Refuse a count that only a wrong unit explains.
+    """Raise if a count is so large that only a wrong unit explains it.
 
     Args:
-        count: How many there would be; may be infinite.
-        maximum: Of them.
-        what: What they are.
-        do: What the user can do.
-        at: The argument to lower.
+        count: Required number; may be infinite.
+        maximum: Largest number.
+        what: Name of the objects, for the error.
+        do: Remedy, for the error.
+        at: Argument to lower.
 
     Raises:
         InputError: More than that, or not a number.
@@ -73,12 +73,12 @@ def require_at_most(count: float, maximum: float, what: str, do: str, at: str = 
 
 
 def format_gigabytes(count: float) -> str:
-    """Bytes as text."""
+    """Format a number of bytes in gigabytes."""
     return f"{min(count, 1e300) / 1e9:.3g} GB"
 
 
 def _read_stated_bytes(file: str, name: str) -> float | None:
-    """Bytes that Linux states in a line of a file; None where there is no such file or line."""
+    """Return the bytes that Linux states in a line of a file; None without file or line."""
     try:
         for line in Path(file).read_text().splitlines():
             if line.startswith(f"{name}:"):
@@ -98,22 +98,12 @@ def _machine_memory() -> float:
 
 
 def _control_group_memory() -> Iterator[float]:
-    """What the control groups of this process, which containers are made of, still allow."""
-    try:
-        lines = Path("/proc/self/cgroup").read_text().splitlines()
-    except OSError:
-        return
-    for line in lines:
-        _, controllers, name = line.split(":", 2)
-        if controllers not in ("", "memory") and "memory" not in controllers.split(","):
-            continue
-        root = _GROUPS if not controllers else _GROUPS / "memory"
+    """Yield the memory that the control groups of this process still allow [B]."""
+    for folder, version in group_folders("memory"):
         names = ("memory.max", "memory.current", "inactive_file")
-        if controllers:
+        if version == 1:
             names = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
-        # In a container the name may be that of the host, whose group is then the root here.
-        for path in (PurePosixPath(name), *PurePosixPath(name).parents):
-            yield from _group_memory(root / str(path).strip("/"), *names)
+        yield from _group_memory(folder, *names)
 
 
 def _group_memory(
@@ -130,7 +120,7 @@ def _group_memory(
 
 
 def _process_memory() -> Iterator[float]:
-    """What `ulimit -v` still allows."""
+    """Yield the memory that `ulimit -v` still allows [B]."""
     try:
         import resource
 

@@ -10,6 +10,8 @@ import math
 import os
 from pathlib import Path
 
+from invertwin.runtime.control_groups import group_folders, read_text
+
 #: What tells libraries how their threads wait, read when they are loaded.
 _WAIT_POLICY = {
     "OMP_WAIT_POLICY": "PASSIVE",
@@ -18,7 +20,6 @@ _WAIT_POLICY = {
     "OPENBLAS_THREAD_TIMEOUT": "4",  # its least: 2⁴ turns
 }
 _COUNTS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-_GROUPS = Path("/sys/fs/cgroup")
 
 
 def set_thread_environment() -> None:
@@ -32,7 +33,7 @@ def set_thread_environment() -> None:
 
 
 def available_threads() -> int:
-    """Threads that work at once here: cores that the process may use, or ``OMP_NUM_THREADS``.
+    """Return the number of threads to start: usable cores, or ``OMP_NUM_THREADS``.
 
     Counted are the affinity mask and the quota of the control group.
     """
@@ -44,38 +45,23 @@ def available_threads() -> int:
     return max(1, math.ceil(min(cores, cgroup_quota())))
 
 
-def cgroup_quota(listing: Path = Path("/proc/self/cgroup"), root: Path = _GROUPS) -> float:
-    """Cores that the control groups of this process grant it, infinite where they do not say.
+def cgroup_quota(
+    listing: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")
+) -> float:
+    """Return the cores that the control groups of this process grant; infinite without a quota.
 
     Args:
-        listing: Names the groups of the process.
-        root: Where their files are.
+        listing: file that names the groups of the process.
+        root: folder of the hierarchies.
     """
-    least = math.inf
-    for line in _read_text(listing).splitlines():
-        _, kinds, name = line.split(":", 2)
-        if kinds and "cpu" not in kinds.split(","):
-            continue
-        top = root / kinds if kinds else root
-        inside = top / name.lstrip("/")
-        # A container sees its own group as the root, whatever name it has outside.
-        for folder in (inside, *inside.parents, root / "cpu", root):
-            if folder == root or root in folder.parents:
-                least = min(least, _read_quota(folder))
-    return least
+    folders = group_folders("cpu", listing, root)
+    return min((_read_quota(folder) for folder, _ in folders), default=math.inf)
 
 
 def _read_quota(folder: Path) -> float:
-    words = _read_text(folder / "cpu.max").split()  # version 2
+    words = read_text(folder / "cpu.max").split()  # version 2
     if not words:
-        words = [_read_text(folder / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period")]
+        words = [read_text(folder / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period")]
     if len(words) == 2 and all(word.isdecimal() for word in words) and int(words[1]) > 0:
         return int(words[0]) / int(words[1])
     return math.inf
-
-
-def _read_text(file: Path) -> str:
-    try:
-        return file.read_text()
-    except OSError:
-        return ""

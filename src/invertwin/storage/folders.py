@@ -162,7 +162,7 @@ def path_in_folder(path: Path, name: str) -> Path:
 
 
 def _is_possible_name(path: Path) -> bool:
-    """Whether a file of this name can be, such as one that is not too long."""
+    """Return True if a file of this name can exist, such as one that is not too long."""
     try:
         path.lstat()
     except (FileNotFoundError, NotADirectoryError):

@@ -47,7 +47,7 @@ class StoredArray(NamedTuple):
 
 
 class StoredArrays(NamedTuple):
-    """What a file holds.
+    """Arrays and attributes of a file.
 
     Attributes:
         arrays: By name.
@@ -112,7 +112,7 @@ def read_isolated(
 
 
 def run_child_reader(kind: str, path: str, variable: str, memory: str, seconds: str) -> None:
-    """What the child process does: read a file within limits, and write what it holds.
+    """Read a file within limits in the child process, and write its arrays.
 
     Args:
         kind: Of the file.

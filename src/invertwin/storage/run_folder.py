@@ -79,7 +79,7 @@ class RunFolder:
 
     @property
     def resumable(self) -> bool:
-        """Whether this run left something to go on from."""
+        """Return True if this run left a state to resume from."""
         return _resumable(self.path, self._manifest)
 
     @property
@@ -90,7 +90,7 @@ class RunFolder:
         return {name: self.file(name).read_text(encoding="utf-8") for name in found}
 
     def file(self, name: str) -> Path:
-        """Where a result file is while the run goes on; it is owned by this run from now on.
+        """Return the path of a result file during the run, and own it from now on.
 
         Raises:
             InputError: The folder holds a file of that name that no run has written.

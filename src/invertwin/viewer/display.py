@@ -1,4 +1,4 @@
-"""What a viewer shows, as plain arrays: layers, the steps of a fit, and maps of its data."""
+"""Contents of a viewer as plain arrays: layers, the steps of a fit, and maps of its data."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -56,13 +56,13 @@ class DisplayLayer:
 
     @property
     def group(self) -> str:
-        """What it is switched with."""
+        """Name of the switch of the layer."""
         return self.name.split("/")[0]
 
 
 @dataclass(frozen=True, eq=False)
 class DisplayStep:
-    """Where a fit stood.
+    """State of a fit at a step.
 
     Attributes:
         number: Steps done.

@@ -1,4 +1,4 @@
-"""Who may look: loopback only, or a token in the address; no page of another site."""
+"""Access to the viewer: loopback only, or a token in the address; no page of another site."""
 
 import http
 import ipaddress
@@ -59,7 +59,7 @@ class AccessGuard:
         self._token = token
 
     def admits(self, path: str, headers: Any, port: int) -> bool:
-        """Whether a request may be answered.
+        """Return True if a request may be answered.
 
         Args:
             path: With the query.

@@ -139,7 +139,7 @@ def capture_layers(capture: Capture) -> list[DisplayLayer]:
 
 
 def ellipsoid_layers(scene: Scene, metrics: Mapping[str, Any]) -> list[DisplayLayer]:
-    """Where the middles of fitted objects are with 95 %, as three circles each.
+    """Build 95 % confidence ellipsoids of the centres of fitted objects, as three circles each.
 
     A coordinate without an error bar has none here either: the ellipsoid is flat along it.
 

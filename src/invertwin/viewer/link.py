@@ -1,4 +1,4 @@
-"""What joins a scene and its map: the map of a moved scene, and the points that feed a bin."""
+"""Link of a scene and its map: maps of moved scenes, and points that contribute to a bin."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ _SEED = 0
 
 @dataclass(frozen=True, eq=False)
 class PositionSample:
-    """What one position sees.
+    """Predicted map and paths of one position.
 
     Attributes:
         place: Of the radar [m].

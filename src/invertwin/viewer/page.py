@@ -119,7 +119,7 @@ def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
 
 
 def content_security_policy() -> str:
-    """What a page with a display may do: run our script alone, and load nothing."""
+    """Return the policy of a page with a display: it runs our script alone and loads nothing."""
     digest = base64.b64encode(hashlib.sha256(_script().encode()).digest()).decode()
     return (
         f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; "

@@ -114,7 +114,7 @@ class MapPanels:
                 self._nodes[name].image = _draw_picture(np.uint8(255 * colors[..., :3]), chosen)
 
     def _is_current(self, name: str, power: NDArray[np.float32], chosen: Any) -> bool:
-        """Whether a picture shows that already; from now on it does."""
+        """Return True if a picture is up to date, and mark it so."""
         before, frame = self._known.get(name, (None, None))
         self._known[name] = power, chosen
         return before is not None and frame == chosen and np.array_equal(before, power)

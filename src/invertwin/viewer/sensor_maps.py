@@ -23,7 +23,7 @@ _MAX_BINS = 96  # of a map along range, and across
 
 @dataclass(frozen=True, eq=False)
 class SensorMaps:
-    """What a page shows of one sensor.
+    """Maps of one sensor on a page.
 
     Attributes:
         frames: Numbers of its positions.

@@ -39,7 +39,7 @@ _SETTLE_TIME = 0.4  # seconds after which nothing moves
 
 @dataclass
 class _ViewerState:
-    """What the person has chosen last."""
+    """Choices of the person at the viewer."""
 
     step: int
     sensor: str

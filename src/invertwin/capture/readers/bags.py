@@ -60,7 +60,7 @@ class BagMessages:
 
 @safe_reader("a bag of ROS 1 or ROS 2")
 def bag_topics(path: str | Path) -> dict[str, str]:
-    """What a bag holds: the type of the messages of every topic.
+    """Return the type of the messages of every topic in a bag.
 
     Args:
         path: A ``.bag`` file of ROS 1, or the folder of a bag of ROS 2.

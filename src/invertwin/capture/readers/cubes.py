@@ -28,7 +28,7 @@ def to_radarsimpy(
 def from_radarsimpy(
     baseband: Complex[Tensor, "channel chirp sample"], transmitters: int, receivers: int
 ) -> Complex[Tensor, "frame chirp tx rx sample"]:
-    """What ``to_radarsimpy`` made, or RadarSimPy simulated.
+    """Convert a cube of RadarSimPy, simulated or made by ``to_radarsimpy``.
 
     Args:
         baseband: RadarSimPy's [channels/frames, pulses, samples].
@@ -67,7 +67,7 @@ def from_openradar(
     transmitters: int,
     order: Sequence[int] | None = None,
 ) -> Complex[Tensor, "frame chirp tx rx sample"]:
-    """What ``to_openradar`` made, or OpenRadar organised.
+    """Convert a cube of OpenRadar, organised there or made by ``to_openradar``.
 
     Args:
         adc_data: OpenRadar's [frames, chirps, receivers, samples].

@@ -42,7 +42,7 @@ _SPACING_TOLERANCE = 0.01  # of a step: how far a frequency may be off; then a p
 
 
 def describes_sweeps(path: str | Path) -> bool:
-    """Whether a TOML description is one of sweeps: it has a section ``[sweep]``.
+    """Return True for a TOML description of sweeps: it has a section ``[sweep]``.
 
     Args:
         path: the TOML file.
@@ -116,22 +116,7 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     if TOUCHSTONE.fullmatch(files[0].suffix):
         frequencies, beat = _load_touchstone_sweeps(files, sweep, path.parent)
     else:
-        if len(files) > 1:
-            raise InputError(
-                f"expected one data file or Touchstone files, got {len(files)} of {files[0].name}; "
-                "put the arrays into one"
-            )
-        senders = len(tx.positions)
-        array = load_array(files[0], data.get("variable"), trusted=trusted)
-        order = data.get("dimensions", ["frame", "tx", "rx", "sample"])
-        samples = torch.from_numpy(arrange_dimensions(array, order, senders))
-        if samples.shape[1] != 1:
-            raise InputError(
-                f"expected one sweep a frame, got {samples.shape[1]} chirps; name that dimension "
-                '"frame"'
-            )
-        beat = samples[:, 0].conj() if data.get("conjugate", False) else samples[:, 0]
-        beat = beat.resolve_conj()
+        beat = _load_sweep_array(files, data, len(tx.positions), trusted)
         frequencies = _load_frequencies(source, sweep, beat.shape[-1])
     start, step = _frequency_spacing(frequencies)
     waveform = SteppedFrequency(start, step, len(frequencies), sweep.get("dwell", _DWELL))
@@ -142,9 +127,30 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     return Capture.from_beat(beat, _set_range_origin(device, source, radar))
 
 
+def _load_sweep_array(
+    files: list[Path], data: dict[str, Any], tx_count: int, trusted: bool
+) -> Tensor:
+    """Load the sweeps of an array file, [frame, tx, rx, sample]."""
+    if len(files) > 1:
+        raise InputError(
+            f"expected one data file or Touchstone files, got {len(files)} of {files[0].name}; "
+            "put the arrays into one"
+        )
+    array = load_array(files[0], data.get("variable"), trusted=trusted)
+    order = data.get("dimensions", ["frame", "tx", "rx", "sample"])
+    samples = torch.from_numpy(arrange_dimensions(array, order, tx_count))
+    if samples.shape[1] != 1:
+        raise InputError(
+            f"expected one sweep a frame, got {samples.shape[1]} chirps; name that dimension "
+            '"frame"'
+        )
+    beat = samples[:, 0].conj() if data.get("conjugate", False) else samples[:, 0]
+    return beat.resolve_conj()
+
+
 @dataclass(frozen=True)
 class _SweepFile:
-    """Where a description finds what it names: in its data file, or in files beside it."""
+    """The arrays that a description names: in its data file, or in files beside it."""
 
     file: Path
     trusted: bool

@@ -63,7 +63,7 @@ def read(
 
 
 def is_sweeps(path: str | Path) -> bool:
-    """Whether a recording holds sweeps over frequency: a Touchstone file, or their description.
+    """Return True for sweeps over frequency: a Touchstone file, or a description of sweeps.
 
     Args:
         path: the file.

@@ -1,4 +1,4 @@
-"""What both kinds of settings file share: numbers in other units, masks, turns of transmitters."""
+"""Units, channel masks and the order of transmitters, common to both kinds of settings file."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -132,7 +132,7 @@ def _check_numbers(first: int, last: int) -> None:
 def _transmit_order(
     defined: Mapping[int, tuple[int, int]], first: int, last: int
 ) -> tuple[list[int], set[int]]:
-    """Which transmitter sends in each chirp of a loop, and the profiles in use."""
+    """Return the transmitter of each chirp of a loop, and the profiles in use."""
     order, used = [], set()
     for chirp in range(first, last + 1):
         if chirp not in defined:

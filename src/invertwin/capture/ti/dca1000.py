@@ -245,7 +245,7 @@ def _find_alternatives(
 
 
 def _word_indices(settings: ChirpSettings) -> np.ndarray:
-    """Which words of a frame are I and Q: numbers from 0 [chirp, tx, rx, sample, I and Q]."""
+    """Indices of the I and Q words of a frame, from 0 [chirp, tx, rx, sample, I and Q]."""
     s, parts = settings, 1 if settings.real else 2
     chirps = s.loops, len(s.transmit_order)
     words = np.arange(frame_words(s))

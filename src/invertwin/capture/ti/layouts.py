@@ -66,7 +66,7 @@ def change_settings(settings: ChirpSettings, changes: Mapping[str, Any]) -> Chir
 
 @dataclass(frozen=True)
 class LayoutEvidence:
-    """What samples say of the blocks into which settings cut them.
+    """Evidence of samples for the blocks into which settings cut them.
 
     Attributes:
         border_ratio: Failure of prediction at the quietest borders over the largest anywhere
@@ -106,7 +106,7 @@ class LayoutCandidate:
 
 
 def block_layout(settings: ChirpSettings) -> tuple[int, ...]:
-    """What of the settings says where blocks begin and end."""
+    """Return the settings that determine the blocks."""
     return settings.lanes or 0, int(settings.real), settings.samples
 
 
@@ -122,7 +122,7 @@ def frame_words(settings: ChirpSettings) -> int:
 
 
 def layout_error(settings: ChirpSettings) -> str | None:
-    """Why no DCA1000 records a file with these settings; None = it does."""
+    """Return the reason why no DCA1000 records a file with these settings; None = it does."""
     if settings.lanes == LANE_COUNT and max(settings.receivers) > LANE_COUNT:
         return (
             f"receivers 1 to {LANE_COUNT}, one per lane, got {settings.receivers}; the DCA1000 "
@@ -250,7 +250,7 @@ def _apply_changes(changes: dict[str, Any], settings: ChirpSettings) -> ChirpSet
 
 
 def measure_evidence(words: np.ndarray, settings: ChirpSettings) -> LayoutEvidence:
-    """How well the samples break where the settings say that blocks end.
+    """Measure discontinuities of the samples at the ends of blocks.
 
     Borders are taken in classes, every second and every third or fourth, and the quietest class
     counts: blocks that are cut in two have borders without a break.
@@ -345,7 +345,7 @@ def better_candidates(
 
 
 def silent_lanes_contradict(words: np.ndarray, settings: ChirpSettings) -> bool:
-    """Whether lanes of receivers that are not stated hold samples.
+    """Return True if lanes of receivers that are not stated hold samples.
 
     Args:
         words: Of the file.
@@ -355,7 +355,7 @@ def silent_lanes_contradict(words: np.ndarray, settings: ChirpSettings) -> bool:
 
 
 def format_advice(found: list[LayoutCandidate]) -> str:
-    """What fits, best first, and whether the samples tell.
+    """List the layouts that fit, best first, and say if the samples decide between them.
 
     Args:
         found: Of ``candidates``.
