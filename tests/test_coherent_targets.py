@@ -86,7 +86,7 @@ def test_straight_on_a_target_is_as_strong_as_sampled_rays_say(name, low):
     """Within 0.3 dB, peak and total. Lobes, whose bounces add in power, fail."""
     mesh, depth = MESHES[name]
     scene = alone(mesh, (0.0, TOWARDS, 0.0))
-    drawn = Sampling(depth=depth, samples=60_000, boundary=False)
+    drawn = Sampling(depth=depth, samples=60_000, conductor_samples=60_000, boundary=False)
     paths = trace_field(scene, DEVICE.link(), sampling=drawn, seed=1)
     truth = exact_spectrum(beat_signal(paths, DEVICE), DEVICE, GRID)
     model = SurrogateMap(GRID, sampling=drawn, coherent=["target"])

@@ -46,7 +46,7 @@ def test_exact_signals_and_surrogate_have_one_shape_and_one_unit():
 def test_conductors_and_dielectrics_in_one_scene():
     device = radar()
     scene = occluder(wall=RoughDielectric(4.0), occluder=PerfectConductor())
-    drawn = Sampling(samples=2_000, points_per_m2=300.0)
+    drawn = Sampling(conductor_samples=2_000, points_per_m2=300.0)
     found = simulate(scene, device, device.grid(0.5, 2.5), seed=0, sampling=drawn)
     assert found.paths.kind == "field"
     assert torch.isfinite(found.spectrum).all()
@@ -123,7 +123,9 @@ def test_a_radar_of_both_polarisations_hears_each_as_one_of_its_own():
     )
     spots = float64([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     device = replace(radar(), receivers=AntennaArray(spots, polarisation=[[1.0, 0.0], [0.0, 1.0]]))
-    few = Sampling(depth=2, samples=2_000, points_per_m2=1000.0, rough_paths=1000, boundary=False)
+    few = Sampling(
+        depth=2, conductor_samples=2_000, points_per_m2=1000.0, rough_paths=1000, boundary=False
+    )
     both = simulate(scene, device, device.grid(0.5, 2.5), seed=0, sampling=few).beat
     for number, polarisation in enumerate("VH"):
         one = replace(device, receivers=AntennaArray(spots[:1], polarisation=polarisation))

@@ -88,7 +88,10 @@ def test_paths_of_an_empty_view():
     assert (
         len(
             trace_field(
-                metal, apart, sampling=Sampling(depth=1, samples=100, boundary_samples=0), seed=0
+                metal,
+                apart,
+                sampling=Sampling(depth=1, conductor_samples=100, boundary_samples=0),
+                seed=0,
             )
         )
         == 0

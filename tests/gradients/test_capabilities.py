@@ -258,7 +258,7 @@ def coherent_case(parameter: str) -> Found:
     def value(theta: Tensor, seed: int, boundary: bool, samples: int, edges: int) -> Tensor:
         return response(
             *moves(scene, radar, theta),
-            Sampling(depth=1, samples=samples, boundary_samples=edges, boundary=boundary),
+            Sampling(depth=1, conductor_samples=samples, boundary_samples=edges, boundary=boundary),
             seed,
         )
 
@@ -666,7 +666,9 @@ def attempt(mechanism: str, scene: Scene, radar: Radar) -> None:
     paths = trace_field(
         scene,
         radar.link(),
-        sampling=Sampling(depth=1, samples=1_000, boundary_samples=100, points_per_m2=100.0),
+        sampling=Sampling(
+            depth=1, conductor_samples=1_000, boundary_samples=100, points_per_m2=100.0
+        ),
         seed=0,
     )
     exact_spectrum(beat_signal(paths, radar), radar, radar.grid(0.4, 2.8, 0.6))

@@ -56,7 +56,7 @@ def test_the_surrogate_correlates_with_the_mean_over_looks():
 def test_looks_of_conductors_are_all_the_same():
     device = radar()
     scene = Scene({"plate": thing(plate(0.2, 0.2), (0, 0, 1.2), material=PerfectConductor())})
-    model = SurrogateMap(device.grid(0.7, 1.7, 0.7), sampling=Sampling(samples=5_000))
+    model = SurrogateMap(device.grid(0.7, 1.7, 0.7), sampling=Sampling(conductor_samples=5_000))
     few, many = (
         surrogate_correlation(scene, device, model, seed=0, realisations=looks) for looks in (1, 4)
     )
@@ -223,7 +223,7 @@ def test_chains_have_the_strength_of_a_corner_reflector():
     """All chains of three bounces add in phase; the power model adds their powers."""
     device = radar()
     grid = device.grid(0.7, 1.3)
-    drawn = Sampling(depth=3, samples=60_000, boundary=False)
+    drawn = Sampling(depth=3, conductor_samples=60_000, boundary=False)
     truth = simulate(corner(), device, grid, seed=1, sampling=drawn).spectrum
     found = FacetMap(grid, sampling=Sampling(depth=3)).predict(corner(), device, 0)
     assert float(found.max()) == pytest.approx(float(truth.max()), rel=0.15)
@@ -249,7 +249,7 @@ def test_chains_blur_both_maps_alike_and_have_looks():
 def test_chain_fields_are_the_range_profiles_of_a_recording():
     device = radar()
     grid = device.grid(0.7, 1.3)
-    drawn = Sampling(depth=3, samples=60_000, boundary=False)
+    drawn = Sampling(depth=3, conductor_samples=60_000, boundary=False)
     beat = simulate(corner(), device, grid, seed=1, sampling=drawn).beat
     model = FacetField(grid, sampling=Sampling(depth=3))
     truth = model.observe(Capture.from_beat(beat, device))

@@ -69,7 +69,7 @@ def test_doppler_equals_moved_geometry(tdm, material):
     chirps = Chirps(count=4, interval=80e-6, tdm=tdm)
     # Sideways little enough that no point crosses the terminator.
     scene = moving([0.0, 0.0, -3.0], material)
-    options: dict[str, Any] = {"seed": 1, "sampling": replace(FEW, samples=4000)}
+    options: dict[str, Any] = {"seed": 1, "sampling": replace(FEW, conductor_samples=4000)}
     moved = simulate_chirps(scene, RADAR, chirps, **options)
     traced = simulate_chirps(scene, RADAR, chirps, retrace=True, **options)
     assert moved.shape == (1, 4, 2, 2, 32)
@@ -102,7 +102,11 @@ def test_phase_of_an_approaching_mirror_falls_by_4_pi_v_t_over_lambda():
     alone = AntennaArray(torch.zeros(1, 3, dtype=torch.float64), Isotropic())
     radar = Radar(alone, alone, WAVE, torch.zeros(1, 3, dtype=torch.float64))
     cube = simulate_chirps(
-        Scene({"mirror": mirror}), radar, CHIRPS, seed=1, sampling=Sampling(depth=1, samples=2000)
+        Scene({"mirror": mirror}),
+        radar,
+        CHIRPS,
+        seed=1,
+        sampling=Sampling(depth=1, conductor_samples=2000),
     )[0]
     steps = torch.angle(cube[1:, 0, 0] / cube[:-1, 0, 0])
     frequency = WAVE.start_frequency + WAVE.slope * WAVE.sample_times
@@ -153,7 +157,7 @@ def test_any_motion_as_a_function_of_time(name):
         return torch.cat([0.3 + 0.15 * angle.sin(), 0 * t, 4.4 + 0.15 * angle.cos()], dim=-1)
 
     scene = ball_on(way)
-    drawn = Sampling(depth=1, samples=100_000, boundary_samples=0)
+    drawn = Sampling(depth=1, conductor_samples=100_000, boundary_samples=0)
     speckle = draw_speckle(scene(0.0), RADAR.link(), drawn, seed=3)
     paths = trace_field(
         scene(0.0),

@@ -27,7 +27,7 @@ from scenes import float64
 
 PAINT = RoughDielectric(4.0)
 WALL = Object(plate(2.0, 2.0), PAINT, rigid(translation=[0.0, 0.0, 3.0]))
-FEW = Sampling(depth=1, points_per_m2=300.0, samples=3_000)
+FEW = Sampling(depth=1, points_per_m2=300.0, conductor_samples=3_000)
 CHIRPS = Chirps(8, 60e-6)
 
 
