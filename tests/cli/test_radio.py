@@ -124,7 +124,7 @@ def test_a_run_file_as_used_compares_levels_as_the_first_one_did(tmp_path):
     assert (
         build.build_section(again, "loss")
         == build.build_section(run, "loss")
-        == SpectrumLoss(levels=1, gain="one")
+        == SpectrumLoss("mse", levels=1, gain="one")
     )
 
 
