@@ -319,13 +319,13 @@ class Room:
         }
 
     def _judged(self, true: Thing, found: Any, error: float) -> dict[str, Any]:
-        figure = found.figure
+        figure = found.shape
         row: dict[str, Any] = {"kind": true.kind, "called": found.kind, "error": error}
         row["scores"] = [
             abs(float(found.position[axis]) - at) / found.deviations[name]
             for axis, name, at in ((0, "x", true.place[0]), (2, "z", true.place[1]))
         ]
-        if true.kind in ("wall", "box") and figure.boxed:
+        if true.kind in ("wall", "box") and figure.is_rectangular:
             row["yaw_error"] = yaw_error(true, figure)
         return row
 

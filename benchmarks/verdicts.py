@@ -162,7 +162,7 @@ class Trial:
             "word": seen.word,
             "excess": seen.excess,
             "structure": seen.structure,
-            "rivals": [rival.score for rival in seen.rivals],
+            "rivals": [rival.score for rival in seen.ambiguities],
             "reasons": seen.reasons,
         }
 

@@ -140,9 +140,9 @@ def test_a_map_may_hold_scattered_power(tmp_path):
     text = RUN.replace(
         "depth = 1\nscatter", "depth = 1\nrough = { depth = 1, samples = 5000 }\nscatter"
     )
-    rough = loaded(tmp_path, text).map.build().reception.rough
+    rough = loaded(tmp_path, text).map.build().propagation.rough
     assert (rough.depth, rough.samples) == (1, 5000)
-    assert loaded(tmp_path, RUN).map.build().reception.rough is None
+    assert loaded(tmp_path, RUN).map.build().propagation.rough is None
 
 
 def test_starts_are_in_free_space(tmp_path):
@@ -186,7 +186,7 @@ def test_antennas_are_turned(tmp_path):
     text = RUN.replace("power_dbm = 10.0", "power_dbm = 10.0" + antenna)
     sensor = loaded(tmp_path, text).transmitter.build()
     ahead = -sensor.positions[0] / sensor.positions[0].norm()
-    torch.testing.assert_close(sensor.terminals.rotations[0, :, 2], ahead)
+    torch.testing.assert_close(sensor.mount.rotations[0, :, 2], ahead)
     assert sensor.powers.tolist() == [10.0]
 
 

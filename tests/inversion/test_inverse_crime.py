@@ -118,7 +118,7 @@ def check_data(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def check_levels(run: Any) -> None:
     """Simulated levels know paths that no stage of any fit knows, and other rays."""
-    ways = [run, *(run.varied(variant) for variant in run.variants.values())]
+    ways = [run, *(run.apply_overrides(variant) for variant in run.variants.values())]
     fitted: list[Any] = [own.map for way in ways for _, own in stage_runs(way)]
     assert run.data.depth > max(table.depth for table in fitted)
     assert (run.data.edges or 0) > max(table.edges for table in fitted) or not run.data.edges

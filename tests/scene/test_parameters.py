@@ -220,7 +220,7 @@ def test_material_values_carry_gradients():
     assert len(parameters) == 4
 
     def total() -> Tensor:
-        surface = module(scene())["block"].material.surface(77e9)
+        surface = module(scene())["block"].material.scattering_law(77e9)
         return surface.amplitude.sum() + surface.lobes.sum() + surface.diffuse
 
     gradients = torch.autograd.grad(total(), parameters)
@@ -265,7 +265,7 @@ def test_every_value_of_a_slab_can_be_fitted():
     for extreme in (-30.0, 30.0):
         for parameter in module.parameters():
             parameter.data.fill_(extreme)
-        surface = module(board)["wall"].material.surface(77e9)
+        surface = module(board)["wall"].material.scattering_law(77e9)
         assert all(torch.isfinite(value).all() for value in vars(surface).values())
 
 

@@ -84,7 +84,7 @@ def track_moving_targets(
         live += [_start_track(one) for one in seen if one not in taken]
     paths = [path for path in (*ended, *live) if len(path.measurements) >= _MIN_TRACK_FRAMES]
     things = [_to_detected_object(path, step, recording.frame_period, ground) for path in paths]
-    things.sort(key=lambda one: -one.confidence)
+    things.sort(key=lambda one: -one.existence_probability)
     return [replace(one, name=f"mover_{k}") for k, one in enumerate(things, 1)]
 
 

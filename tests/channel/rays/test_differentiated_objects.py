@@ -112,7 +112,7 @@ def reach(offset: Callable[[float], list[float]]) -> list[bool]:
             edge = dr.arange(mi.UInt32, 5)  # those of the plate
             y0, y1 = rays.exact_ends(edge)
             asked = to_torch(
-                rays.differentiated_objects.beyond(edge, mi.Point3f(0.0), y0, y1)
+                rays.differentiated_objects.may_receive_shadow(edge, mi.Point3f(0.0), y0, y1)
             ).bool()
             ends = rays.geometry.vertices.detach()[rays.topology.edges[:5]]
             upright = (ends[..., 0].abs() < 1e-9).all(1)

@@ -75,7 +75,9 @@ def test_materials_follow_the_frequency_of_the_radar(make):
         values = entry.permittivity(frequency), entry.conductivity(frequency)
         expected = fixed(*values).complex_permittivity(frequency)
         assert torch.equal(material.complex_permittivity(frequency), expected)
-    assert not torch.equal(material.surface(10e9).amplitude, material.surface(77e9).amplitude)
+    assert not torch.equal(
+        material.scattering_law(10e9).amplitude, material.surface(77e9).amplitude
+    )
 
 
 def test_other_values_beside_the_table():

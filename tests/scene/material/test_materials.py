@@ -78,7 +78,7 @@ def test_gradient_is_zero_in_vacuum():
     ],
 )
 def test_each_material_fills_its_part_of_the_surface(make, lets_through, refracts):
-    surface = make().surface(FREQUENCY)
+    surface = make().scattering_law(FREQUENCY)
     assert all(value.dtype == torch.float64 for value in vars(surface).values())
     assert bool((surface.transmittance > 0).any()) == lets_through
     assert bool((surface.extra_length != 0).any()) == lets_through
@@ -124,7 +124,7 @@ def test_gradients_in_every_value(kind):
     names = [n for n in VALUES if n in kind.__dataclass_fields__ and n != "rms_height"]
 
     def tables(*values):
-        surface = kind(**dict(zip(names, values, strict=True))).surface(FREQUENCY)
+        surface = kind(**dict(zip(names, values, strict=True))).scattering_law(FREQUENCY)
         # The node at grazing incidence has derivatives beyond any finite difference.
         return tuple(t[5:] if t.shape == (256,) else t for t in vars(surface).values())
 

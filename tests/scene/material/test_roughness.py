@@ -182,7 +182,7 @@ def test_lobe_has_the_stated_width_and_integral(width):
 
 @pytest.mark.parametrize("material", ROUGH)
 def test_three_lobes_never_return_more_than_came_in(material):
-    reflected = albedo(material.surface(FREQUENCY), ANGLES)
+    reflected = albedo(material.scattering_law(FREQUENCY), ANGLES)
     assert reflected.min() >= 0
     assert reflected.max() <= 1 + 2e-5
     if isinstance(material, RoughConductor):

@@ -303,6 +303,6 @@ def test_bad_slabs_are_refused(make, message):
 def test_tables_between_their_nodes(slab, least, most):
     cosine = np.linspace(0, 1, 5000)
     exact = slab_tables([slab.sheet(FREQUENCY)], torch.from_numpy(cosine), FREQUENCY)
-    table = np.interp(cosine, NODES, slab.surface(FREQUENCY).amplitude.numpy())
+    table = np.interp(cosine, NODES, slab.scattering_law(FREQUENCY).amplitude.numpy())
     error = np.abs(table - exact.reflectance.sqrt().numpy()).max()
     assert least < error < most

@@ -106,11 +106,11 @@ def test_values_per_triangle_are_those_of_single_objects(make):
     values = [1.5, 2.5, 3.0]
     together = make(torch.tensor(values, dtype=torch.float64))
     assert together.faces == 3
-    surface = together.surface(FREQUENCY)
+    surface = together.scattering_law(FREQUENCY)
     for k, value in enumerate(values):
         single = make(torch.tensor(value, dtype=torch.float64))
         assert single.faces is None
-        for name, table in vars(single.surface(FREQUENCY)).items():
+        for name, table in vars(single.scattering_law(FREQUENCY)).items():
             row = getattr(surface, name)
             assert row.shape == (3, *table.shape), name
             assert torch.allclose(row[k], table, rtol=1e-12, atol=1e-14), name

@@ -155,7 +155,7 @@ def _rcs_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _Gradch
             return table.build({Scene: scene}, **more)
 
     def draw(report: GradientReport) -> Figure:
-        angles, label = table.angles
+        angles, label = table.swept_angles
         size = report.difference.abs().sum((0, 1))
         i, j = max(table.channels.values(), key=lambda at: float(size[at]))
         curves = {n: values[:, :, i, j] for n, values in _derivative_maps(report).items()}

@@ -127,7 +127,7 @@ class SplineTrajectory:
         shape = (len(times), 3)
         places = checked_tensor(self.positions, shape, "places [m]", "give x, y, z for each time")
         object.__setattr__(self, "times", times.detach())
-        object.__setattr__(self, "places", places.detach())
+        object.__setattr__(self, "positions", places.detach())
         from scipy.interpolate import CubicSpline  # slow to import
 
         curve = CubicSpline(times.detach().numpy(), places.detach().numpy(), bc_type="natural")
