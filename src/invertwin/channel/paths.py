@@ -1,4 +1,4 @@
-"""Frozen values that leave or enter the channel: the bins, the antennas' places, the paths."""
+"""Frozen values that enter or leave the channel: bins, antenna poses, and paths."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -17,7 +17,7 @@ from invertwin.scene.polarisation import VERTICAL, Polarisation
 
 @runtime_checkable
 class GainPattern(Protocol):
-    """What the channel asks of an antenna pattern (see ``invertwin.scene.antenna``)."""
+    """Antenna pattern as the channel uses it (see ``invertwin.scene.antenna``)."""
 
     def gain(self, direction: Float[Tensor, "*point 3"]) -> Float[Tensor, "*point"]:
         """Linear power gain for unit directions in the radar frame."""
@@ -79,7 +79,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Link:
-    """Where the antennas are in each frame, and how they see.
+    """Poses, patterns and polarisations of the antennas in each frame.
 
     Attributes:
         tx: Phase centre of the transmitters, world coordinates [m].
@@ -190,7 +190,7 @@ class Paths:
 
     @property
     def has_field(self) -> Bool[Tensor, " path"]:
-        """Which paths have a field, between any of the elements."""
+        """Mask of paths with a field between any of the elements."""
         own = self.coefficient != 0
         return own if self.matrix is None else own | (self.matrix != 0).flatten(1).any(1)
 

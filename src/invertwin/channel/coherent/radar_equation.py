@@ -60,7 +60,7 @@ class SurfacePaths:
         return SurfacePaths(*(column[rows] for column in vars(self).values()))
 
     def material_points(self, geometry: Geometry) -> list[MaterialPoints]:
-        """Where the points are now."""
+        """Locate material points."""
         found = []
         for face, b1, b2 in zip(self.face.T, self.b1.T, self.b2.T, strict=True):
             p0, p1, p2 = geometry.corners(face)
@@ -82,7 +82,7 @@ class SurfacePaths:
 
 @dataclass(frozen=True)
 class PathTransfer:
-    """What paths carry, attached; one row a path.
+    """Power and geometry of paths, attached; one row a path.
 
     Attributes:
         frame: Radar pose.
@@ -311,7 +311,7 @@ def trace_transmittance(
 def find_unblocked(
     rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths
 ) -> Bool[Tensor, " n"]:
-    """Which paths have nothing but sheets in their way.
+    """Find the paths that nothing but sheets intersects.
 
     Args:
         rays: The scene and its antennas.
@@ -348,7 +348,7 @@ def evaluate_paths(rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePat
 def _trace_segments(
     rays: RayScene, frame: Tensor, points: Sequence[MaterialPoints]
 ) -> list[tuple[Tensor, Tensor]]:
-    """What all segments of paths pass, see ``trace_transmittance``."""
+    """Trace the transmission of all segments of paths, see ``trace_transmittance``."""
     link = rays.link
     stops = [link.tx[frame], *(place.position for place in points), link.rx[frame]]
     found: list[tuple[Tensor, Tensor]] = []

@@ -173,7 +173,7 @@ class _RoughPathSampler:
     def _resample_lanes(
         self, state: walk.PathState, parent: Tensor, weight: Tensor
     ) -> walk.PathState:
-        """Lanes that go on from others; each has its own number, and so its own way."""
+        """Resample lanes; each has its own index, and so its own random numbers."""
         at = to_index(parent)
         incident = [dr.gather(mi.Float, state["incident"][k], at) for k in range(3)]
         return walk.update_state(
@@ -185,7 +185,7 @@ class _RoughPathSampler:
         )
 
     def _selection_shares(self, paths: SurfacePaths, *, received: bool) -> Tensor:
-        """How the draws are shared among paths: by their power, and by sequences of objects."""
+        """Compute the selection probabilities of paths, by power and by sequence of objects."""
         if not len(paths.weight):
             return paths.weight
         power = paths.weight * self._estimate_power(paths, received=received)

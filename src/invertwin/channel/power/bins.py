@@ -78,7 +78,8 @@ class BinLayout:
     Attributes:
         grid: bins of one frame.
         frames: number of radar poses.
-        origin: range origin of every frame [m]; None = 0."""
+        origin: range origin of every frame [m]; None = 0.
+    """
 
     grid: Grid
     frames: int
@@ -90,7 +91,8 @@ class BinLayout:
 
         Args:
             grid: bins of one frame.
-            link: antennas."""
+            link: antennas.
+        """
         return BinLayout(grid, link.frame_count, link.range_origin)
 
     @property
@@ -114,7 +116,8 @@ class BinLayout:
         """Sum strips to the map.
 
         Args:
-            strips: flat array, one or more of the shape ``strip_shape``."""
+            strips: flat array, one or more of the shape ``strip_shape``.
+        """
         parts = view_as_torch(strips).reshape(-1, *self.strip_shape)
         parts = parts[0] if len(parts) == 1 else parts.sum(0)
         total = parts[..., 2:, 0] + parts[..., 1:-1, 1] + parts[..., :-2, 2]
@@ -124,7 +127,8 @@ class BinLayout:
         """Adjoint of ``sum_strips``: copy the values of its three bins to every strip.
 
         Args:
-            bins: value of every bin."""
+            bins: value of every bin.
+        """
         rows = torch.nn.functional.pad(bins.movedim(self.strip_axis + 1, -1), (2, 3))
         return to_float(rows.unfold(-1, 4, 1))
 
@@ -132,7 +136,8 @@ class BinLayout:
         """Compute the ranges of paths from the origin of their frame [m] (detached).
 
         Args:
-            path: contributions."""
+            path: contributions.
+        """
         length = dr.detach(path.range)
         if self.origin is None:
             return length
@@ -165,7 +170,8 @@ class _Strip:
 
         Args:
             axis: 0 range, 1 u, 2 v.
-            strip_axis: axis of the strips."""
+            strip_axis: axis of the strips.
+        """
         return [
             self.transverse_derivatives[axis] * w
             for w in (self.weight_derivatives if axis == strip_axis else self.weights)
@@ -219,7 +225,8 @@ class BinAccumulator:
     not be atomic.
 
     Args:
-        layout: bins of the map."""
+        layout: bins of the map.
+    """
 
     def __init__(self, layout: BinLayout) -> None:
         self.layout = layout
@@ -235,7 +242,8 @@ class BinAccumulator:
 
         Args:
             path: contributions.
-            active: mask of paths that exist."""
+            active: mask of paths that exist.
+        """
         for strip in _iterate_strips(self.layout, path):
             power = path.power * strip.transverse_weight
             self._scatter_strip([power * weight for weight in strip.weights], strip, active)
@@ -248,7 +256,8 @@ class BinAccumulator:
         Args:
             path: contributions.
             tangents: tangents of power, range, u and v.
-            active: mask of paths that exist."""
+            active: mask of paths that exist.
+        """
         power = dr.detach(path.power)
         power_tangent, *others = tangents
         fine = self.layout.strip_axis
@@ -281,7 +290,8 @@ def gather_adjoint(
         strip_gradient: ∂loss/∂map, see ``BinLayout.expand_to_strips``.
         layout: bins of the map.
         path: contributions.
-        active: mask of paths that exist."""
+        active: mask of paths that exist.
+    """
     adjoints = [mi.Float(0.0) for _ in range(4)]
     for strip in _iterate_strips(layout, path):
         values = dr.gather(mi.Vector4f, strip_gradient, strip.index, strip.is_inside & active)
@@ -304,7 +314,8 @@ def deposit_paths(paths: Paths, link: Link, grid: Grid) -> Float32[Tensor, "fram
         link: antennas of the paths.
         grid: bins of one frame.
 
-    Source: derivations §5."""
+    Source: derivations §5.
+    """
     u, v = paths.direction_cosines(link).unbind(1)
     with tracing():
         return Splat.apply(

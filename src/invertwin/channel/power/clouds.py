@@ -84,7 +84,8 @@ class _CloudRays:
         frame: frame of every ray.
         box_points: point of the box through which each ray passes [m].
         jitter: position of the points within their segments, in [0, 1).
-        steps: segments of a ray."""
+        steps: segments of a ray.
+    """
 
     cloud: Cloud
     link: Link

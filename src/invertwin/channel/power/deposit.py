@@ -74,7 +74,8 @@ def deposit_power(
     Raises:
         InputError: No silhouette samples for a derivative that needs them, an antenna pattern that
             carries derivatives, objects in motion, an unknown backend, a polarisation that depends
-            on direction."""
+            on direction.
+    """
     if scheme not in ("rays", "area"):
         raise InputError(f"expected scheme 'rays' or 'area', got {scheme!r}; choose one")
     surfaces, clouds = _split_clouds(scene)
@@ -115,7 +116,8 @@ def deposit_batch(
     Source: as ``deposit_power``; ``rays.batching`` states why boxes separate scenes.
 
     Raises:
-        InputError: No scenes, clouds, more samples than numbers, or as of ``deposit_power``."""
+        InputError: No scenes, clouds, more samples than numbers, or as of ``deposit_power``.
+    """
     objects, owners = {}, []
     for number, scene in enumerate(scenes):
         clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
@@ -197,7 +199,8 @@ class _Deposit(torch.autograd.Function):
     """Map of a scene, with ∂map/∂(vertices, poses, materials) in both modes.
 
     The derivative of the deposit itself is written out, and that of a path is replayed from its
-    records; Dr.Jit differentiates the smooth geometry at one vertex."""
+    records; Dr.Jit differentiates the smooth geometry at one vertex.
+    """
 
     @staticmethod
     def forward(

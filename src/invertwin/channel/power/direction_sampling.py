@@ -34,7 +34,8 @@ class DirectionSample:
         lobe_density: probability density per solid angle of the lobes alone; infinite if total
             reflection leaves no direction.
         group: group of objects at which it aims, if any: it is void if it ends elsewhere.
-        target: object of that group at which it aims, if any."""
+        target: object of that group at which it aims, if any.
+    """
 
     omega: mit.Vector3f
     lobe_density: mit.Float
@@ -47,7 +48,8 @@ class DirectionSampler:
 
     Args:
         rays: ray scene with the objects to aim at.
-        surfaces: scattering laws of the surfaces."""
+        surfaces: scattering laws of the surfaces.
+    """
 
     def __init__(self, rays: RayScene, surfaces: ScatteringLawTables) -> None:
         self.rays, self.spheres = rays, rays.spheres
@@ -70,7 +72,8 @@ class DirectionSampler:
             point: latest vertex.
             incident: unit directions to the vertex before.
             numbers: six uniform numbers; the second is reserved for Russian roulette.
-            scene: scenes whose objects are aimed at."""
+            scene: scenes whose objects are aimed at.
+        """
         facing = mi.Normal3f(dr.mulsign(point.normal, dr.dot(point.normal, incident)))
         omega = self._sample_lobes(point, incident, facing, numbers)
         group, aimed = mi.UInt32(_NO_TARGET), mi.UInt32(_NO_TARGET)
@@ -119,7 +122,8 @@ class DirectionSampler:
             scene: scenes whose objects were aimed at.
 
         Returns:
-            The density, 0 for directions that are void."""
+            The density, 0 for directions that are void.
+        """
         spheres = self.spheres
         if spheres.max_objects == 1:
             return sample.lobe_density

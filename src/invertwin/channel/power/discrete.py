@@ -15,7 +15,8 @@ class DiscreteSampler:
     """Sampler of entries in proportion to weights, without reading any back.
 
     Args:
-        weights: weights of the entries."""
+        weights: weights of the entries.
+    """
 
     def __init__(self, weights: mit.Float) -> None:
         self.weights, self.sums = weights, dr.cumsum(weights)
@@ -29,7 +30,8 @@ class DiscreteSampler:
             number: uniform numbers.
 
         Returns:
-            The entry, the rest of the number within it, and its probability: 0 if there is none."""
+            The entry, the rest of the number within it, and its probability: 0 if there is none.
+        """
         target = number * self.total
 
         def is_below(at: mit.UInt32) -> mit.Bool:
@@ -59,7 +61,8 @@ def balance_by_object(
         edge: edge indices.
         weight: weights of the edges.
         receiver: True for silhouettes as the receiver sees them.
-        antenna_count: 2 if the receiver has silhouettes of its own, else 1."""
+        antenna_count: 2 if the receiver has silhouettes of its own, else 1.
+    """
     objects = len(rays.geometry.names)
     antenna = dr.select(receiver, mi.UInt32(1), 0)
     row = dr.gather(mi.UInt32, rays.topology.device_edge_object, edge) + antenna * objects
@@ -82,7 +85,8 @@ def balance_by_scene(rays: RayScene, scene: mit.UInt32, weight: mit.Float) -> mi
     Args:
         rays: ray scene.
         scene: scene of each weight.
-        weight: weights."""
+        weight: weights.
+    """
     if rays.scene_count == 1:
         return weight
     totals = dr.zeros(mi.Float, rays.scene_count)
@@ -107,7 +111,8 @@ def sample_edge_point(
         key: key of the random numbers, if other than the index.
 
     Returns:
-        The entry, the position along its edge from 0 to 1, and the probability of the entry."""
+        The entry, the position along its edge from 0 to 1, and the probability of the entry.
+    """
     jitter, along = uniform_pair(index if key is None else key, seed)
     entry, rest, probability = sampler.draw((mi.Float(index) + jitter) / count)
     return entry, dr.select(probability > _MIN_RESOLVED_PROBABILITY, rest, along), probability

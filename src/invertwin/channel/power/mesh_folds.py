@@ -59,10 +59,12 @@ def is_hidden_by_fold(
         outward: unit directions off the edge's own triangles; zero if these are all around.
         clearance: distance beside the edge at which rays pass [m].
         start_distance: distance off the edge at which they start [m].
-        active: mask of active lanes."""
+        active: mask of active lanes.
+    """
     topology, most = rays.topology, opaque(_MAX_FOLD_TRIANGLES)
     across, along = dr.cross(direction, outward), dr.normalize(direction)
     start, found = mi.UInt32(edge), mi.Bool(False)
+    columns = list(zip(topology.device_edge_faces, topology.device_edge_apexes, strict=True))
 
     def body(state: _FoldState) -> tuple[_FoldState]:
         state = state.copy()
@@ -90,9 +92,7 @@ def is_hidden_by_fold(
         low = (height < -clearance) & (state["count"] >= _MIN_FOLD_TRIANGLES)
         on &= (height <= PLANE_TOLERANCE) & ~low
         edge, after, others = mi.UInt32(dr.maximum(leaving, 0)), mi.UInt32(0), mi.UInt32(0)
-        for column, apex in zip(
-            topology.device_edge_faces, topology.device_edge_apexes, strict=True
-        ):
+        for column, apex in columns:
             next_face = dr.gather(mi.UInt32, column, edge, on)
             other = (dr.gather(mi.Int32, apex, edge, on) >= 0) & (next_face != face)
             after = dr.select(other, next_face, after)
@@ -101,9 +101,7 @@ def is_hidden_by_fold(
         state["going"] = on & (others == 1) & (state["count"] < most)
         return (state,)
 
-    for column, apex in zip(
-        topology.device_edge_faces[:2], topology.device_edge_apexes[:2], strict=True
-    ):
+    for column, apex in columns[:2]:
         there = active & (dr.gather(mi.Int32, apex, edge) >= 0) & (dr.squared_norm(across) > 0)
         state = {
             "edge": start,

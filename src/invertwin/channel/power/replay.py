@@ -203,15 +203,9 @@ def _evaluate_vertex(
     arriving = gain * here.jacobian * loss / dr.square(distance)
     receiver = antennas.pose(True, active)
     connection = integrand.connect_antenna(
-        inputs,
-        frame,
-        here,
-        incident,
-        True,
-        active,
-        is_same_antenna=single and inputs.monostatic,
-        antenna=receiver,
-    )
+        inputs, frame, here, incident, True, active,
+        is_same_antenna=single and inputs.monostatic, antenna=receiver,
+    )  # fmt: skip
     scattered = mi.Float(1.0)
     if not single:
         start = antennas.pose(False, active).position

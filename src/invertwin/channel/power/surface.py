@@ -50,7 +50,8 @@ class ScatteringLawTables:
         """Upload the surfaces of a scene.
 
         Args:
-            geometry: scene as flat tables."""
+            geometry: scene as flat tables.
+        """
         rows = geometry.surfaces
         known = {}
         if len(rows.diffuse) == 1:
@@ -73,7 +74,8 @@ class ScatteringLawTables:
         Args:
             name: name of the table.
             row: rows of the surfaces.
-            active: mask of active lanes."""
+            active: mask of active lanes.
+        """
         return self._column(name, 0, 1, row, active)
 
     def _column(
@@ -101,7 +103,8 @@ class ScatteringLawTables:
             name: name of the table.
             row: rows of the surfaces.
             cosine: cosine of the angle of incidence, at least 0.
-            active: mask of active lanes."""
+            active: mask of active lanes.
+        """
         if self._is_constant(name):
             return mi.Float(self.constants[name][0])
         t = dr.minimum(cosine, 1.0) * (self.cosine_count - 1)
@@ -118,7 +121,8 @@ class ScatteringLawTables:
         Args:
             row: rows of the surfaces.
             cosine: cosine of the angle of incidence.
-            active: mask of active lanes."""
+            active: mask of active lanes.
+        """
         return tuple(  # type: ignore[return-value]
             self.interpolate_cosine(name, row, cosine, active)
             for name in ("transmittance", "extra_length")
@@ -144,7 +148,8 @@ class ScatteringLawTables:
             normal: unit normals.
             incident: unit directions to the previous vertex.
             outgoing: unit directions to the next vertex.
-            active: mask of active lanes."""
+            active: mask of active lanes.
+        """
         axis = incident if number == 2 else normal * (2 * dr.dot(normal, incident)) - incident
         apart = dr.squared_norm(outgoing - axis)
         exponent = self.exponent(number, row, active)
@@ -156,7 +161,8 @@ class ScatteringLawTables:
         Args:
             number: 0 specular, 1 directive, 2 backscattering.
             row: rows of the surfaces.
-            active: mask of active lanes."""
+            active: mask of active lanes.
+        """
         return self._column("exponents", number, 3, row, active)
 
     def evaluate_scattering(
@@ -177,7 +183,8 @@ class ScatteringLawTables:
             normal: unit normals.
             incident: unit directions to the previous vertex.
             outgoing: unit directions to the next vertex; None if both directions are one.
-            active: mask of active lanes."""
+            active: mask of active lanes.
+        """
         first = dr.dot(normal, incident)
         low = self._amplitude(row, first, active)
         if outgoing is None:
@@ -238,7 +245,8 @@ class ScatteringLawTables:
             row: rows of the surfaces.
             normal: unit normals.
             incident, outgoing: unit directions of the path, away from the surface.
-            active: mask of active lanes."""
+            active: mask of active lanes.
+        """
         first, second = dr.dot(normal, incident), dr.dot(normal, outgoing)
         inner = self.value("index", row, active)
         variance = self.refraction_variance(row, active)
@@ -261,7 +269,8 @@ class ScatteringLawTables:
 
         Args:
             row: rows of the surfaces.
-            active: mask of active lanes."""
+            active: mask of active lanes.
+        """
         exponent = self.exponent(0, row, active)
         return 2 / dr.maximum(exponent, 1.0)
 
@@ -269,7 +278,8 @@ class ScatteringLawTables:
         """Test whether surfaces are interfaces of refracting bodies.
 
         Args:
-            row: rows of the surfaces."""
+            row: rows of the surfaces.
+        """
         last = (row + 1) * self.cosine_count - 1
         return dr.detach(dr.gather(mi.Float, self.tables["refraction"], last)) > 0
 
@@ -278,7 +288,8 @@ def opaque_row(row: Tensor) -> list[mit.Float]:
     """Upload the numbers of a table of one row, each as an opaque scalar.
 
     Args:
-        row: table of one row."""
+        row: table of one row.
+    """
     return [opaque(float(number), "Float") for number in row.detach().ravel()]
 
 
@@ -286,7 +297,8 @@ def log_one_minus(fraction: mit.Float) -> mit.Float:
     """Compute log(1 − x), bounded below by log(1e-7), accurate for small x.
 
     Args:
-        fraction: x, from 0 to 1."""
+        fraction: x, from 0 to 1.
+    """
     series = -fraction * (1 + fraction * (1 / 2 + fraction / 3))
     return dr.select(dr.detach(fraction) < 0.01, series, dr.log(dr.maximum(1 - fraction, 1e-7)))
 
@@ -296,5 +308,6 @@ def gaussian(mismatch: mit.Vector3f, variance: mit.Float) -> mit.Float:
 
     Args:
         mismatch: offset from the centre.
-        variance: variance along each axis."""
+        variance: variance along each axis.
+    """
     return dr.exp(-dr.squared_norm(mismatch) / (2 * variance)) / (2 * dr.pi * variance)

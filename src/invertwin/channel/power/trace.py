@@ -35,7 +35,8 @@ def differentiable_tables(geometry: Geometry, link: Link) -> list[Tensor]:
 
     Args:
         geometry: scene as flat tables.
-        link: antennas."""
+        link: antennas.
+    """
     owners = {"vertices": geometry, **dict.fromkeys(SCATTERING_TABLES, geometry.surfaces)}
     return [getattr(owners.get(name, link), name) for name in DIFFERENTIABLE]
 
@@ -45,7 +46,8 @@ def strip_scene_derivatives(geometry: Geometry, link: Link) -> tuple[Geometry, L
 
     Args:
         geometry: scene as flat tables.
-        link: antennas."""
+        link: antennas.
+    """
     tables = dict(
         zip(
             DIFFERENTIABLE,
@@ -72,7 +74,8 @@ class PowerTracer:
         scheme: sampling of the start points, see ``deposit_power``.
         reference: reference scene of the start points, see ``deposit_power``.
         coupling: polarisation factors of paths with an odd and an even number of bounces.
-        differentiate_antennas: True if derivatives may flow through the antennas' positions."""
+        differentiate_antennas: True if derivatives may flow through the antennas' positions.
+    """
 
     def __init__(
         self,
@@ -111,7 +114,8 @@ class PowerTracer:
 
         Args:
             tables: replaced tables by name.
-            joint_antennas: True if antennas at one position also move as one."""
+            joint_antennas: True if antennas at one position also move as one.
+        """
         attached = self.fixed.with_tables(tables or {})
         return replace(attached, monostatic=joint_antennas and self.fixed.monostatic)
 
@@ -120,7 +124,8 @@ class PowerTracer:
 
         Args:
             out: accumulator of the map.
-            record: True to record the paths, provided that all fit in one chunk."""
+            record: True to record the paths, provided that all fit in one chunk.
+        """
         record = record and self.sampler.size <= self.chunk
         records = None
         for index in index_chunks(self.sampler.size, self.chunk):
@@ -201,7 +206,8 @@ class PowerTracer:
         """Trace the boundary paths of all families, a chunk at a time.
 
         Args:
-            inputs: attached inputs."""
+            inputs: attached inputs.
+        """
         if self.boundary_samples is None:
             return iter(())
         return trace_boundary_paths(self.rays, inputs, self._walk, self.boundary_samples)
@@ -212,7 +218,8 @@ def index_chunks(size: int, chunk: int) -> Iterator[mit.UInt32]:
 
     Args:
         size: number of indices.
-        chunk: most indices at a time."""
+        chunk: most indices at a time.
+    """
     # Equal sizes but for the last, so that a chunk reuses the memory of the one before.
     chunk = max(1, -(-size // max(1, -(-size // chunk))))
     for start in range(0, size, chunk):

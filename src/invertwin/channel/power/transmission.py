@@ -260,8 +260,22 @@ def trace_to_surface(
         state["going"] = passes & (state["count"] < _MAX_SHEETS)
         return (state,)
 
-    first: _SurfaceState = {
-        "going": hit.valid,
+    first = _initial_surface_state(rays, ray, hit.valid, lanes)
+    (last,) = rays.loop((first,), lambda state: state["going"], body)
+    return SegmentHit(
+        last["valid"],
+        SurfacePoint(last["face"], last["b1"], last["b2"]),
+        SegmentTransmission(last["transmittance"], last["extra"]),
+        last["probability"],
+    )
+
+
+def _initial_surface_state(
+    rays: RayScene, ray: mit.Ray3f, going: mit.Bool, lanes: int
+) -> _SurfaceState:
+    """Create the state before the first surface."""
+    return {
+        "going": going,
         "valid": dr.zeros(mi.Bool, lanes),
         "face": dr.zeros(mi.UInt32, lanes) + rays.fallback_face,
         "b1": dr.full(mi.Float, 0.25, lanes),
@@ -272,10 +286,3 @@ def trace_to_surface(
         "origin": mi.Point3f(ray.o) + dr.zeros(mi.Point3f, lanes),
         "count": dr.zeros(mi.UInt32, lanes),
     }
-    (last,) = rays.loop((first,), lambda state: state["going"], body)
-    return SegmentHit(
-        last["valid"],
-        SurfacePoint(last["face"], last["b1"], last["b2"]),
-        SegmentTransmission(last["transmittance"], last["extra"]),
-        last["probability"],
-    )

@@ -1,7 +1,7 @@
-"""Which backend traces rays, and the only place where Mitsuba and Dr.Jit are imported.
+"""Backend of the ray tracer; the only file that imports Mitsuba and Dr.Jit.
 
 The ray tracer and torch's forward-mode derivatives have one state for the whole process, so that
-one thread at a time may use them. Threads that use them at once wait for each other.
+one thread at a time may use them; other threads wait.
 """
 
 import importlib
@@ -40,7 +40,7 @@ class _ThreadState(threading.local):
 
 
 _thread = _ThreadState()
-_forked = False  # whether the parent of this process had started the ray tracer
+_forked = False  # True if the parent of this process had started the ray tracer
 
 
 @cache
@@ -58,7 +58,7 @@ def backend() -> str:
     ``INVERTWIN_BACKEND``, then ``auto``: CUDA where Dr.Jit finds it, the CPU elsewhere.
 
     Raises:
-        InputError: A name that is not known, or CUDA asked for where there is none.
+        InputError: An unknown name, or CUDA without a GPU.
     """
     if _thread.backends:
         return _thread.backends[-1]
@@ -97,10 +97,10 @@ def _switch_types() -> None:
 
 @contextmanager
 def tracing(name: str | None = None) -> Iterator[None]:
-    """What touches Mitsuba or Dr.Jit does so in such a block: one thread at a time.
+    """Enter a block that may use Mitsuba and Dr.Jit: one thread at a time.
 
     Args:
-        name: As for :func:`use_backend`.
+        name: backend, as for :func:`use_backend`.
 
     Raises:
         InputError: A process that was forked from one whose ray tracer had been started.
@@ -116,7 +116,7 @@ def tracing(name: str | None = None) -> Iterator[None]:
         _switch_types()
         try:
             yield
-            # Side effects and kernels under way are the thread's own: others would not wait.
+            # Wait for pending side effects and kernels of this thread: others would not.
             dr.eval()
             dr.sync_thread()
         finally:
@@ -126,7 +126,7 @@ def tracing(name: str | None = None) -> Iterator[None]:
 
 
 def _after_fork() -> None:
-    """In a forked child the threads of the ray tracer and of torch are gone; nobody waits."""
+    """Mark a forked child, which lacks the threads of the ray tracer and of torch."""
     global _forked
     _forked = _forked or _load_module.cache_info().currsize > 0
     if _forked:
@@ -156,14 +156,14 @@ class _Mitsuba:
         self._types: dict[str, dict[str, type]] = {}
 
     def switch_types(self, backend_name: str | None) -> None:
-        """Know the types of one backend, or of none: where no one traces.
+        """Switch to the types of one backend, or of none outside of tracing.
 
         Args:
-            backend_name: The backend.
+            backend_name: name of the backend, or None.
         """
         types = self._types
         self.__dict__.clear()
-        # Kernels ask for types a thousand times, so that those in force are plain attributes.
+        # Kernels look up types a thousand times, so that those in force are plain attributes.
         self.__dict__.update(types.get(backend_name or "", {}), _types=types)
 
     def __getattr__(self, name: str) -> Any:
@@ -184,7 +184,7 @@ class _DrJit:
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(_load_module("drjit", backend()), name)
-        setattr(self, name, found)  # the same for all backends, so that no one asks again
+        setattr(self, name, found)  # the same for all backends: looked up once
         return found
 
 

@@ -1,4 +1,4 @@
-"""Spheres around objects as tables, so that kernels do not grow with the number of objects."""
+"""Bounding spheres of objects as tables: kernels do not grow with the number of objects."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import morton_order
 
 _MAX_GROUP_SIZE = 8  # objects of a group
-_EMPTY_SPHERE = (0.0, 0.0, 0.0, -1.0)  # a sphere that nothing meets
+_EMPTY_SPHERE = (0.0, 0.0, 0.0, -1.0)  # a sphere that no ray meets
 
 
 State = TypeVar("State", bound=tuple[object, ...])
@@ -33,21 +33,19 @@ class LoopRecorder(Protocol):
 
 
 class BoundingSpheres:
-    """A sphere around each object, detached; objects that lie side by side form groups.
+    """Bounding sphere of each object, detached; neighbouring objects form groups.
 
-    Rays that are aimed at an object count where they end on one of its group: so the density of
-    a ray is a sum over one group, however many objects there are. Kernels number the objects by
-    their place in the table, group after group.
+    A ray that is aimed at an object counts if it ends on any object of its group: the density of a
+    ray is then a sum over one group, whatever the number of objects. Kernels number the objects by
+    their index in the table, group after group.
+
+    Args:
+        geometry: scene as flat tables.
+        origin: local origin of the kernel [m].
+        margin: factor by which spheres are larger than necessary.
     """
 
     def __init__(self, geometry: Geometry, origin: Float64[Tensor, 3], margin: float) -> None:
-        """Surround the objects.
-
-        Args:
-            geometry: The scene.
-            origin: About which the kernel counts places [m].
-            margin: By how much spheres are larger than they need to be.
-        """
         centres, radii = _fit_spheres(geometry)
         order = morton_order(centres)
         self.object_count = len(order)  # of all scenes
@@ -61,46 +59,46 @@ class BoundingSpheres:
         groups = -(-counts // self.group_size)
         first = np.cumsum(groups) - groups
         rank = np.arange(self.object_count) - (np.cumsum(counts) - counts)[scene[order]]
-        places = first[scene[order]] * self.group_size + rank
+        indices = first[scene[order]] * self.group_size + rank
         rows = np.full((int(groups.sum()) * self.group_size, 4), _EMPTY_SPHERE)
-        rows[places] = np.column_stack([centres - origin.numpy(), margin * radii])[order]
+        rows[indices] = np.column_stack([centres - origin.numpy(), margin * radii])[order]
         self.table = to_float(torch.from_numpy(rows))
         of_object = np.empty_like(order)
-        of_object[order] = places // self.group_size
+        of_object[order] = indices // self.group_size
         self.group_count = len(rows) // self.group_size  # of all scenes
         self._group = to_index(torch.from_numpy(of_object))
-        place = np.empty_like(order)
-        place[order] = places
-        self._table_indices = to_index(torch.from_numpy(place))
+        index = np.empty_like(order)
+        index[order] = indices
+        self._table_indices = to_index(torch.from_numpy(index))
         self._owner = geometry.topology.device_face_object
         self._size = opaque(self.group_size)
         self._scenes: dict[str, mit.UInt32] | None = None
         if geometry.object_scene is not None:
             members = np.bincount(of_object)
-            columns = {"place": places, "scene": scene[order], "first": first, "groups": groups}
+            columns = {"index": indices, "scene": scene[order], "first": first, "groups": groups}
             self._scenes = {
                 name: to_index(torch.from_numpy(column))
                 for name, column in {**columns, "members": members}.items()
             }
 
     def table_entry(self, number: mit.UInt32) -> tuple[mit.UInt32, mit.UInt32]:
-        """Place in the table and scene of objects, in the order of the table.
+        """Look up table index and scene of objects in the order of the table.
 
         Args:
-            number: From 0 to ``count``.
+            number: numbers from 0 to ``object_count`` − 1.
         """
         if self._scenes is None:
             return number, mi.UInt32(0)
-        place, scene = (
-            dr.gather(mi.UInt32, self._scenes[name], number) for name in ("place", "scene")
+        index, scene = (
+            dr.gather(mi.UInt32, self._scenes[name], number) for name in ("index", "scene")
         )
-        return place, scene
+        return index, scene
 
     def scene_groups(self, scene: mit.UInt32) -> tuple[mit.UInt32, mit.UInt32]:
-        """The first group of a scene, and how many it has.
+        """Look up the first group of a scene and the number of its groups.
 
         Args:
-            scene: Number of the scene.
+            scene: scene numbers.
         """
         if self._scenes is None:
             return 0, self.group_count  # type: ignore[return-value]
@@ -110,34 +108,35 @@ class BoundingSpheres:
         return first, groups
 
     def member_count(self, group: mit.UInt32) -> mit.UInt32:
-        """How many objects a group has.
+        """Look up the number of objects in groups.
 
         Args:
-            group: The group.
+            group: group numbers.
         """
         if self._scenes is None:
             return dr.minimum(self.group_size, self.object_count - group * self.group_size)
         return dr.gather(mi.UInt32, self._scenes["members"], group)
 
     def table_index(self, number: mit.UInt32) -> mit.UInt32:
-        """Places of objects in the table.
+        """Look up the table indices of objects.
 
         Args:
-            number: Of the objects, as the scene numbers them.
+            number: object indices of the scene.
         """
         return dr.gather(mi.UInt32, self._table_indices, number)
 
     def cap(
         self, index: mit.UInt32, point: mit.Point3f
     ) -> tuple[mit.Vector3f, mit.Float, mit.Bool]:
-        """Axis and height 1 − cos of the cap of directions in which an object lies.
+        """Compute axis and height 1 − cos of the cap of directions to an object.
 
         Args:
-            place: Of the object in the table.
-            point: From where it is seen.
+            index: table indices of the objects.
+            point: positions from which they are seen [m].
 
         Returns:
-            Both, and whether the point is outside of the sphere; inside, every direction counts.
+            Axis, height, and the mask of points outside of the sphere; inside, the cap is the whole
+            sphere of directions.
         """
         sphere = dr.gather(mi.Vector4f, self.table, index)
         offset = sphere.xyz - point
@@ -147,11 +146,11 @@ class BoundingSpheres:
         return axis, dr.select(outside, _cap_height(radius / distance), 2.0), outside
 
     def face_group(self, face: mit.UInt32, active: mit.Bool | bool = True) -> mit.UInt32:
-        """The group of a triangle's object.
+        """Look up the groups of triangles.
 
         Args:
-            face: Triangle.
-            active: Lanes.
+            face: triangle indices.
+            active: mask of active lanes.
         """
         if self.group_count == 1:
             return mi.UInt32(0)
@@ -165,16 +164,17 @@ class BoundingSpheres:
         direction: mit.Vector3f,
         target: mit.UInt32 | int,
     ) -> tuple[mit.Float, mit.Bool]:
-        """One over the solid angle of an object's cap, if that holds a direction, else 0.
+        """Compute one over the solid angle of an object's cap; 0 if a direction is not in it.
 
         Args:
-            place: Of the object in the table.
-            point: From where it is seen.
-            direction: Unit vector.
-            target: Place of the object that the direction was drawn for, whose cap holds it.
+            index: table indices of the objects.
+            point: positions from which they are seen [m].
+            direction: unit directions.
+            target: table index of the object for which the direction was sampled: its cap
+                contains it.
 
         Returns:
-            This, and whether the point is inside of the sphere, which then has no cap.
+            The density, and the mask of points inside the sphere, which then has no cap.
         """
         sphere = dr.gather(mi.Vector4f, self.table, index)
         offset = sphere.xyz - point
@@ -195,18 +195,18 @@ class BoundingSpheres:
         active: mit.Bool,
         target: mit.UInt32 | int,
     ) -> tuple[mit.Float, mit.Float]:
-        """Σ 1/(solid angle) over the caps of a group that hold a direction.
+        """Sum 1/(solid angle) over the caps of a group that contain a direction.
 
         Args:
-            rays: Whose kernel this is a part of.
-            group: The group.
-            point: From where the objects are seen.
-            direction: Unit vector.
-            active: Lanes.
-            target: Place of the object that the direction was drawn for, whose cap holds it.
+            rays: ray scene that records the loop.
+            group: group numbers.
+            point: positions from which the objects are seen [m].
+            direction: unit directions.
+            active: mask of active lanes.
+            target: table index of the object for which the direction was sampled.
 
         Returns:
-            The sum, and how many spheres of the group the point is inside of.
+            The sum, and the number of spheres of the group that contain the point.
         """
         lanes = max(dr.width(direction), dr.width(active))
         start = group * self._size + dr.zeros(mi.UInt32, lanes)
@@ -224,12 +224,12 @@ class BoundingSpheres:
 
 
 def sample_cap(axis: mit.Vector3f, height: mit.Float, numbers: list[mit.Float]) -> mit.Vector3f:
-    """Uniform on the spherical cap of a height 1 − cos about an axis.
+    """Sample a direction uniformly on a spherical cap.
 
     Args:
-        axis: Unit vector.
-        height: Of the cap, at most 2.
-        numbers: Two uniform numbers.
+        axis: unit axis of the cap.
+        height: height 1 − cos of the cap, at most 2.
+        numbers: two uniform numbers.
     """
     depth = numbers[0] * height
     sine = dr.sqrt(dr.maximum(depth * (2 - depth), 0.0))
@@ -243,7 +243,7 @@ def _cap_height(sine: mit.Float) -> mit.Float:
 
 
 def _fit_spheres(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and radius of a sphere around each object [m]."""
+    """Compute centre and radius of a sphere around each object [m]."""
     used, first, owner = geometry.topology.used_vertices
     corners = geometry.vertices.detach().numpy()[used]
     low, high = (f.reduceat(corners, first) for f in (np.minimum, np.maximum))

@@ -1,6 +1,6 @@
-"""Scenes of a few triangles: rays are tested against each of them, and no tree is asked.
+"""Brute-force intersection with few triangles, without a BVH.
 
-A tree spends on a packet of rays as much as some dozens of tests that all lanes do alike. Two
+For a packet of rays, a BVH costs as much as some dozens of tests that all lanes do alike. Two
 triangles that make a parallelogram, as those of a box's side, are one test.
 """
 
@@ -13,31 +13,31 @@ from torch import Tensor
 from invertwin.channel.rays.arrays import opaque, to_index
 from invertwin.channel.rays.backend import dr, mi, mit
 
-#: Most tests of such a scene: with 24 paths take three quarters of their time, from 40 on more.
+#: Most tests of such a scene: with 24, paths take three quarters of their time; from 40 on, more.
 MAX_TESTS = 24
-_CORNER_TOLERANCE = 1e-9  # how near corners are that are one, of the largest coordinate
+_CORNER_TOLERANCE = 1e-9  # distance of equal corners, relative to the largest coordinate
 
 
 class BruteForceIntersector:
-    """A few triangles, each known to all lanes.
+    """Intersector of few triangles, each stored as opaque scalars.
 
     Every test has a corner, its normal (of any length), and two vectors in its plane whose products
-    with a point, from the corner on, are the point's coordinates along the two sides.
+    with a point, relative to the corner, are the point's coordinates along the two sides.
 
     Args:
-        vertices: About the local origin [m].
-        faces: At least one triangle.
+        vertices: positions [v, 3] about the local origin [m].
+        faces: vertex indices [f, 3] of at least one triangle.
     """
 
     @staticmethod
     def build(
         vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]
     ) -> BruteForceIntersector | None:
-        """None where there are too many of them.
+        """Build the intersector, or return None for too many triangles.
 
         Args:
-            vertices: About the local origin [m].
-            faces: At least one triangle.
+            vertices: positions [v, 3] about the local origin [m].
+            faces: vertex indices [f, 3] of at least one triangle.
         """
         if len(faces) > 2 * MAX_TESTS:
             return None
@@ -59,7 +59,7 @@ class BruteForceIntersector:
             torch.linalg.cross(sides[1], normal) / square,
             torch.linalg.cross(normal, sides[0]) / square,
         )
-        # A triangle without area is met by no ray: products with NaN are not in any interval.
+        # No ray meets a triangle without area: products with NaN are not in any interval.
         numbers = torch.stack([p0, normal, *along], dim=1).tolist()
         self._pairs, self.test_count = len(pairs), len(rows)
         self._patches = [[_opaque_vector(vector) for vector in row] for row in numbers]
@@ -69,14 +69,14 @@ class BruteForceIntersector:
     def find_nearest(
         self, ray: mit.Ray3f, active: mit.Bool | bool
     ) -> tuple[mit.Bool, mit.UInt32, mit.Float, mit.Float, mit.Float]:
-        """The first triangle on a ray.
+        """Find the first triangle on rays.
 
         Args:
-            ray: Origin, direction and largest distance.
-            active: Lanes.
+            ray: origins, directions and largest distances.
+            active: mask of active lanes.
 
         Returns:
-            Whether there is one, its number, barycentric coordinates, and the distance.
+            The mask of hits, triangle indices, two barycentric coordinates, and distances.
         """
         far, u, v = mi.Float(ray.maxt), mi.Float(0.0), mi.Float(0.0)
         test, valid = mi.UInt32(0), mi.Bool(False)
@@ -100,11 +100,11 @@ class BruteForceIntersector:
         return valid, half.x, b1, b2, far
 
     def is_blocked(self, ray: mit.Ray3f, active: mit.Bool | bool) -> mit.Bool:
-        """Whether any triangle is on a ray.
+        """Test whether any triangle is on rays.
 
         Args:
-            ray: Origin, direction and largest distance.
-            active: Lanes.
+            ray: origins, directions and largest distances.
+            active: mask of active lanes.
         """
         blocked = mi.Bool(False)
         for number in range(self.test_count):
@@ -114,7 +114,7 @@ class BruteForceIntersector:
     def _intersect_patch(
         self, number: int, ray: mit.Ray3f, max_distance: mit.Float
     ) -> tuple[mit.Float, mit.Float, mit.Float, mit.Bool]:
-        """Distance and coordinates where a ray meets a plane, and whether that is within."""
+        """Intersect rays with a plane: distance, coordinates, and mask of hits within the patch."""
         corner, normal, first, second = self._patches[number]
         origin = mi.Vector3f(ray.o - corner)  # type: ignore[operator]
         along = -dr.dot(normal, origin) / dr.dot(normal, ray.d)
@@ -129,9 +129,9 @@ def _opaque_vector(numbers: list[float]) -> mit.Vector3f:
 
 
 def _pair_parallelograms(triangles: Float64[Tensor, "n 3 3"]) -> list[tuple[int, int, int, int]]:
-    """Pairs of triangles that make one, no triangle twice.
+    """Find pairs of triangles that make a parallelogram, with no triangle twice.
 
-    Of both: its number, and which of its corners is opposite to the side that they have in common.
+    Each pair lists, for both triangles, its number and the corner opposite to the common side.
     """
     after, last = triangles.roll(-1, 1), triangles.roll(-2, 1)
     opposite = after + last - triangles

@@ -1,4 +1,4 @@
-"""Surfaces in one plane that are seen: which of them a ray meets is left to rounding."""
+"""Visible coplanar surfaces: rounding decides which of them a ray meets."""
 
 import warnings
 
@@ -11,12 +11,12 @@ from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene, is_visible
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.errors import PhysicsWarning
 
-_MAX_PAIRS = 20_000  # of triangles in one plane that are compared, evenly chosen of more
-_MAX_POINTS = 64  # of a pair of objects that are looked at
-_MAX_POSES = 16  # radar poses that are asked
+_MAX_PAIRS = 20_000  # most coplanar pairs of triangles that are compared, evenly chosen
+_MAX_POINTS = 64  # most tested points of a pair of objects
+_MAX_POSES = 16  # most tested radar poses
 _MIN_BARYCENTRIC = 1e-6  # least barycentric coordinate: what only touches does not overlap
 _MAX_PLANE_SINE = 1e-3  # largest sine of the angle between planes that are one
-#: Barycentric coordinates of a triangle's middle, and of places just within corners and sides.
+#: Barycentric coordinates of a triangle's centre, and of points just within corners and sides.
 _TEST_POINTS = torch.tensor(
     [
         [1 / 3, 1 / 3, 1 / 3],
@@ -28,13 +28,13 @@ _TEST_POINTS = torch.tensor(
 
 
 def warn_coplanar_surfaces(rays: RayScene) -> None:
-    """Warn where an antenna sees two objects in one place, unless it makes no difference.
+    """Warn of coplanar surfaces of two objects that an antenna sees, unless they are equivalent.
 
-    It makes none where both are at rest and of one material. What is hidden, as the underside of a
-    box that stands on a floor, is not seen.
+    They are if both objects are at rest and of one material. Hidden surfaces, as the underside of a
+    box on a floor, do not count.
 
     Args:
-        rays: The scene and its antennas.
+        rays: ray scene.
     """
     geometry = rays.geometry
     for one, other in sorted(_find_coplanar_pairs(rays, _relevant_pairs(geometry))):
@@ -50,18 +50,18 @@ def warn_coplanar_surfaces(rays: RayScene) -> None:
 def _find_coplanar_pairs(
     rays: RayScene, pairs: Bool[Tensor, "object object"]
 ) -> set[tuple[int, int]]:
-    """Pairs of objects that lie in one place that is seen; what has not moved is known by now."""
+    """Find pairs of objects with visible coplanar surfaces; cached for unmoved objects."""
     topology, points = rays.topology, rays.geometry.vertices.detach()
     antennas = torch.cat([rays.link.tx.detach(), rays.link.rx.detach()])
-    known, asked = set[tuple[int, int]](), pairs
+    known, remaining = set[tuple[int, int]](), pairs
     if topology.coplanar_cache is not None:
         found, *before = topology.coplanar_cache
         if torch.equal(before[0], pairs) and torch.equal(before[1], antennas):
             moved = torch.zeros(len(pairs), dtype=torch.bool)
             moved[topology.vertex_object[(points != before[2]).any(1)]] = True
-            asked = pairs & (moved[:, None] | moved)
-            known = {(one, other) for one, other in found if not bool(asked[one, other])}
-    known |= _find_visible_pairs(rays, asked) if bool(asked.any()) else set()
+            remaining = pairs & (moved[:, None] | moved)
+            known = {(one, other) for one, other in found if not bool(remaining[one, other])}
+    known |= _find_visible_pairs(rays, remaining) if bool(remaining.any()) else set()
     topology.coplanar_cache = known, pairs, antennas, points
     return known
 
@@ -69,11 +69,11 @@ def _find_coplanar_pairs(
 def _find_visible_pairs(
     rays: RayScene, pairs: Bool[Tensor, "object object"]
 ) -> set[tuple[int, int]]:
-    """Those of some pairs of objects that lie in one plane where an antenna sees it."""
-    geometry, told = rays.geometry, set[tuple[int, int]]()
+    """Find those of some pairs of objects that are coplanar at a point that an antenna sees."""
+    geometry, found = rays.geometry, set[tuple[int, int]]()
     pairs, low, high = find_overlapping_boxes(geometry, pairs)
     if not bool(pairs.any()):
-        return told
+        return found
     points = geometry.vertices.detach() - rays.origin
     triangles, owner = points[geometry.faces], geometry.face_object
     near = (triangles.amin(1) <= (high - rays.origin)[owner]) & (
@@ -81,7 +81,7 @@ def _find_visible_pairs(
     )
     faces = near.all(1).nonzero()[:, 0]
     if not len(faces):
-        return told
+        return found
     first, second = _pair_coplanar_triangles(triangles[faces], owner[faces])
     first, second = faces[first], faces[second]
     kept = pairs[owner[first], owner[second]]
@@ -93,12 +93,12 @@ def _find_visible_pairs(
         here = here[:: -(-len(here) // _MAX_POINTS)]
         scene = 0 if geometry.object_scene is None else int(geometry.object_scene[one])
         if _is_any_visible(rays, place[here], normal[here], scene):
-            told.add((one, other))
-    return told
+            found.add((one, other))
+    return found
 
 
 def _relevant_pairs(geometry: Geometry) -> Bool[Tensor, "object object"]:
-    """Pairs of objects of which one moves, or which differ in their material."""
+    """Find pairs of objects of which one moves, or whose materials differ."""
     count, owner = len(geometry.names), geometry.face_object
     lowest, highest = (
         torch.zeros(count, dtype=torch.int64).scatter_reduce(
@@ -113,14 +113,14 @@ def _relevant_pairs(geometry: Geometry) -> Bool[Tensor, "object object"]:
 
 
 def _ray_tolerance(points: Float64[Tensor, "*n 3"]) -> Float64[Tensor, "*n"]:
-    """How near surfaces are that rays take for one [m]."""
+    """Compute the distance [m] within which rays do not separate surfaces."""
     return RAY_EPSILON * points.norm(dim=-1) + 1e-9
 
 
 def _pair_coplanar_triangles(
     triangles: Float64[Tensor, "n 3 3"], owners: Int64[Tensor, " n"]
 ) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
-    """Pairs of triangles whose planes are as far from the origin, on the same side of it."""
+    """Pair triangles whose planes have the same distance from the origin, on the same side."""
     normal = _unit_normal(triangles)
     largest = normal.gather(1, normal.abs().argmax(1, keepdim=True))
     away = (normal * triangles[:, 0]).sum(1) * largest[:, 0].sign()
@@ -140,7 +140,7 @@ def _pair_coplanar_triangles(
 def _has_near_neighbour(
     offsets: Float64[Tensor, " n"], owner: Int64[Tensor, " n"], max_distance: Tensor
 ) -> Bool[Tensor, " n"]:
-    """Which of some sorted numbers have one of another owner within reach."""
+    """Find the sorted numbers with one of another owner within reach."""
     change = (owner[1:] != owner[:-1]).nonzero()[:, 0]  # the last number of every run
     if not len(change):
         return torch.zeros(len(offsets), dtype=torch.bool)
@@ -156,7 +156,7 @@ def _has_near_neighbour(
 def _find_common_points(
     triangles: Float64[Tensor, "f 3 3"], first: Int64[Tensor, " n"], second: Int64[Tensor, " n"]
 ) -> tuple[Int64[Tensor, " m"], Float64[Tensor, "m 3"], Float64[Tensor, "m 3"]]:
-    """Places that two triangles have in common: number of the pair, place and normal."""
+    """Find common points of pairs of triangles: number of the pair, point and normal."""
     parts = []
     normals = [_unit_normal(triangles[face]) for face in (first, second)]
     alike = torch.linalg.cross(*normals).norm(dim=1) < _MAX_PLANE_SINE
@@ -181,7 +181,7 @@ def _find_common_points(
 def _is_any_visible(
     rays: RayScene, points: Float64[Tensor, "n 3"], normal: Float64[Tensor, "n 3"], scene: int
 ) -> bool:
-    """Whether an antenna sees any of some places past all surfaces but those in their plane."""
+    """Test whether an antenna sees any of some points, ignoring surfaces in their plane."""
     looks = scene * rays.poses_per_scene + torch.arange(
         0, rays.poses_per_scene, max(1, -(-rays.poses_per_scene // _MAX_POSES))
     )

@@ -1,7 +1,8 @@
-"""Which shadows a derivative can move, in scenes of which a part stands still."""
+"""Shadows that move with θ, in scenes of which only some objects carry derivatives."""
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Protocol
 
 import torch
@@ -13,19 +14,15 @@ from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.bounding_spheres import BoundingSpheres, LoopRecorder, sample_cap
 from invertwin.channel.rays.topology import Topology
 
-NO_TARGET = 0xFFFFFFFF  # no place in a table
-_TOLERANCE = 1e-4  # of a distance: far more than rounding
+NO_TARGET = 0xFFFFFFFF  # index of no object
+_TOLERANCE = 1e-4  # relative to a distance: far more than rounding
 
 
 class _Objects(LoopRecorder, Protocol):
     """Ray scene as differentiated objects see it."""
 
     topology: Topology
-
-    @property
-    def spheres(self) -> BoundingSpheres:
-        """Bounding spheres of the objects."""
-        ...
+    spheres: cached_property[BoundingSpheres]
 
     def object_scene(self, number: mit.UInt32) -> mit.UInt32:
         """Look up the scenes of objects."""
@@ -37,14 +34,14 @@ class _Objects(LoopRecorder, Protocol):
 
 
 class DifferentiatedObjects:
-    """Objects through whose vertices derivatives flow, where the antennas and others stand still.
+    """Objects with derivatives, if the antennas and other objects have none.
 
-    A shadow moves over a surface if what casts it moves or the surface does. So an edge at rest
-    counts only if its shadow may fall on an object that moves.
+    A shadow moves over a surface if the object that casts it moves or the surface does. An edge of
+    an object at rest therefore counts only if its shadow may fall on an object that moves.
 
     Args:
-        differentiated: Per object, whether it moves; some do.
-        rays: The ray scene whose kernels this is a part of.
+        differentiated: True for each object with derivatives; some are.
+        rays: ray scene.
     """
 
     def __init__(self, differentiated: Bool[Tensor, " object"], rays: _Objects) -> None:
@@ -54,40 +51,43 @@ class DifferentiatedObjects:
         self._count = opaque(int(differentiated.sum()))
 
     def has_object(self, owner: mit.UInt32, active: mit.Bool | bool = True) -> mit.Bool:
-        """Whether objects move.
+        """Test whether objects carry derivatives.
 
         Args:
-            owner: Numbers of the objects.
-            active: Lanes.
+            owner: object indices.
+            active: mask of active lanes.
         """
         return dr.gather(mi.UInt32, self._differentiated, owner, active) > 0
 
     def has_face(self, face: mit.UInt32, active: mit.Bool | bool = True) -> mit.Bool:
-        """Whether triangles are parts of objects that move.
+        """Test whether triangles belong to objects with derivatives.
 
         Args:
-            face: Triangles.
-            active: Lanes.
+            face: triangle indices.
+            active: mask of active lanes.
         """
         owners = self._rays.topology.device_face_object
         return self.has_object(dr.gather(mi.UInt32, owners, face, active), active)
 
     def has_edge(self, edge: mit.UInt32) -> mit.Bool:
-        """Whether edges are parts of objects that move.
+        """Test whether edges belong to objects with derivatives.
 
         Args:
-            edge: Edges.
+            edge: edge indices.
         """
         return self.has_object(dr.gather(mi.UInt32, self._rays.topology.device_edge_object, edge))
 
     def sample_direction(
         self, point: mit.Point3f, numbers: list[mit.Float]
     ) -> tuple[mit.Vector3f, mit.UInt32]:
-        """A direction to the sphere of an object that moves, and the object's place in the table.
+        """Sample a direction to the bounding sphere of an object with derivatives.
 
         Args:
-            point: From where.
-            numbers: Three uniform numbers.
+            point: positions from which the objects are seen [m].
+            numbers: three uniform numbers.
+
+        Returns:
+            The unit direction, and the table index of the object.
         """
         spheres = self._rays.spheres
         number = dr.minimum(mi.UInt32(numbers[0] * self._count), self._count - 1)
@@ -98,12 +98,13 @@ class DifferentiatedObjects:
     def line_density(
         self, point: mit.Point3f, direction: mit.Vector3f, target: mit.UInt32
     ) -> mit.Float:
-        """Probability per solid angle of such directions, of which half are turned round.
+        """Evaluate the density per solid angle of such directions, half of them reversed.
 
         Args:
-            point: From where.
-            direction: Unit vectors.
-            target: What ``towards`` drew them for; any other number where it did not.
+            point: positions from which the objects are seen [m].
+            direction: unit directions.
+            target: table index of the object that the direction was sampled for, or any other
+                number if it was sampled otherwise.
         """
         rays, spheres = self._rays, self._rays.spheres
 
@@ -125,18 +126,18 @@ class DifferentiatedObjects:
     def may_receive_shadow(
         self, edge: mit.UInt32, origin: mit.Point3f, y0: mit.Vector3d, y1: mit.Vector3d
     ) -> mit.Bool:
-        """Whether shadows of edges may fall on an object that moves: its sphere is asked.
+        """Test whether shadows of edges may fall on the spheres of objects with derivatives.
 
         Args:
-            edge: Edges.
-            origin: From where they are seen.
-            y0, y1: Their ends.
+            edge: edge indices.
+            origin: positions of the antennas [m].
+            y0, y1: ends of the edges [m].
         """
         rays, spheres = self._rays, self._rays.spheres
         first, second = (mi.Vector3f(y - mi.Vector3d(origin)) for y in (y0, y1))
         normal = dr.cross(first, second)
         length = dr.norm(normal)
-        # An edge that points at the antenna may cast its shadow anywhere.
+        # The shadow of an edge that points at the antenna may fall anywhere.
         normal = dr.select(length > 0, normal / length, 0.0)
         rims = [dr.normalize(end) for end in (first, second)]
         along = second - first
@@ -148,7 +149,7 @@ class DifferentiatedObjects:
             owner = dr.gather(mi.UInt32, self._numbers, number)
             sphere = dr.gather(mi.Vector4f, spheres.table, spheres.table_index(owner))
             centre, radius = sphere.xyz - origin, sphere.w
-            # Within the sector of directions through the edge, or beside one of its rims.
+            # Within the sector of directions through the edge, or near one of its rims.
             height = dr.dot(centre, normal)
             inside = (dr.dot(dr.cross(first, centre), normal) >= 0) & (
                 dr.dot(dr.cross(centre, second), normal) >= 0

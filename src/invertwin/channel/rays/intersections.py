@@ -1,4 +1,4 @@
-"""Where surfaces meet: the segments that pairs of triangles have in common, in float64.
+"""Intersection curves of surfaces: common segments of pairs of triangles, in float64.
 
 Edges are rays through the tree: each end of such a segment is where an edge of one triangle meets
 the other. The tree, in float32, only proposes pairs; float64 decides (derivations §3).
@@ -24,13 +24,13 @@ _MAX_HITS = 64  # surfaces that an edge may pass
 
 @dataclass(frozen=True)
 class IntersectionCurves:
-    """Segments that two triangles have in common.
+    """Common segments of pairs of triangles.
 
     Attributes:
-        first, second: The triangles.
-        start, end: Of the segments, in the world [m].
-        touching: Where one surface ends in the other: no segment of a crossing.
-        has_close_surfaces: Whether two objects are so close that one's edges may lie in the other.
+        first, second: triangle indices.
+        start, end: ends of the segments in the world [m].
+        touching: True if one surface ends in the other, so that the segment is no crossing.
+        has_close_surfaces: True if two objects are so close that edges of one may lie in the other.
     """
 
     first: Int64[Tensor, " n"]
@@ -41,7 +41,11 @@ class IntersectionCurves:
     has_close_surfaces: bool = False
 
     def select(self, mask: Bool[Tensor, " n"]) -> "IntersectionCurves":
-        """Some of them."""
+        """Select segments.
+
+        Args:
+            mask: True for the segments to keep.
+        """
         rows = {k: v[mask] for k, v in vars(self).items() if isinstance(v, Tensor)}
         return replace(self, **rows)
 
@@ -56,12 +60,15 @@ _EMPTY = IntersectionCurves(
 def find_possible_intersections(
     geometry: Geometry,
 ) -> tuple[Bool[Tensor, "object object"], Tensor, Tensor]:
-    """Which objects' boxes overlap while one moves past the other, and where, per object.
+    """Find pairs of objects that may intersect: one moves past the other, and their boxes overlap.
 
-    An object meets itself where its own shape changes.
+    An object may intersect itself if its own shape changes.
 
     Args:
-        geometry: The scene.
+        geometry: scene as flat tables.
+
+    Returns:
+        The pairs, and per object the bounds of all overlaps, low and high [m].
     """
     moving, deforming = (
         torch.tensor(flags) for flags in (geometry.differentiated, geometry.shape_differentiated)
@@ -73,11 +80,14 @@ def find_possible_intersections(
 def find_overlapping_boxes(
     geometry: Geometry, pairs: Bool[Tensor, "object object"]
 ) -> tuple[Bool[Tensor, "object object"], Tensor, Tensor]:
-    """Those of some pairs of objects whose boxes overlap, and where, per object.
+    """Find those of some pairs of objects whose boxes overlap.
 
     Args:
-        geometry: The scene.
-        pairs: Of objects.
+        geometry: scene as flat tables.
+        pairs: pairs of objects.
+
+    Returns:
+        The pairs, and per object the bounds of all overlaps, low and high [m].
     """
     count = len(geometry.differentiated)
     owner = geometry.topology.vertex_object[:, None].expand(-1, 3)
@@ -102,10 +112,10 @@ def find_overlapping_boxes(
 
 
 def find_intersection_curves(rays: RayScene) -> IntersectionCurves | None:
-    """All segments in which surfaces meet that move past each other; None if none can.
+    """Find all segments in which surfaces meet that move past each other; None if none can.
 
     Args:
-        rays: The scene.
+        rays: ray scene.
     """
     geometry, topology = rays.geometry, rays.topology
     if not any(geometry.differentiated):
@@ -154,8 +164,8 @@ def find_intersection_curves(rays: RayScene) -> IntersectionCurves | None:
 def _trace_edges(
     rays: RayScene, edges: Int64[Tensor, " n"], extended: Bool[Tensor, " n"]
 ) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
-    """Edges and the triangles that they pass, one row each; some a little beyond their ends."""
-    # Both ways, so that of two surfaces close to each other neither hides the other.
+    """Find intersections of edges with triangles; some edges are extended beyond their ends."""
+    # In both directions, so that neither of two close surfaces hides the other.
     edge = to_index(torch.cat([edges, edges[extended]]))
     longer = to_index(torch.cat([extended, extended[extended]])) > 0
     back = dr.arange(mi.UInt32, dr.width(edge)) >= len(edges)
@@ -192,12 +202,12 @@ def intersect_triangles(
     first: Int64[Tensor, " n"],
     second: Int64[Tensor, " n"],
 ) -> IntersectionCurves:
-    """What pairs of triangles have in common, where it is a segment.
+    """Intersect pairs of triangles, and keep the intersections that are segments.
 
     Args:
-        points: World positions of all vertices [m].
-        topology: Their triangles.
-        first, second: The triangles of each pair.
+        points: world positions of all vertices [v, 3] in metres.
+        topology: connectivity of the triangles.
+        first, second: triangle indices of each pair [n].
     """
     faces = first, second
     triangles = [points[topology.welded_faces[face]] for face in faces]
@@ -235,7 +245,7 @@ def intersect_triangles(
 def _line_interval(
     triangle: Float64[Tensor, "n 3 3"], height: Float64[Tensor, "n 3"], line: Float64[Tensor, "n 3"]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """From where to where along the line a triangle is in a plane, and a point of it there."""
+    """Compute the interval of a line within triangles of a common plane, and a point of it."""
     places, there = [*triangle.unbind(1)], [*(height == 0).unbind(1)]
     for i, j in ((0, 1), (1, 2), (2, 0)):
         share = height[:, i] / (height[:, i] - height[:, j])
@@ -258,10 +268,10 @@ _BOX_PAIRS_AT_ONCE = 1 << 22  # triangles × triangles whose boxes are compared 
 def find_overlapping_pairs(
     first: Float64[Tensor, "n 3 3"], second: Float64[Tensor, "m 3 3"]
 ) -> tuple[Int64[Tensor, " pair"], Int64[Tensor, " pair"]]:
-    """Pairs of triangles whose boxes overlap.
+    """Find pairs of triangles whose boxes overlap.
 
     Args:
-        first, second: Corners of the triangles.
+        first, second: corners of the triangles [n, 3, 3] and [m, 3, 3] in metres.
     """
     low, high = second.amin(1), second.amax(1)
     rows = [torch.zeros(2, 0, dtype=torch.int64)]

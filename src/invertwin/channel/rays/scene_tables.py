@@ -22,11 +22,11 @@ _WIDE_LOBE = 0.2  # radians: no mesh is too coarse for such lobes
 
 
 def interpolate_values(corners: tuple[Tensor, Tensor, Tensor], b1: Tensor, b2: Tensor) -> Tensor:
-    """Values at barycentric coordinates of triangles, from those at the corners.
+    """Interpolate between the corners of triangles (Dr.Jit form: ``interpolate_position``).
 
     Args:
-        corners: Values at the three corners.
-        b1, b2: Barycentric coordinates.
+        corners: values at the three corners.
+        b1, b2: barycentric coordinates of the second and the third corner.
     """
     c0, c1, c2 = corners
     b1, b2 = b1[:, None], b2[:, None]
@@ -54,7 +54,7 @@ class Geometry:
         topology: What depends on the connectivity only.
         velocities: World velocities of the vertices [m/s]; None = all at rest.
         object_scene: Per object, the scene that it belongs to, where several stand apart (see
-            ``rays.apart``); None = one scene.
+            ``rays.batching``); None = one scene.
     """
 
     vertices: Float64[Tensor, "v 3"]
@@ -107,11 +107,11 @@ class Geometry:
 
 
 def is_visibility_differentiated(geometry: Geometry, link: Link) -> bool:
-    """Whether a derivative flows through anything that decides what is visible.
+    """Test whether derivatives flow through vertices or antenna positions, which decide visibility.
 
     Args:
-        geometry: The scene.
-        link: Antennas.
+        geometry: scene as flat tables.
+        link: antennas.
     """
     return any(is_differentiated(value) for value in (geometry.vertices, link.tx, link.rx))
 
@@ -234,7 +234,7 @@ def _require_closed(name: str, triangles: Tensor, is_open: bool) -> None:
 
 
 def _scattering_law(material: Material, frequency: float) -> ScatteringLaw:
-    """What a material does; remembered where it is frozen and of plain numbers."""
+    """Evaluate the scattering law of a material; cached for frozen materials of plain numbers."""
     frozen = getattr(type(material), "__dataclass_params__", None)
     plain = all(isinstance(value, int | float | str) for value in vars(material).values())
     if plain and frozen is not None and frozen.frozen:

@@ -1,4 +1,4 @@
-"""Which triangles share which edges, and the ray tracer's copy of a flattened scene."""
+"""Topology of a scene: edges shared by triangles, and the ray tracer's copy of the mesh."""
 
 from __future__ import annotations
 
@@ -95,13 +95,13 @@ class Topology:
         return table
 
     def facet_angle(self, number: int, vertices: Float64[Tensor, "v 3"]) -> float:
-        """By how much normals of neighbours turn where an object is curved [rad]; 0 = nowhere.
+        """Compute the typical angle between normals of neighbours where an object is curved [rad].
 
-        The median over its smooth edges, as the mesh is when this is first asked for.
+        It is the median over its smooth edges of the mesh at the first call; 0 = no curvature.
 
         Args:
-            number: Of the object.
-            vertices: World positions [m].
+            number: object index.
+            vertices: world positions [v, 3] in metres.
         """
         if self._facet_angles is None:
             a, b, c = vertices.detach()[self.faces].unbind(1)

@@ -1,4 +1,4 @@
-"""What is seen from one place: the first surface along rays, and outlines of surfaces.
+"""Visibility from one viewpoint: the first surface along rays, and silhouettes.
 
 Along a ray, what is seen jumps at two kinds of curves: outlines, where a surface turns away or
 ends, and curves in which two objects cross. Both move with the scene and with the place from which
@@ -77,7 +77,7 @@ class ViewpointScene:
 
     @property
     def is_differentiated(self) -> bool:
-        """Whether derivatives flow to the scene's places or to the place itself."""
+        """True if derivatives flow to the vertices or to the viewpoint."""
         return is_differentiated(self._vertices) or is_differentiated(self._viewpoint)
 
     def find_first_faces(self, directions: Float64[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
@@ -98,11 +98,11 @@ class ViewpointScene:
     def plane_distances(
         self, face: Int64[Tensor, " n"], directions: Float64[Tensor, "n 3"]
     ) -> Float64[Tensor, " n"]:
-        """How many lengths of its direction each ray goes to the plane of a triangle; attached.
+        """Compute distances to the planes of triangles, in lengths of the directions; attached.
 
         Args:
-            face: Triangles.
-            directions: In the world.
+            face: triangle indices [n].
+            directions: directions in the world [n, 3].
         """
         a, b, c = self._vertices[self._topology.faces[face]].unbind(1)
         normal = cross(b - a, c - a)
