@@ -277,4 +277,4 @@ def test_the_tree_is_there_before_a_loop_is_recorded(repository):
 
 def test_all_loops_over_rays_are_made_where_the_tree_is_built(repository):
     users = [p.name for p in (repository / "src").rglob("*.py") if "while_loop(" in p.read_text()]
-    assert users == ["scene.py"]
+    assert users == ["ray_scene.py"]

@@ -208,8 +208,8 @@ def test_shadows_of_things_at_rest_on_what_moves_are_found_more_often(monkeypatc
             geometry = flatten(scene, WAVELENGTH)
             rays = RayScene(geometry, link(), differentiate_antennas=False)
             sampler = InteriorSilhouetteSampler(rays, Inputs.from_rays(rays), 100_000, 1)
-            points = sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress().edge
-            owner = geometry.topology.vertex_object[to_torch(mi.Int32(points.first)).long()]
+            points = sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress()
+            owner = geometry.topology.vertex_object[to_torch(mi.Int32(points.first_vertex)).long()]
             return int((owner != 2).sum())
 
     aimed = kept()
