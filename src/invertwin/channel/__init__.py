@@ -10,6 +10,7 @@ from invertwin.channel.coherent.field import trace_field as trace_field
 from invertwin.channel.coherent.power_paths import trace_power as trace_power
 from invertwin.channel.coherent.speckle import Speckle as Speckle
 from invertwin.channel.coherent.speckle import draw_speckle as draw_speckle
+from invertwin.channel.coverage.coverage import PathMeasure as PathMeasure
 from invertwin.channel.coverage.coverage import trace_coverage as trace_coverage
 from invertwin.channel.coverage.single_scattering import (
     trace_single_scattering as trace_single_scattering,

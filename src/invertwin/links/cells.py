@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.channel import RayPaths, trace_coverage
+from invertwin.channel import PathMeasure, RayPaths, trace_coverage
 from invertwin.checks import (
     ArrayLike,
     check_fields,
@@ -156,8 +156,7 @@ class Cells(ReceiverLocations):
             self.surface(),
             points.flatten(0, 1),
             propagation.frequency,
-            measure,
-            3,
+            PathMeasure(measure, 3),
             depth=propagation.depth,
             rays=propagation.rays,
             boundary_samples=self.sampling.edge_points if self.sampling.boundary else 0,

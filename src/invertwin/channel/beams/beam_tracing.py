@@ -417,10 +417,10 @@ def clip(
     extent = (polygon - polygon[:, :1]).detach().norm(dim=2).amax(1, keepdim=True)
     steep = crossed & ((height - after).detach().abs() > _COPLANAR_TOLERANCE * extent)
     fraction = height / torch.where(steep, height - after, torch.ones_like(height))
-    intersections = polygon + torch.where(steep, fraction, 0.0)[..., None] * (
+    between = polygon + torch.where(steep, fraction, 0.0)[..., None] * (
         polygon.roll(-1, 1) - polygon
     )
-    points = torch.stack([polygon, intersections], 2).flatten(1, 2)
+    points = torch.stack([polygon, between], 2).flatten(1, 2)
     keep = torch.stack([inside, crossed], 2).flatten(1, 2)
     order = torch.argsort((~keep).to(torch.int8), dim=1, stable=True)
     number = keep.sum(1)

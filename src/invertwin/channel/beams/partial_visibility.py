@@ -109,44 +109,19 @@ def visible_fractions(
     items = list(scene.objects.values())
     topology = topology_of([item.mesh for item in items])
     vertices = torch.cat([item.vertices for item in items])
+    fixed, origins = strip_derivatives(vertices), strip_derivatives(observers)
+    columns = (strip_derivatives(column) for column in (cells.center, cells.axes, cells.offsets))
+    panel = PanelCells(*columns, cells.size)
     with tracing():
-        occluders = Occluders(
-            strip_derivatives(vertices), topology, strip_derivatives(cells.center)
-        )
-        detached_cells = PanelCells(
-            strip_derivatives(cells.center),
-            strip_derivatives(cells.axes),
-            strip_derivatives(cells.offsets),
-            cells.size,
-        )
-        detached_observers = strip_derivatives(observers)
-        edges = _find_silhouette_edges(
-            strip_derivatives(vertices),
-            topology,
-            detached_observers,
-            detached_cells,
-            detached_cells.radius + blur,
-        )
-        edges = _select_visible_edges(
-            occluders, strip_derivatives(vertices), detached_observers, detached_cells, edges
-        )
-        is_center_visible = _test_cell_centers(
-            occluders, detached_observers, detached_cells, edges, strip_derivatives(vertices)
-        )
-        row, cell = _match_cells_to_edges(
-            edges,
-            is_center_visible,
-            (strip_derivatives(vertices), detached_observers, detached_cells),
-            blur,
-        )
-    fractions = is_center_visible.to(torch.float64)
+        rays = Occluders(fixed, topology, panel.center)
+        edges = _find_silhouette_edges(fixed, topology, origins, panel, panel.radius + blur)
+        edges = _select_visible_edges(rays, fixed, origins, panel, edges)
+        visible = _test_cell_centers(rays, origins, panel, edges, fixed)
+        row, cell = _match_cells_to_edges(edges, visible, (fixed, origins, panel), blur)
+    fractions = visible.to(torch.float64)
     if not len(row):
         return fractions
-    geometry = (
-        (vertices, observers, cells)
-        if boundary
-        else (strip_derivatives(vertices), detached_observers, detached_cells)
-    )
+    geometry = (vertices, observers, cells) if boundary else (fixed, origins, panel)
     edges = edges.select(row)
     offsets = geometry[2].offsets[cell]
     distance, normal = _shadow_distances(_project_edges(edges, *geometry), offsets)

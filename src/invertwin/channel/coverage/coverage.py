@@ -23,7 +23,7 @@ from invertwin.channel.coverage.shadow_boundaries import (
     sample_along_curves,
     sample_illumination_boundaries,
 )
-from invertwin.channel.em.plane_waves import cross, dot
+from invertwin.channel.em.plane_waves import dot, interpolate_vectors, triangle_normals
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.intersections import find_overlapping_pairs, intersect_triangles
 from invertwin.channel.rays.topology import Topology, topology_of
@@ -46,9 +46,19 @@ from invertwin.scene.scene import Scene
 
 _POINTS_AT_ONCE = 1 << 13
 
-#: Function of paths and of the positions of their transmitters and receivers; returns the values
-#: that each path contributes, ``[path, amount]``.
-PathMeasure = Callable[[RayPaths, Tensor, Tensor], Tensor]
+
+@dataclass(frozen=True)
+class PathMeasure:
+    """Values that each path contributes to sums over a surface.
+
+    Attributes:
+        evaluate: function of paths and of the positions of their transmitters and receivers;
+            returns the values of each path, [path, amount].
+        count: number of values per path.
+    """
+
+    evaluate: Callable[[RayPaths, Tensor, Tensor], Tensor]
+    count: int
 
 
 @dataclass(frozen=True)
@@ -97,7 +107,6 @@ def trace_coverage(
     points: Float64[Tensor, "point 3"],
     frequency: float,
     measure: PathMeasure,
-    value_count: int,
     *,
     depth: int,
     rays: int | None,
@@ -113,7 +122,6 @@ def trace_coverage(
         points: points on the surface [m].
         frequency: carrier frequency [Hz].
         measure: values that a path contributes.
-        value_count: number of values per path.
         depth: maximum number of surfaces on a path.
         rays: number of rays from each transmitter to find sequences of surfaces; None tests every
             one.
@@ -123,17 +131,17 @@ def trace_coverage(
     """
     path_scene = prepare_path_scene(scene, tx, points, frequency, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     with tracing():
-        tracer = _CoverageTracer(path_scene, surface, measure, value_count, depth, rays, seed)
+        tracer = _CoverageTracer(path_scene, surface, measure, depth, rays, seed)
         amount = tracer.sum_paths(path_scene, tracer.find_paths(strip_derivatives(path_scene.rx)))
         boundary_paths: list[CoverageBoundaryPaths] = []
-        vertices_move = is_differentiated(path_scene.vertices)
-        if boundary_samples and (vertices_move or is_differentiated(path_scene.tx)):
+        deforms = is_differentiated(path_scene.vertices)
+        if boundary_samples and (deforms or is_differentiated(path_scene.tx)):
             boundary_paths += tracer.trace_illumination_boundaries(
                 path_scene, boundary_samples, seed
             )
             boundary_paths += (
                 tracer.trace_intersection_curves(path_scene, boundary_samples, seed)
-                if vertices_move
+                if deforms
                 else []
             )
     return CoverageTrace(amount, tuple(boundary_paths))
@@ -147,12 +155,11 @@ class _CoverageTracer:
         stage: PathScene,
         surface: Mesh,
         measure: PathMeasure,
-        value_count: int,
         depth: int,
         rays: int | None,
         seed: int,
     ) -> None:
-        self.measure, self.value_count, self.depth = measure, value_count, depth
+        self.measure, self.depth = measure, depth
         self.tx, self.powers = strip_derivatives(stage.tx), face_interactions(stage)
         # Discrete: `torch.func` would claim the intermediate tensors.
         with _DisableFuncTorch():
@@ -177,28 +184,22 @@ class _CoverageTracer:
 
     def find_paths(self, points: Tensor) -> list[_PointBatch]:
         """Find the paths to points, in batches of points."""
-        every = (torch.zeros(1, 0, dtype=torch.int64), *self.sequences)
+        sequences = (torch.zeros(1, 0, dtype=torch.int64), *self.sequences)
+        begins = range(0, len(points), _POINTS_AT_ONCE)
+        batches: list[_PointBatch] = []
         with _DisableFuncTorch():
-            return [
-                _PointBatch(
-                    begin,
-                    len(points),
-                    [
-                        part
-                        for steps in every
-                        for number, source in enumerate(self.tx)
-                        for part in find_paths_between(
-                            self.candidate_surfaces, steps, source, points, number
-                        )
-                        if len(part.source)
-                    ],
-                )
-                for begin, points in zip(
-                    range(0, len(points), _POINTS_AT_ONCE),
-                    points.split(_POINTS_AT_ONCE),
-                    strict=True,
-                )
-            ]
+            for begin, some in zip(begins, points.split(_POINTS_AT_ONCE), strict=False):
+                paths = [
+                    part
+                    for steps in sequences
+                    for number, source in enumerate(self.tx)
+                    for part in find_paths_between(
+                        self.candidate_surfaces, steps, source, some, number
+                    )
+                    if len(part.source)
+                ]
+                batches.append(_PointBatch(begin, len(some), paths))
+        return batches
 
     def sum_paths(
         self, stage: PathScene, batches: list[_PointBatch]
@@ -208,19 +209,15 @@ class _CoverageTracer:
         found: list[Tensor] = []
         for batch in batches:
             rx = stage.rx[batch.begin : batch.begin + batch.count]
-            receivers_scene = replace(stage, rx=rx, rx_velocity=torch.zeros_like(rx))
+            local = replace(stage, rx=rx, rx_velocity=torch.zeros_like(rx))
 
-            def total(
-                receivers_scene: PathScene = receivers_scene, batch: _PointBatch = batch
-            ) -> Tensor:
-                sums = torch.zeros(
-                    len(self.tx) * batch.count, self.value_count, dtype=torch.float64
-                )
+            def total(local: PathScene = local, batch: _PointBatch = batch) -> Tensor:
+                count = len(self.tx) * batch.count
+                sums = torch.zeros(count, self.measure.count, dtype=torch.float64)
                 for part in batch.paths:
-                    paths = join_ray_paths(evaluate_paths(receivers_scene, part))
-                    sums = sums.index_add(
-                        0, paths.link, self.measure(paths, receivers_scene.tx, receivers_scene.rx)
-                    )
+                    paths = join_ray_paths(evaluate_paths(local, part))
+                    values = self.measure.evaluate(paths, local.tx, local.rx)
+                    sums = sums.index_add(0, paths.link, values)
                 return sums.unflatten(0, (len(self.tx), batch.count))
 
             found.append(checkpoint(total, use_reentrant=False) if recompute else total())
@@ -231,7 +228,7 @@ class _CoverageTracer:
     ) -> list[CoverageBoundaryPaths]:
         """Boundary paths to illumination boundaries: path values times the boundary's area rate."""
         with _DisableFuncTorch():
-            samples_by_length = sample_illumination_boundaries(
+            groups = sample_illumination_boundaries(
                 self.candidate_surfaces,
                 self.receiving_surface,
                 self.tx,
@@ -242,18 +239,18 @@ class _CoverageTracer:
                 seed=seed,
             )
         boundary_paths: list[CoverageBoundaryPaths] = []
-        for boundary_samples in samples_by_length:
+        for some in groups:
             boundary = evaluate_illumination_boundary(
                 self.candidate_surfaces,
                 self.receiving_surface.corners,
-                boundary_samples,
+                some,
                 stage.tx,
                 stage.vertices,
             )
             detached = _detach_stage(stage, boundary.point)
             with torch.no_grad():
                 paths = join_ray_paths(evaluate_paths(detached, boundary.paths))
-                values = strip_derivatives(self.measure(paths, detached.tx, detached.rx))
+                values = strip_derivatives(self.measure.evaluate(paths, detached.tx, detached.rx))
             # One path a row, in another order.
             amount = torch.zeros_like(values).index_copy(0, paths.rx, values)
             boundary_paths.append(
@@ -354,8 +351,8 @@ def sample_intersection_curves(
     row, fraction, weight = sample_along_curves(span.norm(dim=1), samples, seed)
     face, receiving_face = segments.first[row], segments.second[row] - len(corners)
     normal, up = (
-        _triangle_normals(corners[face]),
-        _triangle_normals(receiving_surface.corners[receiving_face]),
+        triangle_normals(triangles)
+        for triangles in (corners[face], receiving_surface.corners[receiving_face])
     )
     across = normalize(normal - dot(normal, up)[:, None] * up, dim=1)
     return IntersectionCurvePoints(
@@ -381,16 +378,5 @@ def intersection_area_rates(
         vertices: vertex positions in world axes, with derivatives [m].
     """
     corners = vertices[candidate_surfaces.topology.faces[points.face]]
-    a, b, c = strip_derivatives(corners).unbind(1)
-    area = cross(b - a, c - a)
-    square = dot(area, area)
-    v = dot(cross(b - a, points.point - a), area) / square
-    u = dot(cross(points.point - a, c - a), area) / square
-    share = torch.stack([1 - u - v, u, v], 1)
-    material = (share[..., None] * corners).sum(1)
+    material = interpolate_vectors(corners, strip_derivatives(corners), points.point)
     return dot(points.normal, material - strip_derivatives(material)) * points.weight
-
-
-def _triangle_normals(corners: Tensor) -> Tensor:
-    a, b, c = corners.unbind(1)
-    return normalize(cross(b - a, c - a), dim=1)

@@ -21,7 +21,13 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
-from invertwin.channel.em.plane_waves import cross, dot, interpolate_vectors, reflect_vectors
+from invertwin.channel.em.plane_waves import (
+    cross,
+    dot,
+    interpolate_vectors,
+    reflect_vectors,
+    triangle_normals,
+)
 from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
@@ -187,27 +193,27 @@ def sample_illumination_boundaries(
         if not len(edges.fraction):
             continue
         ends = [candidate_surfaces.exact_vertices[vertex] for vertex in (edges.first, edges.second)]
-        edge_points = torch.lerp(ends[0], ends[1], edges.fraction[:, None])
+        y = torch.lerp(ends[0], ends[1], edges.fraction[:, None])
         paths = [
             part
             for steps in (torch.zeros(1, 0, dtype=torch.int64), *sequences)
             for part in find_paths_between(
-                candidate_surfaces, steps, source, edge_points + candidate_surfaces.origin, number
+                candidate_surfaces, steps, source, y + candidate_surfaces.origin, number
             )
         ]
-        by_length: dict[int, list[tuple[_RaysPastEdges, Tensor]]] = {}
+        hits: dict[int, list[tuple[_RaysPastEdges, Tensor]]] = {}
         for part in paths:
             for legs in _launch_past_edges(
                 candidate_surfaces,
                 source - candidate_surfaces.origin,
-                edge_points,
+                y,
                 ends,
                 part,
                 depth,
             ):
                 for last, face in _follow_rays(candidate_surfaces, receiver, legs, powers, depth):
-                    by_length.setdefault(last.faces.shape[1], []).append((last, face))
-        for part in by_length.values():
+                    hits.setdefault(last.faces.shape[1], []).append((last, face))
+        for part in hits.values():
             legs, faces = zip(*part, strict=True)
             found.append(
                 IlluminationBoundarySamples(edges, _concatenate_rays(legs), torch.cat(faces))
@@ -382,23 +388,19 @@ def _find_surface_hits(
     receiver: ReceivingSurface, rays: _RaysPastEdges, max_distance: Tensor
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Rows and triangles of surface crossings past the edge and before the next surface."""
-    rows, distance_along = torch.arange(len(rays.edge_point)), rays.min_distance.clamp_min(0.0)
+    rows, reach = torch.arange(len(rays.edge_point)), rays.min_distance.clamp_min(0.0)
     for _ in range(_MAX_SURFACE_HITS):
-        ahead = torch.nonzero(distance_along < max_distance[rows])[:, 0]
+        ahead = torch.nonzero(reach < max_distance[rows])[:, 0]
         if not len(ahead):
             return
-        rows, distance_along = rows[ahead], distance_along[ahead]
+        rows, reach = rows[ahead], reach[ahead]
         origin, direction = rays.origin[rows], rays.direction[rows]
-        face, distance = _intersect_rays(
-            receiver, origin + distance_along[:, None] * direction, direction
-        )
-        distance_along = distance_along + distance
-        is_hit = torch.nonzero((face >= 0) & (distance_along < max_distance[rows]))[:, 0]
-        rows, distance_along = rows[is_hit], distance_along[is_hit]
+        face, distance = _intersect_rays(receiver, origin + reach[:, None] * direction, direction)
+        reach = reach + distance
+        is_hit = torch.nonzero((face >= 0) & (reach < max_distance[rows]))[:, 0]
+        rows, reach = rows[is_hit], reach[is_hit]
         yield rows, face[is_hit]
-        distance_along = distance_along + RAY_EPSILON * (
-            1 + distance_along + origin[is_hit].norm(dim=1)
-        )
+        reach = reach + RAY_EPSILON * (1 + reach + origin[is_hit].norm(dim=1))
 
 
 def evaluate_illumination_boundary(
@@ -419,37 +421,29 @@ def evaluate_illumination_boundary(
     """
     legs, edges = samples.rays, samples.edges.select(samples.rays.edge_point)
     corners = vertices[candidate_surfaces.topology.faces[legs.faces]]
-    sides = corners[..., 1:, :] - corners[..., :1, :]
-    normal = normalize(cross(sides[..., 0, :], sides[..., 1, :]), dim=-1)
-    point = corners[..., 0, :]
+    normal, point = triangle_normals(corners), corners[..., 0, :]
     image = image_positions(tx[legs.source], point, normal, legs.through)[-1]
     # Only surfaces after the edge reflect the edge point.
-    is_unreflected = legs.through | (
-        torch.arange(legs.faces.shape[1]) < legs.steps_before_edge[:, None]
-    )
+    direct = legs.through | (torch.arange(legs.faces.shape[1]) < legs.steps_before_edge[:, None])
     y0, y1 = vertices[edges.first], vertices[edges.second]
-    y = image_positions(torch.lerp(y0, y1, edges.fraction[:, None]), point, normal, is_unreflected)[
-        -1
-    ]
+    y = image_positions(torch.lerp(y0, y1, edges.fraction[:, None]), point, normal, direct)[-1]
     receiving = receiving_corners[samples.face]
-    p0, p1, p2 = receiving.unbind(1)
-    up = normalize(cross(p1 - p0, p2 - p0), dim=1)
+    p0, up = receiving[:, 0], triangle_normals(receiving)
     ray = y - image
     scale = dot(p0 - image, up) / dot(ray, up)
-    boundary = image + scale[:, None] * ray
+    curve = image + scale[:, None] * ray
     material = interpolate_vectors(
-        receiving, strip_derivatives(receiving), strip_derivatives(boundary)
+        receiving, strip_derivatives(receiving), strip_derivatives(curve)
     )
 
     up = strip_derivatives(up)
     fixed = strip_derivatives(ray), strip_derivatives(scale), strip_derivatives(normal)
-    edge, side_shift = (
-        _project_shift(v, fixed, is_unreflected, up)
-        for v in (strip_derivatives(y1 - y0), legs.side)
+    edge, shift = (
+        _project_shift(v, fixed, direct, up) for v in (strip_derivatives(y1 - y0), legs.side)
     )
     outwards = cross(up, edge)
-    outwards = outwards * -dot(outwards, side_shift).sign()[:, None]
-    rate = dot(outwards, boundary - material) * edges.weight
+    outwards = outwards * -dot(outwards, shift).sign()[:, None]
+    rate = dot(outwards, curve - material) * edges.weight
     is_valid = dot(fixed[0], up).abs() > _MIN_COSINE * fixed[0].norm(dim=1)
     rows = torch.nonzero(is_valid)[:, 0]
     paths = SpecularPaths(
@@ -457,7 +451,7 @@ def evaluate_illumination_boundary(
     )
     return IlluminationBoundary(
         paths,
-        strip_derivatives(boundary)[rows],
+        strip_derivatives(curve)[rows],
         samples.face[rows],
         rate[rows],
         legs.edge_point[rows],

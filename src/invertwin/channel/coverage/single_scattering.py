@@ -22,7 +22,6 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch._C import _DisableFuncTorch
-from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
 from invertwin.channel.coherent.radar_equation import (
@@ -35,7 +34,7 @@ from invertwin.channel.coverage.shadow_boundaries import (
     evaluate_illumination_boundary,
     sample_illumination_boundaries,
 )
-from invertwin.channel.em.plane_waves import dot
+from invertwin.channel.em.plane_waves import dot, triangle_normals
 from invertwin.channel.paths import Link
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.intersections import find_intersection_curves
@@ -142,12 +141,10 @@ def trace_single_scattering(
                 len(path_scene.tx), len(path_scene.rx), value_count, dtype=torch.float64
             )
         total = tracer.sum_interior(path_scene, geometry)
-        vertices_move = is_differentiated(path_scene.vertices)
-        any_motion = (
-            vertices_move or is_differentiated(path_scene.tx) or is_differentiated(path_scene.rx)
-        )
-        if sampling.boundary and sampling.boundary_samples and any_motion:
-            if vertices_move and sampling.contacts:
+        deforms = is_differentiated(path_scene.vertices)
+        moves = deforms or is_differentiated(path_scene.tx) or is_differentiated(path_scene.rx)
+        if sampling.boundary and sampling.boundary_samples and moves:
+            if deforms and sampling.contacts:
                 _require_no_contact(geometry, path_scene, tracer.is_scattering)
             total = total + tracer.sum_boundary(path_scene, geometry)
     return total
@@ -183,21 +180,21 @@ class _SingleScatteringTracer:
 
     def _find_sequences(self, end: int, rays: int | None) -> tuple[Tensor, ...]:
         """Find candidate sequences from antennas of one end to rough points, by length from 1."""
-        planes, max_steps = self.candidate_surfaces.planes, self.depth - 1
-        if max_steps < 1 or not bool(self.powers.reflect.any()):
+        planes, most = self.candidate_surfaces.planes, self.depth - 1
+        if most < 1 or not bool(self.powers.reflect.any()):
             return ()
         if rays is None:
-            found = enumerate_sequences(planes, self.powers, max_steps).steps
+            found = enumerate_sequences(planes, self.powers, most).steps
             return tuple(steps for steps in found if len(steps))
         origins = self.antennas[end][torch.arange(rays) % len(self.antennas[end])]
-        prefix_index = torch.zeros(rays, dtype=torch.int64)
+        prefix = torch.zeros(rays, dtype=torch.int64)
         columns = shoot_sequences_from_edges(
             self.candidate_surfaces,
             planes,
             self.powers,
             origins,
-            prefix_index,
-            max_steps,
+            prefix,
+            most,
             self.seed + end,
         )
         return tuple(steps[:, 1:] for steps in columns if len(steps))
@@ -349,24 +346,22 @@ class _SingleScatteringTracer:
         kept = (has_reflection[0] | has_reflection[1]) & (steps[0] + steps[1] < self.depth)
         rows = torch.nonzero(kept & (side[0] == side[1]))[:, 0]
         outbound, inbound = outbound.select(first[rows]), inbound.select(second[rows])
-        point_number = outbound.rx
+        index = outbound.rx
         material = MaterialPoints(
-            point.position[point_number],
-            point.normal[point_number],
-            point.jacobian[point_number],
-            point.row[point_number],
+            point.position[index],
+            point.normal[index],
+            point.jacobian[index],
+            point.row[index],
         )
         k = 4 * math.pi * stage.frequency / SPEED_OF_LIGHT
-        scattering = (
+        law = (
             k**2
-            * area[point_number]
+            * area[index]
             * evaluate_scattering(geometry, material, outbound.arrival, inbound.arrival)
         )
-        depolarised = geometry.surfaces.depolarisation[material.row]
-        amount = scattering[:, None] * self.measure(
-            outbound, inbound, depolarised, stage.tx, stage.rx
-        )
-        return _LegPairs(outbound.tx, inbound.tx, point_number, amount)
+        chi = geometry.surfaces.depolarisation[material.row]
+        amount = law[:, None] * self.measure(outbound, inbound, chi, stage.tx, stage.rx)
+        return _LegPairs(outbound.tx, inbound.tx, index, amount)
 
     def _sum_pairs(self, pairs: "_LegPairs") -> Float64[Tensor, "tx rx amount"]:
         """Sum the values of the pairs of each link."""
@@ -402,8 +397,7 @@ def _material_points_at(
     geometry: Geometry, position: Float64[Tensor, "row 3"], face: Tensor
 ) -> MaterialPoints:
     """Material points on triangles for the scattering law; at rest."""
-    a, b, c = strip_derivatives(geometry.vertices)[geometry.faces[face]].unbind(1)
-    normal = normalize(torch.linalg.cross(b - a, c - a), dim=1)
+    normal = triangle_normals(strip_derivatives(geometry.vertices)[geometry.faces[face]])
     return MaterialPoints(
         position, normal, torch.ones_like(position[:, 0]), geometry.face_surface[face]
     )

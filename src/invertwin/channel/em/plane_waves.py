@@ -423,6 +423,16 @@ def area_vector(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tensor, "ro
     return torch.linalg.cross(spokes, spokes.roll(-1, 1), dim=-1).sum(1) / 2
 
 
+def triangle_normals(corners: Float64[Tensor, "*row 3 3"]) -> Float64[Tensor, "*row 3"]:
+    """Unit normals of triangles.
+
+    Args:
+        corners: corners of the triangles [m].
+    """
+    a, b, c = corners.unbind(-2)
+    return normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+
+
 def interpolate_vectors(
     values: Float64[Tensor, "*#row 3 3"],
     corners: Float64[Tensor, "*#row 3 3"],

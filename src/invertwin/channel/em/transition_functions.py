@@ -18,11 +18,13 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
+from invertwin.channel.em.plane_waves import phasor
+
 _WEIDEMAN_TERMS = 40  # of Weideman's sum: error 1e-14
 _QUADRATURE_POINTS = 24  # of either quadrature: error 1e-14
 _CHAIN_POINTS = 48  # of the quadrature over a third edge
 _NEAR_LIMIT = 16.0  # s² + t² above which the far quadrature is used
-_EXP_J_PI_4 = complex(math.sqrt(0.5), math.sqrt(0.5))  # exp(jπ/4)
+EXP_J_PI_4 = complex(math.sqrt(0.5), math.sqrt(0.5))  # exp(jπ/4)
 _SQRT_PI = math.sqrt(math.pi)
 _DECAY_LIMIT = 6.0  # upper limit of integrals: exp(−36) of the largest value
 _ROWS_AT_ONCE = 1 << 13  # chunks that fit into the processor's cache: ten times as fast
@@ -112,7 +114,7 @@ def edge_transition_slope(
         size = _half_erfc(t.abs())
         fraction = torch.where(t < 0, 1 - size, size)
         square = (s * s + t * t).clamp_min(1e-300)
-        slope = slope + 2j * fraction - _EXP_J_PI_4 / _SQRT_PI * _phasor(-t * t) / square * t
+        slope = slope + 2j * fraction - EXP_J_PI_4 / _SQRT_PI * phasor(-t * t) / square * t
     return slope
 
 
@@ -137,10 +139,10 @@ def corner_transition(
     w = sign * coupling
     root = torch.sqrt((1 - w) * (1 + w))
     parts = [
-        _phasor(own * own) * end_transition((other + w * own) / root, own)
+        phasor(own * own) * end_transition((other + w * own) / root, own)
         for own, other in ((s, t), (t, s))
     ]
-    return (2j * _SQRT_PI * _EXP_J_PI_4.conjugate() * sign / root) * (parts[0] + parts[1])
+    return (2j * _SQRT_PI * EXP_J_PI_4.conjugate() * sign / root) * (parts[0] + parts[1])
 
 
 def chain_transition(
@@ -174,7 +176,7 @@ def chain_transition(
         sides.append(torch.stack([up + down, up - down]) / 2)
     decay = remainder[:, None] * x**2 + math.sqrt(2) * middle[..., None] * x
     phase = -math.sqrt(2) * middle[..., None] * x
-    kernel = torch.polar(2 * step * (-decay).exp(), phase) * _EXP_J_PI_4
+    kernel = torch.polar(2 * step * (-decay).exp(), phase) * EXP_J_PI_4
     return torch.einsum("crx,parx,qbrx->pqcabr", kernel, sides[0], sides[1])
 
 
@@ -186,7 +188,7 @@ def _apply_in_chunks(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
 
 def _scaled_erfc(x: Tensor) -> Tensor:
     """Scaled erfc exp(jx²) erfc(exp(jπ/4) x) for x ≥ 0: w(exp(j3π/4) x) by Weideman's sum."""
-    rotated = x * complex(-_EXP_J_PI_4.imag, -_EXP_J_PI_4.real)  # j exp(j3π/4) x
+    rotated = x * complex(-EXP_J_PI_4.imag, -EXP_J_PI_4.real)  # j exp(j3π/4) x
     denominator = _SCALE - rotated
     ratio = (_SCALE + rotated) / denominator
     total = torch.zeros_like(ratio) + _COEFFICIENTS[0]
@@ -225,28 +227,23 @@ class _ShiftedTransition(torch.autograd.Function):
 
 def _evaluate_shifted(s: Tensor, shift: Tensor) -> Tensor:
     """Evaluate 1D arrays; beyond s = √2 shift through the function of −s."""
-    argument = s - _EXP_J_PI_4.conjugate() * shift
+    argument = s - EXP_J_PI_4.conjugate() * shift
     beyond = shift * math.sqrt(2) > s
     size = _scaled_erfc(torch.where(beyond, -argument, argument)) * torch.exp(-shift * shift)
     phase = s * s - math.sqrt(2) * shift * s
     direct = torch.exp(torch.complex(-math.sqrt(2) * shift * s * beyond, phase))
-    return _SQRT_PI * _EXP_J_PI_4 * torch.where(beyond, 2 * direct - size, size)
+    return _SQRT_PI * EXP_J_PI_4 * torch.where(beyond, 2 * direct - size, size)
 
 
 def _shifted_derivatives(s: Tensor, w: Tensor, x: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    argument = s - _EXP_J_PI_4.conjugate() * w * x
+    argument = s - EXP_J_PI_4.conjugate() * w * x
     by_s = 2j * argument * value - 2j * torch.exp(-((w * x) ** 2))
-    return by_s, -_EXP_J_PI_4.conjugate() * x * by_s - 2 * w * x * x * value
-
-
-def _phasor(phase: Tensor) -> Tensor:
-    """exp(j phase)."""
-    return torch.complex(phase.cos(), phase.sin())
+    return by_s, -EXP_J_PI_4.conjugate() * x * by_s - 2 * w * x * x * value
 
 
 def _half_erfc(x: Tensor) -> Tensor:
     """½ erfc(exp(jπ/4) x) for x ≥ 0: fraction of a direct wave beyond a half plane."""
-    return 0.5 * _phasor(-x * x) * _scaled_erfc(x)
+    return 0.5 * phasor(-x * x) * _scaled_erfc(x)
 
 
 class _TransitionFunction(torch.autograd.Function):
@@ -254,7 +251,7 @@ class _TransitionFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(s: Tensor) -> Tensor:  # type: ignore[override]
-        size = _SQRT_PI * _EXP_J_PI_4 * _apply_in_chunks(_scaled_erfc, s.abs())
+        size = _SQRT_PI * EXP_J_PI_4 * _apply_in_chunks(_scaled_erfc, s.abs())
         return torch.where(s < 0, -size, size)
 
     @staticmethod
@@ -307,7 +304,7 @@ def _truncated_derivatives(s: Tensor, t: Tensor, value: Tensor) -> tuple[Tensor,
     """Derivatives with respect to s and t of the part beyond t; finite at s = t = 0."""
     square = (s * s + t * t).clamp_min(1e-300)
     half = _apply_in_chunks(_half_erfc, t)
-    front = _EXP_J_PI_4 / _SQRT_PI * _phasor(-t * t) / square
+    front = EXP_J_PI_4 / _SQRT_PI * phasor(-t * t) / square
     return 2j * s * value - 2j * half + front * t, -front * s
 
 
@@ -321,7 +318,7 @@ def _evaluate_truncated(s: Tensor, t: Tensor) -> Tensor:
     ):
         at = torch.nonzero(rows)[:, 0]
         found[at] = rule(s[at], t[at])
-    return _EXP_J_PI_4 / _SQRT_PI * found
+    return EXP_J_PI_4 / _SQRT_PI * found
 
 
 def _near_quadrature(s: Tensor, t: Tensor) -> Tensor:
@@ -330,8 +327,8 @@ def _near_quadrature(s: Tensor, t: Tensor) -> Tensor:
     square = s * s + t * t
     for node, weight in _LEGENDRE_RULE:
         x = (node + 1) / 2
-        total = total + weight / 2 * _phasor(-x * x * square) * _scaled_erfc(x * t)
-    return _phasor(s * s) * (torch.atan2(s, t) - _SQRT_PI * _EXP_J_PI_4 * s * total)
+        total = total + weight / 2 * phasor(-x * x * square) * _scaled_erfc(x * t)
+    return phasor(s * s) * (torch.atan2(s, t) - _SQRT_PI * EXP_J_PI_4 * s * total)
 
 
 def _far_quadrature(s: Tensor, t: Tensor) -> Tensor:
@@ -345,6 +342,6 @@ def _far_quadrature(s: Tensor, t: Tensor) -> Tensor:
     for node, weight in _LAGUERRE_RULE:
         lower = torch.complex(square, torch.full_like(square, -node))
         total = total + weight / (torch.sqrt(lower) * (lower + low * low))
-    truncated = -0.5j * low * total * _phasor(-high * high)
-    product = 0.5 * math.pi * _scaled_erfc(s) * _scaled_erfc(t) * _phasor(-t * t)
-    return torch.where(s > t, product - truncated * _phasor(s * s - low * low), truncated)
+    truncated = -0.5j * low * total * phasor(-high * high)
+    product = 0.5 * math.pi * _scaled_erfc(s) * _scaled_erfc(t) * phasor(-t * t)
+    return torch.where(s > t, product - truncated * phasor(s * s - low * low), truncated)

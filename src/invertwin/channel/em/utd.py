@@ -27,6 +27,7 @@ from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import cross, dot, plane_of_incidence, reflect_vectors
 from invertwin.channel.em.transition_functions import (
+    EXP_J_PI_4,
     chain_transition,
     corner_transition,
     edge_transition,
@@ -36,7 +37,6 @@ from invertwin.channel.em.transition_functions import (
 from invertwin.channel.em.wedges import Wedges, edge_axis
 from invertwin.scene.material.fresnel import FieldCoefficients
 
-_EXP_MINUS_J_PI_4 = complex(math.sqrt(0.5), -math.sqrt(0.5))  # exp(−jπ/4)
 _SHEET_TOLERANCE = 1e-6  # of an opening: both faces belong to one sheet
 _MIN_COUPLING = 1e-9  # couplings below this are neglected
 _SERIES_ANGLE = 1e-4  # rad from a boundary, within which quotients are series
@@ -263,12 +263,12 @@ def _couple_cotangents(diffraction: EdgeDiffraction, wave_number: float) -> _Cou
         ratio = torch.where(is_near, opening, torch.sin(safe) / torch.sin(safe / opening))
         cosine = torch.cos(half / opening)
         s = root * torch.sin(half)
-        finite_scale = scale * (edge_transition(s, diffraction.end_parameters) / transition(s))
-        curve = finite_scale * ratio**3 * cosine / opening**2
+        factor = scale * (edge_transition(s, diffraction.end_parameters) / transition(s))
+        curve = factor * ratio**3 * cosine / opening**2
         columns.append(
             (
-                finite_scale * _cotangent_quotient(half, opening),
-                finite_scale * ratio**2 / opening,
+                factor * _cotangent_quotient(half, opening),
+                factor * ratio**2 / opening,
                 curve,
                 s,
             )
@@ -317,7 +317,7 @@ def _term_signs(diffraction: EdgeDiffraction) -> tuple[tuple[float, float], ...]
 
 
 def _dyad_scale(diffraction: EdgeDiffraction, wave_number: float) -> Tensor:
-    return -_EXP_MINUS_J_PI_4 / (
+    return -EXP_J_PI_4.conjugate() / (
         2 * diffraction.wedges.opening * math.sqrt(2 * math.pi * wave_number) * diffraction.sin_beta
     )
 
@@ -350,10 +350,8 @@ def _cotangent_quotient(half: Tensor, opening: Tensor) -> Tensor:
     """Return sin(δ/2)/tan(δ/2n)."""
     near = half.abs() < _SERIES_ANGLE
     safe = torch.where(near, torch.full_like(half, _SERIES_ANGLE), half)
-    curvature = opening * (1 / 6 + 1 / (3 * opening**2))
-    return torch.where(
-        near, opening - curvature * half**2, torch.sin(safe) / torch.tan(safe / opening)
-    )
+    bend = opening * (1 / 6 + 1 / (3 * opening**2))
+    return torch.where(near, opening - bend * half**2, torch.sin(safe) / torch.tan(safe / opening))
 
 
 def _cotangent(

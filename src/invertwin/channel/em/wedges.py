@@ -104,12 +104,10 @@ def find_wedges(
             )
             continue
         # Angle from the first face to the second about the edge, through the first one's normal.
-        angle_between = torch.atan2(
-            dot(normal[:, 0], tangent[:, 1]), dot(tangent[:, 0], tangent[:, 1])
-        )
-        angle_between = angle_between % (2 * math.pi)
+        angle_in = torch.atan2(dot(normal[:, 0], tangent[:, 1]), dot(tangent[:, 0], tangent[:, 1]))
+        angle_in = angle_in % (2 * math.pi)
         for sign in (1.0, -1.0):
-            angle = angle_between if sign > 0 else 2 * math.pi - angle_between
+            angle = angle_in if sign > 0 else 2 * math.pi - angle_in
             keep = angle.detach() > math.pi + _MIN_CREASE_ANGLE
             # Normals that point into this region: along the first turn, against the second.
             normals = torch.stack([sign * normal[:, 0], -sign * normal[:, 1]], 1)
@@ -209,10 +207,8 @@ def _group_collinear(wedges: Wedges) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     names = ("start", "end", "face_tangents", "normals")
     start, end, tangents, normals = (strip_derivatives(getattr(wedges, name)) for name in names)
     # Normalise the order of the faces: the first has the larger projection on a fixed direction.
-    projection = (tangents + normals * math.sqrt(3)) @ _GENERIC_DIRECTION
-    order = torch.where(
-        (projection[:, :1] < projection[:, 1:]), _SWAPPED_FACES, _SWAPPED_FACES.flip(0)
-    )
+    lean = (tangents + normals * math.sqrt(3)) @ _GENERIC_DIRECTION
+    order = torch.where((lean[:, :1] < lean[:, 1:]), _SWAPPED_FACES, _SWAPPED_FACES.flip(0))
     rows = torch.arange(len(order))[:, None]
     tangents, normals = tangents[rows, order], normals[rows, order]
     axis = cross(tangents[:, 0], normals[:, 0])

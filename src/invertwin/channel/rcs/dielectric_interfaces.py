@@ -77,18 +77,14 @@ def apply_fresnel(
     n, tangential_vector = normal[:, None], (wave_vector + p[:, None] * normal)[:, None]
     total, mixed = p + q, permittivity_in * q + permittivity_out * p
     tangential = field - dot(n, field)[..., None] * n
-    projection = dot(tangential_vector, tangential)[..., None]
+    share = dot(tangential_vector, tangential)[..., None]
     r = ((p - q) / total)[:, None, None]
     g = (2 * (permittivity_out - permittivity_in) / (mixed * total))[:, None, None]
-    reflected = r * tangential + g * projection * tangential_vector
+    reflected = r * tangential + g * share * tangential_vector
     # K·E = 0 for each wave determines the normal components.
-    normal_reflected = ((permittivity_in * q - permittivity_out * p) / (mixed * p))[
-        :, None, None
-    ] * projection
-    normal_transmitted = (2 * permittivity_in / mixed)[:, None, None] * projection
-    return InterfaceCoefficients(
-        reflected - normal_reflected * n, tangential + reflected + normal_transmitted * n
-    )
+    upright = ((permittivity_in * q - permittivity_out * p) / (mixed * p))[:, None, None] * share
+    through = (2 * permittivity_in / mixed)[:, None, None] * share
+    return InterfaceCoefficients(reflected - upright * n, tangential + reflected + through * n)
 
 
 def scatter_at_interfaces(
@@ -116,8 +112,8 @@ def scatter_at_interfaces(
     Source: derivations §13 and §14.
     """
     radiated, reflected, transmitted = (torch.zeros_like(field) for _ in range(3))
-    outer, conducting = patches.medium < 0, solids.conducting[patches.facet]
-    rows = torch.nonzero(outer)[:, 0]
+    outside, conducting = patches.medium < 0, solids.conducting[patches.facet]
+    rows = torch.nonzero(outside)[:, 0]
     front = (
         interfaces.rows(rows),
         wave_number,
@@ -127,36 +123,32 @@ def scatter_at_interfaces(
     )
     radiated = radiated.index_copy(0, rows, radiate_field(*front, scattering_direction[rows]))
     reflected = reflected.index_copy(0, rows, reflect_field(*front))
-    rows = torch.nonzero(~outer & conducting)[:, 0]
+    rows = torch.nonzero(~outside & conducting)[:, 0]
     n = patches.normal[rows, None]
     reflected = reflected.index_copy(0, rows, 2 * dot(n, field[rows])[..., None] * n - field[rows])
-    rows = torch.nonzero(outer & solids.transparent[patches.facet])[:, 0]
+    rows = torch.nonzero(outside & solids.transparent[patches.facet])[:, 0]
     transmitted = transmitted.index_copy(
         0, rows, _refract_at_faces(solids, interfaces, wave_number, patches, field, rows)[1]
     )
-    rows = torch.nonzero(~outer & ~conducting)[:, 0]
-    reflected_inside, transmitted_outside = _refract_at_faces(
-        solids, interfaces, wave_number, patches, field, rows
-    )
+    rows = torch.nonzero(~outside & ~conducting)[:, 0]
+    inner, onward = _refract_at_faces(solids, interfaces, wave_number, patches, field, rows)
     n, s, wave, roughness = (
         patches.normal[rows],
         scattering_direction[rows],
         patches.wave_vector[rows],
         interfaces.rows(rows),
     )
-    outer_radiation = radiate_currents(wave_number, -n, wave, field[rows], reflected_inside, s)
+    outer = radiate_currents(wave_number, -n, wave, field[rows], inner, s)
     p = -dot(wave, n).real
-    attenuations = [
-        roughness_attenuation(roughness, wave_number, cosine_sum)[:, None, None]
-        for cosine_sum in (p + dot(n, s), 2 * p)
+    losses = [
+        roughness_attenuation(roughness, wave_number, cosine)[:, None, None]
+        for cosine in (p + dot(n, s), 2 * p)
     ]
-    radiated = radiated.index_copy(
-        0, rows, project_transverse(outer_radiation, s) * attenuations[0]
-    )
+    radiated = radiated.index_copy(0, rows, project_transverse(outer, s) * losses[0])
     return InterfaceFields(
         radiated,
-        reflected.index_copy(0, rows, reflected_inside * attenuations[1]),
-        transmitted.index_copy(0, rows, transmitted_outside),
+        reflected.index_copy(0, rows, inner * losses[1]),
+        transmitted.index_copy(0, rows, onward),
     )
 
 

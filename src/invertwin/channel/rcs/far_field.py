@@ -32,6 +32,7 @@ from invertwin.channel.em.plane_waves import (
     SmoothInterfaces,
     dot,
     parallelogram_integral,
+    phasor,
     polarisations,
     radiate_field,
     reflect_field,
@@ -283,12 +284,12 @@ class _FarFieldTracer:
     def _trace_tube_orders(self, depth: int, tube_width: float) -> Iterator[_PatchOrders]:
         """Trace many facets by ray tubes that start as illuminated triangles."""
         target = self.target
-        for illuminated in find_illuminated_triangles(
+        for first in find_illuminated_triangles(
             target.facets, target.is_unoccluded, -self.transmitters, tube_width
         ):
             outside = [
-                illuminated,
-                *trace_tubes(target.facets, target.occluders, illuminated, tube_width, depth),
+                first,
+                *trace_tubes(target.facets, target.occluders, first, tube_width, depth),
             ]
             for solids, members in target.interiors:
                 patch_orders = outside
@@ -314,21 +315,19 @@ class _FarFieldTracer:
             elif solids is None:
                 field = reflected[patches.parent]
             else:
-                is_transmitted = patches.transmitted[:, None, None]
-                field = torch.where(
-                    is_transmitted, transmitted[patches.parent], reflected[patches.parent]
-                )
+                through = patches.transmitted[:, None, None]
+                field = torch.where(through, transmitted[patches.parent], reflected[patches.parent])
                 field = field * patches.spreading[:, None, None]
-            receiver, patch_interfaces = (
+            receiver, surface_rows = (
                 self.receivers[patches.aspect],
                 interfaces.rows(patches.facet),
             )
             if solids is None:
-                surface = (patch_interfaces, k, patches.normal, patches.direction, field)
+                surface = (surface_rows, k, patches.normal, patches.direction, field)
                 radiated, reflected = radiate_field(*surface, receiver), reflect_field(*surface)
             else:
                 radiated, reflected, transmitted = scatter_at_interfaces(
-                    solids, patch_interfaces, k, patches, field, receiver
+                    solids, surface_rows, k, patches, field, receiver
                 )
             received = polarisations(self.receivers, self.target.up)[patches.aspect]
             found.append(dot(received[:, :, None], radiated[:, None]))
@@ -394,7 +393,7 @@ class _FarFieldTracer:
                 wave = k * (s - d)
                 width = parallelogram_integral(wave, side, torch.zeros_like(side))
                 phase = dot(wave, centre)
-                scale = torch.polar(torch.ones_like(phase), phase) * width * side.norm(dim=1)
+                scale = phasor(phase) * width * side.norm(dim=1)
                 total[f] = self._add_received(total[f], aspect, radiated * scale[:, None, None])
         if left_out:
             warnings.warn(
@@ -469,15 +468,11 @@ def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTar
     topology = topology_of([item.mesh for item in objects.values()])
     facets = build_facets(vertices, topology)
     occluders = Occluders(vertices, topology, vertices.detach().mean(0))
-    interfaces = [
-        _smooth_interfaces(scene, topology, frequency) for frequency in frequencies.tolist()
-    ]
+    tables = [_smooth_interfaces(scene, topology, frequency) for frequency in frequencies.tolist()]
     wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in frequencies.tolist()]
     owner, names = topology.face_object, list(objects)
-    interiors = group_solids(interfaces, wave_numbers, facets.corners, facets.solid, owner, names)
-    return _FarFieldTarget(
-        facets, topology, vertices, occluders, interfaces, wave_numbers, up, interiors
-    )
+    solids = group_solids(tables, wave_numbers, facets.corners, facets.solid, owner, names)
+    return _FarFieldTarget(facets, topology, vertices, occluders, tables, wave_numbers, up, solids)
 
 
 def _smooth_interfaces(scene: Scene, topology: Topology, frequency: float) -> SmoothInterfaces:
@@ -532,14 +527,10 @@ def _warn_validity(
                 f"{name} is {size / target.wavelength:.2g} wavelengths large: physical optics is "
                 "for objects of several"
             )
-        own_edges = smooth & own[neighbours[:, 0]]
+        mine = smooth & own[neighbours[:, 0]]
         # Wavelengths inside are shorter.
         index = target.max_refractive_index(number)
-        sagitta = (
-            float(sagittas[own_edges].median()) / target.wavelength
-            if bool(own_edges.any())
-            else 0.0
-        )
+        sagitta = float(sagittas[mine].median()) / target.wavelength if bool(mine.any()) else 0.0
         if sagitta * index > _MAX_SAGITTA:
             found.append(
                 f"the facets of {name} are {sagitta * shorter:.2g} wavelengths off the curved "

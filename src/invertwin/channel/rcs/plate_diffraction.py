@@ -71,22 +71,22 @@ def find_plates(wedges: Wedges) -> list[Wedges]:
     Args:
         wedges: sharp edges; those of solid bodies and creases are left out.
     """
-    remaining = torch.nonzero(wedges.opening > 2 - _TOLERANCE)[:, 0].tolist()
+    left = torch.nonzero(wedges.opening > 2 - _TOLERANCE)[:, 0].tolist()
     found: list[Wedges] = []
-    while remaining:
-        plate, others, has_grown = [remaining[0]], remaining[1:], True
-        while has_grown:
-            neighbours = [
+    while left:
+        plate, others, grown = [left[0]], left[1:], True
+        while grown:
+            near = [
                 e
                 for e in others
                 if any(_are_coplanar_neighbours(wedges, e, other) for other in plate)
             ]
-            plate, others, has_grown = (
-                plate + neighbours,
-                [e for e in others if e not in neighbours],
-                bool(neighbours),
+            plate, others, grown = (
+                plate + near,
+                [e for e in others if e not in near],
+                bool(near),
             )
-        remaining = others
+        left = others
         edges = wedges.rows(torch.tensor(plate))
         if _is_convex(edges):
             found.append(_merge_collinear_edges(edges))
@@ -115,18 +115,16 @@ def _is_convex(edges: Wedges) -> bool:
 
 def _merge_collinear_edges(edges: Wedges) -> Wedges:
     """Merge collinear edges of a convex plate."""
-    inward, remaining, sides = edges.face_tangents[:, 0], list(range(len(edges.start))), []
-    while remaining:
-        line = [
-            e for e in remaining if bool((inward[e] - inward[remaining[0]]).norm() < _TOLERANCE)
-        ]
-        remaining = [e for e in remaining if e not in line]
+    inward, left, sides = edges.face_tangents[:, 0], list(range(len(edges.start))), []
+    while left:
+        line = [e for e in left if bool((inward[e] - inward[left[0]]).norm() < _TOLERANCE)]
+        left = [e for e in left if e not in line]
         points = torch.cat([edges.start[line], edges.end[line]])
-        projection = points @ (edges.end[line[0]] - edges.start[line[0]])
+        along = points @ (edges.end[line[0]] - edges.start[line[0]])
         first = edges.rows(torch.tensor(line[:1]))
         ends = {
-            "start": points[projection.argmin()][None],
-            "end": points[projection.argmax()][None],
+            "start": points[along.argmin()][None],
+            "end": points[along.argmax()][None],
         }
         sides.append(vars(first) | ends)
     return Wedges(**{name: torch.cat([side[name] for side in sides]) for name in sides[0]})
@@ -252,15 +250,13 @@ def _trace_back(
     wedges: Wedges, sequence: list[int], directions: list[Tensor], point: Tensor
 ) -> _PlateRays:
     fractions, lengths = [], []
-    point_on_edge = point.expand_as(directions[0])
+    at = point.expand_as(directions[0])
     for edge, direction in zip(sequence[-2::-1], directions[::-1], strict=True):
-        origin, inward = wedges.start[edge], wedges.face_tangents[edge, 0].expand_as(point_on_edge)
+        origin, inward = wedges.start[edge], wedges.face_tangents[edge, 0].expand_as(at)
         sideways = wedges.end[edge] - origin
-        length = dot(point_on_edge - origin, inward) / dot(direction, inward)
-        point_on_edge = point_on_edge - length[:, None] * direction
-        fractions.append(
-            dot(point_on_edge - origin, sideways.expand_as(point_on_edge)) / dot(sideways, sideways)
-        )
+        length = dot(at - origin, inward) / dot(direction, inward)
+        at = at - length[:, None] * direction
+        fractions.append(dot(at - origin, sideways.expand_as(at)) / dot(sideways, sideways))
         lengths.append(length)
     between = torch.stack(lengths, 1)
-    return _PlateRays(point_on_edge, between.sum(1), torch.stack(fractions, 1), between)
+    return _PlateRays(at, between.sum(1), torch.stack(fractions, 1), between)

@@ -161,10 +161,10 @@ def trace_inner_tubes(
     found: list[IlluminatedPatches] = []
     tubes: _RayTubes | None = None
     for order in range(depth):
-        parts, tube_parts = [], []
+        parts, begun = [], []
         if order < len(outer_orders):
             parts.append(_to_complex(outer_orders[order]))
-            tube_parts.append(_launch_inner_tubes(surface, solids, outer_orders[order]))
+            begun.append(_launch_inner_tubes(surface, solids, outer_orders[order]))
         if tubes is not None:
             inner, tubes = _trace_tubes(
                 surface, occluders, solids, found[-1], tubes, min_tube_width
@@ -172,12 +172,10 @@ def trace_inner_tubes(
             if parts:
                 tubes = replace(tubes, patch=tubes.patch + len(parts[0].aspect))
             parts.append(inner)
-            tube_parts.append(tubes)
+            begun.append(tubes)
         found.append(concatenate_patches(parts))
         names = [entry.name for entry in fields(_RayTubes)]
-        tubes = _RayTubes(
-            **{n: torch.cat([getattr(some, n) for some in tube_parts]) for n in names}
-        )
+        tubes = _RayTubes(**{n: torch.cat([getattr(some, n) for some in begun]) for n in names})
         if not len(found[-1].aspect):
             return found[:-1]
     return found
@@ -219,20 +217,20 @@ def _continue_tubes(
 ) -> _DepartingTubes:
     """Continue tubes by reflection, followed by transmission."""
     facet, medium = previous.facet[tubes.patch], previous.medium[tubes.patch]
-    reflected = torch.nonzero(~tubes.from_outside)[:, 0]
+    again = torch.nonzero(~tubes.from_outside)[:, 0]
     behind = solids.medium_behind(facet, medium)
-    index_in, index_out = (refractive_index(solids.permittivity_in(m)) for m in (medium, behind))
+    inside, outside = (refractive_index(solids.permittivity_in(m)) for m in (medium, behind))
     cosine = -dot(tubes.normals, tubes.directions)
-    ratio = (index_in / index_out)[:, None]
+    ratio = (inside / outside)[:, None]
     square = 1 - ratio**2 * (1 - cosine**2)
-    normal_part = ratio * cosine - square.clamp_min(0).sqrt()
-    directions = ratio[..., None] * tubes.directions + normal_part[..., None] * tubes.normals
+    factor = ratio * cosine - square.clamp_min(0).sqrt()
+    directions = ratio[..., None] * tubes.directions + factor[..., None] * tubes.normals
     propagates = (square > 0).all(1) & (cosine > _MIN_COSINE).all(1) & solids.transparent[facet]
     propagates = torch.nonzero(propagates)[:, 0]
-    row = torch.cat([reflected, propagates])
-    transmitted = torch.arange(len(row)) >= len(reflected)
-    reflected_directions = reflect_vectors(tubes.directions, tubes.normals)[reflected]
-    directions = normalize(torch.cat([reflected_directions, directions[propagates]]), dim=2)
+    row = torch.cat([again, propagates])
+    transmitted = torch.arange(len(row)) >= len(again)
+    mirror = reflect_vectors(tubes.directions, tubes.normals)[again]
+    directions = normalize(torch.cat([mirror, directions[propagates]]), dim=2)
     normal = previous.normal[tubes.patch[row]]
     source_normal = torch.where(transmitted[:, None], -normal, normal)
     medium = torch.where(transmitted, behind[row], medium[row])
@@ -396,13 +394,11 @@ def _fit_wave_vector(wave_vector: Tensor, corners: Tensor, phases: Tensor) -> Te
     """Correct K in the plane of three corners to match the phase differences there."""
     first, second = ((corners[:, n] - corners[:, 0]) for n in (1, 2))
     normal = cross(first, second)
-    first_residual, second_residual = (
+    short, long = (
         (phases[:, n] - phases[:, 0] - dot(wave_vector, side))
         for n, side in ((1, first), (2, second))
     )
-    slope = first_residual[:, None] * cross(second, normal) + second_residual[:, None] * cross(
-        normal, first
-    )
+    slope = short[:, None] * cross(second, normal) + long[:, None] * cross(normal, first)
     return wave_vector + slope / dot(normal, normal)[:, None]
 
 
@@ -447,17 +443,15 @@ def require_separate_conductors(facets: Facets, solids: DielectricSolids) -> Non
         InputError: a conductor in the plane of a face.
     """
     corners, normal = facets.corners.detach(), facets.normal.detach()
-    own, conducting = (
-        torch.nonzero(some)[:, 0] for some in (solids.transparent, solids.conducting)
-    )
+    own, metal = (torch.nonzero(some)[:, 0] for some in (solids.transparent, solids.conducting))
     planes = torch.cat([normal, dot(normal, corners[:, 0])[:, None] / facets.size], 1)
-    if not len(conducting):
+    if not len(metal):
         return
-    tree = KDTree(torch.cat([planes[conducting], -planes[conducting]]))
+    tree = KDTree(torch.cat([planes[metal], -planes[metal]]))
     candidates = tree.query_ball_point(planes[own], _CONTACT_TOLERANCE)
     low, high = corners.amin(1), corners.amax(1)
     for facet, others in zip(own.tolist(), candidates, strict=True):
-        other = conducting[torch.tensor(others, dtype=torch.int64) % len(conducting)]
+        other = metal[torch.tensor(others, dtype=torch.int64) % len(metal)]
         gap = torch.maximum(low[other] - high[facet], low[facet] - high[other])
         # Coplanar neighbours with a common side do not overlap.
         overlaps = (gap < _CONTACT_TOLERANCE * facets.size).all(1) & (

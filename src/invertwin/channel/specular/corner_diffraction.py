@@ -85,46 +85,40 @@ def diffract_round_corner(
     """
     before, last = edges[:-1], edges[-1]
     route, row = find_route(before, tx, rx), torch.arange(len(end))
-    wedges, diffractions = before[-1].wedges, route.edge_diffractions(wave_number)
-    end_distance, root = (
-        each[row, end] for each in route.end_distances(len(before) - 1, wave_number)
-    )
+    wedges, first = before[-1].wedges, route.edge_diffractions(wave_number)
+    gap, root = (each[row, end] for each in route.end_distances(len(before) - 1, wave_number))
     corner = torch.where(end[:, None] > 0, wedges.end, wedges.start)
     leaving = rx - corner
-    direction = normalize(leaving, dim=1)
-    reach = end_distance.clamp_min(0.0) + 1 / (
-        root * (1 + 2 * end_distance.abs() * root)
-    ).clamp_min(1e-300)
+    leg = normalize(leaving, dim=1)
+    reach = gap.clamp_min(0.0) + 1 / (root * (1 + 2 * gap.abs() * root)).clamp_min(1e-300)
     length = 1 / (1 / reach + 1 / leaving.norm(dim=1))
-    sine = cross(edge_axis(last.wedges), direction).norm(dim=1)
+    sine = cross(edge_axis(last.wedges), leg).norm(dim=1)
     if last.azimuth_in is None:
         raise ValueError("no face lies between both edges")
-    azimuth = exterior_azimuth(last.wedges, direction, 0)
-    last_diffraction = EdgeDiffraction(
+    azimuth = exterior_azimuth(last.wedges, leg, 0)
+    final = EdgeDiffraction(
         last.wedges,
-        direction,
-        direction,
+        leg,
+        leg,
         last.azimuth_in,
         azimuth,
         length * sine**2,
         last.face_coefficients,
     )
     orders: tuple[DyadDerivative, ...] = ("value", "out") if len(before) == 1 else ("value",)
-    fields = transfer_dyads(route, diffractions, wave_number, orders)
-    dyads = diffraction_dyads(last_diffraction, wave_number, ("value", "in"))
+    fields = transfer_dyads(route, first, wave_number, orders)
+    dyads = diffraction_dyads(final, wave_number, ("value", "in"))
     transfer = dyads[0] @ fields[0]
     if len(fields) > 1:
         # Away from the face, azimuths grow from face 0 and fall from the other.
         sign = torch.where(faces[:, 0] == faces[:, 1], 1.0, -1.0)
-        scale = sign / (1j * wave_number * sine * diffractions[0].sin_beta * reach)
+        scale = sign / (1j * wave_number * sine * first[0].sin_beta * reach)
         transfer = transfer + scale[:, None, None] * (dyads[1] @ fields[1])
     normal = wedges.normals[row, faces[:, 0]]
     arriving = normalize(route.vertices[:, -3] - corner, dim=1)
-    high, low = (dot(normal, u) ** 2 + _MIN_SQUARED_SINE for u in (arriving, direction))
-    weight = (
-        _deficit_weight(route, end, last.wedges, end_distance, wave_number) * high / (high + low)
-    )
-    weight = 0.5 * weight * face_weight(wedges, last.wedges, faces, direction) / length.sqrt()
+    high, low = (dot(normal, u) ** 2 + _MIN_SQUARED_SINE for u in (arriving, leg))
+    weight = _deficit_weight(route, end, last.wedges, gap, wave_number) * high / (high + low)
+    weight = 0.5 * weight * face_weight(wedges, last.wedges, faces, leg) / length.sqrt()
     points = torch.cat([route.points, corner[:, None]], 1)
     transfer = transfer * weight[:, None, None]
     return EdgePaths(points, route.legs.sum(1), transfer, route.stationary)

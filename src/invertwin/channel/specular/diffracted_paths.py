@@ -14,7 +14,7 @@ from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.em.plane_waves import cross, dot, plane_of_incidence, reflect_vectors
+from invertwin.channel.em.plane_waves import dot, phasor, plane_of_incidence, reflect_vectors
 from invertwin.channel.em.wedges import edge_axis
 from invertwin.channel.specular.corner_diffraction import diffract_round_corner
 from invertwin.channel.specular.diffraction_candidates import (
@@ -24,7 +24,7 @@ from invertwin.channel.specular.diffraction_candidates import (
     face_azimuths,
 )
 from invertwin.channel.specular.edge_path_geometry import EdgePaths, PathEdge, diffract_over_edges
-from invertwin.channel.specular.image_method import image_positions, interaction_points
+from invertwin.channel.specular.image_method import UnfoldedPaths
 from invertwin.channel.specular.ray_paths import DIFFRACTION
 from invertwin.channel.specular.wedge_scene import WedgeScene, clamp_to_edge
 
@@ -99,7 +99,7 @@ def evaluate_diffracted_paths(
     length = segments.norm(dim=2).sum(1)
     # The field of the end of an edge has the delay of the path over that end.
     phase = wave_number * (length - edge_fields.length)
-    delay_phasor = torch.polar(torch.ones_like(phase), phase)[:, None, None]
+    delay_phasor = phasor(phase)[:, None, None]
     arriving = legs[0].dyad(edge_fields.points[:, 0])
     # Reciprocity: the dyad after the edges is the transpose of that towards them.
     leaving = legs[1].dyad(edge_fields.points[:, -1]).mT
@@ -153,52 +153,29 @@ def _reverse_legs(legs: PathLegs) -> PathLegs:
     return PathLegs(legs.faces.flip(1), legs.transmitted.flip(1))
 
 
-class _AntennaLeg:
-    """Unfolded leg: surfaces between an antenna and an edge, in this order, differentiable."""
+class _AntennaLeg(UnfoldedPaths):
+    """Unfolded legs between an antenna and an edge."""
 
     def __init__(self, wedge_scene: WedgeScene, legs: PathLegs, position: Tensor) -> None:
-        corners = wedge_scene.vertices[wedge_scene.topology.faces[legs.faces]]
-        self.wedge_scene = wedge_scene
-        self.legs = legs
-        self.normal = normalize(
-            cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]),
-            dim=-1,
+        super().__init__(
+            wedge_scene.vertices, wedge_scene.topology, legs.faces, legs.transmitted, position
         )
-        self.point = corners[..., 0, :]
-        self.images = image_positions(position, self.point, self.normal, legs.transmitted)
-
-    @property
-    def image(self) -> Float64[Tensor, "row 3"]:
-        """Image of the antenna in all surfaces [m]."""
-        return self.images[-1]
-
-    def interaction_points(self, point: Tensor) -> Float64[Tensor, "row step 3"]:
-        """Interaction points of the path to a point [m]."""
-        found = interaction_points(point, self.images, self.point, self.normal)
-        return torch.stack(found, 1) if found else self.point
-
-    def directions(self, point: Tensor) -> list[Tensor]:
-        """Unit vectors of the path to a point, from the antenna on."""
-        found = [normalize(point - self.image, dim=1)]
-        for step in reversed(range(self.normal.shape[1])):
-            reflected = reflect_vectors(found[0], self.normal[:, step])
-            found.insert(0, torch.where(self.legs.transmitted[:, step, None], found[0], reflected))
-        return found
+        self.coefficients = wedge_scene.coefficients
 
     def rotate_axis(self, axis: Tensor) -> Tensor:
         """Transform an axis of rotation at the edge to the antenna."""
         for step in reversed(range(self.normal.shape[1])):
             back = -reflect_vectors(axis, self.normal[:, step])
-            axis = torch.where(self.legs.transmitted[:, step, None], axis, back)
+            axis = torch.where(self.transmitted[:, step, None], axis, back)
         return axis
 
     def dyad(self, point: Tensor) -> Complex128[Tensor, "row 3 3"]:
         """Dyads from E at the antenna to E at a point, without spreading."""
         ways = self.directions(point)
         total = torch.eye(3, dtype=torch.complex128).expand(len(point), 3, 3)
-        for step, through in enumerate(self.legs.transmitted.unbind(1)):
+        for step, through in enumerate(self.transmitted.unbind(1)):
             normal, way = self.normal[:, step], ways[step]
-            law = self.wedge_scene.coefficients(self.legs.faces[:, step], dot(normal, way).abs())
+            law = self.coefficients(self.faces[:, step], dot(normal, way).abs())
             s, before, after = (v[:, 0] for v in plane_of_incidence(normal, way))
             passing = through[:, None]
             both = torch.where(passing, before, after)

@@ -294,7 +294,7 @@ def _diffract_once(
             wedge_scene.detached_wedges.rows(outbound.edge), outbound.image, inbound.image
         )
         valid &= wedge_scene.is_diffracting(outbound.edge, points)
-        offset_points = wedge_scene.offset_points(outbound.edge, points)
+        beside = wedge_scene.offset_points(outbound.edge, points)
         for side in (outbound, inbound):
             steps = side.steps.flip(1)
             rows = torch.nonzero(valid)[:, 0]
@@ -303,7 +303,7 @@ def _diffract_once(
                 wedge_scene.surfaces,
                 steps[rows],
                 images,
-                offset_points[rows] - wedge_scene.surfaces.origin,
+                beside[rows] - wedge_scene.surfaces.origin,
             )
         faces = [torch.full_like(side.steps, -1) for side in (outbound, inbound)]
         for side, side_faces in zip((outbound, inbound), faces, strict=True):
@@ -312,7 +312,7 @@ def _diffract_once(
                 wedge_scene.surfaces,
                 side.steps[rows].flip(1),
                 side.antenna_positions[rows],
-                offset_points[rows],
+                beside[rows],
             )
         if bool(valid.any()):
             found = DiffractionCandidates(
@@ -448,15 +448,13 @@ def _find_corner_paths(
         edge, neighbour = candidates.edge[:, own], candidates.edge[:, other]
         distance = (ends[edge][:, :, None] - ends[neighbour][:, None]).norm(dim=3)
         smallest, end = distance.amin(1).min(1)
-        corner_point = ends[neighbour, end]
+        at = ends[neighbour, end]
         faces = candidates.between[:, own]
         faces = faces.flip(1) if corner == "first" else faces
         valid = (smallest < _PLANE_TOLERANCE * wedge_scene.surfaces.size) & (faces[:, 0] >= 0)
         rows = torch.nonzero(valid)[:, 0]
-        sending, next_edge = (wedges.rows(column[rows]) for column in (neighbour, edge))
-        rows = rows[
-            face_weight(sending, next_edge, faces[rows], (antenna - corner_point)[rows]) > 0
-        ]
+        first, last = (wedges.rows(column[rows]) for column in (neighbour, edge))
+        rows = rows[face_weight(first, last, faces[rows], (antenna - at)[rows]) > 0]
         if not len(rows):
             continue
         part = replace(candidates.rows(rows), corner=corner, end=end[rows])
@@ -469,11 +467,7 @@ def _find_corner_paths(
             points = points[:, None]
         else:
             points, valid = multiple_diffraction_points(between, source, target)
-        both = (
-            [points, corner_point[rows, None]]
-            if corner == "last"
-            else [corner_point[rows, None], points]
-        )
+        both = [points, at[rows, None]] if corner == "last" else [at[rows, None], points]
         yield from _select_unobstructed(wedge_scene, part, tx, rx, torch.cat(both, 1), valid)
 
 

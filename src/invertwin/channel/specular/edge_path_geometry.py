@@ -205,34 +205,24 @@ class Route:
         """Covariances Σ of the edges' apertures, towards growing azimuths of departure [m]."""
         legs = self.legs
         total, reached = legs.sum(1), legs.cumsum(1)
-        directions = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(
-            1e-300
-        )
+        units = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(1e-300)
         count = len(self.edges)
         found = [[total] * count for _ in range(count)]
         axes = [edge_axis(edge.wedges) for edge in self.edges]
         # Orthogonal to every edge and to the path, before and after the edge.
-        incident, departing = (
-            [_normalise(cross(axis, directions[:, n + after])) for n, axis in enumerate(axes)]
+        into, out = (
+            [_normalise(cross(axis, units[:, n + after])) for n, axis in enumerate(axes)]
             for after in (0, 1)
         )
         for a in range(count):
-            lateral = departing[a]
+            lateral = out[a]
             for b in range(a, count):
-                correlation = torch.ones_like(total) if a == b else dot(lateral, incident[b])
-                found[a][b] = found[b][a] = (
-                    correlation * reached[:, a] * (1 - reached[:, b] / total)
-                )
+                cosine = torch.ones_like(total) if a == b else dot(lateral, into[b])
+                found[a][b] = found[b][a] = cosine * reached[:, a] * (1 - reached[:, b] / total)
                 if a < b:
                     # Diffraction rotates the path about this edge.
-                    transported = [
-                        cross(directions[:, b + n], each[b])
-                        for n, each in enumerate((incident, departing))
-                    ]
-                    lateral = (
-                        dot(lateral, transported[0])[:, None] * transported[1]
-                        + correlation[:, None] * departing[b]
-                    )
+                    sides = [cross(units[:, b + n], each[b]) for n, each in enumerate((into, out))]
+                    lateral = dot(lateral, sides[0])[:, None] * sides[1] + cosine[:, None] * out[b]
         return torch.stack([torch.stack(row, 1) for row in found], 1)
 
     def edge_diffractions(self, wave_number: float) -> list[EdgeDiffraction]:
@@ -242,12 +232,10 @@ class Route:
             wave_number: wave number k [1/m].
         """
         found, legs = [], self.legs
-        directions = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(
-            1e-300
-        )
+        units = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(1e-300)
         parameters = self._distance_parameters()
         for number, edge in enumerate(self.edges):
-            incident, diffracted = directions[:, number], directions[:, number + 1]
+            incident, diffracted = units[:, number], units[:, number + 1]
             diffraction = EdgeDiffraction(
                 edge.wedges,
                 incident,
@@ -343,16 +331,16 @@ def _shortest_length(wedges: Sequence[Wedges], first: Tensor, last: Tensor) -> T
     # smooth.
     offset, cosine = starts[:, 1] - starts[:, 0], dot(axes[0], axes[1])
     square = (1 - cosine**2).clamp_min(_MIN_LENGTH_FRACTION)
-    closest = (
+    near = (
         starts[:, 0]
         + (dot(offset, axes[0] - cosine[:, None] * axes[1]) / square)[:, None] * axes[0]
     )
     crossing = (
-        cross(closest - starts[:, 1], axes[1]).detach().norm(dim=1)
+        cross(near - starts[:, 1], axes[1]).detach().norm(dim=1)
         < _MIN_LENGTH_FRACTION * found.detach()
     )
-    length_over = (closest - first).norm(dim=1) + (last - closest).norm(dim=1)
-    found = torch.where(crossing & (length_over.detach() < found.detach()), length_over, found)
+    over = (near - first).norm(dim=1) + (last - near).norm(dim=1)
+    found = torch.where(crossing & (over.detach() < found.detach()), over, found)
     # A point on the adjacent line has no distance to it.
     for side, point in ((0, first), (1, last)):
         distance = cross(point - wedges[side].start, axes[side]).detach().norm(dim=1)

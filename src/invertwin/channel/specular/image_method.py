@@ -20,7 +20,13 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.em.plane_waves import cross, dot, orthogonal_unit_vectors, reflect_vectors
+from invertwin.channel.em.plane_waves import (
+    cross,
+    dot,
+    orthogonal_unit_vectors,
+    reflect_vectors,
+    triangle_normals,
+)
 from invertwin.channel.rays.arrays import opaque, to_double, to_float, to_index, to_torch
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
@@ -101,6 +107,10 @@ class SpecularPaths:
     faces: Int64[Tensor, "path step"]
     transmitted: Bool[Tensor, "path step"]
 
+    def rows(self, index: Tensor) -> "SpecularPaths":
+        """Select rows."""
+        return SpecularPaths(*(column[index] for column in vars(self).values()))
+
     def reverse(self) -> "SpecularPaths":
         """Return the paths from target to source."""
         return SpecularPaths(self.target, self.source, self.faces.flip(1), self.transmitted.flip(1))
@@ -151,6 +161,57 @@ def interaction_points(
         position = position + fraction[:, None] * direction
         found.insert(0, position)
     return found
+
+
+class UnfoldedPaths:
+    """Paths from sources over given triangles, unfolded by images; differentiable.
+
+    Args:
+        vertices: vertex positions [m].
+        topology: triangles of the vertices.
+        faces: triangles of the interactions, from the source on.
+        transmitted: True for transmission, False for reflection.
+        source: positions of the sources [m].
+    """
+
+    def __init__(
+        self,
+        vertices: Float64[Tensor, "v 3"],
+        topology: Topology,
+        faces: Int64[Tensor, "row step"],
+        transmitted: Bool[Tensor, "row step"],
+        source: Float64[Tensor, "row 3"],
+    ) -> None:
+        corners = vertices[topology.faces[faces]]
+        self.faces, self.transmitted = faces, transmitted
+        self.normal, self.point = triangle_normals(corners), corners[..., 0, :]
+        self.images = image_positions(source, self.point, self.normal, transmitted)
+
+    @property
+    def image(self) -> Float64[Tensor, "row 3"]:
+        """Image of the source in all surfaces [m]."""
+        return self.images[-1]
+
+    def interaction_points(self, target: Float64[Tensor, "row 3"]) -> Tensor:
+        """Interaction points of the paths to targets, [row, step, 3] [m].
+
+        Args:
+            target: positions of the targets [m].
+        """
+        found = interaction_points(target, self.images, self.point, self.normal)
+        return torch.stack(found, 1) if found else self.point
+
+    def directions(self, target: Float64[Tensor, "row 3"]) -> list[Float64[Tensor, "row 3"]]:
+        """Unit vectors of the legs to targets, from the source on.
+
+        Args:
+            target: positions of the targets [m].
+        """
+        found = [normalize(target - self.image, dim=1)]
+        for step in reversed(range(self.normal.shape[1])):
+            reflected = reflect_vectors(found[0], self.normal[:, step])
+            found.insert(0, torch.where(self.transmitted[:, step, None], found[0], reflected))
+        return found
 
 
 def find_paths_between(
@@ -352,21 +413,21 @@ def intersects_planes(
     valid = torch.ones(len(target), dtype=torch.bool)
     for step in reversed(range(steps.shape[1])):
         plane, transmitted = steps[:, step] >> 1, (steps[:, step] & 1).bool()
-        point, normal, direction = (
+        point, normal, ray = (
             planes.point[plane],
             planes.normal[plane],
             images[step + 1] - position,
         )
-        slope = dot(direction, normal)
+        slope = dot(ray, normal)
         valid &= slope != 0
-        fraction = dot(point - position, normal) / torch.where(
+        share = dot(point - position, normal) / torch.where(
             slope == 0, torch.ones_like(slope), slope
         )
-        length = direction.norm(dim=1)
+        length = ray.norm(dim=1)
         # A receiver in a reflecting plane has a reflection; one in a sheet is not behind it.
-        valid &= fraction * length > torch.where(transmitted, tolerance, -tolerance)
-        valid &= fraction * length < length - tolerance
-        position = position + fraction[:, None] * direction
+        valid &= share * length > torch.where(transmitted, tolerance, -tolerance)
+        valid &= share * length < length - tolerance
+        position = position + share[:, None] * ray
         at = torch.einsum("rx,rax->ra", position - point, planes.axes[plane])
         valid &= (at >= planes.low[plane] - surfaces.margin).all(1)
         valid &= (at <= planes.high[plane] + surfaces.margin).all(1)

@@ -77,14 +77,14 @@ def trace_point_targets(
     strength = (4 * math.pi * sizes).sqrt() / link.wavelength
     echoes = []
     for frame in range(link.frame_count):
-        frame_legs = outbound.select(outbound.tx == frame), inbound.select(inbound.tx == frame)
-        outbound_rows, inbound_rows = _match_legs(frame_legs[0].rx, frame_legs[1].rx)
+        own = outbound.select(outbound.tx == frame), inbound.select(inbound.tx == frame)
+        first, second = _match_legs(own[0].rx, own[1].rx)
         echoes.append(
             _echo_paths(
                 link,
                 frame,
-                frame_legs[0].select(outbound_rows),
-                frame_legs[1].select(inbound_rows),
+                own[0].select(first),
+                own[1].select(second),
                 strength,
             )
         )

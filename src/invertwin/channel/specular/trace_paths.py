@@ -9,13 +9,13 @@ Source: derivations §10.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 from torch._C import _DisableFuncTorch
-from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
 from invertwin.channel.em.plane_waves import (
@@ -23,7 +23,6 @@ from invertwin.channel.em.plane_waves import (
     interpolate_vectors,
     plane_of_incidence,
     polarisations,
-    reflect_vectors,
 )
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.scene_tables import vertex_velocities
@@ -42,9 +41,8 @@ from invertwin.channel.specular.diffraction_candidates import (
 from invertwin.channel.specular.image_method import (
     CandidateSurfaces,
     SpecularPaths,
+    UnfoldedPaths,
     find_paths_between,
-    image_positions,
-    interaction_points,
 )
 from invertwin.channel.specular.ray_paths import REFLECTION, TRANSMISSION, RayPaths, join_ray_paths
 from invertwin.channel.specular.wedge_scene import WedgeScene
@@ -65,6 +63,10 @@ _MAX_DEPTH, _MAX_EDGES = 6, 3
 _ROWS_AT_ONCE = 1 << 15
 _DIFFRACTED_ROWS_AT_ONCE = 1 << 13  # diffracted paths need more memory a row
 _UP = (0.0, 0.0, 1.0)
+_Columns = tuple[
+    Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None
+]
+"""Delay, coefficient, departure, arrival, vertices, kinds, faces, Doppler, slopes and axes."""
 _VELOCITY_HINT = "give one vector, or one per antenna"
 
 
@@ -311,46 +313,47 @@ def _evaluate_diffracted(
     path_scene: PathScene, wedge_scene: WedgeScene, candidates: DiffractionCandidates
 ) -> list[RayPaths]:
     """Evaluate diffracted paths in chunks, as ``evaluate_paths``."""
-    rows = torch.arange(len(candidates.tx))
-    some = (path_scene.vertices, path_scene.tx, path_scene.rx)
-    heavy = len(rows) > _DIFFRACTED_ROWS_AT_ONCE and any(value.requires_grad for value in some)
-    parts: list[RayPaths] = []
-    for row in rows.split(_DIFFRACTED_ROWS_AT_ONCE):
-        part = candidates.rows(row)
+    return _evaluate_in_chunks(
+        path_scene,
+        candidates.tx,
+        candidates.rx,
+        _DIFFRACTED_ROWS_AT_ONCE,
+        lambda rows: _diffracted_columns(path_scene, wedge_scene, candidates.rows(rows)),
+    )
 
-        def columns(part: DiffractionCandidates = part) -> tuple[Tensor, ...]:
-            return _diffracted_columns(path_scene, wedge_scene, part)
 
-        values = checkpoint(columns, use_reentrant=False) if heavy else columns()
-        delay, coefficient, departure, arrival, vertices, doppler, *rest = values
-        kinds, faces, slopes, axes = rest
-        parts.append(
+def _evaluate_in_chunks(
+    path_scene: PathScene, tx: Tensor, rx: Tensor, size: int, columns: Callable[[Tensor], _Columns]
+) -> list[RayPaths]:
+    """Evaluate the columns of paths in chunks, with checkpointing for many rows."""
+    inputs = (path_scene.vertices, path_scene.tx, path_scene.rx)
+    heavy = len(tx) > size and any(value.requires_grad for value in inputs)
+    found: list[RayPaths] = []
+    for rows in torch.arange(len(tx)).split(size):
+        values = checkpoint(columns, rows, use_reentrant=False) if heavy else columns(rows)
+        *geometry, faces, doppler, slopes, axes = values
+        found.append(
             RayPaths(
                 (len(path_scene.tx), len(path_scene.rx)),
                 path_scene.frequency,
-                part.tx,
-                part.rx,
-                delay,
-                coefficient,
-                departure,
-                arrival,
-                vertices,
-                kinds,
+                tx[rows],
+                rx[rows],
+                *geometry,
                 faces,
                 path_scene.topology.face_object[faces],
                 path_scene.scene.names,
                 doppler,
-                slopes if part.edge.shape[1] == 1 else None,
-                axes if part.edge.shape[1] == 1 else None,
+                slopes,
+                axes,
             )
         )
-    return parts
+    return found
 
 
 def _diffracted_columns(
     path_scene: PathScene, wedge_scene: WedgeScene, candidates: DiffractionCandidates
-) -> tuple[Tensor, ...]:
-    """As ``_specular_columns``, and kinds, faces, slopes and axes of diffracted paths."""
+) -> _Columns:
+    """Columns of diffracted paths."""
     k = 2 * math.pi * path_scene.frequency / SPEED_OF_LIGHT
     found = evaluate_diffracted_paths(wedge_scene, candidates, path_scene.tx, path_scene.rx, k)
     departure, arrival = found.directions[:, 0], -found.directions[:, -1]
@@ -369,17 +372,18 @@ def _diffracted_columns(
         found.points,
         found.faces,
     )
+    single = candidates.edge.shape[1] == 1
     return (
         found.length / SPEED_OF_LIGHT,
         matrix * scale,
         departure,
         arrival,
         found.points,
-        path_scene.frequency / SPEED_OF_LIGHT * rate,
         found.kinds,
         found.faces,
-        slopes * scale,
-        found.axes,
+        path_scene.frequency / SPEED_OF_LIGHT * rate,
+        slopes * scale if single else None,
+        found.axes if single else None,
     )
 
 
@@ -412,96 +416,53 @@ def evaluate_paths(path_scene: PathScene, specular_paths: SpecularPaths) -> list
         path_scene: scene and antennas.
         specular_paths: triangles that each path meets.
     """
-    rows = torch.arange(len(specular_paths.source))
-    some = (path_scene.vertices, path_scene.tx, path_scene.rx)
-    heavy = len(rows) > _ROWS_AT_ONCE and any(value.requires_grad for value in some)
-    found: list[RayPaths] = []
-    for row in rows.split(_ROWS_AT_ONCE):
-        part = SpecularPaths(*(column[row] for column in vars(specular_paths).values()))
-
-        def columns(part: SpecularPaths = part) -> tuple[Tensor, ...]:
-            return _specular_columns(path_scene, part)
-
-        values = checkpoint(columns, use_reentrant=False) if heavy else columns()
-        found.append(_assemble_paths(path_scene, part, values))
-    return found
-
-
-def _assemble_paths(
-    path_scene: PathScene, specular_paths: SpecularPaths, values: tuple[Tensor, ...]
-) -> RayPaths:
-    delay, coefficient, departure, arrival, vertices, doppler = values
-    return RayPaths(
-        (len(path_scene.tx), len(path_scene.rx)),
-        path_scene.frequency,
-        specular_paths.source,
-        specular_paths.target,
-        delay,
-        coefficient,
-        departure,
-        arrival,
-        vertices,
-        torch.where(specular_paths.transmitted, TRANSMISSION, REFLECTION),
-        specular_paths.faces,
-        path_scene.topology.face_object[specular_paths.faces],
-        path_scene.scene.names,
-        doppler,
-    )
-
-
-def _specular_columns(path_scene: PathScene, specular_paths: SpecularPaths) -> tuple[Tensor, ...]:
-    """Delay, coefficient, departure, arrival, vertices and Doppler shift of specular paths."""
-    tx, rx = path_scene.tx[specular_paths.source], path_scene.rx[specular_paths.target]
-    count, length = specular_paths.faces.shape
-    corners = path_scene.vertices[path_scene.topology.faces[specular_paths.faces]]
-    sides = corners[..., 1:, :] - corners[..., :1, :]
-    normal = normalize(torch.linalg.cross(sides[..., 0, :], sides[..., 1, :]), dim=-1)
-    point = corners[..., 0, :]
-    seen = image_positions(tx, point, normal, specular_paths.transmitted)
-    whole = rx - seen[-1]
-    distance = whole.norm(dim=1)
-    ways = [whole / distance[:, None]]
-    for step in reversed(range(length)):
-        turned = reflect_vectors(ways[0], normal[:, step])
-        ways.insert(0, torch.where(specular_paths.transmitted[:, step, None], ways[0], turned))
-    cosine = [dot(way, normal[:, step]).abs() for step, way in enumerate(ways[:length])]
-    field = _transfer_matrix(path_scene, specular_paths, ways, normal, cosine)
-    spread = SPEED_OF_LIGHT / path_scene.frequency / (4 * math.pi) / distance
-    nodes = interaction_points(rx, seen, point, normal)
-    vertices = torch.stack(nodes, 1) if nodes else torch.zeros(count, 0, 3, dtype=torch.float64)
-    rate = _shortening_rate(
+    return _evaluate_in_chunks(
         path_scene,
         specular_paths.source,
         specular_paths.target,
-        ways,
-        vertices,
-        specular_paths.faces,
+        _ROWS_AT_ONCE,
+        lambda rows: _specular_columns(path_scene, specular_paths.rows(rows)),
+    )
+
+
+def _specular_columns(path_scene: PathScene, paths: SpecularPaths) -> _Columns:
+    """Columns of specular paths."""
+    tx, rx = path_scene.tx[paths.source], path_scene.rx[paths.target]
+    unfolded = UnfoldedPaths(
+        path_scene.vertices, path_scene.topology, paths.faces, paths.transmitted, tx
+    )
+    distance = (rx - unfolded.image).norm(dim=1)
+    directions, vertices = unfolded.directions(rx), unfolded.interaction_points(rx)
+    matrix = _transfer_matrix(path_scene, paths, directions, unfolded.normal)
+    scale = SPEED_OF_LIGHT / path_scene.frequency / (4 * math.pi) / distance
+    rate = _shortening_rate(
+        path_scene, paths.source, paths.target, directions, vertices, paths.faces
     )
     return (
         distance / SPEED_OF_LIGHT,
-        field * spread[:, None, None],
-        ways[0],
-        -ways[-1],
+        matrix * scale[:, None, None],
+        directions[0],
+        -directions[-1],
         vertices,
+        torch.where(paths.transmitted, TRANSMISSION, REFLECTION),
+        paths.faces,
         path_scene.frequency / SPEED_OF_LIGHT * rate,
+        None,
+        None,
     )
 
 
 def _transfer_matrix(
-    path_scene: PathScene,
-    specular_paths: SpecularPaths,
-    directions: list[Tensor],
-    normal: Tensor,
-    cosine: list[Tensor],
+    path_scene: PathScene, paths: SpecularPaths, directions: list[Tensor], normal: Tensor
 ) -> Complex128[Tensor, "path 2 2"]:
     """Polarisation transfer matrix between V and H at both ends, without spreading."""
     up = torch.tensor(_UP, dtype=torch.float64)
     before = polarisations(directions[0], up)
     matrix = torch.eye(2, dtype=torch.complex128).expand(len(before), 2, 2)
-    every = torch.stack(cosine, 1).ravel() if cosine else torch.zeros(0, dtype=torch.float64)
-    met = _face_coefficients(path_scene, specular_paths.faces.ravel(), every)
-    r_s, r_p, t_s, t_p = (value.view(specular_paths.faces.shape).unbind(1) for value in met)
-    for step, passing in enumerate(specular_paths.transmitted.unbind(1)):
+    cosine = dot(torch.stack(directions, 1)[:, :-1], normal).abs()
+    found = _face_coefficients(path_scene, paths.faces.ravel(), cosine.ravel())
+    r_s, r_p, t_s, t_p = (value.view(paths.faces.shape).unbind(1) for value in found)
+    for step, passing in enumerate(paths.transmitted.unbind(1)):
         across, into, out = plane_of_incidence(normal[:, step], directions[step])
         through = passing[:, None]
         matrix = _change_of_basis(torch.cat([across, into], 1), before) @ matrix

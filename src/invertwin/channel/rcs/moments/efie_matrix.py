@@ -266,17 +266,15 @@ class EFIEMatrix:
         The 1/R of the source triangle is integrated in closed form; the remainder of G is smooth.
         """
         test, source = (vertices[self.faces[pairs[:, side]]] for side in (0, 1))
-        test_centroid, source_centroid = test.mean(1), source.mean(1)
+        centre, middle = test.mean(1), source.mean(1)
         shares, weights = QUADRATURE_7
         point = shares @ test
         constant, linear, _ = self._triangle_fields(source, point)
-        test_linear = (point - test_centroid[:, None])[:, None] - (test - test_centroid[:, None])[
-            :, :, None
-        ]
-        test_linear = test_linear * (weights / 4)[:, None]
-        offset = (source - source_centroid[:, None]) + 0j
+        along = (point - centre[:, None])[:, None] - (test - centre[:, None])[:, :, None]
+        along = along * (weights / 4)[:, None]
+        offset = (source - middle[:, None]) + 0j
         inner = linear[:, :, None] - constant[..., None, None] * offset[:, None]
-        found = torch.einsum("piqx,pqjx->pij", test_linear + 0j, inner)
+        found = torch.einsum("piqx,pqjx->pij", along + 0j, inner)
         return found - ((weights * constant).sum(1) / self.k**2)[:, None, None]
 
     def _triangle_fields(
@@ -302,20 +300,18 @@ class EFIEMatrix:
         distance = (dot(offset, offset) + (_MIN_DISTANCE / self.k) ** 2).sqrt()
         phase = self.k * distance
         # exp(−jkR) − 1 without cancellation.
-        remainder = torch.complex(-2 * (phase / 2).sin().square(), -phase.sin())
-        smooth = remainder / (4 * math.pi * distance) * weights
+        rest = torch.complex(-2 * (phase / 2).sin().square(), -phase.sin())
+        smooth = rest / (4 * math.pi * distance) * weights
         constant = level * scale + smooth.sum(2)
         linear = (first + (points - centroid) * level[..., None]) * scale[..., None]
         linear = linear + torch.einsum("pqr,prx->pqx", smooth, (nodes - centroid) + 0j)
         if not gradient:
             return constant, linear, None
-        slope_factor = (
-            -(1j * phase * phasor(-phase) + remainder) / (4 * math.pi * distance**3) * weights
-        )
+        decay = -(1j * phase * phasor(-phase) + rest) / (4 * math.pi * distance**3) * weights
         return (
             constant,
             linear,
-            slope * scale[..., None] + (slope_factor[..., None] * offset).sum(2),
+            slope * scale[..., None] + (decay[..., None] * offset).sum(2),
         )
 
     def bilinear(
@@ -458,7 +454,7 @@ def triangle_potentials(
     offset = [corners[:, None, v] - points for v in range(3)]
     distances = [vector.norm(dim=-1) for vector in offset]
     height = -dot(offset[0], normal)
-    potential = torch.zeros_like(height)
+    level = torch.zeros_like(height)
     first = torch.zeros_like(points)
     slope = torch.zeros_like(points)
     for v in range(3):
@@ -467,12 +463,12 @@ def triangle_potentials(
         length = side.norm(dim=-1)
         tangent = side / length[..., None]
         outwards = cross(tangent, normal)
-        offset_in_plane = dot(offset[v], outwards)
+        distance = dot(offset[v], outwards)
         total = distances[v] + distances[w]
         logarithm = ((total + length) / (total - length)).log()
-        potential = potential + offset_in_plane * logarithm
+        level = level + distance * logarithm
         slope = slope - outwards * logarithm[..., None]
-        square = offset_in_plane.square() + height.square()
+        square = distance.square() + height.square()
         ends = dot(offset[w], tangent) * distances[w] - dot(offset[v], tangent) * distances[v]
         first = first + outwards * ((square * logarithm + ends) / 2)[..., None]
     a, b, c = offset
@@ -480,9 +476,9 @@ def triangle_potentials(
     base = distances[0] * distances[1] * distances[2]
     base = base + dot(a, b) * distances[2] + dot(b, c) * distances[0] + dot(c, a) * distances[1]
     angle = 2 * torch.atan2(-volume, base)
-    potential = potential - height * angle
+    level = level - height * angle
     return (
-        potential,
-        first - normal * (height * potential)[..., None],
+        level,
+        first - normal * (height * level)[..., None],
         slope - normal * angle[..., None],
     )

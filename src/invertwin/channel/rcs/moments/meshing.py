@@ -68,15 +68,15 @@ def build_conforming_mesh(
         return None
     # Edges are directed from the lower to the higher vertex number.
     ends = np.stack([faces, np.roll(faces, -1, 1)], 2)
-    reversed_edge = ends[..., 0] > ends[..., 1]
+    turned = ends[..., 0] > ends[..., 1]
     edges, edge = np.unique(np.sort(ends, 2).reshape(-1, 2), axis=0, return_inverse=True)
     edge = edge.reshape(-1, 3)
     length = np.linalg.norm(vertices[edges[:, 1]] - vertices[edges[:, 0]], axis=1)
     parts = np.maximum(1, np.ceil(length / side - _LENGTH_SLACK)).astype(np.int64)
     first = len(vertices) + np.concatenate([[0], (parts - 1).cumsum()])
-    vertex_numbers = np.arange(len(vertices))
+    every = np.arange(len(vertices))
     parents, weights = (
-        [np.stack([vertex_numbers] * 3, 1)],
+        [np.stack([every] * 3, 1)],
         [np.eye(3)[np.zeros(len(vertices), int)]],
     )
     for (low, high), count in zip(edges, parts, strict=True):
@@ -96,13 +96,13 @@ def build_conforming_mesh(
             between = first[face_edges[corner]] + np.arange(parts[face_edges[corner]] - 1)
             rim += [
                 face[corner : corner + 1],
-                between[::-1] if reversed_edge[number, corner] else between,
+                between[::-1] if turned[number, corner] else between,
             ]
-        numbers_of_face = np.concatenate([*rim, count + np.arange(len(inner))])
+        local_numbers = np.concatenate([*rim, count + np.arange(len(inner))])
         parents.append(np.tile(face, (len(inner), 1)))
         weights.append(inner)
         count += len(inner)
-        triangles.append(numbers_of_face[local])
+        triangles.append(local_numbers[local])
     parent_face = numbers.repeat([len(t) for t in triangles])
     used, small = np.unique(np.concatenate(triangles), return_inverse=True)
     return ConformingMesh(
@@ -234,18 +234,17 @@ def _triangles_touch(
 ) -> NDArray[np.bool_]:
     """Test if vertices or sides of triangles come near triangles that they do not belong to."""
     shared = (one[:, :, None] == other[:, None]).any(2)
-    corners, other_corners = vertices[one], vertices[other]
-    normal = _double_area_vectors(other_corners)
+    corners, beyond = vertices[one], vertices[other]
+    normal = _double_area_vectors(beyond)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    sides = np.roll(other_corners, -1, 1) - other_corners
+    sides = np.roll(beyond, -1, 1) - beyond
     inwards = np.cross(normal[:, None], sides)
-    height = np.einsum("pvx,px->pv", corners - other_corners[:, :1], normal)
+    height = np.einsum("pvx,px->pv", corners - beyond[:, :1], normal)
 
     def projects_inside(points: Array) -> NDArray[np.bool_]:
         return np.asarray(
             (
-                np.einsum("px,psx->ps", points, inwards)
-                > np.einsum("psx,psx->ps", other_corners, inwards)
+                np.einsum("px,psx->ps", points, inwards) > np.einsum("psx,psx->ps", beyond, inwards)
             ).all(1)
         )
 
@@ -255,21 +254,17 @@ def _triangles_touch(
         w = (v + 1) % 3
         is_free = ~shared[:, v] & ~shared[:, w]
         difference = height[:, v] - height[:, w]
-        fraction = height[:, v] / np.where(difference == 0, 1.0, difference)
-        intersection = corners[:, v] + fraction[:, None] * (corners[:, w] - corners[:, v])
-        touches |= is_free & (height[:, v] * height[:, w] < 0) & projects_inside(intersection)
+        at = height[:, v] / np.where(difference == 0, 1.0, difference)
+        meets = corners[:, v] + at[:, None] * (corners[:, w] - corners[:, v])
+        touches |= is_free & (height[:, v] * height[:, w] < 0) & projects_inside(meets)
         for s in range(3):
             e = (s + 1) % 3
             disjoint = ~((one[:, [v, w], None] == other[:, None, [s, e]]).any((1, 2)))
-            gap = _segment_distances(
-                corners[:, v], corners[:, w], other_corners[:, s], other_corners[:, e]
-            )
+            gap = _segment_distances(corners[:, v], corners[:, w], beyond[:, s], beyond[:, e])
             touches |= disjoint & (gap < min_gap)
             # A corner that lies on a side whose other end is a neighbour.
             touches |= ~shared[:, v] & (
-                _segment_distances(
-                    corners[:, v], corners[:, v], other_corners[:, s], other_corners[:, e]
-                )
+                _segment_distances(corners[:, v], corners[:, v], beyond[:, s], beyond[:, e])
                 < min_gap
             )
     return touches

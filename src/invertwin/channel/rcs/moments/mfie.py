@@ -86,22 +86,20 @@ def build_cells(corners: Float64[np.ndarray, "facet 3 3"], side: float) -> Surfa
         corners: corners of the triangles, with outward normals [m].
         side: side of a cell [m].
     """
-    position, normal, area = _subdivide_triangles(corners, side / _PIECES_PER_SIDE)
-    owner = _cluster_pieces(
-        np.concatenate([position, _NORMAL_WEIGHT * side * normal], 1), area, side
-    )
+    place, normal, area = _subdivide_triangles(corners, side / _PIECES_PER_SIDE)
+    owner = _cluster_pieces(np.concatenate([place, _NORMAL_WEIGHT * side * normal], 1), area, side)
     count = int(owner.max()) + 1
-    cell_area = np.bincount(owner, area, count).astype(np.float64)
-    centre = _cell_means(owner, area, position, cell_area)
-    outward = _cell_means(owner, area, normal, cell_area)
-    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    whole = np.bincount(owner, area, count).astype(np.float64)
+    centre = _cell_means(owner, area, place, whole)
+    normals = _cell_means(owner, area, normal, whole)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     # The centroid of a curved patch lies off the surface.
-    near = _find_nearest(position, centre)
-    distance = np.einsum("cx,cx->c", position[near] - centre, normal[near])
-    centre += (distance / np.einsum("cx,cx->c", outward, normal[near]))[:, None] * outward
-    radius, closed = _inscribed_radii(centre, outward, cell_area)
+    near = _find_nearest(place, centre)
+    distance = np.einsum("cx,cx->c", place[near] - centre, normal[near])
+    centre += (distance / np.einsum("cx,cx->c", normals, normal[near]))[:, None] * normals
+    radius, closed = _inscribed_radii(centre, normals, whole)
     return SurfaceCells(
-        centre, outward, cell_area, _estimate_curvature(centre, outward), radius, closed
+        centre, normals, whole, _estimate_curvature(centre, normals), radius, closed
     )
 
 
@@ -167,13 +165,11 @@ def _estimate_curvature(point: Array, normal: Array) -> Array:
     axes = _tangent_axes(normal)
     same = np.einsum("ckx,cx->ck", normal[near], normal) > _MIN_NEIGHBOUR_COSINE
     offset = np.einsum("cax,ckx->cka", axes, point[near] - point[:, None]) * same[..., None]
-    normal_change = (
-        np.einsum("cax,ckx->cka", axes, normal[near] - normal[:, None]) * same[..., None]
-    )
+    change = np.einsum("cax,ckx->cka", axes, normal[near] - normal[:, None]) * same[..., None]
     square = np.einsum("cka,ckb->cab", offset, offset)
     # Regularised: few or collinear neighbours give a flat surface.
     regularisation = 1e-9 * np.einsum("caa->c", square) + 1e-30
-    sums = np.einsum("cka,ckb->cab", offset, normal_change)
+    sums = np.einsum("cka,ckb->cab", offset, change)
     solution: Array = np.linalg.solve(square + regularisation[:, None, None] * np.eye(2), sums).real
     symmetric = (solution + solution.transpose(0, 2, 1)) / 2
     return np.asarray(axes.transpose(0, 2, 1) @ symmetric @ axes, dtype=np.float64)
@@ -273,20 +269,16 @@ class _MFIEEquation:
             strength[torch.arange(len(rows)), rows] = 0
             inner = square - 2 * self.inner_depth[rows, None].float() * height
             inner = (inner + self.inner_depth[rows, None].float() ** 2).clamp_min(1e-20)
-            inner_strength = self.inner_weight[rows, None].to(torch.complex64) * _greens_gradient(
+            second = self.inner_weight[rows, None].to(torch.complex64) * _greens_gradient(
                 self.k, inner, weight
             )
-            combined = strength + inner_strength
-            normal_part = strength * height + inner_strength * (
-                height - self.inner_depth[rows, None].float()
-            )
+            combined = strength + second
+            lower = strength * height + second * (height - self.inner_depth[rows, None].float())
             for a in (0, 1):
-                tangential = combined * dot(offset, axes[rows, None, a])
+                along = combined * dot(offset, axes[rows, None, a])
                 for b in (0, 1):
-                    projection = normal[rows] @ axes[:, b].T
-                    matrix[a, rows, b] = (
-                        normal_part * (axes[rows, a] @ axes[:, b].T) - tangential * projection
-                    )
+                    lean = normal[rows] @ axes[:, b].T
+                    matrix[a, rows, b] = lower * (axes[rows, a] @ axes[:, b].T) - along * lean
         # Self term: a disc with the curvature of the surface; half of J is the jump.
         self_term = self.tangents @ self.curvature @ self.tangents.mT
         trace = self_term.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
@@ -360,10 +352,8 @@ class _MFIEEquation:
     def conserves_power(self, current: Tensor, transmitters: Tensor) -> bool:
         """Test the power balance of the first wave's currents (optical theorem)."""
         moments = current[:, 0] * self.area[:, None, None]
-        incident = polarisations(transmitters[:1], self.up)[0]
-        return conserves_power(
-            self.k, self.point + self.origin, moments, -transmitters[0], incident
-        )
+        sent = polarisations(transmitters[:1], self.up)[0]
+        return conserves_power(self.k, self.point + self.origin, moments, -transmitters[0], sent)
 
 
 def _solve_gmres(

@@ -172,8 +172,8 @@ def conserves_power(
         )
         wave = phasor(wave_number * (directions @ offset.T))
         field = wave_number / (4 * math.pi) * torch.einsum("sc,ctx->stx", wave, current_moments)
-        longitudinal = torch.einsum("stx,sx->st", field, directions + 0j)
-        radiated += weight * (field.abs().square().sum((0, 2)) - longitudinal.abs().square().sum(0))
+        along = torch.einsum("stx,sx->st", field, directions + 0j)
+        radiated += weight * (field.abs().square().sum((0, 2)) - along.abs().square().sum(0))
     return bool(((radiated / extracted.real - 1).abs() < _POWER_TOLERANCE).all())
 
 
