@@ -239,10 +239,8 @@ def _launch_plane_waves(incident: Tensor, solids: DielectricSolids | None) -> _D
     wave = incident if solids is None else incident.to(torch.complex128)
     zeros = torch.zeros(len(incident), dtype=wave.dtype)
     aspect = torch.arange(len(incident))
-    origin, transmitted = torch.zeros_like(incident), none >= 0
-    return _DepartingBeams(
-        aspect, none, none, origin, origin, incident, zeros, wave, none, transmitted
-    )
+    zero, transmitted = torch.zeros_like(incident), none >= 0
+    return _DepartingBeams(aspect, none, none, zero, zero, incident, zeros, wave, none, transmitted)
 
 
 def _continue_beams(
@@ -253,9 +251,9 @@ def _continue_beams(
         reflect_vectors(previous.direction, previous.normal),
         reflect_vectors(previous.wave_vector, previous.normal),
     )
-    row, point = torch.arange(len(previous.aspect)), previous.polygon[:, 0]
+    row, p = torch.arange(len(previous.aspect)), previous.polygon[:, 0]
     transmitted = torch.zeros_like(row, dtype=torch.bool)
-    medium, normal = previous.medium, previous.normal
+    medium, n = previous.medium, previous.normal
     if solids is not None:
         behind = solids.medium_behind(previous.facet, previous.medium)
         refracted, propagates = refract_waves(
@@ -263,20 +261,16 @@ def _continue_beams(
         )
         rows = torch.nonzero(propagates & solids.transparent[previous.facet])[:, 0]
         row = torch.cat([row, rows])
-        point = point[row]
+        p = p[row]
         transmitted = torch.cat([transmitted, torch.ones_like(rows, dtype=torch.bool)])
         wave = torch.cat([wave, refracted[rows]])
         direction = torch.cat([direction, normalize(refracted[rows].real, dim=1)])
         medium = torch.cat([medium, behind[rows]])
-        normal = torch.cat([normal, -previous.normal[rows]])
+        n = torch.cat([n, -previous.normal[rows]])
     # Phase matching on the face.
-    offset = previous.phase_offset[row] + dot(
-        previous.wave_vector[row] - wave, point.to(wave.dtype)
-    )
+    offset = previous.phase_offset[row] + dot(previous.wave_vector[row] - wave, p.to(wave.dtype))
     aspect, facet = previous.aspect[row], previous.facet[row]
-    return _DepartingBeams(
-        aspect, facet, row, normal, point, direction, offset, wave, medium, transmitted
-    )
+    return _DepartingBeams(aspect, facet, row, n, p, direction, offset, wave, medium, transmitted)
 
 
 def exceeds_min_amplitude(patches: IlluminatedPatches, wave_number: float) -> Bool[Tensor, " row"]:
@@ -417,10 +411,8 @@ def clip(
     extent = (polygon - polygon[:, :1]).detach().norm(dim=2).amax(1, keepdim=True)
     steep = crossed & ((height - after).detach().abs() > _COPLANAR_TOLERANCE * extent)
     fraction = height / torch.where(steep, height - after, torch.ones_like(height))
-    between = polygon + torch.where(steep, fraction, 0.0)[..., None] * (
-        polygon.roll(-1, 1) - polygon
-    )
-    points = torch.stack([polygon, between], 2).flatten(1, 2)
+    cuts = polygon + torch.where(steep, fraction, 0.0)[..., None] * (polygon.roll(-1, 1) - polygon)
+    points = torch.stack([polygon, cuts], 2).flatten(1, 2)
     keep = torch.stack([inside, crossed], 2).flatten(1, 2)
     order = torch.argsort((~keep).to(torch.int8), dim=1, stable=True)
     number = keep.sum(1)

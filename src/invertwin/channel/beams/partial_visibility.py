@@ -243,12 +243,10 @@ def _select_visible_edges(
     side = end - start
     fraction = (-(start * side).sum(1) / side.square().sum(1).clamp_min(1e-300)).clamp(0, 1)
     nearest = start + fraction[:, None] * side
-    _, normal = _shadow_distances(shadows, nearest)
+    _, n = _shadow_distances(shadows, nearest)
     observer = observers[edges.observer]
     foot = cells.center + nearest @ cells.axes[:, :2].T
-    step = (
-        _RAY_OFFSET * (foot - observer).norm(dim=1, keepdim=True) * (normal @ cells.axes[:, :2].T)
-    )
+    step = _RAY_OFFSET * (foot - observer).norm(dim=1, keepdim=True) * (n @ cells.axes[:, :2].T)
     # Position of the edge between the observer and its shadow.
     first, last = _edge_ray_fractions(edges, vertices, observers, cells).unbind(1)
     limit = 1 / ((1 - fraction) / first + fraction / last)

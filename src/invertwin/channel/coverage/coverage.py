@@ -133,18 +133,16 @@ def trace_coverage(
     with tracing():
         tracer = _CoverageTracer(path_scene, surface, measure, depth, rays, seed)
         amount = tracer.sum_paths(path_scene, tracer.find_paths(strip_derivatives(path_scene.rx)))
-        boundary_paths: list[CoverageBoundaryPaths] = []
+        paths: list[CoverageBoundaryPaths] = []
         deforms = is_differentiated(path_scene.vertices)
         if boundary_samples and (deforms or is_differentiated(path_scene.tx)):
-            boundary_paths += tracer.trace_illumination_boundaries(
-                path_scene, boundary_samples, seed
-            )
-            boundary_paths += (
+            paths += tracer.trace_illumination_boundaries(path_scene, boundary_samples, seed)
+            paths += (
                 tracer.trace_intersection_curves(path_scene, boundary_samples, seed)
                 if deforms
                 else []
             )
-    return CoverageTrace(amount, tuple(boundary_paths))
+    return CoverageTrace(amount, tuple(paths))
 
 
 class _CoverageTracer:

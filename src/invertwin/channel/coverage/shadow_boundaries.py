@@ -204,12 +204,7 @@ def sample_illumination_boundaries(
         hits: dict[int, list[tuple[_RaysPastEdges, Tensor]]] = {}
         for part in paths:
             for legs in _launch_past_edges(
-                candidate_surfaces,
-                source - candidate_surfaces.origin,
-                y,
-                ends,
-                part,
-                depth,
+                candidate_surfaces, source - candidate_surfaces.origin, y, ends, part, depth
             ):
                 for last, face in _follow_rays(candidate_surfaces, receiver, legs, powers, depth):
                     hits.setdefault(last.faces.shape[1], []).append((last, face))
@@ -427,14 +422,12 @@ def evaluate_illumination_boundary(
     direct = legs.through | (torch.arange(legs.faces.shape[1]) < legs.steps_before_edge[:, None])
     y0, y1 = vertices[edges.first], vertices[edges.second]
     y = image_positions(torch.lerp(y0, y1, edges.fraction[:, None]), point, normal, direct)[-1]
-    receiving = receiving_corners[samples.face]
-    p0, up = receiving[:, 0], triangle_normals(receiving)
+    facets = receiving_corners[samples.face]
+    p0, up = facets[:, 0], triangle_normals(facets)
     ray = y - image
     scale = dot(p0 - image, up) / dot(ray, up)
     curve = image + scale[:, None] * ray
-    material = interpolate_vectors(
-        receiving, strip_derivatives(receiving), strip_derivatives(curve)
-    )
+    material = interpolate_vectors(facets, strip_derivatives(facets), strip_derivatives(curve))
 
     up = strip_derivatives(up)
     fixed = strip_derivatives(ray), strip_derivatives(scale), strip_derivatives(normal)
@@ -450,11 +443,7 @@ def evaluate_illumination_boundary(
         legs.source[rows], torch.arange(len(rows)), legs.faces[rows], legs.through[rows]
     )
     return IlluminationBoundary(
-        paths,
-        strip_derivatives(curve)[rows],
-        samples.face[rows],
-        rate[rows],
-        legs.edge_point[rows],
+        paths, strip_derivatives(curve)[rows], samples.face[rows], rate[rows], legs.edge_point[rows]
     )
 
 

@@ -128,25 +128,21 @@ def trace_single_scattering(
             that scatters.
     """
     zero = (0.0, 0.0, 0.0)
-    path_scene = replace(prepare_path_scene(scene, tx, rx, frequency, zero, zero), velocities=None)
+    stage = replace(prepare_path_scene(scene, tx, rx, frequency, zero, zero), velocities=None)
     with tracing(sampling.backend), torch_threads(1):
         geometry = flatten(scattering_scene, SPEED_OF_LIGHT / frequency)
-        tracer = _SingleScatteringTracer(
-            path_scene, geometry, measure, value_count, rays, sampling, seed
-        )
-        if not tracer.is_scattering.any() or not any(
-            map(len, tracer.sequences[0] + tracer.sequences[1])
+        trace = _SingleScatteringTracer(stage, geometry, measure, value_count, rays, sampling, seed)
+        if not trace.is_scattering.any() or not any(
+            map(len, trace.sequences[0] + trace.sequences[1])
         ):
-            return torch.zeros(
-                len(path_scene.tx), len(path_scene.rx), value_count, dtype=torch.float64
-            )
-        total = tracer.sum_interior(path_scene, geometry)
-        deforms = is_differentiated(path_scene.vertices)
-        moves = deforms or is_differentiated(path_scene.tx) or is_differentiated(path_scene.rx)
+            return torch.zeros(len(stage.tx), len(stage.rx), value_count, dtype=torch.float64)
+        total = trace.sum_interior(stage, geometry)
+        deforms = is_differentiated(stage.vertices)
+        moves = deforms or is_differentiated(stage.tx) or is_differentiated(stage.rx)
         if sampling.boundary and sampling.boundary_samples and moves:
             if deforms and sampling.contacts:
-                _require_no_contact(geometry, path_scene, tracer.is_scattering)
-            total = total + tracer.sum_boundary(path_scene, geometry)
+                _require_no_contact(geometry, stage, trace.is_scattering)
+            total = total + trace.sum_boundary(stage, geometry)
     return total
 
 
@@ -189,13 +185,7 @@ class _SingleScatteringTracer:
         origins = self.antennas[end][torch.arange(rays) % len(self.antennas[end])]
         prefix = torch.zeros(rays, dtype=torch.int64)
         columns = shoot_sequences_from_edges(
-            self.candidate_surfaces,
-            planes,
-            self.powers,
-            origins,
-            prefix,
-            most,
-            self.seed + end,
+            self.candidate_surfaces, planes, self.powers, origins, prefix, most, self.seed + end
         )
         return tuple(steps[:, 1:] for steps in columns if len(steps))
 
@@ -348,10 +338,7 @@ class _SingleScatteringTracer:
         outbound, inbound = outbound.select(first[rows]), inbound.select(second[rows])
         index = outbound.rx
         material = MaterialPoints(
-            point.position[index],
-            point.normal[index],
-            point.jacobian[index],
-            point.row[index],
+            point.position[index], point.normal[index], point.jacobian[index], point.row[index]
         )
         k = 4 * math.pi * stage.frequency / SPEED_OF_LIGHT
         law = (

@@ -54,10 +54,8 @@ def polarisation_shares(link: Link, *, depolarising: bool) -> list[PolarisationS
     Raises:
         InputError: polarisations that depend on the direction.
     """
-    transmit, receive = (
-        _stokes_parameters(j.vectors.mean(0)) for j in (link.tx_jones, link.rx_jones)
-    )
-    whole, q, u, v = (0.5 * s * r for s, r in zip(transmit, receive, strict=True))
+    tx, rx = (_stokes_parameters(j.vectors.mean(0)) for j in (link.tx_jones, link.rx_jones))
+    whole, q, u, v = (0.5 * s * r for s, r in zip(tx, rx, strict=True))
     terms = [
         PolarisationShare(whole, whole, 0.0),
         PolarisationShare(q + u, q - u, _LINEAR),

@@ -127,10 +127,8 @@ def group_solids(
         skin = interfaces[members[0]]
         permittivities = torch.stack([skin.permittivity[own[0]] for own in bodies])
         epsilon = torch.where(transmits, permittivities, torch.ones_like(permittivities))
-        smallest = min(wave_numbers[f] for f in members)
-        solids = DielectricSolids(
-            owner, transmits[owner], skin.conducting, epsilon, smallest, names
-        )
+        least = min(wave_numbers[f] for f in members)
+        solids = DielectricSolids(owner, transmits[owner], skin.conducting, epsilon, least, names)
         groups_found.append((solids, members))
     return groups_found
 

@@ -144,19 +144,17 @@ def radiate_field(
     Source: derivations §13 and §14; Balanis, Advanced Engineering Electromagnetics, §6.8.
     """
     reflected = _reflect_from_smooth(interfaces, wave_number, normal, direction, field)
-    radiated = radiate_currents(
-        wave_number, normal, direction, field, reflected, scattered_direction
-    )
+    total = radiate_currents(wave_number, normal, direction, field, reflected, scattered_direction)
     thin = torch.isfinite(interfaces.thickness) & ~interfaces.conducting
     if bool(thin.any()):
         sheet = _radiate_sheet(
             interfaces, wave_number, normal, direction, field, scattered_direction
         )
-        radiated = torch.where(thin[:, None, None], sheet, radiated)
+        total = torch.where(thin[:, None, None], sheet, total)
     leaving = dot(normal, scattered_direction)
     attenuation = roughness_attenuation(interfaces, wave_number, leaving - dot(normal, direction))
     attenuation = attenuation * torch.where(leaving > 0, interfaces.coherence, 1.0)
-    return project_transverse(radiated * attenuation[:, None, None], scattered_direction)
+    return project_transverse(total * attenuation[:, None, None], scattered_direction)
 
 
 def project_transverse(

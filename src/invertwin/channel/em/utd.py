@@ -266,12 +266,7 @@ def _couple_cotangents(diffraction: EdgeDiffraction, wave_number: float) -> _Cou
         factor = scale * (edge_transition(s, diffraction.end_parameters) / transition(s))
         curve = factor * ratio**3 * cosine / opening**2
         columns.append(
-            (
-                factor * _cotangent_quotient(half, opening),
-                factor * ratio**2 / opening,
-                curve,
-                s,
-            )
+            (factor * _cotangent_quotient(half, opening), factor * ratio**2 / opening, curve, s)
         )
     value, slope, curve, s = (torch.stack(column) for column in zip(*columns, strict=True))
     sides = (

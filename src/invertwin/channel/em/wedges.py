@@ -82,14 +82,14 @@ def find_wedges(
         edge = torch.nonzero(number == count)[:, 0]
         faces = edge_faces[edge].sort(1, descending=True).values[:, :count]
         axis = normalize(endpoints[edge, 1] - endpoints[edge, 0], dim=1)
-        tangent = corners[faces].mean(2) - endpoints[edge, :1]
-        tangent = normalize(tangent - dot(tangent, axis[:, None])[..., None] * axis[:, None], dim=2)
-        normal = cross(axis[:, None], tangent)
+        t = corners[faces].mean(2) - endpoints[edge, :1]
+        t = normalize(t - dot(t, axis[:, None])[..., None] * axis[:, None], dim=2)
+        normal = cross(axis[:, None], t)
         # Triangles without area have no face tangent.
         valid = (normal.detach().norm(dim=2) > 0.5).all(1)
-        edge, faces, tangent, normal = edge[valid], faces[valid], tangent[valid], normal[valid]
+        edge, faces, t, normal = edge[valid], faces[valid], t[valid], normal[valid]
         if count == 1:
-            tangents = tangent.expand(-1, 2, 3)
+            tangents = t.expand(-1, 2, 3)
             normals = torch.cat([normal, -normal], 1)
             opening = torch.full((len(edge),), 2.0, dtype=torch.float64)
             found.append(
@@ -104,7 +104,7 @@ def find_wedges(
             )
             continue
         # Angle from the first face to the second about the edge, through the first one's normal.
-        angle_in = torch.atan2(dot(normal[:, 0], tangent[:, 1]), dot(tangent[:, 0], tangent[:, 1]))
+        angle_in = torch.atan2(dot(normal[:, 0], t[:, 1]), dot(t[:, 0], t[:, 1]))
         angle_in = angle_in % (2 * math.pi)
         for sign in (1.0, -1.0):
             angle = angle_in if sign > 0 else 2 * math.pi - angle_in
@@ -112,7 +112,7 @@ def find_wedges(
             # Normals that point into this region: along the first turn, against the second.
             normals = torch.stack([sign * normal[:, 0], -sign * normal[:, 1]], 1)
             wedge = Wedges(
-                endpoints[edge, 0], endpoints[edge, 1], tangent, normals, angle / math.pi, faces
+                endpoints[edge, 0], endpoints[edge, 1], t, normals, angle / math.pi, faces
             )
             found.append(wedge.rows(keep))
     columns = zip(*(vars(part).values() for part in found), strict=True)
@@ -136,17 +136,15 @@ def select_body_edges(wedges: Wedges, min_length: float) -> Bool[Tensor, " row"]
     if not count:
         return torch.zeros(0, dtype=torch.bool)
     size = float((ends.amax(0) - ends.amin(0)).norm())
-    _, vertex = torch.unique(
-        (ends / (_VERTEX_TOLERANCE * size)).round(), dim=0, return_inverse=True
-    )
+    _, node = torch.unique((ends / (_VERTEX_TOLERANCE * size)).round(), dim=0, return_inverse=True)
     outward = normalize(ends[:count] - ends[count:], dim=1)
     outward = torch.cat([-outward, outward])
     opening = wedges.opening.detach().repeat(2)
-    order, number = torch.argsort(vertex), torch.bincount(vertex)
+    order, number = torch.argsort(node), torch.bincount(node)
     pairs: list[Tensor] = [torch.zeros(2, 0, dtype=torch.int64)]
     for step in range(1, int(number.max())):
         own, other = order[:-step], order[step:]
-        continued = (vertex[own] == vertex[other]) & (
+        continued = (node[own] == node[other]) & (
             dot(outward[own], outward[other]) < _MAX_COLLINEAR_COSINE
         )
         continued &= (opening[own] - opening[other]).abs() < _OPENING_TOLERANCE
@@ -168,7 +166,7 @@ def select_body_edges(wedges: Wedges, min_length: float) -> Bool[Tensor, " row"]
     while previous != int(kept.sum()):
         previous = int(kept.sum())
         there = kept[line.repeat(2)]
-        loose = there & (torch.bincount(vertex[there], minlength=len(number))[vertex] == 1)
+        loose = there & (torch.bincount(node[there], minlength=len(number))[node] == 1)
         kept[line.repeat(2)[loose]] &= ~short[line.repeat(2)[loose]]
     return kept[line]
 

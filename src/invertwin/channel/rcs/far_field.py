@@ -427,19 +427,17 @@ def _residual_field(
     """Residual of rays and edges from the method of moments for small targets; zero for larger."""
     efie = EFIESolver(target.vertices, target.topology.faces, target.facets.solid, target.up)
     mfie = MFIESolver(target.facets.corners.detach(), target.up) if target.is_closed else None
-    residual: dict[int, Tensor] = {}
+    rest: dict[int, Tensor] = {}
     order = sorted(range(len(modelled)), key=lambda f: -target.wave_numbers[f])
     for f in track(order, "frequencies"):
         k = target.wave_numbers[f]
         solver = mfie if mfie is not None and mfie.supports(k) else efie
         found = solver.solve_scattering(k, antenna_pairs)
         if found is not None:
-            residual[f] = (found[0] + found[-1].mT) / 2 - modelled[f]
-    if not residual:
+            rest[f] = (found[0] + found[-1].mT) / 2 - modelled[f]
+    if not rest:
         return None
-    return torch.stack(
-        [residual.get(f, torch.zeros_like(modelled[f])) for f in range(len(modelled))]
-    )
+    return torch.stack([rest.get(f, torch.zeros_like(modelled[f])) for f in range(len(modelled))])
 
 
 def _split_edges(wedges: Wedges, max_length: float) -> Wedges:

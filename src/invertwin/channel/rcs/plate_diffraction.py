@@ -81,11 +81,7 @@ def find_plates(wedges: Wedges) -> list[Wedges]:
                 for e in others
                 if any(_are_coplanar_neighbours(wedges, e, other) for other in plate)
             ]
-            plate, others, grown = (
-                plate + near,
-                [e for e in others if e not in near],
-                bool(near),
-            )
+            plate, others, grown = (plate + near, [e for e in others if e not in near], bool(near))
         left = others
         edges = wedges.rows(torch.tensor(plate))
         if _is_convex(edges):
@@ -122,10 +118,7 @@ def _merge_collinear_edges(edges: Wedges) -> Wedges:
         points = torch.cat([edges.start[line], edges.end[line]])
         along = points @ (edges.end[line[0]] - edges.start[line[0]])
         first = edges.rows(torch.tensor(line[:1]))
-        ends = {
-            "start": points[along.argmin()][None],
-            "end": points[along.argmax()][None],
-        }
+        ends = {"start": points[along.argmin()][None], "end": points[along.argmax()][None]}
         sides.append(vars(first) | ends)
     return Wedges(**{name: torch.cat([side[name] for side in sides]) for name in sides[0]})
 

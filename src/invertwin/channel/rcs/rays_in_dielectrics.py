@@ -383,10 +383,8 @@ def _terminate_tubes(
     keep = is_valid & exceeds_min_amplitude(patches, solids.wave_number)
     solids.require_gaps(patches.facet[keep], patches.medium[keep])
     number = torch.arange(int(keep.sum()))
-    from_outside = torch.zeros_like(number, dtype=torch.bool)
-    tubes = _RayTubes(
-        number, ends[keep], directions[keep], normals[keep], phases[keep], from_outside
-    )
+    fresh = torch.zeros_like(number, dtype=torch.bool)
+    tubes = _RayTubes(number, ends[keep], directions[keep], normals[keep], phases[keep], fresh)
     return select_patches(patches, keep), tubes
 
 

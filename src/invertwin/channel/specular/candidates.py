@@ -233,11 +233,11 @@ class _SequenceTracer:
         for step in range(depth):
             if step:
                 origin = origin + self.surfaces.margin * direction
-            face, place_hit, reflected = self._intersect_rays(origin, direction)
+            face, point, reflected = self._intersect_rays(origin, direction)
             hit = (face >= 0) & (self.planes.face_plane[face.clamp_min(0)] >= 0)
             ended.append((prefixes, prefix_index[~hit]))
-            prefix_index, face, place_hit, reflected, direction = (
-                column[hit] for column in (prefix_index, face, place_hit, reflected, direction)
+            prefix_index, face, point, reflected, direction = (
+                column[hit] for column in (prefix_index, face, point, reflected, direction)
             )
             branches = []
             for mask, next_direction, bit in (
@@ -246,9 +246,7 @@ class _SequenceTracer:
             ):
                 chosen = mask[face]
                 code = 2 * self.planes.face_plane[face[chosen]] + bit
-                branches.append(
-                    (prefix_index[chosen], code, place_hit[chosen], next_direction[chosen])
-                )
+                branches.append((prefix_index[chosen], code, point[chosen], next_direction[chosen]))
             stops = ~(self.interactions.reflect[face] | self.interactions.transmit[face])
             ended.append((prefixes, prefix_index[stops]))
             prefix_index, code, origin, direction = (

@@ -97,13 +97,7 @@ def diffract_round_corner(
         raise ValueError("no face lies between both edges")
     azimuth = exterior_azimuth(last.wedges, leg, 0)
     final = EdgeDiffraction(
-        last.wedges,
-        leg,
-        leg,
-        last.azimuth_in,
-        azimuth,
-        length * sine**2,
-        last.face_coefficients,
+        last.wedges, leg, leg, last.azimuth_in, azimuth, length * sine**2, last.face_coefficients
     )
     orders: tuple[DyadDerivative, ...] = ("value", "out") if len(before) == 1 else ("value",)
     fields = transfer_dyads(route, first, wave_number, orders)

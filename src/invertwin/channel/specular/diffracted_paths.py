@@ -90,22 +90,20 @@ def evaluate_diffracted_paths(
         wedge_scene.path_edge(row, pair, absorbing=candidates.absorbing)
         for row, pair in zip(candidates.edge.T, zip(incidence, departure, strict=True), strict=True)
     ]
-    edge_fields = _edge_fields(candidates, edges, legs[0].image, legs[1].image, wave_number)
-    edge_points = [
-        clamp_to_edge(edge.wedges, edge_fields.points[:, n]) for n, edge in enumerate(edges)
-    ]
+    found = _edge_fields(candidates, edges, legs[0].image, legs[1].image, wave_number)
+    edge_points = [clamp_to_edge(edge.wedges, found.points[:, n]) for n, edge in enumerate(edges)]
     nodes = torch.stack([legs[0].image, *edge_points, legs[1].image], 1)
     segments = nodes[:, 1:] - nodes[:, :-1]
     length = segments.norm(dim=2).sum(1)
     # The field of the end of an edge has the delay of the path over that end.
-    phase = wave_number * (length - edge_fields.length)
+    phase = wave_number * (length - found.length)
     delay_phasor = phasor(phase)[:, None, None]
-    arriving = legs[0].dyad(edge_fields.points[:, 0])
+    arriving = legs[0].dyad(found.points[:, 0])
     # Reciprocity: the dyad after the edges is the transpose of that towards them.
-    leaving = legs[1].dyad(edge_fields.points[:, -1]).mT
-    slopes = torch.zeros_like(edge_fields.transfer).expand(2, -1, -1, -1)
-    if edge_fields.slopes is not None:
-        slopes = leaving @ (edge_fields.slopes * delay_phasor) @ arriving
+    leaving = legs[1].dyad(found.points[:, -1]).mT
+    slopes = torch.zeros_like(found.transfer).expand(2, -1, -1, -1)
+    if found.slopes is not None:
+        slopes = leaving @ (found.slopes * delay_phasor) @ arriving
     axes = [
         leg.rotate_axis(-edge_axis(edges[n].wedges)) for leg, n in zip(legs, (0, -1), strict=True)
     ]
@@ -129,7 +127,7 @@ def evaluate_diffracted_paths(
         torch.cat([candidates.before.faces, first, candidates.after.faces], 1),
         torch.cat(directions, 1),
         length,
-        leaving @ (edge_fields.transfer * delay_phasor) @ arriving,
+        leaving @ (found.transfer * delay_phasor) @ arriving,
         slopes.transpose(0, 1),
         torch.stack(axes, 1),
         candidates.corner,

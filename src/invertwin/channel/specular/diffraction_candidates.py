@@ -260,7 +260,7 @@ def _may_cross_planes(
     for step in reversed(range(steps.shape[1])):
         plane = steps[:, step] >> 1
         point, normal = planes.point[plane], planes.normal[plane]
-        coordinates, valid = [], []
+        local, valid = [], []
         for number, end in enumerate(points):
             direction = images[step + 1] - end
             slope = dot(direction, normal)
@@ -270,12 +270,10 @@ def _may_cross_planes(
                 (slope != 0) & (fraction > -_PLANE_TOLERANCE) & (fraction < 1 + _PLANE_TOLERANCE)
             )
             points[number] = end + fraction[:, None] * direction
-            coordinates.append(
-                torch.einsum("rx,rax->ra", points[number] - point, planes.axes[plane])
-            )
+            local.append(torch.einsum("rx,rax->ra", points[number] - point, planes.axes[plane]))
         both = valid[0] & valid[1]
-        below = torch.maximum(*coordinates) < planes.low[plane] - margin
-        above = torch.minimum(*coordinates) > planes.high[plane] + margin
+        below = torch.maximum(*local) < planes.low[plane] - margin
+        above = torch.minimum(*local) > planes.high[plane] + margin
         keep &= ~decidable | valid[0] | valid[1]
         # If one line misses a plane, the remaining planes decide nothing.
         decidable &= both

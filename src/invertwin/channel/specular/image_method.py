@@ -408,27 +408,21 @@ def intersects_planes(
         images: result of ``image_positions``, relative to the scene's origin [m].
         target: positions relative to the scene's origin [m].
     """
-    planes, position = surfaces.planes, target
+    planes, x = surfaces.planes, target
     tolerance = _EXACT_TOLERANCE * surfaces.size
     valid = torch.ones(len(target), dtype=torch.bool)
     for step in reversed(range(steps.shape[1])):
         plane, transmitted = steps[:, step] >> 1, (steps[:, step] & 1).bool()
-        point, normal, ray = (
-            planes.point[plane],
-            planes.normal[plane],
-            images[step + 1] - position,
-        )
+        point, normal, ray = (planes.point[plane], planes.normal[plane], images[step + 1] - x)
         slope = dot(ray, normal)
         valid &= slope != 0
-        share = dot(point - position, normal) / torch.where(
-            slope == 0, torch.ones_like(slope), slope
-        )
+        share = dot(point - x, normal) / torch.where(slope == 0, torch.ones_like(slope), slope)
         length = ray.norm(dim=1)
         # A receiver in a reflecting plane has a reflection; one in a sheet is not behind it.
         valid &= share * length > torch.where(transmitted, tolerance, -tolerance)
         valid &= share * length < length - tolerance
-        position = position + share[:, None] * ray
-        at = torch.einsum("rx,rax->ra", position - point, planes.axes[plane])
+        x = x + share[:, None] * ray
+        at = torch.einsum("rx,rax->ra", x - point, planes.axes[plane])
         valid &= (at >= planes.low[plane] - surfaces.margin).all(1)
         valid &= (at <= planes.high[plane] + surfaces.margin).all(1)
     return valid
@@ -454,11 +448,9 @@ def find_unobstructed_paths(
         return torch.zeros(0, dtype=torch.bool), torch.zeros_like(steps)
     planes, plane = surfaces.planes, steps >> 1
     point, normal = planes.point[plane], planes.normal[plane]
-    local_source, target = source - surfaces.origin, targets - surfaces.origin
-    images = image_positions(local_source, point, normal, (steps & 1).bool())
-    nodes = torch.stack(
-        [local_source, *interaction_points(target, images, point, normal), target], 1
-    )
+    begin, target = source - surfaces.origin, targets - surfaces.origin
+    images = image_positions(begin, point, normal, (steps & 1).bool())
+    nodes = torch.stack([begin, *interaction_points(target, images, point, normal), target], 1)
     none = torch.full((count, 1), -1)
     before, after = torch.cat([none, plane], 1), torch.cat([plane, none], 1)
     target_plane = none if target_planes is None else target_planes[:, None]

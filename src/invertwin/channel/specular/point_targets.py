@@ -75,20 +75,12 @@ def trace_point_targets(
     outbound = legs(link.tx)
     inbound = outbound if torch.equal(link.tx, link.rx) else legs(link.rx)
     strength = (4 * math.pi * sizes).sqrt() / link.wavelength
-    echoes = []
+    found = []
     for frame in range(link.frame_count):
         own = outbound.select(outbound.tx == frame), inbound.select(inbound.tx == frame)
-        first, second = _match_legs(own[0].rx, own[1].rx)
-        echoes.append(
-            _echo_paths(
-                link,
-                frame,
-                own[0].select(first),
-                own[1].select(second),
-                strength,
-            )
-        )
-    return concatenate_paths(echoes)
+        first, last = _match_legs(own[0].rx, own[1].rx)
+        found.append(_echo_paths(link, frame, own[0].select(first), own[1].select(last), strength))
+    return concatenate_paths(found)
 
 
 def _match_legs(outbound: Tensor, inbound: Tensor) -> tuple[Tensor, Tensor]:

@@ -432,17 +432,15 @@ def _specular_columns(path_scene: PathScene, paths: SpecularPaths) -> _Columns:
         path_scene.vertices, path_scene.topology, paths.faces, paths.transmitted, tx
     )
     distance = (rx - unfolded.image).norm(dim=1)
-    directions, vertices = unfolded.directions(rx), unfolded.interaction_points(rx)
-    matrix = _transfer_matrix(path_scene, paths, directions, unfolded.normal)
+    units, vertices = unfolded.directions(rx), unfolded.interaction_points(rx)
+    matrix = _transfer_matrix(path_scene, paths, units, unfolded.normal)
     scale = SPEED_OF_LIGHT / path_scene.frequency / (4 * math.pi) / distance
-    rate = _shortening_rate(
-        path_scene, paths.source, paths.target, directions, vertices, paths.faces
-    )
+    rate = _shortening_rate(path_scene, paths.source, paths.target, units, vertices, paths.faces)
     return (
         distance / SPEED_OF_LIGHT,
         matrix * scale[:, None, None],
-        directions[0],
-        -directions[-1],
+        units[0],
+        -units[-1],
         vertices,
         torch.where(paths.transmitted, TRANSMISSION, REFLECTION),
         paths.faces,

@@ -308,11 +308,7 @@ class EFIEMatrix:
         if not gradient:
             return constant, linear, None
         decay = -(1j * phase * phasor(-phase) + rest) / (4 * math.pi * distance**3) * weights
-        return (
-            constant,
-            linear,
-            slope * scale[..., None] + (decay[..., None] * offset).sum(2),
-        )
+        return (constant, linear, slope * scale[..., None] + (decay[..., None] * offset).sum(2))
 
     def bilinear(
         self,
@@ -477,8 +473,4 @@ def triangle_potentials(
     base = base + dot(a, b) * distances[2] + dot(b, c) * distances[0] + dot(c, a) * distances[1]
     angle = 2 * torch.atan2(-volume, base)
     level = level - height * angle
-    return (
-        level,
-        first - normal * (height * level)[..., None],
-        slope - normal * angle[..., None],
-    )
+    return (level, first - normal * (height * level)[..., None], slope - normal * angle[..., None])

@@ -195,15 +195,13 @@ def _sample_interior_points(
     corners = target.vertices[target.faces]
     normal = torch.nn.functional.normalize(target.double_area_vectors, dim=1)
     start = vertices[torch.from_numpy(mesh.faces)[closed]].mean(1)
-    outward = normal[origin[closed]]
-    opposite, is_hit = _find_opposite_faces(
-        target, start.detach(), -outward.detach(), corners.detach()
-    )
-    start, outward, opposite = start[is_hit], outward[is_hit], opposite[is_hit]
-    thickness = dot(start - corners[opposite, 0], normal[opposite]) / dot(outward, normal[opposite])
+    n = normal[origin[closed]]
+    opposite, is_hit = _find_opposite_faces(target, start.detach(), -n.detach(), corners.detach())
+    start, n, opposite = start[is_hit], n[is_hit], opposite[is_hit]
+    thickness = dot(start - corners[opposite, 0], normal[opposite]) / dot(n, normal[opposite])
     depth = torch.tensor(_DEPTH_SHARES, dtype=torch.float64).repeat(len(start))[: len(start)]
     max_depth = thickness.clamp_max(_MAX_DEPTH * wavelength)
-    points = start - (depth * max_depth)[:, None] * outward
+    points = start - (depth * max_depth)[:, None] * n
     closed_mesh = Mesh(target.vertices.detach(), target.faces[target.solid])
     clearance = signed_distance(closed_mesh, points.detach()).abs()
     return points[clearance >= _MIN_CLEARANCE * max_depth.detach()]

@@ -75,10 +75,7 @@ def build_conforming_mesh(
     parts = np.maximum(1, np.ceil(length / side - _LENGTH_SLACK)).astype(np.int64)
     first = len(vertices) + np.concatenate([[0], (parts - 1).cumsum()])
     every = np.arange(len(vertices))
-    parents, weights = (
-        [np.stack([every] * 3, 1)],
-        [np.eye(3)[np.zeros(len(vertices), int)]],
-    )
+    parents, weights = ([np.stack([every] * 3, 1)], [np.eye(3)[np.zeros(len(vertices), int)]])
     for (low, high), count in zip(edges, parts, strict=True):
         fraction = np.arange(1, count) / count
         parents.append(np.tile([low, high, high], (count - 1, 1)))
@@ -88,16 +85,12 @@ def build_conforming_mesh(
     for number, face in enumerate(faces):
         face_edges = edge[number]
         inner, local = _triangulate_face(
-            tuple(int(n) for n in parts[face_edges]),
-            _face_shape(vertices[face] / side),
+            tuple(int(n) for n in parts[face_edges]), _face_shape(vertices[face] / side)
         )
         rim: list[Index] = []
         for corner in range(3):
             between = first[face_edges[corner]] + np.arange(parts[face_edges[corner]] - 1)
-            rim += [
-                face[corner : corner + 1],
-                between[::-1] if turned[number, corner] else between,
-            ]
+            rim += [face[corner : corner + 1], between[::-1] if turned[number, corner] else between]
         local_numbers = np.concatenate([*rim, count + np.arange(len(inner))])
         parents.append(np.tile(face, (len(inner), 1)))
         weights.append(inner)

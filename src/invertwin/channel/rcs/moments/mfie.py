@@ -97,10 +97,8 @@ def build_cells(corners: Float64[np.ndarray, "facet 3 3"], side: float) -> Surfa
     near = _find_nearest(place, centre)
     distance = np.einsum("cx,cx->c", place[near] - centre, normal[near])
     centre += (distance / np.einsum("cx,cx->c", normals, normal[near]))[:, None] * normals
-    radius, closed = _inscribed_radii(centre, normals, whole)
-    return SurfaceCells(
-        centre, normals, whole, _estimate_curvature(centre, normals), radius, closed
-    )
+    ball, closed = _inscribed_radii(centre, normals, whole)
+    return SurfaceCells(centre, normals, whole, _estimate_curvature(centre, normals), ball, closed)
 
 
 def _subdivide_triangles(corners: Array, longest: float) -> tuple[Array, Array, Array]:
