@@ -573,9 +573,9 @@ def test_padded_links_may_be_empty():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tx": [1.0, 2.0]}, "tx places"),
+        ({"tx": [1.0, 2.0]}, "tx positions"),
         ({"rx": []}, "rx"),
-        ({"tx": [float("nan"), 0.0, 0.0]}, "finite tx places"),
+        ({"tx": [float("nan"), 0.0, 0.0]}, "finite tx positions"),
         ({"frequency": -1.0}, "frequency"),
         ({"depth": 7}, "depth of at most 6"),
         ({"rays": 0}, "rays"),

@@ -18,9 +18,9 @@ from torch import Tensor
 from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.ray_scene import Occluders, is_visible
+from invertwin.channel.rays.scene_tables import require_surfaces
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.checks import strip_derivatives
-from invertwin.errors import InputError
 from invertwin.scene import Scene
 
 _PAIRS_AT_ONCE = 1 << 21  # edges × observers, or edges × cells, per chunk
@@ -101,11 +101,7 @@ def visible_fractions(
     Raises:
         InputError: a cloud among the objects.
     """
-    clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
-    if clouds:
-        raise InputError(
-            f"expected objects with surfaces, got clouds for {', '.join(clouds)}; mesh them"
-        )
+    require_surfaces(scene)
     items = list(scene.objects.values())
     topology = topology_of([item.mesh for item in items])
     vertices = torch.cat([item.vertices for item in items])

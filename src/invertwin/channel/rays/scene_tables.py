@@ -134,6 +134,22 @@ def require_silhouette_samples(geometry: Geometry, link: Link, samples: int) -> 
         )
 
 
+def require_surfaces(scene: Scene, hint: str = "mesh them") -> None:
+    """Raise an error for point clouds.
+
+    Args:
+        scene: scene whose objects must be meshes.
+        hint: remedy that ends the message.
+
+    Raises:
+        InputError: a cloud in the scene.
+    """
+    clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
+    if clouds:
+        names = ", ".join(clouds)
+        raise InputError(f"expected objects with surfaces, got clouds for {names}; {hint}")
+
+
 def flatten(
     scene: Scene, wavelength: float, *, motion: Literal["refused", "fixed", "free"] = "refused"
 ) -> Geometry:
@@ -149,12 +165,11 @@ def flatten(
             to a velocity, or an object that is a cloud.
     """
     objects = list(scene.objects.values())
-    clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
-    if clouds:
-        raise InputError(
-            f"expected objects with surfaces, got clouds for {', '.join(clouds)}; only power "
-            "(deposit_power, the surrogate) is computed of clouds: mesh them for exact signals"
-        )
+    require_surfaces(
+        scene,
+        "only power (deposit_power, the surrogate) is computed of clouds: mesh them for exact "
+        "signals",
+    )
     fitted = [n for n, o in scene.objects.items() if is_differentiated(o.velocity)]
     moving = fitted or [n for n, o in scene.objects.items() if _is_moving(o)]
     if (fitted and motion != "free") or (moving and motion == "refused"):

@@ -20,9 +20,9 @@ from invertwin.channel.rays.arrays import to_float, to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
 from invertwin.channel.rays.intersections import find_overlapping_pairs, intersect_triangles
 from invertwin.channel.rays.ray_scene import Occluders
+from invertwin.channel.rays.scene_tables import require_surfaces
 from invertwin.channel.rays.topology import topology_of
 from invertwin.checks import is_differentiated, strip_derivatives
-from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
 
@@ -60,11 +60,7 @@ class ViewpointScene:
 
     def __init__(self, scene: Scene, viewpoint: Float64[Tensor, "3"]) -> None:
         objects = scene.objects.values()
-        clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
-        if clouds:
-            raise InputError(
-                f"expected objects with surfaces, got clouds for {', '.join(clouds)}; mesh them"
-            )
+        require_surfaces(scene)
         self.names = tuple(scene.objects)
         self._vertices = torch.cat([item.vertices for item in objects])
         self._viewpoint = viewpoint

@@ -48,6 +48,7 @@ from invertwin.channel.em.wedges import (
 )
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.ray_scene import Occluders, is_visible
+from invertwin.channel.rays.scene_tables import require_surfaces
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.channel.rcs.dielectric_interfaces import scatter_at_interfaces
 from invertwin.channel.rcs.moments.efie_solver import EFIESolver
@@ -457,11 +458,7 @@ def _split_edges(wedges: Wedges, max_length: float) -> Wedges:
 
 def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTarget:
     objects = scene.objects
-    clouds = [name for name, item in objects.items() if item.cloud is not None]
-    if clouds:
-        raise InputError(
-            f"expected objects with surfaces, got clouds for {', '.join(clouds)}; mesh them"
-        )
+    require_surfaces(scene)
     vertices = torch.cat([item.vertices for item in objects.values()])
     topology = topology_of([item.mesh for item in objects.values()])
     facets = build_facets(vertices, topology)

@@ -97,17 +97,9 @@ class DiffractionCandidates:
 
     def rows(self, index: Tensor) -> "DiffractionCandidates":
         """Select rows."""
-        return DiffractionCandidates(
-            self.tx[index],
-            self.rx[index],
-            self.edge[index],
-            self.before.rows(index),
-            self.after.rows(index),
-            self.between[index],
-            self.absorbing,
-            self.corner,
-            None if self.end is None else self.end[index],
-        )
+        columns = {n: v[index] for n, v in vars(self).items() if isinstance(v, Tensor)}
+        legs = {"before": self.before.rows(index), "after": self.after.rows(index)}
+        return replace(self, **columns, **legs)
 
 
 def find_diffraction_candidates(

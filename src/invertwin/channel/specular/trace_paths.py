@@ -25,7 +25,7 @@ from invertwin.channel.em.plane_waves import (
     polarisations,
 )
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.scene_tables import vertex_velocities
+from invertwin.channel.rays.scene_tables import require_surfaces, vertex_velocities
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.channel.specular.candidates import (
     CandidateSequences,
@@ -242,11 +242,7 @@ def prepare_path_scene(
         InputError: a cloud in the scene, or antennas of wrong shape.
     """
     objects = scene.objects.values()
-    clouds = [name for name, item in scene.objects.items() if item.cloud is not None]
-    if clouds:
-        raise InputError(
-            f"expected objects with surfaces, got clouds for {', '.join(clouds)}; mesh them"
-        )
+    require_surfaces(scene)
     ends = [_check_positions(place, what) for place, what in ((tx, "tx"), (rx, "rx"))]
     speeds = [
         _check_velocities(value, len(end), what)
