@@ -39,6 +39,7 @@ from invertwin.channel.specular.image_method import (
     find_unobstructed_paths,
     image_positions,
     intersects_planes,
+    replace_zeros,
 )
 from invertwin.channel.specular.ray_paths import REFLECTION, TRANSMISSION, match_rows
 from invertwin.channel.specular.wedge_scene import WedgeScene, is_exterior
@@ -256,8 +257,7 @@ def _may_cross_planes(
         for number, end in enumerate(points):
             direction = images[step + 1] - end
             slope = dot(direction, normal)
-            safe = torch.where(slope == 0, torch.ones_like(slope), slope)
-            fraction = dot(point - end, normal) / safe
+            fraction = dot(point - end, normal) / replace_zeros(slope)
             valid.append(
                 (slope != 0) & (fraction > -_PLANE_TOLERANCE) & (fraction < 1 + _PLANE_TOLERANCE)
             )

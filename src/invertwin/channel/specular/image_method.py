@@ -137,6 +137,15 @@ def image_positions(
     return found
 
 
+def replace_zeros(values: Tensor) -> Tensor:
+    """Replace zeros by ones, as denominators of masked rows.
+
+    Args:
+        values: denominators, of any shape.
+    """
+    return torch.where(values == 0, torch.ones_like(values), values)
+
+
 def interaction_points(
     target: Float64[Tensor, "row 3"],
     images: list[Float64[Tensor, "row 3"]],
@@ -155,9 +164,7 @@ def interaction_points(
     for step in reversed(range(point.shape[1])):
         n, direction = normal[:, step], images[step + 1] - position
         slope = dot(direction, n)
-        fraction = dot(point[:, step] - position, n) / torch.where(
-            slope == 0, torch.ones_like(slope), slope
-        )
+        fraction = dot(point[:, step] - position, n) / replace_zeros(slope)
         position = position + fraction[:, None] * direction
         found.insert(0, position)
     return found
@@ -416,7 +423,7 @@ def intersects_planes(
         point, normal, ray = (planes.point[plane], planes.normal[plane], images[step + 1] - x)
         slope = dot(ray, normal)
         valid &= slope != 0
-        share = dot(point - x, normal) / torch.where(slope == 0, torch.ones_like(slope), slope)
+        share = dot(point - x, normal) / replace_zeros(slope)
         length = ray.norm(dim=1)
         # A receiver in a reflecting plane has a reflection; one in a sheet is not behind it.
         valid &= share * length > torch.where(transmitted, tolerance, -tolerance)
@@ -553,9 +560,7 @@ def _test_exactly(
         direction = end - start
         length = direction.norm(dim=2)
         slope = dot(direction, area.expand(len(row), -1, -1))
-        fraction = dot(a - start, area.expand(len(row), -1, -1)) / torch.where(
-            slope == 0, torch.ones_like(slope), slope
-        )
+        fraction = dot(a - start, area.expand(len(row), -1, -1)) / replace_zeros(slope)
 
         def inside(point: Tensor) -> Tensor:
             offset = point - a

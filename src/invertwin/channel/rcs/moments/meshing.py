@@ -161,12 +161,14 @@ def _triangulate_face(
     bulge = np.concatenate([4 * t * (1 - t) * u for t, u in zip(fractions, outwards, strict=True)])
     inner = _interior_points(corner, outwards)
     count = len(rim)
+
+    def triangulate() -> Index:
+        points = np.concatenate([rim + _BULGE * bulge, inner])
+        return Delaunay(points).simplices.astype(np.int64)
+
     for _ in range(_SMOOTHING_ROUNDS if len(inner) else 0):
-        triangles = Delaunay(np.concatenate([rim + _BULGE * bulge, inner])).simplices.astype(
-            np.int64
-        )
-        inner = _smooth_points(np.concatenate([rim, inner]), triangles)[count:]
-    triangles = Delaunay(np.concatenate([rim + _BULGE * bulge, inner])).simplices.astype(np.int64)
+        inner = _smooth_points(np.concatenate([rim, inner]), triangulate())[count:]
+    triangles = triangulate()
     positions = np.concatenate([rim, inner])[triangles]
     first, second = positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0]
     is_clockwise = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0] < 0
