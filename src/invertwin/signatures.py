@@ -177,7 +177,8 @@ def rcs(
     receiver_directions = None if receivers is None else _check_directions(receivers, "receivers")
     if receiver_directions is not None and len(receiver_directions) != len(transmitters):
         raise InputError(
-            f"expected {len(sent)} receivers, one for each direction, got {len(received)}"
+            f"expected {len(transmitters)} receivers, one for each direction, got "
+            f"{len(receiver_directions)}"
         )
     sweep = checked_tensor(
         torch.atleast_1d(torch.as_tensor(frequencies, dtype=torch.float64)),

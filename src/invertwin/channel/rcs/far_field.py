@@ -528,7 +528,7 @@ def _warn_validity(
         sagitta = float(sagittas[mine].median()) / target.wavelength if bool(mine.any()) else 0.0
         if sagitta * index > _MAX_SAGITTA:
             found.append(
-                f"the facets of {name} are {sagitta * shorter:.2g} wavelengths off the curved "
+                f"the facets of {name} are {sagitta * index:.2g} wavelengths off the curved "
                 "surface, more than 1/50: use a finer mesh"
             )
         is_mixed = target.facets.solid[own].all() and not is_homogeneous(
