@@ -173,31 +173,7 @@ def rcs(
 
     Source: derivations §4, §13, §14.
     """
-    transmitters = _check_directions(directions, "directions")
-    receiver_directions = None if receivers is None else _check_directions(receivers, "receivers")
-    if receiver_directions is not None and len(receiver_directions) != len(transmitters):
-        raise InputError(
-            f"expected {len(transmitters)} receivers, one for each direction, got "
-            f"{len(receiver_directions)}"
-        )
-    sweep = checked_tensor(
-        torch.atleast_1d(torch.as_tensor(frequencies, dtype=torch.float64)),
-        (None,),
-        "frequencies [Hz]",
-        "give one or more",
-    )
-    for frequency in sweep.tolist():
-        checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-    for value, what in (
-        (transmitters, "directions"),
-        (receiver_directions, "receivers"),
-        (sweep, "frequencies"),
-    ):
-        if is_differentiated(value):
-            raise InputError(
-                f"expected {what} without derivatives, got some that require grad; turn the scene "
-                "instead, or detach them"
-            )
+    transmitters, receiver_directions, sweep = _check_sweep(directions, receivers, frequencies)
     axis = checked_tensor(up, (3,), "up", "give a vector such as 0, 0, 1")
     tubes = checked_number(tubes_per_wavelength, "tubes per wavelength", 0.0, open_low=True)
     parts = trace_far_field(
@@ -243,6 +219,40 @@ def to_dbsm(amplitude: Complex128[Tensor, "*any"]) -> Float64[Tensor, "*any"]:
         amplitude: scattering amplitudes S [m].
     """
     return 10 * torch.log10((4 * math.pi * amplitude.abs() ** 2).clamp_min(1e-300))
+
+
+def _check_sweep(
+    directions: ArrayLike,
+    receivers: ArrayLike | None,
+    frequencies: float | Sequence[float] | Tensor,
+) -> tuple[Tensor, Tensor | None, Tensor]:
+    """Check directions and frequencies; returns them as tensors, directions of unit length."""
+    transmitters = _check_directions(directions, "directions")
+    receiver_directions = None if receivers is None else _check_directions(receivers, "receivers")
+    if receiver_directions is not None and len(receiver_directions) != len(transmitters):
+        raise InputError(
+            f"expected {len(transmitters)} receivers, one for each direction, got "
+            f"{len(receiver_directions)}"
+        )
+    sweep = checked_tensor(
+        torch.atleast_1d(torch.as_tensor(frequencies, dtype=torch.float64)),
+        (None,),
+        "frequencies [Hz]",
+        "give one or more",
+    )
+    for frequency in sweep.tolist():
+        checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
+    for value, what in (
+        (transmitters, "directions"),
+        (receiver_directions, "receivers"),
+        (sweep, "frequencies"),
+    ):
+        if is_differentiated(value):
+            raise InputError(
+                f"expected {what} without derivatives, got some that require grad; turn the scene "
+                "instead, or detach them"
+            )
+    return transmitters, receiver_directions, sweep
 
 
 def _check_directions(values: ArrayLike, what: str) -> Tensor:
