@@ -153,7 +153,7 @@ class Camera:
 
     @property
     def is_differentiated(self) -> bool:
-        """Whether any of its values carries derivatives."""
+        """True if any of its values carries derivatives."""
         values = (self.positions, self.rotations, self.focal, self.centre)
         return any(is_differentiated(torch.as_tensor(value)) for value in values)
 

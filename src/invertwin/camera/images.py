@@ -29,10 +29,10 @@ _MIN_OUTLINE_OFFSET = 2e-5  # minimum angle, since rays are float32 [rad]
 _NEAR_PLANE = 1e-3  # near clipping distance of outlines [m]
 _ROWS_AT_ONCE = 1 << 20
 _R2_STEPS = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
-"""Steps of the sequence R2, which fills a square evenly: powers of the root of x³ = x + 1."""
+"""Steps of the low-discrepancy sequence R2: powers of the root of x³ = x + 1."""
 
 RayValue = Callable[[ViewpointScene, Tensor, Tensor], Tensor]
-"""What single rays show, by scene, the triangles that they meet first (−1: none), and depths."""
+"""Values of single rays from the scene, the first triangles hit (−1: none), and depths."""
 
 
 @dataclass(frozen=True)

@@ -131,12 +131,12 @@ def find_hypotheses(
                 (likelihood.log_likelihood_gains([*shapes[:number], r, *shapes[number + 1 :]]), r)
                 for r in (start, new)
             ]
-            swapped, rival = max(options, key=lambda option: float(option[0].sum()))
+            swapped, other = max(options, key=lambda option: float(option[0].sum()))
             right = min(max(acceptance_probability(together, swapped), 1e-6), 1 - 1e-6)
-            found[number].append(ShapeHypothesis(rival, (1 - right) / right))
-    totals = [sum(rival.probability for rival in row) for row in found]
+            found[number].append(ShapeHypothesis(other, (1 - right) / right))
+    totals = [sum(other.probability for other in row) for row in found]
     return [
-        [replace(rival, probability=rival.probability / total) for rival in row]
+        [replace(other, probability=other.probability / total) for other in row]
         for row, total in zip(found, totals, strict=True)
     ]
 
@@ -148,9 +148,9 @@ def kind_probabilities(hypotheses: Sequence[ShapeHypothesis]) -> dict[str, float
         hypotheses: hypotheses of a shape.
     """
     found = dict[str, float]()
-    for rival in hypotheses:
-        found[rival.shape.effective_kind] = (
-            found.get(rival.shape.effective_kind, 0.0) + rival.probability
+    for other in hypotheses:
+        found[other.shape.effective_kind] = (
+            found.get(other.shape.effective_kind, 0.0) + other.probability
         )
     return found
 

@@ -19,11 +19,11 @@ _MIN_PERSON_EXTENT, _PERSON_MARGIN = (
     0.25,
 )  # minimum extent, and margin of the usual extents [m]
 MAX_CORNER_EXTENT = 0.15
-"""Side of the largest group that may be a corner reflector [m]."""
+"""Maximum side of a group proposed as a corner reflector [m]."""
 
 
 def bright_weights(
-    strength: Float64[Tensor, " place"], fraction: float = 0.02
+    strength: Float64[Tensor, " point"], fraction: float = 0.02
 ) -> Float64[Tensor, " chosen"]:
     """Compute weights of image points; weak points have weight zero.
 
@@ -43,8 +43,8 @@ def bright_weights(
 
 
 def group_bright_points(
-    positions: Float64[Tensor, "place 2"], weight: Float64[Tensor, " place"], max_gap: float
-) -> list[Float64[Tensor, " place"]]:
+    positions: Float64[Tensor, "point 2"], weight: Float64[Tensor, " point"], max_gap: float
+) -> list[Float64[Tensor, " point"]]:
     """Group bright points linked by steps of at most a gap; return their weights over all points.
 
     Args:
@@ -52,21 +52,21 @@ def group_bright_points(
         weight: weight of every point; zero is dark.
         max_gap: longest step [m].
     """
-    lit = weight.nonzero()[:, 0]
-    if not len(lit):
+    bright = weight.nonzero()[:, 0]
+    if not len(bright):
         return []
-    labels = label_groups(positions[lit], max_gap)
+    labels = label_groups(positions[bright], max_gap)
     found = []
     for number in range(int(labels.max()) + 1):
         own = torch.zeros_like(weight)
-        rows = lit[labels == number]
+        rows = bright[labels == number]
         own[rows] = weight[rows]
         found.append(own)
     return sorted(found, key=lambda own: -float(own.sum()))
 
 
 def enclosing_rectangle(
-    positions: Float64[Tensor, "place 2"], weight: Float64[Tensor, " place"], yaw: float
+    positions: Float64[Tensor, "point 2"], weight: Float64[Tensor, " point"], yaw: float
 ) -> tuple[Float64[Tensor, "2"], Float64[Tensor, "2"], float]:
     """Return centre [m], sides [m] and tightness of the rectangle at a yaw around bright points.
 
@@ -99,8 +99,8 @@ def _trimmed_ends(coordinates: Tensor, weight: Tensor) -> Tensor:
 
 
 def propose_shapes(
-    positions: Float64[Tensor, "place 2"],
-    weight: Float64[Tensor, " place"],
+    positions: Float64[Tensor, "point 2"],
+    weight: Float64[Tensor, " point"],
     ground: Ground,
     *,
     step: float,

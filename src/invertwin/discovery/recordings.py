@@ -14,6 +14,7 @@ from invertwin.channel import Grid, ViewpointScene
 from invertwin.checks import checked_count, checked_number, checked_tensor
 from invertwin.discovery.assembly import ShapeLikelihood, make_sampling
 from invertwin.discovery.certainty import (
+    ShapeHypothesis,
     existence_probabilities,
     find_hypotheses,
     kind_probabilities,
@@ -36,9 +37,10 @@ from invertwin.discovery.outcome import DetectedObject, GroundImage, Twin
 from invertwin.discovery.search import ImageGrid, ShapeSearch
 from invertwin.discovery.self_calibration import calibrate_on_scene, phase_spread
 from invertwin.discovery.shapes.outlines import fit_outlines
-from invertwin.discovery.shapes.primitives import shape_center
+from invertwin.discovery.shapes.primitives import ShapeParameters, shape_center
 from invertwin.discovery.tracks import track_moving_targets
 from invertwin.errors import InputError
+from invertwin.inversion import Reconstruction
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar, SampledWaveform
@@ -108,9 +110,9 @@ def twin(
         said = "nothing that stands still is above the noise" if moving else _NO_SIGNAL_NOTE
         return Twin(_sort_objects(moving), plane, floor, notes=(said,))
     places, step = _image_points(radar, plane, plane_at, reach, low, high)
-    told = calibrate_on_scene(capture, radar.grid(*reach), places)
-    if told is not None:
-        recording, capture = told.apply(recording), told.apply(capture)
+    gains = calibrate_on_scene(capture, radar.grid(*reach), places)
+    if gains is not None:
+        recording, capture = gains.apply(recording), gains.apply(capture)
     moving = _find_moving_targets(recording, range_max, plane)
     if is_dense_track(capture):
         # Average over frames, where all of them have an echo.
@@ -125,9 +127,9 @@ def twin(
         return Twin(_sort_objects([*found, *moving]), plane, floor, picture)
     grid = radar.grid(*reach)
     still = _find_static_objects(capture, radar, grid, plane, floor, places, step, rays, seed)
-    notes = () if told is None else (_CALIBRATION_NOTE.format(phase_spread(told, radar)),)
-    things = _sort_objects([*still.objects, *moving])
-    return replace(still, objects=things, notes=(*notes, *still.notes), calibration=told)
+    notes = () if gains is None else (_CALIBRATION_NOTE.format(phase_spread(gains, radar)),)
+    objects = _sort_objects([*still.objects, *moving])
+    return replace(still, objects=objects, notes=(*notes, *still.notes), calibration=gains)
 
 
 def average_chirps(recording: Capture | ChirpCapture) -> Capture:
@@ -143,8 +145,8 @@ def average_chirps(recording: Capture | ChirpCapture) -> Capture:
         return recording
     chirps, radar = recording.chirps, recording.radar()
     lasts = float(chirps.times(radar.shape[1])[-1].max())
-    way = float(platform_velocities(recording).norm(dim=1).max()) * lasts
-    if way > 0.25 * radar.waveform.wavelength:
+    path_length = float(platform_velocities(recording).norm(dim=1).max()) * lasts
+    if path_length > 0.25 * radar.waveform.wavelength:
         return recording.to_capture(chirps.count // 2)
     # At 2.5 bins of range rate a plain mean passes 1.7 % of the power, this one 0.05 %.
     window = torch.hann_window(chirps.count + 2, periodic=False, dtype=recording.beat.real.dtype)
@@ -237,26 +239,14 @@ def _find_static_objects(
             notes = (_IMAGE_BETTER_NOTE,)
     shapes, found = one.fit(shapes, _FINAL_FIT_STEPS)
     among = find_hypotheses(one, shapes)
-    likelier = [max(row, key=lambda rival: rival.probability).shape for row in among]
+    likelier = [max(row, key=lambda one: one.probability).shape for row in among]
     if any(new is not old for new, old in zip(likelier, shapes, strict=True)):
         shapes, found = one.fit(likelier, _FINAL_FIT_STEPS)
         among = find_hypotheses(one, shapes)
-    errors, sure = standard_deviations(one, found), existence_probabilities(one, shapes)
-    things = [
-        DetectedObject(
-            f"object_{k}",
-            shape.effective_kind,
-            kind_probabilities(among[k - 1]),
-            shape_center(shape, ground, level),
-            shape,
-            widen_deviations(one, _select_prefix(errors, f"object_{k}."), among[k - 1]),
-            sure[k - 1],
-        )
-        for k, shape in enumerate(shapes, 1)
-    ]
+    objects = _describe_objects(one, found, shapes, among)
     views = _count_views(radar, positions, one.build_scene(shapes))
     return Twin(
-        tuple(things),
+        objects,
         ground,
         level,
         GroundImage(flat, picture, views),
@@ -264,6 +254,31 @@ def _find_static_objects(
         power,
         grid,
         notes,
+    )
+
+
+def _describe_objects(
+    likelihood: ShapeLikelihood,
+    fit: Reconstruction,
+    shapes: Sequence[ShapeParameters],
+    hypotheses: Sequence[Sequence[ShapeHypothesis]],
+) -> tuple[DetectedObject, ...]:
+    """Return fitted shapes as objects with error bars, kinds and existence probabilities."""
+    errors = standard_deviations(likelihood, fit)
+    probabilities = existence_probabilities(likelihood, shapes)
+    return tuple(
+        DetectedObject(
+            f"object_{k}",
+            shape.effective_kind,
+            kind_probabilities(among),
+            shape_center(shape, likelihood.ground, likelihood.level),
+            shape,
+            widen_deviations(likelihood, _select_prefix(errors, f"object_{k}."), among),
+            probability,
+        )
+        for k, (shape, among, probability) in enumerate(
+            zip(shapes, hypotheses, probabilities, strict=True), 1
+        )
     )
 
 
@@ -342,7 +357,7 @@ def _image_points(
     ranges: tuple[float, float],
     low: Sequence[float] | None,
     high: Sequence[float] | None,
-) -> tuple[Float64[Tensor, "place 3"], float]:
+) -> tuple[Float64[Tensor, "point 3"], float]:
     """Return visible image points on the ground [m], and their distance."""
     axes = list(ground.plane_axes)
     at = radar.positions.detach()[:, axes]
@@ -380,8 +395,8 @@ def _image_points(
 
 
 def _count_views(
-    radar: Radar, positions: Float64[Tensor, "place 3"], scene: Scene | None
-) -> Int64[Tensor, " place"]:
+    radar: Radar, positions: Float64[Tensor, "point 3"], scene: Scene | None
+) -> Int64[Tensor, " point"]:
     """Count the radar positions that see each point past all objects."""
     total = torch.zeros(len(positions), dtype=torch.int64)
     for place, axis in _boresights(radar):

@@ -47,7 +47,7 @@ class ImageGrid:
         height: height of the radars above the ground [m].
     """
 
-    positions: Float64[Tensor, "place 2"]
+    positions: Float64[Tensor, "point 2"]
     step: float
     response: ImageResponse
     height: float
@@ -114,11 +114,11 @@ class ShapeSearch:
         )
 
     @cached_property
-    def first_image(self) -> Float64[Tensor, " place"]:
+    def first_image(self) -> Float64[Tensor, " point"]:
         """Reflectivity image without any known shape."""
         return self.residual_image([])
 
-    def residual_image(self, shapes: Sequence[ShapeParameters]) -> Float64[Tensor, " place"]:
+    def residual_image(self, shapes: Sequence[ShapeParameters]) -> Float64[Tensor, " point"]:
         """Compute the reflectivity image of the residual of shapes.
 
         Args:
@@ -195,23 +195,25 @@ class ShapeSearch:
             loss.bin_losses(rest, power) - loss.bin_losses(nothing, power)
         )
         at = one.radar.positions.detach()[:, list(self.ground.plane_axes)]
-        way = torch.nn.functional.normalize(at[:, None] - lattice.positions, dim=2)
+        direction = torch.nn.functional.normalize(at[:, None] - lattice.positions, dim=2)
         yaws = [k * math.pi / 8 for k in range(16)]
         score = torch.stack(
             [
-                ((way @ corner_direction(yaw, self.ground) > _MIN_CORNER_COSINE) * gain).sum(0)
+                ((direction @ corner_direction(yaw, self.ground) > _MIN_CORNER_COSINE) * gain).sum(
+                    0
+                )
                 for yaw in yaws
             ]
         )
         found = list[ShapeParameters]()
         for _ in range(_CORNERS_PER_ROUND):
             best, yaw = score.amax(0), score.argmax(0)
-            place = int(best.argmax())
+            index = int(best.argmax())
             options = [
                 ShapeParameters(
                     "corner",
-                    (float(lattice.positions[place, 0]), float(lattice.positions[place, 1])),
-                    yaws[int(yaw[place])],
+                    (float(lattice.positions[index, 0]), float(lattice.positions[index, 1])),
+                    yaws[int(yaw[index])],
                     height=part * lattice.height,
                     brightness=brightness,
                 )
@@ -226,7 +228,7 @@ class ShapeSearch:
             if self.evidence([*known, new]) <= self.evidence(known):
                 break
             found.append(new)
-            near = (lattice.positions - lattice.positions[place]).norm(dim=1) < _MAX_MERGE_GAP
+            near = (lattice.positions - lattice.positions[index]).norm(dim=1) < _MAX_MERGE_GAP
             score[:, near] = 0.0
         return found
 
@@ -522,7 +524,7 @@ def perturb_shape(shape: ShapeParameters, step: float) -> list[ShapeParameters]:
     x, y = shape.position
     moves = [(x + a * step, y + b * step) for a in (-1, 0, 1) for b in (-1, 0, 1)]
     return [
-        *(replace(shape, position=place) for place in moves),
+        *(replace(shape, position=position) for position in moves),
         *(replace(shape, yaw=shape.yaw + turn) for turn in (-0.2, 0.2)),
         *(replace(shape, height=shape.height * part) for part in (0.75, 1.3)),
         *(replace(shape, brightness=shape.brightness * part) for part in (0.6, 1.7)),
@@ -599,8 +601,8 @@ def propose_splits(
         sides[along] *= share
         sides[1 - along] *= wide
         x, y = c * shift[0] - s * shift[1], s * shift[0] + c * shift[1]
-        place = box.position[0] + x, box.position[1] + y
-        return replace(box, position=place, length=sides[0], width=sides[1])
+        position = box.position[0] + x, box.position[1] + y
+        return replace(box, position=position, length=sides[0], width=sides[1])
 
     found: list[tuple[ShapeParameters, ShapeParameters]] = []
     slim = [(_SLIM_FRACTION, off) for off in (_SLIM_FRACTION - 1, 0.0, 1 - _SLIM_FRACTION)]

@@ -29,7 +29,7 @@ _MIN_POSITIONS = (
 
 
 def calibrate_on_scene(
-    capture: Capture, grid: Grid, positions: Float64[Tensor, "place 3"]
+    capture: Capture, grid: Grid, positions: Float64[Tensor, "point 3"]
 ) -> ChannelCalibration | None:
     """Estimate the channel gains under which a recording fits its own image best.
 
@@ -76,13 +76,13 @@ def phase_spread(calibration: ChannelCalibration, radar: Radar) -> float:
         calibration: calibration of the channels.
         radar: radar with its array and wavelength.
     """
-    places = radar.virtual_positions[:, :2] / require_sampled_waveform(radar).wavelength
-    extent = places.amax(0) - places.amin(0)
+    elements = radar.virtual_positions[:, :2] / require_sampled_waveform(radar).wavelength
+    extent = elements.amax(0) - elements.amin(0)
     steps = [
         torch.arange(-1.0, 1.0, 1 / (16 * float(e)) if e > 0 else 2.0).double() for e in extent
     ]
     turns = (
-        places @ torch.cartesian_prod(*[axis if len(axis) > 1 else 0 * axis for axis in steps]).T
+        elements @ torch.cartesian_prod(*[axis if len(axis) > 1 else 0 * axis for axis in steps]).T
     )
     left = calibration.gains.flatten()[:, None] * torch.polar(
         torch.ones_like(turns), 2 * math.pi * turns
@@ -93,7 +93,7 @@ def phase_spread(calibration: ChannelCalibration, radar: Radar) -> float:
 
 
 def _estimate_gains(
-    capture: Capture, range_grid: Grid, positions: Float64[Tensor, "place 3"], image: Tensor
+    capture: Capture, range_grid: Grid, positions: Float64[Tensor, "point 3"], image: Tensor
 ) -> ChannelCalibration:
     """Estimate channel gains, given an image.
 
@@ -137,12 +137,12 @@ def _estimate_gains(
 
 
 def _channel_phasors(
-    radar: Radar, positions: Float64[Tensor, "place 3"]
+    radar: Radar, positions: Float64[Tensor, "point 3"]
 ) -> list[Complex128[Tensor, "p c"]]:
     """Compute channel phasors of every frame for echoes at points."""
     found = []
-    for place, axes in zip(radar.positions.detach(), radar.link().rotations.detach(), strict=True):
-        seen = torch.nn.functional.normalize(positions - place, dim=1) @ axes
+    for origin, axes in zip(radar.positions.detach(), radar.link().rotations.detach(), strict=True):
+        seen = torch.nn.functional.normalize(positions - origin, dim=1) @ axes
         path = seen[:, :2] @ radar.virtual_positions[:, :2].T
         phase = -2 * math.pi / require_sampled_waveform(radar).wavelength * path
         found.append(torch.polar(torch.ones_like(phase), phase))

@@ -83,9 +83,9 @@ def track_moving_targets(
         live = [path for path in live if path.missed_frames <= _MAX_MISSED_FRAMES]
         live += [_start_track(one) for one in seen if one not in taken]
     paths = [path for path in (*ended, *live) if len(path.measurements) >= _MIN_TRACK_FRAMES]
-    things = [_to_detected_object(path, step, recording.frame_period, ground) for path in paths]
-    things.sort(key=lambda one: -one.existence_probability)
-    return [replace(one, name=f"mover_{k}") for k, one in enumerate(things, 1)]
+    objects = [_to_detected_object(path, step, recording.frame_period, ground) for path in paths]
+    objects.sort(key=lambda one: -one.existence_probability)
+    return [replace(one, name=f"mover_{k}") for k, one in enumerate(objects, 1)]
 
 
 def _motion_model(period: float) -> tuple[Tensor, Tensor]:

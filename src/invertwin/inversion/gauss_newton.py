@@ -1,20 +1,18 @@
 """Gauss–Newton with forward-mode derivatives of the map with respect to each parameter."""
 
 import math
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
-import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Bool, Float64
 from torch import Tensor, nn
 from torch.autograd import grad
 
 from invertwin.checks import checked_count
 from invertwin.errors import InputError
+from invertwin.inversion.forward_mode import map_tangents
 from invertwin.inversion.loss import MapPairs, Objective, SpectrumLoss
-from invertwin.runtime.concurrency import tracer_lock
 
 _MAX_PARAMETERS = 64  # each parameter costs a derivative of the map per step
 _MAX_DAMPING_TRIALS = 4  # trials of one step with increasing damping
@@ -62,30 +60,26 @@ class GaussNewton:
         damping: float = 0.01,
         curvature_every: int = 1,
     ) -> None:
-        self._slots = [
-            (module, name, parameter)
-            for module in modules.modules()
-            for name, parameter in module.named_parameters(recurse=False)
-            if parameter.requires_grad
-        ]
+        self._modules = modules
+        self._parameters = {n: p for n, p in modules.named_parameters() if p.requires_grad}
         for loss in objective.losses:
             if not isinstance(loss, SpectrumLoss):
                 raise InputError(
                     f"expected a SpectrumLoss for Gauss–Newton, got {type(loss).__name__}; "
                     "give one, or another kind of optimiser"
                 )
-        if not self._slots or not (trust_radius > 0 and damping > 0):
+        if not self._parameters or not (trust_radius > 0 and damping > 0):
             raise InputError(
                 "expected parameters to fit, trust_radius > 0 and damping > 0, got "
-                f"{len(self._slots)}, {trust_radius} and {damping}; a radius of 0.3 suits metres "
-                "and radians"
+                f"{len(self._parameters)}, {trust_radius} and {damping}; a radius of 0.3 suits "
+                "metres and radians"
             )
         self.objective, self.damping = objective, damping
         own = dict(trust_radii or {})
         self.reach = torch.cat(
             [
                 torch.full((p.numel(),), own.get(p, trust_radius), dtype=torch.float64)
-                for _, _, p in self._slots
+                for p in self._parameters.values()
             ]
         )
         self.every = checked_count(curvature_every, "steps from one curvature to the next", 1)
@@ -106,7 +100,7 @@ class GaussNewton:
         Raises:
             InputError: a parameter without effect on the loss, or more than 64 that matter.
         """
-        parameters = [parameter for _, _, parameter in self._slots]
+        parameters = list(self._parameters.values())
         pairs = maps()
         value = self.objective(pairs)
         if penalty is not None:
@@ -114,9 +108,10 @@ class GaussNewton:
         found: Sequence[Tensor | None] = [None] * len(parameters)
         if value.requires_grad:
             found = grad(value, parameters, allow_unused=True)
-        for (module, name, _), slopes in zip(self._slots, found, strict=True):
+        for path, slopes in zip(self._parameters, found, strict=True):
             if slopes is None:
-                raise no_effect_error(module, name)
+                owner, _, name = path.rpartition(".")
+                raise no_effect_error(self._modules.get_submodule(owner), name)
         slope = _flatten([part for part in found if part is not None])
         before = float(value.detach())
         if not bool(torch.isfinite(slope).all()) or before != before:
@@ -202,59 +197,27 @@ class GaussNewton:
         whole[free] = change
         with torch.no_grad():
             parts = whole.split([value.numel() for value in start])
-            for (_, _, parameter), value, part in zip(self._slots, start, parts, strict=True):
+            for parameter, value, part in zip(self._parameters.values(), start, parts, strict=True):
                 parameter.copy_(value + part.reshape(value.shape).to(value))
 
     def _compute_curvature(
         self, maps: Callable[[], MapPairs], pairs: MapPairs, free: Bool[Tensor, " q"]
     ) -> Float64[Tensor, "p p"]:
         fixed = [(predicted.detach(), observed) for predicted, observed in pairs]
-        tangents: list[list[Tensor]] = [[] for _ in fixed]
-        for index in free.nonzero()[:, 0].tolist():
-            with tracer_lock, forward_ad.dual_level(), self._dual_coordinate(index):
-                found = [forward_ad.unpack_dual(predicted).tangent for predicted, _ in maps()]
-            for rows, tangent, (predicted, _) in zip(tangents, found, fixed, strict=True):
-                rows.append(torch.zeros_like(predicted) if tangent is None else tangent)
-        return self.objective.curvature(fixed, [torch.stack(rows) for rows in tangents])
+        columns = [
+            map_tangents(self._modules, lambda: [predicted for predicted, _ in maps()], tangents)
+            for tangents in map(self._unit_tangents, free.nonzero()[:, 0].tolist())
+        ]
+        rows = [torch.stack(column) for column in zip(*columns, strict=True)]
+        return self.objective.curvature(fixed, rows)
 
-    def _dual_coordinate(self, index: int) -> AbstractContextManager[None]:
-        """Parameters as dual numbers whose tangent is one along a single coordinate."""
-        sizes = [parameter.numel() for _, _, parameter in self._slots]
-        slot = next(k for k in range(len(sizes)) if index < sum(sizes[: k + 1]))
-        module, name, parameter = self._slots[slot]
-        tangent = torch.zeros_like(parameter.detach())
-        tangent.view(-1)[index - sum(sizes[:slot])] = 1.0
-        return dual_parameters(module, {name: tangent})
-
-
-@contextmanager
-def dual_parameters(
-    module: nn.Module, tangents: Mapping[str, Tensor]
-) -> Generator[None, None, None]:
-    """Parameters of a module as dual numbers, with these tangents by name.
-
-    Args:
-        module: What is moved, within a ``dual_level``.
-        tangents: Of some of its parameters; names may have dots.
-    """
-    held = []
-    for path, tangent in tangents.items():
-        owner, _, name = path.rpartition(".")
-        part = module.get_submodule(owner)
-        held.append((part, list(part.named_parameters(recurse=False))))
-        value = getattr(part, name).detach()
-        delattr(part, name)
-        setattr(part, name, forward_ad.make_dual(value, tangent.to(value)))
-    try:
-        with torch.no_grad():
-            yield
-    finally:
-        # All of them, in their order, which is that of checkpoints.
-        for part, own in reversed(held):
-            for key, parameter in own:
-                if hasattr(part, key):
-                    delattr(part, key)
-                setattr(part, key, parameter)
+    def _unit_tangents(self, index: int) -> dict[str, Tensor]:
+        """Return the unit tangent along one of the entries of all parameters."""
+        unit = torch.zeros(len(self.reach), dtype=torch.float64)
+        unit[index] = 1.0
+        parts = unit.split([parameter.numel() for parameter in self._parameters.values()])
+        named = zip(self._parameters.items(), parts, strict=True)
+        return {n: part.reshape(p.shape) for (n, p), part in named if part.any()}
 
 
 def _evaluate_loss(

@@ -296,7 +296,7 @@ class SpectrumLoss:
             return 1.0 / unit
         floor = torch.as_tensor(self.floor).to(levels[0][0][0])
         counts = [sum(len(a) for a, *_ in blocks) for blocks in levels]
-        place, slope = -math.log(unit), 1.0
+        log_gain, slope = -math.log(unit), 1.0
         # Start with the coarse maps, which are fast and have nearly the final gain.
         for first in (1, 0):
             step, before = 0.0, 0.0
@@ -304,7 +304,7 @@ class SpectrumLoss:
                 up, down = 0.0, 0.0
                 for blocks, count in zip(levels[first:], counts[first:], strict=True):
                     for _, a, b in blocks:
-                        inverse = torch.add(floor, a, alpha=math.exp(place)).reciprocal_()
+                        inverse = torch.add(floor, a, alpha=math.exp(log_gain)).reciprocal_()
                         down += float(a @ inverse) / count
                         up += (
                             float(self._weight_power(b, inverse) @ inverse.square_().mul_(a))
@@ -314,10 +314,10 @@ class SpectrumLoss:
                 if step != 0:
                     slope = min(max((before - move) / step, 0.1), 1.0)
                 before, step = move, move / slope
-                place += step
+                log_gain += step
                 if abs(step) < _GAIN_TOLERANCE:
                     break
-        return math.exp(place)
+        return math.exp(log_gain)
 
     def _squared_error(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
         gain = self._optimal_gain(pairs)

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
-from invertwin.forward_model import ForwardModel
 from invertwin.inversion.confidence.realisations import FitResult
 from invertwin.inversion.confidence.uncertainty import CovarianceEstimator, Uncertainty
 from invertwin.inversion.confidence.verdict import (
@@ -56,7 +55,7 @@ class Reconstruction:
 
     @cached_property
     def is_uninformative(self) -> bool:
-        """Whether the twin explains next to none of the observed power, as in ``judge_fit``.
+        """True if the twin explains next to none of the observed power, as in ``judge_fit``.
 
         A fitted gain of zero has no gradient, so such a fit stays at its start.
         """
@@ -128,41 +127,23 @@ def reconstruct(
     settings = replace(
         settings, regularizers=(*settings.regularizers, *(t for _, found in made for t in found))
     )
-    begun, current, fit, status = scene, unknowns, None, "budget"
+    begun, fit, status = scene, None, "budget"
     history: list[dict[str, Any]] = []
-    modules, terms = _build_modules(begun, current)
+    modules, terms = _build_modules(begun, unknowns)
     free = _FreeParameters([modules, *sensor_modules])
     for number, stage in enumerate(stages):
         if fit is not None and stage.rebuilds_modules:
-            # Clouds continue as meshes.
-            begun = replace_clouds(fit.twin())
-            for name, change in stage.remesh.items():
-                begun = begun.replace(name, mesh=change(begun[name].mesh))
-            current = {
-                n: u for n, u in unknowns.items() if not stage.unknowns or n in stage.unknowns
-            }
-            fixed = [n for n, u in current.items() if isinstance(u.module, nn.Module)]
-            if fixed:
-                raise InputError(
-                    f"expected functions that make the modules of a stage that rebuilds, got a "
-                    f"module for {fixed[0]!r}; give Unknown(lambda scene: ...)"
-                )
-            modules, terms = _build_modules(begun, current)
+            begun, modules, terms = _rebuild_modules(fit.twin(), unknowns, stage)
             free = _FreeParameters([modules, *sensor_modules])
         free.apply(stage)
         fit = Fit(
             begun,
-            [
-                replace(o, model=m)
-                for o, m in zip(watched, _stage_models(stage, watched), strict=True)
-            ],
+            _stage_observations(stage, watched),
             list(modules.values()),
             [list(named.values()) for named in sensor_modules],
             stage=stage,
             settings=replace(settings, regularizers=(*settings.regularizers, *terms)),
-            rates=free.learning_rates(
-                {**unknowns, **{n: u for named in own for n, u in named.items()}}
-            ),
+            rates=free.learning_rates(dict(i for named in (unknowns, *own) for i in named.items())),
             stage_position=(number, len(history), number == len(stages) - 1),
         )
         status = fit.run(callbacks)
@@ -170,9 +151,8 @@ def reconstruct(
     assert fit is not None
     with torch.no_grad():
         twin, sensors = fit.apply_modules()
-    final = history[-1]["loss"]
-    if status == "diverged" and fit.progress.best is not None:
-        final = fit.progress.best[1]
+    best = fit.progress.best if status == "diverged" else None
+    final = history[-1]["loss"] if best is None else best[1]
     return Reconstruction(
         twin, sensors, fit.modules, history, status, len(history), final, FitResult(fit)
     )
@@ -212,14 +192,16 @@ def prepare_fit(
     )
 
 
-def _stage_models(stage: Stage, observations: Sequence[Observation]) -> Sequence[ForwardModel]:
-    """Return the forward model of every observation in a stage."""
-    if stage.models and len(stage.models) != len(observations):
+def _stage_observations(stage: Stage, observations: list[Observation]) -> list[Observation]:
+    """Return the observations with their forward models of a stage."""
+    if not stage.models:
+        return observations
+    if len(stage.models) != len(observations):
         raise InputError(
             f"expected a model for each of {len(observations)} observations in a stage, got "
             f"{len(stage.models)}; give one each, or none"
         )
-    return stage.models or [o.model for o in observations]
+    return [replace(o, model=m) for o, m in zip(observations, stage.models, strict=True)]
 
 
 def _build_modules(
@@ -237,6 +219,23 @@ def _build_modules(
             with torch.no_grad():
                 target = modules[name](target)
     return modules, terms
+
+
+def _rebuild_modules(
+    twin: Scene, unknowns: Mapping[str, Unknown], stage: Stage
+) -> tuple[Scene, dict[str, nn.Module], list[Any]]:
+    """Rebuild the modules of a stage for the twin of the previous stage, remeshed."""
+    scene = replace_clouds(twin)
+    for name, change in stage.remesh.items():
+        scene = scene.replace(name, mesh=change(scene[name].mesh))
+    current = {n: u for n, u in unknowns.items() if not stage.unknowns or n in stage.unknowns}
+    fixed = [n for n, u in current.items() if isinstance(u.module, nn.Module)]
+    if fixed:
+        raise InputError(
+            f"expected functions that make the modules of a stage that rebuilds, got a module for "
+            f"{fixed[0]!r}; give Unknown(lambda scene: ...)"
+        )
+    return scene, *_build_modules(scene, current)
 
 
 class _FreeParameters:

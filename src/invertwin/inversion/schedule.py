@@ -63,7 +63,7 @@ class Stage(Schedule):
 
     @property
     def rebuilds_modules(self) -> bool:
-        """Whether modules are rebuilt."""
+        """True if modules are rebuilt."""
         return self.rebuild or bool(self.remesh)
 
 

@@ -42,7 +42,7 @@ class Aperture:
 
     @property
     def is_separable(self) -> bool:
-        """Whether the array, and so its response, is the product of a row and a column."""
+        """True if the array, and so its response, is the product of a row and a column."""
         counts = self.counts
         return torch.equal(counts * counts.sum(), counts.sum(1)[:, None] * counts.sum(0)[None])
 

@@ -69,7 +69,7 @@ class Board:
 
     @property
     def has_rows(self) -> bool:
-        """Whether the board resolves elevation, so that the sign of elevation matters."""
+        """True if the board resolves elevation, so that the sign of elevation matters."""
         return any(len({row for _, row in end}) > 1 for end in (self.transmitters, self.receivers))
 
     def arrays(

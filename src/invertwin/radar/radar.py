@@ -137,7 +137,7 @@ class Radar:
 
     @property
     def has_range_bias(self) -> bool:
-        """Whether ranges have a bias, or a derivative with respect to one."""
+        """True if ranges have a bias, or a derivative with respect to one."""
         bias = self.range_bias
         if isinstance(bias, Tensor):
             return is_differentiated(bias) or bool(bias)

@@ -37,7 +37,7 @@ Unit = Literal["m", "cm", "mm", "um", "in", "ft"]
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 _LARGE = 100.0  # size of a suspicious mesh [m]
 CONCRETE = RoughDielectric(permittivity=5.24)
-"""Stands in for the materials of a scene file that nobody names (ITU-R P.2040 concrete)."""
+"""Default material of a scene file (ITU-R P.2040 concrete)."""
 
 
 def load_mesh(file: str | Path, unit: Unit = "m") -> Mesh:

@@ -267,4 +267,4 @@ def _length(share: Tensor) -> Tensor:
 
 
 VERTICAL = Polarisation.from_jones("V", 0.0, 1)
-"""Of one element with V."""
+"""Polarisation of one element with V."""

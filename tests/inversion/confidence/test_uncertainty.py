@@ -162,5 +162,5 @@ def test_a_turn_is_about_the_axes_of_the_world(axis):
 
 def test_fits_without_error_bars_say_so():
     fit = fitted(Blob(frames=1, known=False))
-    with pytest.raises(InputError, match="got one frame of a model without looks"):
+    with pytest.raises(InputError, match="got one frame of a model without realisations"):
         _ = fit.uncertainty

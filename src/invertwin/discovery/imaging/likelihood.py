@@ -15,7 +15,7 @@ from invertwin.radar.radar import require_sampled_waveform
 from invertwin.radar.waveform import unit_window
 
 TAIL_DEGREES = 4.0
-"""Of the heavy-tailed speckle."""
+"""Degrees of freedom of the heavy-tailed speckle."""
 _MIN_POWER = 1e-30  # lower limit of power in logarithms
 _BACKGROUND_QUANTILE = 0.25  # quantile of a range bin that estimates the background
 

@@ -98,10 +98,10 @@ def detect_moving_targets(
             )
         )
     strength = {
-        thing.name: float(points.power[rows[labels == k]].max()) for k, thing in enumerate(found)
+        target.name: float(points.power[rows[labels == k]].max()) for k, target in enumerate(found)
     }
-    found.sort(key=lambda thing: -strength[thing.name])
-    return [replace(thing, name=f"mover_{k}") for k, thing in enumerate(found, 1)]
+    found.sort(key=lambda target: -strength[target.name])
+    return [replace(target, name=f"mover_{k}") for k, target in enumerate(found, 1)]
 
 
 def platform_velocities(recording: ChirpCapture) -> Float64[Tensor, "frame 3"]:
@@ -110,10 +110,10 @@ def platform_velocities(recording: ChirpCapture) -> Float64[Tensor, "frame 3"]:
     Args:
         recording: without a known frame period, the radar counts as static.
     """
-    places = recording.radar().positions.detach()
-    if recording.frame_period is None or len(places) < 2:
-        return torch.zeros_like(places)
-    (along,) = torch.gradient(places, spacing=recording.frame_period, dim=0)
+    positions = recording.radar().positions.detach()
+    if recording.frame_period is None or len(positions) < 2:
+        return torch.zeros_like(positions)
+    (along,) = torch.gradient(positions, spacing=recording.frame_period, dim=0)
     return along
 
 
@@ -131,8 +131,8 @@ def is_dense_track(capture: Capture) -> bool:
 
 
 def coherent_image(
-    capture: Capture, positions: Float64[Tensor, "place 3"]
-) -> tuple[Float64[Tensor, " place"], Float64[Tensor, " place"]]:
+    capture: Capture, positions: Float64[Tensor, "point 3"]
+) -> tuple[Float64[Tensor, " point"], Float64[Tensor, " point"]]:
     """Compute the backprojected image along a track, and the coherence over frames.
 
     Args:
@@ -162,8 +162,8 @@ def _single_frame_power(capture: Capture, positions: Tensor, count: int) -> Tens
 
 
 def locate_coherent_points(
-    capture: Capture, positions: Float64[Tensor, "place 3"], min_separation: float
-) -> tuple[list[DetectedObject], Float64[Tensor, " place"]]:
+    capture: Capture, positions: Float64[Tensor, "point 3"], min_separation: float
+) -> tuple[list[DetectedObject], Float64[Tensor, " point"]]:
     """Detect points with coherent echoes over many frames, the strongest first; also return the
     image.
 

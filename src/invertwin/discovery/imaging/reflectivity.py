@@ -35,7 +35,7 @@ class ImageResponse:
     shape: tuple[int, ...]
 
     def predict_maps(
-        self, strength: Float64[Tensor, " place"]
+        self, strength: Float64[Tensor, " point"]
     ) -> Float64[Tensor, "frame range u v"]:
         """Predict the maps of scatterers.
 
@@ -46,7 +46,7 @@ class ImageResponse:
 
     def average_over_bins(
         self, values: Float64[Tensor, "frame range u v"]
-    ) -> Float64[Tensor, "frame place"]:
+    ) -> Float64[Tensor, "frame point"]:
         """Average values over the bins of every point, frame by frame.
 
         Args:
@@ -94,7 +94,7 @@ def thin_map(
     )
 
 
-def direction_cell(positions: Float64[Tensor, " place"], radar: Radar) -> float:
+def direction_cell(positions: Float64[Tensor, " point"], radar: Radar) -> float:
     """Return the beamwidth of elements in direction cosines.
 
     Args:
@@ -108,7 +108,7 @@ def direction_cell(positions: Float64[Tensor, " place"], radar: Radar) -> float:
 
 
 def compute_response(
-    radar: Radar, grid: Grid, positions: Float64[Tensor, "place 3"]
+    radar: Radar, grid: Grid, positions: Float64[Tensor, "point 3"]
 ) -> ImageResponse:
     """Compute the response of a radar to isotropic scatterers in free space.
 
@@ -127,18 +127,18 @@ def compute_response(
     )
     if estimate > 4 * _MAX_MATRIX_ENTRIES:
         raise InputError(
-            f"expected at most {4 * _MAX_MATRIX_ENTRIES:.0e} pairs of places and bins, got "
+            f"expected at most {4 * _MAX_MATRIX_ENTRIES:.0e} pairs of points and bins, got "
             f"{estimate:.0e}; look "
             "at a smaller region, or with a coarser step"
         )
     columns = np.arange(len(positions), dtype=np.int32)
     frames = []
-    for frame in track(range(radar.frame_count), "responses of places"):
+    for frame in track(range(radar.frame_count), "responses of image points"):
         lengths, seen = [], []
         for ends in (link.tx, link.rx):
-            way = positions - ends[frame].detach()
-            lengths.append(way.norm(dim=1))
-            seen.append(way / lengths[-1][:, None] @ link.rotations[frame].detach())
+            direction = positions - ends[frame].detach()
+            lengths.append(direction.norm(dim=1))
+            seen.append(direction / lengths[-1][:, None] @ link.rotations[frame].detach())
         gain = link.tx_pattern.gain(seen[0]) * link.rx_pattern.gain(seen[1])
         gain = gain * radar.waveform.wavelength**2 / (4 * torch.pi) ** 3
         strength = (gain / (lengths[0] * lengths[1]) ** 2).numpy()
@@ -170,7 +170,7 @@ def reconstruct_reflectivity(
     *,
     steps: int = 40,
     degrees: float = TAIL_DEGREES,
-) -> Float64[Tensor, " place"]:
+) -> Float64[Tensor, " point"]:
     """Compute the maximum-likelihood reflectivity by multiplicative updates.
 
     Each step multiplies the strength of a point by the square root of the ratio of observed to

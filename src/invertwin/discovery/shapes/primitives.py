@@ -31,11 +31,11 @@ ShapeKind = Literal[
 ]
 SHAPE_KINDS: tuple[str, ...] = get_args(ShapeKind)
 MAX_WALL_THICKNESS = 0.06
-"""A box that is thinner than this, and three times as long, is a wall [m]."""
+"""Maximum thickness of a wall, a box three times as long [m]."""
 MAX_POINT_SIZE = 0.06
-"""What is smaller than this is a point [m]."""
+"""Maximum size of a point [m]."""
 CORNER_EXPONENT = 9.0
-"""Power of the cosine with which the echo of a trihedral corner falls off the way it opens."""
+"""Cosine exponent of the echo of a trihedral corner about its axis."""
 _CORNER_FALLOFF = CORNER_EXPONENT - 2  # in addition to the cos² of any plate
 _CORNER_PLATE_SIDE = 0.03  # side of the plate that represents a corner reflector [m]
 _MIN_SIZES, _MAX_SIZES = (0.01, 0.01, 0.01), (10.0, 10.0, 10.0)
@@ -47,7 +47,7 @@ SIZE_LIMITS: dict[str, tuple[tuple[float, float, float], tuple[float, float, flo
         (_CORNER_PLATE_SIDE, _CORNER_PLATE_SIDE, 10.0),
     ),
 }
-"""Least and greatest length, width and height of kinds that have sizes of their own [m]."""
+"""Minimum and maximum length, width and height of kinds with specific sizes [m]."""
 _RECTANGULAR_KINDS, _FREE_HEIGHT_KINDS = (
     ("wall", "box", "person", "vehicle"),
     ("sphere", "point", "corner"),
@@ -108,17 +108,17 @@ class ShapeParameters:
 
     @property
     def is_rectangular(self) -> bool:
-        """Whether its footprint is a rectangle with a yaw."""
+        """True if its footprint is a rectangle with a yaw."""
         return self.kind in _RECTANGULAR_KINDS
 
     @property
     def has_yaw(self) -> bool:
-        """Whether it has a yaw."""
+        """True if it has a yaw."""
         return self.is_rectangular or self.kind == "corner"
 
     @property
     def has_free_height(self) -> bool:
-        """Whether it may be above the ground."""
+        """True if it may be above the ground."""
         return self.kind in _FREE_HEIGHT_KINDS
 
     @property
@@ -288,8 +288,8 @@ class PrimitiveModel(UnknownShape):
     def item(self) -> Object:
         """Return the object, differentiable with respect to all parameters."""
         if self.kind == "corner":
-            lit = self.brightness * _mark_front_triangles(self.ground.up)
-            return Object(self.mesh(), Matte(lit, _CORNER_FALLOFF))
+            brightness = self.brightness * _mark_front_triangles(self.ground.up)
+            return Object(self.mesh(), Matte(brightness, _CORNER_FALLOFF))
         return super().item
 
     def values(self) -> dict[str, Tensor]:
@@ -330,11 +330,11 @@ def shape_center(shape: ShapeParameters, ground: Ground, level: float) -> Float6
         ground: ground plane.
         level: height of the ground [m].
     """
-    place = torch.zeros(3, dtype=torch.float64)
-    place[list(ground.plane_axes)] = torch.tensor(shape.position, dtype=torch.float64)
+    position = torch.zeros(3, dtype=torch.float64)
+    position[list(ground.plane_axes)] = torch.tensor(shape.position, dtype=torch.float64)
     half = shape.height if shape.has_free_height else 0.5 * shape.height
-    place[ground.up_axis] = level + half
-    return place
+    position[ground.up_axis] = level + half
+    return position
 
 
 def corner_direction(yaw: float, ground: Ground) -> Float64[Tensor, "2"]:

@@ -58,9 +58,9 @@ def merge_into_prism(
         float(m) + step * (torch.arange(n, dtype=torch.float64) - 0.5 * (n - 1))
         for m, n in zip(middle, counts, strict=True)
     ]
-    places = torch.cartesian_prod(*lines)
-    nodes = torch.zeros(len(places), 3, dtype=torch.float64)
-    nodes[:, axes] = places
+    grid_points = torch.cartesian_prod(*lines)
+    nodes = torch.zeros(len(grid_points), 3, dtype=torch.float64)
+    nodes[:, axes] = grid_points
     parts: list[Tensor] = []
     for mesh in meshes:
         nodes[:, up] = 0.5 * (mesh.vertices[:, up].amin() + mesh.vertices[:, up].amax())

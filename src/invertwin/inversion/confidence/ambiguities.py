@@ -49,7 +49,7 @@ class Ambiguity:
 
     @property
     def is_rejected(self) -> bool:
-        """Whether the data reject the other result."""
+        """True if the data reject the other result."""
         return not self.has_lower_loss and self.score is not None and self.score >= REJECTION_ZSCORE
 
 

@@ -80,8 +80,8 @@ class FitResult:
         found = []
         for loss, (predicted, observed) in zip(self.fit.objective.losses, self.maps, strict=True):
             law = loss if isinstance(loss, SpectrumLoss) else SpectrumLoss("likelihood")
-            lit = bool(predicted.any())
-            found.append(law.fitted_gain(predicted, observed) if lit else 0.0)
+            visible = bool(predicted.any())
+            found.append(law.fitted_gain(predicted, observed) if visible else 0.0)
         return found
 
     @cached_property
@@ -108,7 +108,7 @@ class FitResult:
         models = [observation.model for observation in self.fit.observations]
         every = zip(self.maps, self.gains, models, strict=True)
         noises = [_estimate_noise(*pair, gain, model.holds_fields) for pair, gain, model in every]
-        for number in track(range(_REALISATION_COUNT), "looks at the twin"):
+        for number in track(range(_REALISATION_COUNT), "realisations of the twin"):
             yield [
                 look(derive_seed(number, k), noise)
                 for k, (look, noise) in enumerate(zip(looks, noises, strict=True))

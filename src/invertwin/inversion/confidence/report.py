@@ -1,4 +1,4 @@
-"""How sure fits are, as numbers: verdict, error bars, and how often these hold."""
+"""Confidence of fits as numbers: verdict, error bars, and their coverage."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,17 +14,17 @@ _COORDINATES = ("x", "y", "z", "pitch", "yaw", "roll")
 
 
 def confidence_metrics(fit: Reconstruction, truth: Mapping[str, Object]) -> dict[str, Any]:
-    """Verdict and error bars of a fit, and how far it is from what is known.
+    """Return verdict, error bars and true errors of a fit.
 
     Args:
-        fit: The fit.
-        truth: Objects as they really are, by name.
+        fit: finished fit.
+        truth: true objects by name.
     """
-    seen = fit.verdict
-    rows: dict[str, Any] = {"verdict": seen.word, "loss_excess": seen.excess}
-    rows |= {"structure_excess": seen.structure, "verdict_reasons": list(seen.reasons)}
+    verdict = fit.verdict
+    rows: dict[str, Any] = {"verdict": verdict.word, "loss_excess": verdict.excess}
+    rows |= {"structure_excess": verdict.structure, "verdict_reasons": list(verdict.reasons)}
     rows["rivals"] = [
-        {"pose": rival.description, "score": rival.score} for rival in seen.ambiguities
+        {"pose": other.description, "score": other.score} for other in verdict.ambiguities
     ]
     errors: dict[str, float] = {}
     for name, item in truth.items():
@@ -41,10 +41,10 @@ def confidence_metrics(fit: Reconstruction, truth: Mapping[str, Object]) -> dict
 
 
 def error_bar_metrics(uncertainty: Uncertainty) -> dict[str, Any]:
-    """Error bars as numbers by name.
+    """Return error bars as numbers by name.
 
     Args:
-        uncertainty: The error bars.
+        uncertainty: error bars of a fit.
     """
     return {
         "standard_deviations": uncertainty.deviations,
@@ -56,10 +56,10 @@ def error_bar_metrics(uncertainty: Uncertainty) -> dict[str, Any]:
 
 
 def error_bar_coverage(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Over recordings: the share of errors within the error bars, and how large these are.
+    """Compute the coverage and the mean size of error bars over recordings.
 
     Args:
-        rows: Of every recording, what ``confidence_metrics`` says.
+        rows: ``confidence_metrics`` of every recording.
     """
     names = [n for n in rows[0].get("errors", {}) if n in rows[0].get("within_95", {})]
     hits, ratios = {}, {}

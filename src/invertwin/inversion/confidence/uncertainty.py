@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64
 from scipy import stats
 from torch import Tensor, nn
@@ -14,7 +13,8 @@ from torch import Tensor, nn
 from invertwin.errors import InputError
 from invertwin.inversion.confidence.realisations import FitResult
 from invertwin.inversion.fit import Fit
-from invertwin.inversion.gauss_newton import dual_parameters, penalty_curvature
+from invertwin.inversion.forward_mode import map_tangents
+from invertwin.inversion.gauss_newton import penalty_curvature
 from invertwin.inversion.loss import SpectrumLoss
 from invertwin.runtime.progress import track
 from invertwin.scene.parameters import Coordinate, Entries
@@ -278,14 +278,14 @@ def map_derivatives(fit: Fit, coordinates: Sequence[Coordinate], seed_number: in
         coordinates: coordinates to differentiate with respect to.
         seed_number: index of the random numbers.
     """
-    rows: list[list[Tensor]] = []
-    for coordinate in track(coordinates, "derivatives"):
-        with forward_ad.dual_level(), dual_parameters(fit.modules, coordinate.tangents):
-            duals = [
-                forward_ad.unpack_dual(predicted)
-                for predicted, _ in fit.unblurred_maps(seed_number)
-            ]
-            rows.append([torch.zeros_like(p) if t is None else t for p, t in duals])
+
+    def predict() -> list[Tensor]:
+        return [predicted for predicted, _ in fit.unblurred_maps(seed_number)]
+
+    rows = [
+        map_tangents(fit.modules, predict, coordinate.tangents)
+        for coordinate in track(coordinates, "derivatives")
+    ]
     return [torch.stack(column) for column in zip(*rows, strict=True)]
 
 

@@ -57,7 +57,7 @@ class Verdict:
 
     @property
     def is_consistent(self) -> bool:
-        """Whether there is no evidence against the twin."""
+        """True if there is no evidence against the twin."""
         return self.word == "consistent"
 
 
@@ -103,9 +103,9 @@ def judge_fit(result: FitResult) -> Verdict:
         return Verdict("inconsistent", excess, structure, tuple(reasons), residuals)
     others = tuple(find_ambiguities(result))
     open_ = [
-        f"{rival.description} explains the data as well{_format_score(rival)}" for rival in others
+        f"{other.description} explains the data as well{_format_score(other)}" for other in others
     ]
-    open_ = [text for text, rival in zip(open_, others, strict=True) if not rival.is_rejected]
+    open_ = [text for text, other in zip(open_, others, strict=True) if not other.is_rejected]
     word: VerdictWord = "at a bound" if bounds else "ambiguous" if open_ else "consistent"
     return Verdict(word, excess, structure, (*bounds, *open_), residuals, others)
 

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, overload
 
 import torch
@@ -115,8 +116,7 @@ def gradcheck(
     Args:
         model: forward model; its ``sampling`` is that of one derivative.
         module: module to differentiate with respect to; θ = 0 is its present state.
-        tangent: changes of its values by name, such as ``{"rotation": [0, 1, 0]}``, or of its only
-            parameter; see ``parameter_changes``.
+        tangent: changes of its values by name, or of its only one; see ``parameter_changes``.
         scene: scene that the module maps, or that the sensor observes.
         sensor: sensor that observes the scene.
         acts_on: "scene" or "sensor": the argument that the module maps.
@@ -129,84 +129,99 @@ def gradcheck(
             mean, or a map that does not depend on θ (all differences are zero).
     """
     settings = settings or GradcheckSettings()
-    if not model.is_smooth:
-        raise InputError(
-            f"expected a smooth model, got {type(model).__name__}, whose silhouettes of single "
-            "rough points have no derivative; use one such as SurrogateMap"
-        )
-    target = scene if acts_on == "scene" else sensor
-    line = make_line(module, tangent, target)
+    _require_smooth(model)
+    line = make_line(module, tangent, scene if acts_on == "scene" else sensor)
     least, repeats = (_MIN_PAIRS, settings.repeats) if model.is_random else (1, 1)
 
     def make_inputs(moved: Any) -> tuple[Scene, Any]:
         return (moved, sensor) if acts_on == "scene" else (scene, moved)
 
-    with torch.no_grad():
-        middle = make_inputs(line.evaluate(torch.zeros((), dtype=torch.float64)))
-    paired = model.for_differences(*middle, settings.difference_samples, settings.scheme)
-
     def derivative(chosen: ForwardModel) -> tuple[Tensor, Tensor]:
-        primals, tangents = [], []
-        for number in range(repeats):
-            with tracer_lock, forward_ad.dual_level():
-                zero = torch.zeros((), dtype=torch.float64)
-                theta = forward_ad.make_dual(zero, torch.ones_like(zero))
-                out = chosen.predict(
-                    *make_inputs(line.evaluate(theta)), derive_seed(seed, 0, number)
-                ).double()
-                primal, slope = forward_ad.unpack_dual(out)
-                primals.append(primal)
-                tangents.append(torch.zeros_like(primal) if slope is None else slope)
-        return torch.stack(primals).mean(0), torch.stack(tangents).mean(0)
+        return _forward_derivative(chosen, lambda t: make_inputs(line.evaluate(t)), repeats, seed)
 
     def difference(epsilon: float, number: int) -> Tensor:
-        ends = [
-            paired.predict(
-                *make_inputs(line.evaluate_end(sign * epsilon)), derive_seed(seed, 1, number)
-            ).double()
-            for sign in (1.0, -1.0)
-        ]
-        return (ends[0] - ends[1]) / (2 * epsilon)
+        ends = (make_inputs(line.evaluate_end(end)) for end in (epsilon, -epsilon))
+        plus, minus = (paired.predict(*e, derive_seed(seed, 1, number)).double() for e in ends)
+        return (plus - minus) / (2 * epsilon)
 
     with torch.no_grad():
+        middle = make_inputs(line.evaluate(torch.zeros((), dtype=torch.float64)))
+        paired = model.for_differences(*middle, settings.difference_samples, settings.scheme)
         value, gradient = derivative(model)
         less = {name: derivative(other)[1] for name, other in model.ablations().items()}
-        apart_gradient = less.get("contacts")
-        if apart_gradient is not None:
-            changed = (apart_gradient - gradient).abs().sum()
-            if not changed > _MIN_RELATIVE_CHANGE * gradient.abs().sum():
-                apart_gradient = None
         interior_gradient = less.get("boundary", gradient)
-        if model.is_random:
-            pairs, reached = _average_differences(
-                lambda n: difference(settings.step, n), settings, progress
-            )
-        else:
-            pairs, reached = difference(settings.step, 0)[None], 0.0
-        truth = pairs.mean(0)
-        if not truth.abs().sum() > 0:
-            raise InputError(
-                "expected a map that depends on θ, got differences that are all zero; "
-                "check the grid and what the parameter moves"
-            )
-        half, far, farther = (
-            torch.stack([difference(factor * settings.step, n) for n in range(least)]).mean(0)
-            for factor in (0.5, 4.0, 8.0)
+        pairs, reached = (
+            _average_differences(partial(difference, settings.step), settings, progress)
+            if model.is_random
+            else (difference(settings.step, 0)[None], 0.0)
         )
-        same = pairs[:least].mean(0)
+        _require_change(truth := pairs.mean(0))
+        half, far, farther = (
+            torch.stack([difference(k * settings.step, n) for n in range(least)]).mean(0)
+            for k in (0.5, 4.0, 8.0)
+        )
+    contacts = _drop_equal(less.get("contacts"), gradient)
     return GradientReport(
         full=_measure_agreement(gradient, truth, far, farther),
         interior=_measure_agreement(interior_gradient, truth, far, farther),
         no_interior_edges=_measure_agreement(less.get("interior_edges"), truth, far, farther),
-        no_contact=_measure_agreement(apart_gradient, truth, far, farther),
+        no_contact=_measure_agreement(contacts, truth, far, farther),
         difference_noise=reached,
-        step_agreement=float((same - half).abs().sum() / same.abs().sum()),
+        step_agreement=_step_agreement(pairs[:least].mean(0), half),
         pairs=len(pairs),
         value=value,
         gradient=gradient,
         interior_gradient=interior_gradient,
         difference=truth,
     )
+
+
+def _require_smooth(model: ForwardModel) -> None:
+    if not model.is_smooth:
+        raise InputError(
+            f"expected a smooth model, got {type(model).__name__}, whose silhouettes of single "
+            "rough points have no derivative; use one such as SurrogateMap"
+        )
+
+
+def _require_change(difference: Tensor) -> None:
+    if not difference.abs().sum() > 0:
+        raise InputError(
+            "expected a map that depends on θ, got differences that are all zero; check the grid "
+            "and what the parameter moves"
+        )
+
+
+def _step_agreement(whole: Tensor, half: Tensor) -> float:
+    """Return ‖FD(ε) − FD(ε/2)‖₁ / ‖FD(ε)‖₁."""
+    return float((whole - half).abs().sum() / whole.abs().sum())
+
+
+def _drop_equal(ablated: Tensor | None, gradient: Tensor) -> Tensor | None:
+    """Return the gradient of an ablation; None if it equals the full gradient."""
+    if ablated is None:
+        return None
+    changed = (ablated - gradient).abs().sum()
+    return ablated if changed > _MIN_RELATIVE_CHANGE * gradient.abs().sum() else None
+
+
+def _forward_derivative(
+    model: ForwardModel,
+    make_inputs: Callable[[Tensor], tuple[Scene, Any]],
+    repeats: int,
+    seed: int,
+) -> tuple[Tensor, Tensor]:
+    """Return the map at θ = 0 and its forward-mode derivative, averaged over seeds."""
+    primals, tangents = [], []
+    for number in range(repeats):
+        with tracer_lock, forward_ad.dual_level():
+            zero = torch.zeros((), dtype=torch.float64)
+            theta = forward_ad.make_dual(zero, torch.ones_like(zero))
+            out = model.predict(*make_inputs(theta), derive_seed(seed, 0, number)).double()
+            primal, slope = forward_ad.unpack_dual(out)
+            primals.append(primal)
+            tangents.append(torch.zeros_like(primal) if slope is None else slope)
+    return torch.stack(primals).mean(0), torch.stack(tangents).mean(0)
 
 
 def _average_differences(

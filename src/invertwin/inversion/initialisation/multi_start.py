@@ -177,17 +177,17 @@ def search(
     for end in sorted(found, key=_unblurred_loss):
         if not any(are_same_poses(end.scene, other.scene, names) for other in ends):
             ends.append(end)
-    rivals = [
+    scores = [
         None if k == 0 else difference_score(ends[0].result, end.result)
         for k, end in enumerate(ends)
     ]
     texts = tuple(
         f"{describe_difference(ends[0].scene, end.scene, names)} explains the data nearly as "
         f"well: z = {z:.1f}"
-        for end, z in zip(ends, rivals, strict=True)
+        for end, z in zip(ends, scores, strict=True)
         if z is not None and z < REJECTION_ZSCORE
     )
-    return Search(ends[0], ends, rivals, texts, found.index(ends[0]), tuple(names))
+    return Search(ends[0], ends, scores, texts, found.index(ends[0]), tuple(names))
 
 
 def _make_screening_loss(

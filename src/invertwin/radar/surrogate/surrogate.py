@@ -131,7 +131,7 @@ class Surrogate:
 
     @property
     def has_blur(self) -> bool:
-        """Whether there is an added blur."""
+        """True if there is an added blur."""
         return self.range_width > 0 or self.angle_width > 0
 
     def scale_blur(self, share: float) -> "Surrogate":
@@ -256,7 +256,7 @@ SURROGATES = MappingProxyType(
         "dirichlet": Surrogate(range_kernel="dirichlet"),
     }
 )
-"""What a ``surrogate`` argument may name; "exact" means exact signals, as None does."""
+"""Names of surrogates; "exact" means exact signals, as None does."""
 
 
 def resolve_surrogate(surrogate: Surrogate | str | None) -> Surrogate | None:

@@ -12,7 +12,7 @@ from invertwin.constants import SPEED_OF_LIGHT, VACUUM_PERMITTIVITY
 from invertwin.scene.material.values import Value, checked_value, evaluate_value
 
 LEAST_COSINE = 1e-9
-"""Grazing incidence on ε = 1 is 0/0; this shift is far below rounding elsewhere."""
+"""Shift that avoids 0/0 at grazing incidence on ε = 1, below rounding elsewhere."""
 
 
 class FieldCoefficients(NamedTuple):

@@ -48,7 +48,7 @@ ITU_MATERIALS: Mapping[str, tuple[Coefficients, ...]] = {
     "medium_dry_ground": (Coefficients(1, 10, 15.0, -0.1, 0.035, 1.63),),
     "wet_ground": (Coefficients(1, 10, 30.0, -0.4, 0.15, 1.30),),
 }
-"""The table of the recommendation by name; several entries where it states several ranges.
+"""Table of the recommendation by name, with one entry per frequency range.
 
 Source: ITU-R P.2040-3 (2023), §3, table of material properties."""
 

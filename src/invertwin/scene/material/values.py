@@ -130,7 +130,7 @@ RANGES: Mapping[str, ValueRange] = {
     "depolarisation": ValueRange("depolarisation", 0.0, 0.25),
     "backscatter_exponent": ValueRange("exponent of the backscattering lobe", 0.0, 1e8),
 }  # The kernel's float32 holds lobes down to an rms slope of 1e-4.
-"""Every value of the library's materials by the name of its field."""
+"""Ranges of the material values by field name."""
 
 MaterialValue = Annotated[str, AllowedValues(tuple(RANGES))]
 

@@ -15,7 +15,7 @@ from invertwin.scene.pose import compose, rigid, rotation_from_vector
 from invertwin.scene.scene import Object, Scene
 
 ObjectMotion = Callable[[Object, float], Object]
-"""The object at a time [s], from the object as the scene has it."""
+"""Function of the object in the scene and a time [s] that returns the moved object."""
 
 _MIN_HEADING_SPEED = 1e-6  # minimum horizontal speed that defines a heading [m/s]
 
