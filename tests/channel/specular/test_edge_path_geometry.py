@@ -217,7 +217,6 @@ def test_long_edge_is_endless():
     ).norm() > 0.02 * endless.norm()
 
 
-@pytest.mark.claim
 @pytest.mark.slow
 def test_derivatives():
     edges = grazing()
