@@ -106,8 +106,8 @@ def visible_fractions(
     topology = topology_of([item.mesh for item in items])
     vertices = torch.cat([item.vertices for item in items])
     fixed, origins = strip_derivatives(vertices), strip_derivatives(observers)
-    columns = (strip_derivatives(column) for column in (cells.center, cells.axes, cells.offsets))
-    panel = PanelCells(*columns, cells.size)
+    center, axes, offsets = map(strip_derivatives, (cells.center, cells.axes, cells.offsets))
+    panel = PanelCells(center, axes, offsets, cells.size)
     with tracing():
         rays = Occluders(fixed, topology, panel.center)
         edges = _find_silhouette_edges(fixed, topology, origins, panel, panel.radius + blur)

@@ -327,14 +327,20 @@ def _evaluate_in_chunks(
     found: list[RayPaths] = []
     for rows in torch.arange(len(tx)).split(size):
         values = checkpoint(columns, rows, use_reentrant=False) if heavy else columns(rows)
-        *geometry, faces, doppler, slopes, axes = values
+        delay, coefficient, departure, arrival, vertices, kinds, faces = values[:7]
+        doppler, slopes, axes = values[7:]
         found.append(
             RayPaths(
                 (len(path_scene.tx), len(path_scene.rx)),
                 path_scene.frequency,
                 tx[rows],
                 rx[rows],
-                *geometry,
+                delay,
+                coefficient,
+                departure,
+                arrival,
+                vertices,
+                kinds,
                 faces,
                 path_scene.topology.face_object[faces],
                 path_scene.scene.names,
