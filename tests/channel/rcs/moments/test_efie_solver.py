@@ -137,7 +137,7 @@ def test_derivatives_of_seams_are_refused():
     moved = Scene(
         beside.objects | {"right": Object(plate(0.8, 0.8), METAL, rigid(translation=place))}
     )
-    with pytest.raises(InputError, match="join the meshes, or give edges=0"):
+    with pytest.raises(InputError, match="merge the vertices, or give edges=0"):
         rcs(moved, TOWARDS, SPEED_OF_LIGHT)
 
 
