@@ -62,7 +62,7 @@ def drawn(scene: Scene, samples: int = 4000) -> tuple[Tensor, Tensor]:
         rays = RayScene(geometry, link(), differentiate_antennas=False)
         sampler = SilhouetteSampler(rays, Inputs.from_rays(rays), ("tx",), samples, 1)
         points = sampler.draw(dr.arange(mi.UInt32, samples)).compress()
-        first, face = to_torch(mi.Int32(points.first)), to_torch(mi.Int32(points.face))
+        first, face = to_torch(mi.Int32(points.first_vertex)), to_torch(mi.Int32(points.face))
         owner = geometry.topology.vertex_object
         return owner[first.long()], geometry.face_object[face.long()]
 
