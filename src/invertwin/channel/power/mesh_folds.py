@@ -47,9 +47,9 @@ def is_hidden_by_fold(
     """Test whether the mesh around an edge folds back into the path of a ray past it.
 
     Rays pass a little beside the edge and start a little off it, so they miss the folds of a fine
-    mesh. Therefore the curve in which the mesh meets the plane through the ray and the outward
-    direction is followed from the edge to both sides, in float64. If it reaches the height of the
-    ray further off, the ray meets it there, and the edge's shadow falls on it.
+    mesh. So the curve in which the mesh meets the plane through the ray and the outward direction
+    is followed from the edge to both sides, in float64. If it reaches the height of the ray
+    further off, the ray meets it there, and the edge shadows it.
 
     Args:
         rays: ray scene.
@@ -85,9 +85,8 @@ def is_hidden_by_fold(
         rises = on & (height > PLANE_TOLERANCE)
         share = (clearance - state["height"]) / (height - state["height"])
         met = state["reach"] + (reach - state["reach"]) * share
-        state["found"] = state["found"] | (
-            rises & ((height <= clearance) | (dr.abs(met) <= start_distance))
-        )
+        meets = (height <= clearance) | (dr.abs(met) <= start_distance)
+        state["found"] = state["found"] | (rises & meets)
         state["height"], state["reach"] = height, reach
         low = (height < -clearance) & (state["count"] >= _MIN_FOLD_TRIANGLES)
         on &= (height <= PLANE_TOLERANCE) & ~low
