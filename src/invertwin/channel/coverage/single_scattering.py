@@ -207,12 +207,12 @@ class _SingleScatteringTracer:
                     self._find_legs(1, positions, part.receiver, face),
                 )
 
-            def found(part: _ScatteringPoints = part, legs: _PathLegs = legs) -> Tensor:
+            def sum_part(part: _ScatteringPoints = part, legs: _PathLegs = legs) -> Tensor:
                 point = part.points.material_points(geometry)[0]
                 area = part.points.weight * point.jacobian
                 return self._sum_pairs(self._evaluate_pairs(stage, geometry, legs, point, area))
 
-            total = total + (checkpoint(found, use_reentrant=False) if recompute else found())
+            total = total + (checkpoint(sum_part, use_reentrant=False) if recompute else sum_part())
         return total
 
     def sum_boundary(self, stage: PathScene, geometry: Geometry) -> Float64[Tensor, "tx rx amount"]:
