@@ -48,7 +48,7 @@ def check_run(
         tangent,
         scene=scene,
         sensor=radar,
-        acts_on=settings.of,
+        acts_on=settings.acts_on,
         settings=replace(check, step=told.step, scheme=told.scheme),
         seed=1,
     )

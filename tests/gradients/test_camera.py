@@ -25,7 +25,7 @@ def test_outlines_that_sweep_over_pixels(file):
         tangent,
         scene=scene,
         sensor=coarse,
-        acts_on=run.gradcheck.of,
+        acts_on=run.gradcheck.acts_on,
         settings=GradcheckSettings(
             repeats=1, step=6e-3, difference_samples=300_000, noise=0.02, max_pairs=8
         ),

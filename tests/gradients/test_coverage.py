@@ -34,7 +34,7 @@ def test_shadows_and_beams_that_sweep_over_cells(name):
         tangent,
         scene=scene,
         sensor=run.transmitter.build(),
-        acts_on=run.gradcheck.of,
+        acts_on=run.gradcheck.acts_on,
         settings=GradcheckSettings(
             repeats=1, step=0.03, difference_samples=100_000, noise=0.05, max_pairs=4
         ),

@@ -277,7 +277,7 @@ def _run_check(
         tangent,
         scene=scene,
         sensor=seen.sensor,
-        acts_on=settings.of,
+        acts_on=settings.acts_on,
         settings=check,
         seed=run.seed,
         progress=say,

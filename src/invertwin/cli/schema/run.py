@@ -230,7 +230,7 @@ class _RunFile(Section):
                 what = f"expected nothing with [{seen}], which has its own, got a value; remove it"
                 raise_key_error(what, path)
             return self
-        if self.gradcheck.of == "sensor":
+        if self.gradcheck.acts_on == "sensor":
             raise_key_error(
                 "expected a parameter of the scene with [rcs], got radar_pose; turn the scene",
                 "gradcheck.parameter.kind",
