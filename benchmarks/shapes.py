@@ -50,7 +50,8 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from invertwin.cli.fits.fitting import run_fit
-from invertwin.cli.fits.problem import OWN_METHOD, build_problem
+from invertwin.cli.fits.kinds import build_problem
+from invertwin.cli.fits.problem import OWN_METHOD, Start
 from invertwin.cli.fits.spreading import FitWorkers
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.run_file import load_run, to_minimal_toml, to_toml, validate_run
@@ -106,7 +107,7 @@ def fitted(run: RunFile) -> Car:
     with tempfile.TemporaryDirectory() as scratch:
         folder = open_run(Path(scratch) / "car", {"car": to_toml(run)})
         for name, mode in MODES.items():
-            row, _ = run_fit(problem, problem.scene, 0, mode, folder, console, None)
+            row, _ = run_fit(problem, Start(problem.scene), 0, mode, folder, console, None)
             kept = {key: row[key] for key in KEPT if key in row}
             found[name] = kept | {key: row[key] for key in ("steps", "loss", "seconds", "curve")}
     return found

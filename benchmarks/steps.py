@@ -35,9 +35,9 @@ import torch
 from report import MetricTable, Required, write
 from rich.console import Console
 
+from invertwin.cli.fits.kinds import build_problem
 from invertwin.cli.fits.problem import (
     Problem,
-    build_problem,
     make_observations,
     make_schedule,
     make_unknowns,
@@ -69,7 +69,7 @@ def fit(problem: Problem, steps: int, after_step: Callable[[dict[str, Any]], Non
     reconstruct(
         problem.scene,
         make_observations(problem),
-        make_unknowns(run),
+        make_unknowns(problem),
         loss=build.build_section(run, "loss"),
         optimizer=build.build_section(run, "optimizer"),
         schedule=replace(stage, steps=steps),

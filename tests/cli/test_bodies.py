@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 import torch
 
-from invertwin.cli.fits.problem import Problem, make_starts
+from invertwin.cli.fits.problem import Problem, initial_scenes
+from invertwin.cli.fits.radar_maps import RadarMaps
 from invertwin.cli.fits.scores import score_joints
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.run_file import validate_run
@@ -42,8 +43,8 @@ def test_every_free_joint_starts_that_far_off_and_only_these():
     scene = build.scene(run)
     body = build.fitted_body(run, scene, "person")
     assert body is not None
-    problem = Problem(run, scene, scene, frozenset())
-    starts, again = make_starts(problem), make_starts(problem)
+    problem = Problem(run, scene, scene, frozenset(), {}, None, RadarMaps())
+    starts, again = initial_scenes(problem), initial_scenes(problem)
     truth = scene["person"].mesh
     true = body.template.estimate_rotations(truth.vertices)
     for start, same in zip(starts, again, strict=True):

@@ -10,7 +10,7 @@ from invertwin.cli import estimate as estimates
 from invertwin.cli.commands import check as run_check
 from invertwin.cli.commands import gradcheck as run_gradcheck
 from invertwin.cli.commands import simulate as run_simulate
-from invertwin.cli.fits import problem
+from invertwin.cli.fits import radar_models
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import load_run, validate_run
 from invertwin.errors import PhysicsWarning
@@ -69,7 +69,7 @@ CASES = {
 def idle(monkeypatch):
     """No work begins."""
     work = (
-        (problem, "simulate_exact"),
+        (radar_models, "simulate_exact"),
         (run_simulate, "simulate_exact"),
         (run_check, "simulate_exact"),
     )
@@ -170,4 +170,4 @@ def test_a_fit_of_another_depth_than_its_data_gets_a_warning(tmp_path):
     text = RUN.replace("depth = 1", "depth = 2", 1)  # of the data
     run = validate_run(tomllib.loads(text), tmp_path / "run.toml")
     with pytest.warns(PhysicsWarning, match=r"reconstruct.depth is 1, data.depth is 2"):
-        problem._warn_if_depths_differ(run, problem.build_sensors(run))
+        radar_models.warn_if_depths_differ(run, radar_models.build_sensors(run))

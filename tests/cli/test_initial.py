@@ -6,7 +6,8 @@ import pytest
 from rich.console import Console
 
 from cli.small import call, read_metrics
-from invertwin.cli.fits.problem import build_problem, estimate_initial_scene
+from invertwin.cli.fits.kinds import build_problem
+from invertwin.cli.fits.radar_models import estimate_initial_scene
 from invertwin.cli.schema.run_file import validate_run
 
 
@@ -64,6 +65,6 @@ def test_a_size_is_guessed_also_of_an_object_whose_true_shape_is_another(reposit
     text = text.replace("\n\n[radar]", parts)
     run = validate_run(tomllib.loads(text), tmp_path / "run.toml")
     console = Console(quiet=True)
-    _, found = estimate_initial_scene(build_problem(run, console), console)
+    found = estimate_initial_scene(build_problem(run, console), console).notes
     assert found["initial_points"] > 20
     assert "initial_scale_error" not in found

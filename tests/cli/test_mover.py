@@ -92,8 +92,8 @@ def test_the_run_file_holds_what_its_note_says(repository, data_folder, tmp_path
             "data: expected one chirp of a recording with movers, got the mean",
         ),
         (
-            ("[optimizer]", '[starts]\nobject = "mover"\ndistance = [0.1, 0.1]\n[optimizer]'),
-            "starts: ",
+            ("[optimizer]", '[calibration]\nobject = "mover"\n[optimizer]'),
+            "calibration: expected no such section with a moving target",
         ),
         (
             ("[optimizer]", f"{SCALE}\n[optimizer]"),

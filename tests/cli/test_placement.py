@@ -28,10 +28,36 @@ receivers = { low = [0.0, 0.5, 1.2], high = [2.0, 2.5, 1.2], count = 40, batch =
 walls = { corners = [[3.9, -2.9], [3.9, 2.9]], height = 1.8 }
 panel = { counts = [6, 6], spacing = 2.5e-3, bits = 2, pattern.kind = "isotropic" }
 starts = 2
-annealing = 1
-annealed_starts = 1
-descent = { scouts = 2, tracks = 1, track_steps = 1, steps = 2 }
-grid = { places = 3, yaws = 1, spread_deg = [5.0] }
+
+[[parameters]]
+kind = "panel"
+
+[[parameters]]
+kind = "panel_phases"
+
+[search]
+kind = "panels"
+count = 2
+fits = 2
+
+[optimizer]
+rate = 0.15
+rotation_rate = 0.06
+
+[reconstruct]
+steps = 2
+
+[[stages]]
+parameters = ["panel"]
+reconstruct = { steps = 1 }
+
+[[stages]]
+placement = { edge_width = 0.03 }
+
+[variants.exhaustive]
+search = { kind = "panel_grid", places = 3, yaws = 1, spread_deg = [5.0], fits = 1 }
+stages = []
+first_starts = 1
 """
 CHECK = """
 [gradcheck]
@@ -60,19 +86,39 @@ def test_a_panel_is_placed_scored_and_drawn(tmp_path: Path):
     run("reconstruct", written(tmp_path, ROOM), "-o", out)
     found = metrics(out)
     assert found["worst_after_db"] - found["worst_before_db"] == pytest.approx(found["gain_db"])
-    assert found["evaluations"] == 2 + 3 * 3 + 2
+    assert found["evaluations"] == 2 + 3 * (2 * 1 + 1 + 2)
     assert found["evaluations_exhaustive"] == 3
     assert len(found["starts"]) == 2
-    assert "evaluations_ratio" in found["starts"][0]
-    assert "evaluations_ratio" not in found["starts"][1]
+    assert len(found["starts_exhaustive"]) == 1
+    assert all(row["found_over_exhaustive"] > 0 for row in found["starts"])
     assert 0 <= found["successes"] <= 2
+    # An aim has no noise: nothing to compare the twin with, and no error bars.
+    assert found["verdict"] in ("unknown", "at a bound", "worse")
+    assert "no_error_bars" in found
     for name in ("landscape.png", "coverage.png", "report.html"):
         assert (out / name).stat().st_size > 1000
+    assert (out / "checkpoint.pt").exists()
+    assert (out / "view.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("starts = 2", "starts = 2\ndescent = { steps = 3 }", r"\[stages\]"),
+        ("starts = 2", "starts = 2\ngrid = { places = 3 }", "panel_grid"),
+        ("starts = 2", "starts = 2\nannealing = 3", "panel_annealing"),
+    ],
+)
+def test_keys_of_before_name_those_of_today(tmp_path: Path, old: str, new: str, words: str):
+    with pytest.raises(InputError, match=words):
+        run("reconstruct", written(tmp_path, ROOM.replace(old, new)), "-o", tmp_path / "out")
 
 
 def test_check_says_what_a_placement_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run("check", written(tmp_path, ROOM))
-    assert "evaluations" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "steps, full, stage 2" in said
+    assert "placement.starts" in said
 
 
 def test_derivatives_by_the_place_are_checked(tmp_path: Path, repository: Path):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cli.small import call, read_metrics
-from invertwin.cli.fits.radio import Heard, spread_of_ends
+from invertwin.cli.fits.received_levels import spread_of_ends
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import to_toml, validate_run
@@ -122,8 +122,8 @@ def test_a_run_file_as_used_compares_levels_as_the_first_one_did(tmp_path):
     run = loaded(tmp_path, RUN)
     again = loaded(tmp_path, to_toml(run))
     assert (
-        build.build_section(again, "loss")
-        == build.build_section(run, "loss")
+        build.build_loss(again)
+        == build.build_loss(run)
         == SpectrumLoss("mse", levels=1, gain="one")
     )
 
@@ -201,15 +201,12 @@ def test_antennas_are_turned(tmp_path):
 )
 def test_ends_that_scatter_beyond_the_bars_are_told(tmp_path, ends, near, inside):
     run = loaded(tmp_path, RUN + STARTS)
-    scene = build.scene(run)
-    sensor = run.transmitter.build()
-    heard = Heard(run, scene, scene, sensor, sensor, torch.zeros(0), None)
     rows = [
         {"start": k, "status": "budget", "values": {"transmitter.position": end}}
         for k, end in enumerate(ends)
     ]
     bars = {f"transmitter.{axis}": 0.005 for axis in "xyz"}
-    found = spread_of_ends(heard, rows, rows[0], bars)
+    found = spread_of_ends(run, rows, rows[0], bars)
     if near is None:
         assert found == {}
         return

@@ -7,15 +7,10 @@ from PIL import Image
 from rich.console import Console
 
 from cli.small import RUN, call, read_metrics
-from invertwin.cli.fits.problem import (
-    OWN_METHOD,
-    Problem,
-    blur_end_step,
-    build_problem,
-    make_schedule,
-    method_run,
-    stage_runs,
-)
+from invertwin.cli.fits.kinds import build_problem
+from invertwin.cli.fits.problem import OWN_METHOD, Problem, make_schedule, method_run, stage_runs
+from invertwin.cli.fits.radar_maps import RadarMaps
+from invertwin.cli.fits.radar_models import blur_end_step
 from invertwin.cli.fits.shape_scores import is_shape_key, score_shape, shape_label
 from invertwin.cli.fits.writing import BestFit, make_tables
 from invertwin.cli.schema import build
@@ -248,7 +243,7 @@ def test_variants_and_stages_have_an_optimizer_of_their_own(tmp_path):
     assert own.reconstruct.annealing == 0.25
     assert method_run(run, OWN_METHOD).optimizer.kind == "adam"
     scene = build.scene(run)
-    first, second = make_schedule(Problem(run, scene, scene, frozenset()))
+    first, second = make_schedule(Problem(run, scene, scene, frozenset(), {}, None, RadarMaps()))
     assert first.optimizer == build.build_section(run, "optimizer")
     assert (first.steps, first.annealing) == (3, 0.7)
     assert second.optimizer is not None
@@ -368,6 +363,7 @@ def test_parts_are_merged_key_by_key_and_kinds_replace(tmp_path):
     text += '\n[loss]\nkind = "likelihood"\nfloor = 0.5\n[surrogate]\nangle_kernel = "airy"\n'
     run = check(text + "[optimizer]\nrate = 0.2\n", tmp_path)
     own = method_run(run, "no_boundary")
+    assert own.loss is not None
     assert (own.loss.kind, own.loss.floor, own.loss.levels) == ("likelihood", 0.5, 1)
     assert (own.optimizer.kind, own.optimizer.rate) == ("gauss_newton", 0.03)
     assert (own.surrogate.range_kernel, own.surrogate.angle_kernel) == ("response", "response")

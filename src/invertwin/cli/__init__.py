@@ -8,6 +8,7 @@ registry.built_in = (
     "invertwin.cli.schema.shape_tables",
     "invertwin.cli.schema.recordings",
     "invertwin.cli.schema.fit_tables",
+    "invertwin.cli.schema.placement",
     "invertwin.cli.schema.cross_sections",
     "invertwin.cli.schema.radio_tables",
     "invertwin.cli.schema.camera_tables",

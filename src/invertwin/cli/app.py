@@ -341,7 +341,7 @@ def _run_one_reconstruction(file: Path, options: ResumableOptions, default: Path
 
 def _reconstruct_sections(run: Any) -> tuple[str, ...]:
     if run.placement is not None:
-        return ()
+        return ("reconstruct", "parameters")
     return ("reconstruct", "data", "grid" if run.map is None else "transmitter", "parameters")
 
 

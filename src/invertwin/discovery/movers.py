@@ -60,12 +60,15 @@ def point_response(
     return model.predict_paths(point, radar)
 
 
-def detect_strongest_target(recording: ChirpCapture, model: RangeDopplerMap) -> DetectedEcho:
+def detect_strongest_target(
+    recording: ChirpCapture, model: RangeDopplerMap, box: tuple[Tensor, Tensor] | None = None
+) -> DetectedEcho:
     """The strongest detected echo of a recording: CFAR over range rate and range, then its peak.
 
     Args:
         recording: One frame of chirps.
         model: The map to look in, with all range rates.
+        box: Two corners of the box of the world that is searched [m]; None = all of the map.
 
     Raises:
         InputError: Nothing stands out of the noise.
@@ -81,12 +84,16 @@ def detect_strongest_target(recording: ChirpCapture, model: RangeDopplerMap) -> 
         power.amax((-2, -1)), guard=guard, training=training, false_alarm=_FALSE_ALARM_RATE
     )
     points = point_cloud(power, seen, radar, grid, chirps)
-    if not len(points.power):
+    strength = points.power
+    if box is not None:
+        outside = (points.position < box[0]) | (points.position > box[1])
+        strength = strength.masked_fill(outside.any(1), 0.0)
+    if not bool((strength > 0).any()):
         raise InputError(
             "expected something that moves, got no echo above the noise; widen the grid, or "
             "record again"
         )
-    best = int(points.power.argmax())
+    best = int(strength.argmax())
     range_, rate, u, v = (
         float(x[best]) for x in (points.range, points.velocity, points.u, points.v)
     )

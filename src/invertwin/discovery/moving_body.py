@@ -61,6 +61,7 @@ class MovingBody(nn.Module):
         radar: Radar,
         echo: DetectedEcho,
         free: Sequence[str] = ("place", "velocity", "spin", "size", "diffuse"),
+        center: Float64[Tensor, "3"] | None = None,
     ) -> None:
         """Start at an echo with the object's own size.
 
@@ -70,6 +71,7 @@ class MovingBody(nn.Module):
             radar: In one pose.
             echo: Where to start.
             free: Names of the parameters that are fitted; the height goes with the place.
+            center: Initial centre [3] in the world [m]; None = the front is at the echo.
 
         Raises:
             InputError: A material without a diffuse share between 0 and 1, or an unknown name.
@@ -99,6 +101,10 @@ class MovingBody(nn.Module):
         self.spin = nn.Parameter(zeros[0].clone())
         self.size = nn.Parameter(torch.zeros(3, dtype=torch.float64))
         self.diffuse = nn.Parameter(torch.tensor(share, dtype=torch.float64).logit())
+        if center is not None:
+            offset = (center - self._center_at()).detach() @ self._axes
+            self.place.data.copy_(offset[[0, 2]])
+            self.height.data.copy_(offset[1])
         held = dict(self.named_parameters())
         rows = len(radar.virtual_positions[:, 1].unique())
         if set(free) - (set(held) - {"height"}):

@@ -12,7 +12,7 @@ from torch.autograd import grad
 from invertwin.checks import checked_count
 from invertwin.errors import InputError
 from invertwin.inversion.forward_mode import map_tangents
-from invertwin.inversion.loss import MapPairs, Objective, SpectrumLoss
+from invertwin.inversion.loss import CURVED, MapPairs, Objective
 
 _MAX_PARAMETERS = 64  # each parameter costs a derivative of the map per step
 _MAX_DAMPING_TRIALS = 4  # trials of one step with increasing damping
@@ -63,7 +63,7 @@ class GaussNewton:
         self._modules = modules
         self._parameters = {n: p for n, p in modules.named_parameters() if p.requires_grad}
         for loss in objective.losses:
-            if not isinstance(loss, SpectrumLoss):
+            if not isinstance(loss, CURVED):
                 raise InputError(
                     f"expected a SpectrumLoss for Gauss–Newton, got {type(loss).__name__}; "
                     "give one, or another kind of optimiser"

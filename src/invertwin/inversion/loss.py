@@ -479,14 +479,32 @@ class CorrelationLoss:
                 f"expected maps of one shape, got {tuple(simulated.shape)} and "
                 f"{tuple(measured.shape)}; use one grid for both"
             )
-        rows = []
-        for power in (simulated, measured):
-            row = _SCALE_TRANSFORMS[self.scale](
-                power.to(torch.float64) / power.detach().max()
-            ).flatten()
-            row = row - row.mean()
-            rows.append(row / row.norm())
-        return 1 - rows[0] @ rows[1]
+        return 1 - self._unit_row(simulated) @ self._unit_row(measured)
+
+    def curvature(
+        self,
+        simulated: Float[Tensor, "*map"],
+        measured: Float[Tensor, "*map"],
+        tangents: Float[Tensor, "p *map"],
+    ) -> Float64[Tensor, "p p"]:
+        """The Gauss–Newton matrix: the loss is half the squared distance of two unit vectors.
+
+        Args:
+            simulated, measured: The maps.
+            tangents: Derivatives of the simulated map with respect to p parameters.
+        """
+        power = simulated.detach()
+        rows = [torch.func.jvp(self._unit_row, (power,), (t.to(power),))[1] for t in tangents]
+        found = torch.stack(rows) if rows else power.new_zeros(0, power.numel())
+        return found @ found.T
+
+    def _unit_row(self, power: Tensor) -> Tensor:
+        """A map at the scale of the loss, without its mean, of length one."""
+        row = _SCALE_TRANSFORMS[self.scale](
+            power.to(torch.float64) / power.detach().max()
+        ).flatten()
+        row = row - row.mean()
+        return row / row.norm()
 
 
 _MIN_RELATIVE_POWER = 1e-4  # relative to the peak: lower levels are noise
@@ -497,6 +515,22 @@ _SCALE_TRANSFORMS: dict[str, Callable[[Tensor], Tensor]] = {
     "power": lambda share: share,
     "level": lambda share: share.clamp(min=_MIN_RELATIVE_POWER).log(),
 }
+
+
+@dataclass(frozen=True)
+class RatioLoss:
+    """Mean of the predicted over that of the observed map: an aim to be lowered.
+
+    It serves designs, which have no data to be met.
+    """
+
+    def __call__(self, simulated: Tensor, measured: Tensor) -> Tensor:
+        """The ratio."""
+        return simulated.mean() / measured.mean()
+
+
+CURVED = (SpectrumLoss, CorrelationLoss)
+"""Losses with a curvature, which Gauss–Newton and error bars need."""
 
 
 @dataclass(frozen=True)
@@ -529,7 +563,7 @@ class Objective:
         """
         total = torch.zeros((), dtype=torch.float64)
         for loss, weight, pair, rows in zip(self.losses, self.weights, maps, tangents, strict=True):
-            assert isinstance(loss, SpectrumLoss)
+            assert isinstance(loss, CURVED)
             total = total + weight * loss.curvature(*pair, rows)
         return total / sum(self.weights)
 

@@ -14,6 +14,8 @@ from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.loss import Objective
 from invertwin.limits import Count, NonNegative, Positive
 
+_ANGLES = ("rotation", "yaw", "spread")  # how parameters that are angles are named
+
 
 @dataclass(frozen=True)
 class Optimizer:
@@ -21,15 +23,15 @@ class Optimizer:
 
     Attributes:
         kind: ``adam``, ``sgd`` with momentum, or ``gauss_newton`` for few parameters.
-        rate: learning rate at the first step; parameters are in metres and radians. For
-            Gauss–Newton it is the trust radius, the largest change of a parameter in a step, and
-            does not fall.
-        rotation_rate: rate of parameters named ``rotation``; None = ``rate``.
-        final_rate: ``rate`` at the last step, after a cosine decay; None = ``rate`` / 20. The rates
-            of all parameters fall by the same factor.
-        momentum: momentum of SGD.
-        curvature_every: for Gauss–Newton, number of steps that reuse one curvature. The derivatives
-            of the map with respect to every parameter dominate the cost of a step.
+        rate: Learning rate at the first step; parameters are in metres and radians. For
+            Gauss–Newton, a rate is the longest change of a parameter in a step; it does not fall.
+        rotation_rate: Rate of angles: parameters named ``rotation``, ``yaw`` or ``spread``; None =
+            ``rate``.
+        final_rate: What ``rate`` has fallen to at the last step, along a cosine; None = ``rate`` /
+            20. The rates of all parameters fall alike.
+        momentum: Momentum of SGD.
+        curvature_every: For Gauss–Newton, steps from one curvature to the next. Derivatives of the
+            map with respect to every parameter cost most of a step.
     """
 
     kind: Literal["adam", "sgd", "gauss_newton"] = "adam"
@@ -61,7 +63,7 @@ class Optimizer:
         found: dict[nn.Parameter, float] = {}
         for name, parameter in modules.named_parameters():
             if parameter.requires_grad:
-                turns = name.endswith("rotation") and self.rotation_rate is not None
+                turns = name.endswith(_ANGLES) and self.rotation_rate is not None
                 found[parameter] = (rates or {}).get(
                     parameter, self.rotation_rate if turns and self.rotation_rate else self.rate
                 )

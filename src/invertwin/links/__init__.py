@@ -9,6 +9,7 @@ from invertwin.links.listing import path_table as path_table
 from invertwin.links.metasurface.panel import Metasurface as Metasurface
 from invertwin.links.metasurface.panel import panel_paths as panel_paths
 from invertwin.links.metasurface.panel import panel_response as panel_response
+from invertwin.links.metasurface.wall_path import ElementPhases as ElementPhases
 from invertwin.links.metasurface.wall_path import PanelPlacement as PanelPlacement
 from invertwin.links.metasurface.wall_path import WallPath as WallPath
 from invertwin.links.places import ReceiverLocations as ReceiverLocations

@@ -1,7 +1,9 @@
 """Forward model of chirp trains: power over range, Doppler and direction."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Float64
@@ -20,7 +22,12 @@ from invertwin.radar.processing.doppler import range_doppler_angle, velocity_axi
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.surrogate.range_doppler import range_doppler_power
+from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene.scene import Scene
+from invertwin.seeds import derive_seed
+from invertwin.simulation import simulate_chirps
+
+_LOOK_POINTS = 300  # of the largest moving surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +51,9 @@ class RangeDopplerMap(ForwardModel):
     rates: Float64[Tensor, " velocity"]
     bins: int
     sampling: Sampling = Sampling(depth=1, boundary=False)
+
+    # Each takes seconds; 16 determine a standard deviation to 18 %.
+    realisation_count: ClassVar[int] = 16
 
     @classmethod
     def from_chirps(
@@ -117,6 +127,43 @@ class RangeDopplerMap(ForwardModel):
         every = velocity_axis(radar, self.chirps, self.bins)
         rows = (every - self.rates[:, None]).abs().argmin(1)
         return power[:, rows]
+
+    def realisations(
+        self, scene: Scene, sensor: Radar, seed: int
+    ) -> Callable[[int, float], Tensor]:
+        """Recordings of the moving scene with other speckle and noise each time.
+
+        A few hundred points of each surface are enough for developed speckle.
+        """
+        middle = float(self.chirps.times(len(sensor.transmitters.positions)).mean())
+        still = {n: o for n, o in scene.objects.items() if o.velocity is None}
+        moving = {
+            name: replace(item.advance(-middle), velocity=item.velocity)
+            for name, item in scene.objects.items()
+            if item.velocity is not None
+        }
+        begun = Scene({**still, **moving})
+        area = max(item.mesh.area for item in moving.values())
+        drawn = Sampling(depth=1, boundary=False, points_per_m2=_LOOK_POINTS / area)
+        shape = (sensor.frame_count, self.chirps.count, *sensor.shape[1:])
+
+        def to_map(beat: Tensor) -> Tensor:
+            return self.observe(ChirpCapture(beat, sensor, self.chirps))
+
+        def white(key: int) -> Tensor:
+            assert isinstance(sensor.waveform, SampledWaveform)
+            generator = torch.Generator().manual_seed(key)
+            size = (*shape, sensor.waveform.samples)
+            return torch.randn(size, dtype=torch.complex128, generator=generator)
+
+        share = float(to_map(white(seed)).mean())
+
+        def look(number: int, noise: float) -> Tensor:
+            own = derive_seed(number, 0)
+            beat = simulate_chirps(begun, sensor, self.chirps, seed=own, sampling=drawn)
+            return to_map(beat + (noise / share) ** 0.5 * white(derive_seed(number, 1)))
+
+        return look
 
     def crop_around(
         self, range_: float, rate: float, cells: int, radar: Radar

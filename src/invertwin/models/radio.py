@@ -12,6 +12,7 @@ from torch import Tensor
 from invertwin.checks import ArrayLike, checked_number, checked_tensor
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
+from invertwin.links.metasurface.coverage import Coverage
 from invertwin.links.metasurface.panel import Metasurface, panel_response
 from invertwin.links.places import ReceiverLocations
 from invertwin.links.received import LinkStatistics, PropagationSettings
@@ -53,6 +54,48 @@ class PanelMap(ForwardModel):
     def ablations(self) -> dict[str, ForwardModel]:
         """The model at fixed shadows. See ``ForwardModel.ablations``."""
         return {"boundary": replace(self, boundary=False)} if self.boundary else {}
+
+
+@dataclass(frozen=True, eq=False)
+class CoverageMap(ForwardModel):
+    """Path loss that the worst share of receivers exceeds [dB]; the sensor is the metasurface.
+
+    A map of one value: an aim to be lowered, compared by ``RatioLoss``.
+
+    Attributes:
+        coverage: Receivers, and the path gain of each without a panel.
+        batch: Receivers of one prediction; the seed draws them.
+        blur: Width that is added to ends of shadows on the panel [m]; a fit takes it away.
+        softness: Width of the quantile, see ``soft_quantile`` [dB]; a tenth is left in the end.
+        boundary: False leaves out of derivatives that shadows move over the panel.
+    """
+
+    coverage: Coverage
+    batch: int
+    blur: float = 0.0
+    softness: float = 3.0
+    boundary: bool = True
+
+    def predict(self, scene: Scene, sensor: Metasurface, seed: int) -> Float64[Tensor, "1 1"]:
+        """See ``ForwardModel.predict``; what is in the way is that of ``coverage``."""
+        generator = torch.Generator().manual_seed(seed)
+        chosen = torch.randperm(len(self.coverage.receivers), generator=generator)[: self.batch]
+        some = self.coverage.part(chosen)
+        return -some.aim(sensor, self.blur, self.boundary, self.softness).reshape(1, 1)
+
+    def observe(self, recording: ArrayLike) -> Float64[Tensor, "1 1"]:
+        """A path loss to compare with [dB]."""
+        return torch.as_tensor(recording, dtype=torch.float64).reshape(1, 1)
+
+    @property
+    def has_blur(self) -> bool:
+        """Whether shadows or the quantile are blurred."""
+        return self.blur > 0 or self.softness > 0
+
+    def scale_blur(self, fraction: float) -> "CoverageMap":
+        """The model with this fraction of its blur."""
+        soft = self.softness * 0.1 ** (1 - fraction)
+        return replace(self, blur=fraction * self.blur, softness=soft)
 
 
 QUANTITIES = ("received_power", "path_gain", "gain", "sinr", "delay_spread")

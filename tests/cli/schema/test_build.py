@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from invertwin.cli.fits.problem import Problem, make_starts
+from invertwin.cli.fits.problem import Problem, initial_scenes
+from invertwin.cli.fits.radar_maps import RadarMaps
 from invertwin.cli.schema import build
 from invertwin.cli.schema.run_file import to_toml, validate_run
 from invertwin.errors import InputError
@@ -144,8 +145,8 @@ def test_starts_are_as_far_off_as_asked_and_repeat():
     run = read(truth={"box": {"position": [1, 2, 3]}}, starts=table)
     assert run.starts is not None
     scene, truth = build.scene(run), build.true_scene(run)
-    problem = Problem(run, scene, truth, frozenset())
-    found, again = make_starts(problem), make_starts(problem)
+    problem = Problem(run, scene, truth, frozenset(), {}, None, RadarMaps())
+    found, again = initial_scenes(problem), initial_scenes(problem)
     for start, same in zip(found, again, strict=True):
         rest = pose_error(start["box"], truth["box"])
         assert rest is not None
@@ -167,7 +168,7 @@ def test_starts_in_a_plane_about_one_axis():
     run = read(starts=table, seed=7)
     assert run.starts is not None
     scene = build.scene(run)
-    for start in make_starts(Problem(run, scene, scene, frozenset())):
+    for start in initial_scenes(Problem(run, scene, scene, frozenset(), {}, None, RadarMaps())):
         assert abs(float(start["box"].center[1])) < 1e-12
         torch.testing.assert_close(start["box"].transform[1, :3], scene["box"].transform[1, :3])
 
@@ -407,7 +408,7 @@ def test_loss_and_optimizer_pass_on_what_is_given():
     loss, optimizer = build.build_section(run, "loss"), build.build_section(run, "optimizer")
     assert (loss.kind, loss.floor, loss.levels) == ("likelihood", 0.05, 2)
     assert (optimizer.rate, optimizer.rotation_rate) == (0.02, 0.2)
-    assert build.build_section(read(), "loss") == SpectrumLoss()
+    assert build.build_loss(read()) == SpectrumLoss()
     assert build.build_section(read(), "optimizer") == Optimizer()
 
 

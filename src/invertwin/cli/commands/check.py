@@ -3,11 +3,14 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 
 import torch
+from rich.console import Console
 
 from invertwin.channel import Sampling
 from invertwin.channel.sampling import resolve_densities
+from invertwin.cli.commands.gradcheck import checked_map
 from invertwin.cli.estimate import (
     ResourceEstimate,
     SensorSetup,
@@ -16,18 +19,15 @@ from invertwin.cli.estimate import (
     estimate_sensor_resources,
 )
 from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact
-from invertwin.cli.fits.problem import (
-    OWN_METHOD,
-    build_sensors,
-    method_run,
-    require_settings,
-    stage_runs,
-)
+from invertwin.cli.fits.kinds import build_problem
+from invertwin.cli.fits.problem import make_observations, make_schedule
+from invertwin.cli.fits.radar_models import build_sensors
 from invertwin.cli.report import ReportTable, load_texts
 from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.cli.schema.recordings import build_chirp_capture
 from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.cli.schema.shape_tables import MovingTargetParameter
+from invertwin.inversion.observation import name_unknowns
 from invertwin.models.radar import SurrogateMap
 from invertwin.runtime.memory import format_gigabytes, free_memory
 from invertwin.runtime.progress import format_duration
@@ -41,6 +41,7 @@ _SMALL_PROBE, _LARGE_PROBE = (
 _DERIVATIVE_COST = 4  # times the work of a map: a step of a fit with one or several derivatives
 _FIT_TASKS = ("reconstruct", "demo")
 _SIMULATION_TASKS = ("simulate", "dataset")
+_STEPS, _STARTS = "reconstruct.steps", ("transmitter_starts.count", "placement.starts")
 
 
 def run_check(run: RunFile) -> tuple[list[ReportTable], str]:
@@ -51,10 +52,8 @@ def run_check(run: RunFile) -> tuple[list[ReportTable], str]:
     """
     if run.rcs is not None:
         return _check_rcs(run)
-    if run.map is not None:
-        return _check_radio_map(run)
-    if run.placement is not None:
-        return _check_placement(run)
+    if run.map is not None or run.placement is not None:
+        return (_check_other_data if run.task in _FIT_TASKS else _check_checked_map)(run)
     if run.image is not None and run.task == "gradcheck":
         return _check_image(run)
     truth, sensors = build.true_scene(run), _build_sensors(run)
@@ -86,60 +85,40 @@ def _make_tables(
     ], line
 
 
-def _check_placement(run: RunFile) -> tuple[list[ReportTable], str]:
-    """The same of `[placement]`: its time is that of one evaluation, and of one derivative."""
-    placing, module = build.panel_design(run, build.scene(run))
-    table = require_section(run, "placement", run.task)
-    settings = table.descent.build()
-    once = _time_call(lambda: placing.level(module))
-    step = _time_call(lambda: placing.descend(module, 1, settings, width=0.0))
-    steps = settings.tracks * settings.track_steps + settings.steps
-    grid = table.grid.places * table.grid.yaws * len(table.grid.spread_deg) ** 2
-    levels = grid + 2 * table.starts * settings.scouts
-    annealed = min(table.starts, table.annealed_starts)
-    levels += annealed * table.annealing * settings.evaluations
-    descents = (2 * table.starts + 1) * steps
-    count = table.panel.counts[0] * table.panel.counts[1]
-    rows = [
-        ["receivers", table.receivers.count + table.receivers.scored, "placement.receivers"],
-        ["elements", count, "placement.panel.counts"],
-        ["evaluations", levels, "placement.annealing, placement.grid"],
-        ["derivatives", descents, "placement.descent"],
-    ]
-    seconds = levels * once + descents * step
-    if run.task == "gradcheck":
-        seconds = 10 * once
-    line = f"about {format_duration(seconds)} for {levels} evaluations and {descents} derivatives"
-    heads = ("needs", "how many", "key")
-    return [ReportTable("Estimate", heads, rows), _mesh_table(build.scene(run))], line
+def _check_other_data(run: RunFile) -> tuple[list[ReportTable], str]:
+    """The same of fits to other data than radar maps: the time of one map of each stage."""
+    problem = build_problem(run, Console(quiet=True))
+    observation = make_observations(problem, problem.starts()[0])[0]
+    sensor = observation.sensor
+    for unknown in name_unknowns(observation.parameters).values():
+        sensor = unknown.build_module(sensor)(sensor)
+    rows: list[list[object]] = []
+    seconds, maps = 0.0, 0.0
+    for method in problem.methods:
+        own, starts = problem.kind.with_method(problem, method), len(problem.starts(method))
+        for number, stage in enumerate(make_schedule(own), 1):
+            rows.append([f"steps, {method}, stage {number}", starts * stage.steps, _STEPS])
+            work = partial(stage.models[0].predict, problem.scene, sensor, 0)
+            with torch.no_grad():
+                seconds += starts * stage.steps * _DERIVATIVE_COST * _time_call(work)
+            maps += starts * stage.steps
+    rows.append(["starts", len(problem.starts()), _STARTS[run.map is None]])
+    line = f"about {format_duration(seconds)} for {maps:.4g} steps, without searches"
+    return [
+        ReportTable("Estimate", ("needs", "how many", "key"), rows),
+        _mesh_table(problem.scene),
+    ], line
 
 
-def _check_radio_map(run: RunFile) -> tuple[list[ReportTable], str]:
-    """The same of `[map]`, whose memory does not grow: the time of one map of each stage."""
-    scene = build.true_scene(run)
-    with prefix_errors("transmitter"):
-        sensor = require_section(run, "transmitter", "[map]").build()
-
-    def time_map(own: RunFile) -> float:
-        with prefix_errors("map"), torch.no_grad():
-            model = require_section(own, "map", run.task).build()
-            return _time_call(lambda: model.predict(scene, sensor, 0))
-
-    starts = 1 if run.transmitter_starts is None else run.transmitter_starts.count
-    rows: list[list[object]] = [["starts", starts, "transmitter_starts.count"]]
-    if run.task == "reconstruct":
-        seconds = 0.0
-        for mode in (OWN_METHOD, *run.variants):
-            for number, (_, own) in enumerate(stage_runs(method_run(run, mode)), 1):
-                steps = require_settings(own).steps
-                rows.append([f"steps, {mode}, stage {number}", steps, "reconstruct.steps"])
-                seconds += starts * steps * _DERIVATIVE_COST * time_map(own)
-    else:
-        check = require_section(run, "gradcheck", run.task)
-        count = 4 * (check.repeats + check.max_pairs)
-        rows.append(["maps", count, "gradcheck.repeats, gradcheck.max_pairs"])
-        seconds = count * time_map(run)
-    line = f"about {format_duration(seconds)} for {len(sensor.positions)} transmitters"
+def _check_checked_map(run: RunFile) -> tuple[list[ReportTable], str]:
+    """The same of a gradient check of `[map]` or `[placement]`, whose memory does not grow."""
+    scene, check = build.scene(run), require_section(run, "gradcheck", run.task)
+    model, sensor = checked_map(run, scene)
+    count = 4 * (check.repeats + check.max_pairs)
+    rows: list[list[object]] = [["maps", count, "gradcheck.repeats, gradcheck.max_pairs"]]
+    with torch.no_grad():
+        seconds = count * _time_call(lambda: model.predict(scene, sensor, 0))
+    line = f"about {format_duration(seconds)} for {count} maps"
     return [ReportTable("Estimate", ("needs", "how many", "key"), rows), _mesh_table(scene)], line
 
 

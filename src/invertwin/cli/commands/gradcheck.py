@@ -66,7 +66,7 @@ class GradcheckOutcome:
     def apply_theta(self, scene: Scene, radar: Radar, theta: Tensor) -> tuple[Scene, Radar]:
         """Scene and radar, moved by θ."""
         module, tangent = build.tangent(self.run, scene)
-        if require_section(self.run, "gradcheck", "gradcheck").of == "sensor":
+        if require_section(self.run, "gradcheck", "gradcheck").acts_on == "sensor":
             return scene, make_line(module, tangent, radar).evaluate(theta)
         return make_line(module, tangent, scene).evaluate(theta), radar
 
@@ -238,10 +238,11 @@ def _radar_map_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _
 
 def _panel_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _GradcheckTarget:
     """What the metasurface of `[placement]` brings to receivers."""
-    placing, module = build.panel_design(run, scene)
-    aim = placing.coverage
-    with torch.no_grad():
-        panel = placing.panel if settings.parameter.kind == "panel" else module(placing.panel)
+    table = require_section(run, "placement", "gradcheck")
+    aim, panel = table.coverage(scene, run.seed), table.metasurface()
+    if settings.parameter.kind != "panel":
+        with torch.no_grad():
+            panel = table.place(aim, table.initial)(panel)
 
     def draw(report: GradientReport) -> Figure:
         order = report.difference[0].argsort()
@@ -304,6 +305,17 @@ def _select_target(run: RunFile) -> Callable[[RunFile, GradcheckTable, Scene], _
     if run.map is not None:
         return _radio_map_target
     return _radar_map_target if run.rcs is None else _rcs_target
+
+
+def checked_map(run: RunFile, scene: Scene) -> tuple[ForwardModel, Any]:
+    """The model and the sensor of a gradient check.
+
+    Args:
+        run: The run file.
+        scene: At θ = 0.
+    """
+    seen = _select_target(run)(run, require_section(run, "gradcheck", "gradcheck"), scene)
+    return seen.model, seen.sensor
 
 
 def _find_studies(run: RunFile) -> dict[str, GradcheckStudy]:

@@ -26,19 +26,19 @@ def plot_landscape(problem: Problem, console: Console) -> tuple[Figure, dict[str
 
     For the exact signal one channel of one frame is enough to show the shape.
     """
-    run, truth, sight = problem.run, problem.truth, problem.first_sensor
+    run, truth, item = problem.run, problem.truth, problem.first_sensor
     table = require_section(run, "landscape", "the loss landscape")
     line, along = make_object_line(truth, table.object, table.axis)
     fine = np.linspace(-table.exact_span, table.exact_span, table.exact_points)
     wide = np.linspace(-table.span, table.span, table.points)
-    model, first = BeatMap(sight.grid, channels=(slice(1), slice(1))), sight.radar.frames([0])
-    beat = Observation(model, sight.capture.beat[:1, :1, :1], sensor=first, loss=relative_error)
+    model, first = BeatMap(item.grid, channels=(slice(1), slice(1))), item.sensor.frames([0])
+    beat = Observation(model, item.recording.beat[:1, :1, :1], sensor=first, loss=relative_error)
     with count_progress(console, "loss landscape, exact signal", len(fine)) as advance:
         exact = evaluate_exact_losses(run, line, fine, beat, advance)
-    model, loss = make_models(problem)[0], build.build_section(run, "loss")
+    model, loss = make_models(problem)[0], build.build_loss(run)
     smooth = {}
     for name, share in (("first widths", 1.0), ("no extra width", 0.0)):
-        seen = Observation(model.scale_blur(share), sight.capture, sensor=sight.radar, loss=loss)
+        seen = Observation(model.scale_blur(share), item.recording, sensor=item.sensor, loss=loss)
         with count_progress(console, f"loss landscape, {name}", len(wide)) as advance:
             losses = evaluate_losses(
                 line, iterate_and_advance(wide, advance), seen, seed=run.seed

@@ -8,14 +8,9 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from invertwin.cli.fits.problem import (
-    Problem,
-    build_problem,
-    make_observations,
-    make_unknowns,
-    stage_runs,
-    with_new_recording,
-)
+from invertwin.cli.fits.kinds import build_problem
+from invertwin.cli.fits.problem import Problem, make_observations, make_unknowns, stage_runs
+from invertwin.cli.fits.radar_models import with_new_recording
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.report import ReportTable, load_texts, write_report
 from invertwin.cli.schema import PlanTable, RunFile, SimulatedData, build
@@ -57,7 +52,7 @@ def run_plan(
     with show_progress(console):
         found, added = plan_error_bars(_prepare_fit_at_truth(own), len(places))
     metrics: dict[str, Any] = {"task": "plan", **error_bar_metrics(found), "verdict_reasons": []}
-    first = len(own.first_sensor.radar.positions) - len(places)
+    first = len(own.first_sensor.sensor.positions) - len(places)
     metrics["candidates"] = [
         {
             "position": places[one.frame - first].tolist(),
@@ -89,8 +84,8 @@ def _prepare_fit_at_truth(problem: Problem) -> Any:
     return prepare_fit(
         problem.truth,
         make_observations(last),
-        make_unknowns(problem.run),
-        loss=build.build_section(problem.run, "loss"),
+        make_unknowns(problem),
+        loss=build.build_loss(problem.run),
         seed=problem.run.seed,
     )
 

@@ -9,7 +9,8 @@ from rich.console import Console
 from invertwin.capture import Capture, search_ranges
 from invertwin.channel import Grid
 from invertwin.cli.fits.displays import VIEW_FILE
-from invertwin.cli.fits.problem import build_sensors, fitted_objects
+from invertwin.cli.fits.problem import fitted_objects
+from invertwin.cli.fits.radar_models import build_sensors
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.run_file import load_run, prefix_file_errors
 from invertwin.errors import InputError

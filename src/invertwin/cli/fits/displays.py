@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from invertwin.cli.fits.problem import Problem, fitted_objects
+from invertwin.cli.fits.problem import Problem, SensorData, fitted_objects
 from invertwin.errors import InputError
 from invertwin.inversion import Callback
 from invertwin.inversion.fit import Fit
@@ -165,9 +165,10 @@ def make_sensor_maps(
     limit = {} if max_values is None else {"most": max_values}
     return {
         name: DisplayMaps.from_spectra(
-            {what: own[k] for what, own in spectra.items()}, sight.grid, **limit
+            {what: own[k] for what, own in spectra.items()}, item.grid, **limit
         )
-        for k, (name, sight) in enumerate(problem.sensor_data.items())
+        for k, (name, item) in enumerate(problem.sensor_data.items())
+        if item.grid is not None and all(spectra.values())
     }
 
 
@@ -180,6 +181,15 @@ def make_problem_display(problem: Problem, scene: Scene) -> Display:
     """
     names = [name for name in fitted_objects(problem.run) if name in scene.names]
     known = any(name in problem.known_objects for name in names)
-    sights = {name: (sight.radar, sight.grid) for name, sight in problem.sensor_data.items()}
-    title = problem.run.title or "Reconstruction"
-    return build_display(scene, sights, title, truth=problem.truth if known else None, fitted=names)
+    radars = {name: (item.sensor, item.grid) for name, item in radar_data(problem).items()}
+    title = problem.run.title or problem.kind.title
+    return build_display(scene, radars, title, truth=problem.truth if known else None, fitted=names)
+
+
+def radar_data(problem: Problem) -> dict[str, SensorData]:
+    """The data of radars, which a viewer can show, by the sensor's name.
+
+    Args:
+        problem: What is fitted.
+    """
+    return {name: item for name, item in problem.sensor_data.items() if item.grid is not None}

@@ -1,4 +1,4 @@
-"""The fits themselves: calibration, one fit per start, progress, interruptions."""
+"""The fits of a run: every start of every method, progress, checkpoints, interruptions."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -15,18 +15,18 @@ from invertwin.capture import calibrate
 from invertwin.cli.fits.displays import StepRecorder, steps_path
 from invertwin.cli.fits.problem import (
     OWN_METHOD,
+    Fits,
     Problem,
+    Row,
+    Start,
     fitted_objects,
-    has_recording_per_start,
-    known_truth,
     make_models,
     make_observations,
     make_schedule,
     make_unknowns,
+    rank,
     require_settings,
-    with_method,
 )
-from invertwin.cli.fits.scores import score_fit
 from invertwin.cli.fits.shape_scores import CURVE_KEY, make_shape_metric
 from invertwin.cli.fits.spreading import fit_file_stem
 from invertwin.cli.schema import build
@@ -44,72 +44,72 @@ from invertwin.inversion import (
     search,
 )
 from invertwin.inversion.callbacks import stage_checkpoint_path
-from invertwin.inversion.confidence.report import confidence_metrics
 from invertwin.inversion.fit import Fit
 from invertwin.radar.parameters import ClockOffset, RangeBias
-from invertwin.scene import Object, Scene
+from invertwin.scene import Scene
 from invertwin.seeds import derive_seed
 from invertwin.storage.folders import PARTS
-from invertwin.storage.run_folder import RunFolder
+from invertwin.storage.run_folder import CHECKPOINT, RunFolder
 from invertwin.viewer import DisplayStep
 
+Show = Callable[[Problem, Fit, DisplayStep], None]
+"""Is told of the steps of a fit as they come."""
 
-def calibrate_problem(
-    problem: Problem, folder: RunFolder, console: Console
-) -> tuple[Problem, dict[str, Any]]:
-    """The problem with range bias and clock offset found on an object whose place is known."""
-    run, table = problem.run, problem.run.calibration
-    if table is None:
-        return problem, {}
-    if len(problem.sensor_data) > 1:
-        raise InputError(
-            "calibration: expected one sensor, got several; calibrate each recording by itself"
-        )
-    sight, target = problem.first_sensor, problem.truth[table.object]
-    if table.method == "backprojection":
-        capture, row = calibrate(sight.capture, target.center), {}
-    else:
-        bias, clock = RangeBias(), ClockOffset(sight.capture.positions)
-        own = replace(problem, run=run.apply_overrides(table))
-        schedule, (model,) = require_settings(own.run).build(), make_models(own)
-        with report_progress("calibration", schedule.steps, console) as shown:
-            found = reconstruct(
-                Scene({table.object: target}),
-                Observation(model, sight.capture, sensor=sight.radar, parameters=[bias, clock]),
-                [],
-                loss=build.build_section(run, "loss"),
-                optimizer=build.build_section(own.run, "optimizer"),
-                schedule=schedule,
-                callbacks=[*shown, _make_checkpoint(problem, folder, f"{PARTS}/calibration.pt")],
-                seed=run.seed,
-            )
-        capture = sight.capture.recalibrate(
-            sight.capture.clock_offset + float(clock.shift.detach()),
-            sight.capture.range_bias + float(bias.bias.detach()),
-        )
-        row = {"loss": found.loss, "status": found.status}
-    row |= {"clock_offset_s": capture.clock_offset, "range_bias_m": capture.range_bias}
-    sight = replace(sight, capture=capture, radar=capture.radar())
-    return replace(problem, sensor_data=dict.fromkeys(problem.sensor_data, sight)), row
+
+def fit_all(
+    problem: Problem, folder: RunFolder, console: Console, show: Show | None = None
+) -> Fits:
+    """Fit from every start in every method; fits that are in the folder are not made again.
+
+    Args:
+        problem: Of the run.
+        folder: Keeps results and checkpoints.
+        console: Shows progress.
+        show: Is told of steps as they come.
+    """
+    work = [(method, k) for method in problem.methods for k in range(len(problem.starts(method)))]
+    rows: dict[str, list[Row]] = {method: [] for method in problem.methods}
+    outcomes: dict[tuple[str, int], Callable[[], Reconstruction]] = {}
+    for method, number in work:
+        own = problem.kind.with_recording_of_start(problem, number, console)
+        checkpoint = CHECKPOINT if len(work) == 1 else None
+        told = None if show is None else partial(show, own)
+        start = problem.starts(method)[number]
+        row, outcome = run_fit(own, start, number, method, folder, console, checkpoint, told)
+        rows[method].append(row)
+        if method not in problem.run.variants:
+            outcomes[method, number] = outcome
+    best = min(rows[OWN_METHOD], key=rank)
+    number = best["start"]
+    return Fits(
+        problem.kind.with_method(
+            problem.kind.with_recording_of_start(problem, number, console), OWN_METHOD
+        ),
+        rows,
+        lambda method, number: outcomes[method, number](),
+        best,
+        problem.starts()[number],
+        outcomes[OWN_METHOD, number](),
+    )
 
 
 def run_fit(
     problem: Problem,
-    start: Scene,
+    start: Start,
     index: int,
-    mode: str,
+    method: str,
     folder: RunFolder,
     console: Console,
     checkpoint: str | None,
     show: Callable[[Fit, DisplayStep], None] | None = None,
-) -> tuple[dict[str, Any], Callable[[], Reconstruction]]:
-    """One fit, or what an interrupted run has kept of it.
+) -> tuple[Row, Callable[[], Reconstruction]]:
+    """Make one fit, or read what an interrupted run has kept of it.
 
     Args:
-        problem: What is to be fitted.
-        start: From where.
+        problem: Of the run.
+        start: Initial values.
         index: Number of the start.
-        mode: The run's own way to fit, or a variant.
+        mode: The run's own way to fit, a variant, or one of the data.
         folder: Keeps results and checkpoints.
         console: Shows progress.
         checkpoint: Name of the checkpoint; None = one among the parts.
@@ -118,9 +118,9 @@ def run_fit(
     Returns:
         The row of the fit, and a function that gives its outcome.
     """
-    part = fit_file_stem(mode, index)
+    part = fit_file_stem(method, index)
     checkpoint = checkpoint or f"{part}.pt"
-    own = with_method(problem, mode)
+    own = problem.kind.with_method(problem, method)
     stages = make_schedule(own)
     again = partial(_fit_or_search, own, stages, start, index, folder, checkpoint, show)
     row = folder.read_json(f"{part}.json")
@@ -128,12 +128,11 @@ def run_fit(
         # The checkpoints say what the fit found; nothing is fitted again.
         return row, lambda: again()[0]
     begin = time.perf_counter()
-    name = f"start {index + 1}" + ("" if mode == OWN_METHOD else f", {mode.replace('_', ' ')}")
+    name = f"start {index + 1}" + ("" if method == OWN_METHOD else f", {method.replace('_', ' ')}")
     with report_progress(name, sum(stage.steps for stage in stages), console) as shown:
         found, found_ends = again(shown)
     row = {
         "start": index,
-        **score_fit(own, start, found.scene),
         "loss": found.loss,
         "status": found.status,
         "lost": found.is_uninformative,
@@ -142,7 +141,7 @@ def run_fit(
         "values": _fitted_values(found.parameters),
         "checkpoint": found_ends.pop("checkpoint", checkpoint),
         **found_ends,
-        **(confidence_metrics(found, known_truth(own)) if has_recording_per_start(own.run) else {}),
+        **own.kind.score_fit(own, start, found),
         "losses": [step["loss"] for step in found.history],
         "curve": [
             [step["step"] + 1, step[CURVE_KEY]] for step in found.history if CURVE_KEY in step
@@ -150,46 +149,57 @@ def run_fit(
     }
     folder.write_json(f"{part}.json", row)
     # The twins of many recordings are read again, not kept.
-    return row, (lambda: again()[0]) if has_recording_per_start(own.run) else lambda: found
+    anew = getattr(own.run.data, "every_start", False)
+    return row, (lambda: again()[0]) if anew else lambda: found
 
 
 def _fit_or_search(
     problem: Problem,
     stages: Sequence[Stage],
-    start: Scene,
+    start: Start,
     index: int,
     folder: RunFolder,
     checkpoint: str,
     show: Callable[[Fit, DisplayStep], None] | None,
-    reports: Sequence[Report] = (),
-) -> tuple[Reconstruction, dict[str, Any]]:
-    """A fit, or a search about its start; and what the row says of the search."""
+    shown: Sequence[Report] = (),
+) -> tuple[Reconstruction, Row]:
+    """Fit, or search about the start; return what the row says of the search, too."""
     run, watch = problem.run, make_shape_metric(problem)
     every = run.measures.every if run.measures else 1
 
-    def make_callbacks(file: str) -> list[Callback]:
+    def callbacks(file: str) -> list[Callback]:
         for k in range(len(stages) - 1):
             folder.file(str(stage_checkpoint_path(Path(file), k)))
         watching = [] if watch is None else [Watch(watch, every)]
         kept = StepRecorder(
             folder.file(steps_path(file)),
-            [name for name in dict.fromkeys(fitted_objects(run)) if name in start.names],
+            [name for name in dict.fromkeys(fitted_objects(run)) if name in start.scene.names],
             sum(stage.steps for stage in stages),
             require_settings(run).checkpoint_every,
-            show if reports else None,
+            show if shown else None,
         )
-        return [*watching, *reports, _make_checkpoint(problem, folder, file), kept]
+        return [*watching, *shown, _make_checkpoint(problem, folder, file), kept]
 
-    given = start, make_observations(problem), make_unknowns(run)
-    how: dict[str, Any] = {key: build.build_section(run, key) for key in ("loss", "optimizer")}
-    how |= {"schedule": stages, "seed": derive_seed(run.seed, index)}
+    given = start.scene, make_observations(problem, start), make_unknowns(problem, start)
+    seed = derive_seed(run.seed, index)
+    how: dict[str, Any] = {
+        "loss": build.build_loss(run),
+        "optimizer": build.build_section(run, "optimizer"),
+    }
+    how |= {"schedule": stages, "seed": seed}
     if run.search is None:
-        return reconstruct(*given, callbacks=make_callbacks(checkpoint), **how), {}
-    name, part = run.search.object, f"{PARTS}/{Path(checkpoint).stem}_fit"
-    chance = torch.Generator().manual_seed(how["seed"])
-    poses = build.build_section(run, "search", {Object: start[name], torch.Generator: chance})
-    starts = {name: [start[name], *poses]}
-    found = search(*given, starts, callbacks=lambda n: make_callbacks(f"{part}{n}.pt"), **how)
+        return reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
+    part = f"{PARTS}/{Path(checkpoint).stem}_fit"
+    chance = torch.Generator().manual_seed(seed)
+    starts = problem.kind.make_candidates(problem, start, chance)
+    found = search(
+        *given,
+        starts,
+        callbacks=lambda n: callbacks(f"{part}{n}.pt"),
+        fits=run.search.fits,
+        shortlist=run.search.shortlist,
+        **how,
+    )
     return found.best, {"checkpoint": f"{part}{found.best_number}.pt", **found.to_metrics()}
 
 
@@ -200,10 +210,58 @@ def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoi
     )
 
 
-def _fitted_values(modules: nn.ModuleList) -> dict[str, Any]:
+def _fitted_values(modules: nn.ModuleList) -> Row:
     """Fitted values by name; vertices are in the mesh file and the checkpoint."""
-    rows: dict[str, Any] = {}
+    rows: Row = {}
     for module in modules:
         found: dict[str, torch.Tensor] = getattr(module, "values", dict)()
         rows |= {name: value.tolist() for name, value in found.items() if value.numel() <= 16}
     return rows
+
+
+def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> Problem:
+    """The problem with range bias and clock offset found on an object whose position is known.
+
+    Args:
+        problem: Of one radar.
+        folder: Keeps the checkpoint.
+        console: Shows progress.
+
+    Raises:
+        InputError: Several sensors.
+    """
+    run, table = problem.run, problem.run.calibration
+    if table is None:
+        return problem
+    if len(problem.sensor_data) > 1:
+        raise InputError(
+            "calibration: expected one sensor, got several; calibrate each recording by itself"
+        )
+    item, target = problem.first_sensor, problem.truth[table.object]
+    capture, row = item.recording, {}
+    if table.method == "backprojection":
+        capture = calibrate(capture, target.center)
+    else:
+        bias, clock = RangeBias(), ClockOffset(capture.positions)
+        own = replace(problem, run=run.apply_overrides(table))
+        schedule, (model,) = require_settings(own.run).build(), make_models(own)
+        with report_progress("calibration", schedule.steps, console) as shown:
+            found = reconstruct(
+                Scene({table.object: target}),
+                Observation(model, capture, sensor=item.sensor, parameters=[bias, clock]),
+                [],
+                loss=build.build_loss(run),
+                optimizer=build.build_section(own.run, "optimizer"),
+                schedule=schedule,
+                callbacks=[*shown, _make_checkpoint(problem, folder, f"{PARTS}/calibration.pt")],
+                seed=run.seed,
+            )
+        capture = capture.recalibrate(
+            capture.clock_offset + float(clock.shift.detach()),
+            capture.range_bias + float(bias.bias.detach()),
+        )
+        row = {"loss": found.loss, "status": found.status}
+    row |= {"clock_offset_s": capture.clock_offset, "range_bias_m": capture.range_bias}
+    item = replace(item, recording=capture, sensor=capture.radar())
+    data, notes = dict.fromkeys(problem.sensor_data, item), {**problem.notes, "calibration": row}
+    return replace(problem, sensor_data=data, notes=notes)

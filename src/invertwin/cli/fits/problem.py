@@ -1,74 +1,100 @@
-"""What is to be fitted: scene, observations, unknowns and stages of a run file."""
+"""A fit of a run file: scene, observations, unknowns and stages, of any kind of data."""
 
 import math
-import time
-import warnings
-from collections.abc import Mapping
-from contextlib import nullcontext
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from rich.console import Console
-from torch import nn
+from torch import Tensor, nn
 
-from invertwin.capture import Capture
-from invertwin.channel import Densities, Grid, Sampling
-from invertwin.cli.estimate import SensorSetup, require_resources
-from invertwin.cli.exact_signals import simulate_exact
+from invertwin.cli.report import ReportPicture, ReportTable
 from invertwin.cli.schema import (
     MeasuresTable,
     ReconstructTable,
     RunFile,
     SamplingBase,
     SimulatedData,
+    StageTable,
     build,
 )
-from invertwin.cli.schema import StageTable as StageTable
-from invertwin.cli.schema.recordings import build_capture
 from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.cli.schema.shape_tables import shape_regularizers
-from invertwin.errors import InputError, PhysicsWarning
+from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.inversion import Observation, Stage, Unknown, remesh
-from invertwin.inversion.initialisation.detections import estimate_density
-from invertwin.inversion.metrics import pose_error
-from invertwin.models.facets import FacetMap
-from invertwin.models.radar import ExactMap, SurrogateMap
-from invertwin.radar.parameters import ClockOffset, RangeBias
-from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate.surrogate import Surrogate
+from invertwin.inversion import Observation, Reconstruction, Stage, Unknown, remesh
+from invertwin.inversion.initialisation.multi_start import Candidate
 from invertwin.scene import Object, Scene, rigid
 from invertwin.seeds import derive_seed
+from invertwin.storage.run_folder import RunFolder
 
 OWN_METHOD, INTERIOR_ONLY = "full", "interior_only"
-
-_RADAR_PARAMETER_KINDS = ("radar_pose", "radar_path")
-_DEFAULT_POINTS_PER_M2 = 2_000.0
-_RECORDING_SEED_KEY = 2**16  # key of the seeds of recordings, beyond those of sensors
+OF_SENSORS = ("radar_pose", "radar_path", "transmitter", "panel", "panel_phases")
+"""Kinds of parameters that belong to a sensor."""
+_POSED = ("translation", "pose", "scale", "body", "vertices", "mover")
+Row = dict[str, Any]
+"""Numbers of one fit."""
 
 
 @dataclass(frozen=True)
 class SensorData:
-    """What one sensor has recorded."""
+    """Data of one sensor.
 
-    capture: Capture
-    radar: Radar
-    grid: Grid
-    weight: float = 1.0  # in the loss
+    Attributes:
+        recording: As the forward model observes it.
+        sensor: What recorded it.
+        grid: Bins of its maps; None where the model needs none.
+        weight: Of its loss in the mean.
+    """
+
+    recording: Any
+    sensor: Any
+    grid: Any = None
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Start:
+    """Initial values of one fit.
+
+    Attributes:
+        scene: Initial scene.
+        transmitter: Initial position of the first transmitter [3] [m]; None where none is fitted.
+    """
+
+    scene: Scene
+    transmitter: Tensor | None = None
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything a fit needs, built from the run file."""
+    """Everything a fit needs, built from the run file.
+
+    Attributes:
+        run: The run file.
+        scene: As known.
+        truth: As it is, where the run file knows it.
+        known_objects: Objects whose true pose is known.
+        sensor_data: By the sensor's name.
+        scored_object: The object that is scored.
+        kind: Kind of the data.
+        reference: What scores need beside the truth: true transmitters, other receivers.
+        notes: Numbers of what came before the fits, for metrics.json.
+    """
 
     run: RunFile
-    scene: Scene  # as known
-    truth: Scene  # where the run file knows it
-    known_objects: frozenset[str]  # objects whose true pose is known
-    sensor_data: Mapping[str, SensorData] = field(default_factory=dict)  # by the sensor's name
-    scored_object: str | None = None  # the object that is scored
+    scene: Scene
+    truth: Scene
+    known_objects: frozenset[str]
+    sensor_data: Mapping[str, SensorData]
+    scored_object: str | None
+    kind: "DataKind"
+    reference: Any = None
+    notes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def first_sensor(self) -> SensorData:
@@ -76,112 +102,298 @@ class Problem:
         return next(iter(self.sensor_data.values()))
 
     @property
-    def sensors_with_runs(self) -> list[tuple[RunFile, SensorData]]:
-        """Every sensor with the run file as it is for it."""
-        runs = sensor_runs(self.run)
-        return [(runs[name], sight) for name, sight in self.sensor_data.items()]
-
-    @property
     def measures(self) -> MeasuresTable | None:
-        """How the shape is scored, where the true one is known."""
+        """Scores of the shape, where the true one is known."""
         table = self.run.measures
         return table if table is not None and table.object in self.known_objects else None
 
+    @property
+    def methods(self) -> list[str]:
+        """Names of the ways to fit: the run's own, its variants, and those of the data."""
+        return [OWN_METHOD, *self.run.variants, *self.kind.methods]
 
-def build_problem(run: RunFile, console: Console) -> Problem:
-    """The problem of a run file; simulated data are simulated here.
+    def starts(self, method: str = OWN_METHOD) -> list[Start]:
+        """Starts of the fits of a method, in order."""
+        variant = self.run.variants.get(method)
+        return self.kind.starts(self)[: variant.first_starts if variant else None]
 
-    Raises:
-        InputError: A section is missing or does not fit the data.
+
+@dataclass(frozen=True)
+class Fits:
+    """All fits of a run.
+
+    Attributes:
+        problem: With the data of the best fit.
+        rows: Of every fit, by method.
+        outcome: Outcome of a fit that is no variant, by method and number of its start.
+        best: Row of the best one, of the run's own method.
+        start: Where it began.
+        found: What it found.
+        maps: Of every sensor, by "measured", "start" and "twin"; empty where none is shown.
     """
-    require_section(run, "parameters", "reconstruct")
-    scene, truth = build.scene(run), build.true_scene(run)
-    for i, parameter in enumerate(run.parameters):
-        if parameter.kind == "mover":
+
+    problem: Problem
+    rows: Mapping[str, list[Row]]
+    outcome: Callable[[str, int], Reconstruction]
+    best: Row
+    start: Start
+    found: Reconstruction
+    maps: Mapping[str, list[Tensor]] = field(default_factory=dict)
+
+    @property
+    def methods(self) -> list[str]:
+        """The run's own method and its variants."""
+        return [OWN_METHOD, *self.problem.run.variants]
+
+    @property
+    def losses(self) -> dict[str, list[list[float]]]:
+        """Losses over the steps of every fit, by method."""
+        return {method: [row["losses"] for row in rows] for method, rows in self.rows.items()}
+
+    def best_of(self, method: str) -> Row:
+        """Row of the best fit of a method."""
+        return min(self.rows[method], key=rank)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A part of the report that depends on the kind of data.
+
+    Attributes:
+        outcome: In a sentence or two.
+        result: Table of the result.
+        pictures: Below it.
+        tables: At the end.
+    """
+
+    outcome: str
+    result: ReportTable
+    pictures: Sequence[ReportPicture]
+    tables: Sequence[ReportTable]
+
+
+def rank(row: Row) -> tuple[bool, float]:
+    """Order of fits, the best first; a loss that is not a number comes last."""
+    loss: float | None = row["loss"]
+    value = math.inf if loss is None or not math.isfinite(loss) else loss
+    return row["status"] == "diverged", value
+
+
+class DataKind(ABC):
+    """A kind of data: how it is read, modelled, scored and shown. All else is the same for all.
+
+    Attributes:
+        title: Of a report without one.
+        unused: Sections that have no meaning for such data.
+        methods: Further fits beside those of the run and its variants.
+    """
+
+    title: ClassVar[str] = "Reconstruction"
+    unused: ClassVar[tuple[str, ...]] = ()
+    methods: ClassVar[tuple[str, ...]] = ()
+
+    @abstractmethod
+    def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:
+        """Read the data, or simulate them.
+
+        Args:
+            run: The run file.
+            scene: As known.
+            truth: As it is.
+            console: Shows progress.
+        """
+
+    @abstractmethod
+    def models(self, problem: Problem) -> list[ForwardModel]:
+        """Forward models of all sensors, for the problem of a method or a stage."""
+
+    def with_method(self, problem: Problem, method: str) -> Problem:
+        """The problem of a method, with the sensors of this fit only."""
+        run = method_run(problem.run, method)
+        chosen = require_settings(run).observations or problem.sensor_data
+        data = {name: item for name, item in problem.sensor_data.items() if name in chosen}
+        return replace(problem, run=run, sensor_data=data)
+
+    def prepare(self, problem: Problem, folder: RunFolder, console: Console) -> Problem:
+        """The problem after what comes before all fits: calibration, an initial estimate."""
+        if problem.run.initial is not None:
             raise InputError(
-                f"parameters[{i}].kind: expected a mover as the only parameter, got "
-                f"{len(run.parameters)} parameters; leave only that"
+                "initial: expected data of a radar, or of transmitters, with [initial], got none; "
+                "remove it"
             )
-    # Their errors come before any work.
-    build.parameters(run.parameters, scene, run.scene)
-    for name, variant in run.variants.items():
-        with prefix_errors(f"variants.{name}"):
-            build.parameters(variant.parameters or [], scene, run.scene)
-    sensors = build_sensors(run)
-    _warn_if_depths_differ(run, sensors)
-    require_resources(run, truth, sensors)
-    sights = _record_sensor_data(run, sensors, truth, console)
-    simulated = all(isinstance(own.data, SimulatedData) for own in sensor_runs(run).values())
-    known = frozenset(truth.names if simulated else run.truth)
-    target = run.starts.object if run.starts else next(iter(fitted_objects(run)), None)
-    return Problem(run, scene, truth, known, sights, target)
+        return problem
+
+    def with_recording_of_start(self, problem: Problem, number: int, console: Console) -> Problem:
+        """The problem with the data of a start: the same for all, unless each has its own."""
+        return problem
+
+    def starts(self, problem: Problem) -> list[Start]:
+        """Starts of the fits: about the truth as ``[starts]`` says, or where the scene is."""
+        return [Start(scene) for scene in initial_scenes(problem)]
+
+    def recorded_values(self, item: SensorData) -> Any:
+        """Data as the forward model observes them."""
+        return item.recording
+
+    def initial_sensor(self, item: SensorData, start: Start) -> Any:
+        """The sensor of some data at the start of a fit."""
+        return item.sensor
+
+    def sensor_unknowns(self, problem: Problem, name: str) -> dict[str, nn.Module | Unknown]:
+        """What is fitted of a sensor beside the parameters of the run file."""
+        return {}
+
+    def make_unknown(self, problem: Problem, name: str, table: Any, start: Start) -> Unknown:
+        """One parameter of the run file.
+
+        Args:
+            problem: Of the fit.
+            name: Of the parameter.
+            table: Of the parameter.
+            start: Initial values.
+        """
+        make = build.module_builders(problem.run.parameters, problem.run.scene)[name]
+        return Unknown(make, getattr(table, "rate", None), partial(shape_regularizers, table))
+
+    def make_candidates(
+        self, problem: Problem, start: Start, generator: torch.Generator
+    ) -> Mapping[str, Sequence[Object]] | Sequence[Candidate]:
+        """Starts that ``[search]`` compares about the start of a fit."""
+        name = require_section(problem.run, "search", "several starts").object
+        given = {Object: start.scene[name], torch.Generator: generator}
+        return {name: [start.scene[name], *build.build_section(problem.run, "search", given)]}
+
+    def score_fit(self, problem: Problem, start: Start, found: Reconstruction) -> Row:
+        """Numbers of a fit beside its loss: distances to the truth."""
+        return {}
+
+    def revise_confidence(self, fits: Fits, believed: Row) -> Row:
+        """Verdict and error bars of the best fit, with what the other fits say of them."""
+        return believed
+
+    @abstractmethod
+    def metrics(self, fits: Fits) -> Row:
+        """Numbers of a run that depend on the kind of data."""
+
+    @abstractmethod
+    def summary(self, fits: Fits, metrics: Row, folder: RunFolder) -> Summary:
+        """Tables and pictures; the pictures are written, too."""
+
+    def measured_maps(self, problem: Problem) -> list[Tensor]:
+        """Measured maps of all sensors for the viewer; none where it cannot show them."""
+        return []
+
+    def predict_maps(self, problem: Problem, scene: Scene, sensors: Sequence[Any]) -> list[Tensor]:
+        """The same as predicted of a scene."""
+        return []
 
 
-def _warn_if_depths_differ(run: RunFile, sensors: Mapping[str, SensorSetup]) -> None:
-    if run.reconstruct is None:
-        return
-    for name, sensor in sensors.items():
-        data, depth = sensor.run.data, run.reconstruct.depth
-        if isinstance(data, SimulatedData) and data.depth != depth and run.chirps is None:
-            at = f"observations.{name}." if name else ""
-            warnings.warn(
-                f"reconstruct.depth is {depth}, {at}data.depth is {data.depth}: the fit explains "
-                "echoes of other numbers of bounces than its data have; make them equal",
-                PhysicsWarning,
-                stacklevel=3,
-            )
+def make_observations(problem: Problem, start: Start | None = None) -> list[Observation]:
+    """Observations of a fit: data, model, and what is unknown of the sensor.
+
+    Args:
+        problem: Of a mode.
+        start: Initial values; None = the scene as known.
+    """
+    kind, begun = problem.kind, start or Start(problem.scene)
+    own = {
+        name: kind.make_unknown(problem, name, table, begun)
+        for name, table in fitted_tables(problem.run).items()
+        if table.kind in OF_SENSORS
+    }
+    return [
+        Observation(
+            model,
+            kind.recorded_values(item),
+            sensor=kind.initial_sensor(item, begun),
+            weight=item.weight,
+            parameters={**own, **kind.sensor_unknowns(problem, name)},
+        )
+        for model, (name, item) in zip(
+            make_models(problem), problem.sensor_data.items(), strict=True
+        )
+    ]
 
 
-def has_recording_per_start(run: RunFile) -> bool:
-    """Whether every start has a recording of its own."""
-    return isinstance(run.data, SimulatedData) and run.data.every_start
+def make_unknowns(problem: Problem, start: Start | None = None) -> dict[str, Unknown]:
+    """Unknowns of the scene, by name.
+
+    Args:
+        problem: Of a mode.
+        start: Initial values; None = the scene as known.
+    """
+    begun = start or Start(problem.scene)
+    return {
+        name: problem.kind.make_unknown(problem, name, table, begun)
+        for name, table in fitted_tables(problem.run).items()
+        if table.kind not in OF_SENSORS
+    }
 
 
-def with_recording_of_start(problem: Problem, start: int, console: Console) -> Problem:
-    """The problem with the recording of a start, where each has one of its own."""
-    return (
-        with_new_recording(problem, start, console)
-        if start and has_recording_per_start(problem.run)
-        else problem
-    )
+def make_models(problem: Problem) -> list[ForwardModel]:
+    """The forward models that are fitted, one for every sensor."""
+    return problem.kind.models(problem)
 
 
-def with_new_recording(problem: Problem, number: int, console: Console) -> Problem:
-    """The problem with another simulated recording."""
-    run, data = problem.run, problem.run.data
-    assert isinstance(data, SimulatedData)
-    seed = derive_seed(run.seed if data.seed is None else data.seed, _RECORDING_SEED_KEY, number)
-    run = run.model_copy(update={"data": data.model_copy(update={"seed": seed})})
-    return replace(
-        problem,
-        run=run,
-        sensor_data=_record_sensor_data(run, build_sensors(run), problem.truth, console),
-    )
-
-
-def build_sensors(run: RunFile) -> dict[str, SensorSetup]:
-    """What the tables of every sensor make; recordings are read, nothing is simulated."""
-    found = {}
-    for name, own in sensor_runs(run).items():
-        with prefix_errors(f"observations.{name}") if name else nullcontext():
-            found[name] = _build_sensor(own)
+def make_schedule(problem: Problem) -> list[Stage]:
+    """The stages of a fit, as the library takes them."""
+    fitted, found = fitted_tables(problem.run), []
+    for table, run in stage_runs(problem.run):
+        names = [name for name in table.parameters if name in fitted]
+        free = [fitted[name] for name in names or fitted]
+        finer = partial(remesh, edge_length=table.remesh or 0.0)
+        counts = {k: v for k, v in (table.reconstruct or {}).items() if k in SamplingBase.made_from}
+        models = make_models(replace(problem, run=run))
+        if counts:
+            models = [m.with_sampling(**counts) if hasattr(m, "sampling") else m for m in models]
+        stage = Stage(
+            **vars(require_settings(run).build()),
+            unknowns=tuple(names),
+            rebuild=table.rebuild,
+            remesh={t.object: finer for t in free if table.remesh and t.kind == "vertices"},
+            optimizer=build.build_section(run, "optimizer"),
+            models=models,
+        )
+        found.append(stage)
     return found
 
 
-def _record_sensor_data(
-    run: RunFile, sensors: Mapping[str, SensorSetup], truth: Scene, console: Console
-) -> dict[str, SensorData]:
-    sights = {}
-    for name, own in sensors.items():
-        capture = own.capture
-        if capture is None:
-            console.print("simulating the exact signals of the true scene")
-            with prefix_errors(f"observations.{name}") if name else nullcontext():
-                beat = simulate_exact(own.run, truth, own.radar, own.grid).beat
-            capture = Capture.from_beat(beat, own.radar)
-        weight = run.observations[name].weight if name else 1.0
-        sights[name] = SensorData(capture, own.radar, own.grid, weight)
-    return sights
+def initial_scenes(problem: Problem) -> list[Scene]:
+    """Scenes where fits start: about the truth as ``[starts]`` says, or the scene as known."""
+    run, scene, table = problem.run, problem.scene, problem.run.starts
+    if table is None:
+        return [scene]
+    body = build.fitted_body(run, scene, table.object)
+    name, truth, found = table.object, problem.truth[table.object], []
+    seed = run.seed if table.seed is None else table.seed
+    generator = torch.Generator().manual_seed(seed)
+    for moved in table.build({Object: truth}, generator=generator):
+        # The object as known may have another size: it is its centre that is placed.
+        turn = moved.transform[:3, :3]
+        begun = scene.replace(name, pose=rigid(turn, moved.center - turn @ scene[name].mesh.center))
+        if body is not None and table.joint_deg > 0:
+            mesh = body.perturb_joints(truth.mesh, math.radians(table.joint_deg), generator)
+            begun = begun.replace(name, mesh=mesh, pose=moved.transform)
+        found.append(begun)
+    return found
+
+
+def require_sections(kind: DataKind, run: RunFile, because: str) -> None:
+    """Refuse sections that have no meaning for a kind of data.
+
+    Args:
+        kind: The kind.
+        run: The run file.
+        because: The section that makes the data such.
+
+    Raises:
+        InputError: One of them is there, or those of every fit are not.
+    """
+    require_settings(run)
+    require_section(run, "parameters", "reconstruct")
+    for name in kind.unused:
+        if getattr(run, name):
+            raise InputError(f"{name}: expected no such section with {because}, got one; remove it")
 
 
 def sensor_runs(run: RunFile) -> dict[str, RunFile]:
@@ -202,27 +414,20 @@ def sensor_runs(run: RunFile) -> dict[str, RunFile]:
     return found
 
 
-def _build_sensor(run: RunFile) -> SensorSetup:
-    data, table = (
-        require_section(run, "data", "reconstruct"),
-        require_section(run, "grid", "reconstruct"),
-    )
-    if isinstance(data, SimulatedData):
-        radar = build.radar(require_section(run, "radar", "simulated data"))
-        return SensorSetup(run, radar, build.grid(table, radar))
-    if run.radar is not None:
-        raise InputError(
-            f"radar: expected no [radar] with data.kind = {data.kind}, got one; "
-            "remove it: a capture brings its radar along"
-        )
-    capture = build_capture(data)
-    radar = capture.radar()
-    return SensorSetup(run, radar, build.grid(table, radar), capture)
+def about_sensor(name: str) -> AbstractContextManager[None]:
+    """Add the table of a sensor to errors; the only sensor has none."""
+    return prefix_errors(f"observations.{name}") if name else nullcontext()
 
 
 def fitted_objects(run: RunFile) -> list[str]:
     """Objects that have parameters."""
     return [p.object for p in run.parameters if getattr(p, "object", None)]
+
+
+def posed_object_name(run: RunFile) -> str | None:
+    """The first object whose pose or shape is fitted."""
+    moved = (p.object for p in run.parameters if p.kind in _POSED)
+    return run.starts.object if run.starts else next(moved, None)
 
 
 def known_truth(problem: Problem) -> dict[str, Object]:
@@ -231,42 +436,14 @@ def known_truth(problem: Problem) -> dict[str, Object]:
     return {name: problem.truth[name]} if name is not None and name in problem.known_objects else {}
 
 
-def make_starts(problem: Problem) -> list[Scene]:
-    """Where fits start: about the truth as `[starts]` says, or where the scene is."""
-    run, scene, table = problem.run, problem.scene, problem.run.starts
-    if table is None:
-        return [scene]
-    body = build.fitted_body(run, scene, table.object)
-    name, truth, found = table.object, problem.truth[table.object], []
-    seed = run.seed if table.seed is None else table.seed
-    generator = torch.Generator().manual_seed(seed)
-    for moved in table.build({Object: truth}, generator=generator):
-        # The object as known may have another size: it is its centre that is placed.
-        turn = moved.transform[:3, :3]
-        begun = scene.replace(name, pose=rigid(turn, moved.center - turn @ scene[name].mesh.center))
-        if body is not None and table.joint_deg > 0:
-            mesh = body.perturb_joints(truth.mesh, math.radians(table.joint_deg), generator)
-            begun = begun.replace(name, mesh=mesh, pose=moved.transform)
-        found.append(begun)
-    return found
-
-
 def require_settings(run: RunFile) -> ReconstructTable:
     """The `[reconstruct]` table, which every fit needs."""
     return require_section(run, "reconstruct", "reconstruct")
 
 
-def method_run(run: RunFile, mode: str) -> RunFile:
-    """The run file of a way to fit: the run's own, or a variant."""
-    return run if mode == OWN_METHOD else run.apply_overrides(run.variants[mode])
-
-
-def with_method(problem: Problem, mode: str) -> Problem:
-    """The problem of a way to fit, with the sensors of this fit only."""
-    run = method_run(problem.run, mode)
-    chosen = require_settings(run).observations or problem.sensor_data
-    sights = {name: sight for name, sight in problem.sensor_data.items() if name in chosen}
-    return replace(problem, run=run, sensor_data=sights)
+def method_run(run: RunFile, method: str) -> RunFile:
+    """The run file of a method: the run's own, or a variant."""
+    return run.apply_overrides(run.variants[method]) if method in run.variants else run
 
 
 def fitted_tables(run: RunFile) -> dict[str, Any]:
@@ -287,181 +464,3 @@ def stage_runs(run: RunFile) -> list[tuple[StageTable, RunFile]]:
         if not stage.parameters or fitted.keys() & set(stage.parameters)
     ]
     return found or [(StageTable(), run)]
-
-
-def make_schedule(problem: Problem) -> list[Stage]:
-    """The stages of a fit, as the library takes them."""
-    fitted, found = fitted_tables(problem.run), []
-    for table, run in stage_runs(problem.run):
-        names = [name for name in table.parameters if name in fitted]
-        free = [fitted[name] for name in names or fitted]
-        finer = partial(remesh, edge_length=table.remesh or 0.0)
-        counts = {k: v for k, v in (table.reconstruct or {}).items() if k in SamplingBase.made_from}
-        models = make_models(replace(problem, run=run))
-        stage = Stage(
-            **vars(require_settings(run).build()),
-            unknowns=tuple(names),
-            rebuild=table.rebuild,
-            remesh={t.object: finer for t in free if table.remesh and t.kind == "vertices"},
-            optimizer=build.build_section(run, "optimizer"),
-            models=[model.with_sampling(**counts) if counts else model for model in models],
-        )
-        found.append(stage)
-    return found
-
-
-def blur_end_step(run: RunFile) -> float | None:
-    """The step from which the surrogate has no extra widths; None if it never has, or in stages."""
-    (_, own), *others = stage_runs(run)
-    kernels, settings = own.surrogate, require_settings(own)
-    widened = kernels.range_width > 0 or kernels.angle_width > 0
-    if own.model is not None and own.model.kind == "surrogate":
-        widened |= own.model.stretch > 1
-    if others or kernels.exact or not widened:
-        return None
-    return settings.annealing * settings.steps
-
-
-def make_sampling(run: RunFile) -> Sampling:
-    """How the model of a fit samples paths."""
-    settings = require_settings(run)
-    counts = {name: getattr(settings, name) for name in SamplingBase.made_from}
-    return Sampling(
-        **counts,
-        conductor_samples=settings.samples,
-        points_per_m2=rough_point_densities(run),
-    )
-
-
-def rough_point_densities(run: RunFile) -> Densities:
-    """Points per m² of rough surfaces in exact signals: those of simulated data, or enough."""
-    return run.data.points_per_m2 if isinstance(run.data, SimulatedData) else _DEFAULT_POINTS_PER_M2
-
-
-def make_models(problem: Problem) -> list[ForwardModel]:
-    """The forward models that are fitted, one for every sensor."""
-    sampling = make_sampling(problem.run)
-    found: list[ForwardModel] = []
-    for run, sight in problem.sensors_with_runs:
-        kernels = build.build_section(run, "surrogate")
-        if run.model is not None:
-            found.append(
-                build.build_section(
-                    run, "model", {Grid: sight.grid, Surrogate: kernels, Sampling: sampling}
-                )
-            )
-        elif run.surrogate.exact:
-            found.append(ExactMap(sight.grid, sampling))
-        else:
-            found.append(SurrogateMap(sight.grid, kernels, sampling))
-    return found
-
-
-def make_display_models(problem: Problem) -> list[ForwardModel]:
-    """Models of the spectra that are shown, sharp: of chains where these are fitted."""
-    fitted = make_models(problem)
-    if all(isinstance(model, FacetMap) for model in fitted):
-        sights = problem.sensor_data.values()
-        return [FacetMap(sight.grid, sampling=make_sampling(problem.run)) for sight in sights]
-    return [*make_unblurred_models(problem)]
-
-
-def make_unblurred_models(problem: Problem) -> list[SurrogateMap]:
-    """The smooth model of every sensor without extra widths, mean over phases."""
-    sampling, found = make_sampling(problem.run), []
-    for model, (run, sight) in zip(make_models(problem), problem.sensors_with_runs, strict=True):
-        smooth = model
-        if not isinstance(smooth, SurrogateMap):
-            smooth = SurrogateMap(sight.grid, build.build_section(run, "surrogate"), sampling)
-        found.append(smooth.scale_blur(0.0))
-    return found
-
-
-def make_observations(problem: Problem) -> list[Observation]:
-    """What is fitted of every sensor: data, model and what is unknown of the sensor."""
-    poses = {
-        name: Unknown(
-            partial(_build_radar_module, table), table.rate, partial(shape_regularizers, table)
-        )
-        for name, table in fitted_tables(problem.run).items()
-        if table.kind in _RADAR_PARAMETER_KINDS
-    }
-    found = []
-    for model, (name, sight) in zip(make_models(problem), problem.sensor_data.items(), strict=True):
-        unknowns: dict[str, Unknown | nn.Module] = {**poses}
-        for kind in require_settings(problem.run).nuisances:
-            unknowns[f"{name}.{kind}" if name else kind] = (
-                RangeBias() if kind == "range_bias" else ClockOffset(sight.capture.positions)
-            )
-        found.append(
-            Observation(
-                model,
-                sight.capture,
-                sensor=sight.radar,
-                weight=sight.weight,
-                parameters=unknowns,
-            )
-        )
-    return found
-
-
-def _build_radar_module(table: Any, _: Radar) -> nn.Module:
-    return table.build()
-
-
-def make_unknowns(run: RunFile) -> dict[str, Unknown]:
-    """What is fitted of the scene, by name."""
-    makers = build.module_builders(run.parameters, run.scene)
-    return {
-        name: Unknown(
-            makers[name], getattr(table, "rate", None), partial(shape_regularizers, table)
-        )
-        for name, table in fitted_tables(run).items()
-        if table.kind not in _RADAR_PARAMETER_KINDS
-    }
-
-
-def estimate_initial_scene(problem: Problem, console: Console) -> tuple[Problem, dict[str, Any]]:
-    """The problem with its object where `[initial]` finds it, and how that went.
-
-    Raises:
-        InputError: `[starts]` beside it, no echoes, or too few points.
-    """
-    run, table, sight = problem.run, problem.run.initial, problem.first_sensor
-    if table is None:
-        return problem, {}
-    if run.starts is not None:
-        raise InputError(
-            "initial: expected no [starts] beside [initial], got both; a fit starts from one"
-        )
-    console.print(f"looking for {table.object} with a conventional detector")
-    begin, name = time.perf_counter(), table.object
-    with prefix_errors("initial"):
-        guess = table.build().find(
-            problem.scene,
-            name,
-            sight.capture,
-            sight.grid,
-            loss=build.build_section(run, "loss"),
-            seed=run.seed,
-        )
-        scene = _add_density(problem, guess.scene, name)
-    found: dict[str, Any] = {"initial_points": guess.points} if guess.points else {}
-    if guess.size is not None:
-        known = table.scale and name in problem.known_objects
-        off = pose_error(guess.scene[name], problem.truth[name]) if known else None
-        found |= {"initial_scale_error": abs(off.scale - 1)} if off else {}
-        found |= {"initial_losses": guess.losses, "initial_size_m": list(guess.size)}
-    found["initial_seconds"] = time.perf_counter() - begin
-    return replace(problem, scene=scene), found
-
-
-def _add_density(problem: Problem, scene: Scene, name: str) -> Scene:
-    """The scene with a density from the backprojected echoes, where one is fitted."""
-    sight = problem.first_sensor
-    for table in problem.run.parameters:
-        if table.kind == "density" and table.object == name:
-            box = table.low, table.high, table.counts
-            grid = estimate_density(sight.capture, sight.grid, scene[name], name, *box)
-            return scene.replace(name, cloud=grid.cloud)
-    return scene

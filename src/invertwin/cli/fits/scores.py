@@ -1,7 +1,7 @@
 """How good a fit is: distances to the truth, held-out objects, losses without blur."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,12 +9,10 @@ import torch
 
 from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
-from invertwin.cli.fits.problem import (
-    Problem,
-    fitted_tables,
+from invertwin.cli.fits.problem import Problem, fitted_tables, require_settings
+from invertwin.cli.fits.radar_models import (
     make_display_models,
     make_unblurred_models,
-    require_settings,
     rough_point_densities,
 )
 from invertwin.cli.fits.shape_scores import score_shape
@@ -78,11 +76,17 @@ def score_fit(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     if "scale" in kinds:
         rows |= {"scale_error": abs(after.scale - 1)}
     told = [table for table in fitted if _is_material_known(problem, table)]
-    frequency = problem.first_sensor.radar.waveform.center_frequency
     for table in told:
+        frequency = _frequency(problem)
         ends = twin[table.object].material, problem.truth[table.object].material
         rows |= material_errors(table.values, *ends, frequency, table.layer)
     return rows | shapes
+
+
+def _frequency(problem: Problem) -> float:
+    """Frequency at which materials are compared [Hz]."""
+    table = problem.run.map
+    return problem.first.sensor.waveform.center_frequency if table is None else table.frequency
 
 
 def score_joints(body: SkinnedBody, start: Mesh, found: Mesh, truth: Mesh) -> dict[str, float]:
@@ -105,7 +109,7 @@ def _is_material_known(problem: Problem, parameter: Any) -> bool:
 
 
 def summarise_successes(
-    problem: Problem, rows: dict[str, list[dict[str, Any]]], modes: Sequence[str]
+    problem: Problem, rows: Mapping[str, list[dict[str, Any]]], modes: Sequence[str]
 ) -> dict[str, Any]:
     """Successes of every way to fit, the run's own first; of several sensors, also each alone."""
     if problem.scored_object not in problem.known_objects or "success" not in rows[modes[0]][0]:
@@ -132,7 +136,7 @@ def score_held_out(
     if table is None or name is None or name not in problem.known_objects or name == table.object:
         return {}
     truth, known = problem.truth[name].center, problem.truth[table.object].center
-    focused = calibrate(problem.first_sensor.capture, known)
+    focused = calibrate(problem.first_sensor.recording, known)
     peak = locate(focused, truth)
     places = torch.tensor([row["position"] for row in rows], dtype=torch.float64)
     spread = (places - places.mean(0)).norm(dim=1).max()
@@ -180,8 +184,8 @@ def total_loss(
     problem: Problem, simulated: Sequence[torch.Tensor], measured: Sequence[torch.Tensor]
 ) -> float | None:
     """The weighted mean of the losses of all sensors; None where a map without power has none."""
-    loss = build.build_section(problem.run, "loss")
-    weights = tuple(sight.weight for sight in problem.sensor_data.values())
+    loss = build.build_loss(problem.run)
+    weights = tuple(item.weight for item in problem.sensor_data.values())
     try:
         pairs = list(zip(simulated, measured, strict=True))
         return float(Objective((loss,) * len(weights), weights)(pairs))

@@ -110,7 +110,7 @@ def _compare_surfaces(
 ) -> ShapeMetrics:
     table = problem.measures
     assert table is not None
-    eyes = [sight.radar.positions.detach() for sight in problem.sensor_data.values()]
+    eyes = [item.sensor.positions.detach() for item in problem.sensor_data.values()]
     return compare_shapes(
         _world_mesh(scene, table.object),
         _world_mesh(problem.truth, table.object),

@@ -12,10 +12,10 @@ from invertwin.cli.fits.problem import (
     INTERIOR_ONLY,
     OWN_METHOD,
     Problem,
-    blur_end_step,
     fitted_objects,
     require_settings,
 )
+from invertwin.cli.fits.radar_models import blur_end_step
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.fits.shape_scores import CURVE_KEY, is_shape_key, shape_label, short_label
 from invertwin.cli.report import (
@@ -185,19 +185,19 @@ def draw_pictures(fitted: BestFit, folder: RunFolder) -> list[ReportPicture]:
     scenes = {"truth": truth} if known else {}
     scenes |= {"start": fitted.start, "twin": fitted.twin}
     outline = Scene(known) if known else None
-    radars = [sight.radar for sight in problem.sensor_data.values()]
+    radars = [item.sensor for item in problem.sensor_data.values()]
     figure = plotting.scene(scenes, radars, highlight=fitted_names, outline=outline)
     found = [save_picture(folder, "scene", figure, note="scene" if "success" in metrics else "")]
     data = "exact simulation" if isinstance(run.data, SimulatedData) else "measured"
     titles = {"measured": f"data ({data})", "start": "surrogate, start", "twin": "surrogate, twin"}
-    for number, (name, sight) in enumerate(problem.sensor_data.items()):
+    for number, (name, item) in enumerate(problem.sensor_data.items()):
         titled = {titles[key]: maps[number] for key, maps in fitted.maps.items()}
         file = f"spectra_{name}" if name else "spectra"
         found.append(
-            save_picture(folder, file, plotting.spectrum(titled, sight.grid), note="spectra")
+            save_picture(folder, file, plotting.spectrum(titled, item.grid), note="spectra")
         )
-    for (name, sight), apart in zip(problem.sensor_data.items(), fitted.residuals, strict=False):
-        figure = plotting.residuals(apart, sight.grid)
+    for (name, item), apart in zip(problem.sensor_data.items(), fitted.residuals, strict=False):
+        figure = plotting.residuals(apart, item.grid)
         file = f"residuals_{name}" if name else "residuals"
         found.append(save_picture(folder, file, figure, note="residuals"))
     losses = {way: [row["losses"] for row in fits] for way, fits in fitted.fits_by_method}
@@ -227,7 +227,7 @@ def _draw_turntable(fitted: BestFit, name: str) -> bytes:
     problem = fitted.problem
     scenes = {"truth": problem.truth} if name in problem.known_objects else {}
     scenes |= {"start": fitted.start, "twin": fitted.twin}
-    turns = problem.first_sensor.radar.rotations
+    turns = problem.first_sensor.sensor.rotations
     up = (0.0, 1.0, 0.0) if turns is None else turns.detach().mean(0)[:, 1]
     found = {key: scene[name] for key, scene in scenes.items()}
     meshes = {key: Mesh(item.vertices, item.mesh.faces) for key, item in found.items()}

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from invertwin.cli.schema import RunFile, SceneFileTable
 from invertwin.cli.schema.run_file import prefix_errors as prefix_errors
@@ -16,8 +16,8 @@ from invertwin.cli.schema.sensors import radar as radar
 from invertwin.cli.schema.shape_tables import ObjectTable, ShapePoseTable, module_values
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.tangents import ParameterChange, parameter_changes
-from invertwin.links.metasurface.placement import PanelDesign
-from invertwin.links.metasurface.wall_path import PanelPlacement
+from invertwin.inversion.loss import CorrelationLoss, RatioLoss, SpectrumLoss
+from invertwin.links import PanelPlacement
 from invertwin.registry.kinds import ConstructorTable
 from invertwin.scene import Mesh, Object, Scene, SkinnedBody, merge_meshes
 from invertwin.scene.files import CONCRETE, load_scene_xml
@@ -113,6 +113,24 @@ def build_section(run: RunFile, section: str, given: Mapping[type, object] | Non
         return getattr(run, section).build(given)
 
 
+def build_loss(run: RunFile) -> Callable[[Tensor, Tensor], Tensor]:
+    """The loss of `[loss]`; without it the one that suits the data.
+
+    Levels in decibels are compared as they are: their gain means something. A placement has an aim
+    in place of data.
+    """
+    if run.placement is not None:
+        return RatioLoss()
+    if run.loss is not None:
+        found = build_section(run, "loss")
+        plain = run.map is not None and "kind" not in run.loss.model_fields_set
+        return replace(found, kind="mse") if plain else found
+    if run.map is not None:
+        return SpectrumLoss("mse", levels=1, gain="one")
+    moving = any(table.kind == "mover" for table in run.parameters)
+    return CorrelationLoss() if moving else SpectrumLoss()
+
+
 def module_builders(
     tables: Sequence[Any], objects: Mapping[str, ObjectTable] | None = None
 ) -> dict[str, Callable[[Scene], nn.Module]]:
@@ -181,19 +199,13 @@ def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, ParameterC
     return module, changes
 
 
-def panel_design(run: RunFile, scene: Scene) -> tuple[PanelDesign, PanelPlacement]:
-    """The metasurface of `[placement]`, and where a gradient check has it.
-
-    Raises:
-        InputError: What the library refuses, by its key.
-    """
-    table = require_section(run, "placement", "a metasurface")
-    found = table.placing(table.coverage(scene, run.seed))
-    return found, table.example(found)
-
-
 def _panel_values(run: RunFile, scene: Scene) -> dict[type, object]:
-    return {} if run.placement is None else {PanelPlacement: panel_design(run, scene)[1]}
+    if run.placement is None:
+        return {}
+    table = run.placement
+    return {
+        PanelPlacement: table.place(table.coverage(scene, run.seed), table.initial, phases=True)
+    }
 
 
 def _build_module(

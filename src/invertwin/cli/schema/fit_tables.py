@@ -9,8 +9,9 @@ from invertwin.channel import Grid, Sampling
 from invertwin.errors import InputError
 from invertwin.inversion.initialisation.multi_start import pose_grid
 from invertwin.inversion.initialisation.starts import place_at_poses, sample_nearby_poses
-from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.loss import CorrelationLoss, SpectrumLoss
 from invertwin.inversion.optimizer import Optimizer
+from invertwin.limits import Count
 from invertwin.models.facets import FacetField, FacetMap
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar.surrogate.surrogate import Surrogate, resolve_surrogate
@@ -44,6 +45,10 @@ class SearchTable(ConstructorTable):
     """Poses in which an object may begin, beside its start; the best few are fitted."""
 
     object: str = key("name in the scene")
+    fits: Count = key("of the best starts", 4)
+    shortlist: bool = key(
+        "fit these in the first stage only; the best of them is fitted in all", False
+    )
 
 
 def register(registry: Registry) -> None:
@@ -56,6 +61,7 @@ def register(registry: Registry) -> None:
     registry.add("loss", "mse", SpectrumLoss, without=("floor", "degrees"))
     registry.add("loss", "likelihood", SpectrumLoss, without=("degrees",))
     registry.add("loss", "heavy_tailed", SpectrumLoss)
+    registry.add("loss", "correlation", CorrelationLoss)
     registry.add("model", "surrogate", SurrogateMap, without=("_reference",), checked=False)
     registry.add("model", "chains", FacetMap, checked=False)
     registry.add("model", "chain_field", FacetField, checked=False)

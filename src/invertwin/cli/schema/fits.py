@@ -30,7 +30,10 @@ class _StartsTable(ConstructorTable):
 class _InitialTable(ConstructorTable):
     """Where an object stands by conventional processing: the fit starts there."""
 
-    object: str = key("name in the scene")
+    object: str | None = key(
+        "name in the scene; with [map] none: it is the first transmitter, at the centroid of power",
+        None,
+    )
 
 
 AnyStarts = Annotated[Any, TableOf(sample_nearby_poses, _StartsTable, ("generator",))]
@@ -39,7 +42,10 @@ AnyInitial = Annotated[Any, TableOf(InitialPoseEstimator, _InitialTable)]
 SamplingBase = registry.constructor_table(
     Sampling,
     "SamplingTable",
-    without=("interior_edges", "points_per_m2", "rough_paths", "memory_budget", "backend"),
+    without=(
+        *("interior_edges", "points_per_m2", "rough_paths", "memory_budget", "backend"),
+        "conductor_samples",  # as many as samples
+    ),
 )
 
 
@@ -89,6 +95,7 @@ class RunOverrides(Section):
     )
     model: TomlTable | None = key("what differs from [model]; another `kind` replaces it", None)
     map: TomlTable | None = key("what differs from [map]", None)
+    placement: TomlTable | None = key("what differs from [placement]", None)
 
     def overrides(self) -> dict[str, Any]:
         """What is merged over the run; a part has no stages."""
@@ -122,11 +129,14 @@ class VariantTable(RunOverrides):
     parameters: list[Annotated[Any, OneOf("parameter")]] | None = key(
         "in place of [[parameters]]", None
     )
+    search: TomlTable | None = key("what differs from [search]; another `kind` replaces it", None)
     stages: list[StageTable] | None = key("in place of [[stages]]", None)
+    first_starts: Count | None = key("so many of the starts; without it all", None)
 
     def overrides(self) -> dict[str, Any]:
         """What is merged over the run."""
-        return self.model_dump(exclude_unset=True, exclude_none=True)
+        own = {"first_starts"}
+        return self.model_dump(exclude_unset=True, exclude_none=True, exclude=own)
 
     def with_resolved_paths(self, run: Any) -> "VariantTable":
         """The variant with paths of files as the run that it makes has found them."""
@@ -134,7 +144,8 @@ class VariantTable(RunOverrides):
         for name, change in self.overrides().items():
             value = run.model_dump(include={name}, exclude_unset=True)[name]
             found[name] = {k: value[k] for k in change} if isinstance(change, dict) else value
-        return VariantTable.model_validate(found)
+        first = {} if self.first_starts is None else {"first_starts": self.first_starts}
+        return VariantTable.model_validate(found | first)
 
 
 class CalibrationTable(RunOverrides):

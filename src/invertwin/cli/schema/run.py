@@ -171,7 +171,11 @@ class _RunFile(Section):
     )
     surrogate: AnySurrogate = key("kernels of the smooth model", {}, validate_default=True)
     model: AnyModel | None = key("a forward model in place of the surrogate's", None)
-    loss: Annotated[Any, OneOf("loss")] = key("how maps are compared", {}, validate_default=True)
+    loss: Annotated[Any, OneOf("loss")] | None = key(
+        "how maps are compared; without it likelihood; of received levels mse as they are, of "
+        "movers correlation",
+        None,
+    )
     optimizer: Annotated[Any, OneOf("optimizer")] = key(
         "how a gradient becomes a step", {}, validate_default=True
     )
@@ -192,17 +196,6 @@ class _RunFile(Section):
     vary: list[Annotated[Any, OneOf("distribution")]] = key(
         "[[vary]]: what is drawn anew for every sample of [dataset]", []
     )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _set_level_loss(cls, data: Any) -> Any:
-        """Received levels [dB] are compared as they are, at one resolution, unless said else."""
-        read = data.get("data") if isinstance(data, dict) else None
-        if isinstance(read, dict) and read.get("kind") in ("received", "received_file"):
-            given = data.get("loss", {"levels": 1, "gain": "one"})
-            if isinstance(given, dict):
-                return data | {"loss": {"kind": "mse", **given}}
-        return data
 
     @model_validator(mode="after")
     def _check_object_names(self) -> "_RunFile":

@@ -34,6 +34,14 @@ _MOVED_KEYS = {
     key: f"write it in `{place}`" for place, keys in _KEYS_BY_TABLE.items() for key in keys.split()
 }
 _MOVED_KEYS["also_interior_only"] = "add [variants.interior_only] with reconstruct.boundary = false"
+_MOVED_KEYS |= {
+    "descent": "write it in [search], [[stages]] and [optimizer], see docs/run_files.md",
+    "annealed_starts": "run benchmarks/panel_annealing.py",
+}
+_MOVED_WITHIN = {
+    "placement.grid": 'write it in [variants.exhaustive] as search = { kind = "panel_grid", ... }',
+    "placement.annealing": "run benchmarks/panel_annealing.py",
+}
 """Where keys belong that stand in the wrong table, or are gone."""
 _INSTALL_STUDIES_ADVICE = "install the studies: pip install -e ./experiments/studies"
 _PHRASE_REPLACEMENTS = {
@@ -173,7 +181,11 @@ def _explain_error(error: ErrorDetails) -> str:
             return (
                 f"{path}.{key}".lstrip(".")
                 + f": {said}"
-                + (_MOVED_KEYS.get(key) or _suggest_name(key, allowed, "remove the key"))
+                + (
+                    _MOVED_WITHIN.get(f"{path}.{key}")
+                    or _MOVED_KEYS.get(key)
+                    or _suggest_name(key, allowed, "remove the key")
+                )
             )
         case "unknown_object":
             at = ".".join(filter(None, (path, context["path"])))

@@ -148,8 +148,14 @@ class MovingTargetParameter(ParameterTable):
     )
 
 
+class PanelPhases(ParameterTable):
+    """Phases of the elements of the metasurface of `[placement]`."""
+
+    kind: Literal["panel_phases"]
+
+
 class PanelParameter(ParameterTable):
-    """The metasurface of `[placement]`, in a gradient check."""
+    """Position, yaw and beam of the metasurface of `[placement]`."""
 
     kind: Literal["panel"]
 
@@ -158,8 +164,7 @@ class PanelParameter(ParameterTable):
         found = (given or {}).get(PanelPlacement)
         if not isinstance(found, PanelPlacement):
             raise InputError(
-                "expected a section [placement] and a gradient check with the metasurface, got "
-                "none; choose another kind"
+                "expected a section [placement] with the metasurface, got none; choose another kind"
             )
         return found
 
@@ -203,6 +208,7 @@ def register(registry: Registry) -> None:
         ("radar_path", RadarTrajectory, ()),
         ("mover", MovingTargetParameter, ()),
         ("panel", PanelParameter, ()),
+        ("panel_phases", PanelPhases, ()),
     ):
         registry.add("parameter", name, make, without=without)
 

@@ -14,7 +14,6 @@ from invertwin.inversion.loss import MapPairs, SpectrumLoss, halve_resolution
 from invertwin.runtime.progress import track
 from invertwin.seeds import derive_seed
 
-_REALISATION_COUNT = 64  # determines a standard deviation to 9 %
 _NOISE_BIN_FRACTION = 0.2  # weakest fraction of bins, in which noise is estimated
 _POOLING_LEVELS = 2  # halvings of the resolution for residuals
 
@@ -108,7 +107,8 @@ class FitResult:
         models = [observation.model for observation in self.fit.observations]
         every = zip(self.maps, self.gains, models, strict=True)
         noises = [_estimate_noise(*pair, gain, model.holds_fields) for pair, gain, model in every]
-        for number in track(range(_REALISATION_COUNT), "realisations of the twin"):
+        count = min(model.realisation_count for model in models)
+        for number in track(range(count), "realisations of the twin"):
             yield [
                 look(derive_seed(number, k), noise)
                 for k, (look, noise) in enumerate(zip(looks, noises, strict=True))

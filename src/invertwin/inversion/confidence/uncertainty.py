@@ -15,7 +15,7 @@ from invertwin.inversion.confidence.realisations import FitResult
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.forward_mode import map_tangents
 from invertwin.inversion.gauss_newton import penalty_curvature
-from invertwin.inversion.loss import SpectrumLoss
+from invertwin.inversion.loss import CURVED
 from invertwin.runtime.progress import track
 from invertwin.scene.parameters import Coordinate, Entries
 
@@ -98,13 +98,13 @@ class CovarianceEstimator:
         result: result of the fit.
 
     Raises:
-        InputError: More than 64 coordinates, or a loss that is no ``SpectrumLoss``.
+        InputError: More than 64 coordinates, or a loss without a curvature.
     """
 
     def __init__(self, result: FitResult) -> None:
         fit = result.fit
         found = list(iterate_coordinates(fit.modules))
-        others = [x for x in fit.objective.losses if not isinstance(x, SpectrumLoss)]
+        others = [x for x in fit.objective.losses if not isinstance(x, CURVED)]
         if len(found) > _MAX_COORDINATES or others:
             raise InputError(
                 f"expected a SpectrumLoss and at most {_MAX_COORDINATES} parameters for error "

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -24,13 +24,14 @@ from invertwin.inversion.confidence.ambiguities import (
 from invertwin.inversion.fit import Callback
 from invertwin.inversion.loss import Objective, resolve_loss
 from invertwin.inversion.metrics import pose_error
-from invertwin.inversion.observation import Observation, Unknowns
+from invertwin.inversion.observation import Observation, Unknowns, name_unknowns
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.reconstruction import Reconstruction, reconstruct
 from invertwin.inversion.regularization import Regularizer
 from invertwin.inversion.schedule import Schedule
 from invertwin.limits import Count, Positive
 from invertwin.runtime.memory import require_at_most
+from invertwin.runtime.progress import track
 from invertwin.scene.scene import Object, Scene, displace
 from invertwin.seeds import derive_seed
 
@@ -41,18 +42,33 @@ _SAME_START_DISTANCE, _SAME_START_ANGLE = 0.1, 0.35  # m and rad: closer starts 
 
 
 @dataclass(frozen=True)
+class Candidate:
+    """A start among those that a search compares.
+
+    Attributes:
+        scene: Initial scene.
+        observations: With sensors and unknowns that begin there.
+        group: Of candidates of one group the best one alone is fitted; None = of none.
+    """
+
+    scene: Scene
+    observations: Sequence[Observation]
+    group: Hashable = None
+
+
+@dataclass(frozen=True)
 class Search:
     """Result of a multi-start fit.
 
     Attributes:
-        best: fit with the lowest loss.
-        minima: all distinct results, the best first.
-        scores: for every result the significance of its difference in loss from the best, assuming
-            that it is true, in standard deviations over its realisations; None without
-            realisations.
-        ambiguities: a sentence for every result that the data do not reject.
-        best_number: index of the best fit, as passed to ``callbacks``.
-        objects: names of the objects with several starts.
+        best: The fit with the lowest loss.
+        minima: All ends that differ, the best first.
+        rivals: For every end how unlikely the difference of its loss and the best one's is, were it
+            right, in standard deviations over looks at its twin. None where there are no looks.
+        ambiguities: A sentence for every end that the data do not reject.
+        best_number: Of the best fit, as ``callbacks`` got it.
+        objects: Names of those with several starts.
+        losses: Of all candidates at the widest blur, in their order.
     """
 
     best: Reconstruction
@@ -61,6 +77,7 @@ class Search:
     ambiguities: tuple[str, ...]
     best_number: int
     objects: tuple[str, ...]
+    losses: tuple[float, ...]
 
     def to_metrics(self) -> dict[str, Any]:
         """Return the other results as numbers: pose difference, loss, score."""
@@ -73,7 +90,8 @@ class Search:
             }
             for end, score in zip(self.minima[1:], self.scores[1:], strict=True)
         ]
-        return {"other_ends": ends, "ambiguities": list(self.ambiguities)}
+        found = {"other_ends": ends, "ambiguities": list(self.ambiguities)}
+        return found | {"screened": list(self.losses)}
 
 
 def pose_grid(
@@ -115,7 +133,7 @@ def search(
     scene: Scene,
     observations: Observation | Sequence[Observation],
     parameters: Unknowns,
-    starts: Mapping[str, Sequence[Object]],
+    starts: Mapping[str, Sequence[Object]] | Sequence[Candidate],
     *,
     loss: Callable[[Tensor, Tensor], Tensor] | None = None,
     optimizer: Optimizer | None = None,
@@ -123,56 +141,68 @@ def search(
     regularizers: Sequence[Regularizer] = (),
     callbacks: Callable[[int], Sequence[Callback]] = lambda _: (),
     seed: int = 0,
+    fits: Count = _FULL_FIT_COUNT,
+    shortlist: bool = False,
 ) -> Search:
     """Fit from many starts, and report the results that the data do not distinguish.
 
-    All starts are screened at the initial, widest blur; the best four are fitted. Then the best
-    result is rotated by ``candidate_rotations``, half turns first, and refitted. Distinct results
-    are compared in pairs with realisations of the worse one: common speckle cancels in the
-    difference of the losses.
+    All starts are compared at the first, widest blur; the best few are fitted. Then the best end
+    is turned as ``rivals.turns`` says, by half a turn first, and fitted again.
+    Ends that differ are compared in pairs with looks at the twin of the worse one: speckle that
+    both losses share cancels in their difference.
 
     Args:
-        scene: known scene. The other arguments are those of ``reconstruct``.
-        observations: data with their forward models.
-        parameters: unknowns of the scene; every fit takes a copy.
-        starts: initial poses by object name, for example from ``sample_nearby_poses`` or
-            ``pose_grid``.
-        loss: (predicted, observed) → number.
-        optimizer: kind of optimiser and rates.
-        schedule: schedule of every fit.
-        regularizers: functions Scene → number, added to the loss.
-        callbacks: maps the index of a fit, from 0, to its callbacks.
-        seed: seed of all random numbers.
+        scene: As known. The other arguments are those of ``reconstruct``.
+        observations: What was observed.
+        parameters: Unknowns of the scene; every fit takes a copy.
+        starts: By the name of an object, the poses in which it may begin: given ones, random ones
+            from ``sample_nearby_poses``, or those of ``pose_grid``. Or candidates, whose
+            sensors differ, too.
+        loss: How maps are compared.
+        optimizer: Kind and rates.
+        schedule: Of every fit.
+        regularizers: Added to the loss.
+        callbacks: For the number of a fit, from 0, what watches it.
+        seed: Of all random numbers.
+        fits: Number of the best starts that are fitted.
+        shortlist: Fit these in the first stage only; the best of them is fitted in all.
 
     Raises:
         InputError: No starts; see ``reconstruct``.
     """
-    names = list(starts)
-    begun = [scene.replace(name, pose=o.transform) for name, all_ in starts.items() for o in all_]
-    if not begun:
-        raise InputError("expected at least one start, got none; give poses of an object")
     watched = [observations] if isinstance(observations, Observation) else list(observations)
-    screened = sorted(begun, key=_make_screening_loss(watched, loss, seed))
+    names = list(starts) if isinstance(starts, Mapping) else []
+    begun = _candidates(scene, watched, starts)
+    stages = [*schedule] if isinstance(schedule, Sequence) else [schedule or Schedule()]
+    score_start = _make_screening_loss(watched, loss, seed)
+    losses = [score_start(candidate) for candidate in track(begun, "starts")]
+    order = sorted(range(len(begun)), key=losses.__getitem__)
+    kept = _select_distinct_starts([begun[k] for k in order], names, fits)
 
-    def fit(start: Scene, number: int) -> Reconstruction:
+    def fit(start: Candidate, number: int, parts: Sequence[Schedule]) -> Reconstruction:
         return reconstruct(
-            start,
-            [replace(o, parameters=copy.deepcopy(o.parameters)) for o in watched],
+            start.scene,
+            [replace(o, parameters=copy.deepcopy(o.parameters)) for o in start.observations],
             copy.deepcopy(parameters),
             loss=loss,
             optimizer=optimizer,
-            schedule=schedule,
+            schedule=parts,
             regularizers=regularizers,
             callbacks=callbacks(number),
             seed=derive_seed(seed, number),
         )
 
-    found = [
-        fit(start, number) for number, start in enumerate(_select_distinct_starts(screened, names))
-    ]
+    if shortlist and len(stages) > 1 and len(kept) > 1:
+        tried = [fit(start, number, stages[:1]) for number, start in enumerate(kept)]
+        first = tried.index(min(tried, key=_unblurred_loss))
+        # Numbers of files go on after those of the trials.
+        found, offset = [fit(kept[first], len(kept), stages)], len(kept)
+    else:
+        found, offset = [fit(start, number, stages) for number, start in enumerate(kept)], 0
     best = min(found, key=_unblurred_loss)
     for start in _rotated_starts(best):
-        found.append(fit(start, len(found)))
+        again = Candidate(start, watched)
+        found.append(fit(again, offset + len(found), stages))
     ends: list[Reconstruction] = []
     for end in sorted(found, key=_unblurred_loss):
         if not any(are_same_poses(end.scene, other.scene, names) for other in ends):
@@ -187,13 +217,35 @@ def search(
         for end, z in zip(ends, scores, strict=True)
         if z is not None and z < REJECTION_ZSCORE
     )
-    return Search(ends[0], ends, scores, texts, found.index(ends[0]), tuple(names))
+    number = offset + found.index(ends[0])
+    return Search(ends[0], ends, scores, texts, number, tuple(names), tuple(losses))
+
+
+def _candidates(
+    scene: Scene,
+    observations: Sequence[Observation],
+    starts: Mapping[str, Sequence[Object]] | Sequence[Candidate],
+) -> list[Candidate]:
+    """The starts of a search as candidates.
+
+    Raises:
+        InputError: There are none.
+    """
+    if not isinstance(starts, Mapping):
+        found = list(starts)
+    else:
+        poses = [(name, item) for name, items in starts.items() for item in items]
+        scenes = [scene.replace(name, pose=item.transform) for name, item in poses]
+        found = [Candidate(begun, observations) for begun in scenes]
+    if not found:
+        raise InputError("expected at least one start, got none; give poses of an object")
+    return found
 
 
 def _make_screening_loss(
     observations: Sequence[Observation], loss: Callable[[Tensor, Tensor], Tensor] | None, seed: int
-) -> Callable[[Scene], float]:
-    """Return the function that computes the loss of a scene at the widest blur."""
+) -> Callable[[Candidate], float]:
+    """The loss of a candidate at the widest blur."""
     objective = Objective(
         tuple(resolve_loss(o.model, o.loss or loss) for o in observations),
         tuple(o.weight for o in observations),
@@ -201,15 +253,23 @@ def _make_screening_loss(
     blurred = [o.model.blur_observed(o.observed_map(), o.sensor) for o in observations]
     models = [_reduce_samples(o.model) for o in observations]
 
-    def score(scene: Scene) -> float:
+    def score(candidate: Candidate) -> float:
         with torch.no_grad():
-            drawn = zip(models, observations, strict=True)
-            maps = [model.predict(scene, o.sensor, seed) for model, o in drawn]
+            drawn = zip(models, candidate.observations, strict=True)
+            maps = [model.predict(candidate.scene, _initial_sensor(o), seed) for model, o in drawn]
             visible = all(bool(power.any()) for power in maps)
             pairs = list(zip(maps, blurred, strict=True))
             return float(objective(pairs)) if visible else math.inf
 
     return score
+
+
+def _initial_sensor(observation: Observation) -> Any:
+    """The sensor with its unknowns at their initial values."""
+    sensor = observation.sensor
+    for unknown in name_unknowns(observation.parameters).values():
+        sensor = unknown.build_module(sensor)(sensor)
+    return sensor
 
 
 def _reduce_samples(model: ForwardModel) -> ForwardModel:
@@ -235,20 +295,24 @@ def _rotated_starts(found: Reconstruction) -> Iterator[Scene]:
             yield found.scene.replace(str(module.object), pose=moved.transform.detach())
 
 
-def _select_distinct_starts(scenes: Sequence[Scene], names: Sequence[str]) -> list[Scene]:
-    """Return the first scenes, without those near a better one."""
-    kept: list[Scene] = []
-    for scene in scenes:
-        if len(kept) == _FULL_FIT_COUNT:
+def _select_distinct_starts(
+    candidates: Sequence[Candidate], names: Sequence[str], most: int
+) -> list[Candidate]:
+    """The first candidates, without those that a better one stands for."""
+    kept: list[Candidate] = []
+    for candidate in candidates:
+        if len(kept) == most:
             break
-        if not any(_are_near(scene, other, names) for other in kept):
-            kept.append(scene)
+        if not any(_are_near(candidate, other, names) for other in kept):
+            kept.append(candidate)
     return kept
 
 
-def _are_near(first: Scene, second: Scene, names: Sequence[str]) -> bool:
-    """Return whether two starts are close enough to fit once."""
-    offs = [pose_error(first[name], second[name]) for name in names]
+def _are_near(first: Candidate, second: Candidate, names: Sequence[str]) -> bool:
+    """Whether one start stands for another."""
+    if not names:
+        return first.group is not None and first.group == second.group
+    offs = [pose_error(first.scene[name], second.scene[name]) for name in names]
     return all(
         o and o.distance < _SAME_START_DISTANCE and o.angle < _SAME_START_ANGLE for o in offs
     )

@@ -125,24 +125,28 @@ def _build_segments(points: Tensor, radius: float, closed: bool) -> list[_PathSe
 
 
 class PanelPlacement(nn.Module):
-    """A module Metasurface → Metasurface: its place along walls, its yaw, and its phases.
+    """A module Metasurface → Metasurface: its position along walls, its yaw, and its focus.
 
     Phases are those of a focus that stays where it is when the panel moves, widened by a quadratic
-    term, plus a shift of each element. The derivative by the place holds that of the focus.
+    term, plus a shift of each element. The derivative with respect to the position holds that of
+    the focus. Values that leave their ranges in a step end on the border.
 
     Args:
         path: Along the walls.
         tx: The transmitter that is focused [m].
         target: On what [m].
         frequency: [Hz].
-        counts: Of elements along x and y.
+        counts: Elements along x and y whose own phases are fitted; None = of none: those are
+            the matter of ``ElementPhases``.
         along: Place on the path at the start [m].
         yaw: Turn about the vertical away from the wall's normal, at the start [rad].
         spread: Half widths of the beam, across and up, at the start [rad].
+        yaw_limit: Largest turn away from the wall's normal [rad].
+        spread_limit: Largest half width of the beam [rad].
 
     Attributes:
         along, yaw, spread: Parameters.
-        shift: Parameter, [x, y] of the elements [rad].
+        shift: Parameter, [x, y] of the elements [rad], where ``counts`` are given.
 
     Raises:
         InputError: Wrong shapes or numbers.
@@ -154,14 +158,17 @@ class PanelPlacement(nn.Module):
         tx: ArrayLike,
         target: ArrayLike,
         frequency: float,
-        counts: Sequence[int],
+        counts: Sequence[int] | None = None,
         *,
         along: float = 0.0,
         yaw: float = 0.0,
         spread: ArrayLike = (0.0, 0.0),
+        yaw_limit: float = math.inf,
+        spread_limit: float = math.inf,
     ) -> None:
         super().__init__()
         self.path = path
+        self._limits = {"yaw": yaw_limit, "spread": spread_limit}
         do = "give x, y, z"
         self._tx = checked_tensor(tx, (3,), "place of a transmitter [m]", do)
         self._target = checked_tensor(target, (3,), "target of a focus [m]", do)
@@ -172,10 +179,12 @@ class PanelPlacement(nn.Module):
         self.yaw = nn.Parameter(torch.tensor(turn, dtype=torch.float64))
         widths = checked_tensor(spread, (2,), "spread of a beam [rad]", "give two half widths")
         self.spread = nn.Parameter(widths.clone())
-        self.shift = nn.Parameter(torch.zeros(*counts, dtype=torch.float64))
+        if counts is not None:
+            self.shift = nn.Parameter(torch.zeros(*counts, dtype=torch.float64))
 
     def forward(self, panel: Metasurface) -> Metasurface:
         """The panel where it stands, with its phases."""
+        self._keep_inside()
         place, normal = self.path.locate(self.along)
         turned = normal * self.yaw.cos() + torch.linalg.cross(_UP, normal) * self.yaw.sin()
         axes = torch.stack([torch.linalg.cross(_UP, turned), _UP, turned], 1)
@@ -183,11 +192,39 @@ class PanelPlacement(nn.Module):
         half = 0.5 * panel.spacing * torch.tensor(panel.phase.shape, dtype=torch.float64)
         wave_number = 2 * math.pi * self._frequency / SPEED_OF_LIGHT
         bowed = 0.5 * wave_number * (offsets.square() / half) @ self.spread
-        phase = panel.phase + self.shift + bowed.view(panel.phase.shape)
+        phase = panel.phase + bowed.view(panel.phase.shape)
+        if hasattr(self, "shift"):
+            phase = phase + self.shift
         placed = replace(panel, position=place, axes=axes, phase=phase)
         return placed.focus(self._tx, self._target, self._frequency)
+
+    @torch.no_grad()
+    def _keep_inside(self) -> None:
+        for name, limit in self._limits.items():
+            getattr(self, name).data.clamp_(-limit, limit)
+        if not self.path.closed:
+            self.along.data.clamp_(0.0, self.path.length)
 
     def values(self) -> dict[str, Tensor]:
         """Place [m], yaw and spread [rad] by name, for progress and reports."""
         named = {"along": self.along, "yaw": self.yaw, "spread": self.spread}
         return {f"panel.{name}": value.detach().clone() for name, value in named.items()}
+
+
+class ElementPhases(nn.Module):
+    """A module Metasurface → Metasurface that adds a phase to each element.
+
+    Args:
+        counts: Elements along x and y.
+
+    Attributes:
+        shift: Parameter, [x, y] [rad].
+    """
+
+    def __init__(self, counts: Sequence[int]) -> None:
+        super().__init__()
+        self.shift = nn.Parameter(torch.zeros(*counts, dtype=torch.float64))
+
+    def forward(self, panel: Metasurface) -> Metasurface:
+        """The panel with its phases shifted."""
+        return replace(panel, phase=panel.phase + self.shift)

@@ -1,0 +1,145 @@
+"""Fits to maps of radars: power over range and direction."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console
+from torch import Tensor
+
+from invertwin.cli.estimate import require_resources
+from invertwin.cli.fits.fitting import calibrate_problem
+from invertwin.cli.fits.problem import (
+    OWN_METHOD,
+    DataKind,
+    Fits,
+    Problem,
+    Row,
+    Start,
+    Summary,
+    fitted_objects,
+    known_truth,
+    require_settings,
+    sensor_runs,
+)
+from invertwin.cli.fits.radar_models import (
+    build_sensors,
+    estimate_initial_scene,
+    has_recording_per_start,
+    make_radar_models,
+    record_sensors,
+    warn_if_depths_differ,
+    with_new_recording,
+)
+from invertwin.cli.fits.scores import (
+    predict_unblurred_maps,
+    score_fit,
+    score_held_out,
+    summarise_successes,
+    surrogate_agreement,
+    total_loss,
+)
+from invertwin.cli.fits.shape_scores import is_shape_key
+from invertwin.cli.fits.writing import (
+    START_COLUMNS,
+    BestFit,
+    describe_outcome,
+    draw_pictures,
+    make_tables,
+)
+from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.forward_model import ForwardModel
+from invertwin.inversion import Reconstruction, Unknown
+from invertwin.inversion.confidence.report import confidence_metrics, error_bar_coverage
+from invertwin.radar.parameters import ClockOffset, RangeBias
+from invertwin.runtime.memory import peak_memory
+from invertwin.scene import Scene
+from invertwin.scene.shape_models.density import replace_clouds
+from invertwin.storage.run_folder import RunFolder
+
+
+class RadarMaps(DataKind):
+    """Spectra of radars, simulated or recorded."""
+
+    def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:
+        """See ``DataKind.read_problem``."""
+        sensors = build_sensors(run)
+        warn_if_depths_differ(run, sensors)
+        require_resources(run, truth, sensors)
+        data = record_sensors(run, sensors, truth, console)
+        simulated = all(isinstance(own.data, SimulatedData) for own in sensor_runs(run).values())
+        known = frozenset(truth.names if simulated else run.truth)
+        target = run.starts.object if run.starts else next(iter(fitted_objects(run)), None)
+        return Problem(run, scene, truth, known, data, target, kind=self)
+
+    def prepare(self, problem: Problem, folder: RunFolder, console: Console) -> Problem:
+        """The problem with its radar calibrated, and its object where echoes are."""
+        return estimate_initial_scene(calibrate_problem(problem, folder, console), console)
+
+    def with_recording_of_start(self, problem: Problem, number: int, console: Console) -> Problem:
+        """The problem with the recording of a start. Only the first one's is shared."""
+        if number == 0 or not has_recording_per_start(problem.run):
+            return problem
+        return with_new_recording(problem, number, console)
+
+    def models(self, problem: Problem) -> list[ForwardModel]:
+        """See ``DataKind.models``."""
+        return make_radar_models(problem)
+
+    def sensor_unknowns(self, problem: Problem, name: str) -> dict[str, Any]:
+        """Nuisances of a radar."""
+        positions = problem.sensor_data[name].recording.positions
+        return {
+            f"{name}.{kind}" if name else kind: Unknown(
+                RangeBias() if kind == "range_bias" else ClockOffset(positions)
+            )
+            for kind in require_settings(problem.run).nuisances
+        }
+
+    def score_fit(self, problem: Problem, start: Start, found: Reconstruction) -> Row:
+        """Distances to the truth; of a recording of its own, error bars, too."""
+        rows = score_fit(problem, start.scene, found.scene)
+        own = has_recording_per_start(problem.run)
+        return rows | (confidence_metrics(found, known_truth(problem)) if own else {})
+
+    def measured_maps(self, problem: Problem) -> list[Tensor]:
+        """Spectra of the recordings."""
+        return [item.recording.spectrum(item.grid).float() for item in problem.sensor_data.values()]
+
+    def predict_maps(self, problem: Problem, scene: Scene, sensors: Sequence[Any]) -> list[Tensor]:
+        """Sharp spectra of a scene."""
+        return predict_unblurred_maps(problem, scene, sensors)
+
+    def metrics(self, fits: Fits) -> Row:
+        """See ``DataKind.metrics``."""
+        problem, rows, best, methods = fits.problem, fits.rows, fits.best, fits.methods
+        found: Row = {
+            **summarise_successes(problem, rows, methods),
+            **(
+                error_bar_coverage(rows[OWN_METHOD]) if has_recording_per_start(problem.run) else {}
+            ),
+            **{
+                k: best[k]
+                for k in best
+                if (k in START_COLUMNS or is_shape_key(k)) and k != "seconds"
+            },
+            "start_loss_sharp": total_loss(problem, fits.maps["start"], fits.maps["measured"]),
+            "loss_sharp": total_loss(problem, fits.maps["twin"], fits.maps["measured"]),
+            **surrogate_agreement(problem, fits.found.scene, fits.found.sensors[0]),
+            **score_held_out(problem, rows[OWN_METHOD], best),
+        }
+        for method in methods[1:]:
+            same = rows[method][min(best["start"], len(rows[method]) - 1)]
+            own = [key for key in same if is_shape_key(key) and not key.startswith("true_")]
+            found |= {f"{key}_{method}": same[key] for key in own}
+        if (held := peak_memory()) is not None:
+            found["peak_memory_gb"] = held / 1e9
+        return found
+
+    def summary(self, fits: Fits, metrics: Row, folder: RunFolder) -> Summary:
+        """See ``DataKind.summary``."""
+        scenes = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
+        residuals = fits.found.verdict.residuals
+        fitted = BestFit(fits.problem, metrics, fits.rows, *scenes, fits.maps, residuals)
+        result, *tables = make_tables(fitted)
+        outcome = describe_outcome(fits.problem.run, metrics)
+        return Summary(outcome, result, draw_pictures(fitted, folder), tables)

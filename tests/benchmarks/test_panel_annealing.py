@@ -1,0 +1,39 @@
+"""Annealing keeps its best, and stops where a level is reached."""
+
+import tomllib
+
+import pytest
+from rich.console import Console
+
+from cli.test_placement import ROOM
+from invertwin.cli.fits.kinds import build_problem
+from invertwin.cli.schema.run_file import validate_run
+
+
+@pytest.fixture
+def own(panel_annealing, tmp_path):
+    run = validate_run(tomllib.loads(ROOM), tmp_path / "run.toml")
+    problem = build_problem(run, Console(quiet=True))
+    return problem, panel_annealing.Annealing(problem)
+
+
+def test_annealing_gets_better_and_keeps_its_ranges(own):
+    _, annealing = own
+    first, one = annealing.anneal(1, 1, 1e9)
+    module, count = annealing.anneal(40, 1, 1e9)
+    assert (one, count) == (1, 40)
+    assert annealing.level(module) > annealing.level(first)
+    placed = module[0]
+    assert abs(float(placed.yaw)) <= 25.0 / 57.29
+
+
+def test_a_fit_is_compared_at_an_equal_level(own, panel_annealing):
+    problem, annealing = own
+    fits = {
+        "starts": [{"level_db": -1e9, "evaluations": 4}, {"level_db": 1e9, "evaluations": 4}],
+        "worst_exhaustive_db": annealing.level(annealing.anneal(1, 1, 1e9)[0], scored=True),
+    }
+    found = panel_annealing.compare(problem, fits, 2, 2)
+    assert [row["annealing_evaluations"] for row in found["starts"]] == [1, 8]
+    assert found["annealing_reached"] == 1
+    assert found["starts"][0]["evaluations_ratio"] == 4.0
