@@ -4,7 +4,8 @@
 
 Prints a table and writes `metrics.json` into DIR (default `out/house`). Everything is read from
 `src/invertwin`, most of it from its syntax trees, and from README.md and docs/limitations.md. What
-must hold is tested by `tests/test_house.py`, which `make check` runs.
+must hold is tested by `tests/test_house.py`, which `make check` runs; a value that is not reached
+yet (`REACHED`) may not grow.
 
 - `circles`: cycles of imports between files; menus (`__init__.py`) count as files. `arrows_up`:
   imports against the order of rooms, and of folders inside rooms. `own_imports_by_string`: calls of
@@ -52,7 +53,7 @@ PACKAGE = ROOT / "src" / "invertwin"
 OPTION = "boundary_samples"
 CONSTRUCTORS = ("__init__", "__new__", "__call__")
 POWERS = ("pow", "power", "float_power")
-LOGARITHMS = ("log", "log1p", "log_less")  # the last is log(1 - x), of our own
+LOGARITHMS = ("log", "log1p", "log_one_minus")  # the last is log(1 - x), of our own
 REQUIRED: Required = {
     "circles": ("<=", 0),
     "arrows_up": ("<=", 0),
@@ -73,6 +74,11 @@ REQUIRED: Required = {
     "lobe_law_copies.torch": ("<=", 1),
     "lobe_law_copies.drjit": ("<=", 1),
     "import_arrow_exceptions": ("<=", 0),
+}
+# What is required, but not reached yet, and the value that must not grow: lower it with every
+# change that lowers the value, and drop the row where the requirement holds.
+REACHED: dict[str, float] = {
+    "code_lines": 45_464,
 }
 
 AnyFunction = ast.FunctionDef | ast.AsyncFunctionDef
