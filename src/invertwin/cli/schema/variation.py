@@ -57,7 +57,7 @@ def check_samples(run: Any, raw: dict[str, Any], info: Any) -> None:
                     f'expected every key once, got "{path}" twice; remove one', f"{at}.key"
                 )
             taken.add(parse_key_path(path))
-        for value in table.build().ends():
+        for value in table.build().extreme_values():
             try:
                 changed = set_values(raw, ((path, value) for path in table.paths))
             except InputError as error:
