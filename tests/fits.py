@@ -13,6 +13,7 @@ from invertwin.inversion import (
     Reconstruction,
     Report,
     Schedule,
+    SpectrumLoss,
     Watch,
     reconstruct,
 )
@@ -60,8 +61,11 @@ def fit(
         progress: Called with every row.
         watch: See ``Watch``.
         watch_every: [steps].
-        others: Settings of ``Sampling`` and ``Schedule``, and keywords of ``reconstruct``.
+        others: Settings of ``Sampling`` and ``Schedule``, and keywords of ``reconstruct``; without
+            a loss it is ``SpectrumLoss("mse")``.
     """
+    # The bounds of these fits are those of squares: single realisations, in few bins.
+    others.setdefault("loss", SpectrumLoss("mse"))
     drawn = Sampling(**{name: others.pop(name) for name in _SAMPLING & others.keys()})
     schedule = Schedule(**{name: others.pop(name) for name in _SCHEDULE & others.keys()})
     model: ForwardModel = (
