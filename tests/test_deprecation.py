@@ -3,6 +3,7 @@
 import ast
 import warnings
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ ROOMS = (
 def radar() -> iw.Radar:
     chirp = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=64)
     row = iw.linear_array(4, chirp.wavelength / 2)
-    return iw.Radar(iw.linear_array(1, 1.0), row, chirp, positions=[[0.0, 0.0, 0.0]])
+    return iw.Radar(iw.linear_array(1, 1.0), row, chirp, positions=torch.zeros(1, 3).double())
 
 
 def ball() -> iw.Scene:
@@ -87,7 +88,7 @@ def test_samples_for_fields_of_conductors_warn():
     device = radar()
     grid = device.grid(1.0, 3.0)
 
-    def signal(**counts: int) -> Tensor:
+    def signal(**counts: Any) -> Tensor:
         drawn = iw.Sampling(depth=1, boundary=False, **counts)
         return iw.simulate(ball(), device, grid, seed=1, sampling=drawn).beat
 
@@ -99,9 +100,10 @@ def test_samples_for_fields_of_conductors_warn():
 
 
 def test_a_partial_function_for_an_rcs_map_warns():
-    options = {"directions": [[0.0, 0.0, 1.0]], "frequencies": [10e9]}
+    options: dict[str, Any] = {"directions": [[0.0, 0.0, 1.0]], "frequencies": [10e9]}
     with pytest.warns(DeprecationWarning, match=r"RcsMap\(partial.* → RcsMap\(directions"):
-        old = models.RcsMap(lambda scene, boundary: iw.rcs(scene, boundary=boundary, **options))
+        part: Any = partial(iw.rcs, **options)
+        old = models.RcsMap(part)
     plate = iw.Scene({"plate": iw.Object(iw.plate(0.3, 0.3), iw.PerfectConductor())})
     new = models.RcsMap(**options)
     assert torch.equal(old.predict(plate, None, 0), new.predict(plate, None, 0))

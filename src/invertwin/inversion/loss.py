@@ -25,7 +25,7 @@ _BINS_PER_BLOCK = 2**16  # bins per block, so that the working set fits a core's
 
 LOSS_KINDS = ("mse", "likelihood", "heavy_tailed")
 BACKGROUNDS = ("none", "level", "static")
-PowerArray = TypeVar("Power", Tensor, NDArray[np.float32])
+PowerArray = TypeVar("PowerArray", Tensor, NDArray[np.float32])
 _PowerBlock = tuple[Tensor, Tensor, Tensor]  # simulated map, its positive part, measured power
 MapPairs = Sequence[tuple[Tensor, Tensor]]
 """The predicted and the observed map of every observation."""

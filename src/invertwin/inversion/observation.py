@@ -102,10 +102,8 @@ class Observation:
         if deprecated:
             warn_renamed("Observation(model, sensor, data)", "Observation(model, data, sensor=...)")
             sensor = data
-            data, weight, parameters, loss = (
-                *deprecated,
-                *(weight, parameters, loss)[len(deprecated) - 1 :],
-            )
+            given = [*deprecated, *(weight, parameters, loss)[len(deprecated) - 1 :]]
+            data, weight, parameters, loss = given
         if not isinstance(model, ForwardModel):
             raise InputError(
                 f"expected a forward model, got {type(model).__name__}; give one such as "

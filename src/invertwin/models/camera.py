@@ -13,7 +13,7 @@ from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.limits import Positive
-from invertwin.models.noise import _add_white_errors
+from invertwin.models.noise import add_white_errors
 from invertwin.scene.scene import Scene
 
 
@@ -60,7 +60,7 @@ class SilhouetteMap(ForwardModel):
         self, scene: Scene, sensor: Camera, seed: int
     ) -> Callable[[int, float], Tensor]:
         """The masks with other errors each time."""
-        return _add_white_errors(self.predict(scene, sensor, seed), self.scatter)
+        return add_white_errors(self.predict(scene, sensor, seed), self.scatter)
 
     def for_differences(
         self, scene: Scene, sensor: Camera, samples: int, scheme: Literal["rays", "area"]
@@ -111,7 +111,7 @@ class DepthMap(ForwardModel):
         self, scene: Scene, sensor: Camera, seed: int
     ) -> Callable[[int, float], Tensor]:
         """The depths with other errors each time."""
-        return _add_white_errors(self.predict(scene, sensor, seed), self.scatter)
+        return add_white_errors(self.predict(scene, sensor, seed), self.scatter)
 
     def for_differences(
         self, scene: Scene, sensor: Camera, samples: int, scheme: Literal["rays", "area"]

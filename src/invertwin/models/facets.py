@@ -15,7 +15,7 @@ from invertwin.channel import (
     trace_facet_paths,
 )
 from invertwin.forward_model import ForwardModel
-from invertwin.models.noise import _noisy_realisations
+from invertwin.models.noise import noisy_realisations
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import beat_signal, range_profile
@@ -69,7 +69,7 @@ class FacetMap(ForwardModel):
         if not isinstance(sensor.waveform, SampledWaveform):
             return None
         beat = self._beat(scene, sensor)
-        return _noisy_realisations(
+        return noisy_realisations(
             lambda _: beat,
             lambda signal: self._to_map(signal, sensor),
             sensor,

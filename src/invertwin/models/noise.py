@@ -10,7 +10,7 @@ from invertwin.radar.waveform import SampledWaveform
 from invertwin.seeds import derive_seed
 
 
-def _noisy_realisations(
+def noisy_realisations(
     simulate_beat: Callable[[int], Tensor],
     to_map: Callable[[Tensor], Tensor],
     sensor: Radar,
@@ -37,7 +37,7 @@ def _noisy_realisations(
     return realise
 
 
-def _add_white_errors(mean: Tensor, scatter: float | None) -> Callable[[int, float], Tensor]:
+def add_white_errors(mean: Tensor, scatter: float | None) -> Callable[[int, float], Tensor]:
     """Looks at a map with white errors: of a known deviation, or of the mean square asked for."""
     mean = mean.detach()
 

@@ -22,7 +22,7 @@ from invertwin.channel import (
 )
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.models.noise import _noisy_realisations
+from invertwin.models.noise import noisy_realisations
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import beat_signal
@@ -184,7 +184,7 @@ class SurrogateMap(ForwardModel):
                 total = total + turn * target.to(total)
             return total
 
-        return _noisy_realisations(
+        return noisy_realisations(
             simulate_beat,
             lambda beat: exact_spectrum(beat, sensor, self.grid).to(torch.float32),
             sensor,

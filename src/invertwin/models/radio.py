@@ -17,7 +17,7 @@ from invertwin.links.metasurface.panel import Metasurface, panel_response
 from invertwin.links.places import ReceiverLocations
 from invertwin.links.received import LinkStatistics, PropagationSettings
 from invertwin.links.transmitters import Transmitters
-from invertwin.models.noise import _add_white_errors
+from invertwin.models.noise import add_white_errors
 from invertwin.scene.scene import Scene
 
 
@@ -214,7 +214,7 @@ class RadioMap(ForwardModel):
         Args:
             mean: The map without errors.
         """
-        return _add_white_errors(mean, self.scatter)
+        return add_white_errors(mean, self.scatter)
 
     def best_server(self, scene: Scene, sensor: Transmitters, seed: int) -> Int64[Tensor, "*map"]:
         """Number of the transmitter of which most power arrives; −1 where none arrives.
@@ -322,4 +322,4 @@ class ResponseMap(ForwardModel):
         self, scene: Scene, sensor: Transmitters, seed: int
     ) -> Callable[[int, float], Tensor]:
         """The responses with other noise each time."""
-        return _add_white_errors(self.predict(scene, sensor, seed), self.scatter)
+        return add_white_errors(self.predict(scene, sensor, seed), self.scatter)
