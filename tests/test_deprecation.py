@@ -101,8 +101,8 @@ def test_samples_for_fields_of_conductors_warn():
 
 def test_a_partial_function_for_an_rcs_map_warns():
     options: dict[str, Any] = {"directions": [[0.0, 0.0, 1.0]], "frequencies": [10e9]}
+    part: Any = partial(iw.rcs, **options)
     with pytest.warns(DeprecationWarning, match=r"RcsMap\(partial.* → RcsMap\(directions"):
-        part: Any = partial(iw.rcs, **options)
         old = models.RcsMap(part)
     plate = iw.Scene({"plate": iw.Object(iw.plate(0.3, 0.3), iw.PerfectConductor())})
     new = models.RcsMap(**options)

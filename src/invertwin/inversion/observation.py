@@ -102,7 +102,7 @@ class Observation:
         if deprecated:
             warn_renamed("Observation(model, sensor, data)", "Observation(model, data, sensor=...)")
             sensor = data
-            given = [*deprecated, *(weight, parameters, loss)[len(deprecated) - 1 :]]
+            given: list[Any] = [*deprecated, *(weight, parameters, loss)[len(deprecated) - 1 :]]
             data, weight, parameters, loss = given
         if not isinstance(model, ForwardModel):
             raise InputError(
