@@ -29,7 +29,7 @@ _RAY_COUNT = 10_000  # of a map that is compared or drawn
 def point_response(
     model: RangeDopplerMap, radar: Radar, echo: DetectedEcho, time: float = 0.0
 ) -> Tensor:
-    """What a point at an echo looks like in a map: the bare response of the radar.
+    """Return the map of a point at an echo: the bare response of the radar.
 
     Args:
         model: The map.

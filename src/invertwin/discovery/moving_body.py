@@ -139,7 +139,7 @@ class MovingBody(nn.Module):
         return placed.replace(self.object, velocity=self._axes @ self._velocity_vector + turn)
 
     def values(self) -> dict[str, Tensor]:
-        """What was found, by name, in SI units; velocity and position in the world."""
+        """Return the fitted values by name, in SI units; velocity and position in the world."""
         with torch.no_grad():
             return {
                 "position_m": self._center_at(),

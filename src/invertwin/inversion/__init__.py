@@ -21,6 +21,7 @@ from invertwin.inversion.initialisation.initial_pose import InitialEstimate as I
 from invertwin.inversion.initialisation.initial_pose import (
     InitialPoseEstimator as InitialPoseEstimator,
 )
+from invertwin.inversion.initialisation.multi_start import Screening as Screening
 from invertwin.inversion.initialisation.multi_start import Search as Search
 from invertwin.inversion.initialisation.multi_start import pose_grid as pose_grid
 from invertwin.inversion.initialisation.multi_start import search as search

@@ -89,7 +89,7 @@ class CoverageMap(ForwardModel):
 
     @property
     def has_blur(self) -> bool:
-        """Whether shadows or the quantile are blurred."""
+        """Return whether shadows or the quantile are blurred."""
         return self.blur > 0 or self.softness > 0
 
     def scale_blur(self, fraction: float) -> "CoverageMap":
@@ -99,7 +99,7 @@ class CoverageMap(ForwardModel):
 
 
 QUANTITIES = ("received_power", "path_gain", "gain", "sinr", "delay_spread")
-"""What a ``RadioMap`` may show."""
+"""Quantities of a ``RadioMap``."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,6 +37,7 @@ from invertwin.inversion import (
     Observation,
     Reconstruction,
     Report,
+    Screening,
     Stage,
     Watch,
     reconstruct,
@@ -194,10 +195,8 @@ def _fit_or_search(
     starts = problem.kind.make_candidates(problem, start, chance)
     found = search(
         *given,
-        starts,
+        Screening(starts, run.search.fits, run.search.shortlist),
         callbacks=lambda n: callbacks(f"{part}{n}.pt"),
-        fits=run.search.fits,
-        shortlist=run.search.shortlist,
         **how,
     )
     return found.best, {"checkpoint": f"{part}{found.best_number}.pt", **found.to_metrics()}

@@ -57,6 +57,23 @@ class Candidate:
 
 
 @dataclass(frozen=True)
+class Screening:
+    """Starts of a search, and the number of them that are fitted.
+
+    Attributes:
+        starts: poses in which objects may begin, by name: given ones, random ones from
+            ``sample_nearby_poses``, or those of ``pose_grid``. Or candidates, whose sensors
+            differ, too.
+        fits: number of the best starts that are fitted.
+        shortlist: whether these are fitted in the first stage only, and the best of them in all.
+    """
+
+    starts: Mapping[str, Sequence[Object]] | Sequence[Candidate]
+    fits: Count = _FULL_FIT_COUNT
+    shortlist: bool = False
+
+
+@dataclass(frozen=True)
 class Search:
     """Result of a multi-start fit.
 
@@ -133,7 +150,7 @@ def search(
     scene: Scene,
     observations: Observation | Sequence[Observation],
     parameters: Unknowns,
-    starts: Mapping[str, Sequence[Object]] | Sequence[Candidate],
+    starts: Mapping[str, Sequence[Object]] | Sequence[Candidate] | Screening,
     *,
     loss: Callable[[Tensor, Tensor], Tensor] | None = None,
     optimizer: Optimizer | None = None,
@@ -141,43 +158,38 @@ def search(
     regularizers: Sequence[Regularizer] = (),
     callbacks: Callable[[int], Sequence[Callback]] = lambda _: (),
     seed: int = 0,
-    fits: Count = _FULL_FIT_COUNT,
-    shortlist: bool = False,
 ) -> Search:
     """Fit from many starts, and report the results that the data do not distinguish.
 
     All starts are compared at the first, widest blur; the best few are fitted. Then the best end
-    is turned as ``rivals.turns`` says, by half a turn first, and fitted again.
-    Ends that differ are compared in pairs with looks at the twin of the worse one: speckle that
-    both losses share cancels in their difference.
+    is rotated by half a turn and the other symmetries of its objects, and fitted again. Ends that
+    differ are compared in pairs with realisations of the twin of the worse one: speckle that both
+    losses share cancels in their difference.
 
     Args:
-        scene: As known. The other arguments are those of ``reconstruct``.
-        observations: What was observed.
-        parameters: Unknowns of the scene; every fit takes a copy.
-        starts: By the name of an object, the poses in which it may begin: given ones, random ones
-            from ``sample_nearby_poses``, or those of ``pose_grid``. Or candidates, whose
-            sensors differ, too.
-        loss: How maps are compared.
-        optimizer: Kind and rates.
-        schedule: Of every fit.
-        regularizers: Added to the loss.
-        callbacks: For the number of a fit, from 0, what watches it.
-        seed: Of all random numbers.
-        fits: Number of the best starts that are fitted.
-        shortlist: Fit these in the first stage only; the best of them is fitted in all.
+        scene: scene as known; the other arguments are those of ``reconstruct``.
+        observations: recordings with their models.
+        parameters: unknowns of the scene; every fit takes a copy.
+        starts: poses by name of an object, candidates, or a ``Screening`` of either.
+        loss: comparison of two maps.
+        optimizer: kind and rates.
+        schedule: stages of every fit.
+        regularizers: terms added to the loss.
+        callbacks: function of the number of a fit, from 0, that returns its callbacks.
+        seed: seed of all random numbers.
 
     Raises:
         InputError: No starts; see ``reconstruct``.
     """
     watched = [observations] if isinstance(observations, Observation) else list(observations)
-    names = list(starts) if isinstance(starts, Mapping) else []
-    begun = _candidates(scene, watched, starts)
+    screening = starts if isinstance(starts, Screening) else Screening(starts)
+    names = list(screening.starts) if isinstance(screening.starts, Mapping) else []
+    begun = _candidates(scene, watched, screening.starts)
     stages = [*schedule] if isinstance(schedule, Sequence) else [schedule or Schedule()]
     score_start = _make_screening_loss(watched, loss, seed)
     losses = [score_start(candidate) for candidate in track(begun, "starts")]
     order = sorted(range(len(begun)), key=losses.__getitem__)
-    kept = _select_distinct_starts([begun[k] for k in order], names, fits)
+    kept = _select_distinct_starts([begun[k] for k in order], names, screening.fits)
 
     def fit(start: Candidate, number: int, parts: Sequence[Schedule]) -> Reconstruction:
         return reconstruct(
@@ -192,7 +204,7 @@ def search(
             seed=derive_seed(seed, number),
         )
 
-    if shortlist and len(stages) > 1 and len(kept) > 1:
+    if screening.shortlist and len(stages) > 1 and len(kept) > 1:
         tried = [fit(start, number, stages[:1]) for number, start in enumerate(kept)]
         first = tried.index(min(tried, key=_unblurred_loss))
         # Numbers of files go on after those of the trials.
@@ -203,6 +215,13 @@ def search(
     for start in _rotated_starts(best):
         again = Candidate(start, watched)
         found.append(fit(again, offset + len(found), stages))
+    return _compare_ends(found, offset, names, losses)
+
+
+def _compare_ends(
+    found: Sequence[Reconstruction], offset: int, names: Sequence[str], losses: Sequence[float]
+) -> Search:
+    """Keep the ends that differ, the best first, and test which of them the data reject."""
     ends: list[Reconstruction] = []
     for end in sorted(found, key=_unblurred_loss):
         if not any(are_same_poses(end.scene, other.scene, names) for other in ends):
@@ -217,7 +236,7 @@ def search(
         for end, z in zip(ends, scores, strict=True)
         if z is not None and z < REJECTION_ZSCORE
     )
-    number = offset + found.index(ends[0])
+    number = offset + list(found).index(ends[0])
     return Search(ends[0], ends, scores, texts, number, tuple(names), tuple(losses))
 
 
@@ -309,7 +328,7 @@ def _select_distinct_starts(
 
 
 def _are_near(first: Candidate, second: Candidate, names: Sequence[str]) -> bool:
-    """Whether one start stands for another."""
+    """Return whether one start stands for another."""
     if not names:
         return first.group is not None and first.group == second.group
     offs = [pose_error(first.scene[name], second.scene[name]) for name in names]

@@ -41,7 +41,7 @@ def soft_quantile(values: Float64[Tensor, " n"], share: float, width: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """What receivers get, by the paths of the scene and over a panel.
+    """Field at receivers, over the paths of the scene and over a panel.
 
     Powers of the two are added, which is the mean over the fringes of a few wavelengths between
     them; the paths of the scene add up coherently among themselves.

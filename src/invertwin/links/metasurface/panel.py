@@ -107,7 +107,7 @@ class Metasurface:
 
     @property
     def response(self) -> Complex128[Tensor, " element"]:
-        """What every element multiplies the field with, after rounding of its phase."""
+        """Reflection factor of every element, after rounding of its phase."""
         phase = self.phase.ravel()
         if self.bits is not None:
             step = 2 * math.pi / 2**self.bits

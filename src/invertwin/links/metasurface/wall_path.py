@@ -1,4 +1,4 @@
-"""Where a metasurface stands: on a path along the walls, turned about the vertical."""
+"""Positions of a metasurface: on a path along the walls, rotated about the vertical."""
 
 import math
 from collections.abc import Sequence
