@@ -1,4 +1,4 @@
-"""What a run needs, before it begins: memory by part, and how much there is to trace."""
+"""Resources of a run, before it begins: memory by part, and numbers of rays and paths."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -38,13 +38,13 @@ _SIZE_KEYS = ("max_edge", "divisions", "subdivisions", "spacing", "file", "parts
 
 @dataclass(frozen=True)
 class MemoryItem:
-    """One thing that a run needs memory for.
+    """One item of the memory of a run.
 
     Attributes:
-        name: What it is.
-        count: How many of them.
+        name: Name of the item.
+        count: Number of equal items.
         memory: Bytes.
-        key: Of the run file, to be lowered.
+        key: Run-file key to lower.
     """
 
     name: str
@@ -55,13 +55,13 @@ class MemoryItem:
 
 @dataclass(frozen=True)
 class ResourceEstimate:
-    """What a run needs.
+    """Resource estimate of a run: memory, rays, paths.
 
     Attributes:
-        memory_items: What takes memory, the largest first.
+        memory_items: Items of memory, the largest first.
         map_count: Smooth maps that are predicted.
         ray_count: Samples of all of them.
-        rays_key: Key of the run file that has most to do with their number.
+        rays_key: Run-file key that determines most of their number.
         recording_count: Exact signals that are simulated.
         path_count: Paths of all of them, times frames.
     """
@@ -75,14 +75,14 @@ class ResourceEstimate:
 
     @property
     def memory(self) -> float:
-        """Bytes at the peak."""
+        """Peak memory in bytes."""
         return _PROGRAM_BYTES + sum(part.memory for part in self.memory_items)
 
     def require_available(self) -> None:
         """Refuse a run that this machine cannot do.
 
         Raises:
-            InputError: More memory than is free, or more rays than anybody can trace.
+            InputError: More memory than is free, or more rays than can be traced.
         """
         free = free_memory()
         if not self.memory <= free:
@@ -103,12 +103,12 @@ class ResourceEstimate:
 
 @dataclass(frozen=True)
 class SensorSetup:
-    """What measures.
+    """Sensor of a run, with its own tables and data.
 
     Attributes:
         run: The run file as it is for this sensor.
-        radar, grid: What its tables make.
-        capture: What it has recorded; None where that is simulated.
+        radar, grid: Radar and bins of its tables.
+        capture: Its recording; None where data are simulated.
     """
 
     run: RunFile
@@ -120,12 +120,12 @@ class SensorSetup:
 def estimate_resources(
     run: RunFile, truth: Scene, sensors: Mapping[str, SensorSetup]
 ) -> ResourceEstimate:
-    """What a run needs, from its tables and what they make: nothing is traced.
+    """Estimate the resources of a run from its tables and their objects, without tracing.
 
     Args:
         run: The run file.
         truth: Its true scene.
-        sensors: By name; a run without `[observations]` has one without a name.
+        sensors: Sensors by name; a run without `[observations]` has one without a name.
 
     Raises:
         InputError: Too many starts, or a stage that makes too many triangles.
@@ -150,7 +150,7 @@ def estimate_resources(
 
 
 def estimate_rcs_resources(run: RunFile, scene: Scene) -> ResourceEstimate:
-    """What `[rcs]` needs.
+    """Estimate the resources of `[rcs]`.
 
     Args:
         run: The run file.
@@ -199,11 +199,11 @@ def _triangle_item(run: RunFile, scene: Scene) -> MemoryItem:
 
 
 def estimate_sensor_resources(sensor: SensorSetup, scene: Scene) -> tuple[list[MemoryItem], float]:
-    """What the data of one sensor need, and how many paths they have over all frames.
+    """Estimate the memory of one sensor's data, and their number of paths over all frames.
 
     Args:
-        sensor: What measures.
-        scene: What it measures.
+        sensor: Sensor of the data.
+        scene: Measured scene.
     """
     run, radar, grid = sensor.run, sensor.radar, sensor.grid
     frames, senders, receivers = radar.shape
@@ -253,7 +253,7 @@ def estimate_sensor_resources(sensor: SensorSetup, scene: Scene) -> tuple[list[M
 def _simulation_items(
     data: SimulatedData, scene: Scene, frames: int
 ) -> Iterator[tuple[MemoryItem, float]]:
-    """Paths of exact signals, and how many there are over all frames."""
+    """Return the memory of exact signals' paths, and their number over all frames."""
     with prefix_errors("data.points_per_m2"):
         rough = resolve_densities(scene, data.points_per_m2)
     areas = {name: Mesh(scene[name].vertices, scene[name].mesh.faces).area for name in rough}
@@ -279,7 +279,7 @@ def _simulation_items(
 
 
 def _fit_items(run: RunFile, sensors: Mapping[str, SensorSetup]) -> Iterator[MemoryItem]:
-    """What fits and checks of derivatives keep, beside the data."""
+    """Return the memory of fits and derivative checks, beside the data."""
     copies = (run.starts.count if run.starts else 1) * (1 + len(run.variants))
     key = "starts.count" if run.starts else "variants"
     yield MemoryItem("starts", copies, copies * _START_BYTES, key)
@@ -303,7 +303,7 @@ def _fit_items(run: RunFile, sensors: Mapping[str, SensorSetup]) -> Iterator[Mem
 
 
 def _count_rays(run: RunFile) -> tuple[float, float, str]:
-    """Smooth maps, samples of all of them, and the key that says most of these."""
+    """Count smooth maps and their samples, and return the key that determines most of these."""
     if run.task == "gradcheck" and run.gradcheck is not None:
         table = run.gradcheck
         ends, slopes = 4 * table.max_pairs, 4 * table.repeats
@@ -328,7 +328,7 @@ def _count_rays(run: RunFile) -> tuple[float, float, str]:
 
 
 def _fit_budgets(run: RunFile) -> list[Any]:
-    """The `[reconstruct]` of every stage of every way to fit."""
+    """Return the `[reconstruct]` table of every stage of every variant."""
     ways = [run, *(run.apply_overrides(variant) for variant in run.variants.values())]
     runs = [
         own for way in ways for own in [run.apply_overrides(stage) for stage in way.stages] or [way]
@@ -337,7 +337,7 @@ def _fit_budgets(run: RunFile) -> list[Any]:
 
 
 def _count_recordings(run: RunFile) -> int:
-    """How often data are simulated."""
+    """Count the simulations of data."""
     if not isinstance(run.data, SimulatedData):
         return 1
     if run.task == "dataset" and run.dataset is not None:
@@ -363,7 +363,7 @@ def _check_starts_and_stages(run: RunFile, scene: Scene) -> None:
 
 
 def _is_separable(radar: Radar) -> bool:
-    """Whether the virtual array is a product of a row and a column."""
+    """Return whether the virtual array is a product of a row and a column."""
     places = radar.virtual_positions / (1e-3 * radar.waveform.wavelength)
     x, y, both = (
         len(part.round().unique(dim=0)) for part in (places[:, :1], places[:, 1:2], places)

@@ -36,7 +36,7 @@ FilesArgument = Annotated[list[Path], typer.Argument(help="Run files (TOML).", s
 
 @dataclass(frozen=True, kw_only=True)
 class OutputOptions:
-    """Where the results of a command go."""
+    """Output folder of a command."""
 
     out: Annotated[
         Path | None,
@@ -49,7 +49,7 @@ class OutputOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(OutputOptions):
-    """What commands with run files have in common."""
+    """Options common to commands with run files."""
 
     seed: Annotated[
         int | None,
@@ -60,7 +60,7 @@ class RunOptions(OutputOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ResumableOptions(RunOptions):
-    """What commands have whose work is kept when it is interrupted."""
+    """Options of commands that resume interrupted work."""
 
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the interrupted run in the folder.")
@@ -75,7 +75,7 @@ EngineOption = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetOptions(ResumableOptions):
-    """Who simulates a data set, and which part of it."""
+    """Engine and workers of a data set, and the part to simulate."""
 
     workers: Annotated[
         int | None,
@@ -92,7 +92,7 @@ class DatasetOptions(ResumableOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions(ResumableOptions):
-    """Who makes the fits of a run."""
+    """Engine and workers of the fits of a run."""
 
     workers: Annotated[
         int | None,
@@ -111,7 +111,7 @@ class FitOptions(ResumableOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions(OutputOptions):
-    """A recording, and what it takes to read it."""
+    """Recording and the options of its reader."""
 
     recording: Annotated[
         Path,
@@ -149,7 +149,7 @@ class RecordingOptions(OutputOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class LookOptions(RecordingOptions):
-    """What to look at, as the options of `invertwin look` say it."""
+    """Options of `invertwin look`."""
 
     chirp: Annotated[
         int | None, typer.Option(min=0, help="The one that the capture keeps; default: mean.")
@@ -175,7 +175,7 @@ class LookOptions(RecordingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class TwinOptions(RecordingOptions):
-    """What to make a twin of, as the options of `invertwin twin` say it."""
+    """Options of `invertwin twin`."""
 
     low: Annotated[
         tuple[float, float] | None,

@@ -1,4 +1,4 @@
-"""What a run shows: tables of its numbers, pictures, and report.html that opens anywhere."""
+"""Report of a run: tables of its numbers, pictures, and a self-contained report.html."""
 
 import base64
 import math
@@ -176,7 +176,7 @@ def _encode_base64(png: bytes) -> str:
 
 
 def is_numeric_cell(value: Any) -> bool:
-    """Whether a cell is right-aligned."""
+    """Return whether a cell is right-aligned."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 

@@ -1,4 +1,4 @@
-"""What commands do before and after their work: run files in, folder, tables on the terminal."""
+"""Shared steps of commands: load run files, open the folder, print tables and progress."""
 
 import math
 import sys
@@ -32,7 +32,7 @@ def run_folder(
     """The run's folder, as of `open_run`; says where the results are, or how to resume.
 
     Args:
-        options: What the user has chosen.
+        options: Options of the user.
         default: The folder if the user has chosen none.
         runs: Run files by stem.
     """
@@ -63,10 +63,10 @@ def load_runs(
     A seed of the options replaces theirs. Run files of another task than the command's are refused.
 
     Args:
-        files: Where they are.
-        options: What the user has chosen.
-        command: Whose task they must have.
-        sections: What it needs, or what it needs of a run file.
+        files: Paths of the run files.
+        options: Options of the user.
+        command: Command whose task they must have.
+        sections: Required sections, or a function that returns them for a run file.
     """
     runs: dict[str, Any] = {}
     for file in files:
@@ -93,16 +93,16 @@ def compute_in_parts(
     folder: RunFolder,
     compute: Callable[[str, Any], dict[str, Any]],
 ) -> Iterator[tuple[str, Any, dict[str, Any]]]:
-    """What every run file gives, kept as it comes: an interrupted run does not compute it again.
+    """Compute a result for each run file, saved at once: a resumed run does not repeat it.
 
     Args:
         runs: Run files by stem.
-        files: Where they are.
-        folder: Keeps what is done.
-        compute: Takes a stem and its run file.
+        files: Paths of the run files.
+        folder: Folder that keeps finished results.
+        compute: Function of a stem and its run file.
 
     Yields:
-        Stem, run file and what was computed.
+        Stem, run file and result.
     """
     for name, run in runs.items():
         part = f"{PARTS}/{name}.json"
@@ -119,9 +119,9 @@ def count_progress(console: Console, name: str, total: int) -> Iterator[Callable
     """Progress with the time that is left: a bar, or a line now and then where no terminal is.
 
     Args:
-        console: Where.
-        name: Of what is counted.
-        total: How many there are.
+        console: Console to print on.
+        name: Name of the counted items.
+        total: Number of items.
 
     Yields:
         A function to be called after each of them.
@@ -149,7 +149,7 @@ def show_progress(console: Console) -> Iterator[None]:
     """Show how far long loops have come: on one line, or a line now and then in a log.
 
     Args:
-        console: Where.
+        console: Console to print on.
     """
     with console.status("working") as status:
         say = status.update if console.is_terminal else limit_rate(console, time.monotonic())
@@ -165,8 +165,8 @@ def limit_rate(shown: Console = console, last: float = -math.inf) -> Callable[[s
     """A function that prints a line of progress, unless one was printed just now.
 
     Args:
-        shown: Where.
-        last: When the last one was printed.
+        shown: Console of the printed line.
+        last: Time of the last line.
     """
 
     def say(line: str) -> None:

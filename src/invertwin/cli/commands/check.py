@@ -1,4 +1,4 @@
-"""`invertwin check`: what a run file needs, memory and time, before anything is done."""
+"""`invertwin check`: memory and time that a run file needs, before it runs."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -45,10 +45,10 @@ _STEPS, _STARTS = "reconstruct.steps", ("transmitter_starts.count", "placement.s
 
 
 def run_check(run: RunFile) -> tuple[list[ReportTable], str]:
-    """Tables of what a run needs and of its meshes, and a line with its time.
+    """Build tables of a run's resources and meshes, and a line with its time.
 
     Raises:
-        InputError: What the run's own command refuses before it begins.
+        InputError: An input that the run's own command refuses before it begins.
     """
     if run.rcs is not None:
         return _check_rcs(run)
@@ -86,7 +86,7 @@ def _make_tables(
 
 
 def _check_other_data(run: RunFile) -> tuple[list[ReportTable], str]:
-    """The same of fits to other data than radar maps: the time of one map of each stage."""
+    """Check fits to other data than radar maps: the time of one map of each stage."""
     problem = build_problem(run, Console(quiet=True))
     observation = make_observations(problem, problem.starts()[0])[0]
     sensor = observation.sensor
@@ -111,7 +111,7 @@ def _check_other_data(run: RunFile) -> tuple[list[ReportTable], str]:
 
 
 def _check_checked_map(run: RunFile) -> tuple[list[ReportTable], str]:
-    """The same of a gradient check of `[map]` or `[placement]`, whose memory does not grow."""
+    """Check a gradient check of `[map]` or `[placement]`, whose memory is constant."""
     scene, check = build.scene(run), require_section(run, "gradcheck", run.task)
     model, sensor = checked_map(run, scene)
     count = 4 * (check.repeats + check.max_pairs)
@@ -123,7 +123,7 @@ def _check_checked_map(run: RunFile) -> tuple[list[ReportTable], str]:
 
 
 def _check_image(run: RunFile) -> tuple[list[ReportTable], str]:
-    """The same of `[image]`, whose memory does not grow: the time of one image."""
+    """Check `[image]`, whose memory is constant: the time of one image."""
     scene, check = build.scene(run), require_section(run, "gradcheck", run.task)
     model, camera = build.build_section(run, "image"), build.build_section(run, "camera")
     rays = len(camera.positions) * camera.width * camera.height * model.sampling.samples
@@ -140,7 +140,7 @@ def _check_image(run: RunFile) -> tuple[list[ReportTable], str]:
 
 
 def _time_call(work: Callable[[], object]) -> float:
-    """Seconds of some work, once it has been compiled."""
+    """Return the seconds of a call, once it has been compiled."""
     work()
     begin = time.perf_counter()
     work()
@@ -148,7 +148,7 @@ def _time_call(work: Callable[[], object]) -> float:
 
 
 def _check_rcs(run: RunFile) -> tuple[list[ReportTable], str]:
-    """The same of `[rcs]`: its time is that of one aspect and of a few more, carried on."""
+    """Check `[rcs]`: extrapolate its time from one aspect and a few more."""
     table, scene = require_section(run, "rcs", run.task), build.scene(run)
     found = estimate_rcs_resources(run, scene)
     found.require_available()
@@ -198,7 +198,7 @@ def _build_sensors(run: RunFile) -> Mapping[str, SensorSetup]:
 def _estimate_seconds(
     run: RunFile, found: ResourceEstimate, truth: Scene, sensors: Mapping[str, SensorSetup]
 ) -> float:
-    """Time of the run, from the time of a few rays and a few paths on this machine."""
+    """Estimate the time of the run from a few rays and a few paths on this machine."""
     whole, settings = next(iter(sensors.values())), run.gradcheck or run.reconstruct
     depth = settings.depth if settings else run.data.depth if run.data else 1
     frames = whole.radar.frame_count
@@ -217,7 +217,7 @@ def _estimate_seconds(
 
 
 def _fit_cost(work: Callable[[int], float]) -> tuple[float, float]:
-    """Seconds that work takes at least, and more of them for each ray or path."""
+    """Fit the fixed seconds of a call, and the seconds per ray or path."""
     work(_SMALL_PROBE)  # compiled now
     times, counts = [time.perf_counter()], []
     for count in (_SMALL_PROBE, _LARGE_PROBE):

@@ -107,11 +107,11 @@ def dataset(
 
 
 def part_folder(folder: Path, part: tuple[int, int]) -> Path:
-    """Where a part of a data set is written.
+    """Return the folder of a part of a data set.
 
     Args:
-        folder: Of the whole.
-        part: Number and count; the only part is the whole.
+        folder: Folder of the whole data set.
+        part: Number and count; a single part uses the folder itself.
     """
     return folder if part == (1, 1) else folder / f"part_{part[0]}_of_{part[1]}"
 
@@ -120,7 +120,7 @@ def parse_part(text: str | None) -> tuple[int, int]:
     """The part that `--shard i/n` names.
 
     Raises:
-        InputError: No such text.
+        InputError: The text is not of the form i/n.
     """
     if text is None:
         return 1, 1
@@ -137,9 +137,9 @@ def run_dataset(
 
     Args:
         run: The run file of the data set.
-        folder: Of the part.
+        folder: Folder of the part.
         part: Number and count.
-        engine, workers: Who simulates.
+        engine, workers: Engine and number of its processes.
 
     Raises:
         InputError: A sample that cannot be simulated; the message names it.
@@ -166,7 +166,7 @@ def run_dataset(
 
 
 def make_shard(job: tuple[str, int, int]) -> bytes:
-    """A shard as a tar file: what a worker does.
+    """Write a shard as a tar file: the job of a worker.
 
     Args:
         job: The run file of the data set, the first sample, and how many.
@@ -188,7 +188,7 @@ def make_sample(run: RunFile, index: int) -> dict[str, bytes]:
 
     Args:
         run: The run file of the data set.
-        index: Of the sample.
+        index: Index of the sample.
     """
     own = make_sample_run(run, index)
     with prefix_file_errors(Path(f"sample {index}")):
@@ -210,11 +210,11 @@ def make_sample(run: RunFile, index: int) -> dict[str, bytes]:
 
 
 def make_sample_run(run: RunFile, index: int) -> RunFile:
-    """The run file of a sample: what `invertwin simulate` takes.
+    """Return the run file of a sample, as `invertwin simulate` takes it.
 
     Args:
         run: The run file of the data set.
-        index: Of the sample.
+        index: Index of the sample.
 
     Raises:
         InputError: Drawn values that are no run file together; the message names the sample.
@@ -243,7 +243,7 @@ def _check_first(run: RunFile, index: int) -> None:
 def _simulate_signals(
     run: RunFile, scene: Scene, sensor: SensorSetup, table: Any
 ) -> dict[str, np.ndarray]:
-    """Exact signals and what is made of them, by name."""
+    """Simulate exact signals and the arrays derived from them, by name."""
     if run.chirps is None:
         simulated = simulate_exact(run, scene, sensor.radar, sensor.grid)
         beat, power = simulated.beat, simulated.spectrum
@@ -259,7 +259,7 @@ def _simulate_signals(
 
 
 def _labelled_scene(run: RunFile, scene: Scene, radar: Radar) -> Scene:
-    """The scene as the frame begins, which labels are of."""
+    """Return the scene at the start of the frame, to which the labels refer."""
     if run.chirps is None:
         return scene
     return scene_at_start(run, scene, float(run.chirps.build().times(radar.shape[1]).max()))
@@ -271,7 +271,7 @@ def _path_arrays(paths: Paths) -> dict[str, np.ndarray]:
 
 
 def _describe_arrays(run: RunFile) -> dict[str, ArrayInfo]:
-    """What the manifest says of the arrays."""
+    """Describe the arrays for the manifest."""
     table = require_section(run, "dataset", "a data set")
     chirp, rate = ([], []) if run.chirps is None else (["chirp"], ["velocity"])
     known = {
@@ -334,5 +334,5 @@ def _read_finished_shard(folder: RunFolder, number: int) -> dict[str, Any] | Non
 
 
 def _shard_row_path(number: int) -> str:
-    """What is kept of a shard that is done, until the run ends."""
+    """Return the file that keeps a finished shard's manifest row until the run ends."""
     return f"{PARTS}/shard-{number:06d}.json"

@@ -40,7 +40,7 @@ _REPORT_FIELDS = (
     *("full", "interior", "no_interior_edges", "no_contact"),
     *("difference_noise", "step_agreement", "pairs"),
 )
-# Units of a derivative with respect to θ, by the value that θ changes; angles are told apart.
+# Units of a derivative with respect to θ, by the value that θ changes; angles have their own.
 _DERIVATIVE_UNITS = {
     **dict.fromkeys(("translation", "offsets", "value"), "1/m"),
     "place": "1/m",
@@ -53,7 +53,7 @@ _FIXED_TRIANGLE_KINDS = ("translation", "pose", "scale", "material", "radar_pose
 
 @dataclass(frozen=True)
 class GradcheckOutcome:
-    """A gradient check that is done, for the studies that compare something with it."""
+    """Finished gradient check, for the studies that compare something with it."""
 
     run: RunFile
     scene: Scene  # at θ = 0, as the radar
@@ -88,8 +88,8 @@ class GradcheckStudy(Protocol):
         """The table of those results.
 
         Args:
-            name: Of the gradient check.
-            found: What `compare` returned, also when it was read back from JSON.
+            name: Name of the gradient check.
+            found: Result of `compare`, possibly read back from JSON.
         """
         ...
 
@@ -124,7 +124,7 @@ def run_gradcheck(
         metrics |= compared
     rows = [_table_row(*item) for item in scenes.items()]
     legend = load_texts("notes")["gradcheck"]
-    # What no scene has, such as contacts, takes the room of numbers in a terminal.
+    # Omit columns that are empty for all scenes, such as contacts: they would narrow the others.
     told = [k for k in range(len(_TABLE_COLUMNS)) if any(row[k] is not None for row in rows)]
     columns, rows = [_TABLE_COLUMNS[k] for k in told], [[row[k] for k in told] for row in rows]
     table = ReportTable("Agreement with central differences", columns, rows, legend)
@@ -137,7 +137,7 @@ def run_gradcheck(
 
 @dataclass(frozen=True)
 class _GradcheckTarget:
-    """What is differentiated."""
+    """Differentiated quantity of a gradient check."""
 
     model: ForwardModel
     sensor: Any
@@ -205,7 +205,7 @@ def _radio_map_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _
 
 
 def _image_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _GradcheckTarget:
-    """What `[camera]` shows as `[image]`."""
+    """Camera image of `[camera]` and `[image]`."""
     require_section(run, "camera", "an image")
     kind = require_section(run, "image", "gradcheck").kind
     model, camera = build.build_section(run, "image"), build.build_section(run, "camera")
@@ -237,7 +237,7 @@ def _radar_map_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _
 
 
 def _panel_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _GradcheckTarget:
-    """What the metasurface of `[placement]` brings to receivers."""
+    """Gain at the receivers through the metasurface of `[placement]`."""
     table = require_section(run, "placement", "gradcheck")
     aim, panel = table.coverage(scene, run.seed), table.metasurface()
     if settings.parameter.kind != "panel":
@@ -297,7 +297,7 @@ def _run_check(
 
 
 def _select_target(run: RunFile) -> Callable[[RunFile, GradcheckTable, Scene], _GradcheckTarget]:
-    """What makes a gradient check of the sections that are there."""
+    """Return the builder of the gradient check, by the sections of the run file."""
     if run.placement is not None:
         return _panel_target
     if run.image is not None:
@@ -312,7 +312,7 @@ def checked_map(run: RunFile, scene: Scene) -> tuple[ForwardModel, Any]:
 
     Args:
         run: The run file.
-        scene: At θ = 0.
+        scene: Scene at θ = 0.
     """
     seen = _select_target(run)(run, require_section(run, "gradcheck", "gradcheck"), scene)
     return seen.model, seen.sensor
@@ -339,7 +339,7 @@ def _derivative_maps(report: GradientReport) -> dict[str, Tensor]:
 
 
 def _derivative_unit(settings: GradcheckTable) -> str:
-    """Of a derivative of a number by θ."""
+    """Return the unit of a number's derivative with respect to θ."""
     name = next(iter(settings.tangent))
     return "1/rad" if settings.changes_angle else _DERIVATIVE_UNITS.get(name, f"per unit of {name}")
 

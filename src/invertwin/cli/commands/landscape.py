@@ -1,4 +1,4 @@
-"""Why the surrogate: the exact signal's loss beside the surrogate's, along a line."""
+"""Loss landscapes: the exact signal's loss beside the surrogate's, along a line."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -50,7 +50,7 @@ def plot_landscape(problem: Problem, console: Console) -> tuple[Figure, dict[str
 
 
 def make_object_line(truth: Scene, name: str, axis: Sequence[float]) -> tuple[ParameterLine, str]:
-    """The line on which one object is off the truth by θ [m], and what figures call it."""
+    """Return the line on which one object is θ [m] off the truth, and its label in figures."""
     unit = torch.tensor(axis, dtype=torch.float64)
     used = [letter for letter, value in zip("xyz", axis, strict=True) if value]
     way = f"({', '.join(f'{value:g}' for value in axis)})"

@@ -124,7 +124,7 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
 
 @contextmanager
 def _collect_warnings(messages: list[str]) -> Iterator[None]:
-    """Warnings of a reader go on, and into a list."""
+    """Collect the warnings of a reader in a list, and pass them on."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", PhysicsWarning)
         yield
@@ -135,12 +135,12 @@ def _collect_warnings(messages: list[str]) -> Iterator[None]:
 
 
 def _warning_rows(messages: list[str]) -> list[list[str]]:
-    """Names and evidence of warnings."""
+    """Build table rows of warnings: name and evidence."""
     return [list(line.split(": ", 1)) for line in messages]
 
 
 def read_recording(options: RecordingOptions) -> tuple[str, AnyRecording]:
-    """The name of the reader, and what it has read."""
+    """Return the name of the reader, and the recording."""
     path, ending = options.recording, options.recording.suffix.lower()
     if not path.exists():
         raise InputError(f"expected a recording, got no file {path}; check the path")
@@ -173,7 +173,7 @@ def read_recording(options: RecordingOptions) -> tuple[str, AnyRecording]:
 
 
 def _parse_changes(given: list[str]) -> dict[str, Any]:
-    """Values by name, as NAME=NUMBER or real=True."""
+    """Parse values by name, given as NAME=NUMBER or real=True."""
     found: dict[str, Any] = {}
     for text in given:
         name, _, value = text.partition("=")
@@ -210,7 +210,7 @@ def _require_board(options: RecordingOptions, board: str | None) -> Mounting:
 
 
 def _to_capture(options: LookOptions, recording: AnyRecording) -> Capture:
-    """One signal a frame."""
+    """Return the capture with one signal a frame."""
     if isinstance(recording, Capture):
         return recording
     return replace(recording, moving=False).to_capture(
@@ -221,7 +221,7 @@ def _to_capture(options: LookOptions, recording: AnyRecording) -> Capture:
 def _calibrate_channels(
     options: LookOptions, recording: AnyRecording, folder: RunFolder
 ) -> tuple[AnyRecording, dict[str, Any]]:
-    """The recording with its channels calibrated, and how far they were apart."""
+    """Calibrate the channels of a recording; return also their spread before."""
     if options.channels is not None and options.reflector is not None:
         raise InputError("expected --channels or --reflector, got both; choose one")
     if options.channels is not None:
@@ -258,7 +258,7 @@ def _make_grid(options: LookOptions, capture: Capture, recording: AnyRecording) 
 def _high_resolution_panels(
     options: LookOptions, capture: Capture, chirps: ChirpCapture | None, grid: Grid
 ) -> dict[str, MapPanel]:
-    """Directions by another method than Bartlett's."""
+    """Draw direction spectra by a method other than Bartlett's."""
     radar = capture.radar()
     if "range_profile" in capture.dataset:
         raise InputError(
@@ -276,7 +276,7 @@ def _high_resolution_panels(
 def _make_panels(
     capture: Capture, chirps: ChirpCapture | None, grid: Grid, frame: int
 ) -> tuple[dict[str, MapPanel], dict[str, Any]]:
-    """Pictures and numbers of one frame."""
+    """Make the pictures and numbers of one frame."""
     if chirps is not None:
         maps = doppler_maps(chirps.beat, chirps.device, grid, chirps.chirps, frame)
         return doppler_panels(maps), {

@@ -1,4 +1,4 @@
-"""`invertwin plan`: error bars before any recording, and what further positions would add."""
+"""`invertwin plan`: error bars before any recording, and the gain of further positions."""
 
 import time
 from collections.abc import Callable
@@ -97,7 +97,7 @@ def _compare_with_fits(
     console: Console,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Fits of simulated recordings that begin at the truth, and how far they scatter."""
+    """Fit simulated recordings from the truth, and return the scatter of the results."""
     count = problem.run.plan.fits if problem.run.plan else 0
     if not count:
         return {}

@@ -17,10 +17,10 @@ _FULL_SCALE_MARGIN = 1.25
 
 
 def make_chirp_settings(run: RunFile, radar: Radar) -> ChirpSettings:
-    """Settings that would record what the run file simulates.
+    """Return the board settings that would record the simulated data of the run file.
 
     Raises:
-        InputError: A radar that sends no ramps, transmitters that send at once, or ramps that
+        InputError: A radar without ramps, simultaneous transmitters, or ramps that
             do not fit their interval.
     """
     if not isinstance(radar.waveform, FMCW):
@@ -66,7 +66,7 @@ def write_raw_files(
     """Write raw/capture.bin and its settings files; return numbers for metrics.json.
 
     Raises:
-        InputError: What no such file can hold.
+        InputError: Data that no such file can hold.
     """
     assert run.raw is not None
     settings = make_chirp_settings(run, radar)

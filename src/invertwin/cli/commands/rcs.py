@@ -1,4 +1,4 @@
-"""`invertwin rcs`: radar signatures of scenes, beside what is known or was measured."""
+"""`invertwin rcs`: radar signatures of scenes, beside known or measured values."""
 
 import time
 import warnings
@@ -103,13 +103,13 @@ def _compute_rcs(name: str, run: RunFile, folder: RunFolder) -> _RcsMetrics:
 
 
 def _peak_level(levels: Tensor) -> float | None:
-    """The largest, unless it is none."""
+    """Return the largest level; None without levels."""
     level = float(levels.max())
     return level if level > _MIN_LEVEL else None
 
 
 def _case_error(table: RcsTable, name: str, found: Signature) -> float:
-    """How far a case is from what it should be, in dB."""
+    """Return the error of a case against its expected value, in dB."""
     case = table.cases[name]
     with prefix_errors(f"rcs.cases.{name}"):
         if case.part is not None and case.part not in found.parts:
@@ -130,7 +130,7 @@ _MeasuredRows = tuple[Tensor, Tensor, Tensor, tuple[int, int]]  # frequency, asp
 def _load_measurements(
     table: RcsTable, found: Signature
 ) -> tuple[dict[str, _MeasuredRows], list[str]]:
-    """Measured rows that were swept, by frequency and polarisation; and what is not there."""
+    """Load measured rows of the sweep by frequency and polarisation, and list the missing ones."""
     rows: dict[str, _MeasuredRows] = {}
     skipped: list[str] = []
     for number, measurement in enumerate(table.measured):
@@ -186,7 +186,7 @@ def _draw_pictures(
     measured: Mapping[str, _MeasuredRows],
     folder: RunFolder,
 ) -> dict[str, str]:
-    """Draw what was found; file names and titles."""
+    """Draw the results; return file names and titles."""
     shown = {name: "Radar cross-section"}
     angles, label = table.swept_angles
     first, *_, second = table.channels.values()
@@ -243,7 +243,7 @@ def _image_axes(found: Signature) -> tuple[Tensor, Tensor]:
 
 
 def _format_csv(table: RcsTable, found: Signature) -> str:
-    """All of S as text."""
+    """Format the whole scattering matrix S as CSV text."""
     names = list(table.channels)
     lines = ["frequency_hz,x,y,z," + ",".join(f"{n}_re_m,{n}_im_m" for n in names)]
     matrix = found.matrix

@@ -72,7 +72,7 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[ReportTable]:
 def _simulate_frames(
     run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid
 ) -> _SimulationOutcome:
-    """One ramp a frame, beside what the surrogate makes of the scene."""
+    """Simulate one ramp a frame, beside the surrogate's map of the scene."""
     begin = time.perf_counter()
     found = simulate_exact(run, scene, radar, grid)
     seconds = time.perf_counter() - begin
@@ -98,7 +98,7 @@ def _simulate_frames(
 def _simulate_moving_frames(
     run: RunFile, folder: RunFolder, scene: Scene, radar: Radar, grid: Grid
 ) -> _SimulationOutcome:
-    """Several ramps a frame, between which objects move."""
+    """Simulate several ramps a frame, between which objects move."""
     table = require_section(run, "chirps", "several ramps a frame")
     begin = time.perf_counter()
     chirps = table.build()
@@ -122,7 +122,7 @@ def _simulate_moving_frames(
 
 
 def _find_peak(spectrum: torch.Tensor, grid: Grid) -> dict[str, float | None]:
-    """Where the power, summed over frames, is largest, and the largest of one frame in dB."""
+    """Find the bin of largest power summed over frames, and the peak of a single frame in dB."""
     total = spectrum.sum(0)
     r, u, v = np.unravel_index(int(total.argmax()), total.shape)
     peak = float(spectrum.max())

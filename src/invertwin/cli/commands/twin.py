@@ -1,4 +1,4 @@
-"""`invertwin twin`: what stands in a recording, found with no start."""
+"""`invertwin twin`: automatic reconstruction from a recording, without an initial guess."""
 
 import math
 import time
@@ -88,7 +88,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
 
 
 def _to_arguments(options: dict[str, Any]) -> list[str]:
-    """Options as the command line takes them."""
+    """Return options in the form of the command line."""
     found: list[str] = []
     for name, value in options.items():
         values = value if isinstance(value, list | tuple) else [value]
@@ -99,7 +99,7 @@ def _to_arguments(options: dict[str, Any]) -> list[str]:
 def _load_run_file(
     options: TwinOptions,
 ) -> tuple[Capture | ChirpCapture, Scene | None, dict[str, Any]]:
-    """The data of a run file, what is true of them, and what it says of the search."""
+    """Load the data of a run file, their ground truth, and the settings of the search."""
     with prefix_file_errors(options.recording):
         run = load_run(options.recording)
         given = {} if run.twin is None else run.twin.model_dump(exclude_none=True)
@@ -158,7 +158,7 @@ def _draw_maps(twin: Twin, folder: RunFolder) -> list[ReportPicture]:
 
 
 def _describe_as_run(twin: Twin, folder: RunFolder) -> dict[str, Any]:
-    """A run file that simulates the things that have a shape, and fits their poses on."""
+    """Return a run file that simulates the objects with a shape and refines their poses."""
     assert twin.grid is not None
     assert twin.scene is not None
     scene: dict[str, Any] = {}

@@ -35,9 +35,9 @@ def run_view(
 
     Args:
         target: A run folder, a run file or a capture.
-        console: Says where to look.
+        console: Console that prints the address.
         host, port, token: See ``Viewer``.
-        record: The page.
+        record: Path of the page.
 
     Raises:
         InputError: A target that is none of these, or a host without a token.
@@ -57,13 +57,13 @@ def run_view(
 
 
 def load_display(target: Path) -> tuple[Display, dict[str, InteractiveSensor]]:
-    """What there is to see of a target, and by sensor what lets people move it.
+    """Load the display of a target, and by sensor the radars that a viewer can move.
 
     Args:
         target: A run folder, a run file or a capture.
 
     Raises:
-        InputError: It is none of these.
+        InputError: The target is none of these.
     """
     if target.is_dir():
         files = [target / name for name in ("run.toml", "twin.toml")]
@@ -93,7 +93,7 @@ def _display_of_run(
         radars = _build_radars(run)
         title = run.title or file.stem
         names = fitted_objects(run)
-        # Without a fit what stands there is shown where it stands.
+        # Without a fit, show objects at their current pose.
         own = truth if folder is None or not (folder / VIEW_FILE).exists() else scene
         depth = run.reconstruct.depth if run.reconstruct else getattr(run.data, "depth", 1)
         links = {

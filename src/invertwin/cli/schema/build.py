@@ -102,7 +102,7 @@ def _load_scene_file(table: SceneFileTable) -> Scene:
 
 
 def build_section(run: RunFile, section: str, given: Mapping[type, object] | None = None) -> Any:
-    """What the constructor of a section of the run file makes of it.
+    """Build the object of a run-file section with its constructor.
 
     Args:
         run: The run file.
@@ -134,7 +134,7 @@ def build_loss(run: RunFile) -> Callable[[Tensor, Tensor], Tensor]:
 def module_builders(
     tables: Sequence[Any], objects: Mapping[str, ObjectTable] | None = None
 ) -> dict[str, Callable[[Scene], nn.Module]]:
-    """What makes the modules of the `[[parameters]]` tables for a scene, by name, in order.
+    """Return the builders of the `[[parameters]]` modules for a scene, by name, in order.
 
     Bodies and learned shapes are those of their `[scene.<name>]` tables, the objects.
     """

@@ -43,7 +43,7 @@ class DatasetTable(Section):
 
 
 class VaryTable(ConstructorTable):
-    """What is drawn anew for every sample."""
+    """Values drawn anew for every sample."""
 
     key: Annotated[Any, _KeyPaths] = described(
         "its path in the run file, such as scene.box.position[0]; a list of paths gets one value"
@@ -51,7 +51,7 @@ class VaryTable(ConstructorTable):
 
     @property
     def paths(self) -> list[str]:
-        """Where the value goes."""
+        """Key paths of the drawn value."""
         return [self.key] if isinstance(self.key, str) else self.key
 
     @model_validator(mode="after")

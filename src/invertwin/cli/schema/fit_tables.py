@@ -1,4 +1,4 @@
-"""How maps are compared and how a gradient becomes a step, in run files."""
+"""Losses and optimisers of run files."""
 
 from typing import Any
 
@@ -45,7 +45,7 @@ class SearchTable(ConstructorTable):
     """Poses in which an object may begin, beside its start; the best few are fitted."""
 
     object: str = key("name in the scene")
-    fits: Count = key("of the best starts", 4)
+    fits: Count = key("number of best starts that are fitted", 4)
     shortlist: bool = key(
         "fit these in the first stage only; the best of them is fitted in all", False
     )

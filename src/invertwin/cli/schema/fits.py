@@ -28,7 +28,7 @@ class _StartsTable(ConstructorTable):
 
 
 class _InitialTable(ConstructorTable):
-    """Where an object stands by conventional processing: the fit starts there."""
+    """Initial pose of an object from conventional processing."""
 
     object: str | None = key(
         "name in the scene; with [map] none: it is the first transmitter, at the centroid of power",
@@ -50,7 +50,7 @@ SamplingBase = registry.constructor_table(
 
 
 class Budget(registry.constructor_table(Schedule, "Schedule", SamplingBase)):
-    """How long a fit lasts, and what it samples."""
+    """Budget of a fit: steps and samples."""
 
 
 class ReconstructTable(Budget):
@@ -59,7 +59,9 @@ class ReconstructTable(Budget):
     parameters: list[str] = key("names of the parameters that are fitted; empty = all", [])
     observations: list[str] = key("names of the sensors that are fitted; empty = all", [])
     checkpoint_every: Count = key("steps from one checkpoint to the next", 10)
-    nuisances: list[Literal["range_bias", "clock_offset"]] = key("of the radar, fitted too", [])
+    nuisances: list[Literal["range_bias", "clock_offset"]] = key(
+        "unknowns of the radar, fitted too", []
+    )
     position_limit: Positive = key("m, largest error of a success", 0.03)
     rotation_limit_deg: Positive = key("largest error of a success", 3.0)
     axis: Vector | None = key(
@@ -98,7 +100,7 @@ class RunOverrides(Section):
     placement: TomlTable | None = key("what differs from [placement]", None)
 
     def overrides(self) -> dict[str, Any]:
-        """What is merged over the run; a part has no stages."""
+        """Tables merged over the run; a part has no stages."""
         return {
             **self.model_dump(include=set(RunOverrides.model_fields), exclude_none=True),
             "stages": [],
@@ -134,7 +136,7 @@ class VariantTable(RunOverrides):
     first_starts: Count | None = key("so many of the starts; without it all", None)
 
     def overrides(self) -> dict[str, Any]:
-        """What is merged over the run."""
+        """Tables merged over the run."""
         own = {"first_starts"}
         return self.model_dump(exclude_unset=True, exclude_none=True, exclude=own)
 
@@ -158,7 +160,7 @@ class CalibrationTable(RunOverrides):
 
 
 class MeasuresTable(Section):
-    """How near the found shape is to the true one, in numbers and pictures."""
+    """Measures of shape error against the truth, in numbers and pictures."""
 
     object: str = key("name in the scene")
     thresholds: Annotated[list[Positive], MinLen(1)] = key("m, thresholds of the F-score", [0.02])
@@ -168,7 +170,7 @@ class MeasuresTable(Section):
 
 
 class PlanTable(Section):
-    """What a plan is compared with, and what it tries."""
+    """Settings of a plan: comparisons and candidate positions."""
 
     fits: Annotated[int, Ge(0)] = key("simulated fits whose spread it is compared with", 0)
     candidates: Annotated[Any, OneOf("track")] | None = key("m, positions that may be added", None)

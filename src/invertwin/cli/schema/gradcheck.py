@@ -33,7 +33,7 @@ class GradcheckTable(ConstructorTable):
         "how fast its values change with θ, by name: a number for all entries, a list, or a bump "
         "over the nodes of a grid"
     )
-    step: Positive | None = key("of θ in the differences", None)
+    step: Positive | None = key("step of θ in the differences", None)
     step_deg: Positive | None = key("the same where θ turns something", None)
     depth: Depth = key("most bounces of a path", 3)
     samples: Count = key("rays of one derivative", 4_000_000)
@@ -41,17 +41,17 @@ class GradcheckTable(ConstructorTable):
 
     @property
     def acts_on(self) -> Literal["scene", "sensor"]:
-        """What changes with θ."""
+        """Quantity that θ changes."""
         moved = ("radar_pose", "radar_path", "camera_pose", "transmitter", "panel")
         return "sensor" if self.parameter.kind in moved else "scene"
 
     @property
     def changes_angle(self) -> bool:
-        """Whether θ is an angle."""
+        """True if θ is an angle."""
         return not {"rotation", "yaw"}.isdisjoint(self.tangent) or self.parameter.kind == "body"
 
     def build(self, given: Any = None, /, **more: Any) -> GradcheckSettings:
-        """How sharp the check is."""
+        """Build the settings of the check: steps and samples."""
         turn = {} if self.step_deg is None else {"step": math.radians(self.step_deg)}
         return super().build(given, **turn, **more)
 

@@ -1,4 +1,4 @@
-"""What may be written in a run file, as tables made from its JSON Schema."""
+"""Reference tables of run-file keys, made from the JSON Schema."""
 
 import contextlib
 import difflib
@@ -41,7 +41,7 @@ def json_schema() -> JsonSchema:
 
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     schema |= RunFile.model_json_schema()
-    # Without a place to write, the next call makes it again: slower, not wrong.
+    # Without a writable folder the next call rebuilds it: slower, not wrong.
     with contextlib.suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)
         for old in file.parent.glob("keys-*.json"):

@@ -1,4 +1,4 @@
-"""What objects of run files do over time: `[[scene.<name>.motion]]`."""
+"""Motions of run-file objects: `[[scene.<name>.motion]]`."""
 
 from torch import Tensor
 
@@ -50,7 +50,7 @@ def scene_at_start(run: RunFile, scene: Scene, duration: float) -> Scene:
 
 
 def joint_positions_at_start(run: RunFile, scene: Scene) -> dict[str, dict[str, Tensor]]:
-    """Where joints of bodies are in the world as a frame begins [m], by object and name.
+    """Return joint positions of bodies at the start of a frame [m], by object and name.
 
     Args:
         run: The run file.
@@ -82,7 +82,7 @@ def refuse_motion(run: RunFile) -> None:
 
 
 def _build_motions(table: ObjectTable) -> list[ObjectMotion]:
-    """What an object does; waving replaces what the person does meanwhile."""
+    """Build the motions of an object; waving replaces the person's own motion meanwhile."""
     found: list[ObjectMotion] = []
     for number, row in enumerate(table.motion):
         with prefix_errors(f"motion[{number}]"):

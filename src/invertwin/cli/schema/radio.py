@@ -58,7 +58,7 @@ class AntennaTable(Section):
 
 
 class TransmitterTable(AntennaTable):
-    """What sends: one transmitter or several, all with the same antenna."""
+    """Transmitters: one or several, all with the same antenna."""
 
     positions: Annotated[list[Vector], MinLen(1)] = key(
         "m, of each; where a fit of it starts, unless [transmitter_starts] says otherwise"
@@ -77,15 +77,15 @@ PropagationBase: Any = registry.constructor_table(
 
 
 class RoughPathsTable(SamplingBase):
-    """How paths that rough surfaces scatter are drawn."""
+    """Sampling of paths that rough surfaces scatter."""
 
 
 class MapTable(
     registry.constructor_table(RadioMap, "RadioMap", PropagationBase, without=("propagation",))
 ):
-    """What receivers at known places get of the transmitters."""
+    """Gain from the transmitters to receivers at known positions."""
 
-    antenna: AntennaTable = key("of every receiver", AntennaTable())
+    antenna: AntennaTable = key("antenna of every receiver", AntennaTable())
     rough: RoughPathsTable | None = key(
         "paths that rough surfaces scatter, whose power is added; without it left out", None
     )
@@ -111,7 +111,7 @@ class TransmitterStartsTable(Section):
     seed: Seed | None = key("without it the run's", None)
 
     def sample_positions(self, scene: Scene, seed: int) -> Tensor:
-        """Where fits start [start, 3].
+        """Sample start positions of fits [start, 3].
 
         Args:
             scene: As known.

@@ -1,4 +1,4 @@
-"""Radio maps of run files: places, and what is measured there."""
+"""Radio maps of run files: receiver positions, and measured levels."""
 
 from collections.abc import Sequence
 from typing import Annotated, Literal
@@ -24,7 +24,7 @@ from invertwin.scene import load_mesh
 
 
 class ReceivedData(Section):
-    """Levels that receivers would get in the true scene, with errors; what differs from [map]."""
+    """Simulated levels of receivers in the true scene, with errors; keys that differ from [map]."""
 
     kind: Literal["received"]
     positions: Annotated[list[Vector], MinLen(1)] | None = key(
@@ -35,11 +35,11 @@ class ReceivedData(Section):
     depth: Annotated[int, Ge(0)] | None = key("without it that of [map]", None)
     edges: Annotated[int, Ge(0)] | None = key("without it that of [map]", None)
     rays: Count | None = key("without it those of [map]", None)
-    seed: Seed | None = key("of errors and rays; without it the run's", None)
+    seed: Seed | None = key("seed of errors and rays; without it the run's", None)
 
 
 class ReceivedFile(Section):
-    """Measured levels: rows of x, y, z and one level for each transmitter, with one line of heads.
+    """Measured levels: rows of x, y, z and one level for each transmitter, with one header line.
 
     The places of the rows stand in for those of [map].
     """
@@ -48,7 +48,7 @@ class ReceivedFile(Section):
     file: InputPath = key("CSV: x,y,z [m], then the levels")
 
     def read(self) -> tuple[ReceiverPoints, Tensor]:
-        """Places, and levels [tx, place].
+        """Read receiver positions, and levels [tx, position].
 
         Raises:
             InputError: No such file, or no numbers.
@@ -59,7 +59,7 @@ class ReceivedFile(Section):
 
 
 def register(registry: Registry) -> None:
-    """Add places of radio maps, and data of received levels."""
+    """Add receiver positions of radio maps, and data of received levels."""
     registry.groups["places"] = KindGroup(product=ReceiverLocations, default="points")
     registry.add("places", "points", ReceiverPoints)
     registry.add("places", "random", random_points)
@@ -79,8 +79,8 @@ def random_points(
     Args:
         low: corner of the box [m].
         high: the opposite corner [m].
-        count: how many.
-        seed: of the points.
+        count: number of points.
+        seed: seed of the points.
     """
     generator = torch.Generator().manual_seed(seed)
     ends = [torch.tensor(corner, dtype=torch.float64) for corner in (low, high)]
@@ -89,7 +89,7 @@ def random_points(
 
 
 def points_file(file: InputPath) -> ReceiverPoints:
-    """Points of a CSV file with one line of heads: x,y,z [m].
+    """Points of a CSV file with one header line: x,y,z [m].
 
     Args:
         file: path, from the run file's folder.
@@ -113,8 +113,8 @@ def plane_cells(
         high: greatest x and y [m].
         height: z [m].
         cell: length of a cell's sides; the nearest that divides the sides of the map [m].
-        points: in a cell, at least.
-        edge_points: on edges of the scene, for each transmitter; they serve derivatives alone.
+        points: least number of points in a cell.
+        edge_points: points on edges of the scene, for each transmitter; for derivatives only.
     """
     return MapPlane.horizontal(low, high, height, cell, CellSampling(points, edge_points))
 
@@ -124,8 +124,8 @@ def mesh_cells(file: InputPath, points: Count = 16, edge_points: Count = 20_000)
 
     Args:
         file: PLY, OBJ, STL or GLB, in metres; path, from the run file's folder.
-        points: in a triangle, at least.
-        edge_points: on edges of the scene, for each transmitter; they serve derivatives alone.
+        points: least number of points in a triangle.
+        edge_points: points on edges of the scene, for each transmitter; for derivatives only.
     """
     with prefix_errors("file"):
         return MapMesh(load_mesh(file), CellSampling(points, edge_points))

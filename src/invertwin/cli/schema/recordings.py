@@ -130,9 +130,9 @@ def read_dca1000(
 
     Args:
         file: .bin, or the .setup.json that names the files.
-        board: whose elements recorded; those in use are what the settings say.
-        settings: .cfg or .mmwave.json; without it what the .setup.json names.
-        lanes: of the LVDS link, where the settings do not say.
+        board: board of the elements; the settings say which are in use.
+        settings: .cfg or .mmwave.json; without it the file that .setup.json names.
+        lanes: number of LVDS lanes, where the settings do not state it.
     """
     with prefix_errors("file"):
         chirps = ti.read_recording(file, settings, lanes)
@@ -146,7 +146,7 @@ def read_arrays(
 
     Args:
         file: the description.
-        board: whose elements recorded; without it what the description says.
+        board: board of the elements; without it that of the description.
         trusted: true reads it in this process, not in a child process.
     """
     with prefix_errors("file"):

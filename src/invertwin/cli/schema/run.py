@@ -88,14 +88,16 @@ class SceneFileTable(Section):
 
 
 class TruthTable(Section):
-    """What an object really is: replaces values of its scene table, key by key."""
+    """True values of an object: they replace those of its scene table, key by key."""
 
     position: Vector | None = key("m", None)
     rotation_deg: Vector | None = key("rotation vector", None)
     scale: Positive | None = key("factor", None)
     material: AnyMaterial | None = key("what it is really made of", None)
     velocity: Vector | None = key("m/s", None)
-    angles_deg: dict[str, Vector] | None = key("of a body: all joints that are not at rest", None)
+    angles_deg: dict[str, Vector] | None = key(
+        "joint angles of a body: all that are not at rest", None
+    )
     parts: Annotated[list[Annotated[Any, OneOf("shape")]], MinLen(1)] | None = key(
         "its real shape, in place of the scene's and in the same frame", None
     )
@@ -104,9 +106,9 @@ class TruthTable(Section):
 class RawTable(Section):
     """Raw files as other tools read them: DCA1000 samples, SDK and mmWave Studio settings."""
 
-    lanes: Literal[2, 4] = key("of the LVDS link: 4 for xWR12xx and xWR14xx, 2 for later ones", 2)
+    lanes: Literal[2, 4] = key("LVDS lanes: 4 for xWR12xx and xWR14xx, 2 for later ones", 2)
     real: bool = key("real samples instead of I and Q", False)
-    bits: Literal[12, 14, 16] = key("of the ADC", 16)
+    bits: Literal[12, 14, 16] = key("bits of the ADC", 16)
     full_scale: Positive | None = key(
         "√(received over sent power) of the largest count; without it 1.25 times the largest "
         "sample",
@@ -119,7 +121,7 @@ class RawTable(Section):
 
 
 class ObservationTable(Section):
-    """What one of several sensors has measured; without a key the section of this name counts."""
+    """Data of one of several sensors; a missing key falls back to the section of its name."""
 
     radar: AnyRadar | None = key("what measures; not with a capture", None)
     grid: AnyGrid | None = key("the map that is compared", None)
@@ -332,7 +334,7 @@ class _RunFile(Section):
         return self
 
     def _require_simulated_data(self) -> None:
-        """What a data set cannot be made of."""
+        """Refuse data that a data set cannot be made of."""
         if self.dataset is not None and self.dataset.paths and self.chirps is not None:
             raise_key_error("expected false with [chirps], got true; remove it", "dataset.paths")
         if self.observations:
@@ -371,7 +373,7 @@ class _RunFile(Section):
         return found | own
 
     def object_references(self) -> list[tuple[str, str]]:
-        """Where the run file names an object of the scene: path and name."""
+        """Yield every reference to an object of the scene: path and name."""
         used = [(f"truth.{name}", name) for name in self.truth]
         if self.dataset is not None:
             used += [(f"dataset.classes.{name}", name) for name in self.dataset.classes]

@@ -80,7 +80,7 @@ def load_run(path: Path) -> Any:
 
 
 def is_run_file(path: Path) -> bool:
-    """Whether a file is TOML with a task; descriptions of recordings have none."""
+    """Return whether a file is TOML with a task; descriptions of recordings have none."""
     if path.suffix.lower() != ".toml":
         return False
     try:
@@ -142,7 +142,7 @@ def to_minimal_toml(run: Any) -> str:
 
 
 def unknown_object_message(path: str, name: str, known: Sequence[str]) -> str:
-    """What is wrong with a key that names an object which the scene does not have."""
+    """Return the message for a key that names an object which the scene does not have."""
     return (
         f"{path}: expected the name of an object of the scene ({', '.join(known)}), "
         f"got {_format_value(name)}; " + _suggest_name(name, known, "add it to the scene")

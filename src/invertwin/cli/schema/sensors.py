@@ -97,7 +97,9 @@ class BoardTable(ConstructorTable):
     receivers: ElementNumbers | None = key(
         "numbers from 1, ascending; without it all, or those of the recording", None
     )
-    pattern: Annotated[Any, OneOf("pattern")] | None = key("of every element; else isotropic", None)
+    pattern: Annotated[Any, OneOf("pattern")] | None = key(
+        "pattern of every element; else isotropic", None
+    )
     polarisation: PolarisationValue | None = key(
         _POLARISATION_HELP + "; without it the board's", None
     )
@@ -134,7 +136,7 @@ Orientation = Annotated[
 
 
 class RadarPoseTable(ConstructorTable):
-    """Where a radar is in every frame."""
+    """Pose of a radar in every frame."""
 
     positions: TrackValue = key(
         "m, one for each frame: a list of points or a track; for a recording also one for all",
@@ -153,7 +155,7 @@ class RadarPoseTable(ConstructorTable):
         """Positions [frame, 3]; columns are the radar's right, up and boresight axes [frame, 3, 3].
 
         Args:
-            frames: How many there are, where one position holds for all.
+            frames: Number of frames, where one position holds for all.
 
         Raises:
             InputError: A target straight above a position.
@@ -172,7 +174,7 @@ class RadarPoseTable(ConstructorTable):
         """The radar with the range origin of its data.
 
         Args:
-            radar: At the poses.
+            radar: Radar at the poses.
         """
         if self.range_center is None:
             return radar
@@ -255,7 +257,7 @@ def register(registry: Registry) -> None:
 def custom_board(
     tx_places: boards.ElementGrid, rx_places: boards.ElementGrid, design_frequency: Positive
 ) -> boards.Board:
-    """A board of one's own: a table of places.
+    """Custom board: element positions on its grid.
 
     Args:
         tx_places: column, row of TX1, TX2, … in half wavelengths.

@@ -48,19 +48,19 @@ from invertwin.scene.people.body_models import body, body_template
 
 
 class ShapePoseTable(ConstructorTable):
-    """Where a shape stands: scaled, then rotated about its own origin, then moved."""
+    """Pose of a shape: scaled, then rotated about its own origin, then moved."""
 
     position: Vector = key("m", [0.0, 0.0, 0.0])
     rotation_deg: Vector = key("rotation vector", [0.0, 0.0, 0.0])
     scale: Positive = key("factor", 1.0)
 
     def build_mesh(self) -> Mesh:
-        """In its own frame, scaled but not placed."""
+        """Build the mesh in its own frame, scaled but not placed."""
         mesh = super().build()
         return Mesh(mesh.vertices * self.scale, mesh.faces)
 
     def build_pose(self) -> Tensor:
-        """Where it stands [4, 4]."""
+        """Build the pose matrix [4, 4]."""
         turn = torch.tensor(self.rotation_deg, dtype=torch.float64).deg2rad()
         return rigid(rotation_from_vector(turn), torch.tensor(self.position, dtype=torch.float64))
 
@@ -79,7 +79,7 @@ class _ObjectProperties(ConstructorTable):
 
 
 class ObjectTable(ShapePoseTable, _ObjectProperties):
-    """A shape with what makes it an object of the scene."""
+    """Object of the scene: a shape with its material and motion."""
 
     def build(self, given: Any = None, /, **more: Any) -> Object:
         """The object; `mesh` stands in for its shape."""
@@ -117,16 +117,16 @@ class RoomTable(ConstructorTable):
 
 
 class ParameterTable(ConstructorTable):
-    """What every parameter may have."""
+    """Keys common to all parameters."""
 
     name: str | None = key("by which stages and variants call it; without it its kind", None)
-    rate: Positive | None = key("of its own; without it the optimizer's", None)
+    rate: Positive | None = key("its own learning rate; without it the optimizer's", None)
 
 
 class LatentTable(ConstructorTable):
     """Coordinates in standard deviations."""
 
-    weight: NonNegative = key("of ½ Σ z²", 0.0)
+    weight: NonNegative = key("weight of ½ Σ z²", 0.0)
 
 
 class LearnedTable(LatentTable):
@@ -306,7 +306,7 @@ def shape_regularizers(table: Any, module: nn.Module, scene: Scene | Radar) -> l
 
 
 def module_values(name: str, scene: Scene, objects: Mapping[str, Any]) -> dict[type, object]:
-    """What a module of an object may ask for beside its keys, where a fit starts."""
+    """Return the values that an object's module may require beside its keys, at the start."""
     item, table = scene[name], objects.get(name)
     found: dict[type, object] = {Scene: scene, Object: item, Mesh: item.mesh}
     return found if table is None else {**found, ObjectTable: table}
@@ -316,7 +316,7 @@ def body_template_of(table: Any) -> BodyTemplate | None:
     """The body of an object's table in its rest pose; None of other shapes.
 
     Args:
-        table: Of the object.
+        table: Table of the object.
     """
     if _shape_kind(table) != "body":
         return None
@@ -325,12 +325,12 @@ def body_template_of(table: Any) -> BodyTemplate | None:
 
 
 def joint_positions(table: Any, item: Object, rotations: Tensor | None = None) -> dict[str, Tensor]:
-    """Where the joints of a body are in the world [m], by name; none of other objects.
+    """Return joint positions of a body in the world [m], by name; empty for other objects.
 
     Args:
-        table: Of the object.
-        item: What it has made.
-        rotations: Of every joint in the frame of its parent; without them those of the table.
+        table: Table of the object.
+        item: Object built from the table.
+        rotations: Joint rotations in the parents' frames; by default those of the table.
     """
     template = body_template_of(table)
     if template is None:

@@ -37,7 +37,7 @@ SweptValues = Annotated[Any, _SweptNumbers]
 
 
 def count_values(value: Any) -> int:
-    """How many numbers a sweep, a list or a single one has."""
+    """Count the numbers of a sweep, a list or a single one."""
     if isinstance(value, SweepTable):
         return value.count
     return len(value) if isinstance(value, list) else 1
@@ -51,14 +51,14 @@ def expand_values(value: Any) -> Tensor:
 
 
 class ReceiverDirection(Section):
-    """Where the receiver is, apart from the transmitter."""
+    """Direction of a bistatic receiver."""
 
     theta_deg: SweptValues = key("angle to z, one for all or one for each aspect")
     phi_deg: SweptValues = key("angle from x towards y")
 
 
 class RcsCase(Section):
-    """A radar cross-section that is known otherwise."""
+    """Radar cross-section that is known from another source."""
 
     reference: Annotated[Any, OneOf("cross_section")] = key("what it should be")
     channel: Literal["VV", "HH", "VH", "HV", "RR", "LL", "RL", "LR"] = key(
@@ -138,11 +138,11 @@ class RcsTable(ConstructorTable):
 
     @property
     def aspect_count(self) -> int:
-        """How many directions are swept."""
+        """Number of swept directions."""
         return max(count_values(self.theta_deg), count_values(self.phi_deg))
 
     def select_aspects(self, indices: list[int]) -> "RcsTable":
-        """The same of some aspects, and nothing to compare them with."""
+        """Return the table for a subset of aspects, without comparisons."""
 
         def select_angles(section: Any) -> dict[str, list[float]]:
             return {
@@ -157,7 +157,7 @@ class RcsTable(ConstructorTable):
 
     @property
     def swept_angles(self) -> tuple[Tensor, str]:
-        """What changes from aspect to aspect [°], and its name."""
+        """Angles that change from aspect to aspect [°], and their name."""
         theta, phi = expand_values(self.theta_deg), expand_values(self.phi_deg)
         return (theta, "θ [°]") if len(theta) > len(phi) else (phi, "φ [°]")
 

@@ -1,4 +1,4 @@
-"""What `invertwin twin` searches."""
+"""Search settings of `invertwin twin`."""
 
 from typing import Annotated, Literal
 
@@ -23,4 +23,4 @@ class TwinTable(Section):
     height: NonNegative | None = key(
         "m above the ground, where echoes are looked for; without it that of the radars", None
     )
-    rays: Annotated[int, Ge(100)] = key("of every frame in fits", 2000)
+    rays: Annotated[int, Ge(100)] = key("rays of every frame in fits", 2000)

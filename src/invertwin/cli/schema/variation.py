@@ -1,4 +1,4 @@
-"""Values that are drawn for a run file: where they go, and the run file that comes of them."""
+"""Random variation of run files: key paths, drawn values, and the resulting run file."""
 
 import copy
 import difflib
@@ -43,8 +43,8 @@ def check_samples(run: Any, raw: dict[str, Any], info: Any) -> None:
 
     Args:
         run: The run file.
-        raw: It as TOML, without what makes it a data set.
-        info: Of pydantic.
+        raw: The same as TOML, without its data-set sections.
+        info: Validation info of pydantic.
     """
     kind = type(run)
     whole = TypeAdapter(dict[str, kind])  # type: ignore[valid-type]
@@ -70,8 +70,8 @@ def draw_sample(run: Any, raw: dict[str, Any], index: int) -> dict[str, Any]:
 
     Args:
         run: The run file of the data set.
-        raw: It as TOML, without what makes it a data set.
-        index: Of the sample.
+        raw: The same as TOML, without its data-set sections.
+        index: Index of the sample.
 
     Raises:
         InputError: A key that is not there, since another drawn value has replaced its table.
