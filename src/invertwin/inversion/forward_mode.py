@@ -1,7 +1,6 @@
 """Forward-mode derivatives of functions of a module's parameters."""
 
 from collections.abc import Callable, Mapping
-from typing import TypeVar
 
 import torch
 import torch.autograd.forward_ad as forward_ad
@@ -9,17 +8,15 @@ from torch import Tensor, nn
 
 from invertwin.runtime.concurrency import tracer_lock
 
-Result = TypeVar("Result")
-
 
 class _Evaluation(nn.Module):
     """Module whose call evaluates a function of another module's parameters."""
 
-    def __init__(self, module: nn.Module, function: Callable[[], Result]) -> None:
+    def __init__(self, module: nn.Module, function: Callable[[], list[Tensor]]) -> None:
         super().__init__()
         self.module, self._function = module, function
 
-    def forward(self) -> Result:
+    def forward(self) -> list[Tensor]:
         return self._function()
 
 
