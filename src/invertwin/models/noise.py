@@ -18,7 +18,15 @@ def noisy_realisations(
     *,
     holds_fields: bool = False,
 ) -> Callable[[int, float], Tensor]:
-    """Looks with noise: a function of their number gives beat signals, another shows them."""
+    """Return realisations of a map with receiver noise.
+
+    Args:
+        simulate_beat: function of a realisation's number that returns its beat signal.
+        to_map: function that turns a beat signal into a map, as the model observes it.
+        sensor: radar with a sampled waveform.
+        seed: seed of the noise that calibrates the level of a bin.
+        holds_fields: whether maps hold parts of fields, not power.
+    """
     assert isinstance(sensor.waveform, SampledWaveform)
     shape = (*sensor.shape, sensor.waveform.samples)
 
@@ -38,7 +46,13 @@ def noisy_realisations(
 
 
 def add_white_errors(mean: Tensor, scatter: float | None) -> Callable[[int, float], Tensor]:
-    """Looks at a map with white errors: of a known deviation, or of the mean square asked for."""
+    """Return realisations of a map with white errors.
+
+    Args:
+        mean: map without errors.
+        scatter: standard deviation of the errors; None = the square root of the mean square that
+            each realisation is called with.
+    """
     mean = mean.detach()
 
     def realise(number: int, noise: float) -> Tensor:

@@ -27,7 +27,7 @@ class PositionSample:
     """Predicted map and paths of one position.
 
     Attributes:
-        place: Of the radar [m].
+        position: position of the radar [3], m.
         points: Where the paths meet surfaces first and last [m].
         power: Of each path, received over transmitted.
         bins: Range and u of each path, in bins.

@@ -28,7 +28,7 @@ class SensorMaps:
     Attributes:
         frames: Numbers of its positions.
         grid: Middle of the first bin and distance of the bins, of range [m] and of u.
-        places: Of the radar [m], [frame, 3]; none where nothing links maps to places.
+        positions: positions of the radar [frame, 3], m; none where nothing links maps to them.
         rotations: Columns are the radar's axes, [frame, 3, 3].
         origins: Range from which each position counts its own [m].
         measured: Power [frame, range, u], if there is any.

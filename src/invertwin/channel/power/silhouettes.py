@@ -292,6 +292,12 @@ def classify_sides(
 
     An opaque edge is a silhouette if one side is free. In float64: the triangles of a fine mesh
     are nearly edge-on at the boundary of a shadow.
+
+    Args:
+        rays: ray scene.
+        inputs: attached tables of the scene.
+        edge: index of each edge.
+        direction: direction from the shadowing point to the edge [lane, 3].
     """
     topology = rays.topology
     y0, y1 = rays.exact_ends(edge)
@@ -398,7 +404,14 @@ def trace_past_edge(
 def is_not_grazing(
     rays: RayScene, face: mit.UInt32, direction: mit.Vector3f, active: mit.Bool
 ) -> mit.Bool:
-    """Compute the mask of rays that are not in the plane of the triangle they meet."""
+    """Compute the mask of rays that are not in the plane of the triangle they meet.
+
+    Args:
+        rays: ray scene.
+        face: index of the triangle that each ray meets.
+        direction: direction of each ray [lane, 3].
+        active: mask of valid rays.
+    """
     normal = face_normal(rays.corners(face, active))
     return active & (dr.abs(dr.dot(normal, direction)) > _MIN_GRAZING_COSINE * dr.norm(direction))
 

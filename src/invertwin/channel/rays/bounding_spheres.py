@@ -28,7 +28,13 @@ class LoopRecorder(Protocol):
     def loop(
         self, state: State, going: Callable[..., mit.Bool], step: Callable[..., State]
     ) -> State:
-        """Record a loop, see ``Occluders.loop``."""
+        """Record a loop, see ``Occluders.loop``.
+
+        Args:
+            state: variables of the loop.
+            going: function of the state that returns the mask of lanes that go on.
+            step: function of the state that returns the next state.
+        """
         ...
 
 

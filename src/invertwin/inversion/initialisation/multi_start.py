@@ -78,14 +78,14 @@ class Search:
     """Result of a multi-start fit.
 
     Attributes:
-        best: The fit with the lowest loss.
-        minima: All ends that differ, the best first.
-        rivals: For every end how unlikely the difference of its loss and the best one's is, were it
-            right, in standard deviations over looks at its twin. None where there are no looks.
-        ambiguities: A sentence for every end that the data do not reject.
-        best_number: Of the best fit, as ``callbacks`` got it.
-        objects: Names of those with several starts.
-        losses: Of all candidates at the widest blur, in their order.
+        best: fit with the lowest loss.
+        minima: all ends that differ, the best first.
+        scores: z-score of every end: the difference of its loss and the best one's, in standard
+            deviations over realisations of its own twin. None where there are no realisations.
+        ambiguities: a sentence for every end that the data do not reject.
+        best_number: number of the best fit, as ``callbacks`` got it.
+        objects: names of the objects with several starts.
+        losses: losses of all candidates at the widest blur, in their order.
     """
 
     best: Reconstruction
