@@ -343,7 +343,7 @@ class Viewer:
     def _show_step(self, state: _ViewerState) -> None:
         if not self._steps or state.step == self._taken:
             return
-        if state.moved != _NO_OBJECT:
+        if state.moved_object != _NO_OBJECT:
             self._mover.value = _NO_OBJECT  # what was moved stands where the step has it
         self._taken, step = state.step, self._steps[state.step]
         for layer in self._display.show_step(step).layers:
@@ -365,10 +365,12 @@ class Viewer:
             maps |= found.maps_of_frame(state.frame)
         if link is None:
             scene = None
-        elif state.moved == _NO_OBJECT:
+        elif state.moved_object == _NO_OBJECT:
             scene = link.scene
         else:
-            scene = link.move_object(state.moved, self._rigid_motion(state.turn, state.place))
+            scene = link.move_object(
+                state.moved_object, self._rigid_motion(state.quaternion, state.position)
+            )
         if link is not None and scene is not None:
             maps |= {SIMULATED: to_float32(link.predict_map(scene, state.frame))}
         self._panels.show(maps, state.bin)
