@@ -20,7 +20,7 @@ from invertwin.radar.waveform import unit_window
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, existing_file
 
-RecordingT = TypeVar("Recorded", bound=Capture | ChirpCapture)
+RecordingT = TypeVar("RecordingT", bound=Capture | ChirpCapture)
 _MIN_RELATIVE_GAIN = 1e-3
 
 

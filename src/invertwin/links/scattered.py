@@ -186,8 +186,8 @@ class _IncoherentMaterial(Material):
     def faces(self) -> int | None:
         return self.base.faces
 
-    def surface(self, frequency: float) -> ScatteringLaw:
-        """See ``Material.incoherent``."""
+    def scattering_law(self, frequency: float) -> ScatteringLaw:
+        """Return the incoherent part of the law. See ``Material.incoherent_law``."""
         return self.base.incoherent_law(frequency)
 
 
