@@ -102,27 +102,27 @@ def run_reconstruct(
             problem, folder, console, None if live is None else partial(_show_step, live)
         )
     fits = replace(fits, maps=_maps(fits))
-    metrics = _metrics(fits, console)
+    with show_progress(console):
+        confidence = confidence_metrics(fits.found, known_truth(fits.problem))
+        confidence = fits.problem.kind.revise_confidence(fits, confidence)
+    metrics = _metrics(fits, confidence)
     if run.landscape is not None and isinstance(run.data, SimulatedData):
         figure, minima = plot_landscape(fits.problem, console)
         save_picture(folder, "landscape", figure)
         metrics["landscape"] = minima
     metrics["wall_seconds"] = time.perf_counter() - begin
-    return _write(fits, metrics, folder)
+    return _write(fits, metrics, confidence, folder)
 
 
-def _metrics(fits: Fits, console: Console) -> dict[str, Any]:
+def _metrics(fits: Fits, confidence: dict[str, Any]) -> dict[str, Any]:
     """Numbers of the run, as metrics.json has them."""
     problem, best, rows = fits.problem, fits.best, fits.rows
-    with show_progress(console):
-        believed = confidence_metrics(fits.found, known_truth(problem))
-        believed = problem.kind.revise_confidence(fits, believed)
     kept = ("other_ends", "ambiguities", "status", "steps", "loss", "start")
     return {
         "task": problem.run.task,
         "starts_count": len(rows[OWN_METHOD]),
-        **believed,
-        **{key: best[key] for key in kept if key in best and key not in believed},
+        **confidence,
+        **{key: best[key] for key in kept if key in best and key not in confidence},
         "parameters": best["values"],
         **problem.notes,
         **{
@@ -147,13 +147,15 @@ def _maps(fits: Fits) -> dict[str, list[torch.Tensor]]:
     }
 
 
-def _write(fits: Fits, metrics: dict[str, Any], folder: RunFolder) -> tuple[list[ReportTable], str]:
+def _write(
+    fits: Fits, metrics: dict[str, Any], confidence: dict[str, Any], folder: RunFolder
+) -> tuple[list[ReportTable], str]:
     """Write the report, the display and the meshes of the best fit."""
     problem, best, run = fits.problem, fits.best, fits.problem.run
     start, twin = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
     summary = problem.kind.summary(fits, metrics, folder)
     steps = load_steps(folder.file(steps_path(best["checkpoint"])))
-    display = make_fit_display(problem, start, twin, fits.maps, metrics, steps)
+    display = make_fit_display(problem, start, twin, fits.maps, confidence, steps)
     display.save(folder.file(VIEW_FILE))
     sensors = dict(zip(problem.sensor_data, fits.found.sensors, strict=True))
     links = {
