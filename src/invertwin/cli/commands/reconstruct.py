@@ -117,6 +117,7 @@ def run_reconstruct(
 def _metrics(fits: Fits, confidence: dict[str, Any]) -> dict[str, Any]:
     """Numbers of the run, as metrics.json has them."""
     problem, best, rows = fits.problem, fits.best, fits.rows
+    dropped = problem.kind.histories
     kept = ("other_ends", "ambiguities", "status", "steps", "loss", "start")
     return {
         "task": problem.run.task,
@@ -126,11 +127,11 @@ def _metrics(fits: Fits, confidence: dict[str, Any]) -> dict[str, Any]:
         "parameters": best["values"],
         **problem.notes,
         **{
-            f"starts_{method}": drop_histories(rows[method])
+            f"starts_{method}": drop_histories(rows[method], dropped)
             for method in rows
             if method != OWN_METHOD
         },
-        "starts": drop_histories(rows[OWN_METHOD]),
+        "starts": drop_histories(rows[OWN_METHOD], dropped),
         **problem.kind.metrics(fits),
         "fit_seconds": sum(row["seconds"] for fits in rows.values() for row in fits),
     }

@@ -36,6 +36,8 @@ OWN_METHOD, INTERIOR_ONLY = "full", "interior_only"
 OF_SENSORS = ("radar_pose", "radar_path", "transmitter", "panel", "panel_phases")
 """Kinds of parameters that belong to a sensor."""
 _POSED = ("translation", "pose", "scale", "body", "vertices", "mover")
+HISTORIES = ("losses", "curve", "checkpoint", "screened")
+"""Keys of rows that metrics.json leaves out."""
 Row = dict[str, Any]
 """Numbers of one fit."""
 
@@ -186,11 +188,13 @@ class DataKind(ABC):
         title: Of a report without one.
         unused: Sections that have no meaning for such data.
         methods: Further fits beside those of the run and its variants.
+        histories: Keys of rows that metrics.json leaves out.
     """
 
     title: ClassVar[str] = "Reconstruction"
     unused: ClassVar[tuple[str, ...]] = ()
     methods: ClassVar[tuple[str, ...]] = ()
+    histories: ClassVar[tuple[str, ...]] = HISTORIES
 
     @abstractmethod
     def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:

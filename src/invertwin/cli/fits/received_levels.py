@@ -50,6 +50,7 @@ class ReceivedLevels(DataKind):
     """Levels that receivers at known positions get of transmitters."""
 
     title: ClassVar[str] = "Received levels"
+    histories: ClassVar[tuple[str, ...]] = ("curve", "checkpoint", "screened")
     unused: ClassVar[tuple[str, ...]] = (
         *("radar", "grid", "chirps", "calibration", "landscape", "model", "placement"),
     )

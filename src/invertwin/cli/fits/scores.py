@@ -9,7 +9,7 @@ import torch
 
 from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
-from invertwin.cli.fits.problem import Problem, fitted_tables, require_settings
+from invertwin.cli.fits.problem import HISTORIES, Problem, fitted_tables, require_settings
 from invertwin.cli.fits.radar_models import (
     make_display_models,
     make_unblurred_models,
@@ -151,10 +151,11 @@ def score_held_out(
     }
 
 
-def drop_histories(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def drop_histories(
+    rows: Sequence[dict[str, Any]], dropped: Sequence[str] = HISTORIES
+) -> list[dict[str, Any]]:
     """The rows of the fits as metrics keep them."""
-    long = ("losses", "curve", "checkpoint")
-    return [{key: value for key, value in row.items() if key not in long} for row in rows]
+    return [{key: value for key, value in row.items() if key not in dropped} for row in rows]
 
 
 def predict_unblurred_maps(
