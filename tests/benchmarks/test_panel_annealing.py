@@ -1,6 +1,7 @@
 """Annealing keeps its best, and stops where a level is reached."""
 
 import tomllib
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -19,12 +20,17 @@ def own(panel_annealing, tmp_path):
 
 def test_annealing_gets_better_and_keeps_its_ranges(own):
     _, annealing = own
-    first, one = annealing.anneal(1, 1, 1e9)
-    module, count = annealing.anneal(40, 1, 1e9)
-    assert (one, count) == (1, 40)
-    assert annealing.level(module) > annealing.level(first)
-    placed = module[0]
-    assert abs(float(placed.yaw)) <= 25.0 / 57.29
+    # Half of these few receivers, so that most moves change the level.
+    annealing.aim = replace(annealing.aim, share=0.5)
+    gains = []
+    for seed in (1, 2, 3):
+        first, one = annealing.anneal(1, seed, 1e9)
+        module, count = annealing.anneal(20, seed, 1e9)
+        assert (one, count) == (1, 20)
+        gains.append(annealing.level(module) - annealing.level(first))
+        assert abs(float(module[0].yaw.detach())) <= 25.0 / 57.29
+    assert min(gains) >= 0.0
+    assert max(gains) > 0.01
 
 
 def test_a_fit_is_compared_at_an_equal_level(own, panel_annealing):
