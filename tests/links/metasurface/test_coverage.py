@@ -8,7 +8,7 @@ import torch
 
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.inversion import Observation, Optimizer, Stage
-from invertwin.inversion.initialisation.multi_start import Candidate, search
+from invertwin.inversion.initialisation.multi_start import Candidate, Screening, search
 from invertwin.inversion.loss import RatioLoss
 from invertwin.links import ElementPhases, Metasurface, PanelPlacement, WallPath
 from invertwin.links.metasurface.coverage import Coverage, soft_quantile
@@ -124,13 +124,11 @@ def test_a_fit_reaches_the_best_of_the_grid():
         own.scene,
         starts[0].observations,
         [],
-        starts,
+        Screening(starts, 2, shortlist=True),
         loss=RatioLoss(),
         optimizer=Optimizer(rate=0.15, rotation_rate=0.06, final_rate=0.003),
         schedule=[Stage(6, unknowns=("panel",)), Stage(15, models=[fine])],
         seed=3,
-        fits=2,
-        shortlist=True,
     )
     assert len(found.losses) == 6
     assert found.best_number == 2  # after two trials
