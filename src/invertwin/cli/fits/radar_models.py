@@ -26,6 +26,7 @@ from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.initialisation.detections import estimate_density
+from invertwin.inversion.initialisation.initial_pose import InitialPoseEstimator
 from invertwin.inversion.metrics import pose_error
 from invertwin.models.facets import FacetMap
 from invertwin.models.radar import ExactMap, SurrogateMap
@@ -222,7 +223,8 @@ def estimate_initial_scene(problem: Problem, console: Console) -> Problem:
             raise InputError("expected the name of an object, got none; add `object`")
         console.print(f"looking for {name} with a conventional detector")
         begin = time.perf_counter()
-        guess = table.build().estimate(
+        estimator: InitialPoseEstimator = table.build()
+        found = estimator.estimate(
             problem.scene,
             name,
             item.recording,
@@ -230,15 +232,17 @@ def estimate_initial_scene(problem: Problem, console: Console) -> Problem:
             loss=build.build_loss(run),
             seed=run.seed,
         )
-        scene = _add_density(problem, guess.scene, name)
-    found: dict[str, Any] = {"initial_points": guess.points} if guess.points else {}
-    if guess.size is not None:
+        scene = _add_density(problem, found.scene, name)
+    notes: dict[str, Any] = {}
+    if found.detection_count:
+        notes["initial_points"] = found.detection_count
+    if found.rectangle_size is not None:
         known = table.scale and name in problem.known_objects
-        off = pose_error(guess.scene[name], problem.truth[name]) if known else None
-        found |= {"initial_scale_error": abs(off.scale - 1)} if off else {}
-        found |= {"initial_losses": guess.losses, "initial_size_m": list(guess.size)}
-    found["initial_seconds"] = time.perf_counter() - begin
-    return replace(problem, scene=scene, notes={**problem.notes, **found})
+        off = pose_error(found.scene[name], problem.truth[name]) if known else None
+        notes |= {"initial_scale_error": abs(off.scale - 1)} if off else {}
+        notes |= {"initial_losses": found.losses, "initial_size_m": list(found.rectangle_size)}
+    notes["initial_seconds"] = time.perf_counter() - begin
+    return replace(problem, scene=scene, notes={**problem.notes, **notes})
 
 
 def _add_density(problem: Problem, scene: Scene, name: str) -> Scene:
