@@ -92,7 +92,7 @@ def test_textures_are_laid_over_the_object(tmp_path):
     found = material_of(table, tmp_path)
     assert isinstance(found.permittivity, Texture)
     assert found.faces == 2
-    assert found.surface(77e9).amplitude.shape == (2, 256)
+    assert found.scattering_law(77e9).amplitude.shape == (2, 256)
 
 
 def test_run_files_with_materials_are_written_and_read_again(tmp_path):

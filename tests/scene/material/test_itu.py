@@ -76,7 +76,7 @@ def test_materials_follow_the_frequency_of_the_radar(make):
         expected = fixed(*values).complex_permittivity(frequency)
         assert torch.equal(material.complex_permittivity(frequency), expected)
     assert not torch.equal(
-        material.scattering_law(10e9).amplitude, material.surface(77e9).amplitude
+        material.scattering_law(10e9).amplitude, material.scattering_law(77e9).amplitude
     )
 
 
