@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from invertwin.channel.power import integrand
 from invertwin.channel.power import random_walk as walk
@@ -39,6 +39,7 @@ from invertwin.channel.sampling import Sampling
 _SECOND_PART_OFFSET = 1 << 30  # added to indices, so that both parts have their own random numbers
 
 
+@runtime_checkable
 class _Sampler(Protocol):
     """Sampler of points of boundary paths."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ _EMPTY_SPHERE = (0.0, 0.0, 0.0, -1.0)  # a sphere that no ray meets
 State = TypeVar("State", bound=tuple[object, ...])
 
 
+@runtime_checkable
 class LoopRecorder(Protocol):
     """Ray scene as the loops over its objects see it."""
 
