@@ -130,7 +130,7 @@ def test_both_ways_are_equal(pair, places):
     turned = thing(trihedral(EDGE), turn=(0.1, 0.2, 0.4), material=METAL)
     # Few rays, of which none grazes an edge: there rounding decides who sees what.
     ways = [
-        complex(summed(traced(Scene({"a": turned}), way, depth=3, conductor_samples=2000)))
+        complex(summed(traced(Scene({"a": turned}), way, depth=3, samples=2000)))
         for way in (there, back)
     ]
     assert ways[0] == pytest.approx(ways[1], rel=1e-6)
