@@ -184,7 +184,7 @@ def build_capture(data: Any) -> Capture:
         found = data.build()
         if isinstance(found, Capture):
             return found
-        return found.capture("mean" if data.chirp is None else data.chirp)
+        return found.to_capture("mean" if data.chirp is None else data.chirp)
 
 
 def build_chirp_capture(data: Any) -> ChirpCapture:
