@@ -487,6 +487,7 @@ def test_exact_signals_as_the_model(case):
         case.scene,
         Observation(ExactMap(case.grid, drawn, speckle), case.capture, sensor=case.radar),
         case.parameters(),
+        loss=SpectrumLoss("mse"),
         optimizer=settings["optimizer"],
         schedule=Schedule(FAST["steps"]),
         seed=3,

@@ -130,7 +130,7 @@ def test_coordinates_are_the_numbers_of_the_figure():
         ball,
     ):
         one = PrimitiveModel("thing", figure, Ground())
-        names = {"x": "place", "z": "place"}
+        names = {"x": "position", "z": "position"}
         for row in iterate_coordinates(one):
             name = row.name.removeprefix("thing.")
             moved = PrimitiveModel("thing", figure, Ground())

@@ -158,7 +158,7 @@ def _check_rcs(run: RunFile) -> tuple[list[ReportTable], str]:
         chosen = torch.linspace(0, count - 1, aspects).round().long().tolist()
         begin = time.perf_counter()
         with prefix_errors("rcs"), torch.no_grad():
-            table.at(chosen).build({Scene: scene})
+            table.select_aspects(chosen).build({Scene: scene})
         return time.perf_counter() - begin
 
     time_aspects(1)  # compiled now
