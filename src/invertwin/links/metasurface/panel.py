@@ -312,7 +312,9 @@ def _check_positions(value: ArrayLike, what: str) -> Tensor:
     given = given[None] if given.ndim == 1 else given
     found = checked_tensor(given, (None, 3), f"{what} places [m]", "give x, y, z of each")
     if not len(found):
-        raise InputError(f"expected at least one position of {what}, got none; give x, y, z of each")
+        raise InputError(
+            f"expected at least one position of {what}, got none; give x, y, z of each"
+        )
     return found
 
 
