@@ -24,6 +24,7 @@ from invertwin.cli.fits.problem import make_observations, make_schedule
 from invertwin.cli.fits.radar_models import build_sensors
 from invertwin.cli.report import ReportTable, load_texts
 from invertwin.cli.schema import RunFile, SimulatedData, build
+from invertwin.cli.schema.radio_tables import ReceivedData
 from invertwin.cli.schema.recordings import build_chirp_capture
 from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.cli.schema.shape_tables import MovingTargetParameter
@@ -87,6 +88,10 @@ def _make_tables(
 
 def _check_other_data(run: RunFile) -> tuple[list[ReportTable], str]:
     """Check fits to other data than radar maps: the time of one map of each stage."""
+    if isinstance(run.data, ReceivedData):
+        # Data that know no more than the fit are simulated in the time of one map.
+        known: dict[str, None] = dict.fromkeys(("bandwidth", "depth", "edges", "rays"))
+        run = run.model_copy(update={"data": run.data.model_copy(update=known)})
     problem = build_problem(run, Console(quiet=True))
     observation = make_observations(problem, problem.starts()[0])[0]
     sensor = observation.sensor
