@@ -156,7 +156,7 @@ class Estimator:
             )
             walk = RandomWalk(self.rays, self.inputs, seed)
             for paths in boundary.trace_boundary_paths(self.rays, attached, walk, points):
-                total = paths.sum_weighted(lambda _, exists: dr.select(exists, 1.0, 0.0))
+                total = paths.sum_weighted(lambda _, exists: dr.select(exists, mi.Float(1.0), 0.0))
                 dr.backward_from(paths.speed * total)
         gradient = from_points(dr.grad(vertices)).numpy()
         seconds = perf_counter() - start
@@ -171,7 +171,7 @@ def compare(body: Mesh, samples: int, seeds: int) -> dict[str, Any]:
     with torch_threads(1):
         for seed in range(WARM_UP + seeds):
             for name, weighted in WAYS.items():
-                value, seconds = estimate(samples, seed, importance_sampling=weighted)
+                value, seconds = estimate(samples, seed, weighted=weighted)
                 values[name].append(value)
                 times[name].append(seconds)
     found: dict[str, Any] = {}

@@ -126,40 +126,6 @@ class Signature:
         return torch.cat(found).reshape(*positions.shape[:-1], 2, 2)
 
 
-def _check_sweep(
-    directions: ArrayLike,
-    receivers: ArrayLike | None,
-    frequencies: float | Sequence[float] | Tensor,
-) -> tuple[Tensor, Tensor | None, Tensor]:
-    """Check aspects and frequencies, and return them as tensors without derivatives."""
-    transmitters = _check_directions(directions, "directions")
-    receiver_directions = None if receivers is None else _check_directions(receivers, "receivers")
-    if receiver_directions is not None and len(receiver_directions) != len(transmitters):
-        raise InputError(
-            f"expected {len(transmitters)} receivers, one for each direction, got "
-            f"{len(receiver_directions)}; give as many"
-        )
-    sweep = checked_tensor(
-        torch.atleast_1d(torch.as_tensor(frequencies, dtype=torch.float64)),
-        (None,),
-        "frequencies [Hz]",
-        "give one or more",
-    )
-    for frequency in sweep.tolist():
-        checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-    for value, what in (
-        (transmitters, "directions"),
-        (receiver_directions, "receivers"),
-        (sweep, "frequencies"),
-    ):
-        if is_differentiated(value):
-            raise InputError(
-                f"expected {what} without derivatives, got some that require grad; turn the scene "
-                "instead, or detach them"
-            )
-    return transmitters, receiver_directions, sweep
-
-
 def rcs(
     scene: Scene,
     directions: ArrayLike,

@@ -5,6 +5,7 @@ import re
 import signal
 import sys
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -53,7 +54,7 @@ def test_a_running_ipython_gets_the_pages(monkeypatch):
     formatter = SimpleNamespace(for_type=registered.__setitem__)
     display = SimpleNamespace(formatters={"text/html": formatter})
     module = ModuleType("IPython")
-    shells = [SimpleNamespace(display_formatter=display)]
+    shells: list[Any] = [SimpleNamespace(display_formatter=display)]
     module.get_ipython = lambda: shells[0]
     monkeypatch.setitem(sys.modules, "IPython", module)
     register_formatters()

@@ -40,9 +40,9 @@ class _CommandGroup(TyperGroup):
         with exit_on_interrupt():
             return super().make_context(*args, **given)
 
-    def invoke(self, context: Any) -> Any:
+    def invoke(self, ctx: Any) -> Any:
         with exit_on_interrupt():
-            return super().invoke(context)
+            return super().invoke(ctx)
 
     def list_commands(self, ctx: Any) -> list[str]:
         self._add_plugins()

@@ -8,7 +8,7 @@ from torch import Tensor, distributed, nn
 
 from invertwin.errors import InputError
 
-_ViewItem = TypeVar("_View")
+_ViewItem = TypeVar("_ViewItem")
 
 
 def mean_over_views(

@@ -135,7 +135,7 @@ def test_derivatives_of_seams_are_refused():
     assert float((found.matrix - whole).abs().max()) < 1e-6 * float(whole.abs().max())
     place = float64([0.8, 0.0, 0.0]).requires_grad_()
     moved = Scene(
-        beside.objects | {"right": Object(plate(0.8, 0.8), METAL, rigid(translation=place))}
+        dict(beside.objects) | {"right": Object(plate(0.8, 0.8), METAL, rigid(translation=place))}
     )
     with pytest.raises(InputError, match="merge the vertices, or give edges=0"):
         rcs(moved, TOWARDS, SPEED_OF_LIGHT)
