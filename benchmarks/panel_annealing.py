@@ -26,8 +26,8 @@ from rich.console import Console
 
 from invertwin.cli.fits.kinds import build_problem
 from invertwin.cli.fits.problem import Problem
+from invertwin.cli.run_file import load_run
 from invertwin.cli.schema.placement import RandomPanels
-from invertwin.cli.schema.run_file import load_run
 from invertwin.links import ElementPhases, PanelPlacement
 from invertwin.seeds import derive_seed
 

@@ -53,8 +53,8 @@ from invertwin.cli.fits.fitting import run_fit
 from invertwin.cli.fits.kinds import build_problem
 from invertwin.cli.fits.problem import OWN_METHOD, Start
 from invertwin.cli.fits.spreading import FitWorkers
+from invertwin.cli.run_file import load_run, to_minimal_toml, to_toml, validate_run
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import load_run, to_minimal_toml, to_toml, validate_run
 from invertwin.runtime.engines import run_jobs
 from invertwin.storage.run_folder import open_run
 

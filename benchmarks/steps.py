@@ -42,8 +42,8 @@ from invertwin.cli.fits.problem import (
     make_schedule,
     make_unknowns,
 )
+from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import load_run
 from invertwin.inversion import Report, reconstruct
 
 RUN = Path(__file__).parents[1] / "experiments" / "demo.toml"

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from invertwin.cli.run_file import load_run, validate_run
 from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.run_file import load_run, validate_run
 from invertwin.registry.kinds import PLUGINS
 from invertwin_studies.recordings import rail_sar
 from pages import start_page_runner

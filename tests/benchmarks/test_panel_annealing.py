@@ -8,7 +8,7 @@ from rich.console import Console
 
 from cli.test_placement import ROOM
 from invertwin.cli.fits.kinds import build_problem
-from invertwin.cli.schema.run_file import validate_run
+from invertwin.cli.run_file import validate_run
 
 
 @pytest.fixture

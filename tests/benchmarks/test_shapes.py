@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from invertwin.cli.fits.problem import method_run
+from invertwin.cli.run_file import require_section
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import require_section
 from invertwin.scene import load_mesh
 from invertwin_studies.vehicles import Car, car_mesh
 

@@ -18,7 +18,7 @@ from rich.console import Console
 from cli.small import BEHIND, GRADCHECK, MATERIAL, RUN, STARTS, call, read_metrics
 from invertwin.cli import app
 from invertwin.cli import terminal as running
-from invertwin.cli.schema.run_file import load_run
+from invertwin.cli.run_file import load_run
 
 
 def test_help_names_the_commands(monkeypatch, capsys):

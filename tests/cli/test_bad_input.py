@@ -7,8 +7,8 @@ import torch
 from cli.small import BEHIND, MATERIAL, RUN, call, read_metrics
 from invertwin.capture import Capture
 from invertwin.capture.readers.netcdf import write_dataset
+from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import load_run
 from invertwin.scene import Mesh, plate
 from invertwin.scene.files import save_mesh
 from invertwin.storage.folders import MANIFEST

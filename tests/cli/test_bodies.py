@@ -9,8 +9,8 @@ import torch
 from invertwin.cli.fits.problem import Problem, initial_scenes
 from invertwin.cli.fits.radar_maps import RadarMaps
 from invertwin.cli.fits.scores import score_joints
+from invertwin.cli.run_file import validate_run
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import validate_run
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.lines import make_line
 from invertwin.scene import Scene

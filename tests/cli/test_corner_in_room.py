@@ -11,8 +11,8 @@ from invertwin.capture import Capture
 from invertwin.cli.fits.problem import Problem, SensorData, make_models
 from invertwin.cli.fits.radar_maps import RadarMaps
 from invertwin.cli.fits.radar_models import blur_end_step, make_unblurred_models
+from invertwin.cli.run_file import validate_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import validate_run
 from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap
 

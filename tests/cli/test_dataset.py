@@ -16,8 +16,8 @@ import invertwin
 from cli.small import call, read_metrics
 from invertwin.capture.readers import described_arrays
 from invertwin.cli.commands.dataset import make_sample_run, make_shard
+from invertwin.cli.run_file import load_run, to_toml, validate_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import load_run, to_toml, validate_run
 from invertwin.cli.schema.shape_tables import joint_positions
 from invertwin.cli.schema.variation import parse_key_path, set_values
 from invertwin.datasets import SampleDataset, object_labels

@@ -11,8 +11,8 @@ from invertwin.cli.commands import check as run_check
 from invertwin.cli.commands import gradcheck as run_gradcheck
 from invertwin.cli.commands import simulate as run_simulate
 from invertwin.cli.fits import radar_models
+from invertwin.cli.run_file import load_run, validate_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import load_run, validate_run
 from invertwin.errors import PhysicsWarning
 from invertwin.runtime.progress import format_duration
 from invertwin.scene import Mesh, shapes

@@ -8,7 +8,7 @@ from rich.console import Console
 from cli.small import call, read_metrics
 from invertwin.cli.fits.kinds import build_problem
 from invertwin.cli.fits.radar_models import estimate_initial_scene
-from invertwin.cli.schema.run_file import validate_run
+from invertwin.cli.run_file import validate_run
 
 
 def smaller(repository, **changes: str) -> str:

@@ -9,13 +9,13 @@ import torch
 
 from cli.small import call, read_metrics
 from invertwin.cli.commands.dataset import make_sample
+from invertwin.cli.run_file import validate_run
 from invertwin.cli.schema import build
 from invertwin.cli.schema.motion_tables import (
     build_moving_scene,
     joint_positions_at_start,
     scene_at_start,
 )
-from invertwin.cli.schema.run_file import validate_run
 from invertwin.errors import InputError
 from invertwin.scene import MovingScene, Scene, Waving
 

@@ -9,8 +9,8 @@ import torch
 from cli.small import call, read_metrics
 from invertwin.cli.fits.received_levels import spread_of_ends
 from invertwin.cli.fits.scores import error_bar_table
+from invertwin.cli.run_file import to_toml, validate_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import to_toml, validate_run
 from invertwin.errors import InputError
 from invertwin.inversion import SpectrumLoss
 from invertwin.links import ReceiverPoints

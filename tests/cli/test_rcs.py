@@ -6,7 +6,7 @@ import tomllib
 import pytest
 
 from invertwin.cli.app import app
-from invertwin.cli.schema.run_file import load_run, validate_run
+from invertwin.cli.run_file import load_run, validate_run
 from invertwin.errors import InputError
 
 PLATE = """

@@ -13,8 +13,8 @@ from invertwin.cli.fits.radar_maps import RadarMaps
 from invertwin.cli.fits.radar_models import blur_end_step
 from invertwin.cli.fits.shape_scores import is_shape_key, score_shape, shape_label
 from invertwin.cli.fits.writing import BestFit, make_tables
+from invertwin.cli.run_file import to_toml, validate_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import to_toml, validate_run
 from invertwin.cli.schema.shape_tables import shape_regularizers
 from invertwin.errors import InputError
 from invertwin.scene import Mesh, PriorShape

@@ -5,7 +5,7 @@ import tomllib
 import pytest
 
 from cli.small import RUN, call, read_metrics
-from invertwin.cli.schema.run_file import to_toml, validate_run
+from invertwin.cli.run_file import to_toml, validate_run
 from invertwin.errors import InputError
 from invertwin.radar import SURROGATES
 

@@ -10,7 +10,7 @@ import torch
 import invertwin as iw
 from cli.small import call
 from invertwin.capture import Capture
-from invertwin.cli.schema.run_file import load_run
+from invertwin.cli.run_file import load_run
 from invertwin.scene import linear_array
 
 STILL = torch.zeros(1, 3, dtype=torch.float64)

@@ -12,7 +12,7 @@ import pytest
 from cli.small import RUN, call, read_metrics
 from invertwin.cli.commands.view import load_display
 from invertwin.cli.fits.displays import VIEW_FILE, load_steps
-from invertwin.cli.schema.run_file import load_run
+from invertwin.cli.run_file import load_run
 from invertwin.viewer import Display, Viewer, content_security_policy
 
 EVIL = "<script>alert(1)</script>"

@@ -15,8 +15,8 @@ from cli.small import GRADCHECK, RUN, STARTS
 from fuzz.damage import SOUND, Files
 from invertwin.capture import Capture, ChannelCalibration, ChirpData, ChirpSettings, read, ti
 from invertwin.capture.readers.described_arrays import write_chirps
+from invertwin.cli.run_file import load_run, to_toml
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import load_run, to_toml
 from invertwin.inversion.callbacks import Checkpoint
 from invertwin.inversion.fingerprint import Fingerprint
 from invertwin.inversion.fit import Fit, FitProgress

@@ -4,8 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from invertwin.channel import Sampling
+from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import load_run
 from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, GradientReport, gradcheck
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Surrogate

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import load_run
 from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "camera"

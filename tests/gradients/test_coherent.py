@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from invertwin.cli.run_file import validate_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import validate_run
 from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, GradientReport, gradcheck
 from invertwin.models.rcs import RcsMap
 from invertwin.scene import Object, PerfectConductor, Scale, Scene, dihedral

@@ -11,9 +11,9 @@ import pytest
 from invertwin.capture import Capture
 from invertwin.channel import Sampling
 from invertwin.cli.fits.problem import stage_runs
+from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import SimulatedData, build
 from invertwin.cli.schema.radio_tables import ReceivedData
-from invertwin.cli.schema.run_file import load_run
 from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap
 from scenes import occluder, radar

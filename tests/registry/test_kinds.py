@@ -14,9 +14,9 @@ from annotated_types import Le
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.cli.run_file import require_section, to_toml, validate_run
 from invertwin.cli.schema.keys import json_schema
 from invertwin.cli.schema.recordings import build_chirp_capture
-from invertwin.cli.schema.run_file import require_section, to_toml, validate_run
 from invertwin.errors import InputError
 from invertwin.limits import Angle, Axes, Positive
 from invertwin.registry.kinds import registry

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from invertwin.cli.run_file import to_toml, validate_run
 from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.run_file import to_toml, validate_run
 from invertwin.errors import InputError
 from invertwin.storage.folders import LOCK, MANIFEST, UNFINISHED
 from invertwin.storage.run_folder import open_run, to_json_value

@@ -10,8 +10,8 @@ from invertwin.capture.channel_calibration import ChannelCalibration
 from invertwin.capture.readers import described_arrays
 from invertwin.capture.ti.mmwave_studio import read_studio
 from invertwin.capture.ti.sdk_cfg import read_cfg
+from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import load_run
 from invertwin.errors import InputError
 from invertwin.scene.files import load_mesh, load_scene_xml
 from invertwin.storage.untrusted import convert_read_errors, read_arrays, read_npy, safe_reader

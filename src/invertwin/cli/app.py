@@ -27,7 +27,7 @@ from invertwin.cli.options import (
     with_options,
 )
 from invertwin.cli.report import ReportTable
-from invertwin.cli.schema.run_file import prefix_file_errors
+from invertwin.cli.run_file import prefix_file_errors
 from invertwin.cli.terminal import limit_rate, load_runs, print_tables, run_folder, show_progress
 from invertwin.errors import InputError, exit_on_interrupt, to_one_line
 from invertwin.runtime.threads import available_threads
@@ -157,7 +157,7 @@ def plan(options: ResumableOptions, file: FileArgument) -> None:
 @app.command()
 def check(file: FileArgument, backend: BackendOption = None) -> None:
     """Say what a run file needs, memory and time, and do nothing else."""
-    from invertwin.cli.schema.run_file import load_run
+    from invertwin.cli.run_file import load_run
 
     run = load_run(file)
     from invertwin.cli.commands.check import run_check

@@ -10,8 +10,8 @@ import torch
 from invertwin.capture import Capture
 from invertwin.channel import Grid
 from invertwin.channel.sampling import resolve_densities
+from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData
-from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.cli.schema.signature import count_values
 from invertwin.errors import InputError
 from invertwin.inversion import require_edge_length

@@ -3,9 +3,9 @@
 import torch
 
 from invertwin.channel import Grid, Sampling
+from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData, sensors
 from invertwin.cli.schema.motion_tables import build_moving_scene, refuse_motion
-from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps

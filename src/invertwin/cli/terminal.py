@@ -16,7 +16,7 @@ from rich.text import Text
 
 from invertwin.cli.options import OutputOptions, RunOptions, console
 from invertwin.cli.report import ReportTable, format_cell, is_numeric_cell
-from invertwin.cli.schema.run_file import load_run, prefix_file_errors, require_section, to_toml
+from invertwin.cli.run_file import load_run, prefix_file_errors, require_section, to_toml
 from invertwin.errors import InputError
 from invertwin.runtime.progress import format_duration, progress_callback
 from invertwin.storage.folders import PARTS

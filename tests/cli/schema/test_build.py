@@ -9,8 +9,8 @@ import torch
 
 from invertwin.cli.fits.problem import Problem, initial_scenes
 from invertwin.cli.fits.radar_maps import RadarMaps
+from invertwin.cli.run_file import to_toml, validate_run
 from invertwin.cli.schema import build
-from invertwin.cli.schema.run_file import to_toml, validate_run
 from invertwin.errors import InputError
 from invertwin.inversion import displace, pose_error
 from invertwin.inversion.loss import SpectrumLoss

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from invertwin.cli.run_file import load_run, to_toml, validate_run
 from invertwin.cli.schema import build
 from invertwin.cli.schema.keys import key_tables
-from invertwin.cli.schema.run_file import load_run, to_toml, validate_run
 from invertwin.errors import InputError
 from invertwin.inversion.metrics import material_errors
 from invertwin.scene import (

@@ -15,9 +15,9 @@ from invertwin.capture.readers import described_arrays
 from invertwin.capture.ti import read_cfg, read_recording, read_settings
 from invertwin.cli import schema
 from invertwin.cli.commands.raw_files import make_chirp_settings
+from invertwin.cli.run_file import to_toml, validate_run
 from invertwin.cli.schema import build, sensors
 from invertwin.cli.schema.recordings import build_capture
-from invertwin.cli.schema.run_file import to_toml, validate_run
 from invertwin.errors import InputError
 from invertwin.radar import FMCW, OFDM, Impulse, SteppedFrequency
 from invertwin.radar.boards import board

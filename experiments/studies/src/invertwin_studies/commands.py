@@ -11,7 +11,7 @@ from invertwin.cli.options import FileArgument, OutputOptions, RunOptions, with_
 @with_options(RunOptions)
 def loss_scan(options: RunOptions, file: FileArgument) -> None:
     """Show the losses of signals and of the surrogate along a line."""
-    from invertwin.cli.schema.run_file import prefix_file_errors
+    from invertwin.cli.run_file import prefix_file_errors
     from invertwin.cli.terminal import load_runs, print_tables, run_folder
 
     runs = load_runs([file], options, "loss-scan", ("loss_scan", "radar", "grid", "data"))

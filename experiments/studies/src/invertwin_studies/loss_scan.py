@@ -14,8 +14,8 @@ from invertwin.cli.commands.landscape import evaluate_exact_losses, make_object_
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.report import ReportTable, save_picture, write_report
+from invertwin.cli.run_file import require_section
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import require_section
 from invertwin.errors import InputError
 from invertwin.inversion import Observation
 from invertwin.inversion.gradcheck.lines import ParameterLine, evaluate_losses

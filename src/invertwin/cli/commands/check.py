@@ -23,10 +23,10 @@ from invertwin.cli.fits.kinds import build_problem
 from invertwin.cli.fits.problem import make_observations, make_schedule
 from invertwin.cli.fits.radar_models import build_sensors
 from invertwin.cli.report import ReportTable, load_texts
+from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.cli.schema.radio_tables import ReceivedData
 from invertwin.cli.schema.recordings import build_chirp_capture
-from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.cli.schema.shape_tables import MovingTargetParameter
 from invertwin.inversion.observation import name_unknowns
 from invertwin.models.radar import SurrogateMap

@@ -20,15 +20,15 @@ from invertwin.channel import Paths
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact
 from invertwin.cli.report import ReportTable, quantity_table, write_report
-from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.motion_tables import joint_positions_at_start, scene_at_start
-from invertwin.cli.schema.run_file import (
+from invertwin.cli.run_file import (
     load_run,
     prefix_file_errors,
     require_section,
     to_toml,
     validate_run,
 )
+from invertwin.cli.schema import RunFile, build
+from invertwin.cli.schema.motion_tables import joint_positions_at_start, scene_at_start
 from invertwin.cli.schema.variation import draw_sample
 from invertwin.datasets import SampleDataset, object_labels, radar_labels, triangle_visibility
 from invertwin.datasets.shards import (

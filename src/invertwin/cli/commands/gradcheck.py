@@ -14,9 +14,9 @@ from invertwin import plotting
 from invertwin.channel import Grid, Sampling
 from invertwin.cli.estimate import SensorSetup, estimate_rcs_resources, require_resources
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
+from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.gradcheck import GradcheckTable
-from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.cli.schema.signature import expand_values
 from invertwin.cli.terminal import compute_in_parts
 from invertwin.errors import InputError

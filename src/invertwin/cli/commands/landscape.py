@@ -11,8 +11,8 @@ from rich.console import Console
 
 from invertwin import plotting
 from invertwin.cli.fits.problem import Problem, make_models
+from invertwin.cli.run_file import require_section
 from invertwin.cli.schema import RunFile, SimulatedData, build
-from invertwin.cli.schema.run_file import require_section
 from invertwin.cli.terminal import count_progress
 from invertwin.inversion import Observation
 from invertwin.inversion.gradcheck.lines import ParameterLine, evaluate_losses, make_line

@@ -13,8 +13,8 @@ from invertwin.cli.fits.problem import Problem, make_observations, make_unknowns
 from invertwin.cli.fits.radar_models import with_new_recording
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.report import ReportTable, load_texts, write_report
+from invertwin.cli.run_file import require_section
 from invertwin.cli.schema import PlanTable, RunFile, SimulatedData, build
-from invertwin.cli.schema.run_file import require_section
 from invertwin.cli.terminal import show_progress
 from invertwin.errors import InputError
 from invertwin.inversion import plan_error_bars, prepare_fit

@@ -5,8 +5,8 @@ from jaxtyping import Complex
 from torch import Tensor
 
 from invertwin.capture import ChirpSettings, adc_counts, make_settings, ti
+from invertwin.cli.run_file import prefix_errors
 from invertwin.cli.schema import RawTable, RunFile
-from invertwin.cli.schema.run_file import prefix_errors
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW

@@ -13,8 +13,8 @@ from invertwin import plotting
 from invertwin.capture import load_rcs
 from invertwin.cli.estimate import estimate_rcs_resources
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
+from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.cli.schema.signature import RcsMeasurement, RcsTable
 from invertwin.cli.terminal import compute_in_parts
 from invertwin.errors import InputError

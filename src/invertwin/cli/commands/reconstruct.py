@@ -36,8 +36,8 @@ from invertwin.cli.fits.scores import drop_histories
 from invertwin.cli.fits.shape_scores import check_measures
 from invertwin.cli.fits.spreading import QUIET_CONSOLE, FitWorkers, distribute_fits
 from invertwin.cli.report import ReportTable, ReportView, save_picture, write_report
+from invertwin.cli.run_file import to_minimal_toml, validate_run
 from invertwin.cli.schema import RunFile, SimulatedData
-from invertwin.cli.schema.run_file import to_minimal_toml, validate_run
 from invertwin.cli.terminal import show_progress
 from invertwin.errors import InputError
 from invertwin.inversion.confidence.report import confidence_metrics

@@ -21,8 +21,8 @@ from invertwin.cli.exact_signals import (
     simulate_exact,
 )
 from invertwin.cli.report import ReportTable, quantity_table, save_picture, write_report
+from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.models.radar import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, doppler_maps, velocity_span
 from invertwin.radar.radar import Radar

@@ -13,9 +13,9 @@ from invertwin.cli.commands.look import read_recording
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.options import TwinOptions
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
+from invertwin.cli.run_file import is_run_file, load_run, prefix_file_errors, require_section
 from invertwin.cli.schema import build
 from invertwin.cli.schema.recordings import SimulatedData
-from invertwin.cli.schema.run_file import is_run_file, load_run, prefix_file_errors, require_section
 from invertwin.discovery import Twin, average_chirps, twin
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.inversion.metrics import compare_shapes

@@ -11,8 +11,8 @@ from invertwin.channel import Grid
 from invertwin.cli.fits.displays import VIEW_FILE
 from invertwin.cli.fits.problem import fitted_objects
 from invertwin.cli.fits.radar_models import build_sensors
+from invertwin.cli.run_file import load_run, prefix_file_errors
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import load_run, prefix_file_errors
 from invertwin.errors import InputError
 from invertwin.radar import Radar
 from invertwin.viewer import (

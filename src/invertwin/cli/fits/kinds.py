@@ -7,8 +7,8 @@ from invertwin.cli.fits.panel_coverage import PanelCoverage
 from invertwin.cli.fits.problem import DataKind, Problem
 from invertwin.cli.fits.radar_maps import RadarMaps
 from invertwin.cli.fits.received_levels import ReceivedLevels
+from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.cli.schema.shape_tables import MovingTargetParameter
 from invertwin.errors import InputError
 

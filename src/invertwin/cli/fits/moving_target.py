@@ -36,10 +36,10 @@ from invertwin.cli.report import (
     quantity_table,
     save_picture,
 )
+from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.cli.schema.motion_tables import scene_at_start
 from invertwin.cli.schema.recordings import build_chirp_capture
-from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.cli.schema.shape_tables import MovingTargetParameter
 from invertwin.discovery import (
     MovingBody,

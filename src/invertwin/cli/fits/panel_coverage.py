@@ -29,9 +29,9 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.scores import drop_histories, error_bar_table
 from invertwin.cli.report import ReportTable, load_texts, save_picture
+from invertwin.cli.run_file import require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.placement import Placement, Trial
-from invertwin.cli.schema.run_file import require_section
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion import Reconstruction, Unknown
 from invertwin.inversion.initialisation.multi_start import Candidate

@@ -13,6 +13,7 @@ from rich.console import Console
 from torch import Tensor, nn
 
 from invertwin.cli.report import ReportPicture, ReportTable
+from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import (
     MeasuresTable,
     ReconstructTable,
@@ -22,7 +23,6 @@ from invertwin.cli.schema import (
     StageTable,
     build,
 )
-from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.cli.schema.shape_tables import shape_regularizers
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel

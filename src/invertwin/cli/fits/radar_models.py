@@ -20,9 +20,9 @@ from invertwin.cli.fits.problem import (
     sensor_runs,
     stage_runs,
 )
+from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SamplingBase, SimulatedData, build
 from invertwin.cli.schema.recordings import build_capture
-from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.initialisation.detections import estimate_density

@@ -29,9 +29,9 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.scores import error_bar_table, score_fit
 from invertwin.cli.report import ReportTable, load_texts, quantity_table, save_picture
+from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.radio_tables import ReceivedData, ReceivedFile
-from invertwin.cli.schema.run_file import prefix_errors, require_section
 from invertwin.cli.schema.shape_tables import module_values
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel

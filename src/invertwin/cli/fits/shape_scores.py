@@ -7,7 +7,7 @@ import torch
 
 from invertwin.cli.fits.problem import Problem
 from invertwin.cli.report import load_texts
-from invertwin.cli.schema.run_file import prefix_errors
+from invertwin.cli.run_file import prefix_errors
 from invertwin.errors import InputError
 from invertwin.inversion.metrics import (
     ShapeMetrics,

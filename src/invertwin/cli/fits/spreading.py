@@ -14,8 +14,8 @@ from pathlib import Path
 
 from rich.console import Console
 
+from invertwin.cli.run_file import to_minimal_toml, validate_run
 from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.run_file import to_minimal_toml, validate_run
 from invertwin.cli.terminal import show_progress
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.runtime.engines import Engine, run_jobs

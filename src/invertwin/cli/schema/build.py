@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from invertwin.cli.run_file import prefix_errors as prefix_errors
+from invertwin.cli.run_file import require_section, unknown_object_message
 from invertwin.cli.schema import RunFile, SceneFileTable
-from invertwin.cli.schema.run_file import prefix_errors as prefix_errors
-from invertwin.cli.schema.run_file import require_section, unknown_object_message
 from invertwin.cli.schema.sensors import grid as grid
 from invertwin.cli.schema.sensors import radar as radar
 from invertwin.cli.schema.shape_tables import ObjectTable, ShapePoseTable, module_values

@@ -2,8 +2,8 @@
 
 from torch import Tensor
 
+from invertwin.cli.run_file import prefix_errors
 from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.run_file import prefix_errors
 from invertwin.cli.schema.shape_tables import ObjectTable, body_template_of, joint_positions
 from invertwin.errors import InputError
 from invertwin.scene import MovingScene, ObjectMotion, Scene, Sitting, Walking, Waving

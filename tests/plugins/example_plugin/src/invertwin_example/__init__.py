@@ -26,7 +26,7 @@ class Survey:
 
 def plants(file: Annotated[Path, typer.Argument(help="Run file (TOML).")]) -> None:
     """Tell how densely the plants of a run file stand."""
-    from invertwin.cli.schema.run_file import load_run, require_section
+    from invertwin.cli.run_file import load_run, require_section
 
     survey = require_section(load_run(file), "survey", "plants").build()
     print(f"{survey.count / survey.area:g} plants per m²")

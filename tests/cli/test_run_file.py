@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from cli.small import RUN
+from invertwin.cli.run_file import load_run, to_minimal_toml, validate_run
 from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.run_file import load_run, to_minimal_toml, validate_run
 from invertwin.errors import InputError
 
 REPOSITORY = Path(__file__).parents[2]
