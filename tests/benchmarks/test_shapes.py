@@ -152,7 +152,7 @@ def test_infinite_numbers_are_null_in_the_file(shapes, tmp_path, monkeypatch):
 
 def test_every_method_is_a_fit_of_the_run_file(shapes):
     run = shapes.load_run(shapes.RUN)
-    assert set(shapes.MODES.values()) == {shapes.FULL, *run.variants}
+    assert set(shapes.MODES.values()) == {shapes.OWN_METHOD, *run.variants}
     for mode in shapes.MODES.values():
         settings = require_section(method_run(run, mode), "reconstruct", "reconstruct")
         assert settings.steps % require_section(run, "measures", "reconstruct").every == 0
@@ -163,7 +163,7 @@ def test_both_run_files_are_one_experiment(shapes):
     one, other = (shapes.load_run(shapes.RUN.with_name(f"shape_car_{n}.toml")) for n in MAIN)
     same = {name: getattr(one, name) for name in ("title", "reconstruct", "optimizer", "variants")}
     assert other.model_copy(update=same) == one
-    for mine, theirs in ((shapes.FULL, "prior"), ("free", shapes.FULL), ("pose_only",) * 2):
+    for mine, theirs in ((shapes.OWN_METHOD, "prior"), ("free", shapes.OWN_METHOD), ("pose_only",) * 2):
         fits = method_run(one, mine), method_run(other, theirs)
         first, second = (
             found.model_copy(
@@ -226,7 +226,7 @@ def test_a_car_is_fitted(shapes, data_folder, monkeypatch):
     short = run.reconstruct.model_copy(update=cheap)
     few = run.data.model_copy(update={"points_per_m2": 50.0})
     every = run.measures.model_copy(update={"every": 1})
-    monkeypatch.setattr(shapes, "MODES", {"prior": shapes.FULL})
+    monkeypatch.setattr(shapes, "MODES", {"prior": shapes.OWN_METHOD})
     run = run.model_copy(update={"reconstruct": short, "data": few, "measures": every})
     (found,) = shapes.fitted(run).values()
     assert [step for step, _ in found["curve"]] == [1, 2, 3]
