@@ -136,7 +136,7 @@ def test_cars_that_others_fit_are_those_that_are_missing(shapes, tmp_path, monke
             yield at, work(jobs[at])
 
     monkeypatch.setattr(shapes, "run_jobs", spread)
-    found = shapes.measure(tmp_path, 3, run, shapes.Workers("ray", 1))
+    found = shapes.measure(tmp_path, 3, run, shapes.FitWorkers("ray", 1))
     assert asked == [("ray", 1, 2)]
     assert list(found["cars"]) == ["1", "2", "3"]
     assert found["worst"]["car"] == 3
