@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo -n)
 MAY_APT := command -v apt-get >/dev/null && $(SUDO) true 2>/dev/null
 APT := $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get -q
-LLVM_USABLE := $(BIN)/python -c 'from invertwin.runtime import doctor; doctor.require()' 2>/dev/null
+LLVM_USABLE := $(BIN)/python -c 'from invertwin.runtime import doctor; doctor.require_backend()' 2>/dev/null
 # Two processes, a file at a time: files share what is slow to make. What each test took goes to
 # out/tests; benchmarks/test_time.py reads it.
 PYTEST = $(BIN)/python -m pytest -n 2 --dist loadfile --junitxml=out/tests/$@.xml
@@ -176,6 +176,6 @@ $(BIN)/python:
 	    done; \
 	fi; \
 	$(LLVM_USABLE) || { \
-	    $(BIN)/python -c 'from invertwin.runtime import doctor; print(doctor.render(doctor.report()))'; \
+	    $(BIN)/python -c 'from invertwin.runtime import doctor; print(doctor.render_report(doctor.collect_report()))'; \
 	    exit 1; }
 	@touch $@

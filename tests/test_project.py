@@ -1,5 +1,6 @@
 """The public menu and the project's own files agree with each other."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -51,6 +52,17 @@ def test_importing_the_package_loads_no_ray_tracer():
     code = "import sys, invertwin; print(*{'drjit', 'mitsuba', 'torch'} & set(sys.modules))"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ended.stdout.strip() == ""
+
+
+def test_python_in_the_makefile_names_functions_that_exist(repository):
+    makefile = (repository / "Makefile").read_text()
+    calls = re.findall(r"from (invertwin[.\w]*) import (\w+); (.+)'", makefile)
+    assert len(calls) == makefile.count("-c 'from invertwin")
+    for package, module, code in calls:
+        imported = importlib.import_module(f"{package}.{module}")
+        functions = re.findall(rf"\b{module}\.(\w+)", code)
+        assert functions
+        assert [name for name in functions if not hasattr(imported, name)] == []
 
 
 def test_every_dependency_has_its_licence_in_the_notice(project, repository):

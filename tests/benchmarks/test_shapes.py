@@ -163,7 +163,11 @@ def test_both_run_files_are_one_experiment(shapes):
     one, other = (shapes.load_run(shapes.RUN.with_name(f"shape_car_{n}.toml")) for n in MAIN)
     same = {name: getattr(one, name) for name in ("title", "reconstruct", "optimizer", "variants")}
     assert other.model_copy(update=same) == one
-    for mine, theirs in ((shapes.OWN_METHOD, "prior"), ("free", shapes.OWN_METHOD), ("pose_only",) * 2):
+    for mine, theirs in (
+        (shapes.OWN_METHOD, "prior"),
+        ("free", shapes.OWN_METHOD),
+        ("pose_only",) * 2,
+    ):
         fits = method_run(one, mine), method_run(other, theirs)
         first, second = (
             found.model_copy(
