@@ -31,10 +31,8 @@ scene = iw.Scene(
         "table": iw.Object(iw.box([1.6, 0.8, 0.04]), board, at(1.6, 4.6, 0.75)),
     }
 )
-mast, reception = (
-    Transmitters(torch.tensor([[0.7, 0.6, 2.4]]).double()),
-    PropagationSettings(3.5e9, depth=2),
-)
+mast = Transmitters(torch.tensor([[0.7, 0.6, 2.4]]).double())
+reception = PropagationSettings(3.5e9, depth=2)
 zero, one, step = torch.tensor([0.0, 1.0, 0.02]).double()
 
 

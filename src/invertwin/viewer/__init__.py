@@ -16,7 +16,6 @@ from invertwin.viewer.link import InteractiveSensor as InteractiveSensor
 from invertwin.viewer.notebook import capture_html as capture_html
 from invertwin.viewer.notebook import radar_html as radar_html
 from invertwin.viewer.notebook import reconstruction_html as reconstruction_html
-from invertwin.viewer.notebook import register_formatters as register_formatters
 from invertwin.viewer.notebook import scene_html as scene_html
 from invertwin.viewer.notebook import show as show
 from invertwin.viewer.page import content_security_policy as content_security_policy
