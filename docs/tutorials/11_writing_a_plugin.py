@@ -22,8 +22,8 @@ from invertwin.scene import sphere
 # %% [markdown]
 # ## A package with a material
 # Foliage returns the same share of the power at every angle, equally in all directions. A material hands the ray
-# tracer a `ScatteringLaw`: the square root of its reflectance over the angle, and its diffuse share. The annotation `Share`
-# limits the value to 0 … 1, and the docstring explains the key of the run file. `register` gets a registry and adds
+# tracer a `ScatteringLaw`: the square root of its reflectance over the angle, and its diffuse share. The annotation
+# `UnitFraction` limits the value to 0 … 1, and the docstring explains the key of the run file. `register` gets a registry and adds
 # the contents of the package.
 
 # %%
@@ -33,7 +33,7 @@ from typing import ClassVar
 
 import torch
 
-from invertwin.limits import Share
+from invertwin.limits import UnitFraction
 from invertwin.registry import Registry
 from invertwin.scene import Material, ScatteringLaw
 
@@ -45,7 +45,7 @@ class Foliage(Material):
         share: of the power that comes back.
     """
 
-    share: Share | torch.Tensor = 0.05
+    share: UnitFraction | torch.Tensor = 0.05
     coherent: ClassVar[bool] = False  # a rough surface
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:

@@ -178,7 +178,7 @@ def test_a_mask_ends_where_objects_cross(monkeypatch):
         ends = [float(area(float64(0.1 + step), 4096)) for step in (-0.02, 0.02)]
     assert found == pytest.approx((ends[1] - ends[0]) / 0.04, rel=0.02)
     # The outline alone, without the curve in which the floor cuts the ball, says something else.
-    monkeypatch.setattr(ViewpointScene, "crossings", ViewpointScene.find_silhouettes)
+    monkeypatch.setattr(ViewpointScene, "find_intersections", ViewpointScene.find_silhouettes)
     assert float(forward(area, 0.1)) != pytest.approx(found, rel=0.2)
 
 

@@ -2,7 +2,6 @@
 
 import tomllib
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -34,7 +33,7 @@ def check_run(name: str, count: int) -> GradientReport:
     assert run.rcs is not None
     table, scene = run.rcs, build.scene(run)
     module, tangent = build.tangent(run, scene)
-    model = RcsMap(lambda seen, **more: table.build({Scene: seen}, **more))
+    model = RcsMap(compute=lambda seen, **more: table.build({Scene: seen}, **more))
     return gradcheck(
         model, module, tangent, scene=scene, sensor=None, settings=run.gradcheck.build()
     )
@@ -63,15 +62,14 @@ def test_a_plate_through_broadside_has_no_beams_that_end_on_it():
 
 def test_fixed_visibility_changes_no_value():
     corner = Scene({"corner": Object(dihedral(0.1, 1.5), PerfectConductor())})
-    seen = partial(
-        rcs, directions=aspect_directions([2.9, 3.1, 3.4], 0.2), frequencies=30e9, edges=0
-    )
-    model = RcsMap(seen)
+    model = RcsMap(aspect_directions([2.9, 3.1, 3.4], 0.2), 30e9, edges=0)
     value = model.predict(corner, None, 0)
     fixed = replace(model, boundary=False)
     assert torch.allclose(fixed.predict(corner, None, 1), value, rtol=1e-9)
-    assert torch.equal(model.observe(seen(corner)), value)
-    assert list(model.ablations().values()) == [fixed]
+    assert torch.equal(model.observe(rcs(corner, model.directions, 30e9, edges=0)), value)
+    (ablated,) = model.ablations().values()
+    assert isinstance(ablated, RcsMap)
+    assert (ablated.boundary, ablated.edges) == (False, 0)
     assert not fixed.ablations()
 
 
@@ -79,10 +77,10 @@ def test_fixed_visibility_changes_no_value():
 def test_both_modes_agree(boundary):
     """Reverse mode through the clipped polygons, against the forward mode of the check."""
     corner = Scene({"corner": Object(dihedral(0.1, 1.5), PerfectConductor())})
-    seen = partial(rcs, directions=aspect_directions([2.9, 3.4], 0.2), frequencies=30e9, edges=0)
+    model = RcsMap(aspect_directions([2.9, 3.4], 0.2), 30e9, edges=0)
     module = Scale("corner")
     report = gradcheck(
-        RcsMap(seen),
+        model,
         module,
         {"log_scale": 1.0},
         scene=corner,
@@ -90,6 +88,6 @@ def test_both_modes_agree(boundary):
         settings=GradcheckSettings(step=1e-5),
     )
     forward = report.gradient if boundary else report.interior_gradient
-    total = RcsMap(seen, boundary).predict(module(corner), None, 0).sum()
+    total = replace(model, boundary=boundary).predict(module(corner), None, 0).sum()
     (backward,) = torch.autograd.grad(total, [*module.parameters()])
     assert float(backward.sum()) == pytest.approx(float(forward.sum()), rel=1e-9)

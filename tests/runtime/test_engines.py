@@ -69,10 +69,10 @@ def test_ray_that_is_not_installed_is_told(monkeypatch):
 
 SLEEPER = """
 import time
-from invertwin.runtime.engines import spread
+from invertwin.runtime.engines import run_jobs
 if __name__ == "__main__":
     print("begun", flush=True)
-    list(spread(time.sleep, [60, 60], workers=2))
+    list(run_jobs(time.sleep, [60, 60], workers=2))
 """
 
 

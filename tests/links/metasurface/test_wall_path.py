@@ -55,7 +55,7 @@ def test_a_placed_panel_stays_focused():
         module = PanelPlacement(path, tx, target, FREQUENCY, (6, 4), along=along, yaw=yaw)
         with torch.no_grad():
             placed = module(plain)
-        elements = placed.cells.places
+        elements = placed.cells.centers
         length = (elements - tx).norm(dim=1) + (elements - target).norm(dim=1)
         left = placed.phase.ravel() - 2 * math.pi * FREQUENCY / SPEED_OF_LIGHT * length
         assert float(left.abs().max()) < 1e-9

@@ -102,7 +102,7 @@ def _losses(
     capture = Capture.from_beat(measured, radar)
     sampling = Sampling(depth=1, samples=settings.samples)
     model = SurrogateMap(grid, build.build_section(run, "surrogate"), sampling)
-    smooth = Observation(model, capture, sensor=radar, loss=build.build_section(run, "loss"))
+    smooth = Observation(model, capture, sensor=radar, loss=build.build_loss(run))
     first = radar.frames([0])
     views = _views(settings, first, grid)
 

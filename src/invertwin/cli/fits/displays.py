@@ -162,7 +162,7 @@ def make_sensor_maps(
         spectra: Power [frame, range, u, v] of every sensor, by what is shown.
         max_values: Values that are kept of a sensor, about; None = of a few megabytes.
     """
-    limit = {} if max_values is None else {"most": max_values}
+    limit = {} if max_values is None else {"max_values": max_values}
     return {
         name: DisplayMaps.from_spectra(
             {what: own[k] for what, own in spectra.items()}, item.grid, **limit
