@@ -129,9 +129,9 @@ def measure(
     signed(scene, 0.25, (*frequencies[:2], 2))
     rays = Rays()
     with (
-        patch.object(tubes, "next_surface", rays.traced(tubes.find_next_surface)),
-        patch.object(signature, "visible", rays.traced(signature.is_visible)),
-        patch.object(signature, "tubes", rays.bounced(signature.trace_tubes)),
+        patch.object(tubes, "find_next_surface", rays.traced(tubes.find_next_surface)),
+        patch.object(signature, "is_visible", rays.traced(signature.is_visible)),
+        patch.object(signature, "trace_tubes", rays.bounced(signature.trace_tubes)),
     ):
         start = perf_counter()
         found = signed(scene, DENSITY, frequencies)

@@ -84,7 +84,7 @@ def tubes_error(densities: tuple[float, ...]) -> dict[str, float]:
     exact = rcs(scene, directions, 30e9, edges=0).parts
     errors = {}
     for density in densities:
-        with patch.object(signature, "FEW", 0):
+        with patch.object(signature, "MAX_FACETS_BEAM_TRACING", 0):
             found = rcs(scene, directions, 30e9, edges=0, tubes_per_wavelength=density).parts
         for name, part in exact.items():
             errors[f"{name}_{density:g}"] = float((found[name] - part).norm() / part.norm())

@@ -122,7 +122,7 @@ def test_a_fit_is_seen_while_it_goes_on(run_file, monkeypatch, capsys):
         (own,) = found.values()
         (known,) = self._display.maps.values()
         begun.append(known.maps_of_frame(0)["simulated"])
-        maps.append(own.at(0)["simulated"])
+        maps.append(own.maps_of_frame(0)["simulated"])
 
     monkeypatch.setattr(Viewer, "add_step", noted)
     assert call(monkeypatch, "reconstruct", run_file, "--view", "-o", "watched") == 0

@@ -69,5 +69,5 @@ def test_the_mean_and_its_derivative_are_added_to_what_is_there():
 @pytest.mark.parametrize("views", [[], [0]])
 def test_nothing_to_do_is_told(views):
     module = torch.nn.Linear(1, 1) if not views else torch.nn.ReLU()
-    with pytest.raises(InputError, match="expected views and parameters"):
+    with pytest.raises(InputError, match="expected views and free parameters"):
         mean_over_views(lambda _: torch.zeros(()), views, module)

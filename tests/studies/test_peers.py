@@ -107,7 +107,7 @@ def test_edge_sampling_lacks_the_delay_and_nothing_else(radar, grid, turn, least
 
 def test_edge_sampling_refuses_what_it_cannot_do(radar, grid):
     def moved(scene, radar, theta):
-        return scene, radar.moved(torch.eye(3, dtype=torch.float64), ALONG * theta)
+        return scene, radar.transform_rigidly(torch.eye(3, dtype=torch.float64), ALONG * theta)
 
     with pytest.raises(InputError, match="moves the radar"):
         edge_sampling_derivative(

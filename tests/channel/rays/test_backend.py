@@ -13,10 +13,10 @@ from invertwin.channel import (
     backend,
     deposit_power,
     trace_field,
-    tracer_lock,
     use_backend,
 )
 from invertwin.errors import InputError
+from invertwin.runtime.concurrency import tracer_lock
 from scenes import GRID, link, occluder
 
 FEW = Sampling(depth=1, samples=4000, boundary_samples=500)

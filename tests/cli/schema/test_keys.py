@@ -29,12 +29,12 @@ def test_units_limits_and_defaults_are_shown():
     assert rows["range_min"] == [
         "number",
         "required",
-        "First range to cover [m], of at least 0 without a range origin",
+        "minimum range [m], at least 0 without a range origin",
     ]
     assert rows["u_max"] == [
         "number > 0, ≤ 1",
         "1.0",
-        "Direction cosine to the right; the map is as wide to the left",
+        "maximum direction cosine to the right; the map is symmetric",
     ]
 
 
