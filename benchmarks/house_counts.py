@@ -9,6 +9,7 @@ import re
 import tokenize
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 AnyFunction = ast.FunctionDef | ast.AsyncFunctionDef
@@ -29,6 +30,7 @@ IRREGULAR = frozenset(
 NOT_PARTICIPLES = ("embed", "exceed", "feed", "need", "proceed", "seed", "shed", "speed", "succeed")
 
 
+@cache
 def tree(file: Path) -> ast.Module:
     """Return the syntax tree of a file."""
     return ast.parse(file.read_text(encoding="utf-8"))

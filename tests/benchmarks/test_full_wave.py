@@ -40,6 +40,7 @@ def test_a_dihedral_across_its_crease(full_wave):
     assert "yes" in console.export_text()
 
 
+@pytest.mark.slow
 def test_a_cube_whose_faces_are_grazed_exactly(full_wave):
     metrics = full_wave.measure(["cube"])
     assert max(metrics["phase_deg"].values()) < 5.0

@@ -48,7 +48,6 @@ def test_a_stretch_below_one_is_refused(tmp_path):
         run_of(RUN + MODEL.replace("2.0", "0.5"), tmp_path)
 
 
-@pytest.mark.claim
 @pytest.mark.slow
 def test_a_corner_is_found_beside_rough_things(repository, tmp_path, monkeypatch):
     text = (repository / "experiments" / "corner_in_room.toml").read_text(encoding="utf-8")

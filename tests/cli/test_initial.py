@@ -26,7 +26,7 @@ def smaller(repository, **changes: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [pytest.param("points", marks=pytest.mark.claim), "image"])
+@pytest.mark.parametrize("method", ["points", "image"])
 def test_the_fit_adds_to_a_conventional_guess(method, repository, tmp_path, monkeypatch):
     text = smaller(repository, **{"[initial]": f'[initial]\nmethod = "{method}"'})
     file = tmp_path / "small.toml"

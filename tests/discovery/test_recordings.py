@@ -71,7 +71,6 @@ def room() -> Twin:
     return twin(capture, low=(-1.2, -1.2), high=(1.2, 1.2), level=0.0)
 
 
-@pytest.mark.claim
 @pytest.mark.slow
 def test_what_stands_in_a_room_is_found(room: Twin):
     assert len(room.objects) == 2
@@ -92,6 +91,7 @@ def test_what_stands_in_a_room_is_found(room: Twin):
     assert abs(math.remainder(long_way - 0.5, math.pi)) < math.radians(4)
 
 
+@pytest.mark.slow
 def test_what_is_likelier_something_else_becomes_that(monkeypatch):
     """The search ends with a box where a post stands."""
     monkeypatch.setattr(

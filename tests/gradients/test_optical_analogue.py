@@ -152,7 +152,6 @@ def mitsuba(seeds: int, size: int = 128) -> tuple[Tensor, Tensor, float]:
     return binned[0].mean(0), slope, float(error.sum() / slope.abs().sum())
 
 
-@pytest.mark.claim
 @pytest.mark.slow
 def test_the_optical_analogue_has_mitsubas_gradient():
     """Bin by bin to 2 %; fixed visibility alone is far off."""

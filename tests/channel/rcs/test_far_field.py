@@ -318,6 +318,7 @@ def test_edges_bring_a_plate_to_the_method_of_moments(channel):
     assert errors[2] < (0.6, 1.0)[channel]
 
 
+@pytest.mark.slow
 def test_creases_between_facets_of_a_flat_or_smooth_surface_are_no_edges():
     ball = traced(metal(sphere(0.03, 4)), random_directions(3), depth=1, edges=1)
     assert float(ball["edges 1"].abs().max()) == 0

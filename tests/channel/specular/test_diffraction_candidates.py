@@ -192,7 +192,6 @@ def test_a_lost_link_gives_zeros_and_zero_gradients():
     assert not rx.grad.any()
 
 
-@pytest.mark.claim
 @pytest.mark.slow
 def test_gradients_are_differences():
     """By the wall's place and turn, its size, the floor's height and the antennas."""

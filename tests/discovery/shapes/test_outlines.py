@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import pytest
 import torch
 
 import invertwin as iw
@@ -51,6 +52,7 @@ def overlap(prism: PrismParameters, corners: Sequence[tuple[float, float]]) -> f
     return float((first & second).sum()) / float((first | second).sum())
 
 
+@pytest.mark.slow
 def test_a_triangle_in_four_pieces_becomes_one_prism():
     search = search_for(wedge(CORNERS, 0.8), 24)
     assert search.held_out_frames is not None
@@ -73,6 +75,7 @@ def test_a_triangle_in_four_pieces_becomes_one_prism():
     assert gains[0] > gains[1] + 5
 
 
+@pytest.mark.slow
 def test_a_box_stays_a_box_and_others_are_left_alone():
     search = search_for(box((0.7, 1.2, 0.4)), 12)
     assert search.held_out_frames is not None

@@ -86,7 +86,9 @@ def score_fit(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
 def _frequency(problem: Problem) -> float:
     """Frequency at which materials are compared [Hz]."""
     table = problem.run.map
-    return problem.first_sensor.sensor.waveform.center_frequency if table is None else table.frequency
+    return (
+        problem.first_sensor.sensor.waveform.center_frequency if table is None else table.frequency
+    )
 
 
 def score_joints(body: SkinnedBody, start: Mesh, found: Mesh, truth: Mesh) -> dict[str, float]:
