@@ -85,10 +85,9 @@ def score_fit(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
 
 def _frequency(problem: Problem) -> float:
     """Frequency at which materials are compared [Hz]."""
-    table = problem.run.map
-    return (
-        problem.first_sensor.sensor.waveform.center_frequency if table is None else table.frequency
-    )
+    if problem.run.map is not None:
+        return problem.run.map.frequency
+    return problem.first_sensor.sensor.waveform.center_frequency
 
 
 def score_joints(body: SkinnedBody, start: Mesh, found: Mesh, truth: Mesh) -> dict[str, float]:
