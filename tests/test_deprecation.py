@@ -99,7 +99,7 @@ def test_samples_for_fields_of_conductors_warn():
     assert not torch.equal(new, signal(conductor_samples=21))
 
 
-def test_a_partial_function_for_an_rcs_map_warns():
+def test_a_partial_function_for_an_rcs_map_warns(unchecked):
     options: dict[str, Any] = {"directions": [[0.0, 0.0, 1.0]], "frequencies": [10e9]}
     part: Any = partial(iw.rcs, **options)
     with pytest.warns(DeprecationWarning, match=r"RcsMap\(partial.* → RcsMap\(directions"):

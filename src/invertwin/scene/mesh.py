@@ -4,13 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
+import numpy as np
 import torch
 from annotated_types import MinLen
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.checks import checked_tensor
+from invertwin.checks import checked_tensor, strip_derivatives
 from invertwin.errors import InputError
+from invertwin.scene import seams
 
 
 @dataclass(frozen=True)
@@ -63,12 +65,15 @@ class Mesh:
         object.__setattr__(self, "faces", checked_faces(self.faces, len(vertices)))
 
     def summary(self) -> "MeshSummary":
-        """Return its size and topology."""
-        places, faces = self.vertices.detach(), self.faces
-        pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-        _, counts = pairs.sort(dim=1).values.unique(dim=0, return_counts=True)
-        x, y, z = (places.amax(0) - places.amin(0)).tolist()
-        return MeshSummary((x, y, z), len(faces), int((counts == 1).sum()), int((counts > 2).sum()))
+        """Return its size and topology, of welded vertices and divided edges as rays meet them."""
+        points = strip_derivatives(self.vertices).numpy()
+        places = seams.separate_groups(points, np.zeros(len(points), dtype=np.int64))
+        welded = seams.weld_vertices(places)[strip_derivatives(self.faces).numpy()]
+        ends, _, _ = seams.half_edges(welded, places)
+        _, _, counts = seams.unique_edges(ends, len(places))
+        x, y, z = np.ptp(points, axis=0).tolist()
+        edges = int((counts == 1).sum()), int((counts > 2).sum())
+        return MeshSummary((x, y, z), len(self.faces), *edges)
 
     @property
     def center(self) -> Float64[Tensor, "3"]:

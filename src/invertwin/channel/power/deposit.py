@@ -138,7 +138,7 @@ def deposit_batch(
             "samples at a time"
         )
     with tracing(sampling.backend), torch_threads(1):
-        geometry = flatten(Scene(objects), link.wavelength)
+        geometry = flatten(Scene(objects), link.wavelength, scenes=owners)
         geometry, links = arrange_scenes(geometry, link, torch.tensor(owners))
         total = _sum_maps(_deposit_surfaces(geometry, links, grid, sampling, seed))
     return total.unflatten(0, (len(scenes), link.frame_count))

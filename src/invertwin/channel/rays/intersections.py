@@ -228,7 +228,8 @@ def intersect_triangles(
         nearby = topology.edge_apexes[edge.clamp_min(0)]
         there = ((points[nearby.clamp_min(0)] - plane[:, None]) * normal[:, None]).sum(2)
         mine = height.gather(1, apex)
-        across = ((nearby >= 0) & (there * mine < 0) & (there.abs() >= PLANE_TOLERANCE)).any(1)
+        across = (nearby >= 0) & (edge >= 0)[:, None] & (there * mine < 0)
+        across = (across & (there.abs() >= PLANE_TOLERANCE)).any(1)
         touching |= lies & ~across
         kept &= ~(lies & across & (mine[:, 0] > 0))  # the triangle on the other side has it
         sides.append(height)

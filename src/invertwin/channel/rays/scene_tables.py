@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Literal
@@ -151,7 +152,11 @@ def require_surfaces(scene: Scene, hint: str = "mesh them") -> None:
 
 
 def flatten(
-    scene: Scene, wavelength: float, *, motion: Literal["refused", "fixed", "free"] = "refused"
+    scene: Scene,
+    wavelength: float,
+    *,
+    motion: Literal["refused", "fixed", "free"] = "refused",
+    scenes: Sequence[int] | None = None,
 ) -> Geometry:
     """All objects of a scene in one set of tables.
 
@@ -159,6 +164,7 @@ def flatten(
         scene: Its objects.
         wavelength: [m].
         motion: Whether objects may move, and whether derivatives flow through their velocities.
+        scenes: Number of the scene of each object; None = one scene.
 
     Raises:
         InputError: An object in motion where a frame is one instant, a derivative with respect
@@ -179,8 +185,11 @@ def flatten(
             f"expected {what} velocities on {names}; a frame is one instant: use scene.at(time) "
             "and then replace(name, velocity=None), or simulate_chirps for motion within a frame"
         )
-    vertices = torch.cat(transform_vertices(objects))
-    topology = topology_of([item.mesh for item in objects])
+    parts = transform_vertices(objects)
+    vertices, topology = (
+        torch.cat(parts),
+        topology_of([item.mesh for item in objects], parts, scenes),
+    )
     surfaces, face_surface = _collect_scattering_laws(
         objects, SPEED_OF_LIGHT / wavelength, topology.face_object
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import OrderedDict
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +16,9 @@ from torch._C import _DisableFuncTorch
 
 from invertwin.channel.rays.arrays import to_float, to_index, to_signed
 from invertwin.channel.rays.backend import VARIANTS, backend, mi, mit
+from invertwin.channel.rays.rigid_groups import find_rigid_groups
 from invertwin.checks import strip_derivatives
+from invertwin.scene import seams
 from invertwin.scene.mesh import Mesh
 
 _MAX_CACHED_TOPOLOGIES = 8
@@ -34,10 +37,13 @@ class Topology:
     Args:
         faces: Vertex indices of all triangles.
         face_object: Object of every triangle.
-        vertices: In the objects' own frames; those of one object at one place count as one.
+        vertices: In the objects' own frames, or in the world where objects share edges.
+        groups: Group of each object, within which vertices at one place count as one.
     """
 
-    def __init__(self, faces: Tensor, face_object: Tensor, vertices: Tensor) -> None:
+    def __init__(
+        self, faces: Tensor, face_object: Tensor, vertices: Tensor, groups: np.ndarray
+    ) -> None:
         self.faces = faces
         self.face_object = face_object
         self.fallback_face: int | None = None  # a triangle that was no sliver when last looked at
@@ -50,15 +56,17 @@ class Topology:
         # Vertices of triangles, the first of each object among them, and the object of each.
         first = torch.searchsorted(owner[used], torch.arange(int(owner.max()) + 1))
         self.used_vertices = used.numpy(), first.numpy(), owner[used].numpy()
-        places = torch.cat([owner[:, None].double(), vertices], dim=1).numpy()
-        tables = edges_of(faces.numpy(), places)
+        places = seams.separate_groups(vertices.numpy(), groups[owner.numpy()])
+        welded = seams.weld_vertices(places)[faces.numpy()]
+        #: Vertices of triangles, where vertices at one place count as one.
+        self.welded_faces: Int64[Tensor, "f 3"] = torch.from_numpy(welded)
+        tables = edge_tables(welded, places)
         # Of each object, side by side: samples that follow this order are spread over its surface.
         order = torch.from_numpy(morton_order(vertices[tables[0]].mean(1).numpy()))
         order = order[owner[tables[0][order, 0]].argsort(stable=True)]
         self.edges, self.edge_apexes, self.edge_faces = (table[order] for table in tables)
         beside = self.edge_faces
-        alone = (self.edge_apexes >= 0).sum(1) == 1
-        self.open_objects = set(face_object[beside[alone, 0]].tolist())
+        self.open_objects = _open_objects(beside, face_object)
         self.device_faces = to_index(faces)
         #: The same, four numbers each, the last one zero: each is read as a whole.
         self.device_corners = to_index(torch.nn.functional.pad(faces, (0, 1)))
@@ -76,23 +84,15 @@ class Topology:
         self._scene: Any = None
 
     @cached_property
-    def welded_faces(self) -> Int64[Tensor, "f 3"]:
-        """Vertices of triangles, where vertices at one place count as one; in any order."""
-        table = self.faces.clone()
-        for face, apex in zip(self.edge_faces.T, self.edge_apexes.T, strict=True):
-            at = face >= 0
-            table[face[at]] = torch.cat([self.edges[at], apex[at, None]], 1)
-        return table
-
-    @cached_property
     def face_edges(self) -> Int64[Tensor, "f 3"]:
-        """The edge opposite to each of a triangle's ``welded`` vertices (−1: no proper edge)."""
-        table = torch.full_like(self.faces, -1)
+        """The edge opposite to each of a triangle's welded vertices; −1 = none, or several."""
+        table, number = torch.full_like(self.faces, -1), torch.zeros_like(self.faces)
         for face, apex in zip(self.edge_faces.T, self.edge_apexes.T, strict=True):
             edge = torch.nonzero(face >= 0)[:, 0]
             slot = (self.welded_faces[face[edge]] == apex[edge, None]).int().argmax(1)
             table[face[edge], slot] = edge
-        return table
+            number.index_put_((face[edge], slot), torch.ones_like(edge), accumulate=True)
+        return torch.where(number == 1, table, -1)
 
     def facet_angle(self, number: int, vertices: Float64[Tensor, "v 3"]) -> float:
         """Compute the typical angle between normals of neighbours where an object is curved [rad].
@@ -168,63 +168,113 @@ class Topology:
         }
 
 
-_topologies: OrderedDict[tuple, tuple[list[Tensor], Topology]] = OrderedDict()
+_topologies: OrderedDict[tuple, tuple[list[Tensor], Tensor | None, Topology]] = OrderedDict()
 
 
-def topology_of(meshes: list[Mesh]) -> Topology:
-    """The connectivity of meshes as one, kept between calls while their faces are the same."""
-    # The entry holds the face tensors, so that their ids stay theirs.
-    owners = [mesh.faces for mesh in meshes]
-    key = (VARIANTS[backend()], *map(id, owners))
-    if key not in _topologies:
-        starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
-        with _DisableFuncTorch():
-            faces = [
-                strip_derivatives(mesh.faces) + start
-                for mesh, start in zip(meshes, starts, strict=False)
-            ]
-            objects = [torch.full((len(mesh.faces),), n) for n, mesh in enumerate(meshes)]
-            # In the objects' own frames, where equal positions are equal to the last bit.
-            vertices = torch.cat([strip_derivatives(mesh.vertices) for mesh in meshes])
-            made = Topology(torch.cat(faces), torch.cat(objects), vertices)
-        _topologies[key] = (owners, made)
+def topology_of(
+    meshes: Sequence[Mesh],
+    vertices: Sequence[Float64[Tensor, "_ 3"]] | None = None,
+    scenes: Sequence[int] | None = None,
+) -> Topology:
+    """The connectivity of meshes as one, kept between calls while their faces are the same.
+
+    Args:
+        meshes: one of each object.
+        vertices: world positions of each object [m], with derivatives: objects that touch and
+            move together share edges. None = no object shares edges with another one.
+        scenes: scene of each object; None = one scene.
+    """
+    faces = [mesh.faces for mesh in meshes]
+    with _DisableFuncTorch():
+        groups = np.arange(len(meshes))
+        if vertices is not None:
+            groups = find_rigid_groups(faces, vertices, scenes)
+        shared = np.bincount(groups)[groups] > 1
+        # Joined objects in the world; else in their own frames, where no pose changes a seam.
+        points = [
+            strip_derivatives(vertices[n] if vertices is not None and shared[n] else mesh.vertices)
+            for n, mesh in enumerate(meshes)
+        ]
+        relative = _relative_distances(points, groups, shared) if shared.any() else None
+        # The entry holds the face tensors, so that their ids stay theirs.
+        key = (VARIANTS[backend()], groups.tobytes(), *map(id, faces))
+        _, known, found = _topologies.get(key, (faces, None, None))
+        if known is not None and relative is not None:
+            same = known.shape == relative.shape and torch.allclose(known, relative, atol=1e-9)
+            found = found if same else None
+        if found is None:
+            starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
+            own = [strip_derivatives(f) + start for f, start in zip(faces, starts, strict=False)]
+            objects = [torch.full((len(f),), n) for n, f in enumerate(own)]
+            found = Topology(torch.cat(own), torch.cat(objects), torch.cat(points), groups)
+            _topologies[key] = faces, relative, found
         while len(_topologies) > _MAX_CACHED_TOPOLOGIES:
             _topologies.popitem(last=False)
     _topologies.move_to_end(key)
-    return _topologies[key][1]
+    return found
+
+
+def _open_objects(edge_faces: Tensor, face_object: Tensor) -> set[int]:
+    """Objects that have an edge at which one triangle of theirs ends."""
+    edge, column = torch.nonzero(edge_faces >= 0, as_tuple=True)
+    owner = face_object[edge_faces[edge, column]]
+    pairs, counts = torch.stack([edge, owner], 1).unique(dim=0, return_counts=True)
+    return set(pairs[counts == 1, 1].tolist())
+
+
+def _relative_distances(
+    points: Sequence[Tensor], groups: np.ndarray, shared: np.ndarray
+) -> Float64[Tensor, "row 16"]:
+    """Distances from corners of each joined object to those of the first one of its group [m].
+
+    They stay while the objects of a group move as one body, of which the seams stay as they are.
+    """
+    first, rows = dict[int, Tensor](), []
+    for number in np.flatnonzero(shared).tolist():
+        own = points[number]
+        own = own[torch.linspace(0, len(own) - 1, 4).long()]
+        rows.append(torch.cdist(own, first.setdefault(groups[number], own)).flatten())
+    return torch.stack(rows)
 
 
 def edges_of(
-    faces: np.ndarray, vertex_keys: np.ndarray
+    faces: np.ndarray, points: np.ndarray, groups: np.ndarray | None = None
 ) -> tuple[Int64[Tensor, "e 2"], Int64[Tensor, "e k"], Int64[Tensor, "e k"]]:
     """Edges of a triangle mesh, with opposite vertex and number of every triangle at the edge.
 
-    Vertices with equal rows in ``vertex_keys`` (object and position) count as one, so that a mesh
-    with split vertices has no false open edges; objects that touch may part. The other two tables
-    have as many columns as the edge with most triangles (2 for a manifold mesh); absent ones are
-    −1.
+    Coincident vertices of one group count as one, and an edge ends where vertices of others lie on
+    it (``seams``), so that split vertices and T-junctions make no false open edges. The other two
+    tables have as many columns as the edge with most triangles, at least 2; absent
+    ones are −1.
 
     Args:
-        faces: Vertex indices of triangles.
-        vertex_keys: One row a vertex: object and position.
+        faces: vertex indices of triangles.
+        points: positions of vertices [m].
+        groups: group of each vertex, from 0; only those of one group are welded. None = all.
     """
-    _, first, inverse = np.unique(vertex_keys, axis=0, return_index=True, return_inverse=True)
-    welded = first[inverse.ravel()][faces]
-    corners = [(0, 1, 2), (1, 2, 0), (2, 0, 1)]
-    ends = np.concatenate([np.sort(welded[:, [a, b]], axis=1) for a, b, _ in corners])
-    apex = np.concatenate([welded[:, c] for _, _, c in corners])
-    proper = ends[:, 0] != ends[:, 1]
-    triangle = np.tile(np.arange(len(faces)), 3)[proper]
-    ends, apex = ends[proper], apex[proper]
-    edges, group, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(group.ravel(), kind="stable")
+    groups = np.zeros(len(points), dtype=np.int64) if groups is None else groups
+    places = seams.separate_groups(points, groups)
+    return edge_tables(seams.weld_vertices(places)[faces], places)
+
+
+def edge_tables(
+    faces: np.ndarray, places: np.ndarray
+) -> tuple[Int64[Tensor, "e 2"], Int64[Tensor, "e k"], Int64[Tensor, "e k"]]:
+    """Edges as ``edges_of`` returns them, of welded faces.
+
+    Args:
+        faces: welded vertices of triangles.
+        places: positions in units of the size of their group.
+    """
+    ends, apex, triangle = seams.half_edges(faces, places)
+    edges, group, counts = seams.unique_edges(ends, len(places))
+    order = np.argsort(group, kind="stable")
     start = np.repeat(np.cumsum(counts) - counts, counts)
-    opposite = np.full((len(edges), counts.max(initial=1)), -1, dtype=np.int64)
+    opposite = np.full((len(edges), counts.max(initial=2)), -1, dtype=np.int64)
     beside = opposite.copy()
-    at = group.ravel()[order], np.arange(len(order)) - start
+    at = group[order], np.arange(len(order)) - start
     opposite[at], beside[at] = apex[order], triangle[order]
-    tables = edges.astype(np.int64), opposite, beside
-    return torch.from_numpy(tables[0]), torch.from_numpy(tables[1]), torch.from_numpy(tables[2])
+    return torch.from_numpy(edges), torch.from_numpy(opposite), torch.from_numpy(beside)
 
 
 def morton_order(positions: np.ndarray) -> np.ndarray:

@@ -62,10 +62,11 @@ class ViewpointScene:
         objects = scene.objects.values()
         require_surfaces(scene)
         self.names = tuple(scene.objects)
-        self._vertices = torch.cat([item.vertices for item in objects])
+        parts = [item.vertices for item in objects]
+        self._vertices = torch.cat(parts)
         self._viewpoint = viewpoint
         with tracing():
-            self._topology = topology_of([item.mesh for item in objects])
+            self._topology = topology_of([item.mesh for item in objects], parts)
             self._occluders = Occluders(
                 strip_derivatives(self._vertices), self._topology, strip_derivatives(viewpoint)
             )

@@ -459,8 +459,9 @@ def _split_edges(wedges: Wedges, max_length: float) -> Wedges:
 def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTarget:
     objects = scene.objects
     require_surfaces(scene)
-    vertices = torch.cat([item.vertices for item in objects.values()])
-    topology = topology_of([item.mesh for item in objects.values()])
+    parts = [item.vertices for item in objects.values()]
+    vertices = torch.cat(parts)
+    topology = topology_of([item.mesh for item in objects.values()], parts)
     facets = build_facets(vertices, topology)
     occluders = Occluders(vertices, topology, vertices.detach().mean(0))
     tables = [_smooth_interfaces(scene, topology, frequency) for frequency in frequencies.tolist()]

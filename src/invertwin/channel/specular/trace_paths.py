@@ -254,7 +254,7 @@ def prepare_path_scene(
         velocities = torch.cat([vertex_velocities(item) for item in objects])
     return PathScene(
         scene,
-        topology_of([item.mesh for item in objects]),
+        topology_of([item.mesh for item in objects], vertices),
         torch.cat(vertices),
         velocities,
         ends[0],

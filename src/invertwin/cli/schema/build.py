@@ -212,7 +212,7 @@ def _build_module(
     table: Any,
     path: str,
     objects: Mapping[str, ObjectTable],
-    scene: Scene,
+    scene: Any,  # a scene, or the sensor that a module of sensors starts from
     more: Mapping[type, object] | None = None,
 ) -> nn.Module:
     name = getattr(table, "object", None)

@@ -1,0 +1,215 @@
+"""Seams of triangle meshes: coincident vertices, and edges that vertices of others divide.
+
+Files from CAD programs, STL files and merged parts repeat a corner for each face, equal to rounding
+only, and put the corners of one part on an edge of another. An edge is the boundary of a surface
+only where no other triangle continues it.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+WELD_TOLERANCE = 1e-6
+"""Distance within which vertices count as one, relative to the diagonal of their object."""
+
+Points: TypeAlias = Float64[np.ndarray, "v 3"]
+Groups: TypeAlias = Int64[np.ndarray, " v"]
+# Of a hash of three numbers: odd constants of good mixing.
+_MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+_MAX_PARTS = 2000  # whose boxes are compared in pairs
+_CORNERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+
+
+def weld_vertices(places: Points) -> Int64[np.ndarray, " v"]:
+    """Return for each vertex the first one within the tolerance; chains count as one.
+
+    Args:
+        places: positions in units of the size of their group, as ``separate_groups`` returns them.
+    """
+    # Equal to the last bit first: files repeat each corner about six times.
+    first, inverse = _unique_rows(np.ascontiguousarray(places).view(np.int64))
+    tree = cKDTree(places[first], balanced_tree=False, compact_nodes=False)
+    pairs = first[tree.query_pairs(WELD_TOLERANCE, output_type="ndarray")]
+    welded = first[inverse]
+    if len(pairs):
+        graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(places),) * 2)
+        chain = connected_components(graph, directed=False)[1][welded]
+        lowest = np.full(chain.max() + 1, len(places))
+        np.minimum.at(lowest, chain, welded)
+        welded = lowest[chain]
+    return welded
+
+
+def _unique_rows(
+    rows: Int64[np.ndarray, "n 3"],
+) -> tuple[Int64[np.ndarray, " u"], Int64[np.ndarray, " n"]]:
+    """Return the first row of each kind, and the kind of each row; by hashes, which sort faster."""
+    mixed = (rows.view(np.uint64) * _MIXERS).sum(1, dtype=np.uint64)
+    _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
+    if not np.array_equal(rows[first][inverse], rows):  # two kinds with one hash
+        _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return first, inverse.ravel()
+
+
+def separate_groups(points: Points, groups: Groups) -> Points:
+    """Scale each group of vertices to a diagonal of 1, and place them side by side.
+
+    Args:
+        points: positions [m].
+        groups: number of the group of each vertex, from 0.
+    """
+    index = np.argsort(groups, kind="stable")
+    present, start = np.unique(groups[index], return_index=True)
+    low, high = (f.reduceat(points[index], start) for f in (np.minimum, np.maximum))
+    size = np.linalg.norm(high - low, axis=1)
+    row = np.searchsorted(present, groups)
+    places = (points - low[row]) / np.where(size > 0, size, 1.0)[row, None]
+    places[:, 0] += 2.0 * row
+    return places + 0.0  # −0 and 0 are one place
+
+
+def half_edges(
+    faces: Int64[np.ndarray, "f 3"], places: Points
+) -> tuple[Int64[np.ndarray, "h 2"], Int64[np.ndarray, " h"], Int64[np.ndarray, " h"]]:
+    """Return the sides of triangles: ends in ascending order, opposite vertex, and triangle.
+
+    Slivers and repetitions of a triangle have no sides. A side on which vertices of other edges
+    lie is several, from one to the next.
+
+    Args:
+        faces: welded vertices of each triangle.
+        places: positions in units of the size of their group.
+    """
+    number = np.flatnonzero(~_is_sliver(places[faces]))
+    number = number[np.sort(_unique_rows(np.sort(faces[number], axis=1))[0])]
+    corners = faces[number]
+    ends = np.concatenate([np.sort(corners[:, [a, b]], axis=1) for a, b, _ in _CORNERS])
+    apex = np.concatenate([corners[:, c] for _, _, c in _CORNERS])
+    triangle = np.tile(number, 3)
+    return _split_at_vertices(ends, apex, triangle, places)
+
+
+def _is_sliver(corners: Float64[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, " f"]:
+    """Mask of triangles that are narrower than the tolerance."""
+    sides = corners[:, [1, 2, 0]] - corners
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    return area <= WELD_TOLERANCE * np.linalg.norm(sides, axis=2).max(1, initial=0.0)
+
+
+def _split_at_vertices(
+    ends: Int64[np.ndarray, "h 2"],
+    apex: Int64[np.ndarray, " h"],
+    triangle: Int64[np.ndarray, " h"],
+    places: Points,
+) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " p"], Int64[np.ndarray, " p"]]:
+    """Split half edges at the vertices of other edges that lie on them."""
+    edges, group, counts = unique_edges(ends, len(places))
+    # Two triangles complete an edge, except where another part of the mesh touches it.
+    candidates = counts != 2
+    order = np.argsort(group, kind="stable")
+    pairs = triangle[order[np.repeat(~candidates, counts)]].reshape(-1, 2)
+    if len(pairs):
+        candidates[~candidates] = _near_other_parts(edges[~candidates], pairs, places)
+    rows = np.flatnonzero(candidates)
+    row, vertex, share = find_vertices_on_edges(edges[rows], np.unique(edges[rows]), places)
+    inner = (vertex[:, None] != edges[rows[row]]).all(1)
+    if not inner.any():
+        return ends, apex, triangle
+    order = np.flatnonzero(inner)[np.lexsort((share[inner], row[inner]))]
+    row, vertex = row[order], vertex[order]
+    pieces = np.bincount(rows[row], minlength=len(edges)) + 1
+    # Stations along each edge, one edge after the other: an end, the vertices on it, the other end.
+    first = np.cumsum(pieces + 1) - (pieces + 1)
+    stations = np.empty(int((pieces + 1).sum()), dtype=np.int64)
+    stations[first], stations[first + pieces] = edges.T
+    inner = np.ones(len(stations), dtype=bool)
+    inner[first] = inner[first + pieces] = False
+    stations[inner] = vertex
+    piece = np.repeat(np.arange(len(ends)), pieces[group])
+    step = np.arange(len(piece)) - np.repeat(
+        np.cumsum(pieces[group]) - pieces[group], pieces[group]
+    )
+    at = first[group[piece]] + step
+    return np.sort(np.stack([stations[at], stations[at + 1]], 1), 1), apex[piece], triangle[piece]
+
+
+def unique_edges(
+    ends: Int64[np.ndarray, "h 2"], vertex_count: int
+) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, " h"], Int64[np.ndarray, " e"]]:
+    """Return edges in ascending order, the edge of each half edge, and the numbers of these.
+
+    Args:
+        ends: ends of half edges, in ascending order each.
+        vertex_count: number of vertices.
+    """
+    code = ends[:, 0] * vertex_count + ends[:, 1]
+    _, first, group, counts = np.unique(
+        code, return_index=True, return_inverse=True, return_counts=True
+    )
+    return ends[first], group.ravel(), counts
+
+
+def _near_other_parts(
+    edges: Int64[np.ndarray, "e 2"],
+    pairs: Int64[np.ndarray, "e 2"],
+    places: Points,
+) -> Bool[np.ndarray, " e"]:
+    """Mask of edges of two triangles that are near another part, connected by such edges.
+
+    Args:
+        edges: ends of each edge.
+        pairs: its two triangles.
+        places: positions in units of the size of their group.
+    """
+    ones, count = np.ones(len(pairs), dtype=bool), int(pairs.max(initial=-1)) + 1
+    graph = coo_array((ones, tuple(pairs.T)), shape=(count, count))
+    part = connected_components(graph, directed=False)[1][pairs[:, 0]]
+    order = np.argsort(part, kind="stable")
+    present, start = np.unique(part[order], return_index=True)
+    if len(present) == 1:
+        return ~ones
+    if len(present) > _MAX_PARTS:
+        return ones
+    ends = places[edges]
+    low = np.minimum.reduceat(ends.min(1)[order], start) - WELD_TOLERANCE
+    high = np.maximum.reduceat(ends.max(1)[order], start) + WELD_TOLERANCE
+    meets = (low[:, None] <= high).all(2)
+    one, other = np.nonzero(meets & meets.T & ~np.eye(len(low), dtype=bool))
+    reach = np.full_like(low, np.inf), np.full_like(high, -np.inf)
+    np.minimum.at(reach[0], one, np.maximum(low[one], low[other]))
+    np.maximum.at(reach[1], one, np.minimum(high[one], high[other]))
+    own = np.searchsorted(present, part)
+    return ((ends.min(1) <= reach[1][own]) & (ends.max(1) >= reach[0][own])).all(1)
+
+
+def find_vertices_on_edges(
+    edges: Int64[np.ndarray, "e 2"], vertices: Int64[np.ndarray, " c"], places: Points
+) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """Return edge, vertex and position along the edge, 0 to 1, of vertices that lie on edges.
+
+    Args:
+        edges: ends of each edge.
+        vertices: vertices that count.
+        places: positions of all vertices, in units of the size of their group.
+    """
+    if not len(edges) or not len(vertices):
+        return edges[:0, 0], edges[:0, 0], np.zeros(0)
+    start, side = places[edges[:, 0]], places[edges[:, 1]] - places[edges[:, 0]]
+    length = np.linalg.norm(side, axis=1)
+    tree = cKDTree(places[vertices], balanced_tree=False, compact_nodes=False)
+    radius = 0.5 * length + WELD_TOLERANCE
+    near = tree.query_ball_point(start + 0.5 * side, radius, return_sorted=False)
+    row = np.repeat(np.arange(len(edges)), [len(found) for found in near])
+    vertex = vertices[np.concatenate(near).astype(np.int64)]
+    offset = places[vertex] - start[row]
+    along = (offset * side[row]).sum(1) / length[row]
+    aside = np.linalg.norm(offset - (along / length[row])[:, None] * side[row], axis=1)
+    on = (aside <= WELD_TOLERANCE) & (along >= -WELD_TOLERANCE)
+    on &= along <= length[row] + WELD_TOLERANCE
+    return row[on], vertex[on], along[on] / length[row[on]]

@@ -1,0 +1,177 @@
+"""Meshes as files and programs have them: repeated corners, T-junctions, slivers, panels."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import forward_ad
+
+from invertwin.channel.rays.rigid_groups import find_rigid_groups
+from invertwin.channel.rays.topology import edges_of, topology_of
+from invertwin.scene import Mesh, box, merge_meshes, plate, rotation_from_vector, sphere
+from invertwin.scene.seams import WELD_TOLERANCE, separate_groups, weld_vertices
+
+HALF = math.pi / 2
+TURNS = ((0, 0, 0), (0, 2 * HALF, 0), (0, HALF, 0), (0, -HALF, 0), (HALF, 0, 0), (-HALF, 0, 0))
+
+
+def float64(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def plates_of_a_box(side=0.4):
+    """Six plates about the origin whose corners agree to rounding only."""
+    parts = []
+    for turn in TURNS:
+        part = plate(side, side)
+        rotation = rotation_from_vector(float64(*turn))
+        parts.append(Mesh((part.vertices - float64(0, 0, side / 2)) @ rotation.T, part.faces))
+    return parts
+
+
+def table(mesh):
+    """Number of edges by number of triangles."""
+    _, _, faces = edges_of(mesh.faces.numpy(), mesh.vertices.detach().numpy())
+    numbers, counts = (faces >= 0).sum(1).unique(return_counts=True)
+    return dict(zip(numbers.tolist(), counts.tolist(), strict=True))
+
+
+def soup(mesh, dtype=torch.float32):
+    """Three vertices for each triangle, rounded as STL files round them."""
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3).to(dtype).double()
+    return Mesh(corners, torch.arange(len(corners)).reshape(-1, 3))
+
+
+def test_plates_that_agree_to_rounding_are_a_closed_box():
+    whole = merge_meshes(plates_of_a_box())
+    assert len(whole.vertices.unique(dim=0)) > 8  # not to the last bit
+    assert table(whole) == {2: 18}
+    assert not topology_of([whole]).open_objects
+
+
+@pytest.mark.parametrize("shift", [0.0, 100.0])
+def test_a_soup_of_single_precision_is_the_mesh(shift):
+    ball = sphere(0.3, 3)
+    moved = Mesh(ball.vertices + shift, ball.faces)
+    assert table(soup(moved)) == table(ball)
+
+
+def test_a_crack_wider_than_the_tolerance_stays_open():
+    one, other = plates_of_a_box()[:2]
+    size = float((merge_meshes([one, other]).summary().extent[0]) * math.sqrt(3))
+    for width, closed in ((0.3 * WELD_TOLERANCE * size, True), (3 * WELD_TOLERANCE * size, False)):
+        parts = plates_of_a_box()
+        parts[0] = Mesh(parts[0].vertices - width * float64(0, 0, 1), parts[0].faces)
+        assert (1 not in table(merge_meshes(parts))) == closed
+
+
+def test_an_edge_ends_where_vertices_lie_on_it():
+    """A long side of one triangle against two short ones of others: a T-junction."""
+    vertices = float64([0, 0, 0], [2, 0, 0], [1, 1, 0], [0.5, 0, 0], [1, -1, 0])
+    mesh = Mesh(vertices, torch.tensor([[0, 1, 2], [0, 4, 3], [3, 4, 1]]))
+    edges, apexes, faces = edges_of(mesh.faces.numpy(), vertices.numpy())
+    rows = {tuple(edge): k for k, edge in enumerate(edges.tolist())}
+    assert (0, 1) not in rows
+    for pair, below in (((0, 3), 1), ((1, 3), 2)):
+        assert sorted(faces[rows[pair]].tolist()) == [0, below]
+        assert 2 in apexes[rows[pair]].tolist()
+    assert table(mesh) == {1: 4, 2: 3}
+
+
+def test_a_divided_edge_has_no_single_neighbour():
+    vertices = float64([0, 0, 0], [2, 0, 0], [1, 1, 0], [0.5, 0, 0], [1, -1, 0])
+    shape = topology_of([Mesh(vertices, torch.tensor([[0, 1, 2], [0, 4, 3], [3, 4, 1]]))])
+    assert shape.face_edges[0].tolist().count(-1) == 1
+    assert (shape.face_edges[1:] >= 0).all()
+    assert shape.welded_faces.tolist() == [[0, 1, 2], [0, 4, 3], [3, 4, 1]]
+
+
+def test_slivers_and_repeated_triangles_have_no_sides():
+    vertices = float64([0, 0, 0], [2, 0, 0], [1, 1, 0], [1, 1e-9, 0])
+    faces = torch.tensor([[0, 1, 2], [0, 1, 3], [2, 0, 1], [1, 0, 2]])
+    assert table(Mesh(vertices, faces)) == {1: 3}
+
+
+def test_boxes_that_touch_along_part_of_an_edge_share_it():
+    """A leg at the corner of a seat: the leg's top lies in the seat's lower face."""
+    seat = box((0.4, 0.6, 0.05))
+    leg = box((0.05, 0.05, 0.4))
+    place = float64(0.175, 0.275, -0.225)
+    chair = merge_meshes([seat, Mesh(leg.vertices + place, leg.faces)])
+    numbers = table(chair)
+    assert 1 not in numbers
+    assert numbers[4] == 2  # the two sides of the corner that both have
+
+
+def test_groups_of_vertices_stay_apart():
+    places = separate_groups(np.zeros((4, 3)), np.array([0, 0, 1, 1]))
+    assert weld_vertices(places).tolist() == [0, 0, 2, 2]
+
+
+def panels(pose=None):
+    """The faces of a box as six objects."""
+    whole = box((0.4, 0.5, 0.3))
+    parts = [
+        Mesh(whole.vertices[f.unique()], torch.searchsorted(f.unique(), f))
+        for f in whole.faces.split(2)
+    ]
+    points = [part.vertices if pose is None else pose(part.vertices) for part in parts]
+    return [part.faces for part in parts], points, parts
+
+
+def test_panels_at_rest_are_one_surface():
+    faces, points, parts = panels()
+    assert find_rigid_groups(faces, points).tolist() == [0] * 6
+    shape = topology_of(parts, points)
+    assert (shape.edge_faces >= 0).all()
+    assert shape.edge_faces.shape == (18, 2)
+    assert shape.open_objects == set(range(6))  # each by itself is a sheet
+    assert topology_of(parts, points) is shape
+    apart = topology_of(parts)
+    assert ((apart.edge_faces >= 0).sum(1) == 1).sum() == 24
+
+
+def test_panels_of_several_scenes_are_apart():
+    faces, points, _ = panels()
+    groups = find_rigid_groups(faces, points, scenes=[0, 0, 0, 1, 1, 1])
+    assert groups[0] == 0
+    assert set(groups[:3].tolist()).isdisjoint(groups[3:].tolist())
+
+
+def test_panels_that_move_apart_are_not_one_surface():
+    """With respect to one parameter, by either mode; or at rest beside what moves."""
+    step = float64(0.1, 0.2, 0.3)
+    for mode in ("reverse", "forward"):
+        with forward_ad.dual_level():
+            shift = torch.zeros((), dtype=torch.float64, requires_grad=mode == "reverse")
+            if mode == "forward":
+                shift = forward_ad.make_dual(shift, torch.ones_like(shift))
+            faces, points, _ = panels()
+            together = [own + shift * step for own in points]
+            assert find_rigid_groups(faces, together).tolist() == [0] * 6
+            halves = [own + shift * step * (1 + (k == 2)) for k, own in enumerate(points)]
+            groups = find_rigid_groups(faces, halves).tolist()
+            assert [k for k in range(6) if groups.count(groups[k]) == 1] == [2]
+            rest = [own if k == 2 else own + shift * step for k, own in enumerate(points)]
+            assert find_rigid_groups(faces, rest).tolist() == groups
+
+
+def test_poses_of_their_own_are_several_parameters():
+    """One tensor holds all of them, so that the leaves of the graph are the same."""
+    shifts = torch.zeros(6, 3, dtype=torch.float64, requires_grad=True)
+    faces, points, _ = panels()
+    moved = [own + shift for own, shift in zip(points, shifts, strict=True)]
+    assert find_rigid_groups(faces, moved).tolist() == list(range(6))
+
+
+def test_a_seam_is_found_again_where_objects_slide():
+    """The group stays, while its seam is another one."""
+    _, points, parts = panels()
+    shape = topology_of(parts, points)
+    turned = [own @ rotation_from_vector(float64(0.1, 0.2, 0.3)).T + 1.0 for own in points]
+    assert topology_of(parts, turned) is shape
+    slid = [own + (0.1 if k == 5 else 0.0) * float64(1, 0, 0) for k, own in enumerate(points)]
+    other = topology_of(parts, slid)
+    assert other is not shape
+    assert int((other.edge_faces >= 0).sum()) != int((shape.edge_faces >= 0).sum())
