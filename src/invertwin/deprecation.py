@@ -55,11 +55,16 @@ class RenamedMember:
     """
 
     def __init__(self, old: str, new: str) -> None:
-        """Name the member; see ``rename_members``."""
+        """Name the member.
+
+        Args:
+            old: the old name.
+            new: the new name, or a dotted path; see ``rename_members``.
+        """
         self.old, self.new = old, new
 
     def __get__(self, instance: Any, owner: type) -> Any:
-        """Return what the new name stands for, of an instance or of the class."""
+        """Return the member of the new name, of an instance or of the class."""
         if instance is None and self.old in owner.__annotations__:
             # A dataclass asks whether its own field of this name has a default.
             raise AttributeError(f"type object {owner.__name__!r} has no attribute {self.old!r}")
