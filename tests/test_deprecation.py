@@ -1,10 +1,16 @@
 """Old spellings of version 0.3: each warns in one line that names the new one, and works."""
 
 import ast
+import importlib
+import inspect
+import operator
+import pickle
 import warnings
 from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,13 +19,14 @@ from torch import Tensor
 
 import invertwin as iw
 from invertwin import models
+from invertwin.deprecation import RenamedMember, rename_arguments, rename_members
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.loss import resolve_loss
 
 ROOMS = (
     iw, iw.capture, iw.channel, iw.datasets, iw.discovery, iw.inversion, iw.links, iw.plotting,
-    iw.radar, iw.scene, iw.viewer, models,
+    iw.radar, iw.scene, iw.viewer, models, importlib.import_module("invertwin.signatures"),
 )  # fmt: skip
 
 
@@ -44,6 +51,44 @@ def renamed() -> Iterator[tuple[Any, str, str]]:
                     yield room, old, new
 
 
+def bridged() -> list[Any]:
+    """Every class and function, and every method, in files that bridge members or arguments."""
+    root = Path(str(iw.__path__[0]))
+    found: dict[Any, None] = {}
+    for path in sorted(root.rglob("*.py")):
+        if "import rename_" in path.read_text(encoding="utf-8"):
+            parts = path.relative_to(root.parent).with_suffix("").parts
+            module = importlib.import_module(".".join(parts).removesuffix(".__init__"))
+            for value in list(vars(module).values()):
+                if inspect.isclass(value) and value.__module__.startswith("invertwin."):
+                    methods = [getattr(x, "__func__", x) for x in list(vars(value).values())]
+                    found |= dict.fromkeys([value, *filter(inspect.isfunction, methods)])
+                elif inspect.isfunction(value):
+                    found[value] = None
+    return list(found)
+
+
+def renamed_members() -> list[Any]:
+    """Every old name of a member of a class."""
+    return [
+        pytest.param(cls, old, id=f"{cls.__name__}.{old}")
+        for cls in bridged()
+        if inspect.isclass(cls)
+        for old, member in vars(cls).items()
+        if isinstance(member, RenamedMember)
+    ]
+
+
+def renamed_arguments() -> list[Any]:
+    """Every old name of an argument, of a function, a method or a constructor."""
+    return [
+        pytest.param(function, old, new, id=f"{function.__qualname__}({old})")
+        for function in bridged()
+        if inspect.isfunction(function)
+        for old, new in getattr(function, "renamed_arguments", {}).items()
+    ]
+
+
 @pytest.mark.parametrize(("room", "old", "new"), [pytest.param(*x, id=x[1]) for x in renamed()])
 def test_an_old_name_of_a_menu_warns_and_is_the_new_one(room, old, new):
     path = new if "." in new else f"{room.__name__}.{new}".removeprefix("invertwin.")
@@ -54,6 +99,97 @@ def test_an_old_name_of_a_menu_warns_and_is_the_new_one(room, old, new):
         target = getattr(target, part)
     assert found is target
     assert old not in dir(room)
+
+
+@pytest.mark.parametrize(("cls", "old"), renamed_members())
+def test_an_old_name_of_a_member_warns_and_is_the_new_one(cls, old):
+    member = vars(cls)[old]
+    if "." in member.new:
+        assert callable(operator.attrgetter(member.new)(iw))
+        return
+    known = {name for base in cls.__mro__ for name in inspect.get_annotations(base)}
+    if not hasattr(cls, member.new) and member.new not in known:
+        assert f"self.{member.new}" in inspect.getsource(cls)
+    for base in cls.__mro__:
+        assert old not in inspect.get_annotations(base)
+    with pytest.warns(DeprecationWarning, match=rf"^deprecated: \w+\.{old} → \w+\.{member.new}$"):
+        assert member.__get__(SimpleNamespace(**{member.new: "found"}), cls) == "found"
+
+
+@pytest.mark.parametrize(("function", "old", "new"), renamed_arguments())
+def test_an_old_name_of_an_argument_warns_and_is_the_new_one(function, old, new):
+    known = inspect.signature(function).parameters
+    assert new in known
+    assert old not in known
+    taken = rename_arguments(**function.renamed_arguments)(lambda **options: options)
+    with pytest.warns(DeprecationWarning, match=rf"{old}=\.\.\.\) → .*{new}=\.\.\.\)$"):
+        assert taken(**{old: 1}) == {new: 1}
+
+
+def test_a_radar_that_is_moved_is_one_that_is_transformed():
+    turn = iw.scene.rotation_from_vector(torch.tensor([0.1, 0.2, 0.3]).double())
+    shift = torch.tensor([0.3, 0.2, 0.1]).double()
+    device: Any = radar()
+    with pytest.warns(
+        DeprecationWarning, match=r"Radar\.moved → Radar\.transform_rigidly$"
+    ) as told:
+        old = device.moved(turn, shift)
+    assert told[0].filename == __file__
+    new = radar().transform_rigidly(turn, shift)
+    assert torch.equal(old.positions, new.positions)
+    assert torch.equal(old.rotations, new.rotations)
+
+
+def test_a_constructor_a_copy_and_a_class_method_know_old_names():
+    plane: dict[str, Any] = {"low": [0.0, 0.0], "high": [1.0, 1.0], "height": 1.0}
+    menu: Any = iw
+    with pytest.warns(
+        DeprecationWarning, match=r"MapPlane\.horizontal\(cell=\.\.\.\) → .*cell_size"
+    ):
+        cells = menu.links.MapPlane.horizontal(**plane, cell=0.5)
+    settings = iw.links.PropagationSettings(3.5e9)
+    with pytest.warns(DeprecationWarning, match=r"RadioMap\(reception=\.\.\.\) → RadioMap\(propag"):
+        old = menu.RadioMap(cells, reception=settings)
+    assert (old.places, old.propagation) == (cells, settings)
+    assert [x.name for x in fields(old)][:2] == ["places", "propagation"]
+    assert list(inspect.signature(iw.RadioMap).parameters)[:2] == ["places", "propagation"]
+    assert pickle.loads(pickle.dumps(old)).propagation.frequency == settings.frequency
+    other = iw.links.PropagationSettings(2.4e9)
+    with pytest.warns(DeprecationWarning, match=r"RadioMap\(reception=\.\.\.\)"):
+        assert replace(old, reception=other).propagation == other
+    with pytest.warns(DeprecationWarning, match=r"TabulatedPattern\.of_decibels → "):
+        table = menu.scene.TabulatedPattern.of_decibels
+    assert table == iw.scene.TabulatedPattern.from_decibels
+
+
+def test_a_function_knows_old_arguments_and_shows_new_ones():
+    inversion: Any = iw.inversion
+    names = list(inspect.signature(iw.gradcheck).parameters)
+    assert names[names.index("acts_on") + 1] == "settings"
+    with pytest.warns(DeprecationWarning, match=r"remesh\(edge=...\) → remesh\(edge_length=...\)$"):
+        old = inversion.remesh(iw.box(0.2), edge=0.1)
+    assert torch.equal(old.vertices, iw.inversion.remesh(iw.box(0.2), 0.1).vertices)
+
+
+def test_members_of_subclasses_come_before_old_names():
+    class Base:
+        def new(self) -> str:
+            return "new"
+
+    rename_members(Base, old="new", place="new")
+
+    @dataclass
+    class Mine(Base):
+        place: int
+        size: int
+
+        def old(self) -> str:
+            return "own"
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mine = Mine(1, 2)
+        assert (mine.old(), mine.place) == ("own", 1)
 
 
 @pytest.mark.parametrize("room", ROOMS, ids=lambda room: room.__name__)

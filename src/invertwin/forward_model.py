@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from invertwin.deprecation import warn_renamed
+from invertwin.deprecation import rename_members, warn_renamed
 from invertwin.scene.scene import Scene
 
 # Names of version 0.3. A subclass that defines one overrides the method of the new name.
@@ -155,3 +155,6 @@ class ForwardModel(ABC):
             sensor: What recorded it.
         """
         return observed
+
+
+rename_members(ForwardModel, **_RENAMED_METHODS, **_RENAMED_FLAGS)

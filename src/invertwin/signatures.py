@@ -22,6 +22,7 @@ from invertwin.checks import (
     is_differentiated,
 )
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.deprecation import rename_attributes, rename_members
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.scene import Scene
@@ -267,3 +268,7 @@ def _hann_window(count: int) -> Tensor:
     """Hann window of mean one, without zeros at its ends, so that short sweeps keep their ends."""
     window = torch.hann_window(count + 2, periodic=False, dtype=torch.float64)[1:-1]
     return window / window.mean()
+
+
+rename_members(Signature, section="cross_section")
+rename_attributes(__name__, {"aspects": "aspect_directions", "decibels": "to_dbsm"})

@@ -16,6 +16,7 @@ from invertwin.checks import (
     is_differentiated,
     strip_derivatives,
 )
+from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.scene.parameters import Coordinate, RigidMotion
 
@@ -113,6 +114,7 @@ class Camera:
         angle = checked_number(field_of_view, "field of view [rad]", 0.0, math.pi, open_low=True)
         return Camera(places, rotations, width, height, width / (2 * math.tan(angle / 2)))
 
+    @rename_arguments(chosen="indices")
     def frames(self, indices: Sequence[int]) -> "Camera":
         """Return the camera with selected frames.
 

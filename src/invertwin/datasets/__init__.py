@@ -13,7 +13,7 @@ from invertwin.datasets.labels import radar_labels as radar_labels
 from invertwin.datasets.labels import triangle_visibility as triangle_visibility
 from invertwin.datasets.reader import SampleDataset as SampleDataset
 from invertwin.datasets.shards import DatasetManifest as DatasetManifest
-from invertwin.deprecation import rename_attributes
+from invertwin.deprecation import rename_attributes, rename_members
 
 rename_attributes(
     __name__,
@@ -24,3 +24,4 @@ rename_attributes(
         "seen_triangles": "triangle_visibility",
     },
 )
+rename_members(Distribution, ends="extreme_values")

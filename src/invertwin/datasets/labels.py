@@ -9,6 +9,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.channel import visible_points
+from invertwin.deprecation import rename_arguments
 from invertwin.radar.radar import Radar
 from invertwin.scene import Mesh, Scene, merge_meshes
 
@@ -16,6 +17,7 @@ _POINTS = 256  # at least so many on every object
 _R2_STEPS = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
 
 
+@rename_arguments(seen="visibility")
 def object_labels(
     scene: Scene,
     visibility: Mapping[str, Float[Tensor, "frame face"]],

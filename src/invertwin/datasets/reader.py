@@ -12,6 +12,7 @@ import torch
 from torch.utils.data import Dataset
 
 from invertwin.datasets.shards import DatasetManifest, locate_members, read_manifests
+from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.storage.untrusted import convert_read_errors
 
@@ -37,6 +38,7 @@ class SampleDataset(Dataset[Any]):
         InputError: No complete data set, or an entry that it does not have.
     """
 
+    @rename_arguments(keep="entries")
     def __init__(
         self,
         folder: str | Path,

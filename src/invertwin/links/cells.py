@@ -27,6 +27,7 @@ from invertwin.checks import (
     checked_tensor,
     strip_derivatives,
 )
+from invertwin.deprecation import rename_arguments, rename_members
 from invertwin.errors import InputError
 from invertwin.limits import Count
 from invertwin.links.places import ReceiverLocations
@@ -213,6 +214,7 @@ class MapPlane(Cells):
             )
 
     @classmethod
+    @rename_arguments(cell="cell_size")
     def horizontal(
         cls,
         low: ArrayLike,
@@ -364,3 +366,6 @@ class MapMesh(Cells):
     ) -> Int64[Tensor, " row"]:
         """The triangles. See ``Cells.cell_of``."""
         return faces
+
+
+rename_members(Cells, cell_of="find_cells", drawn="sample_points", sampled="with_sampling")

@@ -1,6 +1,6 @@
 """Forward models, one file a kind of sensor."""
 
-from invertwin.deprecation import rename_attributes
+from invertwin.deprecation import rename_attributes, rename_members
 from invertwin.models.camera import DepthMap as DepthMap
 from invertwin.models.camera import SilhouetteMap as SilhouetteMap
 from invertwin.models.doppler import RangeDopplerMap as RangeDopplerMap
@@ -26,3 +26,8 @@ rename_attributes(
         "SignatureMap": "RcsMap",
     },
 )
+rename_members(RadioMap, looks_about="realisations_about", reception="propagation")
+rename_members(RadioMap, received="link_statistics")
+rename_members(RangeDopplerMap, around="crop_around", expected="predict_paths", of="from_chirps")
+rename_members(RcsMap, signature="compute")
+rename_members(ResponseMap, reception="propagation")

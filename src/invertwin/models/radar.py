@@ -20,6 +20,7 @@ from invertwin.channel import (
     trace_field,
     trace_target,
 )
+from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.models.noise import noisy_realisations
@@ -276,6 +277,7 @@ class BeatMap(ExactMap):
         return recording.beat[(slice(None), *self.channels)]
 
 
+@rename_arguments(looks="realisations")
 def surrogate_correlation(
     scene: Scene, radar: Radar, model: SurrogateMap, *, seed: int, realisations: int = 16
 ) -> float:

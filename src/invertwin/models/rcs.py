@@ -56,7 +56,7 @@ class RcsMap(ForwardModel):
 
     def __post_init__(self) -> None:
         if callable(self.directions):
-            warn_renamed("RcsMap(partial(rcs, ...))", "RcsMap(directions=..., frequencies=...)", 4)
+            warn_renamed("RcsMap(partial(rcs, ...))", "RcsMap(directions=..., frequencies=...)", 5)
             object.__setattr__(self, "compute", self.directions)
             if isinstance(self.frequencies, bool):  # RcsMap(signature, boundary)
                 object.__setattr__(self, "boundary", self.frequencies)

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from invertwin.deprecation import rename_arguments
 from invertwin.plotting.figures import color, legible
 
 Curve = tuple[NDArray, NDArray]
@@ -65,6 +66,7 @@ def _draw_errors(axes, losses, errors, label: str) -> None:
     axes.set(xlabel="step", ylabel=label, ylim=(0, 1.05 * highest))
 
 
+@rename_arguments(along="displacements")
 def landscape(exact: Curve, surrogates: Mapping[str, Curve], displacements: str) -> Figure:
     """The exact signal's loss beside the surrogate's, over the offset from the truth.
 

@@ -7,12 +7,14 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.plotting.figures import legible, numbers
 
 _SHARE = 0.995  # of the pixels have derivatives within the colours
 
 
+@rename_arguments(shown="panels")
 def images(
     panels: Mapping[str, Float[Tensor, "row column"]],
     derivatives: Mapping[str, Float[Tensor, "row column"]] | None = None,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from invertwin.channel import Grid
+from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.inversion.confidence.realisations import coarsen_map
 from invertwin.plotting.figures import legible, numbers
@@ -73,6 +74,7 @@ def spectrum(
     return figure
 
 
+@rename_arguments(shown="maps")
 def panels(maps: Mapping[str, MapPanel], *, dynamic_range: float = 40.0) -> Figure:
     """Power maps of different axes side by side, each in dB below its own peak.
 

@@ -9,6 +9,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from invertwin.deprecation import rename_arguments
 from invertwin.plotting.figures import PALETTE, legible, numbers
 from invertwin.scene import Scene
 
@@ -61,6 +62,7 @@ def floor_plan(
     return figure
 
 
+@rename_arguments(along="positions", ends="search_ends")
 def placements(
     positions: Float64[Tensor, " place"],
     levels: Float64[Tensor, " place"],
@@ -86,6 +88,7 @@ def placements(
     return figure
 
 
+@rename_arguments(places="positions")
 def transmitter_fits(
     scene: Scene,
     height: float,

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from invertwin.checks import check_fields
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.errors import PhysicsWarning as PhysicsWarning
 from invertwin.limits import Bandwidth, CountOfTwo, Duration, Frequency, FrequencyStep
@@ -252,6 +253,7 @@ class OFDM(SampledWaveform):
         """
         return beat.conj() * self._check_symbols(symbols)
 
+    @rename_arguments(received="received_symbols")
     def beat(
         self,
         received_symbols: Complex[Tensor, "*batch sample"],

@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from torch import Tensor, nn
 
 from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.deprecation import rename_members
 from invertwin.errors import InputError
 from invertwin.limits import Axes
 from invertwin.scene.material.itu import Itu
@@ -555,3 +556,6 @@ def _rotation_numbers(value: ArrayLike) -> Tensor:
             f"got {numbers.tolist()}; {do}"
         )
     return numbers.detach().clone()
+
+
+rename_members(ObjectModule, reshaped="update_mesh")

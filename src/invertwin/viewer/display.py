@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from invertwin.channel import Grid
+from invertwin.deprecation import rename_arguments
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, read_arrays
 
@@ -92,6 +93,7 @@ class DisplayMaps:
     power: Mapping[str, NDArray[np.float32]]
 
     @classmethod
+    @rename_arguments(most="max_values")
     def from_spectra(
         cls, spectra: Mapping[str, Tensor], grid: Grid, max_values: int = _MAX_VALUES
     ) -> "DisplayMaps":

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from invertwin.capture import Capture
 from invertwin.channel import Grid
+from invertwin.deprecation import rename_arguments
 from invertwin.radar import Radar
 from invertwin.scene import Object, Scene
 from invertwin.scene.shape_models.density import replace_clouds
@@ -56,6 +57,7 @@ def display_mesh(item: Object) -> DisplayMesh:
     return DisplayMesh(to_float32(item.vertices), faces)
 
 
+@rename_arguments(only="fitted_only")
 def scene_layers(
     scene: Scene, group: str = "twin", *, fitted: Collection[str] = (), fitted_only: bool = False
 ) -> list[DisplayLayer]:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invertwin.channel import Grid, Paths, Sampling, trace_power
+from invertwin.deprecation import rename_members
 from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar
@@ -148,3 +149,6 @@ class InteractiveSensor:
         return PositionSample(
             place, torch.stack([paths.first, paths.last], 1), paths.power, bins, edges
         )
+
+
+rename_members(PositionSample, feeding="points_in_bin", place="position")

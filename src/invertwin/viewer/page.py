@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from invertwin.deprecation import rename_arguments
 from invertwin.viewer.display import Display, DisplayStep
 from invertwin.viewer.layers import ELLIPSOID, POSITION_LAYERS, SAMPLED_PATHS
 from invertwin.viewer.link import InteractiveSensor
@@ -31,6 +32,7 @@ from invertwin.viewer.sensor_maps import SensorMaps, collect_sensor_maps
 _MAX_BYTES = 1_500_000  # of the steps on a page
 
 
+@rename_arguments(links="sensors")
 def page_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None = None) -> str:
     """A whole page with a display.
 
@@ -49,6 +51,7 @@ def page_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
     )
 
 
+@rename_arguments(links="sensors")
 def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None = None) -> str:
     """A display as a part of a page; one page may hold it once.
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.scene import rigid, rotation_from_quaternion
 from invertwin.viewer.display import Display, DisplayLayer, DisplayMaps, DisplayStep
@@ -70,6 +71,7 @@ class Viewer:
         InputError: No `viser`, or a host without a token.
     """
 
+    @rename_arguments(links="sensors")
     def __init__(
         self,
         display: Display,

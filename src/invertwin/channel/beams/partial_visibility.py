@@ -21,6 +21,7 @@ from invertwin.channel.rays.ray_scene import Occluders, is_visible
 from invertwin.channel.rays.scene_tables import require_surfaces
 from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.checks import strip_derivatives
+from invertwin.deprecation import rename_arguments
 from invertwin.scene import Scene
 
 _PAIRS_AT_ONCE = 1 << 21  # edges × observers, or edges × cells, per chunk
@@ -78,6 +79,7 @@ class _ShadowingEdges:
         return _ShadowingEdges(*(column[index] for column in vars(self).values()))
 
 
+@rename_arguments(places="observers", width="blur")
 def visible_fractions(
     scene: Scene,
     observers: Float64[Tensor, "place 3"],

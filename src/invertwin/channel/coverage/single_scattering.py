@@ -56,6 +56,7 @@ from invertwin.channel.specular.trace_paths import (
 )
 from invertwin.checks import ArrayLike, is_differentiated, strip_derivatives
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.runtime.concurrency import torch_threads
 from invertwin.scene import Isotropic
@@ -91,6 +92,7 @@ class _ScatteringPoints:
 _PathLegs = tuple[list[SpecularPaths], list[SpecularPaths]]
 
 
+@rename_arguments(rough="scattering_scene", width="value_count")
 def trace_single_scattering(
     scene: Scene,
     scattering_scene: Scene,

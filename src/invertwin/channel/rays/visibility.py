@@ -23,6 +23,7 @@ from invertwin.channel.rays.ray_scene import Occluders
 from invertwin.channel.rays.scene_tables import require_surfaces
 from invertwin.channel.rays.topology import topology_of
 from invertwin.checks import is_differentiated, strip_derivatives
+from invertwin.deprecation import rename_arguments
 from invertwin.scene.scene import Scene
 
 
@@ -58,6 +59,7 @@ class ViewpointScene:
         InputError: A cloud in the scene.
     """
 
+    @rename_arguments(place="viewpoint")
     def __init__(self, scene: Scene, viewpoint: Float64[Tensor, "3"]) -> None:
         objects = scene.objects.values()
         require_surfaces(scene)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from invertwin.deprecation import rename_members
 from invertwin.errors import InputError
 from invertwin.inversion.confidence.realisations import FitResult, zscore
 from invertwin.inversion.fit import Fit
@@ -235,3 +236,6 @@ def _surface_distance(first: Mesh, second: Mesh) -> float:
 def _object_name(module: nn.Module) -> str:
     assert isinstance(module, Pose)
     return module.object
+
+
+rename_members(Ambiguity, better="has_lower_loss", end="result", told="description")

@@ -12,6 +12,7 @@ import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.gradcheck.lines import make_line
@@ -94,6 +95,7 @@ class GradientReport:
     difference: Float64[Tensor, "frame *map"]
 
 
+@rename_arguments(of="acts_on", check="settings")
 def gradcheck(
     model: ForwardModel,
     module: nn.Module,

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.channel import Sampling
+from invertwin.deprecation import rename_members
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.tangents import ParameterChange, parameter_changes
 from invertwin.inversion.loss import resolve_loss
@@ -158,3 +159,6 @@ class _DistanceModule(nn.Module):
 
     def forward(self, positions: Tensor) -> Tensor:
         return self.shape.distance(positions)  # type: ignore[operator]
+
+
+rename_members(ParameterLine, at="evaluate", end="evaluate_end")

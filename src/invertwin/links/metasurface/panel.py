@@ -27,6 +27,7 @@ from invertwin.channel import (
 )
 from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.scene import Scene
 
@@ -131,6 +132,7 @@ class Metasurface:
         return replace(self, phase=self.phase + turn.view(self.phase.shape))
 
 
+@rename_arguments(width="blur", far="far_field")
 def panel_response(
     scene: Scene,
     panel: Metasurface,
@@ -216,6 +218,7 @@ def _element_waves(
     return torch.polar(visible / length, -wave_number * later), obliquity
 
 
+@rename_arguments(width="blur", far="far_field")
 def panel_paths(
     scene: Scene,
     panels: Metasurface | Sequence[Metasurface],

@@ -11,6 +11,7 @@ from torch import Tensor
 from invertwin.channel import Paths
 from invertwin.checks import check_fields
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.radar.radar import Radar, require_sampled_waveform
@@ -99,6 +100,7 @@ class Chirps:
         return wavelength / (4 * self.interval * turns)
 
 
+@rename_arguments(places="trajectory")
 def moving_beat(
     paths: Paths,
     radar: Radar,

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from invertwin.checks import ArrayLike, checked_count, checked_tensor
+from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh, merge_meshes
 from invertwin.scene.parameters import Entries, ObjectModule, axes_mask, free_part
@@ -320,6 +321,7 @@ class SkinnedBody(ObjectModule):
             )
         return Mesh(self.template.apply_pose(rotations)[0], mesh.faces)
 
+    @rename_arguments(found="estimate")
     def joint_errors(self, estimate: Mesh, truth: Mesh) -> dict[str, float]:
         """Return the angles [rad] between the free joints of two meshes of the body, by name.
 

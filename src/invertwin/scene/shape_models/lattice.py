@@ -8,6 +8,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.checks import ArrayLike, checked_count, checked_tensor
+from invertwin.deprecation import rename_members
 from invertwin.errors import InputError
 from invertwin.runtime.memory import require_at_most
 
@@ -164,3 +165,6 @@ def _cubic_convolution(t: Tensor) -> Tensor:
     r = 1 - t
     inner = 2 - 5 * t**2 + 3 * t**3, 2 - 5 * r**2 + 3 * r**3
     return 0.5 * torch.stack([-t * r**2, *inner, -r * t**2], dim=-1)
+
+
+rename_members(Lattice, between="from_bounds")
