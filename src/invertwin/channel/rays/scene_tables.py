@@ -197,9 +197,7 @@ def flatten(
     for number, name in enumerate(scene.objects) if bool(skins.any()) else ():
         own = topology.face_object == number
         if bool(skins[face_surface[own]].any()):
-            _require_closed(
-                name, vertices.detach()[topology.faces[own]], number in topology.open_objects
-            )
+            _require_closed(name, number in topology.open_objects)
     _warn_coarse_facets(list(scene.objects), topology, vertices, surfaces, face_surface)
     deforming = tuple(is_differentiated(item.mesh.vertices) for item in objects)
     weights, free = surfaces.lobes, is_differentiated(surfaces.lobes)
@@ -246,14 +244,12 @@ def _warn_coarse_facets(
             )
 
 
-def _require_closed(name: str, triangles: Tensor, is_open: bool) -> None:
+def _require_closed(name: str, is_open: bool) -> None:
     """Refuse a refracting body without an inside."""
-    volume = (triangles[:, 0] * torch.linalg.cross(triangles[:, 1], triangles[:, 2])).sum() / 6
-    if is_open or not volume > 0:
-        found = "an open one" if is_open else "one wound inwards"
+    if is_open:
         raise InputError(
-            f"expected a closed mesh with outward triangles for the refracting body {name}, got "
-            f"{found}; close or turn it, or use a Slab for a sheet"
+            f"expected a closed mesh for the refracting body {name}, got an open one; close it "
+            "(merge_meshes joins panels), or use a Slab for a sheet"
         )
 
 

@@ -20,6 +20,7 @@ from invertwin.channel.rays.rigid_groups import find_rigid_groups
 from invertwin.checks import strip_derivatives
 from invertwin.scene import seams
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.winding import find_inward_faces
 
 _MAX_CACHED_TOPOLOGIES = 8
 _MIN_SMOOTH_ANGLE, _MAX_SMOOTH_ANGLE = (
@@ -35,7 +36,7 @@ class Topology:
     The acceleration structure is rebuilt only when the vertices differ from the last upload.
 
     Args:
-        faces: Vertex indices of all triangles.
+        faces: Vertex indices of all triangles; those of closed objects are turned outwards.
         face_object: Object of every triangle.
         vertices: In the objects' own frames, or in the world where objects share edges.
         groups: Group of each object, within which vertices at one place count as one.
@@ -44,7 +45,6 @@ class Topology:
     def __init__(
         self, faces: Tensor, face_object: Tensor, vertices: Tensor, groups: np.ndarray
     ) -> None:
-        self.faces = faces
         self.face_object = face_object
         self.fallback_face: int | None = None  # a triangle that was no sliver when last looked at
         #: Objects in one place, when last looked at, and for which pairs, antennas and vertices.
@@ -67,6 +67,7 @@ class Topology:
         self.edges, self.edge_apexes, self.edge_faces = (table[order] for table in tables)
         beside = self.edge_faces
         self.open_objects = _open_objects(beside, face_object)
+        self.faces = faces = _turn_outwards(faces, welded, face_object, places, self.open_objects)
         self.device_faces = to_index(faces)
         #: The same, four numbers each, the last one zero: each is read as a whole.
         self.device_corners = to_index(torch.nn.functional.pad(faces, (0, 1)))
@@ -220,6 +221,21 @@ def _open_objects(edge_faces: Tensor, face_object: Tensor) -> set[int]:
     owner = face_object[edge_faces[edge, column]]
     pairs, counts = torch.stack([edge, owner], 1).unique(dim=0, return_counts=True)
     return set(pairs[counts == 1, 1].tolist())
+
+
+def _turn_outwards(
+    faces: Int64[Tensor, "f 3"],
+    welded: np.ndarray,
+    face_object: Int64[Tensor, " f"],
+    places: np.ndarray,
+    open_objects: set[int],
+) -> Int64[Tensor, "f 3"]:
+    """Triangles of closed objects with outward normals, all others as they are."""
+    inward = torch.zeros(len(faces), dtype=torch.bool)
+    for number in set(face_object.tolist()) - open_objects:
+        own = face_object == number
+        inward[own] = torch.from_numpy(find_inward_faces(welded[own.numpy()], places))
+    return torch.where(inward[:, None], faces.flip(1), faces)
 
 
 def _relative_distances(
