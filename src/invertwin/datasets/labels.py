@@ -11,7 +11,8 @@ from torch import Tensor
 from invertwin.channel import visible_points
 from invertwin.deprecation import rename_arguments
 from invertwin.radar.radar import Radar
-from invertwin.scene import Mesh, Scene, merge_meshes
+from invertwin.scene import Mesh, Scene
+from invertwin.scene.mesh import concatenate_meshes
 
 _POINTS = 256  # at least so many on every object
 _R2_STEPS = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
@@ -91,7 +92,7 @@ def triangle_visibility(scene: Scene, radar: Radar) -> dict[str, Float[Tensor, "
     """
     meshes = [Mesh(item.vertices.detach(), item.mesh.faces) for item in scene.objects.values()]
     points = [_sample_triangles(mesh) for mesh in meshes]
-    flat, whole = torch.cat([part.reshape(-1, 3) for part in points]), merge_meshes(meshes)
+    flat, whole = torch.cat([part.reshape(-1, 3) for part in points]), concatenate_meshes(meshes)
     frames = [visible_points(whole, flat, place[None]) for place in radar.positions.detach()]
     parts = torch.stack(frames).split([part.shape[0] * part.shape[1] for part in points], dim=1)
     return {

@@ -40,7 +40,7 @@ from invertwin.scene.material.surface import ScatteringLaw as ScatteringLaw
 from invertwin.scene.material.values import Texture as Texture
 from invertwin.scene.mesh import Mesh as Mesh
 from invertwin.scene.mesh import MeshSummary as MeshSummary
-from invertwin.scene.mesh import merge_meshes as merge_meshes
+from invertwin.scene.mesh_union import merge_meshes as merge_meshes
 from invertwin.scene.parameters import Compose as Compose
 from invertwin.scene.parameters import MaterialValues as MaterialValues
 from invertwin.scene.parameters import Pose as Pose

@@ -27,6 +27,7 @@ from invertwin.scene.material.materials import (
 from invertwin.scene.material.radio_materials import radio_bsdf, read_radio_material
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.mesh_union import unite_parts
 from invertwin.scene.scene import Object, Scene
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, existing_file, safe_reader
@@ -44,6 +45,7 @@ def load_mesh(file: str | Path, unit: Unit = "m") -> Mesh:
     """Load a triangle mesh from a file; `Mesh.summary` describes it.
 
     Vertices at equal positions are merged, unused vertices are dropped, the rest keep their order.
+    Closed parts that overlap or touch become one surface, which a warning says.
     All parts of the file become one mesh (`load_parts` separates them); axes are kept. A mesh
     larger than 100 m causes a warning, since it may be in millimetres. From an Abaqus file (.inp)
     the corners of shell elements are read, in the coordinates of their definition; quadrilaterals
@@ -114,11 +116,20 @@ def _load_with(
         # Check the raw file first: merging would hide its defects.
         for vertices, faces in found.values():
             Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
-        meshes = {name: _merge_vertices(*part) for name, part in found.items()}
+        merged = {name: _merge_vertices(*part) for name, part in found.items()}
+        meshes = {name: unite_parts(mesh) for name, mesh in merged.items()}
         if not meshes:
             raise InputError("expected triangles, got none; export the mesh again")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    for name, mesh in meshes.items():
+        if mesh is not merged[name]:
+            warnings.warn(
+                f"{path}: parts of the mesh overlap or touch; without what lies inside of others, "
+                f"{len(merged[name].faces)} triangles are {len(mesh.faces)}",
+                PhysicsWarning,
+                stacklevel=3,
+            )
     extent = max(float(np.ptp(vertices, axis=0).max()) for vertices, _ in found.values())
     if extent > _LARGE:
         warnings.warn(

@@ -87,8 +87,8 @@ class Mesh:
         return 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
 
 
-def merge_meshes(parts: Annotated[Sequence[Mesh], MinLen(1)]) -> Mesh:
-    """Merge shapes into one rigid object of one material.
+def concatenate_meshes(parts: Annotated[Sequence[Mesh], MinLen(1)]) -> Mesh:
+    """Put the vertices and triangles of shapes one after the other.
 
     Args:
         parts: shapes in the frame of the object.

@@ -8,7 +8,7 @@ from invertwin.checks import checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Positive
 from invertwin.scene.material.materials import RoughDielectric
-from invertwin.scene.mesh import Mesh, merge_meshes
+from invertwin.scene.mesh import Mesh, concatenate_meshes
 from invertwin.scene.pose import rigid
 from invertwin.scene.scene import Object
 from invertwin.scene.shapes import box
@@ -107,7 +107,7 @@ def _panel(middle: Sequence[float], first: Sequence[float], second: Sequence[flo
 def _boxes(*parts: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Mesh:
     """Return boxes by size and centre."""
     meshes = [(box(size), torch.tensor(middle, dtype=torch.float64)) for size, middle in parts]
-    return merge_meshes([Mesh(mesh.vertices + middle, mesh.faces) for mesh, middle in meshes])
+    return concatenate_meshes([Mesh(mesh.vertices + middle, mesh.faces) for mesh, middle in meshes])
 
 
 def _legs(

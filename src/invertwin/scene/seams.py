@@ -112,8 +112,7 @@ def _split_at_vertices(
     edges, group, counts = unique_edges(ends, len(places))
     # Two triangles complete an edge, except where another part of the mesh touches it.
     candidates = counts != 2
-    order = np.argsort(group, kind="stable")
-    pairs = triangle[order[np.repeat(~candidates, counts)]].reshape(-1, 2)
+    pairs = _pairs_of_triangles(triangle, group, counts)
     if len(pairs):
         candidates[~candidates] = _near_other_parts(edges[~candidates], pairs, places)
     rows = np.flatnonzero(candidates)
@@ -153,6 +152,35 @@ def unique_edges(
         code, return_index=True, return_inverse=True, return_counts=True
     )
     return ends[first], group.ravel(), counts
+
+
+def find_parts(faces: Int64[np.ndarray, "f 3"], places: Points) -> Int64[np.ndarray, " f"]:
+    """Return the part of each triangle, connected across edges of two triangles; −1 = none.
+
+    Slivers and repetitions of a triangle belong to no part.
+
+    Args:
+        faces: welded vertices of each triangle.
+        places: positions in units of the size of their group.
+    """
+    ends, _, triangle = half_edges(faces, places)
+    _, group, counts = unique_edges(ends, len(places))
+    pairs = _pairs_of_triangles(triangle, group, counts)
+    graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(faces),) * 2)
+    label, found = connected_components(graph, directed=False)[1], np.full(len(faces), -1)
+    real = np.unique(triangle)
+    found[real] = np.unique(label[real], return_inverse=True)[1].ravel()
+    return found
+
+
+def _pairs_of_triangles(
+    triangle: Int64[np.ndarray, " h"],
+    group: Int64[np.ndarray, " h"],
+    counts: Int64[np.ndarray, " e"],
+) -> Int64[np.ndarray, "e2 2"]:
+    """Return the triangles of each edge that has two."""
+    order = np.argsort(group, kind="stable")
+    return triangle[order[np.repeat(counts == 2, counts)]].reshape(-1, 2)
 
 
 def _near_other_parts(

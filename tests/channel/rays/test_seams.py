@@ -10,6 +10,7 @@ from torch.autograd import forward_ad
 from invertwin.channel.rays.rigid_groups import find_rigid_groups
 from invertwin.channel.rays.topology import edges_of, topology_of
 from invertwin.scene import Mesh, box, merge_meshes, plate, rotation_from_vector, sphere
+from invertwin.scene.mesh import concatenate_meshes
 from invertwin.scene.seams import WELD_TOLERANCE, separate_groups, weld_vertices
 
 HALF = math.pi / 2
@@ -98,7 +99,7 @@ def test_boxes_that_touch_along_part_of_an_edge_share_it():
     seat = box((0.4, 0.6, 0.05))
     leg = box((0.05, 0.05, 0.4))
     place = float64(0.175, 0.275, -0.225)
-    chair = merge_meshes([seat, Mesh(leg.vertices + place, leg.faces)])
+    chair = concatenate_meshes([seat, Mesh(leg.vertices + place, leg.faces)])
     numbers = table(chair)
     assert 1 not in numbers
     assert numbers[4] == 2  # the two sides of the corner that both have

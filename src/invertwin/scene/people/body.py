@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from invertwin.checks import ArrayLike, checked_count, checked_tensor
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
-from invertwin.scene.mesh import Mesh, merge_meshes
+from invertwin.scene.mesh import Mesh, concatenate_meshes
 from invertwin.scene.parameters import Entries, ObjectModule, axes_mask, free_part
 from invertwin.scene.pose import rotation_angle, rotation_from_vector
 from invertwin.storage.untrusted import read_arrays, safe_reader
@@ -379,7 +379,7 @@ def articulated_template(
         )
     sizes = [len(part.vertices) for part in parts]
     owner = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor(sizes))
-    whole = merge_meshes(parts)
+    whole = concatenate_meshes(parts)
     return BodyTemplate(
         whole.vertices,
         whole.faces,
