@@ -2,15 +2,16 @@
 
     python benchmarks/meshes.py [-o DIR]
 
-Each row is a mechanism, each column a mesh of the same surface: `plates` (six, whose corners agree to
-rounding), `panels` (six objects), `finer`, `diagonals` (the other one of each face), `junctions` (one
-face of four parts against undivided neighbours), `overlapping` (two boxes with shared planes),
-`inside_out`, `mixed` (windings at random), `cracked` (by 1e-9 m), `soup` (three float32 corners a
-triangle, as in an STL file). Prints tables and writes `metrics.json` into DIR (default `out/meshes`):
+Each row is a mechanism, each column a mesh of the same surface: `plates` (six, whose corners agree
+to rounding), `panels` (six objects), `finer`, `diagonals` (the other one of each face), `junctions`
+(one face of eight triangles against undivided neighbours), `overlapping` (two boxes with shared
+planes), `inside_out`, `mixed` (every third triangle turned), `cracked` (by 1e-9 m), `soup` (three
+float32 corners a triangle, as in an STL file). Prints tables and writes `metrics.json` into DIR
+(default `out/meshes`):
 
-- `value.<mechanism>.<mesh>`, `derivative.<mechanism>.<mesh>`: ⟨a, b⟩/⟨b, b⟩ of a quantity a and that
-  of the clean mesh, b; its derivative is with respect to a translation that turns.
-- `refused`: cells that are refused, by the message. `worst_ratio`: largest |ratio − 1| of all others.
+- `value.<mechanism>.<mesh>`, `derivative.<mechanism>.<mesh>`: ⟨a, b⟩/⟨b, b⟩ of a quantity a and
+  that of the clean mesh, b; its derivative is with respect to a translation that turns.
+- `refused`: cells that are refused, by message. `worst_ratio`: largest |ratio − 1| of all others.
 - `topology_seconds`: time of the edges of a mesh of 10⁶ triangles, indexed and as soup.
 """
 
@@ -176,8 +177,11 @@ def signature(material: Material, edges: int) -> Mechanism:
 
 
 def links(depth: int, edges: int) -> Mechanism:
-    """Power gains of three links past the box."""
+    """Power gains of links past the box, or around the transmitter where it mirrors."""
     rx = torch.stack([vector(0.1, 0.05, 2.2), vector(-0.1, 0.1, 2.3), vector(0.35, -0.1, 2.0)])
+    if depth:
+        across = torch.linspace(-1.5, 1.5, 9, dtype=torch.float64)
+        rx = torch.cartesian_prod(across, across, vector(0.3))
 
     def compute(parts: Parts, theta: Tensor) -> Tensor:
         around = scene(parts, METAL, theta, None)
@@ -185,7 +189,7 @@ def links(depth: int, edges: int) -> Mechanism:
             around, vector(0.03, 0.02, 0.0), rx, FREQUENCY, depth=depth, edges=edges, rays=None
         )
         turn = torch.polar(torch.ones_like(paths.delay), -2 * math.pi * FREQUENCY * paths.delay)
-        total = torch.zeros(3, 2, dtype=torch.complex128)
+        total = torch.zeros(len(rx), 2, dtype=torch.complex128)
         total = total.index_add(0, paths.rx, paths.coefficient[:, :, 0] * turn[:, None])
         return total.abs().square()
 

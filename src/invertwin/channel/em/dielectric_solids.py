@@ -6,7 +6,7 @@ decays, and propagates along the real part of K.
 
 import cmath
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -131,6 +131,31 @@ def group_solids(
         solids = DielectricSolids(owner, transmits[owner], skin.conducting, epsilon, least, names)
         groups_found.append((solids, members))
     return groups_found
+
+
+def require_whole_solids(
+    interfaces: SmoothInterfaces,
+    panels: Collection[int],
+    owner: Int64[Tensor, " facet"],
+    names: Sequence[str],
+) -> None:
+    """Raise if dielectric objects close a body only together.
+
+    Args:
+        interfaces: smooth interfaces of the facets.
+        panels: numbers of open objects that others close.
+        owner: object number of each facet.
+        names: object names, [object].
+
+    Raises:
+        InputError: such an object whose material is a dielectric body.
+    """
+    found = [names[n] for n in sorted(panels) if not _is_opaque(interfaces.rows(owner == n))]
+    if found:
+        raise InputError(
+            f"expected each dielectric body as one object, got {', '.join(found)}, which close one "
+            "together; join their meshes with merge_meshes"
+        )
 
 
 def is_homogeneous(interfaces: SmoothInterfaces) -> bool:

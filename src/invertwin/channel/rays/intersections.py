@@ -62,7 +62,8 @@ def find_possible_intersections(
 ) -> tuple[Bool[Tensor, "object object"], Tensor, Tensor]:
     """Find pairs of objects that may intersect: one moves past the other, and their boxes overlap.
 
-    An object may intersect itself if its own shape changes.
+    An object may intersect itself if its own shape changes. Rigid objects of one group, which keep
+    together along edges, do not pass each other.
 
     Args:
         geometry: scene as flat tables.
@@ -74,6 +75,8 @@ def find_possible_intersections(
         torch.tensor(flags) for flags in (geometry.differentiated, geometry.shape_differentiated)
     )
     pairs = (moving[:, None] | moving).fill_diagonal_(False) | torch.diag(deforming)
+    groups = geometry.topology.object_group
+    pairs &= (groups[:, None] != groups) | deforming[:, None] | deforming
     return find_overlapping_boxes(geometry, pairs)
 
 

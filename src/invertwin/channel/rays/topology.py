@@ -46,6 +46,7 @@ class Topology:
         self, faces: Tensor, face_object: Tensor, vertices: Tensor, groups: np.ndarray
     ) -> None:
         self.face_object = face_object
+        self.object_group = torch.from_numpy(groups)
         self.fallback_face: int | None = None  # a triangle that was no sliver when last looked at
         #: Objects in one place, when last looked at, and for which pairs, antennas and vertices.
         self.coplanar_cache: tuple[set[tuple[int, int]], Tensor, Tensor, Tensor] | None = None
@@ -67,6 +68,9 @@ class Topology:
         self.edges, self.edge_apexes, self.edge_faces = (table[order] for table in tables)
         beside = self.edge_faces
         self.open_objects = _open_objects(beside, face_object)
+        unshared = face_object[beside[(beside >= 0).sum(1) == 1, 0]]
+        #: Open objects that others close: panels of a body.
+        self.panels = self.open_objects - set(unshared.tolist())
         self.faces = faces = _turn_outwards(faces, welded, face_object, places, self.open_objects)
         self.device_faces = to_index(faces)
         #: The same, four numbers each, the last one zero: each is read as a whole.

@@ -27,7 +27,12 @@ from invertwin.channel.beams.beam_tracing import (
     build_facets,
     trace_beams,
 )
-from invertwin.channel.em.dielectric_solids import DielectricSolids, group_solids, is_homogeneous
+from invertwin.channel.em.dielectric_solids import (
+    DielectricSolids,
+    group_solids,
+    is_homogeneous,
+    require_whole_solids,
+)
 from invertwin.channel.em.plane_waves import (
     SmoothInterfaces,
     dot,
@@ -467,6 +472,7 @@ def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTar
     tables = [_smooth_interfaces(scene, topology, frequency) for frequency in frequencies.tolist()]
     wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in frequencies.tolist()]
     owner, names = topology.face_object, list(objects)
+    require_whole_solids(tables[0], topology.panels, owner, names)
     solids = group_solids(tables, wave_numbers, facets.corners, facets.solid, owner, names)
     return _FarFieldTarget(facets, topology, vertices, occluders, tables, wave_numbers, up, solids)
 
