@@ -66,6 +66,7 @@ class UsualValue:
 
 
 Frequency = Annotated[Positive, UsualValue("Hz", 77e9, low=1e6)]
+SweptFrequency = Annotated[Positive, UsualValue("Hz", 77e9, low=1e3)]  # analysers start at 9 kHz
 Bandwidth = Annotated[Positive, UsualValue("Hz", 1e9, low=1e6)]
 FrequencyStep = Annotated[Positive, UsualValue("Hz", 1e6, low=1e3)]
 Duration = Annotated[Positive, UsualValue("seconds", 4e-5, high=1.0)]

@@ -16,7 +16,14 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.errors import PhysicsWarning as PhysicsWarning
-from invertwin.limits import Bandwidth, CountOfTwo, Duration, Frequency, FrequencyStep
+from invertwin.limits import (
+    Bandwidth,
+    CountOfTwo,
+    Duration,
+    Frequency,
+    FrequencyStep,
+    SweptFrequency,
+)
 
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
@@ -170,7 +177,7 @@ class SteppedFrequency(SampledWaveform):
         dwell: duration of each tone, over which its sample is averaged [s].
     """
 
-    start_frequency: Frequency
+    start_frequency: SweptFrequency
     step: FrequencyStep
     samples: CountOfTwo
     dwell: Duration

@@ -268,3 +268,33 @@ def test_descriptions_as_the_docs_have_them(rail, repository):
     scipy.io.savemat(rail.parent / "pass.mat", {"data": history([1.0, 2.0, 0.0])})
     rail.write_text(passes)
     assert float(read_sweeps(rail, trusted=True).radar().origins[0]) == pytest.approx(1000.0)
+
+
+WIDE = np.linspace(100e3, 6e9, 601)
+
+
+@pytest.mark.parametrize("band", [None, [2e9, 4e9]])
+def test_an_analyser_starts_at_100_khz_and_a_band_is_selected(tmp_path, band):
+    distance = 2.4
+    s21 = np.exp(-2j * np.pi * WIDE * 2 * distance / SPEED_OF_LIGHT)
+    touchstone(tmp_path / "wide.s2p", s21, WIDE)
+    path = tmp_path / "wide.toml"
+    more = "" if band is None else f"band = {band}"
+    path.write_text(f'[data]\nfile = "wide.s2p"\n[sweep]\n{more}\n')
+    capture = read_sweeps(path)
+    waveform = capture.radar().waveform
+    inside = WIDE if band is None else WIDE[(band[0] <= WIDE) & (band[1] >= WIDE)]
+    assert waveform.start_frequency == pytest.approx(inside[0])
+    assert waveform.samples == len(inside)
+    grid = capture.radar().grid(1.0, 4.0)
+    profile = capture.spectrum(grid).abs()[0, :, 0, 0]
+    assert float(grid.ranges[profile.argmax()]) == pytest.approx(distance, abs=0.05)
+
+
+@pytest.mark.parametrize("band", ["[4e9, 2e9]", "[7e9, 8e9]", "2e9", "[1e9]"])
+def test_bands_that_hold_nothing_are_named(tmp_path, band):
+    touchstone(tmp_path / "wide.s2p", np.ones(len(WIDE)) + 0j, WIDE)
+    path = tmp_path / "wide.toml"
+    path.write_text(f'[data]\nfile = "wide.s2p"\n[sweep]\nband = {band}\n')
+    with pytest.raises(InputError, match=r"sweep\.band: expected"):
+        read_sweeps(path)

@@ -31,7 +31,7 @@ TOUCHSTONE = re.compile(r"\.s\d+p", re.IGNORECASE)
 _PARAMETER = re.compile(r"S([1-9])([1-9])")
 _KEYS = {
     "data": {"file", "files", "variable", "dimensions", "conjugate"},
-    "sweep": {"parameter", "background", "frequencies", "start_frequency", "step", "dwell"},
+    "sweep": {"parameter", "background", "band", "frequencies", "start_frequency", "step", "dwell"},
     "radar": {
         *("positions", "look_at", "tx_positions", "rx_positions"),
         *("range_origin", "range_center"),
@@ -67,6 +67,7 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
         [sweep]
         parameter = "S21"             # by default S11 of one port, else S21
         background = "empty.s2p"      # a sweep of the empty room, subtracted
+        band = [2e9, 6e9]             # of all frequencies, those that count [Hz]
 
         [radar]
         positions = "rail.csv"        # x, y, z [m] of every file; or a list of points
@@ -118,6 +119,7 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     else:
         beat = _load_sweep_array(files, data, len(tx.positions), trusted)
         frequencies = _load_frequencies(source, sweep, beat.shape[-1])
+    frequencies, beat = _select_band(frequencies, beat, sweep.get("band"))
     start, step = _frequency_spacing(frequencies)
     waveform = SteppedFrequency(start, step, len(frequencies), sweep.get("dwell", _DWELL))
     places = _load_positions(source, radar.get("positions"), len(beat))
@@ -125,6 +127,28 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     turned = None if toward is None else look_at(places, toward)
     device = Radar(tx, rx, waveform, places, turned)
     return Capture.from_beat(beat, _set_range_origin(device, source, radar))
+
+
+def _select_band(
+    frequencies: Float64[Tensor, " sample"],
+    beat: Complex128[Tensor, "frame tx rx sample"],
+    band: Any,
+) -> tuple[Float64[Tensor, " part"], Complex128[Tensor, "frame tx rx part"]]:
+    """Select the frequencies within a band [Hz], and their samples."""
+    if band is None:
+        return frequencies, beat
+    if not isinstance(band, list) or len(band) != 2 or not float(band[0]) < float(band[1]):
+        raise InputError(
+            f"sweep.band: expected its lowest and highest frequency [Hz], got {band!r}; "
+            "write band = [2e9, 6e9]"
+        )
+    inside = (frequencies >= band[0]) & (frequencies <= band[1])
+    if inside.sum() < 2:
+        raise InputError(
+            f"sweep.band: expected a band that holds two frequencies or more of "
+            f"{frequencies.min():.4g} to {frequencies.max():.4g} Hz, got {band!r}; widen it"
+        )
+    return frequencies[inside], beat[..., inside]
 
 
 def _load_sweep_array(
