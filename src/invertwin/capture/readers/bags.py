@@ -124,11 +124,8 @@ def read_track(path: str | Path, topic: str) -> Track:
 
     found = dict(_read_messages(path, topic, read_position))
     times = sorted(found)
-    rows = [found[time] for time in times]
-    return Track(
-        torch.tensor(times, dtype=torch.float64),
-        torch.tensor(rows, dtype=torch.float64).reshape(-1, 3),
-    )
+    places = torch.tensor([found[time] for time in times], dtype=torch.float64).reshape(-1, 3)
+    return Track(torch.tensor(times, dtype=torch.float64), places)
 
 
 @safe_reader("a bag of ROS 1 or ROS 2")

@@ -17,7 +17,6 @@ import torch
 from invertwin.capture.chirps import ChirpData, ChirpSettings
 from invertwin.capture.ti.layouts import (
     LANE_COUNT,
-    MIN_BORDER_RATIO,
     LayoutCandidate,
     better_candidates,
     block_layout,
@@ -225,7 +224,7 @@ def _find_alternatives(
         exact: Whether the size is that of the settings.
         truncated: Whether it is that of a recording that was stopped.
     """
-    sound = measure_evidence(words, settings).border_ratio >= MIN_BORDER_RATIO if exact else False
+    sound = exact and measure_evidence(words, settings).breaks_at_borders
     if not words.size or (sound and not silent_lanes_contradict(words, settings)):
         return []
     found = find_candidates(words, settings)
@@ -239,7 +238,7 @@ def _find_alternatives(
         return others
     # The same blocks in other numbers: no sample tells a stopped recording from another one.
     alike = [one for one in found if len(one.changes) == 1 and "frames" not in one.changes]
-    if stated.border_ratio >= MIN_BORDER_RATIO:
+    if stated.breaks_at_borders:
         alike = [one for one in alike if block_layout(one.settings) == block_layout(settings)]
     return [*(one for one in found if alike and set(one.changes) == {"frames"}), *alike]
 

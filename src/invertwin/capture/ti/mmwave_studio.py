@@ -128,9 +128,8 @@ def _parse_settings(content: dict[str, Any], device: str) -> ChirpSettings:
         # 0 = receivers interleaved, as through 4 lanes; 1 = one after the other, as through 2.
         order, what = int(lanes == 2), f"chInterleave {int(lanes == 2)} with {lanes} LVDS lanes"
         _require_equal(int(layout["chInterleave"]), order, what, "other orders are not supported")
-    profiles = [
-        item["rlProfileCfg_t"] for item in _list_items(radio["rlProfiles"], "rlProfileCfg_t")
-    ]
+    profiles = _list_items(radio["rlProfiles"], "rlProfileCfg_t")
+    profiles = [item["rlProfileCfg_t"] for item in profiles]
     chirps = [item["rlChirpCfg_t"] for item in _list_items(radio["rlChirps"], "rlChirpCfg_t")]
     frame, output = radio["rlFrameCfg_t"], radio["rlAdcOutCfg_t"]["fmt"]
     return frame_settings(

@@ -1,6 +1,5 @@
 """Settings files (`.cfg`) of the mmWave SDK and its demos: one command per line."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from invertwin.capture.chirps import ChirpSettings
@@ -114,7 +113,8 @@ def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> Chi
         frame,
         receivers=bits_to_numbers(int(channel[0], 0)),
         real=kind == 0,
-        swap_iq=_swaps_iq(found.get("adcbufCfg", [])),
+        # SampleSwap: 1 = Q in the lower half word. Since SDK 2 a sub-frame number comes first.
+        swap_iq="adcbufCfg" in found and bool(int(found["adcbufCfg"][-1][-3])),
         bits=BITS[bits],
         lanes=lanes,
     )
@@ -130,12 +130,6 @@ def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> Chi
             "the two commands contradict each other"
         )
     return read
-
-
-def _swaps_iq(commands: Sequence[list[str]]) -> bool:
-    """SampleSwap: 1 = Q in the lower half word, so first in the file."""
-    # Since SDK 2 a sub-frame number comes first.
-    return bool(commands) and bool(int(commands[-1][-3]))
 
 
 def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
