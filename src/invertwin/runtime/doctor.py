@@ -196,9 +196,8 @@ def find_libraries(folders: Iterable[Path] | None = None) -> list[LlvmLibrary]:
         for file in Path(folder).glob("libLLVM*"):
             if _LIBRARY.match(file.name) and file.is_file():
                 path = os.path.realpath(file)
-                found[path] = max(
-                    found.get(path, ()), _library_version(path) or _library_version(str(file))
-                )
+                version = _library_version(path) or _library_version(str(file))
+                found[path] = max(found.get(path, ()), version)
     newest = sorted(((version, path) for path, version in found.items()), reverse=True)
     return [LlvmLibrary(path, version) for version, path in newest]
 
@@ -226,17 +225,15 @@ def probe_library(path: str) -> LlvmProbeResult:
     if missing:
         return LlvmProbeResult(False, f"could not be tried: Dr.Jit needs {missing[1]}", final=False)
     if lines[0].startswith("Traceback"):
-        return LlvmProbeResult(
-            False, f"could not be tried: {_shorten_message(lines[-1])}", final=False
-        )
+        reason = f"could not be tried: {_shorten_message(lines[-1])}"
+        return LlvmProbeResult(False, reason, final=False)
     reason = lines[0].split("(): ")[-1].split(". ")[0].rstrip(".")
     return LlvmProbeResult(False, f"refused: {_shorten_message(reason)}")
 
 
 def _shorten_message(message: str) -> str:
     """A message without addresses of memory, cut between words."""
-    plain = re.sub(r":? ?\b0x[0-9a-f]+\b,?", "", message)
-    return textwrap.shorten(plain, 120, placeholder=" …")
+    return textwrap.shorten(re.sub(r":? ?\b0x[0-9a-f]+\b,?", "", message), 120, placeholder=" …")
 
 
 def gpu_name() -> str | None:
@@ -367,9 +364,8 @@ def _reject_if_loaded(choice: _LlvmChoice) -> _LlvmChoice:
     if loaded[:1] == _library_version(choice.path or "")[:1]:
         return choice
     version = ".".join(map(str, loaded))
-    return _LlvmChoice(
-        None, f"libLLVM {version}, as Dr.Jit was imported first (import invertwin before it)"
-    )
+    why = "as Dr.Jit was imported first (import invertwin before it)"
+    return _LlvmChoice(None, f"libLLVM {version}, {why}")
 
 
 def _explicit_path() -> str | None:
