@@ -20,6 +20,7 @@ from invertwin.cli.options import (
     FilesArgument,
     FitOptions,
     LookOptions,
+    RecordingOptions,
     ResumableOptions,
     RunOptions,
     TwinOptions,
@@ -72,6 +73,15 @@ app = typer.Typer(
 )
 
 
+def _command_with(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add a command whose options are the fields of a dataclass."""
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        return app.command()(with_options(kind)(function))
+
+    return decorate
+
+
 def _show_version(wanted: bool) -> bool:
     if wanted:
         print(f"invertwin {__version__}")
@@ -91,8 +101,7 @@ def invertwin(
     """Digital twins from radar: find a scene from its echoes by differentiating ray tracing."""
 
 
-@app.command()
-@with_options(RunOptions)
+@_command_with(RunOptions)
 def simulate(options: RunOptions, file: FileArgument) -> None:
     """Simulate exact radar signals of a scene, and their spectra."""
     runs = load_runs([file], options, "simulate", ("radar", "grid", "data"))
@@ -104,8 +113,7 @@ def simulate(options: RunOptions, file: FileArgument) -> None:
         print_tables(tables)
 
 
-@app.command()
-@with_options(DatasetOptions)
+@_command_with(DatasetOptions)
 def dataset(options: DatasetOptions, file: FileArgument) -> None:
     """Simulate a data set: many samples of a run file with other values each, and their labels."""
     from invertwin.cli.commands.dataset import (
@@ -132,15 +140,13 @@ def dataset(options: DatasetOptions, file: FileArgument) -> None:
         print_tables(tables)
 
 
-@app.command()
-@with_options(FitOptions)
+@_command_with(FitOptions)
 def reconstruct(options: FitOptions, file: FileArgument) -> None:
     """Fit the parameters of a scene to radar data."""
     _run_one_reconstruction(file, options, Path("out", file.stem))
 
 
-@app.command()
-@with_options(ResumableOptions)
+@_command_with(ResumableOptions)
 def plan(options: ResumableOptions, file: FileArgument) -> None:
     """State the error bars of a fit before anything is recorded, and rank positions to add."""
     runs = load_runs([file], options, "plan", ("radar", "data", "grid", "parameters"))
@@ -168,8 +174,7 @@ def check(file: FileArgument, backend: BackendOption = None) -> None:
     console.print(line, markup=False, soft_wrap=True)
 
 
-@app.command()
-@with_options(ResumableOptions)
+@_command_with(ResumableOptions)
 def demo(options: ResumableOptions) -> None:
     """Find a hidden letter from its radar echoes."""
     # In its own folder the demo replaces what it left there before.
@@ -177,30 +182,20 @@ def demo(options: ResumableOptions) -> None:
     _run_one_reconstruction(_find_demo_file(), replace(options, overwrite=again), Path("out/demo"))
 
 
-@app.command()
-@with_options(LookOptions)
+@_command_with(LookOptions)
 def look(options: LookOptions) -> None:
     """Show a recording: range, range rate, direction; and write it as a capture."""
     from invertwin.cli.commands.look import run_look
 
-    default = Path("out") / options.recording.name.split(".")[0]
-    with run_folder(options, default) as folder:
-        with show_progress(console):
-            tables = run_look(options, folder)
-        print_tables(tables)
+    _run_recording(options, "", run_look)
 
 
-@app.command()
-@with_options(TwinOptions)
+@_command_with(TwinOptions)
 def twin(options: TwinOptions) -> None:
     """Find what stands in a recording, with no start: things, places, sizes, confidences."""
     from invertwin.cli.commands.twin import run_twin
 
-    default = Path("out") / f"{options.recording.name.split('.')[0]}_twin"
-    with run_folder(options, default) as folder:
-        with show_progress(console):
-            tables = run_twin(options, folder)
-        print_tables(tables)
+    _run_recording(options, "_twin", run_twin)
 
 
 @app.command()
@@ -226,8 +221,7 @@ def view(
     run_view(target, console, host=host, port=port, token=token, record=record)
 
 
-@app.command()
-@with_options(ResumableOptions)
+@_command_with(ResumableOptions)
 def gradcheck(options: ResumableOptions, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
 
@@ -248,8 +242,7 @@ def _gradcheck_sections(run: Any) -> tuple[str, ...]:
     return ("gradcheck",) if alone else ("gradcheck", "radar", "grid")
 
 
-@app.command()
-@with_options(ResumableOptions)
+@_command_with(ResumableOptions)
 def rcs(options: ResumableOptions, files: FilesArgument) -> None:
     """Compute radar signatures: cross-sections, range profiles, images."""
 
@@ -301,6 +294,17 @@ def main() -> None:
     except InputError as error:
         print(f"invertwin: {error}", file=sys.stderr)
         sys.exit(2)
+
+
+def _run_recording(
+    options: RecordingOptions, ending: str, work: Callable[..., list[ReportTable]]
+) -> None:
+    """One recording, by default in a folder of its name and an ending."""
+    default = Path("out", options.recording.name.split(".")[0] + ending)
+    with run_folder(options, default) as folder:
+        with show_progress(console):
+            tables = work(options, folder)
+        print_tables(tables)
 
 
 def _run_each(

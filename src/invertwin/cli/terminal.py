@@ -140,8 +140,7 @@ def count_progress(console: Console, name: str, total: int) -> Iterator[Callable
         return
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task("", total=total)
-        yield partial(bar.advance, task)
+        yield partial(bar.advance, bar.add_task("", total=total))
 
 
 @contextmanager

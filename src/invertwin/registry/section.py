@@ -114,16 +114,9 @@ class Section(BaseModel):
         if not unknown:
             return handler(data)
         # Pydantic's own error for an extra key does not carry the keys that are allowed.
-        found = [
-            InitErrorDetails(
-                type=PydanticCustomError(
-                    "unknown_key", "unknown key", {"key": n, "allowed": names}
-                ),
-                loc=(),
-                input=data,
-            )
-            for n in unknown
-        ]
+        told = [{"key": name, "allowed": names} for name in unknown]
+        kinds = [PydanticCustomError("unknown_key", "unknown key", context) for context in told]
+        found = [InitErrorDetails(type=kind, loc=(), input=data) for kind in kinds]
         meant = {m for n in unknown for m in difflib.get_close_matches(str(n), names, cutoff=0.5)}
         try:
             handler({name: value for name, value in data.items() if name in names})
@@ -140,11 +133,8 @@ def _to_init_error(row: ErrorDetails) -> InitErrorDetails:
     """An error of pydantic as one that can be raised again."""
     kind, context = row["type"], row.get("ctx", {})
     if kind not in _PYDANTIC_ERRORS:
-        return InitErrorDetails(
-            type=PydanticCustomError(kind, "{text}", {**context, "text": row["msg"]}),  # type: ignore[arg-type]
-            loc=row["loc"],
-            input=row["input"],
-        )
+        own = PydanticCustomError(kind, "{text}", {**context, "text": row["msg"]})  # type: ignore[arg-type]
+        return InitErrorDetails(type=own, loc=row["loc"], input=row["input"])
     return InitErrorDetails(type=kind, loc=row["loc"], input=row["input"], ctx=context)
 
 

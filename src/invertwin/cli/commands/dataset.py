@@ -227,9 +227,8 @@ def make_sample_run(run: RunFile, index: int) -> RunFile:
 def _build_sample(run: RunFile) -> tuple[Scene, SensorSetup]:
     scene = build.true_scene(run)
     radar = build.radar(require_section(run, "radar", "a sample"))
-    return scene, SensorSetup(
-        run, radar, build.grid(require_section(run, "grid", "a sample"), radar)
-    )
+    grid = build.grid(require_section(run, "grid", "a sample"), radar)
+    return scene, SensorSetup(run, radar, grid)
 
 
 def _check_first(run: RunFile, index: int) -> None:
@@ -318,19 +317,15 @@ def _write_report(
         "wall_seconds": seconds,
     }
     status = f"{count} samples in {len(shards)} shards."
-    parts = [quantity_table("Data set", metrics)]
-    return write_report(
-        folder, metrics, run.title or "Data set", status, parts, again="dataset", note=run.note
-    )
+    parts, title = [quantity_table("Data set", metrics)], run.title or "Data set"
+    return write_report(folder, metrics, title, status, parts, again="dataset", note=run.note)
 
 
 def _read_finished_shard(folder: RunFolder, number: int) -> dict[str, Any] | None:
     """The manifest's row of a shard that an interrupted run has written whole, or None."""
-    unfinished = folder.path / UNFINISHED
-    there = (unfinished / _shard_row_path(number)).exists() and (
-        unfinished / shard_name(number)
-    ).exists()
-    return folder.read_json(_shard_row_path(number)) if there else None
+    row = _shard_row_path(number)
+    whole = all((folder.path / UNFINISHED / name).exists() for name in (row, shard_name(number)))
+    return folder.read_json(row) if whole else None
 
 
 def _shard_row_path(number: int) -> str:

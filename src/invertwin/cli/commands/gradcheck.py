@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -128,11 +129,9 @@ def run_gradcheck(
     told = [k for k in range(len(_TABLE_COLUMNS)) if any(row[k] is not None for row in rows)]
     columns, rows = [_TABLE_COLUMNS[k] for k in told], [[row[k] for k in told] for row in rows]
     table = ReportTable("Agreement with central differences", columns, rows, legend)
-    count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
+    status = "1 scene checked." if len(scenes) == 1 else f"{len(scenes)} scenes checked."
     parts = [table, *studies, *pictures]
-    return write_report(
-        folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck"
-    )
+    return write_report(folder, metrics, "Gradient check", status, parts, again="gradcheck")
 
 
 @dataclass(frozen=True)
@@ -165,9 +164,8 @@ def _rcs_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _Gradch
         else:
             places = (expand_values(table.frequencies) / 1e9, "frequency [GHz]")
             curves = {name: values[:, 0] for name, values in curves.items()}
-        return plotting.rcs_derivatives(
-            curves, *places, f"∂σ, σ in m² [{_derivative_unit(settings)}]"
-        )
+        unit = _derivative_unit(settings)
+        return plotting.rcs_derivatives(curves, *places, f"∂σ, σ in m² [{unit}]")
 
     return _GradcheckTarget(RcsMap(compute=compute_rcs), None, None, draw)
 
@@ -231,9 +229,8 @@ def _radar_map_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _
     require_resources(run, scene, {"": SensorSetup(run, radar, grid)})
     drawn = {key: getattr(settings, key) for key in ("depth", "samples", "boundary_samples")}
     model = SurrogateMap(grid, build.build_section(run, "surrogate"), Sampling(**drawn))
-    return _GradcheckTarget(
-        model, radar, (radar, grid), lambda report: _draw_maps(report, grid, settings)
-    )
+    draw = partial(_draw_maps, grid=grid, settings=settings)
+    return _GradcheckTarget(model, radar, (radar, grid), draw)
 
 
 def _panel_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _GradcheckTarget:
@@ -248,9 +245,8 @@ def _panel_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _Grad
         order = report.difference[0].argsort()
         curves = {n: values[0, order] for n, values in _derivative_maps(report).items()}
         number = torch.arange(len(order), dtype=torch.float64)
-        return plotting.rcs_derivatives(
-            curves, number, "receiver", f"∂ path gain [{_derivative_unit(settings)}]"
-        )
+        label = f"∂ path gain [{_derivative_unit(settings)}]"
+        return plotting.rcs_derivatives(curves, number, "receiver", label)
 
     return _GradcheckTarget(PanelMap(aim.tx, aim.receivers, aim.frequency), panel, None, draw)
 

@@ -73,9 +73,8 @@ def run_plan(
         )
         parts.append(ReportTable("Positions to add", heads, rows, note))
     status = f"{len(found.names)} parameters, {len(found.unobserved)} directions not observed."
-    return write_report(
-        folder, metrics, run.title or "Plan", status, parts, again="plan", note=run.note
-    )
+    title = run.title or "Plan"
+    return write_report(folder, metrics, title, status, parts, again="plan", note=run.note)
 
 
 def _prepare_fit_at_truth(problem: Problem) -> Any:
@@ -106,9 +105,8 @@ def _compare_with_fits(
         part = f"{PARTS}/fit_{number:03d}.json"
         row = folder.read_json(part)
         if row is None:
-            row = fit_errors(
-                _prepare_fit_at_truth(with_new_recording(problem, number + 1, console))
-            )
+            own = with_new_recording(problem, number + 1, console)
+            row = fit_errors(_prepare_fit_at_truth(own))
             folder.write_json(part, row)
             done += 1
         left = (time.perf_counter() - begin) / max(done, 1) * (count - number - 1)
@@ -116,11 +114,10 @@ def _compare_with_fits(
         rows.append(row)
     errors = torch.tensor([list(row.values()) for row in rows], dtype=torch.float64)
     spread = dict(zip(rows[0], errors.std(0).tolist(), strict=True))
+    ratios = {n: own / spread[n] for n, own in predicted_deviations.items() if spread.get(n)}
     return {
         "simulated_fits": count,
         "observed_deviations": spread,
         "observed_means": dict(zip(rows[0], errors.mean(0).tolist(), strict=True)),
-        "predicted_over_observed": {
-            n: predicted_deviations[n] / spread[n] for n in predicted_deviations if spread.get(n)
-        },
+        "predicted_over_observed": ratios,
     }

@@ -24,14 +24,7 @@ from invertwin.cli.fits.displays import (
 )
 from invertwin.cli.fits.fitting import fit_all, run_fit
 from invertwin.cli.fits.kinds import build_problem
-from invertwin.cli.fits.problem import (
-    OWN_METHOD,
-    Fits,
-    Problem,
-    Start,
-    known_truth,
-    require_settings,
-)
+from invertwin.cli.fits.problem import OWN_METHOD, Fits, Problem, Start, known_truth
 from invertwin.cli.fits.scores import drop_histories
 from invertwin.cli.fits.shape_scores import check_measures
 from invertwin.cli.fits.spreading import QUIET_CONSOLE, FitWorkers, distribute_fits
@@ -90,17 +83,13 @@ def run_reconstruct(
     starts = problem.starts()
     check_measures(problem.kind.with_method(problem, OWN_METHOD), replace_clouds(starts[0].scene))
     if workers is not None:
-        work = [
-            (method, k) for method in problem.methods for k in range(len(problem.starts(method)))
-        ]
-        distribute_fits(_fit_one, run, folder, console, workers, work)
+        distribute_fits(_fit_one, run, folder, console, workers, problem.work)
     live = Viewer(_start_display(problem, starts[0])) if view else None
     with live or nullcontext():
         if live is not None:
             console.print(f"open {live.address}", markup=False, soft_wrap=True)
-        fits = fit_all(
-            problem, folder, console, None if live is None else partial(_show_step, live)
-        )
+        show = None if live is None else partial(_show_step, live)
+        fits = fit_all(problem, folder, console, show)
     fits = replace(fits, maps=_maps(fits))
     with show_progress(console):
         confidence = confidence_metrics(fits.found, known_truth(fits.problem))
@@ -117,7 +106,7 @@ def run_reconstruct(
 def _metrics(fits: Fits, confidence: dict[str, Any]) -> dict[str, Any]:
     """Numbers of the run, as metrics.json has them."""
     problem, best, rows = fits.problem, fits.best, fits.rows
-    dropped = problem.kind.histories
+    lean = {name: drop_histories(own, problem.kind.histories) for name, own in rows.items()}
     kept = ("other_ends", "ambiguities", "status", "steps", "loss", "start")
     return {
         "task": problem.run.task,
@@ -126,12 +115,8 @@ def _metrics(fits: Fits, confidence: dict[str, Any]) -> dict[str, Any]:
         **{key: best[key] for key in kept if key in best and key not in confidence},
         "parameters": best["values"],
         **problem.notes,
-        **{
-            f"starts_{method}": drop_histories(rows[method], dropped)
-            for method in rows
-            if method != OWN_METHOD
-        },
-        "starts": drop_histories(rows[OWN_METHOD], dropped),
+        **{f"starts_{name}": own for name, own in lean.items() if name != OWN_METHOD},
+        "starts": lean[OWN_METHOD],
         **problem.kind.metrics(fits),
         "fit_seconds": sum(row["seconds"] for fits in rows.values() for row in fits),
     }
@@ -159,10 +144,9 @@ def _write(
     display = make_fit_display(problem, start, twin, fits.maps, confidence, steps)
     display.save(folder.file(VIEW_FILE))
     sensors = dict(zip(problem.sensor_data, fits.found.sensors, strict=True))
+    depth = run.fit_settings.depth
     links = {
-        name: InteractiveSensor(
-            fits.found.scene, sensors[name], item.grid, require_settings(run).depth
-        )
+        name: InteractiveSensor(fits.found.scene, sensors[name], item.grid, depth)
         for name, item in radar_data(problem).items()
     }
     shown = ReportView(view_html(display, links))

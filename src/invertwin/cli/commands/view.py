@@ -9,7 +9,6 @@ from rich.console import Console
 from invertwin.capture import Capture, search_ranges
 from invertwin.channel import Grid
 from invertwin.cli.fits.displays import VIEW_FILE
-from invertwin.cli.fits.problem import fitted_objects
 from invertwin.cli.fits.radar_models import build_sensors
 from invertwin.cli.run_file import load_run, prefix_file_errors
 from invertwin.cli.schema import RunFile, build
@@ -92,7 +91,7 @@ def _display_of_run(
         scene, truth = build.scene(run), build.true_scene(run)
         radars = _build_radars(run)
         title = run.title or file.stem
-        names = fitted_objects(run)
+        names = run.fitted_objects
         # Without a fit, show objects at their current pose.
         own = truth if folder is None or not (folder / VIEW_FILE).exists() else scene
         depth = run.reconstruct.depth if run.reconstruct else getattr(run.data, "depth", 1)
@@ -109,9 +108,8 @@ def _display_of_run(
                 link.replace_meshes(display.steps[-1].bodies)
     elif folder is not None and (folder / "capture.nc").exists() and "" in links:
         capture, grid = Capture.load(folder / "capture.nc"), links[""].grid
-        display = replace(
-            display, maps={"": DisplayMaps.from_spectra({MEASURED: capture.spectrum(grid)}, grid)}
-        )
+        maps = DisplayMaps.from_spectra({MEASURED: capture.spectrum(grid)}, grid)
+        display = replace(display, maps={"": maps})
     return display, links
 
 

@@ -1,4 +1,4 @@
-"""What a fit leaves to be seen in three dimensions: its steps, its twin, the truth, error bars."""
+"""Displays of a fit in three dimensions: its steps, its twin, the truth, error bars."""
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from invertwin.cli.fits.problem import Problem, SensorData, fitted_objects
+from invertwin.cli.fits.problem import Problem, SensorData
 from invertwin.errors import InputError
 from invertwin.inversion import Callback
 from invertwin.inversion.fit import Fit
@@ -106,7 +106,7 @@ class StepRecorder(Callback):
 
 
 def steps_path(checkpoint: str) -> str:
-    """Where the steps of a fit are kept, as a path in the run's folder.
+    """The path in the run's folder at which the steps of a fit are kept.
 
     Args:
         checkpoint: That of the fit.
@@ -142,7 +142,7 @@ def make_fit_display(
         steps: Those that were kept.
     """
     display = make_problem_display(problem, twin)
-    names = [name for name in fitted_objects(problem.run) if name in start.names]
+    names = [name for name in problem.run.fitted_objects if name in start.names]
     more = scene_layers(start, "start", fitted=names, fitted_only=True)
     return replace(
         display,
@@ -155,7 +155,7 @@ def make_fit_display(
 def make_sensor_maps(
     problem: Problem, spectra: Mapping[str, Sequence[Tensor]], max_values: int | None = None
 ) -> dict[str, DisplayMaps]:
-    """What the sensors of a fit see, by their names.
+    """Maps of the sensors of a fit, by their names.
 
     Args:
         problem: What is fitted.
@@ -163,13 +163,12 @@ def make_sensor_maps(
         max_values: Values that are kept of a sensor, about; None = of a few megabytes.
     """
     limit = {} if max_values is None else {"max_values": max_values}
-    return {
-        name: DisplayMaps.from_spectra(
-            {what: own[k] for what, own in spectra.items()}, item.grid, **limit
-        )
-        for k, (name, item) in enumerate(problem.sensor_data.items())
-        if item.grid is not None and all(spectra.values())
-    }
+    found = {}
+    for k, (name, item) in enumerate(problem.sensor_data.items()):
+        if item.grid is not None and all(spectra.values()):
+            own = {what: maps[k] for what, maps in spectra.items()}
+            found[name] = DisplayMaps.from_spectra(own, item.grid, **limit)
+    return found
 
 
 def make_problem_display(problem: Problem, scene: Scene) -> Display:
@@ -179,7 +178,7 @@ def make_problem_display(problem: Problem, scene: Scene) -> Display:
         problem: What is fitted.
         scene: The start or the twin.
     """
-    names = [name for name in fitted_objects(problem.run) if name in scene.names]
+    names = [name for name in problem.run.fitted_objects if name in scene.names]
     known = any(name in problem.known_objects for name in names)
     radars = {name: (item.sensor, item.grid) for name, item in radar_data(problem).items()}
     title = problem.run.title or problem.kind.title

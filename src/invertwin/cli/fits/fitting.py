@@ -19,13 +19,11 @@ from invertwin.cli.fits.problem import (
     Problem,
     Row,
     Start,
-    fitted_objects,
     make_models,
     make_observations,
     make_schedule,
     make_unknowns,
     rank,
-    require_settings,
 )
 from invertwin.cli.fits.shape_scores import CURVE_KEY, make_shape_metric
 from invertwin.cli.fits.spreading import fit_file_stem
@@ -68,12 +66,11 @@ def fit_all(
         console: Shows progress.
         show: Is told of steps as they come.
     """
-    work = [(method, k) for method in problem.methods for k in range(len(problem.starts(method)))]
     rows: dict[str, list[Row]] = {method: [] for method in problem.methods}
     outcomes: dict[tuple[str, int], Callable[[], Reconstruction]] = {}
-    for method, number in work:
+    for method, number in problem.work:
         own = problem.kind.with_recording_of_start(problem, number, console)
-        checkpoint = CHECKPOINT if len(work) == 1 else None
+        checkpoint = CHECKPOINT if len(problem.work) == 1 else None
         told = None if show is None else partial(show, own)
         start = problem.starts(method)[number]
         row, outcome = run_fit(own, start, number, method, folder, console, checkpoint, told)
@@ -82,16 +79,10 @@ def fit_all(
             outcomes[method, number] = outcome
     best = min(rows[OWN_METHOD], key=rank)
     number = best["start"]
-    return Fits(
-        problem.kind.with_method(
-            problem.kind.with_recording_of_start(problem, number, console), OWN_METHOD
-        ),
-        rows,
-        lambda method, number: outcomes[method, number](),
-        best,
-        problem.starts()[number],
-        outcomes[OWN_METHOD, number](),
-    )
+    own = problem.kind.with_recording_of_start(problem, number, console)
+    own = problem.kind.with_method(own, OWN_METHOD)
+    start, found = problem.starts()[number], outcomes[OWN_METHOD, number]()
+    return Fits(own, rows, lambda method, k: outcomes[method, k](), best, start, found)
 
 
 def run_fit(
@@ -132,6 +123,7 @@ def run_fit(
     name = f"start {index + 1}" + ("" if method == OWN_METHOD else f", {method.replace('_', ' ')}")
     with report_progress(name, sum(stage.steps for stage in stages), console) as shown:
         found, found_ends = again(shown)
+    curve = [[row["step"] + 1, row[CURVE_KEY]] for row in found.history if CURVE_KEY in row]
     row = {
         "start": index,
         "loss": found.loss,
@@ -144,9 +136,7 @@ def run_fit(
         **found_ends,
         **own.kind.score_fit(own, start, found),
         "losses": [step["loss"] for step in found.history],
-        "curve": [
-            [step["step"] + 1, step[CURVE_KEY]] for step in found.history if CURVE_KEY in step
-        ],
+        "curve": curve,
     }
     folder.write_json(f"{part}.json", row)
     # The twins of many recordings are read again, not kept.
@@ -174,25 +164,21 @@ def _fit_or_search(
         watching = [] if watch is None else [Watch(watch, every)]
         kept = StepRecorder(
             folder.file(steps_path(file)),
-            [name for name in dict.fromkeys(fitted_objects(run)) if name in start.scene.names],
+            [name for name in dict.fromkeys(run.fitted_objects) if name in start.scene.names],
             sum(stage.steps for stage in stages),
-            require_settings(run).checkpoint_every,
+            run.fit_settings.checkpoint_every,
             show if shown else None,
         )
         return [*watching, *shown, _make_checkpoint(problem, folder, file), kept]
 
     given = start.scene, make_observations(problem, start), make_unknowns(problem, start)
     seed = derive_seed(run.seed, index)
-    how: dict[str, Any] = {
-        "loss": build.build_loss(run),
-        "optimizer": build.build_section(run, "optimizer"),
-    }
-    how |= {"schedule": stages, "seed": seed}
+    how: dict[str, Any] = {"loss": build.build_loss(run), "schedule": stages, "seed": seed}
+    how["optimizer"] = build.build_section(run, "optimizer")
     if run.search is None:
         return reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
     part = f"{PARTS}/{Path(checkpoint).stem}_fit"
-    chance = torch.Generator().manual_seed(seed)
-    starts = problem.kind.make_candidates(problem, start, chance)
+    starts = problem.kind.make_candidates(problem, start, torch.Generator().manual_seed(seed))
     found = search(
         *given,
         Screening(starts, run.search.fits, run.search.shortlist),
@@ -204,9 +190,8 @@ def _fit_or_search(
 
 def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:
     """Goes on from its own unfinished part; open_run has settled what may be there."""
-    return Checkpoint(
-        folder.file(name), require_settings(problem.run).checkpoint_every, resume=True
-    )
+    every = problem.run.fit_settings.checkpoint_every
+    return Checkpoint(folder.file(name), every, resume=True)
 
 
 def _fitted_values(modules: nn.ModuleList) -> Row:
@@ -243,7 +228,7 @@ def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> 
     else:
         bias, clock = RangeBias(), ClockOffset(capture.positions)
         own = replace(problem, run=run.apply_overrides(table))
-        schedule, (model,) = require_settings(own.run).build(), make_models(own)
+        schedule, (model,) = own.run.fit_settings.build(), make_models(own)
         with report_progress("calibration", schedule.steps, console) as shown:
             found = reconstruct(
                 Scene({table.object: target}),

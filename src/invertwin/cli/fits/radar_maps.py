@@ -16,9 +16,7 @@ from invertwin.cli.fits.problem import (
     Row,
     Start,
     Summary,
-    fitted_objects,
     known_truth,
-    require_settings,
     sensor_runs,
 )
 from invertwin.cli.fits.radar_models import (
@@ -68,7 +66,7 @@ class RadarMaps(DataKind):
         data = record_sensors(run, sensors, truth, console)
         simulated = all(isinstance(own.data, SimulatedData) for own in sensor_runs(run).values())
         known = frozenset(truth.names if simulated else run.truth)
-        target = run.starts.object if run.starts else next(iter(fitted_objects(run)), None)
+        target = run.starts.object if run.starts else next(iter(run.fitted_objects), None)
         return Problem(run, scene, truth, known, data, target, kind=self)
 
     def prepare(self, problem: Problem, folder: RunFolder, console: Console) -> Problem:
@@ -92,7 +90,7 @@ class RadarMaps(DataKind):
             f"{name}.{kind}" if name else kind: Unknown(
                 RangeBias() if kind == "range_bias" else ClockOffset(positions)
             )
-            for kind in require_settings(problem.run).nuisances
+            for kind in problem.run.fit_settings.nuisances
         }
 
     def score_fit(self, problem: Problem, start: Start, found: Reconstruction) -> Row:
@@ -112,16 +110,12 @@ class RadarMaps(DataKind):
     def metrics(self, fits: Fits) -> Row:
         """See ``DataKind.metrics``."""
         problem, rows, best, methods = fits.problem, fits.rows, fits.best, fits.methods
-        found: Row = {
-            **summarise_successes(problem, rows, methods),
-            **(
-                error_bar_coverage(rows[OWN_METHOD]) if has_recording_per_start(problem.run) else {}
-            ),
-            **{
-                k: best[k]
-                for k in best
-                if (k in START_COLUMNS or is_shape_key(k)) and k != "seconds"
-            },
+        found: Row = summarise_successes(problem, rows, methods)
+        if has_recording_per_start(problem.run):
+            found |= error_bar_coverage(rows[OWN_METHOD])
+        told = [k for k in best if (k in START_COLUMNS or is_shape_key(k)) and k != "seconds"]
+        found |= {
+            **{key: best[key] for key in told},
             "start_loss_sharp": total_loss(problem, fits.maps["start"], fits.maps["measured"]),
             "loss_sharp": total_loss(problem, fits.maps["twin"], fits.maps["measured"]),
             **surrogate_agreement(problem, fits.found.scene, fits.found.sensors[0]),

@@ -1,4 +1,4 @@
-"""How good a fit is: distances to the truth, held-out objects, losses without blur."""
+"""Scores of a fit: distances to the truth, held-out objects, losses without blur."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ import torch
 
 from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
-from invertwin.cli.fits.problem import HISTORIES, Problem, fitted_tables, require_settings
+from invertwin.cli.fits.problem import HISTORIES, Problem, fitted_tables
 from invertwin.cli.fits.radar_models import (
     make_display_models,
     make_unblurred_models,
@@ -29,7 +29,7 @@ from invertwin.scene.shape_models.density import replace_clouds
 
 
 def score_fit(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
-    """How far start and twin are from the truth, where it is known."""
+    """Errors of start and twin, where the truth is known."""
     name, twin = problem.scored_object, replace_clouds(twin)
     if name is None:
         return {}
@@ -41,7 +41,7 @@ def score_fit(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     after = pose_error(twin[name], problem.truth[name])
     if before is None or after is None:
         return {"position": place, **shapes}
-    settings = require_settings(problem.run)
+    settings = problem.run.fit_settings
     body = build.fitted_body(problem.run, problem.scene, name)
     if body is not None:
         angles = score_joints(body, *(s[name].mesh for s in (start, twin, problem.truth)))
@@ -75,11 +75,10 @@ def score_fit(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
         rows["success"] &= angle <= settings.rotation_limit_deg
     if "scale" in kinds:
         rows |= {"scale_error": abs(after.scale - 1)}
-    told = [table for table in fitted if _is_material_known(problem, table)]
-    for table in told:
-        frequency = _frequency(problem)
-        ends = twin[table.object].material, problem.truth[table.object].material
-        rows |= material_errors(table.values, *ends, frequency, table.layer)
+    for table in fitted:
+        if _is_material_known(problem, table):
+            ends = twin[table.object].material, problem.truth[table.object].material
+            rows |= material_errors(table.values, *ends, _frequency(problem), table.layer)
     return rows | shapes
 
 
@@ -101,7 +100,7 @@ def score_joints(body: SkinnedBody, start: Mesh, found: Mesh, truth: Mesh) -> di
 
 
 def _is_material_known(problem: Problem, parameter: Any) -> bool:
-    """Whether the run file tells what a fitted object is really made of."""
+    """Return True if the run file tells the true material of a fitted object."""
     if parameter.kind != "material":
         return False
     table = problem.run.truth.get(parameter.object)
@@ -163,7 +162,7 @@ def predict_unblurred_maps(
     problem: Problem, scene: Scene, radars: Sequence[Radar]
 ) -> list[torch.Tensor]:
     """The surrogate's map of every sensor, as fitted, without extra widths."""
-    counts = {"samples": 4 * require_settings(problem.run).samples, "boundary_samples": 0}
+    counts = {"samples": 4 * problem.run.fit_settings.samples, "boundary_samples": 0}
     with torch.no_grad():
         return [
             model.with_sampling(**counts).predict(scene, radar, problem.run.seed)

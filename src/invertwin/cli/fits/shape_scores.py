@@ -1,4 +1,4 @@
-"""How near found shapes are to true ones: numbers of a run, and their curves over the steps."""
+"""Errors of found shapes: numbers of a run, and their curves over the steps."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,21 +20,20 @@ from invertwin.scene import Mesh, Scene
 from invertwin.scene.shape_models.density import replace_clouds
 
 CURVE_KEY = "chamfer_m"
-"""What the curves show."""
+"""Metric of the curves."""
 _MEASURE_PREFIXES = ("chamfer", "fscore", "iou", "normal_consistency", "components", "euler_number")
 _SUBJECT_LABELS = {"start_": ", start", "true_": ", truth", "": ""}
 _SURFACE_LABELS = {"_whole": ", whole surface", "_seen": ", surface that is seen", "": ""}
 
 
 def is_shape_key(key: str) -> bool:
-    """Whether a number of a fit is a measure of its shape."""
-    return key.startswith(
-        tuple(whose + name for whose in _SUBJECT_LABELS for name in _MEASURE_PREFIXES)
-    )
+    """Return True if a number of a fit is a measure of its shape."""
+    begins = tuple(whose + name for whose in _SUBJECT_LABELS for name in _MEASURE_PREFIXES)
+    return key.startswith(begins)
 
 
 def shape_label(key: str) -> str:
-    """What a measure is, in words."""
+    """Name of a measure in words."""
     whose = next(whose for whose in _SUBJECT_LABELS if key.startswith(whose))
     part = next(part for part in _SURFACE_LABELS if part in key)
     name = key.removeprefix(whose).replace(part, "")
@@ -77,30 +76,25 @@ def score_shape(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     if table is None:
         return {}
     rows = _shape_metrics(problem, twin, table.seen)
-    rows |= _shape_metrics(problem, twin, False, "_whole") | _shape_metrics(
-        problem, twin, True, "_seen"
-    )
+    rows |= _shape_metrics(problem, twin, False, "_whole")
+    rows |= _shape_metrics(problem, twin, True, "_seen")
     rows |= _topology_metrics(twin[table.object].mesh)
     truth = _topology_metrics(problem.truth[table.object].mesh)
-    before = _shape_metrics(problem, start, table.seen) | _topology_metrics(
-        start[table.object].mesh
-    )
+    before = _shape_metrics(problem, start, table.seen)
+    before |= _topology_metrics(start[table.object].mesh)
     rows |= {f"true_{key}": value for key, value in truth.items()}
     return rows | {f"start_{key}": value for key, value in before.items()}
 
 
 def make_shape_metric(problem: Problem) -> Callable[[Scene], dict[str, float]] | None:
-    """What is noted of the twin during the fit, where the truth is known."""
+    """Metric of the twin during the fit, where the truth is known."""
     table = problem.measures
     if table is None:
         return None
 
     def measure_shape(scene: Scene) -> dict[str, float]:
-        return {
-            CURVE_KEY: _compare_surfaces(
-                problem, replace_clouds(scene), table.seen, volume=False
-            ).chamfer
-        }
+        found = _compare_surfaces(problem, replace_clouds(scene), table.seen, volume=False)
+        return {CURVE_KEY: found.chamfer}
 
     return measure_shape
 

@@ -30,7 +30,7 @@ FitFunction = Callable[[RunFile, str, int, RunFolder], object]
 
 @dataclass(frozen=True)
 class FitWorkers:
-    """Who fits.
+    """Workers of the fits of a run.
 
     Attributes:
         engine: Processes of this machine, or tasks of a Ray cluster.
@@ -42,7 +42,7 @@ class FitWorkers:
 
     @classmethod
     def from_options(cls, engine: Engine, count: int | None) -> "FitWorkers | None":
-        """What the options `--engine` and `--workers` ask for; None without them.
+        """Workers that the options `--engine` and `--workers` ask for; None without them.
 
         Args:
             engine: Of the option.
@@ -123,7 +123,7 @@ def no_parallel_fits_error(got: str) -> InputError:
 
 
 def fit_file_stem(mode: str, start: int) -> str:
-    """How the files of a fit begin, in the run's folder.
+    """Path in the run's folder with which the files of a fit begin.
 
     Args:
         mode: The run's own way to fit, or a variant.

@@ -114,15 +114,12 @@ def _iterate_sections(top: JsonSchema) -> Iterator[tuple[str, list[ReportTable]]
     def walk(path: str, models: Sequence[JsonSchema]) -> Iterator[tuple[str, list[ReportTable]]]:
         title = f"[{path}]" if path else "top of the file, and its sections"
         common = set.intersection(*map(_keys_without_tag, models)) if len(models) > 1 else set()
-        shared = [
-            key
-            for key in models[0]["properties"]
-            if (key, _key_description(models[0], key)) in common
-        ]
+        first = models[0]
+        shared = [k for k in first["properties"] if (k, _key_description(first, k)) in common]
         inner: list[tuple[str, list[JsonSchema]]] = []
         tables = []
         if shared:
-            rows = [row(path, models[0], key, inner) for key in shared]
+            rows = [row(path, first, key, inner) for key in shared]
             tables.append(ReportTable(f"{title}, all kinds", KEY_COLUMNS, rows, ""))
         for model in models:
             keys = [key for key in model.get("properties", {}) if key not in shared]
@@ -152,13 +149,8 @@ def _iterate_sections(top: JsonSchema) -> Iterator[tuple[str, list[ReportTable]]
         elif below:
             inner.append((place, below))
             seen[identity] = place
-        required = key in model.get("required", ())
-        return [
-            key,
-            _describe_value(value),
-            "required" if required else _format_default(value),
-            note,
-        ]
+        default = "required" if key in model.get("required", ()) else _format_default(value)
+        return [key, _describe_value(value), default, note]
 
     yield from walk("", [top])
 
@@ -171,9 +163,8 @@ def _nested_tables(value: JsonSchema, defined: Mapping[str, JsonSchema]) -> list
     held = [value[key] for key in ("items", "additionalProperties") if key in value]
     parts = [*value.get("anyOf", ()), *value.get("oneOf", ()), *held]
     tables = (part for part in parts if isinstance(part, dict))
-    return list(
-        {id(model): model for part in tables for model in _nested_tables(part, defined)}.values()
-    )
+    found = {id(model): model for part in tables for model in _nested_tables(part, defined)}
+    return list(found.values())
 
 
 def _describe_value(value: JsonSchema) -> str:
@@ -205,12 +196,8 @@ def _kind_tags(model: JsonSchema) -> dict[str, str]:
 
 def _keys_without_tag(model: JsonSchema) -> set[tuple[str, str]]:
     """Keys and what they mean, without the one that names the kind."""
-    tags = _kind_tags(model)
-    return {
-        (key, _key_description(model, key))
-        for key in model.get("properties", {})
-        if key not in tags
-    }
+    own = model.get("properties", {}).keys() - _kind_tags(model).keys()
+    return {(key, _key_description(model, key)) for key in own}
 
 
 def _format_value(value: Any) -> str:

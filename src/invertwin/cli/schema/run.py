@@ -2,7 +2,7 @@
 
 import json
 import re
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import MinLen
@@ -10,6 +10,7 @@ from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from invertwin.channel.sampling import ALL_OTHERS
+from invertwin.cli.run_file import require_section
 from invertwin.cli.schema.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.schema.dataset import DatasetTable
 from invertwin.cli.schema.fit_tables import SurrogateTable
@@ -68,15 +69,8 @@ AnyData = Annotated[Any, OneOf("data")]
 AnyRoom = Annotated[Any, TableOf(room, RoomTable, checked=True)]
 AnySurrogate = Annotated[Any, TableOf(Surrogate, SurrogateTable)]
 AnyGradcheck = Annotated[Any, TableOf(GradcheckSettings, GradcheckTable)]
-AnyRcs = Annotated[
-    Any,
-    TableOf(
-        rcs,
-        RcsTable,
-        ("directions", "frequencies", "receivers", "polarisation", "boundary"),
-        checked=False,
-    ),
-]
+_RCS_GIVEN = ("directions", "frequencies", "receivers", "polarisation", "boundary")
+AnyRcs = Annotated[Any, TableOf(rcs, RcsTable, _RCS_GIVEN, checked=False)]
 
 
 class SceneFileTable(Section):
@@ -260,12 +254,10 @@ class _RunFile(Section):
             )
         own = set(names)
         if self.reconstruct is not None:
-            sensors, used = [*self.observations], self.reconstruct
-            _require_known_names("parameters", used.parameters, names, "reconstruct.parameters")
-            _require_known_names(
-                "observations", used.observations, sensors, "reconstruct.observations"
-            )
-            own = set(used.parameters) or own
+            for what, known in (("parameters", names), ("observations", [*self.observations])):
+                used = getattr(self.reconstruct, what)
+                _require_known_names(what, used, known, f"reconstruct.{what}")
+            own = set(self.reconstruct.parameters) or own
         for i, stage in enumerate(self.stages):
             _require_known_names("parameters", stage.parameters, names, f"stages[{i}].parameters")
             fitted = own & set(stage.parameters or names)
@@ -297,9 +289,8 @@ class _RunFile(Section):
             name, why = parameter.object, f'with kind = "{parameter.kind}", which has its own size'
             scale = self.scene[name].scale if name in self.scene else 1.0
             if scale != 1:
-                raise_key_error(
-                    f"expected 1 {why}, got {scale:g}; remove it", f"scene.{name}.scale"
-                )
+                got = f"expected 1 {why}, got {scale:g}; remove it"
+                raise_key_error(got, f"scene.{name}.scale")
             if self.initial is not None and self.initial.object == name and self.initial.scale:
                 raise_key_error(f"expected false {why}, got true; remove it", "initial.scale")
         return self
@@ -307,20 +298,13 @@ class _RunFile(Section):
     @model_validator(mode="after")
     def _check_overrides(self, info: Any) -> "_RunFile":
         """Every stage and variant makes a run that is right; errors begin at its own path."""
-        runs = _overrides_model(type(self))
-        runs.model_validate(
-            {"stages": [self._dump_with_overrides(s) for s in self.stages]}, context=info.context
-        )
-        variants = {
-            name: self._dump_with_overrides(variant) for name, variant in self.variants.items()
-        }
-        found = runs.model_validate({"variants": variants}, context=info.context).variants
-        for name, run in found.items():
+        check = partial(_overrides_model(type(self)).model_validate, context=info.context)
+        check({"stages": [self._dump_with_overrides(stage) for stage in self.stages]})
+        variants = {name: self._dump_with_overrides(own) for name, own in self.variants.items()}
+        for name, run in check({"variants": variants}).variants.items():
             self.variants[name] = self.variants[name].with_resolved_paths(run)
         if self.calibration is not None:
-            runs.model_validate(
-                {"calibration": self._dump_with_overrides(self.calibration)}, context=info.context
-            )
+            check({"calibration": self._dump_with_overrides(self.calibration)})
         return self
 
     @model_validator(mode="after")
@@ -366,6 +350,16 @@ class _RunFile(Section):
         return found
 
     @property
+    def fit_settings(self) -> ReconstructTable:
+        """The `[reconstruct]` table, which every fit needs."""
+        return require_section(self, "reconstruct", "reconstruct")
+
+    @property
+    def fitted_objects(self) -> list[str]:
+        """Objects that have parameters."""
+        return [p.object for p in self.parameters if getattr(p, "object", None)]
+
+    @property
     def parameter_tables(self) -> dict[str, Any]:
         """The tables of what is unknown, and of what a gradient check moves, by path."""
         found = {f"parameters[{i}]": table for i, table in enumerate(self.parameters)}
@@ -385,10 +379,8 @@ class _RunFile(Section):
         data |= {f"observations.{name}.data": t.data for name, t in self.observations.items()}
         for path, table in data.items():
             found = getattr(table, "points_per_m2", None)
-            named = (
-                [name for name in found if name != ALL_OTHERS] if isinstance(found, dict) else []
-            )
-            used += [(f"{path}.points_per_m2.{name}", name) for name in named]
+            if isinstance(found, dict):
+                used += [(f"{path}.points_per_m2.{n}", n) for n in found if n != ALL_OTHERS]
         for section in type(self).model_fields:
             name = getattr(getattr(self, section), "object", None)
             if name is not None:

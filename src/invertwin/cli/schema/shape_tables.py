@@ -320,8 +320,7 @@ def body_template_of(table: Any) -> BodyTemplate | None:
     """
     if _shape_kind(table) != "body":
         return None
-    found = body_template(table.model, table.file, table.height, table.spacing)
-    return found.scale(table.scale)
+    return body_template(table.model, table.file, table.height, table.spacing).scale(table.scale)
 
 
 def joint_positions(table: Any, item: Object, rotations: Tensor | None = None) -> dict[str, Tensor]:
@@ -338,6 +337,5 @@ def joint_positions(table: Any, item: Object, rotations: Tensor | None = None) -
     if rotations is None:
         turns = {name: torch.tensor(turn).deg2rad() for name, turn in table.angles_deg.items()}
         rotations = rotation_from_vector(template.rotations(turns))
-    places = template.apply_pose(rotations)[1]
-    world = places @ item.transform[:3, :3].T + item.transform[:3, 3]
+    world = template.apply_pose(rotations)[1] @ item.transform[:3, :3].T + item.transform[:3, 3]
     return dict(zip(template.names, world, strict=True))
