@@ -105,10 +105,8 @@ class Capture:
             range_bias: what was subtracted from the radar's own ranges [m].
             survey: known positions of targets [m].
         """
-        variables = {
-            "range_profile": to_data_array(PROFILE_DIMS, profile, "1"),
-            "range": to_data_array(("range",), ranges, "m"),
-        }
+        variables = {"range_profile": to_data_array(PROFILE_DIMS, profile, "1")}
+        variables["range"] = to_data_array(("range",), ranges, "m")
         if track is not None:
             variables["track_time"] = to_data_array(("track_time",), track.times, "s")
             dims = ("track_time", "axis")

@@ -70,10 +70,8 @@ def find_faults(
     beat = _limit_samples(beat)
     if not any(found):
         # Both of them break phases and make ghosts, too.
-        found += [
-            detect_phase_break(beat, real=real),
-            detect_ghosts(_strongest_range_rates(beat), waveform, real=real),
-        ]
+        found.append(detect_phase_break(beat, real=real))
+        found.append(detect_ghosts(_strongest_range_rates(beat), waveform, real=real))
     found.append(detect_iq_images(beat))
     shown = search_ranges(recording, range_min, range_max)
     found.append(detect_leakage(beat, waveform, radar.window, shown, real=real))

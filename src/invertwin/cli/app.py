@@ -3,7 +3,7 @@
 import json
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,7 +29,7 @@ from invertwin.cli.options import (
 )
 from invertwin.cli.report import ReportTable
 from invertwin.cli.run_file import prefix_file_errors
-from invertwin.cli.terminal import limit_rate, load_runs, print_tables, run_folder, show_progress
+from invertwin.cli.terminal import load_runs, print_tables, run_each, run_folder, show_progress
 from invertwin.errors import InputError, exit_on_interrupt, to_one_line
 from invertwin.runtime.threads import available_threads
 
@@ -130,13 +130,8 @@ def dataset(options: DatasetOptions, file: FileArgument) -> None:
         if folder.complete:
             return
         with prefix_file_errors(file), show_progress(console):
-            tables = run_dataset(
-                runs[file.stem],
-                folder,
-                part,
-                options.engine,
-                options.workers or available_threads(),
-            )
+            workers = options.workers or available_threads()
+            tables = run_dataset(runs[file.stem], folder, part, options.engine, workers)
         print_tables(tables)
 
 
@@ -156,7 +151,7 @@ def plan(options: ResumableOptions, file: FileArgument) -> None:
         from invertwin.cli.commands.plan import run_plan
 
         with prefix_file_errors(file):
-            tables = run_plan(runs[file.stem], folder, console, limit_rate())
+            tables = run_plan(runs[file.stem], folder, console)
         print_tables(tables)
 
 
@@ -230,7 +225,7 @@ def gradcheck(options: ResumableOptions, files: FilesArgument) -> None:
 
         return run_gradcheck(*given)
 
-    _run_each(options, files, "gradcheck", _gradcheck_sections, run_command)
+    run_each(options, files, "gradcheck", _gradcheck_sections, run_command)
 
 
 def _gradcheck_sections(run: Any) -> tuple[str, ...]:
@@ -251,7 +246,7 @@ def rcs(options: ResumableOptions, files: FilesArgument) -> None:
 
         return run_rcs(*given)
 
-    _run_each(options, files, "rcs", ("rcs",), run_command)
+    run_each(options, files, "rcs", ("rcs",), run_command)
 
 
 @app.command()
@@ -304,25 +299,6 @@ def _run_recording(
     with run_folder(options, default) as folder:
         with show_progress(console):
             tables = work(options, folder)
-        print_tables(tables)
-
-
-def _run_each(
-    options: ResumableOptions,
-    files: Sequence[Path],
-    command: str,
-    sections: Sequence[str] | Callable[[Any], Sequence[str]],
-    work: Callable[..., list[ReportTable]],
-) -> None:
-    """Several run files with one report."""
-    runs = load_runs(files, options, command, sections)
-    default = Path("out", files[0].stem if len(files) == 1 else command)
-    with run_folder(options, default, runs) as folder:
-        if folder.complete:
-            return
-        with console.status("tracing") as status:
-            say = status.update if console.is_terminal else limit_rate()
-            tables = work(runs, {file.stem: file for file in files}, folder, say)
         print_tables(tables)
 
 

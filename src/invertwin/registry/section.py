@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, get_args
+from typing import Annotated, Any, NoReturn, get_args
 
 from annotated_types import Ge, Le, Len, Lt, MinLen
 from pydantic import (
@@ -24,14 +24,11 @@ from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ErrorType
 
 from invertwin.errors import InputError
-from invertwin.limits import NonNegative
 
 Depth = Annotated[int, Ge(1), Le(16)]
 Seed = Annotated[int, Ge(0), Lt(2**31)]
 Vector = Annotated[list[float], Len(3, 3)]
 Counts = Annotated[list[Annotated[int, Ge(2)]], Len(3, 3)]
-Interval = Annotated[list[NonNegative], Len(2, 2)]
-WorldAxes = Annotated[list[Literal["x", "y", "z"]], MinLen(1)]
 
 _PYDANTIC_ERRORS = frozenset(get_args(ErrorType))  # kinds of errors that pydantic itself knows
 # Pydantic puts the tag of a union into an error's location; the mark tells it from a key.

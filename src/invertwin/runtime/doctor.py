@@ -139,12 +139,11 @@ class _LlvmChoice:
     requested: str | None = None
 
 
+_Probe = Callable[[str], LlvmProbeResult]
 _choice: _LlvmChoice | None = None
 
 
-def select_libllvm(
-    folders: Sequence[Path] | None = None, probe: Callable[[str], LlvmProbeResult] | None = None
-) -> None:
+def select_libllvm(folders: Sequence[Path] | None = None, probe: _Probe | None = None) -> None:
     """Set ``DRJIT_LIBLLVM_PATH`` to the newest libLLVM that passes, before Dr.Jit is imported.
 
     ``import invertwin`` calls it. It never raises: when nothing passes, :func:`require_backend`
@@ -331,9 +330,7 @@ def render_report(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _choose_library(
-    folders: Sequence[Path] | None, probe: Callable[[str], LlvmProbeResult]
-) -> _LlvmChoice:
+def _choose_library(folders: Sequence[Path] | None, probe: _Probe) -> _LlvmChoice:
     explicit = _explicit_path()
     complaint = ""
     if explicit:
@@ -409,7 +406,7 @@ def _library_version(path: str) -> tuple[int, ...]:
     return ()
 
 
-def _probe_cached(path: str, probe: Callable[[str], LlvmProbeResult]) -> LlvmProbeResult:
+def _probe_cached(path: str, probe: _Probe) -> LlvmProbeResult:
     """The verdict on a path from the disk, or from the probe, which is then remembered."""
     try:
         status = os.stat(path)

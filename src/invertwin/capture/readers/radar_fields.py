@@ -33,10 +33,9 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
     kind = type(waveform).__name__
     if kind not in WAVEFORMS or not isinstance(waveform, tuple(WAVEFORMS.values())):
         raise InputError(f"expected a waveform of {', '.join(WAVEFORMS)}, got {kind}; use those")
-    variables = {
-        "position": to_data_array(("frame", "axis"), radar.positions, "m"),
-        "rotation": to_data_array(("frame", "axis", "radar_axis"), radar.link().rotations, "1"),
-    }
+    variables = {"position": to_data_array(("frame", "axis"), radar.positions, "m")}
+    axes = ("frame", "axis", "radar_axis")
+    variables["rotation"] = to_data_array(axes, radar.link().rotations, "1")
     if radar.range_origin is not None:
         variables["range_origin"] = to_data_array(("frame",), radar.range_origin, "m")
     attributes: dict[str, Any] = {

@@ -179,18 +179,17 @@ def _count_whole_frames(words: np.ndarray, settings: ChirpSettings, name: str) -
     exact = not rest and frames == (expected or frames) and frames > 0
     cut = frames > 0 and (expected is None or frames < expected)
     others = _find_alternatives(words, settings, exact=exact, truncated=cut)
-    if others or not exact:
-        if others:
-            wanted = f"{expected} frames of {frame}" if expected else f"whole frames of {frame}"
-            raise InputError(
-                f"expected the recording of its settings in {name} ({wanted} bytes), got {size} "
-                f"bytes{' whose chirps break elsewhere' if exact else ''}; {format_advice(others)}"
-            )
-        if not exact and expected is not None and not cut:
-            raise InputError(
-                f"expected {expected * frame} bytes in {name} ({expected} frames of {frame}), got "
-                f"{size}; no one or two changes of the settings fit, find those of this recording"
-            )
+    if others:
+        wanted = f"{expected} frames of {frame}" if expected else f"whole frames of {frame}"
+        raise InputError(
+            f"expected the recording of its settings in {name} ({wanted} bytes), got {size} "
+            f"bytes{' whose chirps break elsewhere' if exact else ''}; {format_advice(others)}"
+        )
+    if not exact and expected is not None and not cut:
+        raise InputError(
+            f"expected {expected * frame} bytes in {name} ({expected} frames of {frame}), got "
+            f"{size}; no one or two changes of the settings fit, find those of this recording"
+        )
     if not frames:
         raise InputError(
             f"expected at least one frame of {frame} bytes in {name}, got {size} bytes; "

@@ -338,12 +338,9 @@ def better_candidates(
     """
     if stated_evidence.breaks_at_borders:
         return []
-    return [
-        one
-        for one in found
-        if one.evidence.breaks_at_borders
-        and one.evidence.code_length < stated_evidence.code_length - MIN_CODE_SAVING
-    ]
+    most = stated_evidence.code_length - MIN_CODE_SAVING
+    breaking = [one for one in found if one.evidence.breaks_at_borders]
+    return [one for one in breaking if one.evidence.code_length < most]
 
 
 def silent_lanes_contradict(words: np.ndarray, settings: ChirpSettings) -> bool:
@@ -380,7 +377,7 @@ def format_advice(found: list[LayoutCandidate]) -> str:
     for one in _most_coherent(near) if clear else near:
         groups.setdefault(_block_period(one.settings) if clear else 0, []).append(one)
     fewest = (one for group in groups.values() for one in _fewest_changes(group))
-    near = sorted(fewest, key=_count_changes)
+    near = sorted(fewest, key=lambda one: len(one.changes))
     shown = " or ".join(map(str, near[:_MAX_LISTED]))
     said = "its samples do not tell where blocks end"
     if clear:
@@ -397,21 +394,14 @@ def format_advice(found: list[LayoutCandidate]) -> str:
     return f"what fits: {shown} ({said}); {do}, or look with --set {options}"
 
 
-def _count_changes(candidate: LayoutCandidate) -> int:
-    return len(candidate.changes)
-
-
 def _fewest_changes(group: list[LayoutCandidate]) -> list[LayoutCandidate]:
     """Those with the fewest changes."""
-    fewest = min(map(_count_changes, group))
-    return [one for one in group if _count_changes(one) == fewest]
+    fewest = min(len(one.changes) for one in group)
+    return [one for one in group if len(one.changes) == fewest]
 
 
 def _most_coherent(near: list[LayoutCandidate]) -> list[LayoutCandidate]:
     """Those whose blocks of one channel are most alike."""
     highest = max((one.coherence for one in near if one.coherence is not None), default=0.0)
-    return [
-        one
-        for one in near
-        if one.coherence is None or one.coherence >= _MIN_RELATIVE_COHERENCE * highest
-    ]
+    least = _MIN_RELATIVE_COHERENCE * highest
+    return [one for one in near if one.coherence is None or one.coherence >= least]

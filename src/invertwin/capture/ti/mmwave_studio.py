@@ -162,10 +162,8 @@ def _single_device(written: Any) -> dict[str, Any]:
             "expected settings of one device, got none; connect the device in mmWave Studio, then "
             "save the settings again"
         )
-    modes = [
-        _parse_integer((device["rfConfig"].get("rlChanCfg_t") or {}).get("cascading", 0))
-        for device in devices
-    ]
+    channels = [device["rfConfig"].get("rlChanCfg_t") or {} for device in devices]
+    modes = [_parse_integer(own.get("cascading", 0)) for own in channels]
     if any(modes):
         raise InputError(
             f"expected settings of one device, got those of a cascade of {len(devices)} (cascading "

@@ -126,10 +126,8 @@ def _check_image(run: RunFile) -> tuple[list[ReportTable], str]:
     with torch.no_grad():
         ray = _time_call(lambda: model.predict(scene, camera, 0)) / rays
     count = ends * max(rays, check.difference_samples) + _DERIVATIVE_COST * slopes * rays
-    rows: list[list[object]] = [
-        ["images", ends + slopes, "gradcheck.max_pairs, gradcheck.repeats"],
-        ["rays", count, "gradcheck.difference_samples"],
-    ]
+    rows: list[list[object]] = [["images", ends + slopes, "gradcheck.max_pairs, gradcheck.repeats"]]
+    rows.append(["rays", count, "gradcheck.difference_samples"])
     line = f"about {format_duration(count * ray)} for {count:.2g} rays"
     return [ReportTable("Estimate", _COUNT_HEADS, rows), _mesh_table(scene)], line
 

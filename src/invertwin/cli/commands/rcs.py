@@ -16,7 +16,7 @@ from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_pi
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.signature import RcsMeasurement, RcsTable
-from invertwin.cli.terminal import compute_in_parts
+from invertwin.cli.terminal import RunBatch
 from invertwin.errors import InputError
 from invertwin.scene import Scene
 from invertwin.signatures import Signature, to_dbsm
@@ -29,14 +29,9 @@ _MAX_PANELS = 4
 _RcsMetrics = dict[str, Any]
 
 
-def run_rcs(
-    runs: Mapping[str, RunFile],
-    files: Mapping[str, Path],
-    folder: RunFolder,
-    say: Callable[[str], None],
-) -> list[ReportTable]:
+def run_rcs(batch: RunBatch, say: Callable[[str], None]) -> list[ReportTable]:
     """Compute every run file's signature, write the folder, and return the tables to print."""
-    begin = time.perf_counter()
+    begin, folder = time.perf_counter(), batch.folder
     scenes: dict[str, _RcsMetrics] = {}
     pictures: list[ReportPicture] = []
 
@@ -44,10 +39,10 @@ def run_rcs(
         say(name)
         return _compute_rcs(name, run, folder)
 
-    for name, run, found in compute_in_parts(runs, files, folder, compute):
+    for name, run, found in batch.results(compute):
         scenes[name] = found
         for file, title in found.pop("pictures").items():
-            title = title if len(runs) == 1 else f"{name}: {title}"
+            title = title if len(batch.runs) == 1 else f"{name}: {title}"
             pictures.append(ReportPicture(title, folder.file(f"{file}.png").read_bytes(), run.note))
     metrics = {"task": "rcs", "scenes": scenes, "wall_seconds": time.perf_counter() - begin}
     if len(scenes) == 1:
@@ -58,11 +53,8 @@ def run_rcs(
     skipped = [file for found in scenes.values() for file in found.get("skipped", ())]
     if skipped:
         missing = f"{len(skipped)} measured files are not there, such as {skipped[0]}"
-        warnings.warn(
-            f"skipped a comparison: {missing}; get the data and set INVERTWIN_DATA",
-            UserWarning,
-            stacklevel=2,
-        )
+        told = f"skipped a comparison: {missing}; get the data and set INVERTWIN_DATA"
+        warnings.warn(told, UserWarning, stacklevel=2)
         status += f" Skipped a comparison: {missing}."
     parts = [*_make_tables(scenes), *pictures]
     return write_report(folder, metrics, "Radar signatures", status, parts, again="rcs")

@@ -9,7 +9,7 @@ import tomli_w
 import torch
 
 from invertwin.capture import Capture, ChirpCapture
-from invertwin.cli.commands.look import read_recording
+from invertwin.cli.commands.look import AnyRecording, read_recording
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.options import TwinOptions
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
@@ -92,9 +92,7 @@ def _to_arguments(options: dict[str, Any]) -> list[str]:
     return found
 
 
-def _load_run_file(
-    options: TwinOptions,
-) -> tuple[Capture | ChirpCapture, Scene | None, dict[str, Any]]:
+def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, dict[str, Any]]:
     """Load the data of a run file, their ground truth, and the settings of the search."""
     with prefix_file_errors(options.recording):
         run = load_run(options.recording)

@@ -144,12 +144,9 @@ def make_fit_display(
     display = make_problem_display(problem, twin)
     names = [name for name in problem.run.fitted_objects if name in start.names]
     more = scene_layers(start, "start", fitted=names, fitted_only=True)
-    return replace(
-        display,
-        layers=[*display.layers, *more, *ellipsoid_layers(twin, metrics)],
-        steps=steps,
-        maps=make_sensor_maps(problem, {MEASURED: maps["measured"], SIMULATED: maps["twin"]}),
-    )
+    layers = [*display.layers, *more, *ellipsoid_layers(twin, metrics)]
+    seen = make_sensor_maps(problem, {MEASURED: maps["measured"], SIMULATED: maps["twin"]})
+    return replace(display, layers=layers, steps=steps, maps=seen)
 
 
 def make_sensor_maps(

@@ -179,12 +179,8 @@ def _fit_or_search(
         return reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
     part = f"{PARTS}/{Path(checkpoint).stem}_fit"
     starts = problem.kind.make_candidates(problem, start, torch.Generator().manual_seed(seed))
-    found = search(
-        *given,
-        Screening(starts, run.search.fits, run.search.shortlist),
-        callbacks=lambda n: callbacks(f"{part}{n}.pt"),
-        **how,
-    )
+    screening = Screening(starts, run.search.fits, run.search.shortlist)
+    found = search(*given, screening, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how)
     return found.best, {"checkpoint": f"{part}{found.best_number}.pt", **found.to_metrics()}
 
 
@@ -240,10 +236,8 @@ def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> 
                 callbacks=[*shown, _make_checkpoint(problem, folder, f"{PARTS}/calibration.pt")],
                 seed=run.seed,
             )
-        capture = capture.recalibrate(
-            capture.clock_offset + float(clock.shift.detach()),
-            capture.range_bias + float(bias.bias.detach()),
-        )
+        offset = capture.clock_offset + float(clock.shift.detach())
+        capture = capture.recalibrate(offset, capture.range_bias + float(bias.bias.detach()))
         row = {"loss": found.loss, "status": found.status}
     row |= {"clock_offset_s": capture.clock_offset, "range_bias_m": capture.range_bias}
     item = replace(item, recording=capture, sensor=capture.radar())

@@ -86,10 +86,9 @@ class RadarMaps(DataKind):
     def sensor_unknowns(self, problem: Problem, name: str) -> dict[str, Any]:
         """Nuisances of a radar."""
         positions = problem.sensor_data[name].recording.positions
+        begin = f"{name}." if name else ""
         return {
-            f"{name}.{kind}" if name else kind: Unknown(
-                RangeBias() if kind == "range_bias" else ClockOffset(positions)
-            )
+            begin + kind: Unknown(RangeBias() if kind == "range_bias" else ClockOffset(positions))
             for kind in problem.run.fit_settings.nuisances
         }
 

@@ -299,10 +299,8 @@ def spread_of_ends(run: RunFile, rows: Sequence[Row], best: Row, bars: Mapping[s
     if len(near) < _FEW_ENDS:
         return {}
     names = [f"transmitter.{axis}" for axis in "xyz"]
-    inside = [
-        all(abs(x) <= bars.get(name, math.inf) for name, x in zip(names, off, strict=True))
-        for off in near
-    ]
+    widths = [bars.get(name, math.inf) for name in names]
+    inside = [all(abs(x) <= w for x, w in zip(off, widths, strict=True)) for off in near]
     squares = zip(names, zip(*near, strict=True), strict=True)
     middle = sorted(math.hypot(*off) for off in near)[len(near) // 2]
     found: Row = {
@@ -356,10 +354,8 @@ def _plan(fits: Fits) -> Figure:
     points = radio_map(problem.run, problem.first_sensor.recording[1]).places
     if isinstance(points, ReceiverPoints):
         shown["receivers"] = points.positions
-    ends = [
-        [row["start_position"], row["values"]["transmitter.position"]]
-        for row in fits.rows[OWN_METHOD]
-    ]
+    rows = fits.rows[OWN_METHOD]
+    ends = [[row["start_position"], row["values"]["transmitter.position"]] for row in rows]
     starts = torch.tensor(ends, dtype=torch.float64)
     return plotting.transmitter_fits(fits.found.scene, float(place[0, 2]), shown, starts)
 

@@ -9,7 +9,7 @@ import torch
 
 from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
-from invertwin.cli.fits.problem import HISTORIES, Problem, fitted_tables
+from invertwin.cli.fits.problem import HISTORIES, Problem, Row, fitted_tables
 from invertwin.cli.fits.radar_models import (
     make_display_models,
     make_unblurred_models,
@@ -28,7 +28,7 @@ from invertwin.scene import Mesh, Scene, SkinnedBody
 from invertwin.scene.shape_models.density import replace_clouds
 
 
-def score_fit(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
+def score_fit(problem: Problem, start: Scene, twin: Scene) -> Row:
     """Errors of start and twin, where the truth is known."""
     name, twin = problem.scored_object, replace_clouds(twin)
     if name is None:
@@ -47,7 +47,7 @@ def score_fit(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
         angles = score_joints(body, *(s[name].mesh for s in (start, twin, problem.truth)))
         good = angles["joint_error_after_deg"] <= settings.joint_limit_deg
         return {**angles, "success": good, "position": place, **shapes}
-    rows: dict[str, Any] = {
+    rows: Row = {
         "start_distance_m": before.distance,
         "position_error_m": after.distance,
         "success": after.distance <= settings.position_limit,
@@ -109,8 +109,8 @@ def _is_material_known(problem: Problem, parameter: Any) -> bool:
 
 
 def summarise_successes(
-    problem: Problem, rows: Mapping[str, list[dict[str, Any]]], modes: Sequence[str]
-) -> dict[str, Any]:
+    problem: Problem, rows: Mapping[str, list[Row]], modes: Sequence[str]
+) -> Row:
     """Successes of every way to fit, the run's own first; of several sensors, also each alone."""
     if problem.scored_object not in problem.known_objects or "success" not in rows[modes[0]][0]:
         return {}
@@ -127,9 +127,7 @@ def summarise_successes(
     return found
 
 
-def score_held_out(
-    problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any]
-) -> dict[str, Any]:
+def score_held_out(problem: Problem, rows: list[Row], best: Row) -> Row:
     """For calibrated captures: the error on an object that took no part in the calibration."""
     table = problem.run.calibration
     name = problem.scored_object
@@ -151,9 +149,7 @@ def score_held_out(
     }
 
 
-def drop_histories(
-    rows: Sequence[dict[str, Any]], dropped: Sequence[str] = HISTORIES
-) -> list[dict[str, Any]]:
+def drop_histories(rows: Sequence[Row], dropped: Sequence[str] = HISTORIES) -> list[Row]:
     """The rows of the fits as metrics keep them."""
     return [{key: value for key, value in row.items() if key not in dropped} for row in rows]
 
@@ -194,7 +190,7 @@ def total_loss(
         return None
 
 
-def error_bar_table(metrics: dict[str, Any]) -> ReportTable:
+def error_bar_table(metrics: Row) -> ReportTable:
     """The error bars of the best fit."""
     cells = []
     for name, value in metrics.get("standard_deviations", {}).items():

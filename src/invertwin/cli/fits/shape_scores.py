@@ -1,11 +1,10 @@
 """Errors of found shapes: numbers of a run, and their curves over the steps."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 
-from invertwin.cli.fits.problem import Problem
+from invertwin.cli.fits.problem import Problem, Row
 from invertwin.cli.report import load_texts
 from invertwin.cli.run_file import prefix_errors
 from invertwin.errors import InputError
@@ -65,7 +64,7 @@ def check_measures(problem: Problem, start: Scene) -> None:
             volume_iou(truth, truth, table.voxel)
 
 
-def score_shape(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
+def score_shape(problem: Problem, start: Scene, twin: Scene) -> Row:
     """Measures of the found shape, whole and as far as some radar position sees it.
 
     Those without an ending are the ones that the run file asks for. Parts and holes are those of
@@ -105,24 +104,18 @@ def _compare_surfaces(
     table = problem.measures
     assert table is not None
     eyes = [item.sensor.positions.detach() for item in problem.sensor_data.values()]
-    return compare_shapes(
-        _world_mesh(scene, table.object),
-        _world_mesh(problem.truth, table.object),
-        seen_from=torch.cat(eyes) if visible_only else None,
-        thresholds=table.thresholds,
-        voxel=table.voxel if volume else None,
-    )
+    shapes = [_world_mesh(one, table.object) for one in (scene, problem.truth)]
+    seen_from, voxel = torch.cat(eyes) if visible_only else None, table.voxel if volume else None
+    return compare_shapes(*shapes, seen_from=seen_from, thresholds=table.thresholds, voxel=voxel)
 
 
-def _shape_metrics(
-    problem: Problem, scene: Scene, visible_only: bool, suffix: str = ""
-) -> dict[str, Any]:
+def _shape_metrics(problem: Problem, scene: Scene, visible_only: bool, suffix: str = "") -> Row:
     """Measures as metrics keep them; none if the shape is empty or invisible."""
     try:
         found = _compare_surfaces(problem, scene, visible_only)
     except InputError:
         return {}
-    rows: dict[str, Any] = {f"chamfer{suffix}_m": found.chamfer}
+    rows: Row = {f"chamfer{suffix}_m": found.chamfer}
     for threshold, value in found.fscore.items():
         rows[f"fscore_{threshold * 100:g}cm{suffix}"] = value
     if found.iou is not None:
@@ -130,7 +123,7 @@ def _shape_metrics(
     return rows | {f"normal_consistency{suffix}": found.normal_consistency}
 
 
-def _topology_metrics(mesh: Mesh) -> dict[str, Any]:
+def _topology_metrics(mesh: Mesh) -> Row:
     return dict(vars(count_topology(mesh))) if is_watertight(mesh) else {}
 
 

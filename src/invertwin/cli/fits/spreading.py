@@ -92,7 +92,10 @@ def distribute_fits(
         InputError: What a fit refuses, or only one fit.
     """
     if len(fits) == 1:
-        raise no_parallel_fits_error("one fit")
+        raise InputError(
+            "expected several starts or variants for --engine ray or --workers, got one fit; leave "
+            "the option out"
+        )
     text, begun = to_minimal_toml(run), f"{PARTS}/calibration.pt"
     path = folder.path / UNFINISHED / begun
     files = {begun: path.read_bytes()} if path.exists() else {}
@@ -108,18 +111,6 @@ def distribute_fits(
             # A row says that its fit is done, so it comes last.
             for name in sorted(made, key=lambda name: name.endswith(".json")):
                 folder.write_bytes(name, made[name])
-
-
-def no_parallel_fits_error(got: str) -> InputError:
-    """The error where there is nothing to spread.
-
-    Args:
-        got: What there is.
-    """
-    return InputError(
-        f"expected several starts or variants for --engine ray or --workers, got {got}; leave "
-        "the option out"
-    )
 
 
 def fit_file_stem(mode: str, start: int) -> str:

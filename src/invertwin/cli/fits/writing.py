@@ -91,10 +91,8 @@ def make_tables(fitted: BestFit) -> list[ReportTable]:
 
 
 def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
-    rows: list[list[Any]] = [
-        ["verdict", metrics["verdict"]],
-        ["why it stopped", _stop_reason(metrics)],
-    ]
+    rows: list[list[Any]] = [["verdict", metrics["verdict"]]]
+    rows.append(["why it stopped", _stop_reason(metrics)])
     if "success" in metrics:
         count, limits = metrics["starts_count"], _success_limits(run, metrics)
         if count == 1:

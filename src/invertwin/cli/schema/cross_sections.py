@@ -15,12 +15,9 @@ from invertwin.registry.kinds import KindGroup, Registry
 def register(registry: Registry) -> None:
     """Add the oracles of radar signatures."""
     registry.groups["cross_section"] = KindGroup(product=CrossSection)
-    for name, kind in (
-        ("plate", PlateSection),
-        ("dihedral", DihedralSection),
-        ("trihedral", TrihedralSection),
-        ("square_trihedral", SquareTrihedralSection),
-        ("sphere", SphereSection),
-        ("dihedral_moments", DihedralByMoments),
-    ):
-        registry.add("cross_section", name, kind)
+    registry.add("cross_section", "plate", PlateSection)
+    registry.add("cross_section", "dihedral", DihedralSection)
+    registry.add("cross_section", "trihedral", TrihedralSection)
+    registry.add("cross_section", "square_trihedral", SquareTrihedralSection)
+    registry.add("cross_section", "sphere", SphereSection)
+    registry.add("cross_section", "dihedral_moments", DihedralByMoments)

@@ -62,12 +62,9 @@ class VaryTable(ConstructorTable):
 def register(registry: Registry) -> None:
     """Add the distributions."""
     registry.groups["distribution"] = KindGroup(base=VaryTable)
-    for name, make in (
-        ("uniform", Uniform),
-        ("log_uniform", LogUniform),
-        ("normal", Normal),
-        ("integer", Integer),
-        ("choice", Choice),
-        ("presence", Presence),
-    ):
-        registry.add("distribution", name, make)
+    registry.add("distribution", "uniform", Uniform)
+    registry.add("distribution", "log_uniform", LogUniform)
+    registry.add("distribution", "normal", Normal)
+    registry.add("distribution", "integer", Integer)
+    registry.add("distribution", "choice", Choice)
+    registry.add("distribution", "presence", Presence)

@@ -67,11 +67,8 @@ def _code_digest() -> str:
 def key_index() -> ReportTable:
     """The sections of a run file, and what each is."""
     top = json_schema()
-    rows = [
-        [name, top["properties"][name].get("description", "")]
-        for name in top["properties"]
-        if _nested_tables(top["properties"][name], top["$defs"])
-    ]
+    tables = {n: v for n, v in top["properties"].items() if _nested_tables(v, top["$defs"])}
+    rows = [[name, value.get("description", "")] for name, value in tables.items()]
     note = "invertwin keys SECTION prints the keys of one, such as radar or radar.waveform."
     return ReportTable("Sections of a run file", ("section", "what it is"), rows, note)
 

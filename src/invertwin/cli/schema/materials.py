@@ -21,7 +21,6 @@ from invertwin.registry.section import InputPath, Section, key, raise_key_error
 from invertwin.scene import (
     Dielectric,
     Itu,
-    Material,
     Mesh,
     Multilayer,
     PerfectConductor,
@@ -34,16 +33,6 @@ from invertwin.scene import (
 from invertwin.scene.material.materials import Medium
 from invertwin.scene.material.values import RANGES, Value
 from invertwin.storage.untrusted import read_npy
-
-_MATERIAL_CLASSES: Mapping[str, type[Material]] = {
-    "rough_dielectric": RoughDielectric,
-    "perfect_conductor": PerfectConductor,
-    "rough_conductor": RoughConductor,
-    "dielectric": Dielectric,
-    "refracting_body": RefractingBody,
-    "slab": Slab,
-    "multilayer": Multilayer,
-}
 
 
 class TextureFile(Section):
@@ -93,8 +82,13 @@ def register(registry: Registry) -> None:
     registry.forms[Texture] = ValueFormat(_value_type, _build_value)
     registry.bases[Medium] = MediumTable
     registry.given.add(Mesh)
-    for name, kind in _MATERIAL_CLASSES.items():
-        registry.add("material", name, kind)
+    registry.add("material", "rough_dielectric", RoughDielectric)
+    registry.add("material", "perfect_conductor", PerfectConductor)
+    registry.add("material", "rough_conductor", RoughConductor)
+    registry.add("material", "dielectric", Dielectric)
+    registry.add("material", "refracting_body", RefractingBody)
+    registry.add("material", "slab", Slab)
+    registry.add("material", "multilayer", Multilayer)
 
 
 def _build_value(value: Any, name: str, angle: bool, given: Mapping[type, object]) -> Value:

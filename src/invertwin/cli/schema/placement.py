@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 from typing import Annotated, Any, Literal
 
 import torch
@@ -218,13 +219,8 @@ class PanelGrid(_PanelSearch):
         step = path.length / (self.places if path.closed else self.places - 1)
         turns = torch.linspace(-turn, turn, self.yaws).tolist() if self.yaws > 1 else [0.0]
         spreads = [math.radians(angle) for angle in self.spread_deg]
-        return [
-            (number * step, yaw, (across, up))
-            for number in range(self.places)
-            for yaw in turns
-            for across in spreads
-            for up in spreads
-        ]
+        grid = product(range(self.places), turns, product(spreads, spreads))
+        return [(number * step, yaw, widths) for number, yaw, widths in grid]
 
 
 def register(registry: Registry) -> None:
