@@ -116,22 +116,17 @@ def simulate(options: RunOptions, file: FileArgument) -> None:
 @_command_with(DatasetOptions)
 def dataset(options: DatasetOptions, file: FileArgument) -> None:
     """Simulate a data set: many samples of a run file with other values each, and their labels."""
-    from invertwin.cli.commands.dataset import (
-        DATASET_SECTIONS,
-        parse_part,
-        part_folder,
-        run_dataset,
-    )
+    from invertwin.cli.commands import dataset as command
 
-    part = parse_part(options.shard)
-    runs = load_runs([file], options, "dataset", DATASET_SECTIONS)
-    chosen = replace(options, out=part_folder(options.out or Path("out", file.stem), part))
+    part = command.parse_part(options.shard)
+    runs = load_runs([file], options, "dataset", command.DATASET_SECTIONS)
+    chosen = replace(options, out=command.part_folder(options.out or Path("out", file.stem), part))
     with run_folder(chosen, Path("out"), runs) as folder:
         if folder.complete:
             return
         with prefix_file_errors(file), show_progress(console):
             workers = options.workers or available_threads()
-            tables = run_dataset(runs[file.stem], folder, part, options.engine, workers)
+            tables = command.run_dataset(runs[file.stem], folder, part, options.engine, workers)
         print_tables(tables)
 
 

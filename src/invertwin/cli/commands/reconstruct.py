@@ -17,14 +17,14 @@ from invertwin.cli.fits.displays import (
     VIEW_FILE,
     load_steps,
     make_fit_display,
-    make_problem_display,
     make_sensor_maps,
+    make_start_display,
     radar_data,
     steps_path,
 )
 from invertwin.cli.fits.fitting import fit_all, run_fit
 from invertwin.cli.fits.kinds import build_problem
-from invertwin.cli.fits.problem import OWN_METHOD, Fits, Problem, Start, known_truth
+from invertwin.cli.fits.problem import OWN_METHOD, Fits, Problem, known_truth
 from invertwin.cli.fits.scores import drop_histories
 from invertwin.cli.fits.shape_scores import check_measures
 from invertwin.cli.fits.spreading import QUIET_CONSOLE, FitWorkers, distribute_fits
@@ -38,15 +38,7 @@ from invertwin.inversion.fit import Fit
 from invertwin.scene.files import save_mesh
 from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.run_folder import CHECKPOINT, RunFolder
-from invertwin.viewer import (
-    MEASURED,
-    SIMULATED,
-    Display,
-    DisplayStep,
-    InteractiveSensor,
-    Viewer,
-    view_html,
-)
+from invertwin.viewer import SIMULATED, DisplayStep, InteractiveSensor, Viewer, view_html
 
 _MAX_STEP_VALUES = 200_000  # of the maps of a step that is shown while the fit goes on
 
@@ -84,7 +76,7 @@ def run_reconstruct(
     check_measures(problem.kind.with_method(problem, OWN_METHOD), replace_clouds(starts[0].scene))
     if workers is not None:
         distribute_fits(_fit_one, run, folder, console, workers, problem.work)
-    live = Viewer(_start_display(problem, starts[0])) if view else None
+    live = Viewer(make_start_display(problem, starts[0])) if view else None
     with live or nullcontext():
         if live is not None:
             console.print(f"open {live.address}", markup=False, soft_wrap=True)
@@ -161,17 +153,6 @@ def _write(
         folder, metrics, title, outcome, parts, again="reconstruct", note=run.note
     )
     return tables, outcome
-
-
-def _start_display(problem: Problem, start: Start) -> Display:
-    """A display of a fit that has not begun: what was measured, and what the start has for it."""
-    display = make_problem_display(problem, start.scene)
-    sensors = [item.sensor for item in problem.sensor_data.values()]
-    spectra = {
-        MEASURED: problem.kind.measured_maps(problem),
-        SIMULATED: problem.kind.predict_maps(problem, start.scene, sensors),
-    }
-    return replace(display, maps=make_sensor_maps(problem, spectra))
 
 
 def _show_step(live: Viewer, problem: Problem, going: Fit, step: DisplayStep) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from invertwin.cli.fits.problem import Problem, SensorData
+from invertwin.cli.fits.problem import Problem, SensorData, Start
 from invertwin.errors import InputError
 from invertwin.inversion import Callback
 from invertwin.inversion.fit import Fit
@@ -166,6 +166,20 @@ def make_sensor_maps(
             own = {what: maps[k] for what, maps in spectra.items()}
             found[name] = DisplayMaps.from_spectra(own, item.grid, **limit)
     return found
+
+
+def make_start_display(problem: Problem, start: Start) -> Display:
+    """A display of a fit that has not begun, with the measured maps and those of the start.
+
+    Args:
+        problem: What is fitted.
+        start: Of the first fit.
+    """
+    display = make_problem_display(problem, start.scene)
+    sensors = [item.sensor for item in problem.sensor_data.values()]
+    predicted = problem.kind.predict_maps(problem, start.scene, sensors)
+    spectra = {MEASURED: problem.kind.measured_maps(problem), SIMULATED: predicted}
+    return replace(display, maps=make_sensor_maps(problem, spectra))
 
 
 def make_problem_display(problem: Problem, scene: Scene) -> Display:

@@ -37,13 +37,7 @@ from invertwin.cli.fits.scores import (
     total_loss,
 )
 from invertwin.cli.fits.shape_scores import is_shape_key
-from invertwin.cli.fits.writing import (
-    START_COLUMNS,
-    BestFit,
-    describe_outcome,
-    draw_pictures,
-    make_tables,
-)
+from invertwin.cli.fits.writing import START_COLUMNS, summarise_maps
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion import Reconstruction, Unknown
@@ -51,7 +45,6 @@ from invertwin.inversion.confidence.report import confidence_metrics, error_bar_
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.runtime.memory import peak_memory
 from invertwin.scene import Scene
-from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.run_folder import RunFolder
 
 
@@ -130,9 +123,4 @@ class RadarMaps(DataKind):
 
     def summary(self, fits: Fits, metrics: Row, folder: RunFolder) -> Summary:
         """See ``DataKind.summary``."""
-        scenes = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
-        residuals = fits.found.verdict.residuals
-        fitted = BestFit(fits.problem, metrics, fits.rows, *scenes, fits.maps, residuals)
-        result, *tables = make_tables(fitted)
-        outcome = describe_outcome(fits.problem.run, metrics)
-        return Summary(outcome, result, draw_pictures(fitted, folder), tables)
+        return summarise_maps(fits, metrics, folder)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from invertwin import plotting
-from invertwin.cli.fits.problem import INTERIOR_ONLY, OWN_METHOD, Problem
+from invertwin.cli.fits.problem import INTERIOR_ONLY, OWN_METHOD, Fits, Problem, Row, Summary
 from invertwin.cli.fits.radar_models import blur_end_step
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.fits.shape_scores import CURVE_KEY, is_shape_key, shape_label, short_label
@@ -24,6 +24,7 @@ from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.inversion.metrics import pose_error
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.material.values import RANGES
+from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.run_folder import RunFolder
 
 _MATERIAL_ERRORS = {f"{name}_error": name for name in RANGES}
@@ -64,6 +65,22 @@ class BestFit:
             (own if mode == OWN_METHOD else mode.replace("_", " "), fits)
             for mode, fits in self.rows.items()
         ]
+
+
+def summarise_maps(fits: Fits, metrics: Row, folder: RunFolder) -> Summary:
+    """Summary of fits to maps of radars; its pictures are written.
+
+    Args:
+        fits: All fits of the run.
+        metrics: Numbers of the run.
+        folder: Gets the pictures.
+    """
+    scenes = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
+    residuals = fits.found.verdict.residuals
+    fitted = BestFit(fits.problem, metrics, fits.rows, *scenes, fits.maps, residuals)
+    result, *tables = make_tables(fitted)
+    outcome = describe_outcome(fits.problem.run, metrics)
+    return Summary(outcome, result, draw_pictures(fitted, folder), tables)
 
 
 def make_tables(fitted: BestFit) -> list[ReportTable]:
