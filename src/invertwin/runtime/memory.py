@@ -100,17 +100,23 @@ def _machine_memory() -> float:
 def _control_group_memory() -> Iterator[float]:
     """Yield the memory that the control groups of this process still allow [B]."""
     for folder, version in group_folders("memory"):
-        *names, cache = ("memory.max", "memory.current", "inactive_file")
+        names = ("memory.max", "memory.current", "inactive_file")
         if version == 1:
-            *names, cache = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
-        try:
-            limit, taken = (int((folder / name).read_text()) for name in names)
-            rows = (line.split() for line in (folder / "memory.stat").read_text().splitlines())
-            files = next((int(row[1]) for row in rows if row[0] == cache), 0)
-        except (OSError, ValueError):  # no such group, or "max"
-            continue
-        if limit < _UNLIMITED:
-            yield float(limit - taken + files)
+            names = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
+        yield from _group_memory(folder, *names)
+
+
+def _group_memory(
+    folder: Path, limit_name: str, usage_name: str, cache_name: str
+) -> Iterator[float]:
+    try:
+        limit, taken = (int((folder / file).read_text()) for file in (limit_name, usage_name))
+        rows = (line.split() for line in (folder / "memory.stat").read_text().splitlines())
+        files = next((int(row[1]) for row in rows if row[0] == cache_name), 0)
+    except (OSError, ValueError):  # no such group, or "max"
+        return
+    if limit < _UNLIMITED:
+        yield float(limit - taken + files)
 
 
 def _process_memory() -> Iterator[float]:

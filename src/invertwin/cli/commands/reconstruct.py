@@ -13,15 +13,7 @@ import torch
 from rich.console import Console
 
 from invertwin.cli.commands.landscape import plot_landscape
-from invertwin.cli.fits.displays import (
-    VIEW_FILE,
-    load_steps,
-    make_fit_display,
-    make_sensor_maps,
-    make_start_display,
-    radar_data,
-    steps_path,
-)
+from invertwin.cli.fits import displays
 from invertwin.cli.fits.fitting import fit_all, run_fit
 from invertwin.cli.fits.kinds import build_problem
 from invertwin.cli.fits.problem import OWN_METHOD, Fits, Problem, known_truth
@@ -76,7 +68,7 @@ def run_reconstruct(
     check_measures(problem.kind.with_method(problem, OWN_METHOD), replace_clouds(starts[0].scene))
     if workers is not None:
         distribute_fits(_fit_one, run, folder, console, workers, problem.work)
-    live = Viewer(make_start_display(problem, starts[0])) if view else None
+    live = Viewer(displays.make_start_display(problem, starts[0])) if view else None
     with live or nullcontext():
         if live is not None:
             console.print(f"open {live.address}", markup=False, soft_wrap=True)
@@ -132,14 +124,14 @@ def _write(
     problem, best, run = fits.problem, fits.best, fits.problem.run
     start, twin = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
     summary = problem.kind.summary(fits, metrics, folder)
-    steps = load_steps(folder.file(steps_path(best["checkpoint"])))
-    display = make_fit_display(problem, start, twin, fits.maps, confidence, steps)
-    display.save(folder.file(VIEW_FILE))
+    steps = displays.load_steps(folder.file(displays.steps_path(best["checkpoint"])))
+    display = displays.make_fit_display(problem, start, twin, fits.maps, confidence, steps)
+    display.save(folder.file(displays.VIEW_FILE))
     sensors = dict(zip(problem.sensor_data, fits.found.sensors, strict=True))
     depth = run.fit_settings.depth
     links = {
         name: InteractiveSensor(fits.found.scene, sensors[name], item.grid, depth)
-        for name, item in radar_data(problem).items()
+        for name, item in displays.radar_data(problem).items()
     }
     shown = ReportView(view_html(display, links))
     parts = [summary.result, shown, *summary.pictures, *summary.tables]
@@ -159,7 +151,8 @@ def _show_step(live: Viewer, problem: Problem, going: Fit, step: DisplayStep) ->
     """Show a step of a fit with what its sensors would see."""
     with torch.no_grad():
         simulated = problem.kind.predict_maps(problem, *going.apply_modules())
-    live.add_step(step, make_sensor_maps(problem, {SIMULATED: simulated}, _MAX_STEP_VALUES))
+    maps = displays.make_sensor_maps(problem, {SIMULATED: simulated}, _MAX_STEP_VALUES)
+    live.add_step(step, maps)
 
 
 def _fit_one(run: RunFile, method: str, number: int, folder: RunFolder) -> None:

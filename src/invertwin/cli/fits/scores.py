@@ -9,12 +9,8 @@ import torch
 
 from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
+from invertwin.cli.fits import radar_models
 from invertwin.cli.fits.problem import HISTORIES, Problem, Row, fitted_tables
-from invertwin.cli.fits.radar_models import (
-    make_display_models,
-    make_unblurred_models,
-    rough_point_densities,
-)
 from invertwin.cli.fits.shape_scores import score_shape
 from invertwin.cli.report import ReportTable, load_texts
 from invertwin.cli.schema import SimulatedData, build
@@ -162,7 +158,7 @@ def predict_unblurred_maps(
     with torch.no_grad():
         return [
             model.with_sampling(**counts).predict(scene, radar, problem.run.seed)
-            for model, radar in zip(make_display_models(problem), radars, strict=True)
+            for model, radar in zip(radar_models.make_display_models(problem), radars, strict=True)
         ]
 
 
@@ -170,8 +166,8 @@ def surrogate_agreement(problem: Problem, twin: Scene, radar: Radar) -> dict[str
     """Correlation of the surrogate with the mean of exact spectra: one bounce, first frame."""
     if not isinstance(radar.waveform, SampledWaveform):
         return {}
-    sampling = Sampling(depth=1, points_per_m2=rough_point_densities(problem.run))
-    model = replace(make_unblurred_models(problem)[0], sampling=sampling)
+    sampling = Sampling(depth=1, points_per_m2=radar_models.rough_point_densities(problem.run))
+    model = replace(radar_models.make_unblurred_models(problem)[0], sampling=sampling)
     first = replace(radar.frames([0]), range_bias=0.0)
     found = surrogate_correlation(twin, first, model, seed=problem.run.seed)
     return {"surrogate_correlation": found}

@@ -11,21 +11,10 @@ from pydantic_core import PydanticCustomError
 
 from invertwin.channel.sampling import ALL_OTHERS
 from invertwin.cli.run_file import require_section
+from invertwin.cli.schema import fits
 from invertwin.cli.schema.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.schema.dataset import DatasetTable
 from invertwin.cli.schema.fit_tables import SurrogateTable
-from invertwin.cli.schema.fits import (
-    AnyInitial,
-    AnyStarts,
-    CalibrationTable,
-    LandscapeTable,
-    MeasuresTable,
-    PlanTable,
-    ReconstructTable,
-    RunOverrides,
-    StageTable,
-    VariantTable,
-)
 from invertwin.cli.schema.gradcheck import GradcheckTable
 from invertwin.cli.schema.placement import Placement
 from invertwin.cli.schema.radio import AnyMap, TransmitterStartsTable, TransmitterTable
@@ -156,13 +145,13 @@ class _RunFile(Section):
     parameters: list[Annotated[Any, OneOf("parameter")]] = key(
         "[[parameters]]: what is unknown", []
     )
-    starts: AnyStarts | None = key("where fits start; without it where the scene says", None)
+    starts: fits.AnyStarts | None = key("where fits start; without it where the scene says", None)
     search: Annotated[Any, OneOf("search")] | None = key(
         "several poses to begin from at every start; the best end counts", None
     )
-    plan: PlanTable | None = key("what `invertwin plan` compares and tries", None)
+    plan: fits.PlanTable | None = key("what `invertwin plan` compares and tries", None)
     twin: TwinTable | None = key("the ground that `invertwin twin` searches", None)
-    initial: AnyInitial | None = key(
+    initial: fits.AnyInitial | None = key(
         "where the fit starts by conventional processing, not with [starts]", None
     )
     surrogate: AnySurrogate = key("kernels of the smooth model", {}, validate_default=True)
@@ -175,14 +164,16 @@ class _RunFile(Section):
     optimizer: Annotated[Any, OneOf("optimizer")] = key(
         "how a gradient becomes a step", {}, validate_default=True
     )
-    reconstruct: ReconstructTable | None = key("the fit", None)
-    stages: list[StageTable] = key(
+    reconstruct: fits.ReconstructTable | None = key("the fit", None)
+    stages: list[fits.StageTable] = key(
         "[[stages]]: parts of the fit, one after another; without them one", []
     )
-    variants: dict[str, VariantTable] = key("[variants.<name>]: other ways to fit, to compare", {})
-    measures: MeasuresTable | None = key("scores of the found shape", None)
-    calibration: CalibrationTable | None = key("calibration before the fit", None)
-    landscape: LandscapeTable | None = key("losses along a line", None)
+    variants: dict[str, fits.VariantTable] = key(
+        "[variants.<name>]: other ways to fit, to compare", {}
+    )
+    measures: fits.MeasuresTable | None = key("scores of the found shape", None)
+    calibration: fits.CalibrationTable | None = key("calibration before the fit", None)
+    landscape: fits.LandscapeTable | None = key("losses along a line", None)
     gradcheck: AnyGradcheck | None = key("the gradient check", None)
     placement: Placement | None = key(
         "a metasurface that is placed; with [gradcheck] what is differentiated", None
@@ -335,11 +326,11 @@ class _RunFile(Section):
         """As TOML, without what makes it a data set."""
         return self.model_dump(**_DUMP_GIVEN, exclude={"dataset", "vary"})
 
-    def apply_overrides(self, part: RunOverrides) -> "_RunFile":
+    def apply_overrides(self, part: fits.RunOverrides) -> "_RunFile":
         """The run file with a stage, a variant or the calibration merged over it."""
         return type(self).model_validate(self._dump_with_overrides(part))
 
-    def _dump_with_overrides(self, part: RunOverrides) -> dict[str, Any]:
+    def _dump_with_overrides(self, part: fits.RunOverrides) -> dict[str, Any]:
         """The run file as TOML, with a part: keys of tables replace keys, all else is replaced."""
         found = self.model_dump(**_DUMP_GIVEN, exclude={"variants", "calibration"})
         for name, change in part.overrides().items():
@@ -350,7 +341,7 @@ class _RunFile(Section):
         return found
 
     @property
-    def fit_settings(self) -> ReconstructTable:
+    def fit_settings(self) -> fits.ReconstructTable:
         """The `[reconstruct]` table, which every fit needs."""
         return require_section(self, "reconstruct", "reconstruct")
 

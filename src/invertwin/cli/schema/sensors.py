@@ -8,6 +8,7 @@ from annotated_types import Ge, MinLen
 from pydantic import Tag, model_validator
 from torch import Tensor
 
+from invertwin import scene
 from invertwin.capture.readers.radar_fields import WAVEFORMS
 from invertwin.channel import Grid
 from invertwin.limits import Count, Positive
@@ -25,16 +26,6 @@ from invertwin.registry.section import (
     key,
     prefix_errors,
     tag_by,
-)
-from invertwin.scene import (
-    AntennaArray,
-    Cosine,
-    Isotropic,
-    Pattern,
-    linear_array,
-    look_at,
-    planar_array,
-    rotation_from_vector,
 )
 from invertwin.scene import TabulatedPattern as PatternTable
 
@@ -56,7 +47,7 @@ class ArrayTable(ConstructorTable):
     polarisation: PolarisationValue = key(_POLARISATION_HELP, "V")
     leakage: _NumberOrEach = key(_LEAKAGE_HELP + ", of all elements or of each", 0.0)
 
-    def build(self, given: Any = None, /, **more: Any) -> AntennaArray:
+    def build(self, given: Any = None, /, **more: Any) -> scene.AntennaArray:
         """The elements about their centre."""
         array = super().build(given, **more)
         return replace(array, positions=array.positions + _float64(self.center))
@@ -97,7 +88,7 @@ class LookAtOrientation(Section):
     def rotations(self, places: Tensor) -> Tensor:
         """Axes [place, 3, 3] at places [place, 3] [m]."""
         with prefix_errors("orientation.look_at"):
-            return look_at(places, self.look_at)
+            return scene.look_at(places, self.look_at)
 
 
 class RotatedOrientation(Section):
@@ -105,7 +96,7 @@ class RotatedOrientation(Section):
 
     def rotations(self, places: Tensor) -> Tensor:
         """Axes [3, 3], the same at all places."""
-        return rotation_from_vector(_float64(self.rotation_deg).deg2rad())
+        return scene.rotation_from_vector(_float64(self.rotation_deg).deg2rad())
 
 
 TrackValue = Annotated[Any, OneOf("track")]
@@ -211,20 +202,20 @@ AnyImpairments = Annotated[Any, TableOf(Impairments, without=("snr_db", "noise_f
 
 def register(registry: Registry) -> None:
     """Add waveforms, antennas, boards and tracks."""
-    registry.groups["pattern"] = KindGroup(product=Pattern)
+    registry.groups["pattern"] = KindGroup(product=scene.Pattern)
     registry.groups["waveform"] = KindGroup(product=Waveform)
-    registry.groups["array"] = KindGroup(base=ArrayTable, product=AntennaArray)
+    registry.groups["array"] = KindGroup(base=ArrayTable, product=scene.AntennaArray)
     registry.groups["board"] = KindGroup(base=BoardTable, product=boards.Mounting)
     registry.groups["track"] = KindGroup(points=Annotated[list[Vector], MinLen(1)])
     waveforms = {"fmcw": FMCW, "stepped": SteppedFrequency, "ofdm": OFDM, "impulse": Impulse}
     for name, waveform in waveforms.items():
         registry.add("waveform", name, waveform)
-    registry.add("pattern", "isotropic", Isotropic)
-    registry.add("pattern", "cosine", Cosine)
+    registry.add("pattern", "isotropic", scene.Isotropic)
+    registry.add("pattern", "cosine", scene.Cosine)
     registry.add("pattern", "table", PatternTable.from_decibels, checked=True)
-    registry.add("array", "planar", planar_array)
-    registry.add("array", "linear", linear_array)
-    registry.add("array", "positions", AntennaArray)
+    registry.add("array", "planar", scene.planar_array)
+    registry.add("array", "linear", scene.linear_array)
+    registry.add("array", "positions", scene.AntennaArray)
     registry.add("board", "name", boards.board, untagged=True)
     registry.add("board", "tx_places", custom_board, untagged=True)
     for curve in (tracks.line, tracks.arc, tracks.grid):
