@@ -19,6 +19,7 @@ from pydantic_core import ErrorDetails
 from invertwin.errors import InputError
 from invertwin.registry.section import TAG_MARK
 from invertwin.registry.section import prefix_errors as prefix_errors
+from invertwin.registry.section import require_section as require_section
 from invertwin.storage.untrusted import convert_read_errors
 
 _MAX_ERRORS = 20  # in one line
@@ -87,23 +88,6 @@ def is_run_file(path: Path) -> bool:
         return "task" in tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
-
-
-def require_section(run: Any, section: str, command: str, otherwise: str = "add it") -> Any:
-    """A section that a command cannot do without.
-
-    Raises:
-        InputError: The run file does not have it; the message ends with `otherwise`.
-    """
-    found = getattr(run, section)
-    observed = run.observations.values()
-    if observed and all(getattr(table, section, None) for table in observed):
-        return found
-    if found in (None, []):
-        raise InputError(
-            f"expected a section [{section}] for {command}, got a run file without one; {otherwise}"
-        )
-    return found
 
 
 @contextmanager

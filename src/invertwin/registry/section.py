@@ -170,6 +170,23 @@ def check_presence(section: Section, wanted: dict[str, bool], when: str) -> None
             raise_key_error(f"expected {verb}`{name}` {when}, got {got}; {do}")
 
 
+def require_section(run: Any, section: str, command: str, otherwise: str = "add it") -> Any:
+    """A section that a command cannot do without.
+
+    Raises:
+        InputError: The run file does not have it; the message ends with `otherwise`.
+    """
+    found = getattr(run, section)
+    observed = run.observations.values()
+    if observed and all(getattr(table, section, None) for table in observed):
+        return found
+    if found in (None, []):
+        raise InputError(
+            f"expected a section [{section}] for {command}, got a run file without one; {otherwise}"
+        )
+    return found
+
+
 def raise_key_error(text: str, path: str = "") -> NoReturn:
     """Raise an error of the run file.
 

@@ -154,10 +154,8 @@ def _rcs_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _Gradch
             at, places = (0, slice(None), *channel), (angles, label)
         else:
             at, places = (slice(None), 0, *channel), (frequencies, "frequency [GHz]")
-        unit = _derivative_unit(settings)
-        return plotting.rcs_derivatives(
-            _derivative_maps(report, at), *places, f"∂σ, σ in m² [{unit}]"
-        )
+        curves, unit = _derivative_maps(report, at), _derivative_unit(settings)
+        return plotting.rcs_derivatives(curves, *places, f"∂σ, σ in m² [{unit}]")
 
     return _GradcheckTarget(RcsMap(compute=compute_rcs), None, None, draw)
 

@@ -134,9 +134,8 @@ def make_fit_display(
     names = [name for name in problem.run.fitted_objects if name in start.names]
     more = viewer.scene_layers(start, "start", fitted=names, fitted_only=True)
     layers = [*display.layers, *more, *viewer.ellipsoid_layers(twin, metrics)]
-    seen = make_sensor_maps(
-        problem, {viewer.MEASURED: maps["measured"], viewer.SIMULATED: maps["twin"]}
-    )
+    spectra = {viewer.MEASURED: maps["measured"], viewer.SIMULATED: maps["twin"]}
+    seen = make_sensor_maps(problem, spectra)
     return replace(display, layers=layers, steps=steps, maps=seen)
 
 
@@ -181,12 +180,10 @@ def make_problem_display(problem: Problem, scene: Scene) -> viewer.Display:
         scene: The start or the twin.
     """
     names = [name for name in problem.run.fitted_objects if name in scene.names]
-    known = any(name in problem.known_objects for name in names)
+    truth = problem.truth if any(name in problem.known_objects for name in names) else None
     radars = {name: (item.sensor, item.grid) for name, item in radar_data(problem).items()}
     title = problem.run.title or problem.kind.title
-    return viewer.build_display(
-        scene, radars, title, truth=problem.truth if known else None, fitted=names
-    )
+    return viewer.build_display(scene, radars, title, truth=truth, fitted=names)
 
 
 def radar_data(problem: Problem) -> dict[str, SensorData]:

@@ -57,8 +57,7 @@ class BestFit:
     @property
     def fits_by_method(self) -> list[tuple[str, list[dict[str, Any]]]]:
         """The fits of every way to fit, by its name in words."""
-        run = self.problem.run
-        own = "with boundary terms" if run.fit_settings.boundary else "interior only"
+        own = "with boundary terms" if self.problem.run.fit_settings.boundary else "interior only"
         if set(self.rows) - {OWN_METHOD, INTERIOR_ONLY}:
             own = "as the run says"
         return [

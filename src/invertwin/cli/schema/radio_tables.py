@@ -111,9 +111,8 @@ def plane_cells(
         points: least number of points in a cell.
         edge_points: points on edges of the scene, for each transmitter; for derivatives only.
     """
-    return links.MapPlane.horizontal(
-        low, high, height, cell, links.CellSampling(points, edge_points)
-    )
+    sampling = links.CellSampling(points, edge_points)
+    return links.MapPlane.horizontal(low, high, height, cell, sampling)
 
 
 def mesh_cells(file: InputPath, points: Count = 16, edge_points: Count = 20_000) -> links.MapMesh:

@@ -10,7 +10,6 @@ from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from invertwin.channel.sampling import ALL_OTHERS
-from invertwin.cli.run_file import require_section
 from invertwin.cli.schema import fits
 from invertwin.cli.schema.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.schema.dataset import DatasetTable
@@ -37,6 +36,7 @@ from invertwin.registry.section import (
     Vector,
     key,
     raise_key_error,
+    require_section,
 )
 from invertwin.scene.rooms import room
 from invertwin.signatures import rcs
