@@ -18,12 +18,7 @@ from invertwin.runtime.doctor import cache_folder
 from invertwin.storage.folders import replace_file
 
 KEY_COLUMNS = ("key", "value", "default", "unit or meaning")
-_TYPE_NAMES = {
-    "number": "number",
-    "integer": "integer",
-    "boolean": "true or false",
-    "string": "text",
-}
+_TYPE_NAMES = {"boolean": "true or false", "string": "text"}  # others are called as they are
 _LIMIT_SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
 JsonSchema = dict[str, Any]
 
@@ -178,7 +173,8 @@ def _describe_value(value: JsonSchema) -> str:
     if "$ref" in value or value.get("type", "object") == "object":
         return "table"
     signs = [f"{sign} {value[name]:.10g}" for name, sign in _LIMIT_SIGNS.items() if name in value]
-    return " ".join([_TYPE_NAMES[value["type"]], ", ".join(signs)]).strip()
+    kind = value["type"]
+    return " ".join([_TYPE_NAMES.get(kind, kind), ", ".join(signs)]).strip()
 
 
 def _key_description(model: JsonSchema, key: str) -> str:
