@@ -20,13 +20,7 @@ from invertwin.channel import Paths
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact
 from invertwin.cli.report import ReportTable, quantity_table, write_report
-from invertwin.cli.run_file import (
-    load_run,
-    prefix_file_errors,
-    require_section,
-    to_toml,
-    validate_run,
-)
+from invertwin.cli.run_file import load_run, prefix_file_errors, to_toml, validate_run
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.motion_tables import joint_positions_at_start, scene_at_start
 from invertwin.cli.schema.variation import draw_sample
@@ -34,6 +28,7 @@ from invertwin.datasets import SampleDataset, labels, shards
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar import range_doppler_angle
 from invertwin.radar.radar import Radar
+from invertwin.registry.section import require_section
 from invertwin.runtime.engines import Engine, run_jobs
 from invertwin.runtime.progress import track
 from invertwin.scene import Scene

@@ -11,13 +11,7 @@ from pydantic import model_validator
 
 from invertwin import scene
 from invertwin.errors import InputError
-from invertwin.registry.kinds import (
-    ConstructorTable,
-    KindGroup,
-    Registry,
-    ValueFormat,
-    number_or_list,
-)
+from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry, ValueFormat
 from invertwin.registry.section import InputPath, Section, key, raise_key_error
 from invertwin.scene.material.materials import Medium
 from invertwin.scene.material.values import RANGES, Value
@@ -40,7 +34,7 @@ def _value_type(name: str, angle: bool) -> Any:
         low, high = (math.degrees(end) if angle else end for end in (span.low, span.high))
         number = Annotated[float, Gt(low) if span.open_low else Ge(low)]
         number = number if math.isinf(high) else Annotated[number, Le(high)]
-    return number_or_list(number, Annotated[list[number], MinLen(1)], TextureFile)
+    return Annotated[Any, FormOf((number, Annotated[list[number], MinLen(1)], TextureFile))]
 
 
 class MediumTable(ConstructorTable):
