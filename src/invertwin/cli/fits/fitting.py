@@ -54,11 +54,12 @@ def fit_all(
         console: Shows progress.
         show: Is told of steps as they come.
     """
+    work = problem.work
     rows: dict[str, list[Row]] = {method: [] for method in problem.methods}
     outcomes: dict[tuple[str, int], Callable[[], inversion.Reconstruction]] = {}
-    for method, number in problem.work:
+    for method, number in work:
         own = problem.kind.with_recording_of_start(problem, number, console)
-        checkpoint = CHECKPOINT if len(problem.work) == 1 else None
+        checkpoint = CHECKPOINT if len(work) == 1 else None
         told = None if show is None else partial(show, own)
         start = problem.starts(method)[number]
         row, outcome = run_fit(own, start, number, method, folder, console, checkpoint, told)
