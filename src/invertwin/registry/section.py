@@ -173,6 +173,12 @@ def check_presence(section: Section, wanted: dict[str, bool], when: str) -> None
 def require_section(run: Any, section: str, command: str, otherwise: str = "add it") -> Any:
     """A section that a command cannot do without.
 
+    Args:
+        run: The run file.
+        section: Name of the section.
+        command: Which needs it, for the error.
+        otherwise: What to do without it, for the error.
+
     Raises:
         InputError: The run file does not have it; the message ends with `otherwise`.
     """

@@ -173,7 +173,7 @@ def _describe_value(value: JsonSchema) -> str:
     if "$ref" in value or value.get("type", "object") == "object":
         return "table"
     signs = [f"{sign} {value[name]:.10g}" for name, sign in _LIMIT_SIGNS.items() if name in value]
-    kind = value["type"]
+    kind: str = value["type"]
     return " ".join([_TYPE_NAMES.get(kind, kind), ", ".join(signs)]).strip()
 
 
