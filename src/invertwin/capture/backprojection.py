@@ -94,8 +94,7 @@ def calibrate(capture: Capture, target: Float64[Tensor, "3"]) -> Capture:
     def focus(trial: Float64[Tensor, "trial 2"]) -> Float64[Tensor, " trial"]:
         """Amplitude at the target for rows of shifts of clock [s] and bias [m]."""
         ranges = [(capture.positions(clock) - target).norm(dim=1) for clock in trial[:, 0]]
-        shown = torch.stack(ranges, dim=1) - origins + trial[:, 1]
-        return interpolator(shown).mean(0).abs()
+        return interpolator(torch.stack(ranges, dim=1) - origins + trial[:, 1]).mean(0).abs()
 
     clock, bias = _maximise_measure(focus, (_CLOCK_SEARCH, _BIAS_SEARCH))
     return capture.recalibrate(capture.clock_offset + clock, capture.range_bias + bias)

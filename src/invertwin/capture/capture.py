@@ -78,8 +78,7 @@ class Capture:
                 f"expected complex (I/Q) beat samples, got {got}; of real ADC samples take the "
                 "analytic signal (scipy.signal.hilbert) along the last axis first"
             )
-        variables = {"beat": to_data_array(BEAT_DIMS, samples, "1")}
-        return cls._assemble(variables, radar, times)
+        return cls._assemble({"beat": to_data_array(BEAT_DIMS, samples, "1")}, radar, times)
 
     @classmethod
     def from_range_profile(
@@ -106,15 +105,12 @@ class Capture:
             range_bias: what was subtracted from the radar's own ranges [m].
             survey: known positions of targets [m].
         """
-        variables = {
-            "range_profile": to_data_array(PROFILE_DIMS, profile, "1"),
-            "range": to_data_array(("range",), ranges, "m"),
-        }
+        variables = {"range_profile": to_data_array(PROFILE_DIMS, profile, "1")}
+        variables["range"] = to_data_array(("range",), ranges, "m")
         if track is not None:
             variables["track_time"] = to_data_array(("track_time",), track.times, "s")
-            variables["track_position"] = to_data_array(
-                ("track_time", "axis"), track.positions, "m"
-            )
+            dims = ("track_time", "axis")
+            variables["track_position"] = to_data_array(dims, track.positions, "m")
         if survey is not None:
             variables["survey"] = to_data_array(("target", "axis"), survey, "m")
         capture = cls._assemble(variables, radar, times)
@@ -200,9 +196,8 @@ class Capture:
         """The track that the positions were read from; None where it is not known."""
         if "track_time" not in self.dataset.variables:
             return None
-        return Track(
-            read_tensor(self.dataset, "track_time"), read_tensor(self.dataset, "track_position")
-        )
+        names = ("track_time", "track_position")
+        return Track(*(read_tensor(self.dataset, name) for name in names))
 
     @property
     def clock_offset(self) -> float:

@@ -52,8 +52,8 @@ class ChannelCalibration:
             tx, rx = (int(index) for index in weak.nonzero()[0])
             raise InputError(
                 f"expected signal in every channel, got less than {_MIN_RELATIVE_GAIN:g} of the "
-                f"strongest from "
-                f"TX element {tx} to RX element {rx} (from 0); leave out the dead element"
+                f"strongest from TX element {tx} to RX element {rx} (from 0); leave out the dead "
+                "element"
             )
         gains = gains / gains.abs().square().mean().sqrt()
         total = gains.sum()

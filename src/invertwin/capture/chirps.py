@@ -12,25 +12,17 @@ from jaxtyping import Complex, Float64
 from scipy.signal import hilbert
 from torch import Tensor
 
+from invertwin import limits
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.checks import check_fields, check_shape, checked_number
 from invertwin.errors import InputError
-from invertwin.limits import (
-    AllowedValues,
-    Count,
-    CountOfTwo,
-    Frequency,
-    NonNegative,
-    Positive,
-    UsualValue,
-)
 from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.waveform import FMCW, PhysicsWarning
 
 CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")
-IdleTime = Annotated[NonNegative, UsualValue("seconds", 5e-6, high=1.0)]
+IdleTime = Annotated[limits.NonNegative, limits.UsualValue("seconds", 5e-6, high=1.0)]
 
 
 @dataclass(frozen=True)
@@ -60,22 +52,22 @@ class ChirpSettings:
             ends before its last sample.
     """
 
-    start_frequency: Frequency
-    slope: Annotated[Positive, UsualValue("Hz/s", 60e12, low=1.0)]
-    sample_rate: Annotated[Positive, UsualValue("Hz", 5e6, low=1.0)]
-    samples: CountOfTwo
+    start_frequency: limits.Frequency
+    slope: Annotated[limits.Positive, limits.UsualValue("Hz/s", 60e12, low=1.0)]
+    sample_rate: Annotated[limits.Positive, limits.UsualValue("Hz", 5e6, low=1.0)]
+    samples: limits.CountOfTwo
     transmit_order: tuple[int, ...]
     receivers: tuple[int, ...]
-    loops: Count
-    frames: Count | None = None
+    loops: limits.Count
+    frames: limits.Count | None = None
     frame_period: float | None = None
     idle_time: IdleTime = 0.0
     adc_start_time: IdleTime = 0.0
     ramp_end_time: float | None = None
     real: bool = False
     swap_iq: bool = False
-    bits: Annotated[int, AllowedValues((12, 14, 16))] = 16
-    lanes: Annotated[int, AllowedValues((2, 4))] | None = None
+    bits: Annotated[int, limits.AllowedValues((12, 14, 16))] = 16
+    lanes: Annotated[int, limits.AllowedValues((2, 4))] | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -23,6 +23,10 @@ _LEAKAGE_CELLS = 3  # from range zero, in which leakage outshines everything
 _MAX_SAMPLES, _MAX_CHANNELS = 2**20, 64  # that are looked at
 _STRONGEST_RATES = 3  # strongest range rates of a frame in which a pattern is looked for
 
+_Beat = Complex[Tensor, "frame chirp tx rx sample"]
+_LimitedBeat = Complex128[Tensor, "frame chirp tx rx sample"]  # not more than is looked at
+_Rates = Complex128[Tensor, "rate channel sample"]
+
 
 @dataclass(frozen=True)
 class Fault:
@@ -66,10 +70,8 @@ def find_faults(
     beat = _limit_samples(beat)
     if not any(found):
         # Both of them break phases and make ghosts, too.
-        found += [
-            detect_phase_break(beat, real=real),
-            detect_ghosts(_strongest_range_rates(beat), waveform, real=real),
-        ]
+        found.append(detect_phase_break(beat, real=real))
+        found.append(detect_ghosts(_strongest_range_rates(beat), waveform, real=real))
     found.append(detect_iq_images(beat))
     shown = search_ranges(recording, range_min, range_max)
     found.append(detect_leakage(beat, waveform, radar.window, shown, real=real))
@@ -90,8 +92,7 @@ def search_ranges(
         range_max: What the user has chosen.
     """
     radar = recording.radar()
-    waveform = require_sampled_waveform(radar)
-    leaking = _LEAKAGE_CELLS * waveform.range_resolution
+    leaking = _LEAKAGE_CELLS * require_sampled_waveform(radar).range_resolution
     # Ranges that count from a scene begin before it.
     near = max(leaking - float(radar.origins.min()), radar.range_limits[0])
     real = isinstance(recording, ChirpCapture) and recording.real
@@ -110,9 +111,7 @@ _MIN_CLIPPED_COUNT = 8
 _MIN_CODES = 200  # of the largest value, below which a pure tone piles up too
 
 
-def detect_saturation(
-    beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: bool
-) -> Fault | None:
+def detect_saturation(beat: _Beat, *, real: bool) -> Fault | None:
     """Values that pile up at the ends of their range, whatever the converter's full scale is.
 
     A tone of amplitude A that is clipped at A/s has ``acos(1/s)/π`` of its values at either end
@@ -150,9 +149,7 @@ _FALSE_ALARM_PROBABILITY = 1e-4  # probability that a sound recording in noise i
 _MIN_RUN_LENGTH = 8
 
 
-def detect_lost_samples(
-    beat: Complex[Tensor, "frame chirp tx rx sample"], *, real: bool
-) -> Fault | None:
+def detect_lost_samples(beat: _Beat, *, real: bool) -> Fault | None:
     """Runs of zeros within chirps that are too long to be rounded noise.
 
     With a share z of zeros elsewhere, one of n samples begins L zeros with a probability below
@@ -171,8 +168,7 @@ def detect_lost_samples(
     before, after = _zero_run_lengths(zero), _zero_run_lengths(zero.flip(1)).flip(1)
     length = torch.where(zero, before + after - 1, 0)
     longest, long = int(length.max()), length >= _MIN_RUN_LENGTH
-    rest = int((zero & ~long).sum())
-    share = max(rest, 1) / max(int((~long).sum()), 1)
+    share = max(int((zero & ~long).sum()), 1) / max(int((~long).sum()), 1)
     if longest < _MIN_RUN_LENGTH or zero.numel() * share**longest > _FALSE_ALARM_PROBABILITY:
         return None
     return Fault(
@@ -194,7 +190,7 @@ _MIN_TOTAL_COHERENCE = 0.97
 _MIN_BIN_COHERENCE = 0.5
 
 
-def detect_iq_images(beat: Complex128[Tensor, "frame chirp tx rx sample"]) -> Fault | None:
+def detect_iq_images(beat: _LimitedBeat) -> Fault | None:
     """Complex by type only: every frequency has its mirror image at the negative one.
 
     ``X(−f) = e^{2jα} conj X(f)`` where I and Q lie on one line. Coherence
@@ -240,16 +236,12 @@ def detect_iq_images(beat: Complex128[Tensor, "frame chirp tx rx sample"]) -> Fa
 _MIN_GHOST_TO_NOISE = 100.0
 _MAX_RESIDUAL_FRACTION = 0.03
 _MIN_PEAK_TO_SURROUNDINGS = 10.0
-_NOISE_ONLY_FRACTION, _WINDOW_FLOOR = (
-    0.2,
-    1e-10,
-)  # share of a spectrum without echoes; what its window leaves
+# Share of a spectrum without echoes; what its window leaves.
+_NOISE_ONLY_FRACTION, _WINDOW_FLOOR = 0.2, 1e-10
 _MIN_RELATIVE_ECHO = 1e-4  # of the strongest one's power, that is searched for ghosts
 
 
-def detect_ghosts(
-    rates: Complex128[Tensor, "rate channel sample"], waveform: SampledWaveform, *, real: bool
-) -> Fault | None:
+def detect_ghosts(rates: _Rates, waveform: SampledWaveform, *, real: bool) -> Fault | None:
     """Echoes whose copies lie half the unambiguous range away: odd samples unlike even ones.
 
     Factors that alternate from sample to sample move a part of every echo by half the sampling
@@ -268,10 +260,8 @@ def detect_ghosts(
     tapered = rates * _blackman_harris_window(count)
     power = torch.fft.fft(tapered, 4 * count).abs().square().flatten(0, 1).mean(0)
     looks, top = rates.shape[0] * rates.shape[1], float(power.max())
-    noise = max(
-        noise_power(power[: 2 * count] if real else power, looks, _NOISE_ONLY_FRACTION),
-        _WINDOW_FLOOR * top,
-    )
+    own_half = power[: 2 * count] if real else power
+    noise = max(noise_power(own_half, looks, _NOISE_ONLY_FRACTION), _WINDOW_FLOOR * top)
     highest = (power >= power.roll(1)) & (power > power.roll(-1))
     strong = highest & (power > _MIN_RELATIVE_ECHO * top) & (power > _MIN_GHOST_TO_NOISE * noise)
     kinds = ((0.5, 1.0, False), (0.5, -1.0, True)) if not real else ((0.5, -1.0, True),)
@@ -314,9 +304,7 @@ _MIN_RESIDUAL_RATIO = 4.0
 _MIN_CHIRPS = 4
 
 
-def detect_phase_break(
-    beat: Complex128[Tensor, "frame chirp tx rx sample"], *, real: bool
-) -> Fault | None:
+def detect_phase_break(beat: _LimitedBeat, *, real: bool) -> Fault | None:
     """A sample that does not follow from the ones before it, in all chirps or in one.
 
     Tones are predicted from the samples before, and after. Where the phase jumps or samples are
@@ -342,9 +330,8 @@ def detect_phase_break(
     kept = torch.ones(len(products), dtype=torch.bool)
     left, place = torch.zeros(0), 0
     for _ in range(3):
-        left = _window_means(
-            prediction_residuals(products, prediction_coefficients(products, kept)), order
-        )
+        residuals = prediction_residuals(products, prediction_coefficients(products, kept))
+        left = _window_means(residuals, order)
         place = int(left.argmax())
         kept[:] = True
         kept[place : place + order] = False
@@ -356,9 +343,8 @@ def detect_phase_break(
     chirps = beat.flatten(0, 1).flatten(1, 2)[..., settled:]
     if len(chirps) < _MIN_CHIRPS:
         return None
-    coefficients = prediction_coefficients(
-        covariances(chirps.flatten(0, 1), order), torch.ones_like(kept)
-    )
+    products = covariances(chirps.flatten(0, 1), order)
+    coefficients = prediction_coefficients(products, torch.ones_like(kept))
     past = chirps.unfold(-1, order + 1, 1).flip(-1)
     both = [(past @ part).abs().square() for part in (coefficients, coefficients.conj().flip(0))]
     each = _window_means(0.5 * (both[0] + both[1]).mean(1), order)
@@ -400,9 +386,8 @@ def _outlier_ratio(values: Tensor, reference: Tensor, averages: int) -> float | 
     if middle <= 0:
         return None
     shape = _gamma_shape(high / max(low, 1e-300), averages)
-    limit = float(
-        gammainccinv(shape, _FALSE_ALARM_PROBABILITY / values.numel()) / gammaincinv(shape, 0.5)
-    )
+    rare = _FALSE_ALARM_PROBABILITY / values.numel()
+    limit = float(gammainccinv(shape, rare) / gammaincinv(shape, 0.5))
     ratio = float(values.max()) / middle
     return ratio if ratio > max(limit, _MIN_RESIDUAL_RATIO) else None
 
@@ -419,15 +404,14 @@ def _gamma_shape(quartile_ratio: float, maximum: float) -> float:
     return low
 
 
-_BOARD_RANGE = (
-    0.3  # m, half the length of ways from transmitters to receivers over a board and its cover
-)
+# m, half the length of ways from transmitters to receivers over a board and its cover.
+_BOARD_RANGE = 0.3
 # Over the window's sidelobes; ends of a chirp, which do not meet, raise those of analytic signals.
 _SIDELOBE_FACTOR, _REAL_SIDELOBE_FACTOR = 4.0, 16.0
 
 
 def detect_leakage(
-    beat: Complex128[Tensor, "frame chirp tx rx sample"],
+    beat: _LimitedBeat,
     waveform: SampledWaveform,
     window: str,
     search_range: tuple[float, float],
@@ -487,9 +471,7 @@ def detect_leakage(
     )
 
 
-def _limit_samples(
-    beat: Complex[Tensor, "frame chirp tx rx sample"],
-) -> Complex128[Tensor, "frame chirp tx rx sample"]:
+def _limit_samples(beat: _Beat) -> _LimitedBeat:
     """As many transmitters, chirps and frames, the latter in equal steps, as are looked at."""
     _, chirps, tx, rx, count = beat.shape
     senders = max(1, min(tx, _MAX_CHANNELS // rx))
@@ -499,16 +481,14 @@ def _limit_samples(
     return beat[chosen][:, :loops, :senders].to(torch.complex128)
 
 
-def _is_analytic(beat: Complex[Tensor, "frame chirp tx rx sample"]) -> bool:
+def _is_analytic(beat: _Beat) -> bool:
     """Return True for real samples: no power in the farther half of the unambiguous range."""
     count = beat.shape[-1]
     power = torch.fft.fft(beat[:1]).abs().square().flatten(0, 3).sum(0)
     return bool(power[count // 2 + 1 :].sum() < _WINDOW_FLOOR * power.sum())
 
 
-def _strongest_range_rates(
-    beat: Complex128[Tensor, "frame chirp tx rx sample"],
-) -> Complex128[Tensor, "rate channel sample"]:
+def _strongest_range_rates(beat: _LimitedBeat) -> _Rates:
     """The strongest range rates of every frame, in which noise of many chirps is averaged."""
     rates = torch.fft.fft(beat.flatten(2, 3), dim=1) / math.sqrt(beat.shape[1])
     energy = rates.abs().square().sum((2, 3))
@@ -523,9 +503,7 @@ def _blackman_harris_window(count: int) -> Float64[Tensor, " sample"]:
     return sum((a * torch.cos(k * turn) for k, a in enumerate(terms)), torch.zeros(count)) / count
 
 
-def _adjacent_lines(
-    tapered: Complex128[Tensor, "rate channel sample"], frequency: float
-) -> Complex128[Tensor, "rate channel line"]:
+def _adjacent_lines(tapered: _Rates, frequency: float) -> Complex128[Tensor, "rate channel line"]:
     """Spectra a bin below, at, and a bin above a frequency in cycles per sample."""
     count = tapered.shape[-1]
     lines = frequency + torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64) / count

@@ -3,7 +3,7 @@
 import json
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,6 +20,7 @@ from invertwin.cli.options import (
     FilesArgument,
     FitOptions,
     LookOptions,
+    RecordingOptions,
     ResumableOptions,
     RunOptions,
     TwinOptions,
@@ -28,7 +29,7 @@ from invertwin.cli.options import (
 )
 from invertwin.cli.report import ReportTable
 from invertwin.cli.run_file import prefix_file_errors
-from invertwin.cli.terminal import limit_rate, load_runs, print_tables, run_folder, show_progress
+from invertwin.cli.terminal import load_runs, print_tables, run_each, run_folder, show_progress
 from invertwin.errors import InputError, exit_on_interrupt, to_one_line
 from invertwin.runtime.threads import available_threads
 
@@ -72,6 +73,15 @@ app = typer.Typer(
 )
 
 
+def _command_with(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add a command whose options are the fields of a dataclass."""
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        return app.command()(with_options(kind)(function))
+
+    return decorate
+
+
 def _show_version(wanted: bool) -> bool:
     if wanted:
         print(f"invertwin {__version__}")
@@ -91,8 +101,7 @@ def invertwin(
     """Digital twins from radar: find a scene from its echoes by differentiating ray tracing."""
 
 
-@app.command()
-@with_options(RunOptions)
+@_command_with(RunOptions)
 def simulate(options: RunOptions, file: FileArgument) -> None:
     """Simulate exact radar signals of a scene, and their spectra."""
     runs = load_runs([file], options, "simulate", ("radar", "grid", "data"))
@@ -104,43 +113,30 @@ def simulate(options: RunOptions, file: FileArgument) -> None:
         print_tables(tables)
 
 
-@app.command()
-@with_options(DatasetOptions)
+@_command_with(DatasetOptions)
 def dataset(options: DatasetOptions, file: FileArgument) -> None:
     """Simulate a data set: many samples of a run file with other values each, and their labels."""
-    from invertwin.cli.commands.dataset import (
-        DATASET_SECTIONS,
-        parse_part,
-        part_folder,
-        run_dataset,
-    )
+    from invertwin.cli.commands import dataset as command
 
-    part = parse_part(options.shard)
-    runs = load_runs([file], options, "dataset", DATASET_SECTIONS)
-    chosen = replace(options, out=part_folder(options.out or Path("out", file.stem), part))
+    part = command.parse_part(options.shard)
+    runs = load_runs([file], options, "dataset", command.DATASET_SECTIONS)
+    chosen = replace(options, out=command.part_folder(options.out or Path("out", file.stem), part))
     with run_folder(chosen, Path("out"), runs) as folder:
         if folder.complete:
             return
         with prefix_file_errors(file), show_progress(console):
-            tables = run_dataset(
-                runs[file.stem],
-                folder,
-                part,
-                options.engine,
-                options.workers or available_threads(),
-            )
+            workers = options.workers or available_threads()
+            tables = command.run_dataset(runs[file.stem], folder, part, options.engine, workers)
         print_tables(tables)
 
 
-@app.command()
-@with_options(FitOptions)
+@_command_with(FitOptions)
 def reconstruct(options: FitOptions, file: FileArgument) -> None:
     """Fit the parameters of a scene to radar data."""
     _run_one_reconstruction(file, options, Path("out", file.stem))
 
 
-@app.command()
-@with_options(ResumableOptions)
+@_command_with(ResumableOptions)
 def plan(options: ResumableOptions, file: FileArgument) -> None:
     """State the error bars of a fit before anything is recorded, and rank positions to add."""
     runs = load_runs([file], options, "plan", ("radar", "data", "grid", "parameters"))
@@ -150,7 +146,7 @@ def plan(options: ResumableOptions, file: FileArgument) -> None:
         from invertwin.cli.commands.plan import run_plan
 
         with prefix_file_errors(file):
-            tables = run_plan(runs[file.stem], folder, console, limit_rate())
+            tables = run_plan(runs[file.stem], folder, console)
         print_tables(tables)
 
 
@@ -168,8 +164,7 @@ def check(file: FileArgument, backend: BackendOption = None) -> None:
     console.print(line, markup=False, soft_wrap=True)
 
 
-@app.command()
-@with_options(ResumableOptions)
+@_command_with(ResumableOptions)
 def demo(options: ResumableOptions) -> None:
     """Find a hidden letter from its radar echoes."""
     # In its own folder the demo replaces what it left there before.
@@ -177,30 +172,20 @@ def demo(options: ResumableOptions) -> None:
     _run_one_reconstruction(_find_demo_file(), replace(options, overwrite=again), Path("out/demo"))
 
 
-@app.command()
-@with_options(LookOptions)
+@_command_with(LookOptions)
 def look(options: LookOptions) -> None:
     """Show a recording: range, range rate, direction; and write it as a capture."""
     from invertwin.cli.commands.look import run_look
 
-    default = Path("out") / options.recording.name.split(".")[0]
-    with run_folder(options, default) as folder:
-        with show_progress(console):
-            tables = run_look(options, folder)
-        print_tables(tables)
+    _run_recording(options, "", run_look)
 
 
-@app.command()
-@with_options(TwinOptions)
+@_command_with(TwinOptions)
 def twin(options: TwinOptions) -> None:
     """Find what stands in a recording, with no start: things, places, sizes, confidences."""
     from invertwin.cli.commands.twin import run_twin
 
-    default = Path("out") / f"{options.recording.name.split('.')[0]}_twin"
-    with run_folder(options, default) as folder:
-        with show_progress(console):
-            tables = run_twin(options, folder)
-        print_tables(tables)
+    _run_recording(options, "_twin", run_twin)
 
 
 @app.command()
@@ -226,8 +211,7 @@ def view(
     run_view(target, console, host=host, port=port, token=token, record=record)
 
 
-@app.command()
-@with_options(ResumableOptions)
+@_command_with(ResumableOptions)
 def gradcheck(options: ResumableOptions, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
 
@@ -236,7 +220,7 @@ def gradcheck(options: ResumableOptions, files: FilesArgument) -> None:
 
         return run_gradcheck(*given)
 
-    _run_each(options, files, "gradcheck", _gradcheck_sections, run_command)
+    run_each(options, files, "gradcheck", _gradcheck_sections, run_command)
 
 
 def _gradcheck_sections(run: Any) -> tuple[str, ...]:
@@ -248,8 +232,7 @@ def _gradcheck_sections(run: Any) -> tuple[str, ...]:
     return ("gradcheck",) if alone else ("gradcheck", "radar", "grid")
 
 
-@app.command()
-@with_options(ResumableOptions)
+@_command_with(ResumableOptions)
 def rcs(options: ResumableOptions, files: FilesArgument) -> None:
     """Compute radar signatures: cross-sections, range profiles, images."""
 
@@ -258,7 +241,7 @@ def rcs(options: ResumableOptions, files: FilesArgument) -> None:
 
         return run_rcs(*given)
 
-    _run_each(options, files, "rcs", ("rcs",), run_command)
+    run_each(options, files, "rcs", ("rcs",), run_command)
 
 
 @app.command()
@@ -303,22 +286,14 @@ def main() -> None:
         sys.exit(2)
 
 
-def _run_each(
-    options: ResumableOptions,
-    files: Sequence[Path],
-    command: str,
-    sections: Sequence[str] | Callable[[Any], Sequence[str]],
-    work: Callable[..., list[ReportTable]],
+def _run_recording(
+    options: RecordingOptions, ending: str, work: Callable[..., list[ReportTable]]
 ) -> None:
-    """Several run files with one report."""
-    runs = load_runs(files, options, command, sections)
-    default = Path("out", files[0].stem if len(files) == 1 else command)
-    with run_folder(options, default, runs) as folder:
-        if folder.complete:
-            return
-        with console.status("tracing") as status:
-            say = status.update if console.is_terminal else limit_rate()
-            tables = work(runs, {file.stem: file for file in files}, folder, say)
+    """One recording, by default in a folder of its name and an ending."""
+    default = Path("out", options.recording.name.split(".")[0] + ending)
+    with run_folder(options, default) as folder:
+        with show_progress(console):
+            tables = work(options, folder)
         print_tables(tables)
 
 

@@ -43,14 +43,19 @@ class MemoryItem:
     Attributes:
         name: Name of the item.
         count: Number of equal items.
-        memory: Bytes.
+        size: Bytes of each.
         key: Run-file key to lower.
     """
 
     name: str
     count: float
-    memory: float
+    size: float
     key: str
+
+    @property
+    def memory(self) -> float:
+        """Bytes of all of them."""
+        return self.count * self.size
 
 
 @dataclass(frozen=True)
@@ -89,8 +94,7 @@ class ResourceEstimate:
             most = self.memory_items[0]
             raise InputError(
                 f"{most.key}: expected a run within the {format_gigabytes(free)} of memory that "
-                f"are free, "
-                f"got an estimate of {format_gigabytes(self.memory)}, most of it for "
+                f"are free, got an estimate of {format_gigabytes(self.memory)}, most of it for "
                 f"{min(most.count, 1e300):.3g} {most.name}; lower {most.key}, or give metres if "
                 "these are millimetres"
             )
@@ -134,9 +138,8 @@ def estimate_resources(
     parts, rows, one_channel = [_triangle_item(run, truth)], 0.0, 0.0
     for name, sensor in sensors.items():
         found, traced = estimate_sensor_resources(sensor, truth)
-        parts += [
-            _prefix_item_key(f"observations.{name}.", part) if name else part for part in found
-        ]
+        path = f"observations.{name}." if name else ""
+        parts += [replace(part, key=path + part.key) for part in found]
         rows += traced
         one_channel += traced / math.prod(sensor.radar.shape)
     parts += _fit_items(run, sensors)
@@ -144,8 +147,7 @@ def estimate_resources(
     recordings, rows = again * len(sensors), rows * again
     if run.landscape is not None:
         rows += run.landscape.exact_points * one_channel
-    ordered = sorted(parts, key=lambda part: -part.memory)
-    kept = tuple(part for part in ordered if part.memory)
+    kept = tuple(part for part in sorted(parts, key=lambda part: -part.memory) if part.memory)
     return ResourceEstimate(kept, *_count_rays(run), recordings, rows)
 
 
@@ -160,18 +162,12 @@ def estimate_rcs_resources(run: RunFile, scene: Scene) -> ResourceEstimate:
     sizes = {n: count_values(getattr(table, n)) for n in ("frequencies", "theta_deg", "phi_deg")}
     values = sizes["frequencies"] * table.aspect_count
     largest = max(sizes, key=lambda name: sizes[name])
-    parts = [
-        _triangle_item(run, scene),
-        MemoryItem(
-            "values of the field",
-            values,
-            values * _MATRIX_BYTES * (table.depth + 2),
-            f"rcs.{largest}",
-        ),
-    ]
+    size = _MATRIX_BYTES * (table.depth + 2)
+    parts = [_triangle_item(run, scene)]
+    parts.append(MemoryItem("values of the field", values, size, f"rcs.{largest}"))
     if table.image is not None:
         pixels = table.image.pixels**2
-        parts.append(MemoryItem("pixels", pixels, pixels * _MATRIX_BYTES, "rcs.image.pixels"))
+        parts.append(MemoryItem("pixels", pixels, _MATRIX_BYTES, "rcs.image.pixels"))
     ordered = tuple(sorted(parts, key=lambda part: -part.memory))
     return ResourceEstimate(ordered, 0, 0, "rcs.frequencies", 0, 0)
 
@@ -183,19 +179,14 @@ def require_resources(run: RunFile, truth: Scene, sensors: Mapping[str, SensorSe
     estimate_resources(run, truth, sensors).require_available()
 
 
-def _prefix_item_key(path: str, item: MemoryItem) -> MemoryItem:
-    return replace(item, key=f"{path}{item.key}")
-
-
 def _triangle_item(run: RunFile, scene: Scene) -> MemoryItem:
     counts = {name: len(item.mesh.faces) for name, item in scene.objects.items()}
     name = max(counts, key=lambda name: counts[name])
-    total = sum(counts.values())
     key = "room.furniture" if run.scene_file is None else "scene_file.file"
     if name in run.scene:
         size = next(size for size in _SIZE_KEYS if hasattr(run.scene[name], size))
         key = f"scene.{name}.{size}"
-    return MemoryItem("triangles", total, total * _TRIANGLE_BYTES, key)
+    return MemoryItem("triangles", sum(counts.values()), _TRIANGLE_BYTES, key)
 
 
 def estimate_sensor_resources(sensor: SensorSetup, scene: Scene) -> tuple[list[MemoryItem], float]:
@@ -214,15 +205,8 @@ def estimate_sensor_resources(sensor: SensorSetup, scene: Scene) -> tuple[list[M
     counts |= {"grid.u_max": grid.u_count, "grid.v_max": grid.v_count}
     largest = max(counts, key=lambda name: counts[name])
     parts = [
-        MemoryItem(
-            "bins of a map over all frames", bins * frames, bins * frames * _BIN_BYTES, largest
-        ),
-        MemoryItem(
-            "phases of beams and antennas",
-            beams * channels,
-            beams * channels * _PHASOR_BYTES,
-            "grid.u_max",
-        ),
+        MemoryItem("bins of a map over all frames", bins * frames, _BIN_BYTES, largest),
+        MemoryItem("phases of beams and antennas", beams * channels, _PHASOR_BYTES, "grid.u_max"),
     ]
     rows = 0.0
     if isinstance(radar.waveform, SampledWaveform):
@@ -231,21 +215,16 @@ def estimate_sensor_resources(sensor: SensorSetup, scene: Scene) -> tuple[list[M
         taken["radar.waveform"] = samples
         beat = math.prod(taken.values())
         most = max(taken, key=lambda name: taken[name])
-        parts.append(MemoryItem("samples of beat signals", beat, beat * _SAMPLE_BYTES, most))
+        parts.append(MemoryItem("samples of beat signals", beat, _SAMPLE_BYTES, most))
         if fft_bins(radar.waveform, grid) is None:
-            count = samples * grid.range_count
-            parts.append(
-                MemoryItem(
-                    "phases of samples and ranges", count, count * _PHASOR_BYTES, "grid.range_max"
-                )
-            )
+            name, count = "phases of samples and ranges", samples * grid.range_count
+            parts.append(MemoryItem(name, count, _PHASOR_BYTES, "grid.range_max"))
     if isinstance(run.data, SimulatedData):
+        again, moves = 1, any(item.motion for item in run.scene.values())
+        if run.chirps is not None and (run.chirps.retrace or moves):
+            again = -(-chirps // run.chirps.visibility_every)
         for part, traced in _simulation_items(run.data, scene, frames):
             parts.append(part)
-            table = run.chirps
-            moves = any(item.motion for item in run.scene.values())
-            again = chirps if table is not None and (table.retrace or moves) else 1
-            again = 1 if table is None else -(-again // table.visibility_every)
             rows += traced * again
     return parts, rows
 
@@ -261,45 +240,36 @@ def _simulation_items(
     points = sum(areas[name] * density for name, density in rough.items())
     each = _POINT_BYTES + frames * _PATH_BYTES
     name = f"points on {area:.3g} m² of rough surfaces"
-    yield MemoryItem(name, points, points * each, "data.points_per_m2"), points * frames
+    yield MemoryItem(name, points, each, "data.points_per_m2"), points * frames
     if len(rough) < len(scene.objects):
-        rows = data.samples * frames
-        yield (
-            MemoryItem("points on conductors", data.samples, rows * _PATH_BYTES, "data.samples"),
-            rows,
-        )
+        each, name = frames * _PATH_BYTES, "points on conductors"
+        yield MemoryItem(name, data.samples, each, "data.samples"), data.samples * frames
     if data.depth > 1:
-        drawn = data.rough_paths * (data.depth - 1)
-        kept = drawn / 4 * frames
-        memory = drawn * _POINT_BYTES + kept * _PATH_BYTES
-        yield (
-            MemoryItem("paths of several bounces", drawn, memory, "data.rough_paths"),
-            drawn + kept,
-        )
+        drawn, kept = data.rough_paths * (data.depth - 1), frames / 4  # of each
+        each, name = _POINT_BYTES + kept * _PATH_BYTES, "paths of several bounces"
+        yield MemoryItem(name, drawn, each, "data.rough_paths"), drawn * (1 + kept)
 
 
 def _fit_items(run: RunFile, sensors: Mapping[str, SensorSetup]) -> Iterator[MemoryItem]:
     """Return the memory of fits and derivative checks, beside the data."""
     copies = (run.starts.count if run.starts else 1) * (1 + len(run.variants))
     key = "starts.count" if run.starts else "variants"
-    yield MemoryItem("starts", copies, copies * _START_BYTES, key)
+    yield MemoryItem("starts", copies, _START_BYTES, key)
     if run.landscape is not None:
         points = run.landscape.points + run.landscape.exact_points
-        yield MemoryItem("points of a landscape", points, points * 100, "landscape.exact_points")
+        yield MemoryItem("points of a landscape", points, 100, "landscape.exact_points")
     for name, sensor in sensors.items():
         bins, frames = math.prod(sensor.grid.shape), sensor.radar.frame_count
         path = f"observations.{name}." if name else ""
         if run.gradcheck is not None:
             maps = 4 * run.gradcheck.repeats + run.gradcheck.max_pairs
-            count = maps * bins * frames
             most = max(("repeats", "max_pairs"), key=lambda key: getattr(run.gradcheck, key))
-            yield MemoryItem("bins of maps to compare", count, count * 8, f"gradcheck.{most}")
+            count = maps * bins * frames
+            yield MemoryItem("bins of maps to compare", count, 8, f"gradcheck.{most}")
         if run.reconstruct is not None:
             used = max(min(own.frames_per_step or frames, frames) for own in _fit_budgets(run))
-            count = bins * used
-            yield MemoryItem(
-                "bins of a fitted map", count, count * _FITTED_BIN_BYTES, f"{path}grid.range_max"
-            )
+            key = f"{path}grid.range_max"
+            yield MemoryItem("bins of a fitted map", bins * used, _FITTED_BIN_BYTES, key)
 
 
 def _count_rays(run: RunFile) -> tuple[float, float, str]:
@@ -315,10 +285,9 @@ def _count_rays(run: RunFile) -> tuple[float, float, str]:
     if run.task == "simulate" or own is None:
         return 1, _SIMULATED_RAYS, "data.samples"
     each = (run.starts.count if run.starts else 1) * max(1, len(run.observations))
-    maps = each * sum(part.steps for part in _fit_budgets(run))
-    rays = each * sum(
-        part.steps * (part.samples + part.boundary_samples) for part in _fit_budgets(run)
-    )
+    parts = _fit_budgets(run)
+    maps = each * sum(part.steps for part in parts)
+    rays = each * sum(part.steps * (part.samples + part.boundary_samples) for part in parts)
     if run.landscape is not None:
         maps += 2 * run.landscape.points
         rays += 2 * run.landscape.points * own.samples
@@ -330,10 +299,8 @@ def _count_rays(run: RunFile) -> tuple[float, float, str]:
 def _fit_budgets(run: RunFile) -> list[Any]:
     """Return the `[reconstruct]` table of every stage of every variant."""
     ways = [run, *(run.apply_overrides(variant) for variant in run.variants.values())]
-    runs = [
-        own for way in ways for own in [run.apply_overrides(stage) for stage in way.stages] or [way]
-    ]
-    return [own.reconstruct for own in runs if own.reconstruct is not None]
+    runs = ([run.apply_overrides(stage) for stage in way.stages] or [way] for way in ways)
+    return [own.reconstruct for parts in runs for own in parts if own.reconstruct is not None]
 
 
 def _count_recordings(run: RunFile) -> int:
@@ -364,8 +331,6 @@ def _check_starts_and_stages(run: RunFile, scene: Scene) -> None:
 
 def _is_separable(radar: Radar) -> bool:
     """Return whether the virtual array is a product of a row and a column."""
-    places = radar.virtual_positions / (1e-3 * radar.waveform.wavelength)
-    x, y, both = (
-        len(part.round().unique(dim=0)) for part in (places[:, :1], places[:, 1:2], places)
-    )
+    places = (radar.virtual_positions / (1e-3 * radar.waveform.wavelength)).round()
+    x, y, both = (len(part.unique(dim=0)) for part in (places[:, :1], places[:, 1:2], places))
     return x * y == both

@@ -19,7 +19,7 @@ def simulate_exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simu
     Raises:
         InputError: The run file's data are measured, not simulated.
     """
-    data = _require_simulated_data(run)
+    data = require_simulated_data(run)
     refuse_motion(run)
     front = None if run.impairments is None else sensors.impairments(run.impairments, data)
     with torch.no_grad():
@@ -37,7 +37,7 @@ def simulate_exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simu
 
 def simulate_chirp_beats(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> torch.Tensor:
     """Exact beat signals of every chirp with the settings of `[data]` and `[chirps]`."""
-    data = _require_simulated_data(run)
+    data = require_simulated_data(run)
     front = sensors.impairments(run.impairments, data)
     table = require_section(run, "chirps", "several ramps a frame")
     with prefix_errors("chirps"), torch.no_grad():
@@ -53,7 +53,12 @@ def simulate_chirp_beats(run: RunFile, scene: Scene, radar: Radar, chirps: Chirp
         )
 
 
-def _require_simulated_data(run: RunFile) -> SimulatedData:
+def require_simulated_data(run: RunFile) -> SimulatedData:
+    """The `[data]` table of a simulation.
+
+    Raises:
+        InputError: The run file's data are measured, not simulated, or there are none.
+    """
     data = require_section(run, "data", "a simulation")
     if not isinstance(data, SimulatedData):
         raise InputError(

@@ -4,9 +4,9 @@ import inspect
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -217,26 +217,16 @@ def with_options(kind: type) -> Callable[[Callable[..., None]], Callable[..., No
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        names = [field.name for field in fields(kind)]
-
-        def command(**given: Any) -> None:
-            function(kind(**{name: given.pop(name) for name in names}), **given)
-
-        hints = get_type_hints(kind, include_extras=True)
-        own = [
-            inspect.Parameter(
-                field.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=inspect.Parameter.empty if field.default is MISSING else field.default,
-                annotation=hints[field.name],
-            )
-            for field in fields(kind)
-        ]
+        own = inspect.signature(kind, eval_str=True).parameters
         shared = list(inspect.signature(function).parameters.values())[1:]
         rest = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in shared]
+
+        def command(**given: Any) -> None:
+            function(kind(**{name: given.pop(name) for name in own}), **given)
+
         command.__name__, command.__doc__ = function.__name__, function.__doc__
-        command.__annotations__ = {p.name: p.annotation for p in [*own, *rest]}
-        command.__signature__ = inspect.Signature([*own, *rest])  # type: ignore[attr-defined]
+        command.__annotations__ = {p.name: p.annotation for p in [*own.values(), *rest]}
+        command.__signature__ = inspect.Signature([*own.values(), *rest])  # type: ignore[attr-defined]
         return command
 
     return decorate

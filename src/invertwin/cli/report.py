@@ -152,12 +152,8 @@ def quantity_table(
         skip: Keys to leave out.
         label_table: The table of labels.
     """
-    labels = {
-        key: label
-        for key, label in load_texts(label_table).items()
-        if key in values and key not in skip
-    }
-    rows = [[label, values[key]] for key, label in labels.items()]
+    labels = load_texts(label_table).items()
+    rows = [[label, values[key]] for key, label in labels if key in values and key not in skip]
     return ReportTable(title, ["quantity", "value"], rows)
 
 

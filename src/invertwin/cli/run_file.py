@@ -19,6 +19,7 @@ from pydantic_core import ErrorDetails
 from invertwin.errors import InputError
 from invertwin.registry.section import TAG_MARK
 from invertwin.registry.section import prefix_errors as prefix_errors
+from invertwin.registry.section import require_section as require_section
 from invertwin.storage.untrusted import convert_read_errors
 
 _MAX_ERRORS = 20  # in one line
@@ -42,7 +43,7 @@ _MOVED_WITHIN = {
     "placement.grid": 'write it in [variants.exhaustive] as search = { kind = "panel_grid", ... }',
     "placement.annealing": "run benchmarks/panel_annealing.py",
 }
-"""Where keys belong that stand in the wrong table, or are gone."""
+"""Places of keys that stand in the wrong table, or are gone."""
 _INSTALL_STUDIES_ADVICE = "install the studies: pip install -e ./experiments/studies"
 _PHRASE_REPLACEMENTS = {
     r"a valid dictionary( or .*)?": "a table",
@@ -89,23 +90,6 @@ def is_run_file(path: Path) -> bool:
         return False
 
 
-def require_section(run: Any, section: str, command: str, otherwise: str = "add it") -> Any:
-    """A section that a command cannot do without.
-
-    Raises:
-        InputError: The run file does not have it; the message ends with `otherwise`.
-    """
-    found = getattr(run, section)
-    observed = run.observations.values()
-    if observed and all(getattr(table, section, None) for table in observed):
-        return found
-    if found in (None, []):
-        raise InputError(
-            f"expected a section [{section}] for {command}, got a run file without one; {otherwise}"
-        )
-    return found
-
-
 @contextmanager
 def prefix_file_errors(path: Path) -> Iterator[None]:
     """Add the name of the run file to errors."""
@@ -126,8 +110,7 @@ def validate_run(raw: dict[str, Any], source: Path) -> Any:
 
         return RunFile.model_validate(raw, context={"folder": source.parent})
     except ValidationError as error:
-        errors = error.errors(include_url=False)
-        lines = dict.fromkeys(_explain_error(item) for item in errors)
+        lines = dict.fromkeys(_explain_error(item) for item in error.errors(include_url=False))
         raise InputError(f"{source}: {' — also '.join([*lines][:_MAX_ERRORS])}") from None
 
 
@@ -157,8 +140,7 @@ def _syntax_error_message(path: Path, text: str, message: str) -> str:
     line = lines[min(number, len(lines)) - 1].strip()
     return (
         f"{path}: line {number}: expected TOML, got {_format_value(line)} "
-        f"({' '.join(reason.split())}); "
-        "correct that line"
+        f"({' '.join(reason.split())}); correct that line"
     )
 
 
@@ -176,17 +158,11 @@ def _explain_error(error: ErrorDetails) -> str:
         case "unknown_key":
             key, allowed = context["key"], context["allowed"]
             said = f"expected one of the keys {', '.join(allowed)}, got {_format_value(key)}; "
-            if not path and key in _STUDY_NAMES:
-                return f"{key}: {said}{_INSTALL_STUDIES_ADVICE}"
-            return (
-                f"{path}.{key}".lstrip(".")
-                + f": {said}"
-                + (
-                    _MOVED_WITHIN.get(f"{path}.{key}")
-                    or _MOVED_KEYS.get(key)
-                    or _suggest_name(key, allowed, "remove the key")
-                )
-            )
+            at = f"{path}.{key}".lstrip(".")
+            advice = _MOVED_WITHIN.get(at) or _MOVED_KEYS.get(key)
+            if at in _STUDY_NAMES:
+                advice = _INSTALL_STUDIES_ADVICE
+            return f"{at}: {said}{advice or _suggest_name(key, allowed, 'remove the key')}"
         case "unknown_object":
             at = ".".join(filter(None, (path, context["path"])))
             return unknown_object_message(at, context["name"], context["known"])
@@ -201,19 +177,14 @@ def _explain_error(error: ErrorDetails) -> str:
             tags = [t.strip(f" '{TAG_MARK}") for t in context["expected_tags"].split(",")]
             allowed = [tag for tag in tags if tag not in (*others, "points")]
             tag = context["tag"].strip(TAG_MARK)
-            return (
-                f"{path}.{key}: expected one of {', '.join(allowed)}, got {_format_value(tag)}; "
-                + (
-                    _INSTALL_STUDIES_ADVICE
-                    if tag in _STUDY_NAMES
-                    else _suggest_name(tag, allowed, "choose one")
-                )
-            )
+            advice = _suggest_name(tag, allowed, "choose one")
+            advice = _INSTALL_STUDIES_ADVICE if tag in _STUDY_NAMES else advice
+            said = f"expected one of {', '.join(allowed)}, got {_format_value(tag)}"
+            return f"{path}.{key}: {said}; {advice}"
         case "literal_error":
             allowed = [t.strip(" '") for t in context["expected"].replace(" or ", ", ").split(",")]
-            return f"{path}: expected one of {', '.join(allowed)}, got {got}; " + _suggest_name(
-                str(error["input"]), allowed, "choose one"
-            )
+            advice = _suggest_name(str(error["input"]), allowed, "choose one")
+            return f"{path}: expected one of {', '.join(allowed)}, got {got}; {advice}"
         case "missing":
             return f"{path}: expected a value, got nothing; add the key `{error['loc'][-1]}`"
         case "too_short" | "too_long":

@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from invertwin.cli.options import OutputOptions, RunOptions, console
+from invertwin.cli.options import OutputOptions, ResumableOptions, RunOptions, console
 from invertwin.cli.report import ReportTable, format_cell, is_numeric_cell
 from invertwin.cli.run_file import load_run, prefix_file_errors, require_section, to_toml
 from invertwin.errors import InputError
@@ -23,6 +24,8 @@ from invertwin.storage.folders import PARTS
 from invertwin.storage.run_folder import RunFolder, open_run
 
 _LOG_INTERVAL = 10.0  # between lines of progress in a log
+Result = dict[str, Any]
+"""Numbers of one run file."""
 
 
 @contextmanager
@@ -87,31 +90,64 @@ def load_runs(
     return runs
 
 
-def compute_in_parts(
-    runs: Mapping[str, Any],
-    files: Mapping[str, Path],
-    folder: RunFolder,
-    compute: Callable[[str, Any], dict[str, Any]],
-) -> Iterator[tuple[str, Any, dict[str, Any]]]:
-    """Compute a result for each run file, saved at once: a resumed run does not repeat it.
+@dataclass(frozen=True)
+class RunBatch:
+    """Run files of one command that are computed one after another into one folder.
 
-    Args:
+    Attributes:
         runs: Run files by stem.
         files: Paths of the run files.
         folder: Folder that keeps finished results.
-        compute: Function of a stem and its run file.
-
-    Yields:
-        Stem, run file and result.
     """
-    for name, run in runs.items():
-        part = f"{PARTS}/{name}.json"
-        found = folder.read_json(part)
-        if found is None:
-            with prefix_file_errors(files[name]):
-                found = compute(name, run)
-            folder.write_json(part, found)
-        yield name, run, found
+
+    runs: Mapping[str, Any]
+    files: Mapping[str, Path]
+    folder: RunFolder
+
+    def results(self, compute: Callable[[str, Any], Result]) -> Iterator[tuple[str, Any, Result]]:
+        """Compute a result for each run file, saved at once: a resumed run does not repeat it.
+
+        Args:
+            compute: Function of a stem and its run file.
+
+        Yields:
+            Stem, run file and result.
+        """
+        for name, run in self.runs.items():
+            part = f"{PARTS}/{name}.json"
+            found = self.folder.read_json(part)
+            if found is None:
+                with prefix_file_errors(self.files[name]):
+                    found = compute(name, run)
+                self.folder.write_json(part, found)
+            yield name, run, found
+
+
+def run_each(
+    options: ResumableOptions,
+    files: Sequence[Path],
+    command: str,
+    sections: Sequence[str] | Callable[[Any], Sequence[str]],
+    work: Callable[..., list[ReportTable]],
+) -> None:
+    """Work on several run files with one report.
+
+    Args:
+        options: Options of the user.
+        files: Paths of the run files.
+        command: Command whose task they must have.
+        sections: Required sections, or a function that returns them for a run file.
+        work: Function of a `RunBatch` and of a function that takes lines of progress.
+    """
+    runs = load_runs(files, options, command, sections)
+    default = Path("out", files[0].stem if len(files) == 1 else command)
+    with run_folder(options, default, runs) as folder:
+        if folder.complete:
+            return
+        with console.status("tracing") as status:
+            say = status.update if console.is_terminal else limit_rate()
+            tables = work(RunBatch(runs, {file.stem: file for file in files}, folder), say)
+        print_tables(tables)
 
 
 @contextmanager
@@ -140,8 +176,7 @@ def count_progress(console: Console, name: str, total: int) -> Iterator[Callable
         return
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task("", total=total)
-        yield partial(bar.advance, task)
+        yield partial(bar.advance, bar.add_task("", total=total))
 
 
 @contextmanager

@@ -27,8 +27,22 @@ class Distribution(ABC):
         """Values that are as bad as any other: if these are right, all are."""
 
 
+class _Between(Distribution):
+    """Draw values between two limits."""
+
+    low: Any
+    high: Any
+
+    def __post_init__(self) -> None:
+        _check_order(self.low, self.high)
+
+    def extreme_values(self) -> list[Any]:
+        """Both limits."""
+        return [_to_python(self.low), _to_python(self.high)]
+
+
 @dataclass(frozen=True)
-class Uniform(Distribution):
+class Uniform(_Between):
     """Every number between two limits alike; lists entry by entry.
 
     Attributes:
@@ -42,20 +56,13 @@ class Uniform(Distribution):
     low: NumberOrList
     high: NumberOrList
 
-    def __post_init__(self) -> None:
-        _check_order(self.low, self.high)
-
     def draw(self, generator: np.random.Generator) -> Any:
         """A number, or a list of independent ones."""
         return np.asarray(generator.uniform(self.low, self.high, _shape_of(self.low))).tolist()
 
-    def extreme_values(self) -> list[Any]:
-        """Both limits."""
-        return [_to_python(self.low), _to_python(self.high)]
-
 
 @dataclass(frozen=True)
-class LogUniform(Distribution):
+class LogUniform(_Between):
     """Numbers whose logarithms are uniform: every octave alike; lists entry by entry.
 
     Attributes:
@@ -70,7 +77,7 @@ class LogUniform(Distribution):
     high: Positive | Sequence[Positive]
 
     def __post_init__(self) -> None:
-        _check_order(self.low, self.high)
+        super().__post_init__()
         if np.min(self.low) <= 0:
             raise InputError(f"expected low > 0, got {self.low}; its logarithm is needed")
 
@@ -80,10 +87,6 @@ class LogUniform(Distribution):
         low, high = np.asarray(self.low, dtype=float), np.asarray(self.high, dtype=float)
         # The last bit of a power may lie beyond a limit.
         return np.clip(low * (high / low) ** share, low, high).tolist()
-
-    def extreme_values(self) -> list[Any]:
-        """Both limits."""
-        return [_to_python(self.low), _to_python(self.high)]
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ class Normal(Distribution):
 
 
 @dataclass(frozen=True)
-class Integer(Distribution):
+class Integer(_Between):
     """Every whole number between two limits alike; lists entry by entry.
 
     Attributes:
@@ -135,17 +138,10 @@ class Integer(Distribution):
     low: int | Sequence[int]
     high: int | Sequence[int]
 
-    def __post_init__(self) -> None:
-        _check_order(self.low, self.high)
-
     def draw(self, generator: np.random.Generator) -> Any:
         """A whole number, or a list of independent ones."""
         drawn = generator.integers(self.low, self.high, _shape_of(self.low), endpoint=True)
         return np.asarray(drawn).tolist()
-
-    def extreme_values(self) -> list[Any]:
-        """Both limits."""
-        return [_to_python(self.low), _to_python(self.high)]
 
 
 @dataclass(frozen=True)

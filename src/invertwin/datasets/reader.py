@@ -56,10 +56,8 @@ class SampleDataset(Dataset[Any]):
             )
         self._keep = set(known if entries is None else entries)
         self._transform = transform
-        found = [(shard.first, shard, place) for place, m in parts for shard in m.shards]
-        self._shards = [
-            (place / s.name, s) for _, s, place in sorted(found, key=lambda row: row[0])
-        ]
+        found = [(place / shard.name, shard) for place, m in parts for shard in m.shards]
+        self._shards = sorted(found, key=lambda row: row[1].first)
         self._starts = np.cumsum([0, *(shard.samples for _, shard in self._shards)])
         self._places: dict[int, dict[int, dict[str, tuple[int, int]]]] = {}
 

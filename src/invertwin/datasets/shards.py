@@ -11,7 +11,7 @@ Source: A. Aizman, G. Maltby, T. Breuel, "High performance I/O for large scale d
 import hashlib
 import io
 import tarfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -161,13 +161,9 @@ def read_manifests(folder: Path) -> list[tuple[Path, DatasetManifest]]:
             f"expected a data set, got {folder} without {MANIFEST}; give a folder that invertwin "
             "dataset has completed"
         )
-    _require_one_set(folder, [manifest for _, manifest in found])
-    return found
-
-
-def _require_one_set(folder: Path, manifests: Sequence[DatasetManifest]) -> None:
-    if len({(m.fingerprint, m.samples, m.part[1]) for m in manifests}) > 1:
+    if len({(m.fingerprint, m.samples, m.part[1]) for _, m in found}) > 1:
         raise InputError(
             f"expected parts of one data set, got those of several in {folder}; make them with "
             "one run file and one number of parts"
         )
+    return found

@@ -54,7 +54,8 @@ _ARGUMENT_DOCS = {
     "counts": "nodes along x, y and z",
     "smooth": "λ of steps preconditioned by (I + λL)⁻²; 0 = none",
 }
-"""What keys of many tables mean, where a constructor says nothing."""
+"""Meaning of keys of many tables, where a constructor says nothing."""
+_TASKS = ("simulate", "reconstruct", "gradcheck", "rcs", "dataset", "twin", "loss-scan", "demo")
 _PLAIN_TYPES = (bool, int, float, str, list, tuple, dict)
 
 
@@ -178,6 +179,16 @@ class TableOf:
 
 
 @dataclass(frozen=True)
+class FormOf:
+    """Annotates a key whose value is of one of several types, as its form tells."""
+
+    kinds: tuple[Any, ...]  # as `number_or_list` takes them
+
+    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
+        return handler.generate_schema(number_or_list(*self.kinds))
+
+
+@dataclass(frozen=True)
 class NameOf:
     """Annotates a key whose value is the name of a kind of a group, or of a task."""
 
@@ -247,9 +258,7 @@ class Registry:
     def names(self, group: str) -> list[str]:
         """The kinds of a group, or of "task"."""
         if group == "task":
-            own = ["simulate", "reconstruct", "gradcheck", "rcs", "dataset", "twin"]
-            own += ["loss-scan", "demo"]
-            return list(dict.fromkeys([*own, *self.commands]))
+            return list(dict.fromkeys([*_TASKS, *self.commands]))
         return list(self._kinds(group))
 
     @cache  # noqa: B019 - the only registry lives as long as the program
@@ -264,9 +273,8 @@ class Registry:
         if not kinds:
             return _EmptyGroupTable
         keys = (found.tag, *(name for name, kind in kinds.items() if kind.untagged))
-        members = [
-            Annotated[self.kind_table(group, name, base), Tag(TAG_MARK + name)] for name in kinds
-        ]
+        tables = {name: self.kind_table(group, name, base) for name in kinds}
+        members = [Annotated[table, Tag(TAG_MARK + name)] for name, table in tables.items()]
         if found.points is not None:
             members.append(Annotated[found.points, Tag(f"{TAG_MARK}points")])
         if all(kind.untagged for kind in kinds.values()):
@@ -285,14 +293,10 @@ class Registry:
         kind, base = self._kinds(group)[name], base or found.base
         fields: dict[str, Any] = {}
         if not kind.untagged:
-            default = name if name == found.default else ...
-            fields[found.tag] = (Literal[name], key("", default))
-        title = _camel_case(name) + _camel_case(
-            base.__name__ if base is not ConstructorTable else group
-        )
-        return self.constructor_table(
-            kind.make, title, base, fields, kind.without, checked=kind.checked
-        )
+            fields[found.tag] = (Literal[name], key("", name if name == found.default else ...))
+        title = f"{name}_{base.__name__ if base is not ConstructorTable else group}"
+        given = _camel_case(title), base, fields, kind.without
+        return self.constructor_table(kind.make, *given, checked=kind.checked)
 
     def constructor_table(
         self,
@@ -317,7 +321,9 @@ class Registry:
         make = pkgutil.resolve_name(make) if isinstance(make, str) else make
         if isinstance(make, type) and issubclass(make, Section):
             return make
-        hints, documents = _constructor_hints(make), _argument_docs(make)
+        plain = isinstance(make, type) and not is_dataclass(make)
+        hints = get_type_hints(make.__init__ if plain else make, include_extras=True)
+        documents = _argument_docs(make)
         made: dict[str, Any] = dict(fields or {})
         arguments: dict[str, tuple[str | None, Any]] = {}
         product = make if isinstance(make, type) else hints.get("return")
@@ -339,9 +345,8 @@ class Registry:
                 default = None if name in base.optional else parameter.default
                 made[place] = self._field(hint, name, default, documents.get(name, ""))
         checked = is_dataclass(make) if checked is None else checked
-        if checked and not self.forms.keys() & {
-            m for h in hints.values() for m in _union_members(h)
-        }:
+        members = {member for hint in hints.values() for member in _union_members(hint)}
+        if checked and not self.forms.keys() & members:
             base = _combine_tables(_CheckedTable, base)
         words = (inspect.getdoc(make) or "").split("\n\n")[0]
         # Fields of the constructor come first, those of the base after them, but for the tag.
@@ -446,8 +451,7 @@ class Registry:
         if groups[group].includes is None:
             return own
         included = groups[groups[group].includes or ""].kinds
-        told = {name: kind for name, kind in included.items() if not kind.untagged}
-        return told | own | included
+        return {name: kind for name, kind in included.items() if not kind.untagged} | own | included
 
     def _add_kind(self, group: str, kind: str, entry: _RegisteredKind) -> None:
         if group not in self.groups:
@@ -500,9 +504,7 @@ def number_or_list(*kinds: Any) -> Any:
         kind = "list" if isinstance(value, list) else kind
         return TAG_MARK + (kind if kind in tags else tags[0])
 
-    members = [
-        Annotated[kind, Tag(TAG_MARK + name)] for kind, name in zip(kinds, tags, strict=True)
-    ]
+    members = [Annotated[k, Tag(TAG_MARK + name)] for k, name in zip(kinds, tags, strict=True)]
     return Annotated[_union_type(members), Discriminator(form)]
 
 
@@ -531,9 +533,8 @@ def _is_angle(hint: Any) -> bool:
 
 
 def _allowed_letters(hint: Any) -> str:
-    return next(
-        (mark.letters for mark in _annotation_marks(hint) if isinstance(mark, AllowedLetters)), ""
-    )
+    found = [mark for mark in _annotation_marks(hint) if isinstance(mark, AllowedLetters)]
+    return found[0].letters if found else ""
 
 
 def _is_array(kind: Any) -> bool:
@@ -552,11 +553,6 @@ def _to_radians(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _to_radians(item) for name, item in value.items()}
     return [_to_radians(item) for item in value] if isinstance(value, list) else math.radians(value)
-
-
-def _constructor_hints(make: Any) -> dict[str, Any]:
-    plain = isinstance(make, type) and not is_dataclass(make)
-    return get_type_hints(make.__init__ if plain else make, include_extras=True)
 
 
 def _argument_docs(make: Any) -> dict[str, str]:
@@ -595,6 +591,5 @@ def _class_table(
     without: tuple[str, ...] = (),
     checked: bool | None = None,
 ) -> Any:
-    return registry.constructor_table(
-        kind, _camel_case(kind.__name__), base, without=without, checked=checked
-    )
+    title = _camel_case(kind.__name__)
+    return registry.constructor_table(kind, title, base, without=without, checked=checked)

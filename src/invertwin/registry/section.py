@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, get_args
+from typing import Annotated, Any, NoReturn, get_args
 
 from annotated_types import Ge, Le, Len, Lt, MinLen
 from pydantic import (
@@ -24,14 +24,11 @@ from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ErrorType
 
 from invertwin.errors import InputError
-from invertwin.limits import NonNegative
 
 Depth = Annotated[int, Ge(1), Le(16)]
 Seed = Annotated[int, Ge(0), Lt(2**31)]
 Vector = Annotated[list[float], Len(3, 3)]
 Counts = Annotated[list[Annotated[int, Ge(2)]], Len(3, 3)]
-Interval = Annotated[list[NonNegative], Len(2, 2)]
-WorldAxes = Annotated[list[Literal["x", "y", "z"]], MinLen(1)]
 
 _PYDANTIC_ERRORS = frozenset(get_args(ErrorType))  # kinds of errors that pydantic itself knows
 # Pydantic puts the tag of a union into an error's location; the mark tells it from a key.
@@ -114,16 +111,9 @@ class Section(BaseModel):
         if not unknown:
             return handler(data)
         # Pydantic's own error for an extra key does not carry the keys that are allowed.
-        found = [
-            InitErrorDetails(
-                type=PydanticCustomError(
-                    "unknown_key", "unknown key", {"key": n, "allowed": names}
-                ),
-                loc=(),
-                input=data,
-            )
-            for n in unknown
-        ]
+        told = [{"key": name, "allowed": names} for name in unknown]
+        kinds = [PydanticCustomError("unknown_key", "unknown key", context) for context in told]
+        found = [InitErrorDetails(type=kind, loc=(), input=data) for kind in kinds]
         meant = {m for n in unknown for m in difflib.get_close_matches(str(n), names, cutoff=0.5)}
         try:
             handler({name: value for name, value in data.items() if name in names})
@@ -140,11 +130,8 @@ def _to_init_error(row: ErrorDetails) -> InitErrorDetails:
     """An error of pydantic as one that can be raised again."""
     kind, context = row["type"], row.get("ctx", {})
     if kind not in _PYDANTIC_ERRORS:
-        return InitErrorDetails(
-            type=PydanticCustomError(kind, "{text}", {**context, "text": row["msg"]}),  # type: ignore[arg-type]
-            loc=row["loc"],
-            input=row["input"],
-        )
+        own = PydanticCustomError(kind, "{text}", {**context, "text": row["msg"]})  # type: ignore[arg-type]
+        return InitErrorDetails(type=own, loc=row["loc"], input=row["input"])
     return InitErrorDetails(type=kind, loc=row["loc"], input=row["input"], ctx=context)
 
 
@@ -181,6 +168,29 @@ def check_presence(section: Section, wanted: dict[str, bool], when: str) -> None
         if needed != (getattr(section, name) is not None):
             verb, got, do = ("", "none", "add it") if needed else ("no ", "one", "remove it")
             raise_key_error(f"expected {verb}`{name}` {when}, got {got}; {do}")
+
+
+def require_section(run: Any, section: str, command: str, otherwise: str = "add it") -> Any:
+    """A section that a command cannot do without.
+
+    Args:
+        run: The run file.
+        section: Name of the section.
+        command: Which needs it, for the error.
+        otherwise: What to do without it, for the error.
+
+    Raises:
+        InputError: The run file does not have it; the message ends with `otherwise`.
+    """
+    found = getattr(run, section)
+    observed = run.observations.values()
+    if observed and all(getattr(table, section, None) for table in observed):
+        return found
+    if found in (None, []):
+        raise InputError(
+            f"expected a section [{section}] for {command}, got a run file without one; {otherwise}"
+        )
+    return found
 
 
 def raise_key_error(text: str, path: str = "") -> NoReturn:

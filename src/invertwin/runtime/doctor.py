@@ -139,12 +139,11 @@ class _LlvmChoice:
     requested: str | None = None
 
 
+_Probe = Callable[[str], LlvmProbeResult]
 _choice: _LlvmChoice | None = None
 
 
-def select_libllvm(
-    folders: Sequence[Path] | None = None, probe: Callable[[str], LlvmProbeResult] | None = None
-) -> None:
+def select_libllvm(folders: Sequence[Path] | None = None, probe: _Probe | None = None) -> None:
     """Set ``DRJIT_LIBLLVM_PATH`` to the newest libLLVM that passes, before Dr.Jit is imported.
 
     ``import invertwin`` calls it. It never raises: when nothing passes, :func:`require_backend`
@@ -196,9 +195,8 @@ def find_libraries(folders: Iterable[Path] | None = None) -> list[LlvmLibrary]:
         for file in Path(folder).glob("libLLVM*"):
             if _LIBRARY.match(file.name) and file.is_file():
                 path = os.path.realpath(file)
-                found[path] = max(
-                    found.get(path, ()), _library_version(path) or _library_version(str(file))
-                )
+                version = _library_version(path) or _library_version(str(file))
+                found[path] = max(found.get(path, ()), version)
     newest = sorted(((version, path) for path, version in found.items()), reverse=True)
     return [LlvmLibrary(path, version) for version, path in newest]
 
@@ -226,17 +224,15 @@ def probe_library(path: str) -> LlvmProbeResult:
     if missing:
         return LlvmProbeResult(False, f"could not be tried: Dr.Jit needs {missing[1]}", final=False)
     if lines[0].startswith("Traceback"):
-        return LlvmProbeResult(
-            False, f"could not be tried: {_shorten_message(lines[-1])}", final=False
-        )
+        reason = f"could not be tried: {_shorten_message(lines[-1])}"
+        return LlvmProbeResult(False, reason, final=False)
     reason = lines[0].split("(): ")[-1].split(". ")[0].rstrip(".")
     return LlvmProbeResult(False, f"refused: {_shorten_message(reason)}")
 
 
 def _shorten_message(message: str) -> str:
     """A message without addresses of memory, cut between words."""
-    plain = re.sub(r":? ?\b0x[0-9a-f]+\b,?", "", message)
-    return textwrap.shorten(plain, 120, placeholder=" …")
+    return textwrap.shorten(re.sub(r":? ?\b0x[0-9a-f]+\b,?", "", message), 120, placeholder=" …")
 
 
 def gpu_name() -> str | None:
@@ -334,9 +330,7 @@ def render_report(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _choose_library(
-    folders: Sequence[Path] | None, probe: Callable[[str], LlvmProbeResult]
-) -> _LlvmChoice:
+def _choose_library(folders: Sequence[Path] | None, probe: _Probe) -> _LlvmChoice:
     explicit = _explicit_path()
     complaint = ""
     if explicit:
@@ -367,9 +361,8 @@ def _reject_if_loaded(choice: _LlvmChoice) -> _LlvmChoice:
     if loaded[:1] == _library_version(choice.path or "")[:1]:
         return choice
     version = ".".join(map(str, loaded))
-    return _LlvmChoice(
-        None, f"libLLVM {version}, as Dr.Jit was imported first (import invertwin before it)"
-    )
+    why = "as Dr.Jit was imported first (import invertwin before it)"
+    return _LlvmChoice(None, f"libLLVM {version}, {why}")
 
 
 def _explicit_path() -> str | None:
@@ -413,7 +406,7 @@ def _library_version(path: str) -> tuple[int, ...]:
     return ()
 
 
-def _probe_cached(path: str, probe: Callable[[str], LlvmProbeResult]) -> LlvmProbeResult:
+def _probe_cached(path: str, probe: _Probe) -> LlvmProbeResult:
     """The verdict on a path from the disk, or from the probe, which is then remembered."""
     try:
         status = os.stat(path)

@@ -19,15 +19,14 @@ from multiprocessing.connection import Connection
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from invertwin.errors import InputError
+from invertwin.runtime import threads
 
 Engine = Literal["processes", "ray"]
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
 
 _QUEUED_PER_WORKER = 2  # pieces that wait for each worker, so that none is idle
-_ONE_THREAD: dict[str, str] = dict.fromkeys(
-    ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
-)
+_ONE_THREAD: dict[str, str] = dict.fromkeys(threads.COUNT_VARIABLES, "1")
 
 
 class _WorkerError(NamedTuple):
@@ -160,8 +159,7 @@ def _ray_cluster() -> Iterator[tuple[int, Any, Any]]:
     if ours:
         ray.init(include_dashboard=False, log_to_driver=False)
     try:
-        one_thread = {"env_vars": _ONE_THREAD}
-        task = ray.remote(num_cpus=1, runtime_env=one_thread)(_run_remote_job)
+        task = ray.remote(num_cpus=1, runtime_env={"env_vars": _ONE_THREAD})(_run_remote_job)
         count = max(1, int(ray.cluster_resources().get("CPU", 1)))
 
         def wait_for_results(pending: Any) -> list[tuple[Any, Any]]:
@@ -176,8 +174,6 @@ def _ray_cluster() -> Iterator[tuple[int, Any, Any]]:
 
 def _run_remote_job(work: Callable[[Any], Any], job: Any) -> Any:
     """A piece of work on a node of a cluster."""
-    from invertwin.runtime import threads
-
     # Asked for with the task; a worker with more threads would give other bits.
     if threads.available_threads() != 1:
         return _WorkerError(

@@ -19,7 +19,8 @@ _WAIT_POLICY = {
     "KMP_BLOCKTIME": "0",  # OpenMP of Intel and LLVM
     "OPENBLAS_THREAD_TIMEOUT": "4",  # its least: 2⁴ turns
 }
-_COUNTS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+COUNT_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+"""Variables that tell libraries how many threads they may start."""
 
 
 def set_thread_environment() -> None:
@@ -28,7 +29,7 @@ def set_thread_environment() -> None:
     ``import invertwin`` calls it. Libraries that were imported earlier keep their own ways.
     """
     count = str(available_threads())
-    for name, value in (_WAIT_POLICY | dict.fromkeys(_COUNTS, count)).items():
+    for name, value in (_WAIT_POLICY | dict.fromkeys(COUNT_VARIABLES, count)).items():
         os.environ.setdefault(name, value)
 
 

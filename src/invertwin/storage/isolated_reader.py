@@ -180,9 +180,8 @@ def _matlab(path: str, variable: str) -> StoredArrays:
 
     root, *fields = variable.split(".")
     if h5py.is_hdf5(path):
-        inside = _hdf5(path, "/".join([root, *fields]), variable)
         # MATLAB stores the first dimension fastest.
-        array = inside.arrays[variable].values.T
+        array = _hdf5(path, "/".join([root, *fields]), variable).arrays[variable].values.T
     else:
         found = scipy.io.loadmat(path, variable_names=[root])
         if root not in found:

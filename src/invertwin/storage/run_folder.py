@@ -13,30 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from invertwin.errors import InputError
-from invertwin.storage.folders import (
-    PARTS,
-    UNFINISHED,
-    Manifest,
-    UnfinishedRun,
-    convert_os_errors,
-    foreign_file_error,
-    lock_folder,
-    move_results,
-    path_in_folder,
-    read_manifest,
-    remove_empty,
-    remove_unfinished,
-    replace_file,
-    require_free,
-    save_manifest,
-)
+from invertwin.storage import folders
 
 CHECKPOINT = "checkpoint.pt"
 # What commands write, beside run files and the pictures that are named after them.
 RESULTS = (
     *("metrics.json", "report.html", "checkpoint*.pt", "twin.*", "raw", "capture.nc", "chirps.*"),
     *("manifest.json", "shard-*.tar", "view.npz"),
-    *("channels.json", "points.*", "prior.npz", "train.log", "turntable.gif", UNFINISHED),
+    *("channels.json", "points.*", "prior.npz", "train.log", "turntable.gif", folders.UNFINISHED),
     *("scene.png", "spectra*.png", "doppler.png", "loss*.png", "convergence.png", "landscape.png"),
     *("look.png", "recording.png", "twin_*.png", "residuals*.png"),
 )
@@ -58,7 +42,7 @@ class RunFolder:
         stack: Its lock.
     """
 
-    def __init__(self, path: Path, manifest: Manifest, stack: ExitStack):
+    def __init__(self, path: Path, manifest: folders.Manifest, stack: ExitStack):
         self.path, self.complete = path, manifest.unfinished is None
         self._manifest, self._held = manifest, stack
 
@@ -66,14 +50,15 @@ class RunFolder:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        with convert_os_errors("; then --resume goes on" if self.resumable else ""), self._held:
+        more = "; then --resume goes on" if self.resumable else ""
+        with folders.convert_os_errors(more), self._held:
             try:
                 if error is None and not self.complete:
                     self._finish()
             finally:
                 work = self._manifest.unfinished
                 if work is not None and not work.complete and not self.resumable:
-                    remove_unfinished(self.path, self._manifest)
+                    folders.remove_unfinished(self.path, self._manifest)
             if isinstance(error, OSError):
                 raise error
 
@@ -98,10 +83,10 @@ class RunFolder:
         work = self._manifest.unfinished
         assert work is not None
         if name not in work.files:
-            require_free(self.path, name, self._manifest.files)
+            folders.require_free(self.path, name, self._manifest.files)
             work.files.append(name)
-            save_manifest(self.path, self._manifest)
-        path = path_in_folder(self.path, f"{UNFINISHED}/{name}")
+            folders.save_manifest(self.path, self._manifest)
+        path = folders.path_in_folder(self.path, f"{folders.UNFINISHED}/{name}")
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
@@ -112,7 +97,7 @@ class RunFolder:
             name: Its path in the folder.
             data: What it holds.
         """
-        with replace_file(self.file(name)) as part:
+        with folders.replace_file(self.file(name)) as part:
             part.write_bytes(data)
 
     def write_text(self, name: str, text: str) -> None:
@@ -142,12 +127,12 @@ class RunFolder:
     def _finish(self) -> None:
         work = self._manifest.unfinished
         assert work is not None
-        there = [name for name in work.files if (self.path / UNFINISHED / name).exists()]
+        there = [name for name in work.files if (self.path / folders.UNFINISHED / name).exists()]
         done = work.model_copy(update={"files": there, "complete": True})
         manifest = self._manifest.model_copy(update={"unfinished": done})
-        save_manifest(self.path, manifest)
+        folders.save_manifest(self.path, manifest)
         self._manifest = manifest
-        self._manifest = move_results(self.path, manifest)
+        self._manifest = folders.move_results(self.path, manifest)
 
 
 def open_run(
@@ -172,21 +157,21 @@ def open_run(
     if "\0" in str(path):
         raise InputError(f"expected a folder's name, got {str(path)!r}; take the NUL out")
     digest = hashlib.sha256(json.dumps(texts, sort_keys=True).encode()).hexdigest()
-    with convert_os_errors(" or choose another -o"), ExitStack() as held:
+    with folders.convert_os_errors(" or choose another -o"), ExitStack() as held:
         missing = [folder for folder in (path, *path.parents) if not folder.exists()]
         if resume and missing:
             raise _nothing_to_resume(path)
         for folder in reversed(missing):
-            held.callback(remove_empty, folder)
+            held.callback(folders.remove_empty, folder)
         path.mkdir(parents=True, exist_ok=True)
-        lock_folder(path, held)
-        manifest = read_manifest(path)
+        folders.lock_folder(path, held)
+        manifest = folders.read_manifest(path)
         if manifest.unfinished is not None and manifest.unfinished.complete:
-            manifest = move_results(path, manifest)
+            manifest = folders.move_results(path, manifest)
         if not resume:
             _require_free_folder(path, manifest, texts, overwrite)
-            manifest = remove_unfinished(path, manifest)
-            manifest.unfinished = UnfinishedRun(digest=digest, owner="")
+            manifest = folders.remove_unfinished(path, manifest)
+            manifest.unfinished = folders.UnfinishedRun(digest=digest, owner="")
         work = manifest.unfinished
         if work is None and not manifest.files:
             raise _nothing_to_resume(path)
@@ -197,8 +182,8 @@ def open_run(
             )
         if work is not None:
             work.owner = f"process {os.getpid()} on {platform.node()}"
-            save_manifest(path, manifest)  # before there is anything that it could claim
-            (path / UNFINISHED).mkdir(exist_ok=resume)
+            folders.save_manifest(path, manifest)  # before there is anything that it could claim
+            (path / folders.UNFINISHED).mkdir(exist_ok=resume)
         folder = RunFolder(path, manifest, held.pop_all())
     try:
         for name, text in texts.items() if work is not None else ():
@@ -217,7 +202,7 @@ def _nothing_to_resume(path: Path) -> InputError:
 
 
 def _require_free_folder(
-    path: Path, manifest: Manifest, stems: Iterable[str], overwrite: bool
+    path: Path, manifest: folders.Manifest, stems: Iterable[str], overwrite: bool
 ) -> None:
     """Refuse a folder with results that are not to be replaced, or not ours to replace."""
     found = [name for name in manifest.files if (path / name).exists()]
@@ -229,19 +214,19 @@ def _require_free_folder(
         )
     own = {name.split("/")[0]: "/" in name for name in manifest.files}  # whether it is a folder
     if manifest.unfinished is not None:
-        own[UNFINISHED] = True
+        own[folders.UNFINISHED] = True
     pictures = [f"{escape(stem)}{end}" for stem in stems for end in (".png", "_*.png")]
     wanted = (*RESULTS, *pictures, "run.toml" if len(pictures) == 2 else "runs")
     for name in sorted(os.listdir(path)):
         ours = not (path / name).is_symlink() and own.get(name) is (path / name).is_dir()
         if not ours and any(fnmatchcase(name, pattern) for pattern in wanted):
-            raise foreign_file_error(path, name)
+            raise folders.foreign_file_error(path, name)
 
 
-def _resumable(path: Path, manifest: Manifest) -> bool:
-    begins, work = (f"{PARTS}/", Path(CHECKPOINT).stem), manifest.unfinished
+def _resumable(path: Path, manifest: folders.Manifest) -> bool:
+    begins, work = (f"{folders.PARTS}/", Path(CHECKPOINT).stem), manifest.unfinished
     names = [name for name in work.files if name.startswith(begins)] if work else []
-    return any((path / UNFINISHED / name).exists() for name in names)
+    return any((path / folders.UNFINISHED / name).exists() for name in names)
 
 
 def to_json_value(value: Any) -> Any:

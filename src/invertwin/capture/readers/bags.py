@@ -124,11 +124,8 @@ def read_track(path: str | Path, topic: str) -> Track:
 
     found = dict(_read_messages(path, topic, read_position))
     times = sorted(found)
-    rows = [found[time] for time in times]
-    return Track(
-        torch.tensor(times, dtype=torch.float64),
-        torch.tensor(rows, dtype=torch.float64).reshape(-1, 3),
-    )
+    places = torch.tensor([found[time] for time in times], dtype=torch.float64).reshape(-1, 3)
+    return Track(torch.tensor(times, dtype=torch.float64), places)
 
 
 @safe_reader("a bag of ROS 1 or ROS 2")
@@ -154,20 +151,17 @@ def read_clouds(path: str | Path, topic: str) -> list[dict[str, Float64[Tensor, 
                 "sensor_msgs/PointCloud2"
             )
         order = ">" if message.is_bigendian else "<"
-        kind = np.dtype(
-            {
-                "names": [one.name for one in message.fields],
-                "formats": [order + _FIELD_TYPES[one.datatype] for one in message.fields],
-                "offsets": [one.offset for one in message.fields],
-                "itemsize": message.point_step,
-            }
-        )
+        layout: Any = {
+            "names": [one.name for one in message.fields],
+            "formats": [order + _FIELD_TYPES[one.datatype] for one in message.fields],
+            "offsets": [one.offset for one in message.fields],
+            "itemsize": message.point_step,
+        }
         rows = np.asarray(message.data, np.uint8).reshape(message.height, message.row_step)
         rows = np.ascontiguousarray(rows[:, : message.width * message.point_step])
-        points = rows.reshape(-1).view(kind)
-        return {
-            name: torch.from_numpy(points[name].astype(np.float64)) for name in kind.names or ()
-        }
+        points = rows.reshape(-1).view(np.dtype(layout))
+        names: list[str] = layout["names"]
+        return {name: torch.from_numpy(points[name].astype(np.float64)) for name in names}
 
     return [one for _, one in _read_messages(path, topic, parse_cloud)]
 

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 
+_Beat = Complex[Tensor, "frame chirp tx rx sample"]
 
-def to_radarsimpy(
-    beat: Complex[Tensor, "frame chirp tx rx sample"],
-) -> Complex[Tensor, "channel chirp sample"]:
+
+def to_radarsimpy(beat: _Beat) -> Complex[Tensor, "channel chirp sample"]:
     """Samples as RadarSimPy's ``baseband``: [channels/frames, pulses, samples].
 
     Frames are outermost in the first axis, then transmitters, then receivers.
@@ -27,7 +27,7 @@ def to_radarsimpy(
 
 def from_radarsimpy(
     baseband: Complex[Tensor, "channel chirp sample"], transmitters: int, receivers: int
-) -> Complex[Tensor, "frame chirp tx rx sample"]:
+) -> _Beat:
     """Convert a cube of RadarSimPy, simulated or made by ``to_radarsimpy``.
 
     Args:
@@ -39,12 +39,11 @@ def from_radarsimpy(
         InputError: A first axis that is no number of frames of so many channels.
     """
     _check_divides(len(baseband), transmitters * receivers, "channels/frames", "channels")
-    split = baseband.unflatten(0, (-1, transmitters, receivers))
-    return split.transpose(2, 3).transpose(1, 2)
+    return baseband.unflatten(0, (-1, transmitters, receivers)).transpose(2, 3).transpose(1, 2)
 
 
 def to_openradar(
-    beat: Complex[Tensor, "frame chirp tx rx sample"], order: Sequence[int] | None = None
+    beat: _Beat, order: Sequence[int] | None = None
 ) -> Complex[Tensor, "frame pulse rx sample"]:
     """Samples as OpenRadar's ``adc_data``: [frames, chirps, receivers, samples].
 
@@ -66,7 +65,7 @@ def from_openradar(
     adc_data: Complex[Tensor, "frame pulse rx sample"],
     transmitters: int,
     order: Sequence[int] | None = None,
-) -> Complex[Tensor, "frame chirp tx rx sample"]:
+) -> _Beat:
     """Convert a cube of OpenRadar, organised there or made by ``to_openradar``.
 
     Args:
@@ -79,9 +78,8 @@ def from_openradar(
             transmitter once.
     """
     _check_divides(adc_data.shape[1], transmitters, "chirps", "transmitters")
-    return adc_data.unflatten(1, (-1, transmitters))[
-        :, :, _check_transmit_order(order, transmitters).argsort()
-    ]
+    places = _check_transmit_order(order, transmitters).argsort()
+    return adc_data.unflatten(1, (-1, transmitters))[:, :, places]
 
 
 def _check_transmit_order(order: Sequence[int] | None, transmitters: int) -> Tensor:

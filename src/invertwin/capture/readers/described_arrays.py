@@ -275,10 +275,8 @@ def _load_file(path: Path, suffix: str, variable: str | None, *, trusted: bool) 
         return read_npy(path)
     if suffix == ".npz":
         return read_arrays(path, "it is damaged or of another kind", [str(variable)])[str(variable)]
-    stored = read_isolated(
-        path, "matlab" if suffix == ".mat" else "hdf5", str(variable), trusted=trusted
-    )
-    return stored.arrays[str(variable)].values
+    kind = "matlab" if suffix == ".mat" else "hdf5"
+    return read_isolated(path, kind, str(variable), trusted=trusted).arrays[str(variable)].values
 
 
 def arrange_dimensions(array: np.ndarray, order: Any, transmitters: int | None) -> np.ndarray:

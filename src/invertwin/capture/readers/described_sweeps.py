@@ -124,8 +124,7 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     waveform = SteppedFrequency(start, step, len(frequencies), sweep.get("dwell", _DWELL))
     places = _load_positions(source, radar.get("positions"), len(beat))
     toward = radar.get("look_at")
-    turned = None if toward is None else look_at(places, toward)
-    device = Radar(tx, rx, waveform, places, turned)
+    device = Radar(tx, rx, waveform, places, None if toward is None else look_at(places, toward))
     return Capture.from_beat(beat, _set_range_origin(device, source, radar))
 
 
@@ -217,19 +216,10 @@ def _load_touchstone_sweeps(
 ) -> tuple[Float64[Tensor, " sample"], Complex128[Tensor, "frame 1 1 sample"]]:
     """Frequencies, and the beat signal of every file less the background."""
     frequencies, first = _load_parameter(files[0], sweep)
-    rows = [
-        first,
-        *(
-            _require_same_frequencies(_load_parameter(file, sweep), frequencies, file)
-            for file in files[1:]
-        ),
-    ]
+    rows = [first, *(_load_response(file, sweep, frequencies) for file in files[1:])]
     response = torch.stack(rows)
     if "background" in sweep:
-        file = folder / str(sweep["background"])
-        response = response - _require_same_frequencies(
-            _load_parameter(file, sweep), frequencies, file
-        )
+        response = response - _load_response(folder / str(sweep["background"]), sweep, frequencies)
     # The beat signal is conj(H), as that of OFDM.
     return frequencies, response.conj().resolve_conj()[:, None, None]
 
@@ -249,11 +239,9 @@ def _load_parameter(file: Path, sweep: dict[str, Any]) -> tuple[Tensor, Tensor]:
     return found.frequencies, found.parameters[:, out - 1, into - 1]
 
 
-def _require_same_frequencies(
-    found: tuple[Tensor, Tensor], frequencies: Tensor, file: Path
-) -> Tensor:
+def _load_response(file: Path, sweep: dict[str, Any], frequencies: Tensor) -> Tensor:
     """The response of a file, if it was swept over the same frequencies."""
-    own, response = found
+    own, response = _load_parameter(file, sweep)
     if len(own) != len(frequencies) or bool(((own - frequencies).abs() > 1e-9 * own).any()):
         raise InputError(
             f"expected the {len(frequencies)} frequencies of the first file in {file.name}, got "

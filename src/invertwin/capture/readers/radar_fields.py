@@ -33,10 +33,9 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
     kind = type(waveform).__name__
     if kind not in WAVEFORMS or not isinstance(waveform, tuple(WAVEFORMS.values())):
         raise InputError(f"expected a waveform of {', '.join(WAVEFORMS)}, got {kind}; use those")
-    variables = {
-        "position": to_data_array(("frame", "axis"), radar.positions, "m"),
-        "rotation": to_data_array(("frame", "axis", "radar_axis"), radar.link().rotations, "1"),
-    }
+    variables = {"position": to_data_array(("frame", "axis"), radar.positions, "m")}
+    axes = ("frame", "axis", "radar_axis")
+    variables["rotation"] = to_data_array(axes, radar.link().rotations, "1")
     if radar.range_origin is not None:
         variables["range_origin"] = to_data_array(("frame",), radar.range_origin, "m")
     attributes: dict[str, Any] = {
@@ -60,6 +59,7 @@ def radar_from_fields(dataset: xr.Dataset) -> Radar:
     Raises:
         InputError: a missing or unknown attribute or variable.
     """
+    visibility = {name: shared for shared, name in _VISIBILITY.items()}
     return Radar(
         transmitters=_array_from_fields("tx", dataset),
         receivers=_array_from_fields("rx", dataset),
@@ -68,9 +68,7 @@ def radar_from_fields(dataset: xr.Dataset) -> Radar:
         rotations=read_tensor(dataset, "rotation"),
         window=str(_get_entry(dataset.attrs, "window")),
         array_window=str(_get_entry(dataset.attrs, "array_window")),
-        shared_visibility=_get_choice(
-            dataset.attrs, "visibility", {v: k for k, v in _VISIBILITY.items()}
-        ),
+        shared_visibility=_get_choice(dataset.attrs, "visibility", visibility),
         range_origin=read_tensor(dataset, "range_origin") if "range_origin" in dataset else None,
     )
 
@@ -103,9 +101,8 @@ def to_data_array(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArr
             f"expected dimensions {', '.join(dims)}, got shape {tuple(value.shape)}; "
             "give one size for each of them"
         )
-    return xr.DataArray(
-        value.detach().cpu().resolve_conj().numpy().copy(), dims=dims, attrs={"units": unit}
-    )
+    values = value.detach().cpu().resolve_conj().numpy().copy()
+    return xr.DataArray(values, dims=dims, attrs={"units": unit})
 
 
 def read_tensor(dataset: xr.Dataset, name: str) -> Tensor:

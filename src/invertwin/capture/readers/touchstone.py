@@ -101,9 +101,8 @@ def load_touchstone(file: str | Path) -> Touchstone:
         matrix = _to_complex(rows[:, 1::2], rows[:, 2::2], kind).reshape(-1, count, count)
     # Two ports are listed as S11, S21, S12, S22; others row by row.
     ordered = matrix.transpose(0, 2, 1) if count == 2 else matrix
-    return Touchstone(
-        torch.from_numpy(rows[:, 0] * unit), torch.from_numpy(ordered.copy()), resistance
-    )
+    frequencies, ordered = torch.from_numpy(rows[:, 0] * unit), torch.from_numpy(ordered.copy())
+    return Touchstone(frequencies, ordered, resistance)
 
 
 def _parse_option_line(words: list[str]) -> tuple[float, str, float]:

@@ -124,8 +124,7 @@ def _check_numbers(first: int, last: int) -> None:
     if not 0 <= first <= last < _MAX_CHIRPS:
         raise InputError(
             f"expected chirps from 0 to {_MAX_CHIRPS - 1}, the first before the last, got "
-            f"{first} to "
-            f"{last}; correct the settings"
+            f"{first} to {last}; correct the settings"
         )
 
 

@@ -15,19 +15,7 @@ import numpy as np
 import torch
 
 from invertwin.capture.chirps import ChirpData, ChirpSettings
-from invertwin.capture.ti.layouts import (
-    LANE_COUNT,
-    MIN_BORDER_RATIO,
-    LayoutCandidate,
-    better_candidates,
-    block_layout,
-    find_candidates,
-    format_advice,
-    frame_words,
-    layout_error,
-    measure_evidence,
-    silent_lanes_contradict,
-)
+from invertwin.capture.ti import layouts
 from invertwin.capture.ti.mmwave_studio import read_studio, setup_files
 from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.errors import InputError
@@ -117,7 +105,7 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
         lost = words > 2 ** (settings.bits - 1) - 1
         words = np.where(lost, words - 2**settings.bits, words).astype(_WORD)
     frames = _count_whole_frames(words, settings, name)
-    words = words[: frames * frame_words(settings)].astype(np.float32)
+    words = words[: frames * layouts.frame_words(settings)].astype(np.float32)
     parts = words.reshape(frames, -1).take(_word_indices(settings), axis=1)
     samples = parts.astype(np.complex64) if settings.real else parts.view(np.complex64)
     data = ChirpData(torch.from_numpy(samples[..., 0]), replace(settings, frames=frames))
@@ -151,7 +139,7 @@ def write_samples(path: str | Path, data: ChirpData) -> None:
             "expected samples without imaginary part from a real ADC, got some with; "
             "take their real part or set real=False"
         )
-    words = np.zeros((len(parts), frame_words(settings)), _WORD)
+    words = np.zeros((len(parts), layouts.frame_words(settings)), _WORD)
     words[:, _word_indices(settings)] = parts[..., :1] if settings.real else parts
     with replace_file(path) as part:
         words.tofile(part)
@@ -163,7 +151,7 @@ def _check_layout(settings: ChirpSettings) -> None:
             "expected settings with 2 or 4 LVDS lanes, got none; set lanes: 4 for xWR12xx and "
             "xWR14xx, 2 for xWR16xx, xWR18xx and xWR68xx"
         )
-    why = layout_error(settings)
+    why = layouts.layout_error(settings)
     if why is not None:
         raise InputError(f"expected {why}")
 
@@ -174,24 +162,24 @@ def _count_whole_frames(words: np.ndarray, settings: ChirpSettings, name: str) -
     Settings whose size is not the file's are refused, unless the recording was cut off and its
     samples do not speak for others; and so are settings that the samples contradict.
     """
-    size, frame = words.nbytes, frame_words(settings) * _WORD.itemsize
+    size, frame = words.nbytes, layouts.frame_words(settings) * _WORD.itemsize
     frames, rest = divmod(size, frame)
     expected = settings.frames
     exact = not rest and frames == (expected or frames) and frames > 0
     cut = frames > 0 and (expected is None or frames < expected)
     others = _find_alternatives(words, settings, exact=exact, truncated=cut)
-    if others or not exact:
-        if others:
-            wanted = f"{expected} frames of {frame}" if expected else f"whole frames of {frame}"
-            raise InputError(
-                f"expected the recording of its settings in {name} ({wanted} bytes), got {size} "
-                f"bytes{' whose chirps break elsewhere' if exact else ''}; {format_advice(others)}"
-            )
-        if not exact and expected is not None and not cut:
-            raise InputError(
-                f"expected {expected * frame} bytes in {name} ({expected} frames of {frame}), got "
-                f"{size}; no one or two changes of the settings fit, find those of this recording"
-            )
+    if others:
+        wanted = f"{expected} frames of {frame}" if expected else f"whole frames of {frame}"
+        advice = layouts.format_advice(others)
+        raise InputError(
+            f"expected the recording of its settings in {name} ({wanted} bytes), got {size} "
+            f"bytes{' whose chirps break elsewhere' if exact else ''}; {advice}"
+        )
+    if not exact and expected is not None and not cut:
+        raise InputError(
+            f"expected {expected * frame} bytes in {name} ({expected} frames of {frame}), got "
+            f"{size}; no one or two changes of the settings fit, find those of this recording"
+        )
     if not frames:
         raise InputError(
             f"expected at least one frame of {frame} bytes in {name}, got {size} bytes; "
@@ -216,7 +204,7 @@ def _count_whole_frames(words: np.ndarray, settings: ChirpSettings, name: str) -
 
 def _find_alternatives(
     words: np.ndarray, settings: ChirpSettings, *, exact: bool, truncated: bool
-) -> list[LayoutCandidate]:
+) -> list[layouts.LayoutCandidate]:
     """Other settings that the file speaks for, best first; none = it may be as stated.
 
     Args:
@@ -225,22 +213,23 @@ def _find_alternatives(
         exact: Whether the size is that of the settings.
         truncated: Whether it is that of a recording that was stopped.
     """
-    sound = measure_evidence(words, settings).border_ratio >= MIN_BORDER_RATIO if exact else False
-    if not words.size or (sound and not silent_lanes_contradict(words, settings)):
+    sound = exact and layouts.measure_evidence(words, settings).breaks_at_borders
+    if not words.size or (sound and not layouts.silent_lanes_contradict(words, settings)):
         return []
-    found = find_candidates(words, settings)
+    found = layouts.find_candidates(words, settings)
     if not exact and not truncated:
         return found
-    if silent_lanes_contradict(words, settings):
-        return [one for one in found if not silent_lanes_contradict(words, one.settings)]
-    stated = measure_evidence(words, settings)
-    others = better_candidates(found, stated)
+    if layouts.silent_lanes_contradict(words, settings):
+        return [one for one in found if not layouts.silent_lanes_contradict(words, one.settings)]
+    stated = layouts.measure_evidence(words, settings)
+    others = layouts.better_candidates(found, stated)
     if exact or others:
         return others
     # The same blocks in other numbers: no sample tells a stopped recording from another one.
     alike = [one for one in found if len(one.changes) == 1 and "frames" not in one.changes]
-    if stated.border_ratio >= MIN_BORDER_RATIO:
-        alike = [one for one in alike if block_layout(one.settings) == block_layout(settings)]
+    if stated.breaks_at_borders:
+        own = layouts.block_layout(settings)
+        alike = [one for one in alike if layouts.block_layout(one.settings) == own]
     return [*(one for one in found if alike and set(one.changes) == {"frames"}), *alike]
 
 
@@ -248,9 +237,9 @@ def _word_indices(settings: ChirpSettings) -> np.ndarray:
     """Indices of the I and Q words of a frame, from 0 [chirp, tx, rx, sample, I and Q]."""
     s, parts = settings, 1 if settings.real else 2
     chirps = s.loops, len(s.transmit_order)
-    words = np.arange(frame_words(s))
-    if s.lanes == LANE_COUNT:
-        sides = words.reshape(*chirps, s.samples, parts, LANE_COUNT)
+    words = np.arange(layouts.frame_words(s))
+    if s.lanes == layouts.LANE_COUNT:
+        sides = words.reshape(*chirps, s.samples, parts, layouts.LANE_COUNT)
         sides = sides[..., [number - 1 for number in s.receivers]]
         sides = np.moveaxis(sides, (-1, -2), (-3, -1))
     else:

@@ -54,8 +54,7 @@ def change_settings(settings: ChirpSettings, changes: Mapping[str, Any]) -> Chir
     if unknown:
         raise InputError(
             f"expected changes of {', '.join(CHANGEABLE_SETTINGS)}, got {sorted(unknown)}; "
-            f"correct other numbers "
-            "in the settings file"
+            "correct other numbers in the settings file"
         )
     values = {
         _COUNTS.get(name, name): tuple(range(1, value + 1)) if name in _COUNTS else value
@@ -79,6 +78,11 @@ class LayoutEvidence:
 
     border_ratio: float
     code_length: float
+
+    @property
+    def breaks_at_borders(self) -> bool:
+        """True if prediction fails at the borders of blocks, which speaks for them."""
+        return self.border_ratio >= MIN_BORDER_RATIO
 
 
 NO_EVIDENCE = LayoutEvidence(0.0, math.inf)
@@ -179,7 +183,7 @@ def find_candidates(words: np.ndarray, settings: ChirpSettings) -> list[LayoutCa
                     found.append(LayoutCandidate(chosen | solved, made, known[key], alike[period]))
 
     def sort_key(one: LayoutCandidate) -> tuple[Any, ...]:
-        breaks = one.evidence.border_ratio >= MIN_BORDER_RATIO
+        breaks = one.evidence.breaks_at_borders
         return (not breaks, one.evidence.code_length if breaks else 0.0, len(one.changes))
 
     return sorted(found, key=sort_key)
@@ -202,9 +206,8 @@ def _solve_sizes(
 ) -> Iterator[dict[str, int]]:
     """Values of the free sizes with which the rest makes the size exact."""
     try:
-        base = change_settings(
-            settings, known | dict.fromkeys((n for n in free if n != "frames"), 2)
-        )
+        twos = dict.fromkeys((name for name in free if name != "frames"), 2)
+        base = change_settings(settings, known | twos)
     except InputError:
         return
     unit = frame_words(base) // 2 ** sum(name != "frames" for name in free)
@@ -268,9 +271,8 @@ def measure_evidence(words: np.ndarray, settings: ChirpSettings) -> LayoutEviden
         return NO_EVIDENCE
     # Blocks, each with the end of the one before.
     cut = rows[:, count - order : blocks * count].unfold(1, count + order, count)
-    coefficients = prediction_coefficients(
-        covariances(cut.flatten(0, 1), order), torch.arange(count) >= order
-    )
+    products = covariances(cut.flatten(0, 1), order)
+    coefficients = prediction_coefficients(products, torch.arange(count) >= order)
     past = cut.unfold(2, order + 1, 1).flip(-1)
     left = (past @ coefficients).abs().square()  # [row, block, place]
     # As many places as a break reaches.
@@ -334,14 +336,11 @@ def better_candidates(
         found: Of ``candidates``.
         stated_evidence: Of the settings as they are.
     """
-    if stated_evidence.border_ratio >= MIN_BORDER_RATIO:
+    if stated_evidence.breaks_at_borders:
         return []
-    return [
-        one
-        for one in found
-        if one.evidence.border_ratio >= MIN_BORDER_RATIO
-        and one.evidence.code_length < stated_evidence.code_length - MIN_CODE_SAVING
-    ]
+    most = stated_evidence.code_length - MIN_CODE_SAVING
+    breaking = [one for one in found if one.evidence.breaks_at_borders]
+    return [one for one in breaking if one.evidence.code_length < most]
 
 
 def silent_lanes_contradict(words: np.ndarray, settings: ChirpSettings) -> bool:
@@ -360,42 +359,30 @@ def format_advice(found: list[LayoutCandidate]) -> str:
     Args:
         found: Of ``candidates``.
     """
-    first = found[0]
-    own = block_layout(first.settings)
+    best, own = found[0].evidence, block_layout(found[0].settings)
     rivals = [one.evidence for one in found if block_layout(one.settings) != own]
-    dearer = min(
-        (
-            one.code_length - first.evidence.code_length
-            for one in rivals
-            if one.border_ratio >= MIN_BORDER_RATIO
-        ),
-        default=math.inf,
-    )
+    costs = [one.code_length - best.code_length for one in rivals if one.breaks_at_borders]
+    dearer = min(costs, default=math.inf)
     cheapest = min((one.code_length for one in rivals), default=math.inf)
-    clear = (
-        first.evidence.border_ratio >= MIN_BORDER_RATIO
-        and dearer >= MIN_CODE_SAVING
-        and cheapest > first.evidence.code_length - MIN_CODE_SAVING
-    )
+    cheap = cheapest > best.code_length - MIN_CODE_SAVING
+    clear = best.breaks_at_borders and dearer >= MIN_CODE_SAVING and cheap
     near = [
         one
         for one in found
         if block_layout(one.settings) == own
-        or not (clear or one.evidence.code_length - first.evidence.code_length >= MIN_CODE_SAVING)
-        or first.evidence.border_ratio < MIN_BORDER_RATIO
+        or not (clear or one.evidence.code_length - best.code_length >= MIN_CODE_SAVING)
+        or not best.breaks_at_borders
     ]
     groups: dict[int, list[LayoutCandidate]] = {}
     for one in _most_coherent(near) if clear else near:
         groups.setdefault(_block_period(one.settings) if clear else 0, []).append(one)
-    near = sorted(
-        (one for group in groups.values() for one in _fewest_changes(group)), key=_count_changes
-    )
+    fewest = (one for group in groups.values() for one in _fewest_changes(group))
+    near = sorted(fewest, key=lambda one: len(one.changes))
     shown = " or ".join(map(str, near[:_MAX_LISTED]))
     said = "its samples do not tell where blocks end"
     if clear:
         said = (
-            f"prediction fails {first.evidence.border_ratio:.3g} times more at the ends of its "
-            f"blocks "
+            f"prediction fails {best.border_ratio:.3g} times more at the ends of its blocks "
             "than anywhere within"
         )
         if dearer < math.inf:
@@ -403,28 +390,18 @@ def format_advice(found: list[LayoutCandidate]) -> str:
     do = "correct the settings"
     if len(near) > 1:
         do = "the samples do not tell these apart: find out which, and correct the settings"
-    return f"what fits: {shown} ({said}); {do}, or look with --set {_format_options(near[0])}"
-
-
-def _count_changes(candidate: LayoutCandidate) -> int:
-    return len(candidate.changes)
+    options = " --set ".join(f"{name}={value}" for name, value in near[0].changes.items())
+    return f"what fits: {shown} ({said}); {do}, or look with --set {options}"
 
 
 def _fewest_changes(group: list[LayoutCandidate]) -> list[LayoutCandidate]:
     """Those with the fewest changes."""
-    fewest = min(map(_count_changes, group))
-    return [one for one in group if _count_changes(one) == fewest]
+    fewest = min(len(one.changes) for one in group)
+    return [one for one in group if len(one.changes) == fewest]
 
 
 def _most_coherent(near: list[LayoutCandidate]) -> list[LayoutCandidate]:
     """Those whose blocks of one channel are most alike."""
     highest = max((one.coherence for one in near if one.coherence is not None), default=0.0)
-    return [
-        one
-        for one in near
-        if one.coherence is None or one.coherence >= _MIN_RELATIVE_COHERENCE * highest
-    ]
-
-
-def _format_options(candidate: LayoutCandidate) -> str:
-    return " --set ".join(f"{name}={value}" for name, value in candidate.changes.items())
+    least = _MIN_RELATIVE_COHERENCE * highest
+    return [one for one in near if one.coherence is None or one.coherence >= least]

@@ -7,16 +7,7 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings
-from invertwin.capture.ti.chirp_table import (
-    BIT_CODES,
-    BITS,
-    bits_to_numbers,
-    device_lanes,
-    format_decimal,
-    frame_settings,
-    numbers_to_bits,
-    profile_texts,
-)
+from invertwin.capture.ti import chirp_table
 from invertwin.errors import InputError
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, existing_file, read_text, safe_reader
@@ -121,19 +112,19 @@ def _parse_settings(content: dict[str, Any], device: str) -> ChirpSettings:
     sent = (record.get("rlDevDataPathCfg_t") or {}).get("transferFmtPkt0", "0x1")
     do = "record without chirp parameters and quality data"
     _require_equal(_parse_integer(sent), 1, "packets of samples only (transferFmtPkt0 1)", do)
-    layout, lanes = record["rlDevDataFmtCfg_t"], device_lanes(device)
+    layout, lanes = record["rlDevDataFmtCfg_t"], chirp_table.device_lanes(device)
     if "rlDevLaneEnable_t" in record:
-        lanes = len(bits_to_numbers(_parse_integer(record["rlDevLaneEnable_t"]["laneEn"])))
+        enabled = _parse_integer(record["rlDevLaneEnable_t"]["laneEn"])
+        lanes = len(chirp_table.bits_to_numbers(enabled))
     if lanes in (2, 4):
         # 0 = receivers interleaved, as through 4 lanes; 1 = one after the other, as through 2.
         order, what = int(lanes == 2), f"chInterleave {int(lanes == 2)} with {lanes} LVDS lanes"
         _require_equal(int(layout["chInterleave"]), order, what, "other orders are not supported")
-    profiles = [
-        item["rlProfileCfg_t"] for item in _list_items(radio["rlProfiles"], "rlProfileCfg_t")
-    ]
+    profiles = _list_items(radio["rlProfiles"], "rlProfileCfg_t")
+    profiles = [item["rlProfileCfg_t"] for item in profiles]
     chirps = [item["rlChirpCfg_t"] for item in _list_items(radio["rlChirps"], "rlChirpCfg_t")]
     frame, output = radio["rlFrameCfg_t"], radio["rlAdcOutCfg_t"]["fmt"]
-    return frame_settings(
+    return chirp_table.frame_settings(
         {int(profile["profileId"]): profile for profile in profiles},
         _PROFILE,
         [
@@ -147,10 +138,10 @@ def _parse_settings(content: dict[str, Any], device: str) -> ChirpSettings:
             for chirp in chirps
         ],
         [frame[key] for key in _FRAME],
-        receivers=bits_to_numbers(_parse_integer(radio["rlChanCfg_t"]["rxChannelEn"])),
+        receivers=chirp_table.bits_to_numbers(_parse_integer(radio["rlChanCfg_t"]["rxChannelEn"])),
         real=int(output["b2AdcOutFmt"]) in (0, 3),
         swap_iq=bool(int(layout["iqSwapSel"])),
-        bits=BITS[int(output["b2AdcBits"])],
+        bits=chirp_table.BITS[int(output["b2AdcBits"])],
         lanes=lanes,
     )
 
@@ -163,10 +154,8 @@ def _single_device(written: Any) -> dict[str, Any]:
             "expected settings of one device, got none; connect the device in mmWave Studio, then "
             "save the settings again"
         )
-    modes = [
-        _parse_integer((device["rfConfig"].get("rlChanCfg_t") or {}).get("cascading", 0))
-        for device in devices
-    ]
+    channels = [device["rfConfig"].get("rlChanCfg_t") or {} for device in devices]
+    modes = [_parse_integer(own.get("cascading", 0)) for own in channels]
     if any(modes):
         raise InputError(
             f"expected settings of one device, got those of a cascade of {len(devices)} (cascading "
@@ -213,20 +202,20 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
     s = chirp_settings
     if s.lanes is None:
         raise InputError("expected settings with 2 or 4 lanes, got none; set lanes")
-    profile = dict(zip(_PROFILE, map(float, profile_texts(s)), strict=True))
+    profile = dict(zip(_PROFILE, map(float, chirp_table.profile_texts(s)), strict=True))
     frame = (0, len(s.transmit_order) - 1, s.loops, s.frames or 0)
-    period = float(format_decimal(s.frame_period or 0.0, 3))
+    period = float(chirp_table.format_decimal(s.frame_period or 0.0, 3))
     radio = {
         "waveformType": "legacyFrameChirp",
         "MIMOScheme": "TDM",
         "rlChanCfg_t": {
-            "rxChannelEn": f"0x{numbers_to_bits(s.receivers):X}",
-            "txChannelEn": f"0x{numbers_to_bits(s.transmit_order):X}",
+            "rxChannelEn": f"0x{chirp_table.numbers_to_bits(s.receivers):X}",
+            "txChannelEn": f"0x{chirp_table.numbers_to_bits(s.transmit_order):X}",
             "cascading": 0,
         },
         "rlAdcOutCfg_t": {
             "fmt": {
-                "b2AdcBits": BIT_CODES[s.bits],
+                "b2AdcBits": chirp_table.BIT_CODES[s.bits],
                 "b2AdcOutFmt": 0 if s.real else 1,
                 "b8FullScaleReducFctr": 0,
             }
@@ -239,7 +228,7 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
                     "chirpEndIdx": index,
                     "profileId": 0,
                     **dict.fromkeys(_VARIATIONS, 0.0),
-                    "txEnable": f"0x{numbers_to_bits([tx]):X}",
+                    "txEnable": f"0x{chirp_table.numbers_to_bits([tx]):X}",
                 }
             }
             for index, tx in enumerate(s.transmit_order)

@@ -1,19 +1,9 @@
 """Settings files (`.cfg`) of the mmWave SDK and its demos: one command per line."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from invertwin.capture.chirps import ChirpSettings
-from invertwin.capture.ti.chirp_table import (
-    BIT_CODES,
-    BITS,
-    bits_to_numbers,
-    device_lanes,
-    format_decimal,
-    frame_settings,
-    numbers_to_bits,
-    profile_texts,
-)
+from invertwin.capture.ti import chirp_table
 from invertwin.errors import InputError
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import read_text, safe_reader
@@ -66,7 +56,7 @@ def read_cfg(path: str | Path) -> ChirpSettings:
             "sub-frames are not supported"
         )
     try:
-        return _parse_settings(found, device_lanes(platform))
+        return _parse_settings(found, chirp_table.device_lanes(platform))
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from error
     except (ValueError, ArithmeticError) as error:
@@ -102,23 +92,24 @@ def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> Chi
                 "expected a stream of samples only, got headers (lvdsStreamCfg); record without"
             )
     bits, kind = int(adc[0]), int(adc[1])
-    if bits not in BITS or kind not in (0, 1, 2):
+    if bits not in chirp_table.BITS or kind not in (0, 1, 2):
         raise InputError(
             f"expected adcCfg with bits 0 to 2 and format 0 to 2, got {bits} and {kind}; "
             "see the SDK's user guide"
         )
-    read = frame_settings(
+    read = chirp_table.frame_settings(
         {int(profile[0]): profile for profile in found["profileCfg"]},
         _PROFILE,
         chirps,
         frame,
-        receivers=bits_to_numbers(int(channel[0], 0)),
+        receivers=chirp_table.bits_to_numbers(int(channel[0], 0)),
         real=kind == 0,
-        swap_iq=_swaps_iq(found.get("adcbufCfg", [])),
-        bits=BITS[bits],
+        # SampleSwap: 1 = Q in the lower half word. Since SDK 2 a sub-frame number comes first.
+        swap_iq="adcbufCfg" in found and bool(int(found["adcbufCfg"][-1][-3])),
+        bits=chirp_table.BITS[bits],
         lanes=lanes,
     )
-    unused = set(read.transmit_order) - set(bits_to_numbers(int(channel[1], 0)))
+    unused = set(read.transmit_order) - set(chirp_table.bits_to_numbers(int(channel[1], 0)))
     if unused:
         raise InputError(
             f"expected chirps of the transmitters that channelCfg enables, got TX {unused}; "
@@ -130,12 +121,6 @@ def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> Chi
             "the two commands contradict each other"
         )
     return read
-
-
-def _swaps_iq(commands: Sequence[list[str]]) -> bool:
-    """SampleSwap: 1 = Q in the lower half word, so first in the file."""
-    # Since SDK 2 a sub-frame number comes first.
-    return bool(commands) and bool(int(commands[-1][-3]))
 
 
 def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
@@ -150,22 +135,23 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
     """
     s = chirp_settings
     devices = {2: "xWR18xx", 4: "xWR1443"}
-    start, idle, adc, end, slope, samples, rate = profile_texts(s)
+    start, idle, adc, end, slope, samples, rate = chirp_table.profile_texts(s)
+    receivers = chirp_table.numbers_to_bits(s.receivers)
     lines = [
         *([f"% Platform:{devices[s.lanes]}"] if s.lanes else []),
         "sensorStop",
         "flushCfg",
         "dfeDataOutputMode 1",
-        f"channelCfg {numbers_to_bits(s.receivers)} {numbers_to_bits(s.transmit_order)} 0",
-        f"adcCfg {BIT_CODES[s.bits]} {int(not s.real)}",
+        f"channelCfg {receivers} {chirp_table.numbers_to_bits(s.transmit_order)} 0",
+        f"adcCfg {chirp_table.BIT_CODES[s.bits]} {int(not s.real)}",
         f"adcbufCfg -1 {int(s.real)} {int(s.swap_iq)} 1 1",
         f"profileCfg 0 {start} {idle} {adc} {end} 0 0 {slope} 0 {samples} {rate} 0 0 30",
         *(
-            f"chirpCfg {i} {i} 0 0 0 0 0 {numbers_to_bits([tx])}"
+            f"chirpCfg {i} {i} 0 0 0 0 0 {chirp_table.numbers_to_bits([tx])}"
             for i, tx in enumerate(s.transmit_order)
         ),
         f"frameCfg 0 {len(s.transmit_order) - 1} {s.loops} {s.frames or 0} "
-        f"{format_decimal(s.frame_period or 0, 3)} 1 0",
+        f"{chirp_table.format_decimal(s.frame_period or 0, 3)} 1 0",
         "lvdsStreamCfg -1 0 1 0",
         "sensorStart",
     ]

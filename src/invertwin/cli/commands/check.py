@@ -35,14 +35,13 @@ from invertwin.runtime.progress import format_duration
 from invertwin.scene import Scene, Translation
 
 _PROBE_FRAMES = 4  # of the radar, or aspects, in the probe
-_SMALL_PROBE, _LARGE_PROBE = (
-    10_000,
-    100_000,
-)  # rays or paths that are timed: less than a second of work
+# Rays or paths that are timed: less than a second of work.
+_SMALL_PROBE, _LARGE_PROBE = 10_000, 100_000
 _DERIVATIVE_COST = 4  # times the work of a map: a step of a fit with one or several derivatives
 _FIT_TASKS = ("reconstruct", "demo")
 _SIMULATION_TASKS = ("simulate", "dataset")
 _STEPS, _STARTS = "reconstruct.steps", ("transmitter_starts.count", "placement.starts")
+_COUNT_HEADS = ("needs", "how many", "key")
 
 
 def run_check(run: RunFile) -> tuple[list[ReportTable], str]:
@@ -58,17 +57,13 @@ def run_check(run: RunFile) -> tuple[list[ReportTable], str]:
     if run.image is not None and run.task == "gradcheck":
         return _check_image(run)
     truth, sensors = build.true_scene(run), _build_sensors(run)
-    build.parameters(
-        [table for table in run.parameters if not isinstance(table, MovingTargetParameter)],
-        build.scene(run),
-        run.scene,
-    )
+    tables = [table for table in run.parameters if not isinstance(table, MovingTargetParameter)]
+    build.parameters(tables, build.scene(run), run.scene)
     found = estimate_resources(run, truth, sensors)
     found.require_available()
     seconds = _estimate_seconds(run, found, truth, sensors)
-    return _make_tables(
-        found, truth, seconds, f"{found.ray_count:.2g} rays and {found.path_count:.2g} paths"
-    )
+    work = f"{found.ray_count:.2g} rays and {found.path_count:.2g} paths"
+    return _make_tables(found, truth, seconds, work)
 
 
 def _make_tables(
@@ -80,10 +75,8 @@ def _make_tables(
         f"about {format_gigabytes(found.memory)} of {format_gigabytes(free_memory())} free, and "
         f"{format_duration(seconds)} for {work}"
     )
-    return [
-        ReportTable("Estimate", heads, rows, load_texts("notes")["estimate"]),
-        _mesh_table(scene),
-    ], line
+    needs = ReportTable("Estimate", heads, rows, load_texts("notes")["estimate"])
+    return [needs, _mesh_table(scene)], line
 
 
 def _check_other_data(run: RunFile) -> tuple[list[ReportTable], str]:
@@ -109,10 +102,7 @@ def _check_other_data(run: RunFile) -> tuple[list[ReportTable], str]:
             maps += starts * stage.steps
     rows.append(["starts", len(problem.starts()), _STARTS[run.map is None]])
     line = f"about {format_duration(seconds)} for {maps:.4g} steps, without searches"
-    return [
-        ReportTable("Estimate", ("needs", "how many", "key"), rows),
-        _mesh_table(problem.scene),
-    ], line
+    return [ReportTable("Estimate", _COUNT_HEADS, rows), _mesh_table(problem.scene)], line
 
 
 def _check_checked_map(run: RunFile) -> tuple[list[ReportTable], str]:
@@ -124,7 +114,7 @@ def _check_checked_map(run: RunFile) -> tuple[list[ReportTable], str]:
     with torch.no_grad():
         seconds = count * _time_call(lambda: model.predict(scene, sensor, 0))
     line = f"about {format_duration(seconds)} for {count} maps"
-    return [ReportTable("Estimate", ("needs", "how many", "key"), rows), _mesh_table(scene)], line
+    return [ReportTable("Estimate", _COUNT_HEADS, rows), _mesh_table(scene)], line
 
 
 def _check_image(run: RunFile) -> tuple[list[ReportTable], str]:
@@ -136,12 +126,10 @@ def _check_image(run: RunFile) -> tuple[list[ReportTable], str]:
     with torch.no_grad():
         ray = _time_call(lambda: model.predict(scene, camera, 0)) / rays
     count = ends * max(rays, check.difference_samples) + _DERIVATIVE_COST * slopes * rays
-    rows: list[list[object]] = [
-        ["images", ends + slopes, "gradcheck.max_pairs, gradcheck.repeats"],
-        ["rays", count, "gradcheck.difference_samples"],
-    ]
+    rows: list[list[object]] = [["images", ends + slopes, "gradcheck.max_pairs, gradcheck.repeats"]]
+    rows.append(["rays", count, "gradcheck.difference_samples"])
     line = f"about {format_duration(count * ray)} for {count:.2g} rays"
-    return [ReportTable("Estimate", ("needs", "how many", "key"), rows), _mesh_table(scene)], line
+    return [ReportTable("Estimate", _COUNT_HEADS, rows), _mesh_table(scene)], line
 
 
 def _time_call(work: Callable[[], object]) -> float:
@@ -188,15 +176,13 @@ def _mesh_table(scene: Scene) -> ReportTable:
 
 def _build_sensors(run: RunFile) -> Mapping[str, SensorSetup]:
     mover = isinstance(next(iter(run.parameters), None), MovingTargetParameter)
-    measured = run.data is not None and not isinstance(run.data, SimulatedData)
     if run.task in _FIT_TASKS and not mover:
         return build_sensors(run)
     table = require_section(run, "grid", run.task)
-    radar = (
-        build_chirp_capture(run.data).device
-        if measured
-        else build.radar(require_section(run, "radar", run.task))
-    )
+    if run.data is None or isinstance(run.data, SimulatedData):
+        radar = build.radar(require_section(run, "radar", run.task))
+    else:
+        radar = build_chirp_capture(run.data).device
     return {"": SensorSetup(run, radar, build.grid(table, radar))}
 
 
@@ -248,16 +234,11 @@ def _predict_map(sensor: SensorSetup, truth: Scene, depth: int, count: int, fitt
 
 def _simulate_signals(sensor: SensorSetup, truth: Scene, count: int) -> float:
     """Simulate exact signals of about so many paths; return their number."""
-    data, whole = (
-        require_section(sensor.run, "data", "a simulation"),
-        estimate_sensor_resources(sensor, truth)[1],
-    )
-    share = min(1.0, count / whole)
+    data = require_section(sensor.run, "data", "a simulation")
+    whole = estimate_sensor_resources(sensor, truth)[1]
+    share, rough = min(1.0, count / whole), resolve_densities(truth, data.points_per_m2)
     fewer = {
-        "points_per_m2": {
-            name: density * share
-            for name, density in resolve_densities(truth, data.points_per_m2).items()
-        },
+        "points_per_m2": {name: density * share for name, density in rough.items()},
         "samples": max(1, round(data.samples * share)),
         "rough_paths": max(1, round(data.rough_paths * share)),
         "every_start": False,

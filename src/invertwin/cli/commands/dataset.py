@@ -20,32 +20,15 @@ from invertwin.channel import Paths
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact
 from invertwin.cli.report import ReportTable, quantity_table, write_report
-from invertwin.cli.run_file import (
-    load_run,
-    prefix_file_errors,
-    require_section,
-    to_toml,
-    validate_run,
-)
+from invertwin.cli.run_file import load_run, prefix_file_errors, to_toml, validate_run
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.motion_tables import joint_positions_at_start, scene_at_start
 from invertwin.cli.schema.variation import draw_sample
-from invertwin.datasets import SampleDataset, object_labels, radar_labels, triangle_visibility
-from invertwin.datasets.shards import (
-    FORMAT,
-    MANIFEST,
-    ArrayInfo,
-    DatasetManifest,
-    Shard,
-    describe_shard,
-    npy_bytes,
-    pack_shard,
-    shard_name,
-    shard_ranges,
-)
+from invertwin.datasets import SampleDataset, labels, shards
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar import range_doppler_angle
 from invertwin.radar.radar import Radar
+from invertwin.registry.section import require_section
 from invertwin.runtime.engines import Engine, run_jobs
 from invertwin.runtime.progress import track
 from invertwin.scene import Scene
@@ -145,7 +128,7 @@ def run_dataset(
         InputError: A sample that cannot be simulated; the message names it.
     """
     table, begin = require_section(run, "dataset", "a data set"), time.perf_counter()
-    wanted = shard_ranges(table.samples, table.shard, part)
+    wanted = shards.shard_ranges(table.samples, table.shard, part)
     _check_first(run, wanted[0][1])
     found = {number: _read_finished_shard(folder, number) for number, _, _ in wanted}
     missing = [row for row in wanted if found[row[0]] is None]
@@ -155,14 +138,14 @@ def run_dataset(
         for _ in track(missing, "shards"):
             at, content = next(done)
             number, first, count = missing[at]
-            name = shard_name(number)
+            name = shards.shard_name(number)
             folder.write_bytes(name, content)
-            found[number] = describe_shard(name, first, count, content).model_dump()
+            found[number] = shards.describe_shard(name, first, count, content).model_dump()
             folder.write_json(_shard_row_path(number), found[number])
-    shards = [Shard.model_validate(found[number]) for number, _, _ in wanted]
-    _write_manifest(run, folder, part, shards)
+    rows = [shards.Shard.model_validate(found[number]) for number, _, _ in wanted]
+    _write_manifest(run, folder, part, rows)
     seconds = time.perf_counter() - begin
-    return _write_report(run, folder, shards, sum(count for _, _, count in missing), seconds)
+    return _write_report(run, folder, rows, sum(count for _, _, count in missing), seconds)
 
 
 def make_shard(job: tuple[str, int, int]) -> bytes:
@@ -180,7 +163,7 @@ def make_shard(job: tuple[str, int, int]) -> bytes:
 
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore", PhysicsWarning)  # told once, where the run began
-        return pack_shard(iterate_samples())
+        return shards.pack_shard(iterate_samples())
 
 
 def make_sample(run: RunFile, index: int) -> dict[str, bytes]:
@@ -196,16 +179,17 @@ def make_sample(run: RunFile, index: int) -> dict[str, bytes]:
         table = require_section(run, "dataset", "a data set")
         arrays = _simulate_signals(own, scene, sensor, table)
         begun = _labelled_scene(own, scene, sensor.radar)
-        seen = triangle_visibility(begun, sensor.radar)
+        seen = labels.triangle_visibility(begun, sensor.radar)
     if table.masks:
         arrays["masks"] = torch.cat(list(seen.values()), dim=1).numpy()
-    labels = {
+    joints = joint_positions_at_start(own, begun)
+    told = {
         "index": index,
-        "objects": object_labels(begun, seen, table.classes, joint_positions_at_start(own, begun)),
-        "radar": radar_labels(sensor.radar),
+        "objects": labels.object_labels(begun, seen, table.classes, joints),
+        "radar": labels.radar_labels(sensor.radar),
     }
-    files = {f"{name}.npy": npy_bytes(array) for name, array in arrays.items()}
-    text = json.dumps(labels, ensure_ascii=False, allow_nan=False)
+    files = {f"{name}.npy": shards.npy_bytes(array) for name, array in arrays.items()}
+    text = json.dumps(told, ensure_ascii=False, allow_nan=False)
     return files | {"labels.json": text.encode(), "run.toml": to_toml(own).encode()}
 
 
@@ -227,9 +211,8 @@ def make_sample_run(run: RunFile, index: int) -> RunFile:
 def _build_sample(run: RunFile) -> tuple[Scene, SensorSetup]:
     scene = build.true_scene(run)
     radar = build.radar(require_section(run, "radar", "a sample"))
-    return scene, SensorSetup(
-        run, radar, build.grid(require_section(run, "grid", "a sample"), radar)
-    )
+    grid = build.grid(require_section(run, "grid", "a sample"), radar)
+    return scene, SensorSetup(run, radar, grid)
 
 
 def _check_first(run: RunFile, index: int) -> None:
@@ -270,19 +253,20 @@ def _path_arrays(paths: Paths) -> dict[str, np.ndarray]:
     return {f"paths_{name}": getattr(paths, name).detach().numpy() for name in kept}
 
 
-def _describe_arrays(run: RunFile) -> dict[str, ArrayInfo]:
+def _describe_arrays(run: RunFile) -> dict[str, shards.ArrayInfo]:
     """Describe the arrays for the manifest."""
     table = require_section(run, "dataset", "a data set")
+    info = shards.ArrayInfo
     chirp, rate = ([], []) if run.chirps is None else (["chirp"], ["velocity"])
     known = {
-        "beat": ArrayInfo(dims=["frame", *chirp, "tx", "rx", "sample"], unit=_FIELD_UNIT),
-        "map": ArrayInfo(dims=["frame", *rate, "range", "u", "v"], unit="received over sent"),
-        "masks": ArrayInfo(dims=["frame", "triangle"], unit="share that is seen"),
-        "paths_frame": ArrayInfo(dims=["path"], unit="number"),
-        "paths_delay": ArrayInfo(dims=["path"], unit="s"),
-        "paths_coefficient": ArrayInfo(dims=["path"], unit=_FIELD_UNIT),
-        "paths_first": ArrayInfo(dims=["path", "xyz"], unit="m"),
-        "paths_last": ArrayInfo(dims=["path", "xyz"], unit="m"),
+        "beat": info(dims=["frame", *chirp, "tx", "rx", "sample"], unit=_FIELD_UNIT),
+        "map": info(dims=["frame", *rate, "range", "u", "v"], unit="received over sent"),
+        "masks": info(dims=["frame", "triangle"], unit="share that is seen"),
+        "paths_frame": info(dims=["path"], unit="number"),
+        "paths_delay": info(dims=["path"], unit="s"),
+        "paths_coefficient": info(dims=["path"], unit=_FIELD_UNIT),
+        "paths_first": info(dims=["path", "xyz"], unit="m"),
+        "paths_last": info(dims=["path", "xyz"], unit="m"),
     }
     held = {_ARRAY_NAMES[name] for name in table.signals}
     held |= {"masks"} if table.masks else set()
@@ -290,47 +274,43 @@ def _describe_arrays(run: RunFile) -> dict[str, ArrayInfo]:
 
 
 def _write_manifest(
-    run: RunFile, folder: RunFolder, part: tuple[int, int], shards: list[Shard]
+    run: RunFile, folder: RunFolder, part: tuple[int, int], rows: list[shards.Shard]
 ) -> None:
     versions = {name: metadata.version(name) for name in _NUMERICAL_PACKAGES}
-    found = DatasetManifest(
-        format=FORMAT,
+    found = shards.DatasetManifest(
+        format=shards.FORMAT,
         samples=require_section(run, "dataset", "a data set").samples,
         part=part,
         fingerprint=hashlib.sha256(to_toml(run).encode()).hexdigest(),
         versions={"invertwin": __version__, **versions},
         arrays=_describe_arrays(run),
-        shards=shards,
+        shards=rows,
     )
-    folder.write_text(MANIFEST, found.model_dump_json(indent=1) + "\n")
+    folder.write_text(shards.MANIFEST, found.model_dump_json(indent=1) + "\n")
 
 
 def _write_report(
-    run: RunFile, folder: RunFolder, shards: list[Shard], made: int, seconds: float
+    run: RunFile, folder: RunFolder, rows: list[shards.Shard], made: int, seconds: float
 ) -> list[ReportTable]:
-    count = sum(shard.samples for shard in shards)
+    count = sum(shard.samples for shard in rows)
     metrics = {
         "task": "dataset",
         "dataset_samples": count,
-        "shards": len(shards),
-        "dataset_bytes": sum(shard.size for shard in shards),
+        "shards": len(rows),
+        "dataset_bytes": sum(shard.size for shard in rows),
         "samples_per_second": made / seconds,
         "wall_seconds": seconds,
     }
-    status = f"{count} samples in {len(shards)} shards."
-    parts = [quantity_table("Data set", metrics)]
-    return write_report(
-        folder, metrics, run.title or "Data set", status, parts, again="dataset", note=run.note
-    )
+    status = f"{count} samples in {len(rows)} shards."
+    parts, title = [quantity_table("Data set", metrics)], run.title or "Data set"
+    return write_report(folder, metrics, title, status, parts, again="dataset", note=run.note)
 
 
 def _read_finished_shard(folder: RunFolder, number: int) -> dict[str, Any] | None:
     """The manifest's row of a shard that an interrupted run has written whole, or None."""
-    unfinished = folder.path / UNFINISHED
-    there = (unfinished / _shard_row_path(number)).exists() and (
-        unfinished / shard_name(number)
-    ).exists()
-    return folder.read_json(_shard_row_path(number)) if there else None
+    row, unfinished = _shard_row_path(number), folder.path / UNFINISHED
+    whole = all((unfinished / name).exists() for name in (row, shards.shard_name(number)))
+    return folder.read_json(row) if whole else None
 
 
 def _shard_row_path(number: int) -> str:

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -18,7 +17,7 @@ from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.gradcheck import GradcheckTable
 from invertwin.cli.schema.signature import expand_values
-from invertwin.cli.terminal import compute_in_parts
+from invertwin.cli.terminal import RunBatch
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.gradcheck.gradcheck import GradientAgreement, GradientReport, gradcheck
@@ -94,14 +93,9 @@ class GradcheckStudy(Protocol):
         ...
 
 
-def run_gradcheck(
-    runs: Mapping[str, RunFile],
-    files: Mapping[str, Path],
-    folder: RunFolder,
-    say: Callable[[str], None],
-) -> list[ReportTable]:
+def run_gradcheck(batch: RunBatch, say: Callable[[str], None]) -> list[ReportTable]:
     """Check every run file, write the folder, and return the tables to print."""
-    begin = time.perf_counter()
+    begin, folder = time.perf_counter(), batch.folder
     scenes: dict[str, Any] = {}
     compared: dict[str, Any] = {}
     studies: list[ReportTable] = []
@@ -110,7 +104,7 @@ def run_gradcheck(
     def check(name: str, run: RunFile) -> dict[str, Any]:
         return _run_check(name, run, folder, lambda line: say(f"{name}: {line}"))
 
-    for name, run, found in compute_in_parts(runs, files, folder, check):
+    for name, run, found in batch.results(check):
         scenes[name] = found
         shown = {f"{name}_scene": (run.title or name, ""), name: (name, _picture_note(run, found))}
         for key, study in _find_studies(run).items():
@@ -128,11 +122,9 @@ def run_gradcheck(
     told = [k for k in range(len(_TABLE_COLUMNS)) if any(row[k] is not None for row in rows)]
     columns, rows = [_TABLE_COLUMNS[k] for k in told], [[row[k] for k in told] for row in rows]
     table = ReportTable("Agreement with central differences", columns, rows, legend)
-    count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
+    status = "1 scene checked." if len(scenes) == 1 else f"{len(scenes)} scenes checked."
     parts = [table, *studies, *pictures]
-    return write_report(
-        folder, metrics, "Gradient check", f"{count} checked.", parts, again="gradcheck"
-    )
+    return write_report(folder, metrics, "Gradient check", status, parts, again="gradcheck")
 
 
 @dataclass(frozen=True)
@@ -155,19 +147,15 @@ def _rcs_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _Gradch
             return table.build({Scene: scene}, **more)
 
     def draw(report: GradientReport) -> Figure:
-        angles, label = table.swept_angles
+        (angles, label), frequencies = table.swept_angles, expand_values(table.frequencies) / 1e9
         size = report.difference.abs().sum((0, 1))
-        i, j = max(table.channels.values(), key=lambda at: float(size[at]))
-        curves = {n: values[:, :, i, j] for n, values in _derivative_maps(report).items()}
+        channel = max(table.channels.values(), key=lambda at: float(size[at]))
         if len(angles) > 1:
-            places = (angles, label)
-            curves = {name: values[0] for name, values in curves.items()}
+            at, places = (0, slice(None), *channel), (angles, label)
         else:
-            places = (expand_values(table.frequencies) / 1e9, "frequency [GHz]")
-            curves = {name: values[:, 0] for name, values in curves.items()}
-        return plotting.rcs_derivatives(
-            curves, *places, f"∂σ, σ in m² [{_derivative_unit(settings)}]"
-        )
+            at, places = (slice(None), 0, *channel), (frequencies, "frequency [GHz]")
+        curves, unit = _derivative_maps(report, at), _derivative_unit(settings)
+        return plotting.rcs_derivatives(curves, *places, f"∂σ, σ in m² [{unit}]")
 
     return _GradcheckTarget(RcsMap(compute=compute_rcs), None, None, draw)
 
@@ -188,7 +176,7 @@ def _radio_map_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _
 
     def draw(report: GradientReport) -> Figure:
         peak = float(report.value.max())
-        rates = {name: values[0] / peak for name, values in _derivative_maps(report).items()}
+        rates = {name: values / peak for name, values in _derivative_maps(report, 0).items()}
         if isinstance(places, ReceiverPoints):
             number = torch.arange(len(places.positions), dtype=torch.float64)
             return plotting.rcs_derivatives(rates, number, "receiver", label)
@@ -212,9 +200,8 @@ def _image_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _Grad
     unit = "" if kind == "silhouette" else "m · "
 
     def draw(report: GradientReport) -> Figure:
-        rates = {name: values[0] for name, values in _derivative_maps(report).items()}
         label = f"∂ {kind} [{unit}{_derivative_unit(settings)}]"
-        return plotting.images({kind: report.value[0]}, rates, label)
+        return plotting.images({kind: report.value[0]}, _derivative_maps(report, 0), label)
 
     return _GradcheckTarget(model, camera, None, draw)
 
@@ -231,9 +218,13 @@ def _radar_map_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _
     require_resources(run, scene, {"": SensorSetup(run, radar, grid)})
     drawn = {key: getattr(settings, key) for key in ("depth", "samples", "boundary_samples")}
     model = SurrogateMap(grid, build.build_section(run, "surrogate"), Sampling(**drawn))
-    return _GradcheckTarget(
-        model, radar, (radar, grid), lambda report: _draw_maps(report, grid, settings)
-    )
+    label = f"∂ power (received/sent) [{_derivative_unit(settings)}]"
+
+    def draw(report: GradientReport) -> Figure:
+        error = {"full − differences, own scale": report.gradient - report.difference}
+        return plotting.gradient(_derivative_maps(report), grid, label=label, own_scale=error)
+
+    return _GradcheckTarget(model, radar, (radar, grid), draw)
 
 
 def _panel_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _GradcheckTarget:
@@ -246,11 +237,10 @@ def _panel_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _Grad
 
     def draw(report: GradientReport) -> Figure:
         order = report.difference[0].argsort()
-        curves = {n: values[0, order] for n, values in _derivative_maps(report).items()}
+        curves = _derivative_maps(report, (0, order))
         number = torch.arange(len(order), dtype=torch.float64)
-        return plotting.rcs_derivatives(
-            curves, number, "receiver", f"∂ path gain [{_derivative_unit(settings)}]"
-        )
+        label = f"∂ path gain [{_derivative_unit(settings)}]"
+        return plotting.rcs_derivatives(curves, number, "receiver", label)
 
     return _GradcheckTarget(PanelMap(aim.tx, aim.receivers, aim.frequency), panel, None, draw)
 
@@ -324,17 +314,12 @@ def _find_studies(run: RunFile) -> dict[str, GradcheckStudy]:
     return {key: value for key, value in values.items() if isinstance(value, GradcheckStudy)}
 
 
-def _draw_maps(report: GradientReport, grid: Grid, settings: GradcheckTable) -> Figure:
-    error = {"full − differences, own scale": report.gradient - report.difference}
-    label = f"∂ power (received/sent) [{_derivative_unit(settings)}]"
-    return plotting.gradient(_derivative_maps(report), grid, label=label, own_scale=error)
-
-
-def _derivative_maps(report: GradientReport) -> dict[str, Tensor]:
+def _derivative_maps(report: GradientReport, at: Any = ...) -> dict[str, Tensor]:
+    """Derivatives at an index of the maps, by the terms that they have."""
     return {
-        "differences": report.difference,
-        "full": report.gradient,
-        "interior only": report.interior_gradient,
+        "differences": report.difference[at],
+        "full": report.gradient[at],
+        "interior only": report.interior_gradient[at],
     }
 
 

@@ -40,9 +40,8 @@ def plot_landscape(problem: Problem, console: Console) -> tuple[Figure, dict[str
     for name, share in (("first widths", 1.0), ("no extra width", 0.0)):
         seen = Observation(model.scale_blur(share), item.recording, sensor=item.sensor, loss=loss)
         with count_progress(console, f"loss landscape, {name}", len(wide)) as advance:
-            losses = evaluate_losses(
-                line, iterate_and_advance(wide, advance), seen, seed=run.seed
-            ).numpy()
+            offsets = iterate_and_advance(wide, advance)
+            losses = evaluate_losses(line, offsets, seen, seed=run.seed).numpy()
         smooth[f"surrogate, {name}"] = wide, losses
     minima = {"exact": exact, **{name: losses for name, (_, losses) in smooth.items()}}
     counts = {name: plotting.count_minima(losses) for name, losses in minima.items()}

@@ -65,8 +65,7 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
     if not 0 <= options.frame < radar.frame_count:
         raise InputError(
             f"expected a --frame from 0 to {radar.frame_count - 1}, got {options.frame}; choose "
-            f"one "
-            "of the recording"
+            "one of the recording"
         )
     grid = _make_grid(options, capture, recording)
     said += map(str, find_faults(as_recorded, options.range_min, options.range_max))
@@ -102,24 +101,14 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
         folder.write_text("points.csv", format_points_csv(points))
         for suffix in ("ply", "pcd"):
             save_points(folder.file(f"points.{suffix}"), points)
-    title = options.recording.name
-    return write_report(
-        folder,
-        metrics,
-        title,
-        f"{radar.frame_count} frames, read as {reader}.",
-        [
-            quantity_table(title, metrics),
-            *(
-                [ReportTable("Warnings", ["fault", "evidence"], _warning_rows(said))]
-                if said
-                else []
-            ),
-            save_picture(folder, "look", panels(shown), f"Frame {options.frame}", "doppler"),
-        ],
-        again="look capture.nc",
-        note=load_texts("notes")["look"],
-    )
+    title, note = options.recording.name, load_texts("notes")["look"]
+    tables = [quantity_table(title, metrics)]
+    if said:
+        rows = [line.split(": ", 1) for line in said]
+        tables.append(ReportTable("Warnings", ["fault", "evidence"], rows))
+    drawn = save_picture(folder, "look", panels(shown), f"Frame {options.frame}", "doppler")
+    status, parts = f"{radar.frame_count} frames, read as {reader}.", [*tables, drawn]
+    return write_report(folder, metrics, title, status, parts, again="look capture.nc", note=note)
 
 
 @contextmanager
@@ -132,11 +121,6 @@ def _collect_warnings(messages: list[str]) -> Iterator[None]:
         warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
         if issubclass(one.category, PhysicsWarning):
             messages.append(f"reading: {one.message}")
-
-
-def _warning_rows(messages: list[str]) -> list[list[str]]:
-    """Build table rows of warnings: name and evidence."""
-    return [list(line.split(": ", 1)) for line in messages]
 
 
 def read_recording(options: RecordingOptions) -> tuple[str, AnyRecording]:
@@ -155,9 +139,8 @@ def read_recording(options: RecordingOptions) -> tuple[str, AnyRecording]:
         )
     board = None
     if ending == ".toml":
-        board = described_arrays.load_described_board(
-            path, options.board, options.elevation, options.azimuth
-        )
+        stated = options.board, options.elevation, options.azimuth
+        board = described_arrays.load_described_board(path, *stated)
     elif ending != ".nc":
         board = _require_board(options, options.board)
     settings = options.config
@@ -166,9 +149,8 @@ def read_recording(options: RecordingOptions) -> tuple[str, AnyRecording]:
             raise InputError(
                 f"expected --set with a .bin or .setup.json, got {path.name}; correct its own file"
             )
-        settings = ti.change_settings(
-            ti.read_settings(options.config or path), _parse_changes(options.change)
-        )
+        found = ti.read_settings(options.config or path)
+        settings = ti.change_settings(found, _parse_changes(options.change))
     return readers[ending], read(path, settings, board=board, lanes=options.lanes)
 
 
@@ -213,9 +195,8 @@ def _to_capture(options: LookOptions, recording: AnyRecording) -> Capture:
     """Return the capture with one signal a frame."""
     if isinstance(recording, Capture):
         return recording
-    return replace(recording, moving=False).to_capture(
-        "mean" if options.chirp is None else options.chirp
-    )
+    chirp = "mean" if options.chirp is None else options.chirp
+    return replace(recording, moving=False).to_capture(chirp)
 
 
 def _calibrate_channels(

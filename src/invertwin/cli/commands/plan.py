@@ -1,7 +1,6 @@
 """`invertwin plan`: error bars before any recording, and the gain of further positions."""
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +14,7 @@ from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.report import ReportTable, load_texts, write_report
 from invertwin.cli.run_file import require_section
 from invertwin.cli.schema import PlanTable, RunFile, SimulatedData, build
-from invertwin.cli.terminal import show_progress
+from invertwin.cli.terminal import limit_rate, show_progress
 from invertwin.errors import InputError
 from invertwin.inversion import plan_error_bars, prepare_fit
 from invertwin.inversion.confidence.planning import fit_errors
@@ -24,9 +23,7 @@ from invertwin.storage.folders import PARTS
 from invertwin.storage.run_folder import RunFolder
 
 
-def run_plan(
-    run: RunFile, folder: RunFolder, console: Console, say: Callable[[str], None]
-) -> list[ReportTable]:
+def run_plan(run: RunFile, folder: RunFolder, console: Console) -> list[ReportTable]:
     """State the error bars of a run that has not been recorded; return the tables to print.
 
     Simulated fits that an interrupted run has finished are not done again.
@@ -61,33 +58,25 @@ def run_plan(
         }
         for one in added
     ]
-    metrics |= _compare_with_fits(replace(own, run=run), found.deviations, folder, console, say)
+    metrics |= _compare_with_fits(replace(own, run=run), found.deviations, folder, console)
     metrics["wall_seconds"] = time.perf_counter() - begin
     parts = [replace(error_bar_table(metrics), title="Expected error bars")]
     if added:
         ranked = enumerate(metrics["candidates"], 1)
         rows = [[str(rank), row["position"], row["share"]] for rank, row in ranked]
-        heads, note = (
-            ("rank", "position [m]", "deviations, times"),
-            load_texts("notes")["candidates"],
-        )
+        heads = ("rank", "position [m]", "deviations, times")
+        note = load_texts("notes")["candidates"]
         parts.append(ReportTable("Positions to add", heads, rows, note))
     status = f"{len(found.names)} parameters, {len(found.unobserved)} directions not observed."
-    return write_report(
-        folder, metrics, run.title or "Plan", status, parts, again="plan", note=run.note
-    )
+    title = run.title or "Plan"
+    return write_report(folder, metrics, title, status, parts, again="plan", note=run.note)
 
 
 def _prepare_fit_at_truth(problem: Problem) -> Any:
     # Error bars are those of the last stage, which may have another model.
-    last = replace(problem, run=stage_runs(problem.run)[-1][1])
-    return prepare_fit(
-        problem.truth,
-        make_observations(last),
-        make_unknowns(problem),
-        loss=build.build_loss(problem.run),
-        seed=problem.run.seed,
-    )
+    run, last = problem.run, replace(problem, run=stage_runs(problem.run)[-1][1])
+    unknown = make_observations(last), make_unknowns(problem)
+    return prepare_fit(problem.truth, *unknown, loss=build.build_loss(run), seed=run.seed)
 
 
 def _compare_with_fits(
@@ -95,20 +84,18 @@ def _compare_with_fits(
     predicted_deviations: dict[str, float],
     folder: RunFolder,
     console: Console,
-    say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Fit simulated recordings from the truth, and return the scatter of the results."""
     count = problem.run.plan.fits if problem.run.plan else 0
     if not count:
         return {}
-    rows, begin, done = [], time.perf_counter(), 0
+    rows, begin, done, say = [], time.perf_counter(), 0, limit_rate(console)
     for number in range(count):
         part = f"{PARTS}/fit_{number:03d}.json"
         row = folder.read_json(part)
         if row is None:
-            row = fit_errors(
-                _prepare_fit_at_truth(with_new_recording(problem, number + 1, console))
-            )
+            own = with_new_recording(problem, number + 1, console)
+            row = fit_errors(_prepare_fit_at_truth(own))
             folder.write_json(part, row)
             done += 1
         left = (time.perf_counter() - begin) / max(done, 1) * (count - number - 1)
@@ -116,11 +103,10 @@ def _compare_with_fits(
         rows.append(row)
     errors = torch.tensor([list(row.values()) for row in rows], dtype=torch.float64)
     spread = dict(zip(rows[0], errors.std(0).tolist(), strict=True))
+    ratios = {n: own / spread[n] for n, own in predicted_deviations.items() if spread.get(n)}
     return {
         "simulated_fits": count,
         "observed_deviations": spread,
         "observed_means": dict(zip(rows[0], errors.mean(0).tolist(), strict=True)),
-        "predicted_over_observed": {
-            n: predicted_deviations[n] / spread[n] for n in predicted_deviations if spread.get(n)
-        },
+        "predicted_over_observed": ratios,
     }

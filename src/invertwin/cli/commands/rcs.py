@@ -16,28 +16,22 @@ from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_pi
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.signature import RcsMeasurement, RcsTable
-from invertwin.cli.terminal import compute_in_parts
+from invertwin.cli.terminal import RunBatch
 from invertwin.errors import InputError
 from invertwin.scene import Scene
 from invertwin.signatures import Signature, to_dbsm
 from invertwin.storage.run_folder import RunFolder
 
 _MIN_LEVEL = -200.0  # dBsm that rounding leaves where there is no field
-_MATCH_TOLERANCE = (
-    1e-6  # rad or share of the frequency by which a measured row may be off a swept one
-)
+# Rad, or share of the frequency, by which a measured row may be off a swept one.
+_MATCH_TOLERANCE = 1e-6
 _MAX_PANELS = 4
 _RcsMetrics = dict[str, Any]
 
 
-def run_rcs(
-    runs: Mapping[str, RunFile],
-    files: Mapping[str, Path],
-    folder: RunFolder,
-    say: Callable[[str], None],
-) -> list[ReportTable]:
+def run_rcs(batch: RunBatch, say: Callable[[str], None]) -> list[ReportTable]:
     """Compute every run file's signature, write the folder, and return the tables to print."""
-    begin = time.perf_counter()
+    begin, folder = time.perf_counter(), batch.folder
     scenes: dict[str, _RcsMetrics] = {}
     pictures: list[ReportPicture] = []
 
@@ -45,10 +39,10 @@ def run_rcs(
         say(name)
         return _compute_rcs(name, run, folder)
 
-    for name, run, found in compute_in_parts(runs, files, folder, compute):
+    for name, run, found in batch.results(compute):
         scenes[name] = found
         for file, title in found.pop("pictures").items():
-            title = title if len(runs) == 1 else f"{name}: {title}"
+            title = title if len(batch.runs) == 1 else f"{name}: {title}"
             pictures.append(ReportPicture(title, folder.file(f"{file}.png").read_bytes(), run.note))
     metrics = {"task": "rcs", "scenes": scenes, "wall_seconds": time.perf_counter() - begin}
     if len(scenes) == 1:
@@ -59,15 +53,11 @@ def run_rcs(
     skipped = [file for found in scenes.values() for file in found.get("skipped", ())]
     if skipped:
         missing = f"{len(skipped)} measured files are not there, such as {skipped[0]}"
-        warnings.warn(
-            f"skipped a comparison: {missing}; get the data and set INVERTWIN_DATA",
-            UserWarning,
-            stacklevel=2,
-        )
+        told = f"skipped a comparison: {missing}; get the data and set INVERTWIN_DATA"
+        warnings.warn(told, UserWarning, stacklevel=2)
         status += f" Skipped a comparison: {missing}."
-    return write_report(
-        folder, metrics, "Radar signatures", status, [*_make_tables(scenes), *pictures], again="rcs"
-    )
+    parts = [*_make_tables(scenes), *pictures]
+    return write_report(folder, metrics, "Radar signatures", status, parts, again="rcs")
 
 
 def _compute_rcs(name: str, run: RunFile, folder: RunFolder) -> _RcsMetrics:
@@ -77,24 +67,15 @@ def _compute_rcs(name: str, run: RunFile, folder: RunFolder) -> _RcsMetrics:
     estimate_rcs_resources(run, scene).require_available()
     with prefix_errors("rcs"):
         found = table.build({Scene: scene})
-    kept: _RcsMetrics = {
-        "peak_dbsm": {
-            channel: _peak_level(found.dbsm[:, :, i, j])
-            for channel, (i, j) in table.channels.items()
-        }
-    }
+    levels = {name: found.dbsm[:, :, i, j] for name, (i, j) in table.channels.items()}
+    kept: _RcsMetrics = {"peak_dbsm": {name: _peak_level(own) for name, own in levels.items()}}
     if table.cases:
         kept["error_db"] = {case: _case_error(table, case, found) for case in table.cases}
     measured, skipped = _load_measurements(table, found)
     if measured:
-        kept["mean_db"] = {
-            key: _mean_difference(found.dbsm, *rest) for key, rest in measured.items()
-        }
+        kept["mean_db"] = _mean_differences(found.dbsm, measured)
         optics = [v for part, v in found.parts.items() if part.startswith("order")]
-        alone = to_dbsm(torch.stack(optics).sum(0))
-        kept["mean_db_optics"] = {
-            key: _mean_difference(alone, *rest) for key, rest in measured.items()
-        }
+        kept["mean_db_optics"] = _mean_differences(to_dbsm(torch.stack(optics).sum(0)), measured)
     if skipped:
         kept["skipped"] = skipped
     folder.write_text(f"{name}.csv", _format_csv(table, found))
@@ -149,10 +130,8 @@ def _match_measurement(
     towards = torch.stack(
         [data.theta.sin() * data.phi.cos(), data.theta.sin() * data.phi.sin(), data.theta.cos()], 1
     )
-    apart = torch.cdist(towards, found.directions)
-    off, aspect = apart.min(1)
-    share = (data.frequency[:, None] / found.frequencies - 1).abs()
-    other, frequency = share.min(1)
+    off, aspect = torch.cdist(towards, found.directions).min(1)
+    other, frequency = (data.frequency[:, None] / found.frequencies - 1).abs().min(1)
     same = (off < _MATCH_TOLERANCE) & (other < _MATCH_TOLERANCE)
     if not bool(same.any()):
         raise InputError(
@@ -160,23 +139,22 @@ def _match_measurement(
             f"{measurement.file}; sweep its angles",
             "file",
         )
-    channel = table.channels[measurement.channel]
+    stated = measurement.channel
+    channel, letter = table.channels[stated], stated[0] if len(set(stated)) == 1 else stated
     keys: dict[str, _MeasuredRows] = {}
     for f in frequency[same].unique().tolist():
         own = same & (frequency == f)
-        letter = (
-            measurement.channel[0] if len(set(measurement.channel)) == 1 else (measurement.channel)
-        )
         name = f"{float(found.frequencies[f]) / 1e9:g}GHz_{letter}"
         keys[name] = (frequency[own], aspect[own], data.dbsm[own], channel)
     return keys
 
 
-def _mean_difference(
-    levels: Tensor, frequency: Tensor, aspect: Tensor, measured: Tensor, channel: tuple[int, int]
-) -> float:
-    """Mean absolute difference from the measurement in dB."""
-    return float((levels[frequency, aspect, channel[0], channel[1]] - measured).abs().mean())
+def _mean_differences(levels: Tensor, measured: Mapping[str, _MeasuredRows]) -> dict[str, float]:
+    """Mean absolute differences from the measurements in dB."""
+    return {
+        key: float((levels[frequency, aspect, i, j] - known).abs().mean())
+        for key, (frequency, aspect, known, (i, j)) in measured.items()
+    }
 
 
 def _draw_pictures(
@@ -219,11 +197,8 @@ def _draw_pictures(
         steps = torch.linspace(-side.extent, side.extent, side.pixels, dtype=torch.float64)
         across, along = torch.meshgrid(steps, steps, indexing="xy")
         points = across[..., None] * axes[1] + along[..., None] * axes[0]
-        figure = plotting.rcs_image(
-            to_dbsm(found.image(points)[..., 0, 0]),
-            side.extent,
-            ("across [m]", "towards the middle aspect [m]"),
-        )
+        drawn, labels = found.image(points), ("across [m]", "towards the middle aspect [m]")
+        figure = plotting.rcs_image(to_dbsm(drawn[..., 0, 0]), side.extent, labels)
         save_picture(folder, f"{name}_image", figure)
         shown[f"{name}_image"] = f"Image, {names[first]}"
     return shown
@@ -244,19 +219,14 @@ def _image_axes(found: Signature) -> tuple[Tensor, Tensor]:
 
 def _format_csv(table: RcsTable, found: Signature) -> str:
     """Format the whole scattering matrix S as CSV text."""
-    names = list(table.channels)
-    lines = ["frequency_hz,x,y,z," + ",".join(f"{n}_re_m,{n}_im_m" for n in names)]
+    lines = ["frequency_hz,x,y,z," + ",".join(f"{n}_re_m,{n}_im_m" for n in table.channels)]
     matrix = found.matrix
     for f, frequency in enumerate(found.frequencies.tolist()):
         for a, direction in enumerate(found.directions.tolist()):
             values = [matrix[f, a, i, j] for i, j in table.channels.values()]
-            cells = [f"{float(v.real):.9e},{float(v.imag):.9e}" for v in values]
-            lines.append(
-                f"{frequency:.9e},"
-                + ",".join(f"{c:.9f}" for c in direction)
-                + ","
-                + ",".join(cells)
-            )
+            cells = [f"{frequency:.9e}", *(f"{c:.9f}" for c in direction)]
+            cells += [f"{float(v.real):.9e},{float(v.imag):.9e}" for v in values]
+            lines.append(",".join(cells))
     return "\n".join(lines) + "\n"
 
 
@@ -264,18 +234,16 @@ def _make_tables(scenes: Mapping[str, _RcsMetrics]) -> list[ReportTable]:
     peaks = [[name, *found["peak_dbsm"].values()] for name, found in scenes.items()]
     letters = {tuple(found["peak_dbsm"]) for found in scenes.values()}
     columns = letters.pop() if len(letters) == 1 else ("co-polar", "cross", "cross", "orthogonal")
-    note = load_texts("notes")["rcs_peaks"]
-    tables = [ReportTable("Peaks [dBsm]", ["target", *columns], peaks, note)]
+    notes = load_texts("notes")
+    tables = [ReportTable("Peaks [dBsm]", ["target", *columns], peaks, notes["rcs_peaks"])]
     cases = [
         [name, case, error]
         for name, found in scenes.items()
         for case, error in found.get("error_db", {}).items()
     ]
     if cases:
-        note = load_texts("notes")["rcs_cases"]
-        tables.append(
-            ReportTable("Against what is known", ["target", "case", "error [dB]"], cases, note)
-        )
+        columns = ["target", "case", "error [dB]"]
+        tables.append(ReportTable("Against what is known", columns, cases, notes["rcs_cases"]))
     rows = [
         [name, key, error, found["mean_db_optics"][key]]
         for name, found in scenes.items()
@@ -283,6 +251,5 @@ def _make_tables(scenes: Mapping[str, _RcsMetrics]) -> list[ReportTable]:
     ]
     if rows:
         columns = ["target", "frequency, polarisation", "mean error [dB]", "physical optics alone"]
-        note = load_texts("notes")["rcs_measured"]
-        tables.append(ReportTable("Against measurements", columns, rows, note))
+        tables.append(ReportTable("Against measurements", columns, rows, notes["rcs_measured"]))
     return tables

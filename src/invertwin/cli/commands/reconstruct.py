@@ -13,25 +13,10 @@ import torch
 from rich.console import Console
 
 from invertwin.cli.commands.landscape import plot_landscape
-from invertwin.cli.fits.displays import (
-    VIEW_FILE,
-    load_steps,
-    make_fit_display,
-    make_problem_display,
-    make_sensor_maps,
-    radar_data,
-    steps_path,
-)
+from invertwin.cli.fits import displays
 from invertwin.cli.fits.fitting import fit_all, run_fit
 from invertwin.cli.fits.kinds import build_problem
-from invertwin.cli.fits.problem import (
-    OWN_METHOD,
-    Fits,
-    Problem,
-    Start,
-    known_truth,
-    require_settings,
-)
+from invertwin.cli.fits.problem import OWN_METHOD, Fits, Problem, known_truth
 from invertwin.cli.fits.scores import drop_histories
 from invertwin.cli.fits.shape_scores import check_measures
 from invertwin.cli.fits.spreading import QUIET_CONSOLE, FitWorkers, distribute_fits
@@ -45,15 +30,7 @@ from invertwin.inversion.fit import Fit
 from invertwin.scene.files import save_mesh
 from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.run_folder import CHECKPOINT, RunFolder
-from invertwin.viewer import (
-    MEASURED,
-    SIMULATED,
-    Display,
-    DisplayStep,
-    InteractiveSensor,
-    Viewer,
-    view_html,
-)
+from invertwin.viewer import SIMULATED, DisplayStep, InteractiveSensor, Viewer, view_html
 
 _MAX_STEP_VALUES = 200_000  # of the maps of a step that is shown while the fit goes on
 
@@ -90,17 +67,13 @@ def run_reconstruct(
     starts = problem.starts()
     check_measures(problem.kind.with_method(problem, OWN_METHOD), replace_clouds(starts[0].scene))
     if workers is not None:
-        work = [
-            (method, k) for method in problem.methods for k in range(len(problem.starts(method)))
-        ]
-        distribute_fits(_fit_one, run, folder, console, workers, work)
-    live = Viewer(_start_display(problem, starts[0])) if view else None
+        distribute_fits(_fit_one, run, folder, console, workers, problem.work)
+    live = Viewer(displays.make_start_display(problem, starts[0])) if view else None
     with live or nullcontext():
         if live is not None:
             console.print(f"open {live.address}", markup=False, soft_wrap=True)
-        fits = fit_all(
-            problem, folder, console, None if live is None else partial(_show_step, live)
-        )
+        show = None if live is None else partial(_show_step, live)
+        fits = fit_all(problem, folder, console, show)
     fits = replace(fits, maps=_maps(fits))
     with show_progress(console):
         confidence = confidence_metrics(fits.found, known_truth(fits.problem))
@@ -117,7 +90,7 @@ def run_reconstruct(
 def _metrics(fits: Fits, confidence: dict[str, Any]) -> dict[str, Any]:
     """Numbers of the run, as metrics.json has them."""
     problem, best, rows = fits.problem, fits.best, fits.rows
-    dropped = problem.kind.histories
+    lean = {name: drop_histories(own, problem.kind.histories) for name, own in rows.items()}
     kept = ("other_ends", "ambiguities", "status", "steps", "loss", "start")
     return {
         "task": problem.run.task,
@@ -126,12 +99,8 @@ def _metrics(fits: Fits, confidence: dict[str, Any]) -> dict[str, Any]:
         **{key: best[key] for key in kept if key in best and key not in confidence},
         "parameters": best["values"],
         **problem.notes,
-        **{
-            f"starts_{method}": drop_histories(rows[method], dropped)
-            for method in rows
-            if method != OWN_METHOD
-        },
-        "starts": drop_histories(rows[OWN_METHOD], dropped),
+        **{f"starts_{name}": own for name, own in lean.items() if name != OWN_METHOD},
+        "starts": lean[OWN_METHOD],
         **problem.kind.metrics(fits),
         "fit_seconds": sum(row["seconds"] for fits in rows.values() for row in fits),
     }
@@ -155,15 +124,14 @@ def _write(
     problem, best, run = fits.problem, fits.best, fits.problem.run
     start, twin = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
     summary = problem.kind.summary(fits, metrics, folder)
-    steps = load_steps(folder.file(steps_path(best["checkpoint"])))
-    display = make_fit_display(problem, start, twin, fits.maps, confidence, steps)
-    display.save(folder.file(VIEW_FILE))
+    steps = displays.load_steps(folder.file(displays.steps_path(best["checkpoint"])))
+    display = displays.make_fit_display(problem, start, twin, fits.maps, confidence, steps)
+    display.save(folder.file(displays.VIEW_FILE))
     sensors = dict(zip(problem.sensor_data, fits.found.sensors, strict=True))
+    depth = run.fit_settings.depth
     links = {
-        name: InteractiveSensor(
-            fits.found.scene, sensors[name], item.grid, require_settings(run).depth
-        )
-        for name, item in radar_data(problem).items()
+        name: InteractiveSensor(fits.found.scene, sensors[name], item.grid, depth)
+        for name, item in displays.radar_data(problem).items()
     }
     shown = ReportView(view_html(display, links))
     parts = [summary.result, shown, *summary.pictures, *summary.tables]
@@ -179,22 +147,12 @@ def _write(
     return tables, outcome
 
 
-def _start_display(problem: Problem, start: Start) -> Display:
-    """A display of a fit that has not begun: what was measured, and what the start has for it."""
-    display = make_problem_display(problem, start.scene)
-    sensors = [item.sensor for item in problem.sensor_data.values()]
-    spectra = {
-        MEASURED: problem.kind.measured_maps(problem),
-        SIMULATED: problem.kind.predict_maps(problem, start.scene, sensors),
-    }
-    return replace(display, maps=make_sensor_maps(problem, spectra))
-
-
 def _show_step(live: Viewer, problem: Problem, going: Fit, step: DisplayStep) -> None:
     """Show a step of a fit with what its sensors would see."""
     with torch.no_grad():
         simulated = problem.kind.predict_maps(problem, *going.apply_modules())
-    live.add_step(step, make_sensor_maps(problem, {SIMULATED: simulated}, _MAX_STEP_VALUES))
+    maps = displays.make_sensor_maps(problem, {SIMULATED: simulated}, _MAX_STEP_VALUES)
+    live.add_step(step, maps)
 
 
 def _fit_one(run: RunFile, method: str, number: int, folder: RunFolder) -> None:

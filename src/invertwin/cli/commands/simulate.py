@@ -15,11 +15,7 @@ from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid, Sampling
 from invertwin.cli.commands.raw_files import make_chirp_settings, write_raw_files
 from invertwin.cli.estimate import SensorSetup, require_resources
-from invertwin.cli.exact_signals import (
-    _require_simulated_data,
-    simulate_chirp_beats,
-    simulate_exact,
-)
+from invertwin.cli.exact_signals import require_simulated_data, simulate_chirp_beats, simulate_exact
 from invertwin.cli.report import ReportTable, quantity_table, save_picture, write_report
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
@@ -31,9 +27,8 @@ from invertwin.scene.files import save_mesh
 from invertwin.storage.run_folder import RunFolder
 
 _SURROGATE_SAMPLES = 2_000_000
-_SimulationOutcome = tuple[
-    torch.Tensor, dict[str, Any], Figure, str
-]  # signals, metrics, picture, its note
+# Signals, metrics, picture, its note.
+_SimulationOutcome = tuple[torch.Tensor, dict[str, Any], Figure, str]
 
 
 def run_simulate(run: RunFile, folder: RunFolder) -> list[ReportTable]:
@@ -76,19 +71,18 @@ def _simulate_frames(
     begin = time.perf_counter()
     found = simulate_exact(run, scene, radar, grid)
     seconds = time.perf_counter() - begin
-    data = _require_simulated_data(run)
+    data = require_simulated_data(run)
     sampling = Sampling(depth=data.depth, samples=_SURROGATE_SAMPLES)
     model = SurrogateMap(grid, sampling=sampling)
     with torch.no_grad():
         smooth = model.predict(scene, radar, run.seed)
     Capture.from_beat(found.beat, radar).save(folder.file("capture.nc"))
     one_bounce = replace(model, sampling=Sampling(1, points_per_m2=data.points_per_m2))
+    alike = surrogate_correlation(scene, radar.frames([0]), one_bounce, seed=run.seed)
     metrics = {
         "paths": len(found.paths),
         **_find_peak(found.spectrum, grid),
-        "surrogate_correlation": surrogate_correlation(
-            scene, radar.frames([0]), one_bounce, seed=run.seed
-        ),
+        "surrogate_correlation": alike,
         "wall_seconds": seconds,
     }
     maps = {"exact signal": found.spectrum, "surrogate": smooth}

@@ -9,7 +9,7 @@ import tomli_w
 import torch
 
 from invertwin.capture import Capture, ChirpCapture
-from invertwin.cli.commands.look import read_recording
+from invertwin.cli.commands.look import AnyRecording, read_recording
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.options import TwinOptions
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
@@ -21,7 +21,7 @@ from invertwin.inversion.initialisation.detections import Ground
 from invertwin.inversion.metrics import compare_shapes
 from invertwin.plotting import found as pictures
 from invertwin.plotting import spectrum
-from invertwin.scene import RoughDielectric, Scene, merge_meshes, save_mesh
+from invertwin.scene import Mesh, RoughDielectric, Scene, merge_meshes, save_mesh
 from invertwin.storage.run_folder import RunFolder
 
 _MIN_EXISTENCE_PROBABILITY = 0.5  # confidence of things that are counted
@@ -36,8 +36,8 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
         InputError: A recording or options that do not fit each other; nothing has been written.
     """
     begin = time.perf_counter()
-    stated = {name: getattr(arguments, name) for name in _TWIN_OPTION_NAMES}
-    options = {name: value for name, value in stated.items() if value is not None}
+    stated = ((name, getattr(arguments, name)) for name in _TWIN_OPTION_NAMES)
+    options = {name: value for name, value in stated if value is not None}
     truth = None
     if is_run_file(arguments.recording):
         recording, truth, table = _load_run_file(arguments)
@@ -47,14 +47,12 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
     ground = Ground(options.get("up", "y"))
     rest = {name: value for name, value in options.items() if name != "up"}
     found = twin(recording, ground=ground, **rest)
-    sure = [
-        thing for thing in found.objects if thing.existence_probability > _MIN_EXISTENCE_PROBABILITY
-    ]
+    sure = sum(one.existence_probability > _MIN_EXISTENCE_PROBABILITY for one in found.objects)
     metrics: dict[str, Any] = {
         "task": "twin",
         "things": [thing.to_metrics() for thing in found.objects],
-        "count": len(sure),
-        "unsure": len(found.objects) - len(sure),
+        "count": sure,
+        "unsure": len(found.objects) - sure,
         "notes": list(found.notes),
     }
     if found.image is not None:
@@ -69,12 +67,10 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
     if scene is not None:
         save_mesh(folder.file("twin.glb"), scene)
         folder.write_text("twin.toml", tomli_w.dumps(_describe_as_run(found, folder)))
-    parts: list[ReportTable | ReportPicture] = [_object_table(found)]
-    parts += [
-        save_picture(folder, "ground", pictures.ground(found), "The ground from above", "ground"),
-        *_draw_maps(found, folder),
-    ]
-    said = "; ".join(found.notes) or f"{len(sure)} things, {metrics['unsure']} unsure ones"
+    figure = pictures.ground(found)
+    above = save_picture(folder, "ground", figure, "The ground from above", "ground")
+    parts = [_object_table(found), above, *_draw_maps(found, folder)]
+    said = "; ".join(found.notes) or f"{sure} things, {metrics['unsure']} unsure ones"
     title = arguments.recording.name
     still = average_chirps(recording)
     if found.calibration is not None:
@@ -96,9 +92,7 @@ def _to_arguments(options: dict[str, Any]) -> list[str]:
     return found
 
 
-def _load_run_file(
-    options: TwinOptions,
-) -> tuple[Capture | ChirpCapture, Scene | None, dict[str, Any]]:
+def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, dict[str, Any]]:
     """Load the data of a run file, their ground truth, and the settings of the search."""
     with prefix_file_errors(options.recording):
         run = load_run(options.recording)
@@ -110,21 +104,15 @@ def _load_run_file(
         radar = build.radar(require_section(run, "radar", "simulated data"))
         grid = build.grid(require_section(run, "grid", "simulated data"), radar)
         truth = build.true_scene(run)
-        capture = Capture.from_beat(simulate_exact(run, truth, radar, grid).beat, radar)
-        return capture, truth, given
+        return Capture.from_beat(simulate_exact(run, truth, radar, grid).beat, radar), truth, given
 
 
 def _score_twin(scene: Scene, truth: Scene) -> dict[str, Any]:
     whole = [
-        merge_meshes(
-            [replace(item.mesh, vertices=item.vertices.detach()) for item in one.objects.values()]
-        )
+        merge_meshes([Mesh(o.vertices.detach(), o.mesh.faces) for o in one.objects.values()])
         for one in (scene, truth)
     ]
-    return {
-        "chamfer_m": compare_shapes(whole[0], whole[1], voxel=None).chamfer,
-        "true_count": len(truth.names),
-    }
+    return {"chamfer_m": compare_shapes(*whole, voxel=None).chamfer, "true_count": len(truth.names)}
 
 
 def _object_table(twin: Twin) -> ReportTable:
@@ -188,11 +176,7 @@ def _describe_as_run(twin: Twin, folder: RunFolder) -> dict[str, Any]:
         if isinstance(material, RoughDielectric):
             value = float(torch.as_tensor(material.permittivity))
             described = {"kind": "rough_dielectric", "permittivity": value}
-        scene[thing.name] = {
-            **shape,
-            "position": thing.position.tolist(),
-            "material": described,
-        }
+        scene[thing.name] = shape | {"position": thing.position.tolist(), "material": described}
     grid = twin.grid
     last = grid.range_start + grid.range_step * (grid.range_count - 1)
     return {

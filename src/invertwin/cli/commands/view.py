@@ -6,26 +6,15 @@ from pathlib import Path
 
 from rich.console import Console
 
+from invertwin import viewer
 from invertwin.capture import Capture, search_ranges
 from invertwin.channel import Grid
 from invertwin.cli.fits.displays import VIEW_FILE
-from invertwin.cli.fits.problem import fitted_objects
 from invertwin.cli.fits.radar_models import build_sensors
 from invertwin.cli.run_file import load_run, prefix_file_errors
 from invertwin.cli.schema import RunFile, build
 from invertwin.errors import InputError
 from invertwin.radar import Radar
-from invertwin.viewer import (
-    MEASURED,
-    AccessGuard,
-    Display,
-    DisplayMaps,
-    InteractiveSensor,
-    Viewer,
-    build_display,
-    capture_layers,
-    page_html,
-)
 
 
 def run_view(
@@ -43,20 +32,20 @@ def run_view(
         InputError: A target that is none of these, or a host without a token.
     """
     if record is None:
-        AccessGuard(host, token)  # its errors come before any work
+        viewer.AccessGuard(host, token)  # its errors come before any work
     display, links = load_display(target)
     if record is not None:
-        record.write_text(page_html(display, links), encoding="utf-8")
+        record.write_text(viewer.page_html(display, links), encoding="utf-8")
         console.print(f"written: {record}", markup=False, soft_wrap=True)
         return
-    with Viewer(display, links, host=host, port=port, token=token) as viewer:
-        console.print(f"open {viewer.address} (Ctrl-C ends)", markup=False, soft_wrap=True)
+    with viewer.Viewer(display, links, host=host, port=port, token=token) as shown:
+        console.print(f"open {shown.address} (Ctrl-C ends)", markup=False, soft_wrap=True)
         console.file.flush()  # a log shows it while the viewer runs
         with suppress(KeyboardInterrupt):  # that is how it is meant to end
-            viewer.wait()
+            shown.wait()
 
 
-def load_display(target: Path) -> tuple[Display, dict[str, InteractiveSensor]]:
+def load_display(target: Path) -> tuple[viewer.Display, dict[str, viewer.InteractiveSensor]]:
     """Load the display of a target, and by sensor the radars that a viewer can move.
 
     Args:
@@ -86,32 +75,31 @@ def load_display(target: Path) -> tuple[Display, dict[str, InteractiveSensor]]:
 
 def _display_of_run(
     file: Path, folder: Path | None
-) -> tuple[Display, dict[str, InteractiveSensor]]:
+) -> tuple[viewer.Display, dict[str, viewer.InteractiveSensor]]:
     run: RunFile = load_run(file)
     with prefix_file_errors(file):
         scene, truth = build.scene(run), build.true_scene(run)
         radars = _build_radars(run)
         title = run.title or file.stem
-        names = fitted_objects(run)
+        names = run.fitted_objects
         # Without a fit, show objects at their current pose.
         own = truth if folder is None or not (folder / VIEW_FILE).exists() else scene
         depth = run.reconstruct.depth if run.reconstruct else getattr(run.data, "depth", 1)
         links = {
-            name: InteractiveSensor(own, radar, grid, depth)
+            name: viewer.InteractiveSensor(own, radar, grid, depth)
             for name, (radar, grid) in radars.items()
             if grid is not None
         }
-        display = build_display(own, radars, title, fitted=names or list(run.truth))
+        display = viewer.build_display(own, radars, title, fitted=names or list(run.truth))
     if folder is not None and (folder / VIEW_FILE).exists():
-        display = Display.load(folder / VIEW_FILE)
+        display = viewer.Display.load(folder / VIEW_FILE)
         for link in links.values():
             if display.steps:
                 link.replace_meshes(display.steps[-1].bodies)
     elif folder is not None and (folder / "capture.nc").exists() and "" in links:
         capture, grid = Capture.load(folder / "capture.nc"), links[""].grid
-        display = replace(
-            display, maps={"": DisplayMaps.from_spectra({MEASURED: capture.spectrum(grid)}, grid)}
-        )
+        maps = viewer.DisplayMaps.from_spectra({viewer.MEASURED: capture.spectrum(grid)}, grid)
+        display = replace(display, maps={"": maps})
     return display, links
 
 
@@ -125,13 +113,13 @@ def _build_radars(run: RunFile) -> dict[str, tuple[Radar, Grid | None]]:
     return {"": (radar, None if run.grid is None else build.grid(run.grid, radar))}
 
 
-def _display_of_capture(file: Path) -> Display:
+def _display_of_capture(file: Path) -> viewer.Display:
     capture = Capture.load(file)
     radar, grid = capture.radar(), None
     low, high = search_ranges(capture, None, None) if "beat" in capture.dataset else (0.0, 0.0)
     maps = {}
     if high > low:
         grid = radar.grid(low, high)
-        maps[""] = DisplayMaps.from_spectra({MEASURED: capture.spectrum(grid)}, grid)
-    display = build_display(None, {"": (radar, grid)}, file.name)
-    return replace(display, layers=[*capture_layers(capture), *display.layers], maps=maps)
+        maps[""] = viewer.DisplayMaps.from_spectra({viewer.MEASURED: capture.spectrum(grid)}, grid)
+    display = viewer.build_display(None, {"": (radar, grid)}, file.name)
+    return replace(display, layers=[*viewer.capture_layers(capture), *display.layers], maps=maps)

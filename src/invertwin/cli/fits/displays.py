@@ -1,4 +1,4 @@
-"""What a fit leaves to be seen in three dimensions: its steps, its twin, the truth, error bars."""
+"""Displays of a fit in three dimensions: its steps, its twin, the truth, error bars."""
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -10,25 +10,14 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from invertwin.cli.fits.problem import Problem, SensorData, fitted_objects
+from invertwin import viewer
+from invertwin.cli.fits.problem import Problem, SensorData, Start
 from invertwin.errors import InputError
 from invertwin.inversion import Callback
 from invertwin.inversion.fit import Fit
 from invertwin.scene import Scene
 from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.folders import PARTS
-from invertwin.viewer import (
-    MEASURED,
-    SIMULATED,
-    Display,
-    DisplayMaps,
-    DisplayMesh,
-    DisplayStep,
-    build_display,
-    display_mesh,
-    ellipsoid_layers,
-    scene_layers,
-)
 
 VIEW_FILE = "view.npz"
 """The file of a run folder that `invertwin view` shows."""
@@ -52,11 +41,11 @@ class StepRecorder(Callback):
         names: Collection[str],
         total: int,
         every: int,
-        show: Callable[[Fit, DisplayStep], None] | None,
+        show: Callable[[Fit, viewer.DisplayStep], None] | None,
     ) -> None:
         self._file, self._names, self._show = file, names, show
         self._apart, self._every = math.ceil(total / _MAX_STEPS), every
-        self._steps: list[DisplayStep] = []
+        self._steps: list[viewer.DisplayStep] = []
         self._written = 0
 
     def begin(self, fit: Fit) -> None:
@@ -64,7 +53,7 @@ class StepRecorder(Callback):
         if not self._steps:
             self._steps = load_steps(self._file)
         if not self._steps:
-            self._keep(fit, DisplayStep(0, "start", self._display_meshes(fit.twin())))
+            self._keep(fit, viewer.DisplayStep(0, "start", self._display_meshes(fit.twin())))
 
     def step(self, fit: Fit, row: dict[str, Any]) -> None:
         """Keep some of the steps."""
@@ -75,7 +64,7 @@ class StepRecorder(Callback):
             label = f"step {number}, loss {row['loss']:.4g}"
             # Parameters that the scene refuses have no picture; the fit ends as diverged.
             with suppress(InputError):
-                self._keep(fit, DisplayStep(number, label, self._display_meshes(fit.twin())))
+                self._keep(fit, viewer.DisplayStep(number, label, self._display_meshes(fit.twin())))
         if fit.progress.step % self._every == 0:
             self._write()
 
@@ -83,7 +72,7 @@ class StepRecorder(Callback):
         """Write what is kept."""
         self._write()
 
-    def _keep(self, fit: Fit, step: DisplayStep) -> None:
+    def _keep(self, fit: Fit, step: viewer.DisplayStep) -> None:
         self._steps.append(step)
         if self._show is not None:
             self._show(fit, step)
@@ -91,22 +80,22 @@ class StepRecorder(Callback):
     def _write(self) -> None:
         if self._written != self._steps[-1].number or not self._file.exists():
             self._written = self._steps[-1].number
-            Display("", [], self._steps).save(self._file)
+            viewer.Display("", [], self._steps).save(self._file)
 
-    def _display_meshes(self, scene: Scene) -> dict[str, DisplayMesh]:
+    def _display_meshes(self, scene: Scene) -> dict[str, viewer.DisplayMesh]:
         scene = replace_clouds(scene)
         before = self._steps[-1].bodies if self._steps else {}
         found = {}
         for name in self._names:
-            body = display_mesh(scene[name])
+            body = viewer.display_mesh(scene[name])
             if name in before and np.array_equal(body.faces, before[name].faces):
-                body = DisplayMesh(body.vertices, before[name].faces)  # kept once
+                body = viewer.DisplayMesh(body.vertices, before[name].faces)  # kept once
             found[name] = body
         return found
 
 
 def steps_path(checkpoint: str) -> str:
-    """Where the steps of a fit are kept, as a path in the run's folder.
+    """The path in the run's folder at which the steps of a fit are kept.
 
     Args:
         checkpoint: That of the fit.
@@ -114,13 +103,13 @@ def steps_path(checkpoint: str) -> str:
     return f"{PARTS}/{Path(checkpoint).stem}_steps.npz"
 
 
-def load_steps(file: Path) -> list[DisplayStep]:
+def load_steps(file: Path) -> list[viewer.DisplayStep]:
     """The steps that a fit has kept.
 
     Args:
         file: Of `StepRecorder`.
     """
-    return list(Display.load(file).steps) if file.exists() else []
+    return list(viewer.Display.load(file).steps) if file.exists() else []
 
 
 def make_fit_display(
@@ -129,8 +118,8 @@ def make_fit_display(
     twin: Scene,
     maps: Mapping[str, Sequence[Tensor]],
     metrics: Mapping[str, Any],
-    steps: Sequence[DisplayStep],
-) -> Display:
+    steps: Sequence[viewer.DisplayStep],
+) -> viewer.Display:
     """A display of a fit that has ended.
 
     Args:
@@ -142,20 +131,18 @@ def make_fit_display(
         steps: Those that were kept.
     """
     display = make_problem_display(problem, twin)
-    names = [name for name in fitted_objects(problem.run) if name in start.names]
-    more = scene_layers(start, "start", fitted=names, fitted_only=True)
-    return replace(
-        display,
-        layers=[*display.layers, *more, *ellipsoid_layers(twin, metrics)],
-        steps=steps,
-        maps=make_sensor_maps(problem, {MEASURED: maps["measured"], SIMULATED: maps["twin"]}),
-    )
+    names = [name for name in problem.run.fitted_objects if name in start.names]
+    more = viewer.scene_layers(start, "start", fitted=names, fitted_only=True)
+    layers = [*display.layers, *more, *viewer.ellipsoid_layers(twin, metrics)]
+    spectra = {viewer.MEASURED: maps["measured"], viewer.SIMULATED: maps["twin"]}
+    seen = make_sensor_maps(problem, spectra)
+    return replace(display, layers=layers, steps=steps, maps=seen)
 
 
 def make_sensor_maps(
     problem: Problem, spectra: Mapping[str, Sequence[Tensor]], max_values: int | None = None
-) -> dict[str, DisplayMaps]:
-    """What the sensors of a fit see, by their names.
+) -> dict[str, viewer.DisplayMaps]:
+    """Maps of the sensors of a fit, by their names.
 
     Args:
         problem: What is fitted.
@@ -163,27 +150,40 @@ def make_sensor_maps(
         max_values: Values that are kept of a sensor, about; None = of a few megabytes.
     """
     limit = {} if max_values is None else {"max_values": max_values}
-    return {
-        name: DisplayMaps.from_spectra(
-            {what: own[k] for what, own in spectra.items()}, item.grid, **limit
-        )
-        for k, (name, item) in enumerate(problem.sensor_data.items())
-        if item.grid is not None and all(spectra.values())
-    }
+    found = {}
+    for k, (name, item) in enumerate(problem.sensor_data.items()):
+        if item.grid is not None and all(spectra.values()):
+            own = {what: maps[k] for what, maps in spectra.items()}
+            found[name] = viewer.DisplayMaps.from_spectra(own, item.grid, **limit)
+    return found
 
 
-def make_problem_display(problem: Problem, scene: Scene) -> Display:
+def make_start_display(problem: Problem, start: Start) -> viewer.Display:
+    """A display of a fit that has not begun, with the measured maps and those of the start.
+
+    Args:
+        problem: What is fitted.
+        start: Of the first fit.
+    """
+    display = make_problem_display(problem, start.scene)
+    sensors = [item.sensor for item in problem.sensor_data.values()]
+    predicted = problem.kind.predict_maps(problem, start.scene, sensors)
+    spectra = {viewer.MEASURED: problem.kind.measured_maps(problem), viewer.SIMULATED: predicted}
+    return replace(display, maps=make_sensor_maps(problem, spectra))
+
+
+def make_problem_display(problem: Problem, scene: Scene) -> viewer.Display:
     """A display of a fit: its objects, the truth where it is known, the radars.
 
     Args:
         problem: What is fitted.
         scene: The start or the twin.
     """
-    names = [name for name in fitted_objects(problem.run) if name in scene.names]
-    known = any(name in problem.known_objects for name in names)
+    names = [name for name in problem.run.fitted_objects if name in scene.names]
+    truth = problem.truth if any(name in problem.known_objects for name in names) else None
     radars = {name: (item.sensor, item.grid) for name, item in radar_data(problem).items()}
     title = problem.run.title or problem.kind.title
-    return build_display(scene, radars, title, truth=problem.truth if known else None, fitted=names)
+    return viewer.build_display(scene, radars, title, truth=truth, fitted=names)
 
 
 def radar_data(problem: Problem) -> dict[str, SensorData]:

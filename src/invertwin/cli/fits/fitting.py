@@ -11,6 +11,7 @@ import torch
 from rich.console import Console
 from torch import nn
 
+from invertwin import inversion
 from invertwin.capture import calibrate
 from invertwin.cli.fits.displays import StepRecorder, steps_path
 from invertwin.cli.fits.problem import (
@@ -19,31 +20,16 @@ from invertwin.cli.fits.problem import (
     Problem,
     Row,
     Start,
-    fitted_objects,
     make_models,
     make_observations,
     make_schedule,
     make_unknowns,
     rank,
-    require_settings,
 )
 from invertwin.cli.fits.shape_scores import CURVE_KEY, make_shape_metric
 from invertwin.cli.fits.spreading import fit_file_stem
 from invertwin.cli.schema import build
 from invertwin.errors import InputError
-from invertwin.inversion import (
-    Callback,
-    Checkpoint,
-    Observation,
-    Reconstruction,
-    Report,
-    Screening,
-    Stage,
-    Watch,
-    reconstruct,
-    report_progress,
-    search,
-)
 from invertwin.inversion.callbacks import stage_checkpoint_path
 from invertwin.inversion.fit import Fit
 from invertwin.radar.parameters import ClockOffset, RangeBias
@@ -68,9 +54,9 @@ def fit_all(
         console: Shows progress.
         show: Is told of steps as they come.
     """
-    work = [(method, k) for method in problem.methods for k in range(len(problem.starts(method)))]
+    work = problem.work
     rows: dict[str, list[Row]] = {method: [] for method in problem.methods}
-    outcomes: dict[tuple[str, int], Callable[[], Reconstruction]] = {}
+    outcomes: dict[tuple[str, int], Callable[[], inversion.Reconstruction]] = {}
     for method, number in work:
         own = problem.kind.with_recording_of_start(problem, number, console)
         checkpoint = CHECKPOINT if len(work) == 1 else None
@@ -82,16 +68,10 @@ def fit_all(
             outcomes[method, number] = outcome
     best = min(rows[OWN_METHOD], key=rank)
     number = best["start"]
-    return Fits(
-        problem.kind.with_method(
-            problem.kind.with_recording_of_start(problem, number, console), OWN_METHOD
-        ),
-        rows,
-        lambda method, number: outcomes[method, number](),
-        best,
-        problem.starts()[number],
-        outcomes[OWN_METHOD, number](),
-    )
+    own = problem.kind.with_recording_of_start(problem, number, console)
+    own = problem.kind.with_method(own, OWN_METHOD)
+    start, found = problem.starts()[number], outcomes[OWN_METHOD, number]()
+    return Fits(own, rows, lambda method, k: outcomes[method, k](), best, start, found)
 
 
 def run_fit(
@@ -103,7 +83,7 @@ def run_fit(
     console: Console,
     checkpoint: str | None,
     show: Callable[[Fit, DisplayStep], None] | None = None,
-) -> tuple[Row, Callable[[], Reconstruction]]:
+) -> tuple[Row, Callable[[], inversion.Reconstruction]]:
     """Make one fit, or read what an interrupted run has kept of it.
 
     Args:
@@ -130,8 +110,9 @@ def run_fit(
         return row, lambda: again()[0]
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if method == OWN_METHOD else f", {method.replace('_', ' ')}")
-    with report_progress(name, sum(stage.steps for stage in stages), console) as shown:
+    with inversion.report_progress(name, sum(stage.steps for stage in stages), console) as shown:
         found, found_ends = again(shown)
+    curve = [[row["step"] + 1, row[CURVE_KEY]] for row in found.history if CURVE_KEY in row]
     row = {
         "start": index,
         "loss": found.loss,
@@ -144,9 +125,7 @@ def run_fit(
         **found_ends,
         **own.kind.score_fit(own, start, found),
         "losses": [step["loss"] for step in found.history],
-        "curve": [
-            [step["step"] + 1, step[CURVE_KEY]] for step in found.history if CURVE_KEY in step
-        ],
+        "curve": curve,
     }
     folder.write_json(f"{part}.json", row)
     # The twins of many recordings are read again, not kept.
@@ -156,57 +135,50 @@ def run_fit(
 
 def _fit_or_search(
     problem: Problem,
-    stages: Sequence[Stage],
+    stages: Sequence[inversion.Stage],
     start: Start,
     index: int,
     folder: RunFolder,
     checkpoint: str,
     show: Callable[[Fit, DisplayStep], None] | None,
-    shown: Sequence[Report] = (),
-) -> tuple[Reconstruction, Row]:
+    shown: Sequence[inversion.Report] = (),
+) -> tuple[inversion.Reconstruction, Row]:
     """Fit, or search about the start; return what the row says of the search, too."""
     run, watch = problem.run, make_shape_metric(problem)
     every = run.measures.every if run.measures else 1
 
-    def callbacks(file: str) -> list[Callback]:
+    def callbacks(file: str) -> list[inversion.Callback]:
         for k in range(len(stages) - 1):
             folder.file(str(stage_checkpoint_path(Path(file), k)))
-        watching = [] if watch is None else [Watch(watch, every)]
+        watching = [] if watch is None else [inversion.Watch(watch, every)]
         kept = StepRecorder(
             folder.file(steps_path(file)),
-            [name for name in dict.fromkeys(fitted_objects(run)) if name in start.scene.names],
+            [name for name in dict.fromkeys(run.fitted_objects) if name in start.scene.names],
             sum(stage.steps for stage in stages),
-            require_settings(run).checkpoint_every,
+            run.fit_settings.checkpoint_every,
             show if shown else None,
         )
         return [*watching, *shown, _make_checkpoint(problem, folder, file), kept]
 
     given = start.scene, make_observations(problem, start), make_unknowns(problem, start)
     seed = derive_seed(run.seed, index)
-    how: dict[str, Any] = {
-        "loss": build.build_loss(run),
-        "optimizer": build.build_section(run, "optimizer"),
-    }
-    how |= {"schedule": stages, "seed": seed}
+    how: dict[str, Any] = {"loss": build.build_loss(run), "schedule": stages, "seed": seed}
+    how["optimizer"] = build.build_section(run, "optimizer")
     if run.search is None:
-        return reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
+        return inversion.reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
     part = f"{PARTS}/{Path(checkpoint).stem}_fit"
-    chance = torch.Generator().manual_seed(seed)
-    starts = problem.kind.make_candidates(problem, start, chance)
-    found = search(
-        *given,
-        Screening(starts, run.search.fits, run.search.shortlist),
-        callbacks=lambda n: callbacks(f"{part}{n}.pt"),
-        **how,
+    starts = problem.kind.make_candidates(problem, start, torch.Generator().manual_seed(seed))
+    screening = inversion.Screening(starts, run.search.fits, run.search.shortlist)
+    found = inversion.search(
+        *given, screening, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how
     )
     return found.best, {"checkpoint": f"{part}{found.best_number}.pt", **found.to_metrics()}
 
 
-def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:
+def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> inversion.Checkpoint:
     """Goes on from its own unfinished part; open_run has settled what may be there."""
-    return Checkpoint(
-        folder.file(name), require_settings(problem.run).checkpoint_every, resume=True
-    )
+    every = problem.run.fit_settings.checkpoint_every
+    return inversion.Checkpoint(folder.file(name), every, resume=True)
 
 
 def _fitted_values(modules: nn.ModuleList) -> Row:
@@ -243,11 +215,11 @@ def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> 
     else:
         bias, clock = RangeBias(), ClockOffset(capture.positions)
         own = replace(problem, run=run.apply_overrides(table))
-        schedule, (model,) = require_settings(own.run).build(), make_models(own)
-        with report_progress("calibration", schedule.steps, console) as shown:
-            found = reconstruct(
+        schedule, (model,) = own.run.fit_settings.build(), make_models(own)
+        with inversion.report_progress("calibration", schedule.steps, console) as shown:
+            found = inversion.reconstruct(
                 Scene({table.object: target}),
-                Observation(model, capture, sensor=item.sensor, parameters=[bias, clock]),
+                inversion.Observation(model, capture, sensor=item.sensor, parameters=[bias, clock]),
                 [],
                 loss=build.build_loss(run),
                 optimizer=build.build_section(own.run, "optimizer"),
@@ -255,10 +227,8 @@ def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> 
                 callbacks=[*shown, _make_checkpoint(problem, folder, f"{PARTS}/calibration.pt")],
                 seed=run.seed,
             )
-        capture = capture.recalibrate(
-            capture.clock_offset + float(clock.shift.detach()),
-            capture.range_bias + float(bias.bias.detach()),
-        )
+        offset = capture.clock_offset + float(clock.shift.detach())
+        capture = capture.recalibrate(offset, capture.range_bias + float(bias.bias.detach()))
         row = {"loss": found.loss, "status": found.status}
     row |= {"clock_offset_s": capture.clock_offset, "range_bias_m": capture.range_bias}
     item = replace(item, recording=capture, sensor=capture.radar())

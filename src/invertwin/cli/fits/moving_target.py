@@ -26,7 +26,6 @@ from invertwin.cli.fits.problem import (
     Start,
     Summary,
     require_sections,
-    require_settings,
 )
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.report import (
@@ -79,9 +78,8 @@ class MovingTarget(DataKind):
         require_sections(self, run, "a moving target")
         table, recording = _table(run), _read_recording(run, truth)
         radar = recording.radar()
-        item = SensorData(
-            recording, radar, build.grid(require_section(run, "grid", "reconstruct"), radar)
-        )
+        grid = build.grid(require_section(run, "grid", "reconstruct"), radar)
+        item = SensorData(recording, radar, grid)
         known = isinstance(run.data, SimulatedData) or table.object in run.truth
         names = frozenset(truth.names if known else ())
         problem = Problem(run, scene, truth, names, {"": item}, None, self)
@@ -125,7 +123,7 @@ class MovingTarget(DataKind):
             return MovingBody(table.object, scene, sensor, echo, table.free, center)
 
     def score_fit(self, problem: Problem, start: Start, found: Reconstruction) -> Row:
-        """How far position and velocity are from the truth, where it is known.
+        """Errors of position and velocity, where the truth is known.
 
         The truth is that of the frame's start, the twin that of the middle of its chirps.
         """
@@ -142,7 +140,7 @@ class MovingTarget(DataKind):
         return row | {
             "position_error_m": off,
             "velocity_error_m_s": float((values["velocity_m_s"] - velocity).norm()),
-            "success": off <= require_settings(problem.run).position_limit,
+            "success": off <= problem.run.fit_settings.position_limit,
         }
 
     def metrics(self, fits: Fits) -> Row:
@@ -153,6 +151,7 @@ class MovingTarget(DataKind):
         count = recording.chirps.count // 2
         later = float(_times(recording)[count, 0])
         second = recording.select_chirps(count, count)
+        predicted = half.predict_maps(scene, _CELLS, time=later, seed=seed)
         echo, values = whole.body.echo, whole.body.values()
         errors = ("position_error_m", "velocity_error_m_s", "success")
         found: Row = {
@@ -161,9 +160,7 @@ class MovingTarget(DataKind):
             "mover_azimuth_deg": math.degrees(math.asin(max(-1.0, min(1.0, echo.u)))),
             "phase_coherence": echo.coherence,
             **_correlations(whole.predict_maps(scene, _CELLS, seed=seed), recording),
-            **_correlations(
-                half.predict_maps(scene, _CELLS, time=later, seed=seed), second, "heldout_"
-            ),
+            **_correlations(predicted, second, "heldout_"),
             "twin": {name: value.tolist() for name, value in values.items()},
             **{key: best[key] for key in errors if key in best},
         }
@@ -211,14 +208,10 @@ def _read_recording(run: RunFile, truth: Scene) -> ChirpCapture:
 def _whole_map(problem: Problem) -> RangeDopplerMap:
     """The map of all ranges and range rates."""
     item, run = problem.first_sensor, problem.run
-    radar = item.recording.radar()
-    return RangeDopplerMap.from_chirps(
-        radar,
-        item.grid,
-        item.recording.chirps,
-        math.ceil(require_section(run, "grid", "reconstruct").oversample),
-        Sampling(depth=1, samples=require_settings(run).samples, boundary=False),
-    )
+    radar, chirps = item.recording.radar(), item.recording.chirps
+    oversample = math.ceil(require_section(run, "grid", "reconstruct").oversample)
+    sampling = Sampling(depth=1, samples=run.fit_settings.samples, boundary=False)
+    return RangeDopplerMap.from_chirps(radar, item.grid, chirps, oversample, sampling)
 
 
 def _detect_echo(problem: Problem) -> Any:
@@ -231,7 +224,7 @@ def _detect_echo(problem: Problem) -> Any:
 
 
 def _times(recording: ChirpCapture) -> Tensor:
-    """When each ramp of the frame starts [chirp, tx], s."""
+    """Start times of the ramps of the frame [chirp, tx] [s]."""
     return recording.chirps.times(len(recording.device.transmitters.positions))
 
 
@@ -278,14 +271,11 @@ def _pictures(fits: Fits, folder: RunFolder) -> list[ReportPicture]:
     }
     table = _table(problem.run)
     with torch.no_grad():
-        begun = problem.kind.make_unknown(problem, "", table, fits.start).build_module(
-            fits.start.scene
-        )
+        unknown = problem.kind.make_unknown(problem, "", table, fits.start)
+        begun = unknown.build_module(fits.start.scene)
         scenes = {"start": begun(scene), "twin": whole.body(scene)}
     names = {OWN_METHOD: "twin", HALF: "twin of the first half"}
-    losses = {
-        names.get(method, method.replace("_", " ")): own for method, own in fits.losses.items()
-    }
+    losses = {names.get(how, how.replace("_", " ")): own for how, own in fits.losses.items()}
     seen = doppler_maps(recording.beat, radar, whole.model.grid, recording.chirps)
     where = plotting.scene(scenes, radar, highlight=[whole.body.object])
     drawn = {

@@ -24,7 +24,6 @@ from invertwin.cli.fits.problem import (
     Summary,
     make_observations,
     require_sections,
-    require_settings,
     stage_runs,
 )
 from invertwin.cli.fits.scores import drop_histories, error_bar_table
@@ -62,8 +61,7 @@ class PanelCoverage(DataKind):
         """See ``DataKind.read_problem``; ``reference`` holds the receivers that score the panel."""
         require_sections(self, run, "[placement]")
         table = require_section(run, "placement", "reconstruct")
-        coverage = table.coverage(scene, run.seed)
-        item = SensorData(coverage, table.metasurface())
+        item = SensorData(table.coverage(scene, run.seed), table.metasurface())
         scored = table.coverage(scene, run.seed, scored=True)
         return Problem(run, scene, truth, frozenset(), {"": item}, None, self, scored)
 
@@ -73,7 +71,7 @@ class PanelCoverage(DataKind):
 
     def models(self, problem: Problem) -> list[ForwardModel]:
         """See ``DataKind.models``."""
-        table, settings = _table(problem), require_settings(problem.run)
+        table, settings = _table(problem), problem.run.fit_settings
         blur, soft = table.edge_width, table.softness
         batch = table.receivers.batch
         return [CoverageMap(problem.first_sensor.recording, batch, blur, soft, settings.boundary)]
@@ -111,7 +109,7 @@ class PanelCoverage(DataKind):
         panel, batch = found.sensors[0], _table(problem).receivers.batch
         seen = problem.first_sensor.recording.part(slice(0, batch))
         module = next(m for m in found.parameters if isinstance(m, PanelPlacement))
-        steps = [require_settings(own).steps for _, own in stage_runs(problem.run)]
+        steps = [own.fit_settings.steps for _, own in stage_runs(problem.run)]
         search, tried = problem.run.search, 0
         if search is not None:
             tried = len(search.trials(_table(problem), torch.Generator()))
@@ -206,16 +204,14 @@ def _landscape(fits: Fits) -> Any:
 def _coverage(problem: Problem, panel: Metasurface) -> Any:
     """Path gain over the floor plan, without the panel and with it."""
     table, seen = _table(problem), problem.first_sensor.recording
-    low, high = (
-        torch.tensor(end, dtype=torch.float64)
-        for end in (table.receivers.low, table.receivers.high)
-    )
+    box = table.receivers
+    low, high = (torch.tensor(end, dtype=torch.float64) for end in (box.low, box.high))
     side = (high - low)[:2]
     step = float((side.prod() / _CELLS).sqrt())
     counts = [max(2, round(float(s) / step)) for s in side]
     axes = [torch.linspace(float(low[k]), float(high[k]), counts[k]).double() for k in range(2)]
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
-    height = 0.5 * (table.receivers.low[2] + table.receivers.high[2])
+    height = 0.5 * (box.low[2] + box.high[2])
     points = torch.cat([grid, torch.full((len(grid), 1), height)], 1)
     how = {"depth": table.depth, "edges": table.edges, "seed": problem.run.seed}
     with torch.no_grad():

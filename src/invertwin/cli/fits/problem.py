@@ -16,7 +16,6 @@ from invertwin.cli.report import ReportPicture, ReportTable
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import (
     MeasuresTable,
-    ReconstructTable,
     RunFile,
     SamplingBase,
     SimulatedData,
@@ -113,6 +112,11 @@ class Problem:
     def methods(self) -> list[str]:
         """Names of the ways to fit: the run's own, its variants, and those of the data."""
         return [OWN_METHOD, *self.run.variants, *self.kind.methods]
+
+    @property
+    def work(self) -> list[tuple[str, int]]:
+        """Method and number of the start of every fit."""
+        return [(method, k) for method in self.methods for k in range(len(self.starts(method)))]
 
     def starts(self, method: str = OWN_METHOD) -> list[Start]:
         """Starts of the fits of a method, in order."""
@@ -214,7 +218,7 @@ class DataKind(ABC):
     def with_method(self, problem: Problem, method: str) -> Problem:
         """The problem of a method, with the sensors of this fit only."""
         run = method_run(problem.run, method)
-        chosen = require_settings(run).observations or problem.sensor_data
+        chosen = run.fit_settings.observations or problem.sensor_data
         data = {name: item for name, item in problem.sensor_data.items() if name in chosen}
         return replace(problem, run=run, sensor_data=data)
 
@@ -244,7 +248,7 @@ class DataKind(ABC):
         return item.sensor
 
     def sensor_unknowns(self, problem: Problem, name: str) -> dict[str, nn.Module | Unknown]:
-        """What is fitted of a sensor beside the parameters of the run file."""
+        """Unknowns of a sensor beside the parameters of the run file."""
         return {}
 
     def make_unknown(self, problem: Problem, name: str, table: Any, start: Start) -> Unknown:
@@ -300,11 +304,8 @@ def make_observations(problem: Problem, start: Start | None = None) -> list[Obse
         start: Initial values; None = the scene as known.
     """
     kind, begun = problem.kind, start or Start(problem.scene)
-    own = {
-        name: kind.make_unknown(problem, name, table, begun)
-        for name, table in fitted_tables(problem.run).items()
-        if table.kind in OF_SENSORS
-    }
+    own = _build_unknowns(problem, begun, of_sensors=True)
+    sensors = zip(make_models(problem), problem.sensor_data.items(), strict=True)
     return [
         Observation(
             model,
@@ -313,9 +314,7 @@ def make_observations(problem: Problem, start: Start | None = None) -> list[Obse
             weight=item.weight,
             parameters={**own, **kind.sensor_unknowns(problem, name)},
         )
-        for model, (name, item) in zip(
-            make_models(problem), problem.sensor_data.items(), strict=True
-        )
+        for model, (name, item) in sensors
     ]
 
 
@@ -326,11 +325,14 @@ def make_unknowns(problem: Problem, start: Start | None = None) -> dict[str, Unk
         problem: Of a mode.
         start: Initial values; None = the scene as known.
     """
-    begun = start or Start(problem.scene)
+    return _build_unknowns(problem, start or Start(problem.scene), of_sensors=False)
+
+
+def _build_unknowns(problem: Problem, start: Start, *, of_sensors: bool) -> dict[str, Unknown]:
     return {
-        name: problem.kind.make_unknown(problem, name, table, begun)
+        name: problem.kind.make_unknown(problem, name, table, start)
         for name, table in fitted_tables(problem.run).items()
-        if table.kind not in OF_SENSORS
+        if (table.kind in OF_SENSORS) == of_sensors
     }
 
 
@@ -351,7 +353,7 @@ def make_schedule(problem: Problem) -> list[Stage]:
         if counts:
             models = [m.with_sampling(**counts) if hasattr(m, "sampling") else m for m in models]
         stage = Stage(
-            **vars(require_settings(run).build()),
+            **vars(run.fit_settings.build()),
             unknowns=tuple(names),
             rebuild=table.rebuild,
             remesh={t.object: finer for t in free if table.remesh and t.kind == "vertices"},
@@ -369,8 +371,7 @@ def initial_scenes(problem: Problem) -> list[Scene]:
         return [scene]
     body = build.fitted_body(run, scene, table.object)
     name, truth, found = table.object, problem.truth[table.object], []
-    seed = run.seed if table.seed is None else table.seed
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(run.seed if table.seed is None else table.seed)
     for moved in table.build({Object: truth}, generator=generator):
         # The object as known may have another size: it is its centre that is placed.
         turn = moved.transform[:3, :3]
@@ -393,7 +394,7 @@ def require_sections(kind: DataKind, run: RunFile, because: str) -> None:
     Raises:
         InputError: One of them is there, or those of every fit are not.
     """
-    require_settings(run)
+    require_section(run, "reconstruct", "reconstruct")
     require_section(run, "parameters", "reconstruct")
     for name in kind.unused:
         if getattr(run, name):
@@ -423,11 +424,6 @@ def about_sensor(name: str) -> AbstractContextManager[None]:
     return prefix_errors(f"observations.{name}") if name else nullcontext()
 
 
-def fitted_objects(run: RunFile) -> list[str]:
-    """Objects that have parameters."""
-    return [p.object for p in run.parameters if getattr(p, "object", None)]
-
-
 def posed_object_name(run: RunFile) -> str | None:
     """The first object whose pose or shape is fitted."""
     moved = (p.object for p in run.parameters if p.kind in _POSED)
@@ -440,11 +436,6 @@ def known_truth(problem: Problem) -> dict[str, Object]:
     return {name: problem.truth[name]} if name is not None and name in problem.known_objects else {}
 
 
-def require_settings(run: RunFile) -> ReconstructTable:
-    """The `[reconstruct]` table, which every fit needs."""
-    return require_section(run, "reconstruct", "reconstruct")
-
-
 def method_run(run: RunFile, method: str) -> RunFile:
     """The run file of a method: the run's own, or a variant."""
     return run.apply_overrides(run.variants[method]) if method in run.variants else run
@@ -453,7 +444,7 @@ def method_run(run: RunFile, method: str) -> RunFile:
 def fitted_tables(run: RunFile) -> dict[str, Any]:
     """The tables of what is fitted, by name."""
     tables = build.tables_by_name(run.parameters)
-    names = set(require_settings(run).parameters or tables)
+    names = set(run.fit_settings.parameters or tables)
     if run.stages and all(stage.parameters for stage in run.stages):
         names &= {name for stage in run.stages for name in stage.parameters}
     return {name: table for name, table in tables.items() if name in names}

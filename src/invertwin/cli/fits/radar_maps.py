@@ -7,6 +7,7 @@ from rich.console import Console
 from torch import Tensor
 
 from invertwin.cli.estimate import require_resources
+from invertwin.cli.fits import radar_models, scores
 from invertwin.cli.fits.fitting import calibrate_problem
 from invertwin.cli.fits.problem import (
     OWN_METHOD,
@@ -16,36 +17,11 @@ from invertwin.cli.fits.problem import (
     Row,
     Start,
     Summary,
-    fitted_objects,
     known_truth,
-    require_settings,
     sensor_runs,
 )
-from invertwin.cli.fits.radar_models import (
-    build_sensors,
-    estimate_initial_scene,
-    has_recording_per_start,
-    make_radar_models,
-    record_sensors,
-    warn_if_depths_differ,
-    with_new_recording,
-)
-from invertwin.cli.fits.scores import (
-    predict_unblurred_maps,
-    score_fit,
-    score_held_out,
-    summarise_successes,
-    surrogate_agreement,
-    total_loss,
-)
 from invertwin.cli.fits.shape_scores import is_shape_key
-from invertwin.cli.fits.writing import (
-    START_COLUMNS,
-    BestFit,
-    describe_outcome,
-    draw_pictures,
-    make_tables,
-)
+from invertwin.cli.fits.writing import START_COLUMNS, summarise_maps
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion import Reconstruction, Unknown
@@ -53,7 +29,6 @@ from invertwin.inversion.confidence.report import confidence_metrics, error_bar_
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.runtime.memory import peak_memory
 from invertwin.scene import Scene
-from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.run_folder import RunFolder
 
 
@@ -62,43 +37,43 @@ class RadarMaps(DataKind):
 
     def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:
         """See ``DataKind.read_problem``."""
-        sensors = build_sensors(run)
-        warn_if_depths_differ(run, sensors)
+        sensors = radar_models.build_sensors(run)
+        radar_models.warn_if_depths_differ(run, sensors)
         require_resources(run, truth, sensors)
-        data = record_sensors(run, sensors, truth, console)
+        data = radar_models.record_sensors(run, sensors, truth, console)
         simulated = all(isinstance(own.data, SimulatedData) for own in sensor_runs(run).values())
         known = frozenset(truth.names if simulated else run.truth)
-        target = run.starts.object if run.starts else next(iter(fitted_objects(run)), None)
+        target = run.starts.object if run.starts else next(iter(run.fitted_objects), None)
         return Problem(run, scene, truth, known, data, target, kind=self)
 
     def prepare(self, problem: Problem, folder: RunFolder, console: Console) -> Problem:
         """The problem with its radar calibrated, and its object where echoes are."""
-        return estimate_initial_scene(calibrate_problem(problem, folder, console), console)
+        calibrated = calibrate_problem(problem, folder, console)
+        return radar_models.estimate_initial_scene(calibrated, console)
 
     def with_recording_of_start(self, problem: Problem, number: int, console: Console) -> Problem:
         """The problem with the recording of a start. Only the first one's is shared."""
-        if number == 0 or not has_recording_per_start(problem.run):
+        if number == 0 or not radar_models.has_recording_per_start(problem.run):
             return problem
-        return with_new_recording(problem, number, console)
+        return radar_models.with_new_recording(problem, number, console)
 
     def models(self, problem: Problem) -> list[ForwardModel]:
         """See ``DataKind.models``."""
-        return make_radar_models(problem)
+        return radar_models.make_radar_models(problem)
 
     def sensor_unknowns(self, problem: Problem, name: str) -> dict[str, Any]:
         """Nuisances of a radar."""
         positions = problem.sensor_data[name].recording.positions
+        begin = f"{name}." if name else ""
         return {
-            f"{name}.{kind}" if name else kind: Unknown(
-                RangeBias() if kind == "range_bias" else ClockOffset(positions)
-            )
-            for kind in require_settings(problem.run).nuisances
+            begin + kind: Unknown(RangeBias() if kind == "range_bias" else ClockOffset(positions))
+            for kind in problem.run.fit_settings.nuisances
         }
 
     def score_fit(self, problem: Problem, start: Start, found: Reconstruction) -> Row:
         """Distances to the truth; of a recording of its own, error bars, too."""
-        rows = score_fit(problem, start.scene, found.scene)
-        own = has_recording_per_start(problem.run)
+        rows = scores.score_fit(problem, start.scene, found.scene)
+        own = radar_models.has_recording_per_start(problem.run)
         return rows | (confidence_metrics(found, known_truth(problem)) if own else {})
 
     def measured_maps(self, problem: Problem) -> list[Tensor]:
@@ -107,25 +82,22 @@ class RadarMaps(DataKind):
 
     def predict_maps(self, problem: Problem, scene: Scene, sensors: Sequence[Any]) -> list[Tensor]:
         """Sharp spectra of a scene."""
-        return predict_unblurred_maps(problem, scene, sensors)
+        return scores.predict_unblurred_maps(problem, scene, sensors)
 
     def metrics(self, fits: Fits) -> Row:
         """See ``DataKind.metrics``."""
         problem, rows, best, methods = fits.problem, fits.rows, fits.best, fits.methods
-        found: Row = {
-            **summarise_successes(problem, rows, methods),
-            **(
-                error_bar_coverage(rows[OWN_METHOD]) if has_recording_per_start(problem.run) else {}
-            ),
-            **{
-                k: best[k]
-                for k in best
-                if (k in START_COLUMNS or is_shape_key(k)) and k != "seconds"
-            },
-            "start_loss_sharp": total_loss(problem, fits.maps["start"], fits.maps["measured"]),
-            "loss_sharp": total_loss(problem, fits.maps["twin"], fits.maps["measured"]),
-            **surrogate_agreement(problem, fits.found.scene, fits.found.sensors[0]),
-            **score_held_out(problem, rows[OWN_METHOD], best),
+        found: Row = scores.summarise_successes(problem, rows, methods)
+        if radar_models.has_recording_per_start(problem.run):
+            found |= error_bar_coverage(rows[OWN_METHOD])
+        told = [k for k in best if (k in START_COLUMNS or is_shape_key(k)) and k != "seconds"]
+        measured = fits.maps["measured"]
+        found |= {
+            **{key: best[key] for key in told},
+            "start_loss_sharp": scores.total_loss(problem, fits.maps["start"], measured),
+            "loss_sharp": scores.total_loss(problem, fits.maps["twin"], measured),
+            **scores.surrogate_agreement(problem, fits.found.scene, fits.found.sensors[0]),
+            **scores.score_held_out(problem, rows[OWN_METHOD], best),
         }
         for method in methods[1:]:
             same = rows[method][min(best["start"], len(rows[method]) - 1)]
@@ -137,9 +109,4 @@ class RadarMaps(DataKind):
 
     def summary(self, fits: Fits, metrics: Row, folder: RunFolder) -> Summary:
         """See ``DataKind.summary``."""
-        scenes = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
-        residuals = fits.found.verdict.residuals
-        fitted = BestFit(fits.problem, metrics, fits.rows, *scenes, fits.maps, residuals)
-        result, *tables = make_tables(fitted)
-        outcome = describe_outcome(fits.problem.run, metrics)
-        return Summary(outcome, result, draw_pictures(fitted, folder), tables)
+        return summarise_maps(fits, metrics, folder)

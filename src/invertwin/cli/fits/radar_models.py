@@ -12,14 +12,7 @@ from invertwin.capture import Capture
 from invertwin.channel import Densities, Grid, Sampling
 from invertwin.cli.estimate import SensorSetup
 from invertwin.cli.exact_signals import simulate_exact
-from invertwin.cli.fits.problem import (
-    Problem,
-    SensorData,
-    about_sensor,
-    require_settings,
-    sensor_runs,
-    stage_runs,
-)
+from invertwin.cli.fits.problem import Problem, SensorData, about_sensor, sensor_runs, stage_runs
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SamplingBase, SimulatedData, build
 from invertwin.cli.schema.recordings import build_capture
@@ -48,10 +41,8 @@ def build_sensors(run: RunFile) -> dict[str, SensorSetup]:
 
 
 def _sensor(run: RunFile) -> SensorSetup:
-    data, table = (
-        require_section(run, "data", "reconstruct"),
-        require_section(run, "grid", "reconstruct"),
-    )
+    data = require_section(run, "data", "reconstruct")
+    table = require_section(run, "grid", "reconstruct")
     if isinstance(data, SimulatedData):
         radar = build.radar(require_section(run, "radar", "simulated data"))
         return SensorSetup(run, radar, build.grid(table, radar))
@@ -101,11 +92,8 @@ def with_new_recording(problem: Problem, number: int, console: Console) -> Probl
     assert isinstance(data, SimulatedData)
     seed = derive_seed(run.seed if data.seed is None else data.seed, _RECORDING_SEED_KEY, number)
     run = run.model_copy(update={"data": data.model_copy(update={"seed": seed})})
-    return replace(
-        problem,
-        run=run,
-        sensor_data=record_sensors(run, build_sensors(run), problem.truth, console),
-    )
+    recorded = record_sensors(run, build_sensors(run), problem.truth, console)
+    return replace(problem, run=run, sensor_data=recorded)
 
 
 def warn_if_depths_differ(run: RunFile, sensors: Mapping[str, SensorSetup]) -> None:
@@ -116,7 +104,7 @@ def warn_if_depths_differ(run: RunFile, sensors: Mapping[str, SensorSetup]) -> N
         sensors: By name.
     """
     for name, sensor in sensors.items():
-        data, depth = sensor.run.data, require_settings(run).depth
+        data, depth = sensor.run.data, run.fit_settings.depth
         if isinstance(data, SimulatedData) and data.depth != depth and run.chirps is None:
             at = f"observations.{name}." if name else ""
             warnings.warn(
@@ -128,14 +116,14 @@ def warn_if_depths_differ(run: RunFile, sensors: Mapping[str, SensorSetup]) -> N
 
 
 def has_recording_per_start(run: RunFile) -> bool:
-    """Whether every start has a recording of its own."""
+    """Return True if every start has a recording of its own."""
     return isinstance(run.data, SimulatedData) and run.data.every_start
 
 
 def blur_end_step(run: RunFile) -> float | None:
     """The step from which the surrogate has no extra widths; None if it never has, or in stages."""
     (_, own), *others = stage_runs(run)
-    kernels, settings = own.surrogate, require_settings(own)
+    kernels, settings = own.surrogate, own.fit_settings
     widened = kernels.range_width > 0 or kernels.angle_width > 0
     if own.model is not None and own.model.kind == "surrogate":
         widened |= own.model.stretch > 1
@@ -146,13 +134,10 @@ def blur_end_step(run: RunFile) -> float | None:
 
 def make_sampling(run: RunFile) -> Sampling:
     """Sampling of paths by the model of a fit."""
-    settings = require_settings(run)
+    settings = run.fit_settings
     counts = {name: getattr(settings, name) for name in SamplingBase.made_from}
-    return Sampling(
-        **counts,
-        conductor_samples=settings.samples,
-        points_per_m2=rough_point_densities(run),
-    )
+    rough = rough_point_densities(run)
+    return Sampling(**counts, conductor_samples=settings.samples, points_per_m2=rough)
 
 
 def rough_point_densities(run: RunFile) -> Densities:
@@ -188,13 +173,11 @@ def make_display_models(problem: Problem) -> list[ForwardModel]:
 def make_unblurred_models(problem: Problem) -> list[SurrogateMap]:
     """The smooth model of every radar without extra widths, mean over phases."""
     sampling, found = make_sampling(problem.run), []
-    for model, (run, item) in zip(
-        make_radar_models(problem), _sensors_with_runs(problem), strict=True
-    ):
-        smooth = model
-        if not isinstance(smooth, SurrogateMap):
-            smooth = SurrogateMap(item.grid, build.build_section(run, "surrogate"), sampling)
-        found.append(smooth.scale_blur(0.0))
+    sensors = zip(make_radar_models(problem), _sensors_with_runs(problem), strict=True)
+    for model, (run, item) in sensors:
+        if not isinstance(model, SurrogateMap):
+            model = SurrogateMap(item.grid, build.build_section(run, "surrogate"), sampling)
+        found.append(model.scale_blur(0.0))
     return found
 
 
@@ -224,14 +207,8 @@ def estimate_initial_scene(problem: Problem, console: Console) -> Problem:
         console.print(f"looking for {name} with a conventional detector")
         begin = time.perf_counter()
         estimator: InitialPoseEstimator = table.build()
-        found = estimator.estimate(
-            problem.scene,
-            name,
-            item.recording,
-            item.grid,
-            loss=build.build_loss(run),
-            seed=run.seed,
-        )
+        seen, loss = (item.recording, item.grid), build.build_loss(run)
+        found = estimator.estimate(problem.scene, name, *seen, loss=loss, seed=run.seed)
         scene = _add_density(problem, found.scene, name)
     notes: dict[str, Any] = {}
     if found.detection_count:

@@ -25,10 +25,10 @@ from invertwin.cli.fits.problem import (
     posed_object_name,
     rank,
     require_sections,
-    require_settings,
 )
 from invertwin.cli.fits.scores import error_bar_table, score_fit
-from invertwin.cli.report import ReportTable, load_texts, quantity_table, save_picture
+from invertwin.cli.fits.writing import describe_outcome
+from invertwin.cli.report import ReportTable, quantity_table, save_picture
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.radio_tables import ReceivedData, ReceivedFile
@@ -120,11 +120,8 @@ class ReceivedLevels(DataKind):
 
     def initial_sensor(self, item: SensorData, start: Start) -> Transmitters:
         """The transmitters, the first one where the fit starts."""
-        return (
-            item.sensor
-            if start.transmitter is None
-            else _place_first(item.sensor, start.transmitter)
-        )
+        place = start.transmitter
+        return item.sensor if place is None else _place_first(item.sensor, place)
 
     def make_unknown(self, problem: Problem, name: str, table: Any, start: Start) -> Unknown:
         """See ``DataKind.make_unknown``; a transmitter starts where its sensor has it."""
@@ -144,15 +141,14 @@ class ReceivedLevels(DataKind):
         place = found.sensors[0].positions[0].detach()
         rows |= {"start_error_m": float((start.transmitter - real).norm())}
         rows |= {"position_error_m": float((place - real).norm())}
-        limit = require_settings(problem.run).position_limit
+        limit = problem.run.fit_settings.position_limit
         return {**rows, "success": rows["position_error_m"] <= limit}
 
     def revise_confidence(self, fits: Fits, believed: Row) -> Row:
         """Verdict and error bars; ends of other starts may speak against them."""
         others = _find_other_ends(fits)
-        spread = spread_of_ends(
-            fits.problem.run, fits.rows[OWN_METHOD], fits.best, believed.get("within_95", {})
-        )
+        run, bars = fits.problem.run, believed.get("within_95", {})
+        spread = spread_of_ends(run, fits.rows[OWN_METHOD], fits.best, bars)
         alone = bool(spread) and not spread["ends_within_bars"]
         doubtful = (others or alone) and believed["verdict"] == "consistent"
         return {**believed, **others, **spread, **({"verdict": "ambiguous"} if doubtful else {})}
@@ -169,9 +165,8 @@ class ReceivedLevels(DataKind):
                 found[f"errors_m{tail}"] = [row["position_error_m"] for row in rows[method]]
             if materials:
                 values = fits.best_of(method)["values"]
-                found[f"relative_errors{tail}"] = {
-                    name: abs(values[name] / value - 1) for name, value in materials.items()
-                }
+                errors = {name: abs(values[name] / real - 1) for name, real in materials.items()}
+                found[f"relative_errors{tail}"] = errors
         if "success" in best:
             found |= {key: best[key] for key in ("position_error_m", "success")}
         if "start_error_m" in best:
@@ -188,7 +183,8 @@ class ReceivedLevels(DataKind):
         if "errors_m" in metrics:
             tables.append(_method_table(fits, metrics))
         result = quantity_table("Result", metrics)
-        return Summary(_outcome(fits.problem.run, metrics), result, drawn, tables)
+        outcome = describe_outcome(fits.problem.run, metrics, counted=True)
+        return Summary(outcome, result, drawn, tables)
 
 
 def radio_map(run: RunFile, points: ReceiverPoints | None) -> RadioMap:
@@ -204,7 +200,7 @@ def radio_map(run: RunFile, points: ReceiverPoints | None) -> RadioMap:
 
 
 def has_transmitter(run: RunFile) -> bool:
-    """Whether a transmitter is fitted."""
+    """Return True if a transmitter is fitted."""
     return any(table.kind == "transmitter" for table in run.parameters)
 
 
@@ -262,7 +258,7 @@ def _find_other_ends(fits: Fits) -> Row:
     run = fits.problem.run
     if not has_transmitter(run):
         return {}
-    limit, best = require_settings(run).position_limit, fits.found
+    limit, best = run.fit_settings.position_limit, fits.found
     kept, told = [best.sensors[0].positions[0].detach()], []
     for row in sorted(fits.rows[OWN_METHOD], key=rank):
         if row["start"] == fits.best["start"]:
@@ -280,7 +276,7 @@ def _find_other_ends(fits: Fits) -> Row:
 
 
 def spread_of_ends(run: RunFile, rows: Sequence[Row], best: Row, bars: Mapping[str, float]) -> Row:
-    """How far other starts have ended from the best one, within the limit of positions.
+    """Spread of the ends of other starts about the best one, within the limit of positions.
 
     Error bars hold noise about one minimum. Where no other start has ended in them, there are more.
 
@@ -298,15 +294,13 @@ def spread_of_ends(run: RunFile, rows: Sequence[Row], best: Row, bars: Mapping[s
         for row in rows
         if row["start"] != best["start"] and row["status"] != "diverged"
     }
-    limit = require_settings(run).position_limit
+    limit = run.fit_settings.position_limit
     near = [off for off in apart.values() if math.hypot(*off) <= limit]
     if len(near) < _FEW_ENDS:
         return {}
     names = [f"transmitter.{axis}" for axis in "xyz"]
-    inside = [
-        all(abs(x) <= bars.get(name, math.inf) for name, x in zip(names, off, strict=True))
-        for off in near
-    ]
+    widths = [bars.get(name, math.inf) for name in names]
+    inside = [all(abs(x) <= w for x, w in zip(off, widths, strict=True)) for off in near]
     squares = zip(names, zip(*near, strict=True), strict=True)
     middle = sorted(math.hypot(*off) for off in near)[len(near) // 2]
     found: Row = {
@@ -353,33 +347,17 @@ def _share_blocked_links(problem: Problem, found: Reconstruction) -> Row:
 
 
 def _plan(fits: Fits) -> Figure:
-    """Where the fits of the first transmitter began and ended."""
+    """Plan with the starts and ends of the fits of the first transmitter."""
     problem, place = fits.problem, fits.found.sensors[0].positions[:1].detach()
     real = problem.reference
     shown = {"found": place} if real is None else {"truth": real.positions[:1], "found": place}
     points = radio_map(problem.run, problem.first_sensor.recording[1]).places
     if isinstance(points, ReceiverPoints):
         shown["receivers"] = points.positions
-    ends = [
-        [row["start_position"], row["values"]["transmitter.position"]]
-        for row in fits.rows[OWN_METHOD]
-    ]
+    rows = fits.rows[OWN_METHOD]
+    ends = [[row["start_position"], row["values"]["transmitter.position"]] for row in rows]
     starts = torch.tensor(ends, dtype=torch.float64)
     return plotting.transmitter_fits(fits.found.scene, float(place[0, 2]), shown, starts)
-
-
-def _outcome(run: RunFile, metrics: Row) -> str:
-    ended = load_texts("outcomes")[metrics["status"]].format(steps=metrics["steps"])
-    believed = load_texts("verdicts")[metrics["verdict"]]
-    count = metrics["starts_count"]
-    which = f"Best of {count} starts: " if count > 1 else ""
-    if "successes" in metrics:
-        limit = require_settings(run).position_limit
-        return (
-            f"{which}{metrics['position_error_m']:.3f} m from the truth; {ended}. "
-            f"{metrics['successes']} of {count} starts end within {limit:g} m. {believed}"
-        )
-    return f"{which}{ended}. {believed}"
 
 
 def _parameters(fits: Fits, metrics: Row) -> ReportTable:
@@ -396,7 +374,6 @@ def _method_table(fits: Fits, metrics: Row) -> ReportTable:
         tail = "" if method == OWN_METHOD else f"_{method}"
         errors = sorted(metrics[f"errors_m{tail}"])
         name = "full" if method == OWN_METHOD else method.replace("_", " ")
-        middle = errors[len(errors) // 2]
-        cells.append([name, metrics[f"successes{tail}"], middle, errors[-1]])
+        cells.append([name, metrics[f"successes{tail}"], errors[len(errors) // 2], errors[-1]])
     heads = ["fit", "successes", "median error [m]", "largest error [m]"]
     return ReportTable("Ways to fit", heads, cells)

@@ -1,4 +1,4 @@
-"""How good a fit is: distances to the truth, held-out objects, losses without blur."""
+"""Scores of a fit: distances to the truth, held-out objects, losses without blur."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,12 +9,8 @@ import torch
 
 from invertwin.capture import calibrate, locate
 from invertwin.channel import Sampling
-from invertwin.cli.fits.problem import HISTORIES, Problem, fitted_tables, require_settings
-from invertwin.cli.fits.radar_models import (
-    make_display_models,
-    make_unblurred_models,
-    rough_point_densities,
-)
+from invertwin.cli.fits import radar_models
+from invertwin.cli.fits.problem import HISTORIES, Problem, Row, fitted_tables
 from invertwin.cli.fits.shape_scores import score_shape
 from invertwin.cli.report import ReportTable, load_texts
 from invertwin.cli.schema import SimulatedData, build
@@ -28,8 +24,8 @@ from invertwin.scene import Mesh, Scene, SkinnedBody
 from invertwin.scene.shape_models.density import replace_clouds
 
 
-def score_fit(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
-    """How far start and twin are from the truth, where it is known."""
+def score_fit(problem: Problem, start: Scene, twin: Scene) -> Row:
+    """Errors of start and twin, where the truth is known."""
     name, twin = problem.scored_object, replace_clouds(twin)
     if name is None:
         return {}
@@ -41,13 +37,13 @@ def score_fit(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
     after = pose_error(twin[name], problem.truth[name])
     if before is None or after is None:
         return {"position": place, **shapes}
-    settings = require_settings(problem.run)
+    settings = problem.run.fit_settings
     body = build.fitted_body(problem.run, problem.scene, name)
     if body is not None:
         angles = score_joints(body, *(s[name].mesh for s in (start, twin, problem.truth)))
         good = angles["joint_error_after_deg"] <= settings.joint_limit_deg
         return {**angles, "success": good, "position": place, **shapes}
-    rows: dict[str, Any] = {
+    rows: Row = {
         "start_distance_m": before.distance,
         "position_error_m": after.distance,
         "success": after.distance <= settings.position_limit,
@@ -75,11 +71,10 @@ def score_fit(problem: Problem, start: Scene, twin: Scene) -> dict[str, Any]:
         rows["success"] &= angle <= settings.rotation_limit_deg
     if "scale" in kinds:
         rows |= {"scale_error": abs(after.scale - 1)}
-    told = [table for table in fitted if _is_material_known(problem, table)]
-    for table in told:
-        frequency = _frequency(problem)
-        ends = twin[table.object].material, problem.truth[table.object].material
-        rows |= material_errors(table.values, *ends, frequency, table.layer)
+    for table in fitted:
+        if _is_material_known(problem, table):
+            ends = twin[table.object].material, problem.truth[table.object].material
+            rows |= material_errors(table.values, *ends, _frequency(problem), table.layer)
     return rows | shapes
 
 
@@ -101,7 +96,7 @@ def score_joints(body: SkinnedBody, start: Mesh, found: Mesh, truth: Mesh) -> di
 
 
 def _is_material_known(problem: Problem, parameter: Any) -> bool:
-    """Whether the run file tells what a fitted object is really made of."""
+    """Return True if the run file tells the true material of a fitted object."""
     if parameter.kind != "material":
         return False
     table = problem.run.truth.get(parameter.object)
@@ -110,8 +105,8 @@ def _is_material_known(problem: Problem, parameter: Any) -> bool:
 
 
 def summarise_successes(
-    problem: Problem, rows: Mapping[str, list[dict[str, Any]]], modes: Sequence[str]
-) -> dict[str, Any]:
+    problem: Problem, rows: Mapping[str, list[Row]], modes: Sequence[str]
+) -> Row:
     """Successes of every way to fit, the run's own first; of several sensors, also each alone."""
     if problem.scored_object not in problem.known_objects or "success" not in rows[modes[0]][0]:
         return {}
@@ -128,9 +123,7 @@ def summarise_successes(
     return found
 
 
-def score_held_out(
-    problem: Problem, rows: list[dict[str, Any]], best: dict[str, Any]
-) -> dict[str, Any]:
+def score_held_out(problem: Problem, rows: list[Row], best: Row) -> Row:
     """For calibrated captures: the error on an object that took no part in the calibration."""
     table = problem.run.calibration
     name = problem.scored_object
@@ -152,9 +145,7 @@ def score_held_out(
     }
 
 
-def drop_histories(
-    rows: Sequence[dict[str, Any]], dropped: Sequence[str] = HISTORIES
-) -> list[dict[str, Any]]:
+def drop_histories(rows: Sequence[Row], dropped: Sequence[str] = HISTORIES) -> list[Row]:
     """The rows of the fits as metrics keep them."""
     return [{key: value for key, value in row.items() if key not in dropped} for row in rows]
 
@@ -163,11 +154,11 @@ def predict_unblurred_maps(
     problem: Problem, scene: Scene, radars: Sequence[Radar]
 ) -> list[torch.Tensor]:
     """The surrogate's map of every sensor, as fitted, without extra widths."""
-    counts = {"samples": 4 * require_settings(problem.run).samples, "boundary_samples": 0}
+    counts = {"samples": 4 * problem.run.fit_settings.samples, "boundary_samples": 0}
     with torch.no_grad():
         return [
             model.with_sampling(**counts).predict(scene, radar, problem.run.seed)
-            for model, radar in zip(make_display_models(problem), radars, strict=True)
+            for model, radar in zip(radar_models.make_display_models(problem), radars, strict=True)
         ]
 
 
@@ -175,8 +166,8 @@ def surrogate_agreement(problem: Problem, twin: Scene, radar: Radar) -> dict[str
     """Correlation of the surrogate with the mean of exact spectra: one bounce, first frame."""
     if not isinstance(radar.waveform, SampledWaveform):
         return {}
-    sampling = Sampling(depth=1, points_per_m2=rough_point_densities(problem.run))
-    model = replace(make_unblurred_models(problem)[0], sampling=sampling)
+    sampling = Sampling(depth=1, points_per_m2=radar_models.rough_point_densities(problem.run))
+    model = replace(radar_models.make_unblurred_models(problem)[0], sampling=sampling)
     first = replace(radar.frames([0]), range_bias=0.0)
     found = surrogate_correlation(twin, first, model, seed=problem.run.seed)
     return {"surrogate_correlation": found}
@@ -195,7 +186,7 @@ def total_loss(
         return None
 
 
-def error_bar_table(metrics: dict[str, Any]) -> ReportTable:
+def error_bar_table(metrics: Row) -> ReportTable:
     """The error bars of the best fit."""
     cells = []
     for name, value in metrics.get("standard_deviations", {}).items():

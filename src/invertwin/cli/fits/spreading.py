@@ -30,7 +30,7 @@ FitFunction = Callable[[RunFile, str, int, RunFolder], object]
 
 @dataclass(frozen=True)
 class FitWorkers:
-    """Who fits.
+    """Workers of the fits of a run.
 
     Attributes:
         engine: Processes of this machine, or tasks of a Ray cluster.
@@ -42,7 +42,7 @@ class FitWorkers:
 
     @classmethod
     def from_options(cls, engine: Engine, count: int | None) -> "FitWorkers | None":
-        """What the options `--engine` and `--workers` ask for; None without them.
+        """Workers that the options `--engine` and `--workers` ask for; None without them.
 
         Args:
             engine: Of the option.
@@ -92,7 +92,10 @@ def distribute_fits(
         InputError: What a fit refuses, or only one fit.
     """
     if len(fits) == 1:
-        raise no_parallel_fits_error("one fit")
+        raise InputError(
+            "expected several starts or variants for --engine ray or --workers, got one fit; leave "
+            "the option out"
+        )
     text, begun = to_minimal_toml(run), f"{PARTS}/calibration.pt"
     path = folder.path / UNFINISHED / begun
     files = {begun: path.read_bytes()} if path.exists() else {}
@@ -110,20 +113,8 @@ def distribute_fits(
                 folder.write_bytes(name, made[name])
 
 
-def no_parallel_fits_error(got: str) -> InputError:
-    """The error where there is nothing to spread.
-
-    Args:
-        got: What there is.
-    """
-    return InputError(
-        f"expected several starts or variants for --engine ray or --workers, got {got}; leave "
-        "the option out"
-    )
-
-
 def fit_file_stem(mode: str, start: int) -> str:
-    """How the files of a fit begin, in the run's folder.
+    """Path in the run's folder with which the files of a fit begin.
 
     Args:
         mode: The run's own way to fit, or a variant.

@@ -1,4 +1,4 @@
-"""What a reconstruction leaves behind: tables, pictures, the report."""
+"""Results of a reconstruction: tables, pictures, the report."""
 
 import math
 from collections.abc import Mapping
@@ -8,13 +8,7 @@ from typing import Any
 import torch
 
 from invertwin import plotting
-from invertwin.cli.fits.problem import (
-    INTERIOR_ONLY,
-    OWN_METHOD,
-    Problem,
-    fitted_objects,
-    require_settings,
-)
+from invertwin.cli.fits.problem import INTERIOR_ONLY, OWN_METHOD, Fits, Problem, Row, Summary
 from invertwin.cli.fits.radar_models import blur_end_step
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.fits.shape_scores import CURVE_KEY, is_shape_key, shape_label, short_label
@@ -30,6 +24,7 @@ from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.inversion.metrics import pose_error
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.material.values import RANGES
+from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.run_folder import RunFolder
 
 _MATERIAL_ERRORS = {f"{name}_error": name for name in RANGES}
@@ -62,8 +57,7 @@ class BestFit:
     @property
     def fits_by_method(self) -> list[tuple[str, list[dict[str, Any]]]]:
         """The fits of every way to fit, by its name in words."""
-        run = self.problem.run
-        own = "with boundary terms" if require_settings(run).boundary else "interior only"
+        own = "with boundary terms" if self.problem.run.fit_settings.boundary else "interior only"
         if set(self.rows) - {OWN_METHOD, INTERIOR_ONLY}:
             own = "as the run says"
         return [
@@ -72,20 +66,33 @@ class BestFit:
         ]
 
 
+def summarise_maps(fits: Fits, metrics: Row, folder: RunFolder) -> Summary:
+    """Summary of fits to maps of radars; its pictures are written.
+
+    Args:
+        fits: All fits of the run.
+        metrics: Numbers of the run.
+        folder: Gets the pictures.
+    """
+    scenes = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
+    residuals = fits.found.verdict.residuals
+    fitted = BestFit(fits.problem, metrics, fits.rows, *scenes, fits.maps, residuals)
+    result, *tables = make_tables(fitted)
+    outcome = describe_outcome(fits.problem.run, metrics)
+    return Summary(outcome, result, draw_pictures(fitted, folder), tables)
+
+
 def make_tables(fitted: BestFit) -> list[ReportTable]:
-    """What is printed, and shown in the report."""
+    """Tables that are printed, and shown in the report."""
     metrics = fitted.metrics
     tables = [_result_table(fitted.problem.run, metrics)]
     for way, fits in fitted.fits_by_method:
         if len(fits) > 1:
             keys = [key for key in START_COLUMNS if key in fits[0]]
-            cells = [
-                [
-                    row["start"] + 1,
-                    *(_format_status(key, row[key], row.get("lost", False)) for key in keys),
-                ]
-                for row in fits
-            ]
+            cells: list[list[Any]] = []
+            for row in fits:
+                told = (_format_status(key, row[key], row.get("lost", False)) for key in keys)
+                cells.append([row["start"] + 1, *told])
             heads = ["start", *(START_COLUMNS[key] for key in keys)]
             tables.append(ReportTable(f"Starts, {way}", heads, cells))
     if len(fitted.fits_by_method) > 1 and any(is_shape_key(key) for key in metrics):
@@ -100,10 +107,8 @@ def make_tables(fitted: BestFit) -> list[ReportTable]:
 
 
 def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
-    rows: list[list[Any]] = [
-        ["verdict", metrics["verdict"]],
-        ["why it stopped", _stop_reason(metrics)],
-    ]
+    rows: list[list[Any]] = [["verdict", metrics["verdict"]]]
+    rows.append(["why it stopped", _stop_reason(metrics)])
     if "success" in metrics:
         count, limits = metrics["starts_count"], _success_limits(run, metrics)
         if count == 1:
@@ -129,7 +134,7 @@ def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
 
 
 def _method_table(fitted: BestFit) -> ReportTable:
-    """What each way to fit has made of the shape, means over the starts."""
+    """Measures of the shape by each way to fit, means over the starts."""
     first = fitted.fits_by_method[0][1][0]
     begun = [key for key in first if key.startswith("start_") and is_shape_key(key)]
     keys = [key.removeprefix("start_") for key in begun]
@@ -141,9 +146,9 @@ def _method_table(fitted: BestFit) -> ReportTable:
 
 
 def _pose_table(fitted: BestFit) -> ReportTable:
-    """Where the fitted objects stand, and how they are turned."""
+    """Positions and turns of the fitted objects."""
     problem, cells = fitted.problem, []
-    for name in dict.fromkeys(fitted_objects(problem.run)):
+    for name in dict.fromkeys(problem.run.fitted_objects):
         known = name in problem.known_objects
         scenes = [fitted.start, fitted.twin, *([problem.truth] if known else [])]
         centers = [scene[name].center.detach().tolist() for scene in scenes]
@@ -158,15 +163,14 @@ def _pose_table(fitted: BestFit) -> ReportTable:
 
 
 def _is_own_shape_key(run: RunFile, key: str) -> bool:
-    """Whether a number measures the shape that the run's own way to fit has found."""
+    """Return True if a number measures the shape that the run's own way to fit has found."""
     return is_shape_key(key) and not key.endswith(tuple(f"_{mode}" for mode in run.variants))
 
 
 def _refinement_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
-    """What the fit has made better: the conventional guess beside the twin."""
-    shapes = [
-        (shape_label(key), f"start_{key}", key) for key in metrics if _is_own_shape_key(run, key)
-    ]
+    """Improvement by the fit: the conventional guess beside the twin."""
+    keys = [key for key in metrics if _is_own_shape_key(run, key)]
+    shapes = [(shape_label(key), f"start_{key}", key) for key in keys]
     rows = [
         [label, metrics[before], metrics[after]]
         for label, before, after in (*_INITIAL_METRICS, *shapes)
@@ -180,7 +184,7 @@ def _refinement_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
 def draw_pictures(fitted: BestFit, folder: RunFolder) -> list[ReportPicture]:
     """Write the pictures of the best fit; return those of the report."""
     problem, metrics = fitted.problem, fitted.metrics
-    run, truth, fitted_names = problem.run, problem.truth, fitted_objects(problem.run)
+    run, truth, fitted_names = problem.run, problem.truth, problem.run.fitted_objects
     known = {k: truth[k] for k in truth.names if k in problem.known_objects and k in fitted_names}
     scenes = {"truth": truth} if known else {}
     scenes |= {"start": fitted.start, "twin": fitted.twin}
@@ -193,9 +197,8 @@ def draw_pictures(fitted: BestFit, folder: RunFolder) -> list[ReportPicture]:
     for number, (name, item) in enumerate(problem.sensor_data.items()):
         titled = {titles[key]: maps[number] for key, maps in fitted.maps.items()}
         file = f"spectra_{name}" if name else "spectra"
-        found.append(
-            save_picture(folder, file, plotting.spectrum(titled, item.grid), note="spectra")
-        )
+        figure = plotting.spectrum(titled, item.grid)
+        found.append(save_picture(folder, file, figure, note="spectra"))
     for (name, item), apart in zip(problem.sensor_data.items(), fitted.residuals, strict=False):
         figure = plotting.residuals(apart, item.grid)
         file = f"residuals_{name}" if name else "residuals"
@@ -235,19 +238,24 @@ def _draw_turntable(fitted: BestFit, name: str) -> bytes:
 
 
 def _shape_curve(row: dict[str, Any]) -> list[list[float]]:
-    """How the measure went, from the start on where that is scored."""
-    begun: list[list[float]] = (
-        [[0, row[_START_CURVE_KEY]]] if row["curve"] and _START_CURVE_KEY in row else []
-    )
-    return [*begun, *row["curve"]]
+    """Curve of the measure, from the start on where that is scored."""
+    if not row["curve"] or _START_CURVE_KEY not in row:
+        return row["curve"]
+    return [[0, row[_START_CURVE_KEY]], *row["curve"]]
 
 
-def describe_outcome(run: RunFile, metrics: dict[str, Any]) -> str:
-    """What came out, in a sentence or two."""
+def describe_outcome(run: RunFile, metrics: dict[str, Any], *, counted: bool = False) -> str:
+    """Say in a sentence or two what came out.
+
+    Args:
+        run: The run file.
+        metrics: Numbers of the run.
+        counted: Count the successes of a single start, too.
+    """
     count = metrics.get("starts_count", 1)
     which = f"Best of {count} starts: " if count > 1 else ""
     ended, believed = _stop_reason(metrics), load_texts("verdicts")[metrics["verdict"]]
-    many = "joint_error_after_deg" in metrics or count > 1
+    many = counted or "joint_error_after_deg" in metrics or count > 1
     if "joint_error_after_deg" in metrics:
         score = f"{which}joints {metrics['joint_error_after_deg']:.1f}° off, mean; {ended}."
     elif "position_error_m" in metrics:
@@ -270,17 +278,16 @@ def _stop_reason(metrics: dict[str, Any]) -> str:
 
 
 def _success_limits(run: RunFile, metrics: dict[str, Any]) -> str:
-    """How near the truth counts as a success."""
-    settings = require_settings(run)
+    """Largest errors of a success, in words."""
+    settings = run.fit_settings
     if "joint_error_after_deg" in metrics:
         return f"{settings.joint_limit_deg:g}° (mean over the joints)"
-    turned = "rotation_error_deg" in metrics
-    angle = f" and {settings.rotation_limit_deg:g}°" if turned else ""
+    angle = f" and {settings.rotation_limit_deg:g}°" if "rotation_error_deg" in metrics else ""
     return f"{settings.position_limit:g} m{angle}"
 
 
 def _format_status(key: str, value: Any, uninformative: bool = False) -> Any:
-    """What a table shows of a number; a start that is lost says so, however it ended."""
+    """Cell of a number; a start that is lost says so, however it ended."""
     return load_texts("ends")["lost" if uninformative else value] if key == "status" else value
 
 

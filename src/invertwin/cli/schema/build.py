@@ -64,9 +64,7 @@ def true_scene(run: RunFile) -> Scene:
         changes = {key: value for key, value in truth if value is not None}
         parts = changes.pop("parts", None)
         with prefix_errors(f"truth.{name}"):
-            shape = (
-                {} if parts is None else {"mesh": merge_meshes([part.build() for part in parts])}
-            )
+            shape = {} if parts is None else {"mesh": merge_meshes([p.build() for p in parts])}
             if name in run.scene:
                 item = run.scene[name].model_copy(update=changes).build(**shape)
             else:
@@ -200,12 +198,10 @@ def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, ParameterC
 
 
 def _panel_values(run: RunFile, scene: Scene) -> dict[type, object]:
-    if run.placement is None:
+    if (table := run.placement) is None:
         return {}
-    table = run.placement
-    return {
-        PanelPlacement: table.place(table.coverage(scene, run.seed), table.initial, phases=True)
-    }
+    coverage = table.coverage(scene, run.seed)
+    return {PanelPlacement: table.place(coverage, table.initial, phases=True)}
 
 
 def _build_module(

@@ -3,26 +3,18 @@
 from typing import Annotated, Any, Literal
 
 from annotated_types import MinLen
-from pydantic import GetCoreSchemaHandler, model_validator
+from pydantic import model_validator
 
 from invertwin.cli.schema.variation import parse_key_path
 from invertwin.datasets import Choice, Integer, LogUniform, Normal, Presence, Uniform
 from invertwin.limits import Count
-from invertwin.registry.kinds import ConstructorTable, KindGroup, Registry, number_or_list
+from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry
 from invertwin.registry.section import PrintableText, Section, raise_key_error
 from invertwin.registry.section import key as described
 
 _DATASET_SECTIONS = ("task", "seed", "dataset", "vary")  # of the data set itself
 _KeyPathText = Annotated[PrintableText, MinLen(1)]
-
-
-class _KeyPaths:
-    """Annotates a key that is one path, or a list of them."""
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        kind = number_or_list(_KeyPathText, Annotated[list[_KeyPathText], MinLen(1)])
-        return handler.generate_schema(kind)
+_KeyPaths = FormOf((_KeyPathText, Annotated[list[_KeyPathText], MinLen(1)]))
 
 
 class DatasetTable(Section):
@@ -61,8 +53,7 @@ class VaryTable(ConstructorTable):
             if not steps or steps[0] in _DATASET_SECTIONS:
                 raise_key_error(
                     f"expected a path such as scene.box.position[0], and none of "
-                    f"{', '.join(_DATASET_SECTIONS)},"
-                    f' got "{path}"; correct it',
+                    f'{", ".join(_DATASET_SECTIONS)}, got "{path}"; correct it',
                     "key",
                 )
         return self
@@ -71,12 +62,9 @@ class VaryTable(ConstructorTable):
 def register(registry: Registry) -> None:
     """Add the distributions."""
     registry.groups["distribution"] = KindGroup(base=VaryTable)
-    for name, make in (
-        ("uniform", Uniform),
-        ("log_uniform", LogUniform),
-        ("normal", Normal),
-        ("integer", Integer),
-        ("choice", Choice),
-        ("presence", Presence),
-    ):
-        registry.add("distribution", name, make)
+    registry.add("distribution", "uniform", Uniform)
+    registry.add("distribution", "log_uniform", LogUniform)
+    registry.add("distribution", "normal", Normal)
+    registry.add("distribution", "integer", Integer)
+    registry.add("distribution", "choice", Choice)
+    registry.add("distribution", "presence", Presence)

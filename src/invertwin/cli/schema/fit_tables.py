@@ -65,11 +65,8 @@ def register(registry: Registry) -> None:
     registry.add("model", "surrogate", SurrogateMap, without=("_reference",), checked=False)
     registry.add("model", "chains", FacetMap, checked=False)
     registry.add("model", "chain_field", FacetField, checked=False)
-    for name, make in (
-        ("random", sample_nearby_poses),
-        ("grid", pose_grid),
-        ("given", place_at_poses),
-    ):
-        registry.add("search", name, make)
+    registry.add("search", "random", sample_nearby_poses)
+    registry.add("search", "grid", pose_grid)
+    registry.add("search", "given", place_at_poses)
     for name in ("adam", "sgd", "gauss_newton"):
         registry.add("optimizer", name, Optimizer, without=("module_rates",))

@@ -101,10 +101,8 @@ class RunOverrides(Section):
 
     def overrides(self) -> dict[str, Any]:
         """Tables merged over the run; a part has no stages."""
-        return {
-            **self.model_dump(include=set(RunOverrides.model_fields), exclude_none=True),
-            "stages": [],
-        }
+        own = set(RunOverrides.model_fields)
+        return self.model_dump(include=own, exclude_none=True) | {"stages": []}
 
 
 class StageTable(RunOverrides):
@@ -137,8 +135,7 @@ class VariantTable(RunOverrides):
 
     def overrides(self) -> dict[str, Any]:
         """Tables merged over the run."""
-        own = {"first_starts"}
-        return self.model_dump(exclude_unset=True, exclude_none=True, exclude=own)
+        return self.model_dump(exclude_unset=True, exclude_none=True, exclude={"first_starts"})
 
     def with_resolved_paths(self, run: Any) -> "VariantTable":
         """The variant with paths of files as the run that it makes has found them."""

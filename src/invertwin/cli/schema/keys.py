@@ -18,12 +18,7 @@ from invertwin.runtime.doctor import cache_folder
 from invertwin.storage.folders import replace_file
 
 KEY_COLUMNS = ("key", "value", "default", "unit or meaning")
-_TYPE_NAMES = {
-    "number": "number",
-    "integer": "integer",
-    "boolean": "true or false",
-    "string": "text",
-}
+_TYPE_NAMES = {"boolean": "true or false", "string": "text"}  # others are called as they are
 _LIMIT_SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
 JsonSchema = dict[str, Any]
 
@@ -67,11 +62,8 @@ def _code_digest() -> str:
 def key_index() -> ReportTable:
     """The sections of a run file, and what each is."""
     top = json_schema()
-    rows = [
-        [name, top["properties"][name].get("description", "")]
-        for name in top["properties"]
-        if _nested_tables(top["properties"][name], top["$defs"])
-    ]
+    tables = {n: v for n, v in top["properties"].items() if _nested_tables(v, top["$defs"])}
+    rows = [[name, value.get("description", "")] for name, value in tables.items()]
     note = "invertwin keys SECTION prints the keys of one, such as radar or radar.waveform."
     return ReportTable("Sections of a run file", ("section", "what it is"), rows, note)
 
@@ -114,15 +106,12 @@ def _iterate_sections(top: JsonSchema) -> Iterator[tuple[str, list[ReportTable]]
     def walk(path: str, models: Sequence[JsonSchema]) -> Iterator[tuple[str, list[ReportTable]]]:
         title = f"[{path}]" if path else "top of the file, and its sections"
         common = set.intersection(*map(_keys_without_tag, models)) if len(models) > 1 else set()
-        shared = [
-            key
-            for key in models[0]["properties"]
-            if (key, _key_description(models[0], key)) in common
-        ]
+        first = models[0]
+        shared = [k for k in first["properties"] if (k, _key_description(first, k)) in common]
         inner: list[tuple[str, list[JsonSchema]]] = []
         tables = []
         if shared:
-            rows = [row(path, models[0], key, inner) for key in shared]
+            rows = [row(path, first, key, inner) for key in shared]
             tables.append(ReportTable(f"{title}, all kinds", KEY_COLUMNS, rows, ""))
         for model in models:
             keys = [key for key in model.get("properties", {}) if key not in shared]
@@ -152,13 +141,8 @@ def _iterate_sections(top: JsonSchema) -> Iterator[tuple[str, list[ReportTable]]
         elif below:
             inner.append((place, below))
             seen[identity] = place
-        required = key in model.get("required", ())
-        return [
-            key,
-            _describe_value(value),
-            "required" if required else _format_default(value),
-            note,
-        ]
+        default = "required" if key in model.get("required", ()) else _format_default(value)
+        return [key, _describe_value(value), default, note]
 
     yield from walk("", [top])
 
@@ -171,9 +155,8 @@ def _nested_tables(value: JsonSchema, defined: Mapping[str, JsonSchema]) -> list
     held = [value[key] for key in ("items", "additionalProperties") if key in value]
     parts = [*value.get("anyOf", ()), *value.get("oneOf", ()), *held]
     tables = (part for part in parts if isinstance(part, dict))
-    return list(
-        {id(model): model for part in tables for model in _nested_tables(part, defined)}.values()
-    )
+    found = {id(model): model for part in tables for model in _nested_tables(part, defined)}
+    return list(found.values())
 
 
 def _describe_value(value: JsonSchema) -> str:
@@ -190,7 +173,8 @@ def _describe_value(value: JsonSchema) -> str:
     if "$ref" in value or value.get("type", "object") == "object":
         return "table"
     signs = [f"{sign} {value[name]:.10g}" for name, sign in _LIMIT_SIGNS.items() if name in value]
-    return " ".join([_TYPE_NAMES[value["type"]], ", ".join(signs)]).strip()
+    kind: str = value["type"]
+    return " ".join([_TYPE_NAMES.get(kind, kind), ", ".join(signs)]).strip()
 
 
 def _key_description(model: JsonSchema, key: str) -> str:
@@ -205,12 +189,8 @@ def _kind_tags(model: JsonSchema) -> dict[str, str]:
 
 def _keys_without_tag(model: JsonSchema) -> set[tuple[str, str]]:
     """Keys and what they mean, without the one that names the kind."""
-    tags = _kind_tags(model)
-    return {
-        (key, _key_description(model, key))
-        for key in model.get("properties", {})
-        if key not in tags
-    }
+    own = model.get("properties", {}).keys() - _kind_tags(model).keys()
+    return {(key, _key_description(model, key)) for key in own}
 
 
 def _format_value(value: Any) -> str:

@@ -9,41 +9,13 @@ import torch
 from annotated_types import Ge, Gt, Le, MinLen
 from pydantic import model_validator
 
+from invertwin import scene
 from invertwin.errors import InputError
-from invertwin.registry.kinds import (
-    ConstructorTable,
-    KindGroup,
-    Registry,
-    ValueFormat,
-    number_or_list,
-)
+from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry, ValueFormat
 from invertwin.registry.section import InputPath, Section, key, raise_key_error
-from invertwin.scene import (
-    Dielectric,
-    Itu,
-    Material,
-    Mesh,
-    Multilayer,
-    PerfectConductor,
-    RefractingBody,
-    RoughConductor,
-    RoughDielectric,
-    Slab,
-    Texture,
-)
 from invertwin.scene.material.materials import Medium
 from invertwin.scene.material.values import RANGES, Value
 from invertwin.storage.untrusted import read_npy
-
-_MATERIAL_CLASSES: Mapping[str, type[Material]] = {
-    "rough_dielectric": RoughDielectric,
-    "perfect_conductor": PerfectConductor,
-    "rough_conductor": RoughConductor,
-    "dielectric": Dielectric,
-    "refracting_body": RefractingBody,
-    "slab": Slab,
-    "multilayer": Multilayer,
-}
 
 
 class TextureFile(Section):
@@ -62,7 +34,7 @@ def _value_type(name: str, angle: bool) -> Any:
         low, high = (math.degrees(end) if angle else end for end in (span.low, span.high))
         number = Annotated[float, Gt(low) if span.open_low else Ge(low)]
         number = number if math.isinf(high) else Annotated[number, Le(high)]
-    return number_or_list(number, Annotated[list[number], MinLen(1)], TextureFile)
+    return Annotated[Any, FormOf((number, Annotated[list[number], MinLen(1)], TextureFile))]
 
 
 class MediumTable(ConstructorTable):
@@ -84,17 +56,22 @@ class MediumTable(ConstructorTable):
         found = super().library_values(given)
         if self.itu is None:
             return found
-        return {"permittivity": Itu(self.itu), "conductivity": Itu(self.itu), **found}
+        return {"permittivity": scene.Itu(self.itu), "conductivity": scene.Itu(self.itu), **found}
 
 
 def register(registry: Registry) -> None:
     """Add the materials."""
     registry.groups["material"] = KindGroup()
-    registry.forms[Texture] = ValueFormat(_value_type, _build_value)
+    registry.forms[scene.Texture] = ValueFormat(_value_type, _build_value)
     registry.bases[Medium] = MediumTable
-    registry.given.add(Mesh)
-    for name, kind in _MATERIAL_CLASSES.items():
-        registry.add("material", name, kind)
+    registry.given.add(scene.Mesh)
+    registry.add("material", "rough_dielectric", scene.RoughDielectric)
+    registry.add("material", "perfect_conductor", scene.PerfectConductor)
+    registry.add("material", "rough_conductor", scene.RoughConductor)
+    registry.add("material", "dielectric", scene.Dielectric)
+    registry.add("material", "refracting_body", scene.RefractingBody)
+    registry.add("material", "slab", scene.Slab)
+    registry.add("material", "multilayer", scene.Multilayer)
 
 
 def _build_value(value: Any, name: str, angle: bool, given: Mapping[type, object]) -> Value:
@@ -103,11 +80,11 @@ def _build_value(value: Any, name: str, angle: bool, given: Mapping[type, object
         return torch.deg2rad(row) if angle else row
     if not isinstance(value, TextureFile):
         return math.radians(value) if angle else value
-    mesh = given.get(Mesh)
-    if not isinstance(mesh, Mesh):
+    mesh = given.get(scene.Mesh)
+    if not isinstance(mesh, scene.Mesh):
         raise InputError(
             f"expected {name} as a number for the materials of a scene file, got an image; "
             "give textures to objects of their own"
         )
-    texture = Texture.from_projection(read_npy(value.image), mesh)
+    texture = scene.Texture.from_projection(read_npy(value.image), mesh)
     return replace(texture, image=torch.deg2rad(texture.image)) if angle else texture

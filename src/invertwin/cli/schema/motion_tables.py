@@ -44,8 +44,7 @@ def scene_at_start(run: RunFile, scene: Scene, duration: float) -> Scene:
         return motion
     begin, end = motion(0.0), motion(duration)
     for name in motion.motions:
-        mean = (end[name].vertices - begin[name].vertices) / duration
-        begin = begin.replace(name, velocity=mean)
+        begin = begin.replace(name, velocity=(end[name].vertices - begin[name].vertices) / duration)
     return begin
 
 

@@ -2,12 +2,14 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, Gt, Len, Lt, MinLen
 from torch import Tensor
 
+from invertwin.cli.schema.radio_tables import random_points
 from invertwin.limits import Count, CountOfTwo, NonNegative, Positive
 from invertwin.links.metasurface.coverage import Coverage
 from invertwin.links.metasurface.panel import Metasurface
@@ -36,13 +38,11 @@ class Receivers(Section):
 
     def draw(self, count: int, seed: int) -> Tensor:
         """Places [count, 3] [m]."""
-        low, high = (torch.tensor(end, dtype=torch.float64) for end in (self.low, self.high))
-        generator = torch.Generator().manual_seed(seed)
-        return low + (high - low) * torch.rand(count, 3, generator=generator, dtype=torch.float64)
+        return random_points(self.low, self.high, count, seed).positions
 
 
 class Walls(Section):
-    """Where the panel may stand: a level path along walls, the room on its left."""
+    """Places of the panel: a level path along walls, the room on its left."""
 
     corners: Annotated[list[_POINT], MinLen(2)] = key("m, x and y, off the walls by half a panel")
     height: float = key("m, z of the panel's centre")
@@ -89,7 +89,7 @@ class Placement(Section):
 
     @property
     def initial(self) -> Trial:
-        """Where fits start that have no search, and gradient checks are made."""
+        """Start of fits that have no search, and place of gradient checks."""
         across, up = (math.radians(angle) for angle in self.spread_start_deg)
         return self.along, math.radians(self.yaw_deg), (across, up)
 
@@ -219,13 +219,8 @@ class PanelGrid(_PanelSearch):
         step = path.length / (self.places if path.closed else self.places - 1)
         turns = torch.linspace(-turn, turn, self.yaws).tolist() if self.yaws > 1 else [0.0]
         spreads = [math.radians(angle) for angle in self.spread_deg]
-        return [
-            (number * step, yaw, (across, up))
-            for number in range(self.places)
-            for yaw in turns
-            for across in spreads
-            for up in spreads
-        ]
+        grid = product(range(self.places), turns, product(spreads, spreads))
+        return [(number * step, yaw, widths) for number, yaw, widths in grid]
 
 
 def register(registry: Registry) -> None:

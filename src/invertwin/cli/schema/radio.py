@@ -7,19 +7,14 @@ from annotated_types import MinLen
 from torch import Tensor
 
 from invertwin.cli.schema.fits import SamplingBase
-from invertwin.cli.schema.sensors import (
-    LookAtOrientation,
-    Orientation,
-    PolarisationValue,
-    RotatedOrientation,
-)
+from invertwin.cli.schema.sensors import Orientation, PolarisationValue
 from invertwin.errors import InputError
 from invertwin.limits import Count, NonNegative
 from invertwin.links import AntennaMount, PropagationSettings, Transmitters
 from invertwin.models.radio import RadioMap
 from invertwin.registry.kinds import OneOf, TableOf, registry
 from invertwin.registry.section import Section, Seed, Vector, key, prefix_errors
-from invertwin.scene import AntennaArray, Mesh, Scene, look_at, rotation_from_vector
+from invertwin.scene import AntennaArray, Mesh, Scene
 from invertwin.scene.shape_models.distance import signed_distance
 
 _MAX_DRAWS = 10_000  # places that are drawn, before that is given up
@@ -49,12 +44,7 @@ class AntennaTable(Section):
         array = AntennaArray(element, polarisation=self.polarisation, **pattern)
         if self.orientation is None:
             return AntennaMount(array)
-        if isinstance(self.orientation, LookAtOrientation):
-            with prefix_errors("orientation.look_at"):
-                return AntennaMount(array, look_at(positions, self.orientation.look_at))
-        assert isinstance(self.orientation, RotatedOrientation)
-        turn = torch.tensor(self.orientation.rotation_deg, dtype=torch.float64).deg2rad()
-        return AntennaMount(array, rotation_from_vector(turn))
+        return AntennaMount(array, self.orientation.rotations(positions))
 
 
 class TransmitterTable(AntennaTable):

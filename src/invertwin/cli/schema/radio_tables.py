@@ -8,16 +8,9 @@ import torch
 from annotated_types import Ge, Len, MinLen
 from torch import Tensor
 
+from invertwin import links
 from invertwin.errors import InputError
 from invertwin.limits import Count, NonNegative, Positive
-from invertwin.links import (
-    CellSampling,
-    MapMesh,
-    MapPlane,
-    ReceiverLocations,
-    ReceiverPoints,
-    TransmitterPosition,
-)
 from invertwin.registry.kinds import KindGroup, Registry
 from invertwin.registry.section import InputPath, Section, Seed, Vector, key, prefix_errors
 from invertwin.scene import load_mesh
@@ -47,7 +40,7 @@ class ReceivedFile(Section):
     kind: Literal["received_file"]
     file: InputPath = key("CSV: x,y,z [m], then the levels")
 
-    def read(self) -> tuple[ReceiverPoints, Tensor]:
+    def read(self) -> tuple[links.ReceiverPoints, Tensor]:
         """Read receiver positions, and levels [tx, position].
 
         Raises:
@@ -55,25 +48,27 @@ class ReceivedFile(Section):
         """
         with prefix_errors("file"):
             rows = _read_rows(self.file, 4)
-        return ReceiverPoints(rows[:, :3]), rows[:, 3:].T
+        return links.ReceiverPoints(rows[:, :3]), rows[:, 3:].T
 
 
 def register(registry: Registry) -> None:
     """Add receiver positions of radio maps, and data of received levels."""
-    registry.groups["places"] = KindGroup(product=ReceiverLocations, default="points")
-    registry.add("places", "points", ReceiverPoints)
+    registry.groups["places"] = KindGroup(product=links.ReceiverLocations, default="points")
+    registry.add("places", "points", links.ReceiverPoints)
     registry.add("places", "random", random_points)
     registry.add("places", "file", points_file, untagged=True)
     registry.add("places", "plane", plane_cells)
     registry.add("places", "mesh", mesh_cells)
     registry.add("data", "received", ReceivedData)
     registry.add("data", "received_file", ReceivedFile)
-    registry.add("parameter", "transmitter", TransmitterPosition, without=("initial", "number"))
+    registry.add(
+        "parameter", "transmitter", links.TransmitterPosition, without=("initial", "number")
+    )
 
 
 def random_points(
     low: Sequence[float], high: Sequence[float], count: Count, seed: Annotated[int, Ge(0)] = 0
-) -> ReceiverPoints:
+) -> links.ReceiverPoints:
     """Random points in a box, evenly spread.
 
     Args:
@@ -85,17 +80,17 @@ def random_points(
     generator = torch.Generator().manual_seed(seed)
     ends = [torch.tensor(corner, dtype=torch.float64) for corner in (low, high)]
     share = torch.rand(count, 3, generator=generator, dtype=torch.float64)
-    return ReceiverPoints(ends[0] + share * (ends[1] - ends[0]))
+    return links.ReceiverPoints(ends[0] + share * (ends[1] - ends[0]))
 
 
-def points_file(file: InputPath) -> ReceiverPoints:
+def points_file(file: InputPath) -> links.ReceiverPoints:
     """Points of a CSV file with one header line: x,y,z [m].
 
     Args:
         file: path, from the run file's folder.
     """
     with prefix_errors("file"):
-        return ReceiverPoints(_read_rows(file, 3)[:, :3])
+        return links.ReceiverPoints(_read_rows(file, 3)[:, :3])
 
 
 def plane_cells(
@@ -105,7 +100,7 @@ def plane_cells(
     cell: Positive,
     points: Count = 16,
     edge_points: Count = 20_000,
-) -> MapPlane:
+) -> links.MapPlane:
     """Means over the cells of a horizontal rectangle.
 
     Args:
@@ -116,10 +111,11 @@ def plane_cells(
         points: least number of points in a cell.
         edge_points: points on edges of the scene, for each transmitter; for derivatives only.
     """
-    return MapPlane.horizontal(low, high, height, cell, CellSampling(points, edge_points))
+    sampling = links.CellSampling(points, edge_points)
+    return links.MapPlane.horizontal(low, high, height, cell, sampling)
 
 
-def mesh_cells(file: InputPath, points: Count = 16, edge_points: Count = 20_000) -> MapMesh:
+def mesh_cells(file: InputPath, points: Count = 16, edge_points: Count = 20_000) -> links.MapMesh:
     """Means over the triangles of a mesh.
 
     Args:
@@ -128,7 +124,7 @@ def mesh_cells(file: InputPath, points: Count = 16, edge_points: Count = 20_000)
         edge_points: points on edges of the scene, for each transmitter; for derivatives only.
     """
     with prefix_errors("file"):
-        return MapMesh(load_mesh(file), CellSampling(points, edge_points))
+        return links.MapMesh(load_mesh(file), links.CellSampling(points, edge_points))
 
 
 def _read_rows(file: str, min_columns: int) -> Tensor:

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge
-from pydantic import GetCoreSchemaHandler, model_validator
+from pydantic import model_validator
 
 from invertwin.capture import Capture, ChannelCalibration, ChirpCapture, ChirpData, ti
 from invertwin.capture.readers import described_arrays, described_sweeps
@@ -13,7 +13,7 @@ from invertwin.cli.schema.sensors import RadarPoseTable
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.radar.boards import Mounting
-from invertwin.registry.kinds import ConstructorTable, KindGroup, Registry, number_or_list, registry
+from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry, registry
 from invertwin.registry.section import (
     Depth,
     InputPath,
@@ -25,19 +25,11 @@ from invertwin.registry.section import (
 )
 
 
-class _PointDensities:
-    """Annotates points per m²: a number, or a table with one for each object."""
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        return handler.generate_schema(number_or_list(Positive, dict[str, Positive]))
-
-
 class SimulatedData(Section):
     """Exact signals of the true scene, with noise."""
 
     kind: Literal["simulated"]
-    points_per_m2: Annotated[Any, _PointDensities] = key(
+    points_per_m2: Annotated[Any, FormOf((Positive, dict[str, Positive]))] = key(
         'rough points per m²: a number, or a table by object, "*" for all others'
     )
     samples: Count = key("coherent paths", 200_000)

@@ -2,7 +2,7 @@
 
 import json
 import re
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import MinLen
@@ -10,21 +10,10 @@ from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from invertwin.channel.sampling import ALL_OTHERS
+from invertwin.cli.schema import fits
 from invertwin.cli.schema.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.schema.dataset import DatasetTable
 from invertwin.cli.schema.fit_tables import SurrogateTable
-from invertwin.cli.schema.fits import (
-    AnyInitial,
-    AnyStarts,
-    CalibrationTable,
-    LandscapeTable,
-    MeasuresTable,
-    PlanTable,
-    ReconstructTable,
-    RunOverrides,
-    StageTable,
-    VariantTable,
-)
 from invertwin.cli.schema.gradcheck import GradcheckTable
 from invertwin.cli.schema.placement import Placement
 from invertwin.cli.schema.radio import AnyMap, TransmitterStartsTable, TransmitterTable
@@ -47,6 +36,7 @@ from invertwin.registry.section import (
     Vector,
     key,
     raise_key_error,
+    require_section,
 )
 from invertwin.scene.rooms import room
 from invertwin.signatures import rcs
@@ -68,15 +58,8 @@ AnyData = Annotated[Any, OneOf("data")]
 AnyRoom = Annotated[Any, TableOf(room, RoomTable, checked=True)]
 AnySurrogate = Annotated[Any, TableOf(Surrogate, SurrogateTable)]
 AnyGradcheck = Annotated[Any, TableOf(GradcheckSettings, GradcheckTable)]
-AnyRcs = Annotated[
-    Any,
-    TableOf(
-        rcs,
-        RcsTable,
-        ("directions", "frequencies", "receivers", "polarisation", "boundary"),
-        checked=False,
-    ),
-]
+_RCS_GIVEN = ("directions", "frequencies", "receivers", "polarisation", "boundary")
+AnyRcs = Annotated[Any, TableOf(rcs, RcsTable, _RCS_GIVEN, checked=False)]
 
 
 class SceneFileTable(Section):
@@ -162,13 +145,13 @@ class _RunFile(Section):
     parameters: list[Annotated[Any, OneOf("parameter")]] = key(
         "[[parameters]]: what is unknown", []
     )
-    starts: AnyStarts | None = key("where fits start; without it where the scene says", None)
+    starts: fits.AnyStarts | None = key("where fits start; without it where the scene says", None)
     search: Annotated[Any, OneOf("search")] | None = key(
         "several poses to begin from at every start; the best end counts", None
     )
-    plan: PlanTable | None = key("what `invertwin plan` compares and tries", None)
+    plan: fits.PlanTable | None = key("what `invertwin plan` compares and tries", None)
     twin: TwinTable | None = key("the ground that `invertwin twin` searches", None)
-    initial: AnyInitial | None = key(
+    initial: fits.AnyInitial | None = key(
         "where the fit starts by conventional processing, not with [starts]", None
     )
     surrogate: AnySurrogate = key("kernels of the smooth model", {}, validate_default=True)
@@ -181,14 +164,16 @@ class _RunFile(Section):
     optimizer: Annotated[Any, OneOf("optimizer")] = key(
         "how a gradient becomes a step", {}, validate_default=True
     )
-    reconstruct: ReconstructTable | None = key("the fit", None)
-    stages: list[StageTable] = key(
+    reconstruct: fits.ReconstructTable | None = key("the fit", None)
+    stages: list[fits.StageTable] = key(
         "[[stages]]: parts of the fit, one after another; without them one", []
     )
-    variants: dict[str, VariantTable] = key("[variants.<name>]: other ways to fit, to compare", {})
-    measures: MeasuresTable | None = key("scores of the found shape", None)
-    calibration: CalibrationTable | None = key("calibration before the fit", None)
-    landscape: LandscapeTable | None = key("losses along a line", None)
+    variants: dict[str, fits.VariantTable] = key(
+        "[variants.<name>]: other ways to fit, to compare", {}
+    )
+    measures: fits.MeasuresTable | None = key("scores of the found shape", None)
+    calibration: fits.CalibrationTable | None = key("calibration before the fit", None)
+    landscape: fits.LandscapeTable | None = key("losses along a line", None)
     gradcheck: AnyGradcheck | None = key("the gradient check", None)
     placement: Placement | None = key(
         "a metasurface that is placed; with [gradcheck] what is differentiated", None
@@ -260,12 +245,10 @@ class _RunFile(Section):
             )
         own = set(names)
         if self.reconstruct is not None:
-            sensors, used = [*self.observations], self.reconstruct
-            _require_known_names("parameters", used.parameters, names, "reconstruct.parameters")
-            _require_known_names(
-                "observations", used.observations, sensors, "reconstruct.observations"
-            )
-            own = set(used.parameters) or own
+            for what, known in (("parameters", names), ("observations", [*self.observations])):
+                used = getattr(self.reconstruct, what)
+                _require_known_names(what, used, known, f"reconstruct.{what}")
+            own = set(self.reconstruct.parameters) or own
         for i, stage in enumerate(self.stages):
             _require_known_names("parameters", stage.parameters, names, f"stages[{i}].parameters")
             fitted = own & set(stage.parameters or names)
@@ -297,9 +280,8 @@ class _RunFile(Section):
             name, why = parameter.object, f'with kind = "{parameter.kind}", which has its own size'
             scale = self.scene[name].scale if name in self.scene else 1.0
             if scale != 1:
-                raise_key_error(
-                    f"expected 1 {why}, got {scale:g}; remove it", f"scene.{name}.scale"
-                )
+                got = f"expected 1 {why}, got {scale:g}; remove it"
+                raise_key_error(got, f"scene.{name}.scale")
             if self.initial is not None and self.initial.object == name and self.initial.scale:
                 raise_key_error(f"expected false {why}, got true; remove it", "initial.scale")
         return self
@@ -307,20 +289,13 @@ class _RunFile(Section):
     @model_validator(mode="after")
     def _check_overrides(self, info: Any) -> "_RunFile":
         """Every stage and variant makes a run that is right; errors begin at its own path."""
-        runs = _overrides_model(type(self))
-        runs.model_validate(
-            {"stages": [self._dump_with_overrides(s) for s in self.stages]}, context=info.context
-        )
-        variants = {
-            name: self._dump_with_overrides(variant) for name, variant in self.variants.items()
-        }
-        found = runs.model_validate({"variants": variants}, context=info.context).variants
-        for name, run in found.items():
+        check = partial(_overrides_model(type(self)).model_validate, context=info.context)
+        check({"stages": [self._dump_with_overrides(stage) for stage in self.stages]})
+        variants = {name: self._dump_with_overrides(own) for name, own in self.variants.items()}
+        for name, run in check({"variants": variants}).variants.items():
             self.variants[name] = self.variants[name].with_resolved_paths(run)
         if self.calibration is not None:
-            runs.model_validate(
-                {"calibration": self._dump_with_overrides(self.calibration)}, context=info.context
-            )
+            check({"calibration": self._dump_with_overrides(self.calibration)})
         return self
 
     @model_validator(mode="after")
@@ -351,11 +326,11 @@ class _RunFile(Section):
         """As TOML, without what makes it a data set."""
         return self.model_dump(**_DUMP_GIVEN, exclude={"dataset", "vary"})
 
-    def apply_overrides(self, part: RunOverrides) -> "_RunFile":
+    def apply_overrides(self, part: fits.RunOverrides) -> "_RunFile":
         """The run file with a stage, a variant or the calibration merged over it."""
         return type(self).model_validate(self._dump_with_overrides(part))
 
-    def _dump_with_overrides(self, part: RunOverrides) -> dict[str, Any]:
+    def _dump_with_overrides(self, part: fits.RunOverrides) -> dict[str, Any]:
         """The run file as TOML, with a part: keys of tables replace keys, all else is replaced."""
         found = self.model_dump(**_DUMP_GIVEN, exclude={"variants", "calibration"})
         for name, change in part.overrides().items():
@@ -364,6 +339,16 @@ class _RunFile(Section):
                 if getattr(table, name, None) is not None:
                     found["observations"][sensor][name] = _merge_table(getattr(table, name), change)
         return found
+
+    @property
+    def fit_settings(self) -> fits.ReconstructTable:
+        """The `[reconstruct]` table, which every fit needs."""
+        return require_section(self, "reconstruct", "reconstruct")
+
+    @property
+    def fitted_objects(self) -> list[str]:
+        """Objects that have parameters."""
+        return [p.object for p in self.parameters if getattr(p, "object", None)]
 
     @property
     def parameter_tables(self) -> dict[str, Any]:
@@ -385,10 +370,8 @@ class _RunFile(Section):
         data |= {f"observations.{name}.data": t.data for name, t in self.observations.items()}
         for path, table in data.items():
             found = getattr(table, "points_per_m2", None)
-            named = (
-                [name for name in found if name != ALL_OTHERS] if isinstance(found, dict) else []
-            )
-            used += [(f"{path}.points_per_m2.{name}", name) for name in named]
+            if isinstance(found, dict):
+                used += [(f"{path}.points_per_m2.{n}", n) for n in found if n != ALL_OTHERS]
         for section in type(self).model_fields:
             name = getattr(getattr(self, section), "object", None)
             if name is not None:

@@ -1,13 +1,14 @@
 """Radars of run files: waveforms, antennas, boards, tracks, poses, grids."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, MinLen
-from pydantic import GetCoreSchemaHandler, Tag, model_validator
+from pydantic import Tag, model_validator
 from torch import Tensor
 
+from invertwin import scene
 from invertwin.capture.readers.radar_fields import WAVEFORMS
 from invertwin.channel import Grid
 from invertwin.limits import Count, Positive
@@ -16,14 +17,7 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.signal.impairments import Impairments
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
-from invertwin.registry.kinds import (
-    ConstructorTable,
-    KindGroup,
-    OneOf,
-    Registry,
-    TableOf,
-    number_or_list,
-)
+from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, OneOf, Registry, TableOf
 from invertwin.registry.section import (
     TAG_MARK,
     Section,
@@ -33,36 +27,13 @@ from invertwin.registry.section import (
     prefix_errors,
     tag_by,
 )
-from invertwin.scene import (
-    AntennaArray,
-    Cosine,
-    Isotropic,
-    Pattern,
-    linear_array,
-    look_at,
-    planar_array,
-    rotation_from_vector,
-)
 from invertwin.scene import TabulatedPattern as PatternTable
 
 ElementNumbers = Annotated[list[Count], MinLen(1)]
 
 
-@dataclass(frozen=True)
-class _OneOrEach:
-    """Annotates a key of one value for all elements, or of a list."""
-
-    one: Any
-    each: Any
-
-    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        return handler.generate_schema(number_or_list(self.one, list[self.each]))
-
-
-_NumberOrEach = _OneOrEach(float, float)
-PolarisationValue = Annotated[
-    Any, _OneOrEach(Literal["V", "H", "circular"], Annotated[Any, _NumberOrEach])
-]
+_NumberOrEach = Annotated[Any, FormOf((float, list[float]))]
+PolarisationValue = Annotated[Any, FormOf((Literal["V", "H", "circular"], list[_NumberOrEach]))]
 _POLARISATION_HELP = (
     '"V", "H", "circular" (right-hand) or two numbers (V, H), of all elements or of each'
 )
@@ -74,11 +45,9 @@ class ArrayTable(ConstructorTable):
 
     center: Vector = key("m, in the radar frame", [0.0, 0.0, 0.0])
     polarisation: PolarisationValue = key(_POLARISATION_HELP, "V")
-    leakage: Annotated[Any, _NumberOrEach] = key(
-        _LEAKAGE_HELP + ", of all elements or of each", 0.0
-    )
+    leakage: _NumberOrEach = key(_LEAKAGE_HELP + ", of all elements or of each", 0.0)
 
-    def build(self, given: Any = None, /, **more: Any) -> AntennaArray:
+    def build(self, given: Any = None, /, **more: Any) -> scene.AntennaArray:
         """The elements about their centre."""
         array = super().build(given, **more)
         return replace(array, positions=array.positions + _float64(self.center))
@@ -107,24 +76,27 @@ class BoardTable(ConstructorTable):
 
     def build(self, given: Any = None, /, **more: Any) -> boards.Mounting:
         """The board as it is mounted."""
-        return boards.Mounting(
-            super().build(given, **more),
-            self.elevation,
-            self.azimuth,
-            self.transmitters,
-            self.receivers,
-            None if self.pattern is None else self.pattern.build(),
-            self.polarisation,
-            self.leakage,
-        )
+        own = ("elevation", "azimuth", "transmitters", "receivers", "polarisation", "leakage")
+        stated = {name: getattr(self, name) for name in own}
+        pattern = None if self.pattern is None else self.pattern.build()
+        return boards.Mounting(super().build(given, **more), pattern=pattern, **stated)
 
 
 class LookAtOrientation(Section):
     look_at: Vector = key("m, the point that boresight is turned to")
 
+    def rotations(self, places: Tensor) -> Tensor:
+        """Axes [place, 3, 3] at places [place, 3] [m]."""
+        with prefix_errors("orientation.look_at"):
+            return scene.look_at(places, self.look_at)
+
 
 class RotatedOrientation(Section):
     rotation_deg: Vector = key("rotation vector, the same at every position")
+
+    def rotations(self, places: Tensor) -> Tensor:
+        """Axes [3, 3], the same at all places."""
+        return scene.rotation_from_vector(_float64(self.rotation_deg).deg2rad())
 
 
 TrackValue = Annotated[Any, OneOf("track")]
@@ -164,11 +136,7 @@ class RadarPoseTable(ConstructorTable):
         places = _float64(self.positions) if listed else self.positions.build()
         if len(places) == 1:
             places = places.expand(frames, 3).clone()
-        if isinstance(self.orientation, LookAtOrientation):
-            with prefix_errors("orientation.look_at"):
-                return places, look_at(places, self.orientation.look_at)
-        turn = rotation_from_vector(_float64(self.orientation.rotation_deg).deg2rad())
-        return places, turn.expand(len(places), 3, 3).clone()
+        return places, self.orientation.rotations(places).expand(len(places), 3, 3).clone()
 
     def apply_range_center(self, radar: Radar) -> Radar:
         """The radar with the range origin of its data.
@@ -234,20 +202,20 @@ AnyImpairments = Annotated[Any, TableOf(Impairments, without=("snr_db", "noise_f
 
 def register(registry: Registry) -> None:
     """Add waveforms, antennas, boards and tracks."""
-    registry.groups["pattern"] = KindGroup(product=Pattern)
+    registry.groups["pattern"] = KindGroup(product=scene.Pattern)
     registry.groups["waveform"] = KindGroup(product=Waveform)
-    registry.groups["array"] = KindGroup(base=ArrayTable, product=AntennaArray)
+    registry.groups["array"] = KindGroup(base=ArrayTable, product=scene.AntennaArray)
     registry.groups["board"] = KindGroup(base=BoardTable, product=boards.Mounting)
     registry.groups["track"] = KindGroup(points=Annotated[list[Vector], MinLen(1)])
     waveforms = {"fmcw": FMCW, "stepped": SteppedFrequency, "ofdm": OFDM, "impulse": Impulse}
     for name, waveform in waveforms.items():
         registry.add("waveform", name, waveform)
-    registry.add("pattern", "isotropic", Isotropic)
-    registry.add("pattern", "cosine", Cosine)
+    registry.add("pattern", "isotropic", scene.Isotropic)
+    registry.add("pattern", "cosine", scene.Cosine)
     registry.add("pattern", "table", PatternTable.from_decibels, checked=True)
-    registry.add("array", "planar", planar_array)
-    registry.add("array", "linear", linear_array)
-    registry.add("array", "positions", AntennaArray)
+    registry.add("array", "planar", scene.planar_array)
+    registry.add("array", "linear", scene.linear_array)
+    registry.add("array", "positions", scene.AntennaArray)
     registry.add("board", "name", boards.board, untagged=True)
     registry.add("board", "tx_places", custom_board, untagged=True)
     for curve in (tracks.line, tracks.arc, tracks.grid):

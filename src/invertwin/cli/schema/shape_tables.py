@@ -178,39 +178,33 @@ def register(registry: Registry) -> None:
     registry.bases[RadarTrajectory] = LatentTable
     registry.given |= {Scene, Mesh, Object, ObjectTable, BodyTemplate, Walking, Sitting}
     registry.groups["motion"] = KindGroup()
-    for name, make in (
-        ("walking", Walking),
-        ("sitting", Sitting),
-        ("waving", Waving),
-        ("turning", AxisRotation),
-        ("along", follow_spline),
-    ):
-        registry.add("motion", name, make, checked=False)
+    registry.add("motion", "walking", Walking, checked=False)
+    registry.add("motion", "sitting", Sitting, checked=False)
+    registry.add("motion", "waving", Waving, checked=False)
+    registry.add("motion", "turning", AxisRotation, checked=False)
+    registry.add("motion", "along", follow_spline, checked=False)
     for name in ("plate", "box", "sphere", "cylinder", "dihedral", "trihedral", "text"):
         registry.add("shape", name, getattr(shapes, name))
     registry.add("shape", "prior", learned_car)
     registry.add("shape", "body", body)
     registry.add("shape", "file", load_mesh, untagged=True)
     registry.add("object", "parts", merge_meshes, untagged=True)
-    for name, make, without in (
-        ("translation", Translation, ("initial",)),
-        ("pose", Pose, ("translation", "rotation")),
-        ("scale", Scale, ("initial",)),
-        ("vertices", free_vertices, ()),
-        ("lattice", LatticeDeformation, ()),
-        ("distance_grid", DistanceGrid.from_mesh, ()),
-        ("neural_distance", NeuralDistance, ("seed",)),
-        ("density", DensityGrid.from_object, ()),
-        ("prior", prior_shape, ()),
-        ("body", body_joints, ()),
-        ("material", MaterialValues.from_object, ()),
-        ("radar_pose", RadarPose, ("translation", "rotation")),
-        ("radar_path", RadarTrajectory, ()),
-        ("mover", MovingTargetParameter, ()),
-        ("panel", PanelParameter, ()),
-        ("panel_phases", PanelPhases, ()),
-    ):
-        registry.add("parameter", name, make, without=without)
+    registry.add("parameter", "translation", Translation, without=("initial",))
+    registry.add("parameter", "pose", Pose, without=("translation", "rotation"))
+    registry.add("parameter", "scale", Scale, without=("initial",))
+    registry.add("parameter", "vertices", free_vertices)
+    registry.add("parameter", "lattice", LatticeDeformation)
+    registry.add("parameter", "distance_grid", DistanceGrid.from_mesh)
+    registry.add("parameter", "neural_distance", NeuralDistance, without=("seed",))
+    registry.add("parameter", "density", DensityGrid.from_object)
+    registry.add("parameter", "prior", prior_shape)
+    registry.add("parameter", "body", body_joints)
+    registry.add("parameter", "material", MaterialValues.from_object)
+    registry.add("parameter", "radar_pose", RadarPose, without=("translation", "rotation"))
+    registry.add("parameter", "radar_path", RadarTrajectory)
+    registry.add("parameter", "mover", MovingTargetParameter)
+    registry.add("parameter", "panel", PanelParameter)
+    registry.add("parameter", "panel_phases", PanelPhases)
 
 
 def follow_spline(
@@ -265,7 +259,7 @@ def prior_shape(
         counts: nodes along x, y and z at which it is meshed; without it every 0.1 m or so.
     """
     known: Any = table
-    same = _shape_kind(known) == "prior" and known.prior == file
+    same = getattr(known, "shape", None) == "prior" and known.prior == file
     return PriorShape(object, load_prior(file), known.latent if same else None, counts)
 
 
@@ -292,10 +286,6 @@ def body_joints(
     return SkinnedBody.from_mesh(object, found, mesh, joints)
 
 
-def _shape_kind(table: Any) -> str | None:
-    return getattr(table, "shape", None)
-
-
 def shape_regularizers(table: Any, module: nn.Module, scene: Scene | Radar) -> list[Regularizer]:
     """Terms of the loss that keep a fitted shape, or a path, plausible."""
     if isinstance(scene, Scene) and table.kind == "vertices" and table.laplacian > 0:
@@ -318,10 +308,9 @@ def body_template_of(table: Any) -> BodyTemplate | None:
     Args:
         table: Table of the object.
     """
-    if _shape_kind(table) != "body":
+    if getattr(table, "shape", None) != "body":
         return None
-    found = body_template(table.model, table.file, table.height, table.spacing)
-    return found.scale(table.scale)
+    return body_template(table.model, table.file, table.height, table.spacing).scale(table.scale)
 
 
 def joint_positions(table: Any, item: Object, rotations: Tensor | None = None) -> dict[str, Tensor]:
@@ -338,6 +327,5 @@ def joint_positions(table: Any, item: Object, rotations: Tensor | None = None) -
     if rotations is None:
         turns = {name: torch.tensor(turn).deg2rad() for name, turn in table.angles_deg.items()}
         rotations = rotation_from_vector(template.rotations(turns))
-    places = template.apply_pose(rotations)[1]
-    world = places @ item.transform[:3, :3].T + item.transform[:3, 3]
+    world = template.apply_pose(rotations)[1] @ item.transform[:3, :3].T + item.transform[:3, 3]
     return dict(zip(template.names, world, strict=True))

@@ -4,11 +4,11 @@ from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import MinLen
-from pydantic import GetCoreSchemaHandler, model_validator
+from pydantic import model_validator
 from torch import Tensor
 
 from invertwin.limits import CountOfTwo, Positive
-from invertwin.registry.kinds import ConstructorTable, OneOf, number_or_list
+from invertwin.registry.kinds import ConstructorTable, FormOf, OneOf
 from invertwin.registry.section import InputPath, Section, key, prefix_errors, raise_key_error
 from invertwin.signatures import Signature, aspect_directions
 
@@ -24,16 +24,7 @@ class SweepTable(Section):
     count: CountOfTwo = key("how many, both ends with them")
 
 
-class _SweptNumbers:
-    """Annotates a key that is one number, a list, or a sweep."""
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, _: Any, handler: GetCoreSchemaHandler) -> Any:
-        kind = number_or_list(float, Annotated[list[float], MinLen(1)], SweepTable)
-        return handler.generate_schema(kind)
-
-
-SweptValues = Annotated[Any, _SweptNumbers]
+SweptValues = Annotated[Any, FormOf((float, Annotated[list[float], MinLen(1)], SweepTable))]
 
 
 def count_values(value: Any) -> int:
@@ -106,9 +97,7 @@ class RcsTable(ConstructorTable):
         both = {"directions": _unit_directions(self)}
         if self.receiver is not None:
             with prefix_errors("receiver"):
-                both["receivers"] = _unit_directions(self.receiver).expand(
-                    len(both["directions"]), 3
-                )
+                both["receivers"] = _unit_directions(self.receiver).expand_as(both["directions"])
         return super().build(given, frequencies=expand_values(self.frequencies), **both, **more)
 
     @property
@@ -145,12 +134,8 @@ class RcsTable(ConstructorTable):
         """Return the table for a subset of aspects, without comparisons."""
 
         def select_angles(section: Any) -> dict[str, list[float]]:
-            return {
-                name: expand_values(getattr(section, name))
-                .expand(self.aspect_count)[indices]
-                .tolist()
-                for name in ("theta_deg", "phi_deg")
-            }
+            angles = {n: expand_values(getattr(section, n)) for n in ("theta_deg", "phi_deg")}
+            return {n: a.expand(self.aspect_count)[indices].tolist() for n, a in angles.items()}
 
         receiver = self.receiver and self.receiver.model_copy(update=select_angles(self.receiver))
         return self.model_copy(update={**select_angles(self), "receiver": receiver})

@@ -82,10 +82,7 @@ def draw_sample(run: Any, raw: dict[str, Any], index: int) -> dict[str, Any]:
         value = table.build().draw(np.random.default_rng(words))
         if value is not UNCHANGED:
             drawn += [(path, value) for path in table.paths]
-    return set_values(raw, drawn) | {
-        "task": "simulate",
-        "seed": derive_seed(run.seed, index, 0),
-    }
+    return set_values(raw, drawn) | {"task": "simulate", "seed": derive_seed(run.seed, index, 0)}
 
 
 def set_values(raw: dict[str, Any], values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
