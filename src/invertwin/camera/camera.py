@@ -165,8 +165,7 @@ class Camera:
             frame: index of the pose.
         """
         aside = (pixels - self.principal_point) / self.focal
-        local = torch.cat([aside, torch.ones_like(aside[:, :1])], 1)
-        return local @ self.rotations[frame].mT
+        return torch.cat([aside, torch.ones_like(aside[:, :1])], 1) @ self.rotations[frame].mT
 
     def to_camera_axes(self, points: Float64[Tensor, "n 3"], frame: int) -> Float64[Tensor, "n 3"]:
         """Transform world points to camera axes [m].

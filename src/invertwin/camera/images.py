@@ -112,10 +112,9 @@ def _render_images(
     *,
     crossings: bool,
 ) -> Tensor:
-    frames = range(len(camera.positions))
     every = [
         _ImageRenderer(scene, camera, n, ray_value, sampling, seed).render(crossings)
-        for n in frames
+        for n in range(len(camera.positions))
     ]
     return torch.stack(every)
 

@@ -113,8 +113,7 @@ def _corrupt_labels(labels: Tensor, share: float, random: torch.Generator) -> Te
         neighbour[number].index_copy_(axis, index, labels.index_select(axis, index))
     other = neighbour.gather(0, way[None])[0]
     wrong = torch.rand(labels.shape, generator=random) < share
-    at_outline = (neighbour != labels).any(0)
-    return torch.where(wrong & at_outline, other, labels)
+    return torch.where(wrong & (neighbour != labels).any(0), other, labels)
 
 
 def _draw_normal(like: Tensor, random: torch.Generator) -> Tensor:

@@ -48,8 +48,7 @@ def standard_deviations(
     scatter = slopes @ slopes.T
     spans = torch.tensor([10 * row.span for row in rows], dtype=torch.float64)
     # In units of the spans, with a prior of one unit; keep it positive despite noise.
-    scaled = information * spans * spans[:, None]
-    values, axes = torch.linalg.eigh(scaled)
+    values, axes = torch.linalg.eigh(information * spans * spans[:, None])
     inverse = axes / (values.clamp_min(0.0) + 1.0) @ axes.T
     sandwich = inverse @ (scatter * spans * spans[:, None]) @ inverse
     error = torch.maximum(inverse.diagonal(), sandwich.diagonal()).sqrt() * spans

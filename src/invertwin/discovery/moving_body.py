@@ -78,8 +78,7 @@ class MovingBody(nn.Module):
         """
         super().__init__()
         self.object, self.echo = object, echo
-        material = _require_rough_dielectric(scene, object)
-        share = material.diffuse
+        share = _require_rough_dielectric(scene, object).diffuse
         if not isinstance(share, float | int) or not 0 < share < 1:
             raise InputError(
                 f"expected a number between 0 and 1 as the diffuse share of {object}, got {share}; "

@@ -243,13 +243,11 @@ def _find_static_objects(
     if any(new is not old for new, old in zip(likelier, shapes, strict=True)):
         shapes, found = one.fit(likelier, _FINAL_FIT_STEPS)
         among = find_hypotheses(one, shapes)
-    objects = _describe_objects(one, found, shapes, among)
-    views = _count_views(radar, positions, one.build_scene(shapes))
     return Twin(
-        objects,
+        _describe_objects(one, found, shapes, among),
         ground,
         level,
-        GroundImage(flat, picture, views),
+        GroundImage(flat, picture, _count_views(radar, positions, one.build_scene(shapes))),
         one.predict(shapes) + level_map,
         power,
         grid,
@@ -265,7 +263,6 @@ def _describe_objects(
 ) -> tuple[DetectedObject, ...]:
     """Return fitted shapes as objects with error bars, kinds and existence probabilities."""
     errors = standard_deviations(likelihood, fit)
-    probabilities = existence_probabilities(likelihood, shapes)
     return tuple(
         DetectedObject(
             f"object_{k}",
@@ -277,7 +274,7 @@ def _describe_objects(
             probability,
         )
         for k, (shape, among, probability) in enumerate(
-            zip(shapes, hypotheses, probabilities, strict=True), 1
+            zip(shapes, hypotheses, existence_probabilities(likelihood, shapes), strict=True), 1
         )
     )
 
@@ -342,8 +339,7 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
     grid = radar.grid(first, limit)
     power = capture.spectrum(grid).detach().double()
     # Noise level: a running minimum over range.
-    noise = float(estimate_background(power).min())
-    strongest = power.amax((0, 2, 3)) / noise
+    strongest = power.amax((0, 2, 3)) / float(estimate_background(power).min())
     loud = (strongest > 2 * math.log(power.numel()) + 5).nonzero()[:, 0]
     if not len(loud):
         return None
@@ -374,10 +370,9 @@ def _image_points(
     cell = radar.waveform.range_resolution
     while True:
         counts = [max(2, math.ceil(float(side) / cell) + 1) for side in size]
-        lines = [
-            corners[0][k] + cell * torch.arange(counts[k], dtype=torch.float64) for k in range(2)
-        ]
-        flat = torch.cartesian_prod(*lines)
+        flat = torch.cartesian_prod(
+            *[corners[0][k] + cell * torch.arange(counts[k], dtype=torch.float64) for k in range(2)]
+        )
         places = torch.zeros(len(flat), 3, dtype=torch.float64)
         places[:, axes], places[:, ground.up_axis] = flat, height
         near = torch.zeros(len(flat), dtype=torch.bool)

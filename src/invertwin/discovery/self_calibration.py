@@ -51,8 +51,7 @@ def calibrate_on_scene(
     if len(radar.virtual_positions) == 1 or len(cells) < _MIN_POSITIONS:
         return None
     flat = replace(grid, u_start=0.0, u_step=1.0, u_count=1, v_start=0.0, v_step=1.0, v_count=1)
-    shape = tuple(capture.beat.shape[1:3])
-    found = ChannelCalibration(torch.ones(shape, dtype=torch.complex128))
+    found = ChannelCalibration(torch.ones(tuple(capture.beat.shape[1:3]), dtype=torch.complex128))
     for number in range(_CALIBRATION_ROUNDS):
         now = found.apply(capture)
         bins = flat if number == 0 else grid

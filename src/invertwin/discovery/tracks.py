@@ -101,8 +101,7 @@ def _make_measurement(
     detection: DetectedObject, recording: ChirpCapture, ground: Ground, frame: int
 ) -> _TrackMeasurement:
     axes = list(ground.plane_axes)
-    radar = recording.radar()
-    sight = detection.position - radar.positions[frame].detach()
+    sight = detection.position - recording.radar().positions[frame].detach()
     along = torch.nn.functional.normalize(sight[axes], dim=0)
     across = torch.stack([-along[1], along[0]])
     distance = float(sight.norm())

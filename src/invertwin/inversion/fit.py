@@ -231,8 +231,7 @@ class Fit:
         for k, (model, sensor) in enumerate(zip(self._models, sensors, strict=True)):
             key = derive_seed(self._settings.seed, _UNBLURRED_SEED_KEY, seed_number, k)
             model = model.with_sampling(**sampling_changes) if sampling_changes else model
-            predicted = model.scale_blur(0.0).predict(scene, sensor, key)
-            pairs.append((predicted, self._observed[k]))
+            pairs.append((model.scale_blur(0.0).predict(scene, sensor, key), self._observed[k]))
         return pairs
 
     def loss_at_start(self) -> float:

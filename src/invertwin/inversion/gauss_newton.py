@@ -177,8 +177,7 @@ class GaussNewton:
         """Minimise the damped quadratic model within the trust radius of every parameter."""
         own = curvature.diagonal()
         # Weakly determined parameters get the mean damping; noise would move them otherwise.
-        scale = own.clamp_min(float(own.mean()))
-        model = curvature + torch.diag(self.damping * scale)
+        model = curvature + torch.diag(self.damping * own.clamp_min(float(own.mean())))
         change, free = torch.zeros_like(gradient), torch.ones_like(gradient, dtype=torch.bool)
         while bool(free.any()):
             # Fix parameters at their limit, and minimise over the others.

@@ -82,8 +82,7 @@ class Cells(ReceiverLocations):
 
     def with_sample_count(self, samples: int) -> "Cells":
         """The same cells with so many points in all. See ``Places.finer``."""
-        points = max(1, samples // len(self.areas))
-        return self.with_sampling(replace(self.sampling, points=points))
+        return self.with_sampling(replace(self.sampling, points=max(1, samples // len(self.areas))))
 
     def fixed_visibility(self) -> "Cells | None":
         """The same cells without boundary paths. See ``Places.fixed_visibility``."""
@@ -136,8 +135,7 @@ class Cells(ReceiverLocations):
                 f"{propagation.bandwidth} and edges 0; such fields jump at shadows: give edges=1, "
                 "or leave out the bandwidth"
             )
-        numbers = np.random.default_rng(np.random.SeedSequence([seed, 1]))
-        points = self.sample_points(numbers)
+        points = self.sample_points(np.random.default_rng(np.random.SeedSequence([seed, 1])))
         if propagation.edges:
             gain, moments = propagation.gains_and_moments(scene, sensor, points.flatten(0, 1), seed)
             shape = (len(gain), *self.shape)

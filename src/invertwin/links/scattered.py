@@ -136,8 +136,7 @@ def _stokes(
     power = torch.view_as_real(field).square().sum(-1)
     both = field[..., 0] * field[..., 1].conj()
     first, second = power.unbind(-1)
-    rows = torch.stack([first + second, first - second, 2 * both.real, 2 * both.imag], -1)
-    return rows.mean(1)
+    return torch.stack([first + second, first - second, 2 * both.real, 2 * both.imag], -1).mean(1)
 
 
 def _build_link(

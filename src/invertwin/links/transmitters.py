@@ -63,8 +63,7 @@ class Transmitters:
         terminals = self.mount
         if terminals.rotations.ndim == 3:
             terminals = replace(terminals, rotations=terminals.rotations[rows])
-        power = torch.as_tensor(self.power_dbm)[rows]
-        return Transmitters(self.positions[rows], terminals, power)
+        return Transmitters(self.positions[rows], terminals, torch.as_tensor(self.power_dbm)[rows])
 
 
 class TransmitterPosition(nn.Module):

@@ -74,8 +74,7 @@ class RangeDopplerMap(ForwardModel):
             sampling: How paths are sampled.
         """
         bins = oversample * chirps.count
-        rates = velocity_axis(radar, chirps, bins)
-        return cls(grid, chirps, rates, bins, sampling or cls.sampling)
+        return cls(grid, chirps, velocity_axis(radar, chirps, bins), bins, sampling or cls.sampling)
 
     def __post_init__(self) -> None:
         if self.sampling.depth != 1 or self.sampling.boundary:
@@ -100,8 +99,7 @@ class RangeDopplerMap(ForwardModel):
             )
         paths = trace_power(scene, sensor.link(), sampling=self.sampling, seed=seed)
         assert paths.velocity is not None
-        moves = (paths.velocity.detach() != 0).any(1)
-        return self.predict_paths(paths.select(moves), sensor)
+        return self.predict_paths(paths.select((paths.velocity.detach() != 0).any(1)), sensor)
 
     def predict_paths(
         self, paths: Paths, radar: Radar
@@ -124,8 +122,7 @@ class RangeDopplerMap(ForwardModel):
         beat, radar = recording.beat, recording.radar()
         moving = (beat - beat.mean(1, keepdim=True)).to(torch.complex128)
         power = range_doppler_angle(moving, radar, self.grid, self.chirps, bins=self.bins)
-        every = velocity_axis(radar, self.chirps, self.bins)
-        rows = (every - self.rates[:, None]).abs().argmin(1)
+        rows = (velocity_axis(radar, self.chirps, self.bins) - self.rates[:, None]).abs().argmin(1)
         return power[:, rows]
 
     def realisations(

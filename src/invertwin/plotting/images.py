@@ -39,8 +39,7 @@ def images(
     limit = max((float(np.quantile(abs(numbers(v)), _SHARE)) for v in rates.values()), default=1.0)
     signed = {"cmap": "RdBu_r", "vmin": -(limit or 1.0), "vmax": limit or 1.0}
     styles = [{"cmap": "gray"}] * len(panels) + [signed] * len(rates)
-    names = [*panels, *rates]
-    for axes, name, values, style in zip(cells, names, every, styles, strict=True):
+    for axes, name, values, style in zip(cells, [*panels, *rates], every, styles, strict=True):
         image = axes.imshow(numbers(values), **style)
         axes.set_title(legible(name), fontsize=9)
         axes.tick_params(labelsize=7)

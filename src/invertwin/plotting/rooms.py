@@ -121,8 +121,7 @@ def _cut_triangles(scene: Scene, height: float) -> list[list[list[float]]]:
     found: list[list[list[float]]] = []
     for item in scene.objects.values():
         corners = item.vertices.detach()[item.mesh.faces]
-        above = corners[..., 2] - height
-        for triangle, rise in zip(corners, above, strict=True):
+        for triangle, rise in zip(corners, corners[..., 2] - height, strict=True):
             points = []
             for a, b in ((0, 1), (1, 2), (2, 0)):
                 if (rise[a] > 0) != (rise[b] > 0):

@@ -116,8 +116,7 @@ def aperture(radar: Radar) -> Aperture:
         InputError: The array is not planar in the radar's x-y plane, so that u and v do not
             determine its response.
     """
-    places = radar.virtual_positions.cpu()
-    key = tuple(tuple(place) for place in places.tolist())
+    key = tuple(tuple(place) for place in radar.virtual_positions.cpu().tolist())
     return _aperture(key, radar.waveform.wavelength, radar.array_window)
 
 

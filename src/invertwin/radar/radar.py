@@ -380,8 +380,7 @@ def checked_beat(
 
 
 def _checked_origin(value: object, frames: int) -> Tensor:
-    do = "give one range in metres per frame"
-    origin = checked_tensor(value, (frames,), "range_origin", do)
+    origin = checked_tensor(value, (frames,), "range_origin", "give one range in metres per frame")
     if is_differentiated(origin):
         raise InputError(
             "expected range_origin without derivatives, got one that carries them; it is what the "

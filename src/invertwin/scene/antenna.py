@@ -175,8 +175,7 @@ class TabulatedPattern(Pattern):
         count = grid.shape[1]
         # atan2 has no gradient on the axis; φ is arbitrary there.
         on_axis = (x == 0) & (y == 0)
-        azimuth = torch.atan2(y, torch.where(on_axis, 1.0, x))
-        turn = (azimuth + torch.pi) / (2 * torch.pi) * count
+        turn = (torch.atan2(y, torch.where(on_axis, 1.0, x)) + torch.pi) / (2 * torch.pi) * count
         cell = turn.detach().to(torch.int64)
         across = turn - cell
         column, neighbour = cell % count, (cell + 1) % count
@@ -279,8 +278,7 @@ def planar_array(
     Raises:
         InputError: no elements, or a spacing that is not positive.
     """
-    elements = count[0] * count[1]
-    require_at_most(elements, _MAX_ELEMENTS, "antenna elements", "lower count", "count")
+    require_at_most(count[0] * count[1], _MAX_ELEMENTS, "antenna elements", "lower count", "count")
     x = _centre_positions(count[0], spacing[0], "elements along x")
     y = _centre_positions(count[1], spacing[1], "elements along y")
     plane = torch.cartesian_prod(x, y)

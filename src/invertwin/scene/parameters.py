@@ -283,8 +283,7 @@ class Scale(ObjectModule):
 
     def coordinates(self) -> list[Coordinate]:
         """Return the scale factor."""
-        tangents = {"log_scale": 1 / self.scale.detach()}
-        return [Coordinate(f"{self.object}.scale", "", tangents, 0.2)]
+        return [Coordinate(f"{self.object}.scale", "", {"log_scale": 1 / self.scale.detach()}, 0.2)]
 
 
 class Vertices(ObjectModule):
@@ -435,8 +434,7 @@ class MaterialValues(nn.Module):
 
     def _bounded_values(self) -> dict[str, Tensor | Texture]:
         values = {name: _to_bounded(name, raw) for name, raw in self.raw.items()}
-        textures = {n: replace(t, image=values[n]) for n, t in self._textures.items()}
-        return {**values, **textures}
+        return {**values, **{n: replace(t, image=values[n]) for n, t in self._textures.items()}}
 
 
 class Compose(nn.Module):
@@ -509,10 +507,9 @@ def _to_unbounded(name: str, value: Tensor) -> Tensor:
 
 def _translation_coordinates(name: str, mask: Tensor) -> list[Coordinate]:
     """Return the coordinates of a translation along the free axes."""
-    axes = zip("xyz", torch.diag(mask), mask, strict=True)
     return [
         Coordinate(f"{name}.{axis}", "m", {"translation": along}, _POSITION_SCALE)
-        for axis, along, free in axes
+        for axis, along, free in zip("xyz", torch.diag(mask), mask, strict=True)
         if free
     ]
 

@@ -127,8 +127,7 @@ def dihedral(edge: Positive, opening: Angle = math.pi / 2) -> Mesh:
     length = _length(edge, "dihedral edge [m]")
     half = checked_number(opening, "opening [rad]", 0.0, math.pi, open_low=True) / 2
     tips = [(s * length * math.sin(half), -length * math.cos(half)) for s in (-1, 1)]
-    places = (tips[0], (0.0, 0.0), tips[1])
-    vertices = [(x, y * length / 2, z) for x, z in places for y in (-1, 1)]
+    vertices = [(x, y * length / 2, z) for x, z in (tips[0], (0.0, 0.0), tips[1]) for y in (-1, 1)]
     return _mesh(np.array(vertices), np.array([(0, 1, 3), (0, 3, 2), (2, 3, 5), (2, 5, 4)]))
 
 

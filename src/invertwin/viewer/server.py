@@ -79,8 +79,7 @@ class Viewer:
         port: int = 8080,
         token: str | None = None,
     ) -> None:
-        guard = AccessGuard(host, token)
-        self._server = _start_server(guard, host, port)
+        self._server = _start_server(AccessGuard(host, token), host, port)
         query = "" if token is None else f"/?token={token}"
         # A host that means every address of this machine is none that a browser could open.
         reached = socket.gethostname() if host in ("0.0.0.0", "::") else host
@@ -179,8 +178,7 @@ class Viewer:
         self._build_sensor_controls()
         with gui.add_folder("layers"):
             for group, shown in self._visible.items():
-                box = gui.add_checkbox(group, shown)
-                box.on_update(self._visibility_handler(group))
+                gui.add_checkbox(group, shown).on_update(self._visibility_handler(group))
         self._said = gui.add_text("note", "", disabled=True, visible=False)
         for layer in display.layers:
             self._draw_layer(layer)
@@ -203,8 +201,7 @@ class Viewer:
         gui = self._server.gui
         if not self._sensors:
             return
-        several = len(self._sensors) > 1
-        self._sensor = gui.add_dropdown("sensor", self._sensors, visible=several)
+        self._sensor = gui.add_dropdown("sensor", self._sensors, visible=len(self._sensors) > 1)
         self._sensor.on_update(lambda _: self._select_sensor(str(self._sensor.value)))
         self._frame = gui.add_slider("position", 0, 1, 1, 0)
         self._frame.on_update(lambda _: self._update_state(frame=int(self._frame.value)))
@@ -248,8 +245,7 @@ class Viewer:
         """Let the person move an object, from where the step has it."""
         self._release_object()
         if name != _NO_OBJECT:
-            link = self._links[self._wish.sensor]
-            center = tuple(link.scene[name].center.detach().tolist())
+            center = tuple(self._links[self._wish.sensor].scene[name].center.detach().tolist())
             self._gizmo.position, self._gizmo.wxyz = center, (1.0, 0.0, 0.0, 0.0)
             self._center = np.array(center)
             self._update_state(moved_object=name, quaternion=(1.0, 0.0, 0.0, 0.0), position=center)

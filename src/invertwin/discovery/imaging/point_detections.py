@@ -191,7 +191,6 @@ def locate_coherent_points(
         middle = (weight[:, None] * positions[blob]).sum(0)
         spread = (weight[:, None] * (positions[blob] - middle).square()).sum(0).sqrt()
         chance = len(positions) * math.exp(-min(count * float(agree[peak]), 700.0))
-        share = min(1.0, value / (_NO_SIDELOBE_LEVEL * top))
         found.append(
             DetectedObject(
                 f"point_{len(found) + 1}",
@@ -200,7 +199,7 @@ def locate_coherent_points(
                 positions[peak].double(),
                 None,
                 dict(zip("xyz", spread.clamp_min(0.3 * cell).tolist(), strict=True)),
-                max(0.0, 1 - chance) * share,
+                max(0.0, 1 - chance) * min(1.0, value / (_NO_SIDELOBE_LEVEL * top)),
             )
         )
     return found, image

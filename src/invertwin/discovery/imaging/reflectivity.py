@@ -203,8 +203,7 @@ def reconstruct_reflectivity(
         mean = matrix @ strength + known
         ratio = data / mean
         brighter = back @ (ratio * speckle_weight(ratio, degrees) / mean)
-        alone = np.maximum(back @ (1 / mean), 1e-30)
-        strength *= np.sqrt(brighter / alone)
+        strength *= np.sqrt(brighter / np.maximum(back @ (1 / mean), 1e-30))
     return torch.from_numpy(strength.astype(np.float64))
 
 
@@ -242,8 +241,7 @@ class _AxisResponseTable:
     def near_bins(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the bins near positions [point, n], and the response there."""
         if self.count == 1:
-            zero = np.zeros((len(positions), 1), dtype=np.int64)
-            return zero, np.ones((len(positions), 1))
+            return np.zeros((len(positions), 1), dtype=np.int64), np.ones((len(positions), 1))
         at = (positions - self.start) / self.step
         bins = np.round(at).astype(np.int64)[:, None] + self.offsets
         lag = (

@@ -79,8 +79,7 @@ class FitResult:
         found = []
         for loss, (predicted, observed) in zip(self.fit.objective.losses, self.maps, strict=True):
             law = loss if isinstance(loss, SpectrumLoss) else SpectrumLoss("likelihood")
-            visible = bool(predicted.any())
-            found.append(law.fitted_gain(predicted, observed) if visible else 0.0)
+            found.append(law.fitted_gain(predicted, observed) if bool(predicted.any()) else 0.0)
         return found
 
     @cached_property

@@ -90,10 +90,9 @@ def judge_fit(result: FitResult) -> Verdict:
     if max(excess, structure) > _INCONSISTENT_ZSCORE:
         mean = sum(result.realisation_statistics.losses) / len(result.realisation_statistics.losses)
         reasons = [f"the loss is {loss:.4g}, on recordings of the twin itself {mean:.4g}", *bounds]
-        marked = enumerate(zip(residuals, fit.observations, strict=True))
         reasons += [
             text
-            for k, (map_, o) in marked
+            for k, (map_, o) in enumerate(zip(residuals, fit.observations, strict=True))
             if (text := _describe_residual(k, map_, o.model.holds_fields))
         ]
         reasons += _test_deeper_paths(

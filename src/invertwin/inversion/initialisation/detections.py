@@ -138,10 +138,9 @@ def backproject_power(
     """
     flat = points.reshape(-1, 3)
     if grid.u_count == grid.v_count == 1:
-        parts = [
-            backproject(capture, part).abs().square() for part in flat.split(_POINTS_PER_CHUNK)
-        ]
-        return torch.cat(parts).reshape(points.shape[:-1])
+        return torch.cat(
+            [backproject(capture, part).abs().square() for part in flat.split(_POINTS_PER_CHUNK)]
+        ).reshape(points.shape[:-1])
     maps = capture.spectrum(grid).detach().double()
     radar = capture.radar()
     total = torch.cat(
@@ -265,8 +264,7 @@ def principal_rectangle(
         points: positions [point, 3] [m].
         ground: ground plane.
     """
-    flat = points[:, ground.plane_axes]
-    _, axes = torch.linalg.eigh(torch.cov(flat.T))
+    _, axes = torch.linalg.eigh(torch.cov(points[:, ground.plane_axes].T))
     first = axes[:, 1]
     # The image of the first ground axis under a yaw about y is (cos, −sin) in (x, z).
     yaw = math.atan2(ground.yaw_sign * float(first[1]), float(first[0]))
@@ -376,8 +374,7 @@ def estimate_scale(
         ground: ground plane.
     """
     extent = item.vertices.detach()[:, ground.plane_axes]
-    longest = float((extent.amax(0) - extent.amin(0)).max())
-    return max(rectangle.size) / longest
+    return max(rectangle.size) / float((extent.amax(0) - extent.amin(0)).max())
 
 
 def estimate_density(

@@ -211,10 +211,8 @@ def search(
         found, offset = [fit(kept[first], len(kept), stages)], len(kept)
     else:
         found, offset = [fit(start, number, stages) for number, start in enumerate(kept)], 0
-    best = min(found, key=_unblurred_loss)
-    for start in _rotated_starts(best):
-        again = Candidate(start, watched)
-        found.append(fit(again, offset + len(found), stages))
+    for start in _rotated_starts(min(found, key=_unblurred_loss)):
+        found.append(fit(Candidate(start, watched), offset + len(found), stages))
     return _compare_ends(found, offset, names, losses)
 
 
@@ -277,8 +275,7 @@ def _make_screening_loss(
             drawn = zip(models, candidate.observations, strict=True)
             maps = [model.predict(candidate.scene, _initial_sensor(o), seed) for model, o in drawn]
             visible = all(bool(power.any()) for power in maps)
-            pairs = list(zip(maps, blurred, strict=True))
-            return float(objective(pairs)) if visible else math.inf
+            return float(objective(list(zip(maps, blurred, strict=True)))) if visible else math.inf
 
     return score
 

@@ -125,8 +125,7 @@ class Metasurface:
         """
         do = "give x, y, z"
         ends = [checked_tensor(p, (3,), "ends of a focus [m]", do) for p in (tx, target)]
-        elements = self.cells.centers
-        length = (elements[:, None] - torch.stack(ends)).norm(dim=2).sum(1)
+        length = (self.cells.centers[:, None] - torch.stack(ends)).norm(dim=2).sum(1)
         turn = 2 * math.pi * frequency / SPEED_OF_LIGHT * length
         return replace(self, phase=self.phase + turn.view(self.phase.shape))
 
@@ -156,13 +155,11 @@ def panel_response(
         far_field: Waves are plane over the panel: quicker, right beyond 2D²/λ.
     """
     cells, k = panel.cells, 2 * math.pi * frequency / SPEED_OF_LIGHT
-    both = torch.cat([tx, rx])
-    lit = visible_fractions(scene, both, cells, blur=blur, boundary=boundary)
+    lit = visible_fractions(scene, torch.cat([tx, rx]), cells, blur=blur, boundary=boundary)
     sent = _element_waves(panel, cells, tx, lit[: len(tx)], k, far_field)
     weights = panel.response
     scale = panel.spacing**2 * k / (2 * math.pi)
-    seen = (lit[len(tx) :] > 0).any(1) & bool((lit[: len(tx)] > 0).any())
-    live = torch.nonzero(seen)[:, 0]
+    live = torch.nonzero((lit[len(tx) :] > 0).any(1) & bool((lit[: len(tx)] > 0).any()))[:, 0]
     heavy = len(live) * len(weights) > _VALUES_PER_CHUNK
     found = [torch.zeros(len(tx), 0, dtype=torch.complex128)]
 

@@ -154,8 +154,7 @@ def point_cloud(
     ends = ("nearest", "wrap", "nearest")
     around = maximum_filter(strongest.numpy(), (1, 3, 3), mode=ends)  # type: ignore[arg-type]
     highest = strongest == torch.from_numpy(around)
-    found = detections & highest & (strongest > 0)
-    frame, velocity, place = torch.nonzero(found, as_tuple=True)
+    frame, velocity, place = torch.nonzero(detections & highest & (strongest > 0), as_tuple=True)
     direction = seen.argmax(-1)[frame, velocity, place]
     u, v = direction // grid.v_count, direction % grid.v_count
     cell = [frame, velocity, place, u, v]

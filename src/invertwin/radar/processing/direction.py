@@ -137,8 +137,7 @@ def music(
             )
         count = torch.full(covariance.shape[:2], sources, device=covariance.device)
     # Eigenvalues ascend: those of the signal are last.
-    order = torch.arange(elements, device=covariance.device)
-    signal = order >= elements - count[..., None]
+    signal = torch.arange(elements, device=covariance.device) >= elements - count[..., None]
     projector = _SignalProjector.apply(covariance, signal)
     manifold = snapshots.manifold(grid)
     inside = torch.einsum("dm,frmn,dn->frd", manifold.conj(), projector, manifold).real

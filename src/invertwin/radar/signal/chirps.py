@@ -132,8 +132,7 @@ def moving_beat(
         InputError: As ``beat_signal``; moving paths of several bounces; points so fast that a
             ramp cannot follow them.
     """
-    waveform = require_sampled_waveform(radar)
-    check_paths(paths, radar, waveform)
+    check_paths(paths, radar, require_sampled_waveform(radar))
     if trajectory is None and paths.velocity is None:
         beat = beat_signal(paths, radar, tolerance=tolerance)
         return beat[:, None].repeat(1, chirps.count, 1, 1, 1)

@@ -39,11 +39,10 @@ class SpeckleRealisations:
         bias = torch.as_tensor(radar.range_bias).detach()
         ranges = paths.range - radar.origins[paths.frame] + bias
         steps = (waveform.range_resolution, *radar.beamwidth)
-        axes = [
+        (ranges, rows), (u, columns), (v, layers) = [
             _bin_axis(x, step / _CELLS_PER_RESOLUTION)
             for x, step in zip((ranges, u, v), steps, strict=True)
         ]
-        (ranges, rows), (u, columns), (v, layers) = axes
         self._cells = len(ranges), len(u), len(v)
         self._cell = (rows * len(u) + columns) * len(v) + layers
         delay = paths.delay - radar.origin_delays[paths.frame]

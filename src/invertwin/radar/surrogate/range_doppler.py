@@ -105,9 +105,8 @@ def _range_doppler_coupling(waveform: Waveform) -> float:
 def _range_spread(
     ranges: Float64[Tensor, " path"], radar: Radar, grid: Grid
 ) -> Float64[Tensor, "range path"]:
-    off = grid.ranges[:, None] - ranges
     return interpolate_response(
-        off,
+        grid.ranges[:, None] - ranges,
         radar.waveform.range_resolution,
         lambda places: radar.waveform.range_response(places, radar.window),
     )

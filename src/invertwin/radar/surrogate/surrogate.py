@@ -226,14 +226,13 @@ class Surrogate:
         return power * paired_array_spread(array, u, v)
 
     def _kernels(self, radar: Radar, grid: Grid) -> "tuple[_SurrogateKernel, ...]":
-        resolved = grid.u_count > 1 or grid.v_count > 1
         return _kernels(
             self.range_kernel,
             self.angle_kernel,
             airy_radii(radar, self.aperture_radius),
             radar.waveform,
             radar.window,
-            aperture(radar) if resolved else None,
+            aperture(radar) if (grid.u_count > 1 or grid.v_count > 1) else None,
             grid,
         )
 
@@ -380,8 +379,7 @@ def surrogate_spectra(
             for scene in scenes
         ]
         deposit = deposit + torch.stack(targets)
-    shaped = surrogate.shape(deposit.flatten(0, 1), radar, grid)
-    return shaped.clamp_min(0.0).reshape(deposit.shape)
+    return surrogate.shape(deposit.flatten(0, 1), radar, grid).clamp_min(0.0).reshape(deposit.shape)
 
 
 @dataclass(frozen=True, eq=False)

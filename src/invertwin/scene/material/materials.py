@@ -234,8 +234,7 @@ class Dielectric(Medium, EffectiveRoughness, Material):
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
         """Return the scattering law at `frequency` [Hz], differentiable w.r.t. all values."""
-        epsilon = self.complex_permittivity(frequency)
-        amplitude = fresnel_amplitude(epsilon[..., None], _COSINES)
+        amplitude = fresnel_amplitude(self.complex_permittivity(frequency)[..., None], _COSINES)
         return ScatteringLaw(amplitude, *self.weights(), **self.depolarisation_terms)
 
     def smooth_interface(self, frequency: float) -> SmoothInterface | None:

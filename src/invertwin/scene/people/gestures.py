@@ -177,10 +177,9 @@ class Waving:
         swing = _WAVE * math.sin(2 * math.pi * self.rate * since)
         sign = 1.0 if self.side == "right" else -1.0
         # Held out to the side, forearm upwards: the arm of the rest pose with a bent elbow.
-        bent = sign * (math.pi / 2 + swing)
         raised = {
             "shoulder": rotation_about_axis("z", 0.0),
-            "elbow": rotation_about_axis("z", bent),
+            "elbow": rotation_about_axis("z", sign * (math.pi / 2 + swing)),
         }
         for name, turn in raised.items():
             row = self.body.joint(f"{self.side}_{name}")

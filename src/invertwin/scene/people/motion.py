@@ -96,8 +96,7 @@ class AxisRotation:
         """
         turn = rotation_from_vector(torch.as_tensor(self.axis) * (self.rate * time))
         center = item.mesh.center if self.center is None else torch.as_tensor(self.center)
-        own = rigid(turn, center - turn @ center)
-        return replace(item, pose=compose(own, item.transform))
+        return replace(item, pose=compose(rigid(turn, center - turn @ center), item.transform))
 
 
 @dataclass(frozen=True, eq=False)

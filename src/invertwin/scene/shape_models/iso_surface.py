@@ -67,8 +67,7 @@ def extract_surface(
     )
     start = lattice.low + torch.from_numpy(corners).double() * lattice.spacing
     points = _refine_vertices(field, start, lattice)
-    slope = _value_and_gradient(field, points)[1]
-    return points, torch.from_numpy(faces.astype("int64")), slope
+    return points, torch.from_numpy(faces.astype("int64")), _value_and_gradient(field, points)[1]
 
 
 def attach_shape_derivative(
@@ -92,8 +91,7 @@ def _refine_vertices(field: Field, points: Tensor, lattice: Lattice) -> Tensor:
     for _ in range(_NEWTON_STEPS):
         value, slope = _value_and_gradient(field, points)
         step = slope * (value / slope.square().sum(1).clamp_min(_MIN_GRADIENT**2))[:, None]
-        length = step.norm(dim=1, keepdim=True)
-        points = points - step * (reach / length.clamp_min(reach))
+        points = points - step * (reach / step.norm(dim=1, keepdim=True).clamp_min(reach))
         points = points.clamp(lattice.low, lattice.high)
     return points
 

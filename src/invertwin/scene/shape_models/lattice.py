@@ -84,8 +84,7 @@ class Lattice:
     def cell(self, points: Float64[Tensor, "p 3"]) -> tuple[Tensor, Tensor]:
         """Return the cell of each point [p, 3], clamped, and the position within it in cells."""
         place = (points - self.low) / self.spacing
-        last = torch.tensor(self.counts) - 2
-        index = place.detach().floor().long().clamp_min(0).minimum(last)
+        index = place.detach().floor().long().clamp_min(0).minimum(torch.tensor(self.counts) - 2)
         return index, place - index
 
 

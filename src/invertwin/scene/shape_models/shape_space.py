@@ -34,8 +34,7 @@ class ShapeSpace:
     def __post_init__(self) -> None:
         do = "give mean [v, 3], components [v, 3, k], deviations [k] of one space"
         mesh = Mesh(self.mean, self.faces)
-        rows = len(mesh.vertices)
-        parts = checked_tensor(self.components, (rows, 3, None), "components", do)
+        parts = checked_tensor(self.components, (len(mesh.vertices), 3, None), "components", do)
         sizes = checked_tensor(self.deviations, (parts.shape[2],), "deviations [m]", do)
         if bool((sizes < 0).any()) or not len(sizes):
             raise InputError(f"expected deviations >= 0, got {sizes.tolist()}; {do}")
