@@ -90,9 +90,8 @@ class Viewer:
         self._lock, self._due, self._closed = threading.Lock(), threading.Event(), False
         self._sensors = list(dict.fromkeys([*display.maps, *self._links]))
         self._wish = _ViewerState(step=len(self._steps) - 1, sensor=next(iter(self._sensors), ""))
-        self._found: dict[
-            int, Mapping[str, DisplayMaps]
-        ] = {}  # what sensors see at steps as they come
+        # What sensors see at steps as they come.
+        self._found: dict[int, Mapping[str, DisplayMaps]] = {}
         self._taken: int | None = None  # the step whose bodies the link has
         self._times: deque[float] = deque(maxlen=_RATE_WINDOW)
         self._seen: PositionSample | None = None
@@ -359,14 +358,10 @@ class Viewer:
         maps = known.maps_of_frame(state.frame) if known else {}
         if (found := self._found.get(state.step, {}).get(state.sensor)) is not None:
             maps |= found.maps_of_frame(state.frame)
-        if link is None:
-            scene = None
-        elif state.moved_object == _NO_OBJECT:
-            scene = link.scene
-        else:
-            scene = link.move_object(
-                state.moved_object, self._rigid_motion(state.quaternion, state.position)
-            )
+        scene = None if link is None else link.scene
+        if link is not None and state.moved_object != _NO_OBJECT:
+            motion = self._rigid_motion(state.quaternion, state.position)
+            scene = link.move_object(state.moved_object, motion)
         if link is not None and scene is not None:
             maps |= {SIMULATED: to_float32(link.predict_map(scene, state.frame))}
         self._panels.show(maps, state.bin)
