@@ -231,6 +231,33 @@ def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]
         raise InputError(f"expected {name} in {usual.unit}, got {number:g}; did you mean {meant}?")
 
 
+def check_orthonormal(axes: Tensor, what: str, do: str) -> None:
+    """Raise unless the columns of matrices are orthonormal, to 1e-5.
+
+    Args:
+        axes: [*, 3, 3].
+        what: what they are, for the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: other columns.
+    """
+    still = axes.detach()
+    if float((still.mT @ still - torch.eye(3, dtype=torch.float64)).abs().max()) > 1e-5:
+        raise InputError(f"expected {what} with orthonormal columns; {do}")
+
+
+def set_fields(holder: object, **values: object) -> None:
+    """Set fields of a frozen dataclass, while it is made.
+
+    Args:
+        holder: the dataclass.
+        **values: by the names of the fields.
+    """
+    for name, value in values.items():
+        object.__setattr__(holder, name, value)
+
+
 def is_differentiated(value: Tensor | None) -> bool:
     """Return True if derivatives flow through a tensor, in reverse or in forward mode."""
     if value is None:
