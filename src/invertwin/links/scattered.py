@@ -159,9 +159,8 @@ def _build_link(
 
 def _scale_sampling(sampling: Sampling, fraction: float) -> Sampling:
     """So much of all that is drawn."""
-    samples, edges = (
-        math.ceil(n * fraction) for n in (sampling.samples, sampling.boundary_samples)
-    )
+    samples = math.ceil(sampling.samples * fraction)
+    edges = math.ceil(sampling.boundary_samples * fraction)
     return replace(sampling, samples=samples, boundary_samples=edges)
 
 

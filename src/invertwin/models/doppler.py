@@ -10,12 +10,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.channel import (
-    Grid,
-    Paths,
-    Sampling,
-    trace_power,
-)
+from invertwin.channel import Grid, Paths, Sampling, trace_power
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.radar.processing.doppler import range_doppler_angle, velocity_axis

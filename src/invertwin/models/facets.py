@@ -9,19 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
-from invertwin.channel import (
-    Grid,
-    Sampling,
-    trace_facet_paths,
-)
+from invertwin.channel import Grid, Sampling, trace_facet_paths
 from invertwin.forward_model import ForwardModel
 from invertwin.models.noise import noisy_realisations
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import beat_signal, range_profile
-from invertwin.radar.surrogate.surrogate import (
-    Surrogate,
-)
+from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene.scene import Scene
 

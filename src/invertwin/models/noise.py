@@ -38,9 +38,8 @@ def noisy_realisations(
     share = float((whole.square() if holds_fields else whole).mean())
 
     def realise(number: int, noise: float) -> Tensor:
-        return to_map(
-            simulate_beat(number) + (noise / share) ** 0.5 * white_noise(derive_seed(number, 1))
-        )
+        noisy = (noise / share) ** 0.5 * white_noise(derive_seed(number, 1))
+        return to_map(simulate_beat(number) + noisy)
 
     return realise
 

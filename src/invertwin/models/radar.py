@@ -20,6 +20,7 @@ from invertwin.channel import (
     trace_field,
     trace_target,
 )
+from invertwin.checks import set_fields
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.models.noise import noisy_realisations
@@ -73,13 +74,12 @@ class SurrogateMap(ForwardModel):
             raise InputError(
                 'expected a surrogate for a SurrogateMap, got "exact"; use ExactMap(grid)'
             )
-        object.__setattr__(self, "surrogate", chosen)
         if isinstance(self.coherent, str):
             raise InputError(
                 f"expected a list of names of coherent targets, got {self.coherent!r}; give "
                 f"coherent=[{self.coherent!r}]"
             )
-        object.__setattr__(self, "coherent", tuple(self.coherent))
+        set_fields(self, surrogate=chosen, coherent=tuple(self.coherent))
         if not 1 <= self.stretch < math.inf or (self.stretch > 1 and not self.coherent):
             raise InputError(
                 f"expected a stretch >= 1 of coherent targets, got {self.stretch} and "
@@ -178,10 +178,9 @@ class SurrogateMap(ForwardModel):
             generator = torch.Generator().manual_seed(derive_seed(number, 2))
             turns = 2 * math.pi * torch.rand(len(targets), generator=generator)
             total = looks.beat(derive_seed(number, 0))
-            for turn, target in zip(
-                torch.polar(torch.ones_like(turns), turns), targets, strict=True
-            ):
-                total = total + turn * target.to(total)
+            phasors = torch.polar(torch.ones_like(turns), turns)
+            for phasor, target in zip(phasors, targets, strict=True):
+                total = total + phasor * target.to(total)
             return total
 
         return noisy_realisations(

@@ -9,13 +9,14 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, checked_number, checked_tensor
+from invertwin.checks import ArrayLike, checked_number, checked_tensor, set_fields
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.links.metasurface.coverage import Coverage
 from invertwin.links.metasurface.panel import Metasurface, panel_response
 from invertwin.links.places import ReceiverLocations
 from invertwin.links.received import LinkStatistics, PropagationSettings
+from invertwin.links.responses import checked_frequencies
 from invertwin.links.transmitters import Transmitters
 from invertwin.models.noise import add_white_errors
 from invertwin.scene.scene import Scene
@@ -289,14 +290,7 @@ class ResponseMap(ForwardModel):
     def __post_init__(self) -> None:
         do = "give a row of x, y, z for each"
         places = checked_tensor(self.positions, (None, 3), "positions of receivers [m]", do)
-        swept = checked_tensor(
-            torch.atleast_1d(torch.as_tensor(self.frequencies, dtype=torch.float64)),
-            (None,),
-            "frequencies [Hz]",
-            "give one or several",
-        )
-        object.__setattr__(self, "positions", places)
-        object.__setattr__(self, "frequencies", swept)
+        set_fields(self, positions=places, frequencies=checked_frequencies(self.frequencies))
 
     def predict(
         self, scene: Scene, sensor: Transmitters, seed: int

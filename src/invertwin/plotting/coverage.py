@@ -13,13 +13,7 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.links import MapPlane, Transmitters
-from invertwin.plotting.figures import (
-    add_colorbar,
-    label_axes,
-    numbers,
-    row_of_axes,
-    signed_colors,
-)
+from invertwin.plotting.figures import add_colorbar, label_axes, numbers, row_of_axes, signed_colors
 from invertwin.plotting.triangles import sharp_edges
 from invertwin.scene import Scene
 

@@ -7,13 +7,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from invertwin.errors import InputError
-from invertwin.plotting.figures import (
-    add_colorbar,
-    label_axes,
-    numbers,
-    row_of_axes,
-    signed_colors,
-)
+from invertwin.plotting.figures import add_colorbar, label_axes, numbers, row_of_axes, signed_colors
 
 _SHARE = 0.995  # of the pixels have derivatives within the colours
 

@@ -124,9 +124,8 @@ class Board:
             grid = (grid - grid.mean(dim=0)) * torch.tensor(signs, dtype=torch.float64) * unit
             positions = torch.cat([grid, torch.zeros_like(grid[:, :1])], dim=1)
             own = self.polarisation if polarisation is None else polarisation
-            return AntennaArray(
-                positions[self._indices(grid_positions, numbers, name)], pattern, own, leakage
-            )
+            chosen = positions[self._indices(grid_positions, numbers, name)]
+            return AntennaArray(chosen, pattern, own, leakage)
 
         return array(self.transmitters, transmitters, "TX"), array(self.receivers, receivers, "RX")
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.checks import checked_number, checked_tensor
+from invertwin.checks import checked_number, checked_tensor, set_fields
 from invertwin.errors import InputError
 from invertwin.scene.shape_models.lattice import Lattice
 
@@ -49,8 +49,7 @@ class Cloud:
                 "the density is an extinction [1/m]"
             )
         checked_number(self.albedo, "albedo", 0.0)
-        for name, value in (("low", lattice.low), ("high", lattice.high), ("density", density)):
-            object.__setattr__(self, name, value)
+        set_fields(self, low=lattice.low, high=lattice.high, density=density)
 
     @property
     def spacing(self) -> Float64[Tensor, "3"]:

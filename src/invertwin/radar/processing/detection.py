@@ -278,9 +278,8 @@ def _training_cells(
         )
     reach = [g + t for g, t in zip(guard, training, strict=True)]
     sizes = [2 * r + 1 for r in reach]
-    around = torch.nn.functional.pad(
-        values, (reach[1], reach[1], reach[0], reach[0]), value=math.inf
-    )
+    beside = (reach[1], reach[1], reach[0], reach[0])
+    around = torch.nn.functional.pad(values, beside, value=math.inf)
     around = around.unfold(-2, sizes[0], 1).unfold(-2, sizes[1], 1)
     offsets = [(torch.arange(size) - r).abs() for size, r in zip(sizes, reach, strict=True)]
     kept = (offsets[0][:, None] > guard[0]) | (offsets[1] > guard[1])

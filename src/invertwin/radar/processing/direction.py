@@ -84,9 +84,8 @@ def capon(
     scale = torch.where(level > 0, level, 1.0)
     loaded = covariance / scale[..., None, None] + loading * identity
     manifold = snapshots.manifold(grid)
-    whitened = torch.linalg.solve_triangular(
-        torch.linalg.cholesky(loaded), manifold.mT.expand(*level.shape, -1, -1), upper=False
-    )
+    waves, root = manifold.mT.expand(*level.shape, -1, -1), torch.linalg.cholesky(loaded)
+    whitened = torch.linalg.solve_triangular(root, waves, upper=False)
     power = level[..., None] / whitened.abs().square().sum(-2)
     return power.unflatten(-1, (grid.u_count, grid.v_count))
 

@@ -228,14 +228,13 @@ class ChirpTrain:
         device = paths.delay.device
         centers = [centre.to(device) for centre in (self.radar.link().tx, self.radar.link().rx)]
         span = paths.last - paths.first
-        segments = _segment_length(
-            paths.first, span, centers[0][paths.frame], centers[1][paths.frame]
-        )
+        ends = centers[0][paths.frame], centers[1][paths.frame]
+        segments = _segment_length(paths.first, span, *ends)
         origins = self.radar.origin_delays.to(device)[paths.frame]
         inner = paths.delay - origins - segments / SPEED_OF_LIGHT
         placed = self._points_at_instants(start, 1 if sample_interval(waveform) == 0 else 3)
         if len(placed) > 1 and len(paths):
-            length = _segment_length(placed, span, centers[0][paths.frame], centers[1][paths.frame])
+            length = _segment_length(placed, span, *ends)
             cycles = phase_cycles((length / SPEED_OF_LIGHT).detach(), waveform)
             bend = math.pi * float((cycles[0] - 2 * cycles[1] + cycles[2]).abs().max())
             count = _count_instants(bend)
@@ -246,8 +245,7 @@ class ChirpTrain:
             rows = torch.nonzero(paths.frame == frame)[:, 0]
             points = self._scattering_points(placed[:, rows], centers[1][frame])
             own, rest = paths.select(rows), inner[rows]
-            ends = points + span[rows]
-            back = [(ends - place).norm(dim=-1) for place in receivers[frame]]
+            back = [(points + span[rows] - place).norm(dim=-1) for place in receivers[frame]]
             for tx, found in zip(active_transmitters, signals, strict=True):
                 forth = (points - transmitters[frame, tx]).norm(dim=-1)
                 channels = [

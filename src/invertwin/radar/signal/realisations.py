@@ -10,9 +10,8 @@ from invertwin.channel import Paths
 from invertwin.radar.aperture import aperture
 from invertwin.radar.radar import Radar, require_sampled_waveform
 
-_CELLS_PER_RESOLUTION = (
-    4  # per resolution cell and axis: less than a tenth of a percent of the power is lost
-)
+# Per resolution cell and axis: less than a tenth of a percent of the power is lost.
+_CELLS_PER_RESOLUTION = 4
 _POINT_TOLERANCE = 1e-7  # points closer than this are one [m]
 
 

@@ -118,14 +118,11 @@ class Surrogate:
             )
         angle_width = _DEFAULT_ANGLE_WIDTH
         if distance is not None:
-            degrees = math.degrees(
-                math.atan2(error, checked_number(distance, "distance [m]", 0.0, open_low=True))
-            )
+            far = checked_number(distance, "distance [m]", 0.0, open_low=True)
+            degrees = math.degrees(math.atan2(error, far))
         if degrees is not None:
-            sine = math.sin(
-                math.radians(checked_number(degrees, "error in direction [°]", 0.0, 90))
-            )
-            angle_width = sine / min(radar.beamwidth)
+            angle = math.radians(checked_number(degrees, "error in direction [°]", 0.0, 90))
+            angle_width = math.sin(angle) / min(radar.beamwidth)
         range_width = error / radar.waveform.range_resolution
         return cls(range_width=range_width, angle_width=angle_width, **kernels)
 
@@ -313,11 +310,8 @@ def surrogate_spectrum(
         if reference is not None:
             reference = as_absorbers(reference[0], coherent), reference[1]
         rest = as_absorbers(scene, coherent)
-        parts.append(
-            deposit_power(
-                rest, link, grid, sampling=sampling, seed=seed, scheme=scheme, reference=reference
-            )
-        )
+        how: Any = {"seed": seed, "scheme": scheme, "reference": reference}
+        parts.append(deposit_power(rest, link, grid, sampling=sampling, **how))
     return surrogate.shape(torch.stack(parts).sum(0), radar, grid).clamp_min(0.0)
 
 
@@ -372,12 +366,8 @@ def surrogate_spectra(
     rest = [as_absorbers(scene, coherent) for scene in scenes]
     deposit = deposit_batch(rest, radar.link(), grid, sampling=sampling, seed=seed)
     if coherent:
-        targets = [
-            torch.stack(
-                _deposit_targets(scene, radar, grid, surrogate, sampling, coherent, stretch)
-            ).sum(0)
-            for scene in scenes
-        ]
+        how = (radar, grid, surrogate, sampling, coherent, stretch)
+        targets = [torch.stack(_deposit_targets(scene, *how)).sum(0) for scene in scenes]
         deposit = deposit + torch.stack(targets)
     return surrogate.shape(deposit.flatten(0, 1), radar, grid).clamp_min(0.0).reshape(deposit.shape)
 
@@ -439,9 +429,8 @@ def _kernels(
     grid: Grid,
 ) -> tuple[_SurrogateKernel, ...]:
     """Return the kernels without added widths, cached for the steps of a fit."""
-    spread = range_point_spread(
-        waveform, _lags(grid.range_count) * grid.range_step, window, range_kernel
-    )
+    lags = _lags(grid.range_count) * grid.range_step
+    spread = range_point_spread(waveform, lags, window, range_kernel)
     kernels = [_compensate_spline((1,), (grid.range_count,), spread)]
     if array is None:
         return tuple(kernels)

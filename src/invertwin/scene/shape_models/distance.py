@@ -13,14 +13,7 @@ from annotated_types import Ge, Le
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.checks import (
-    ArrayLike,
-    Counts,
-    Point,
-    checked_count,
-    checked_number,
-    checked_tensor,
-)
+from invertwin.checks import ArrayLike, Counts, Point, checked_count, checked_number, checked_tensor
 from invertwin.limits import NonNegative, Positive
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule

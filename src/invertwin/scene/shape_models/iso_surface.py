@@ -13,9 +13,8 @@ from invertwin.scene.shape_models.lattice import Lattice
 
 Field = Callable[[Float64[Tensor, "p 3"]], Float64[Tensor, " p"]]
 
-_NEWTON_STEPS = (
-    4  # Newton steps from marching cubes, whose error is of second order, to the field's zero
-)
+# Newton steps from marching cubes, whose error is of second order, to the field's zero.
+_NEWTON_STEPS = 4
 _CHUNK = 65_536  # points of the field per chunk
 _MIN_GRADIENT = 1e-6  # minimum gradient of a distance field, nominally 1
 
