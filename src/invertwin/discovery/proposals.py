@@ -14,10 +14,8 @@ from invertwin.inversion.initialisation.detections import Ground, label_groups
 _YAW_COUNT = 45  # candidate yaws of a rectangle over a quarter turn
 _TRIMMED_FRACTION = 0.05  # fraction of the weight beyond each side of a rectangle
 _PERSON_SIZE = 0.66, 0.32, 1.75  # usual length, width and height [m]
-_MIN_PERSON_EXTENT, _PERSON_MARGIN = (
-    0.12,
-    0.25,
-)  # minimum extent, and margin of the usual extents [m]
+# Minimum extent, and margin of the usual extents [m].
+_MIN_PERSON_EXTENT, _PERSON_MARGIN = 0.12, 0.25
 MAX_CORNER_EXTENT = 0.15
 """Maximum side of a group proposed as a corner reflector [m]."""
 

@@ -373,8 +373,7 @@ class ShapeSearch:
             ]
             rest = [*found[:number], *found[number + 1 :]]
             found[number] = max(
-                [shape, *options],
-                key=lambda one, rest=rest: self.evidence([*rest, one]),
+                [shape, *options], key=lambda one, rest=rest: self.evidence([*rest, one])
             )
         return found
 

@@ -23,9 +23,8 @@ from invertwin.radar.radar import require_sampled_waveform
 _CALIBRATION_ROUNDS = 2  # alternations of imaging and calibration
 _MAX_SWEEPS = 100  # maximum number of sweeps over the channels
 _MIN_PHASE_SPREAD = 10.0  # root mean square phase [°]: smaller errors are not corrected
-_MIN_POSITIONS = (
-    8  # minimum number of positions a range cell apart, which resolve directions by ranges
-)
+# Minimum number of positions a range cell apart, which resolve directions by ranges.
+_MIN_POSITIONS = 8
 
 
 def calibrate_on_scene(

@@ -19,9 +19,8 @@ _ACCELERATION_DEVIATION = 1.0  # standard deviation of the acceleration of a tar
 _CROSS_RANGE_SPEED = 3.0  # standard deviation of the cross-range velocity [m/s]
 _MIN_TRACK_FRAMES = 3  # minimum number of frames of a track
 _MAX_MISSED_FRAMES = 3  # maximum number of missed frames
-_MIN_EXISTENCE_PROBABILITY = (
-    0.1  # minimum existence probability of detections that continue a track
-)
+# Minimum existence probability of detections that continue a track.
+_MIN_EXISTENCE_PROBABILITY = 0.1
 
 
 @dataclass(frozen=True, eq=False)

@@ -85,10 +85,7 @@ class DistanceFieldLine(ParameterLine):
     def _distance_and_gradient(self, theta: float, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Return the changed distance at points, and its spatial gradient."""
         at = positions.detach().requires_grad_()
-        moved = {
-            f"shape.{name}": self._start[name] + theta * change
-            for name, change in self._tangent.items()
-        }
+        moved = {f"shape.{n}": self._start[n] + theta * by for n, by in self._tangent.items()}
         with torch.enable_grad():
             found = torch.func.functional_call(self._field, moved, (at,))
             (slope,) = torch.autograd.grad(found.sum(), at)

@@ -104,13 +104,11 @@ def detect_echoes(
     power = capture.spectrum(grid).detach().double()
     strongest = power.amax(3)
     # A frame at a time: the training cells of all take much memory.
-    detections = torch.stack(
-        [
-            ordered_statistics_cfar(frame, false_alarm=false_alarm, rank=_CFAR_RANK)
-            for frame in strongest
-        ]
-    )
-    found = peaks(power, detections, capture.radar(), grid).position
+    detections = [
+        ordered_statistics_cfar(frame, false_alarm=false_alarm, rank=_CFAR_RANK)
+        for frame in strongest
+    ]
+    found = peaks(power, torch.stack(detections), capture.radar(), grid).position
     inside = (found >= box.low) & (found <= box.high)
     if (height := _unresolved_height(capture.radar(), grid)) is not None:
         inside[:, height] = True
@@ -136,17 +134,16 @@ def backproject_power(
         grid: bins of its maps.
         points: positions in world axes [*point, 3] [m].
     """
-    flat = points.reshape(-1, 3)
-    if grid.u_count == grid.v_count == 1:
-        return torch.cat(
-            [backproject(capture, part).abs().square() for part in flat.split(_POINTS_PER_CHUNK)]
-        ).reshape(points.shape[:-1])
-    maps = capture.spectrum(grid).detach().double()
-    radar = capture.radar()
-    total = torch.cat(
-        [_incoherent_power(maps, radar, grid, part) for part in flat.split(_POINTS_PER_CHUNK)]
-    )
-    return total.reshape(points.shape[:-1])
+    maps = None
+    if grid.u_count > 1 or grid.v_count > 1:
+        maps = capture.spectrum(grid).detach().double()
+    parts = [
+        backproject(capture, part).abs().square()
+        if maps is None
+        else _incoherent_power(maps, capture.radar(), grid, part)
+        for part in points.reshape(-1, 3).split(_POINTS_PER_CHUNK)
+    ]
+    return torch.cat(parts).reshape(points.shape[:-1])
 
 
 def find_bright_nodes(
@@ -237,10 +234,9 @@ def fit_rectangle(
     """
     if len(points) < 3:
         raise InputError(f"expected at least 3 points, got {len(points)}; use pose = 'position'")
-    best: tuple[float, GroundRectangle] | None = None
-    for yaw in torch.linspace(0, math.pi / 2, _YAW_COUNT, dtype=torch.float64)[:-1].tolist():
-        found = _bounding_rectangle(points, yaw, ground)
-        axes = ground.yaw_rotation(yaw)[:, ground.plane_axes]
+
+    def score(found: GroundRectangle) -> float:
+        axes = ground.yaw_rotation(found.yaw)[:, ground.plane_axes]
         offsets = (points - found.center) @ axes
         away = (radar.positions.detach().mean(0) - found.center) @ axes
         half = torch.tensor(found.size).double() / 2
@@ -248,11 +244,10 @@ def fit_rectangle(
         near = half - offsets * torch.where(away < 0, -1.0, 1.0)
         nearest = torch.minimum(half - offsets, half + offsets)
         sides = torch.where(away.abs() > half, near, nearest).abs().amin(1)
-        score = float((1 / sides.clamp_min(resolution)).sum())
-        if best is None or score > best[0]:
-            best = (score, found)
-    assert best is not None
-    return best[1]
+        return float((1 / sides.clamp_min(resolution)).sum())
+
+    yaws = torch.linspace(0, math.pi / 2, _YAW_COUNT, dtype=torch.float64)[:-1].tolist()
+    return max((_bounding_rectangle(points, yaw, ground) for yaw in yaws), key=score)
 
 
 def principal_rectangle(
@@ -346,18 +341,11 @@ def select_pose(
         raise InputError("expected at least one pose, got none; use candidate_poses")
     measured = surrogate.blur(capture.spectrum(grid).float(), radar, grid)
     scenes = [scene.replace(name, pose=pose) for pose in poses]
-    losses = []
+    losses, sampling = [], Sampling(depth=1, samples=samples, boundary_samples=0)
     with torch.no_grad():
         for moved in scenes:
-            simulated = surrogate_spectrum(
-                moved,
-                radar,
-                grid,
-                surrogate,
-                sampling=Sampling(depth=1, samples=samples, boundary_samples=0),
-                seed=seed,
-            )
-            losses.append(float(loss(simulated, measured)) if bool(simulated.any()) else math.inf)
+            found = surrogate_spectrum(moved, radar, grid, surrogate, sampling=sampling, seed=seed)
+            losses.append(float(loss(found, measured)) if bool(found.any()) else math.inf)
     return scenes[losses.index(min(losses))], losses
 
 

@@ -224,10 +224,7 @@ def _compare_ends(
     for end in sorted(found, key=_unblurred_loss):
         if not any(are_same_poses(end.scene, other.scene, names) for other in ends):
             ends.append(end)
-    scores = [
-        None if k == 0 else difference_score(ends[0].result, end.result)
-        for k, end in enumerate(ends)
-    ]
+    scores = [None, *(difference_score(ends[0].result, end.result) for end in ends[1:])]
     texts = tuple(
         f"{describe_difference(ends[0].scene, end.scene, names)} explains the data nearly as "
         f"well: z = {z:.1f}"
