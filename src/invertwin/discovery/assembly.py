@@ -69,12 +69,8 @@ class ShapeLikelihood:
         Args:
             shapes: shape parameters.
         """
-        return {
-            f"object_{number}": make_shape_model(
-                f"object_{number}", figure, self.ground, self.level
-            )
-            for number, figure in enumerate(shapes, 1)
-        }
+        named = {f"object_{number}": shape for number, shape in enumerate(shapes, 1)}
+        return {n: make_shape_model(n, one, self.ground, self.level) for n, one in named.items()}
 
     @cached_property
     def coarse_maps(self) -> "CoarseMaps":
@@ -125,6 +121,10 @@ class ShapeLikelihood:
         rows = self._background_loss - self.loss.bin_losses(self.predict(shapes), self.power)
         return rows.flatten(1).double().sum(1) / self.bins_per_draw
 
+    def total_gain(self, shapes: Sequence[ShapeParameters]) -> float:
+        """Sum of ``log_likelihood_gains`` over the frames."""
+        return float(self.log_likelihood_gains(shapes).sum())
+
     @cached_property
     def _background_loss(self) -> Tensor:
         return self.loss.bin_losses(torch.zeros_like(self.power), self.power)
@@ -144,12 +144,8 @@ class ShapeLikelihood:
         sampling = self.model.sampling
         share = len(chosen) / self.radar.frame_count
         fewer = make_sampling(1, max(1, round(sampling.samples * share)))
-        return replace(
-            self,
-            model=replace(self.model, sampling=fewer),
-            radar=self.radar.frames(chosen),
-            power=self.power[chosen],
-        )
+        model, radar = replace(self.model, sampling=fewer), self.radar.frames(chosen)
+        return replace(self, model=model, radar=radar, power=self.power[chosen])
 
     def fit(
         self, shapes: Sequence[ShapeParameters], steps: int

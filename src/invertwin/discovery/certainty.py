@@ -41,10 +41,8 @@ def standard_deviations(
     # The product of two independent draws is free of the apparent information of their noise.
     mixed = torch.einsum("pfn,qfn->pq", *flat)
     information = nu / (nu + 2) * 0.5 * (mixed + mixed.T) / likelihood.bins_per_draw
-    slopes = (
-        torch.einsum("pfn,fn->pf", 0.5 * (flat[0] + flat[1]), score.flatten(1))
-        / likelihood.bins_per_draw
-    )
+    slopes = torch.einsum("pfn,fn->pf", 0.5 * (flat[0] + flat[1]), score.flatten(1))
+    slopes = slopes / likelihood.bins_per_draw
     scatter = slopes @ slopes.T
     spans = torch.tensor([10 * row.span for row in rows], dtype=torch.float64)
     # In units of the spans, with a prior of one unit; keep it positive despite noise.
@@ -80,12 +78,8 @@ def existence_probabilities(
         shapes: all shapes.
     """
     together = likelihood.log_likelihood_gains(shapes)
-    return [
-        acceptance_probability(
-            together, likelihood.log_likelihood_gains([*shapes[:k], *shapes[k + 1 :]])
-        )
-        for k in range(len(shapes))
-    ]
+    without = [[*shapes[:k], *shapes[k + 1 :]] for k in range(len(shapes))]
+    return [acceptance_probability(together, likelihood.log_likelihood_gains(r)) for r in without]
 
 
 @dataclass(frozen=True)
@@ -148,9 +142,8 @@ def kind_probabilities(hypotheses: Sequence[ShapeHypothesis]) -> dict[str, float
     """
     found = dict[str, float]()
     for other in hypotheses:
-        found[other.shape.effective_kind] = (
-            found.get(other.shape.effective_kind, 0.0) + other.probability
-        )
+        kind = other.shape.effective_kind
+        found[kind] = found.get(kind, 0.0) + other.probability
     return found
 
 

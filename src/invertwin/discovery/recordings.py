@@ -98,11 +98,8 @@ def twin(
         range_max = min(range_max or math.inf, recording.max_range)
     radar = capture.radar()
     base = float(radar.positions.detach()[:, plane.up_axis].mean())
-    floor = (
-        base - _DEFAULT_RADAR_HEIGHT
-        if level is None
-        else checked_number(level, "level of the ground [m]", -math.inf)
-    )
+    floor = base - _DEFAULT_RADAR_HEIGHT if level is None else level
+    floor = checked_number(floor, "level of the ground [m]", -math.inf)
     plane_at = base if height is None else floor + checked_number(height, "height [m]", 0.0)
     reach = _search_range(capture, range_max)
     if reach is None:
@@ -118,12 +115,10 @@ def twin(
         # Average over frames, where all of them have an echo.
         far = torch.cdist(places, radar.positions.detach())
         places = places[(far.amin(1) > reach[0]) & (far.amax(1) < reach[1])]
-        found, image = locate_coherent_points(
-            capture, places, 4 * max(step, radar.waveform.wavelength)
-        )
-        picture = GroundImage(
-            places[:, list(plane.plane_axes)], image, _count_views(radar, places, None)
-        )
+        separation = 4 * max(step, radar.waveform.wavelength)
+        found, image = locate_coherent_points(capture, places, separation)
+        flat, views = places[:, list(plane.plane_axes)], _count_views(radar, places, None)
+        picture = GroundImage(flat, image, views)
         return Twin(_sort_objects([*found, *moving]), plane, floor, picture)
     grid = radar.grid(*reach)
     still = _find_static_objects(capture, radar, grid, plane, floor, places, step, rays, seed)
@@ -208,18 +203,14 @@ def _find_static_objects(
         level,
         seed,
     )
-    held = (
-        list(range(_HELD_OUT_EVERY - 1, frames, _HELD_OUT_EVERY))
-        if frames >= 2 * _HELD_OUT_EVERY
-        else []
-    )
+    held = list(range(_HELD_OUT_EVERY - 1, frames, _HELD_OUT_EVERY))
+    held = held if frames >= 2 * _HELD_OUT_EVERY else []
     fitted = one.select_frames([k for k in range(frames) if k not in held]) if held else one
     coarse = fitted.coarse_maps.grid
     flat = positions[:, list(ground.plane_axes)]
     height = float(positions[:, ground.up_axis].mean()) - level
-    lattice = ImageGrid(
-        flat, step, compute_response(fitted.radar, coarse, positions), max(height, 0.1)
-    )
+    response = compute_response(fitted.radar, coarse, positions)
+    lattice = ImageGrid(flat, step, response, max(height, 0.1))
     aside = one.select_frames(held) if held else None
     search = ShapeSearch(fitted, aside, lattice)
     picture = search.first_image
@@ -233,9 +224,7 @@ def _find_static_objects(
     if aside is not None:
         shapes = fit_outlines(fitted, aside, shapes)
         seen_there = compute_response(aside.radar, coarse, positions)
-        if _image_likelihood_gain(aside, seen_there, picture) > float(
-            aside.log_likelihood_gains(shapes).sum()
-        ):
+        if _image_likelihood_gain(aside, seen_there, picture) > aside.total_gain(shapes):
             notes = (_IMAGE_BETTER_NOTE,)
     shapes, found = one.fit(shapes, _FINAL_FIT_STEPS)
     among = find_hypotheses(one, shapes)
@@ -289,15 +278,10 @@ def _image_likelihood_gain(
         response: response of the image points in thinned maps.
         strength: image [point].
     """
-    power, coarse, loss = (
-        likelihood.coarse_maps.power,
-        likelihood.coarse_maps.grid,
-        likelihood.coarse_maps.loss,
-    )
-    rows = loss.bin_losses(torch.zeros_like(power), power) - loss.bin_losses(
-        response.predict_maps(strength), power
-    )
-    return float(rows.sum()) / count_bins_per_draw(likelihood.radar, coarse)
+    coarse = likelihood.coarse_maps
+    nothing, image = torch.zeros_like(coarse.power), response.predict_maps(strength)
+    losses = [coarse.loss.bin_losses(power, coarse.power) for power in (nothing, image)]
+    return float((losses[0] - losses[1]).sum()) / count_bins_per_draw(likelihood.radar, coarse.grid)
 
 
 def _sort_objects(things: list[DetectedObject]) -> tuple[DetectedObject, ...]:
@@ -326,10 +310,8 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
         # The last cells of a period hold leakage of its first cells.
         longest = 0.98 * waveform.max_range
     else:
-        first, longest = (
-            max(first, float(capture.ranges[0]) + cell),
-            float(capture.ranges[-1]) - cell,
-        )
+        first = max(first, float(capture.ranges[0]) + cell)
+        longest = float(capture.ranges[-1]) - cell
     limit = longest if range_max is None else min(range_max, longest)
     if not first < limit:
         raise InputError(

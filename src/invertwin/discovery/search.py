@@ -93,10 +93,8 @@ class ShapeSearch:
         Args:
             shapes: candidate shapes.
         """
-        count = sum(count_parameters(shape) for shape in shapes)
-        return float(
-            self.fitted_frames.log_likelihood_gains(shapes).sum()
-        ) - 0.5 * count * math.log(self.fitted_frames.independent_draws)
+        one, count = self.fitted_frames, sum(count_parameters(shape) for shape in shapes)
+        return one.total_gain(shapes) - 0.5 * count * math.log(one.independent_draws)
 
     def is_better(self, new: Sequence[ShapeParameters], old: Sequence[ShapeParameters]) -> bool:
         """Return whether new shapes are preferred to old ones.
@@ -109,9 +107,7 @@ class ShapeSearch:
             return False
         if self.held_out_frames is None or len(new) <= len(old):
             return True
-        return float(self.held_out_frames.log_likelihood_gains(new).sum()) > float(
-            self.held_out_frames.log_likelihood_gains(old).sum()
-        )
+        return self.held_out_frames.total_gain(new) > self.held_out_frames.total_gain(old)
 
     @cached_property
     def first_image(self) -> Float64[Tensor, " point"]:
@@ -146,9 +142,8 @@ class ShapeSearch:
                 break
         if not shapes:
             return []
-        shapes = self.split_shapes(
-            self.merge_shapes(self.select_headings(self.select_kinds(shapes)))
-        )
+        shapes = self.select_headings(self.select_kinds(shapes))
+        shapes = self.split_shapes(self.merge_shapes(shapes))
         shapes, _ = self.fitted_frames.fit(shapes, _LONG_FIT_STEPS)
         shapes = self.refine(self.select_heights(shapes))
         return self.prune(shapes)
@@ -166,10 +161,10 @@ class ShapeSearch:
         total = float(strength.sum())
         parts = [part for part in parts if float(part.sum()) > _MIN_GROUP_FRACTION * total]
         known, born = list(shapes), list[tuple[Tensor, ShapeParameters]]()
-        gain, vain = float(self.fitted_frames.log_likelihood_gains(known).sum()), 0
+        gain, vain = self.fitted_frames.total_gain(known), 0
         for part in parts[: _MAX_SHAPES - len(shapes)]:
             one = self.select_best(known, self.propose_for_group(part))
-            new = float(self.fitted_frames.log_likelihood_gains([*known, one]).sum())
+            new = self.fitted_frames.total_gain([*known, one])
             if new > gain:
                 gain, vain = new, 0
                 known.append(one)
@@ -191,32 +186,21 @@ class ShapeSearch:
         power, loss = one.coarse_maps.power, one.coarse_maps.loss
         rest = one.predict_coarse(shapes)
         nothing = (power - loss.level[:, None, None]).clamp_min(rest)
-        gain = lattice.response.average_over_bins(
-            loss.bin_losses(rest, power) - loss.bin_losses(nothing, power)
-        )
+        saved = loss.bin_losses(rest, power) - loss.bin_losses(nothing, power)
+        gain = lattice.response.average_over_bins(saved)
         at = one.radar.positions.detach()[:, list(self.ground.plane_axes)]
         direction = torch.nn.functional.normalize(at[:, None] - lattice.positions, dim=2)
         yaws = [k * math.pi / 8 for k in range(16)]
-        score = torch.stack(
-            [
-                ((direction @ corner_direction(yaw, self.ground) > _MIN_CORNER_COSINE) * gain).sum(
-                    0
-                )
-                for yaw in yaws
-            ]
-        )
+        cosines = (direction @ corner_direction(yaw, self.ground) for yaw in yaws)
+        score = torch.stack([((c > _MIN_CORNER_COSINE) * gain).sum(0) for c in cosines])
         found = list[ShapeParameters]()
         for _ in range(_CORNERS_PER_ROUND):
             best, yaw = score.amax(0), score.argmax(0)
             index = int(best.argmax())
+            x, y = lattice.positions[index].tolist()
+            corner = ShapeParameters("corner", (x, y), yaws[int(yaw[index])])
             options = [
-                ShapeParameters(
-                    "corner",
-                    (float(lattice.positions[index, 0]), float(lattice.positions[index, 1])),
-                    yaws[int(yaw[index])],
-                    height=part * lattice.height,
-                    brightness=brightness,
-                )
+                replace(corner, height=part * lattice.height, brightness=brightness)
                 for part in (0.6, 1.0, 1.5)
                 for brightness in (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
             ]
@@ -277,10 +261,8 @@ class ShapeSearch:
         rows = propose_shapes(
             lattice.positions, group, self.ground, step=lattice.step, height=lattice.height
         )
-        found: list[ShapeParameters] = []
-        for row in rows:
-            found.append(replace(row, brightness=max(float(group.sum()) / mean_rcs(row), 1e-4)))
-        return found
+        total = float(group.sum())
+        return [replace(row, brightness=max(total / mean_rcs(row), 1e-4)) for row in rows]
 
     def select_best(
         self, known: Sequence[ShapeParameters], candidates: Iterable[ShapeParameters]
@@ -309,9 +291,7 @@ class ShapeSearch:
         """
         found: list[ShapeParameters] = [*shapes]
         while found:
-            without: list[list[ShapeParameters]] = [
-                [*found[:k], *found[k + 1 :]] for k in range(len(found))
-            ]
+            without = [[*found[:k], *found[k + 1 :]] for k in range(len(found))]
             weakest = max(without, key=self.evidence)
             if self.is_better(found, weakest):
                 break
@@ -465,15 +445,10 @@ def propose_kinds(
     for kind in ("person", "vehicle", "corner"):
         changed = list(shapes)
         for number, shape in enumerate(shapes):
-            options = [
-                row for row in _propose_headed_shapes(shape) if row.kind == kind != shape.kind
-            ]
+            options = [r for r in _propose_headed_shapes(shape) if r.kind == kind != shape.kind]
             if options:
                 rest = [*shapes[:number], *shapes[number + 1 :]]
-                gains = [
-                    float(likelihood.log_likelihood_gains([*rest, option]).sum())
-                    for option in options
-                ]
+                gains = [likelihood.total_gain([*rest, option]) for option in options]
                 changed[number] = options[gains.index(max(gains))]
         found.append(changed)
     return [
@@ -571,9 +546,8 @@ def enclosing_box(shapes: Sequence[ShapeParameters], yaw: float, ground: Ground)
     length, width = (high - low).tolist()
     brightest = max(shapes, key=lambda one: one.brightness)
     tall = max(shape.height for shape in shapes)
-    return ShapeParameters(
-        "box", (c * x - s * y, s * x + c * y), yaw, length, width, tall, brightest.brightness
-    )
+    position = c * x - s * y, s * x + c * y
+    return ShapeParameters("box", position, yaw, length, width, tall, brightest.brightness)
 
 
 def propose_splits(

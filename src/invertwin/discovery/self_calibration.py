@@ -79,12 +79,10 @@ def phase_spread(calibration: ChannelCalibration, radar: Radar) -> float:
     steps = [
         torch.arange(-1.0, 1.0, 1 / (16 * float(e)) if e > 0 else 2.0).double() for e in extent
     ]
-    turns = (
-        elements @ torch.cartesian_prod(*[axis if len(axis) > 1 else 0 * axis for axis in steps]).T
-    )
-    left = calibration.gains.flatten()[:, None] * torch.polar(
-        torch.ones_like(turns), 2 * math.pi * turns
-    )
+    axes = [axis if len(axis) > 1 else 0 * axis for axis in steps]
+    turns = elements @ torch.cartesian_prod(*axes).T
+    phasors = torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
+    left = calibration.gains.flatten()[:, None] * phasors
     best = left[:, int(left.sum(0).abs().argmax())]
     best = best * best.sum().conj()
     return math.degrees(float(best.angle().square().mean().sqrt()))

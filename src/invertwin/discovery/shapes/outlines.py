@@ -43,10 +43,8 @@ def fit_outlines(
     found = list(shapes)
     for part, one in zip(parts, new, strict=False):
         changed = [*_remove_shapes(found, part), one]
-        if (
-            float((held.log_likelihood_gains(changed) - held.log_likelihood_gains(found)).sum())
-            > _MIN_LOG_ODDS
-        ):
+        gain = held.log_likelihood_gains(changed) - held.log_likelihood_gains(found)
+        if float(gain.sum()) > _MIN_LOG_ODDS:
             found = changed
     return found
 

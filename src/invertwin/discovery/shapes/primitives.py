@@ -48,10 +48,8 @@ SIZE_LIMITS: dict[str, tuple[tuple[float, float, float], tuple[float, float, flo
     ),
 }
 """Minimum and maximum length, width and height of kinds with specific sizes [m]."""
-_RECTANGULAR_KINDS, _FREE_HEIGHT_KINDS = (
-    ("wall", "box", "person", "vehicle"),
-    ("sphere", "point", "corner"),
-)
+_RECTANGULAR_KINDS = ("wall", "box", "person", "vehicle")
+_FREE_HEIGHT_KINDS = ("sphere", "point", "corner")
 _MAX_DIELECTRIC_REFLECTANCE = 0.9  # larger reflectances are metal
 
 
@@ -403,9 +401,8 @@ def _person_mesh() -> Mesh:
 def _vehicle_mesh() -> Mesh:
     """Return a car facing x: stacked octagonal layers joined by a skin."""
     sides = 8
-    rings = torch.tensor(
-        [_vehicle_layer(*layer) for layer in _VEHICLE_LAYERS], dtype=torch.float64
-    ).flatten(0, 1)
+    layers = [_vehicle_layer(*layer) for layer in _VEHICLE_LAYERS]
+    rings = torch.tensor(layers, dtype=torch.float64).flatten(0, 1)
     faces: list[list[int]] = []
     for layer in range(len(_VEHICLE_LAYERS) - 1):
         for k in range(sides):
