@@ -11,7 +11,7 @@ from torch import Tensor
 from invertwin.channel import Grid, Sampling
 from invertwin.discovery.imaging.likelihood import HeavyTailedLoss
 from invertwin.discovery.imaging.reflectivity import thin_map
-from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters
+from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters, Shapes
 from invertwin.discovery.shapes.prisms import OutlineModel, make_shape_model
 from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
 from invertwin.inversion.initialisation.detections import Ground
@@ -61,9 +61,7 @@ class ShapeLikelihood:
     level: float
     seed: int
 
-    def unknowns(
-        self, shapes: Sequence[ShapeParameters]
-    ) -> dict[str, PrimitiveModel | OutlineModel]:
+    def unknowns(self, shapes: Shapes) -> dict[str, PrimitiveModel | OutlineModel]:
         """Return the shape models of shapes by name.
 
         Args:
@@ -79,9 +77,7 @@ class ShapeLikelihood:
         stride = round(grid.range_step / self.model.grid.range_step)
         return CoarseMaps(power, grid, replace(self.loss, level=self.loss.level[::stride]))
 
-    def predict_coarse(
-        self, shapes: Sequence[ShapeParameters]
-    ) -> Float64[Tensor, "frame some_range some_u some_v"]:
+    def predict_coarse(self, shapes: Shapes) -> Float64[Tensor, "frame some_range some_u some_v"]:
         """Return ``predict`` in the bins of ``coarse_maps``.
 
         Args:
@@ -89,7 +85,7 @@ class ShapeLikelihood:
         """
         return thin_map(self.predict(shapes).double(), self.radar, self.model.grid)[0]
 
-    def build_scene(self, shapes: Sequence[ShapeParameters]) -> Scene:
+    def build_scene(self, shapes: Shapes) -> Scene:
         """Build the scene of shapes.
 
         Args:
@@ -98,7 +94,7 @@ class ShapeLikelihood:
         return Scene({name: one.item for name, one in self.unknowns(shapes).items()})
 
     @torch.no_grad()
-    def predict(self, shapes: Sequence[ShapeParameters]) -> Float[Tensor, "frame range u v"]:
+    def predict(self, shapes: Shapes) -> Float[Tensor, "frame range u v"]:
         """Predict the maps of shapes, without background.
 
         Args:
@@ -109,7 +105,7 @@ class ShapeLikelihood:
         model = replace(self.model, sampling=replace(self.model.sampling, boundary=False))
         return model.predict(self.build_scene(shapes), self.radar, self.seed)
 
-    def log_likelihood_gains(self, shapes: Sequence[ShapeParameters]) -> Float64[Tensor, " frame"]:
+    def log_likelihood_gains(self, shapes: Shapes) -> Float64[Tensor, " frame"]:
         """Compute the log-likelihood of shapes over that of the background alone for every frame.
 
         Args:
@@ -121,7 +117,7 @@ class ShapeLikelihood:
         rows = self._background_loss - self.loss.bin_losses(self.predict(shapes), self.power)
         return rows.flatten(1).double().sum(1) / self.bins_per_draw
 
-    def total_gain(self, shapes: Sequence[ShapeParameters]) -> float:
+    def total_gain(self, shapes: Shapes) -> float:
         """Sum of ``log_likelihood_gains`` over the frames."""
         return float(self.log_likelihood_gains(shapes).sum())
 
@@ -147,9 +143,7 @@ class ShapeLikelihood:
         model, radar = replace(self.model, sampling=fewer), self.radar.frames(chosen)
         return replace(self, model=model, radar=radar, power=self.power[chosen])
 
-    def fit(
-        self, shapes: Sequence[ShapeParameters], steps: int
-    ) -> tuple[list[ShapeParameters], Reconstruction]:
+    def fit(self, shapes: Shapes, steps: int) -> tuple[list[ShapeParameters], Reconstruction]:
         """Fit all numbers of the shapes jointly.
 
         Args:

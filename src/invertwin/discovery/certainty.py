@@ -9,7 +9,7 @@ from torch import Tensor
 
 from invertwin.discovery.assembly import ShapeLikelihood
 from invertwin.discovery.search import propose_kinds, rotate_headed_shapes
-from invertwin.discovery.shapes.primitives import ShapeParameters, shape_center
+from invertwin.discovery.shapes.primitives import ShapeParameters, Shapes, shape_center
 from invertwin.inversion import Reconstruction, speckle_weight
 from invertwin.inversion.confidence.uncertainty import iterate_coordinates, map_derivatives
 
@@ -68,9 +68,7 @@ def acceptance_probability(gains_with: Tensor, gains_without: Tensor) -> float:
     return float(torch.special.ndtr(torch.tensor(total / max(spread, 1e-9)).double()))
 
 
-def existence_probabilities(
-    likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters]
-) -> list[float]:
+def existence_probabilities(likelihood: ShapeLikelihood, shapes: Shapes) -> list[float]:
     """Compute the existence probability of every shape.
 
     Args:
@@ -95,9 +93,7 @@ class ShapeHypothesis:
     probability: float
 
 
-def find_hypotheses(
-    likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters]
-) -> list[list[ShapeHypothesis]]:
+def find_hypotheses(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[ShapeHypothesis]]:
     """Return alternative hypotheses of every shape with all others fixed; the shape itself comes
     first.
 

@@ -37,7 +37,7 @@ from invertwin.discovery.outcome import DetectedObject, GroundImage, Twin
 from invertwin.discovery.search import ImageGrid, ShapeSearch
 from invertwin.discovery.self_calibration import calibrate_on_scene, phase_spread
 from invertwin.discovery.shapes.outlines import fit_outlines
-from invertwin.discovery.shapes.primitives import ShapeParameters, shape_center
+from invertwin.discovery.shapes.primitives import Shapes, shape_center
 from invertwin.discovery.tracks import track_moving_targets
 from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
@@ -247,7 +247,7 @@ def _find_static_objects(
 def _describe_objects(
     likelihood: ShapeLikelihood,
     fit: Reconstruction,
-    shapes: Sequence[ShapeParameters],
+    shapes: Shapes,
     hypotheses: Sequence[Sequence[ShapeHypothesis]],
 ) -> tuple[DetectedObject, ...]:
     """Return fitted shapes as objects with error bars, kinds and existence probabilities."""

@@ -19,7 +19,12 @@ from invertwin.discovery.proposals import (
     propose_people_and_vehicles,
     propose_shapes,
 )
-from invertwin.discovery.shapes.primitives import ShapeParameters, corner_direction, rotate_shape
+from invertwin.discovery.shapes.primitives import (
+    ShapeParameters,
+    Shapes,
+    corner_direction,
+    rotate_shape,
+)
 from invertwin.discovery.shapes.prisms import PrismParameters, prism_contour
 from invertwin.inversion.initialisation.detections import Ground
 
@@ -87,7 +92,7 @@ class ShapeSearch:
         """Ground plane."""
         return self.fitted_frames.ground
 
-    def evidence(self, shapes: Sequence[ShapeParameters]) -> float:
+    def evidence(self, shapes: Shapes) -> float:
         """Compute the evidence of shapes on the fitted frames.
 
         Args:
@@ -96,7 +101,7 @@ class ShapeSearch:
         one, count = self.fitted_frames, sum(count_parameters(shape) for shape in shapes)
         return one.total_gain(shapes) - 0.5 * count * math.log(one.independent_draws)
 
-    def is_better(self, new: Sequence[ShapeParameters], old: Sequence[ShapeParameters]) -> bool:
+    def is_better(self, new: Shapes, old: Shapes) -> bool:
         """Return whether new shapes are preferred to old ones.
 
         Args:
@@ -114,7 +119,7 @@ class ShapeSearch:
         """Reflectivity image without any known shape."""
         return self.residual_image([])
 
-    def residual_image(self, shapes: Sequence[ShapeParameters]) -> Float64[Tensor, " point"]:
+    def residual_image(self, shapes: Shapes) -> Float64[Tensor, " point"]:
         """Compute the reflectivity image of the residual of shapes.
 
         Args:
@@ -148,7 +153,7 @@ class ShapeSearch:
         shapes = self.refine(self.select_heights(shapes))
         return self.prune(shapes)
 
-    def propose_births(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def propose_births(self, shapes: Shapes) -> list[ShapeParameters]:
         """Propose shapes at bright groups of the residual image.
 
         Args:
@@ -174,7 +179,7 @@ class ShapeSearch:
         found = [one for _, one in self.unite_groups(shapes, born)]
         return found + self.propose_corners([*shapes, *found])
 
-    def propose_corners(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def propose_corners(self, shapes: Shapes) -> list[ShapeParameters]:
         """Propose corner reflectors for echoes that only some directions observe.
 
         An image of isotropic reflectors does not show them.
@@ -217,7 +222,7 @@ class ShapeSearch:
         return found
 
     def unite_groups(
-        self, shapes: Sequence[ShapeParameters], born: Sequence[tuple[Tensor, ShapeParameters]]
+        self, shapes: Shapes, born: Sequence[tuple[Tensor, ShapeParameters]]
     ) -> list[tuple[Tensor, ShapeParameters]]:
         """Return groups and their shapes, with one box for two groups where that is more likely.
 
@@ -264,9 +269,7 @@ class ShapeSearch:
         total = float(group.sum())
         return [replace(row, brightness=max(total / mean_rcs(row), 1e-4)) for row in rows]
 
-    def select_best(
-        self, known: Sequence[ShapeParameters], candidates: Iterable[ShapeParameters]
-    ) -> ShapeParameters:
+    def select_best(self, known: Shapes, candidates: Iterable[ShapeParameters]) -> ShapeParameters:
         """Select the candidate of highest likelihood, given other shapes.
 
         Args:
@@ -275,7 +278,7 @@ class ShapeSearch:
         """
         return max(candidates, key=lambda one: self.evidence([*known, one]))
 
-    def refine(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def refine(self, shapes: Shapes) -> list[ShapeParameters]:
         """Refine shapes by a short fit.
 
         Args:
@@ -283,7 +286,7 @@ class ShapeSearch:
         """
         return self.fitted_frames.fit(shapes, _SHORT_FIT_STEPS)[0]
 
-    def prune(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def prune(self, shapes: Shapes) -> list[ShapeParameters]:
         """Remove shapes without supporting evidence, the weakest first.
 
         Args:
@@ -298,7 +301,7 @@ class ShapeSearch:
             found = weakest
         return found
 
-    def select_kinds(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def select_kinds(self, shapes: Shapes) -> list[ShapeParameters]:
         """Select the most likely kind of every shape, after a fit as every kind.
 
         Args:
@@ -306,7 +309,7 @@ class ShapeSearch:
         """
         return self.select_likeliest(shapes, propose_kinds(self.fitted_frames, shapes))
 
-    def select_headings(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def select_headings(self, shapes: Shapes) -> list[ShapeParameters]:
         """Select the most likely heading of people and vehicles, after a fit of every rotation.
 
         Args:
@@ -317,7 +320,7 @@ class ShapeSearch:
         return self.select_likeliest(shapes, [rows for rows in others if rows])
 
     def select_likeliest(
-        self, shapes: Sequence[ShapeParameters], alternatives: Sequence[Sequence[ShapeParameters]]
+        self, shapes: Shapes, alternatives: Sequence[Shapes]
     ) -> list[ShapeParameters]:
         """Select every shape from alternative lists after a fit, whichever is most likely.
 
@@ -333,7 +336,7 @@ class ShapeSearch:
             found[number] = max(options, key=lambda one, rest=rest: self.evidence([*rest, one]))
         return found
 
-    def select_heights(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def select_heights(self, shapes: Shapes) -> list[ShapeParameters]:
         """Select the most likely heights of shapes.
 
         Points above and below the radars have nearly equal ranges, so that the likelihood has
@@ -357,7 +360,7 @@ class ShapeSearch:
             )
         return found
 
-    def split_shapes(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def split_shapes(self, shapes: Shapes) -> list[ShapeParameters]:
         """Replace shapes by two boxes where that is more likely.
 
         Two touching objects form one group of the image, and one shape at first.
@@ -382,7 +385,7 @@ class ShapeSearch:
                 found, tried = new, 0
         return found
 
-    def merge_shapes(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def merge_shapes(self, shapes: Shapes) -> list[ShapeParameters]:
         """Replace two shapes by one box, person or vehicle where that is more likely.
 
         Args:
@@ -430,9 +433,7 @@ def mean_rcs(shape: ShapeParameters) -> float:
     return 0.5 * math.pi * (shape.length + shape.width) * shape.height
 
 
-def propose_kinds(
-    likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters]
-) -> list[list[ShapeParameters]]:
+def propose_kinds(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[ShapeParameters]]:
     """Convert all eligible shapes to each other kind, before any fit.
 
     Args:
@@ -456,9 +457,7 @@ def propose_kinds(
     ]
 
 
-def rotate_headed_shapes(
-    shapes: Sequence[ShapeParameters], rotation: float, ground: Ground
-) -> list[ShapeParameters]:
+def rotate_headed_shapes(shapes: Shapes, rotation: float, ground: Ground) -> list[ShapeParameters]:
     """Rotate people and vehicles; empty if there are none.
 
     Args:
@@ -530,7 +529,7 @@ def convert_kind(shape: ShapeParameters, kind: str) -> ShapeParameters:
     return replace(shape, kind=kind, length=across, width=across, height=max(high, 0.05))
 
 
-def enclosing_box(shapes: Sequence[ShapeParameters], yaw: float, ground: Ground) -> ShapeParameters:
+def enclosing_box(shapes: Shapes, yaw: float, ground: Ground) -> ShapeParameters:
     """Return a box around shapes.
 
     Args:

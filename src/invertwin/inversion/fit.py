@@ -14,6 +14,7 @@ from pydantic import ConfigDict, TypeAdapter
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
+from invertwin.forward_model import Realisations
 from invertwin.inversion.fingerprint import Fingerprint
 from invertwin.inversion.gauss_newton import GaussNewton, no_effect_error
 from invertwin.inversion.loss import MapPairs, Objective, resolve_loss
@@ -246,7 +247,7 @@ class Fit:
         finally:
             self.modules.load_state_dict(present)
 
-    def realisations(self, seed_number: int) -> list[Callable[[int, float], Tensor] | None]:
+    def realisations(self, seed_number: int) -> list[Realisations | None]:
         """Return functions that simulate recordings of the twin, see ``ForwardModel.realisations``.
 
         Args:

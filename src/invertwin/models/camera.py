@@ -1,6 +1,5 @@
 """Forward models of cameras: silhouettes and depth."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
@@ -11,7 +10,7 @@ from torch import Tensor
 from invertwin.camera import Camera, ImageSampling, depths, silhouettes
 from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
-from invertwin.forward_model import ForwardModel
+from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.limits import Positive
 from invertwin.models.noise import add_white_errors
 from invertwin.scene.scene import Scene
@@ -25,9 +24,7 @@ class _ImageMap(ForwardModel):
 
     holds_fields: ClassVar[bool] = True
 
-    def realisations(
-        self, scene: Scene, sensor: Camera, seed: int
-    ) -> Callable[[int, float], Tensor]:
+    def realisations(self, scene: Scene, sensor: Camera, seed: int) -> Realisations:
         """The images with other errors each time."""
         return add_white_errors(self.predict(scene, sensor, seed), self.scatter)
 

@@ -1,7 +1,6 @@
 """Forward model of chirp trains: power over range, Doppler and direction."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -12,7 +11,7 @@ from torch import Tensor
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.channel import Grid, Paths, Sampling, trace_power
 from invertwin.errors import InputError
-from invertwin.forward_model import ForwardModel
+from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.radar.processing.doppler import range_doppler_angle, velocity_axis
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
@@ -120,9 +119,7 @@ class RangeDopplerMap(ForwardModel):
         rows = (velocity_axis(radar, self.chirps, self.bins) - self.rates[:, None]).abs().argmin(1)
         return power[:, rows]
 
-    def realisations(
-        self, scene: Scene, sensor: Radar, seed: int
-    ) -> Callable[[int, float], Tensor]:
+    def realisations(self, scene: Scene, sensor: Radar, seed: int) -> Realisations:
         """Recordings of the moving scene with other speckle and noise each time.
 
         A few hundred points of each surface are enough for developed speckle.

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from invertwin.forward_model import Realisations
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.seeds import derive_seed
@@ -17,7 +18,7 @@ def noisy_realisations(
     seed: int,
     *,
     holds_fields: bool = False,
-) -> Callable[[int, float], Tensor]:
+) -> Realisations:
     """Return realisations of a map with receiver noise.
 
     Args:
@@ -44,7 +45,7 @@ def noisy_realisations(
     return realise
 
 
-def add_white_errors(mean: Tensor, scatter: float | None) -> Callable[[int, float], Tensor]:
+def add_white_errors(mean: Tensor, scatter: float | None) -> Realisations:
     """Return realisations of a map with white errors.
 
     Args:

@@ -1,7 +1,7 @@
 """Forward models of radar spectra: the smooth surrogate and the exact signal."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -22,7 +22,7 @@ from invertwin.channel import (
 )
 from invertwin.checks import set_fields
 from invertwin.errors import InputError
-from invertwin.forward_model import ForwardModel
+from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.models.noise import noisy_realisations
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
@@ -155,9 +155,7 @@ class SurrogateMap(ForwardModel):
         sampling = replace(self.sampling, samples=samples, boundary_samples=0)
         return replace(self, sampling=sampling, _reference=(scene, sensor, scheme))
 
-    def realisations(
-        self, scene: Scene, sensor: Radar, seed: int
-    ) -> Callable[[int, float], Tensor] | None:
+    def realisations(self, scene: Scene, sensor: Radar, seed: int) -> Realisations | None:
         """Spectra of one scene with other speckle, and another phase of every coherent target.
 
         None for clouds and for smooth conductors that are no targets.

@@ -1,7 +1,7 @@
 """Forward models of links: received power, frequency responses, power of panels."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from invertwin.checks import ArrayLike, checked_number, checked_tensor, set_fields
 from invertwin.errors import InputError
-from invertwin.forward_model import ForwardModel
+from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.links.metasurface.coverage import Coverage
 from invertwin.links.metasurface.panel import Metasurface, panel_response
 from invertwin.links.places import ReceiverLocations
@@ -201,15 +201,11 @@ class RadioMap(ForwardModel):
         what = f"measured {self.quantity.replace('_', ' ')}"
         return checked_tensor(given, (None, *shape), what, "give a map for each transmitter")
 
-    def realisations(
-        self, scene: Scene, sensor: Transmitters, seed: int
-    ) -> Callable[[int, float], Tensor]:
+    def realisations(self, scene: Scene, sensor: Transmitters, seed: int) -> Realisations:
         """The map with other errors of measurement each time."""
         return self.realisations_about(self.predict(scene, sensor, seed))
 
-    def realisations_about(
-        self, mean: Float64[Tensor, "tx *map"]
-    ) -> Callable[[int, float], Tensor]:
+    def realisations_about(self, mean: Float64[Tensor, "tx *map"]) -> Realisations:
         """A map with other errors of measurement each time, see ``ForwardModel.looks``.
 
         Args:
@@ -312,8 +308,6 @@ class ResponseMap(ForwardModel):
         do = "give complex numbers [tx, place, frequency]"
         return checked_tensor(torch.view_as_real(given), shape, "measured responses", do)
 
-    def realisations(
-        self, scene: Scene, sensor: Transmitters, seed: int
-    ) -> Callable[[int, float], Tensor]:
+    def realisations(self, scene: Scene, sensor: Transmitters, seed: int) -> Realisations:
         """The responses with other noise each time."""
         return add_white_errors(self.predict(scene, sensor, seed), self.scatter)

@@ -1,6 +1,7 @@
 """Parametric shapes on the ground: the primitives of an automatic twin."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal, get_args
@@ -136,6 +137,9 @@ class ShapeParameters:
         if self.kind in ("sphere", "point"):
             return "point" if self.length < MAX_POINT_SIZE else "sphere"
         return self.kind
+
+
+Shapes = Sequence[ShapeParameters]
 
 
 class UnknownShape(nn.Module):

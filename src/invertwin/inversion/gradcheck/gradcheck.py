@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.gradcheck.lines import make_line
-from invertwin.inversion.gradcheck.tangents import ParameterChange
+from invertwin.inversion.gradcheck.tangents import ParameterChanges
 from invertwin.limits import Count, NonNegative, Positive
 from invertwin.runtime.concurrency import tracer_lock
 from invertwin.scene.scene import Scene
@@ -97,7 +97,7 @@ class GradientReport:
 def gradcheck(
     model: ForwardModel,
     module: nn.Module,
-    tangent: Mapping[str, ParameterChange] | Tensor,
+    tangent: ParameterChanges | Tensor,
     *,
     scene: Scene,
     sensor: Any,
