@@ -352,9 +352,8 @@ def _image_points(
     cell = radar.waveform.range_resolution
     while True:
         counts = [max(2, math.ceil(float(side) / cell) + 1) for side in size]
-        flat = torch.cartesian_prod(
-            *[corners[0][k] + cell * torch.arange(counts[k], dtype=torch.float64) for k in range(2)]
-        )
+        steps = [cell * torch.arange(count, dtype=torch.float64) for count in counts]
+        flat = torch.cartesian_prod(corners[0][0] + steps[0], corners[0][1] + steps[1])
         places = torch.zeros(len(flat), 3, dtype=torch.float64)
         places[:, axes], places[:, ground.up_axis] = flat, height
         near = torch.zeros(len(flat), dtype=torch.bool)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations, product
 
 import torch
 from jaxtyping import Float64
@@ -128,9 +129,8 @@ class ShapeSearch:
         one = self.fitted_frames
         coarse = one.coarse_maps
         rest = one.predict_coarse(shapes) + coarse.loss.level[:, None, None]
-        return reconstruct_reflectivity(
-            self.image_grid.response, coarse.power, rest, degrees=coarse.loss.degrees
-        )
+        response, degrees = self.image_grid.response, coarse.loss.degrees
+        return reconstruct_reflectivity(response, coarse.power, rest, degrees=degrees)
 
     def run(self) -> list[ShapeParameters]:
         """Run the search and return the shapes."""
@@ -236,8 +236,7 @@ class ShapeSearch:
         while True:
             pairs = [
                 (self._group_gap(a[0], b[0]), a, b)
-                for k, a in enumerate(found)
-                for b in found[k + 1 :]
+                for a, b in combinations(found, 2)
                 if (id(a[0]), id(b[0])) not in tried
             ]
             pairs = [pair for pair in pairs if pair[0] < _MAX_MERGE_GAP]
@@ -333,7 +332,7 @@ class ShapeSearch:
         for number in range(len(found)):
             rest = [*found[:number], *found[number + 1 :]]
             options = [found[number], *(rows[number] for rows in (*alternatives, *fitted))]
-            found[number] = max(options, key=lambda one, rest=rest: self.evidence([*rest, one]))
+            found[number] = self.select_best(rest, options)
         return found
 
     def select_heights(self, shapes: Shapes) -> list[ShapeParameters]:
@@ -347,17 +346,10 @@ class ShapeSearch:
         """
         found = list(shapes)
         for number, shape in enumerate(found):
-            options = [
-                replace(
-                    shape, height=shape.height * part, brightness=shape.brightness * part**-power
-                )
-                for part in _HEIGHT_FACTORS
-                for power in (0.5, 1.0)
-            ]
-            rest = [*found[:number], *found[number + 1 :]]
-            found[number] = max(
-                [shape, *options], key=lambda one, rest=rest: self.evidence([*rest, one])
-            )
+            options, high, bright = [shape], shape.height, shape.brightness
+            for part, power in product(_HEIGHT_FACTORS, (0.5, 1.0)):
+                options.append(replace(shape, height=high * part, brightness=bright * part**-power))
+            found[number] = self.select_best([*found[:number], *found[number + 1 :]], options)
         return found
 
     def split_shapes(self, shapes: Shapes) -> list[ShapeParameters]:
@@ -395,8 +387,7 @@ class ShapeSearch:
         while True:
             pairs = [
                 (a, b)
-                for k, a in enumerate(found)
-                for b in found[k + 1 :]
+                for a, b in combinations(found, 2)
                 if (a, b) not in tried and shape_gap(a, b, self.ground) < _MAX_MERGE_GAP
             ]
             if not pairs:

@@ -186,14 +186,5 @@ def _to_detected_object(
     frames = torch.arange(path.first_frame, path.first_frame + count, dtype=torch.float64)
     deviations = dict(zip(names, spreads.T, strict=True))
     track = ObjectTrack(frames * period, positions, velocities, deviations)
-    return DetectedObject(
-        "",
-        "point",
-        {"point": 1.0},
-        positions[-1],
-        None,
-        {name: float(column[-1]) for name, column in track.deviations.items()},
-        sure,
-        velocities[-1],
-        track,
-    )
+    last = {name: float(column[-1]) for name, column in deviations.items()}
+    return DetectedObject.point("", positions[-1], last, sure, velocities[-1], track)

@@ -89,9 +89,8 @@ class Fingerprint:
             self._update_digest("code", value.co_code.hex(), *value.co_names)
             self._add(value.co_consts)
         elif isinstance(value, type | types.BuiltinFunctionType | types.ModuleType):
-            self._update_digest(
-                getattr(value, "__module__", ""), getattr(value, "__qualname__", value)
-            )
+            name = getattr(value, "__qualname__", value)
+            self._update_digest(getattr(value, "__module__", ""), name)
         else:
             self._add_object(value)
 

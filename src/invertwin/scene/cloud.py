@@ -38,9 +38,8 @@ class Cloud:
     albedo: float | Float64[Tensor, ""] = 1.0
 
     def __post_init__(self) -> None:
-        density = checked_tensor(
-            self.density, (None, None, None), "densities [1/m]", "give one for each node"
-        )
+        do = "give one for each node"
+        density = checked_tensor(self.density, (None, None, None), "densities [1/m]", do)
         lattice = Lattice.from_bounds(self.low, self.high, density.shape)
         least = float(density.detach().min())
         if least < 0:

@@ -381,9 +381,8 @@ class MaterialValues(nn.Module):
         """
         try:
             holder = select_layer(item.material, layer, type(item.material).__name__)
-            return cls(
-                object, layer=layer, **{name: _initial_value(holder, name) for name in values}
-            )
+            start = {name: _initial_value(holder, name) for name in values}
+            return cls(object, layer=layer, **start)
         except InputError as error:
             raise InputError(str(error), f"values, material of {object}") from None
 

@@ -300,10 +300,9 @@ def _split(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
         2: [(ab, b, bc), (a, ab, bc), (a, bc, c)],
         3: [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)],
     }
-    return np.concatenate(
-        [
-            np.column_stack([corner[count == n] for corner in triangle])
-            for n, triangles in patterns.items()
-            for triangle in triangles
-        ]
-    )
+    parts = [
+        np.column_stack([corner[count == n] for corner in triangle])
+        for n, triangles in patterns.items()
+        for triangle in triangles
+    ]
+    return np.concatenate(parts)

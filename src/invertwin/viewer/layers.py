@@ -19,12 +19,8 @@ _GREY, _RADAR = (185, 190, 199), (110, 120, 140)
 _COLORS = {"truth": (192, 20, 60), "start": (224, 128, 60)}
 _TWIN = (76, 120, 168)
 # Layers of the present position: their names, their colours, and how large their points are.
-SAMPLED_PATHS, VISIBLE_POINTS, BOUNDARY_POINTS, BIN_POINTS = (
-    "sampled paths",
-    "what is seen",
-    "boundary paths",
-    "chosen bin",
-)
+SAMPLED_PATHS, VISIBLE_POINTS = "sampled paths", "what is seen"
+BOUNDARY_POINTS, BIN_POINTS = "boundary paths", "chosen bin"
 POSITION_LAYERS: dict[str, tuple[tuple[int, int, int], float]] = {
     SAMPLED_PATHS: ((120, 170, 220), 1.0),
     VISIBLE_POINTS: ((30, 140, 90), 0.4),

@@ -64,9 +64,8 @@ class InteractiveSensor:
     def __init__(self, scene: Scene, radar: Radar, grid: Grid, depth: int = 1) -> None:
         self.scene = self._begun = replace_clouds(scene)
         self.radar, self.grid = radar, grid
-        self._model = SurrogateMap(
-            grid, sampling=Sampling(depth=depth, samples=_SAMPLES, boundary=False)
-        )
+        sampling = Sampling(depth=depth, samples=_SAMPLES, boundary=False)
+        self._model = SurrogateMap(grid, sampling=sampling)
 
     @property
     def names(self) -> tuple[str, ...]:

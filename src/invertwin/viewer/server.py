@@ -166,12 +166,10 @@ class Viewer:
         gui.configure_theme(show_logo=False, show_share_button=False)
         # Texts of fields are shown as they are; markdown would run what names hold.
         gui.add_text("shown", display.title, disabled=True)
-        count = len(self._steps)
-        self._step = gui.add_slider(
-            "step", 0, max(1, count - 1), 1, max(0, count - 1), visible=count > 1
-        )
+        last, several = len(self._steps) - 1, len(self._steps) > 1
+        self._step = gui.add_slider("step", 0, max(1, last), 1, max(0, last), visible=several)
         self._step.on_update(lambda _: self._update_state(step=int(self._step.value)))
-        self._where = gui.add_text("fit", "", disabled=True, visible=count > 1)
+        self._where = gui.add_text("fit", "", disabled=True, visible=several)
         low, high = display.box
         self._size = float(np.linalg.norm(high - low)) or 1.0
         self._build_sensor_controls()
@@ -191,9 +189,8 @@ class Viewer:
         up, ahead = np.array(display.up), np.array(display.ahead)
         # The window's own panel covers its right, where u falls.
         camera.look_at = middle + 0.6 * self._panels.offset - 0.3 * self._size * self._panels.right
-        camera.position = camera.look_at + self._size * (
-            0.15 * up - 1.6 * ahead + 0.25 * self._panels.right
-        )
+        back = 0.15 * up - 1.6 * ahead + 0.25 * self._panels.right
+        camera.position = camera.look_at + self._size * back
         camera.up = up
 
     def _build_sensor_controls(self) -> None:

@@ -75,23 +75,15 @@ def detect_moving_targets(
         ]
         position = points.position[best].detach().double()
         across = beam * float((position - origin).norm())
-        found.append(
-            DetectedObject(
-                f"mover_{number + 1}",
-                "point",
-                {"point": 1.0},
-                position,
-                None,
-                {
-                    "range": max(spread[0], 0.3 * radar.waveform.range_resolution),
-                    "across": _DIRECTION_ERROR_BEAMS * across,
-                    "range_rate": max(spread[1], 0.3 * cell),
-                },
-                max(0.0, 1 - draws * math.exp(-min(power / noise, 700.0)))
-                * min(1.0, power / (_TARGET_SIDELOBE_LEVEL * top)),
-                float(rates[best]) * aways[best],
-            )
-        )
+        deviations = {
+            "range": max(spread[0], 0.3 * radar.waveform.range_resolution),
+            "across": _DIRECTION_ERROR_BEAMS * across,
+            "range_rate": max(spread[1], 0.3 * cell),
+        }
+        sure = max(0.0, 1 - draws * math.exp(-min(power / noise, 700.0)))
+        sure *= min(1.0, power / (_TARGET_SIDELOBE_LEVEL * top))
+        name, velocity = f"mover_{number + 1}", float(rates[best]) * aways[best]
+        found.append(DetectedObject.point(name, position, deviations, sure, velocity))
     strength = {
         target.name: float(points.power[rows[labels == k]].max()) for k, target in enumerate(found)
     }
@@ -185,15 +177,8 @@ def locate_coherent_points(
         middle = (weight[:, None] * positions[blob]).sum(0)
         spread = (weight[:, None] * (positions[blob] - middle).square()).sum(0).sqrt()
         chance = len(positions) * math.exp(-min(count * float(agree[peak]), 700.0))
-        found.append(
-            DetectedObject(
-                f"point_{len(found) + 1}",
-                "point",
-                {"point": 1.0},
-                positions[peak].double(),
-                None,
-                dict(zip("xyz", spread.clamp_min(0.3 * cell).tolist(), strict=True)),
-                max(0.0, 1 - chance) * min(1.0, value / (_NO_SIDELOBE_LEVEL * top)),
-            )
-        )
+        deviations = dict(zip("xyz", spread.clamp_min(0.3 * cell).tolist(), strict=True))
+        sure = max(0.0, 1 - chance) * min(1.0, value / (_NO_SIDELOBE_LEVEL * top))
+        name, place = f"point_{len(found) + 1}", positions[peak].double()
+        found.append(DetectedObject.point(name, place, deviations, sure))
     return found, image

@@ -257,9 +257,8 @@ class PrimitiveModel(UnknownShape):
         if self.kind not in _RECTANGULAR_KINDS:
             width = length
         yaw = self.TURN_SCALE * float(self.turn.detach())
-        return ShapeParameters(
-            self.kind, (x, y), yaw, length, width, height, float(self.brightness.detach())
-        )
+        brightness = float(self.brightness.detach())
+        return ShapeParameters(self.kind, (x, y), yaw, length, width, height, brightness)
 
     def mesh(self) -> Mesh:
         """Return the shape in the world, differentiable with respect to all parameters."""

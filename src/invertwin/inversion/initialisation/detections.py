@@ -170,9 +170,8 @@ def find_bright_nodes(
     size = torch.as_tensor(high, dtype=torch.float64) - torch.as_tensor(low, dtype=torch.float64)
     width = checked_number(step, "step of the image [m]", 0.0, open_low=True)
     most = float(size.max()) / width
-    require_at_most(
-        most, _MAX_NODES_PER_SIDE, "nodes along a side", "give metres, or a larger step", "step"
-    )
+    do = "give metres, or a larger step"
+    require_at_most(most, _MAX_NODES_PER_SIDE, "nodes along a side", do, "step")
     counts = [max(2, round(float(side) / width) + 1) for side in size]
     nodes = Lattice.from_bounds(low, high, counts).nodes
     if (height := _unresolved_height(capture.radar(), grid)) is not None:
@@ -392,9 +391,8 @@ def estimate_density(
     """
     lattice = Lattice.from_bounds(low, high, counts)
     pose = item.transform.detach()
-    image = _require_echoes(
-        backproject_power(capture, grid, lattice.nodes @ pose[:3, :3].T + pose[:3, 3])
-    )
+    places = lattice.nodes @ pose[:3, :3].T + pose[:3, 3]
+    image = _require_echoes(backproject_power(capture, grid, places))
     density = depth / float(lattice.spacing.mean()) * image / image.max()
     return DensityGrid(name, low, high, density)
 
@@ -404,9 +402,8 @@ def _bounding_rectangle(points: Tensor, yaw: float, ground: Ground) -> GroundRec
     axes = ground.yaw_rotation(yaw)[:, ground.plane_axes]
     middle = points.median(0).values
     places = (points - middle) @ axes
-    low, high = (
-        torch.quantile(places, q, dim=0) for q in (_TRIMMED_FRACTION, 1 - _TRIMMED_FRACTION)
-    )
+    ends = (_TRIMMED_FRACTION, 1 - _TRIMMED_FRACTION)
+    low, high = (torch.quantile(places, end, dim=0) for end in ends)
     center = middle + axes @ ((low + high) / 2)
     first, second = (high - low).tolist()
     return GroundRectangle(center, yaw, (first, second))

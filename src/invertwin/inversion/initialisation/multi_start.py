@@ -99,14 +99,10 @@ class Search:
     def to_metrics(self) -> dict[str, Any]:
         """Return the other results as numbers: pose difference, loss, score."""
         best = self.best.scene
-        ends = [
-            {
-                "pose": describe_difference(best, end.scene, self.objects),
-                "loss": end.loss,
-                "score": score,
-            }
-            for end, score in zip(self.minima[1:], self.scores[1:], strict=True)
-        ]
+        ends = []
+        for end, score in zip(self.minima[1:], self.scores[1:], strict=True):
+            pose = describe_difference(best, end.scene, self.objects)
+            ends.append({"pose": pose, "loss": end.loss, "score": score})
         found = {"other_ends": ends, "ambiguities": list(self.ambiguities)}
         return found | {"screened": list(self.losses)}
 
@@ -134,9 +130,8 @@ def pose_grid(
             f"expected a box with low <= high, got {list(low)} and {list(high)}; exchange them"
         )
     total = math.prod(1 + float(b - a) / step for a, b in zip(low, high, strict=True)) * turns
-    require_at_most(
-        total, _MAX_POSES, "poses", "give metres, a larger step, or fewer turns", "step"
-    )
+    do = "give metres, a larger step, or fewer turns"
+    require_at_most(total, _MAX_POSES, "poses", do, "step")
     axes = [
         torch.linspace(a, b, 1 + math.ceil((b - a) / step - 1e-9), dtype=torch.float64)
         for a, b in zip(low, high, strict=True)
@@ -290,9 +285,8 @@ def _reduce_samples(model: ForwardModel) -> ForwardModel:
     sampling = getattr(model, "sampling", None)
     if not isinstance(sampling, Sampling):
         return model
-    return model.with_sampling(
-        samples=max(1, sampling.samples // _SCREENING_DIVISOR), boundary=False
-    )
+    samples = max(1, sampling.samples // _SCREENING_DIVISOR)
+    return model.with_sampling(samples=samples, boundary=False)
 
 
 def _unblurred_loss(found: Reconstruction) -> float:

@@ -248,15 +248,11 @@ class ChirpTrain:
             back = [(points + span[rows] - place).norm(dim=-1) for place in receivers[frame]]
             for tx, found in zip(active_transmitters, signals, strict=True):
                 forth = (points - transmitters[frame, tx]).norm(dim=-1)
-                channels = [
-                    beat_of_delays(
-                        self.radar.coefficient(own, tx, rx),
-                        (forth + segment) / SPEED_OF_LIGHT + rest,
-                        waveform,
-                        self.tolerance,
-                    )
-                    for rx, segment in enumerate(back)
-                ]
+                channels = []
+                for rx, segment in enumerate(back):
+                    field = self.radar.coefficient(own, tx, rx)
+                    delay = (forth + segment) / SPEED_OF_LIGHT + rest
+                    channels.append(beat_of_delays(field, delay, waveform, self.tolerance))
                 found.append(torch.stack(channels))
         return torch.stack([torch.stack(found) for found in signals], dim=1)
 

@@ -285,9 +285,8 @@ class Layer(Medium):
     def sheet(self, frequency: float) -> SlabLayer:
         """Return the layer as numbers at `frequency` [Hz], for `slab_tables`."""
         epsilon, dispersion = self._epsilon(frequency)
-        return SlabLayer(
-            epsilon[..., None], dispersion[..., None], evaluate_value(self.thickness)[..., None]
-        )
+        values = (epsilon, dispersion, evaluate_value(self.thickness))
+        return SlabLayer(*(value[..., None] for value in values))
 
 
 @dataclass(frozen=True)

@@ -124,9 +124,8 @@ class EffectiveRoughness:
             thickness: thickness of a sheet [m].
         """
         coherent = (1 - evaluate_value(self.scattering) ** 2).sqrt()
-        return SmoothInterface(
-            permittivity, evaluate_value(thickness), coherent, evaluate_value(self.rms_height)
-        )
+        depth, height = evaluate_value(thickness), evaluate_value(self.rms_height)
+        return SmoothInterface(permittivity, depth, coherent, height)
 
     @property
     def depolarisation_terms(self) -> dict[str, Tensor]:

@@ -91,9 +91,8 @@ class DistanceGrid(_Distance):
         value: Float64[Tensor, "x y z"],
         smoothing: float = 0.0,
     ) -> None:
-        given = checked_tensor(
-            value, (None, None, None), "signed distances [m]", "give one for each node"
-        )
+        do = "give one for each node"
+        given = checked_tensor(value, (None, None, None), "signed distances [m]", do)
         super().__init__(object, low, high, tuple(given.shape))
         self._smoother = GridSmoother(given.shape, checked_number(smoothing, "smoothing λ", 0))
         self.value = nn.Parameter(self._smoother.power(1, given.detach()).clone())

@@ -61,12 +61,26 @@ def extract_surface(
             f"[{float(values.min()):.3g}, {float(values.max()):.3g}]; "
             "start with a surface inside of the box"
         )
-    corners, faces, _, _ = marching_cubes(
-        values.detach().numpy(), 0.0, gradient_direction="descent", allow_degenerate=False
-    )
-    start = lattice.low + torch.from_numpy(corners).double() * lattice.spacing
+    corners, faces = march_cubes(values.detach(), 0.0, "descent")
+    start = lattice.low + corners * lattice.spacing
     points = _refine_vertices(field, start, lattice)
-    return points, torch.from_numpy(faces.astype("int64")), _value_and_gradient(field, points)[1]
+    return points, faces, _value_and_gradient(field, points)[1]
+
+
+def march_cubes(
+    values: Float64[Tensor, "x y z"], level: float, gradient: str
+) -> tuple[Float64[Tensor, "p 3"], Int64[Tensor, "t 3"]]:
+    """Corners, in steps between the nodes, and triangles where values on nodes are at a level.
+
+    Args:
+        values: On the nodes.
+        level: Of the surface.
+        gradient: "ascent" towards the inside, or "descent".
+    """
+    corners, faces, _, _ = marching_cubes(
+        values.numpy(), level, gradient_direction=gradient, allow_degenerate=False
+    )
+    return torch.from_numpy(corners).double(), torch.from_numpy(faces.astype("int64"))
 
 
 def attach_shape_derivative(

@@ -58,9 +58,8 @@ class Lattice:
             (max(x, y, z), _MAX_NODES_PER_AXIS, " along an axis"),
             (0 if sliced else x * y * z, _MAX_NODES, ""),
         ):
-            require_at_most(
-                count, most, f"nodes of a grid{where}", "take fewer, wider apart", "counts"
-            )
+            do = "take fewer, wider apart"
+            require_at_most(count, most, f"nodes of a grid{where}", do, "counts")
         return cls(first, last, (x, y, z))
 
     @property
