@@ -2,7 +2,7 @@
 
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import cache
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -67,6 +67,22 @@ def checked_type(value: object, kind: type, what: str, do: str) -> None:
     """
     if not isinstance(value, kind):
         raise InputError(f"expected {what} ({kind.__name__}), got {value!r:.80}; {do}")
+
+
+def check_choice(value: object, known: Collection[str], what: str, do: str = "choose one") -> None:
+    """Raise unless a value is one of some words.
+
+    Args:
+        value: the value.
+        known: the words.
+        what: what comes before the words in the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: another value.
+    """
+    if value not in known:
+        raise InputError(f"expected {what} {', '.join(known)}, got {value!r}; {do}")
 
 
 def refuse_batch(value: Tensor) -> Tensor:

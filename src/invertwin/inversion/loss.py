@@ -11,6 +11,7 @@ from jaxtyping import Float, Float64
 from numpy.typing import NDArray
 from torch import Tensor
 
+from invertwin.checks import check_choice
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.limits import Count, Positive
@@ -120,20 +121,13 @@ class SpectrumLoss:
     degrees: Positive = 4.0
 
     def __post_init__(self) -> None:
-        if self.kind not in LOSS_KINDS:
-            raise InputError(
-                f"expected kind among {', '.join(LOSS_KINDS)}, got {self.kind!r}; choose one"
-            )
+        check_choice(self.kind, LOSS_KINDS, "kind among")
         if self.levels < 1 or self.gain not in ("fitted", "one"):
             raise InputError(
                 f"expected levels >= 1 and gain 'fitted' or 'one', got {self.levels} and "
                 f"{self.gain!r}; 3 levels and a fitted gain suit uncalibrated radars"
             )
-        if self.background not in BACKGROUNDS:
-            raise InputError(
-                f"expected background among {', '.join(BACKGROUNDS)}, got {self.background!r}; "
-                "choose one"
-            )
+        check_choice(self.background, BACKGROUNDS, "background among")
         if self.kind != "mse" and (self.background != "none" or not self.floor > 0):
             raise InputError(
                 f"expected no background and floor > 0 with kind {self.kind!r}, got "
@@ -437,11 +431,7 @@ class CorrelationLoss:
     scale: CorrelationScale = "magnitude"
 
     def __post_init__(self) -> None:
-        if self.scale not in _SCALE_TRANSFORMS:
-            raise InputError(
-                f"expected a scale of {', '.join(_SCALE_TRANSFORMS)}, got {self.scale!r}; choose "
-                f"one"
-            )
+        check_choice(self.scale, _SCALE_TRANSFORMS, "a scale of")
 
     def __call__(
         self, simulated: Float[Tensor, "*map"], measured: Float[Tensor, "*map"]

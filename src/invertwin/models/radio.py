@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, checked_number, checked_tensor, set_fields
+from invertwin.checks import ArrayLike, check_choice, checked_number, checked_tensor, set_fields
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.links.metasurface.coverage import Coverage
@@ -142,11 +142,7 @@ class RadioMap(ForwardModel):
     holds_fields: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if self.quantity not in QUANTITIES:
-            raise InputError(
-                f"expected a quantity among {', '.join(QUANTITIES)}, got {self.quantity!r}; "
-                "choose one"
-            )
+        check_choice(self.quantity, QUANTITIES, "a quantity among")
         checked_number(self.floor_db, "floor [dB]", -math.inf)
         checked_number(self.noise_dbm, "noise [dBm]", -math.inf)
         if self.scatter is not None:

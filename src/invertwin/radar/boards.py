@@ -14,7 +14,7 @@ import torch
 from annotated_types import Len, MinLen
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, check_fields, checked_tensor
+from invertwin.checks import ArrayLike, check_choice, check_fields, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import AllowedValues, Frequency, Positive
@@ -293,10 +293,6 @@ def board(
     Raises:
         InputError: an unknown name.
     """
-    if name not in BOARDS:
-        raise InputError(
-            f"expected a board of {', '.join(BOARDS)}, got {name!r}; "
-            "describe another one as a Board with its own table"
-        )
+    check_choice(name, BOARDS, "a board of", "describe another one as a Board with its own table")
     found = BOARDS[name]
     return found if design_frequency is None else replace(found, design_frequency=design_frequency)

@@ -510,7 +510,6 @@ def position_coordinates(name: str, parameter: str, mask: Tensor) -> list[Coordi
         parameter: Name of the parameter [3] that moves it.
         mask: 1 for each free axis.
     """
-    """Return the coordinates of a translation along the free axes."""
     return [
         Coordinate(f"{name}.{axis}", "m", {parameter: along}, _POSITION_SCALE)
         for axis, along, free in zip("xyz", torch.diag(mask), mask, strict=True)

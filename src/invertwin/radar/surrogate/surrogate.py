@@ -24,7 +24,7 @@ from invertwin.channel import (
     trace_target,
     use_backend,
 )
-from invertwin.checks import check_fields, checked_number
+from invertwin.checks import check_choice, check_fields, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.aperture import Aperture, aperture
@@ -263,11 +263,8 @@ def resolve_surrogate(surrogate: Surrogate | str | None) -> Surrogate | None:
     """
     if not isinstance(surrogate, str):
         return surrogate
-    if surrogate not in SURROGATES:
-        raise InputError(
-            f"expected a Surrogate or one of {', '.join(SURROGATES)}, got {surrogate!r}; "
-            'surrogate="exact" means exact signals'
-        )
+    do = 'surrogate="exact" means exact signals'
+    check_choice(surrogate, SURROGATES, "a Surrogate or one of", do)
     return SURROGATES[surrogate]
 
 

@@ -68,9 +68,8 @@ class BodyTemplate:
         off = float((weights.sum(1) - 1).abs().max())
         if float(weights.min()) < 0 or off > 1e-3:
             raise InputError(
-                "expected skinning weights >= 0 that add up to 1 at each vertex, "
-                f"got a least one of {float(weights.min()):.3g} and sums {off:.3g} off; "
-                "normalise them"
+                "expected skinning weights >= 0 that add up to 1 at each vertex, got a least one "
+                f"of {float(weights.min()):.3g} and sums {off:.3g} off; normalise them"
             )
         weights = weights / weights.sum(1, keepdim=True)
         joints = checked_tensor(self.joints, (count, 3), "joints [m]", _DO)
