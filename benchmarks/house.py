@@ -79,7 +79,6 @@ REQUIRED: Required = {
 # change that lowers the value, and drop the row where the requirement holds.
 REACHED: dict[str, float] = {
     "code_lines": 45_414,
-    "longest_function_lines": 89,
 }
 
 AnyFunction = ast.FunctionDef | ast.AsyncFunctionDef

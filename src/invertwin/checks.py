@@ -2,7 +2,7 @@
 
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import cache
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -67,6 +67,22 @@ def checked_type(value: object, kind: type, what: str, do: str) -> None:
     """
     if not isinstance(value, kind):
         raise InputError(f"expected {what} ({kind.__name__}), got {value!r:.80}; {do}")
+
+
+def check_choice(value: object, known: Collection[str], what: str, do: str = "choose one") -> None:
+    """Raise unless a value is one of some words.
+
+    Args:
+        value: the value.
+        known: the words.
+        what: what comes before the words in the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: another value.
+    """
+    if value not in known:
+        raise InputError(f"expected {what} {', '.join(known)}, got {value!r}; {do}")
 
 
 def refuse_batch(value: Tensor) -> Tensor:
@@ -229,6 +245,33 @@ def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]
     if usual and not usual.low <= number <= usual.high:
         meant = usual.suggest_value(float(number))
         raise InputError(f"expected {name} in {usual.unit}, got {number:g}; did you mean {meant}?")
+
+
+def check_orthonormal(axes: Tensor, what: str, do: str) -> None:
+    """Raise unless the columns of matrices are orthonormal, to 1e-5.
+
+    Args:
+        axes: [*, 3, 3].
+        what: what they are, for the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: other columns.
+    """
+    still = axes.detach()
+    if float((still.mT @ still - torch.eye(3, dtype=torch.float64)).abs().max()) > 1e-5:
+        raise InputError(f"expected {what} with orthonormal columns; {do}")
+
+
+def set_fields(holder: object, **values: object) -> None:
+    """Set fields of a frozen dataclass, while it is made.
+
+    Args:
+        holder: the dataclass.
+        **values: by the names of the fields.
+    """
+    for name, value in values.items():
+        object.__setattr__(holder, name, value)
 
 
 def is_differentiated(value: Tensor | None) -> bool:

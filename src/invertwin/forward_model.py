@@ -17,6 +17,9 @@ from torch import Tensor
 from invertwin.deprecation import rename_members, warn_renamed
 from invertwin.scene.scene import Scene
 
+Realisations = Callable[[int, float], Tensor]
+"""A map of a seed and of the mean noise in a bin: a recording that was simulated."""
+
 # Names of version 0.3. A subclass that defines one overrides the method of the new name.
 _RENAMED_METHODS = {
     "blurred": "blur_observed",
@@ -101,9 +104,7 @@ class ForwardModel(ABC):
         """
         return self
 
-    def realisations(
-        self, scene: Scene, sensor: Any, seed: int
-    ) -> Callable[[int, float], Tensor] | None:
+    def realisations(self, scene: Scene, sensor: Any, seed: int) -> Realisations | None:
         """Return a source of simulated recordings, each with its own speckle and noise.
 
         The error bars of a fit and the test of its goodness draw from it.

@@ -10,10 +10,12 @@ from torch import Tensor
 
 from invertwin.checks import (
     ArrayLike,
+    check_orthonormal,
     checked_count,
     checked_number,
     checked_tensor,
     is_differentiated,
+    set_fields,
     strip_derivatives,
 )
 from invertwin.deprecation import rename_arguments
@@ -59,9 +61,7 @@ class Camera:
         axes = axes.expand(len(places), 3, 3) if axes.ndim == 2 else axes
         do = "give the camera's axes as columns, once or for each frame"
         axes = checked_tensor(axes, (len(places), 3, 3), "rotations of a camera", do)
-        unit = torch.eye(3, dtype=torch.float64)
-        if float((axes.detach().mT @ axes.detach() - unit).abs().max()) > 1e-5:
-            raise InputError(f"expected rotations of a camera with orthonormal columns; {do}")
+        check_orthonormal(axes, "rotations of a camera", do)
         pixels = checked_count(self.width, "width", 1) * checked_count(self.height, "height", 1)
         if pixels > _MAX_PIXELS:
             raise InputError(f"expected at most {_MAX_PIXELS:,} pixels, got {pixels:,}; bin them")
@@ -70,13 +70,7 @@ class Camera:
         middle = torch.tensor([self.width / 2, self.height / 2], dtype=torch.float64)
         centre = middle if self.centre is None else self.centre
         centre = checked_tensor(centre, (2,), "centre of an image [pixel]", "give u and v")
-        for name, value in (
-            ("positions", places),
-            ("rotations", axes),
-            ("focal", focal),
-            ("centre", centre),
-        ):
-            object.__setattr__(self, name, value)
+        set_fields(self, positions=places, rotations=axes, focal=focal, centre=centre)
 
     @staticmethod
     def look_at(
@@ -142,11 +136,8 @@ class Camera:
 
     def detach(self) -> "Camera":
         """Return the camera without derivatives."""
-        values = {
-            name: strip_derivatives(getattr(self, name))
-            for name in ("positions", "rotations", "focal", "centre")
-        }
-        return replace(self, **values)
+        names = ("positions", "rotations", "focal", "centre")
+        return replace(self, **{name: strip_derivatives(getattr(self, name)) for name in names})
 
     @property
     def principal_point(self) -> Float64[Tensor, "2"]:
@@ -167,8 +158,7 @@ class Camera:
             frame: index of the pose.
         """
         aside = (pixels - self.principal_point) / self.focal
-        local = torch.cat([aside, torch.ones_like(aside[:, :1])], 1)
-        return local @ self.rotations[frame].mT
+        return torch.cat([aside, torch.ones_like(aside[:, :1])], 1) @ self.rotations[frame].mT
 
     def to_camera_axes(self, points: Float64[Tensor, "n 3"], frame: int) -> Float64[Tensor, "n 3"]:
         """Transform world points to camera axes [m].

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.camera.camera import Camera
@@ -65,19 +65,32 @@ def silhouettes(
     Raises:
         InputError: A name that is not in the scene, or a cloud.
     """
-    missing = [name for name in objects if name not in scene.objects]
-    if missing or not objects:
-        raise InputError(
-            f"expected names of objects among {', '.join(scene.objects)}, got "
-            f"{', '.join(missing) or 'none'}; name those that the mask shows"
-        )
-    numbers = torch.tensor([list(scene.objects).index(name) for name in objects])
+    numbers = object_numbers(scene.names, objects)
 
     def evaluate_mask(sight: ViewpointScene, face: Tensor, depth: Tensor) -> Tensor:
         owner = torch.where(face >= 0, sight.face_object[face.clamp_min(0)], -1)
         return torch.isin(owner, numbers).double()
 
     return _render_images(scene, camera, evaluate_mask, sampling, seed, crossings=True)
+
+
+def object_numbers(names: Sequence[str], objects: Sequence[str]) -> Int64[Tensor, " object"]:
+    """Numbers of the objects that a mask shows.
+
+    Args:
+        names: All objects, in order.
+        objects: Those of the mask.
+
+    Raises:
+        InputError: None, or an unknown one.
+    """
+    missing = [name for name in objects if name not in names]
+    if missing or not objects:
+        raise InputError(
+            f"expected names of objects among {', '.join(names)}, got "
+            f"{', '.join(missing) or 'none'}; name those that the mask shows"
+        )
+    return torch.tensor([names.index(name) for name in objects])
 
 
 def depths(
@@ -112,10 +125,9 @@ def _render_images(
     *,
     crossings: bool,
 ) -> Tensor:
-    frames = range(len(camera.positions))
     every = [
         _ImageRenderer(scene, camera, n, ray_value, sampling, seed).render(crossings)
-        for n in frames
+        for n in range(len(camera.positions))
     ]
     return torch.stack(every)
 
@@ -132,12 +144,8 @@ class _ImageRenderer:
         sampling: ImageSampling,
         seed: int,
     ) -> None:
-        self.camera, self.number, self.ray_value, self.sampling = (
-            camera,
-            number,
-            ray_value,
-            sampling,
-        )
+        self.camera, self.number = camera, number
+        self.ray_value, self.sampling = ray_value, sampling
         self.sight = ViewpointScene(scene, camera.positions[number])
         self.random = np.random.default_rng(np.random.SeedSequence([seed, number]))
         self.fixed = camera.detach()
@@ -171,9 +179,8 @@ class _ImageRenderer:
         """
         face = self.sight.find_first_faces(self.fixed.directions(positions, self.number))
         rows = torch.nonzero(face >= 0)[:, 0]
-        depth = self.sight.plane_distances(
-            face[rows], camera.directions(positions[rows], self.number)
-        )
+        directions = camera.directions(positions[rows], self.number)
+        depth = self.sight.plane_distances(face[rows], directions)
         none = torch.full((len(face),), math.inf, dtype=torch.float64)
         return self.ray_value(self.sight, face, none.index_put((rows,), depth))
 
@@ -181,9 +188,8 @@ class _ImageRenderer:
         """Return the contribution of outlines to derivatives; zero in value."""
         camera, fixed, number = self.camera, self.fixed, self.number
         size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-        ends = torch.stack(
-            [fixed.to_camera_axes(end, number) for end in (curves.start, curves.end)]
-        )
+        both = [fixed.to_camera_axes(end, number) for end in (curves.start, curves.end)]
+        ends = torch.stack(both)
         low, high = _clip_segments(ends, fixed, size)
         piece = torch.nonzero(high > low)[:, 0]
         ends = ends[:, piece]

@@ -11,9 +11,9 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.camera.camera import Camera
+from invertwin.camera.images import object_numbers
 from invertwin.channel import ViewpointScene
 from invertwin.checks import checked_number
-from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
 
@@ -40,14 +40,7 @@ class Photograph:
         Raises:
             InputError: A name that is not in the scene.
         """
-        missing = [name for name in objects if name not in self.names]
-        if missing or not objects:
-            raise InputError(
-                f"expected names of objects among {', '.join(self.names)}, got "
-                f"{', '.join(missing) or 'none'}; name those that the mask shows"
-            )
-        numbers = torch.tensor([self.names.index(name) for name in objects])
-        return torch.isin(self.labels, numbers).double()
+        return torch.isin(self.labels, object_numbers(self.names, objects)).double()
 
 
 def photograph(
@@ -77,22 +70,18 @@ def photograph(
     random = torch.Generator().manual_seed(seed)
     fixed = camera.detach()
     frames = [_render_labels(scene, fixed, number) for number in range(len(fixed.positions))]
-    labels = torch.stack([label for label, _ in frames])
-    depth = torch.stack([depth for _, depth in frames])
-    return Photograph(
-        tuple(scene.objects),
-        _corrupt_labels(labels, share, random),
-        depth
-        + _draw_normal(depth, random) * torch.where(depth.isfinite(), depth**2 * deviation, 0.0),
-    )
+    labels, depth = (torch.stack(parts) for parts in zip(*frames, strict=True))
+    labels = _corrupt_labels(labels, share, random)
+    errors = torch.randn(depth.shape, generator=random, dtype=depth.dtype)
+    errors = errors * torch.where(depth.isfinite(), depth**2 * deviation, 0.0)
+    return Photograph(tuple(scene.objects), labels, depth + errors)
 
 
 def _render_labels(scene: Scene, camera: Camera, number: int) -> tuple[Tensor, Tensor]:
     with torch.no_grad():
         sight = ViewpointScene(scene, camera.positions[number])
-        row, column = torch.meshgrid(
-            torch.arange(camera.height), torch.arange(camera.width), indexing="ij"
-        )
+        sides = torch.arange(camera.height), torch.arange(camera.width)
+        row, column = torch.meshgrid(*sides, indexing="ij")
         middles = torch.stack([column, row], 2).reshape(-1, 2).double() + 0.5
         directions = camera.directions(middles, number)
         face = sight.find_first_faces(directions)
@@ -113,9 +102,4 @@ def _corrupt_labels(labels: Tensor, share: float, random: torch.Generator) -> Te
         neighbour[number].index_copy_(axis, index, labels.index_select(axis, index))
     other = neighbour.gather(0, way[None])[0]
     wrong = torch.rand(labels.shape, generator=random) < share
-    at_outline = (neighbour != labels).any(0)
-    return torch.where(wrong & at_outline, other, labels)
-
-
-def _draw_normal(like: Tensor, random: torch.Generator) -> Tensor:
-    return torch.randn(like.shape, generator=random, dtype=like.dtype)
+    return torch.where(wrong & (neighbour != labels).any(0), other, labels)

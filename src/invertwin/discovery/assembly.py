@@ -11,7 +11,7 @@ from torch import Tensor
 from invertwin.channel import Grid, Sampling
 from invertwin.discovery.imaging.likelihood import HeavyTailedLoss
 from invertwin.discovery.imaging.reflectivity import thin_map
-from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters
+from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters, Shapes
 from invertwin.discovery.shapes.prisms import OutlineModel, make_shape_model
 from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
 from invertwin.inversion.initialisation.detections import Ground
@@ -61,20 +61,14 @@ class ShapeLikelihood:
     level: float
     seed: int
 
-    def unknowns(
-        self, shapes: Sequence[ShapeParameters]
-    ) -> dict[str, PrimitiveModel | OutlineModel]:
+    def unknowns(self, shapes: Shapes) -> dict[str, PrimitiveModel | OutlineModel]:
         """Return the shape models of shapes by name.
 
         Args:
             shapes: shape parameters.
         """
-        return {
-            f"object_{number}": make_shape_model(
-                f"object_{number}", figure, self.ground, self.level
-            )
-            for number, figure in enumerate(shapes, 1)
-        }
+        named = {f"object_{number}": shape for number, shape in enumerate(shapes, 1)}
+        return {n: make_shape_model(n, one, self.ground, self.level) for n, one in named.items()}
 
     @cached_property
     def coarse_maps(self) -> "CoarseMaps":
@@ -83,9 +77,7 @@ class ShapeLikelihood:
         stride = round(grid.range_step / self.model.grid.range_step)
         return CoarseMaps(power, grid, replace(self.loss, level=self.loss.level[::stride]))
 
-    def predict_coarse(
-        self, shapes: Sequence[ShapeParameters]
-    ) -> Float64[Tensor, "frame some_range some_u some_v"]:
+    def predict_coarse(self, shapes: Shapes) -> Float64[Tensor, "frame some_range some_u some_v"]:
         """Return ``predict`` in the bins of ``coarse_maps``.
 
         Args:
@@ -93,7 +85,7 @@ class ShapeLikelihood:
         """
         return thin_map(self.predict(shapes).double(), self.radar, self.model.grid)[0]
 
-    def build_scene(self, shapes: Sequence[ShapeParameters]) -> Scene:
+    def build_scene(self, shapes: Shapes) -> Scene:
         """Build the scene of shapes.
 
         Args:
@@ -102,7 +94,7 @@ class ShapeLikelihood:
         return Scene({name: one.item for name, one in self.unknowns(shapes).items()})
 
     @torch.no_grad()
-    def predict(self, shapes: Sequence[ShapeParameters]) -> Float[Tensor, "frame range u v"]:
+    def predict(self, shapes: Shapes) -> Float[Tensor, "frame range u v"]:
         """Predict the maps of shapes, without background.
 
         Args:
@@ -113,7 +105,7 @@ class ShapeLikelihood:
         model = replace(self.model, sampling=replace(self.model.sampling, boundary=False))
         return model.predict(self.build_scene(shapes), self.radar, self.seed)
 
-    def log_likelihood_gains(self, shapes: Sequence[ShapeParameters]) -> Float64[Tensor, " frame"]:
+    def log_likelihood_gains(self, shapes: Shapes) -> Float64[Tensor, " frame"]:
         """Compute the log-likelihood of shapes over that of the background alone for every frame.
 
         Args:
@@ -124,6 +116,10 @@ class ShapeLikelihood:
         """
         rows = self._background_loss - self.loss.bin_losses(self.predict(shapes), self.power)
         return rows.flatten(1).double().sum(1) / self.bins_per_draw
+
+    def total_gain(self, shapes: Shapes) -> float:
+        """Sum of ``log_likelihood_gains`` over the frames."""
+        return float(self.log_likelihood_gains(shapes).sum())
 
     @cached_property
     def _background_loss(self) -> Tensor:
@@ -144,16 +140,10 @@ class ShapeLikelihood:
         sampling = self.model.sampling
         share = len(chosen) / self.radar.frame_count
         fewer = make_sampling(1, max(1, round(sampling.samples * share)))
-        return replace(
-            self,
-            model=replace(self.model, sampling=fewer),
-            radar=self.radar.frames(chosen),
-            power=self.power[chosen],
-        )
+        model, radar = replace(self.model, sampling=fewer), self.radar.frames(chosen)
+        return replace(self, model=model, radar=radar, power=self.power[chosen])
 
-    def fit(
-        self, shapes: Sequence[ShapeParameters], steps: int
-    ) -> tuple[list[ShapeParameters], Reconstruction]:
+    def fit(self, shapes: Shapes, steps: int) -> tuple[list[ShapeParameters], Reconstruction]:
         """Fit all numbers of the shapes jointly.
 
         Args:

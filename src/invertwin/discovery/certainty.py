@@ -9,7 +9,7 @@ from torch import Tensor
 
 from invertwin.discovery.assembly import ShapeLikelihood
 from invertwin.discovery.search import propose_kinds, rotate_headed_shapes
-from invertwin.discovery.shapes.primitives import ShapeParameters, shape_center
+from invertwin.discovery.shapes.primitives import ShapeParameters, Shapes, shape_center
 from invertwin.inversion import Reconstruction, speckle_weight
 from invertwin.inversion.confidence.uncertainty import iterate_coordinates, map_derivatives
 
@@ -41,15 +41,12 @@ def standard_deviations(
     # The product of two independent draws is free of the apparent information of their noise.
     mixed = torch.einsum("pfn,qfn->pq", *flat)
     information = nu / (nu + 2) * 0.5 * (mixed + mixed.T) / likelihood.bins_per_draw
-    slopes = (
-        torch.einsum("pfn,fn->pf", 0.5 * (flat[0] + flat[1]), score.flatten(1))
-        / likelihood.bins_per_draw
-    )
+    slopes = torch.einsum("pfn,fn->pf", 0.5 * (flat[0] + flat[1]), score.flatten(1))
+    slopes = slopes / likelihood.bins_per_draw
     scatter = slopes @ slopes.T
     spans = torch.tensor([10 * row.span for row in rows], dtype=torch.float64)
     # In units of the spans, with a prior of one unit; keep it positive despite noise.
-    scaled = information * spans * spans[:, None]
-    values, axes = torch.linalg.eigh(scaled)
+    values, axes = torch.linalg.eigh(information * spans * spans[:, None])
     inverse = axes / (values.clamp_min(0.0) + 1.0) @ axes.T
     sandwich = inverse @ (scatter * spans * spans[:, None]) @ inverse
     error = torch.maximum(inverse.diagonal(), sandwich.diagonal()).sqrt() * spans
@@ -71,9 +68,7 @@ def acceptance_probability(gains_with: Tensor, gains_without: Tensor) -> float:
     return float(torch.special.ndtr(torch.tensor(total / max(spread, 1e-9)).double()))
 
 
-def existence_probabilities(
-    likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters]
-) -> list[float]:
+def existence_probabilities(likelihood: ShapeLikelihood, shapes: Shapes) -> list[float]:
     """Compute the existence probability of every shape.
 
     Args:
@@ -81,12 +76,8 @@ def existence_probabilities(
         shapes: all shapes.
     """
     together = likelihood.log_likelihood_gains(shapes)
-    return [
-        acceptance_probability(
-            together, likelihood.log_likelihood_gains([*shapes[:k], *shapes[k + 1 :]])
-        )
-        for k in range(len(shapes))
-    ]
+    without = [[*shapes[:k], *shapes[k + 1 :]] for k in range(len(shapes))]
+    return [acceptance_probability(together, likelihood.log_likelihood_gains(r)) for r in without]
 
 
 @dataclass(frozen=True)
@@ -102,9 +93,7 @@ class ShapeHypothesis:
     probability: float
 
 
-def find_hypotheses(
-    likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters]
-) -> list[list[ShapeHypothesis]]:
+def find_hypotheses(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[ShapeHypothesis]]:
     """Return alternative hypotheses of every shape with all others fixed; the shape itself comes
     first.
 
@@ -149,9 +138,8 @@ def kind_probabilities(hypotheses: Sequence[ShapeHypothesis]) -> dict[str, float
     """
     found = dict[str, float]()
     for other in hypotheses:
-        found[other.shape.effective_kind] = (
-            found.get(other.shape.effective_kind, 0.0) + other.probability
-        )
+        kind = other.shape.effective_kind
+        found[kind] = found.get(kind, 0.0) + other.probability
     return found
 
 

@@ -172,11 +172,9 @@ class MovingTargetFit:
             seed: Of the rays.
         """
         radar, echo = self.recording.radar(), self.body.echo
-        near = self.model.crop_around(
-            echo.range + echo.range_rate * time, echo.range_rate, cells, radar
-        )
+        range_ = echo.range + echo.range_rate * time
+        near = self.model.crop_around(range_, echo.range_rate, cells, radar)
         with torch.no_grad():
-            twin = near.with_sampling(samples=_RAY_COUNT).predict(
-                self.body(scene, time), radar, seed
-            )[0]
+            model = near.with_sampling(samples=_RAY_COUNT)
+            twin = model.predict(self.body(scene, time), radar, seed)[0]
         return MovingTargetMaps(near, twin, point_response(near, radar, echo, time)[0])

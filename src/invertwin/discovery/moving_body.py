@@ -78,8 +78,7 @@ class MovingBody(nn.Module):
         """
         super().__init__()
         self.object, self.echo = object, echo
-        material = _require_rough_dielectric(scene, object)
-        share = material.diffuse
+        share = _require_rough_dielectric(scene, object).diffuse
         if not isinstance(share, float | int) or not 0 < share < 1:
             raise InputError(
                 f"expected a number between 0 and 1 as the diffuse share of {object}, got {share}; "
@@ -126,14 +125,10 @@ class MovingBody(nn.Module):
         item = scene[self.object]
         mesh = Mesh((item.mesh.vertices - item.mesh.center) * self.size.exp(), item.mesh.faces)
         center = self._center_at(time)
-        placed = scene.replace(
-            self.object,
-            mesh=mesh,
-            pose=rigid(self._axes, center),
-            material=replace(
-                _require_rough_dielectric(scene, self.object), diffuse=self.diffuse.sigmoid()
-            ),
-        )
+        material = _require_rough_dielectric(scene, self.object)
+        material = replace(material, diffuse=self.diffuse.sigmoid())
+        pose = rigid(self._axes, center)
+        placed = scene.replace(self.object, mesh=mesh, pose=pose, material=material)
         lever = placed[self.object].vertices - center
         turn = torch.linalg.cross((self.spin * self._axes[:, 1]).expand_as(lever), lever)
         return placed.replace(self.object, velocity=self._axes @ self._velocity_vector + turn)

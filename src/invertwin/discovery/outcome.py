@@ -69,6 +69,21 @@ class DetectedObject:
     velocity: Float64[Tensor, "3"] | None = None
     track: ObjectTrack | None = None
 
+    @classmethod
+    def point(
+        cls, name: str, position: Tensor, deviations: Mapping[str, float], sure: float, *motion: Any
+    ) -> "DetectedObject":
+        """An object without a shape.
+
+        Args:
+            name: Name of the object.
+            position: Where it is [m].
+            deviations: Standard deviations of its coordinates.
+            sure: Probability that it exists.
+            *motion: Its velocity [m/s] and track.
+        """
+        return cls(name, "point", {"point": 1.0}, position, None, deviations, sure, *motion)
+
     def to_metrics(self) -> dict[str, Any]:
         """Return the object as plain numbers."""
         found: dict[str, Any] = {

@@ -14,10 +14,8 @@ from invertwin.inversion.initialisation.detections import Ground, label_groups
 _YAW_COUNT = 45  # candidate yaws of a rectangle over a quarter turn
 _TRIMMED_FRACTION = 0.05  # fraction of the weight beyond each side of a rectangle
 _PERSON_SIZE = 0.66, 0.32, 1.75  # usual length, width and height [m]
-_MIN_PERSON_EXTENT, _PERSON_MARGIN = (
-    0.12,
-    0.25,
-)  # minimum extent, and margin of the usual extents [m]
+# Minimum extent, and margin of the usual extents [m].
+_MIN_PERSON_EXTENT, _PERSON_MARGIN = 0.12, 0.25
 MAX_CORNER_EXTENT = 0.15
 """Maximum side of a group proposed as a corner reflector [m]."""
 
@@ -79,9 +77,8 @@ def enclosing_rectangle(
         The tightness is the weighted mean of 1/(d + 3 cm), d the distance to the nearest side.
     """
     c, s = math.cos(yaw), math.sin(yaw)
-    own = torch.stack(
-        [c * positions[:, 0] + s * positions[:, 1], c * positions[:, 1] - s * positions[:, 0]], 1
-    )
+    first, second = positions.unbind(1)
+    own = torch.stack([c * first + s * second, c * second - s * first], 1)
     ends = torch.stack([_trimmed_ends(own[:, axis], weight) for axis in range(2)])
     middle, sides = ends.mean(1), ends[:, 1] - ends[:, 0]
     away = (0.5 * sides - (own - middle).abs()).abs().amin(1)
@@ -129,9 +126,8 @@ def propose_shapes(
         # The image is about one step wider than the object.
         length, width = (max(float(side), 0.02) for side in sides)
         x, y = middle.tolist()
-        rows.append(
-            ShapeParameters("box", (x, y), ground.yaw_sign * turn, length, width, 1.5 * height)
-        )
+        yaw = ground.yaw_sign * turn
+        rows.append(ShapeParameters("box", (x, y), yaw, length, width, 1.5 * height))
     spread = max(float(smallest[0][1].mean()), 0.02)
     x, y = smallest[0][0].tolist()
     rows.append(ShapeParameters("cylinder", (x, y), 0.0, spread, spread, 1.5 * height))
@@ -139,9 +135,8 @@ def propose_shapes(
     middle, sides, _ = smallest[0]
     if float(sides.max()) < MAX_CORNER_EXTENT:
         rows += propose_headings(ShapeParameters("corner", (x, y), height=height))
-    around = ShapeParameters(
-        "box", (x, y), ground.yaw_sign * smallest[1], *sides.clamp_min(0.02).tolist()
-    )
+    yaw = ground.yaw_sign * smallest[1]
+    around = ShapeParameters("box", (x, y), yaw, *sides.clamp_min(0.02).tolist())
     return rows + propose_people_and_vehicles(around)
 
 
@@ -167,21 +162,12 @@ def propose_people_and_vehicles(box: ShapeParameters) -> list[ShapeParameters]:
         and short < _PERSON_SIZE[1] + _PERSON_MARGIN
     ):
         length, width, height = _PERSON_SIZE
-        rows += propose_headings(
-            replace(box, kind="person", length=length, width=width, height=height)
-        )
+        upright = replace(box, kind="person", length=length, width=width, height=height)
+        rows += propose_headings(upright)
     (low, _, _), (high, wide, height) = SIZE_LIMITS["vehicle"]
     if 0.8 * low < long < high and short < wide:
         ahead = box.yaw if box.length >= box.width else box.yaw + 0.5 * math.pi
-        rows += [
-            replace(
-                box,
-                kind="vehicle",
-                yaw=ahead + turn,
-                length=max(long, low),
-                width=max(short, 0.8 * wide),
-                height=0.6 * height,
-            )
-            for turn in (0.0, math.pi)
-        ]
+        sizes = {"length": max(long, low), "width": max(short, 0.8 * wide), "height": 0.6 * height}
+        turns = (ahead, ahead + math.pi)
+        rows += [replace(box, kind="vehicle", yaw=yaw, **sizes) for yaw in turns]
     return rows

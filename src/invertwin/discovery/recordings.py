@@ -37,7 +37,7 @@ from invertwin.discovery.outcome import DetectedObject, GroundImage, Twin
 from invertwin.discovery.search import ImageGrid, ShapeSearch
 from invertwin.discovery.self_calibration import calibrate_on_scene, phase_spread
 from invertwin.discovery.shapes.outlines import fit_outlines
-from invertwin.discovery.shapes.primitives import ShapeParameters, shape_center
+from invertwin.discovery.shapes.primitives import Shapes, shape_center
 from invertwin.discovery.tracks import track_moving_targets
 from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
@@ -98,11 +98,8 @@ def twin(
         range_max = min(range_max or math.inf, recording.max_range)
     radar = capture.radar()
     base = float(radar.positions.detach()[:, plane.up_axis].mean())
-    floor = (
-        base - _DEFAULT_RADAR_HEIGHT
-        if level is None
-        else checked_number(level, "level of the ground [m]", -math.inf)
-    )
+    floor = base - _DEFAULT_RADAR_HEIGHT if level is None else level
+    floor = checked_number(floor, "level of the ground [m]", -math.inf)
     plane_at = base if height is None else floor + checked_number(height, "height [m]", 0.0)
     reach = _search_range(capture, range_max)
     if reach is None:
@@ -118,12 +115,10 @@ def twin(
         # Average over frames, where all of them have an echo.
         far = torch.cdist(places, radar.positions.detach())
         places = places[(far.amin(1) > reach[0]) & (far.amax(1) < reach[1])]
-        found, image = locate_coherent_points(
-            capture, places, 4 * max(step, radar.waveform.wavelength)
-        )
-        picture = GroundImage(
-            places[:, list(plane.plane_axes)], image, _count_views(radar, places, None)
-        )
+        separation = 4 * max(step, radar.waveform.wavelength)
+        found, image = locate_coherent_points(capture, places, separation)
+        flat, views = places[:, list(plane.plane_axes)], _count_views(radar, places, None)
+        picture = GroundImage(flat, image, views)
         return Twin(_sort_objects([*found, *moving]), plane, floor, picture)
     grid = radar.grid(*reach)
     still = _find_static_objects(capture, radar, grid, plane, floor, places, step, rays, seed)
@@ -208,18 +203,14 @@ def _find_static_objects(
         level,
         seed,
     )
-    held = (
-        list(range(_HELD_OUT_EVERY - 1, frames, _HELD_OUT_EVERY))
-        if frames >= 2 * _HELD_OUT_EVERY
-        else []
-    )
+    held = list(range(_HELD_OUT_EVERY - 1, frames, _HELD_OUT_EVERY))
+    held = held if frames >= 2 * _HELD_OUT_EVERY else []
     fitted = one.select_frames([k for k in range(frames) if k not in held]) if held else one
     coarse = fitted.coarse_maps.grid
     flat = positions[:, list(ground.plane_axes)]
     height = float(positions[:, ground.up_axis].mean()) - level
-    lattice = ImageGrid(
-        flat, step, compute_response(fitted.radar, coarse, positions), max(height, 0.1)
-    )
+    response = compute_response(fitted.radar, coarse, positions)
+    lattice = ImageGrid(flat, step, response, max(height, 0.1))
     aside = one.select_frames(held) if held else None
     search = ShapeSearch(fitted, aside, lattice)
     picture = search.first_image
@@ -233,9 +224,7 @@ def _find_static_objects(
     if aside is not None:
         shapes = fit_outlines(fitted, aside, shapes)
         seen_there = compute_response(aside.radar, coarse, positions)
-        if _image_likelihood_gain(aside, seen_there, picture) > float(
-            aside.log_likelihood_gains(shapes).sum()
-        ):
+        if _image_likelihood_gain(aside, seen_there, picture) > aside.total_gain(shapes):
             notes = (_IMAGE_BETTER_NOTE,)
     shapes, found = one.fit(shapes, _FINAL_FIT_STEPS)
     among = find_hypotheses(one, shapes)
@@ -243,13 +232,11 @@ def _find_static_objects(
     if any(new is not old for new, old in zip(likelier, shapes, strict=True)):
         shapes, found = one.fit(likelier, _FINAL_FIT_STEPS)
         among = find_hypotheses(one, shapes)
-    objects = _describe_objects(one, found, shapes, among)
-    views = _count_views(radar, positions, one.build_scene(shapes))
     return Twin(
-        objects,
+        _describe_objects(one, found, shapes, among),
         ground,
         level,
-        GroundImage(flat, picture, views),
+        GroundImage(flat, picture, _count_views(radar, positions, one.build_scene(shapes))),
         one.predict(shapes) + level_map,
         power,
         grid,
@@ -260,12 +247,11 @@ def _find_static_objects(
 def _describe_objects(
     likelihood: ShapeLikelihood,
     fit: Reconstruction,
-    shapes: Sequence[ShapeParameters],
+    shapes: Shapes,
     hypotheses: Sequence[Sequence[ShapeHypothesis]],
 ) -> tuple[DetectedObject, ...]:
     """Return fitted shapes as objects with error bars, kinds and existence probabilities."""
     errors = standard_deviations(likelihood, fit)
-    probabilities = existence_probabilities(likelihood, shapes)
     return tuple(
         DetectedObject(
             f"object_{k}",
@@ -277,7 +263,7 @@ def _describe_objects(
             probability,
         )
         for k, (shape, among, probability) in enumerate(
-            zip(shapes, hypotheses, probabilities, strict=True), 1
+            zip(shapes, hypotheses, existence_probabilities(likelihood, shapes), strict=True), 1
         )
     )
 
@@ -292,15 +278,10 @@ def _image_likelihood_gain(
         response: response of the image points in thinned maps.
         strength: image [point].
     """
-    power, coarse, loss = (
-        likelihood.coarse_maps.power,
-        likelihood.coarse_maps.grid,
-        likelihood.coarse_maps.loss,
-    )
-    rows = loss.bin_losses(torch.zeros_like(power), power) - loss.bin_losses(
-        response.predict_maps(strength), power
-    )
-    return float(rows.sum()) / count_bins_per_draw(likelihood.radar, coarse)
+    coarse = likelihood.coarse_maps
+    nothing, image = torch.zeros_like(coarse.power), response.predict_maps(strength)
+    losses = [coarse.loss.bin_losses(power, coarse.power) for power in (nothing, image)]
+    return float((losses[0] - losses[1]).sum()) / count_bins_per_draw(likelihood.radar, coarse.grid)
 
 
 def _sort_objects(things: list[DetectedObject]) -> tuple[DetectedObject, ...]:
@@ -329,10 +310,8 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
         # The last cells of a period hold leakage of its first cells.
         longest = 0.98 * waveform.max_range
     else:
-        first, longest = (
-            max(first, float(capture.ranges[0]) + cell),
-            float(capture.ranges[-1]) - cell,
-        )
+        first = max(first, float(capture.ranges[0]) + cell)
+        longest = float(capture.ranges[-1]) - cell
     limit = longest if range_max is None else min(range_max, longest)
     if not first < limit:
         raise InputError(
@@ -342,8 +321,7 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
     grid = radar.grid(first, limit)
     power = capture.spectrum(grid).detach().double()
     # Noise level: a running minimum over range.
-    noise = float(estimate_background(power).min())
-    strongest = power.amax((0, 2, 3)) / noise
+    strongest = power.amax((0, 2, 3)) / float(estimate_background(power).min())
     loud = (strongest > 2 * math.log(power.numel()) + 5).nonzero()[:, 0]
     if not len(loud):
         return None
@@ -374,10 +352,8 @@ def _image_points(
     cell = radar.waveform.range_resolution
     while True:
         counts = [max(2, math.ceil(float(side) / cell) + 1) for side in size]
-        lines = [
-            corners[0][k] + cell * torch.arange(counts[k], dtype=torch.float64) for k in range(2)
-        ]
-        flat = torch.cartesian_prod(*lines)
+        steps = [cell * torch.arange(count, dtype=torch.float64) for count in counts]
+        flat = torch.cartesian_prod(corners[0][0] + steps[0], corners[0][1] + steps[1])
         places = torch.zeros(len(flat), 3, dtype=torch.float64)
         places[:, axes], places[:, ground.up_axis] = flat, height
         near = torch.zeros(len(flat), dtype=torch.bool)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations, product
 
 import torch
 from jaxtyping import Float64
@@ -19,7 +20,12 @@ from invertwin.discovery.proposals import (
     propose_people_and_vehicles,
     propose_shapes,
 )
-from invertwin.discovery.shapes.primitives import ShapeParameters, corner_direction, rotate_shape
+from invertwin.discovery.shapes.primitives import (
+    ShapeParameters,
+    Shapes,
+    corner_direction,
+    rotate_shape,
+)
 from invertwin.discovery.shapes.prisms import PrismParameters, prism_contour
 from invertwin.inversion.initialisation.detections import Ground
 
@@ -87,18 +93,16 @@ class ShapeSearch:
         """Ground plane."""
         return self.fitted_frames.ground
 
-    def evidence(self, shapes: Sequence[ShapeParameters]) -> float:
+    def evidence(self, shapes: Shapes) -> float:
         """Compute the evidence of shapes on the fitted frames.
 
         Args:
             shapes: candidate shapes.
         """
-        count = sum(count_parameters(shape) for shape in shapes)
-        return float(
-            self.fitted_frames.log_likelihood_gains(shapes).sum()
-        ) - 0.5 * count * math.log(self.fitted_frames.independent_draws)
+        one, count = self.fitted_frames, sum(count_parameters(shape) for shape in shapes)
+        return one.total_gain(shapes) - 0.5 * count * math.log(one.independent_draws)
 
-    def is_better(self, new: Sequence[ShapeParameters], old: Sequence[ShapeParameters]) -> bool:
+    def is_better(self, new: Shapes, old: Shapes) -> bool:
         """Return whether new shapes are preferred to old ones.
 
         Args:
@@ -109,16 +113,14 @@ class ShapeSearch:
             return False
         if self.held_out_frames is None or len(new) <= len(old):
             return True
-        return float(self.held_out_frames.log_likelihood_gains(new).sum()) > float(
-            self.held_out_frames.log_likelihood_gains(old).sum()
-        )
+        return self.held_out_frames.total_gain(new) > self.held_out_frames.total_gain(old)
 
     @cached_property
     def first_image(self) -> Float64[Tensor, " point"]:
         """Reflectivity image without any known shape."""
         return self.residual_image([])
 
-    def residual_image(self, shapes: Sequence[ShapeParameters]) -> Float64[Tensor, " point"]:
+    def residual_image(self, shapes: Shapes) -> Float64[Tensor, " point"]:
         """Compute the reflectivity image of the residual of shapes.
 
         Args:
@@ -127,9 +129,8 @@ class ShapeSearch:
         one = self.fitted_frames
         coarse = one.coarse_maps
         rest = one.predict_coarse(shapes) + coarse.loss.level[:, None, None]
-        return reconstruct_reflectivity(
-            self.image_grid.response, coarse.power, rest, degrees=coarse.loss.degrees
-        )
+        response, degrees = self.image_grid.response, coarse.loss.degrees
+        return reconstruct_reflectivity(response, coarse.power, rest, degrees=degrees)
 
     def run(self) -> list[ShapeParameters]:
         """Run the search and return the shapes."""
@@ -146,14 +147,13 @@ class ShapeSearch:
                 break
         if not shapes:
             return []
-        shapes = self.split_shapes(
-            self.merge_shapes(self.select_headings(self.select_kinds(shapes)))
-        )
+        shapes = self.select_headings(self.select_kinds(shapes))
+        shapes = self.split_shapes(self.merge_shapes(shapes))
         shapes, _ = self.fitted_frames.fit(shapes, _LONG_FIT_STEPS)
         shapes = self.refine(self.select_heights(shapes))
         return self.prune(shapes)
 
-    def propose_births(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def propose_births(self, shapes: Shapes) -> list[ShapeParameters]:
         """Propose shapes at bright groups of the residual image.
 
         Args:
@@ -166,10 +166,10 @@ class ShapeSearch:
         total = float(strength.sum())
         parts = [part for part in parts if float(part.sum()) > _MIN_GROUP_FRACTION * total]
         known, born = list(shapes), list[tuple[Tensor, ShapeParameters]]()
-        gain, vain = float(self.fitted_frames.log_likelihood_gains(known).sum()), 0
+        gain, vain = self.fitted_frames.total_gain(known), 0
         for part in parts[: _MAX_SHAPES - len(shapes)]:
             one = self.select_best(known, self.propose_for_group(part))
-            new = float(self.fitted_frames.log_likelihood_gains([*known, one]).sum())
+            new = self.fitted_frames.total_gain([*known, one])
             if new > gain:
                 gain, vain = new, 0
                 known.append(one)
@@ -179,7 +179,7 @@ class ShapeSearch:
         found = [one for _, one in self.unite_groups(shapes, born)]
         return found + self.propose_corners([*shapes, *found])
 
-    def propose_corners(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def propose_corners(self, shapes: Shapes) -> list[ShapeParameters]:
         """Propose corner reflectors for echoes that only some directions observe.
 
         An image of isotropic reflectors does not show them.
@@ -191,32 +191,21 @@ class ShapeSearch:
         power, loss = one.coarse_maps.power, one.coarse_maps.loss
         rest = one.predict_coarse(shapes)
         nothing = (power - loss.level[:, None, None]).clamp_min(rest)
-        gain = lattice.response.average_over_bins(
-            loss.bin_losses(rest, power) - loss.bin_losses(nothing, power)
-        )
+        saved = loss.bin_losses(rest, power) - loss.bin_losses(nothing, power)
+        gain = lattice.response.average_over_bins(saved)
         at = one.radar.positions.detach()[:, list(self.ground.plane_axes)]
         direction = torch.nn.functional.normalize(at[:, None] - lattice.positions, dim=2)
         yaws = [k * math.pi / 8 for k in range(16)]
-        score = torch.stack(
-            [
-                ((direction @ corner_direction(yaw, self.ground) > _MIN_CORNER_COSINE) * gain).sum(
-                    0
-                )
-                for yaw in yaws
-            ]
-        )
+        cosines = (direction @ corner_direction(yaw, self.ground) for yaw in yaws)
+        score = torch.stack([((c > _MIN_CORNER_COSINE) * gain).sum(0) for c in cosines])
         found = list[ShapeParameters]()
         for _ in range(_CORNERS_PER_ROUND):
             best, yaw = score.amax(0), score.argmax(0)
             index = int(best.argmax())
+            x, y = lattice.positions[index].tolist()
+            corner = ShapeParameters("corner", (x, y), yaws[int(yaw[index])])
             options = [
-                ShapeParameters(
-                    "corner",
-                    (float(lattice.positions[index, 0]), float(lattice.positions[index, 1])),
-                    yaws[int(yaw[index])],
-                    height=part * lattice.height,
-                    brightness=brightness,
-                )
+                replace(corner, height=part * lattice.height, brightness=brightness)
                 for part in (0.6, 1.0, 1.5)
                 for brightness in (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
             ]
@@ -233,7 +222,7 @@ class ShapeSearch:
         return found
 
     def unite_groups(
-        self, shapes: Sequence[ShapeParameters], born: Sequence[tuple[Tensor, ShapeParameters]]
+        self, shapes: Shapes, born: Sequence[tuple[Tensor, ShapeParameters]]
     ) -> list[tuple[Tensor, ShapeParameters]]:
         """Return groups and their shapes, with one box for two groups where that is more likely.
 
@@ -247,8 +236,7 @@ class ShapeSearch:
         while True:
             pairs = [
                 (self._group_gap(a[0], b[0]), a, b)
-                for k, a in enumerate(found)
-                for b in found[k + 1 :]
+                for a, b in combinations(found, 2)
                 if (id(a[0]), id(b[0])) not in tried
             ]
             pairs = [pair for pair in pairs if pair[0] < _MAX_MERGE_GAP]
@@ -277,14 +265,10 @@ class ShapeSearch:
         rows = propose_shapes(
             lattice.positions, group, self.ground, step=lattice.step, height=lattice.height
         )
-        found: list[ShapeParameters] = []
-        for row in rows:
-            found.append(replace(row, brightness=max(float(group.sum()) / mean_rcs(row), 1e-4)))
-        return found
+        total = float(group.sum())
+        return [replace(row, brightness=max(total / mean_rcs(row), 1e-4)) for row in rows]
 
-    def select_best(
-        self, known: Sequence[ShapeParameters], candidates: Iterable[ShapeParameters]
-    ) -> ShapeParameters:
+    def select_best(self, known: Shapes, candidates: Iterable[ShapeParameters]) -> ShapeParameters:
         """Select the candidate of highest likelihood, given other shapes.
 
         Args:
@@ -293,7 +277,7 @@ class ShapeSearch:
         """
         return max(candidates, key=lambda one: self.evidence([*known, one]))
 
-    def refine(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def refine(self, shapes: Shapes) -> list[ShapeParameters]:
         """Refine shapes by a short fit.
 
         Args:
@@ -301,7 +285,7 @@ class ShapeSearch:
         """
         return self.fitted_frames.fit(shapes, _SHORT_FIT_STEPS)[0]
 
-    def prune(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def prune(self, shapes: Shapes) -> list[ShapeParameters]:
         """Remove shapes without supporting evidence, the weakest first.
 
         Args:
@@ -309,16 +293,14 @@ class ShapeSearch:
         """
         found: list[ShapeParameters] = [*shapes]
         while found:
-            without: list[list[ShapeParameters]] = [
-                [*found[:k], *found[k + 1 :]] for k in range(len(found))
-            ]
+            without = [[*found[:k], *found[k + 1 :]] for k in range(len(found))]
             weakest = max(without, key=self.evidence)
             if self.is_better(found, weakest):
                 break
             found = weakest
         return found
 
-    def select_kinds(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def select_kinds(self, shapes: Shapes) -> list[ShapeParameters]:
         """Select the most likely kind of every shape, after a fit as every kind.
 
         Args:
@@ -326,7 +308,7 @@ class ShapeSearch:
         """
         return self.select_likeliest(shapes, propose_kinds(self.fitted_frames, shapes))
 
-    def select_headings(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def select_headings(self, shapes: Shapes) -> list[ShapeParameters]:
         """Select the most likely heading of people and vehicles, after a fit of every rotation.
 
         Args:
@@ -337,7 +319,7 @@ class ShapeSearch:
         return self.select_likeliest(shapes, [rows for rows in others if rows])
 
     def select_likeliest(
-        self, shapes: Sequence[ShapeParameters], alternatives: Sequence[Sequence[ShapeParameters]]
+        self, shapes: Shapes, alternatives: Sequence[Shapes]
     ) -> list[ShapeParameters]:
         """Select every shape from alternative lists after a fit, whichever is most likely.
 
@@ -350,10 +332,10 @@ class ShapeSearch:
         for number in range(len(found)):
             rest = [*found[:number], *found[number + 1 :]]
             options = [found[number], *(rows[number] for rows in (*alternatives, *fitted))]
-            found[number] = max(options, key=lambda one, rest=rest: self.evidence([*rest, one]))
+            found[number] = self.select_best(rest, options)
         return found
 
-    def select_heights(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def select_heights(self, shapes: Shapes) -> list[ShapeParameters]:
         """Select the most likely heights of shapes.
 
         Points above and below the radars have nearly equal ranges, so that the likelihood has
@@ -364,21 +346,13 @@ class ShapeSearch:
         """
         found = list(shapes)
         for number, shape in enumerate(found):
-            options = [
-                replace(
-                    shape, height=shape.height * part, brightness=shape.brightness * part**-power
-                )
-                for part in _HEIGHT_FACTORS
-                for power in (0.5, 1.0)
-            ]
-            rest = [*found[:number], *found[number + 1 :]]
-            found[number] = max(
-                [shape, *options],
-                key=lambda one, rest=rest: self.evidence([*rest, one]),
-            )
+            options, high, bright = [shape], shape.height, shape.brightness
+            for part, power in product(_HEIGHT_FACTORS, (0.5, 1.0)):
+                options.append(replace(shape, height=high * part, brightness=bright * part**-power))
+            found[number] = self.select_best([*found[:number], *found[number + 1 :]], options)
         return found
 
-    def split_shapes(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def split_shapes(self, shapes: Shapes) -> list[ShapeParameters]:
         """Replace shapes by two boxes where that is more likely.
 
         Two touching objects form one group of the image, and one shape at first.
@@ -403,7 +377,7 @@ class ShapeSearch:
                 found, tried = new, 0
         return found
 
-    def merge_shapes(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+    def merge_shapes(self, shapes: Shapes) -> list[ShapeParameters]:
         """Replace two shapes by one box, person or vehicle where that is more likely.
 
         Args:
@@ -413,8 +387,7 @@ class ShapeSearch:
         while True:
             pairs = [
                 (a, b)
-                for k, a in enumerate(found)
-                for b in found[k + 1 :]
+                for a, b in combinations(found, 2)
                 if (a, b) not in tried and shape_gap(a, b, self.ground) < _MAX_MERGE_GAP
             ]
             if not pairs:
@@ -451,9 +424,7 @@ def mean_rcs(shape: ShapeParameters) -> float:
     return 0.5 * math.pi * (shape.length + shape.width) * shape.height
 
 
-def propose_kinds(
-    likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters]
-) -> list[list[ShapeParameters]]:
+def propose_kinds(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[ShapeParameters]]:
     """Convert all eligible shapes to each other kind, before any fit.
 
     Args:
@@ -466,15 +437,10 @@ def propose_kinds(
     for kind in ("person", "vehicle", "corner"):
         changed = list(shapes)
         for number, shape in enumerate(shapes):
-            options = [
-                row for row in _propose_headed_shapes(shape) if row.kind == kind != shape.kind
-            ]
+            options = [r for r in _propose_headed_shapes(shape) if r.kind == kind != shape.kind]
             if options:
                 rest = [*shapes[:number], *shapes[number + 1 :]]
-                gains = [
-                    float(likelihood.log_likelihood_gains([*rest, option]).sum())
-                    for option in options
-                ]
+                gains = [likelihood.total_gain([*rest, option]) for option in options]
                 changed[number] = options[gains.index(max(gains))]
         found.append(changed)
     return [
@@ -482,9 +448,7 @@ def propose_kinds(
     ]
 
 
-def rotate_headed_shapes(
-    shapes: Sequence[ShapeParameters], rotation: float, ground: Ground
-) -> list[ShapeParameters]:
+def rotate_headed_shapes(shapes: Shapes, rotation: float, ground: Ground) -> list[ShapeParameters]:
     """Rotate people and vehicles; empty if there are none.
 
     Args:
@@ -556,7 +520,7 @@ def convert_kind(shape: ShapeParameters, kind: str) -> ShapeParameters:
     return replace(shape, kind=kind, length=across, width=across, height=max(high, 0.05))
 
 
-def enclosing_box(shapes: Sequence[ShapeParameters], yaw: float, ground: Ground) -> ShapeParameters:
+def enclosing_box(shapes: Shapes, yaw: float, ground: Ground) -> ShapeParameters:
     """Return a box around shapes.
 
     Args:
@@ -572,9 +536,8 @@ def enclosing_box(shapes: Sequence[ShapeParameters], yaw: float, ground: Ground)
     length, width = (high - low).tolist()
     brightest = max(shapes, key=lambda one: one.brightness)
     tall = max(shape.height for shape in shapes)
-    return ShapeParameters(
-        "box", (c * x - s * y, s * x + c * y), yaw, length, width, tall, brightest.brightness
-    )
+    position = c * x - s * y, s * x + c * y
+    return ShapeParameters("box", position, yaw, length, width, tall, brightest.brightness)
 
 
 def propose_splits(

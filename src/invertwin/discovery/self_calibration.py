@@ -23,9 +23,8 @@ from invertwin.radar.radar import require_sampled_waveform
 _CALIBRATION_ROUNDS = 2  # alternations of imaging and calibration
 _MAX_SWEEPS = 100  # maximum number of sweeps over the channels
 _MIN_PHASE_SPREAD = 10.0  # root mean square phase [°]: smaller errors are not corrected
-_MIN_POSITIONS = (
-    8  # minimum number of positions a range cell apart, which resolve directions by ranges
-)
+# Minimum number of positions a range cell apart, which resolve directions by ranges.
+_MIN_POSITIONS = 8
 
 
 def calibrate_on_scene(
@@ -51,8 +50,7 @@ def calibrate_on_scene(
     if len(radar.virtual_positions) == 1 or len(cells) < _MIN_POSITIONS:
         return None
     flat = replace(grid, u_start=0.0, u_step=1.0, u_count=1, v_start=0.0, v_step=1.0, v_count=1)
-    shape = tuple(capture.beat.shape[1:3])
-    found = ChannelCalibration(torch.ones(shape, dtype=torch.complex128))
+    found = ChannelCalibration(torch.ones(tuple(capture.beat.shape[1:3]), dtype=torch.complex128))
     for number in range(_CALIBRATION_ROUNDS):
         now = found.apply(capture)
         bins = flat if number == 0 else grid
@@ -81,12 +79,10 @@ def phase_spread(calibration: ChannelCalibration, radar: Radar) -> float:
     steps = [
         torch.arange(-1.0, 1.0, 1 / (16 * float(e)) if e > 0 else 2.0).double() for e in extent
     ]
-    turns = (
-        elements @ torch.cartesian_prod(*[axis if len(axis) > 1 else 0 * axis for axis in steps]).T
-    )
-    left = calibration.gains.flatten()[:, None] * torch.polar(
-        torch.ones_like(turns), 2 * math.pi * turns
-    )
+    axes = [axis if len(axis) > 1 else 0 * axis for axis in steps]
+    turns = elements @ torch.cartesian_prod(*axes).T
+    phasors = torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
+    left = calibration.gains.flatten()[:, None] * phasors
     best = left[:, int(left.sum(0).abs().argmax())]
     best = best * best.sum().conj()
     return math.degrees(float(best.angle().square().mean().sqrt()))

@@ -19,9 +19,8 @@ _ACCELERATION_DEVIATION = 1.0  # standard deviation of the acceleration of a tar
 _CROSS_RANGE_SPEED = 3.0  # standard deviation of the cross-range velocity [m/s]
 _MIN_TRACK_FRAMES = 3  # minimum number of frames of a track
 _MAX_MISSED_FRAMES = 3  # maximum number of missed frames
-_MIN_EXISTENCE_PROBABILITY = (
-    0.1  # minimum existence probability of detections that continue a track
-)
+# Minimum existence probability of detections that continue a track.
+_MIN_EXISTENCE_PROBABILITY = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +100,7 @@ def _make_measurement(
     detection: DetectedObject, recording: ChirpCapture, ground: Ground, frame: int
 ) -> _TrackMeasurement:
     axes = list(ground.plane_axes)
-    radar = recording.radar()
-    sight = detection.position - radar.positions[frame].detach()
+    sight = detection.position - recording.radar().positions[frame].detach()
     along = torch.nn.functional.normalize(sight[axes], dim=0)
     across = torch.stack([-along[1], along[0]])
     distance = float(sight.norm())
@@ -123,24 +121,19 @@ def _start_track(measurement: _TrackMeasurement) -> _KalmanTrack:
     along, rate = measurement.matrix[2, 2:], measurement.value[2]
     error = torch.zeros(4, 4, dtype=torch.float64)
     error[:2, :2] = measurement.noise[:2, :2]
-    error[2:, 2:] = _CROSS_RANGE_SPEED**2 * (
-        torch.eye(2, dtype=torch.float64) - torch.outer(along, along)
-    )
-    error[2:, 2:] += measurement.noise[2, 2] * torch.outer(along, along)
-    return _KalmanTrack(
-        measurement.frame,
-        [measurement],
-        [(torch.cat([measurement.value[:2], rate * along]), error)],
-    )
+    radial = torch.outer(along, along)
+    error[2:, 2:] = _CROSS_RANGE_SPEED**2 * (torch.eye(2, dtype=torch.float64) - radial)
+    error[2:, 2:] += measurement.noise[2, 2] * radial
+    state = torch.cat([measurement.value[:2], rate * along])
+    return _KalmanTrack(measurement.frame, [measurement], [(state, error)])
 
 
 def _update_tracks(
     active_tracks: Sequence[_KalmanTrack], measurements: Sequence[_TrackMeasurement]
 ) -> list[_TrackMeasurement]:
     """Update tracks by jointly assigned measurements; return the assigned ones."""
-    away = torch.full(
-        (len(active_tracks), len(measurements)), 2 * _MAX_SQUARED_DISTANCE, dtype=torch.float64
-    )
+    shape = len(active_tracks), len(measurements)
+    away = torch.full(shape, 2 * _MAX_SQUARED_DISTANCE, dtype=torch.float64)
     for row, path in enumerate(active_tracks):
         state, error = path.predictions[-1]
         for column, one in enumerate(measurements):
@@ -162,51 +155,36 @@ def _update_tracks(
         one = measurements[pairs[row]]
         spread = one.matrix @ error @ one.matrix.T + one.noise
         gain = torch.linalg.solve(spread, one.matrix @ error).T
-        path.states.append(
-            (state + gain @ (one.value - one.matrix @ state), error - gain @ one.matrix @ error)
-        )
+        moved = state + gain @ (one.value - one.matrix @ state)
+        path.states.append((moved, error - gain @ one.matrix @ error))
         path.measurements.append(one)
         path.missed_frames = 0
     return [measurements[column] for column in pairs.values()]
 
 
 def _to_detected_object(
-    target_track: _KalmanTrack, transition: Tensor, period: float, ground: Ground
+    path: _KalmanTrack, transition: Tensor, period: float, ground: Ground
 ) -> DetectedObject:
     """Convert a smoothed track to an object; frames after its last detection are dropped."""
-    count = target_track.measurements[-1].frame - target_track.first_frame + 1
-    states = target_track.states[:count]
+    count = path.measurements[-1].frame - path.first_frame + 1
+    states = path.states[:count]
     for k in range(count - 2, -1, -1):
-        (state, error), (ahead, wide) = states[k], target_track.predictions[k]
+        (state, error), (ahead, wide) = states[k], path.predictions[k]
         gain = torch.linalg.solve(wide, transition @ error).T
         later, surer = states[k + 1]
         states[k] = (state + gain @ (later - ahead), error + gain @ (surer - wide) @ gain.T)
     axes = list(ground.plane_axes)
-    height = torch.stack(
-        [one.detection.position[ground.up_axis] for one in target_track.measurements]
-    ).mean()
+    heights = [one.detection.position[ground.up_axis] for one in path.measurements]
     values = torch.stack([state for state, _ in states])
     spreads = torch.stack([error.diagonal().clamp_min(0.0).sqrt() for _, error in states])
     positions, velocities = (torch.zeros(count, 3, dtype=torch.float64) for _ in range(2))
-    positions[:, axes], positions[:, ground.up_axis] = values[:, :2], height
+    positions[:, axes], positions[:, ground.up_axis] = values[:, :2], torch.stack(heights).mean()
     velocities[:, axes] = values[:, 2:]
     names = ["xyz"[axis] for axis in axes]
     names += [f"velocity_{name}" for name in names]
-    sure = sum(one.detection.existence_probability for one in target_track.measurements) / count
-    frames = torch.arange(
-        target_track.first_frame, target_track.first_frame + count, dtype=torch.float64
-    )
-    track = ObjectTrack(
-        frames * period, positions, velocities, dict(zip(names, spreads.T, strict=True))
-    )
-    return DetectedObject(
-        "",
-        "point",
-        {"point": 1.0},
-        positions[-1],
-        None,
-        {name: float(column[-1]) for name, column in track.deviations.items()},
-        sure,
-        velocities[-1],
-        track,
-    )
+    sure = sum(one.detection.existence_probability for one in path.measurements) / count
+    frames = torch.arange(path.first_frame, path.first_frame + count, dtype=torch.float64)
+    deviations = dict(zip(names, spreads.T, strict=True))
+    track = ObjectTrack(frames * period, positions, velocities, deviations)
+    last = {name: float(column[-1]) for name, column in deviations.items()}
+    return DetectedObject.point("", positions[-1], last, sure, velocities[-1], track)

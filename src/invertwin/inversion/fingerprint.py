@@ -44,10 +44,9 @@ class Fingerprint:
         """Return whether stored content belongs to equal values, up to rounding."""
         if not isinstance(stored, dict) or stored.get("digest") != self._hash.hexdigest():
             return False
-        pairs = zip(stored["numbers"], self._numbers, strict=True)
         return all(
             math.isclose(a, b, rel_tol=_ROUNDING_TOLERANCE, abs_tol=_ROUNDING_TOLERANCE)
-            for a, b in pairs
+            for a, b in zip(stored["numbers"], self._numbers, strict=True)
         )
 
     def _update_digest(self, *words: object) -> None:
@@ -90,9 +89,8 @@ class Fingerprint:
             self._update_digest("code", value.co_code.hex(), *value.co_names)
             self._add(value.co_consts)
         elif isinstance(value, type | types.BuiltinFunctionType | types.ModuleType):
-            self._update_digest(
-                getattr(value, "__module__", ""), getattr(value, "__qualname__", value)
-            )
+            name = getattr(value, "__qualname__", value)
+            self._update_digest(getattr(value, "__module__", ""), name)
         else:
             self._add_object(value)
 

@@ -14,6 +14,7 @@ from pydantic import ConfigDict, TypeAdapter
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
+from invertwin.forward_model import Realisations
 from invertwin.inversion.fingerprint import Fingerprint
 from invertwin.inversion.gauss_newton import GaussNewton, no_effect_error
 from invertwin.inversion.loss import MapPairs, Objective, resolve_loss
@@ -231,8 +232,7 @@ class Fit:
         for k, (model, sensor) in enumerate(zip(self._models, sensors, strict=True)):
             key = derive_seed(self._settings.seed, _UNBLURRED_SEED_KEY, seed_number, k)
             model = model.with_sampling(**sampling_changes) if sampling_changes else model
-            predicted = model.scale_blur(0.0).predict(scene, sensor, key)
-            pairs.append((predicted, self._observed[k]))
+            pairs.append((model.scale_blur(0.0).predict(scene, sensor, key), self._observed[k]))
         return pairs
 
     def loss_at_start(self) -> float:
@@ -247,7 +247,7 @@ class Fit:
         finally:
             self.modules.load_state_dict(present)
 
-    def realisations(self, seed_number: int) -> list[Callable[[int, float], Tensor] | None]:
+    def realisations(self, seed_number: int) -> list[Realisations | None]:
         """Return functions that simulate recordings of the twin, see ``ForwardModel.realisations``.
 
         Args:
@@ -255,12 +255,9 @@ class Fit:
         """
         with torch.no_grad():
             scene, sensors = self.apply_modules()
+            key = (self._settings.seed, _REALISATION_SEED_KEY, seed_number)
             return [
-                model.realisations(
-                    scene,
-                    sensor,
-                    derive_seed(self._settings.seed, _REALISATION_SEED_KEY, seed_number, k),
-                )
+                model.realisations(scene, sensor, derive_seed(*key, k))
                 for k, (model, sensor) in enumerate(zip(self._models, sensors, strict=True))
             ]
 
@@ -338,15 +335,13 @@ class Fit:
         self, number: int, step: int, sensor: Any, observed: Tensor
     ) -> tuple[Any, Tensor]:
         """Select the frames of one observation that a step compares."""
-        fitted = np.array(
-            [n for n in range(len(observed)) if n not in self._held_out_frames(len(observed))]
-        )
+        every = np.arange(len(observed))
+        fitted = np.setdiff1d(every, self._held_out_frames(len(observed)))
         count = min(self.stage.frames_per_step or len(fitted), len(fitted))
         if count == len(observed):
             return sensor, observed
-        rng = np.random.default_rng(
-            derive_seed(self._settings.seed, self.number, step, _FRAME_SEED_KEY + number)
-        )
+        key = (self.number, step, _FRAME_SEED_KEY + number)
+        rng = np.random.default_rng(derive_seed(self._settings.seed, *key))
         chosen = np.sort(rng.choice(fitted, count, replace=False))
         return sensor.frames(chosen.tolist()), observed.index_select(0, torch.from_numpy(chosen))
 
@@ -445,10 +440,9 @@ class Fit:
 
     def _has_converged(self, tolerance: float) -> bool:
         """Return whether the unblurred loss, averaged over two windows, no longer falls."""
-        rows = [row["loss"] for row in self.progress.history[-2 * _CONVERGENCE_WINDOW :]]
-        if len(rows) < 2 * _CONVERGENCE_WINDOW or not self.is_unblurred(
-            self.progress.step - 2 * _CONVERGENCE_WINDOW
-        ):
+        count = 2 * _CONVERGENCE_WINDOW
+        rows = [row["loss"] for row in self.progress.history[-count:]]
+        if len(rows) < count or not self.is_unblurred(self.progress.step - count):
             return False
         before, after = np.mean(rows[:_CONVERGENCE_WINDOW]), np.mean(rows[_CONVERGENCE_WINDOW:])
         return bool(before - after < tolerance * before)
@@ -495,9 +489,8 @@ def _require_all_used(modules: nn.ModuleList) -> None:
 
 
 def _has_diverged(loss: float, history: list[dict[str, Any]]) -> bool:
-    return not math.isfinite(loss) or bool(
-        history and loss > _MAX_RELATIVE_LOSS * history[0]["loss"]
-    )
+    most = _MAX_RELATIVE_LOSS * history[0]["loss"] if history else math.inf
+    return not math.isfinite(loss) or loss > most
 
 
 def _parameter_values(modules: nn.ModuleList) -> dict[str, Any]:

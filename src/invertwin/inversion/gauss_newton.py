@@ -76,12 +76,11 @@ class GaussNewton:
             )
         self.objective, self.damping = objective, damping
         own = dict(trust_radii or {})
-        self.reach = torch.cat(
-            [
-                torch.full((p.numel(),), own.get(p, trust_radius), dtype=torch.float64)
-                for p in self._parameters.values()
-            ]
-        )
+        radii = [
+            torch.full((p.numel(),), own.get(p, trust_radius), dtype=torch.float64)
+            for p in self._parameters.values()
+        ]
+        self.reach = torch.cat(radii)
         self.every = checked_count(curvature_every, "steps from one curvature to the next", 1)
         self._known: tuple[Tensor, Tensor] | None = None  # H, and the mask of its parameters
         self._age = 0  # number of steps with the present H
@@ -121,8 +120,7 @@ class GaussNewton:
         if int(free.sum()) > _MAX_PARAMETERS:
             raise InputError(
                 f"expected at most {_MAX_PARAMETERS} parameters for Gauss–Newton, got "
-                f"{int(free.sum())}; "
-                "use adam for many"
+                f"{int(free.sum())}; use adam for many"
             )
         if not bool(free.any()):
             return before
@@ -136,9 +134,8 @@ class GaussNewton:
         start = [parameter.detach().clone() for parameter in parameters]
         given = self.damping
         for _ in range(_MAX_DAMPING_TRIALS):
-            self._set_parameters(
-                start, self._solve_step(curvature, slope[free], self.reach[free]), free
-            )
+            change = self._solve_step(curvature, slope[free], self.reach[free])
+            self._set_parameters(start, change, free)
             after = _evaluate_loss(self.objective, maps, penalty)
             if after < before + _LOSS_TOLERANCE * abs(before):
                 self.damping = max(self.damping * _DAMPING_DECREASE, _MIN_DAMPING)
@@ -177,8 +174,7 @@ class GaussNewton:
         """Minimise the damped quadratic model within the trust radius of every parameter."""
         own = curvature.diagonal()
         # Weakly determined parameters get the mean damping; noise would move them otherwise.
-        scale = own.clamp_min(float(own.mean()))
-        model = curvature + torch.diag(self.damping * scale)
+        model = curvature + torch.diag(self.damping * own.clamp_min(float(own.mean())))
         change, free = torch.zeros_like(gradient), torch.ones_like(gradient, dtype=torch.bool)
         while bool(free.any()):
             # Fix parameters at their limit, and minimise over the others.

@@ -11,15 +11,15 @@ from jaxtyping import Float, Float64
 from numpy.typing import NDArray
 from torch import Tensor
 
+from invertwin.checks import check_choice
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.limits import Count, Positive
 
 _MIN_POSITIVE = 1e-38  # lower limit of logarithms
 _GAIN_STEPS = 8  # maximum number of iterations; three or four suffice
-_GAIN_TOLERANCE = (
-    1e-3  # relative step of the gain at which the iteration ends; the remaining error is below 1e-5
-)
+# Relative step of the gain at which the iteration ends; the remaining error is below 1e-5.
+_GAIN_TOLERANCE = 1e-3
 _MAX_NEGATIVE = 0.1  # of the peak: less is rounding or interpolation of power
 _BINS_PER_BLOCK = 2**16  # bins per block, so that the working set fits a core's cache
 
@@ -121,20 +121,13 @@ class SpectrumLoss:
     degrees: Positive = 4.0
 
     def __post_init__(self) -> None:
-        if self.kind not in LOSS_KINDS:
-            raise InputError(
-                f"expected kind among {', '.join(LOSS_KINDS)}, got {self.kind!r}; choose one"
-            )
+        check_choice(self.kind, LOSS_KINDS, "kind among")
         if self.levels < 1 or self.gain not in ("fitted", "one"):
             raise InputError(
                 f"expected levels >= 1 and gain 'fitted' or 'one', got {self.levels} and "
                 f"{self.gain!r}; 3 levels and a fitted gain suit uncalibrated radars"
             )
-        if self.background not in BACKGROUNDS:
-            raise InputError(
-                f"expected background among {', '.join(BACKGROUNDS)}, got {self.background!r}; "
-                "choose one"
-            )
+        check_choice(self.background, BACKGROUNDS, "background among")
         if self.kind != "mse" and (self.background != "none" or not self.floor > 0):
             raise InputError(
                 f"expected no background and floor > 0 with kind {self.kind!r}, got "
@@ -163,26 +156,17 @@ class SpectrumLoss:
         return power * speckle_weight(power * inverse, self.degrees)
 
     def __call__(
-        self,
-        simulated: Float[Tensor, "frame *map"],
-        measured: Float[Tensor, "frame *map"],
+        self, simulated: Float[Tensor, "frame *map"], measured: Float[Tensor, "frame *map"]
     ) -> Float[Tensor, ""]:
         """Return the loss: 0 for equal maps, 1 for an empty simulated map under ``mse``.
 
         Raises:
             InputError: Different shapes, or a measured map that is zero everywhere.
         """
-        if simulated.shape != measured.shape:
-            raise InputError(
-                f"expected maps of one shape, got {tuple(simulated.shape)} and "
-                f"{tuple(measured.shape)}; use one grid for both"
-            )
+        _check_shapes(simulated, measured)
         if self.kind != "mse":
             return self._divergence(simulated, measured)
-        pairs = self._pyramid(simulated, measured)
-        return self._squared_error(
-            [(self._subtract_background(a), self._subtract_background(b)) for a, b in pairs]
-        )
+        return self._squared_error(self._pyramid(simulated, measured))
 
     def curvature(
         self,
@@ -205,8 +189,6 @@ class SpectrumLoss:
         # The derivative of a map with respect to the logarithm of its gain is the map.
         rows = torch.cat([tangents, simulated.detach()[None].to(tangents)])
         rows = rows / self._normalisations(simulated, measured)[0]
-        if self.kind == "mse":
-            pairs = [(self._subtract_background(a), self._subtract_background(b)) for a, b in pairs]
         gain = self._optimal_gain(pairs)
         total = rows.new_zeros(len(rows), len(rows), dtype=torch.float64)
         for level, (a, b) in enumerate(pairs):
@@ -217,9 +199,8 @@ class SpectrumLoss:
                 weighed = torch.stack([self._subtract_background(row) for row in rows]).flatten(1)
             else:
                 weight = 1.0 / (1.0 + 2.0 / self._tail_degrees)
-                weighed = (
-                    rows * ((a > 0) * gain / (gain * a.clamp_min(0.0) + self.floor))
-                ).flatten(1)
+                inverse = (a > 0) * gain / (gain * a.clamp_min(0.0) + self.floor)
+                weighed = (rows * inverse).flatten(1)
             product = (weighed @ weighed.T).double()
             total = total + weight * product / (weighed.shape[1] * len(pairs))
         own, mixed = total[:-1, :-1], total[:-1, -1:]
@@ -236,8 +217,6 @@ class SpectrumLoss:
         """
         unit, scale = self._normalisations(simulated, measured)
         pairs = self._pyramid(simulated.detach(), measured)
-        if self.kind == "mse":
-            pairs = [(self._subtract_background(a), self._subtract_background(b)) for a, b in pairs]
         return float(self._optimal_gain(pairs) * scale / unit)
 
     def _normalisations(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
@@ -258,11 +237,10 @@ class SpectrumLoss:
     def _pyramid(self, simulated: Tensor, measured: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return both maps at all resolutions, in units near one."""
         unit, scale = self._normalisations(simulated, measured)
-        both = (
-            self._resolutions(simulated / unit),
-            self._resolutions(measured.to(simulated) / scale),
-        )
-        return list(zip(*both, strict=True))
+        levels = [self._resolutions(m) for m in (simulated / unit, measured.to(simulated) / scale)]
+        if self.kind == "mse":
+            levels = [[self._subtract_background(m) for m in own] for own in levels]
+        return list(zip(*levels, strict=True))
 
     def _optimal_gain(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
         """Return the gain that minimises the loss."""
@@ -306,10 +284,8 @@ class SpectrumLoss:
                     for _, a, b in blocks:
                         inverse = torch.add(floor, a, alpha=math.exp(log_gain)).reciprocal_()
                         down += float(a @ inverse) / count
-                        up += (
-                            float(self._weight_power(b, inverse) @ inverse.square_().mul_(a))
-                            / count
-                        )
+                        data = self._weight_power(b, inverse)
+                        up += float(data @ inverse.square_().mul_(a)) / count
                 move = math.log(max(up, _MIN_POSITIVE) / max(down, _MIN_POSITIVE))
                 if step != 0:
                     slope = min(max((before - move) / step, 0.1), 1.0)
@@ -329,9 +305,8 @@ class SpectrumLoss:
         # torch has no public function for this.
         transformed = torch._C._are_functorch_transforms_active()  # pyright: ignore[reportPrivateUsage]
         if not transformed:
-            return _ScalarWithGradient.apply(
-                simulated, *self._divergence_and_gradient(simulated, measured)
-            )
+            value, slope = self._divergence_and_gradient(simulated, measured)
+            return _ScalarWithGradient.apply(simulated, value, slope)
         # For example a second derivative.
         pairs = self._pyramid(simulated, measured)
         gain = self._optimal_gain(pairs)
@@ -339,9 +314,8 @@ class SpectrumLoss:
             (b.clamp_min(0.0) + self.floor) / (gain * a.clamp_min(0.0) + self.floor)
             for a, b in pairs
         ]
-        return torch.stack(
-            [speckle_divergence(q, self._tail_degrees).mean() for q in ratios]
-        ).mean()
+        terms = [speckle_divergence(q, self._tail_degrees).mean() for q in ratios]
+        return torch.stack(terms).mean()
 
     @torch.no_grad()
     def _divergence_and_gradient(
@@ -457,11 +431,7 @@ class CorrelationLoss:
     scale: CorrelationScale = "magnitude"
 
     def __post_init__(self) -> None:
-        if self.scale not in _SCALE_TRANSFORMS:
-            raise InputError(
-                f"expected a scale of {', '.join(_SCALE_TRANSFORMS)}, got {self.scale!r}; choose "
-                f"one"
-            )
+        check_choice(self.scale, _SCALE_TRANSFORMS, "a scale of")
 
     def __call__(
         self, simulated: Float[Tensor, "*map"], measured: Float[Tensor, "*map"]
@@ -474,11 +444,7 @@ class CorrelationLoss:
         Raises:
             InputError: Maps of different shapes.
         """
-        if simulated.shape != measured.shape:
-            raise InputError(
-                f"expected maps of one shape, got {tuple(simulated.shape)} and "
-                f"{tuple(measured.shape)}; use one grid for both"
-            )
+        _check_shapes(simulated, measured)
         return 1 - self._unit_row(simulated) @ self._unit_row(measured)
 
     def curvature(
@@ -500,9 +466,8 @@ class CorrelationLoss:
 
     def _unit_row(self, power: Tensor) -> Tensor:
         """A map at the scale of the loss, without its mean, of length one."""
-        row = _SCALE_TRANSFORMS[self.scale](
-            power.to(torch.float64) / power.detach().max()
-        ).flatten()
+        share = power.to(torch.float64) / power.detach().max()
+        row = _SCALE_TRANSFORMS[self.scale](share).flatten()
         row = row - row.mean()
         return row / row.norm()
 
@@ -566,6 +531,14 @@ class Objective:
             assert isinstance(loss, CURVED)
             total = total + weight * loss.curvature(*pair, rows)
         return total / sum(self.weights)
+
+
+def _check_shapes(simulated: Tensor, measured: Tensor) -> None:
+    if simulated.shape != measured.shape:
+        raise InputError(
+            f"expected maps of one shape, got {tuple(simulated.shape)} and "
+            f"{tuple(measured.shape)}; use one grid for both"
+        )
 
 
 def _mean_magnitude(power: Tensor) -> Tensor:

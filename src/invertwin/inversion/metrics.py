@@ -285,8 +285,7 @@ def sample_surface(
         raise InputError("expected a surface with area, got none; check the mesh")
     number = checked_count(count, "points", 1)
     points, rows = trimesh.sample.sample_surface(solid, number, seed=[seed, stream])[:2]
-    normals = solid.face_normals[rows]
-    return torch.from_numpy(np.array(points)), torch.from_numpy(np.array(normals))
+    return torch.from_numpy(np.array(points)), torch.from_numpy(np.array(solid.face_normals[rows]))
 
 
 def _check_watertight(mesh: Mesh, name: str) -> None:

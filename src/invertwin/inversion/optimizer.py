@@ -63,10 +63,8 @@ class Optimizer:
         found: dict[nn.Parameter, float] = {}
         for name, parameter in modules.named_parameters():
             if parameter.requires_grad:
-                turns = name.endswith(_ANGLES) and self.rotation_rate is not None
-                found[parameter] = (rates or {}).get(
-                    parameter, self.rotation_rate if turns and self.rotation_rate else self.rate
-                )
+                own = self.rotation_rate if name.endswith(_ANGLES) else None
+                found[parameter] = (rates or {}).get(parameter, own or self.rate)
         if self.kind == "gauss_newton":
             return GaussNewton(
                 modules,

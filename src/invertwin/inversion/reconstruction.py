@@ -124,9 +124,8 @@ def reconstruct(
     stages = make_stages(schedule, names)
     made = [_build_modules(o.sensor, found) for o, found in zip(watched, own, strict=True)]
     sensor_modules = [found for found, _ in made]
-    settings = replace(
-        settings, regularizers=(*settings.regularizers, *(t for _, found in made for t in found))
-    )
+    penalties = [term for _, found in made for term in found]
+    settings = replace(settings, regularizers=(*settings.regularizers, *penalties))
     begun, fit, status = scene, None, "budget"
     history: list[dict[str, Any]] = []
     modules, terms = _build_modules(begun, unknowns)

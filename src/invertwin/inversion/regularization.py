@@ -84,8 +84,7 @@ def cotangent_edges(mesh: Mesh) -> tuple[Tensor, Float64[Tensor, " edge"], float
         area = torch.linalg.cross(a - c, b - c).norm(dim=1).clamp_min(1e-12)
         pairs.append(torch.stack([mesh.faces[:, k], mesh.faces[:, (k + 1) % 3]], dim=1))
         weights.append(0.5 * dot / area)
-    ends = torch.cat(pairs).sort(dim=1).values
-    edges, group = ends.unique(dim=0, return_inverse=True)
+    edges, group = torch.cat(pairs).sort(dim=1).values.unique(dim=0, return_inverse=True)
     total = torch.zeros(len(edges), dtype=torch.float64).index_add(0, group, torch.cat(weights))
     lengths = (positions[edges[:, 0]] - positions[edges[:, 1]]).norm(dim=1)
     return edges, total.clamp_min(0.01), float(lengths.mean())

@@ -12,7 +12,7 @@ derivative without boundary paths.
 import math
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from invertwin.checks import (
     check_fields,
     checked_number,
     checked_tensor,
+    set_fields,
     strip_derivatives,
 )
 from invertwin.deprecation import rename_arguments, rename_members
@@ -73,18 +74,17 @@ class Cells(ReceiverLocations):
     sampling: CellSampling
     is_random: ClassVar[bool] = True
 
-    @abstractmethod
-    def with_sampling(self, sampling: CellSampling) -> "Cells":
+    def with_sampling(self, sampling: CellSampling) -> Self:
         """The same cells with other numbers of points.
 
         Args:
             sampling: How many points.
         """
+        return replace(self, sampling=sampling)  # type: ignore[type-var]
 
     def with_sample_count(self, samples: int) -> "Cells":
         """The same cells with so many points in all. See ``Places.finer``."""
-        points = max(1, samples // len(self.areas))
-        return self.with_sampling(replace(self.sampling, points=points))
+        return self.with_sampling(replace(self.sampling, points=max(1, samples // len(self.areas))))
 
     def fixed_visibility(self) -> "Cells | None":
         """The same cells without boundary paths. See ``Places.fixed_visibility``."""
@@ -137,16 +137,14 @@ class Cells(ReceiverLocations):
                 f"{propagation.bandwidth} and edges 0; such fields jump at shadows: give edges=1, "
                 "or leave out the bandwidth"
             )
-        numbers = np.random.default_rng(np.random.SeedSequence([seed, 1]))
-        points = self.sample_points(numbers)
+        points = self.sample_points(np.random.default_rng(np.random.SeedSequence([seed, 1])))
         if propagation.edges:
             gain, moments = propagation.gains_and_moments(scene, sensor, points.flatten(0, 1), seed)
             shape = (len(gain), *self.shape)
             mean = moments.unflatten(1, points.shape[:2]).mean(2)
             gain = gain.unflatten(1, points.shape[:2]).mean(2)
-            return LinkStatistics(
-                gain.reshape(shape), delay_spread_from_moments(mean).reshape(shape)
-            )
+            spread = delay_spread_from_moments(mean)
+            return LinkStatistics(gain.reshape(shape), spread.reshape(shape))
 
         def measure(paths: RayPaths, tx: Tensor, rx: Tensor) -> Tensor:
             return propagation.path_moments(paths, tx, rx, sensor.mount)
@@ -172,9 +170,8 @@ class Cells(ReceiverLocations):
         aside = propagation.panel_and_rough_moments(scene, sensor, points.flatten(0, 1), seed)
         mean = mean + aside.unflatten(1, points.shape[:2]).mean(2)
         shape = (len(mean), *self.shape)
-        return LinkStatistics(
-            mean[..., 0].reshape(shape), delay_spread_from_moments(mean).reshape(shape)
-        )
+        spread = delay_spread_from_moments(mean)
+        return LinkStatistics(mean[..., 0].reshape(shape), spread.reshape(shape))
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,10 +196,9 @@ class MapPlane(Cells):
 
     def __post_init__(self) -> None:
         for name in ("corner", "first", "second"):
-            value = checked_tensor(
-                getattr(self, name), (3,), f"{name} of a map [m]", "give x, y, z"
-            )
-            object.__setattr__(self, name, strip_derivatives(value))
+            what = f"{name} of a map [m]"
+            value = checked_tensor(getattr(self, name), (3,), what, "give x, y, z")
+            set_fields(self, **{name: strip_derivatives(value)})
         if not float(self._normal.norm()) > 0:
             raise InputError(
                 "expected sides of a map that span an area, got parallel ones or none; give two "
@@ -236,23 +232,17 @@ class MapPlane(Cells):
             InputError: Wrong shapes or numbers, or a map without an area.
         """
         do = "give x and y"
-        ends = [
-            checked_tensor(v, (2,), f"{n} of a map [m]", do)
-            for n, v in (("low", low), ("high", high))
-        ]
+        start = checked_tensor(low, (2,), "low of a map [m]", do)
+        end = checked_tensor(high, (2,), "high of a map [m]", do)
         z = checked_number(height, "height of a map [m]", -math.inf)
         size = checked_number(cell_size, "size of cells [m]", 0.0, open_low=True)
-        x, y = (ends[1] - ends[0]).tolist()
+        x, y = (end - start).tolist()
         if not (x > 0 and y > 0):
             raise InputError("expected high beyond low in x and y; exchange them")
         count = max(1, round(x / size)), max(1, round(y / size))
-        corner = torch.cat([ends[0], torch.tensor([z], dtype=torch.float64)])
+        corner = torch.cat([start, torch.tensor([z], dtype=torch.float64)])
         sides = torch.tensor([[x, 0.0, 0.0], [0.0, y, 0.0]], dtype=torch.float64)
         return cls(corner, sides[0], sides[1], count, sampling)
-
-    def with_sampling(self, sampling: CellSampling) -> "MapPlane":
-        """The same cells with other numbers of points. See ``Cells.sampled``."""
-        return replace(self, sampling=sampling)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -325,15 +315,11 @@ class MapMesh(Cells):
 
     def __post_init__(self) -> None:
         mesh = replace(self.mesh, vertices=strip_derivatives(self.mesh.vertices))
-        object.__setattr__(self, "mesh", mesh)
+        set_fields(self, mesh=mesh)
         if not bool((self.areas > 0).all()):
             raise InputError(
                 "expected triangles with an area for the cells of a map, got one without; remove it"
             )
-
-    def with_sampling(self, sampling: CellSampling) -> "MapMesh":
-        """The same cells with other numbers of points. See ``Cells.sampled``."""
-        return replace(self, sampling=sampling)
 
     @property
     def shape(self) -> tuple[int]:

@@ -7,7 +7,7 @@ from typing import ClassVar
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.checks import checked_tensor
+from invertwin.checks import checked_tensor, set_fields
 from invertwin.errors import InputError
 from invertwin.links.received import LinkStatistics, PropagationSettings
 from invertwin.links.transmitters import Transmitters
@@ -72,7 +72,7 @@ class ReceiverPoints(ReceiverLocations):
         places = checked_tensor(self.positions, (None, 3), "positions of receivers [m]", do)
         if not len(places):
             raise InputError(f"expected at least one point of a map, got none; {do}")
-        object.__setattr__(self, "positions", places)
+        set_fields(self, positions=places)
 
     @property
     def shape(self) -> tuple[int, ...]:

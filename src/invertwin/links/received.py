@@ -113,8 +113,7 @@ class PropagationSettings:
         )
         if not self.panels:
             return found
-        over = panel_paths(scene, self.panels, sensor.positions, positions, self.frequency)
-        return found + over
+        return found + panel_paths(scene, self.panels, sensor.positions, positions, self.frequency)
 
     def link_statistics(
         self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int

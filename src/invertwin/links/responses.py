@@ -13,7 +13,14 @@ from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import RayPaths, polarisations
-from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.checks import (
+    ArrayLike,
+    check_orthonormal,
+    checked_count,
+    checked_number,
+    checked_tensor,
+    set_fields,
+)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.runtime.memory import require_memory
@@ -58,10 +65,8 @@ class AntennaMount:
         given = torch.as_tensor(self.rotations, dtype=torch.float64)
         shape = (3, 3) if given.ndim < 3 else (None, 3, 3)
         turns = checked_tensor(given, shape, "rotations of terminals", do)
-        unit = torch.eye(3, dtype=torch.float64)
-        if float((turns.detach().mT @ turns.detach() - unit).abs().max()) > 1e-5:
-            raise InputError(f"expected rotations of terminals with orthonormal columns; {do}")
-        object.__setattr__(self, "rotations", turns)
+        check_orthonormal(turns, "rotations of terminals", do)
+        set_fields(self, rotations=turns)
 
     def element_weights(
         self, direction: Float64[Tensor, "path 3"], index: Int64[Tensor, " path"]
@@ -206,9 +211,14 @@ def frequency_response(
     Raises:
         InputError: No frequency, or one that is not finite.
     """
+    swept, start = checked_frequencies(frequencies), torch.zeros(1, dtype=torch.float64)
+    return _evaluate_responses(paths, swept, start, tx, rx)[..., 0, :]
+
+
+def checked_frequencies(frequencies: ArrayLike) -> Float64[Tensor, " frequency"]:
+    """One or several frequencies [Hz] as a row."""
     swept = torch.atleast_1d(torch.as_tensor(frequencies, dtype=torch.float64))
-    swept = checked_tensor(swept, (None,), "frequencies [Hz]", "give one or several")
-    return _evaluate_responses(paths, swept, torch.zeros(1, dtype=torch.float64), tx, rx)[..., 0, :]
+    return checked_tensor(swept, (None,), "frequencies [Hz]", "give one or several")
 
 
 def ofdm_channel(
@@ -247,9 +257,8 @@ def ofdm_channel(
     _require_channel_memory(paths, count * instants, tx, rx)
     number = torch.arange(instants, dtype=torch.float64)
     grid = torch.arange(count, dtype=torch.float64) - count // 2
-    return _evaluate_responses(
-        paths, paths.frequency + grid * step, number * (1 / step + prefix), tx, rx
-    )
+    swept, times = paths.frequency + grid * step, number * (1 / step + prefix)
+    return _evaluate_responses(paths, swept, times, tx, rx)
 
 
 def impulse_response(
@@ -301,9 +310,8 @@ def _evaluate_responses(
     # Delays change with time: a Doppler shift ν of the carrier f₀ is dτ/dt = −ν/f₀.
     rate = -paths.doppler / paths.frequency
     parts = []
-    for some in frequencies.split(
-        max(1, _VALUES_PER_CHUNK // max(1, len(paths) * pairs * len(times)))
-    ):
+    chunk = max(1, _VALUES_PER_CHUNK // max(1, len(paths) * pairs * len(times)))
+    for some in frequencies.split(chunk):
         moved = times[:, None] * rate[:, None, None, None, None]
         turn = phasor(-some * (delay[..., None, None] + moved))
         parts.append(_sum_by_link(paths, amplitude[..., None, None] * turn))

@@ -136,8 +136,7 @@ def _stokes(
     power = torch.view_as_real(field).square().sum(-1)
     both = field[..., 0] * field[..., 1].conj()
     first, second = power.unbind(-1)
-    rows = torch.stack([first + second, first - second, 2 * both.real, 2 * both.imag], -1)
-    return rows.mean(1)
+    return torch.stack([first + second, first - second, 2 * both.real, 2 * both.imag], -1).mean(1)
 
 
 def _build_link(
@@ -160,9 +159,8 @@ def _build_link(
 
 def _scale_sampling(sampling: Sampling, fraction: float) -> Sampling:
     """So much of all that is drawn."""
-    samples, edges = (
-        math.ceil(n * fraction) for n in (sampling.samples, sampling.boundary_samples)
-    )
+    samples = math.ceil(sampling.samples * fraction)
+    edges = math.ceil(sampling.boundary_samples * fraction)
     return replace(sampling, samples=samples, boundary_samples=edges)
 
 

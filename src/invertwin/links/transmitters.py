@@ -7,13 +7,11 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.checks import ArrayLike, checked_tensor
+from invertwin.checks import ArrayLike, checked_tensor, set_fields
 from invertwin.errors import InputError
 from invertwin.limits import Axes
 from invertwin.links.responses import AntennaMount
-from invertwin.scene.parameters import Coordinate, axes_mask, free_part
-
-_POSITION_ERROR = 0.1  # m: an error that matters
+from invertwin.scene.parameters import Coordinate, axes_mask, free_part, position_coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +40,9 @@ class Transmitters:
             raise InputError(f"expected at least one transmitter, got none; {do}")
         power = torch.as_tensor(self.power_dbm, dtype=torch.float64)
         power = power.expand(len(places)) if power.ndim == 0 else power
-        power = checked_tensor(
-            power, (len(places),), "powers of transmitters [dBm]", "give one for all, or one each"
-        )
-        object.__setattr__(self, "positions", places)
-        object.__setattr__(self, "power_dbm", power)
+        do = "give one for all, or one each"
+        power = checked_tensor(power, (len(places),), "powers of transmitters [dBm]", do)
+        set_fields(self, positions=places, power_dbm=power)
 
     @property
     def powers(self) -> Float64[Tensor, " tx"]:
@@ -63,8 +59,7 @@ class Transmitters:
         terminals = self.mount
         if terminals.rotations.ndim == 3:
             terminals = replace(terminals, rotations=terminals.rotations[rows])
-        power = torch.as_tensor(self.power_dbm)[rows]
-        return Transmitters(self.positions[rows], terminals, power)
+        return Transmitters(self.positions[rows], terminals, torch.as_tensor(self.power_dbm)[rows])
 
 
 class TransmitterPosition(nn.Module):
@@ -135,11 +130,7 @@ class TransmitterPosition(nn.Module):
 
     def coordinates(self) -> list[Coordinate]:
         """x, y and z of the transmitter, as far as they are free."""
-        return [
-            Coordinate(f"transmitter.{axis}", "m", {"raw_position": along}, _POSITION_ERROR)
-            for axis, along, free in zip("xyz", torch.eye(3).double(), self._axes, strict=True)
-            if free
-        ]
+        return position_coordinates("transmitter", "raw_position", self._axes)
 
     def at_bounds(self) -> list[str]:
         """Names of coordinates on the border of the box."""

@@ -1,7 +1,6 @@
 """Forward models of cameras: silhouettes and depth."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import torch
@@ -11,14 +10,38 @@ from torch import Tensor
 from invertwin.camera import Camera, ImageSampling, depths, silhouettes
 from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
-from invertwin.forward_model import ForwardModel
+from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.limits import Positive
 from invertwin.models.noise import add_white_errors
 from invertwin.scene.scene import Scene
 
 
+class _ImageMap(ForwardModel):
+    """What models of a camera's images share."""
+
+    sampling: ImageSampling
+    scatter: float | None
+
+    holds_fields: ClassVar[bool] = True
+
+    def realisations(self, scene: Scene, sensor: Camera, seed: int) -> Realisations:
+        """The images with other errors each time."""
+        return add_white_errors(self.predict(scene, sensor, seed), self.scatter)
+
+    def for_differences(
+        self, scene: Scene, sensor: Camera, samples: int, scheme: Literal["rays", "area"]
+    ) -> ForwardModel:
+        """More rays in every pixel. See ``ForwardModel.for_differences``."""
+        pixels = len(sensor.positions) * sensor.width * sensor.height
+        return self.with_sampling(samples=max(self.sampling.samples, samples // pixels))
+
+    def ablations(self) -> dict[str, ForwardModel]:
+        """The model with outlines at rest. See ``ForwardModel.ablations``."""
+        return {"boundary": self.with_sampling(boundary=False)} if self.sampling.boundary else {}
+
+
 @dataclass(frozen=True)
-class SilhouetteMap(ForwardModel):
+class SilhouetteMap(_ImageMap):
     """Masks of some objects as a camera sees them: 1 inside, 0 outside, between at their outlines.
 
     Compare them by ``SpectrumLoss(gain="one")``. Masks of several objects are several observations.
@@ -33,8 +56,6 @@ class SilhouetteMap(ForwardModel):
     objects: tuple[str, ...]
     sampling: ImageSampling = field(default_factory=ImageSampling)
     scatter: float | None = None
-
-    holds_fields: ClassVar[bool] = True
 
     def predict(
         self, scene: Scene, sensor: Camera, seed: int
@@ -56,25 +77,9 @@ class SilhouetteMap(ForwardModel):
             )
         return found
 
-    def realisations(
-        self, scene: Scene, sensor: Camera, seed: int
-    ) -> Callable[[int, float], Tensor]:
-        """The masks with other errors each time."""
-        return add_white_errors(self.predict(scene, sensor, seed), self.scatter)
-
-    def for_differences(
-        self, scene: Scene, sensor: Camera, samples: int, scheme: Literal["rays", "area"]
-    ) -> "SilhouetteMap":
-        """More rays in every pixel. See ``ForwardModel.for_differences``."""
-        return replace(self, sampling=_refine_sampling(self.sampling, sensor, samples))
-
-    def ablations(self) -> dict[str, ForwardModel]:
-        """The model with outlines at rest. See ``ForwardModel.ablations``."""
-        return {"boundary": self.with_sampling(boundary=False)} if self.sampling.boundary else {}
-
 
 @dataclass(frozen=True)
-class DepthMap(ForwardModel):
+class DepthMap(_ImageMap):
     """Depth images of a camera: the mean over each pixel of z in camera axes [m].
 
     Compare them by ``SpectrumLoss(gain="one")``.
@@ -89,8 +94,6 @@ class DepthMap(ForwardModel):
     far: Positive
     sampling: ImageSampling = field(default_factory=ImageSampling)
     scatter: float | None = None
-
-    holds_fields: ClassVar[bool] = True
 
     def predict(
         self, scene: Scene, sensor: Camera, seed: int
@@ -107,29 +110,8 @@ class DepthMap(ForwardModel):
         given = torch.as_tensor(recording, dtype=torch.float64)
         return _check_images(given.clamp_max(self.far), "depths [m]")
 
-    def realisations(
-        self, scene: Scene, sensor: Camera, seed: int
-    ) -> Callable[[int, float], Tensor]:
-        """The depths with other errors each time."""
-        return add_white_errors(self.predict(scene, sensor, seed), self.scatter)
-
-    def for_differences(
-        self, scene: Scene, sensor: Camera, samples: int, scheme: Literal["rays", "area"]
-    ) -> "DepthMap":
-        """More rays in every pixel. See ``ForwardModel.for_differences``."""
-        return replace(self, sampling=_refine_sampling(self.sampling, sensor, samples))
-
-    def ablations(self) -> dict[str, ForwardModel]:
-        """The model with outlines at rest. See ``ForwardModel.ablations``."""
-        return {"boundary": self.with_sampling(boundary=False)} if self.sampling.boundary else {}
-
 
 def _check_images(recording: ArrayLike, what: str) -> Tensor:
     given = torch.as_tensor(recording, dtype=torch.float64)
     given = given[None] if given.ndim == 2 else given
     return checked_tensor(given, (None, None, None), what, "give [frame, row, column]")
-
-
-def _refine_sampling(sampling: ImageSampling, camera: Camera, samples: int) -> ImageSampling:
-    pixels = len(camera.positions) * camera.width * camera.height
-    return replace(sampling, samples=max(sampling.samples, samples // pixels))

@@ -1,7 +1,6 @@
 """Forward model of chirp trains: power over range, Doppler and direction."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -10,14 +9,9 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.channel import (
-    Grid,
-    Paths,
-    Sampling,
-    trace_power,
-)
+from invertwin.channel import Grid, Paths, Sampling, trace_power
 from invertwin.errors import InputError
-from invertwin.forward_model import ForwardModel
+from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.radar.processing.doppler import range_doppler_angle, velocity_axis
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
@@ -74,8 +68,7 @@ class RangeDopplerMap(ForwardModel):
             sampling: How paths are sampled.
         """
         bins = oversample * chirps.count
-        rates = velocity_axis(radar, chirps, bins)
-        return cls(grid, chirps, rates, bins, sampling or cls.sampling)
+        return cls(grid, chirps, velocity_axis(radar, chirps, bins), bins, sampling or cls.sampling)
 
     def __post_init__(self) -> None:
         if self.sampling.depth != 1 or self.sampling.boundary:
@@ -100,8 +93,7 @@ class RangeDopplerMap(ForwardModel):
             )
         paths = trace_power(scene, sensor.link(), sampling=self.sampling, seed=seed)
         assert paths.velocity is not None
-        moves = (paths.velocity.detach() != 0).any(1)
-        return self.predict_paths(paths.select(moves), sensor)
+        return self.predict_paths(paths.select((paths.velocity.detach() != 0).any(1)), sensor)
 
     def predict_paths(
         self, paths: Paths, radar: Radar
@@ -124,13 +116,10 @@ class RangeDopplerMap(ForwardModel):
         beat, radar = recording.beat, recording.radar()
         moving = (beat - beat.mean(1, keepdim=True)).to(torch.complex128)
         power = range_doppler_angle(moving, radar, self.grid, self.chirps, bins=self.bins)
-        every = velocity_axis(radar, self.chirps, self.bins)
-        rows = (every - self.rates[:, None]).abs().argmin(1)
+        rows = (velocity_axis(radar, self.chirps, self.bins) - self.rates[:, None]).abs().argmin(1)
         return power[:, rows]
 
-    def realisations(
-        self, scene: Scene, sensor: Radar, seed: int
-    ) -> Callable[[int, float], Tensor]:
+    def realisations(self, scene: Scene, sensor: Radar, seed: int) -> Realisations:
         """Recordings of the moving scene with other speckle and noise each time.
 
         A few hundred points of each surface are enough for developed speckle.

@@ -1,6 +1,5 @@
 """Forward models of a few flat conductors: coherent beam tracing."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -9,19 +8,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
-from invertwin.channel import (
-    Grid,
-    Sampling,
-    trace_facet_paths,
-)
-from invertwin.forward_model import ForwardModel
+from invertwin.channel import Grid, Sampling, trace_facet_paths
+from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.models.noise import noisy_realisations
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import beat_signal, range_profile
-from invertwin.radar.surrogate.surrogate import (
-    Surrogate,
-)
+from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene.scene import Scene
 
@@ -62,9 +55,7 @@ class FacetMap(ForwardModel):
         """The measured power spectrum of a capture."""
         return recording.spectrum(self.grid).to(torch.float32)
 
-    def realisations(
-        self, scene: Scene, sensor: Radar, seed: int
-    ) -> Callable[[int, float], Tensor] | None:
+    def realisations(self, scene: Scene, sensor: Radar, seed: int) -> Realisations | None:
         """The map with other noise each time; None for waveforms without samples."""
         if not isinstance(sensor.waveform, SampledWaveform):
             return None

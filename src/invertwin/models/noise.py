@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from invertwin.forward_model import Realisations
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.seeds import derive_seed
@@ -17,7 +18,7 @@ def noisy_realisations(
     seed: int,
     *,
     holds_fields: bool = False,
-) -> Callable[[int, float], Tensor]:
+) -> Realisations:
     """Return realisations of a map with receiver noise.
 
     Args:
@@ -38,14 +39,13 @@ def noisy_realisations(
     share = float((whole.square() if holds_fields else whole).mean())
 
     def realise(number: int, noise: float) -> Tensor:
-        return to_map(
-            simulate_beat(number) + (noise / share) ** 0.5 * white_noise(derive_seed(number, 1))
-        )
+        noisy = (noise / share) ** 0.5 * white_noise(derive_seed(number, 1))
+        return to_map(simulate_beat(number) + noisy)
 
     return realise
 
 
-def add_white_errors(mean: Tensor, scatter: float | None) -> Callable[[int, float], Tensor]:
+def add_white_errors(mean: Tensor, scatter: float | None) -> Realisations:
     """Return realisations of a map with white errors.
 
     Args:

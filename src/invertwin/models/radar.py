@@ -1,7 +1,7 @@
 """Forward models of radar spectra: the smooth surrogate and the exact signal."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -20,9 +20,10 @@ from invertwin.channel import (
     trace_field,
     trace_target,
 )
+from invertwin.checks import set_fields
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
-from invertwin.forward_model import ForwardModel
+from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.models.noise import noisy_realisations
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
@@ -74,13 +75,12 @@ class SurrogateMap(ForwardModel):
             raise InputError(
                 'expected a surrogate for a SurrogateMap, got "exact"; use ExactMap(grid)'
             )
-        object.__setattr__(self, "surrogate", chosen)
         if isinstance(self.coherent, str):
             raise InputError(
                 f"expected a list of names of coherent targets, got {self.coherent!r}; give "
                 f"coherent=[{self.coherent!r}]"
             )
-        object.__setattr__(self, "coherent", tuple(self.coherent))
+        set_fields(self, surrogate=chosen, coherent=tuple(self.coherent))
         if not 1 <= self.stretch < math.inf or (self.stretch > 1 and not self.coherent):
             raise InputError(
                 f"expected a stretch >= 1 of coherent targets, got {self.stretch} and "
@@ -156,9 +156,7 @@ class SurrogateMap(ForwardModel):
         sampling = replace(self.sampling, samples=samples, boundary_samples=0)
         return replace(self, sampling=sampling, _reference=(scene, sensor, scheme))
 
-    def realisations(
-        self, scene: Scene, sensor: Radar, seed: int
-    ) -> Callable[[int, float], Tensor] | None:
+    def realisations(self, scene: Scene, sensor: Radar, seed: int) -> Realisations | None:
         """Spectra of one scene with other speckle, and another phase of every coherent target.
 
         None for clouds and for smooth conductors that are no targets.
@@ -179,10 +177,9 @@ class SurrogateMap(ForwardModel):
             generator = torch.Generator().manual_seed(derive_seed(number, 2))
             turns = 2 * math.pi * torch.rand(len(targets), generator=generator)
             total = looks.beat(derive_seed(number, 0))
-            for turn, target in zip(
-                torch.polar(torch.ones_like(turns), turns), targets, strict=True
-            ):
-                total = total + turn * target.to(total)
+            phasors = torch.polar(torch.ones_like(turns), turns)
+            for phasor, target in zip(phasors, targets, strict=True):
+                total = total + phasor * target.to(total)
             return total
 
         return noisy_realisations(

@@ -1,7 +1,7 @@
 """Forward models of links: received power, frequency responses, power of panels."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -9,13 +9,14 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, checked_number, checked_tensor
+from invertwin.checks import ArrayLike, check_choice, checked_number, checked_tensor, set_fields
 from invertwin.errors import InputError
-from invertwin.forward_model import ForwardModel
+from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.links.metasurface.coverage import Coverage
 from invertwin.links.metasurface.panel import Metasurface, panel_response
 from invertwin.links.places import ReceiverLocations
 from invertwin.links.received import LinkStatistics, PropagationSettings
+from invertwin.links.responses import checked_frequencies
 from invertwin.links.transmitters import Transmitters
 from invertwin.models.noise import add_white_errors
 from invertwin.scene.scene import Scene
@@ -141,11 +142,7 @@ class RadioMap(ForwardModel):
     holds_fields: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if self.quantity not in QUANTITIES:
-            raise InputError(
-                f"expected a quantity among {', '.join(QUANTITIES)}, got {self.quantity!r}; "
-                "choose one"
-            )
+        check_choice(self.quantity, QUANTITIES, "a quantity among")
         checked_number(self.floor_db, "floor [dB]", -math.inf)
         checked_number(self.noise_dbm, "noise [dBm]", -math.inf)
         if self.scatter is not None:
@@ -200,15 +197,11 @@ class RadioMap(ForwardModel):
         what = f"measured {self.quantity.replace('_', ' ')}"
         return checked_tensor(given, (None, *shape), what, "give a map for each transmitter")
 
-    def realisations(
-        self, scene: Scene, sensor: Transmitters, seed: int
-    ) -> Callable[[int, float], Tensor]:
+    def realisations(self, scene: Scene, sensor: Transmitters, seed: int) -> Realisations:
         """The map with other errors of measurement each time."""
         return self.realisations_about(self.predict(scene, sensor, seed))
 
-    def realisations_about(
-        self, mean: Float64[Tensor, "tx *map"]
-    ) -> Callable[[int, float], Tensor]:
+    def realisations_about(self, mean: Float64[Tensor, "tx *map"]) -> Realisations:
         """A map with other errors of measurement each time, see ``ForwardModel.looks``.
 
         Args:
@@ -289,14 +282,7 @@ class ResponseMap(ForwardModel):
     def __post_init__(self) -> None:
         do = "give a row of x, y, z for each"
         places = checked_tensor(self.positions, (None, 3), "positions of receivers [m]", do)
-        swept = checked_tensor(
-            torch.atleast_1d(torch.as_tensor(self.frequencies, dtype=torch.float64)),
-            (None,),
-            "frequencies [Hz]",
-            "give one or several",
-        )
-        object.__setattr__(self, "positions", places)
-        object.__setattr__(self, "frequencies", swept)
+        set_fields(self, positions=places, frequencies=checked_frequencies(self.frequencies))
 
     def predict(
         self, scene: Scene, sensor: Transmitters, seed: int
@@ -318,8 +304,6 @@ class ResponseMap(ForwardModel):
         do = "give complex numbers [tx, place, frequency]"
         return checked_tensor(torch.view_as_real(given), shape, "measured responses", do)
 
-    def realisations(
-        self, scene: Scene, sensor: Transmitters, seed: int
-    ) -> Callable[[int, float], Tensor]:
+    def realisations(self, scene: Scene, sensor: Transmitters, seed: int) -> Realisations:
         """The responses with other noise each time."""
         return add_white_errors(self.predict(scene, sensor, seed), self.scatter)

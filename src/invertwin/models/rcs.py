@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike
+from invertwin.checks import ArrayLike, set_fields
 from invertwin.deprecation import warn_renamed
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
@@ -57,11 +57,9 @@ class RcsMap(ForwardModel):
     def __post_init__(self) -> None:
         if callable(self.directions):
             warn_renamed("RcsMap(partial(rcs, ...))", "RcsMap(directions=..., frequencies=...)", 5)
-            object.__setattr__(self, "compute", self.directions)
             if isinstance(self.frequencies, bool):  # RcsMap(signature, boundary)
-                object.__setattr__(self, "boundary", self.frequencies)
-            object.__setattr__(self, "directions", ())
-            object.__setattr__(self, "frequencies", ())
+                set_fields(self, boundary=self.frequencies)
+            set_fields(self, compute=self.directions, directions=(), frequencies=())
         if self.compute is None and not all(map(_has_values, (self.directions, self.frequencies))):
             raise InputError(
                 "expected directions and frequencies for an RcsMap, got none; give "

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from invertwin.errors import InputError
 from invertwin.links import MapPlane, Transmitters
-from invertwin.plotting.figures import legible, numbers
+from invertwin.plotting.figures import add_colorbar, label_axes, numbers, row_of_axes, signed_colors
 from invertwin.plotting.triangles import sharp_edges
 from invertwin.scene import Scene
 
@@ -63,26 +63,21 @@ def coverage(
     grid = _project_to_plane(plane, _corners(plane))
     width, height = np.ptp(grid[..., 0]), np.ptp(grid[..., 1])
     tall = min(max(3.4 * height / width, 1.6), 5.0)
-    figure = Figure(figsize=(1.4 + 3.4 * count, tall + 0.9), layout="constrained")
-    cells = figure.subplots(1, count, squeeze=False, sharey=True)[0]
+    figure, cells = row_of_axes(count, (1.4 + 3.4 * count, tall + 0.9), sharey=True)
     lines = [] if scene is None else _project_edges(scene, plane)
     marks = None if transmitters is None else _project_to_plane(plane, transmitters.positions)
     split = len(levels)
     top = max((float(v.detach().amax()) for v in levels.values()), default=0.0)
-    known = [numbers(v) for v in rates.values()]
-    limit = max((float(np.quantile(np.abs(v), _SHARE)) for v in known), default=1.0) or 1.0
     for part, maps, style, name in (
         (cells[:split], levels, {"vmin": top - dynamic_range, "vmax": top}, label),
-        (cells[split:], rates, {"vmin": -limit, "vmax": limit, "cmap": "RdBu_r"}, derivative_label),
+        (cells[split:], rates, signed_colors(rates.values(), _SHARE), derivative_label),
     ):
         image = None
         for axes, (title, values) in zip(part, maps.items(), strict=True):
             image = axes.pcolormesh(grid[..., 0], grid[..., 1], numbers(values), **style)
             _format_axes(axes, title, plane, lines, marks)
         if image is not None:
-            bar = figure.colorbar(image, ax=[*part], shrink=0.85)
-            bar.set_label(name, fontsize=8)
-            bar.ax.tick_params(labelsize=7)
+            add_colorbar(figure, image, part, name)
     cells[0].set_ylabel(_names(plane)[1], fontsize=8)
     return figure
 
@@ -130,6 +125,4 @@ def _format_axes(axes: Any, title: str, plane: MapPlane, lines: Any, marks: Any)
     if marks is not None:
         axes.plot(marks[:, 0], marks[:, 1], "^", color="#c0143c", markeredgecolor="white")
     axes.set_aspect("equal")
-    axes.set_title(legible(title), fontsize=9)
-    axes.set_xlabel(_names(plane)[0], fontsize=8)
-    axes.tick_params(labelsize=7)
+    label_axes(axes, title, _names(plane)[0])

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from invertwin.deprecation import rename_arguments
-from invertwin.plotting.figures import color, legible
+from invertwin.plotting.figures import color, legible, row_of_axes
 
 Curve = tuple[NDArray, NDArray]
 """Places and values."""
@@ -32,8 +32,8 @@ def convergence(
     """
     if not isinstance(losses, Mapping):
         losses = {"loss": [losses]}
-    figure = Figure(figsize=(7 if errors is None else 10, 3.3), layout="constrained")
-    left, *others = figure.subplots(1, 1 if errors is None else 2, squeeze=False)[0]
+    count, width = (1, 7) if errors is None else (2, 10)
+    figure, (left, *others) = row_of_axes(count, (width, 3.3))
     for i, (name, fits) in enumerate(losses.items()):
         for k, values in enumerate(fits):
             label = "_" if k else legible(f"{name} ({len(fits)})")
@@ -75,20 +75,16 @@ def landscape(exact: Curve, surrogates: Mapping[str, Curve], displacements: str)
         surrogates: Offsets [m] and losses of the surrogate, by name.
         displacements: What is moved and in which direction, such as ``letter along z``.
     """
-    figure = Figure(figsize=(10, 3.4), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = row_of_axes(2, (10, 3.4))
     left.plot(exact[0] * 1e3, exact[1], color=color(0), linewidth=0.8)
     left.set_title(f"exact signal: {count_minima(exact[1])} local minima", fontsize=9)
-    left.set_xlabel(
-        legible(f"offset of {displacements} from the truth, in millimetres [mm]"), fontsize=9
-    )
+    offset = legible(f"offset of {displacements} from the truth, in")
+    left.set_xlabel(f"{offset} millimetres [mm]", fontsize=9)
     for i, (name, (offsets, losses)) in enumerate(surrogates.items()):
         label = legible(f"{name} ({count_minima(losses)})")
         right.plot(offsets, losses, color=color(i + 1), label=label)
     right.set_title("surrogate, and its number of local minima", fontsize=9)
-    right.set_xlabel(
-        legible(f"offset of {displacements} from the truth, in metres [m]"), fontsize=9
-    )
+    right.set_xlabel(f"{offset} metres [m]", fontsize=9)
     right.legend(fontsize=8)
     for axes in (left, right):
         axes.axvline(0, color="black", linewidth=0.6, linestyle=":")

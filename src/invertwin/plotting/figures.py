@@ -1,8 +1,10 @@
 """Common parts of figures: colours, numbers of tensors, PNG bytes."""
 
 import io
+from collections.abc import Iterable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -20,6 +22,57 @@ def color(index: int) -> str:
 def numbers(values: Tensor | NDArray) -> NDArray[Any]:
     """An array without gradients, on the CPU."""
     return torch.as_tensor(values).detach().cpu().numpy()
+
+
+def row_of_axes(count: int, size: tuple[float, float], **options: Any) -> tuple[Figure, list[Any]]:
+    """A figure with axes side by side.
+
+    Args:
+        count: Number of axes.
+        size: Width and height [inch].
+        **options: As for ``Figure.subplots``.
+    """
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, list(figure.subplots(1, count, squeeze=False, **options)[0])
+
+
+def label_axes(axes: Any, title: str, across: str = "") -> None:
+    """Write the title and the name of the horizontal axis, small.
+
+    Args:
+        axes: Where.
+        title: A user's words.
+        across: Name of the horizontal axis.
+    """
+    axes.set_title(legible(title), fontsize=9)
+    axes.set_xlabel(across, fontsize=8)
+    axes.tick_params(labelsize=7)
+
+
+def add_colorbar(figure: Figure, image: Any, cells: Sequence[Any], label: str) -> None:
+    """Draw the scale of an image beside the axes that share it.
+
+    Args:
+        figure: Of these axes.
+        image: Of one of them.
+        cells: The axes.
+        label: Name and unit of the values.
+    """
+    bar = figure.colorbar(image, ax=[*cells], shrink=0.85)
+    bar.set_label(label, fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+
+
+def signed_colors(values: Iterable[Tensor], share: float) -> dict[str, Any]:
+    """Colours from blue over white, which is zero, to red, the same for some maps.
+
+    Args:
+        values: The maps.
+        share: Of the values of each that the colours reach; the largest stick out.
+    """
+    reached = (float(np.quantile(np.abs(numbers(v)), share)) for v in values)
+    limit = max(reached, default=1.0) or 1.0
+    return {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
 
 
 def png_bytes(figure: Figure) -> bytes:

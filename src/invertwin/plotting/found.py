@@ -8,7 +8,7 @@ from matplotlib.patches import Ellipse
 
 from invertwin.discovery.outcome import Twin
 from invertwin.discovery.search import outline_corners
-from invertwin.plotting.figures import color, numbers
+from invertwin.plotting.figures import color, numbers, row_of_axes
 
 
 def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
@@ -18,8 +18,7 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
         twin: With a picture.
         dynamic_range: Level of the brightest colour above the darkest [dB].
     """
-    figure = Figure(figsize=(7.5, 6.2), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = row_of_axes(1, (7.5, 6.2))
     names = [f"{'xyz'[axis]} [m]" for axis in twin.ground.plane_axes]
     axes.set(xlabel=names[0], ylabel=names[1], aspect="equal", facecolor="black")
     if twin.image is not None and len(twin.image.positions):
@@ -35,15 +34,15 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
         figure.colorbar(dots, label="echoes, dB below bright ones", shrink=0.8)
     for thing in twin.objects:
         x, y = (float(thing.position[axis]) for axis in twin.ground.plane_axes)
-        at = (x, y)
+        at = x, y
         tint = color(0) if thing.existence_probability > 0.5 else "0.5"
         if thing.shape is not None:
             corners = numbers(outline_corners(thing.shape, twin.ground))
             axes.plot(*np.concatenate([corners, corners[:1]]).T, color=tint, linewidth=1.5)
         spread = [thing.deviations.get("xyz"[axis]) for axis in twin.ground.plane_axes]
         if None not in spread:
-            sizes = [4 * float(value or 0.0) for value in spread]
-            axes.add_patch(Ellipse(at, sizes[0], sizes[1], fill=False, color=tint))
+            width, height = (4 * float(value or 0.0) for value in spread)
+            axes.add_patch(Ellipse(at, width, height, fill=False, color=tint))
         if thing.track is not None:
             path = numbers(thing.track.positions)[:, list(twin.ground.plane_axes)]
             axes.plot(*path.T, color=tint, linewidth=1.0, marker=".", markersize=3)

@@ -2,14 +2,13 @@
 
 from collections.abc import Mapping
 
-import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
-from invertwin.plotting.figures import legible, numbers
+from invertwin.plotting.figures import add_colorbar, label_axes, numbers, row_of_axes, signed_colors
 
 _SHARE = 0.995  # of the pixels have derivatives within the colours
 
@@ -36,18 +35,12 @@ def images(
         raise InputError("expected at least one image, got none; give images or derivatives")
     rows, columns = every[0].shape
     size = (1.6 + 3.0 * len(every), min(max(3.0 * rows / columns, 1.4), 5.0) + 0.9)
-    figure = Figure(figsize=size, layout="constrained")
-    cells = figure.subplots(1, len(every), squeeze=False)[0]
-    limit = max((float(np.quantile(abs(numbers(v)), _SHARE)) for v in rates.values()), default=1.0)
-    signed = {"cmap": "RdBu_r", "vmin": -(limit or 1.0), "vmax": limit or 1.0}
-    styles = [{"cmap": "gray"}] * len(panels) + [signed] * len(rates)
-    names = [*panels, *rates]
-    for axes, name, values, style in zip(cells, names, every, styles, strict=True):
+    figure, cells = row_of_axes(len(every), size)
+    styles = [{"cmap": "gray"}] * len(panels)
+    styles += [signed_colors(rates.values(), _SHARE)] * len(rates)
+    for axes, name, values, style in zip(cells, [*panels, *rates], every, styles, strict=True):
         image = axes.imshow(numbers(values), **style)
-        axes.set_title(legible(name), fontsize=9)
-        axes.tick_params(labelsize=7)
+        label_axes(axes, name)
         if values is every[-1] and rates:
-            bar = figure.colorbar(image, ax=[*cells[len(panels) :]], shrink=0.85)
-            bar.set_label(derivative_label, fontsize=8)
-            bar.ax.tick_params(labelsize=7)
+            add_colorbar(figure, image, cells[len(panels) :], derivative_label)
     return figure

@@ -16,7 +16,7 @@ from invertwin.channel import Grid
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.inversion.confidence.realisations import coarsen_map
-from invertwin.plotting.figures import legible, numbers
+from invertwin.plotting.figures import add_colorbar, label_axes, numbers, row_of_axes
 from invertwin.radar import DopplerMaps
 
 U_LABEL, V_LABEL = "direction cosine u (to the right)", "direction cosine v (up)"
@@ -82,8 +82,7 @@ def panels(maps: Mapping[str, MapPanel], *, dynamic_range: float = 40.0) -> Figu
         maps: The maps, by title.
         dynamic_range: Level of the brightest colour above the darkest [dB].
     """
-    figure = Figure(figsize=(3.9 * len(maps), 3.6), layout="constrained")
-    cells = figure.subplots(1, len(maps), squeeze=False)[0]
+    figure, cells = row_of_axes(len(maps), (3.9 * len(maps), 3.6))
     drawn = [(cell, *item) for cell, item in zip(cells, maps.items(), strict=True)]
     _draw_decibels(figure, drawn, True, dynamic_range)
     cells[0].set_ylabel("range [m]", fontsize=8)
@@ -152,8 +151,7 @@ def gradient(
     shared = {title: first(values) for title, values in _title_maps(derivatives).items()}
     others = {title: first(values) for title, values in (own_scale or {}).items()}
     count = len(shared) + len(others) + (power is not None)
-    figure = Figure(figsize=(1.2 + 2.9 * count, 3.3), layout="constrained")
-    cells = list(figure.subplots(1, count, squeeze=False, sharey=True)[0])
+    figure, cells = row_of_axes(count, (1.2 + 2.9 * count, 3.3), sharey=True)
     cells[0].set_ylabel("range [m]", fontsize=8)
     if power is not None:
         _draw_decibels(figure, [(cells.pop(0), "power", first(power))], True, 30.0)
@@ -162,10 +160,10 @@ def gradient(
         _draw_signed(cell, title, panel, limit)
         for cell, (title, panel) in zip(cells, shared.items(), strict=False)
     ]
-    _colorbar(figure, images[-1], cells[: len(shared)], label)
+    add_colorbar(figure, images[-1], cells[: len(shared)], label)
     for cell, (title, panel) in zip(cells[len(shared) :], others.items(), strict=True):
         image = _draw_signed(cell, title, panel, _limit(panel))
-        _colorbar(figure, image, [cell], "own scale, same unit")
+        add_colorbar(figure, image, [cell], "own scale, same unit")
     return figure
 
 
@@ -183,8 +181,7 @@ def residuals(residual: Float[Tensor, "range u v"], grid: Grid, *, marked: float
     ranges, u, v = (coarsen_map(axis[None]) for axis in (grid.ranges, grid.u, grid.v))
     views = [(u, U_LABEL, 2), (v, V_LABEL, 1)]
     views = [view for view in views if len(view[0]) > 1] or [(u, U_LABEL, 2)]
-    figure = Figure(figsize=(1.2 + 3.9 * len(views), 3.6), layout="constrained")
-    cells = figure.subplots(1, len(views), squeeze=False, sharey=True)[0]
+    figure, cells = row_of_axes(len(views), (1.2 + 3.9 * len(views), 3.6), sharey=True)
     image = None
     for cell, (across, label, dim) in zip(cells, views, strict=True):
         largest = residual.abs().argmax(dim, keepdim=True)
@@ -196,7 +193,7 @@ def residuals(residual: Float[Tensor, "range u v"], grid: Grid, *, marked: float
             corner = float(across[column]) - wide, float(ranges[row]) - half
             cell.add_patch(Rectangle(corner, 2 * wide, 2 * half, fill=False, linewidth=0.8))
     cells[0].set_ylabel("range [m]", fontsize=8)
-    _colorbar(figure, image, list(cells), "data − twin [standard deviations]")
+    add_colorbar(figure, image, cells, "data − twin [standard deviations]")
     return figure
 
 
@@ -236,7 +233,7 @@ def _draw_decibels(
         image = _draw_image(cell, title, panel, level, vmin=top - dynamic_range, vmax=top)
     assert image is not None
     label = "power [dB below peak]" if relative else "received over transmitted power [dB]"
-    _colorbar(figure, image, [cell for cell, *_ in panels], label)
+    add_colorbar(figure, image, [cell for cell, *_ in panels], label)
 
 
 def _draw_signed(cell: Any, title: str, panel: MapPanel, limit: float) -> Any:
@@ -258,16 +255,8 @@ def _draw_image(cell: Any, title: str, panel: MapPanel, values: NDArray, **style
         extent=(*_bin_edges(panel.across), *_bin_edges(panel.ranges)),
         **style,
     )
-    cell.set_title(legible(title), fontsize=9)
-    cell.set_xlabel(panel.label, fontsize=8)
-    cell.tick_params(labelsize=7)
+    label_axes(cell, title, panel.label)
     return image
-
-
-def _colorbar(figure: Figure, image: Any, cells: list[Any], label: str) -> None:
-    bar = figure.colorbar(image, ax=cells, shrink=0.85)
-    bar.set_label(label, fontsize=8)
-    bar.ax.tick_params(labelsize=7)
 
 
 def _bin_edges(positions: Tensor) -> tuple[float, float]:

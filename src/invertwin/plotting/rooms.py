@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from invertwin.deprecation import rename_arguments
-from invertwin.plotting.figures import PALETTE, legible, numbers
+from invertwin.plotting.figures import PALETTE, legible, numbers, row_of_axes
 from invertwin.scene import Scene
 
 _MARKS = (("*", "#c0143c"), ("+", PALETTE[1]), (".", PALETTE[2]))
@@ -34,8 +34,7 @@ def floor_plan(
         height: z of the map [m].
         tx, panel: Where they stand [m].
     """
-    figure = Figure(figsize=(1.0 + 4.6 * len(levels), 3.9), layout="constrained")
-    cells = figure.subplots(1, len(levels), squeeze=False, sharey=True)[0]
+    figure, cells = row_of_axes(len(levels), (1.0 + 4.6 * len(levels), 3.9), sharey=True)
     low, high = (numbers(corner) for corner in corners)
     top = max(float(value.max()) for value in levels.values())
     image: Any = None
@@ -49,16 +48,14 @@ def floor_plan(
             cmap="viridis",
             aspect="equal",
         )
-        axes.add_collection(
-            LineCollection(_cut_triangles(scene, height), colors="black", linewidths=1.5)
-        )
+        _draw_walls(axes, scene, height, 1.5)
         axes.plot(*numbers(tx)[:2], "^", color="white", markeredgecolor="black", label="sender")
         if title != next(iter(levels)):
             axes.plot(*numbers(panel)[:2], "s", color=PALETTE[1], label="panel")
         axes.set(title=legible(title), xlabel="x [m]")
         axes.legend(fontsize=8, loc="upper left")
     cells[0].set_ylabel("y [m]")
-    figure.colorbar(image, ax=list(cells), label="path gain [dB]")
+    figure.colorbar(image, ax=cells, label="path gain [dB]")
     return figure
 
 
@@ -75,8 +72,7 @@ def placements(
         levels: The best of a grid at each [dB].
         search_ends: Place [m] and level [dB] of every search.
     """
-    figure = Figure(figsize=(8, 3.3), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = row_of_axes(1, (8, 3.3))
     label = "best of the grid at this place"
     axes.plot(numbers(positions), numbers(levels), color=PALETTE[0], label=label)
     axes.plot(
@@ -103,11 +99,8 @@ def transmitter_fits(
         positions: Further places by title, such as the receivers, the truth and what was found [m].
         fits: Start and end of each [m].
     """
-    figure = Figure(figsize=(6.4, 4.6), layout="constrained")
-    axes = figure.subplots()
-    axes.add_collection(
-        LineCollection(_cut_triangles(scene, height), colors="black", linewidths=1.2)
-    )
+    figure, (axes,) = row_of_axes(1, (6.4, 4.6))
+    _draw_walls(axes, scene, height, 1.2)
     ways = numbers(fits)[..., :2]
     axes.add_collection(LineCollection([*ways], colors="0.75", linewidths=0.8))
     axes.plot(*ways[:, 0].T, "o", color="0.6", markersize=4, label="starts")
@@ -119,13 +112,12 @@ def transmitter_fits(
     return figure
 
 
-def _cut_triangles(scene: Scene, height: float) -> list[list[list[float]]]:
-    """Segments in which a level plane cuts the triangles of a scene, x and y of both ends."""
+def _draw_walls(axes: Any, scene: Scene, height: float, width: float) -> None:
+    """Draw the segments in which a level plane cuts the triangles of a scene."""
     found: list[list[list[float]]] = []
     for item in scene.objects.values():
         corners = item.vertices.detach()[item.mesh.faces]
-        above = corners[..., 2] - height
-        for triangle, rise in zip(corners, above, strict=True):
+        for triangle, rise in zip(corners, corners[..., 2] - height, strict=True):
             points = []
             for a, b in ((0, 1), (1, 2), (2, 0)):
                 if (rise[a] > 0) != (rise[b] > 0):
@@ -133,4 +125,4 @@ def _cut_triangles(scene: Scene, height: float) -> list[list[list[float]]]:
                     points.append(torch.lerp(triangle[a], triangle[b], share)[:2].tolist())
             if len(points) == 2:
                 found.append(points)
-    return found
+    axes.add_collection(LineCollection(found, colors="black", linewidths=width))

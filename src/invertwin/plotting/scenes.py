@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from invertwin.plotting.figures import color, legible, numbers
+from invertwin.plotting.figures import color, label_axes, legible, numbers
 from invertwin.plotting.triangles import Shape, paint, sharp_edges
 from invertwin.radar import Radar
 from invertwin.scene import Scene
@@ -70,7 +70,7 @@ def scene(
     for axes, (k, title) in zip(grid.flat, (c for row in cells for c in row), strict=True):
         colors = _colors(drawn[title], highlight)
         _draw(axes, drawn[title], colors, edges, marks[k], views[k], windows[k])
-        axes.set_title(legible(f"{title}, {views[k].title}"), fontsize=9)
+        label_axes(axes, f"{title}, {views[k].title}", f"{'xyz'[views[k].plane[0]]} [m]")
     names = {name: c for shapes in drawn.values() for name, c in _colors(shapes, highlight).items()}
     _legend(figure, names, bool(edges), places)
     return figure
@@ -173,9 +173,7 @@ def _draw(
         ends = window[c] + window[c + 2] / 2 * np.array([-1, 1])
         set_limits(*ends[:: view.signs[c]])
     axes.set_aspect("equal")
-    axes.set_xlabel(f"{'xyz'[plane[0]]} [m]", fontsize=8)
     axes.set_ylabel(f"{'xyz'[plane[1]]} [m]", fontsize=8)
-    axes.tick_params(labelsize=7)
 
 
 def _draw_marks(positions: NDArray) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from invertwin.plotting.figures import color, legible, numbers
+from invertwin.plotting.figures import color, legible, numbers, row_of_axes
 
 _SPAN = 60.0  # dB below the largest value that figures show
 
@@ -44,8 +44,7 @@ def rcs_derivatives(curves: Mapping[str, Tensor], across: Tensor, label: str, un
         label: of the axis across, with its unit.
         unit: of the derivatives.
     """
-    figure = Figure(figsize=(8, 3.6), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = row_of_axes(1, (8, 3.6))
     _lines(axes, curves, across, dashed=[*curves][-1])
     axes.set(xlabel=label, ylabel=unit)
     return figure
@@ -78,8 +77,7 @@ def rcs_profile(levels: Tensor, ranges: Tensor, across: Tensor, label: str) -> F
         across: angle of each aspect [°].
         label: of the axis across.
     """
-    figure = Figure(figsize=(8, 3.6), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = row_of_axes(1, (8, 3.6))
     values, place = numbers(levels), numbers(ranges)
     top = float(values.max())
     if values.shape[1] == 1:
@@ -104,8 +102,7 @@ def rcs_image(levels: Tensor, extent: float, labels: tuple[str, str]) -> Figure:
         extent: half its side [m].
         labels: of both axes.
     """
-    figure = Figure(figsize=(5.4, 4.6), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = row_of_axes(1, (5.4, 4.6))
     values = numbers(levels)
     top = float(values.max())
     drawn = axes.imshow(

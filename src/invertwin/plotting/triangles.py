@@ -11,9 +11,8 @@ from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 MAX_TRIANGLES = 40_000  # of one object
-_ILLUMINATION_DIRECTION = np.array(
-    [0.35, 0.6, 0.72]
-)  # towards the lamp: right, up, towards the eye
+# Towards the lamp: right, up, towards the eye.
+_ILLUMINATION_DIRECTION = np.array([0.35, 0.6, 0.72])
 
 Shape = tuple[NDArray, NDArray]
 """Vertices [v, 3] and faces [f, 3]."""

@@ -116,8 +116,7 @@ def aperture(radar: Radar) -> Aperture:
         InputError: The array is not planar in the radar's x-y plane, so that u and v do not
             determine its response.
     """
-    places = radar.virtual_positions.cpu()
-    key = tuple(tuple(place) for place in places.tolist())
+    key = tuple(tuple(place) for place in radar.virtual_positions.cpu().tolist())
     return _aperture(key, radar.waveform.wavelength, radar.array_window)
 
 
@@ -134,16 +133,8 @@ def _aperture(key: tuple[tuple[float, ...], ...], wavelength: float, window: str
     y, row = _distinct_positions(places[:, 1], wavelength)
     counts = torch.zeros(len(x), len(y), dtype=torch.float64)
     counts.index_put_((column, row), torch.ones(len(places), dtype=torch.float64), accumulate=True)
-    return Aperture(
-        x,
-        y,
-        column,
-        row,
-        _position_taper(window, x),
-        _position_taper(window, y),
-        counts,
-        wavelength,
-    )
+    tapers = _position_taper(window, x), _position_taper(window, y)
+    return Aperture(x, y, column, row, *tapers, counts, wavelength)
 
 
 # Depth of an array along boresight, in wavelengths, that (u, v) steering may neglect.
@@ -162,8 +153,5 @@ def _distinct_positions(
 
 
 def _position_taper(window: str, positions: Float64[Tensor, " place"]) -> Float64[Tensor, " place"]:
-    extent = positions[-1] - positions[0]
-    position = (
-        (positions - positions[0]) / extent if len(positions) > 1 else torch.zeros_like(positions)
-    )
-    return taper(window, position, len(positions))
+    extent = positions[-1] - positions[0] if len(positions) > 1 else 1.0
+    return taper(window, (positions - positions[0]) / extent, len(positions))

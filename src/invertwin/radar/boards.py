@@ -14,7 +14,7 @@ import torch
 from annotated_types import Len, MinLen
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, check_fields, checked_tensor
+from invertwin.checks import ArrayLike, check_choice, check_fields, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import AllowedValues, Frequency, Positive
@@ -124,9 +124,8 @@ class Board:
             grid = (grid - grid.mean(dim=0)) * torch.tensor(signs, dtype=torch.float64) * unit
             positions = torch.cat([grid, torch.zeros_like(grid[:, :1])], dim=1)
             own = self.polarisation if polarisation is None else polarisation
-            return AntennaArray(
-                positions[self._indices(grid_positions, numbers, name)], pattern, own, leakage
-            )
+            chosen = positions[self._indices(grid_positions, numbers, name)]
+            return AntennaArray(chosen, pattern, own, leakage)
 
         return array(self.transmitters, transmitters, "TX"), array(self.receivers, receivers, "RX")
 
@@ -294,10 +293,6 @@ def board(
     Raises:
         InputError: an unknown name.
     """
-    if name not in BOARDS:
-        raise InputError(
-            f"expected a board of {', '.join(BOARDS)}, got {name!r}; "
-            "describe another one as a Board with its own table"
-        )
+    check_choice(name, BOARDS, "a board of", "describe another one as a Board with its own table")
     found = BOARDS[name]
     return found if design_frequency is None else replace(found, design_frequency=design_frequency)

@@ -84,8 +84,7 @@ class RadarTrajectory(nn.Module):
         """Return displacements of the knots after the first one [m] by name, for progress and
         reports.
         """
-        walk = (self.drift * self.latent.detach()).cumsum(0)
-        return {"radar.displacements": walk}
+        return {"radar.displacements": (self.drift * self.latent.detach()).cumsum(0)}
 
     def coordinates(self) -> list[Coordinate]:
         """Return every step of the walk along the free axes."""

@@ -13,7 +13,14 @@ from jaxtyping import Complex, Complex128, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Paths
-from invertwin.checks import ArrayLike, check_fields, check_shape, checked_tensor, is_differentiated
+from invertwin.checks import (
+    ArrayLike,
+    check_fields,
+    check_shape,
+    checked_tensor,
+    is_differentiated,
+    set_fields,
+)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import MAX_COUNT, AllowedValues
@@ -77,26 +84,19 @@ class Radar:
         positions = checked_tensor(self.positions, (None, 3), "radar positions", do)
         if len(positions) == 0:
             raise InputError(f"expected at least one radar pose, got none; {do}")
-        object.__setattr__(self, "positions", positions)
+        set_fields(self, positions=positions)
         if self.rotations is not None:
-            rotations = _checked_rotations(self.rotations, len(positions))
-            object.__setattr__(self, "rotations", rotations)
+            set_fields(self, rotations=_checked_rotations(self.rotations, len(positions)))
         if self.range_origin is not None:
-            origin = _checked_origin(self.range_origin, len(positions))
-            object.__setattr__(self, "range_origin", origin)
+            set_fields(self, range_origin=_checked_origin(self.range_origin, len(positions)))
         check_fields(self)
         if not self._shared_visibility and self.shape[1] > 1:
             raise InputError(
                 f"expected one transmitter when TX and RX see separately, got {self.shape[1]}; "
                 "set shared_visibility=True or use one transmitter"
             )
-        require_at_most(
-            self.shape[1] * self.shape[2],
-            _MAX_CHANNELS,
-            "pairs of a transmitter and a receiver",
-            "use fewer elements",
-            "receivers",
-        )
+        what, pairs = "pairs of a transmitter and a receiver", self.shape[1] * self.shape[2]
+        require_at_most(pairs, _MAX_CHANNELS, what, "use fewer elements", "receivers")
         self._warn_about_spacing()
 
     @property
@@ -241,11 +241,10 @@ class Radar:
         if not len(chosen):
             return replace(self, positions=self.positions[chosen])  # raises the error
         # Copy without validation, since a fit calls this in every step.
-        radar = copy(self)
-        object.__setattr__(radar, "positions", self.positions[chosen])
-        object.__setattr__(radar, "rotations", self._rotations[chosen])
-        if self.range_origin is not None:
-            object.__setattr__(radar, "range_origin", self.range_origin[chosen])
+        radar, origin = copy(self), self.range_origin
+        set_fields(radar, positions=self.positions[chosen], rotations=self._rotations[chosen])
+        if origin is not None:
+            set_fields(radar, range_origin=origin[chosen])
         return radar
 
     def grid(
@@ -308,15 +307,11 @@ class Radar:
             if size < 1.001 * half:
                 continue
             spacing = self.waveform.wavelength / (2 * oversample * size)
-            require_at_most(
-                limit / spacing, MAX_COUNT / 2 - 1, f"bins of {name}", do, f"{name}_max"
-            )
+            most = MAX_COUNT / 2 - 1
+            require_at_most(limit / spacing, most, f"bins of {name}", do, f"{name}_max")
             side = min(math.ceil(limit / spacing - 1e-9), math.floor(1 / spacing + 1e-9))
-            axes |= {
-                f"{name}_start": -side * spacing,
-                f"{name}_step": spacing,
-                f"{name}_count": 2 * side + 1,
-            }
+            axes |= {f"{name}_start": -side * spacing, f"{name}_step": spacing}
+            axes |= {f"{name}_count": 2 * side + 1}
         return Grid(first * step, step, last - first + 1, **axes)
 
     @property
@@ -380,8 +375,7 @@ def checked_beat(
 
 
 def _checked_origin(value: object, frames: int) -> Tensor:
-    do = "give one range in metres per frame"
-    origin = checked_tensor(value, (frames,), "range_origin", do)
+    origin = checked_tensor(value, (frames,), "range_origin", "give one range in metres per frame")
     if is_differentiated(origin):
         raise InputError(
             "expected range_origin without derivatives, got one that carries them; it is what the "

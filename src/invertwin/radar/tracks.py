@@ -34,8 +34,7 @@ def arc(
         count: number of positions.
     """
     angle = _linspace(start, stop, count)
-    around = torch.stack([angle.sin(), 0 * angle, -angle.cos()], dim=1)
-    return _point(center) + radius * around
+    return _point(center) + radius * torch.stack([angle.sin(), 0 * angle, -angle.cos()], dim=1)
 
 
 def grid(
@@ -53,8 +52,7 @@ def grid(
         (_linspace(-0.5, 0.5, n) if n > 1 else torch.zeros(1, dtype=torch.float64)) * length
         for n, length in zip(count, size, strict=True)
     )
-    across = torch.cartesian_prod(x, y)
-    return _point(center) + torch.nn.functional.pad(across, (0, 1))
+    return _point(center) + torch.nn.functional.pad(torch.cartesian_prod(x, y), (0, 1))
 
 
 def _point(value: Point) -> Tensor:

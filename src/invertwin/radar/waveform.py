@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Complex, Float, Float64
 from torch import Tensor
 
-from invertwin.checks import check_fields
+from invertwin.checks import check_choice, check_fields
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
@@ -332,10 +332,7 @@ def taper(name: str, position: Float[Tensor, " element"], count: int) -> Float[T
     Raises:
         InputError: An unknown window.
     """
-    if name not in WINDOWS:
-        raise InputError(
-            f"expected a window of {', '.join(WINDOWS)}, got {name!r}; choose one of them"
-        )
+    check_choice(name, WINDOWS, "a window of", "choose one of them")
     if name == "rectangular" or count < 2:
         return torch.ones_like(position)
     if name == "hamming":

@@ -15,7 +15,7 @@ from annotated_types import MinLen
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor, set_fields
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Count, NonNegative, Positive
 from invertwin.runtime.memory import require_at_most
@@ -82,9 +82,8 @@ class Cosine(Pattern):
 
     def table(self) -> Float64[Tensor, "2049 1"]:
         """Return the gain over cosθ."""
-        return self._gain_of_cosine(torch.linspace(-1, 1, COSINE_COUNT, dtype=torch.float64))[
-            :, None
-        ]
+        cosine = torch.linspace(-1, 1, COSINE_COUNT, dtype=torch.float64)
+        return self._gain_of_cosine(cosine)[:, None]
 
     def _gain_of_cosine(self, cosine: Tensor) -> Tensor:
         front = cosine > 0
@@ -132,9 +131,8 @@ class TabulatedPattern(Pattern):
                 f"expected linear power gains >= 0, got {float(gains.min()):g}; "
                 "convert decibels with 10**(dB/10)"
             )
-        for name, value in (("theta", theta), ("phi", phi), ("gains", gains)):
-            object.__setattr__(self, name, value)
-        object.__setattr__(self, "_grid", _resample_gains(theta, phi, gains))
+        grid = _resample_gains(theta, phi, gains)
+        set_fields(self, theta=theta, phi=phi, gains=gains, _grid=grid)
 
     @classmethod
     def from_decibels(
@@ -175,8 +173,7 @@ class TabulatedPattern(Pattern):
         count = grid.shape[1]
         # atan2 has no gradient on the axis; φ is arbitrary there.
         on_axis = (x == 0) & (y == 0)
-        azimuth = torch.atan2(y, torch.where(on_axis, 1.0, x))
-        turn = (azimuth + torch.pi) / (2 * torch.pi) * count
+        turn = (torch.atan2(y, torch.where(on_axis, 1.0, x)) + torch.pi) / (2 * torch.pi) * count
         cell = turn.detach().to(torch.int64)
         across = turn - cell
         column, neighbour = cell % count, (cell + 1) % count
@@ -228,9 +225,8 @@ class AntennaArray:
                 f"expected a Pattern, got {type(self.pattern).__name__}; "
                 "give Isotropic(), Cosine(exponent) or Table(theta, phi, gains)"
             )
-        object.__setattr__(self, "positions", positions)
         jones = Polarisation.from_jones(self.polarisation, self.leakage, len(positions))
-        object.__setattr__(self, "jones", jones)
+        set_fields(self, positions=positions, jones=jones)
 
 
 def linear_array(
@@ -279,8 +275,7 @@ def planar_array(
     Raises:
         InputError: no elements, or a spacing that is not positive.
     """
-    elements = count[0] * count[1]
-    require_at_most(elements, _MAX_ELEMENTS, "antenna elements", "lower count", "count")
+    require_at_most(count[0] * count[1], _MAX_ELEMENTS, "antenna elements", "lower count", "count")
     x = _centre_positions(count[0], spacing[0], "elements along x")
     y = _centre_positions(count[1], spacing[1], "elements along y")
     plane = torch.cartesian_prod(x, y)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.checks import checked_number, checked_tensor
+from invertwin.checks import checked_number, checked_tensor, set_fields
 from invertwin.errors import InputError
 from invertwin.scene.shape_models.lattice import Lattice
 
@@ -38,9 +38,8 @@ class Cloud:
     albedo: float | Float64[Tensor, ""] = 1.0
 
     def __post_init__(self) -> None:
-        density = checked_tensor(
-            self.density, (None, None, None), "densities [1/m]", "give one for each node"
-        )
+        do = "give one for each node"
+        density = checked_tensor(self.density, (None, None, None), "densities [1/m]", do)
         lattice = Lattice.from_bounds(self.low, self.high, density.shape)
         least = float(density.detach().min())
         if least < 0:
@@ -49,8 +48,7 @@ class Cloud:
                 "the density is an extinction [1/m]"
             )
         checked_number(self.albedo, "albedo", 0.0)
-        for name, value in (("low", lattice.low), ("high", lattice.high), ("density", density)):
-            object.__setattr__(self, name, value)
+        set_fields(self, low=lattice.low, high=lattice.high, density=density)
 
     @property
     def spacing(self) -> Float64[Tensor, "3"]:

@@ -39,10 +39,8 @@ from invertwin.scene.pose import (
 from invertwin.scene.scene import Object, Scene
 
 ORIGIN = (0.0, 0.0, 0.0)
-_POSITION_SCALE, _ROTATION_SCALE = (
-    0.1,
-    0.2,
-)  # m and rad: relevant errors of a position and a rotation
+# Relevant errors of a position [m] and of a rotation [rad].
+_POSITION_SCALE, _ROTATION_SCALE = 0.1, 0.2
 _T = TypeVar("_T")
 
 
@@ -138,7 +136,7 @@ class Translation(ObjectModule):
 
     def coordinates(self) -> list[Coordinate]:
         """Return the free coordinates among x, y and z."""
-        return _translation_coordinates(self.object, self._axes)
+        return position_coordinates(self.object, "translation", self._axes)
 
 
 class RigidMotion(nn.Module):
@@ -199,7 +197,7 @@ class RigidMotion(nn.Module):
         Args:
             name: name of the moving object.
         """
-        found = _translation_coordinates(name, self._axes)
+        found = position_coordinates(name, "translation", self._axes)
         free = self._rotation_axes[1:]
         w, r = self.rotation.detach()[0], self.rotation.detach()[1:]
         for turn, axis in zip(("pitch", "yaw", "roll"), torch.eye(3, dtype=r.dtype), strict=True):
@@ -284,8 +282,7 @@ class Scale(ObjectModule):
 
     def coordinates(self) -> list[Coordinate]:
         """Return the scale factor."""
-        tangents = {"log_scale": 1 / self.scale.detach()}
-        return [Coordinate(f"{self.object}.scale", "", tangents, 0.2)]
+        return [Coordinate(f"{self.object}.scale", "", {"log_scale": 1 / self.scale.detach()}, 0.2)]
 
 
 class Vertices(ObjectModule):
@@ -385,9 +382,8 @@ class MaterialValues(nn.Module):
         """
         try:
             holder = select_layer(item.material, layer, type(item.material).__name__)
-            return cls(
-                object, layer=layer, **{name: _initial_value(holder, name) for name in values}
-            )
+            start = {name: _initial_value(holder, name) for name in values}
+            return cls(object, layer=layer, **start)
         except InputError as error:
             raise InputError(str(error), f"values, material of {object}") from None
 
@@ -436,8 +432,7 @@ class MaterialValues(nn.Module):
 
     def _bounded_values(self) -> dict[str, Tensor | Texture]:
         values = {name: _to_bounded(name, raw) for name, raw in self.raw.items()}
-        textures = {n: replace(t, image=values[n]) for n, t in self._textures.items()}
-        return {**values, **textures}
+        return {**values, **{n: replace(t, image=values[n]) for n, t in self._textures.items()}}
 
 
 class Compose(nn.Module):
@@ -508,12 +503,17 @@ def _to_unbounded(name: str, value: Tensor) -> Tensor:
     return above.log() if math.isinf(span.high) else torch.logit(above / (span.high - span.low))
 
 
-def _translation_coordinates(name: str, mask: Tensor) -> list[Coordinate]:
-    """Return the coordinates of a translation along the free axes."""
-    axes = zip("xyz", torch.diag(mask), mask, strict=True)
+def position_coordinates(name: str, parameter: str, mask: Tensor) -> list[Coordinate]:
+    """The free coordinates of a position [m].
+
+    Args:
+        name: Of what is there.
+        parameter: Name of the parameter [3] that moves it.
+        mask: 1 for each free axis.
+    """
     return [
-        Coordinate(f"{name}.{axis}", "m", {"translation": along}, _POSITION_SCALE)
-        for axis, along, free in axes
+        Coordinate(f"{name}.{axis}", "m", {parameter: along}, _POSITION_SCALE)
+        for axis, along, free in zip("xyz", torch.diag(mask), mask, strict=True)
         if free
     ]
 

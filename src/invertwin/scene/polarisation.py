@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, checked_tensor
+from invertwin.checks import ArrayLike, checked_tensor, set_fields
 from invertwin.errors import InputError
 
 JONES: Mapping[str, tuple[complex, complex]] = MappingProxyType(
@@ -27,9 +27,7 @@ _LEVELS = "a polarisation as V, H, circular or two complex numbers (V, H)"
 _DETACHED = "polarisations cannot be fitted: detach them"
 
 
-def jones_basis(
-    polarisation: str | ArrayLike,
-) -> Complex128[Tensor, "2 2"]:
+def jones_basis(polarisation: str | ArrayLike) -> Complex128[Tensor, "2 2"]:
     """Return a polarisation and the orthogonal one, of unit length, as columns over (V, H).
 
     Args:
@@ -103,8 +101,7 @@ class JonesTable:
         if not bool((length > 0).all()):
             raise InputError(f"expected Jones vectors of some length, got zeros; {do}")
         found = torch.view_as_complex(parts) / length[..., None]
-        for name, value in (("theta", theta), ("phi", phi), ("vectors", found)):
-            object.__setattr__(self, name, value)
+        set_fields(self, theta=theta, phi=phi, vectors=found)
 
     def vector(self, direction: Float64[Tensor, "row 3"]) -> Complex128[Tensor, "row 2"]:
         """Return unit Jones vectors towards unit vectors in the radar frame.
@@ -150,9 +147,7 @@ class Polarisation:
 
     @staticmethod
     def from_jones(
-        polarisation: str | ArrayLike | JonesTable,
-        leakage: complex | ArrayLike,
-        elements: int,
+        polarisation: str | ArrayLike | JonesTable, leakage: complex | ArrayLike, elements: int
     ) -> "Polarisation":
         """Build the polarisation of an array.
 

@@ -61,9 +61,8 @@ def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
 def rotation_angle(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
     """Return the angle of a rotation matrix in [0, π] rad, accurate at both ends."""
     skew = rotation - rotation.transpose(-1, -2)
-    sine = torch.linalg.vector_norm(
-        torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1), dim=-1
-    )
+    axis = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
+    sine = torch.linalg.vector_norm(axis, dim=-1)
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
     return torch.atan2(sine, trace - 1)
 

@@ -21,10 +21,8 @@ from invertwin.scene.mesh import Mesh
 
 _MAX_TRIANGLES = 1e6  # limit of the loops over single triangles
 _REMESHING_ROUNDS = 5  # rounds of split, collapse, flip, relax; the lengths converge within these
-_SPLIT_FACTOR, _COLLAPSE_FACTOR = (
-    4 / 3,
-    4 / 5,
-)  # split and collapse limits relative to the target length
+# Split and collapse limits relative to the target length.
+_SPLIT_FACTOR, _COLLAPSE_FACTOR = 4 / 3, 4 / 5
 _MIN_FLIP_COSINE = 0.5  # minimum cosine between two triangles of a flipped edge: creases stay
 
 

@@ -57,14 +57,9 @@ def room(
     Raises:
         InputError: A room that is too small for its furniture, or other furniture.
     """
-    w, d, h = (
-        checked_number(value, f"{name} of the room [m]", least)
-        for value, name, least in (
-            (width, "width", 4),
-            (depth, "depth", 4),
-            (height, "height", 2.1),
-        )
-    )
+    w = checked_number(width, "width of the room [m]", 4)
+    d = checked_number(depth, "depth of the room [m]", 4)
+    h = checked_number(height, "height of the room [m]", 2.1)
     unknown = [name for name in furniture if name not in _FURNITURE]
     if isinstance(furniture, str) or unknown:
         raise InputError(

@@ -73,11 +73,8 @@ class Object:
     @property
     def vertices(self) -> Float64[Tensor, "v 3"]:
         """Vertex positions in the world [m], with the gradients of the mesh and the pose."""
-        return (
-            self.mesh.vertices
-            if self.pose is None
-            else _transform_points(self.mesh.vertices, self.pose)
-        )
+        points = self.mesh.vertices
+        return points if self.pose is None else _transform_points(points, self.pose)
 
     @property
     def center(self) -> Float64[Tensor, "3"]:

@@ -64,9 +64,8 @@ def box(size: Positive | Sequence[Positive], divisions: Count = 1) -> Mesh:
         for level, turn in ((0, -1), (n, 1)):
             # Cyclic axes keep the orientation: +axis on the far side, reversed on the near one.
             side = np.empty((len(points), 3), dtype=np.int64)
-            side[:, [(axis + 1) % 3, (axis + 2) % 3, axis]] = np.column_stack(
-                [points, np.full(len(points), level)]
-            )
+            columns = [(axis + 1) % 3, (axis + 2) % 3, axis]
+            side[:, columns] = np.column_stack([points, np.full(len(points), level)])
             triangles.append(faces[:, ::turn] + len(corners) * len(points))
             corners.append(side)
     # Integer corners are exactly equal at shared edges, so merging leaves no seam.
@@ -127,8 +126,7 @@ def dihedral(edge: Positive, opening: Angle = math.pi / 2) -> Mesh:
     length = _length(edge, "dihedral edge [m]")
     half = checked_number(opening, "opening [rad]", 0.0, math.pi, open_low=True) / 2
     tips = [(s * length * math.sin(half), -length * math.cos(half)) for s in (-1, 1)]
-    places = (tips[0], (0.0, 0.0), tips[1])
-    vertices = [(x, y * length / 2, z) for x, z in places for y in (-1, 1)]
+    vertices = [(x, y * length / 2, z) for x, z in (tips[0], (0.0, 0.0), tips[1]) for y in (-1, 1)]
     return _mesh(np.array(vertices), np.array([(0, 1, 3), (0, 3, 2), (2, 3, 5), (2, 5, 4)]))
 
 
@@ -207,12 +205,10 @@ def _lattice(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Return integer points (i, j) of an n × n grid and its triangles, counter-clockwise."""
     points = np.stack(np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij"), -1)
     index = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
-    a, b, c, d = (
-        x.ravel() for x in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])
-    )
-    return points.reshape(-1, 2), np.concatenate(
-        [np.column_stack([a, b, c]), np.column_stack([a, c, d])]
-    )
+    corners = (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])
+    a, b, c, d = (corner.ravel() for corner in corners)
+    halves = [np.column_stack([a, b, c]), np.column_stack([a, c, d])]
+    return points.reshape(-1, 2), np.concatenate(halves)
 
 
 def _triangulate_outline(
@@ -254,12 +250,9 @@ def _triangulate_outline(
     _require_triangles(pieces, "max_edge", "give sizes in metres, or larger edges")
     fine = shapely.segmentize(outline, longest)
     # The triangulation takes one polygon at a time, and returns rings of four points.
-    triangles = np.concatenate(
-        [
-            shapely.get_coordinates(shapely.constrained_delaunay_triangles(part)).reshape(-1, 4, 2)
-            for part in shapely.get_parts(fine)
-        ]
-    )[:, :3]
+    parts = map(shapely.constrained_delaunay_triangles, shapely.get_parts(fine))
+    rings = [shapely.get_coordinates(part).reshape(-1, 4, 2) for part in parts]
+    triangles = np.concatenate(rings)[:, :3]
     side, other = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     clockwise = side[:, 0] * other[:, 1] < side[:, 1] * other[:, 0]
     triangles[clockwise] = triangles[clockwise, ::-1]
@@ -294,9 +287,8 @@ def _split(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
     """Split triangles at given midpoints of their edges 01, 12, 20 (−1: not split)."""
     count = (middle >= 0).sum(axis=1)
     # Permute each triangle so that one split edge comes first, or the one whole edge last.
-    first = np.where(
-        count == 1, np.argmax(middle >= 0, axis=1), (np.argmin(middle, axis=1) + 1) % 3
-    )
+    after = (np.argmin(middle, axis=1) + 1) % 3
+    first = np.where(count == 1, np.argmax(middle >= 0, axis=1), after)
     order = (first[:, None] + np.arange(3)) % 3
     faces = np.take_along_axis(faces, order, axis=1)
     middle = np.take_along_axis(middle, order, axis=1)
@@ -308,10 +300,9 @@ def _split(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
         2: [(ab, b, bc), (a, ab, bc), (a, bc, c)],
         3: [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)],
     }
-    return np.concatenate(
-        [
-            np.column_stack([corner[count == n] for corner in triangle])
-            for n, triangles in patterns.items()
-            for triangle in triangles
-        ]
-    )
+    parts = [
+        np.column_stack([corner[count == n] for corner in triangle])
+        for n, triangles in patterns.items()
+        for triangle in triangles
+    ]
+    return np.concatenate(parts)

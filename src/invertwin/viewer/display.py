@@ -107,15 +107,11 @@ class DisplayMaps:
         frames, ranges, across, _ = next(iter(spectra.values())).shape
         count = max(1, min(frames, max_values // (len(spectra) * ranges * across)))
         chosen = np.unique(np.linspace(0, frames - 1, count).astype(int)).tolist()
-        return cls(
-            chosen,
-            grid.ranges.tolist(),
-            grid.u.tolist(),
-            {
-                name: np.asarray(power.detach()[chosen].amax(3).cpu(), np.float32)
-                for name, power in spectra.items()
-            },
-        )
+        kept = {
+            name: np.asarray(power.detach()[chosen].amax(3).cpu(), np.float32)
+            for name, power in spectra.items()
+        }
+        return cls(chosen, grid.ranges.tolist(), grid.u.tolist(), kept)
 
     def maps_of_frame(self, frame: int) -> dict[str, NDArray[np.float32]]:
         """The maps of a frame; none, where they were not kept.
@@ -192,13 +188,9 @@ class Display:
             if isinstance(value, np.ndarray):
                 arrays[id(value)] = value
                 return {"array": f"a{list(arrays).index(id(value))}"}
-            if isinstance(value, Mapping):
-                return {name: to_json(item) for name, item in value.items()}
-            if isinstance(value, list | tuple):
-                return [to_json(item) for item in value]
-            return to_json(vars(value)) if hasattr(value, "__dataclass_fields__") else value
+            return dict(value) if isinstance(value, Mapping) else vars(value)
 
-        header = np.array(json.dumps(to_json(self) | {"format": _FORMAT_VERSION}))
+        header = np.array(json.dumps(vars(self) | {"format": _FORMAT_VERSION}, default=to_json))
         named = {f"a{number}": array for number, array in enumerate(arrays.values())}
         # A run that is killed meanwhile goes on from the file before.
         with replace_file(path) as part:
@@ -217,30 +209,19 @@ class Display:
         with convert_read_errors(path, "what a fit leaves to be viewed", _RERUN_ADVICE):
             arrays = read_arrays(path, _RERUN_ADVICE)
 
-            def restore_arrays(value: Any) -> Any:
-                if isinstance(value, dict):
-                    if set(value) == {"array"}:
-                        return arrays[value["array"]]
-                    return {name: restore_arrays(item) for name, item in value.items()}
-                return (
-                    [restore_arrays(item) for item in value] if isinstance(value, list) else value
-                )
+            def restore_array(value: dict[str, Any]) -> Any:
+                return arrays[value["array"]] if set(value) == {"array"} else value
 
-            read = restore_arrays(json.loads(str(arrays["header"])))
+            read = json.loads(str(arrays["header"]), object_hook=restore_array)
             if read.pop("format") != _FORMAT_VERSION:
                 raise ValueError("of another version")
             maps = {name: DisplayMaps(**own) for name, own in read.pop("maps").items()}
-            steps = [
-                DisplayStep(
-                    **step
-                    | {"bodies": {n: DisplayMesh(**body) for n, body in step["bodies"].items()}}
-                )
-                for step in read.pop("steps")
-            ]
-            layers = [
-                DisplayLayer(**layer | {"color": tuple(layer["color"])})
-                for layer in read.pop("layers")
-            ]
+            steps, layers = [], []
+            for step in read.pop("steps"):
+                bodies = {name: DisplayMesh(**body) for name, body in step.pop("bodies").items()}
+                steps.append(DisplayStep(**step, bodies=bodies))
+            for layer in read.pop("layers"):
+                layers.append(DisplayLayer(**layer | {"color": tuple(layer["color"])}))
             read |= {key: tuple(read[key]) for key in ("up", "ahead")}
             for body in (*layers, *(body for step in steps for body in step.bodies.values())):
                 _check_triangles(body)

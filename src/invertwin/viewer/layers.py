@@ -20,12 +20,8 @@ _GREY, _RADAR = (185, 190, 199), (110, 120, 140)
 _COLORS = {"truth": (192, 20, 60), "start": (224, 128, 60)}
 _TWIN = (76, 120, 168)
 # Layers of the present position: their names, their colours, and how large their points are.
-SAMPLED_PATHS, VISIBLE_POINTS, BOUNDARY_POINTS, BIN_POINTS = (
-    "sampled paths",
-    "what is seen",
-    "boundary paths",
-    "chosen bin",
-)
+SAMPLED_PATHS, VISIBLE_POINTS = "sampled paths", "what is seen"
+BOUNDARY_POINTS, BIN_POINTS = "boundary paths", "chosen bin"
 POSITION_LAYERS: dict[str, tuple[tuple[int, int, int], float]] = {
     SAMPLED_PATHS: ((120, 170, 220), 1.0),
     VISIBLE_POINTS: ((30, 140, 90), 0.4),
@@ -69,19 +65,12 @@ def scene_layers(
         fitted: Names of objects that are coloured.
         fitted_only: Leave the others out.
     """
-    layers = []
+    layers, opacity = [], 0.35 if group in _COLORS else 1.0
     for name, item in replace_clouds(scene).objects.items():
-        if fitted_only and name not in fitted:
-            continue
-        body = display_mesh(item)
-        color = _COLORS.get(group, _TWIN if name in fitted else _GREY)
-        opacity = 0.35 if group in _COLORS else 1.0
-        shown = group != "start"
-        layers.append(
-            DisplayLayer(
-                f"{group}/{name}", "surface", body.vertices, body.faces, color, opacity, shown
-            )
-        )
+        if name in fitted or not fitted_only:
+            body, of = display_mesh(item), f"{group}/{name}"
+            look = _COLORS.get(group, _TWIN if name in fitted else _GREY), opacity, group != "start"
+            layers.append(DisplayLayer(of, "surface", body.vertices, body.faces, *look))
     return layers
 
 
@@ -98,9 +87,8 @@ def radar_layers(
     """
     places, axes = radar.positions.detach(), radar.link().rotations.detach()
     chosen = np.unique(np.linspace(0, len(places) - 1, _MAX_BEAMS).astype(int))
-    half = [_largest_cosine(grid and grid.u, 0.5), _largest_cosine(grid and grid.v, 0.5)]
-    u = torch.tensor([-1.0, 1.0, 1.0, -1.0]).double() * half[0]
-    v = torch.tensor([-1.0, -1.0, 1.0, 1.0]).double() * half[1]
+    u = torch.tensor([-1.0, 1.0, 1.0, -1.0]).double() * _largest_cosine(grid and grid.u)
+    v = torch.tensor([-1.0, -1.0, 1.0, 1.0]).double() * _largest_cosine(grid and grid.v)
     w = (1 - u.square() - v.square()).clamp_min(0.0).sqrt()
     corners = torch.stack([u, v, w], dim=1) * length
     lines = []
@@ -116,10 +104,10 @@ def radar_layers(
     ]
 
 
-def _largest_cosine(cosines: torch.Tensor | None, default: float) -> float:
+def _largest_cosine(cosines: torch.Tensor | None) -> float:
     """The largest direction cosine that is covered, short of the side."""
     if cosines is None or len(cosines) < 2:
-        return default
+        return 0.5
     return min(float(cosines.abs().max()), math.sqrt(0.45))
 
 
@@ -135,8 +123,7 @@ def capture_layers(capture: Capture) -> list[DisplayLayer]:
         layers.append(DisplayLayer("surveyed targets", "points", points, color=_COLORS["truth"]))
     if capture.track is not None:
         places = to_float32(capture.track.positions)
-        pairs = np.stack([places[:-1], places[1:]], axis=1).reshape(-1, 3)
-        layers.append(DisplayLayer("track", "lines", pairs, color=_RADAR))
+        layers.append(DisplayLayer("track", "lines", _join_points(places), color=_RADAR))
     return layers
 
 
@@ -153,21 +140,20 @@ def ellipsoid_layers(scene: Scene, metrics: Mapping[str, Any]) -> list[DisplayLa
     names, layers = list(deviations), []
     correlations = torch.as_tensor(metrics.get("correlations", [])).double().numpy()
     for name in scene.names:
-        own = [(axis, f"{name}.{c}") for axis, c in enumerate("xyz") if f"{name}.{c}" in names]
+        own = {k: f"{name}.{c}" for k, c in enumerate("xyz") if f"{name}.{c}" in deviations}
         if not own:
             continue
+        axes, rows = [*own], [names.index(one) for one in own.values()]
+        scale = np.array([deviations[one] for one in own.values()])
         covariance = np.zeros((3, 3))
-        for i, first in own:
-            for j, second in own:
-                scale = deviations[first] * deviations[second]
-                covariance[i, j] = scale * correlations[names.index(first), names.index(second)]
+        covariance[np.ix_(axes, axes)] = np.outer(scale, scale) * correlations[np.ix_(rows, rows)]
         sizes, axes = np.linalg.eigh(covariance)
         radii = axes * np.sqrt(_CHI_SQUARED_95 * sizes.clip(0))
         turn = np.linspace(0, 2 * math.pi, _CIRCLE_POINTS + 1)
         circle = np.stack([np.cos(turn), np.sin(turn)])
         rings = [(radii[:, [i, j]] @ circle).T for i, j in ((0, 1), (1, 2), (0, 2))]
-        pairs = [np.stack([ring[:-1], ring[1:]], axis=1).reshape(-1, 3) for ring in rings]
-        points = to_float32(np.concatenate(pairs)) + to_float32(scene[name].center)
+        pairs = np.concatenate([_join_points(ring) for ring in rings])
+        points = to_float32(pairs) + to_float32(scene[name].center)
         layers.append(DisplayLayer(f"{ELLIPSOID}/{name}", "lines", points, color=(230, 160, 0)))
     return layers
 
@@ -204,6 +190,11 @@ def build_display(
         axes = radar.link().rotations.detach().mean(0)
         up, ahead = _unit_vector(axes[:, 1], up), _unit_vector(axes[:, 2], ahead)
     return Display(title, layers, up=up, ahead=ahead)
+
+
+def _join_points(points: NDArray[Any]) -> NDArray[Any]:
+    """Both ends of each piece of the line through some points, one after the other."""
+    return np.stack([points[:-1], points[1:]], axis=1).reshape(-1, 3)
 
 
 def _unit_vector(

@@ -65,9 +65,8 @@ class InteractiveSensor:
     def __init__(self, scene: Scene, radar: Radar, grid: Grid, depth: int = 1) -> None:
         self.scene = self._begun = replace_clouds(scene)
         self.radar, self.grid = radar, grid
-        self._model = SurrogateMap(
-            grid, sampling=Sampling(depth=depth, samples=_SAMPLES, boundary=False)
-        )
+        sampling = Sampling(depth=depth, samples=_SAMPLES, boundary=False)
+        self._model = SurrogateMap(grid, sampling=sampling)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -85,10 +84,7 @@ class InteractiveSensor:
         """
         scene = self._begun
         for name, body in meshes.items():
-            mesh = Mesh(
-                torch.tensor(body.vertices, dtype=torch.float64),
-                torch.tensor(body.faces, dtype=torch.int64),
-            )
+            mesh = Mesh(torch.tensor(body.vertices).double(), torch.tensor(body.faces).long())
             scene = scene.replace(name, mesh=mesh, pose=None)
         self.scene = scene
 
@@ -137,18 +133,10 @@ class InteractiveSensor:
         paths = paths.select(~paths.boundary)
         toward = torch.nn.functional.normalize(paths.last - place, dim=1) @ rotation
         origin = float(self.radar.origins[frame])
-        bins = torch.stack(
-            [
-                (paths.range - origin - grid.range_start) / grid.range_step,
-                (toward[:, 0] - grid.u_start) / grid.u_step
-                if grid.u_count > 1
-                else torch.zeros(len(paths), dtype=torch.float64),
-            ],
-            dim=1,
-        )
-        return PositionSample(
-            place, torch.stack([paths.first, paths.last], 1), paths.power, bins, edges
-        )
+        rows = (paths.range - origin - grid.range_start) / grid.range_step
+        columns = (toward[:, 0] - grid.u_start) / grid.u_step * (grid.u_count > 1)
+        points, bins = torch.stack([paths.first, paths.last], 1), torch.stack([rows, columns], 1)
+        return PositionSample(place, points, paths.power, bins, edges)
 
 
 rename_members(PositionSample, feeding="points_in_bin", place="position")

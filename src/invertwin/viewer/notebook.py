@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from matplotlib.figure import Figure
 
@@ -13,6 +14,7 @@ from invertwin import plotting
 from invertwin.capture import Capture, search_ranges
 from invertwin.channel import Grid
 from invertwin.inversion import Reconstruction
+from invertwin.plotting.figures import numbers, row_of_axes
 from invertwin.radar import Radar, SampledWaveform
 from invertwin.scene import Scene
 from invertwin.scene.shape_models.density import replace_clouds
@@ -68,13 +70,13 @@ def scene_html(scene: Scene) -> str:
             name,
             len(item.mesh.faces),
             type(item.material).__name__,
-            " × ".join(f"{x:.3g}" for x in _extent(surfaces[name].vertices)),
+            " × ".join(f"{x:.3g}" for x in np.ptp(numbers(surfaces[name].vertices), axis=0)),
             ", ".join(f"{x:.3g}" for x in item.center.detach().tolist()),
         )
         for name, item in scene.objects.items()
     ]
     heads = ("object", "triangles", "material", "size [m]", "middle [m]")
-    return _figure_and_table(plotting.scene(surfaces), "three views of the scene", heads, rows)
+    return _figure_and_table(plotting.scene(surfaces), "three views of the scene", rows, heads)
 
 
 def radar_html(radar: Radar) -> str:
@@ -84,13 +86,10 @@ def radar_html(radar: Radar) -> str:
         radar: The radar.
     """
     places = 1e3 * radar.virtual_positions.detach()
-    figure = Figure(figsize=(4, 2.5), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = row_of_axes(1, (4, 2.5))
     axes.plot(places[:, 0].numpy(), places[:, 1].numpy(), ".")
     axes.set(xlabel="x [mm]", ylabel="y [mm]", title="virtual array")
-    return _figure_and_table(
-        figure, "places of the virtual elements", ("quantity", "value"), _radar_rows(radar)
-    )
+    return _figure_and_table(figure, "places of the virtual elements", _radar_rows(radar))
 
 
 def capture_html(capture: Capture) -> str:
@@ -104,14 +103,11 @@ def capture_html(capture: Capture) -> str:
         grid = radar.grid(*search_ranges(capture, None, None))
         figure = plotting.spectrum({"first frame": capture.frames([0]).spectrum(grid)}, grid)
     else:
-        figure = Figure(figsize=(5, 2.5), layout="constrained")
-        axes = figure.subplots()
+        figure, (axes,) = row_of_axes(1, (5, 2.5))
         level = 20 * torch.log10(capture.range_profile[0].abs().clamp_min(1e-30))
         axes.plot(capture.ranges.numpy(), level.numpy())
         axes.set(xlabel="range [m]", ylabel="power [dB]", title="first frame")
-    return _figure_and_table(
-        figure, "map of the first frame", ("quantity", "value"), _radar_rows(radar)
-    )
+    return _figure_and_table(figure, "map of the first frame", _radar_rows(radar))
 
 
 def reconstruction_html(found: Reconstruction) -> str:
@@ -137,7 +133,7 @@ def reconstruction_html(found: Reconstruction) -> str:
             rows.append((name, ", ".join(f"{x:.4g}" for x in numbers.tolist())))
     rows += [(f"{name}, within (95 %)", f"± {width:.2g}") for name, width in bars.items()]
     figure = plotting.convergence({"loss": [[step["loss"] for step in found.history]]})
-    return _figure_and_table(figure, "loss over the steps", ("quantity", "value"), rows)
+    return _figure_and_table(figure, "loss over the steps", rows)
 
 
 def _radar_rows(radar: Radar) -> list[tuple[str, Any]]:
@@ -155,12 +151,11 @@ def _radar_rows(radar: Radar) -> list[tuple[str, Any]]:
     return rows
 
 
-def _extent(vertices: torch.Tensor) -> list[float]:
-    return (vertices.amax(0) - vertices.amin(0)).detach().tolist()
-
-
 def _figure_and_table(
-    figure: Figure, alt: str, heads: Sequence[str], rows: Iterable[Sequence[Any]]
+    figure: Figure,
+    alt: str,
+    rows: Iterable[Sequence[Any]],
+    heads: Sequence[str] = ("quantity", "value"),
 ) -> str:
     """A picture above a table; texts of users are escaped."""
     png = base64.b64encode(plotting.png_bytes(figure)).decode()

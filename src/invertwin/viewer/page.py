@@ -86,16 +86,10 @@ def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
         "ahead": display.ahead,
         "box": [low.tolist(), high.tolist()],
         "layers": [
-            {
-                "name": layer.name,
-                "group": layer.group,
-                "kind": layer.kind,
-                "color": layer.color,
-                "opacity": layer.opacity,
-                "shown": layer.shown,
-                "through": layer.group == ELLIPSOID,  # it is inside of its object
-                **_encode_mesh(layer.points, layer.faces),
-            }
+            # An ellipsoid is inside of its object, and seen through it.
+            vars(layer)
+            | {"group": layer.group, "through": layer.group == ELLIPSOID}
+            | _encode_mesh(layer.points, layer.faces)
             for layer in display.layers
         ],
         "steps": [pack_step(step) for step in kept],
@@ -105,10 +99,7 @@ def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
             for name, (color, size) in POSITION_LAYERS.items()
         ],
         "pictures": {"measured": MEASURED, "simulated": SIMULATED, "residual": RESIDUAL},
-        "colors": {
-            "power": _colormap_bytes(POWER_COLORMAP),
-            "apart": _colormap_bytes(RESIDUAL_COLORMAP),
-        },
+        "colors": {"power": _colormap(POWER_COLORMAP), "apart": _colormap(RESIDUAL_COLORMAP)},
         "depth": -MIN_LEVEL_DB,
         "largest": MAX_RESIDUAL_DB,
     }
@@ -134,9 +125,8 @@ def _sensor_data(name: str, maps: SensorMaps) -> dict[str, Any]:
     """Maps of a sensor, each value one byte: 255 is the peak of its map, 0 the darkest."""
 
     def pack_power(power: NDArray[np.float32]) -> str:
-        return _base64(
-            np.rint(255 * (1 - relative_decibels(power) / MIN_LEVEL_DB)).astype(np.uint8)
-        )
+        levels = 255 * (1 - relative_decibels(power) / MIN_LEVEL_DB)
+        return _base64(np.rint(levels).astype(np.uint8))
 
     some = maps.measured if maps.simulated is None else maps.simulated
     assert some is not None
@@ -153,7 +143,7 @@ def _sensor_data(name: str, maps: SensorMaps) -> dict[str, Any]:
     }
 
 
-def _colormap_bytes(name: str) -> str:
+def _colormap(name: str) -> str:
     """A colour map as 256 times red, green and blue."""
     from matplotlib import colormaps
 
@@ -167,10 +157,8 @@ def _base64(array: NDArray[Any]) -> str:
 
 def _encode_mesh(points: NDArray[Any], faces: NDArray[Any] | None) -> dict[str, str]:
     """Numbers in little-endian order, as base64."""
-    found = {"points": points.astype("<f4")} | (
-        {} if faces is None else {"faces": faces.astype("<u4")}
-    )
-    return {name: _base64(array) for name, array in found.items()}
+    found = {"points": _base64(points.astype("<f4"))}
+    return found if faces is None else found | {"faces": _base64(faces.astype("<u4"))}
 
 
 @cache

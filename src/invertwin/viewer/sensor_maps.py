@@ -74,11 +74,8 @@ def _collect_maps(
     known = display.maps.get(name)
     if known is None:
         assert sensor is not None
-        frames, ranges, across = (
-            list(range(sensor.radar.frame_count)),
-            sensor.grid.ranges.tolist(),
-            sensor.grid.u.tolist(),
-        )
+        frames = list(range(sensor.radar.frame_count))
+        ranges, across = sensor.grid.ranges.tolist(), sensor.grid.u.tolist()
     else:
         frames, ranges, across = known.frames, known.ranges, known.across
     chosen = np.unique(np.linspace(0, len(frames) - 1, count).astype(int)).tolist()
@@ -99,12 +96,10 @@ def _collect_maps(
     if sensor is not None:
         radar = sensor.radar.frames(frames)
         places, rotations, origins = radar.positions, radar.link().rotations, radar.origins
-    start, step = zip(
-        *(_block_axis(*x) for x in zip((ranges, across), blocks, strict=True)), strict=True
-    )
+    rows, columns = _block_axis(ranges, blocks[0]), _block_axis(across, blocks[1])
     return SensorMaps(
         frames,
-        (start[0], step[0], start[1], step[1]),
+        (*rows, *columns),
         to_float32(places),
         to_float32(rotations),
         to_float32(origins),
@@ -121,9 +116,8 @@ def _simulate_maps(display: Display, sensor: InteractiveSensor, frames: list[int
         for step in display.steps or [None]:
             if step is not None:
                 sensor.replace_meshes(step.bodies)
-            found.append(
-                torch.stack([sensor.predict_map(sensor.scene, frame).float() for frame in frames])
-            )
+            maps = [sensor.predict_map(sensor.scene, frame).float() for frame in frames]
+            found.append(torch.stack(maps))
     if len(found) < max(1, len(display.steps)):
         return None
     return torch.stack(found)

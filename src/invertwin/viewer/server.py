@@ -81,8 +81,7 @@ class Viewer:
         port: int = 8080,
         token: str | None = None,
     ) -> None:
-        guard = AccessGuard(host, token)
-        self._server = _start_server(guard, host, port)
+        self._server = _start_server(AccessGuard(host, token), host, port)
         query = "" if token is None else f"/?token={token}"
         # A host that means every address of this machine is none that a browser could open.
         reached = socket.gethostname() if host in ("0.0.0.0", "::") else host
@@ -93,9 +92,8 @@ class Viewer:
         self._lock, self._due, self._closed = threading.Lock(), threading.Event(), False
         self._sensors = list(dict.fromkeys([*display.maps, *self._links]))
         self._wish = _ViewerState(step=len(self._steps) - 1, sensor=next(iter(self._sensors), ""))
-        self._found: dict[
-            int, Mapping[str, DisplayMaps]
-        ] = {}  # what sensors see at steps as they come
+        # What sensors see at steps as they come.
+        self._found: dict[int, Mapping[str, DisplayMaps]] = {}
         self._taken: int | None = None  # the step whose bodies the link has
         self._times: deque[float] = deque(maxlen=_RATE_WINDOW)
         self._seen: PositionSample | None = None
@@ -170,19 +168,16 @@ class Viewer:
         gui.configure_theme(show_logo=False, show_share_button=False)
         # Texts of fields are shown as they are; markdown would run what names hold.
         gui.add_text("shown", display.title, disabled=True)
-        count = len(self._steps)
-        self._step = gui.add_slider(
-            "step", 0, max(1, count - 1), 1, max(0, count - 1), visible=count > 1
-        )
+        last, several = len(self._steps) - 1, len(self._steps) > 1
+        self._step = gui.add_slider("step", 0, max(1, last), 1, max(0, last), visible=several)
         self._step.on_update(lambda _: self._update_state(step=int(self._step.value)))
-        self._where = gui.add_text("fit", "", disabled=True, visible=count > 1)
+        self._where = gui.add_text("fit", "", disabled=True, visible=several)
         low, high = display.box
         self._size = float(np.linalg.norm(high - low)) or 1.0
         self._build_sensor_controls()
         with gui.add_folder("layers"):
             for group, shown in self._visible.items():
-                box = gui.add_checkbox(group, shown)
-                box.on_update(self._visibility_handler(group))
+                gui.add_checkbox(group, shown).on_update(self._visibility_handler(group))
         self._said = gui.add_text("note", "", disabled=True, visible=False)
         for layer in display.layers:
             self._draw_layer(layer)
@@ -196,17 +191,15 @@ class Viewer:
         up, ahead = np.array(display.up), np.array(display.ahead)
         # The window's own panel covers its right, where u falls.
         camera.look_at = middle + 0.6 * self._panels.offset - 0.3 * self._size * self._panels.right
-        camera.position = camera.look_at + self._size * (
-            0.15 * up - 1.6 * ahead + 0.25 * self._panels.right
-        )
+        back = 0.15 * up - 1.6 * ahead + 0.25 * self._panels.right
+        camera.position = camera.look_at + self._size * back
         camera.up = up
 
     def _build_sensor_controls(self) -> None:
         gui = self._server.gui
         if not self._sensors:
             return
-        several = len(self._sensors) > 1
-        self._sensor = gui.add_dropdown("sensor", self._sensors, visible=several)
+        self._sensor = gui.add_dropdown("sensor", self._sensors, visible=len(self._sensors) > 1)
         self._sensor.on_update(lambda _: self._select_sensor(str(self._sensor.value)))
         self._frame = gui.add_slider("position", 0, 1, 1, 0)
         self._frame.on_update(lambda _: self._update_state(frame=int(self._frame.value)))
@@ -250,8 +243,7 @@ class Viewer:
         """Let the person move an object, from where the step has it."""
         self._release_object()
         if name != _NO_OBJECT:
-            link = self._links[self._wish.sensor]
-            center = tuple(link.scene[name].center.detach().tolist())
+            center = tuple(self._links[self._wish.sensor].scene[name].center.detach().tolist())
             self._gizmo.position, self._gizmo.wxyz = center, (1.0, 0.0, 0.0, 0.0)
             self._center = np.array(center)
             self._update_state(moved_object=name, quaternion=(1.0, 0.0, 0.0, 0.0), position=center)
@@ -365,14 +357,10 @@ class Viewer:
         maps = known.maps_of_frame(state.frame) if known else {}
         if (found := self._found.get(state.step, {}).get(state.sensor)) is not None:
             maps |= found.maps_of_frame(state.frame)
-        if link is None:
-            scene = None
-        elif state.moved_object == _NO_OBJECT:
-            scene = link.scene
-        else:
-            scene = link.move_object(
-                state.moved_object, self._rigid_motion(state.quaternion, state.position)
-            )
+        scene = None if link is None else link.scene
+        if link is not None and state.moved_object != _NO_OBJECT:
+            motion = self._rigid_motion(state.quaternion, state.position)
+            scene = link.move_object(state.moved_object, motion)
         if link is not None and scene is not None:
             maps |= {SIMULATED: to_float32(link.predict_map(scene, state.frame))}
         self._panels.show(maps, state.bin)

@@ -31,8 +31,7 @@ def estimate_background(power: Float[Tensor, "frame range u v"]) -> Float64[Tens
     """
     flat = power.detach().double().movedim(1, 0).flatten(1)
     level = torch.quantile(flat, _BACKGROUND_QUANTILE, dim=1) / -math.log(1 - _BACKGROUND_QUANTILE)
-    floor = 1e-12 * float(power.max())
-    return level.clamp_min(floor)
+    return level.clamp_min(1e-12 * float(power.max()))
 
 
 def count_bins_per_draw(radar: Radar, grid: Grid) -> float:

@@ -48,16 +48,11 @@ def detect_moving_targets(
     aways = torch.nn.functional.normalize(points.position.detach().double() - origin, dim=1)
     rates = points.velocity + aways @ own_velocity
     # Clutter removal subtracts the mean only; a direction is known to a fraction of a beam.
-    blur = (
-        float(own_velocity.norm())
-        * direction_cell(aperture(radar).x, radar)
-        * _DIRECTION_ERROR_BEAMS
-    )
+    beam = direction_cell(aperture(radar).x, radar)
+    blur = float(own_velocity.norm()) * beam * _DIRECTION_ERROR_BEAMS
     moves = rates.abs() > cell + blur
-    scales = (
-        torch.tensor([radar.waveform.range_resolution, cell], dtype=torch.float64)
-        * _MAX_GROUP_CELLS
-    )
+    cells = torch.tensor([radar.waveform.range_resolution, cell], dtype=torch.float64)
+    scales = cells * _MAX_GROUP_CELLS
     rows = moves.nonzero()[:, 0]
     if not len(rows):
         return []
@@ -79,24 +74,16 @@ def detect_moving_targets(
             for values in (points.range, rates)
         ]
         position = points.position[best].detach().double()
-        beam = direction_cell(aperture(radar).x, radar) * float((position - origin).norm())
-        found.append(
-            DetectedObject(
-                f"mover_{number + 1}",
-                "point",
-                {"point": 1.0},
-                position,
-                None,
-                {
-                    "range": max(spread[0], 0.3 * radar.waveform.range_resolution),
-                    "across": _DIRECTION_ERROR_BEAMS * beam,
-                    "range_rate": max(spread[1], 0.3 * cell),
-                },
-                max(0.0, 1 - draws * math.exp(-min(power / noise, 700.0)))
-                * min(1.0, power / (_TARGET_SIDELOBE_LEVEL * top)),
-                float(rates[best]) * aways[best],
-            )
-        )
+        across = beam * float((position - origin).norm())
+        deviations = {
+            "range": max(spread[0], 0.3 * radar.waveform.range_resolution),
+            "across": _DIRECTION_ERROR_BEAMS * across,
+            "range_rate": max(spread[1], 0.3 * cell),
+        }
+        sure = max(0.0, 1 - draws * math.exp(-min(power / noise, 700.0)))
+        sure *= min(1.0, power / (_TARGET_SIDELOBE_LEVEL * top))
+        name, velocity = f"mover_{number + 1}", float(rates[best]) * aways[best]
+        found.append(DetectedObject.point(name, position, deviations, sure, velocity))
     strength = {
         target.name: float(points.power[rows[labels == k]].max()) for k, target in enumerate(found)
     }
@@ -148,8 +135,7 @@ def coherent_image(
         (backproject(capture, part), _single_frame_power(capture, part, count))
         for part in positions.split(_POINTS_PER_CHUNK)
     ]
-    field = torch.cat([image for image, _ in parts])
-    power = torch.cat([alone for _, alone in parts])
+    field, power = (torch.cat(column) for column in zip(*parts, strict=True))
     image = field.abs().square().double()
     return image, image / power.clamp_min(1e-300)
 
@@ -191,16 +177,8 @@ def locate_coherent_points(
         middle = (weight[:, None] * positions[blob]).sum(0)
         spread = (weight[:, None] * (positions[blob] - middle).square()).sum(0).sqrt()
         chance = len(positions) * math.exp(-min(count * float(agree[peak]), 700.0))
-        share = min(1.0, value / (_NO_SIDELOBE_LEVEL * top))
-        found.append(
-            DetectedObject(
-                f"point_{len(found) + 1}",
-                "point",
-                {"point": 1.0},
-                positions[peak].double(),
-                None,
-                dict(zip("xyz", spread.clamp_min(0.3 * cell).tolist(), strict=True)),
-                max(0.0, 1 - chance) * share,
-            )
-        )
+        deviations = dict(zip("xyz", spread.clamp_min(0.3 * cell).tolist(), strict=True))
+        sure = max(0.0, 1 - chance) * min(1.0, value / (_NO_SIDELOBE_LEVEL * top))
+        name, place = f"point_{len(found) + 1}", positions[peak].double()
+        found.append(DetectedObject.point(name, place, deviations, sure))
     return found, image

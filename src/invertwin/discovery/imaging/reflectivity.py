@@ -19,6 +19,7 @@ from invertwin.runtime.progress import track
 _MIN_RELATIVE_RESPONSE = 1e-3  # relative to the peak of a response: smaller entries are dropped
 _MIN_RESPONSE = 1e-30  # smaller responses are invisible points [1/m²]
 _TABLE_STEPS_PER_BIN = 32  # entries of a kernel's table per bin
+_TABLE_MIDDLE = 16 * _TABLE_STEPS_PER_BIN  # entry of lag 0
 _MAX_MATRIX_ENTRIES = 8e7  # entries of the matrix, 8 bytes each
 
 
@@ -122,14 +123,12 @@ def compute_response(
     """
     link, shape = radar.link(), (radar.frame_count, *grid.shape)
     tables = [_AxisResponseTable.from_axis(axis) for axis in map_axes(radar, grid)]
-    estimate = (
-        len(positions) * radar.frame_count * np.prod([len(table.offsets) for table in tables])
-    )
+    pairs = np.prod([len(table.offsets) for table in tables])
+    estimate = len(positions) * radar.frame_count * pairs
     if estimate > 4 * _MAX_MATRIX_ENTRIES:
         raise InputError(
             f"expected at most {4 * _MAX_MATRIX_ENTRIES:.0e} pairs of points and bins, got "
-            f"{estimate:.0e}; look "
-            "at a smaller region, or with a coarser step"
+            f"{estimate:.0e}; look at a smaller region, or with a coarser step"
         )
     columns = np.arange(len(positions), dtype=np.int32)
     frames = []
@@ -154,12 +153,9 @@ def compute_response(
         kept = inside & (value > _MIN_RELATIVE_RESPONSE) & (strength[:, None] > 0)
         index = np.broadcast_to(columns[:, None], kept.shape)[kept]
         entries = (value * strength[:, None])[kept].astype(np.float32)
-        frames.append(
-            sparse.csr_matrix(
-                (entries, (row[kept].astype(np.int32), index)),
-                shape=(int(np.prod(grid.shape)), len(positions)),
-            )
-        )
+        places = row[kept].astype(np.int32), index
+        size = int(np.prod(grid.shape)), len(positions)
+        frames.append(sparse.csr_matrix((entries, places), shape=size))
     return ImageResponse(sparse.csr_matrix(sparse.vstack(frames)), shape)
 
 
@@ -203,8 +199,7 @@ def reconstruct_reflectivity(
         mean = matrix @ strength + known
         ratio = data / mean
         brighter = back @ (ratio * speckle_weight(ratio, degrees) / mean)
-        alone = np.maximum(back @ (1 / mean), 1e-30)
-        strength *= np.sqrt(brighter / alone)
+        strength *= np.sqrt(brighter / np.maximum(back @ (1 / mean), 1e-30))
     return torch.from_numpy(strength.astype(np.float64))
 
 
@@ -223,15 +218,10 @@ class _AxisResponseTable:
         start, step, count = axis.start, axis.step, axis.count
         if count == 1:
             return cls(start, step, 1, np.zeros(1, dtype=np.int64), np.ones(1))
-        lags = (
-            torch.arange(
-                -16 * _TABLE_STEPS_PER_BIN, 16 * _TABLE_STEPS_PER_BIN + 1, dtype=torch.float64
-            )
-            / _TABLE_STEPS_PER_BIN
-        )
-        power = axis.response(lags)
+        lags = torch.arange(-_TABLE_MIDDLE, _TABLE_MIDDLE + 1, dtype=torch.float64)
+        power = axis.response(lags / _TABLE_STEPS_PER_BIN)
         # Up to the first null: sidelobes are below the background of most recordings.
-        middle = 16 * _TABLE_STEPS_PER_BIN
+        middle = _TABLE_MIDDLE
         rising = (power[middle + 1 :] > power[middle:-1]).nonzero()
         reach = int(rising[0]) if len(rising) else middle
         power[: middle - reach] = 0.0
@@ -242,12 +232,8 @@ class _AxisResponseTable:
     def near_bins(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the bins near positions [point, n], and the response there."""
         if self.count == 1:
-            zero = np.zeros((len(positions), 1), dtype=np.int64)
-            return zero, np.ones((len(positions), 1))
+            return np.zeros((len(positions), 1), dtype=np.int64), np.ones((len(positions), 1))
         at = (positions - self.start) / self.step
         bins = np.round(at).astype(np.int64)[:, None] + self.offsets
-        lag = (
-            np.round((bins - at[:, None]) * _TABLE_STEPS_PER_BIN).astype(np.int64)
-            + 16 * _TABLE_STEPS_PER_BIN
-        )
-        return bins, self.table[lag]
+        lag = np.round((bins - at[:, None]) * _TABLE_STEPS_PER_BIN).astype(np.int64)
+        return bins, self.table[lag + _TABLE_MIDDLE]

@@ -1,13 +1,11 @@
 """Free outlines in place of simple shapes, if held-out frames support them."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from invertwin.discovery.assembly import ShapeLikelihood
 from invertwin.discovery.search import shape_gap
-from invertwin.discovery.shapes.primitives import ShapeParameters
+from invertwin.discovery.shapes.primitives import ShapeParameters, Shapes
 from invertwin.discovery.shapes.prisms import merge_into_prism
 
 _MAX_GAP_CELLS = 2.0  # range cells between shapes that may merge
@@ -18,7 +16,7 @@ _REPLACEABLE_KINDS = ("box", "cylinder", "sphere")  # kinds that a prism may rep
 
 
 def fit_outlines(
-    fitted: ShapeLikelihood, held: ShapeLikelihood, shapes: Sequence[ShapeParameters]
+    fitted: ShapeLikelihood, held: ShapeLikelihood, shapes: Shapes
 ) -> list[ShapeParameters]:
     """Replace touching shapes, or a single one, by one prism where that is more likely.
 
@@ -43,16 +41,14 @@ def fit_outlines(
     found = list(shapes)
     for part, one in zip(parts, new, strict=False):
         changed = [*_remove_shapes(found, part), one]
-        if (
-            float((held.log_likelihood_gains(changed) - held.log_likelihood_gains(found)).sum())
-            > _MIN_LOG_ODDS
-        ):
+        gain = held.log_likelihood_gains(changed) - held.log_likelihood_gains(found)
+        if float(gain.sum()) > _MIN_LOG_ODDS:
             found = changed
     return found
 
 
 def _group_touching(
-    likelihood: ShapeLikelihood, shapes: Sequence[ShapeParameters], max_gap: float
+    likelihood: ShapeLikelihood, shapes: Shapes, max_gap: float
 ) -> list[list[ShapeParameters]]:
     """Group shapes connected by gaps smaller than a limit [m]."""
     count = len(shapes)
@@ -64,18 +60,16 @@ def _group_touching(
     return [[shapes[k] for k in np.flatnonzero(labels == part).tolist()] for part in range(total)]
 
 
-def _is_outline_candidate(group: Sequence[ShapeParameters], min_length: float) -> bool:
+def _is_outline_candidate(group: Shapes, min_length: float) -> bool:
     """Return whether touching shapes, the larger of a minimum length [m], may be a prism."""
     solid = _select_solid(group)
     large = any(max(one.length, one.width) > min_length for one in solid)
     return large and (len(group) > 1 or solid[0].kind in _REPLACEABLE_KINDS)
 
 
-def _select_solid(shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+def _select_solid(shapes: Shapes) -> list[ShapeParameters]:
     return [one for one in shapes if one.kind not in ("corner", "point")]
 
 
-def _remove_shapes(
-    shapes: Sequence[ShapeParameters], removed: Sequence[ShapeParameters]
-) -> list[ShapeParameters]:
+def _remove_shapes(shapes: Shapes, removed: Shapes) -> list[ShapeParameters]:
     return [shape for shape in shapes if not any(shape is one for one in removed)]

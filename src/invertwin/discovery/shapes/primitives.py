@@ -1,6 +1,7 @@
 """Parametric shapes on the ground: the primitives of an automatic twin."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal, get_args
@@ -48,10 +49,8 @@ SIZE_LIMITS: dict[str, tuple[tuple[float, float, float], tuple[float, float, flo
     ),
 }
 """Minimum and maximum length, width and height of kinds with specific sizes [m]."""
-_RECTANGULAR_KINDS, _FREE_HEIGHT_KINDS = (
-    ("wall", "box", "person", "vehicle"),
-    ("sphere", "point", "corner"),
-)
+_RECTANGULAR_KINDS = ("wall", "box", "person", "vehicle")
+_FREE_HEIGHT_KINDS = ("sphere", "point", "corner")
 _MAX_DIELECTRIC_REFLECTANCE = 0.9  # larger reflectances are metal
 
 
@@ -138,6 +137,9 @@ class ShapeParameters:
         if self.kind in ("sphere", "point"):
             return "point" if self.length < MAX_POINT_SIZE else "sphere"
         return self.kind
+
+
+Shapes = Sequence[ShapeParameters]
 
 
 class UnknownShape(nn.Module):
@@ -255,9 +257,8 @@ class PrimitiveModel(UnknownShape):
         if self.kind not in _RECTANGULAR_KINDS:
             width = length
         yaw = self.TURN_SCALE * float(self.turn.detach())
-        return ShapeParameters(
-            self.kind, (x, y), yaw, length, width, height, float(self.brightness.detach())
-        )
+        brightness = float(self.brightness.detach())
+        return ShapeParameters(self.kind, (x, y), yaw, length, width, height, brightness)
 
     def mesh(self) -> Mesh:
         """Return the shape in the world, differentiable with respect to all parameters."""
@@ -403,9 +404,8 @@ def _person_mesh() -> Mesh:
 def _vehicle_mesh() -> Mesh:
     """Return a car facing x: stacked octagonal layers joined by a skin."""
     sides = 8
-    rings = torch.tensor(
-        [_vehicle_layer(*layer) for layer in _VEHICLE_LAYERS], dtype=torch.float64
-    ).flatten(0, 1)
+    layers = [_vehicle_layer(*layer) for layer in _VEHICLE_LAYERS]
+    rings = torch.tensor(layers, dtype=torch.float64).flatten(0, 1)
     faces: list[list[int]] = []
     for layer in range(len(_VEHICLE_LAYERS) - 1):
         for k in range(sides):

@@ -1,7 +1,6 @@
 """Prisms with a free outline on the ground."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -9,7 +8,12 @@ from jaxtyping import Float64
 from skimage.measure import find_contours
 from torch import Tensor, nn
 
-from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters, UnknownShape
+from invertwin.discovery.shapes.primitives import (
+    PrimitiveModel,
+    ShapeParameters,
+    Shapes,
+    UnknownShape,
+)
 from invertwin.inversion.initialisation.detections import Ground
 from invertwin.scene import DistanceGrid, Mesh, iso_surface, signed_distance
 from invertwin.scene.parameters import Coordinate
@@ -36,7 +40,7 @@ class PrismParameters(ShapeParameters):
 
 
 def merge_into_prism(
-    shapes: Sequence[ShapeParameters], ground: Ground, level: float, spacing: float
+    shapes: Shapes, ground: Ground, level: float, spacing: float
 ) -> PrismParameters:
     """Merge shapes into one prism: their union, with the height of the largest.
 

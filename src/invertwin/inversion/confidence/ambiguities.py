@@ -96,15 +96,14 @@ def candidate_rotations(module: nn.Module, twin: Scene) -> Iterator[Float64[Tens
     for axis, name in zip(own, ("pitch", "yaw", "roll"), strict=True):
         if name not in free:
             continue
-        near = (
-            _surface_distance(rotate_object(2 * math.pi / n * axis), kept[0])
-            for n in _SYMMETRY_ORDERS
+        alike = (
+            order
+            for order in _SYMMETRY_ORDERS
+            if _surface_distance(rotate_object(2 * math.pi / order * axis), kept[0])
+            < _SIMILAR_DISTANCE
         )
-        parts = next(
-            (n for n, far in zip(_SYMMETRY_ORDERS, near, strict=True) if far < _SIMILAR_DISTANCE),
-            None,
-        )
-        for share in (0.5, *((k / parts for k in range(1, parts)) if parts else ())):
+        parts = next(alike, 1)
+        for share in (0.5, *(k / parts for k in range(1, parts))):
             vector = 2 * math.pi * (share - (share > 0.5)) * axis
             found = rotate_object(vector)
             if all(_surface_distance(found, other) > _EQUAL_DISTANCE for other in kept):
@@ -175,11 +174,8 @@ def describe_difference(best: Scene, other: Scene, names: Sequence[str]) -> str:
         if off is not None:
             axis = "xyz"[int(off.rotation.abs().argmax())]
             turned = f"turned by {math.degrees(off.angle):.1f}° about {axis}, "
-            far = (
-                f"{name} {turned if off.angle > SAME_POSE_ANGLE else ''}moved by "
-                f"{off.distance:.3f} m"
-            )
-            texts.append(far)
+            turned = turned if off.angle > SAME_POSE_ANGLE else ""
+            texts.append(f"{name} {turned}moved by {off.distance:.3f} m")
     return ", ".join(texts) or "another shape"
 
 

@@ -65,9 +65,8 @@ def plan_error_bars(fit: Fit, candidates: int = 0) -> tuple[Uncertainty, list[Ca
     for frame in track(range(every - candidates, every), "positions to add"):
         more = evidence.error_bars([*known, frame], looks)
         change = torch.linalg.slogdet(more.covariance)[1] - torch.linalg.slogdet(bars.covariance)[1]
-        added.append(
-            CandidatePosition(frame, math.exp(0.5 * float(change) / len(bars.names)), more)
-        )
+        ratio = math.exp(0.5 * float(change) / len(bars.names))
+        added.append(CandidatePosition(frame, ratio, more))
     return bars, sorted(added, key=lambda one: one.deviation_ratio)
 
 

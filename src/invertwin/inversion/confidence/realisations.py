@@ -60,9 +60,8 @@ class FitResult:
             realisations: realisations of all frames.
         """
         maps = [(a[indices], b[indices]) for a, b in self.maps]
-        return FitResult(
-            self.fit, maps, [[power[indices] for power in look] for look in realisations]
-        )
+        looks = [[power[indices] for power in look] for look in realisations]
+        return FitResult(self.fit, maps, looks)
 
     @cached_property
     def maps(self) -> MapPairs:
@@ -79,8 +78,7 @@ class FitResult:
         found = []
         for loss, (predicted, observed) in zip(self.fit.objective.losses, self.maps, strict=True):
             law = loss if isinstance(loss, SpectrumLoss) else SpectrumLoss("likelihood")
-            visible = bool(predicted.any())
-            found.append(law.fitted_gain(predicted, observed) if visible else 0.0)
+            found.append(law.fitted_gain(predicted, observed) if bool(predicted.any()) else 0.0)
         return found
 
     @cached_property
@@ -88,9 +86,8 @@ class FitResult:
         """Statistics of realisations; None for models without them, or if a gain is zero."""
         found = RealisationStatistics([], [], [])
         for seen in self.realisations():
-            loss, slopes = self.loss_gradients(
-                [(a, look) for (a, _), look in zip(self.maps, seen, strict=True)]
-            )
+            pairs = [(a, look) for (a, _), look in zip(self.maps, seen, strict=True)]
+            loss, slopes = self.loss_gradients(pairs)
             found.losses.append(loss)
             found.gradients.append(slopes)
             found.coarse_maps.append([coarsen_map(look) for look in seen])

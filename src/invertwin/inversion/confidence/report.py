@@ -23,9 +23,8 @@ def confidence_metrics(fit: Reconstruction, truth: Mapping[str, Object]) -> dict
     verdict = fit.verdict
     rows: dict[str, Any] = {"verdict": verdict.word, "loss_excess": verdict.excess}
     rows |= {"structure_excess": verdict.structure, "verdict_reasons": list(verdict.reasons)}
-    rows["rivals"] = [
-        {"pose": other.description, "score": other.score} for other in verdict.ambiguities
-    ]
+    others = verdict.ambiguities
+    rows["rivals"] = [{"pose": other.description, "score": other.score} for other in others]
     errors: dict[str, float] = {}
     for name, item in truth.items():
         off = pose_error(fit.scene[name], item)

@@ -20,9 +20,8 @@ from invertwin.runtime.progress import track
 from invertwin.scene.parameters import Coordinate, Entries
 
 _MAX_COORDINATES = 64  # each coordinate costs derivatives of the map
-_MIN_INFORMATION_FRACTION = (
-    0.5  # relative to the apparent information due to noise of the derivatives
-)
+# Relative to the apparent information due to noise of the derivatives.
+_MIN_INFORMATION_FRACTION = 0.5
 _UNOBSERVED_VARIANCE_RATIO = 20.0  # times the smallest variance in spans: not observed
 _UNOBSERVED_VARIANCE = 25.0  # spans squared: not observed in any case
 _MIN_NAMED_COMPONENT = 0.3  # smaller components of a direction are not named
@@ -108,9 +107,8 @@ class CovarianceEstimator:
         if len(found) > _MAX_COORDINATES or others:
             raise InputError(
                 f"expected a SpectrumLoss and at most {_MAX_COORDINATES} parameters for error "
-                f"bars, got "
-                f"{type(others[0]).__name__ if others else len(found)}; error bars are not "
-                "available"
+                f"bars, got {type(others[0]).__name__ if others else len(found)}; error bars are "
+                "not available"
             )
         self._end = result
         first, second = (map_derivatives(fit, found, number) for number in (0, 1))
@@ -143,9 +141,8 @@ class CovarianceEstimator:
         curvature, feigned = (objective.curvature(end.maps, some) for some in rows)
         if end.realisation_statistics is not None:
             count, by = len(end.realisation_statistics.losses), "looks"
-            scatter, chance = (
-                _gradient_covariance(end.realisation_statistics.gradients, some) for some in rows
-            )
+            looks = end.realisation_statistics.gradients
+            scatter, chance = (_gradient_covariance(looks, some) for some in rows)
         else:
             count, by = min(len(b) for _, b in end.maps), "frames"
             if count < 2:
@@ -153,17 +150,15 @@ class CovarianceEstimator:
                     "expected a model with realisations or several frames for error bars, got one "
                     "frame of a model without realisations; error bars are not available"
                 )
-            scatter, chance = (
-                _frame_covariance(end.loss_gradients(end.maps)[1], some) for some in rows
-            )
+            slopes = end.loss_gradients(end.maps)[1]
+            scatter, chance = (_frame_covariance(slopes, some) for some in rows)
         curvature = curvature - feigned + _penalty_curvature(end.fit, found)
         spans = torch.tensor([c.span for c in found], dtype=torch.float64)
         own = curvature.diagonal().clamp_min(1e-30).rsqrt()
         spans = torch.where(spans.isinf(), own, spans)
         square = spans * spans[:, None]
-        covariance = _sandwich_covariance(
-            *(m * square for m in (curvature, feigned, scatter, chance))
-        )
+        parts = (m * square for m in (curvature, feigned, scatter, chance))
+        covariance = _sandwich_covariance(*parts)
         if frames is None:
             covariance = self._widen_covariance(covariance, spans)
         return Uncertainty(
@@ -214,9 +209,7 @@ class CovarianceEstimator:
             every = list(iterate_coordinates(fit.modules))
             return [every[k] for k in self._kept]
 
-        across = torch.linalg.svd(displacement[None])[2][
-            1:
-        ]  # directions perpendicular to the displacement
+        across = torch.linalg.svd(displacement[None])[2][1:]  # perpendicular to the displacement
         for step in range(_PROFILE_REFITS + 1):
             with torch.no_grad():
                 for change, coordinate in zip((displacement * spans).tolist(), here(), strict=True):
@@ -294,13 +287,11 @@ def _gradient_covariance(
 ) -> Tensor:
     """Estimate the covariance of the gradient over realisations."""
     flat = [part.flatten(1) for part in map_derivatives]
-    scores = torch.stack(
-        [
-            torch.stack([f @ s.flatten() for f, s in zip(flat, own, strict=True)]).sum(0)
-            for own in loss_gradients
-        ]
-    )
-    return torch.cov(scores.T.double()).reshape(len(flat[0]), -1)
+    scores = [
+        torch.stack([f @ s.flatten() for f, s in zip(flat, own, strict=True)]).sum(0)
+        for own in loss_gradients
+    ]
+    return torch.cov(torch.stack(scores).T.double()).reshape(len(flat[0]), -1)
 
 
 def _frame_covariance(
@@ -317,18 +308,11 @@ def _frame_covariance(
 def _penalty_curvature(fit: Fit, coordinates: Sequence[Coordinate]) -> Tensor:
     """Compute second derivatives of the regularisers along the coordinates."""
     free = {n: p for n, p in fit.modules.named_parameters() if p.requires_grad}
-    tangents = (
-        torch.stack(
-            [
-                torch.cat(
-                    [c.tangents.get(n, torch.zeros_like(p)).flatten() for n, p in free.items()]
-                )
-                for c in coordinates
-            ]
-        )
-        .detach()
-        .double()
-    )
+    rows = [
+        torch.cat([c.tangents.get(n, torch.zeros_like(p)).flatten() for n, p in free.items()])
+        for c in coordinates
+    ]
+    tangents = torch.stack(rows).detach().double()
     every = torch.ones(tangents.shape[1], dtype=torch.bool)
     with torch.enable_grad():
         own = penalty_curvature(fit.penalty, list(free.values()), every)
@@ -360,16 +344,12 @@ def _describe_unobserved(coordinates: Sequence[Coordinate], covariance: Tensor) 
     """
     known = [k for k, c in enumerate(coordinates) if math.isfinite(c.span)]
     own = covariance[known][:, known]
+    most = _UNOBSERVED_VARIANCE_RATIO * float(own.diagonal().min()) if known else math.inf
     for error, axis in zip(*_eigen_rows(own), strict=True):
-        if not error > max(
-            1.0, min(_UNOBSERVED_VARIANCE_RATIO * float(own.diagonal().min()), _UNOBSERVED_VARIANCE)
-        ):
+        if not error > max(1.0, min(most, _UNOBSERVED_VARIANCE)):
             continue
-        parts = [
-            k
-            for k in axis.abs().argsort(descending=True).tolist()
-            if abs(axis[k]) > _MIN_NAMED_COMPONENT
-        ]
+        order = axis.abs().argsort(descending=True).tolist()
+        parts = [k for k in order if abs(axis[k]) > _MIN_NAMED_COMPONENT]
         names = " and ".join(coordinates[known[k]].name for k in parts)
         if len(parts) > 1:
             mixed = " ".join(f"{float(axis[k]):+.2f} {coordinates[known[k]].name}" for k in parts)

@@ -1,7 +1,6 @@
 """Verdict of a fit: goodness of fit and ambiguities, independent of the stopping reason."""
 
 import contextlib
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
@@ -69,10 +68,8 @@ def judge_fit(result: FitResult) -> Verdict:
     """
     fit, explained = result.fit, explained_fractions(result)
     if min(explained) < MIN_EXPLAINED_FRACTION:
-        shown = (
-            f"{100 * min(explained):.2g} % of the power of observation "
-            f"{_smallest_number(explained)}"
-        )
+        number = explained.index(min(explained)) + 1
+        shown = f"{100 * min(explained):.2g} % of the power of observation {number}"
         return Verdict("lost", reasons=(f"the twin explains {shown}; start nearer to the truth",))
     loss = float(fit.objective(result.maps))
     begun = fit.loss_at_start()
@@ -88,24 +85,19 @@ def judge_fit(result: FitResult) -> Verdict:
     excess = zscore(loss, result.realisation_statistics.losses)
     residuals, structure = _coarse_residuals(result)
     if max(excess, structure) > _INCONSISTENT_ZSCORE:
-        mean = sum(result.realisation_statistics.losses) / len(result.realisation_statistics.losses)
+        drawn = result.realisation_statistics.losses
+        mean, deviation = sum(drawn) / len(drawn), float(torch.tensor(drawn).std())
         reasons = [f"the loss is {loss:.4g}, on recordings of the twin itself {mean:.4g}", *bounds]
-        marked = enumerate(zip(residuals, fit.observations, strict=True))
-        reasons += [
-            text
-            for k, (map_, o) in marked
-            if (text := _describe_residual(k, map_, o.model.holds_fields))
-        ]
-        reasons += _test_deeper_paths(
-            result,
-            loss - _DEPTH_ZSCORE * float(torch.tensor(result.realisation_statistics.losses).std()),
-        )
+        for k, (residual, o) in enumerate(zip(residuals, fit.observations, strict=True)):
+            reasons += _describe_residual(k, residual, o.model.holds_fields)
+        reasons += _test_deeper_paths(result, loss - _DEPTH_ZSCORE * deviation)
         return Verdict("inconsistent", excess, structure, tuple(reasons), residuals)
     others = tuple(find_ambiguities(result))
     open_ = [
-        f"{other.description} explains the data as well{_format_score(other)}" for other in others
+        f"{other.description} explains the data as well{_format_score(other)}"
+        for other in others
+        if not other.is_rejected
     ]
-    open_ = [text for text, other in zip(open_, others, strict=True) if not other.is_rejected]
     word: VerdictWord = "at a bound" if bounds else "ambiguous" if open_ else "consistent"
     return Verdict(word, excess, structure, (*bounds, *open_), residuals, others)
 
@@ -137,10 +129,6 @@ def _test_deeper_paths(result: FitResult, limit: float) -> Iterator[str]:
                 yield f"with depth = {depth} its loss is {loss:.4g}: the fit leaves out bounces"
 
 
-def _smallest_number(values: list[float]) -> int:
-    return min(range(len(values)), key=values.__getitem__) + 1
-
-
 def _coarse_residuals(result: FitResult) -> tuple[list[Tensor], float]:
     """Compute coarse residuals in standard deviations, and their significance."""
     assert result.realisation_statistics is not None
@@ -158,18 +146,13 @@ def _coarse_residuals(result: FitResult) -> tuple[list[Tensor], float]:
     return found, zscore(float(data), drawn.tolist())
 
 
-def _describe_residual(number: int, residual: Tensor, holds_fields: bool) -> str:
-    """Describe a residual map in words."""
-    more, less = (
-        int((residual > _MARKED_BIN_ZSCORE).sum()),
-        int((residual < -_MARKED_BIN_ZSCORE).sum()),
-    )
-    if not more + less:
-        return ""
-    if holds_fields:
-        off, count = more + less, residual.numel()
-        return f"observation {number + 1}: {off} of {count} coarse bins are not those of the twin"
-    return (
-        f"observation {number + 1}: {more} of {math.prod(residual.shape)} coarse bins hold more "
-        f"power than the twin explains, {less} less"
-    )
+def _describe_residual(number: int, residual: Tensor, holds_fields: bool) -> Iterator[str]:
+    """Describe a residual map in words, if some bins are marked."""
+    more = int((residual > _MARKED_BIN_ZSCORE).sum())
+    less = int((residual < -_MARKED_BIN_ZSCORE).sum())
+    start, count = f"observation {number + 1}:", residual.numel()
+    if more + less and holds_fields:
+        yield f"{start} {more + less} of {count} coarse bins are not those of the twin"
+    elif more + less:
+        bins = f"{more} of {count} coarse bins"
+        yield f"{start} {bins} hold more power than the twin explains, {less} less"

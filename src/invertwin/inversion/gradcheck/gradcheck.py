@@ -2,10 +2,10 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import torch
 import torch.autograd.forward_ad as forward_ad
@@ -16,7 +16,7 @@ from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.gradcheck.lines import make_line
-from invertwin.inversion.gradcheck.tangents import ParameterChange
+from invertwin.inversion.gradcheck.tangents import ParameterChanges
 from invertwin.limits import Count, NonNegative, Positive
 from invertwin.runtime.concurrency import tracer_lock
 from invertwin.scene.scene import Scene
@@ -99,7 +99,7 @@ class GradientReport:
 def gradcheck(
     model: ForwardModel,
     module: nn.Module,
-    tangent: Mapping[str, ParameterChange] | Tensor,
+    tangent: ParameterChanges | Tensor,
     *,
     scene: Scene,
     sensor: Any,
@@ -141,7 +141,7 @@ def gradcheck(
     def derivative(chosen: ForwardModel) -> tuple[Tensor, Tensor]:
         return _forward_derivative(chosen, lambda t: make_inputs(line.evaluate(t)), repeats, seed)
 
-    def difference(epsilon: float, number: int) -> Tensor:
+    def difference(number: int, epsilon: float = settings.step) -> Tensor:
         ends = (make_inputs(line.evaluate_end(end)) for end in (epsilon, -epsilon))
         plus, minus = (paired.predict(*e, derive_seed(seed, 1, number)).double() for e in ends)
         return (plus - minus) / (2 * epsilon)
@@ -152,22 +152,22 @@ def gradcheck(
         value, gradient = derivative(model)
         less = {name: derivative(other)[1] for name, other in model.ablations().items()}
         interior_gradient = less.get("boundary", gradient)
-        pairs, reached = (
-            _average_differences(partial(difference, settings.step), settings, progress)
-            if model.is_random
-            else (difference(settings.step, 0)[None], 0.0)
-        )
+        if model.is_random:
+            pairs, reached = _average_differences(difference, settings, progress)
+        else:
+            pairs, reached = difference(0)[None], 0.0
         _require_change(truth := pairs.mean(0))
         half, far, farther = (
-            torch.stack([difference(k * settings.step, n) for n in range(least)]).mean(0)
+            torch.stack([difference(n, k * settings.step) for n in range(least)]).mean(0)
             for k in (0.5, 4.0, 8.0)
         )
-    contacts = _drop_equal(less.get("contacts"), gradient)
+    edges, contacts = less.get("interior_edges"), _drop_equal(less.get("contacts"), gradient)
+    agree = partial(_measure_agreement, truth=truth, far=far, farther=farther)
     return GradientReport(
-        full=_measure_agreement(gradient, truth, far, farther),
-        interior=_measure_agreement(interior_gradient, truth, far, farther),
-        no_interior_edges=_measure_agreement(less.get("interior_edges"), truth, far, farther),
-        no_contact=_measure_agreement(contacts, truth, far, farther),
+        full=agree(gradient),
+        interior=agree(interior_gradient),
+        no_interior_edges=None if edges is None else agree(edges),
+        no_contact=None if contacts is None else agree(contacts),
         difference_noise=reached,
         step_agreement=_step_agreement(pairs[:least].mean(0), half),
         pairs=len(pairs),
@@ -208,10 +208,7 @@ def _drop_equal(ablated: Tensor | None, gradient: Tensor) -> Tensor | None:
 
 
 def _forward_derivative(
-    model: ForwardModel,
-    make_inputs: Callable[[Tensor], tuple[Scene, Any]],
-    repeats: int,
-    seed: int,
+    model: ForwardModel, make_inputs: Callable[[Tensor], tuple[Scene, Any]], repeats: int, seed: int
 ) -> tuple[Tensor, Tensor]:
     """Return the map at θ = 0 and its forward-mode derivative, averaged over seeds."""
     primals, tangents = [], []
@@ -255,17 +252,9 @@ def _relative_noise(pairs: Tensor) -> float:
     return float(error.abs().sum() / mean.abs().sum().clamp_min(1e-300))
 
 
-@overload
 def _measure_agreement(
     gradient: Tensor, truth: Tensor, far: Tensor, farther: Tensor
-) -> GradientAgreement: ...
-@overload
-def _measure_agreement(gradient: None, truth: Tensor, far: Tensor, farther: Tensor) -> None: ...
-def _measure_agreement(
-    gradient: Tensor | None, truth: Tensor, far: Tensor, farther: Tensor
-) -> GradientAgreement | None:
-    if gradient is None:
-        return None
+) -> GradientAgreement:
     miss = gradient - truth
     both = torch.stack([gradient.flatten(), truth.flatten()])
     errors = [float((d - gradient).norm()) for d in (far, farther)]

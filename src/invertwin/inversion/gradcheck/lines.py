@@ -1,6 +1,6 @@
 """Lines through the parameters of a module: paths of gradient checks and loss landscapes."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from invertwin.channel import Sampling
 from invertwin.deprecation import rename_members
 from invertwin.errors import InputError
-from invertwin.inversion.gradcheck.tangents import ParameterChange, parameter_changes
+from invertwin.inversion.gradcheck.tangents import ParameterChanges, parameter_changes
 from invertwin.inversion.loss import resolve_loss
 from invertwin.inversion.observation import Observation
 from invertwin.scene.mesh import Mesh
@@ -21,9 +21,7 @@ _SURFACE_TOLERANCE = 1e-9  # residual distance to that zero [m]
 class ParameterLine:
     """Parameters of a module, displaced by θ times a tangent."""
 
-    def __init__(
-        self, module: nn.Module, tangent: Mapping[str, ParameterChange], target: Any
-    ) -> None:
+    def __init__(self, module: nn.Module, tangent: ParameterChanges, target: Any) -> None:
         """Define the line.
 
         Args:
@@ -56,9 +54,7 @@ class DistanceFieldLine(ParameterLine):
     Derivatives pass through the module, its marching cubes included.
     """
 
-    def __init__(
-        self, module: nn.Module, tangent: Mapping[str, ParameterChange], target: Any
-    ) -> None:
+    def __init__(self, module: nn.Module, tangent: ParameterChanges, target: Any) -> None:
         """Define the line of a module with an ``object`` and a ``distance`` method."""
         super().__init__(module, tangent, target)
         self._field, self._object = _DistanceModule(module), str(module.object)
@@ -86,19 +82,14 @@ class DistanceFieldLine(ParameterLine):
     def _distance_and_gradient(self, theta: float, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Return the changed distance at points, and its spatial gradient."""
         at = positions.detach().requires_grad_()
-        moved = {
-            f"shape.{name}": self._start[name] + theta * change
-            for name, change in self._tangent.items()
-        }
+        moved = {f"shape.{n}": self._start[n] + theta * by for n, by in self._tangent.items()}
         with torch.enable_grad():
             found = torch.func.functional_call(self._field, moved, (at,))
             (slope,) = torch.autograd.grad(found.sum(), at)
         return found.detach(), slope
 
 
-def make_line(
-    module: nn.Module, tangent: Mapping[str, ParameterChange] | Tensor, target: Any
-) -> ParameterLine:
+def make_line(module: nn.Module, tangent: ParameterChanges | Tensor, target: Any) -> ParameterLine:
     """Return the line of a module's parameters along a tangent.
 
     Args:

@@ -44,12 +44,11 @@ class GaussianBump:
 
 
 ParameterChange = float | ArrayLike | GaussianBump
+ParameterChanges = Mapping[str, ParameterChange]
 """One number for all entries, an array of all entries, the leading entries of a row, or a bump."""
 
 
-def parameter_changes(
-    module: nn.Module, tangent: Mapping[str, ParameterChange]
-) -> dict[str, Tensor]:
+def parameter_changes(module: nn.Module, tangent: ParameterChanges) -> dict[str, Tensor]:
     """Return the changes of a module's parameters by name for θ = 1.
 
     A tangent names parameters, or named entries of them (see ``Entries``): the ``rotation`` [rad]

@@ -104,13 +104,11 @@ def detect_echoes(
     power = capture.spectrum(grid).detach().double()
     strongest = power.amax(3)
     # A frame at a time: the training cells of all take much memory.
-    detections = torch.stack(
-        [
-            ordered_statistics_cfar(frame, false_alarm=false_alarm, rank=_CFAR_RANK)
-            for frame in strongest
-        ]
-    )
-    found = peaks(power, detections, capture.radar(), grid).position
+    detections = [
+        ordered_statistics_cfar(frame, false_alarm=false_alarm, rank=_CFAR_RANK)
+        for frame in strongest
+    ]
+    found = peaks(power, torch.stack(detections), capture.radar(), grid).position
     inside = (found >= box.low) & (found <= box.high)
     if (height := _unresolved_height(capture.radar(), grid)) is not None:
         inside[:, height] = True
@@ -136,18 +134,16 @@ def backproject_power(
         grid: bins of its maps.
         points: positions in world axes [*point, 3] [m].
     """
-    flat = points.reshape(-1, 3)
-    if grid.u_count == grid.v_count == 1:
-        parts = [
-            backproject(capture, part).abs().square() for part in flat.split(_POINTS_PER_CHUNK)
-        ]
-        return torch.cat(parts).reshape(points.shape[:-1])
-    maps = capture.spectrum(grid).detach().double()
-    radar = capture.radar()
-    total = torch.cat(
-        [_incoherent_power(maps, radar, grid, part) for part in flat.split(_POINTS_PER_CHUNK)]
-    )
-    return total.reshape(points.shape[:-1])
+    maps = None
+    if grid.u_count > 1 or grid.v_count > 1:
+        maps = capture.spectrum(grid).detach().double()
+    parts = [
+        backproject(capture, part).abs().square()
+        if maps is None
+        else _incoherent_power(maps, capture.radar(), grid, part)
+        for part in points.reshape(-1, 3).split(_POINTS_PER_CHUNK)
+    ]
+    return torch.cat(parts).reshape(points.shape[:-1])
 
 
 def find_bright_nodes(
@@ -174,9 +170,8 @@ def find_bright_nodes(
     size = torch.as_tensor(high, dtype=torch.float64) - torch.as_tensor(low, dtype=torch.float64)
     width = checked_number(step, "step of the image [m]", 0.0, open_low=True)
     most = float(size.max()) / width
-    require_at_most(
-        most, _MAX_NODES_PER_SIDE, "nodes along a side", "give metres, or a larger step", "step"
-    )
+    do = "give metres, or a larger step"
+    require_at_most(most, _MAX_NODES_PER_SIDE, "nodes along a side", do, "step")
     counts = [max(2, round(float(side) / width) + 1) for side in size]
     nodes = Lattice.from_bounds(low, high, counts).nodes
     if (height := _unresolved_height(capture.radar(), grid)) is not None:
@@ -238,10 +233,9 @@ def fit_rectangle(
     """
     if len(points) < 3:
         raise InputError(f"expected at least 3 points, got {len(points)}; use pose = 'position'")
-    best: tuple[float, GroundRectangle] | None = None
-    for yaw in torch.linspace(0, math.pi / 2, _YAW_COUNT, dtype=torch.float64)[:-1].tolist():
-        found = _bounding_rectangle(points, yaw, ground)
-        axes = ground.yaw_rotation(yaw)[:, ground.plane_axes]
+
+    def score(found: GroundRectangle) -> float:
+        axes = ground.yaw_rotation(found.yaw)[:, ground.plane_axes]
         offsets = (points - found.center) @ axes
         away = (radar.positions.detach().mean(0) - found.center) @ axes
         half = torch.tensor(found.size).double() / 2
@@ -249,11 +243,10 @@ def fit_rectangle(
         near = half - offsets * torch.where(away < 0, -1.0, 1.0)
         nearest = torch.minimum(half - offsets, half + offsets)
         sides = torch.where(away.abs() > half, near, nearest).abs().amin(1)
-        score = float((1 / sides.clamp_min(resolution)).sum())
-        if best is None or score > best[0]:
-            best = (score, found)
-    assert best is not None
-    return best[1]
+        return float((1 / sides.clamp_min(resolution)).sum())
+
+    yaws = torch.linspace(0, math.pi / 2, _YAW_COUNT, dtype=torch.float64)[:-1].tolist()
+    return max((_bounding_rectangle(points, yaw, ground) for yaw in yaws), key=score)
 
 
 def principal_rectangle(
@@ -265,8 +258,7 @@ def principal_rectangle(
         points: positions [point, 3] [m].
         ground: ground plane.
     """
-    flat = points[:, ground.plane_axes]
-    _, axes = torch.linalg.eigh(torch.cov(flat.T))
+    _, axes = torch.linalg.eigh(torch.cov(points[:, ground.plane_axes].T))
     first = axes[:, 1]
     # The image of the first ground axis under a yaw about y is (cos, −sin) in (x, z).
     yaw = math.atan2(ground.yaw_sign * float(first[1]), float(first[0]))
@@ -348,18 +340,11 @@ def select_pose(
         raise InputError("expected at least one pose, got none; use candidate_poses")
     measured = surrogate.blur(capture.spectrum(grid).float(), radar, grid)
     scenes = [scene.replace(name, pose=pose) for pose in poses]
-    losses = []
+    losses, sampling = [], Sampling(depth=1, samples=samples, boundary_samples=0)
     with torch.no_grad():
         for moved in scenes:
-            simulated = surrogate_spectrum(
-                moved,
-                radar,
-                grid,
-                surrogate,
-                sampling=Sampling(depth=1, samples=samples, boundary_samples=0),
-                seed=seed,
-            )
-            losses.append(float(loss(simulated, measured)) if bool(simulated.any()) else math.inf)
+            found = surrogate_spectrum(moved, radar, grid, surrogate, sampling=sampling, seed=seed)
+            losses.append(float(loss(found, measured)) if bool(found.any()) else math.inf)
     return scenes[losses.index(min(losses))], losses
 
 
@@ -376,8 +361,7 @@ def estimate_scale(
         ground: ground plane.
     """
     extent = item.vertices.detach()[:, ground.plane_axes]
-    longest = float((extent.amax(0) - extent.amin(0)).max())
-    return max(rectangle.size) / longest
+    return max(rectangle.size) / float((extent.amax(0) - extent.amin(0)).max())
 
 
 def estimate_density(
@@ -407,9 +391,8 @@ def estimate_density(
     """
     lattice = Lattice.from_bounds(low, high, counts)
     pose = item.transform.detach()
-    image = _require_echoes(
-        backproject_power(capture, grid, lattice.nodes @ pose[:3, :3].T + pose[:3, 3])
-    )
+    places = lattice.nodes @ pose[:3, :3].T + pose[:3, 3]
+    image = _require_echoes(backproject_power(capture, grid, places))
     density = depth / float(lattice.spacing.mean()) * image / image.max()
     return DensityGrid(name, low, high, density)
 
@@ -419,9 +402,8 @@ def _bounding_rectangle(points: Tensor, yaw: float, ground: Ground) -> GroundRec
     axes = ground.yaw_rotation(yaw)[:, ground.plane_axes]
     middle = points.median(0).values
     places = (points - middle) @ axes
-    low, high = (
-        torch.quantile(places, q, dim=0) for q in (_TRIMMED_FRACTION, 1 - _TRIMMED_FRACTION)
-    )
+    ends = (_TRIMMED_FRACTION, 1 - _TRIMMED_FRACTION)
+    low, high = (torch.quantile(places, end, dim=0) for end in ends)
     center = middle + axes @ ((low + high) / 2)
     first, second = (high - low).tolist()
     return GroundRectangle(center, yaw, (first, second))

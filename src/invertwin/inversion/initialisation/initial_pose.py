@@ -135,11 +135,10 @@ class InitialPoseEstimator:
             middle = item.mesh.center
             mesh = Mesh(middle + (item.mesh.vertices - middle) * factor, item.mesh.faces)
             scene = scene.replace(name, mesh=mesh)
-        poses = candidate_poses(scene[name], rectangle, radar, ground=plane)
         scene, losses = select_pose(
             scene,
             name,
-            poses,
+            candidate_poses(scene[name], rectangle, radar, ground=plane),
             radar,
             capture,
             grid,

@@ -99,14 +99,10 @@ class Search:
     def to_metrics(self) -> dict[str, Any]:
         """Return the other results as numbers: pose difference, loss, score."""
         best = self.best.scene
-        ends = [
-            {
-                "pose": describe_difference(best, end.scene, self.objects),
-                "loss": end.loss,
-                "score": score,
-            }
-            for end, score in zip(self.minima[1:], self.scores[1:], strict=True)
-        ]
+        ends = []
+        for end, score in zip(self.minima[1:], self.scores[1:], strict=True):
+            pose = describe_difference(best, end.scene, self.objects)
+            ends.append({"pose": pose, "loss": end.loss, "score": score})
         found = {"other_ends": ends, "ambiguities": list(self.ambiguities)}
         return found | {"screened": list(self.losses)}
 
@@ -134,9 +130,8 @@ def pose_grid(
             f"expected a box with low <= high, got {list(low)} and {list(high)}; exchange them"
         )
     total = math.prod(1 + float(b - a) / step for a, b in zip(low, high, strict=True)) * turns
-    require_at_most(
-        total, _MAX_POSES, "poses", "give metres, a larger step, or fewer turns", "step"
-    )
+    do = "give metres, a larger step, or fewer turns"
+    require_at_most(total, _MAX_POSES, "poses", do, "step")
     axes = [
         torch.linspace(a, b, 1 + math.ceil((b - a) / step - 1e-9), dtype=torch.float64)
         for a, b in zip(low, high, strict=True)
@@ -211,10 +206,8 @@ def search(
         found, offset = [fit(kept[first], len(kept), stages)], len(kept)
     else:
         found, offset = [fit(start, number, stages) for number, start in enumerate(kept)], 0
-    best = min(found, key=_unblurred_loss)
-    for start in _rotated_starts(best):
-        again = Candidate(start, watched)
-        found.append(fit(again, offset + len(found), stages))
+    for start in _rotated_starts(min(found, key=_unblurred_loss)):
+        found.append(fit(Candidate(start, watched), offset + len(found), stages))
     return _compare_ends(found, offset, names, losses)
 
 
@@ -226,10 +219,7 @@ def _compare_ends(
     for end in sorted(found, key=_unblurred_loss):
         if not any(are_same_poses(end.scene, other.scene, names) for other in ends):
             ends.append(end)
-    scores = [
-        None if k == 0 else difference_score(ends[0].result, end.result)
-        for k, end in enumerate(ends)
-    ]
+    scores = [None, *(difference_score(ends[0].result, end.result) for end in ends[1:])]
     texts = tuple(
         f"{describe_difference(ends[0].scene, end.scene, names)} explains the data nearly as "
         f"well: z = {z:.1f}"
@@ -277,8 +267,7 @@ def _make_screening_loss(
             drawn = zip(models, candidate.observations, strict=True)
             maps = [model.predict(candidate.scene, _initial_sensor(o), seed) for model, o in drawn]
             visible = all(bool(power.any()) for power in maps)
-            pairs = list(zip(maps, blurred, strict=True))
-            return float(objective(pairs)) if visible else math.inf
+            return float(objective(list(zip(maps, blurred, strict=True)))) if visible else math.inf
 
     return score
 
@@ -296,9 +285,8 @@ def _reduce_samples(model: ForwardModel) -> ForwardModel:
     sampling = getattr(model, "sampling", None)
     if not isinstance(sampling, Sampling):
         return model
-    return model.with_sampling(
-        samples=max(1, sampling.samples // _SCREENING_DIVISOR), boundary=False
-    )
+    samples = max(1, sampling.samples // _SCREENING_DIVISOR)
+    return model.with_sampling(samples=samples, boundary=False)
 
 
 def _unblurred_loss(found: Reconstruction) -> float:

@@ -25,7 +25,14 @@ from invertwin.channel import (
     polarisations,
     visible_fractions,
 )
-from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.checks import (
+    ArrayLike,
+    check_orthonormal,
+    checked_count,
+    checked_number,
+    checked_tensor,
+    set_fields,
+)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
@@ -70,31 +77,21 @@ class Metasurface:
         what = "of a metasurface"
         place = checked_tensor(self.position, (3,), f"position {what} [m]", "give x, y, z")
         axes = checked_tensor(self.axes, (3, 3), f"axes {what}", "give them as columns")
-        still = axes.detach()
-        if float((still.mT @ still - torch.eye(3, dtype=torch.float64)).abs().max()) > 1e-5:
-            raise InputError(
-                f"expected axes {what} with orthonormal columns; give x, y and the normal"
-            )
+        check_orthonormal(axes, f"axes {what}", "give x, y and the normal")
         do = "give one for each element, along x and y"
         phase = checked_tensor(self.phase, (None, None), f"phases {what} [rad]", do)
         if not phase.numel():
             raise InputError(f"expected at least one element {what}, got none; {do}")
-        amplitude = checked_tensor(
-            torch.as_tensor(self.amplitude, dtype=torch.float64).expand(phase.shape)
-            if torch.as_tensor(self.amplitude).ndim == 0
-            else self.amplitude,
-            tuple(phase.shape),
-            f"amplitudes {what}",
-            "give one, or one for each",
-        )
+        amplitude = torch.as_tensor(self.amplitude, dtype=torch.float64)
+        amplitude = amplitude.expand(phase.shape) if amplitude.ndim == 0 else amplitude
+        do = "give one, or one for each"
+        amplitude = checked_tensor(amplitude, tuple(phase.shape), f"amplitudes {what}", do)
         if bool((amplitude.detach() < 0).any()):
             raise InputError(f"expected amplitudes {what} of at least 0, got less; turn the phase")
         checked_number(self.spacing, f"spacing {what} [m]", 0.0, open_low=True)
         if self.bits is not None and checked_count(self.bits, f"bits {what}", 1) > _MAX_BITS:
             raise InputError(f"expected at most {_MAX_BITS} bits {what}, got {self.bits}; use None")
-        found = {"position": place, "axes": axes, "phase": phase, "amplitude": amplitude}
-        for name, value in found.items():
-            object.__setattr__(self, name, value)
+        set_fields(self, position=place, axes=axes, phase=phase, amplitude=amplitude)
 
     @property
     def cells(self) -> PanelCells:
@@ -126,8 +123,7 @@ class Metasurface:
         """
         do = "give x, y, z"
         ends = [checked_tensor(p, (3,), "ends of a focus [m]", do) for p in (tx, target)]
-        elements = self.cells.centers
-        length = (elements[:, None] - torch.stack(ends)).norm(dim=2).sum(1)
+        length = (self.cells.centers[:, None] - torch.stack(ends)).norm(dim=2).sum(1)
         turn = 2 * math.pi * frequency / SPEED_OF_LIGHT * length
         return replace(self, phase=self.phase + turn.view(self.phase.shape))
 
@@ -158,13 +154,11 @@ def panel_response(
         far_field: Waves are plane over the panel: quicker, right beyond 2D²/λ.
     """
     cells, k = panel.cells, 2 * math.pi * frequency / SPEED_OF_LIGHT
-    both = torch.cat([tx, rx])
-    lit = visible_fractions(scene, both, cells, blur=blur, boundary=boundary)
+    lit = visible_fractions(scene, torch.cat([tx, rx]), cells, blur=blur, boundary=boundary)
     sent = _element_waves(panel, cells, tx, lit[: len(tx)], k, far_field)
     weights = panel.response
     scale = panel.spacing**2 * k / (2 * math.pi)
-    seen = (lit[len(tx) :] > 0).any(1) & bool((lit[: len(tx)] > 0).any())
-    live = torch.nonzero(seen)[:, 0]
+    live = torch.nonzero((lit[len(tx) :] > 0).any(1) & bool((lit[: len(tx)] > 0).any()))[:, 0]
     heavy = len(live) * len(weights) > _VALUES_PER_CHUNK
     found = [torch.zeros(len(tx), 0, dtype=torch.complex128)]
 
@@ -209,9 +203,8 @@ def _element_waves(
     else:
         aside = whole[:, None, :2] - (0 if far_field else cells.offsets)
         up = whole[:, None, 2:].expand(-1, len(cells.offsets), 1)
-        gain = panel.pattern.gain(
-            torch.cat([aside.expand(*up.shape[:2], 2), up], 2) / length[..., None]
-        )
+        toward = torch.cat([aside.expand(*up.shape[:2], 2), up], 2) / length[..., None]
+        gain = panel.pattern.gain(toward)
         some = gain > 0  # a root of zero has no derivative
         # Of a cell of λ/2, π is the gain that takes all of what falls on it.
         obliquity = torch.where(some, torch.where(some, gain, 1.0) / math.pi, 0.0).sqrt()
@@ -253,61 +246,55 @@ def panel_paths(
     Source: derivations §12.
     """
     several = [panels] if isinstance(panels, Metasurface) else list(panels)
-    ends = [_check_positions(place, what) for place, what in ((tx, "tx"), (rx, "rx"))]
+    ends = _check_positions(tx, "tx"), _check_positions(rx, "rx")
     checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
     checked_number(blur, "width of shadows [m]", 0.0)
-    counts = len(ends[0]), len(ends[1])
-    up = torch.tensor(_UP, dtype=torch.float64)
-    source = torch.arange(counts[0]).repeat_interleave(counts[1])
-    target = torch.arange(counts[1]).repeat(counts[0])
     rows: list[RayPaths] = []
     for panel in several:
         _require_clearance(panel, torch.cat(ends))
-        total = panel_response(
-            scene,
-            panel,
-            ends[0],
-            ends[1],
-            frequency,
-            blur=blur,
-            boundary=boundary,
-            far_field=far_field,
-        ).ravel()
-        link = torch.nonzero(total.detach() != 0)[:, 0]
-        ways = [
-            panel.position - end[at[link]] for end, at in zip(ends, (source, target), strict=True)
-        ]
-        length = ways[0].norm(dim=1) + ways[1].norm(dim=1)
-        units = [normalize(way, dim=1) for way in ways]
-        sent, received = (polarisations(unit, up) for unit in units)
-        normal = panel.axes[:, 2]
-        turned = sent - 2 * (sent @ normal)[..., None] * normal
-        matrix = received @ turned.mT
-        one = torch.ones(len(link), 1, dtype=torch.int64)
-        rows.append(
-            RayPaths(
-                counts,
-                frequency,
-                source[link],
-                target[link],
-                length / SPEED_OF_LIGHT,
-                total[link, None, None] * matrix,
-                units[0],
-                units[1],
-                panel.position.expand(len(link), 1, 3),
-                METASURFACE * one,
-                -one,
-                -one,
-                scene.names,
-                torch.zeros(len(link), dtype=torch.float64),
-            )
+        response = panel_response(
+            scene, panel, *ends, frequency, blur=blur, boundary=boundary, far_field=far_field
         )
+        rows.append(_paths_over_panel(panel, ends, response, frequency, scene.names))
     if not rows:
         raise InputError("expected at least one metasurface, got none; give one")
-    found = rows[0]
-    for more in rows[1:]:
-        found = found + more
-    return found.sort_rows()
+    return sum(rows[1:], start=rows[0]).sort_rows()
+
+
+def _paths_over_panel(
+    panel: Metasurface,
+    ends: tuple[Tensor, Tensor],
+    response: Complex128[Tensor, "tx rx"],
+    frequency: float,
+    names: tuple[str, ...],
+) -> RayPaths:
+    """One path over a panel for each pair of antennas between which it passes something on."""
+    total, (senders, hearers) = response.ravel(), response.shape
+    link = torch.nonzero(total.detach() != 0)[:, 0]
+    source, target = link // hearers, link % hearers
+    ways = [panel.position - ends[0][source], panel.position - ends[1][target]]
+    units = [normalize(way, dim=1) for way in ways]
+    up = torch.tensor(_UP, dtype=torch.float64)
+    sent, received = (polarisations(unit, up) for unit in units)
+    normal = panel.axes[:, 2]
+    turned = sent - 2 * (sent @ normal)[..., None] * normal
+    one = torch.ones(len(link), 1, dtype=torch.int64)
+    return RayPaths(
+        (senders, hearers),
+        frequency,
+        source,
+        target,
+        (ways[0].norm(dim=1) + ways[1].norm(dim=1)) / SPEED_OF_LIGHT,
+        total[link, None, None] * (received @ turned.mT),
+        units[0],
+        units[1],
+        panel.position.expand(len(link), 1, 3),
+        METASURFACE * one,
+        -one,
+        -one,
+        names,
+        torch.zeros(len(link), dtype=torch.float64),
+    )
 
 
 def _check_positions(value: ArrayLike, what: str) -> Tensor:

@@ -52,9 +52,8 @@ class WallPath:
         radius: float = 0.2,
         closed: bool = False,
     ) -> None:
-        flat = checked_tensor(
-            corners, (None, 2), "corners of a path along walls [m]", _CORNERS_ADVICE
-        )
+        what = "corners of a path along walls [m]"
+        flat = checked_tensor(corners, (None, 2), what, _CORNERS_ADVICE)
         if len(flat) < 2 + closed:
             raise InputError(
                 f"expected more corners of a path along walls, got {len(flat)}; {_CORNERS_ADVICE}"

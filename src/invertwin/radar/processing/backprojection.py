@@ -61,11 +61,8 @@ def backproject_beat(
             _check_range(delay, limits)
             index = torch.remainder(delay * (waveform.step * length), length)
             echo = interpolate_samples(spectrum[frame, sender], index)
-            cycles = delay * (
-                waveform.start_frequency
-                + middle * waveform.step
-                - 0.5 * waveform.residual_slope * delay
-            )
+            tone = waveform.start_frequency + middle * waveform.step
+            cycles = delay * (tone - 0.5 * waveform.residual_slope * delay)
             # Reduce the 1e5 cycles at 77 GHz and 200 m in float64.
             phase = -2 * math.pi * (cycles - cycles.detach().round())
             image = image + (echo * torch.polar(torch.ones_like(phase), phase)).sum(0)

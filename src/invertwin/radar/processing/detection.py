@@ -154,8 +154,7 @@ def point_cloud(
     ends = ("nearest", "wrap", "nearest")
     around = maximum_filter(strongest.numpy(), (1, 3, 3), mode=ends)  # type: ignore[arg-type]
     highest = strongest == torch.from_numpy(around)
-    found = detections & highest & (strongest > 0)
-    frame, velocity, place = torch.nonzero(found, as_tuple=True)
+    frame, velocity, place = torch.nonzero(detections & highest & (strongest > 0), as_tuple=True)
     direction = seen.argmax(-1)[frame, velocity, place]
     u, v = direction // grid.v_count, direction % grid.v_count
     cell = [frame, velocity, place, u, v]
@@ -279,9 +278,8 @@ def _training_cells(
         )
     reach = [g + t for g, t in zip(guard, training, strict=True)]
     sizes = [2 * r + 1 for r in reach]
-    around = torch.nn.functional.pad(
-        values, (reach[1], reach[1], reach[0], reach[0]), value=math.inf
-    )
+    beside = (reach[1], reach[1], reach[0], reach[0])
+    around = torch.nn.functional.pad(values, beside, value=math.inf)
     around = around.unfold(-2, sizes[0], 1).unfold(-2, sizes[1], 1)
     offsets = [(torch.arange(size) - r).abs() for size, r in zip(sizes, reach, strict=True)]
     kept = (offsets[0][:, None] > guard[0]) | (offsets[1] > guard[1])

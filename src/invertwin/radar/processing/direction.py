@@ -84,9 +84,8 @@ def capon(
     scale = torch.where(level > 0, level, 1.0)
     loaded = covariance / scale[..., None, None] + loading * identity
     manifold = snapshots.manifold(grid)
-    whitened = torch.linalg.solve_triangular(
-        torch.linalg.cholesky(loaded), manifold.mT.expand(*level.shape, -1, -1), upper=False
-    )
+    waves, root = manifold.mT.expand(*level.shape, -1, -1), torch.linalg.cholesky(loaded)
+    whitened = torch.linalg.solve_triangular(root, waves, upper=False)
     power = level[..., None] / whitened.abs().square().sum(-2)
     return power.unflatten(-1, (grid.u_count, grid.v_count))
 
@@ -137,8 +136,7 @@ def music(
             )
         count = torch.full(covariance.shape[:2], sources, device=covariance.device)
     # Eigenvalues ascend: those of the signal are last.
-    order = torch.arange(elements, device=covariance.device)
-    signal = order >= elements - count[..., None]
+    signal = torch.arange(elements, device=covariance.device) >= elements - count[..., None]
     projector = _SignalProjector.apply(covariance, signal)
     manifold = snapshots.manifold(grid)
     inside = torch.einsum("dm,frmn,dn->frd", manifold.conj(), projector, manifold).real

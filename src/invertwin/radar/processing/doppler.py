@@ -161,14 +161,9 @@ def resolve_fold(
     """
     if not candidates:
         raise InputError("expected at least one candidate, got none; (0, -1, 1) are usual")
-    peaks = [
-        _steer_beams(compensate_tdm(spectrum.detach(), radar, chirps, fold), radar, grid).amax(
-            (-2, -1)
-        )
-        for fold in candidates
-    ]
+    parts = (compensate_tdm(spectrum.detach(), radar, chirps, fold) for fold in candidates)
+    best = torch.stack([_steer_beams(part, radar, grid).amax((-2, -1)) for part in parts])
     # Break ties independently of rounding errors.
-    best = torch.stack(peaks)
     chosen = (best >= (1 - 1e-9) * best.amax(0)).to(torch.int64).argmax(0)
     return torch.tensor(list(candidates), device=chosen.device)[chosen]
 

@@ -13,11 +13,7 @@ from torch import Tensor
 from invertwin.channel import Grid
 from invertwin.radar.processing.beamforming import beamform
 from invertwin.radar.processing.direction import capon, music
-from invertwin.radar.processing.doppler import (
-    compensate_tdm,
-    range_doppler,
-    velocity_axis,
-)
+from invertwin.radar.processing.doppler import compensate_tdm, range_doppler, velocity_axis
 from invertwin.radar.processing.reflectors import noise_power
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
@@ -118,9 +114,8 @@ def doppler_maps(
     flat = cube.abs().square().mean((2, 3))[0]
     everything, strongest = _sum_range_rates(cube, radar, grid, chirps, torch.ones_like(flat) > 0)
     moving = range_doppler(signal - signal.mean(1, keepdim=True), radar, grid, chirps)
-    cells = _detect_moving_cells(
-        moving.abs().square().mean((2, 3))[0], flat, len(radar.virtual_positions)
-    )
+    power = moving.abs().square().mean((2, 3))[0]
+    cells = _detect_moving_cells(power, flat, len(radar.virtual_positions))
     movers, mover = None, None
     if bool(cells.any()):
         movers, mover = _sum_range_rates(moving, radar, grid, chirps, cells)
@@ -146,10 +141,8 @@ def _sum_range_rates(
         power = beamform(cube[rows], radar.frames([0] * len(rows)), grid).double() * seen
         total += power.sum(0)
         power = power * candidates[rows][:, :, None, None]
-        peaks += [
-            find_peak(part, grid, float(rate))
-            for part, rate in zip(power, velocities[rows], strict=True)
-        ]
+        pairs = zip(power, velocities[rows], strict=True)
+        peaks += [find_peak(part, grid, float(rate)) for part, rate in pairs]
     return total, max(peaks, key=attrgetter("power"))
 
 

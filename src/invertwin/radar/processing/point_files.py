@@ -28,12 +28,9 @@ def save_points(path: str | Path, points: PointCloud) -> None:
         raise InputError(
             f"expected a file name ending in .ply or .pcd, got {file.name}; rename the output"
         )
-    x, y, z = points.position.detach().cpu().numpy().T
-    columns = {"x": x, "y": y, "z": z}
-    columns |= {
-        name: getattr(points, name).detach().cpu().numpy()
-        for name in ("range", "velocity", "u", "v", "power", "frame")
-    }
+    columns = dict(zip("xyz", points.position.detach().cpu().numpy().T, strict=True))
+    for name in ("range", "velocity", "u", "v", "power", "frame"):
+        columns[name] = getattr(points, name).detach().cpu().numpy()
     order = np.argsort(-columns["power"], kind="stable")
     columns["power"] = 10 * np.log10(columns["power"])
     table = np.stack([values[order] for values in columns.values()], axis=1).astype("<f4")

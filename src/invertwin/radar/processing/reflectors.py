@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Complex, Complex128, Float, Float64, Int64
@@ -75,21 +76,17 @@ def detect_points(
     noise = noise_power(flat, looks)
     rows: list[list[float]] = []
     for v, r in track(_find_cells(flat, radar, grid, looks), "points"):
-        rate = float(rates[v]) + _vertex(flat[[v - 1, v, (v + 1) % len(flat)], r]) * span / len(
-            flat
-        )
+        beside = flat[[v - 1, v, (v + 1) % len(flat)], r]
+        rate = float(rates[v]) + _vertex(beside) * span / len(flat)
         near = [max(r - 1, 0), r, min(r + 1, grid.range_count - 1)]
         place = float(grid.ranges[r]) + _vertex(flat[v, near]) * grid.range_step
-        rows += [
-            [place, rate, *direction]
-            for direction in _resolve_directions(cube[v, :, :, r], radar, grid, noise)
-        ]
+        directions = _resolve_directions(cube[v, :, :, r], radar, grid, noise)
+        rows += [[place, rate, *direction] for direction in directions]
     table = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5)
     ranges, found, u, v, power = table.T
     frames = torch.zeros(len(table), dtype=torch.int64)
-    return PointCloud(
-        frames + frame, ranges, found, u, v, power, world_positions(radar, frames, ranges, u, v)
-    )
+    places = world_positions(radar, frames, ranges, u, v)
+    return PointCloud(frames + frame, ranges, found, u, v, power, places)
 
 
 def format_points_csv(points: PointCloud) -> str:
@@ -139,13 +136,8 @@ def _threshold_cells(
 ) -> Bool[Tensor, "velocity range"]:
     if len(flat) >= _MIN_RATES_2D:
         return cell_averaging_cfar(flat, looks=looks)
-    rows = [
-        ordered_statistics_cfar(
-            row[None], guard=_GUARD, training=_TRAINING, rank=_RANK, looks=looks
-        )
-        for row in flat
-    ]
-    return torch.cat(rows)
+    how: Any = {"guard": _GUARD, "training": _TRAINING, "rank": _RANK, "looks": looks}
+    return torch.cat([ordered_statistics_cfar(row[None], **how) for row in flat])
 
 
 def _sidelobe_response(
@@ -216,9 +208,8 @@ def _refine_direction(
     """Return the direction near one of the grid that maximises the coherent sum of the channels."""
     place = [u, v]
     for shrink in (1.0, 4.0):
-        for axis, (count, width) in enumerate(
-            ((grid.u_count, grid.u_step), (grid.v_count, grid.v_step))
-        ):
+        axes = ((grid.u_count, grid.u_step), (grid.v_count, grid.v_step))
+        for axis, (count, width) in enumerate(axes):
             if count == 1:
                 continue
             levels = []

@@ -134,8 +134,7 @@ def moving_beat(
         InputError: As ``beat_signal``; moving paths of several bounces; points so fast that a
             ramp cannot follow them.
     """
-    waveform = require_sampled_waveform(radar)
-    check_paths(paths, radar, waveform)
+    check_paths(paths, radar, require_sampled_waveform(radar))
     if trajectory is None and paths.velocity is None:
         beat = beat_signal(paths, radar, tolerance=tolerance)
         return beat[:, None].repeat(1, chirps.count, 1, 1, 1)
@@ -231,14 +230,13 @@ class ChirpTrain:
         device = paths.delay.device
         centers = [centre.to(device) for centre in (self.radar.link().tx, self.radar.link().rx)]
         span = paths.last - paths.first
-        segments = _segment_length(
-            paths.first, span, centers[0][paths.frame], centers[1][paths.frame]
-        )
+        ends = centers[0][paths.frame], centers[1][paths.frame]
+        segments = _segment_length(paths.first, span, *ends)
         origins = self.radar.origin_delays.to(device)[paths.frame]
         inner = paths.delay - origins - segments / SPEED_OF_LIGHT
         placed = self._points_at_instants(start, 1 if sample_interval(waveform) == 0 else 3)
         if len(placed) > 1 and len(paths):
-            length = _segment_length(placed, span, centers[0][paths.frame], centers[1][paths.frame])
+            length = _segment_length(placed, span, *ends)
             cycles = phase_cycles((length / SPEED_OF_LIGHT).detach(), waveform)
             bend = math.pi * float((cycles[0] - 2 * cycles[1] + cycles[2]).abs().max())
             count = _count_instants(bend)
@@ -249,19 +247,14 @@ class ChirpTrain:
             rows = torch.nonzero(paths.frame == frame)[:, 0]
             points = self._scattering_points(placed[:, rows], centers[1][frame])
             own, rest = paths.select(rows), inner[rows]
-            ends = points + span[rows]
-            back = [(ends - place).norm(dim=-1) for place in receivers[frame]]
+            back = [(points + span[rows] - place).norm(dim=-1) for place in receivers[frame]]
             for tx, found in zip(active_transmitters, signals, strict=True):
                 forth = (points - transmitters[frame, tx]).norm(dim=-1)
-                channels = [
-                    beat_of_delays(
-                        self.radar.coefficient(own, tx, rx),
-                        (forth + segment) / SPEED_OF_LIGHT + rest,
-                        waveform,
-                        self.tolerance,
-                    )
-                    for rx, segment in enumerate(back)
-                ]
+                channels = []
+                for rx, segment in enumerate(back):
+                    field = self.radar.coefficient(own, tx, rx)
+                    delay = (forth + segment) / SPEED_OF_LIGHT + rest
+                    channels.append(beat_of_delays(field, delay, waveform, self.tolerance))
                 found.append(torch.stack(channels))
         return torch.stack([torch.stack(found) for found in signals], dim=1)
 

@@ -75,8 +75,7 @@ class PhaseNoise:
             level = self.levels[0] - 20 * torch.log10(offset / self.offsets[0])
         else:
             points = np.log10(np.asarray(self.offsets))
-            between = np.interp(np.log10(offset.numpy()), points, self.levels)
-            level = torch.from_numpy(between)
+            level = torch.from_numpy(np.interp(np.log10(offset.numpy()), points, self.levels))
         return 2 * 10 ** (level / 10)
 
 
@@ -221,9 +220,8 @@ class Impairments:
                 )
             direct = leakage_signal(self.leakage, radar)
             if self.phase_noise is not None:
-                delay = self.leakage.delay
                 residual = residual_phase(
-                    self.phase_noise, radar, delay, seed=streams[0], chirps=chirps
+                    self.phase_noise, radar, self.leakage.delay, seed=streams[0], chirps=chirps
                 )
                 direct = direct * _phasor(residual).unsqueeze(-2)
             beat = beat + direct.to(beat.device)
@@ -404,8 +402,7 @@ def quantize(
             "expected a beat signal without a gradient, got one that carries it; codes are "
             "constant between their steps: quantise data only, or detach() first"
         )
-    parts = torch.view_as_real(beat.resolve_conj())
-    codes = torch.round(parts / adc.step)
+    codes = torch.round(torch.view_as_real(beat.resolve_conj()) / adc.step)
     lowest, highest = -(2 ** (adc.bits - 1)), 2 ** (adc.bits - 1) - 1
     clipped = int(((codes < lowest) | (codes > highest)).any(-1).sum())
     if clipped:

@@ -9,6 +9,7 @@ takes about a fortieth of the time.
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -18,6 +19,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import Radar, require_sampled_waveform
 from invertwin.radar.signal.chirps import Chirps, ChirpTrain, sample_interval
 from invertwin.radar.signal.range_profile import beat_signal, check_paths
+from invertwin.scene.mesh import merge_meshes
 from invertwin.scene.scene import Scene
 
 _TRAJECTORY_TOLERANCE = 1e-7  # tolerance of polynomial trajectories [m]
@@ -46,9 +48,8 @@ class VisibilityKeyframes:
     ) -> None:
         self.motion, self.trace, self.radar, self.loops = motion, trace, radar, loops
         self.starts = chirps.times(radar.shape[1])
-        self.last = (require_sampled_waveform(radar).samples - 1) * sample_interval(
-            require_sampled_waveform(radar)
-        )
+        waveform = require_sampled_waveform(radar)
+        self.last = (waveform.samples - 1) * sample_interval(waveform)
         self.number, self.still, self.train = -1, torch.zeros(0), None
 
     def simulate_ramp(self, start: float, transmitters: list[int]) -> Tensor:
@@ -63,9 +64,9 @@ class VisibilityKeyframes:
             self.number = loop // self.loops
             self._start_keyframe()
         still = self.still[:, transmitters]
-        return (
-            still if self.train is None else still + self.train.simulate_ramp(start, transmitters)
-        )
+        if self.train is None:
+            return still
+        return still + self.train.simulate_ramp(start, transmitters)
 
     def _start_keyframe(self) -> None:
         own = self.starts[self.number * self.loops : (self.number + 1) * self.loops]
@@ -75,12 +76,8 @@ class VisibilityKeyframes:
         check_paths(paths, self.radar, require_sampled_waveform(self.radar))
         assert paths.face is not None
         assert paths.barycentric is not None
-        corners = torch.cat(
-            [
-                i.mesh.faces + n
-                for i, n in zip(scene.objects.values(), _vertex_offsets(scene), strict=True)
-            ]
-        )[paths.face]
+        whole = merge_meshes([item.mesh for item in scene.objects.values()])
+        corners = whole.faces[paths.face]
         vertices = _VertexTrajectories(self.motion, scene, begin, end)
         moves = vertices.moves[corners].any(1)
         self.still = beat_signal(paths.select(~moves), self.radar)
@@ -91,11 +88,10 @@ class VisibilityKeyframes:
         self.train = None
         if len(rows):
             moving = paths.select(rows)
-            here = vertices.interpolate(nodes, 0.5 * (begin + end))
+            trajectory = partial(vertices.interpolate, nodes)
+            here = trajectory(0.5 * (begin + end))
             moving = replace(moving, first=here, last=here, velocity=None)
-            self.train = ChirpTrain(
-                moving, self.radar, lambda time: vertices.interpolate(nodes, time)
-            )
+            self.train = ChirpTrain(moving, self.radar, trajectory)
 
 
 class _VertexTrajectories:
@@ -122,10 +118,8 @@ class _VertexTrajectories:
             angles = torch.arange(degree + 1, dtype=torch.float64) * math.pi / degree
             self.places = begin + 0.5 * (1 - angles.cos()) * (end - begin)
             self.nodes = torch.stack([vertices(time) for time in self.places.tolist()])
-            if all(
-                float((self.interpolate(self.nodes, t) - v).abs().max()) < _TRAJECTORY_TOLERANCE
-                for t, v in known
-            ):
+            off = (float((self.interpolate(self.nodes, t) - v).abs().max()) for t, v in known)
+            if all(error < _TRAJECTORY_TOLERANCE for error in off):
                 break
         else:
             raise InputError(
@@ -150,12 +144,6 @@ class _VertexTrajectories:
         weights[0], weights[-1] = 0.5 * weights[0], 0.5 * weights[-1]
         weights = weights / apart
         return torch.tensordot(weights / weights.sum(), nodes, dims=1)
-
-
-def _vertex_offsets(scene: Scene) -> list[int]:
-    """Return the index of the first vertex of every object."""
-    counts = [len(item.vertices) for item in scene.objects.values()]
-    return [sum(counts[:number]) for number in range(len(counts))]
 
 
 def vertex_displacements(scene: Scene, other: Scene) -> dict[str, Tensor]:

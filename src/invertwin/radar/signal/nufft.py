@@ -133,9 +133,8 @@ class NonUniformSum(torch.autograd.Function):
         ctx.save_for_backward(coefficient, offset_cycles, step_cycles)
         ctx.save_for_forward(coefficient, offset_cycles, step_cycles)
         ctx.samples, ctx.tolerance = samples, tolerance
-        return _transform(
-            1, step_cycles, coefficient.conj() * _phasor(offset_cycles), samples, tolerance
-        )
+        strengths = coefficient.conj() * _phasor(offset_cycles)
+        return _transform(1, step_cycles, strengths, samples, tolerance)
 
     @staticmethod
     @torch.autograd.function.once_differentiable

@@ -63,19 +63,11 @@ def beat_signal(
         own = paths.select(rows)
         first, last = own.first, own.last
         # Delay without the segments to the antennas.
-        inner = (
-            paths.delay[rows]
-            - origin_delays[frame]
-            - ((first - tx[frame].mean(0)).norm(dim=1) + (last - rx[frame].mean(0)).norm(dim=1))
-            / SPEED_OF_LIGHT
-        )
-        forth = [
-            inner + (first - place).norm(dim=1) / SPEED_OF_LIGHT for place in tx[frame][channels[0]]
-        ]
-        back = [(last - place).norm(dim=1) / SPEED_OF_LIGHT for place in rx[frame][channels[1]]]
-        senders, hearers = (
-            range(n)[part] for n, part in zip(radar.shape[1:], channels, strict=True)
-        )
+        outer = (first - tx[frame].mean(0)).norm(dim=1) + (last - rx[frame].mean(0)).norm(dim=1)
+        inner = paths.delay[rows] - origin_delays[frame] - outer / SPEED_OF_LIGHT
+        senders, hearers = range(radar.shape[1])[channels[0]], range(radar.shape[2])[channels[1]]
+        forth = [inner + (first - tx[frame, t]).norm(dim=1) / SPEED_OF_LIGHT for t in senders]
+        back = [(last - rx[frame, r]).norm(dim=1) / SPEED_OF_LIGHT for r in hearers]
         signals = [
             beat_of_delays(radar.coefficient(own, t, r), (f + b)[None], waveform, tolerance)
             for t, f in zip(senders, forth, strict=True)
@@ -191,11 +183,8 @@ def check_paths(paths: Paths, radar: Radar, waveform: SampledWaveform) -> None:
     shown = paths.range - radar.origins.to(paths.delay.device)[paths.frame]
     beyond = int(((shown < low) | (shown > high)).sum())
     if beyond:
-        within = (
-            f" from {low:.2f} to {high:.2f} m of the origin"
-            if radar.range_origin is not None
-            else ""
-        )
+        centred = radar.range_origin is not None
+        within = f" from {low:.2f} to {high:.2f} m of the origin" if centred else ""
         warnings.warn(
             f"{beyond} of {len(paths)} paths lie beyond the unambiguous range of "
             f"{waveform.max_range:.2f} m{within} and appear at wrong ranges; use finer frequency "

@@ -10,9 +10,8 @@ from invertwin.channel import Paths
 from invertwin.radar.aperture import aperture
 from invertwin.radar.radar import Radar, require_sampled_waveform
 
-_CELLS_PER_RESOLUTION = (
-    4  # per resolution cell and axis: less than a tenth of a percent of the power is lost
-)
+# Per resolution cell and axis: less than a tenth of a percent of the power is lost.
+_CELLS_PER_RESOLUTION = 4
 _POINT_TOLERANCE = 1e-7  # points closer than this are one [m]
 
 
@@ -39,11 +38,10 @@ class SpeckleRealisations:
         bias = torch.as_tensor(radar.range_bias).detach()
         ranges = paths.range - radar.origins[paths.frame] + bias
         steps = (waveform.range_resolution, *radar.beamwidth)
-        axes = [
+        (ranges, rows), (u, columns), (v, layers) = [
             _bin_axis(x, step / _CELLS_PER_RESOLUTION)
             for x, step in zip((ranges, u, v), steps, strict=True)
         ]
-        (ranges, rows), (u, columns), (v, layers) = axes
         self._cells = len(ranges), len(u), len(v)
         self._cell = (rows * len(u) + columns) * len(v) + layers
         delay = paths.delay - radar.origin_delays[paths.frame]

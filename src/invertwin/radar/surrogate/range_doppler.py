@@ -52,20 +52,13 @@ def range_doppler_power(
         InputError: Velocities that do not fit the paths, an unknown window, or a grid that the
             array does not resolve.
     """
-    check_shape(
-        velocities,
-        paths.first.shape,
-        "velocities, one per path,",
-        "evaluate them at the paths' points",
-    )
+    do = "evaluate them at the paths' points"
+    check_shape(velocities, paths.first.shape, "velocities, one per path,", do)
     direction, own_rates = _directions_and_rates(paths, velocities, radar)
     off = own_rates - rates[:, None]
     doppler = _doppler_response(off / velocity_span(radar, chirps), chirps, window)
-    shown = (
-        paths.range
-        - radar.origins[paths.frame]
-        + own_rates * _range_doppler_coupling(radar.waveform)
-    )
+    coupled = own_rates * _range_doppler_coupling(radar.waveform)
+    shown = paths.range - radar.origins[paths.frame] + coupled
     spread = _range_spread(shown, radar, grid)
     steered = _beam_weights(direction, radar, grid)
     starts = 4 * math.pi / radar.waveform.wavelength * chirps.times(len(steered))[0]
@@ -105,9 +98,8 @@ def _range_doppler_coupling(waveform: Waveform) -> float:
 def _range_spread(
     ranges: Float64[Tensor, " path"], radar: Radar, grid: Grid
 ) -> Float64[Tensor, "range path"]:
-    off = grid.ranges[:, None] - ranges
     return interpolate_response(
-        off,
+        grid.ranges[:, None] - ranges,
         radar.waveform.range_resolution,
         lambda places: radar.waveform.range_response(places, radar.window),
     )

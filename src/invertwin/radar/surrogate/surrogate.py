@@ -24,7 +24,7 @@ from invertwin.channel import (
     trace_target,
     use_backend,
 )
-from invertwin.checks import check_fields, checked_number
+from invertwin.checks import check_choice, check_fields, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.aperture import Aperture, aperture
@@ -118,14 +118,11 @@ class Surrogate:
             )
         angle_width = _DEFAULT_ANGLE_WIDTH
         if distance is not None:
-            degrees = math.degrees(
-                math.atan2(error, checked_number(distance, "distance [m]", 0.0, open_low=True))
-            )
+            far = checked_number(distance, "distance [m]", 0.0, open_low=True)
+            degrees = math.degrees(math.atan2(error, far))
         if degrees is not None:
-            sine = math.sin(
-                math.radians(checked_number(degrees, "error in direction [°]", 0.0, 90))
-            )
-            angle_width = sine / min(radar.beamwidth)
+            angle = math.radians(checked_number(degrees, "error in direction [°]", 0.0, 90))
+            angle_width = math.sin(angle) / min(radar.beamwidth)
         range_width = error / radar.waveform.range_resolution
         return cls(range_width=range_width, angle_width=angle_width, **kernels)
 
@@ -226,14 +223,13 @@ class Surrogate:
         return power * paired_array_spread(array, u, v)
 
     def _kernels(self, radar: Radar, grid: Grid) -> "tuple[_SurrogateKernel, ...]":
-        resolved = grid.u_count > 1 or grid.v_count > 1
         return _kernels(
             self.range_kernel,
             self.angle_kernel,
             airy_radii(radar, self.aperture_radius),
             radar.waveform,
             radar.window,
-            aperture(radar) if resolved else None,
+            aperture(radar) if (grid.u_count > 1 or grid.v_count > 1) else None,
             grid,
         )
 
@@ -267,11 +263,8 @@ def resolve_surrogate(surrogate: Surrogate | str | None) -> Surrogate | None:
     """
     if not isinstance(surrogate, str):
         return surrogate
-    if surrogate not in SURROGATES:
-        raise InputError(
-            f"expected a Surrogate or one of {', '.join(SURROGATES)}, got {surrogate!r}; "
-            'surrogate="exact" means exact signals'
-        )
+    do = 'surrogate="exact" means exact signals'
+    check_choice(surrogate, SURROGATES, "a Surrogate or one of", do)
     return SURROGATES[surrogate]
 
 
@@ -314,11 +307,8 @@ def surrogate_spectrum(
         if reference is not None:
             reference = as_absorbers(reference[0], coherent), reference[1]
         rest = as_absorbers(scene, coherent)
-        parts.append(
-            deposit_power(
-                rest, link, grid, sampling=sampling, seed=seed, scheme=scheme, reference=reference
-            )
-        )
+        how: Any = {"seed": seed, "scheme": scheme, "reference": reference}
+        parts.append(deposit_power(rest, link, grid, sampling=sampling, **how))
     return surrogate.shape(torch.stack(parts).sum(0), radar, grid).clamp_min(0.0)
 
 
@@ -373,15 +363,10 @@ def surrogate_spectra(
     rest = [as_absorbers(scene, coherent) for scene in scenes]
     deposit = deposit_batch(rest, radar.link(), grid, sampling=sampling, seed=seed)
     if coherent:
-        targets = [
-            torch.stack(
-                _deposit_targets(scene, radar, grid, surrogate, sampling, coherent, stretch)
-            ).sum(0)
-            for scene in scenes
-        ]
+        how = (radar, grid, surrogate, sampling, coherent, stretch)
+        targets = [torch.stack(_deposit_targets(scene, *how)).sum(0) for scene in scenes]
         deposit = deposit + torch.stack(targets)
-    shaped = surrogate.shape(deposit.flatten(0, 1), radar, grid)
-    return shaped.clamp_min(0.0).reshape(deposit.shape)
+    return surrogate.shape(deposit.flatten(0, 1), radar, grid).clamp_min(0.0).reshape(deposit.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -441,9 +426,8 @@ def _kernels(
     grid: Grid,
 ) -> tuple[_SurrogateKernel, ...]:
     """Return the kernels without added widths, cached for the steps of a fit."""
-    spread = range_point_spread(
-        waveform, _lags(grid.range_count) * grid.range_step, window, range_kernel
-    )
+    lags = _lags(grid.range_count) * grid.range_step
+    spread = range_point_spread(waveform, lags, window, range_kernel)
     kernels = [_compensate_spline((1,), (grid.range_count,), spread)]
     if array is None:
         return tuple(kernels)

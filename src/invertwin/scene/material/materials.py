@@ -165,9 +165,8 @@ class PerfectConductor(_MaterialRecord, Material):
         """Return the scattering law, equal at every `frequency` [Hz]."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
         nothing = torch.zeros((), dtype=torch.float64)
-        return ScatteringLaw(
-            _FULL_REFLECTANCE, *specular_weights(nothing, lobe_exponent(self.lobe_width))
-        )
+        weights = specular_weights(nothing, lobe_exponent(self.lobe_width))
+        return ScatteringLaw(_FULL_REFLECTANCE, *weights)
 
 
 @dataclass(frozen=True)
@@ -214,9 +213,8 @@ class RoughDielectric(Medium, Material):
         epsilon = self.complex_permittivity(frequency)
         weights = specular_weights(evaluate_value(self.diffuse), lobe_exponent(self.lobe_width))
         amplitude = fresnel_amplitude(epsilon[..., None], _COSINES)
-        return ScatteringLaw(
-            amplitude, *weights, depolarisation=evaluate_value(self.depolarisation)
-        )
+        depolarisation = evaluate_value(self.depolarisation)
+        return ScatteringLaw(amplitude, *weights, depolarisation=depolarisation)
 
 
 @dataclass(frozen=True)
@@ -234,8 +232,7 @@ class Dielectric(Medium, EffectiveRoughness, Material):
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
         """Return the scattering law at `frequency` [Hz], differentiable w.r.t. all values."""
-        epsilon = self.complex_permittivity(frequency)
-        amplitude = fresnel_amplitude(epsilon[..., None], _COSINES)
+        amplitude = fresnel_amplitude(self.complex_permittivity(frequency)[..., None], _COSINES)
         return ScatteringLaw(amplitude, *self.weights(), **self.depolarisation_terms)
 
     def smooth_interface(self, frequency: float) -> SmoothInterface | None:
@@ -288,9 +285,8 @@ class Layer(Medium):
     def sheet(self, frequency: float) -> SlabLayer:
         """Return the layer as numbers at `frequency` [Hz], for `slab_tables`."""
         epsilon, dispersion = self._epsilon(frequency)
-        return SlabLayer(
-            epsilon[..., None], dispersion[..., None], evaluate_value(self.thickness)[..., None]
-        )
+        values = (epsilon, dispersion, evaluate_value(self.thickness))
+        return SlabLayer(*(value[..., None] for value in values))
 
 
 @dataclass(frozen=True)
@@ -359,11 +355,8 @@ class Multilayer(_MaterialRecord, EffectiveRoughness, Material):
     ) -> FieldCoefficients:
         """Return the coherent field coefficients of the stack, about its middle."""
         layers = [_select_triangles(layer.sheet(frequency), triangle) for layer in self.layers]
-        kept = (
-            self.make_interface(None)
-            .select_triangles(triangle)
-            .coherent_reflection(frequency, cosine)
-        )
+        skin = self.make_interface(None).select_triangles(triangle)
+        kept = skin.coherent_reflection(frequency, cosine)
         return sheet_coefficients(layers, cosine, frequency).scale_reflection(kept)
 
     def incoherent_law(self, frequency: float) -> ScatteringLaw:
@@ -389,6 +382,5 @@ def _slab_scattering_law(
     seen = tables.reflectance > _SAFE_POWER
     amplitude = torch.where(seen, torch.where(seen, tables.reflectance, 1.0).sqrt(), 0.0)
     through = {"transmittance": tables.transmittance, "extra_length": tables.extra_length}
-    return ScatteringLaw(
-        amplitude, *roughness.weights(), **through, **roughness.depolarisation_terms
-    )
+    through |= roughness.depolarisation_terms
+    return ScatteringLaw(amplitude, *roughness.weights(), **through)

@@ -60,10 +60,7 @@ def radio_bsdf(material: Material, name: str) -> ElementTree.Element:
     stated = isinstance(table, Itu) and getattr(material, "conductivity", None) == table
     given = {word: getattr(material, field, None) for word, field in _NUMBERS.items()}
     if stated:
-        given = {
-            "thickness": given["thickness"],
-            "scattering_coefficient": given["scattering_coefficient"],
-        }
+        given = {word: given[word] for word in ("thickness", "scattering_coefficient")}
     plain = all(isinstance(value, int | float) for value in given.values())
     if not (isinstance(material, Slab) and plain and material.loss_tangent == 0):
         raise InputError(

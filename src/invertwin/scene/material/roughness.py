@@ -82,11 +82,8 @@ def specular_weights(
     diffuse, exponent = torch.broadcast_tensors(diffuse, exponent)
     none = diffuse.new_zeros((*diffuse.shape, LOBE_COUNT - 1))
     weight = (1 - diffuse) / lobe_integral(exponent)
-    return LobeWeights(
-        diffuse,
-        torch.cat([weight[..., None], none], dim=-1),
-        torch.cat([exponent[..., None], none], dim=-1),
-    )
+    lobes = (torch.cat([first[..., None], none], dim=-1) for first in (weight, exponent))
+    return LobeWeights(diffuse, *lobes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,9 +124,8 @@ class EffectiveRoughness:
             thickness: thickness of a sheet [m].
         """
         coherent = (1 - evaluate_value(self.scattering) ** 2).sqrt()
-        return SmoothInterface(
-            permittivity, evaluate_value(thickness), coherent, evaluate_value(self.rms_height)
-        )
+        depth, height = evaluate_value(thickness), evaluate_value(self.rms_height)
+        return SmoothInterface(permittivity, depth, coherent, height)
 
     @property
     def depolarisation_terms(self) -> dict[str, Tensor]:
@@ -142,13 +138,8 @@ class EffectiveRoughness:
         lambertian, directive = evaluate_value(self.lambertian), evaluate_value(self.directive)
         directed = scattered * (1 - lambertian)
         shares = (1 - scattered, directed * directive, directed * (1 - directive))
-        exponents = (
-            slope_exponent(self.rms_slope),
-            evaluate_value(self.directive_exponent),
-            evaluate_value(self.backscatter_exponent),
-        )
+        others = (self.directive_exponent, self.backscatter_exponent)
+        exponents = (slope_exponent(self.rms_slope), *map(evaluate_value, others))
         diffuse, *rows = torch.broadcast_tensors(scattered * lambertian, *shares, *exponents)
-        exponent = torch.stack(rows[LOBE_COUNT:], dim=-1)
-        return LobeWeights(
-            diffuse, torch.stack(rows[:LOBE_COUNT], dim=-1) / lobe_integral(exponent), exponent
-        )
+        share, exponent = (torch.stack(r, -1) for r in (rows[:LOBE_COUNT], rows[LOBE_COUNT:]))
+        return LobeWeights(diffuse, share / lobe_integral(exponent), exponent)

@@ -158,10 +158,8 @@ def _both_polarisations(
                 f"expected layers at a frequency, got {type(layer).__name__}; give layer.sheet(f)"
             )
     cosine = cos_theta.clamp(min=LEAST_COSINE)
-    return (
-        _response(layers, cosine, frequency, parallel=False),
-        _response(layers, cosine, frequency, parallel=True),
-    )
+    s, p = (_response(layers, cosine, frequency, parallel=parallel) for parallel in (False, True))
+    return s, p
 
 
 def _response(

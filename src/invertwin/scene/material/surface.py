@@ -92,9 +92,8 @@ class ScatteringLaw:
         given = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         widths = {n: v.shape[v.ndim - (n not in _SCALARS) :] for n, v in given.items()}
         # NumPy's function: the first call of torch's takes seconds.
-        row = np.broadcast_shapes(
-            *(values.shape[: values.ndim - len(widths[n])] for n, values in given.items())
-        )
+        rows = (values.shape[: values.ndim - len(widths[n])] for n, values in given.items())
+        row = np.broadcast_shapes(*rows)
         for name, values in given.items():
             object.__setattr__(self, name, values.expand((*row, *widths[name])))
 
@@ -128,9 +127,8 @@ class ScatteringLaw:
         above = at * torch.special.ndtr(at) + torch.exp(-0.5 * at**2) / math.sqrt(2 * math.pi)
         share = share * above[..., -1:] / above
         positive = share > 0  # a root of zero has no derivative
-        return replace(
-            self, spread=torch.where(positive, torch.where(positive, share, 1.0).sqrt(), 0.0)
-        )
+        spread = torch.where(positive, torch.where(positive, share, 1.0).sqrt(), 0.0)
+        return replace(self, spread=spread)
 
 
 class SmoothInterface(NamedTuple):

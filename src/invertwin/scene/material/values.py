@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, checked_number, checked_tensor
+from invertwin.checks import ArrayLike, checked_number, checked_tensor, set_fields
 from invertwin.errors import InputError
 from invertwin.limits import AllowedValues
 from invertwin.scene.mesh import Mesh, checked_faces
@@ -50,8 +50,7 @@ class Texture:
             do = "give u, v of every vertex"
             vertices = checked_tensor(self.uv, (None, 2), "uv of a texture", do)
             uv = vertices[checked_faces(faces, len(vertices))]
-        object.__setattr__(self, "image", image)
-        object.__setattr__(self, "uv", uv.detach())
+        set_fields(self, image=image, uv=uv.detach())
 
     @classmethod
     def from_projection(cls, image: ArrayLike, mesh: Mesh) -> "Texture":

@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from invertwin.checks import ArrayLike, checked_count, checked_tensor
+from invertwin.checks import ArrayLike, checked_count, checked_tensor, set_fields
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh, concatenate_meshes
@@ -69,16 +69,12 @@ class BodyTemplate:
         off = float((weights.sum(1) - 1).abs().max())
         if float(weights.min()) < 0 or off > 1e-3:
             raise InputError(
-                "expected skinning weights >= 0 that add up to 1 at each vertex, "
-                f"got a least one of {float(weights.min()):.3g} and sums {off:.3g} off; "
-                "normalise them"
+                "expected skinning weights >= 0 that add up to 1 at each vertex, got a least one "
+                f"of {float(weights.min()):.3g} and sums {off:.3g} off; normalise them"
             )
-        set_ = object.__setattr__
-        set_(self, "vertices", mesh.vertices)
-        set_(self, "faces", mesh.faces)
-        set_(self, "weights", weights / weights.sum(1, keepdim=True))
-        set_(self, "parents", parents)
-        set_(self, "joints", checked_tensor(self.joints, (count, 3), "joints [m]", _DO))
+        weights = weights / weights.sum(1, keepdim=True)
+        joints = checked_tensor(self.joints, (count, 3), "joints [m]", _DO)
+        set_fields(self, weights=weights, parents=parents, joints=joints, **vars(mesh))
         if self.names and (len(self.names) != count or len(set(self.names)) != count):
             raise InputError(
                 f"expected a name of its own for each of {count} joints, got {len(self.names)} "
@@ -91,16 +87,12 @@ class BodyTemplate:
         if self.shape_directions is not None:
             shapes = checked_tensor(self.shape_directions, (rows, 3, None), "shape directions", _DO)
             places = (count, 3, shapes.shape[2])
-            set_(self, "shape_directions", shapes)
-            set_(
-                self,
-                "joint_directions",
-                checked_tensor(self.joint_directions, places, "joint directions", _DO),
-            )
+            bones = checked_tensor(self.joint_directions, places, "joint directions", _DO)
+            set_fields(self, shape_directions=shapes, joint_directions=bones)
         if self.pose_directions is not None:
             columns = (rows, 3, 9 * (count - 1))
             poses = checked_tensor(self.pose_directions, columns, "pose directions", _DO)
-            set_(self, "pose_directions", poses)
+            set_fields(self, pose_directions=poses)
 
     @property
     def shape_count(self) -> int:

@@ -34,9 +34,8 @@ _HARMONICS = 7
 _SAMPLES = 512  # samples of a cycle for its harmonics
 _MAX_RELATIVE_SPEED = 3.0  # maximum relative speed
 _HANGING = math.radians(80.0)  # shoulder angle from the rest pose, in which arms are held out
-_ADULT_LEG = (
-    0.84  # leg length of ``person`` of 1.75 m [m]; the source states shifts for adults in metres
-)
+# Leg length of ``person`` of 1.75 m [m]; the source states shifts for adults in metres.
+_ADULT_LEG = 0.84
 JOINTS = (
     *("pelvis", "chest", "left_shoulder", "left_elbow", "right_shoulder", "right_elbow"),
     *("left_hip", "left_knee", "right_hip", "right_knee"),
@@ -96,9 +95,8 @@ class Walking:
         yaw, roll = math.radians(4.0 * v) * cycle, -_evaluate_series(curves["tilt"], phase)
         pelvis = rotation_about_axis("y", yaw) @ rotation_about_axis("z", roll)
         lean = math.radians(_swing(v, 8.0)) * (math.sin(2 * math.pi * (2 * phase - 0.1)) - 1)
-        chest = rotation_about_axis(
-            "y", -_evaluate_series(curves["thorax"], phase)
-        ) @ rotation_about_axis("x", lean)
+        twist = rotation_about_axis("y", -_evaluate_series(curves["thorax"], phase))
+        chest = twist @ rotation_about_axis("x", lean)
         found[self.body.joint("pelvis")] = pelvis
         found[self.body.joint("chest")] = pelvis.T @ chest
         for side, later in (("right", 0.0), ("left", 0.5)):

@@ -84,13 +84,10 @@ class Sitting:
         share = (time - self.start) / self.duration
         u = 1 - share if self.rising else share
         knee, thigh = self._leg()
-        bent = math.acos((self.seat - knee) / thigh + _THIGH) * _minimum_jerk(
-            u / _SEAT_CONTACT_SHARE
-        )
-        lean = _LEAN * (
-            _minimum_jerk(u / _SEAT_CONTACT_SHARE)
-            - _minimum_jerk((u - _SEAT_CONTACT_SHARE) / (1 - _SEAT_CONTACT_SHARE))
-        )
+        lowered = _minimum_jerk(u / _SEAT_CONTACT_SHARE)
+        bent = math.acos((self.seat - knee) / thigh + _THIGH) * lowered
+        upright = _minimum_jerk((u - _SEAT_CONTACT_SHARE) / (1 - _SEAT_CONTACT_SHARE))
+        lean = _LEAN * (lowered - upright)
         shoulder, elbow = (angle * _minimum_jerk(u) for angle in _LAP)
         found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
         pelvis = rotation_about_axis("x", -lean / 2)
@@ -171,16 +168,14 @@ class Waving:
         """
         found, shift = self._rest_rotations(time)
         since = time - self.start
-        up = _minimum_jerk(since / _RAISE_DURATION) - _minimum_jerk(
-            1 - (self.duration - since) / _RAISE_DURATION
-        )
+        down = _minimum_jerk(1 - (self.duration - since) / _RAISE_DURATION)
+        up = _minimum_jerk(since / _RAISE_DURATION) - down
         swing = _WAVE * math.sin(2 * math.pi * self.rate * since)
         sign = 1.0 if self.side == "right" else -1.0
         # Held out to the side, forearm upwards: the arm of the rest pose with a bent elbow.
-        bent = sign * (math.pi / 2 + swing)
         raised = {
             "shoulder": rotation_about_axis("z", 0.0),
-            "elbow": rotation_about_axis("z", bent),
+            "elbow": rotation_about_axis("z", sign * (math.pi / 2 + swing)),
         }
         for name, turn in raised.items():
             row = self.body.joint(f"{self.side}_{name}")

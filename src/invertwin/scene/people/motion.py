@@ -9,7 +9,14 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, Point, checked_number, checked_tensor, checked_type
+from invertwin.checks import (
+    ArrayLike,
+    Point,
+    checked_number,
+    checked_tensor,
+    checked_type,
+    set_fields,
+)
 from invertwin.errors import InputError
 from invertwin.scene.pose import compose, rigid, rotation_from_vector
 from invertwin.scene.scene import Object, Scene
@@ -81,11 +88,11 @@ class AxisRotation:
         axis = checked_tensor(self.axis, (3,), "axis", "give x, y, z")
         if float(axis.norm()) == 0:
             raise InputError("expected an axis with a direction, got zeros; give x, y, z")
-        object.__setattr__(self, "axis", axis / axis.norm())
+        set_fields(self, axis=axis / axis.norm())
         checked_number(self.rate, "rate [rad/s]", -math.inf)
         if self.center is not None:
             given = checked_tensor(self.center, (3,), "center [m]", "give x, y, z")
-            object.__setattr__(self, "center", given)
+            set_fields(self, center=given)
 
     def __call__(self, item: Object, time: float) -> Object:
         """Return the object rotated for a time [s].
@@ -96,8 +103,7 @@ class AxisRotation:
         """
         turn = rotation_from_vector(torch.as_tensor(self.axis) * (self.rate * time))
         center = item.mesh.center if self.center is None else torch.as_tensor(self.center)
-        own = rigid(turn, center - turn @ center)
-        return replace(item, pose=compose(own, item.transform))
+        return replace(item, pose=compose(rigid(turn, center - turn @ center), item.transform))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,12 +132,10 @@ class SplineTrajectory:
             )
         shape = (len(times), 3)
         places = checked_tensor(self.positions, shape, "places [m]", "give x, y, z for each time")
-        object.__setattr__(self, "times", times.detach())
-        object.__setattr__(self, "positions", places.detach())
         from scipy.interpolate import CubicSpline  # slow to import
 
         curve = CubicSpline(times.detach().numpy(), places.detach().numpy(), bc_type="natural")
-        object.__setattr__(self, "_curve", curve)
+        set_fields(self, times=times.detach(), positions=places.detach(), _curve=curve)
 
     def position(self, time: float) -> Float64[Tensor, "3"]:
         """Return the position at a time [m].
@@ -199,6 +203,5 @@ class TrajectoryMotion:
             # −z rotated about y by θ is (−sin θ, 0, −cos θ).
             angle = torch.atan2(-ahead[0], -ahead[2])
             turn = rotation_from_vector(torch.stack([0 * angle, angle, 0 * angle]))
-        return replace(
-            item, pose=compose(item.transform, rigid(turn, self.trajectory.position(time)))
-        )
+        motion = rigid(turn, self.trajectory.position(time))
+        return replace(item, pose=compose(item.transform, motion))

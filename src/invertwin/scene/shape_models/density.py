@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float64
-from skimage.measure import marching_cubes
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
@@ -16,6 +15,7 @@ from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import Entries, ObjectModule
 from invertwin.scene.scene import Object, Scene
 from invertwin.scene.shape_models.distance import signed_distance
+from invertwin.scene.shape_models.iso_surface import march_cubes
 from invertwin.scene.shape_models.lattice import Lattice
 
 # Minimum initial density over the inverse node spacing: softplus is too flat below.
@@ -171,11 +171,8 @@ def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
         )
     # A layer of zero density closes the surface at the faces of the box.
     padded = nn.functional.pad(density, (1, 1, 1, 1, 1, 1))
-    corners, faces, _, _ = marching_cubes(
-        padded.numpy(), level, gradient_direction="ascent", allow_degenerate=False
-    )
-    places = torch.from_numpy(corners).double() - 1
-    return Mesh(cloud.low + places * cloud.spacing, torch.from_numpy(faces.astype("int64")))
+    corners, faces = march_cubes(padded, level, "ascent")
+    return Mesh(cloud.low + (corners - 1) * cloud.spacing, faces)
 
 
 def replace_clouds(scene: Scene) -> Scene:

@@ -13,14 +13,7 @@ from annotated_types import Ge, Le
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.checks import (
-    ArrayLike,
-    Counts,
-    Point,
-    checked_count,
-    checked_number,
-    checked_tensor,
-)
+from invertwin.checks import ArrayLike, Counts, Point, checked_count, checked_number, checked_tensor
 from invertwin.limits import NonNegative, Positive
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
@@ -98,9 +91,8 @@ class DistanceGrid(_Distance):
         value: Float64[Tensor, "x y z"],
         smoothing: float = 0.0,
     ) -> None:
-        given = checked_tensor(
-            value, (None, None, None), "signed distances [m]", "give one for each node"
-        )
+        do = "give one for each node"
+        given = checked_tensor(value, (None, None, None), "signed distances [m]", do)
         super().__init__(object, low, high, tuple(given.shape))
         self._smoother = GridSmoother(given.shape, checked_number(smoothing, "smoothing λ", 0))
         self.value = nn.Parameter(self._smoother.power(1, given.detach()).clone())

@@ -13,9 +13,8 @@ from invertwin.scene.shape_models.lattice import Lattice
 
 Field = Callable[[Float64[Tensor, "p 3"]], Float64[Tensor, " p"]]
 
-_NEWTON_STEPS = (
-    4  # Newton steps from marching cubes, whose error is of second order, to the field's zero
-)
+# Newton steps from marching cubes, whose error is of second order, to the field's zero.
+_NEWTON_STEPS = 4
 _CHUNK = 65_536  # points of the field per chunk
 _MIN_GRADIENT = 1e-6  # minimum gradient of a distance field, nominally 1
 
@@ -62,13 +61,26 @@ def extract_surface(
             f"[{float(values.min()):.3g}, {float(values.max()):.3g}]; "
             "start with a surface inside of the box"
         )
-    corners, faces, _, _ = marching_cubes(
-        values.detach().numpy(), 0.0, gradient_direction="descent", allow_degenerate=False
-    )
-    start = lattice.low + torch.from_numpy(corners).double() * lattice.spacing
+    corners, faces = march_cubes(values.detach(), 0.0, "descent")
+    start = lattice.low + corners * lattice.spacing
     points = _refine_vertices(field, start, lattice)
-    slope = _value_and_gradient(field, points)[1]
-    return points, torch.from_numpy(faces.astype("int64")), slope
+    return points, faces, _value_and_gradient(field, points)[1]
+
+
+def march_cubes(
+    values: Float64[Tensor, "x y z"], level: float, gradient: str
+) -> tuple[Float64[Tensor, "p 3"], Int64[Tensor, "t 3"]]:
+    """Corners, in steps between the nodes, and triangles where values on nodes are at a level.
+
+    Args:
+        values: On the nodes.
+        level: Of the surface.
+        gradient: "ascent" towards the inside, or "descent".
+    """
+    corners, faces, _, _ = marching_cubes(
+        values.numpy(), level, gradient_direction=gradient, allow_degenerate=False
+    )
+    return torch.from_numpy(corners).double(), torch.from_numpy(faces.astype("int64"))
 
 
 def attach_shape_derivative(
@@ -92,8 +104,7 @@ def _refine_vertices(field: Field, points: Tensor, lattice: Lattice) -> Tensor:
     for _ in range(_NEWTON_STEPS):
         value, slope = _value_and_gradient(field, points)
         step = slope * (value / slope.square().sum(1).clamp_min(_MIN_GRADIENT**2))[:, None]
-        length = step.norm(dim=1, keepdim=True)
-        points = points - step * (reach / length.clamp_min(reach))
+        points = points - step * (reach / step.norm(dim=1, keepdim=True).clamp_min(reach))
         points = points.clamp(lattice.low, lattice.high)
     return points
 

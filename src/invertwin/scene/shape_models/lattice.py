@@ -59,9 +59,8 @@ class Lattice:
             (max(x, y, z), _MAX_NODES_PER_AXIS, " along an axis"),
             (0 if sliced else x * y * z, _MAX_NODES, ""),
         ):
-            require_at_most(
-                count, most, f"nodes of a grid{where}", "take fewer, wider apart", "counts"
-            )
+            do = "take fewer, wider apart"
+            require_at_most(count, most, f"nodes of a grid{where}", do, "counts")
         return cls(first, last, (x, y, z))
 
     @property
@@ -85,8 +84,7 @@ class Lattice:
     def cell(self, points: Float64[Tensor, "p 3"]) -> tuple[Tensor, Tensor]:
         """Return the cell of each point [p, 3], clamped, and the position within it in cells."""
         place = (points - self.low) / self.spacing
-        last = torch.tensor(self.counts) - 2
-        index = place.detach().floor().long().clamp_min(0).minimum(last)
+        index = place.detach().floor().long().clamp_min(0).minimum(torch.tensor(self.counts) - 2)
         return index, place - index
 
 

@@ -14,7 +14,7 @@ from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
-from invertwin.scene.shape_models.iso_surface import attach_shape_derivative, extract_surface
+from invertwin.scene.shape_models.iso_surface import Field, attach_shape_derivative, extract_surface
 from invertwin.scene.shape_models.lattice import (
     Lattice,
     interpolate_cubic,
@@ -140,9 +140,8 @@ class ShapePrior:
         Raises:
             InputError: as `values`, or fewer than two nodes along an axis.
         """
-        return interpolate_cubic_slices(
-            self.values(latent), self.lattice, self.nodes(counts, sliced=True)
-        )
+        values, target = self.values(latent), self.nodes(counts, sliced=True)
+        return interpolate_cubic_slices(values, self.lattice, target)
 
     def decode(
         self, latent: Float64[Tensor, " k"], counts: Sequence[int]
@@ -164,12 +163,7 @@ class ShapePrior:
         """
         values = self.values(latent)
         points, faces, slope = self._surface(values.detach(), self.nodes(counts))
-        return Mesh(
-            attach_shape_derivative(
-                lambda at: interpolate_cubic(values, self.lattice, at), points, slope
-            ),
-            faces,
-        )
+        return Mesh(attach_shape_derivative(self._field(values), points, slope), faces)
 
     def mean_mesh(self, counts: Sequence[int] | None = None) -> Mesh:
         """Return the surface of z = 0."""
@@ -189,13 +183,13 @@ class ShapePrior:
         """Return vertices, triangles and the field's gradient, cached for derivatives."""
         last = self._last
         if last is None or last[0] != target.counts or not torch.equal(last[1], values):
-
-            def field(at: Tensor) -> Tensor:
-                return interpolate_cubic(values, self.lattice, at)
-
             known = torch.stack(list(interpolate_cubic_slices(values, self.lattice, target)))
-            last = self._last = target.counts, values, extract_surface(field, target, known)
+            found = extract_surface(self._field(values), target, known)
+            last = self._last = target.counts, values, found
         return last[2]
+
+    def _field(self, values: Tensor) -> Field:
+        return lambda at: interpolate_cubic(values, self.lattice, at)
 
     def _check_latent(self, latent: Tensor) -> Tensor:
         """Validate a latent."""

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor, nn
 
-from invertwin.checks import ArrayLike, checked_count, checked_tensor
+from invertwin.checks import ArrayLike, checked_count, checked_tensor, set_fields
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
@@ -34,18 +34,11 @@ class ShapeSpace:
     def __post_init__(self) -> None:
         do = "give mean [v, 3], components [v, 3, k], deviations [k] of one space"
         mesh = Mesh(self.mean, self.faces)
-        rows = len(mesh.vertices)
-        parts = checked_tensor(self.components, (rows, 3, None), "components", do)
+        parts = checked_tensor(self.components, (len(mesh.vertices), 3, None), "components", do)
         sizes = checked_tensor(self.deviations, (parts.shape[2],), "deviations [m]", do)
         if bool((sizes < 0).any()) or not len(sizes):
             raise InputError(f"expected deviations >= 0, got {sizes.tolist()}; {do}")
-        for name, value in (
-            ("mean", mesh.vertices),
-            ("components", parts),
-            ("deviations", sizes),
-            ("faces", mesh.faces),
-        ):
-            object.__setattr__(self, name, value)
+        set_fields(self, mean=mesh.vertices, components=parts, deviations=sizes, faces=mesh.faces)
 
     def mesh(self, latent: Float64[Tensor, " n"]) -> Mesh:
         """Return the shape of the first n coordinates z, in standard deviations.

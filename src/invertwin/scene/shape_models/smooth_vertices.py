@@ -78,9 +78,8 @@ class Smoother:
 
     def __init__(self, faces: Tensor, count: int, amount: float) -> None:
         self._given = faces, count, amount
-        self._factors: SuperLU = splu(
-            csc_array(eye_array(count) + amount * laplacian(faces, count))
-        )
+        matrix = eye_array(count) + amount * laplacian(faces, count)
+        self._factors: SuperLU = splu(csc_array(matrix))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), self._given
