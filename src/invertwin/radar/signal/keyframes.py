@@ -19,7 +19,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import Radar, require_sampled_waveform
 from invertwin.radar.signal.chirps import Chirps, ChirpTrain, sample_interval
 from invertwin.radar.signal.range_profile import beat_signal, check_paths
-from invertwin.scene.mesh import merge_meshes
+from invertwin.scene.mesh import concatenate_meshes
 from invertwin.scene.scene import Scene
 
 _TRAJECTORY_TOLERANCE = 1e-7  # tolerance of polynomial trajectories [m]
@@ -76,7 +76,7 @@ class VisibilityKeyframes:
         check_paths(paths, self.radar, require_sampled_waveform(self.radar))
         assert paths.face is not None
         assert paths.barycentric is not None
-        whole = merge_meshes([item.mesh for item in scene.objects.values()])
+        whole = concatenate_meshes([item.mesh for item in scene.objects.values()])
         corners = whole.faces[paths.face]
         vertices = _VertexTrajectories(self.motion, scene, begin, end)
         moves = vertices.moves[corners].any(1)
