@@ -98,14 +98,11 @@ def _visible_shares(
     boundary: bool,
 ) -> Float64[Tensor, " place"]:
     """Fraction of a target's outline visible from each antenna past other objects."""
-    return torch.stack(
-        [
-            visible_fractions(
-                others, place[None], _outline_cells(points, place), boundary=boundary
-            ).mean()
-            for place in antennas
-        ]
-    )
+    found = []
+    for place in antennas:
+        cells = _outline_cells(points, place)
+        found.append(visible_fractions(others, place[None], cells, boundary=boundary).mean())
+    return torch.stack(found)
 
 
 def _outline_cells(points: Float64[Tensor, "v 3"], antenna: Float64[Tensor, "3"]) -> PanelCells:

@@ -38,10 +38,8 @@ def conductor_matrix(link: Link, echo: PathTransfer) -> Complex128[Tensor, "row 
         sent = antenna_fields(link.tx_jones, rotation, ways[0])
         received = antenna_fields(link.rx_jones, rotation, ways[1])
         kernel = current_kernel(normal, ways[0], sent, ways[1], received)
-    return (
-        conductor_field(echo.spreading, kernel, -dot(normal, ways[1]))
-        * point.jacobian[:, None, None]
-    )
+    field = conductor_field(echo.spreading, kernel, -dot(normal, ways[1]))
+    return field * point.jacobian[:, None, None]
 
 
 def _has_directional_jones(link: Link) -> bool:

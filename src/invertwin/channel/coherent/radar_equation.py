@@ -15,9 +15,11 @@ from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.em.plane_waves import triangle_normals
 from invertwin.channel.paths import Link, Paths
 from invertwin.channel.rays.ray_scene import RayScene, find_next_surface, is_visible
 from invertwin.channel.rays.scene_tables import Geometry, interpolate_values
+from invertwin.channel.rows import Rows
 from invertwin.constants import SPEED_OF_LIGHT
 
 _MAX_SHEETS = 8  # that a segment of an explicit path may pass
@@ -40,7 +42,7 @@ class MaterialPoints:
 
 
 @dataclass(frozen=True)
-class SurfacePaths:
+class SurfacePaths(Rows):
     """Paths over as many material points each, in order from the transmitter; one row a path.
 
     Attributes:
@@ -54,10 +56,6 @@ class SurfacePaths:
     b2: Float64[Tensor, "n k"]
     weight: Float64[Tensor, " n"]
     phase: Float64[Tensor, " n"]
-
-    def select(self, rows: Bool[Tensor, " n"] | Int64[Tensor, " m"]) -> "SurfacePaths":
-        """The rows of a mask, or of indices."""
-        return SurfacePaths(*(column[rows] for column in vars(self).values()))
 
     def material_points(self, geometry: Geometry) -> list[MaterialPoints]:
         """Locate material points."""
@@ -296,13 +294,11 @@ def trace_transmittance(
         rows, hit, step = rows[hit >= 0], hit[hit >= 0], step[hit >= 0]
         at = at.index_add(0, rows, step * (1 - at[rows]))
         row = geometry.face_surface[hit]
-        p0, p1, p2 = geometry.corners(hit)
-        normal = normalize(torch.linalg.cross(p1 - p0, p2 - p0), dim=1)
+        normal = triangle_normals(geometry.vertices[geometry.faces[hit]])
         cosine = (normal * normalize(offset[rows], dim=1)).sum(1)
-        factor = torch.ones_like(transmittance).index_copy(
+        transmittance = transmittance * torch.ones_like(transmittance).index_copy(
             0, rows, _interpolate_table(surfaces.transmittance, row, cosine)
         )
-        transmittance = transmittance * factor
         extra = extra.index_add(0, rows, _interpolate_table(surfaces.extra_length, row, cosine))
         rows = rows[transmittance.detach()[rows] > 0]
     return transmittance * torch.ones_like(transmittance).index_fill(0, rows, 0.0), extra
@@ -358,9 +354,6 @@ def _trace_segments(
         if again and not rays.geometry.has_sheets:
             found += found
         else:
-            found.append(
-                trace_transmittance(rays, end, start)
-                if again
-                else trace_transmittance(rays, start, end)
-            )
+            ends = (end, start) if again else (start, end)
+            found.append(trace_transmittance(rays, *ends))
     return found

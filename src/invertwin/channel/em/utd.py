@@ -202,11 +202,8 @@ def triple_dyad(
             continue
         others = [edge for edge in range(3) if edge != center]
         middle, *outer = (cotangents[edge].rows(rows) for edge in (center, *others))
-        parts = chain_transition(
-            middle.s.abs(),
-            [edge.s.abs() for edge in outer],
-            [couplings[rows, center, other] for other in others],
-        )
+        coupled = [couplings[rows, center, other] for other in others]
+        parts = chain_transition(middle.s.abs(), [edge.s.abs() for edge in outer], coupled)
         strength = torch.zeros(parts.shape[2:], dtype=torch.complex128)
         for odd in itertools.product((0, 1), (0, 1)):
             weights = [middle.strength(sum(odd))]
@@ -250,10 +247,8 @@ class _CoupledCotangents(NamedTuple):
 
 
 def _couple_cotangents(diffraction: EdgeDiffraction, wave_number: float) -> _CoupledCotangents:
-    opening, root = (
-        diffraction.wedges.opening,
-        torch.sqrt(2 * wave_number * diffraction.distance_parameter),
-    )
+    opening = diffraction.wedges.opening
+    root = torch.sqrt(2 * wave_number * diffraction.distance_parameter)
     scale = -_dyad_scale(diffraction, wave_number) * root
     columns = []
     for other, sign in _term_signs(diffraction):
@@ -298,11 +293,9 @@ def _term_dyads(diffraction: EdgeDiffraction) -> Complex128[Tensor, "term row 3 
 def _directional_term_dyads(diffraction: EdgeDiffraction) -> list[Complex128[Tensor, "row 3 3"]]:
     if diffraction.absorbing:
         axis = edge_axis(diffraction.wedges)
-        bases = (
-            _ray_fixed_basis(axis, diffraction.diffracted_direction),
-            _ray_fixed_basis(axis, diffraction.incident_direction),
-        )
-        return [_rotate_dyad(*bases, torch.eye(3, dtype=torch.complex128))] * 2
+        leaving = _ray_fixed_basis(axis, diffraction.diffracted_direction)
+        arriving = _ray_fixed_basis(axis, diffraction.incident_direction)
+        return [_rotate_dyad(leaving, arriving, torch.eye(3, dtype=torch.complex128))] * 2
     direct, *reflected = _geometric_optics_dyads(diffraction)
     return [direct, direct, *reflected]
 
@@ -333,10 +326,8 @@ def _term_coefficients(
 
 def _half_boundary_angle(diffraction: EdgeDiffraction, azimuth_sign: float, sign: float) -> Tensor:
     """Half the angle δ past the boundary of β = φ ± φ′."""
-    beta, full = (
-        diffraction.azimuth + azimuth_sign * diffraction.azimuth_in,
-        2 * math.pi * diffraction.wedges.opening,
-    )
+    beta = diffraction.azimuth + azimuth_sign * diffraction.azimuth_in
+    full = 2 * math.pi * diffraction.wedges.opening
     turns = torch.round((beta + sign * math.pi) / full).detach()
     return (sign * (full * turns - beta) - math.pi) / 2
 
@@ -356,10 +347,8 @@ def _cotangent(
 
     With δ the angle past the boundary, it is −[sin(δ/2)/tan(δ/2n)] √(2kL) g(√(2kL) sin(δ/2)).
     """
-    opening, half = (
-        diffraction.wedges.opening,
-        _half_boundary_angle(diffraction, azimuth_sign, sign),
-    )
+    opening = diffraction.wedges.opening
+    half = _half_boundary_angle(diffraction, azimuth_sign, sign)
     quotient = _cotangent_quotient(half, opening)
     s = root * torch.sin(half)
     transition_value = edge_transition(s, diffraction.end_parameters)
@@ -416,13 +405,12 @@ def _rotate_dyad(leaving: Tensor, arriving: Tensor, law: Tensor) -> Complex128[T
 def _transmission_dyad(diffraction: EdgeDiffraction) -> Complex128[Tensor, "row 3 3"]:
     """Transmission dyad: zero behind bodies; one sheet at an open edge, two at a crease."""
     flat = (diffraction.wedges.opening > 2 - _SHEET_TOLERANCE)[:, None, None]
+    direction = diffraction.incident_direction
     total = torch.eye(3, dtype=torch.complex128)
     for face in (0, 1):
         normal = diffraction.wedges.normals[:, face]
-        unit_s, unit_p, _ = (
-            v[:, 0] for v in plane_of_incidence(normal, diffraction.incident_direction)
-        )
-        law = diffraction.face_coefficients(face, dot(normal, diffraction.incident_direction).abs())
+        unit_s, unit_p, _ = (v[:, 0] for v in plane_of_incidence(normal, direction))
+        law = diffraction.face_coefficients(face, dot(normal, direction).abs())
         through = _outer_product(law.transmission_s, unit_s, unit_s)
         through = through + _outer_product(law.transmission_p, unit_p, unit_p)
         total = through if face == 0 else torch.where(flat, total, through @ total)

@@ -96,10 +96,8 @@ class BoundingSpheres:
         """
         if self._scenes is None:
             return number, mi.UInt32(0)
-        index, scene = (
-            dr.gather(mi.UInt32, self._scenes[name], number) for name in ("index", "scene")
-        )
-        return index, scene
+        columns = self._scenes["index"], self._scenes["scene"]
+        return dr.gather(mi.UInt32, columns[0], number), dr.gather(mi.UInt32, columns[1], number)
 
     def scene_groups(self, scene: mit.UInt32) -> tuple[mit.UInt32, mit.UInt32]:
         """Look up the first group of a scene and the number of its groups.
@@ -109,10 +107,8 @@ class BoundingSpheres:
         """
         if self._scenes is None:
             return 0, self.group_count  # type: ignore[return-value]
-        first, groups = (
-            dr.gather(mi.UInt32, self._scenes[name], scene) for name in ("first", "groups")
-        )
-        return first, groups
+        columns = self._scenes["first"], self._scenes["groups"]
+        return dr.gather(mi.UInt32, columns[0], scene), dr.gather(mi.UInt32, columns[1], scene)
 
     def member_count(self, group: mit.UInt32) -> mit.UInt32:
         """Look up the number of objects in groups.

@@ -116,12 +116,9 @@ class DifferentiatedObjects:
             return number + 1, total + found
 
         lanes = dr.width(direction)
-        state = rays.loop(
-            (dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes)),
-            lambda number, _: number < self._count,
-            step,
-        )
-        return state[1] / mi.Float(self._count)
+        first = dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes)
+        _, total = rays.loop(first, lambda number, _: number < self._count, step)
+        return total / mi.Float(self._count)
 
     def may_receive_shadow(
         self, edge: mit.UInt32, origin: mit.Point3f, y0: mit.Vector3d, y1: mit.Vector3d
@@ -163,9 +160,5 @@ class DifferentiatedObjects:
             return number + 1, found | (met & (rays.object_scene(owner) == scene))
 
         lanes = dr.width(edge)
-        state = rays.loop(
-            (dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Bool, lanes)),
-            lambda number, found: ~found & (number < self._count),
-            step,
-        )
-        return state[1]
+        first = dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Bool, lanes)
+        return rays.loop(first, lambda number, found: ~found & (number < self._count), step)[1]

@@ -118,8 +118,7 @@ class ViewpointScene:
             across = cross(ends[:, 1] - ends[:, 0], ends[:, 0] - strip_derivatives(self._viewpoint))
             sides = [dot(point - ends[:, 0], across) for point in pair]
             turns = sides[0] * sides[1] >= 0
-        chosen = torch.nonzero(alone | turns)[:, 0]
-        first, second = topology.edges[chosen].unbind(1)
+        first, second = topology.edges[torch.nonzero(alone | turns)[:, 0]].unbind(1)
         return DiscontinuityCurves(
             points[first], points[second], first, second, is_intersection=False
         )

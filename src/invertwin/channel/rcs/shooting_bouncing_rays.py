@@ -44,17 +44,9 @@ def find_illuminated_triangles(
         aspect = waves.repeat_interleave(len(number))
         row = torch.arange(len(number)).repeat(len(waves))
         facing = dot(facets.normal[number[row]].detach(), incident[aspect])
-        is_front = (facing < 0) | ~facets.solid[number[row]]
-        keep = is_front & (facing.abs() > 1e-9)
-        yield _illuminate_triangles(
-            facets,
-            is_unoccluded,
-            incident,
-            min_side,
-            aspect[keep],
-            number[row[keep]],
-            corners[row[keep]],
-        )
+        keep = ((facing < 0) | ~facets.solid[number[row]]) & (facing.abs() > 1e-9)
+        lit = aspect[keep], number[row[keep]], corners[row[keep]]
+        yield _illuminate_triangles(facets, is_unoccluded, incident, min_side, *lit)
 
 
 def _illuminate_triangles(

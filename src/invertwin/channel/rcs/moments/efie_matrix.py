@@ -116,8 +116,7 @@ class EFIEMatrix:
         wave = phasor(phase) * weights[:, None] / 2
         linear = torch.einsum("fqa,fqx,atx->fat", wave, offset + 0j, fields + 0j)
         corner_fields = torch.einsum("fvx,atx->fvat", corners - centroid[:, None], fields)
-        local = linear[:, None] - wave.sum(1)[:, None, :, None] * corner_fields
-        return self._combine_halves(local)
+        return self._combine_halves(linear[:, None] - wave.sum(1)[:, None, :, None] * corner_fields)
 
     def _combine_halves(self, local: Tensor) -> Tensor:
         """Combine half functions, given per triangle and corner, to basis functions."""
@@ -133,8 +132,7 @@ class EFIEMatrix:
             current: coefficients of the basis functions.
         """
         face, corner = self.basis.face, self.basis.corner
-        shape = (3 * len(self.faces), *current.shape[1:])
-        found = torch.zeros(shape, dtype=current.dtype)
+        found = torch.zeros(3 * len(self.faces), *current.shape[1:], dtype=current.dtype)
         for half, sign in ((0, 1.0), (1, -1.0)):
             found.index_add_(0, 3 * face[:, half] + corner[:, half], sign * current)
         return found.view(len(self.faces), 3, *current.shape[1:])
@@ -324,10 +322,9 @@ class EFIEMatrix:
         """
         pairs = self.near_pairs(vertices.detach())
         ends = (self.half_coefficients(left), self.half_coefficients(right))
-        aspects = torch.arange(left.shape[1]).split(_ASPECTS_AT_ONCE)
         parts = [
             self._bilinear_block(vertices, pairs, *(end[:, :, some] for end in ends))
-            for some in aspects
+            for some in torch.arange(left.shape[1]).split(_ASPECTS_AT_ONCE)
         ]
         return 1j * self.k * torch.cat(parts)
 
@@ -342,12 +339,10 @@ class EFIEMatrix:
             scale * products.new_tensor([1.0, 1, 1, 0]), scale * products.new_tensor([0.0, 0, 0, 1])
         )
         # The factor j/k of the divergence, squared, is −1/k².
-        strengths = [
-            torch.einsum("fcqz,fcap->fqapz", products * scale, half)
-            .flatten(0, 1)
-            .to(self.complex_dtype)
-            for half in (left, right)
-        ]
+        halves = (
+            torch.einsum("fcqz,fcap->fqapz", products * scale, half) for half in (left, right)
+        )
+        strengths = [half.flatten(0, 1).to(self.complex_dtype) for half in halves]
         bounds = torch.searchsorted(pairs[:, 0].contiguous(), torch.arange(count + 1))
         size = max(1, _ENTRIES_AT_ONCE // (9 * count))
 

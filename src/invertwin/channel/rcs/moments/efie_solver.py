@@ -159,14 +159,9 @@ class _EFIEEquation:
             residual = torch.einsum("yn,nat->yat", interior, current)
             residual = self._incident_fields(self.interior_points, transmitters) - residual
             adjoint_field = torch.einsum("yn,nar->yar", interior.conj(), adjoint)
-            double_area = (
-                self.target.double_area_vectors[
-                    self.target.double_area_vectors.detach().norm(dim=1) > 0
-                ]
-                .norm(dim=1)
-                .sum()
-            )
-            weight = double_area / (2 * len(self.interior_matrix))
+            double_area = self.target.double_area_vectors
+            double_area = double_area[double_area.detach().norm(dim=1) > 0].norm(dim=1)
+            weight = double_area.sum() / (2 * len(self.interior_matrix))
             change = change + weight * torch.einsum("yar,yat->art", adjoint_field, residual)
         return value + scale * (change - change.detach())
 

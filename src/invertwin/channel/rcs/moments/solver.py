@@ -86,16 +86,10 @@ class CurrentSolver(ABC, Generic[Elements]):
             wave_count: number of waves to solve for.
         """
 
-    def supports(self, wave_number: float) -> bool:
-        """Test if a valid discretisation of allowed size exists.
-
-        Args:
-            wave_number: wave number k [1/m].
-        """
-        return self.elements(wave_number) is not None
-
     def elements(self, wave_number: float) -> Elements | None:
         """Return elements for a wave number; the previous ones are reused if fine enough.
+
+        None without a valid discretisation of allowed size.
 
         Args:
             wave_number: wave number k [1/m].
