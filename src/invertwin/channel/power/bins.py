@@ -49,11 +49,6 @@ class PathContribution:
     u: mit.Float
     v: mit.Float
 
-    @property
-    def differentiable_values(self) -> FourFloats:
-        """Power, range, u and v, which may carry derivatives."""
-        return self.power, self.range, self.u, self.v
-
 
 def _axis_taps(
     coordinate: mit.Float, start: float, step: float, count: int

@@ -186,8 +186,7 @@ class DirectionSampler:
     ) -> mit.Vector3f:
         """Sample a direction beyond the surface about Snell's; zero if there is none."""
         here, beyond, variance = self._refractive_indices(point, incident)
-        spread = dr.sqrt(variance)
-        gauss = mi.warp.square_to_std_normal(mi.Point2f(numbers[2], numbers[3])) * spread
+        gauss = mi.warp.square_to_std_normal(mi.Point2f(numbers[2], numbers[3])) * dr.sqrt(variance)
         frame = mi.Frame3f(mi.Vector3f(point.normal))
         local = frame.to_local(mi.Vector3f(incident))
         x, y = ((gauss[k] - here * local[k]) / beyond for k in range(2))
@@ -239,8 +238,7 @@ def _lobe_fractions(surfaces: ScatteringLaw) -> torch.Tensor:
     """Compute the share of each part of a scattering law; Lambertian if it scatters nothing."""
     exponents = surfaces.exponents.detach()
     wide = 4 * torch.pi * (exponents + torch.exp2(-(exponents + 1)))
-    integrals = wide / ((exponents + 1) * (exponents + 2))
-    lobes = surfaces.lobes.detach() * integrals
+    lobes = surfaces.lobes.detach() * (wide / ((exponents + 1) * (exponents + 2)))
     diffuse = surfaces.diffuse.detach()[:, None]
     total = diffuse + lobes.sum(1, keepdim=True)
     # A part of the cosine is kept, so that the density never vanishes where f does not.

@@ -429,10 +429,8 @@ def find_medium(
         values = (
             inputs.surfaces.value(n, point.surface_row, inside) for n in ("index", "attenuation")
         )
-        index, attenuation = (
-            dr.select(inside, value, before)
-            for value, before in zip(values, (index, attenuation), strict=True)
-        )
+        pairs = zip(values, (index, attenuation), strict=True)
+        index, attenuation = (dr.select(inside, value, before) for value, before in pairs)
     return SegmentMedium(index, attenuation)
 
 
@@ -450,10 +448,7 @@ class AntennaPose:
 
     @staticmethod
     def look_up(
-        inputs: Inputs,
-        frame: mit.UInt32,
-        receiver: mit.Bool | bool,
-        active: mit.Bool | bool = True,
+        inputs: Inputs, frame: mit.UInt32, receiver: mit.Bool | bool, active: mit.Bool | bool = True
     ) -> AntennaPose:
         """Gather the pose; a loop need not do so if it is gathered before.
 
@@ -509,9 +504,8 @@ def connect_antenna(
     antenna = antenna or AntennaPose.look_up(inputs, frame, receiver, active)
     to_antenna, distance = direction_and_distance(point.position, antenna.position)
     in_radar_frame = project_to_axes(antenna.axes, -to_antenna)
-    outgoing = None if is_same_antenna else to_antenna
     value = inputs.surfaces.evaluate_scattering(
-        point.surface_row, point.normal, incident, outgoing, active
+        point.surface_row, point.normal, incident, None if is_same_antenna else to_antenna, active
     )
     gain = inputs.gain(frame, receiver, in_radar_frame)
     return AntennaConnection(value * gain / dr.square(distance), distance, in_radar_frame)

@@ -42,6 +42,8 @@ _MIN_WEDGE_COSINE = -0.98  # least cosine between the normals of surfaces betwee
 _SUBPATH_OFFSET = 1 << 29  # added to indices, so that the second part has its own random numbers
 
 PathVisitor = Callable[[PathState, PathContribution, mit.Bool], None]
+PathParts = tuple[mit.Float, PathState, Callable[[PathState, PathVisitor], PathState]]
+"""Fields of ``BoundaryPaths``."""
 
 
 @dataclass(frozen=True)
@@ -177,12 +179,8 @@ def _offset_into_wedge(
 ) -> SurfaceInteraction:
     """Move a point a little off both surfaces, into the wedge to which a direction leads."""
     first, second = (dr.mulsign(normal, dr.dot(normal, direction)) for normal in normals)
-    step = (
-        2
-        * RAY_EPSILON
-        * dr.norm(point.position)
-        / (1 + dr.maximum(dr.dot(first, second), _MIN_WEDGE_COSINE))
-    )
+    cosine = dr.maximum(dr.dot(first, second), _MIN_WEDGE_COSINE)
+    step = 2 * RAY_EPSILON * dr.norm(point.position) / (1 + cosine)
     return replace(point, position=point.position + (first + second) * step)
 
 
@@ -310,10 +308,8 @@ class _CoveredSide:
         spots = points.first, points.second
         normals = self.subpath.normals
         sine = dr.norm(dr.cross(normals[self.own], normals[self.other]))
-        offset = (
-            integrand.compute_interaction(inputs, spots[self.own]).position
-            - integrand.compute_interaction(inputs, spots[self.other]).position
-        )
+        own = integrand.compute_interaction(inputs, spots[self.own]).position
+        offset = own - integrand.compute_interaction(inputs, spots[self.other]).position
         return dr.dot(self.facing, offset) * (points.weight / sine)
 
     def run(self, state: PathState, visit: PathVisitor) -> PathState:
@@ -334,11 +330,8 @@ class _CoveredSide:
             rays, fixed, state, point, before.other_end, shared_visibility=before.shared
         )
         passed = self.transmit(onwards)
-        path = replace(
-            path,
-            power=path.power * passed.transmittance,
-            range=path.range + 0.5 * passed.extra_length,
-        )
+        power, length = path.power * passed.transmittance, path.range + 0.5 * passed.extra_length
+        path = replace(path, power=power, range=length)
         visit(state, path, exists & (passed.transmittance > 0))
         if depth == 1:
             return state
@@ -357,7 +350,7 @@ class _CoveredSide:
 
 def intersection_curve_paths(
     rays: RayScene, inputs: Inputs, walker: RandomWalk, points: IntersectionPoint, depth: int
-) -> Iterator[tuple[mit.Float, PathState, Callable[[PathState, PathVisitor], PathState]]]:
+) -> Iterator[PathParts]:
     """Create the boundary paths with a vertex on an intersection curve.
 
     Args:

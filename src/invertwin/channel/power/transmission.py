@@ -87,9 +87,8 @@ def trace_transmission(
         active: mask of active lanes.
     """
     if not inputs.surfaces.has_sheets:
-        return SegmentTransmission(
-            dr.select(rays.is_clear(start, end, active), 1.0, 0.0), mi.Float(0.0)
-        )
+        clear = rays.is_clear(start, end, active)
+        return SegmentTransmission(dr.select(clear, 1.0, 0.0), mi.Float(0.0))
     lanes = dr.width(active)
     initial = {"transmittance": dr.ones(mi.Float, lanes), "extra": dr.zeros(mi.Float, lanes)}
 
@@ -100,9 +99,8 @@ def trace_transmission(
     done, blocked = visit_sheets(
         rays, inputs, lambda: start, lambda: end, active, initial, multiply
     )
-    return SegmentTransmission(
-        dr.select(active & ~blocked, done["transmittance"], 0.0), done["extra"]
-    )
+    transmittance = dr.select(active & ~blocked, done["transmittance"], 0.0)
+    return SegmentTransmission(transmittance, done["extra"])
 
 
 def visit_sheets(
@@ -147,11 +145,8 @@ def visit_sheets(
         face = dr.select(found, hit.point.face, rays.fallback_face)
         with dr.resume_grad():
             sheet = _sheet_transmission(inputs, face, start(), end(), found)
-            visit(
-                carry,
-                dr.select(found, sheet.transmittance, 1.0),
-                dr.select(found, sheet.extra_length, 0.0),
-            )
+            extra = dr.select(found, sheet.extra_length, 0.0)
+            visit(carry, dr.select(found, sheet.transmittance, 1.0), extra)
         following: _SheetState = {
             "at": dr.select(found, at + hit.t + RAY_EPSILON, at),
             "count": state["count"] + 1,
@@ -248,9 +243,8 @@ def trace_to_surface(
         state["b1"] = dr.select(ends, hit.point.b1, state["b1"])
         state["b2"] = dr.select(ends, hit.point.b2, state["b2"])
         state["valid"] = state["valid"] | ends
-        state["transmittance"] = dr.select(
-            passes, state["transmittance"] * sheet.transmittance, state["transmittance"]
-        )
+        passed = state["transmittance"] * sheet.transmittance
+        state["transmittance"] = dr.select(passes, passed, state["transmittance"])
         state["extra"] = dr.select(passes, state["extra"] + sheet.extra_length, state["extra"])
         odds = dr.select(passes, probability, dr.select(ends, 1 - probability, 1.0))
         state["probability"] = state["probability"] * odds
@@ -262,12 +256,9 @@ def trace_to_surface(
 
     first = _initial_surface_state(rays, ray, hit.valid, lanes)
     (last,) = rays.loop((first,), lambda state: state["going"], body)
-    return SegmentHit(
-        last["valid"],
-        SurfacePoint(last["face"], last["b1"], last["b2"]),
-        SegmentTransmission(last["transmittance"], last["extra"]),
-        last["probability"],
-    )
+    point = SurfacePoint(last["face"], last["b1"], last["b2"])
+    passed = SegmentTransmission(last["transmittance"], last["extra"])
+    return SegmentHit(last["valid"], point, passed, last["probability"])
 
 
 def _initial_surface_state(
