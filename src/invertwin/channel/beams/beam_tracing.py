@@ -254,9 +254,8 @@ def _continue_beams(
     medium, n = previous.medium, previous.normal
     if solids is not None:
         behind = solids.medium_behind(previous.facet, previous.medium)
-        refracted, propagates = refract_waves(
-            solids.permittivity_in(behind), previous.wave_vector, previous.normal
-        )
+        epsilon = solids.permittivity_in(behind)
+        refracted, propagates = refract_waves(epsilon, previous.wave_vector, previous.normal)
         rows = torch.nonzero(propagates & solids.transparent[previous.facet])[:, 0]
         row = torch.cat([row, rows])
         p = p[row]

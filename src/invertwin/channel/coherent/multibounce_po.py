@@ -53,9 +53,8 @@ def trace_multibounce_paths(rays: RayScene, sampling: Sampling, seed: int) -> li
     """
     geometry = rays.geometry
     smooth = torch.tensor(geometry.coherent)[geometry.face_object]
-    points = sample_surface_points(
-        face_areas(geometry) * smooth, sampling.count_conductor_samples(), seed
-    )
+    areas = face_areas(geometry) * smooth
+    points = sample_surface_points(areas, sampling.count_conductor_samples(), seed)
     link = rays.link
     same = torch.equal(link.tx, link.rx) and link.tx_jones.equals(link.rx_jones)
     found: list[Paths] = []
@@ -66,9 +65,8 @@ def trace_multibounce_paths(rays: RayScene, sampling: Sampling, seed: int) -> li
             frame = some.repeat_interleave(len(points.weight))
             for from_receiver in (False,) if same else (False, True):
                 share = 1.0 if same else 0.5
-                chain = _follow_rays(
-                    rays, sampling.depth, smooth, frame, points.select(row), from_receiver
-                )
+                own = points.select(row)
+                chain = _follow_rays(rays, sampling.depth, smooth, frame, own, from_receiver)
                 lit = [paths.select(paths.has_field).scale_fields(share) for paths in chain]
                 found += [paths for paths in lit if len(paths)]
     if found and is_visibility_differentiated(geometry, rays.link):

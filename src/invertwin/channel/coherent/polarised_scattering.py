@@ -26,9 +26,8 @@ def conductor_matrix(link: Link, echo: PathTransfer) -> Complex128[Tensor, "row 
         echo: The radar equation of single points.
     """
     (point,) = echo.points
-    ways = [
-        normalize(point.position - antenna[echo.frame], dim=1) for antenna in (link.tx, link.rx)
-    ]
+    offsets = (point.position - antenna[echo.frame] for antenna in (link.tx, link.rx))
+    ways = [normalize(offset, dim=1) for offset in offsets]
     normal = -dot(point.normal, ways[0]).sign()[:, None] * point.normal
     if torch.equal(link.tx, link.rx) and not _has_directional_jones(link):
         sent, received = link.tx_jones.evaluate(ways[0]), link.rx_jones.evaluate(ways[1])

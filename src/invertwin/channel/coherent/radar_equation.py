@@ -26,7 +26,7 @@ _MAX_SHEETS = 8  # that a segment of an explicit path may pass
 
 
 @dataclass(frozen=True)
-class MaterialPoints:
+class MaterialPoints(Rows):
     """Material points, one row each.
 
     Attributes:
@@ -159,18 +159,15 @@ def radar_equation(
         index, attenuation = _segment_medium(geometry, start, end, ways[number])
         spread = spread * torch.exp(-attenuation * distances[number]) / distances[number] ** 2
         length = length + index * distances[number]
+    turns = list(zip(points, ways, ways[1:], strict=False))
     *earlier, last = (
         point.jacobian * evaluate_scattering(geometry, point, -back, on)
-        for point, back, on in zip(points, ways, ways[1:], strict=False)
+        for point, back, on in turns
     )
     arriving = math.prod(earlier, start=(link.wavelength / (4 * torch.pi)) ** 2 * spread)
-    turned = [
-        _depolarisation(geometry, point, -back, on)
-        for point, back, on in zip(points, ways, ways[1:], strict=False)
-    ]
-    return PathTransfer(
-        frame, points, arriving * last * ending, arriving, spread * ending, length, turned
-    )
+    turned = [_depolarisation(geometry, point, -back, on) for point, back, on in turns]
+    power = arriving * last * ending
+    return PathTransfer(frame, points, power, arriving, spread * ending, length, turned)
 
 
 def _depolarisation(
@@ -196,9 +193,8 @@ def evaluate_scattering(
         outgoing: To where it goes on.
     """
     surfaces, row, normal = geometry.surfaces, point.row, point.normal
-    first, second, between = (
-        (a * b).sum(1) for a, b in ((normal, incident), (normal, outgoing), (incident, outgoing))
-    )
+    pairs = (normal, incident), (normal, outgoing), (incident, outgoing)
+    first, second, between = ((a * b).sum(1) for a, b in pairs)
     product = first * second
     shape = surfaces.diffuse[row] / torch.pi
     for number, cosine in enumerate((2 * product - between, 2 * product - between, between)):

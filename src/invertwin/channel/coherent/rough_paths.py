@@ -71,9 +71,8 @@ def draw_rough_paths(
     with torch.no_grad():
         drawer = _RoughPathSampler(flatten(scene, link.wavelength, motion="fixed"), link, seed)
         rounds = -(-count // _LANES)
-        parts = [
-            drawer.draw(turn, count // rounds, depth) for turn in track(range(rounds), "paths")
-        ]
+        turns = track(range(rounds), "paths")
+        parts = [drawer.draw(turn, count // rounds, depth) for turn in turns]
         return tuple(map(drawer.merge_rounds, zip(*parts, strict=True)))
 
 
@@ -138,9 +137,8 @@ class _RoughPathSampler:
         vertex = SurfacePoint(face, b.x, b.y)
         point = integrand.compute_interaction(self.inputs, vertex)
         frame = dr.gather(mi.UInt32, to_index(self.frames), index % opaque(len(self.frames)))
-        back, distance = integrand.direction_and_distance(
-            point.position, self.inputs.antenna_position(frame, False)
-        )
+        tx = self.inputs.antenna_position(frame, False)
+        back, distance = integrand.direction_and_distance(point.position, tx)
         turned = back - 2 * dr.dot(back, point.normal) * point.normal
         back = dr.select(side < _BACKSIDE_SHARE, turned, back)
         state = walk.initial_state(index, frame, vertex, back, dr.ones(mi.Float, lanes), distance)

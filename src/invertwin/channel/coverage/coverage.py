@@ -160,12 +160,10 @@ class _CoverageTracer:
         # Discrete: `torch.func` would claim the intermediate tensors.
         with _DisableFuncTorch():
             places = strip_derivatives(surface.vertices)
-            self.surfaces = CandidateSurfaces(
-                strip_derivatives(stage.vertices), stage.topology, torch.cat([self.tx, places])
-            )
-            self.receiving_surface = ReceivingSurface(
-                places, topology_of([surface]), self.surfaces.origin
-            )
+            vertices, ends = strip_derivatives(stage.vertices), torch.cat([self.tx, places])
+            self.surfaces = CandidateSurfaces(vertices, stage.topology, ends)
+            own, origin = topology_of([surface]), self.surfaces.origin
+            self.receiving_surface = ReceivingSurface(places, own, origin)
             self.meshes = [*(item.mesh for item in stage.scene.objects.values()), surface]
             self.sequences = find_sequences(self.surfaces, powers, self.tx, depth, rays, seed).steps
 
@@ -246,9 +244,8 @@ class _CoverageTracer:
             offset = SIDE_OFFSET * self.surfaces.margin * curve_points.across
             points = torch.cat([curve_points.point + offset, curve_points.point - offset])
         with torch.no_grad():
-            outer, inner = strip_derivatives(
-                self.sum_paths(_detach_stage(stage, points), self.find_paths(points))
-            ).chunk(2, 1)
+            sums = self.sum_paths(_detach_stage(stage, points), self.find_paths(points))
+            outer, inner = strip_derivatives(sums).chunk(2, 1)
         rate = intersection_area_rates(self.surfaces, curve_points, stage.vertices)
         count = len(self.tx)
         return [

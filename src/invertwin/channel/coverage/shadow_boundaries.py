@@ -221,9 +221,8 @@ def sample_illumination_boundaries(
                     hits.setdefault(last.faces.shape[1], []).append((last, face))
         for part in hits.values():
             legs, faces = zip(*part, strict=True)
-            found.append(
-                IlluminationBoundarySamples(edges, concatenate_rows(legs), torch.cat(faces))
-            )
+            last, face = concatenate_rows(legs), torch.cat(faces)
+            found.append(IlluminationBoundarySamples(edges, last, face))
     return found
 
 
@@ -238,9 +237,8 @@ def _sample_edges(
     flat = (plane == plane[:, :1]).all(1) & (edge_faces >= 0).all(1) & (edge_faces.shape[1] > 1)
     edge = torch.nonzero(~flat)[:, 0]
     ends = surfaces.exact_vertices[topology.edges[edge]]
-    row, fraction, weight = sample_along_curves(
-        (ends[:, 1] - ends[:, 0]).norm(dim=1), samples, seed, number
-    )
+    length = (ends[:, 1] - ends[:, 0]).norm(dim=1)
+    row, fraction, weight = sample_along_curves(length, samples, seed, number)
     chosen = edge[row]
     first, second = topology.edges[chosen].unbind(1)
     return _EdgeSamples(first, second, fraction, weight, topology.edge_faces[chosen])
@@ -404,16 +402,14 @@ def evaluate_illumination_boundary(
 
     up = strip_derivatives(up)
     fixed = strip_derivatives(ray), strip_derivatives(scale), strip_derivatives(normal)
-    edge, shift = (
-        _project_shift(v, fixed, direct, up) for v in (strip_derivatives(y1 - y0), legs.side)
-    )
+    vectors = strip_derivatives(y1 - y0), legs.side
+    edge, shift = (_project_shift(vector, fixed, direct, up) for vector in vectors)
     outwards = cross(up, edge)
     outwards = outwards * -dot(outwards, shift).sign()[:, None]
     rate = dot(outwards, curve - material) * edges.weight
     rows = torch.nonzero(dot(fixed[0], up).abs() > _MIN_COSINE * fixed[0].norm(dim=1))[:, 0]
-    paths = SpecularPaths(
-        legs.source[rows], torch.arange(len(rows)), legs.faces[rows], legs.through[rows]
-    )
+    number = torch.arange(len(rows))
+    paths = SpecularPaths(legs.source[rows], number, legs.faces[rows], legs.through[rows])
     return IlluminationBoundary(
         paths, strip_derivatives(curve)[rows], samples.face[rows], rate[rows], legs.edge_point[rows]
     )

@@ -167,9 +167,8 @@ class _SingleScatteringTracer:
             rows |= (strip_derivatives(geometry.surfaces.lobes) > 0).any(1)
             rows &= (strip_derivatives(geometry.surfaces.amplitude) > 0).any(1)
             self.is_scattering: Bool[Tensor, " f"] = rows[geometry.face_surface]
-            self.surfaces = CandidateSurfaces(
-                strip_derivatives(stage.vertices), stage.topology, torch.cat(self.antennas)
-            )
+            vertices, ends = strip_derivatives(stage.vertices), torch.cat(self.antennas)
+            self.surfaces = CandidateSurfaces(vertices, stage.topology, ends)
             self.sequences = tuple(self._find_sequences(number, rays) for number in range(2))
 
     def _find_sequences(self, end: int, rays: int | None) -> tuple[Tensor, ...]:
@@ -190,9 +189,8 @@ class _SingleScatteringTracer:
     def sum_interior(self, stage: PathScene, geometry: Geometry) -> Float64[Tensor, "tx rx amount"]:
         """Sum over points at fixed visibility; derivatives recompute the paths (checkpointing)."""
         with _DisableFuncTorch():
-            samples = self._sample_points(
-                replace(geometry, vertices=strip_derivatives(geometry.vertices))
-            )
+            vertices = strip_derivatives(geometry.vertices)
+            samples = self._sample_points(replace(geometry, vertices=vertices))
         recompute = any(t.requires_grad for t in (stage.vertices, stage.tx, stage.rx))
         total = torch.zeros(len(stage.tx), len(stage.rx), self.value_count, dtype=torch.float64)
         for rows in torch.arange(len(samples.receiver)).split(_POINTS_AT_ONCE):
@@ -318,9 +316,7 @@ class _SingleScatteringTracer:
         rows = torch.nonzero(kept)[:, 0]
         outbound, inbound = outbound.select(first[rows]), inbound.select(second[rows])
         index = outbound.rx
-        material = MaterialPoints(
-            point.position[index], point.normal[index], point.jacobian[index], point.row[index]
-        )
+        material = point.select(index)
         k = 4 * math.pi * stage.frequency / SPEED_OF_LIGHT
         law = evaluate_scattering(geometry, material, outbound.arrival, inbound.arrival)
         law = k**2 * area[index] * law
@@ -363,9 +359,8 @@ def _material_points_at(
 ) -> MaterialPoints:
     """Material points on triangles for the scattering law; at rest."""
     normal = triangle_normals(strip_derivatives(geometry.vertices)[geometry.faces[face]])
-    return MaterialPoints(
-        position, normal, torch.ones_like(position[:, 0]), geometry.face_surface[face]
-    )
+    one = torch.ones_like(position[:, 0])
+    return MaterialPoints(position, normal, one, geometry.face_surface[face])
 
 
 def _require_no_contact(

@@ -192,9 +192,8 @@ def radiate_currents(
     """
     n, s = normal[:, None], scattered_direction[:, None]
     reflected_direction = reflect_vectors(wave_vector, normal)[:, None]
-    electric = cross(
-        n, cross(wave_vector[:, None], field) + cross(reflected_direction, reflected_field)
-    )
+    magnetic_field = cross(wave_vector[:, None], field)
+    electric = cross(n, magnetic_field + cross(reflected_direction, reflected_field))
     magnetic = cross(s, cross(n, field + reflected_field))
     return -1j * wave_number / (4 * math.pi) * (electric + magnetic)
 
@@ -372,9 +371,8 @@ def polygon_integral(
     centroid_phase = dot(direction, centroid)
     # ∫(1 + jw·x − (w·x)²/2) over the fan of triangles at the first corner.
     first = dot(tangential[:, None], corners)
-    fan = torch.linalg.cross(
-        corners[:, 1:-1] - corners[:, :1], corners[:, 2:] - corners[:, :1], dim=-1
-    )
+    spokes = corners - corners[:, :1]
+    fan = torch.linalg.cross(spokes[:, 1:-1], spokes[:, 2:], dim=-1)
     weight = dot(fan, normal[:, None]) / 2
     a, b, c = first[:, :1], first[:, 1:-1], first[:, 2:]
     mean = (weight * (a + b + c)).sum(1) / 3

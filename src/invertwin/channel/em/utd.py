@@ -137,9 +137,8 @@ def diffraction_dyads(
     if diffraction.face_coefficients is conductor_coefficients or diffraction.absorbing:
         return forward
     exchanged: dict[DyadDerivative, DyadDerivative] = {"value": "value", "in": "out", "out": "in"}
-    backward = _directional_dyads(
-        diffraction.reverse(), wave_number, [exchanged[order] for order in orders]
-    )
+    others: list[DyadDerivative] = [exchanged[order] for order in orders]
+    backward = _directional_dyads(diffraction.reverse(), wave_number, others)
     return (forward + backward.mT) / 2
 
 
@@ -260,13 +259,11 @@ def _couple_cotangents(diffraction: EdgeDiffraction, wave_number: float) -> _Cou
         s = root * torch.sin(half)
         factor = scale * (edge_transition(s, diffraction.end_parameters) / transition(s))
         curve = factor * ratio**3 * cosine / opening**2
-        columns.append(
-            (factor * _cotangent_quotient(half, opening), factor * ratio**2 / opening, curve, s)
-        )
+        quotient = factor * _cotangent_quotient(half, opening)
+        columns.append((quotient, factor * ratio**2 / opening, curve, s))
     value, slope, curve, s = (torch.stack(column) for column in zip(*columns, strict=True))
-    sides = (
-        torch.tensor([[sign * other, sign] for other, sign in _term_signs(diffraction)]).double().T
-    )
+    signs = [[sign * other, sign] for other, sign in _term_signs(diffraction)]
+    sides = torch.tensor(signs).double().T
     return _CoupledCotangents(value, slope, curve, s, sides)
 
 
@@ -385,9 +382,8 @@ def _geometric_optics_dyads(diffraction: EdgeDiffraction) -> list[Complex128[Ten
         normal = diffraction.wedges.normals[:, face]
         unit_s, unit_p, reflected_p = (v[:, 0] for v in plane_of_incidence(normal, direction))
         law = diffraction.face_coefficients(face, dot(normal, direction).abs())
-        reflection = _outer_product(law.reflection_s, unit_s, unit_s) + _outer_product(
-            law.reflection_p, reflected_p, unit_p
-        )
+        reflection = _outer_product(law.reflection_s, unit_s, unit_s)
+        reflection = reflection + _outer_product(law.reflection_p, reflected_p, unit_p)
         reflected = reflect_vectors(direction, normal)
         dyads.append(_rotate_dyad(basis, _ray_fixed_basis(axis, reflected), reflection))
     return dyads

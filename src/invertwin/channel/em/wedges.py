@@ -127,9 +127,8 @@ def select_body_edges(wedges: Wedges, min_length: float) -> Bool[Tensor, " row"]
     pairs: list[Tensor] = [torch.zeros(2, 0, dtype=torch.int64)]
     for step in range(1, int(number.max())):
         own, other = order[:-step], order[step:]
-        continued = (node[own] == node[other]) & (
-            dot(outward[own], outward[other]) < _MAX_COLLINEAR_COSINE
-        )
+        continued = dot(outward[own], outward[other]) < _MAX_COLLINEAR_COSINE
+        continued &= node[own] == node[other]
         continued &= (opening[own] - opening[other]).abs() < _OPENING_TOLERANCE
         pairs.append(torch.stack([own[continued], other[continued]]) % count)
     row, column = torch.cat(pairs, 1).numpy()
@@ -212,9 +211,8 @@ def is_outside_wedge(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Ten
     """
     angle = azimuth(wedges, direction, 0)
     along = normalize(wedges.end - wedges.start, dim=1)
-    return (angle <= wedges.opening * math.pi) & (
-        dot(along, direction).abs() < math.cos(MIN_EDGE_ANGLE)
-    )
+    is_across = dot(along, direction).abs() < math.cos(MIN_EDGE_ANGLE)
+    return (angle <= wedges.opening * math.pi) & is_across
 
 
 def is_grazing_sheet(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:
@@ -289,9 +287,8 @@ def fringe_field(
         h = dot(axis[:, None], cross(direction[:, None], field))
         k = wave_number
         skew = mu * cos_in / sin_in - cos_out / sin_out * torch.cos(phi_out)
-        current = (2j / (k * sin_in**2) * electric)[:, None] * e + (
-            2j / (k * sin_in) * magnetic * skew
-        )[:, None] * h
+        current = (2j / (k * sin_in**2) * electric)[:, None] * e
+        current = current + (2j / (k * sin_in) * magnetic * skew)[:, None] * h
         charge = (-2j / k * magnetic * torch.sin(phi_out) / (sin_in * sin_out))[:, None] * h
         total = total + current[..., None] * cross(scattered_direction, across)[:, None]
         total = total + charge[..., None] * across[:, None]

@@ -313,9 +313,8 @@ def deposit_paths(paths: Paths, link: Link, grid: Grid) -> Float32[Tensor, "fram
     """
     u, v = paths.direction_cosines(link).unbind(1)
     with tracing():
-        return Splat.apply(
-            BinLayout.from_link(grid, link), paths.frame, paths.power, paths.range, u, v
-        )
+        layout = BinLayout.from_link(grid, link)
+        return Splat.apply(layout, paths.frame, paths.power, paths.range, u, v)
 
 
 class Splat(torch.autograd.Function):
@@ -341,9 +340,8 @@ class Splat(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
         with tracing(ctx.backend):
-            power, length, u, v = (
-                mi.Float(0.0) if tangent is None else to_float(tangent) for tangent in tangents[2:]
-            )
+            none = mi.Float(0.0)
+            power, length, u, v = (none if t is None else to_float(t) for t in tangents[2:])
             out = BinAccumulator(ctx.layout)
             out.add_tangent(ctx.path, (power, length, u, v), True)
             return out.to_map()

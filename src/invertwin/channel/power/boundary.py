@@ -133,9 +133,8 @@ class BoundarySamples:
         crossing = curves.select(~curves.touching) if curves is not None else None
         meet = crossing is not None and len(crossing.first) > 0
         share = samples // (len(centres) + inner + meet)
-        antennas = SilhouetteSampler(
-            rays, inputs, centres, len(centres) * share, seed, has_close_surfaces=close
-        )
+        count = len(centres) * share
+        antennas = SilhouetteSampler(rays, inputs, centres, count, seed, has_close_surfaces=close)
         self._samplers: list[_Sampler] = [antennas]
         self._path_builders: list[_PathBuilder] = [_antenna_silhouette_paths]
         if inner:
@@ -144,9 +143,8 @@ class BoundarySamples:
             )
             self._path_builders.append(_interior_silhouette_paths)
         if crossing is not None and meet:
-            self._samplers.append(
-                IntersectionCurveSampler(rays, inputs, crossing, share, depth, seed)
-            )
+            contacts = IntersectionCurveSampler(rays, inputs, crossing, share, depth, seed)
+            self._samplers.append(contacts)
             self._path_builders.append(intersection_curve_paths)
         self._chunks = chunks
         self._prefetched = [
@@ -212,9 +210,8 @@ def _antenna_silhouette_paths(
 
     shadow, speed = locate_shadow()
     point = integrand.compute_interaction(fixed, shadow)
-    incident, distance = integrand.direction_and_distance(
-        point.position, fixed.antenna_position(frame, at_receiver)
-    )
+    antenna = fixed.antenna_position(frame, at_receiver)
+    incident, distance = integrand.direction_and_distance(point.position, antenna)
     departure = integrand.to_radar_frame(fixed, frame, -incident)
     throughput = fixed.scale * fixed.gain(frame, at_receiver, departure) / dr.square(distance)
 

@@ -218,9 +218,8 @@ class _Deposit(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        wanted = tuple(
-            n for n, w in zip(DIFFERENTIABLE, ctx.needs_input_grad[3:], strict=True) if w
-        )
+        pairs = zip(DIFFERENTIABLE, ctx.needs_input_grad[3:], strict=True)
+        wanted = tuple(name for name, needed in pairs if needed)
         found = _Linear.apply(lambda grad: _pull_gradients(ctx, wanted, grad), grad)
         results = dict(zip(wanted, found, strict=True))
         return None, None, None, *(results.get(name) for name in DIFFERENTIABLE)

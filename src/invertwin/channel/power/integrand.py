@@ -272,9 +272,8 @@ class SurfaceInteraction:
         Args:
             state: state with the keys of ``detached_state``.
         """
-        return SurfaceInteraction(
-            state["position"], state["normal"], mi.Float(1.0), state["surface"]
-        )
+        position, normal, one = state["position"], state["normal"], mi.Float(1.0)
+        return SurfaceInteraction(position, normal, one, state["surface"])
 
 
 def compute_interaction(
@@ -458,9 +457,8 @@ class AntennaPose:
             receiver: True for the receiver (a bool, or one per lane).
             active: mask of active lanes.
         """
-        return AntennaPose(
-            inputs.antenna_position(frame, receiver, active), radar_axes(inputs, frame, active)
-        )
+        position = inputs.antenna_position(frame, receiver, active)
+        return AntennaPose(position, radar_axes(inputs, frame, active))
 
 
 @dataclass(frozen=True)

@@ -62,9 +62,8 @@ class InteriorSilhouetteSampler:
             count = min(rays.poses_per_scene, 8)
             for number in range(count):
                 pose = first + number * rays.poses_per_scene // count
-                legs = [
-                    dr.norm(middle - gather_points(t, pose)) + length for t in (rays.tx, rays.rx)
-                ]
+                antennas = (gather_points(table, pose) for table in (rays.tx, rays.rx))
+                legs = [dr.norm(middle - antenna) + length for antenna in antennas]
                 near += 1 / (legs[0] * legs[1])
             weight *= span * near
         # Poses of the same number in all scenes share one choice of edges.

@@ -205,16 +205,14 @@ class _IncidentSubpath:
         frame, index, added = points.frame, points.index, points.transmission.extra_length
         self.rays, self.fixed, self.walker, self.depth = rays, fixed, walker, depth
         self.points = points
-        self.interactions = [
-            integrand.compute_interaction(fixed, point) for point in (points.first, points.second)
-        ]
+        spots = points.first, points.second
+        self.interactions = [integrand.compute_interaction(fixed, spot) for spot in spots]
         here = self.interactions[0]
         self.count, self.at_receiver = count, at_receiver = decode_subpath(index, depth)
         self.shared = rays.link.shared_visibility and depth == 1
         self.other_end = True if isinstance(at_receiver, bool) else ~at_receiver
-        incident, distance = integrand.direction_and_distance(
-            here.position, fixed.antenna_position(frame, at_receiver)
-        )
+        antenna = fixed.antenna_position(frame, at_receiver)
+        incident, distance = integrand.direction_and_distance(here.position, antenna)
         departure = integrand.to_radar_frame(fixed, frame, -incident)
         throughput = fixed.gain(frame, at_receiver, departure) / dr.square(distance)
         length = distance + added
@@ -225,9 +223,8 @@ class _IncidentSubpath:
             medium = integrand.find_medium(fixed, here, source, way, deep)
             odds = dr.abs(dr.dot(source.normal, way)) / (4 * dr.pi)
             kept = dr.select(deep & (odds > 0), dr.exp(-medium.attenuation * step) / odds, 0.0)
-            first = walk.initial_state(
-                index, frame, points.source, -way, kept, medium.refractive_index * step + added
-            )
+            reach = medium.refractive_index * step + added
+            first = walk.initial_state(index, frame, points.source, -way, kept, reach)
             done = walker.trace_subpath(first, count, at_receiver)
             incident = dr.select(deep, way, incident)
             throughput = dr.select(deep, done["power"], throughput)
@@ -278,9 +275,8 @@ class _CoveredSide:
         cosine = dr.dot(self.facing * self.sign, direction)
         if not fixed.surfaces.has_sheets:
             return SegmentTransmission(dr.select(cosine > 0, 1.0, 0.0), mi.Float(0.0))
-        sheet = SegmentTransmission(
-            *fixed.surfaces.sheet_transmission(hiding.surface_row, dr.abs(cosine))
-        )
+        passed = fixed.surfaces.sheet_transmission(hiding.surface_row, dr.abs(cosine))
+        sheet = SegmentTransmission(*passed)
         return dr.select(cosine > 0, SegmentTransmission.clear(), sheet)
 
     def initial_state(self) -> PathState:
@@ -412,9 +408,8 @@ def require_no_interreflection(
     first, second = scattered
     lanes = dr.compress(first | second if fixed.surfaces.has_sheets else first & second)
     if dr.width(lanes):
-        faces = [
-            dr.gather(mi.UInt32, spot.face, lanes[0]) for spot in (points.first, points.second)
-        ]
+        spots = points.first, points.second
+        faces = [dr.gather(mi.UInt32, spot.face, lanes[0]) for spot in spots]
         owners = [int(rays.topology.face_object[int(face[0])]) for face in faces]
         names = " and ".join(dict.fromkeys(rays.geometry.names[owner] for owner in owners))
         raise InputError(

@@ -397,9 +397,8 @@ class PathRecords:
         """
         lanes = dr.width(state["index"])
         count = dr.ones(mi.UInt32, lanes)
-        return PathRecords(
-            lanes, 1, state["frame"], count, _pack_vertex(state, is_visible), state["length"]
-        )
+        row = _pack_vertex(state, is_visible)
+        return PathRecords(lanes, 1, state["frame"], count, row, state["length"])
 
     @staticmethod
     def allocate(state: PathState, depth: int) -> PathRecords:

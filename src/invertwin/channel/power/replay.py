@@ -135,9 +135,8 @@ class _VertexNeighbours:
             dr.ones(mi.Float, dr.width(self.vertex.face)),
             self.interaction.surface_row,
         )
-        before = replace(
-            self.previous_interaction, position=mi.Point3f(self.previous_interaction.position)
-        )
+        before = self.previous_interaction
+        before = replace(before, position=mi.Point3f(before.position))
         after = mi.Point3f(self.next_position)
         dr.enable_grad(here.position, here.normal, here.jacobian, before.position, after)
         return replace(self, interaction=here, previous_interaction=before, next_position=after)
@@ -211,9 +210,8 @@ def _evaluate_vertex(
     scattered = mi.Float(1.0)
     if not single:
         start = antennas.pose(False, active).position
-        direction, _ = integrand.direction_and_distance(
-            here.position, dr.select(has_next, neighbours.next_position, start)
-        )
+        after = dr.select(has_next, neighbours.next_position, start)
+        direction, _ = integrand.direction_and_distance(here.position, after)
         scattered = inputs.surfaces.evaluate_scattering(
             here.surface_row, here.normal, incident, direction, has_next
         )
@@ -528,9 +526,8 @@ def push(
             (power + (growth + more) * found, 0.5 * (longer + distance + further), u, v),
             vertex.is_visible,
         )
-        growth = growth + _log_derivative_factor(
-            vertex.has_next, scattered, vertex.scattering_factor
-        )
+        scattering = vertex.scattering_factor
+        growth = growth + _log_derivative_factor(vertex.has_next, scattered, scattering)
         return (growth, longer), pending
 
     _sweep_vertices(rays, records, sweep, None)

@@ -100,16 +100,13 @@ class RaySampler:
         local = mi.Vector3f(disk.x * spread, disk.y * spread, 1 - depth)
         direction = dr.normalize(mi.Frame3f(axis).to_world(local))
         group = own // self.spheres.group_size
-        found, around = self.spheres.group_density(
-            rays, group, centre, direction, mi.Bool(True), own
-        )
+        every = mi.Bool(True)
+        found, around = self.spheres.group_density(rays, group, centre, direction, every, own)
         density = per_block * (found + around / (4 * dr.pi))
         centre = gather_points(rays.tx, frame)
         ray, key = mi.Ray3f(centre, direction), (index, self.transmission_seed)
         bits = _stratified_bits(column, row)
-        hit = trace_to_surface(
-            rays, inputs, ray, mi.Bool(True), key, coherent=True, stratified_bits=bits
-        )
+        hit = trace_to_surface(rays, inputs, ray, every, key, coherent=True, stratified_bits=bits)
         point = integrand.compute_interaction(inputs, hit.point)
         cosine = dr.maximum(dr.abs(dr.dot(point.normal, direction)), 1e-6)
         distance = dr.squared_norm(point.position - centre)
@@ -171,8 +168,7 @@ class AreaSampler:
         triangle = p0, p1, p2 = rays.corners(face)
         area = 0.5 * dr.norm(dr.cross(p1 - p0, p2 - p0))
         position = interpolate_position(triangle, b.x, b.y)
-        passed = trace_transmission(
-            rays, inputs, gather_points(rays.tx, frame), position, mi.Bool(True)
-        )
+        tx = gather_points(rays.tx, frame)
+        passed = trace_transmission(rays, inputs, tx, position, mi.Bool(True))
         weight = dr.select(passed.transmittance > 0, area / (pmf * self.per_frame), 0.0)
         return StartPoints(frame, SurfacePoint(face, b.x, b.y), weight, passed)

@@ -53,9 +53,8 @@ def strip_scene_derivatives(geometry: Geometry, link: Link) -> tuple[Geometry, L
     rows = {name: tables.pop(name) for name in SCATTERING_TABLES}
     rows["depolarisation"] = strip_derivatives(geometry.surfaces.depolarisation)
     rows = replace(geometry.surfaces, **rows)
-    return replace(geometry, vertices=tables.pop("vertices"), surfaces=rows), replace(
-        link, **tables
-    )
+    bare = replace(geometry, vertices=tables.pop("vertices"), surfaces=rows)
+    return bare, replace(link, **tables)
 
 
 class PowerTracer:

@@ -46,9 +46,8 @@ class SegmentTransmission:
 
     def then(self, other: SegmentTransmission) -> SegmentTransmission:
         """Transmission of this segment followed by another."""
-        return SegmentTransmission(
-            self.transmittance * other.transmittance, self.extra_length + other.extra_length
-        )
+        transmittance = self.transmittance * other.transmittance
+        return SegmentTransmission(transmittance, self.extra_length + other.extra_length)
 
 
 class _SheetState(TypedDict):
@@ -137,9 +136,8 @@ def visit_sheets(
 
     def body(state: _SheetState) -> tuple[_SheetState]:
         at, carry = state["at"], state["carry"].copy()
-        ray = mi.Ray3f(
-            mi.Point3f(origin + offset * at), mi.Vector3f(offset), 1 - RAY_EPSILON - at, 0.0, []
-        )
+        begin, reach = mi.Point3f(origin + offset * at), 1 - RAY_EPSILON - at
+        ray = mi.Ray3f(begin, mi.Vector3f(offset), reach, 0.0, [])
         hit = rays.find_nearest(ray, state["active"])
         found = hit.valid
         face = dr.select(found, hit.point.face, rays.fallback_face)

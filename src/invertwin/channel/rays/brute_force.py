@@ -88,9 +88,8 @@ class BruteForceIntersector:
         beyond, rest = u + v > 1, 1 - u - v
         half = dr.gather(mi.Vector2u, self._halves, 2 * test + dr.select(beyond, 1, 0), valid)
         # Weights of the corners from the one that comes first.
-        weights = [
-            dr.select(beyond, other, own) for own, other in ((rest, -rest), (u, 1 - u), (v, 1 - v))
-        ]
+        pairs = (rest, -rest), (u, 1 - u), (v, 1 - v)
+        weights = [dr.select(beyond, other, own) for own, other in pairs]
         b1, b2 = (
             dr.select(
                 half.y == 0, weights[k], dr.select(half.y == 1, weights[k - 1], weights[k - 2])

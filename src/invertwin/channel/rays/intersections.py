@@ -55,9 +55,8 @@ def find_possible_intersections(
     Returns:
         The pairs, and per object the bounds of all overlaps, low and high [m].
     """
-    moving, deforming = (
-        torch.tensor(flags) for flags in (geometry.differentiated, geometry.shape_differentiated)
-    )
+    moving = torch.tensor(geometry.differentiated)
+    deforming = torch.tensor(geometry.shape_differentiated)
     pairs = (moving[:, None] | moving).fill_diagonal_(False) | torch.diag(deforming)
     return find_overlapping_boxes(geometry, pairs)
 

@@ -180,16 +180,14 @@ def flatten(
         )
     vertices = torch.cat(transform_vertices(objects))
     topology = topology_of([item.mesh for item in objects])
-    surfaces, face_surface = _collect_scattering_laws(
-        objects, SPEED_OF_LIGHT / wavelength, topology.face_object
-    )
+    frequency, owner = SPEED_OF_LIGHT / wavelength, topology.face_object
+    surfaces, face_surface = _collect_scattering_laws(objects, frequency, owner)
     skins = surfaces.refraction.any(1)
     for number, name in enumerate(scene.objects) if bool(skins.any()) else ():
         own = topology.face_object == number
         if bool(skins[face_surface[own]].any()):
-            _require_closed(
-                name, vertices.detach()[topology.faces[own]], number in topology.open_objects
-            )
+            triangles = vertices.detach()[topology.faces[own]]
+            _require_closed(name, triangles, number in topology.open_objects)
     _warn_coarse_facets(list(scene.objects), topology, vertices, surfaces, face_surface)
     deforming = tuple(is_differentiated(item.mesh.vertices) for item in objects)
     weights, free = surfaces.lobes, is_differentiated(surfaces.lobes)

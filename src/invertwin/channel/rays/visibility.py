@@ -66,9 +66,8 @@ class ViewpointScene:
         self._viewpoint = viewpoint
         with tracing():
             self._topology = topology_of([item.mesh for item in objects])
-            self._occluders = Occluders(
-                strip_derivatives(self._vertices), self._topology, strip_derivatives(viewpoint)
-            )
+            fixed, origin = strip_derivatives(self._vertices), strip_derivatives(viewpoint)
+            self._occluders = Occluders(fixed, self._topology, origin)
         self.face_object = self._topology.face_object
 
     @property

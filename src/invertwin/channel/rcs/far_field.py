@@ -183,11 +183,10 @@ def trace_far_field(
                 f"signature, got {count}: "
                 "ray tubes jump at edges; detach the scene, or fit with power paths"
             )
-        if count > MAX_FACETS_BEAM_TRACING:
+        is_large = count > MAX_FACETS_BEAM_TRACING
+        if is_large:
             _check_inner_tubes(target)
-        spacing = (
-            None if count <= MAX_FACETS_BEAM_TRACING else target.wavelength / tubes_per_wavelength
-        )
+        spacing = target.wavelength / tubes_per_wavelength if is_large else None
         antenna_pairs = [(transmitters, transmitters if receivers is None else receivers)]
         if receivers is not None:
             antenna_pairs.append((receivers, transmitters))
@@ -483,9 +482,8 @@ def _warn_validity(
     # An open edge has one normal.
     neighbours = torch.where(neighbours >= 0, neighbours, neighbours[:, :1])
     normal = target.facets.normal.detach()
-    angle = 2 * torch.asin(
-        (0.5 * (normal[neighbours[:, 0]] - normal[neighbours[:, 1]]).norm(dim=1)).clamp_max(1)
-    )
+    half_chord = 0.5 * (normal[neighbours[:, 0]] - normal[neighbours[:, 1]]).norm(dim=1)
+    angle = 2 * torch.asin(half_chord.clamp_max(1))
     ends = target.vertices.detach()[target.topology.edges]
     # A triangle of side ℓ with angles α to its neighbours is ℓα/√12 off the curved surface.
     sagittas = (ends[:, 1] - ends[:, 0]).norm(dim=1) * angle / math.sqrt(12)
@@ -508,10 +506,8 @@ def _warn_validity(
                 f"the facets of {name} are {sagitta * index:.2g} wavelengths off the curved "
                 "surface, more than 1/50: use a finer mesh"
             )
-        is_mixed = target.facets.solid[own].all() and not is_homogeneous(
-            target.interfaces[0].rows(own)
-        )
-        if bool(is_mixed):
+        is_mixed = not is_homogeneous(target.interfaces[0].rows(own))
+        if bool(target.facets.solid[own].all()) and is_mixed:
             found.append(
                 f"{name} is closed and its permittivity differs between triangles: only "
                 "its front face reflects"

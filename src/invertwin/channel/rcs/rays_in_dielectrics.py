@@ -253,9 +253,8 @@ def _trace_tubes(
 
     def directions_at(row: Tensor, points: Tensor) -> Tensor:
         where = departing.corners[row][:, None]
-        return normalize(
-            interpolate_vectors(departing.directions[row][:, None], where, points), dim=2
-        )
+        found = interpolate_vectors(departing.directions[row][:, None], where, points)
+        return normalize(found, dim=2)
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
         shape, many = points.shape[:2], row.repeat_interleave(points.shape[1])
@@ -305,13 +304,11 @@ def _find_first_facets(
         row = torch.nonzero(is_wrong_side())[:, 0]
         if not len(row):
             break
-        beyond = (along[row] * far)[:, None] * directions[row] + 2 * ray_offset(
-            facets, directions[row]
-        )
+        beyond = (along[row] * far)[:, None] * directions[row]
+        beyond = beyond + 2 * ray_offset(facets, directions[row])
         origins = origins.index_copy(0, row, origins[row] + beyond)
-        again, along_again = find_next_surface(
-            occluders, origins[row], origins[row] + far * directions[row]
-        )
+        ends = origins[row] + far * directions[row]
+        again, along_again = find_next_surface(occluders, origins[row], ends)
         found = found.index_copy(0, row, again)
         along = along.index_copy(0, row, along_again)
     return torch.where(is_wrong_side(), -1, found)
@@ -429,9 +426,8 @@ def require_separate_conductors(facets: Facets, solids: DielectricSolids) -> Non
         other = metal[torch.tensor(others, dtype=torch.int64) % len(metal)]
         gap = torch.maximum(low[other] - high[facet], low[facet] - high[other])
         # Coplanar neighbours with a common side do not overlap.
-        overlaps = (gap < _CONTACT_TOLERANCE * facets.size).all(1) & (
-            (gap < -_CONTACT_TOLERANCE * facets.size).sum(1) > 1
-        )
+        overlaps = (gap < _CONTACT_TOLERANCE * facets.size).all(1)
+        overlaps &= (gap < -_CONTACT_TOLERANCE * facets.size).sum(1) > 1
         if bool(overlaps.any()):
             names = [solids.names[int(solids.owner[n])] for n in (facet, other[overlaps][0])]
             raise InputError(

@@ -223,9 +223,8 @@ def _trace_next_order(
     normal, d = facets.normal[facet], directions[parent]
     facing = dot(normal, d)
     keep = (facing.abs() > 1e-9) & ~(facets.solid[facet] & (facing > 0))
-    parent, facet, corners, normal, d, facing = (
-        x[keep] for x in (parent, facet, corners, normal, d, facing)
-    )
+    columns = parent, facet, corners, normal, d, facing
+    parent, facet, corners, normal, d, facing = (column[keep] for column in columns)
     # The ray tracer finds the triangle; the intersection with its plane is computed in float64.
     distance = dot(normal[:, None], facets.corners[facet, :1] - corners) / facing[:, None]
     polygon = corners + distance[..., None] * d[:, None]

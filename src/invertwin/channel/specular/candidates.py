@@ -231,9 +231,8 @@ class _SequenceTracer:
             face, point, reflected = self._intersect_rays(origin, direction)
             hit = (face >= 0) & (self.planes.face_plane[face.clamp_min(0)] >= 0)
             ended.append((prefixes, parent[~hit]))
-            parent, face, point, reflected, direction = (
-                column[hit] for column in (parent, face, point, reflected, direction)
-            )
+            columns = parent, face, point, reflected, direction
+            parent, face, point, reflected, direction = (column[hit] for column in columns)
             branches = []
             for mask, next_direction, bit in (
                 (self.interactions.reflect, reflected, 0),
@@ -244,9 +243,8 @@ class _SequenceTracer:
                 branches.append((parent[chosen], code, point[chosen], next_direction[chosen]))
             stops = ~(self.interactions.reflect[face] | self.interactions.transmit[face])
             ended.append((prefixes, parent[stops]))
-            parent, code, origin, direction = (
-                torch.cat(column) for column in zip(*branches, strict=True)
-            )
+            columns = zip(*branches, strict=True)
+            parent, code, origin, direction = (torch.cat(column) for column in columns)
             options = 2 * len(self.planes)
             pair, parent = (parent * options + code).unique(return_inverse=True)
             prefixes = torch.cat([prefixes[pair // options], (pair % options)[:, None]], 1)

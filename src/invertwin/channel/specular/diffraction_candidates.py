@@ -225,9 +225,8 @@ def _may_cross_planes(
             direction = images[step + 1] - end
             slope = dot(direction, normal)
             fraction = dot(point - end, normal) / replace_zeros(slope)
-            valid.append(
-                (slope != 0) & (fraction > -_PLANE_TOLERANCE) & (fraction < 1 + _PLANE_TOLERANCE)
-            )
+            within = (fraction > -_PLANE_TOLERANCE) & (fraction < 1 + _PLANE_TOLERANCE)
+            valid.append((slope != 0) & within)
             points[number] = end + fraction[:, None] * direction
             local.append(torch.einsum("rx,rax->ra", points[number] - point, planes.axes[plane]))
         both = valid[0] & valid[1]
@@ -247,9 +246,8 @@ def _diffract_once(
     surfaces, count = wedge_scene.surfaces, one.steps.shape[1] + other.steps.shape[1]
     for first, last in _match_edges(one, other, len(wedge_scene.detached_wedges.start)):
         outbound, inbound = one.select(first), other.select(last)
-        points, valid = diffraction_points(
-            wedge_scene.detached_wedges.select(outbound.edge), outbound.image, inbound.image
-        )
+        wedges = wedge_scene.detached_wedges.select(outbound.edge)
+        points, valid = diffraction_points(wedges, outbound.image, inbound.image)
         valid &= wedge_scene.is_diffracting(outbound.edge, points)
         beside = wedge_scene.offset_points(outbound.edge, points)
         for side in (outbound, inbound):

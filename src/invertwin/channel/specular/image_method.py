@@ -302,9 +302,8 @@ class _SequenceScreen:
         count = opaque(self.count)
         target, row = lane // count, lane % count
         end = dr.gather(mi.Vector3d, to_double(targets - self.surfaces.origin), target)
-        first = (dr.gather(mi.UInt32, to_index(source_index), target) * count + row) * (
-            self.length + 1
-        )
+        source = dr.gather(mi.UInt32, to_index(source_index), target)
+        first = (source * count + row) * (self.length + 1)
         active, corners, planes, normals = self._intersect_planes(row, first, end)
         valid = to_torch(self._is_unobstructed(first, active, [*corners, end], planes, normals))
         keep = torch.nonzero(valid)[:, 0]
@@ -492,16 +491,14 @@ def _test_segments(
     first = orthogonal_unit_vectors(unit)
     second = cross(unit, first)
     votes = torch.zeros(len(unit), dtype=torch.int64)
-    faces = torch.full_like(votes, -1)
+    faces, end_plane = torch.full_like(votes, -1), segments.plane.maximum(segments.target_plane)
     for number in range(4):  # the last ray is not shifted
         angle = torch.tensor(2.1 * number, dtype=torch.float64)
         offset = _RAY_SPREAD * surfaces.margin * (angle.cos() * first + angle.sin() * second)
         if number == 3:
             offset = torch.zeros_like(offset)
         start = segments.start + _shift_in_plane(surfaces, offset, unit, segments.plane_before)
-        end = segments.end + _shift_in_plane(
-            surfaces, offset, unit, torch.maximum(segments.plane, segments.target_plane)
-        )
+        end = segments.end + _shift_in_plane(surfaces, offset, unit, end_plane)
         face = _cast_rays(surfaces, start, end, segments)
         valid = torch.where(segments.plane >= 0, face >= 0, face == -1)
         votes += valid

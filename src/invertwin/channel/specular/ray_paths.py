@@ -121,9 +121,8 @@ class RayPaths(Rows):
         width = torch.arange(self.kinds.shape[1])
         back = torch.where(width < depth, depth - 1 - width, width)
         rows = torch.arange(len(self))[:, None]
-        reversed_columns = {
-            n: getattr(self, n)[rows, back] for n in ("vertices", "kinds", "faces", "objects")
-        }
+        names = ("vertices", "kinds", "faces", "objects")
+        reversed_columns = {name: getattr(self, name)[rows, back] for name in names}
         if self.slopes is not None and self.axes is not None:
             reversed_columns |= {"slopes": self.slopes.mT.flip(1), "axes": self.axes.flip(1)}
         return replace(

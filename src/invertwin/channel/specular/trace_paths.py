@@ -307,9 +307,7 @@ def _diffracted_columns(
     ways = found.directions.unbind(1)
     departure, arrival = ways[0], -ways[-1]
     up = torch.tensor(_UP, dtype=torch.float64)
-    sent, received = (
-        polarisations(direction, up).to(found.transfer) for direction in (departure, arrival)
-    )
+    sent, received = (polarisations(way, up).to(found.transfer) for way in (departure, arrival))
     matrix = torch.einsum("pri,pij,ptj->prt", received, found.transfer, sent)
     slopes = torch.einsum("pri,psij,ptj->psrt", received, found.slopes, sent)
     scale = SPEED_OF_LIGHT / path_scene.frequency / (4 * math.pi)
@@ -337,14 +335,12 @@ def _doppler_shifts(
     faces: Int64[Tensor, "path vertex"],
 ) -> Float64[Tensor, " path"]:
     """Doppler shifts [Hz], from the rate at which path lengths decrease."""
-    rate = dot(directions[0], path_scene.tx_velocity[tx]) - dot(
-        directions[-1], path_scene.rx_velocity[rx]
-    )
+    rate = dot(directions[0], path_scene.tx_velocity[tx])
+    rate = rate - dot(directions[-1], path_scene.rx_velocity[rx])
     if path_scene.velocities is not None and faces.shape[1]:
         triangles = path_scene.topology.faces[faces]
-        moved = interpolate_vectors(
-            path_scene.velocities[triangles], path_scene.vertices[triangles], vertices
-        )
+        corners, speeds = path_scene.vertices[triangles], path_scene.velocities[triangles]
+        moved = interpolate_vectors(speeds, corners, vertices)
         for step in range(faces.shape[1]):
             rate = rate + dot(directions[step + 1] - directions[step], moved[:, step])
     return path_scene.frequency / SPEED_OF_LIGHT * rate
@@ -369,9 +365,8 @@ def evaluate_paths(path_scene: PathScene, specular_paths: SpecularPaths) -> list
 def _specular_columns(path_scene: PathScene, paths: SpecularPaths) -> _Columns:
     """Columns of specular paths."""
     tx, rx = path_scene.tx[paths.source], path_scene.rx[paths.target]
-    unfolded = UnfoldedPaths(
-        path_scene.vertices, path_scene.topology, paths.faces, paths.transmitted, tx
-    )
+    moving = path_scene.vertices, path_scene.topology
+    unfolded = UnfoldedPaths(*moving, paths.faces, paths.transmitted, tx)
     distance = (rx - unfolded.image).norm(dim=1)
     units, vertices = unfolded.directions(rx), unfolded.interaction_points(rx)
     matrix = _transfer_matrix(path_scene, paths, units, unfolded.normal)

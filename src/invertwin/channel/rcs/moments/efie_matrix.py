@@ -169,9 +169,8 @@ class EFIEMatrix:
         half_number = (3 * face + corner).T.ravel()
         sign = np.repeat([1.0, -1.0], self.count)
         halves = csr_array((sign, (row, half_number)), shape=(self.count, 3 * len(self.faces)))
-        parts = torch.cat(
-            [self._near_interactions(vertices, block) for block in pairs.split(_PAIRS_AT_ONCE)]
-        ).numpy()
+        blocks = pairs.split(_PAIRS_AT_ONCE)
+        parts = torch.cat([self._near_interactions(vertices, block) for block in blocks]).numpy()
         half_numbers = 3 * pairs.numpy()[:, :, None] + np.arange(3)
         rows = np.broadcast_to(half_numbers[:, 0, :, None], parts.shape).ravel()
         columns = np.broadcast_to(half_numbers[:, 1, None, :], parts.shape).ravel()
@@ -206,9 +205,8 @@ class EFIEMatrix:
             row = np.repeat(np.arange(self.count), 3)
             indices = (np.concatenate([row, row]), np.concatenate([p.ravel() for p in columns]))
             # Keep 32-bit integers and single precision.
-            parts.append(
-                csr_array((np.concatenate([v.ravel() for v in value]), indices), shape=shape)
-            )
+            values = np.concatenate([v.ravel() for v in value])
+            parts.append(csr_array((values, indices), shape=shape))
         scale = [1.0, 1.0, 1.0, -1 / self.k**2]
         total = torch.zeros(self.count, self.count, dtype=self.complex_dtype)
         bounds = torch.searchsorted(pairs[:, 0].contiguous(), torch.arange(count + 1))
@@ -227,9 +225,8 @@ class EFIEMatrix:
             for part, weight in zip(parts, scale, strict=True):
                 radiated = torch.from_numpy(part[:, 3 * begin :] @ flat)
                 tested = part[rows, 3 * begin : 3 * end].toarray()
-                found.addmm_(
-                    radiated.view(2 * self.count, -1), torch.from_numpy(tested).T, alpha=weight
-                )
+                radiated = radiated.view(2 * self.count, -1)
+                found.addmm_(radiated, torch.from_numpy(tested).T, alpha=weight)
             pair = found.view(self.count, 2, len(rows)).permute(2, 0, 1).contiguous()
             total[torch.from_numpy(rows)] += torch.view_as_complex(pair)
         return total
@@ -356,9 +353,8 @@ class EFIEMatrix:
             mask = mask.repeat_interleave(3, 0).repeat_interleave(3, 1)
             kernel = self._greens_function(points[3 * begin : 3 * end], points) * mask
             kernel = torch.complex(kernel[0], kernel[1])
-            field = (kernel @ right_strengths.flatten(1)).view(
-                len(kernel), *right_strengths.shape[1:]
-            )
+            field = kernel @ right_strengths.flatten(1)
+            field = field.view(len(kernel), *right_strengths.shape[1:])
             block = left_strengths[3 * begin : 3 * end]
             return torch.einsum("eapz,eaqz->apq", block, field).to(torch.complex128)
 
@@ -388,9 +384,8 @@ class EFIEMatrix:
             current: coefficients of the basis functions.
         """
         points, products = self._quadrature_points(vertices)
-        moments = torch.einsum(
-            "fiqx,fic->fqcx", products[..., :3] + 0j, self.half_coefficients(current)
-        )
+        halves = self.half_coefficients(current)
+        moments = torch.einsum("fiqx,fic->fqcx", products[..., :3] + 0j, halves)
         return points.flatten(0, 1) + vertices.detach().mean(0), moments.flatten(0, 1)
 
     def interior_field_matrix(

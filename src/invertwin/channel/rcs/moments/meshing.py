@@ -84,9 +84,8 @@ def build_conforming_mesh(
     triangles: list[Index] = []
     for number, face in enumerate(faces):
         face_edges = edge[number]
-        inner, local = _triangulate_face(
-            tuple(int(n) for n in parts[face_edges]), _face_shape(vertices[face] / side)
-        )
+        shape = _face_shape(vertices[face] / side)
+        inner, local = _triangulate_face(tuple(int(n) for n in parts[face_edges]), shape)
         rim: list[Index] = []
         for corner in range(3):
             between = first[face_edges[corner]] + np.arange(parts[face_edges[corner]] - 1)
@@ -147,9 +146,8 @@ def _triangulate_face(
     corner = np.array([[0, 0], [shape[0], 0], shape[1:]])
     fractions = [np.arange(n)[:, None] / n for n in parts]
     following = np.roll(corner, -1, 0)
-    rim = np.concatenate(
-        [(1 - t) * p + t * q for t, p, q in zip(fractions, corner, following, strict=True)]
-    )
+    sides = zip(fractions, corner, following, strict=True)
+    rim = np.concatenate([(1 - t) * p + t * q for t, p, q in sides])
     # Slightly outwards, so that the rim's parts are sides of triangles.
     outwards = (following - corner)[:, ::-1] * [1, -1]
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
@@ -258,9 +256,8 @@ def _segment_distances(a: Array, b: Array, c: Array, d: Array) -> Array:
     Source: Ericson, Real-Time Collision Detection, §5.1.9.
     """
     first, second, offset = b - a, d - c, a - c
-    square, other, mixed = (
-        np.einsum("px,px->p", x, y) for x, y in ((first, first), (second, second), (first, second))
-    )
+    pairs = (first, first), (second, second), (first, second)
+    square, other, mixed = (np.einsum("px,px->p", x, y) for x, y in pairs)
     begin, end = (np.einsum("px,px->p", x, offset) for x in (first, second))
     minimum = 1e-30
     determinant = square * other - mixed**2

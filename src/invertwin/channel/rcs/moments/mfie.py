@@ -238,12 +238,10 @@ class _MFIEEquation:
         self.normal, self.tangents = map(torch.from_numpy, (cells.normal, cells.tangents))
         self.area, self.curvature = torch.from_numpy(cells.area), torch.from_numpy(cells.curvature)
         ball = torch.from_numpy(cells.inscribed_radius)
-        self.inner_depth = (_INNER_DEPTH_SHARE * ball).clamp_max(
-            _MAX_INNER_DEPTH * 2 * math.pi / wave_number
-        )
-        self.inner_weight = _INNER_WEIGHT * (
-            self.inner_depth >= _MIN_CELLS_PER_DEPTH * self.area.sqrt()
-        )
+        most = _MAX_INNER_DEPTH * 2 * math.pi / wave_number
+        self.inner_depth = (_INNER_DEPTH_SHARE * ball).clamp_max(most)
+        is_resolved = self.inner_depth >= _MIN_CELLS_PER_DEPTH * self.area.sqrt()
+        self.inner_weight = _INNER_WEIGHT * is_resolved
 
     @cached_property
     def matrix(self) -> Complex64[Tensor, "unknown unknown"]:
@@ -260,9 +258,8 @@ class _MFIEEquation:
             strength[torch.arange(len(rows)), rows] = 0
             inner = square - 2 * self.inner_depth[rows, None].float() * height
             inner = (inner + self.inner_depth[rows, None].float() ** 2).clamp_min(1e-20)
-            second = self.inner_weight[rows, None].to(torch.complex64) * _greens_gradient(
-                self.k, inner, weight
-            )
+            second = _greens_gradient(self.k, inner, weight)
+            second = self.inner_weight[rows, None].to(torch.complex64) * second
             combined = strength + second
             lower = strength * height + second * (height - self.inner_depth[rows, None].float())
             for a in (0, 1):
@@ -352,9 +349,8 @@ def _solve_gmres(
     """Solve for all columns at once by GMRES (Saad and Schultz 1986)."""
     size = right.norm(dim=0)
     basis = [right / size]
-    upper = torch.zeros(
-        _MAX_ITERATIONS + 1, _MAX_ITERATIONS, right.shape[1], dtype=torch.complex128
-    )
+    shape = _MAX_ITERATIONS + 1, _MAX_ITERATIONS, right.shape[1]
+    upper = torch.zeros(shape, dtype=torch.complex128)
     coefficients = upper[:0]
     for iteration in range(1, _MAX_ITERATIONS + 1):
         vector_new = matrix @ basis[-1]
