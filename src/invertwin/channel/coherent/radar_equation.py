@@ -64,13 +64,9 @@ class SurfacePaths(Rows):
             p0, p1, p2 = geometry.corners(face)
             normal = torch.linalg.cross(p1 - p0, p2 - p0)
             double_area = normal.norm(dim=1)
-            place = MaterialPoints(
-                position=interpolate_values((p0, p1, p2), b1, b2),
-                normal=normal / double_area[:, None],
-                jacobian=double_area / double_area.detach(),
-                row=geometry.face_surface[face],
-            )
-            found.append(place)
+            position, row = interpolate_values((p0, p1, p2), b1, b2), geometry.face_surface[face]
+            jacobian = double_area / double_area.detach()
+            found.append(MaterialPoints(position, normal / double_area[:, None], jacobian, row))
         return found
 
     def velocity(self, geometry: Geometry) -> Float64[Tensor, "n 3"] | None:

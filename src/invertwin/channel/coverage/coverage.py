@@ -91,13 +91,8 @@ class CoverageTrace:
     boundary_paths: tuple[CoverageBoundaryPaths, ...]
 
 
-@dataclass(frozen=True)
-class _PointBatch:
-    """Paths to a batch of points: first point, number of points, and the paths."""
-
-    begin: int
-    count: int
-    paths: list[SpecularPaths]
+#: Paths to a batch of points: the points' numbers, and the paths.
+_PointBatch = tuple[Tensor, list[SpecularPaths]]
 
 
 def trace_coverage(
@@ -169,13 +164,11 @@ class _CoverageTracer:
 
     def find_paths(self, points: Tensor) -> list[_PointBatch]:
         """Find the paths to points, in batches of points."""
-        begins = range(0, len(points), _POINTS_AT_ONCE)
         batches: list[_PointBatch] = []
         with _DisableFuncTorch():
-            for begin, some in zip(begins, points.split(_POINTS_AT_ONCE), strict=False):
-                found = find_paths_along(self.surfaces, self.sequences, self.tx, some)
-                paths = [part for part in found if len(part.source)]
-                batches.append(_PointBatch(begin, len(some), paths))
+            for rows in torch.arange(len(points)).split(_POINTS_AT_ONCE):
+                found = find_paths_along(self.surfaces, self.sequences, self.tx, points[rows])
+                batches.append((rows, [part for part in found if len(part.source)]))
         return batches
 
     def sum_paths(
@@ -184,18 +177,18 @@ class _CoverageTracer:
         """Sum the values of paths at points; derivatives recompute the paths (checkpointing)."""
         recompute = stage.vertices.requires_grad or stage.tx.requires_grad
         found: list[Tensor] = []
-        for batch in batches:
-            rx = stage.rx[batch.begin : batch.begin + batch.count]
+        for rows, parts in batches:
+            rx = stage.rx[rows]
             local = replace(stage, rx=rx, rx_velocity=torch.zeros_like(rx))
 
-            def total(local: PathScene = local, batch: _PointBatch = batch) -> Tensor:
-                count = len(self.tx) * batch.count
+            def total(local: PathScene = local, parts: list[SpecularPaths] = parts) -> Tensor:
+                count = len(self.tx) * len(local.rx)
                 sums = torch.zeros(count, self.measure.count, dtype=torch.float64)
-                for part in batch.paths:
+                for part in parts:
                     paths = join_ray_paths(evaluate_paths(local, part))
                     values = self.measure.evaluate(paths, local.tx, local.rx)
                     sums = sums.index_add(0, paths.link, values)
-                return sums.unflatten(0, (len(self.tx), batch.count))
+                return sums.unflatten(0, (len(self.tx), len(local.rx)))
 
             found.append(checkpoint(total, use_reentrant=False) if recompute else total())
         return torch.cat(found, 1)

@@ -259,10 +259,8 @@ class _SingleScatteringTracer:
         cumulative = ((index + jitter[0]) / count * cumulative_area[-1]).flatten()
         face = torch.searchsorted(cumulative_area, cumulative, right=True)
         face = face.clamp_max(int(torch.nonzero(self.is_scattering)[-1]))
-        b1, b2 = (
-            ((start + index * step) % 1).flatten()
-            for start, step in zip(shift, _PLASTIC_STEPS, strict=True)
-        )
+        steps = zip(shift, _PLASTIC_STEPS, strict=True)
+        b1, b2 = (((start + index * step) % 1).flatten() for start, step in steps)
         is_outside = b1 + b2 > 1
         b1, b2 = torch.where(is_outside, 1 - b1, b1), torch.where(is_outside, 1 - b2, b2)
         weight = torch.full_like(cumulative, float(cumulative_area[-1]) / count)

@@ -167,10 +167,8 @@ class _Strip:
             axis: 0 range, 1 u, 2 v.
             strip_axis: axis of the strips.
         """
-        return [
-            self.transverse_derivatives[axis] * w
-            for w in (self.weight_derivatives if axis == strip_axis else self.weights)
-        ]
+        weights = self.weight_derivatives if axis == strip_axis else self.weights
+        return [self.transverse_derivatives[axis] * weight for weight in weights]
 
 
 def _iterate_strips(layout: BinLayout, path: PathContribution) -> Iterator[_Strip]:

@@ -144,11 +144,8 @@ class Inputs:
         if receiver is True or receiver is False:
             table = self.rx if receiver and not self.monostatic else self.tx
             return gather_points(table, frame, active)
-        return dr.select(
-            receiver,
-            self.antenna_position(frame, True, active),
-            self.antenna_position(frame, False, active),
-        )
+        rx, tx = (self.antenna_position(frame, end, active) for end in (True, False))
+        return dr.select(receiver, rx, tx)
 
     def gain(
         self, frame: mit.UInt32, receiver: mit.Bool | bool, direction: mit.Vector3f
@@ -298,12 +295,9 @@ def compute_interaction(
     triangle = p0, p1, p2 = corners(inputs, face, active)
     normal = dr.cross(p1 - p0, p2 - p0)
     double_area = dr.norm(normal)
-    return SurfaceInteraction(
-        position=interpolate_position(triangle, b1, b2),
-        normal=normal / double_area,
-        jacobian=double_area / dr.detach(double_area),
-        surface_row=surface,
-    )
+    position = interpolate_position(triangle, b1, b2)
+    jacobian = double_area / dr.detach(double_area)
+    return SurfaceInteraction(position, normal / double_area, jacobian, surface)
 
 
 def pull_interaction(

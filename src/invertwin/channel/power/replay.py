@@ -129,12 +129,9 @@ class _VertexNeighbours:
     def as_leaf_variables(self) -> _VertexNeighbours:
         """Copy the vertices, with positions that carry derivatives of their own."""
         assert self.previous_interaction is not None
-        here = SurfaceInteraction(
-            mi.Point3f(self.interaction.position),
-            mi.Vector3f(self.interaction.normal),
-            dr.ones(mi.Float, dr.width(self.vertex.face)),
-            self.interaction.surface_row,
-        )
+        known, one = self.interaction, dr.ones(mi.Float, dr.width(self.vertex.face))
+        position, normal = mi.Point3f(known.position), mi.Vector3f(known.normal)
+        here = SurfaceInteraction(position, normal, one, known.surface_row)
         before = self.previous_interaction
         before = replace(before, position=mi.Point3f(before.position))
         after = mi.Point3f(self.next_position)
@@ -496,15 +493,9 @@ def push(
             near = _VertexNeighbours.read(inputs, records, number, depth)
             vertex = _evaluate_vertex(rays, inputs, records, antennas, number, near)
             path = vertex.to_contribution()
-            values = (
-                vertex.incident_factor,
-                vertex.optical_length,
-                path.power,
-                vertex.connection.distance,
-                path.u,
-                path.v,
-                vertex.scattering_factor,
-            )
+            segment = vertex.incident_factor, vertex.optical_length
+            ending = path.power, vertex.connection.distance, path.u, path.v
+            values = *segment, *ending, vertex.scattering_factor
             # u and v also enter the pattern; by default their tangents would be cleared once
             # propagated.
             tangents = dr.forward_to(*values, flags=dr.ADFlag.ClearEdges)

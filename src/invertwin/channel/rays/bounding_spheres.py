@@ -81,12 +81,9 @@ class BoundingSpheres:
         self._size = opaque(self.group_size)
         self._scenes: dict[str, mit.UInt32] | None = None
         if geometry.object_scene is not None:
-            members = np.bincount(of_object)
             columns = {"index": indices, "scene": scene[order], "first": first, "groups": groups}
-            self._scenes = {
-                name: to_index(torch.from_numpy(column))
-                for name, column in {**columns, "members": members}.items()
-            }
+            columns["members"] = np.bincount(of_object)
+            self._scenes = {n: to_index(torch.from_numpy(c)) for n, c in columns.items()}
 
     def table_entry(self, number: mit.UInt32) -> tuple[mit.UInt32, mit.UInt32]:
         """Look up table index and scene of objects in the order of the table.

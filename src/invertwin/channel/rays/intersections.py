@@ -163,10 +163,8 @@ def _trace_edges(
         if not dr.width(lanes):
             break
         face = dr.gather(mi.UInt32, hit.point.face, lanes)
-        edge, start, offset, at, until, step = (
-            dr.gather(type(value), value, lanes)
-            for value in (edge, mi.Point3f(start), mi.Vector3f(offset), at, until, step)
-        )
+        columns = edge, mi.Point3f(start), mi.Vector3f(offset), at, until, step
+        edge, start, offset, at, until, step = (dr.gather(type(x), x, lanes) for x in columns)
         rows.append(to_torch(mi.Int32(edge)).long())
         faces.append(to_torch(mi.Int32(face)).long())
     return torch.cat(rows), torch.cat(faces)

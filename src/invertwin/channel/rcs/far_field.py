@@ -190,10 +190,8 @@ def trace_far_field(
         antenna_pairs = [(transmitters, transmitters if receivers is None else receivers)]
         if receivers is not None:
             antenna_pairs.append((receivers, transmitters))
-        found = [
-            _FarFieldTracer(target, *pair).trace_parts(depth, edges, spacing, boundary)
-            for pair in antenna_pairs
-        ]
+        tracers = [_FarFieldTracer(target, *pair) for pair in antenna_pairs]
+        found = [tracer.trace_parts(depth, edges, spacing, boundary) for tracer in tracers]
         # Reciprocity: mean over both directions, or over both cross-polar terms of one antenna.
         parts = {name: (found[0][name] + found[-1][name].mT) / 2 for name in found[0]}
         residual = None

@@ -81,10 +81,8 @@ def evaluate_diffracted_paths(
     """
     source, target = tx[candidates.tx], rx[candidates.rx]
     after = PathLegs(candidates.after.faces.flip(1), candidates.after.transmitted.flip(1))
-    legs = [
-        _AntennaLeg(wedge_scene, candidates.before, source),
-        _AntennaLeg(wedge_scene, after, target),
-    ]
+    sides = (candidates.before, source), (after, target)
+    legs = [_AntennaLeg(wedge_scene, *side) for side in sides]
     angles = face_azimuths(wedge_scene, candidates)
     incidence, departure = [None, *angles[..., 1].T], [*angles[..., 0].T, None]
     edges = [
@@ -114,20 +112,13 @@ def evaluate_diffracted_paths(
     bends = torch.full_like(candidates.edge, DIFFRACTION)
     kinds = [candidates.before.kinds, bends, candidates.after.kinds]
     first = wedge_scene.detached_wedges.faces[candidates.edge, 0]
-    return DiffractedPaths(
-        candidates.tx,
-        candidates.rx,
-        candidates.edge,
-        torch.cat(points, 1),
-        torch.cat(kinds, 1),
-        torch.cat([candidates.before.faces, first, candidates.after.faces], 1),
-        torch.cat(directions, 1),
-        length,
-        leaving @ (found.transfer * delay_phasor) @ arriving,
-        slopes.transpose(0, 1),
-        torch.stack(axes, 1),
-        candidates.corner,
-    )
+    faces = [candidates.before.faces, first, candidates.after.faces]
+    numbers = candidates.tx, candidates.rx, candidates.edge
+    vertices = torch.cat(points, 1), torch.cat(kinds, 1), torch.cat(faces, 1)
+    ways = torch.cat(directions, 1)
+    transfer = leaving @ (found.transfer * delay_phasor) @ arriving
+    fields = transfer, slopes.transpose(0, 1), torch.stack(axes, 1)
+    return DiffractedPaths(*numbers, *vertices, ways, length, *fields, candidates.corner)
 
 
 def _edge_fields(

@@ -241,20 +241,13 @@ class Route:
         own = torch.diagonal(minors, dim1=1, dim2=2)
         parameters = whole.clamp_min(0)[:, None] / own.clamp_min(1e-300)
         for number, edge in enumerate(self.edges):
-            incident, diffracted = units[:, number], units[:, number + 1]
-            found.append(
-                EdgeDiffraction(
-                    edge.wedges,
-                    incident,
-                    diffracted,
-                    _azimuth(edge.wedges, -incident, edge.azimuth_in),
-                    _azimuth(edge.wedges, diffracted, edge.azimuth),
-                    parameters[:, number] * cross(edge_axis(edge.wedges), incident).square().sum(1),
-                    edge.face_coefficients,
-                    None if edge.infinite else self.end_parameters(number, wave_number),
-                    edge.absorbing,
-                )
-            )
+            wedges, incident, diffracted = edge.wedges, units[:, number], units[:, number + 1]
+            azimuth_in = _azimuth(wedges, -incident, edge.azimuth_in)
+            angles = azimuth_in, _azimuth(wedges, diffracted, edge.azimuth)
+            length = parameters[:, number] * cross(edge_axis(wedges), incident).square().sum(1)
+            ends = None if edge.infinite else self.end_parameters(number, wave_number)
+            law = edge.face_coefficients, ends, edge.absorbing
+            found.append(EdgeDiffraction(wedges, incident, diffracted, *angles, length, *law))
         return found
 
     @property
@@ -481,14 +474,10 @@ def _minimise_length(starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Te
     none = torch.zeros_like(size)[:, None]
     for lift in _LIFTS:
         ups = lift * size[:, None] * torch.arange(starts.shape[1])
-        offsets = _iterate_offsets(
-            offsets,
-            torch.cat([starts, ups[..., None]], 2),
-            torch.nn.functional.pad(axes, (0, 1)),
-            torch.cat([tx, none], 1),
-            torch.cat([rx, ups[:, -1:]], 1),
-            _COARSE_TOLERANCE if lift else _FINE_TOLERANCE,
-        )
+        lines = torch.cat([starts, ups[..., None]], 2), torch.nn.functional.pad(axes, (0, 1))
+        ends = torch.cat([tx, none], 1), torch.cat([rx, ups[:, -1:]], 1)
+        tolerance = _COARSE_TOLERANCE if lift else _FINE_TOLERANCE
+        offsets = _iterate_offsets(offsets, *lines, *ends, tolerance)
     return offsets
 
 

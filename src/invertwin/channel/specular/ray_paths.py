@@ -125,16 +125,9 @@ class RayPaths(Rows):
         reversed_columns = {name: getattr(self, name)[rows, back] for name in names}
         if self.slopes is not None and self.axes is not None:
             reversed_columns |= {"slopes": self.slopes.mT.flip(1), "axes": self.axes.flip(1)}
-        return replace(
-            self,
-            counts=self.counts[::-1],
-            tx=self.rx,
-            rx=self.tx,
-            coefficient=self.coefficient.mT,
-            departure=self.arrival,
-            arrival=self.departure,
-            **reversed_columns,
-        ).sort_rows()
+        reversed_columns |= {"tx": self.rx, "rx": self.tx, "coefficient": self.coefficient.mT}
+        reversed_columns |= {"departure": self.arrival, "arrival": self.departure}
+        return replace(self, counts=self.counts[::-1], **reversed_columns).sort_rows()
 
     def __add__(self, other: "RayPaths") -> "RayPaths":
         return join_ray_paths([self, other])

@@ -266,13 +266,12 @@ def _evaluate_diffracted(
     path_scene: PathScene, wedge_scene: WedgeScene, candidates: DiffractionCandidates
 ) -> list[RayPaths]:
     """Evaluate diffracted paths in chunks, as ``evaluate_paths``."""
-    return _evaluate_in_chunks(
-        path_scene,
-        candidates.tx,
-        candidates.rx,
-        _DIFFRACTED_ROWS_AT_ONCE,
-        lambda rows: _diffracted_columns(path_scene, wedge_scene, candidates.select(rows)),
-    )
+
+    def columns(rows: Tensor) -> _Columns:
+        return _diffracted_columns(path_scene, wedge_scene, candidates.select(rows))
+
+    ends, size = (candidates.tx, candidates.rx), _DIFFRACTED_ROWS_AT_ONCE
+    return _evaluate_in_chunks(path_scene, *ends, size, columns)
 
 
 def _evaluate_in_chunks(
@@ -353,13 +352,12 @@ def evaluate_paths(path_scene: PathScene, specular_paths: SpecularPaths) -> list
         path_scene: scene and antennas.
         specular_paths: triangles that each path meets.
     """
-    return _evaluate_in_chunks(
-        path_scene,
-        specular_paths.source,
-        specular_paths.target,
-        _ROWS_AT_ONCE,
-        lambda rows: _specular_columns(path_scene, specular_paths.select(rows)),
-    )
+
+    def columns(rows: Tensor) -> _Columns:
+        return _specular_columns(path_scene, specular_paths.select(rows))
+
+    ends = specular_paths.source, specular_paths.target
+    return _evaluate_in_chunks(path_scene, *ends, _ROWS_AT_ONCE, columns)
 
 
 def _specular_columns(path_scene: PathScene, paths: SpecularPaths) -> _Columns:

@@ -411,10 +411,8 @@ class EFIEMatrix:
             return self._combine_halves(0.5j * self.k * part + 1j / self.k * charge[:, None])
 
         size = max(1, (_ENTRIES_AT_ONCE >> 6) // len(corners))
-        found = [
-            checkpoint(evaluate_chunk, chunk, use_reentrant=False)
-            for chunk in interior_points.split(size)
-        ]
+        chunks = interior_points.split(size)
+        found = [checkpoint(evaluate_chunk, chunk, use_reentrant=False) for chunk in chunks]
         return torch.cat(found, 1).flatten(1).T
 
 
