@@ -26,6 +26,7 @@ from invertwin.channel.em.plane_waves import (
     reflect_vectors,
 )
 from invertwin.channel.rays.topology import Topology
+from invertwin.channel.rows import Rows, concatenate_rows
 
 MAX_FACETS_BEAM_TRACING = 24
 """Maximum number of triangles for exact beam tracing."""
@@ -71,7 +72,7 @@ def build_facets(vertices: Float64[Tensor, "v 3"], topology: Topology) -> Facets
 
 
 @dataclass(frozen=True)
-class IlluminatedPatches:
+class IlluminatedPatches(Rows):
     """Illuminated patches of one order, one row per beam that ends there.
 
     Attributes:
@@ -194,11 +195,10 @@ def _trace_order(
 ) -> IlluminatedPatches:
     """Illuminated parts of all facets in all beams of one order."""
     count = len(facets.normal)
-    departing = (
-        _launch_plane_waves(incident, solids)
-        if previous is None
-        else _continue_beams(previous, solids)
-    )
+    if previous is None:
+        departing = _launch_plane_waves(incident, solids)
+    else:
+        departing = _continue_beams(previous, solids)
     source = torch.arange(len(departing.aspect)).repeat_interleave(count)
     facet = torch.arange(count).repeat(len(departing.aspect))
     facing = dot(facets.normal[facet], departing.direction[source]).detach()
@@ -228,7 +228,7 @@ def _trace_order(
     bounce = replace(bounce, parent=departing.parent[bounce.parent])
     if solids is None:
         return bounce
-    bounce = select_patches(bounce, exceeds_min_amplitude(bounce, solids.wave_number))
+    bounce = bounce.select(exceeds_min_amplitude(bounce, solids.wave_number))
     solids.require_gaps(bounce.facet, bounce.medium)
     return bounce
 
@@ -247,18 +247,15 @@ def _continue_beams(
     previous: IlluminatedPatches, solids: DielectricSolids | None
 ) -> _DepartingBeams:
     """Continue beams by reflection, followed by transmission into solids."""
-    direction, wave = (
-        reflect_vectors(previous.direction, previous.normal),
-        reflect_vectors(previous.wave_vector, previous.normal),
-    )
+    direction = reflect_vectors(previous.direction, previous.normal)
+    wave = reflect_vectors(previous.wave_vector, previous.normal)
     row, p = torch.arange(len(previous.aspect)), previous.polygon[:, 0]
     transmitted = torch.zeros_like(row, dtype=torch.bool)
     medium, n = previous.medium, previous.normal
     if solids is not None:
         behind = solids.medium_behind(previous.facet, previous.medium)
-        refracted, propagates = refract_waves(
-            solids.permittivity_in(behind), previous.wave_vector, previous.normal
-        )
+        epsilon = solids.permittivity_in(behind)
+        refracted, propagates = refract_waves(epsilon, previous.wave_vector, previous.normal)
         rows = torch.nonzero(propagates & solids.transparent[previous.facet])[:, 0]
         row = torch.cat([row, rows])
         p = p[row]
@@ -280,9 +277,8 @@ def exceeds_min_amplitude(patches: IlluminatedPatches, wave_number: float) -> Bo
         patches: illuminated patches.
         wave_number: wave number k [1/m].
     """
-    decay = (
-        dot(patches.wave_vector[:, None], patches.polygon.to(patches.wave_vector.dtype)).detach()
-    ).imag
+    polygon = patches.polygon.to(patches.wave_vector.dtype)
+    decay = dot(patches.wave_vector[:, None], polygon).detach().imag
     decay = decay + patches.phase_offset.detach().imag[:, None]
     return wave_number * decay.amax(1) > math.log(_MIN_AMPLITUDE)
 
@@ -303,9 +299,8 @@ def _clip_to_beams(
 ) -> IlluminatedPatches:
     """Clip facets to the beams that leave the previous patches."""
     source_polygon = previous.polygon[departing.parent[patches.parent]]
-    polygon = _clip_in_front(
-        patches.polygon, departing.source_normal[patches.parent], source_polygon[:, 0], 0.0
-    )
+    plane = departing.source_normal[patches.parent]
+    polygon = _clip_in_front(patches.polygon, plane, source_polygon[:, 0], 0.0)
     for plane, point, proper in _side_planes(source_polygon, patches.direction):
         polygon = clip(polygon, plane, torch.where(proper, dot(plane, point), -1.0))
     return _drop_degenerate(facets, patches, polygon)
@@ -328,10 +323,8 @@ def _remove_occluded(
         shadow = facets.corners[other].expand(len(patches.aspect), 3, 3)
         shadow = _clip_in_front(shadow, patches.normal, patches.polygon[:, 0], above)
         if departing is not None:
-            plane, point = (
-                departing.source_normal[patches.parent],
-                departing.source_point[patches.parent],
-            )
+            source = departing.source_normal, departing.source_point
+            plane, point = (column[patches.parent] for column in source)
             shadow = _clip_in_front(shadow, plane, point, _OCCLUSION_TOLERANCE * facets.size)
         patches = _subtract_shadows(facets, patches, shadow)
     return patches
@@ -347,13 +340,12 @@ def _subtract_shadows(
         covered = clip(covered, plane, torch.where(proper, dot(plane, point), -1.0))
     hidden = area_vector(covered).detach().norm(dim=1) > _MIN_AREA * facets.size**2
     # The prism of a degenerate or edge-on polygon occludes nothing.
-    hidden &= (
-        dot(area_vector(shadow), patches.direction).detach().abs() > _MIN_AREA * facets.size**2
-    )
+    profile = dot(area_vector(shadow), patches.direction).detach().abs()
+    hidden &= profile > _MIN_AREA * facets.size**2
     if not bool(hidden.any()):
         return patches
-    part = select_patches(patches, hidden)
-    pieces, rest = [select_patches(patches, ~hidden)], part.polygon
+    part = patches.select(hidden)
+    pieces, rest = [patches.select(~hidden)], part.polygon
     for plane, point, proper in sides:
         plane, point, proper = plane[hidden], point[hidden], proper[hidden]
         outside = clip(rest, -plane, torch.where(proper, -dot(plane, point), 1.0))
@@ -428,18 +420,7 @@ def _drop_degenerate(
 ) -> IlluminatedPatches:
     """Set the polygons of patches and drop those without area."""
     keep = area_vector(polygon).detach().norm(dim=1) > _MIN_AREA * facets.size**2
-    rows = select_patches(patches, keep)
-    return IlluminatedPatches(**{**vars(rows), "polygon": polygon[keep]})
-
-
-def select_patches(patches: IlluminatedPatches, rows: Tensor) -> IlluminatedPatches:
-    """Select rows of patches.
-
-    Args:
-        patches: illuminated patches.
-        rows: mask or row numbers.
-    """
-    return IlluminatedPatches(**{name: column[rows] for name, column in vars(patches).items()})
+    return replace(patches, polygon=polygon).select(keep)
 
 
 def concatenate_patches(parts: Sequence[IlluminatedPatches]) -> IlluminatedPatches:
@@ -454,11 +435,4 @@ def concatenate_patches(parts: Sequence[IlluminatedPatches]) -> IlluminatedPatch
         last = polygon[:, -1:].expand(-1, width - polygon.shape[1], -1)
         return torch.cat([polygon, last], 1)
 
-    columns = {
-        name: torch.cat([getattr(part, name) for part in parts])
-        for name in vars(parts[0])
-        if name != "polygon"
-    }
-    return IlluminatedPatches(
-        **columns, polygon=torch.cat([pad_corners(part.polygon) for part in parts])
-    )
+    return concatenate_rows(parts, polygon=torch.cat([pad_corners(p.polygon) for p in parts]))

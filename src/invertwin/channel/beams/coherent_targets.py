@@ -62,9 +62,8 @@ def trace_target(
             elsewhere in the scene, since these occlude a target only in part.
     """
     boundary = sampling.boundary
-    paths = trace_facet_paths(
-        Scene({name: scene[name]}), link, sampling.depth, stretch=stretch, boundary=boundary
-    )
+    alone = Scene({name: scene[name]})
+    paths = trace_facet_paths(alone, link, sampling.depth, stretch=stretch, boundary=boundary)
     others = {n: o for n, o in scene.objects.items() if n != name and o.cloud is None}
     if not others:
         return paths
@@ -98,14 +97,11 @@ def _visible_shares(
     boundary: bool,
 ) -> Float64[Tensor, " place"]:
     """Fraction of a target's outline visible from each antenna past other objects."""
-    return torch.stack(
-        [
-            visible_fractions(
-                others, place[None], _outline_cells(points, place), boundary=boundary
-            ).mean()
-            for place in antennas
-        ]
-    )
+    found = []
+    for place in antennas:
+        cells = _outline_cells(points, place)
+        found.append(visible_fractions(others, place[None], cells, boundary=boundary).mean())
+    return torch.stack(found)
 
 
 def _outline_cells(points: Float64[Tensor, "v 3"], antenna: Float64[Tensor, "3"]) -> PanelCells:
@@ -143,9 +139,8 @@ def combine_coherently(
     Differs from the source: phases between paths are kept, so that orders add constructively only
     where they are in phase.
     """
-    field = paths.coefficient * torch.exp(
-        -2j * math.pi * SPEED_OF_LIGHT / (stretch * link.wavelength) * paths.delay
-    )
+    phase = -2j * math.pi * SPEED_OF_LIGHT / (stretch * link.wavelength) * paths.delay
+    field = paths.coefficient * torch.exp(phase)
     frames = [torch.nonzero(paths.frame == frame)[:, 0] for frame in range(link.frame_count)]
     pairs = [rows[torch.triu_indices(len(rows), len(rows), 1)] for rows in frames]
     one, other = torch.cat(pairs, 1)

@@ -111,10 +111,8 @@ def _unfold_reflections(
     rotation, translation = previous_unfolding.rotation[row], previous_unfolding.translation[row]
     # M (x − 2 n n·(x − p)) + t
     rotated_normal = (rotation @ normal[..., None])[..., 0]
-    return _Unfolding(
-        rotation - 2 * rotated_normal[:, :, None] * normal[:, None],
-        translation + 2 * dot(normal, point)[:, None] * rotated_normal,
-    )
+    translation = translation + 2 * dot(normal, point)[:, None] * rotated_normal
+    return _Unfolding(rotation - 2 * rotated_normal[:, :, None] * normal[:, None], translation)
 
 
 def _field_paths(

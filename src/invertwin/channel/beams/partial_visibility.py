@@ -20,6 +20,7 @@ from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.ray_scene import Occluders, is_visible
 from invertwin.channel.rays.scene_tables import require_surfaces
 from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.checks import strip_derivatives
 from invertwin.deprecation import rename_arguments
 from invertwin.scene import Scene
@@ -59,7 +60,7 @@ class PanelCells:
 
 
 @dataclass(frozen=True)
-class _ShadowingEdges:
+class _ShadowingEdges(Rows):
     """Edges that may cast shadow boundaries, one row per edge and observer.
 
     Attributes:
@@ -73,10 +74,6 @@ class _ShadowingEdges:
     ends: Int64[Tensor, "row 2"]
     apex: Int64[Tensor, " row"]
     interval: Float64[Tensor, "row 2"]
-
-    def select(self, index: Tensor) -> "_ShadowingEdges":
-        """Select rows."""
-        return _ShadowingEdges(*(column[index] for column in vars(self).values()))
 
 
 @rename_arguments(places="observers", width="blur")
@@ -163,9 +160,7 @@ def _find_silhouette_edges(
         interval = torch.stack([low[observer_row, edge], high[observer_row, edge]], 1)
         apex = topology.edge_apexes[edge, side_number]
         found.append(_ShadowingEdges(rows[observer_row], topology.edges[edge], apex, interval))
-    edges = _ShadowingEdges(
-        *(torch.cat(c) for c in zip(*(vars(f).values() for f in found), strict=True))
-    )
+    edges = concatenate_rows(found)
     none = torch.zeros(len(edges.observer), 2, dtype=torch.float64)
     distance, _ = _shadow_distances(_project_edges(edges, vertices, observers, cells), none)
     return edges.select(torch.nonzero(distance.abs() <= reach)[:, 0])
@@ -180,8 +175,7 @@ def _project_edges(
     """
     observer = observers[edges.observer]
     ends = vertices[edges.ends]
-    side = ends[:, 1] - ends[:, 0]
-    points = ends[:, :1] + edges.interval[:, :, None] * side[:, None]
+    points = ends[:, :1] + edges.interval[:, :, None] * (ends[:, 1] - ends[:, 0])[:, None]
     fraction = _edge_ray_fractions(edges, vertices, observers, cells)
     projection = observer[:, None] + (points - observer[:, None]) / fraction[..., None]
     planar = (projection - cells.center) @ cells.axes[:, :2]

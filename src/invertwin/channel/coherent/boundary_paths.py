@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.coherent.radar_equation import MaterialPoints, PathTransfer, radar_equation
+from invertwin.channel.em.plane_waves import dot
 from invertwin.channel.paths import Paths
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.silhouettes import SilhouetteSampler
@@ -71,7 +72,7 @@ def project_silhouettes(rays: RayScene, points: "_EdgePoints") -> ProjectedSilho
     y = y0 + (y1 - y0) * points.edge_parameter[:, None]
     p0, p1, p2 = geometry.corners(points.face)
     plane = torch.linalg.cross(p1 - p0, p2 - p0)
-    moving = c + (y - c) * (_dot(plane, p0 - c) / _dot(plane, y - c))[:, None]
+    moving = c + (y - c) * (dot(plane, p0 - c) / dot(plane, y - c))[:, None]
 
     shadow, normal = moving.detach(), normalize(plane.detach(), dim=1)
     b1, b2 = _barycentric(shadow, p0.detach(), p1.detach(), p2.detach())
@@ -81,17 +82,16 @@ def project_silhouettes(rays: RayScene, points: "_EdgePoints") -> ProjectedSilho
     stretch = (shadow - c.detach()).norm(dim=1) / ray.norm(dim=1)
 
     def project(vector: Tensor) -> Tensor:
-        along = _dot(normal, vector) / _dot(normal, ray)
+        along = dot(normal, vector) / dot(normal, ray)
         return stretch[:, None] * (vector - ray * along[:, None])
 
-    covered = points.side * _dot(normal, ray).sign()
+    covered = points.side * dot(normal, ray).sign()
     tangent = torch.linalg.cross(normal, project(edge)) * covered[:, None]
     weight = points.weight
     if not link.shared_visibility:
         weight = weight * is_visible(rays, shadow, other)
-    speed = _dot(tangent, moving - material) * weight
-    ones = torch.ones_like(b1)
-    place = MaterialPoints(shadow, normal, ones, geometry.face_surface[points.face])
+    speed = dot(tangent, moving - material) * weight
+    place = MaterialPoints(shadow, normal, torch.ones_like(b1), geometry.face_surface[points.face])
     return ProjectedSilhouettes(points.frame, points.face, b1, b2, place, speed)
 
 
@@ -132,10 +132,6 @@ def trace_shadow_boundary_paths(
 def _barycentric(point: Tensor, p0: Tensor, p1: Tensor, p2: Tensor) -> tuple[Tensor, Tensor]:
     """Second and third barycentric coordinates of points in the planes of triangles."""
     a, b, r = p1 - p0, p2 - p0, point - p0
-    aa, ab, bb, ra, rb = _dot(a, a), _dot(a, b), _dot(b, b), _dot(r, a), _dot(r, b)
+    aa, ab, bb, ra, rb = dot(a, a), dot(a, b), dot(b, b), dot(r, a), dot(r, b)
     determinant = aa * bb - ab * ab
     return (bb * ra - ab * rb) / determinant, (aa * rb - ab * ra) / determinant
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return (a * b).sum(dim=-1)

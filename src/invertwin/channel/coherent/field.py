@@ -145,9 +145,8 @@ def _trace_conductors(rays: RayScene, sampling: Sampling, seed: int) -> list[Pat
         coefficient, matrix = combine_elements(rays.link, fields)
         return echo.to_paths("coherent", coefficient=coefficient, matrix=matrix, boundary=True)
 
-    points = sample_surface_points(
-        face_areas(rays.geometry) * coherent, sampling.count_conductor_samples(), seed
-    )
+    areas = face_areas(rays.geometry) * coherent
+    points = sample_surface_points(areas, sampling.count_conductor_samples(), seed)
     parts = _trace_point_fields(rays, points, "coherent", field)
     if sampling.boundary:
         parts += trace_shadow_boundary_paths(rays, sampling.boundary_samples, seed, boundary_paths)

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from invertwin.channel.coherent.radar_equation import SurfacePaths, trace_transmittance
 from invertwin.channel.em.antenna_fields import (
@@ -21,7 +20,7 @@ from invertwin.channel.em.antenna_fields import (
     conductor_field,
     current_kernel,
 )
-from invertwin.channel.em.plane_waves import dot, reflect_vectors
+from invertwin.channel.em.plane_waves import dot, reflect_vectors, triangle_normals
 from invertwin.channel.paths import Paths
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene, face_areas, find_next_surface
 from invertwin.channel.rays.scene_tables import is_visibility_differentiated
@@ -54,9 +53,8 @@ def trace_multibounce_paths(rays: RayScene, sampling: Sampling, seed: int) -> li
     """
     geometry = rays.geometry
     smooth = torch.tensor(geometry.coherent)[geometry.face_object]
-    points = sample_surface_points(
-        face_areas(geometry) * smooth, sampling.count_conductor_samples(), seed
-    )
+    areas = face_areas(geometry) * smooth
+    points = sample_surface_points(areas, sampling.count_conductor_samples(), seed)
     link = rays.link
     same = torch.equal(link.tx, link.rx) and link.tx_jones.equals(link.rx_jones)
     found: list[Paths] = []
@@ -67,9 +65,8 @@ def trace_multibounce_paths(rays: RayScene, sampling: Sampling, seed: int) -> li
             frame = some.repeat_interleave(len(points.weight))
             for from_receiver in (False,) if same else (False, True):
                 share = 1.0 if same else 0.5
-                chain = _follow_rays(
-                    rays, sampling.depth, smooth, frame, points.select(row), from_receiver
-                )
+                own = points.select(row)
+                chain = _follow_rays(rays, sampling.depth, smooth, frame, own, from_receiver)
                 lit = [paths.select(paths.has_field).scale_fields(share) for paths in chain]
                 found += [paths for paths in lit if len(paths)]
     if found and is_visibility_differentiated(geometry, rays.link):
@@ -90,11 +87,9 @@ def _follow_rays(
 ) -> Iterator[Paths]:
     """Follow rays from one antenna by way of their first points."""
     link, geometry = rays.link, rays.geometry
-    here, there = (link.rx, link.tx) if from_receiver else (link.tx, link.rx)
-    patterns = link.tx_pattern, link.rx_pattern
-    own, other = patterns[::-1] if from_receiver else patterns
-    both = link.tx_jones, link.rx_jones
-    own_jones, other_jones = both[::-1] if from_receiver else both
+    tx, rx = (link.tx, link.tx_pattern, link.tx_jones), (link.rx, link.rx_pattern, link.rx_jones)
+    here, own, own_jones = rx if from_receiver else tx
+    there, other, other_jones = tx if from_receiver else rx
     (place,) = points.material_points(geometry)
     antenna, position = here[frame], place.position
     seen, extra = trace_transmittance(rays, antenna, position)
@@ -122,8 +117,8 @@ def _follow_rays(
         face, frame, position, length, start, gain, angle, direction, sent, extra = (
             column[hit] for column in columns
         )
-        p0, p1, p2 = (corner.detach() for corner in geometry.corners(face))
-        normal = normalize(torch.linalg.cross(p1 - p0, p2 - p0), dim=1)
+        corners = geometry.vertices.detach()[geometry.faces[face]]
+        normal, p0 = triangle_normals(corners), corners[:, 0]
         facing = dot(normal, direction)
         way = dot(normal, p0 - position) / torch.where(facing == 0, torch.ones_like(facing), facing)
         position, length = position + way[:, None] * direction, length + way

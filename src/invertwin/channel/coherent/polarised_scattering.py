@@ -26,9 +26,8 @@ def conductor_matrix(link: Link, echo: PathTransfer) -> Complex128[Tensor, "row 
         echo: The radar equation of single points.
     """
     (point,) = echo.points
-    ways = [
-        normalize(point.position - antenna[echo.frame], dim=1) for antenna in (link.tx, link.rx)
-    ]
+    offsets = (point.position - antenna[echo.frame] for antenna in (link.tx, link.rx))
+    ways = [normalize(offset, dim=1) for offset in offsets]
     normal = -dot(point.normal, ways[0]).sign()[:, None] * point.normal
     if torch.equal(link.tx, link.rx) and not _has_directional_jones(link):
         sent, received = link.tx_jones.evaluate(ways[0]), link.rx_jones.evaluate(ways[1])
@@ -38,10 +37,8 @@ def conductor_matrix(link: Link, echo: PathTransfer) -> Complex128[Tensor, "row 
         sent = antenna_fields(link.tx_jones, rotation, ways[0])
         received = antenna_fields(link.rx_jones, rotation, ways[1])
         kernel = current_kernel(normal, ways[0], sent, ways[1], received)
-    return (
-        conductor_field(echo.spreading, kernel, -dot(normal, ways[1]))
-        * point.jacobian[:, None, None]
-    )
+    field = conductor_field(echo.spreading, kernel, -dot(normal, ways[1]))
+    return field * point.jacobian[:, None, None]
 
 
 def _has_directional_jones(link: Link) -> bool:

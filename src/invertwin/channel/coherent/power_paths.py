@@ -63,11 +63,8 @@ def trace_power(scene: Scene, link: Link, *, sampling: Sampling, seed: int) -> P
                 "expected surfaces that do not meet for derivatives of explicit paths, got some "
                 "that cross or touch; use deposit_power, or contacts=False to leave out what moves"
             )
-        parts = [
-            paths
-            for records in trace.iterate_records()
-            for paths in _read_random_walk(trace, records)
-        ]
+        walks = trace.iterate_records()
+        parts = [paths for records in walks for paths in _read_random_walk(trace, records)]
         if boundary and simple and edges:
             parts += trace_shadow_boundary_paths(
                 trace.rays, edges, seed, lambda *found: _boundary_paths(geometry, link, *found)
@@ -81,12 +78,9 @@ def _boundary_paths(
     """Boundary paths: no power, but a derivative."""
     amount = echo.power * received_power_fraction(link, echo.depolarisation) * shadow.area_rate
     velocity = geometry.velocity(shadow.face, shadow.b1, shadow.b2)
-    return echo.to_paths(
-        "power",
-        power=amount - amount.detach(),
-        boundary=True,
-        velocity=None if velocity is None else velocity.detach(),
-    )
+    velocity = None if velocity is None else velocity.detach()
+    power = amount - amount.detach()
+    return echo.to_paths("power", power=power, boundary=True, velocity=velocity)
 
 
 def _read_random_walk(trace: PowerTracer, records: PathRecords) -> Iterator[Paths]:

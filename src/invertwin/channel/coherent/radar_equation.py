@@ -15,16 +15,18 @@ from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.em.plane_waves import triangle_normals
 from invertwin.channel.paths import Link, Paths
 from invertwin.channel.rays.ray_scene import RayScene, find_next_surface, is_visible
 from invertwin.channel.rays.scene_tables import Geometry, interpolate_values
+from invertwin.channel.rows import Rows
 from invertwin.constants import SPEED_OF_LIGHT
 
 _MAX_SHEETS = 8  # that a segment of an explicit path may pass
 
 
 @dataclass(frozen=True)
-class MaterialPoints:
+class MaterialPoints(Rows):
     """Material points, one row each.
 
     Attributes:
@@ -40,7 +42,7 @@ class MaterialPoints:
 
 
 @dataclass(frozen=True)
-class SurfacePaths:
+class SurfacePaths(Rows):
     """Paths over as many material points each, in order from the transmitter; one row a path.
 
     Attributes:
@@ -55,10 +57,6 @@ class SurfacePaths:
     weight: Float64[Tensor, " n"]
     phase: Float64[Tensor, " n"]
 
-    def select(self, rows: Bool[Tensor, " n"] | Int64[Tensor, " m"]) -> "SurfacePaths":
-        """The rows of a mask, or of indices."""
-        return SurfacePaths(*(column[rows] for column in vars(self).values()))
-
     def material_points(self, geometry: Geometry) -> list[MaterialPoints]:
         """Locate material points."""
         found = []
@@ -66,13 +64,9 @@ class SurfacePaths:
             p0, p1, p2 = geometry.corners(face)
             normal = torch.linalg.cross(p1 - p0, p2 - p0)
             double_area = normal.norm(dim=1)
-            place = MaterialPoints(
-                position=interpolate_values((p0, p1, p2), b1, b2),
-                normal=normal / double_area[:, None],
-                jacobian=double_area / double_area.detach(),
-                row=geometry.face_surface[face],
-            )
-            found.append(place)
+            position, row = interpolate_values((p0, p1, p2), b1, b2), geometry.face_surface[face]
+            jacobian = double_area / double_area.detach()
+            found.append(MaterialPoints(position, normal / double_area[:, None], jacobian, row))
         return found
 
     def velocity(self, geometry: Geometry) -> Float64[Tensor, "n 3"] | None:
@@ -161,18 +155,15 @@ def radar_equation(
         index, attenuation = _segment_medium(geometry, start, end, ways[number])
         spread = spread * torch.exp(-attenuation * distances[number]) / distances[number] ** 2
         length = length + index * distances[number]
+    turns = list(zip(points, ways, ways[1:], strict=False))
     *earlier, last = (
         point.jacobian * evaluate_scattering(geometry, point, -back, on)
-        for point, back, on in zip(points, ways, ways[1:], strict=False)
+        for point, back, on in turns
     )
     arriving = math.prod(earlier, start=(link.wavelength / (4 * torch.pi)) ** 2 * spread)
-    turned = [
-        _depolarisation(geometry, point, -back, on)
-        for point, back, on in zip(points, ways, ways[1:], strict=False)
-    ]
-    return PathTransfer(
-        frame, points, arriving * last * ending, arriving, spread * ending, length, turned
-    )
+    turned = [_depolarisation(geometry, point, -back, on) for point, back, on in turns]
+    power = arriving * last * ending
+    return PathTransfer(frame, points, power, arriving, spread * ending, length, turned)
 
 
 def _depolarisation(
@@ -198,9 +189,8 @@ def evaluate_scattering(
         outgoing: To where it goes on.
     """
     surfaces, row, normal = geometry.surfaces, point.row, point.normal
-    first, second, between = (
-        (a * b).sum(1) for a, b in ((normal, incident), (normal, outgoing), (incident, outgoing))
-    )
+    pairs = (normal, incident), (normal, outgoing), (incident, outgoing)
+    first, second, between = ((a * b).sum(1) for a, b in pairs)
     product = first * second
     shape = surfaces.diffuse[row] / torch.pi
     for number, cosine in enumerate((2 * product - between, 2 * product - between, between)):
@@ -296,13 +286,11 @@ def trace_transmittance(
         rows, hit, step = rows[hit >= 0], hit[hit >= 0], step[hit >= 0]
         at = at.index_add(0, rows, step * (1 - at[rows]))
         row = geometry.face_surface[hit]
-        p0, p1, p2 = geometry.corners(hit)
-        normal = normalize(torch.linalg.cross(p1 - p0, p2 - p0), dim=1)
+        normal = triangle_normals(geometry.vertices[geometry.faces[hit]])
         cosine = (normal * normalize(offset[rows], dim=1)).sum(1)
-        factor = torch.ones_like(transmittance).index_copy(
+        transmittance = transmittance * torch.ones_like(transmittance).index_copy(
             0, rows, _interpolate_table(surfaces.transmittance, row, cosine)
         )
-        transmittance = transmittance * factor
         extra = extra.index_add(0, rows, _interpolate_table(surfaces.extra_length, row, cosine))
         rows = rows[transmittance.detach()[rows] > 0]
     return transmittance * torch.ones_like(transmittance).index_fill(0, rows, 0.0), extra
@@ -358,9 +346,6 @@ def _trace_segments(
         if again and not rays.geometry.has_sheets:
             found += found
         else:
-            found.append(
-                trace_transmittance(rays, end, start)
-                if again
-                else trace_transmittance(rays, start, end)
-            )
+            ends = (end, start) if again else (start, end)
+            found.append(trace_transmittance(rays, *ends))
     return found

@@ -31,6 +31,7 @@ from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry, flatten
 from invertwin.channel.rays.surface_point import SurfacePoint
+from invertwin.channel.rows import concatenate_rows
 from invertwin.runtime.progress import track
 from invertwin.scene.scene import Scene
 
@@ -39,9 +40,7 @@ _KEPT_SHARE = 0.25  # of the paths that are drawn; the others carry little
 _REFERENCE_FRAMES = 8  # frames that say how much a path carries
 _STRATIFIED_SHARE = 0.5  # share of the draws that goes to all sequences of objects alike
 _UNIFORM_SHARE = 0.1  # share that goes to paths whatever the reference frames see of them
-_BACKSIDE_SHARE = (
-    0.125  # share of the first points that are lit from the side the antennas do not see
-)
+_BACKSIDE_SHARE = 0.125  # share of first points lit from the side that the antennas do not see
 
 
 def draw_rough_paths(
@@ -72,9 +71,8 @@ def draw_rough_paths(
     with torch.no_grad():
         drawer = _RoughPathSampler(flatten(scene, link.wavelength, motion="fixed"), link, seed)
         rounds = -(-count // _LANES)
-        parts = [
-            drawer.draw(turn, count // rounds, depth) for turn in track(range(rounds), "paths")
-        ]
+        turns = track(range(rounds), "paths")
+        parts = [drawer.draw(turn, count // rounds, depth) for turn in turns]
         return tuple(map(drawer.merge_rounds, zip(*parts, strict=True)))
 
 
@@ -109,11 +107,8 @@ class _RoughPathSampler:
             if number > 1:
                 chance = self._selection_shares(paths, received=True) * (lanes * _KEPT_SHARE)
                 chance = chance.clamp_max(1.0)
-                found.append(
-                    replace(paths, weight=paths.weight / chance).select(
-                        self._draw_uniform(len(chance)) < chance
-                    )
-                )
+                kept = self._draw_uniform(len(chance)) < chance
+                found.append(replace(paths, weight=paths.weight / chance).select(kept))
             if number < depth and len(alive):
                 shares = self._selection_shares(paths, received=False)
                 drawn = (torch.arange(lanes) + self._draw_uniform(1)) / lanes
@@ -125,10 +120,9 @@ class _RoughPathSampler:
 
     def merge_rounds(self, parts: tuple[SurfacePaths, ...]) -> SurfacePaths:
         """Paths of one length from all rounds, each with a phase."""
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        face, b1, b2, weight, _ = (torch.cat(column) for column in columns)
-        phase = 2 * torch.pi * self._draw_uniform(len(weight))
-        return SurfacePaths(face, b1, b2, weight / len(parts), phase)
+        whole = concatenate_rows(parts)
+        phase = 2 * torch.pi * self._draw_uniform(len(whole.weight))
+        return replace(whole, weight=whole.weight / len(parts), phase=phase)
 
     def _draw_uniform(self, count: int) -> Tensor:
         return torch.rand(count, generator=self.generator, dtype=torch.float64)
@@ -143,14 +137,12 @@ class _RoughPathSampler:
         vertex = SurfacePoint(face, b.x, b.y)
         point = integrand.compute_interaction(self.inputs, vertex)
         frame = dr.gather(mi.UInt32, to_index(self.frames), index % opaque(len(self.frames)))
-        back, distance = integrand.direction_and_distance(
-            point.position, self.inputs.antenna_position(frame, False)
-        )
+        tx = self.inputs.antenna_position(frame, False)
+        back, distance = integrand.direction_and_distance(point.position, tx)
         turned = back - 2 * dr.dot(back, point.normal) * point.normal
         back = dr.select(side < _BACKSIDE_SHARE, turned, back)
         state = walk.initial_state(index, frame, vertex, back, dr.ones(mi.Float, lanes), distance)
-        area = dr.gather(mi.Float, self.areas, face)
-        state["weight"] = area / (
+        state["weight"] = dr.gather(mi.Float, self.areas, face) / (
             pmf * lanes * dr.select(side < _BACKSIDE_SHARE, _BACKSIDE_SHARE, 1 - _BACKSIDE_SHARE)
         )
         return state
@@ -197,8 +189,7 @@ class _RoughPathSampler:
         base = len(self.geometry.coherent) ** torch.arange(objects.shape[1])
         _, family = (objects * base).sum(1).unique(return_inverse=True)
         sums = torch.zeros(int(family.max()) + 1, dtype=torch.float64).index_add(0, family, power)
-        seen = int((sums > 0).sum())
-        alike = power / sums.clamp_min(1e-300)[family] / seen
+        alike = power / sums.clamp_min(1e-300)[family] / int((sums > 0).sum())
         return _UNIFORM_SHARE * blind + (1 - _UNIFORM_SHARE) * (
             _STRATIFIED_SHARE * alike + (1 - _STRATIFIED_SHARE) * power / total
         )

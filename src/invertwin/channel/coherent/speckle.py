@@ -94,7 +94,6 @@ def draw_speckle(scene: Scene, link: Link, sampling: Sampling, seed: int) -> Spe
         InputError: Points per m² of what is not in the scene, or not of all its rough objects.
     """
     with tracing(sampling.backend):
-        paths = draw_rough_paths(
-            scene, link, count=sampling.rough_paths, depth=sampling.depth, seed=seed
-        )
+        count, depth = sampling.rough_paths, sampling.depth
+        paths = draw_rough_paths(scene, link, count=count, depth=depth, seed=seed)
     return Speckle(draw_rough_points(scene, sampling.points_per_m2, seed), paths)

@@ -27,11 +27,11 @@ from invertwin.channel.em.plane_waves import dot, interpolate_vectors, triangle_
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.intersections import find_overlapping_pairs, intersect_triangles
 from invertwin.channel.rays.topology import Topology, topology_of
-from invertwin.channel.specular.candidates import enumerate_sequences, shoot_sequences
+from invertwin.channel.specular.candidates import find_sequences
 from invertwin.channel.specular.image_method import (
     CandidateSurfaces,
     SpecularPaths,
-    find_paths_between,
+    find_paths_along,
 )
 from invertwin.channel.specular.ray_paths import RayPaths, join_ray_paths
 from invertwin.channel.specular.trace_paths import (
@@ -91,13 +91,8 @@ class CoverageTrace:
     boundary_paths: tuple[CoverageBoundaryPaths, ...]
 
 
-@dataclass(frozen=True)
-class _PointBatch:
-    """Paths to a batch of points: first point, number of points, and the paths."""
-
-    begin: int
-    count: int
-    paths: list[SpecularPaths]
+#: Paths to a batch of points: the points' numbers, and the paths.
+_PointBatch = tuple[Tensor, list[SpecularPaths]]
 
 
 def trace_coverage(
@@ -129,7 +124,7 @@ def trace_coverage(
             out. Only derivatives with respect to positions use them.
         seed: random seed of rays and edge points.
     """
-    path_scene = prepare_path_scene(scene, tx, points, frequency, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    path_scene = prepare_path_scene(scene, tx, points, frequency)
     with tracing():
         tracer = _CoverageTracer(path_scene, surface, measure, depth, rays, seed)
         amount = tracer.sum_paths(path_scene, tracer.find_paths(strip_derivatives(path_scene.rx)))
@@ -137,11 +132,8 @@ def trace_coverage(
         deforms = is_differentiated(path_scene.vertices)
         if boundary_samples and (deforms or is_differentiated(path_scene.tx)):
             paths += tracer.trace_illumination_boundaries(path_scene, boundary_samples, seed)
-            paths += (
-                tracer.trace_intersection_curves(path_scene, boundary_samples, seed)
-                if deforms
-                else []
-            )
+            if deforms:
+                paths += tracer.trace_intersection_curves(path_scene, boundary_samples, seed)
     return CoverageTrace(amount, tuple(paths))
 
 
@@ -158,45 +150,25 @@ class _CoverageTracer:
         seed: int,
     ) -> None:
         self.measure, self.depth = measure, depth
-        self.tx, self.powers = strip_derivatives(stage.tx), face_interactions(stage)
+        self.tx, powers = strip_derivatives(stage.tx), face_interactions(stage)
+        self.powers = powers
         # Discrete: `torch.func` would claim the intermediate tensors.
         with _DisableFuncTorch():
             places = strip_derivatives(surface.vertices)
-            self.candidate_surfaces = CandidateSurfaces(
-                strip_derivatives(stage.vertices), stage.topology, torch.cat([self.tx, places])
-            )
-            self.receiving_surface = ReceivingSurface(
-                places, topology_of([surface]), self.candidate_surfaces.origin
-            )
-            meshes = [item.mesh for item in stage.scene.objects.values()]
-            self.meshes = [*meshes, surface]
-            planes = self.candidate_surfaces.planes
-            found: tuple[Tensor, ...] = ()
-            if depth and rays is None:
-                found = enumerate_sequences(planes, self.powers, depth).steps
-            elif depth and rays:
-                found = shoot_sequences(
-                    self.candidate_surfaces, planes, self.powers, self.tx, depth, rays, seed
-                ).steps
-            self.sequences = tuple(steps for steps in found if len(steps))
+            vertices, ends = strip_derivatives(stage.vertices), torch.cat([self.tx, places])
+            self.surfaces = CandidateSurfaces(vertices, stage.topology, ends)
+            own, origin = topology_of([surface]), self.surfaces.origin
+            self.receiving_surface = ReceivingSurface(places, own, origin)
+            self.meshes = [*(item.mesh for item in stage.scene.objects.values()), surface]
+            self.sequences = find_sequences(self.surfaces, powers, self.tx, depth, rays, seed).steps
 
     def find_paths(self, points: Tensor) -> list[_PointBatch]:
         """Find the paths to points, in batches of points."""
-        sequences = (torch.zeros(1, 0, dtype=torch.int64), *self.sequences)
-        begins = range(0, len(points), _POINTS_AT_ONCE)
         batches: list[_PointBatch] = []
         with _DisableFuncTorch():
-            for begin, some in zip(begins, points.split(_POINTS_AT_ONCE), strict=False):
-                paths = [
-                    part
-                    for steps in sequences
-                    for number, source in enumerate(self.tx)
-                    for part in find_paths_between(
-                        self.candidate_surfaces, steps, source, some, number
-                    )
-                    if len(part.source)
-                ]
-                batches.append(_PointBatch(begin, len(some), paths))
+            for rows in torch.arange(len(points)).split(_POINTS_AT_ONCE):
+                found = find_paths_along(self.surfaces, self.sequences, self.tx, points[rows])
+                batches.append((rows, [part for part in found if len(part.source)]))
         return batches
 
     def sum_paths(
@@ -205,18 +177,18 @@ class _CoverageTracer:
         """Sum the values of paths at points; derivatives recompute the paths (checkpointing)."""
         recompute = stage.vertices.requires_grad or stage.tx.requires_grad
         found: list[Tensor] = []
-        for batch in batches:
-            rx = stage.rx[batch.begin : batch.begin + batch.count]
+        for rows, parts in batches:
+            rx = stage.rx[rows]
             local = replace(stage, rx=rx, rx_velocity=torch.zeros_like(rx))
 
-            def total(local: PathScene = local, batch: _PointBatch = batch) -> Tensor:
-                count = len(self.tx) * batch.count
+            def total(local: PathScene = local, parts: list[SpecularPaths] = parts) -> Tensor:
+                count = len(self.tx) * len(local.rx)
                 sums = torch.zeros(count, self.measure.count, dtype=torch.float64)
-                for part in batch.paths:
+                for part in parts:
                     paths = join_ray_paths(evaluate_paths(local, part))
                     values = self.measure.evaluate(paths, local.tx, local.rx)
                     sums = sums.index_add(0, paths.link, values)
-                return sums.unflatten(0, (len(self.tx), batch.count))
+                return sums.unflatten(0, (len(self.tx), len(local.rx)))
 
             found.append(checkpoint(total, use_reentrant=False) if recompute else total())
         return torch.cat(found, 1)
@@ -227,7 +199,7 @@ class _CoverageTracer:
         """Boundary paths to illumination boundaries: path values times the boundary's area rate."""
         with _DisableFuncTorch():
             groups = sample_illumination_boundaries(
-                self.candidate_surfaces,
+                self.surfaces,
                 self.receiving_surface,
                 self.tx,
                 self.sequences,
@@ -238,27 +210,17 @@ class _CoverageTracer:
             )
         boundary_paths: list[CoverageBoundaryPaths] = []
         for some in groups:
-            boundary = evaluate_illumination_boundary(
-                self.candidate_surfaces,
-                self.receiving_surface.corners,
-                some,
-                stage.tx,
-                stage.vertices,
-            )
+            corners, moving = self.receiving_surface.corners, (stage.tx, stage.vertices)
+            boundary = evaluate_illumination_boundary(self.surfaces, corners, some, *moving)
             detached = _detach_stage(stage, boundary.point)
             with torch.no_grad():
                 paths = join_ray_paths(evaluate_paths(detached, boundary.paths))
                 values = strip_derivatives(self.measure.evaluate(paths, detached.tx, detached.rx))
             # One path a row, in another order.
             amount = torch.zeros_like(values).index_copy(0, paths.rx, values)
-            boundary_paths.append(
-                CoverageBoundaryPaths(
-                    boundary.paths.source,
-                    boundary.point,
-                    boundary.face,
-                    amount * boundary.area_rate[:, None],
-                )
-            )
+            amount = amount * boundary.area_rate[:, None]
+            ends = boundary.paths.source, boundary.point, boundary.face
+            boundary_paths.append(CoverageBoundaryPaths(*ends, amount))
         return boundary_paths
 
     def trace_intersection_curves(
@@ -268,18 +230,16 @@ class _CoverageTracer:
         with _DisableFuncTorch():
             joint_topology = topology_of(self.meshes)
             curve_points = sample_intersection_curves(
-                self.candidate_surfaces, self.receiving_surface, joint_topology, samples, seed
+                self.surfaces, self.receiving_surface, joint_topology, samples, seed
             )
             if not len(curve_points.face):
                 return []
-            offset = SIDE_OFFSET * self.candidate_surfaces.margin * curve_points.across
+            offset = SIDE_OFFSET * self.surfaces.margin * curve_points.across
             points = torch.cat([curve_points.point + offset, curve_points.point - offset])
         with torch.no_grad():
-            detached = _detach_stage(stage, points)
-            outer, inner = strip_derivatives(
-                self.sum_paths(detached, self.find_paths(points))
-            ).chunk(2, 1)
-        rate = intersection_area_rates(self.candidate_surfaces, curve_points, stage.vertices)
+            sums = self.sum_paths(_detach_stage(stage, points), self.find_paths(points))
+            outer, inner = strip_derivatives(sums).chunk(2, 1)
+        rate = intersection_area_rates(self.surfaces, curve_points, stage.vertices)
         count = len(self.tx)
         return [
             CoverageBoundaryPaths(
@@ -293,14 +253,8 @@ class _CoverageTracer:
 
 def _detach_stage(stage: PathScene, points: Tensor) -> PathScene:
     """Replace the receivers and detach all positions."""
-    return replace(
-        stage,
-        vertices=strip_derivatives(stage.vertices),
-        velocities=None,
-        tx=strip_derivatives(stage.tx),
-        rx=points,
-        rx_velocity=torch.zeros_like(points),
-    )
+    rest = torch.zeros_like(points)
+    return replace(stage, rx=points, rx_velocity=rest, velocities=None).detach()
 
 
 @dataclass(frozen=True)
@@ -325,7 +279,7 @@ class IntersectionCurvePoints:
 
 
 def sample_intersection_curves(
-    candidate_surfaces: CandidateSurfaces,
+    surfaces: CandidateSurfaces,
     receiving_surface: ReceivingSurface,
     joint_topology: Topology,
     samples: int,
@@ -334,47 +288,40 @@ def sample_intersection_curves(
     """Sample points evenly on the intersection curves of the scene with a receiving surface.
 
     Args:
-        candidate_surfaces: surfaces of the scene.
+        surfaces: surfaces of the scene.
         receiving_surface: the receiving surface.
         joint_topology: triangles of the scene, followed by those of the receiving surface.
         samples: number of points.
         seed: random seed of the points.
     """
-    vertices = candidate_surfaces.exact_vertices + candidate_surfaces.origin
-    corners = vertices[candidate_surfaces.topology.faces]
+    vertices = surfaces.exact_vertices + surfaces.origin
+    corners = vertices[surfaces.topology.faces]
     face, receiving_face = find_overlapping_pairs(corners, receiving_surface.corners)
     points = torch.cat([vertices, receiving_surface.vertices])
     segments = intersect_triangles(points, joint_topology, face, receiving_face + len(corners))
     span = segments.end - segments.start
     row, fraction, weight = sample_along_curves(span.norm(dim=1), samples, seed)
     face, receiving_face = segments.first[row], segments.second[row] - len(corners)
-    normal, up = (
-        triangle_normals(triangles)
-        for triangles in (corners[face], receiving_surface.corners[receiving_face])
-    )
+    normal = triangle_normals(corners[face])
+    up = triangle_normals(receiving_surface.corners[receiving_face])
     across = normalize(normal - dot(normal, up)[:, None] * up, dim=1)
-    return IntersectionCurvePoints(
-        segments.start[row] + fraction[:, None] * span[row],
-        face,
-        receiving_face,
-        across,
-        normal,
-        weight * span[row].norm(dim=1) / dot(normal, across),
-    )
+    points = segments.start[row] + fraction[:, None] * span[row]
+    weight = weight * span[row].norm(dim=1) / dot(normal, across)
+    return IntersectionCurvePoints(points, face, receiving_face, across, normal, weight)
 
 
 def intersection_area_rates(
-    candidate_surfaces: CandidateSurfaces,
+    surfaces: CandidateSurfaces,
     points: IntersectionCurvePoints,
     vertices: Float64[Tensor, "v 3"],
 ) -> Float64[Tensor, " row"]:
     """Rates of the area lost on the side of the normal; zero in value, with derivatives [m²].
 
     Args:
-        candidate_surfaces: surfaces of the scene.
+        surfaces: surfaces of the scene.
         points: points on the intersection curves.
         vertices: vertex positions in world axes, with derivatives [m].
     """
-    corners = vertices[candidate_surfaces.topology.faces[points.face]]
+    corners = vertices[surfaces.topology.faces[points.face]]
     material = interpolate_vectors(corners, strip_derivatives(corners), points.point)
     return dot(points.normal, material - strip_derivatives(material)) * points.weight

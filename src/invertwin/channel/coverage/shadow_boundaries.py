@@ -12,7 +12,7 @@ where the line from S through y intersects the surface: ``ΔI = f · T · (x_c �
 Source: derivations §3 and §11, for specular paths.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,15 +28,16 @@ from invertwin.channel.em.plane_waves import (
     reflect_vectors,
     triangle_normals,
 )
-from invertwin.channel.rays.arrays import to_float, to_torch
+from invertwin.channel.rays.arrays import to_torch, to_vectors
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
+from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.channel.specular.candidates import FaceInteractions
 from invertwin.channel.specular.image_method import (
     CandidateSurfaces,
     SpecularPaths,
-    find_paths_between,
+    find_paths_along,
     image_positions,
 )
 from invertwin.checks import strip_derivatives
@@ -62,6 +63,24 @@ class ReceivingSurface(Occluders):
         self.vertices = vertices
         self.corners = vertices[topology.faces]
 
+    def find_received(
+        self, rays: "_RaysPastEdges", face: Tensor, max_distance: Tensor
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Rows and triangles of surface crossings past the edge and before the next surface."""
+        rows, reach = torch.arange(len(rays.edge_point)), rays.min_distance.clamp_min(0.0)
+        for _ in range(_MAX_SURFACE_HITS):
+            ahead = torch.nonzero(reach < max_distance[rows])[:, 0]
+            if not len(ahead):
+                return
+            rows, reach = rows[ahead], reach[ahead]
+            origin, direction = rays.origin[rows], rays.direction[rows]
+            face, distance = _intersect_rays(self, origin + reach[:, None] * direction, direction)
+            reach = reach + distance
+            is_hit = torch.nonzero((face >= 0) & (reach < max_distance[rows]))[:, 0]
+            rows, reach = rows[is_hit], reach[is_hit]
+            yield rows, face[is_hit]
+            reach = reach + RAY_EPSILON * (1 + reach + origin[is_hit].norm(dim=1))
+
 
 @dataclass(frozen=True)
 class ReceivingTriangles:
@@ -72,6 +91,14 @@ class ReceivingTriangles:
     """
 
     is_receiving: Bool[Tensor, " f"]
+
+    def find_received(
+        self, rays: "_RaysPastEdges", face: Tensor, distance: Tensor
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Rows and triangles that receive power at the ends of segments."""
+        hit = (face >= 0) & self.is_receiving[face.clamp_min(0)] & (distance > rays.min_distance)
+        rows = torch.nonzero(hit)[:, 0]
+        yield rows, face[rows]
 
 
 @dataclass(frozen=True)
@@ -95,7 +122,7 @@ class IlluminationBoundary:
 
 
 @dataclass(frozen=True)
-class _EdgeSamples:
+class _EdgeSamples(Rows):
     """Points on edges, one row each; detached.
 
     Attributes:
@@ -111,12 +138,9 @@ class _EdgeSamples:
     weight: Tensor
     faces: Tensor
 
-    def select(self, rows: Tensor) -> "_EdgeSamples":
-        return _EdgeSamples(*(column[rows] for column in vars(self).values()))
-
 
 @dataclass(frozen=True)
-class _RaysPastEdges:
+class _RaysPastEdges(Rows):
     """Rays that continue past an edge, one row each; detached.
 
     Attributes:
@@ -140,14 +164,6 @@ class _RaysPastEdges:
     faces: Tensor
     through: Tensor
 
-    def select(self, rows: Tensor) -> "_RaysPastEdges":
-        return _RaysPastEdges(*(column[rows] for column in vars(self).values()))
-
-
-def _concatenate_rays(parts: Sequence[_RaysPastEdges]) -> _RaysPastEdges:
-    columns = zip(*(vars(part).values() for part in parts), strict=True)
-    return _RaysPastEdges(*(torch.cat(column) for column in columns))
-
 
 @dataclass(frozen=True)
 class IlluminationBoundarySamples:
@@ -165,7 +181,7 @@ class IlluminationBoundarySamples:
 
 
 def sample_illumination_boundaries(
-    candidate_surfaces: CandidateSurfaces,
+    surfaces: CandidateSurfaces,
     receiver: ReceivingSurface | ReceivingTriangles,
     tx: Float64[Tensor, "tx 3"],
     sequences: tuple[Tensor, ...],
@@ -178,7 +194,7 @@ def sample_illumination_boundaries(
     """Sample points on the boundaries of regions that specular paths illuminate on a surface.
 
     Args:
-        candidate_surfaces: surfaces of the scene.
+        surfaces: surfaces of the scene.
         receiver: surface or triangles that receive power.
         tx: transmitter positions in world axes, detached [m].
         sequences: candidate sequences from transmitter to edge, by length from 1.
@@ -189,47 +205,40 @@ def sample_illumination_boundaries(
     """
     found: list[IlluminationBoundarySamples] = []
     for number, source in enumerate(tx):
-        edges = _sample_edges(candidate_surfaces, samples, seed, number)
+        edges = _sample_edges(surfaces, samples, seed, number)
         if not len(edges.fraction):
             continue
-        ends = [candidate_surfaces.exact_vertices[vertex] for vertex in (edges.first, edges.second)]
+        ends = [surfaces.exact_vertices[vertex] for vertex in (edges.first, edges.second)]
         y = torch.lerp(ends[0], ends[1], edges.fraction[:, None])
-        paths = [
-            part
-            for steps in (torch.zeros(1, 0, dtype=torch.int64), *sequences)
-            for part in find_paths_between(
-                candidate_surfaces, steps, source, y + candidate_surfaces.origin, number
-            )
-        ]
+        paths = find_paths_along(surfaces, sequences, source[None], y + surfaces.origin)
         hits: dict[int, list[tuple[_RaysPastEdges, Tensor]]] = {}
         for part in paths:
+            part = replace(part, source=part.source + number)
             for legs in _launch_past_edges(
-                candidate_surfaces, source - candidate_surfaces.origin, y, ends, part, depth
+                surfaces, source - surfaces.origin, y, ends, part, depth
             ):
-                for last, face in _follow_rays(candidate_surfaces, receiver, legs, powers, depth):
+                for last, face in _follow_rays(surfaces, receiver, legs, powers, depth):
                     hits.setdefault(last.faces.shape[1], []).append((last, face))
         for part in hits.values():
             legs, faces = zip(*part, strict=True)
-            found.append(
-                IlluminationBoundarySamples(edges, _concatenate_rays(legs), torch.cat(faces))
-            )
+            last, face = concatenate_rows(legs), torch.cat(faces)
+            found.append(IlluminationBoundarySamples(edges, last, face))
     return found
 
 
 def _sample_edges(
-    candidate_surfaces: CandidateSurfaces, samples: int, seed: int, number: int
+    surfaces: CandidateSurfaces, samples: int, seed: int, number: int
 ) -> _EdgeSamples:
     """Sample points evenly on all edges that can cast a boundary."""
-    topology, planes = candidate_surfaces.topology, candidate_surfaces.planes.face_plane
+    topology, planes = surfaces.topology, surfaces.planes.face_plane
     edge_faces = topology.edge_faces
     # Coplanar triangles of one object are one surface.
     plane = torch.where(edge_faces >= 0, planes[edge_faces.clamp_min(0)], -1)
     flat = (plane == plane[:, :1]).all(1) & (edge_faces >= 0).all(1) & (edge_faces.shape[1] > 1)
     edge = torch.nonzero(~flat)[:, 0]
-    ends = candidate_surfaces.exact_vertices[topology.edges[edge]]
-    row, fraction, weight = sample_along_curves(
-        (ends[:, 1] - ends[:, 0]).norm(dim=1), samples, seed, number
-    )
+    ends = surfaces.exact_vertices[topology.edges[edge]]
+    length = (ends[:, 1] - ends[:, 0]).norm(dim=1)
+    row, fraction, weight = sample_along_curves(length, samples, seed, number)
     chosen = edge[row]
     first, second = topology.edges[chosen].unbind(1)
     return _EdgeSamples(first, second, fraction, weight, topology.edge_faces[chosen])
@@ -258,7 +267,7 @@ def sample_along_curves(
 
 
 def _launch_past_edges(
-    candidate_surfaces: CandidateSurfaces,
+    surfaces: CandidateSurfaces,
     source: Tensor,
     edge_points: Tensor,
     ends: list[Tensor],
@@ -266,14 +275,14 @@ def _launch_past_edges(
     depth: int,
 ) -> Iterator[_RaysPastEdges]:
     """Launch rays past edges, one on each side, from the last surface before them."""
-    planes, count = candidate_surfaces.planes, chains.faces.shape[1]
+    planes, count = surfaces.planes, chains.faces.shape[1]
     plane = planes.face_plane[chains.faces]
     if count:
         # A step in a plane that contains the edge point is left to the rays past the edge.
         last = plane[:, -1]
         height = dot(edge_points[chains.target] - planes.point[last], planes.normal[last]).abs()
-        rows = torch.nonzero(height > SIDE_OFFSET * candidate_surfaces.margin)[:, 0]
-        chains = SpecularPaths(*(column[rows] for column in vars(chains).values()))
+        rows = torch.nonzero(height > SIDE_OFFSET * surfaces.margin)[:, 0]
+        chains = chains.select(rows)
         plane = plane[rows]
     if not len(chains.source):
         return
@@ -284,14 +293,14 @@ def _launch_past_edges(
     valid = torch.nonzero(sideways.norm(dim=1) > _MIN_COSINE)[:, 0]
     sideways = normalize(sideways, dim=1)
     for side in (sideways, -sideways):
-        offset = target + SIDE_OFFSET * candidate_surfaces.margin * side - image
+        offset = target + SIDE_OFFSET * surfaces.margin * side - image
         length = offset.norm(dim=1)
         direction = offset / length[:, None]
         origin, start = image, torch.zeros_like(length)
         if count:
             slope = dot(direction, normal[:, -1])
             start = dot(point[:, -1] - image, normal[:, -1]) / slope
-            offset_length = candidate_surfaces.margin * slope.sign()
+            offset_length = surfaces.margin * slope.sign()
             origin = image + start[:, None] * direction + offset_length[:, None] * normal[:, -1]
         yield _RaysPastEdges(
             origin,
@@ -307,7 +316,7 @@ def _launch_past_edges(
 
 
 def _follow_rays(
-    candidate_surfaces: CandidateSurfaces,
+    surfaces: CandidateSurfaces,
     receiver: ReceivingSurface | ReceivingTriangles,
     rays: _RaysPastEdges,
     powers: FaceInteractions,
@@ -316,22 +325,22 @@ def _follow_rays(
     """Follow rays through the scene to the surface: last legs with the triangle that they hit."""
     step = int(rays.steps_before_edge[0]) if len(rays.edge_point) else depth
     while len(rays.edge_point):
-        face, distance = _intersect_rays(candidate_surfaces, rays.origin, rays.direction)
-        for rows, triangle in _find_received(receiver, rays, face, distance):
+        face, distance = _intersect_rays(surfaces, rays.origin, rays.direction)
+        for rows, triangle in receiver.find_received(rays, face, distance):
             part = rays.select(rows)
             steps = {"faces": part.faces[:, :step], "through": part.through[:, :step]}
             yield replace(part, **steps), triangle
         if step == depth:
             return
-        has_plane = (face >= 0) & (candidate_surfaces.planes.face_plane[face.clamp_min(0)] >= 0)
+        has_plane = (face >= 0) & (surfaces.planes.face_plane[face.clamp_min(0)] >= 0)
         branches: list[_RaysPastEdges] = []
         for passes, mask in ((False, powers.reflect), (True, powers.transmit)):
             rows = torch.nonzero(has_plane & mask[face.clamp_min(0)])[:, 0]
             part, hit = rays.select(rows), face[rows]
-            normal = candidate_surfaces.planes.normal[candidate_surfaces.planes.face_plane[hit]]
+            normal = surfaces.planes.normal[surfaces.planes.face_plane[hit]]
             hit_point = part.origin + distance[rows, None] * part.direction
             next_direction = part.direction if passes else reflect_vectors(part.direction, normal)
-            ray_offset = candidate_surfaces.margin * dot(next_direction, normal).sign()
+            ray_offset = surfaces.margin * dot(next_direction, normal).sign()
             faces, through = part.faces.clone(), part.through.clone()
             faces[:, step], through[:, step] = hit, passes
             branches.append(
@@ -344,7 +353,7 @@ def _follow_rays(
                     through=through,
                 )
             )
-        rays = _concatenate_rays(branches)
+        rays = concatenate_rows(branches)
         step += 1
 
 
@@ -352,54 +361,16 @@ def _intersect_rays(
     occluders: Occluders, origin: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Triangle that each ray hits (−1: none), and its distance [m] (infinite without a hit)."""
-    start, ray_direction = (
-        kind(*(to_float(values[:, k].to(torch.float32)) for k in range(3)))
-        for kind, values in ((mi.Point3f, origin), (mi.Vector3f, direction))
-    )
-    hit = occluders.scene.ray_intersect_preliminary(mi.Ray3f(start, ray_direction))
+    ray = mi.Ray3f(to_vectors(mi.Point3f, origin), to_vectors(mi.Vector3f, direction))
+    hit = occluders.scene.ray_intersect_preliminary(ray)
     face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
     distance = dr.select(hit.is_valid(), hit.t, dr.inf)
     dr.eval(face, distance)
     return to_torch(face).long(), to_torch(distance).double()
 
 
-def _find_received(
-    receiver: ReceivingSurface | ReceivingTriangles,
-    rays: _RaysPastEdges,
-    face: Tensor,
-    distance: Tensor,
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Rows and triangles that receive power on a segment, or at its end."""
-    if isinstance(receiver, ReceivingSurface):
-        yield from _find_surface_hits(receiver, rays, distance)
-        return
-    rows = torch.nonzero(
-        (face >= 0) & receiver.is_receiving[face.clamp_min(0)] & (distance > rays.min_distance)
-    )
-    yield rows[:, 0], face[rows[:, 0]]
-
-
-def _find_surface_hits(
-    receiver: ReceivingSurface, rays: _RaysPastEdges, max_distance: Tensor
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Rows and triangles of surface crossings past the edge and before the next surface."""
-    rows, reach = torch.arange(len(rays.edge_point)), rays.min_distance.clamp_min(0.0)
-    for _ in range(_MAX_SURFACE_HITS):
-        ahead = torch.nonzero(reach < max_distance[rows])[:, 0]
-        if not len(ahead):
-            return
-        rows, reach = rows[ahead], reach[ahead]
-        origin, direction = rays.origin[rows], rays.direction[rows]
-        face, distance = _intersect_rays(receiver, origin + reach[:, None] * direction, direction)
-        reach = reach + distance
-        is_hit = torch.nonzero((face >= 0) & (reach < max_distance[rows]))[:, 0]
-        rows, reach = rows[is_hit], reach[is_hit]
-        yield rows, face[is_hit]
-        reach = reach + RAY_EPSILON * (1 + reach + origin[is_hit].norm(dim=1))
-
-
 def evaluate_illumination_boundary(
-    candidate_surfaces: CandidateSurfaces,
+    surfaces: CandidateSurfaces,
     receiving_corners: Float64[Tensor, "face 3 3"],
     samples: IlluminationBoundarySamples,
     tx: Float64[Tensor, "tx 3"],
@@ -408,14 +379,14 @@ def evaluate_illumination_boundary(
     """Evaluate boundary points and the velocities of the boundaries.
 
     Args:
-        candidate_surfaces: surfaces of the scene.
+        surfaces: surfaces of the scene.
         receiving_corners: corners of the receiving triangles, with derivatives where they move [m].
         samples: boundary samples.
         tx: transmitter positions in world axes, with derivatives [m].
         vertices: vertex positions in world axes, with derivatives [m].
     """
     legs, edges = samples.rays, samples.edges.select(samples.rays.edge_point)
-    corners = vertices[candidate_surfaces.topology.faces[legs.faces]]
+    corners = vertices[surfaces.topology.faces[legs.faces]]
     normal, point = triangle_normals(corners), corners[..., 0, :]
     image = image_positions(tx[legs.source], point, normal, legs.through)[-1]
     # Only surfaces after the edge reflect the edge point.
@@ -431,17 +402,14 @@ def evaluate_illumination_boundary(
 
     up = strip_derivatives(up)
     fixed = strip_derivatives(ray), strip_derivatives(scale), strip_derivatives(normal)
-    edge, shift = (
-        _project_shift(v, fixed, direct, up) for v in (strip_derivatives(y1 - y0), legs.side)
-    )
+    vectors = strip_derivatives(y1 - y0), legs.side
+    edge, shift = (_project_shift(vector, fixed, direct, up) for vector in vectors)
     outwards = cross(up, edge)
     outwards = outwards * -dot(outwards, shift).sign()[:, None]
     rate = dot(outwards, curve - material) * edges.weight
-    is_valid = dot(fixed[0], up).abs() > _MIN_COSINE * fixed[0].norm(dim=1)
-    rows = torch.nonzero(is_valid)[:, 0]
-    paths = SpecularPaths(
-        legs.source[rows], torch.arange(len(rows)), legs.faces[rows], legs.through[rows]
-    )
+    rows = torch.nonzero(dot(fixed[0], up).abs() > _MIN_COSINE * fixed[0].norm(dim=1))[:, 0]
+    number = torch.arange(len(rows))
+    paths = SpecularPaths(legs.source[rows], number, legs.faces[rows], legs.through[rows])
     return IlluminationBoundary(
         paths, strip_derivatives(curve)[rows], samples.face[rows], rate[rows], legs.edge_point[rows]
     )

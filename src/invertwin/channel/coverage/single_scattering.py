@@ -40,9 +40,11 @@ from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.intersections import find_intersection_curves
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry, flatten
+from invertwin.channel.rows import Rows
 from invertwin.channel.sampling import Sampling
 from invertwin.channel.specular.candidates import enumerate_sequences, shoot_sequences_from_edges
 from invertwin.channel.specular.image_method import (
+    DIRECT,
     CandidateSurfaces,
     SpecularPaths,
     find_paths_from,
@@ -73,7 +75,7 @@ PathPairMeasure = Callable[[RayPaths, RayPaths, Tensor, Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
-class _ScatteringPoints:
+class _ScatteringPoints(Rows):
     """Points on rough surfaces, one row each; detached.
 
     Attributes:
@@ -83,9 +85,6 @@ class _ScatteringPoints:
 
     receiver: Int64[Tensor, " row"]
     points: SurfacePaths
-
-    def select(self, rows: Tensor) -> "_ScatteringPoints":
-        return _ScatteringPoints(self.receiver[rows], self.points.select(rows))
 
 
 #: Paths to points from transmitters, and from receivers; detached.
@@ -129,8 +128,7 @@ def trace_single_scattering(
         InputError: derivatives with respect to motion where a surface touches or intersects one
             that scatters.
     """
-    zero = (0.0, 0.0, 0.0)
-    stage = replace(prepare_path_scene(scene, tx, rx, frequency, zero, zero), velocities=None)
+    stage = replace(prepare_path_scene(scene, tx, rx, frequency), velocities=None)
     with tracing(sampling.backend), torch_threads(1):
         geometry = flatten(scattering_scene, SPEED_OF_LIGHT / frequency)
         trace = _SingleScatteringTracer(stage, geometry, measure, value_count, rays, sampling, seed)
@@ -171,32 +169,30 @@ class _SingleScatteringTracer:
             rows |= (strip_derivatives(geometry.surfaces.lobes) > 0).any(1)
             rows &= (strip_derivatives(geometry.surfaces.amplitude) > 0).any(1)
             self.is_scattering: Bool[Tensor, " f"] = rows[geometry.face_surface]
-            self.candidate_surfaces = CandidateSurfaces(
-                strip_derivatives(stage.vertices), stage.topology, torch.cat(self.antennas)
-            )
+            vertices, ends = strip_derivatives(stage.vertices), torch.cat(self.antennas)
+            self.surfaces = CandidateSurfaces(vertices, stage.topology, ends)
             self.sequences = tuple(self._find_sequences(number, rays) for number in range(2))
 
     def _find_sequences(self, end: int, rays: int | None) -> tuple[Tensor, ...]:
         """Find candidate sequences from antennas of one end to rough points, by length from 1."""
-        planes, most = self.candidate_surfaces.planes, self.depth - 1
+        most = self.depth - 1
         if most < 1 or not bool(self.powers.reflect.any()):
             return ()
         if rays is None:
-            found = enumerate_sequences(planes, self.powers, most).steps
+            found = enumerate_sequences(self.surfaces.planes, self.powers, most).steps
             return tuple(steps for steps in found if len(steps))
         origins = self.antennas[end][torch.arange(rays) % len(self.antennas[end])]
         prefix = torch.zeros(rays, dtype=torch.int64)
         columns = shoot_sequences_from_edges(
-            self.candidate_surfaces, planes, self.powers, origins, prefix, most, self.seed + end
+            self.surfaces, self.powers, origins, prefix, most, self.seed + end
         )
         return tuple(steps[:, 1:] for steps in columns if len(steps))
 
     def sum_interior(self, stage: PathScene, geometry: Geometry) -> Float64[Tensor, "tx rx amount"]:
         """Sum over points at fixed visibility; derivatives recompute the paths (checkpointing)."""
         with _DisableFuncTorch():
-            samples = self._sample_points(
-                replace(geometry, vertices=strip_derivatives(geometry.vertices))
-            )
+            vertices = strip_derivatives(geometry.vertices)
+            samples = self._sample_points(replace(geometry, vertices=vertices))
         recompute = any(t.requires_grad for t in (stage.vertices, stage.tx, stage.rx))
         total = torch.zeros(len(stage.tx), len(stage.rx), self.value_count, dtype=torch.float64)
         for rows in torch.arange(len(samples.receiver)).split(_POINTS_AT_ONCE):
@@ -221,17 +217,11 @@ class _SingleScatteringTracer:
         """Sum over the moving boundaries of illuminated regions; zero in value."""
         samples, receivers = self.sampling.boundary_samples, len(stage.rx)
         total = torch.zeros(len(stage.tx), receivers, self.value_count, dtype=torch.float64)
-        detached = replace(
-            stage,
-            vertices=strip_derivatives(stage.vertices),
-            tx=strip_derivatives(stage.tx),
-            rx=strip_derivatives(stage.rx),
-        )
         corners = stage.vertices[stage.topology.faces]
         for end, count in enumerate((samples, -(-samples // receivers))):
             with _DisableFuncTorch():
                 samples_by_length = sample_illumination_boundaries(
-                    self.candidate_surfaces,
+                    self.surfaces,
                     ReceivingTriangles(self.is_scattering),
                     self.antennas[end],
                     self.sequences[end],
@@ -241,12 +231,9 @@ class _SingleScatteringTracer:
                     seed=self.seed + 2 + end,
                 )
             for boundary_samples in samples_by_length:
+                moving = (stage.tx, stage.rx)[end], stage.vertices
                 boundary = evaluate_illumination_boundary(
-                    self.candidate_surfaces,
-                    corners,
-                    boundary_samples,
-                    (stage.tx, stage.rx)[end],
-                    stage.vertices,
+                    self.surfaces, corners, boundary_samples, *moving
                 )
                 if not len(boundary.face):
                     continue
@@ -258,7 +245,7 @@ class _SingleScatteringTracer:
                 with torch.no_grad():
                     point = _material_points_at(geometry, boundary.point, boundary.face)
                     area = torch.full((len(boundary.face),), 1.0 if end else receivers).double()
-                    pairs = self._evaluate_pairs(detached, geometry, legs, point, area)
+                    pairs = self._evaluate_pairs(stage.detach(), geometry, legs, point, area)
                 amount = strip_derivatives(pairs.amount) * boundary.area_rate[pairs.point, None]
                 total = total + self._sum_pairs(replace(pairs, amount=amount))
         return total
@@ -274,10 +261,8 @@ class _SingleScatteringTracer:
         cumulative = ((index + jitter[0]) / count * cumulative_area[-1]).flatten()
         face = torch.searchsorted(cumulative_area, cumulative, right=True)
         face = face.clamp_max(int(torch.nonzero(self.is_scattering)[-1]))
-        b1, b2 = (
-            ((start + index * step) % 1).flatten()
-            for start, step in zip(shift, _PLASTIC_STEPS, strict=True)
-        )
+        steps = zip(shift, _PLASTIC_STEPS, strict=True)
+        b1, b2 = (((start + index * step) % 1).flatten() for start, step in steps)
         is_outside = b1 + b2 > 1
         b1, b2 = torch.where(is_outside, 1 - b1, b1), torch.where(is_outside, 1 - b2, b2)
         weight = torch.full_like(cumulative, float(cumulative_area[-1]) / count)
@@ -288,22 +273,21 @@ class _SingleScatteringTracer:
         self, end: int, points: Tensor, receiver: Int64[Tensor, " row"] | None, face: Tensor
     ) -> list[SpecularPaths]:
         """Find paths from all antennas of one end to points, or each from its own antenna."""
-        plane, sources = self.candidate_surfaces.planes.face_plane, self.antennas[end]
+        plane, sources = self.surfaces.planes.face_plane, self.antennas[end]
         every = torch.ones(len(points), dtype=torch.int64)
         numbers = [receiver] if receiver is not None else [every * k for k in range(len(sources))]
         found: list[SpecularPaths] = []
-        for steps in (torch.zeros(1, 0, dtype=torch.int64), *self.sequences[end]):
+        for steps in (DIRECT, *self.sequences[end]):
             for antenna_number in numbers:
                 used, number = antenna_number.unique(return_inverse=True)
                 for part in find_paths_from(
-                    self.candidate_surfaces, steps, sources[used], number, points, plane[face]
+                    self.surfaces, steps, sources[used], number, points, plane[face]
                 ):
                     # A point has no image in its own plane.
                     valid = torch.ones(len(part.target), dtype=torch.bool)
                     if steps.shape[1]:
                         valid = plane[part.faces[:, -1]] != plane[face[part.target]]
-                    source, target, faces, transmitted = (c[valid] for c in vars(part).values())
-                    found.append(SpecularPaths(used[source], target, faces, transmitted))
+                    found.append(replace(part, source=used[part.source]).select(valid))
         return found
 
     def _evaluate_pairs(
@@ -324,30 +308,18 @@ class _SingleScatteringTracer:
             )
         )
         first, second = match_rows(outbound.rx, inbound.rx, len(area))
-        has_reflection, steps, side = (
-            (values[0][first], values[1][second])
-            for values in (
-                [(leg.kinds == REFLECTION).any(1) for leg in (outbound, inbound)],
-                [leg.depth for leg in (outbound, inbound)],
-                [
-                    dot(strip_derivatives(point.normal)[leg.rx], strip_derivatives(leg.arrival)) > 0
-                    for leg in (outbound, inbound)
-                ],
-            )
-        )
-        kept = (has_reflection[0] | has_reflection[1]) & (steps[0] + steps[1] < self.depth)
-        rows = torch.nonzero(kept & (side[0] == side[1]))[:, 0]
+        pairs, normal = ((outbound, first), (inbound, second)), strip_derivatives(point.normal)
+        side = [dot(normal[leg.rx], strip_derivatives(leg.arrival))[n] > 0 for leg, n in pairs]
+        has_reflection = [(leg.kinds == REFLECTION).any(1)[n] for leg, n in pairs]
+        kept = outbound.depth[first] + inbound.depth[second] < self.depth
+        kept &= (has_reflection[0] | has_reflection[1]) & (side[0] == side[1])
+        rows = torch.nonzero(kept)[:, 0]
         outbound, inbound = outbound.select(first[rows]), inbound.select(second[rows])
         index = outbound.rx
-        material = MaterialPoints(
-            point.position[index], point.normal[index], point.jacobian[index], point.row[index]
-        )
+        material = point.select(index)
         k = 4 * math.pi * stage.frequency / SPEED_OF_LIGHT
-        law = (
-            k**2
-            * area[index]
-            * evaluate_scattering(geometry, material, outbound.arrival, inbound.arrival)
-        )
+        law = evaluate_scattering(geometry, material, outbound.arrival, inbound.arrival)
+        law = k**2 * area[index] * law
         chi = geometry.surfaces.depolarisation[material.row]
         amount = law[:, None] * self.measure(outbound, inbound, chi, stage.tx, stage.rx)
         return _LegPairs(outbound.tx, inbound.tx, index, amount)
@@ -387,9 +359,8 @@ def _material_points_at(
 ) -> MaterialPoints:
     """Material points on triangles for the scattering law; at rest."""
     normal = triangle_normals(strip_derivatives(geometry.vertices)[geometry.faces[face]])
-    return MaterialPoints(
-        position, normal, torch.ones_like(position[:, 0]), geometry.face_surface[face]
-    )
+    one = torch.ones_like(position[:, 0])
+    return MaterialPoints(position, normal, one, geometry.face_surface[face])
 
 
 def _require_no_contact(

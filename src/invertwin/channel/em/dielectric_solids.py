@@ -196,8 +196,7 @@ def normal_component(
     tangential = wave_vector - dot(wave_vector, normal)[:, None] * normal
     square = permittivity - dot(tangential, tangential)
     root = torch.sqrt(square)
-    growing = (square.detach().real < 0) & (root.detach().imag > 0)
-    return torch.where(growing, -root, root)
+    return torch.where((square.detach().real < 0) & (root.detach().imag > 0), -root, root)
 
 
 def refract_waves(

@@ -115,10 +115,8 @@ def reflect_field(
     """
     cosine = -dot(normal, direction)
     attenuation = interfaces.coherence * roughness_attenuation(interfaces, wave_number, 2 * cosine)
-    return (
-        _reflect_from_smooth(interfaces, wave_number, normal, direction, field)
-        * attenuation[:, None, None]
-    )
+    reflected = _reflect_from_smooth(interfaces, wave_number, normal, direction, field)
+    return reflected * attenuation[:, None, None]
 
 
 def radiate_field(
@@ -194,9 +192,8 @@ def radiate_currents(
     """
     n, s = normal[:, None], scattered_direction[:, None]
     reflected_direction = reflect_vectors(wave_vector, normal)[:, None]
-    electric = cross(
-        n, cross(wave_vector[:, None], field) + cross(reflected_direction, reflected_field)
-    )
+    magnetic_field = cross(wave_vector[:, None], field)
+    electric = cross(n, magnetic_field + cross(reflected_direction, reflected_field))
     magnetic = cross(s, cross(n, field + reflected_field))
     return -1j * wave_number / (4 * math.pi) * (electric + magnetic)
 
@@ -215,11 +212,7 @@ def roughness_attenuation(
 
 
 def _reflect_from_smooth(
-    interfaces: SmoothInterfaces,
-    wave_number: float,
-    normal: Tensor,
-    direction: Tensor,
-    field: Tensor,
+    interfaces: SmoothInterfaces, k: float, normal: Tensor, direction: Tensor, field: Tensor
 ) -> Tensor:
     """Reflected field of a smooth surface."""
     n = normal[:, None]
@@ -227,7 +220,7 @@ def _reflect_from_smooth(
     if bool(interfaces.conducting.all()):
         return conductor
     unit_s, unit_p, reflected_p = plane_of_incidence(normal, direction)
-    r_s, r_p = _coefficients(interfaces, wave_number, -dot(normal, direction))
+    r_s, r_p = _coefficients(interfaces, k, -dot(normal, direction))
     dielectric = r_s[:, None, None] * dot(unit_s, field)[..., None] * unit_s
     dielectric = dielectric + r_p[:, None, None] * dot(unit_p, field)[..., None] * reflected_p
     return torch.where(interfaces.conducting[:, None, None], conductor, dielectric)
@@ -314,8 +307,7 @@ def _radiate_sheet(
     # Fields refer to the mid-plane; the front face is reached earlier and seen later.
     front = torch.exp(1j * k * (cosine + dot(scattered_direction, normal)) * thickness / 2)
     r_s, r_p = _fresnel(epsilon, root, cosine)
-    parts = ((r_s, cosine + root, unit_s), (r_p, epsilon * cosine + root, unit_p))
-    for r, both, unit in parts:
+    for r, both, unit in ((r_s, cosine + root, unit_s), (r_p, epsilon * cosine + root, unit_p)):
         t = 2 * cosine / both
         amplitude = dot(unit, field) * (t / (1 - r**2 * once**2))[:, None]
         for sign, strength in ((1.0, torch.ones_like(r)), (-1.0, -r * once**2)):
@@ -325,8 +317,7 @@ def _radiate_sheet(
                 vector = unit_s.to(field.dtype)
             else:
                 # E of a wave along (sinθ x, ∓q n) with its H across: H ∝ (1/ε)(along, q).
-                inner = tangential - sign * root[:, None] * normal
-                vector = cross(inner, unit_s[:, 0])[:, None]
+                vector = cross(tangential - sign * root[:, None] * normal, unit_s[:, 0])[:, None]
             total = total + vector * (amplitude * (strength * depth * front)[:, None])[..., None]
     return k**2 / (4 * math.pi) * (epsilon - 1)[:, None, None] * total
 
@@ -365,8 +356,7 @@ def polygon_integral(
     0/0 and the series about the centroid to second order replaces it.
     """
     area = area_vector(polygon)
-    size = area.norm(dim=-1)
-    normal = area / size.clamp_min(1e-300)[:, None]
+    normal = area / area.norm(dim=-1).clamp_min(1e-300)[:, None]
     centroid = polygon.mean(1)
     tangential = direction - dot(direction, normal)[:, None] * normal
     square = dot(tangential, tangential)
@@ -381,9 +371,8 @@ def polygon_integral(
     centroid_phase = dot(direction, centroid)
     # ∫(1 + jw·x − (w·x)²/2) over the fan of triangles at the first corner.
     first = dot(tangential[:, None], corners)
-    fan = torch.linalg.cross(
-        corners[:, 1:-1] - corners[:, :1], corners[:, 2:] - corners[:, :1], dim=-1
-    )
+    spokes = corners - corners[:, :1]
+    fan = torch.linalg.cross(spokes[:, 1:-1], spokes[:, 2:], dim=-1)
     weight = dot(fan, normal[:, None]) / 2
     a, b, c = first[:, :1], first[:, 1:-1], first[:, 2:]
     mean = (weight * (a + b + c)).sum(1) / 3

@@ -197,18 +197,28 @@ def _scaled_erfc(x: Tensor) -> Tensor:
     return (2 * total / denominator + 1 / _SQRT_PI) / denominator
 
 
-class _ShiftedTransition(torch.autograd.Function):
+class _WithSlopes(torch.autograd.Function):
+    """Function of real arguments with written first derivatives; saves arguments and value."""
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:  # type: ignore[override]
+        ctx.save_for_backward(*inputs, output)
+        ctx.save_for_forward(*inputs, output)
+
+
+def _push_forward(slopes: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Tensor:
+    """Sum of slopes times tangents, of which some may be None."""
+    pairs = zip(slopes, tangents, strict=True)
+    return torch.stack([slope * tangent for slope, tangent in pairs if tangent is not None]).sum(0)
+
+
+class _ShiftedTransition(_WithSlopes):
     """exp(−w²x²) g(s − exp(−jπ/4) w x), with g continued analytically from s ≥ 0."""
 
     @staticmethod
     def forward(s: Tensor, w: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]
         s, shift = torch.broadcast_tensors(s, w * x)
         return _apply_in_chunks(_evaluate_shifted, s, shift)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:  # type: ignore[override]
-        ctx.save_for_backward(*inputs, output)
-        ctx.save_for_forward(*inputs, output)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[override]
@@ -218,11 +228,7 @@ class _ShiftedTransition(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, tangent_s: Any, tangent_w: Any, _: Any) -> Tensor:  # type: ignore[override]
-        s, w, x, found = ctx.saved_tensors
-        by_s, by_w = _shifted_derivatives(s, w, x, found)
-        return by_s * (torch.zeros_like(s) if tangent_s is None else tangent_s) + by_w * (
-            torch.zeros_like(w) if tangent_w is None else tangent_w
-        )
+        return _push_forward(_shifted_derivatives(*ctx.saved_tensors), (tangent_s, tangent_w))
 
 
 def _evaluate_shifted(s: Tensor, shift: Tensor) -> Tensor:
@@ -246,18 +252,13 @@ def _half_erfc(x: Tensor) -> Tensor:
     return 0.5 * phasor(-x * x) * _scaled_erfc(x)
 
 
-class _TransitionFunction(torch.autograd.Function):
+class _TransitionFunction(_WithSlopes):
     """Transition function g(s) with first derivatives."""
 
     @staticmethod
     def forward(s: Tensor) -> Tensor:  # type: ignore[override]
         size = _SQRT_PI * EXP_J_PI_4 * _apply_in_chunks(_scaled_erfc, s.abs())
         return torch.where(s < 0, -size, size)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:  # type: ignore[override]
-        ctx.save_for_backward(*inputs, output)
-        ctx.save_for_forward(*inputs, output)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[override]
@@ -270,7 +271,7 @@ class _TransitionFunction(torch.autograd.Function):
         return tangent * (2j * s * g - 2j)
 
 
-class _TruncatedTransition(torch.autograd.Function):
+class _TruncatedTransition(_WithSlopes):
     """Part of g(s) beyond t ≥ 0, odd in s."""
 
     @staticmethod
@@ -280,11 +281,6 @@ class _TruncatedTransition(torch.autograd.Function):
         return torch.where(s < 0, -found, found)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # type: ignore[override]
-        ctx.save_for_backward(*inputs, output)
-        ctx.save_for_forward(*inputs, output)
-
-    @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         s, t, found = ctx.saved_tensors
         by_s, by_t = ((grad.conj() * slope).real for slope in _truncated_derivatives(s, t, found))
@@ -292,12 +288,7 @@ class _TruncatedTransition(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, tangent_s: Tensor | None, tangent_t: Tensor | None) -> Tensor:  # type: ignore[override]
-        s, t, found = ctx.saved_tensors
-        by_s, by_t = _truncated_derivatives(s, t, found)
-        zero = torch.zeros_like(s)
-        return by_s * (zero if tangent_s is None else tangent_s) + by_t * (
-            torch.zeros_like(t) if tangent_t is None else tangent_t
-        )
+        return _push_forward(_truncated_derivatives(*ctx.saved_tensors), (tangent_s, tangent_t))
 
 
 def _truncated_derivatives(s: Tensor, t: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:

@@ -137,9 +137,8 @@ def diffraction_dyads(
     if diffraction.face_coefficients is conductor_coefficients or diffraction.absorbing:
         return forward
     exchanged: dict[DyadDerivative, DyadDerivative] = {"value": "value", "in": "out", "out": "in"}
-    backward = _directional_dyads(
-        diffraction.reverse(), wave_number, [exchanged[order] for order in orders]
-    )
+    others: list[DyadDerivative] = [exchanged[order] for order in orders]
+    backward = _directional_dyads(diffraction.reverse(), wave_number, others)
     return (forward + backward.mT) / 2
 
 
@@ -202,11 +201,8 @@ def triple_dyad(
             continue
         others = [edge for edge in range(3) if edge != center]
         middle, *outer = (cotangents[edge].rows(rows) for edge in (center, *others))
-        parts = chain_transition(
-            middle.s.abs(),
-            [edge.s.abs() for edge in outer],
-            [couplings[rows, center, other] for other in others],
-        )
+        coupled = [couplings[rows, center, other] for other in others]
+        parts = chain_transition(middle.s.abs(), [edge.s.abs() for edge in outer], coupled)
         strength = torch.zeros(parts.shape[2:], dtype=torch.complex128)
         for odd in itertools.product((0, 1), (0, 1)):
             weights = [middle.strength(sum(odd))]
@@ -250,10 +246,8 @@ class _CoupledCotangents(NamedTuple):
 
 
 def _couple_cotangents(diffraction: EdgeDiffraction, wave_number: float) -> _CoupledCotangents:
-    opening, root = (
-        diffraction.wedges.opening,
-        torch.sqrt(2 * wave_number * diffraction.distance_parameter),
-    )
+    opening = diffraction.wedges.opening
+    root = torch.sqrt(2 * wave_number * diffraction.distance_parameter)
     scale = -_dyad_scale(diffraction, wave_number) * root
     columns = []
     for other, sign in _term_signs(diffraction):
@@ -265,13 +259,11 @@ def _couple_cotangents(diffraction: EdgeDiffraction, wave_number: float) -> _Cou
         s = root * torch.sin(half)
         factor = scale * (edge_transition(s, diffraction.end_parameters) / transition(s))
         curve = factor * ratio**3 * cosine / opening**2
-        columns.append(
-            (factor * _cotangent_quotient(half, opening), factor * ratio**2 / opening, curve, s)
-        )
+        quotient = factor * _cotangent_quotient(half, opening)
+        columns.append((quotient, factor * ratio**2 / opening, curve, s))
     value, slope, curve, s = (torch.stack(column) for column in zip(*columns, strict=True))
-    sides = (
-        torch.tensor([[sign * other, sign] for other, sign in _term_signs(diffraction)]).double().T
-    )
+    signs = [[sign * other, sign] for other, sign in _term_signs(diffraction)]
+    sides = torch.tensor(signs).double().T
     return _CoupledCotangents(value, slope, curve, s, sides)
 
 
@@ -298,11 +290,9 @@ def _term_dyads(diffraction: EdgeDiffraction) -> Complex128[Tensor, "term row 3 
 def _directional_term_dyads(diffraction: EdgeDiffraction) -> list[Complex128[Tensor, "row 3 3"]]:
     if diffraction.absorbing:
         axis = edge_axis(diffraction.wedges)
-        bases = (
-            _ray_fixed_basis(axis, diffraction.diffracted_direction),
-            _ray_fixed_basis(axis, diffraction.incident_direction),
-        )
-        return [_rotate_dyad(*bases, torch.eye(3, dtype=torch.complex128))] * 2
+        leaving = _ray_fixed_basis(axis, diffraction.diffracted_direction)
+        arriving = _ray_fixed_basis(axis, diffraction.incident_direction)
+        return [_rotate_dyad(leaving, arriving, torch.eye(3, dtype=torch.complex128))] * 2
     direct, *reflected = _geometric_optics_dyads(diffraction)
     return [direct, direct, *reflected]
 
@@ -333,10 +323,8 @@ def _term_coefficients(
 
 def _half_boundary_angle(diffraction: EdgeDiffraction, azimuth_sign: float, sign: float) -> Tensor:
     """Half the angle δ past the boundary of β = φ ± φ′."""
-    beta, full = (
-        diffraction.azimuth + azimuth_sign * diffraction.azimuth_in,
-        2 * math.pi * diffraction.wedges.opening,
-    )
+    beta = diffraction.azimuth + azimuth_sign * diffraction.azimuth_in
+    full = 2 * math.pi * diffraction.wedges.opening
     turns = torch.round((beta + sign * math.pi) / full).detach()
     return (sign * (full * turns - beta) - math.pi) / 2
 
@@ -356,10 +344,8 @@ def _cotangent(
 
     With δ the angle past the boundary, it is −[sin(δ/2)/tan(δ/2n)] √(2kL) g(√(2kL) sin(δ/2)).
     """
-    opening, half = (
-        diffraction.wedges.opening,
-        _half_boundary_angle(diffraction, azimuth_sign, sign),
-    )
+    opening = diffraction.wedges.opening
+    half = _half_boundary_angle(diffraction, azimuth_sign, sign)
     quotient = _cotangent_quotient(half, opening)
     s = root * torch.sin(half)
     transition_value = edge_transition(s, diffraction.end_parameters)
@@ -396,9 +382,8 @@ def _geometric_optics_dyads(diffraction: EdgeDiffraction) -> list[Complex128[Ten
         normal = diffraction.wedges.normals[:, face]
         unit_s, unit_p, reflected_p = (v[:, 0] for v in plane_of_incidence(normal, direction))
         law = diffraction.face_coefficients(face, dot(normal, direction).abs())
-        reflection = _outer_product(law.reflection_s, unit_s, unit_s) + _outer_product(
-            law.reflection_p, reflected_p, unit_p
-        )
+        reflection = _outer_product(law.reflection_s, unit_s, unit_s)
+        reflection = reflection + _outer_product(law.reflection_p, reflected_p, unit_p)
         reflected = reflect_vectors(direction, normal)
         dyads.append(_rotate_dyad(basis, _ray_fixed_basis(axis, reflected), reflection))
     return dyads
@@ -416,13 +401,12 @@ def _rotate_dyad(leaving: Tensor, arriving: Tensor, law: Tensor) -> Complex128[T
 def _transmission_dyad(diffraction: EdgeDiffraction) -> Complex128[Tensor, "row 3 3"]:
     """Transmission dyad: zero behind bodies; one sheet at an open edge, two at a crease."""
     flat = (diffraction.wedges.opening > 2 - _SHEET_TOLERANCE)[:, None, None]
+    direction = diffraction.incident_direction
     total = torch.eye(3, dtype=torch.complex128)
     for face in (0, 1):
         normal = diffraction.wedges.normals[:, face]
-        unit_s, unit_p, _ = (
-            v[:, 0] for v in plane_of_incidence(normal, diffraction.incident_direction)
-        )
-        law = diffraction.face_coefficients(face, dot(normal, diffraction.incident_direction).abs())
+        unit_s, unit_p, _ = (v[:, 0] for v in plane_of_incidence(normal, direction))
+        law = diffraction.face_coefficients(face, dot(normal, direction).abs())
         through = _outer_product(law.transmission_s, unit_s, unit_s)
         through = through + _outer_product(law.transmission_p, unit_p, unit_p)
         total = through if face == 0 else torch.where(flat, total, through @ total)

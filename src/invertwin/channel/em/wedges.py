@@ -21,6 +21,7 @@ from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import cross, dot
+from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.checks import strip_derivatives
 
 MIN_EDGE_ANGLE = math.radians(10.0)
@@ -31,14 +32,13 @@ _SWAPPED_FACES = torch.tensor([1, 0])
 _MIN_CREASE_ANGLE = 0.35  # rad between adjacent normals; less is a curved surface
 _POLE_WIDTH = 1e-5
 _VERTEX_TOLERANCE = 1e-9  # of the body's size: edge ends closer than this coincide
-_MAX_COLLINEAR_COSINE = -math.cos(
-    math.radians(30.0)
-)  # cosine between the outward directions of two continued edges
+# Largest cosine between the outward directions of two edges that continue each other.
+_MAX_COLLINEAR_COSINE = -math.cos(math.radians(30.0))
 _OPENING_TOLERANCE = 0.2  # of openings along one line, over π
 
 
 @dataclass(frozen=True)
-class Wedges:
+class Wedges(Rows):
     """Edges between two faces, one row each.
 
     Attributes:
@@ -55,10 +55,6 @@ class Wedges:
     normals: Float64[Tensor, "row 2 3"]
     opening: Float64[Tensor, " row"]
     faces: Int64[Tensor, "row 2"]
-
-    def rows(self, index: Tensor) -> "Wedges":
-        """Select rows."""
-        return Wedges(*(column[index] for column in vars(self).values()))
 
 
 def find_wedges(
@@ -88,20 +84,11 @@ def find_wedges(
         # Triangles without area have no face tangent.
         valid = (normal.detach().norm(dim=2) > 0.5).all(1)
         edge, faces, t, normal = edge[valid], faces[valid], t[valid], normal[valid]
+        ends = endpoints[edge, 0], endpoints[edge, 1]
         if count == 1:
-            tangents = t.expand(-1, 2, 3)
-            normals = torch.cat([normal, -normal], 1)
+            sides = t.expand(-1, 2, 3), torch.cat([normal, -normal], 1)
             opening = torch.full((len(edge),), 2.0, dtype=torch.float64)
-            found.append(
-                Wedges(
-                    endpoints[edge, 0],
-                    endpoints[edge, 1],
-                    tangents,
-                    normals,
-                    opening,
-                    faces.expand(-1, 2),
-                )
-            )
+            found.append(Wedges(*ends, *sides, opening, faces.expand(-1, 2)))
             continue
         # Angle from the first face to the second about the edge, through the first one's normal.
         angle_in = torch.atan2(dot(normal[:, 0], t[:, 1]), dot(t[:, 0], t[:, 1]))
@@ -111,12 +98,8 @@ def find_wedges(
             keep = angle.detach() > math.pi + _MIN_CREASE_ANGLE
             # Normals that point into this region: along the first turn, against the second.
             normals = torch.stack([sign * normal[:, 0], -sign * normal[:, 1]], 1)
-            wedge = Wedges(
-                endpoints[edge, 0], endpoints[edge, 1], t, normals, angle / math.pi, faces
-            )
-            found.append(wedge.rows(keep))
-    columns = zip(*(vars(part).values() for part in found), strict=True)
-    return Wedges(*(torch.cat(column) for column in columns))
+            found.append(Wedges(*ends, t, normals, angle / math.pi, faces).select(keep))
+    return concatenate_rows(found)
 
 
 def select_body_edges(wedges: Wedges, min_length: float) -> Bool[Tensor, " row"]:
@@ -144,9 +127,8 @@ def select_body_edges(wedges: Wedges, min_length: float) -> Bool[Tensor, " row"]
     pairs: list[Tensor] = [torch.zeros(2, 0, dtype=torch.int64)]
     for step in range(1, int(number.max())):
         own, other = order[:-step], order[step:]
-        continued = (node[own] == node[other]) & (
-            dot(outward[own], outward[other]) < _MAX_COLLINEAR_COSINE
-        )
+        continued = dot(outward[own], outward[other]) < _MAX_COLLINEAR_COSINE
+        continued &= node[own] == node[other]
         continued &= (opening[own] - opening[other]).abs() < _OPENING_TOLERANCE
         pairs.append(torch.stack([own[continued], other[continued]]) % count)
     row, column = torch.cat(pairs, 1).numpy()
@@ -154,12 +136,9 @@ def select_body_edges(wedges: Wedges, min_length: float) -> Bool[Tensor, " row"]
     line = torch.from_numpy(connected_components(graph, directed=False)[1]).long()
     lines = int(line.max()) + 1
     index = line.repeat(2)[:, None].expand(-1, 3)
-    low, high = (
-        torch.zeros(lines, 3, dtype=torch.float64).scatter_reduce(
-            0, index, ends, reduce, include_self=False
-        )
-        for reduce in ("amin", "amax")
-    )
+    none = torch.zeros(lines, 3, dtype=torch.float64)
+    low = none.scatter_reduce(0, index, ends, "amin", include_self=False)
+    high = none.scatter_reduce(0, index, ends, "amax", include_self=False)
     short = (high - low).norm(dim=1) < min_length
     kept, previous = torch.ones(lines, dtype=torch.bool), -1
     # Removing a line may leave the next one with a loose end.
@@ -190,14 +169,10 @@ def merge_collinear_wedges(wedges: Wedges) -> Wedges:
     rows = torch.arange(len(order))[:, None]
     start = torch.where(reversed_edge, wedges.end, wedges.start)
     end = torch.where(reversed_edge, wedges.start, wedges.end)
-    return Wedges(
-        start[first],
-        end[last],
-        wedges.face_tangents[rows, order][first],
-        wedges.normals[rows, order][first],
-        wedges.opening[first],
-        wedges.faces[rows, order][first],
-    )
+    frames = wedges.face_tangents, wedges.normals
+    tangents, normals = (column[rows, order][first] for column in frames)
+    faces = wedges.faces[rows, order][first]
+    return Wedges(start[first], end[last], tangents, normals, wedges.opening[first], faces)
 
 
 def _group_collinear(wedges: Wedges) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -236,9 +211,8 @@ def is_outside_wedge(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Ten
     """
     angle = azimuth(wedges, direction, 0)
     along = normalize(wedges.end - wedges.start, dim=1)
-    return (angle <= wedges.opening * math.pi) & (
-        dot(along, direction).abs() < math.cos(MIN_EDGE_ANGLE)
-    )
+    is_across = dot(along, direction).abs() < math.cos(MIN_EDGE_ANGLE)
+    return (angle <= wedges.opening * math.pi) & is_across
 
 
 def is_grazing_sheet(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Tensor:
@@ -313,9 +287,8 @@ def fringe_field(
         h = dot(axis[:, None], cross(direction[:, None], field))
         k = wave_number
         skew = mu * cos_in / sin_in - cos_out / sin_out * torch.cos(phi_out)
-        current = (2j / (k * sin_in**2) * electric)[:, None] * e + (
-            2j / (k * sin_in) * magnetic * skew
-        )[:, None] * h
+        current = (2j / (k * sin_in**2) * electric)[:, None] * e
+        current = current + (2j / (k * sin_in) * magnetic * skew)[:, None] * h
         charge = (-2j / k * magnetic * torch.sin(phi_out) / (sin_in * sin_out))[:, None] * h
         total = total + current[..., None] * cross(scattered_direction, across)[:, None]
         total = total + charge[..., None] * across[:, None]
@@ -336,11 +309,9 @@ def _fringe_coefficients(opening: Tensor, azimuth: Tensor, mu: Tensor) -> tuple[
     rest = math.pi - alpha
     small = rest.abs() < 1e-7
     rest = torch.where(small, torch.full_like(rest, 1e-7), rest)
-    near = (alpha.abs() < 1e-7) & ~small
-    rest = torch.where(near, rest * (1 - 1e-7), rest)
+    rest = torch.where((alpha.abs() < 1e-7) & ~small, rest * (1 - 1e-7), rest)
     delta = torch.cos(azimuth / opening) - torch.cos(rest / opening)
-    illuminated = (azimuth < math.pi).double()
-    optics = illuminated / (torch.cos(azimuth) + mu)
+    optics = (azimuth < math.pi).double() / (torch.cos(azimuth) + mu)
     electric = torch.sin(azimuth / opening) / (opening * delta) - optics * torch.sin(azimuth)
     magnetic = torch.sin(rest / opening) / (opening * torch.sin(rest) * delta) - optics
     return electric, magnetic

@@ -49,11 +49,6 @@ class PathContribution:
     u: mit.Float
     v: mit.Float
 
-    @property
-    def differentiable_values(self) -> FourFloats:
-        """Power, range, u and v, which may carry derivatives."""
-        return self.power, self.range, self.u, self.v
-
 
 def _axis_taps(
     coordinate: mit.Float, start: float, step: float, count: int
@@ -172,10 +167,8 @@ class _Strip:
             axis: 0 range, 1 u, 2 v.
             strip_axis: axis of the strips.
         """
-        return [
-            self.transverse_derivatives[axis] * w
-            for w in (self.weight_derivatives if axis == strip_axis else self.weights)
-        ]
+        weights = self.weight_derivatives if axis == strip_axis else self.weights
+        return [self.transverse_derivatives[axis] * weight for weight in weights]
 
 
 def _iterate_strips(layout: BinLayout, path: PathContribution) -> Iterator[_Strip]:
@@ -318,9 +311,8 @@ def deposit_paths(paths: Paths, link: Link, grid: Grid) -> Float32[Tensor, "fram
     """
     u, v = paths.direction_cosines(link).unbind(1)
     with tracing():
-        return Splat.apply(
-            BinLayout.from_link(grid, link), paths.frame, paths.power, paths.range, u, v
-        )
+        layout = BinLayout.from_link(grid, link)
+        return Splat.apply(layout, paths.frame, paths.power, paths.range, u, v)
 
 
 class Splat(torch.autograd.Function):
@@ -346,9 +338,8 @@ class Splat(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
         with tracing(ctx.backend):
-            power, length, u, v = (
-                mi.Float(0.0) if tangent is None else to_float(tangent) for tangent in tangents[2:]
-            )
+            none = mi.Float(0.0)
+            power, length, u, v = (none if t is None else to_float(t) for t in tangents[2:])
             out = BinAccumulator(ctx.layout)
             out.add_tangent(ctx.path, (power, length, u, v), True)
             return out.to_map()

@@ -18,7 +18,7 @@ from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
 from invertwin.channel.power.interior_silhouettes import InteriorSilhouetteSampler
 from invertwin.channel.power.intersection_curves import (
     IntersectionCurveSampler,
-    IntersectionPoint,
+    PathParts,
     PathVisitor,
     intersection_curve_paths,
 )
@@ -37,6 +37,10 @@ from invertwin.channel.rays.surface_point import SurfacePoint
 from invertwin.channel.sampling import Sampling
 
 _SECOND_PART_OFFSET = 1 << 30  # added to indices, so that both parts have their own random numbers
+
+
+_PathBuilder = Callable[..., Iterator[PathParts]]
+"""Function of the ray scene, attached inputs, a walker, sampled points and the depth."""
 
 
 @runtime_checkable
@@ -129,23 +133,19 @@ class BoundarySamples:
         crossing = curves.select(~curves.touching) if curves is not None else None
         meet = crossing is not None and len(crossing.first) > 0
         share = samples // (len(centres) + inner + meet)
-        antennas = SilhouetteSampler(
-            rays, inputs, centres, len(centres) * share, seed, has_close_surfaces=close
-        )
+        count = len(centres) * share
+        antennas = SilhouetteSampler(rays, inputs, centres, count, seed, has_close_surfaces=close)
         self._samplers: list[_Sampler] = [antennas]
-        self._path_builders: list[Callable[..., Iterator[BoundaryPaths]]] = [
-            _antenna_silhouette_paths
-        ]
+        self._path_builders: list[_PathBuilder] = [_antenna_silhouette_paths]
         if inner:
             self._samplers.append(
                 InteriorSilhouetteSampler(rays, inputs, share, seed + 2, has_close_surfaces=close)
             )
             self._path_builders.append(_interior_silhouette_paths)
         if crossing is not None and meet:
-            self._samplers.append(
-                IntersectionCurveSampler(rays, inputs, crossing, share, depth, seed)
-            )
-            self._path_builders.append(_intersection_curve_paths)
+            contacts = IntersectionCurveSampler(rays, inputs, crossing, share, depth, seed)
+            self._samplers.append(contacts)
+            self._path_builders.append(intersection_curve_paths)
         self._chunks = chunks
         self._prefetched = [
             list(map(s.draw, itertools.islice(chunks(s.size), 1))) for s in self._samplers
@@ -154,9 +154,7 @@ class BoundarySamples:
             for drawn in family:
                 drawn.launch()
 
-    def iterate_families(
-        self,
-    ) -> list[Iterator[tuple[Callable[..., Iterator[BoundaryPaths]], Any]]]:
+    def iterate_families(self) -> list[Iterator[tuple[_PathBuilder, Any]]]:
         """Iterate over each family: the function that builds paths, and a chunk of points."""
         ahead, self._prefetched = self._prefetched, [[] for _ in self._samplers]
         first = [[drawn.compress() for drawn in family] for family in ahead]
@@ -193,23 +191,15 @@ def trace_boundary_paths(
     def segments() -> Iterator[BoundaryPaths]:
         for kind, found in itertools.chain(*families):
             if found.size:
-                yield from kind(rays, inputs, walker, found, samples.depth)
+                parts = kind(rays, inputs, walker, found, samples.depth)
+                yield from itertools.starmap(BoundaryPaths, parts)
 
     return segments()
 
 
-def _intersection_curve_paths(
-    rays: RayScene, inputs: Inputs, walker: RandomWalk, points: IntersectionPoint, depth: int
-) -> Iterator[BoundaryPaths]:
-    """Third family: surfaces that meet, each of which hides what lies behind it."""
-    return itertools.starmap(
-        BoundaryPaths, intersection_curve_paths(rays, inputs, walker, points, depth)
-    )
-
-
 def _antenna_silhouette_paths(
     rays: RayScene, inputs: Inputs, walker: RandomWalk, samples: SilhouetteSample, depth: int
-) -> Iterator[BoundaryPaths]:
+) -> Iterator[PathParts]:
     """First family: the shadow that an edge casts from an antenna, and the path to the other."""
     at_receiver = samples.is_receiver
     fixed, frame = inputs.detach(), samples.frame
@@ -220,9 +210,8 @@ def _antenna_silhouette_paths(
 
     shadow, speed = locate_shadow()
     point = integrand.compute_interaction(fixed, shadow)
-    incident, distance = integrand.direction_and_distance(
-        point.position, fixed.antenna_position(frame, at_receiver)
-    )
+    antenna = fixed.antenna_position(frame, at_receiver)
+    incident, distance = integrand.direction_and_distance(point.position, antenna)
     departure = integrand.to_radar_frame(fixed, frame, -incident)
     throughput = fixed.scale * fixed.gain(frame, at_receiver, departure) / dr.square(distance)
 
@@ -251,12 +240,12 @@ def _antenna_silhouette_paths(
         if not isinstance(at_receiver, bool):
             state = walk.update_state(state, u=departure.x, v=departure.y, to_receiver=~at_receiver)
         # Anew for each side: a derivative consumes the graph of the velocity.
-        yield BoundaryPaths(speed if number == 0 else locate_shadow()[1], state, run)
+        yield (speed if number == 0 else locate_shadow()[1]), state, run
 
 
 def _interior_silhouette_paths(
     rays: RayScene, inputs: Inputs, walker: RandomWalk, samples: SilhouetteSample, depth: int
-) -> Iterator[BoundaryPaths]:
+) -> Iterator[PathParts]:
     """Second family: a shadow that one surface point casts past an edge on another surface.
 
     The part before the shadow has a random number of vertices, the part after it all that the depth
@@ -267,8 +256,7 @@ def _interior_silhouette_paths(
     behind = integrand.compute_interaction(fixed, source)
 
     def locate_shadow() -> tuple[SurfacePoint, mit.Float]:
-        moving = integrand.compute_interaction(inputs, source)
-        return shadow_speed(inputs, samples, moving.position)
+        return shadow_speed(inputs, samples, integrand.compute_interaction(inputs, source).position)
 
     shadow, speed = locate_shadow()
     ahead = integrand.compute_interaction(fixed, shadow)
@@ -302,4 +290,4 @@ def _interior_silhouette_paths(
         state = walk.update_state(
             state, u=done["u"], v=done["v"], to_receiver=~ends_at_receiver, previous_vertices=count
         )
-        yield BoundaryPaths(speed if number == 0 else locate_shadow()[1], state, run)
+        yield (speed if number == 0 else locate_shadow()[1]), state, run

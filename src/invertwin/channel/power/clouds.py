@@ -134,12 +134,8 @@ class _CloudRays:
         width = max(1, _POINTS_PER_CHUNK // (self.steps * segments))
         for start in range(0, len(self.frame), width):
             part = slice(start, start + width)
-            yield replace(
-                self,
-                frame=self.frame[part],
-                box_points=self.box_points[part],
-                jitter=self.jitter[part],
-            )._evaluate_points(per_frame)
+            columns = {n: getattr(self, n)[part] for n in ("frame", "box_points", "jitter")}
+            yield replace(self, **columns)._evaluate_points(per_frame)
 
     def _evaluate_points(self, per_frame: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         tx = self.origins[0][self.frame]
@@ -147,8 +143,7 @@ class _CloudRays:
         direction = offset / offset.norm(dim=1, keepdim=True)
         near, far = self._clip_to_box(tx, direction)
         # Rays per steradian, of points spread evenly over the box: the chord's share of it.
-        volume = (self.cloud.high - self.cloud.low).prod()
-        weight = 3 * volume / ((far**3 - near**3) * per_frame)
+        weight = 3 * (self.cloud.high - self.cloud.low).prod() / ((far**3 - near**3) * per_frame)
         length = (far - near)[:, None] / self.steps
         fraction = torch.arange(self.steps) + self.jitter[:, None]
         distance = near[:, None] + fraction * length  # from the transmitter
@@ -161,11 +156,8 @@ class _CloudRays:
         else:
             # From the start of the segment, at the density of the segment: otherwise an opaque cell
             # would attenuate as if all its power were scattered at the point.
-            depths = (
-                before
-                + self._return_optical_depth(points, frame)
-                - self.jitter[:, None] * thickness
-            )
+            depths = before + self._return_optical_depth(points, frame)
+            depths = depths - self.jitter[:, None] * thickness
         scattered = -0.5 * torch.exp(-depths) * torch.expm1(-2 * thickness)
         back = points - self.origins[1][self.frame][:, None]
         return_length = back.norm(dim=2)
@@ -179,8 +171,7 @@ class _CloudRays:
         (share,) = polarisation_shares(link, depolarising=False)
         scale = scale * share.for_bounces(1)
         power = scale * weight[:, None] * gain * scattered / return_length.square()
-        total = 0.5 * (distance + return_length)
-        columns = [power, total, towards[1][..., 0], towards[1][..., 1]]
+        columns = [power, 0.5 * (distance + return_length), towards[1][..., 0], towards[1][..., 1]]
         return frame.reshape(-1), *(column.reshape(-1) for column in columns)  # type: ignore[return-value]
 
     def _clip_to_box(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:

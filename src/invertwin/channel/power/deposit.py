@@ -173,10 +173,9 @@ def _deposit_surfaces(
             lossy = replace(geometry, surfaces=surfaces)
         with _DisableFuncTorch():
             bare = strip_scene_derivatives(lossy, link)
-            coupling = share.odd, share.even
             trace = PowerTracer(
-                *bare, sampling, seed, scheme=scheme, reference=reference, coupling=coupling,
-                differentiate_antennas=antennas_move,
+                *bare, sampling, seed, scheme=scheme, reference=reference,
+                coupling=(share.odd, share.even), differentiate_antennas=antennas_move,
             )  # fmt: skip
         tables = differentiable_tables(lossy, link)
         layout = bins.BinLayout.from_link(grid, link)
@@ -219,9 +218,8 @@ class _Deposit(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        wanted = tuple(
-            n for n, w in zip(DIFFERENTIABLE, ctx.needs_input_grad[3:], strict=True) if w
-        )
+        pairs = zip(DIFFERENTIABLE, ctx.needs_input_grad[3:], strict=True)
+        wanted = tuple(name for name, needed in pairs if needed)
         found = _Linear.apply(lambda grad: _pull_gradients(ctx, wanted, grad), grad)
         results = dict(zip(wanted, found, strict=True))
         return None, None, None, *(results.get(name) for name in DIFFERENTIABLE)
@@ -258,16 +256,11 @@ class _Linear(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, dims: tuple[Any, ...], act: Callable[..., Any], *values: Tensor) -> Any:  # type: ignore[override]
-        rows = [
-            _Linear.apply(
-                act,
-                *(
-                    v if dim is None else v.select(dim, k)
-                    for v, dim in zip(values, dims[1:], strict=True)
-                ),
-            )
-            for k in range(info.batch_size)
-        ]
+        rows: list[Any] = []
+        for k in range(info.batch_size):
+            pairs = zip(values, dims[1:], strict=True)
+            row = (v if dim is None else v.select(dim, k) for v, dim in pairs)
+            rows.append(_Linear.apply(act, *row))
         if isinstance(rows[0], Tensor):
             return torch.stack(rows), 0
         stacked = tuple(torch.stack(column) for column in zip(*rows, strict=True))

@@ -147,9 +147,8 @@ class DirectionSampler:
         facing: mit.Vector3f,
         numbers: list[mit.Float],
     ) -> mit.Vector3f:
-        omega = mi.Frame3f(facing).to_world(
-            mi.warp.square_to_cosine_hemisphere(mi.Point2f(numbers[2], numbers[3]))
-        )
+        local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(numbers[2], numbers[3]))
+        omega = mi.Frame3f(facing).to_world(local)
         specular = 2 * dr.dot(incident, facing) * facing - incident
         limit = self._lobe_fraction(point, 0)
         for number, present in enumerate(self.surfaces.has_lobe):
@@ -167,9 +166,8 @@ class DirectionSampler:
             omega = dr.select(chosen, lobe, omega)
             limit += share
         if self.surfaces.has_refracting_bodies:
-            omega = dr.select(
-                numbers[0] >= limit, self._sample_refraction(point, incident, numbers), omega
-            )
+            refracted = self._sample_refraction(point, incident, numbers)
+            omega = dr.select(numbers[0] >= limit, refracted, omega)
         return mi.Vector3f(omega)
 
     def _refractive_indices(
@@ -186,8 +184,7 @@ class DirectionSampler:
     ) -> mit.Vector3f:
         """Sample a direction beyond the surface about Snell's; zero if there is none."""
         here, beyond, variance = self._refractive_indices(point, incident)
-        spread = dr.sqrt(variance)
-        gauss = mi.warp.square_to_std_normal(mi.Point2f(numbers[2], numbers[3])) * spread
+        gauss = mi.warp.square_to_std_normal(mi.Point2f(numbers[2], numbers[3])) * dr.sqrt(variance)
         frame = mi.Frame3f(mi.Vector3f(point.normal))
         local = frame.to_local(mi.Vector3f(incident))
         x, y = ((gauss[k] - here * local[k]) / beyond for k in range(2))
@@ -200,9 +197,8 @@ class DirectionSampler:
     ) -> mit.Float:
         here, beyond, variance = self._refractive_indices(point, incident)
         first, second = dr.dot(point.normal, incident), dr.dot(point.normal, omega)
-        mismatch = here * (incident - point.normal * first) + beyond * (
-            omega - point.normal * second
-        )
+        mismatch = here * (incident - point.normal * first)
+        mismatch = mismatch + beyond * (omega - point.normal * second)
         lobe = gaussian(mismatch, variance)
         return dr.select(first * second < 0, lobe * dr.square(beyond) * dr.abs(second), 0.0)
 
@@ -230,17 +226,15 @@ class DirectionSampler:
     def _lobe_fraction(self, point: SurfaceInteraction, number: int) -> mit.Float:
         if self._single_row is not None:
             return mi.Float(self._single_row[number])  # a copy, which callers may add to
-        return dr.gather(
-            mi.Float, self.lobe_fractions, point.surface_row * self.column_count + number
-        )
+        entry = point.surface_row * self.column_count + number
+        return dr.gather(mi.Float, self.lobe_fractions, entry)
 
 
 def _lobe_fractions(surfaces: ScatteringLaw) -> torch.Tensor:
     """Compute the share of each part of a scattering law; Lambertian if it scatters nothing."""
     exponents = surfaces.exponents.detach()
     wide = 4 * torch.pi * (exponents + torch.exp2(-(exponents + 1)))
-    integrals = wide / ((exponents + 1) * (exponents + 2))
-    lobes = surfaces.lobes.detach() * integrals
+    lobes = surfaces.lobes.detach() * (wide / ((exponents + 1) * (exponents + 2)))
     diffuse = surfaces.diffuse.detach()[:, None]
     total = diffuse + lobes.sum(1, keepdim=True)
     # A part of the cosine is kept, so that the density never vanishes where f does not.

@@ -66,10 +66,8 @@ def balance_by_object(
     objects = len(rays.geometry.names)
     antenna = dr.select(receiver, mi.UInt32(1), 0)
     row = dr.gather(mi.UInt32, rays.topology.device_edge_object, edge) + antenna * objects
-    totals, sums = (
-        dr.zeros(mi.Float, antenna_count * objects),
-        dr.zeros(mi.Float, antenna_count * rays.scene_count),
-    )
+    totals = dr.zeros(mi.Float, antenna_count * objects)
+    sums = dr.zeros(mi.Float, antenna_count * rays.scene_count)
     dr.scatter_add(totals, weight, row)
     roots, rows = dr.sqrt(totals), dr.arange(mi.UInt32, antenna_count * objects)
     scene = rays.object_scene(rows % objects)

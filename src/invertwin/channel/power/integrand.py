@@ -144,11 +144,8 @@ class Inputs:
         if receiver is True or receiver is False:
             table = self.rx if receiver and not self.monostatic else self.tx
             return gather_points(table, frame, active)
-        return dr.select(
-            receiver,
-            self.antenna_position(frame, True, active),
-            self.antenna_position(frame, False, active),
-        )
+        rx, tx = (self.antenna_position(frame, end, active) for end in (True, False))
+        return dr.select(receiver, rx, tx)
 
     def gain(
         self, frame: mit.UInt32, receiver: mit.Bool | bool, direction: mit.Vector3f
@@ -272,9 +269,8 @@ class SurfaceInteraction:
         Args:
             state: state with the keys of ``detached_state``.
         """
-        return SurfaceInteraction(
-            state["position"], state["normal"], mi.Float(1.0), state["surface"]
-        )
+        position, normal, one = state["position"], state["normal"], mi.Float(1.0)
+        return SurfaceInteraction(position, normal, one, state["surface"])
 
 
 def compute_interaction(
@@ -299,12 +295,9 @@ def compute_interaction(
     triangle = p0, p1, p2 = corners(inputs, face, active)
     normal = dr.cross(p1 - p0, p2 - p0)
     double_area = dr.norm(normal)
-    return SurfaceInteraction(
-        position=interpolate_position(triangle, b1, b2),
-        normal=normal / double_area,
-        jacobian=double_area / dr.detach(double_area),
-        surface_row=surface,
-    )
+    position = interpolate_position(triangle, b1, b2)
+    jacobian = double_area / dr.detach(double_area)
+    return SurfaceInteraction(position, normal / double_area, jacobian, surface)
 
 
 def pull_interaction(
@@ -429,10 +422,8 @@ def find_medium(
         values = (
             inputs.surfaces.value(n, point.surface_row, inside) for n in ("index", "attenuation")
         )
-        index, attenuation = (
-            dr.select(inside, value, before)
-            for value, before in zip(values, (index, attenuation), strict=True)
-        )
+        pairs = zip(values, (index, attenuation), strict=True)
+        index, attenuation = (dr.select(inside, value, before) for value, before in pairs)
     return SegmentMedium(index, attenuation)
 
 
@@ -450,10 +441,7 @@ class AntennaPose:
 
     @staticmethod
     def look_up(
-        inputs: Inputs,
-        frame: mit.UInt32,
-        receiver: mit.Bool | bool,
-        active: mit.Bool | bool = True,
+        inputs: Inputs, frame: mit.UInt32, receiver: mit.Bool | bool, active: mit.Bool | bool = True
     ) -> AntennaPose:
         """Gather the pose; a loop need not do so if it is gathered before.
 
@@ -463,9 +451,8 @@ class AntennaPose:
             receiver: True for the receiver (a bool, or one per lane).
             active: mask of active lanes.
         """
-        return AntennaPose(
-            inputs.antenna_position(frame, receiver, active), radar_axes(inputs, frame, active)
-        )
+        position = inputs.antenna_position(frame, receiver, active)
+        return AntennaPose(position, radar_axes(inputs, frame, active))
 
 
 @dataclass(frozen=True)
@@ -509,9 +496,8 @@ def connect_antenna(
     antenna = antenna or AntennaPose.look_up(inputs, frame, receiver, active)
     to_antenna, distance = direction_and_distance(point.position, antenna.position)
     in_radar_frame = project_to_axes(antenna.axes, -to_antenna)
-    outgoing = None if is_same_antenna else to_antenna
     value = inputs.surfaces.evaluate_scattering(
-        point.surface_row, point.normal, incident, outgoing, active
+        point.surface_row, point.normal, incident, None if is_same_antenna else to_antenna, active
     )
     gain = inputs.gain(frame, receiver, in_radar_frame)
     return AntennaConnection(value * gain / dr.square(distance), distance, in_radar_frame)

@@ -49,12 +49,8 @@ class InteriorSilhouetteSampler:
         has_close_surfaces: bool = False,
     ) -> None:
         topology = rays.topology
-        self.rays, self.inputs, self.importance_sampling, self.has_close_surfaces = (
-            rays,
-            inputs,
-            importance_sampling,
-            has_close_surfaces,
-        )
+        self.rays, self.inputs = rays, inputs
+        self.importance_sampling, self.has_close_surfaces = importance_sampling, has_close_surfaces
         edge = dr.arange(mi.UInt32, len(topology.edges))
         y0, y1 = rays.exact_ends(edge)
         length = mi.Float(dr.norm(y1 - y0))
@@ -66,9 +62,8 @@ class InteriorSilhouetteSampler:
             count = min(rays.poses_per_scene, 8)
             for number in range(count):
                 pose = first + number * rays.poses_per_scene // count
-                legs = [
-                    dr.norm(middle - gather_points(t, pose)) + length for t in (rays.tx, rays.rx)
-                ]
+                antennas = (gather_points(table, pose) for table in (rays.tx, rays.rx))
+                legs = [dr.norm(middle - antenna) + length for antenna in antennas]
                 near += 1 / (legs[0] * legs[1])
             weight *= span * near
         # Poses of the same number in all scenes share one choice of edges.
@@ -112,8 +107,7 @@ class InteriorSilhouetteSampler:
         """Compute the mask of edges of which any triangle transmits at normal incidence."""
         inputs, found = self.inputs, mi.Bool(False)
         for column in self.rays.topology.device_edge_faces:
-            face = dr.gather(mi.UInt32, column, edge)
-            row = dr.gather(mi.UInt32, inputs.face_surface, face)
+            row = dr.gather(mi.UInt32, inputs.face_surface, dr.gather(mi.UInt32, column, edge))
             found |= inputs.surfaces.interpolate_cosine("transmittance", row, mi.Float(1.0)) > 0
         return found
 
@@ -226,8 +220,7 @@ class InteriorSilhouetteSampler:
         x, y = self._azimuth_axes(edge, y0, along)
         start, span = self._tangential_azimuths(edge, y0, y1)
         sign = dr.select(second < 0.5, 1.0, -1.0)
-        azimuth = start + span * (2 * second - dr.select(second < 0.5, 0.0, 1.0))
-        s, c = dr.sincos(azimuth)
+        s, c = dr.sincos(start + span * (2 * second - dr.select(second < 0.5, 0.0, 1.0)))
         height = 2 * first - 1
         across = sign * dr.sqrt(dr.maximum(1 - height * height, 0.0))
         omega = along * height + (x * c + y * s) * across

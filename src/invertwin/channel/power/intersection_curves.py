@@ -42,6 +42,8 @@ _MIN_WEDGE_COSINE = -0.98  # least cosine between the normals of surfaces betwee
 _SUBPATH_OFFSET = 1 << 29  # added to indices, so that the second part has its own random numbers
 
 PathVisitor = Callable[[PathState, PathContribution, mit.Bool], None]
+PathParts = tuple[mit.Float, PathState, Callable[[PathState, PathVisitor], PathState]]
+"""Fields of ``BoundaryPaths``."""
 
 
 @dataclass(frozen=True)
@@ -177,12 +179,8 @@ def _offset_into_wedge(
 ) -> SurfaceInteraction:
     """Move a point a little off both surfaces, into the wedge to which a direction leads."""
     first, second = (dr.mulsign(normal, dr.dot(normal, direction)) for normal in normals)
-    step = (
-        2
-        * RAY_EPSILON
-        * dr.norm(point.position)
-        / (1 + dr.maximum(dr.dot(first, second), _MIN_WEDGE_COSINE))
-    )
+    cosine = dr.maximum(dr.dot(first, second), _MIN_WEDGE_COSINE)
+    step = 2 * RAY_EPSILON * dr.norm(point.position) / (1 + cosine)
     return replace(point, position=point.position + (first + second) * step)
 
 
@@ -207,16 +205,14 @@ class _IncidentSubpath:
         frame, index, added = points.frame, points.index, points.transmission.extra_length
         self.rays, self.fixed, self.walker, self.depth = rays, fixed, walker, depth
         self.points = points
-        self.interactions = [
-            integrand.compute_interaction(fixed, point) for point in (points.first, points.second)
-        ]
+        spots = points.first, points.second
+        self.interactions = [integrand.compute_interaction(fixed, spot) for spot in spots]
         here = self.interactions[0]
         self.count, self.at_receiver = count, at_receiver = decode_subpath(index, depth)
         self.shared = rays.link.shared_visibility and depth == 1
         self.other_end = True if isinstance(at_receiver, bool) else ~at_receiver
-        incident, distance = integrand.direction_and_distance(
-            here.position, fixed.antenna_position(frame, at_receiver)
-        )
+        antenna = fixed.antenna_position(frame, at_receiver)
+        incident, distance = integrand.direction_and_distance(here.position, antenna)
         departure = integrand.to_radar_frame(fixed, frame, -incident)
         throughput = fixed.gain(frame, at_receiver, departure) / dr.square(distance)
         length = distance + added
@@ -227,9 +223,8 @@ class _IncidentSubpath:
             medium = integrand.find_medium(fixed, here, source, way, deep)
             odds = dr.abs(dr.dot(source.normal, way)) / (4 * dr.pi)
             kept = dr.select(deep & (odds > 0), dr.exp(-medium.attenuation * step) / odds, 0.0)
-            first = walk.initial_state(
-                index, frame, points.source, -way, kept, medium.refractive_index * step + added
-            )
+            reach = medium.refractive_index * step + added
+            first = walk.initial_state(index, frame, points.source, -way, kept, reach)
             done = walker.trace_subpath(first, count, at_receiver)
             incident = dr.select(deep, way, incident)
             throughput = dr.select(deep, done["power"], throughput)
@@ -280,9 +275,8 @@ class _CoveredSide:
         cosine = dr.dot(self.facing * self.sign, direction)
         if not fixed.surfaces.has_sheets:
             return SegmentTransmission(dr.select(cosine > 0, 1.0, 0.0), mi.Float(0.0))
-        sheet = SegmentTransmission(
-            *fixed.surfaces.sheet_transmission(hiding.surface_row, dr.abs(cosine))
-        )
+        passed = fixed.surfaces.sheet_transmission(hiding.surface_row, dr.abs(cosine))
+        sheet = SegmentTransmission(*passed)
         return dr.select(cosine > 0, SegmentTransmission.clear(), sheet)
 
     def initial_state(self) -> PathState:
@@ -310,10 +304,8 @@ class _CoveredSide:
         spots = points.first, points.second
         normals = self.subpath.normals
         sine = dr.norm(dr.cross(normals[self.own], normals[self.other]))
-        offset = (
-            integrand.compute_interaction(inputs, spots[self.own]).position
-            - integrand.compute_interaction(inputs, spots[self.other]).position
-        )
+        own = integrand.compute_interaction(inputs, spots[self.own]).position
+        offset = own - integrand.compute_interaction(inputs, spots[self.other]).position
         return dr.dot(self.facing, offset) * (points.weight / sine)
 
     def run(self, state: PathState, visit: PathVisitor) -> PathState:
@@ -334,11 +326,8 @@ class _CoveredSide:
             rays, fixed, state, point, before.other_end, shared_visibility=before.shared
         )
         passed = self.transmit(onwards)
-        path = replace(
-            path,
-            power=path.power * passed.transmittance,
-            range=path.range + 0.5 * passed.extra_length,
-        )
+        power, length = path.power * passed.transmittance, path.range + 0.5 * passed.extra_length
+        path = replace(path, power=power, range=length)
         visit(state, path, exists & (passed.transmittance > 0))
         if depth == 1:
             return state
@@ -357,7 +346,7 @@ class _CoveredSide:
 
 def intersection_curve_paths(
     rays: RayScene, inputs: Inputs, walker: RandomWalk, points: IntersectionPoint, depth: int
-) -> Iterator[tuple[mit.Float, PathState, Callable[[PathState, PathVisitor], PathState]]]:
+) -> Iterator[PathParts]:
     """Create the boundary paths with a vertex on an intersection curve.
 
     Args:
@@ -419,9 +408,8 @@ def require_no_interreflection(
     first, second = scattered
     lanes = dr.compress(first | second if fixed.surfaces.has_sheets else first & second)
     if dr.width(lanes):
-        faces = [
-            dr.gather(mi.UInt32, spot.face, lanes[0]) for spot in (points.first, points.second)
-        ]
+        spots = points.first, points.second
+        faces = [dr.gather(mi.UInt32, spot.face, lanes[0]) for spot in spots]
         owners = [int(rays.topology.face_object[int(face[0])]) for face in faces]
         names = " and ".join(dict.fromkeys(rays.geometry.names[owner] for owner in owners))
         raise InputError(

@@ -108,10 +108,9 @@ def initial_state(
         length: optical lengths up to the vertex [m].
         transmission: transmission of the first segment, for antennas with one visibility test.
     """
-    count = dr.width(index)
     state: dict[str, object] = {
         "index": index,
-        "number": dr.full(mi.UInt32, 1, count),
+        "number": dr.full(mi.UInt32, 1, dr.width(index)),
         "active": throughput != 0,
         "frame": frame,
         "face": point.face,
@@ -252,20 +251,18 @@ class RandomWalk:
         active = state["active"] & (state["number"] < state["last"])
         incident = state["incident"]
         scene = self.rays.frame_scene(state["frame"])
-        numbers = self._uniform_numbers(state)
+        # Six uniform numbers for this vertex; ``trace_to_surface`` has a later stream.
+        seeds = [self.seed + (state["number"] * 5 + stream) * _STREAM_STEP for stream in range(3)]
+        numbers = [number for seed in seeds for number in uniform_pair(state["index"], seed)]
         sample = direction_sampler.draw(point, incident, numbers, scene)
         omega = sample.omega
         scattered = self.inputs.surfaces.evaluate_scattering(
             point.surface_row, point.normal, incident, mi.Vector3f(omega)
         )
-        ratio: mit.Float = scattered / (
-            sample.lobe_density * dr.abs(dr.dot(point.normal, incident))
-        )
-        survival = dr.select(
-            state["number"] >= _MIN_ROULETTE_VERTICES,
-            dr.minimum(dr.maximum(ratio, _MIN_SURVIVAL), 1.0),
-            1.0,
-        )
+        facing = dr.abs(dr.dot(point.normal, incident))
+        ratio: mit.Float = scattered / (sample.lobe_density * facing)
+        survival = dr.minimum(dr.maximum(ratio, _MIN_SURVIVAL), 1.0)
+        survival = dr.select(state["number"] >= _MIN_ROULETTE_VERTICES, survival, 1.0)
         active &= (scattered > 0) & (numbers[1] < survival)
         side = dr.mulsign(point.normal, dr.dot(point.normal, omega))
         origin = point.position + side * (RAY_EPSILON * dr.norm(point.position))
@@ -281,31 +278,18 @@ class RandomWalk:
         density = direction_sampler.density(point, sample, hit.point.face, active, scene)
         active &= density > 0
         odds = density * survival * cosine * hit.probability
-        weight = (
-            scattered
-            * hit.transmission.transmittance
-            * dr.exp(-medium.attenuation * distance)
-            / odds
-        )
+        weight = scattered * hit.transmission.transmittance
+        weight = weight * dr.exp(-medium.attenuation * distance) / odds
         state["throughput"] = dr.select(active, state["throughput"] * weight, 0.0)
         if "weight" in state:
             state["weight"] = state["weight"] * dr.square(distance) / odds
         state["face"], state["b1"], state["b2"] = hit.point.face, hit.point.b1, hit.point.b2
         state.update(found.detached_state)  # type: ignore[arg-type]
         state["incident"] = mi.Vector3f(to_point)
-        state["length"] = (
-            state["length"] + medium.refractive_index * distance + hit.transmission.extra_length
-        )
+        state["length"] = state["length"] + medium.refractive_index * distance
+        state["length"] = state["length"] + hit.transmission.extra_length
         state["number"] = state["number"] + 1
         state["active"] = active
-
-    def _uniform_numbers(self, state: PathState) -> list[mit.Float]:
-        """Draw six uniform numbers for this vertex; ``trace_to_surface`` has a later stream."""
-        numbers = []
-        for stream in range(3):
-            seed = self.seed + (state["number"] * 5 + stream) * _STREAM_STEP
-            numbers += uniform_pair(state["index"], seed)
-        return numbers
 
 
 def connect_path(
@@ -337,17 +321,10 @@ def connect_path(
     Returns:
         The path that ends there, and the mask of lanes in which it exists.
     """
-    antenna = antenna or integrand.AntennaPose.look_up(
-        inputs, state["frame"], receiver, state["active"]
-    )
+    frame, incident = state["frame"], state["incident"]
+    antenna = antenna or integrand.AntennaPose.look_up(inputs, frame, receiver, state["active"])
     found = integrand.connect_antenna(
-        inputs,
-        state["frame"],
-        point,
-        state["incident"],
-        receiver,
-        is_same_antenna=monostatic,
-        antenna=antenna,
+        inputs, frame, point, incident, receiver, is_same_antenna=monostatic, antenna=antenna
     )
     u: mit.Float = found.direction.x  # type: ignore[assignment]
     v: mit.Float = found.direction.y  # type: ignore[assignment]
@@ -364,9 +341,8 @@ def connect_path(
         transmittance = dr.select(first, transmittance, passed.transmittance)
         extra = dr.select(first, extra, passed.extra_length)
     length = 0.5 * (state["length"] + found.distance + extra)
-    return PathContribution(state["frame"], power * transmittance, length, u, v), exists & (
-        transmittance > 0
-    )
+    path = PathContribution(frame, power * transmittance, length, u, v)
+    return path, exists & (transmittance > 0)
 
 
 @dataclass
@@ -421,9 +397,8 @@ class PathRecords:
         """
         lanes = dr.width(state["index"])
         count = dr.ones(mi.UInt32, lanes)
-        return PathRecords(
-            lanes, 1, state["frame"], count, _pack_vertex(state, is_visible), state["length"]
-        )
+        row = _pack_vertex(state, is_visible)
+        return PathRecords(lanes, 1, state["frame"], count, row, state["length"])
 
     @staticmethod
     def allocate(state: PathState, depth: int) -> PathRecords:
@@ -435,8 +410,7 @@ class PathRecords:
         """
         lanes = dr.width(state["index"])
         rows, length = dr.empty(mi.Float, 4 * lanes * depth), dr.empty(mi.Float, lanes * depth)
-        count = dr.zeros(mi.UInt32, lanes)
-        return PathRecords(lanes, depth, state["frame"], count, rows, length)
+        return PathRecords(lanes, depth, state["frame"], dr.zeros(mi.UInt32, lanes), rows, length)
 
     @property
     def columns(self) -> list[mit.UInt32 | mit.Float | mit.Vector4f]:

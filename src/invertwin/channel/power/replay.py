@@ -30,6 +30,8 @@ from invertwin.channel.rays.surface_point import SurfacePoint
 
 Sums = tuple[mit.Float, mit.Float]
 Position = Callable[[], mit.Point3f]
+Gradients = tuple[mit.Point3f, mit.Vector3f, mit.Float]
+"""Gradients with respect to position, normal and Jacobian."""
 Gradient = TypeVar("Gradient")
 
 
@@ -127,15 +129,11 @@ class _VertexNeighbours:
     def as_leaf_variables(self) -> _VertexNeighbours:
         """Copy the vertices, with positions that carry derivatives of their own."""
         assert self.previous_interaction is not None
-        here = SurfaceInteraction(
-            mi.Point3f(self.interaction.position),
-            mi.Vector3f(self.interaction.normal),
-            dr.ones(mi.Float, dr.width(self.vertex.face)),
-            self.interaction.surface_row,
-        )
-        before = replace(
-            self.previous_interaction, position=mi.Point3f(self.previous_interaction.position)
-        )
+        known, one = self.interaction, dr.ones(mi.Float, dr.width(self.vertex.face))
+        position, normal = mi.Point3f(known.position), mi.Vector3f(known.normal)
+        here = SurfaceInteraction(position, normal, one, known.surface_row)
+        before = self.previous_interaction
+        before = replace(before, position=mi.Point3f(before.position))
         after = mi.Point3f(self.next_position)
         dr.enable_grad(here.position, here.normal, here.jacobian, before.position, after)
         return replace(self, interaction=here, previous_interaction=before, next_position=after)
@@ -209,9 +207,8 @@ def _evaluate_vertex(
     scattered = mi.Float(1.0)
     if not single:
         start = antennas.pose(False, active).position
-        direction, _ = integrand.direction_and_distance(
-            here.position, dr.select(has_next, neighbours.next_position, start)
-        )
+        after = dr.select(has_next, neighbours.next_position, start)
+        direction, _ = integrand.direction_and_distance(here.position, after)
         scattered = inputs.surfaces.evaluate_scattering(
             here.surface_row, here.normal, incident, direction, has_next
         )
@@ -291,10 +288,9 @@ class _PendingVertex:
         lanes, last = records.path_count, records.read_vertex(depth - 1)
         with dr.suspend_grad():
             here = integrand.compute_interaction(inputs, last)
-        none = PathVertex(last.face, last.b1, last.b2, dr.zeros(mi.Float, lanes), None)
         return _PendingVertex(
             last,
-            none,
+            PathVertex(last.face, last.b1, last.b2, dr.zeros(mi.Float, lanes), None),
             here.detached_state,
             next_position=dr.zeros(mi.Point3f, lanes),
             position=dr.zeros(mi.Point3f, lanes),
@@ -322,8 +318,7 @@ class _PendingVertex:
             # The first vertex has none before it: nothing is read.
             lanes = records.path_count
             face, zero = dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes)
-            vertex = PathVertex(face, zero, zero, zero, dr.zeros(mi.Bool, lanes))
-            return vertex, {
+            return PathVertex(face, zero, zero, zero, dr.zeros(mi.Bool, lanes)), {
                 "position": dr.zeros(mi.Point3f, lanes),
                 "normal": dr.zeros(mi.Vector3f, lanes),
                 "surface": face,
@@ -356,8 +351,7 @@ class _PendingVertex:
 
         last = gradient(neighbours.next_position, neighbours.has_next)
         assert last is not None
-        complete = replace(self, position=self.position + last)
-        complete.pull(inputs, neighbours.has_next)
+        replace(self, position=self.position + last).pull(inputs, neighbours.has_next)
         return _PendingVertex(
             previous,
             replace(neighbours.vertex, is_visible=None),
@@ -377,24 +371,14 @@ class _PendingVertex:
             active: mask of paths that have this vertex.
         """
 
-        def act(
-            face: mit.UInt32,
-            b1: mit.Float,
-            b2: mit.Float,
-            active: mit.Bool,
-            position: mit.Point3f,
-            normal: mit.Vector3f,
-            jacobian: mit.Float,
-        ) -> tuple[()]:
-            point = SurfacePoint(face, b1, b2)
+        def act(point: SurfacePoint, active: mit.Bool, gradients: Gradients) -> tuple[()]:
             with dr.resume_grad():
-                integrand.pull_interaction(inputs, point, active, position, normal, jacobian)
+                integrand.pull_interaction(inputs, point, active, *gradients)
             return ()
 
         # Packets in which no path continues skip it.
-        point = self.following
-        gradients = self.position, self.normal, self.jacobian
-        known = point.face, point.b1, point.b2, mi.Bool(active), *gradients
+        point = SurfacePoint(self.following.face, self.following.b1, self.following.b2)
+        known = point, mi.Bool(active), (self.position, self.normal, self.jacobian)
         dr.if_stmt(known, active, act, lambda *_: (), mode="symbolic")
 
 
@@ -424,29 +408,21 @@ def pull(
         power_sum, range_sum = sums
         known = pending.read_neighbours(fixed, records, number) if pending else None
         with dr.resume_grad():
-            near = (
-                known.as_leaf_variables()
-                if known
-                else _VertexNeighbours.read(inputs, records, number, depth)
-            )
+            if known:
+                near = known.as_leaf_variables()
+            else:
+                near = _VertexNeighbours.read(inputs, records, number, depth)
             vertex = _evaluate_vertex(rays, inputs, records, antennas, number, near)
             path = vertex.to_contribution()
-            power, length, u, v = (
-                dr.select(vertex.is_visible, adjoint, 0.0)
-                for adjoint in gather(path, vertex.is_visible)
-            )
-            after = (
-                _log_derivative_factor(vertex.has_next, power_sum, vertex.scattering_factor)
-                * vertex.scattering_factor
-            )
+            seen, scattering = vertex.is_visible, vertex.scattering_factor
+            power, length, u, v = (dr.select(seen, a, 0.0) for a in gather(path, seen))
+            after = _log_derivative_factor(vertex.has_next, power_sum, scattering) * scattering
             ending = power * path.power + 0.5 * length * vertex.connection.distance
             ending += u * path.u + v * path.v
-            power_sum = power_sum + dr.select(vertex.is_visible, power * dr.detach(path.power), 0.0)
+            power_sum = power_sum + dr.select(seen, power * dr.detach(path.power), 0.0)
             range_sum = range_sum + 0.5 * length
-            before = (
-                _log_derivative_factor(vertex.active, power_sum, vertex.incident_factor)
-                * vertex.incident_factor
-            )
+            arriving = vertex.incident_factor
+            before = _log_derivative_factor(vertex.active, power_sum, arriving) * arriving
             before += range_sum * vertex.optical_length
             # The factors of the attached values are zero in lanes that do not count.
             dr.backward_from(before + ending + after)
@@ -479,25 +455,18 @@ def _pull_sheets(
     """
     own = tuple(dr.select(vertex.is_visible, amount, 0.0) for amount in own)  # type: ignore[assignment]
     again = [dr.select(vertex.shares_segment, amount, 0.0) for amount in own]
-    segments = (
-        (vertex.endpoints[0], vertex.active, (sums[0] + again[0], sums[1] + again[1])),
-        (vertex.endpoints[2], vertex.is_visible & ~vertex.shares_segment, own),
-    )
-    for start, active, (by_transmittance, by_extra) in segments:
 
-        def act(
-            _: Carry,
-            transmittance: mit.Float,
-            extra: mit.Float,
-            a: mit.Float = by_transmittance,
-            b: mit.Float = by_extra,
-        ) -> None:
+    def pull_segment(start: Position, active: mit.Bool, sums: Sums) -> None:
+        def act(_: Carry, transmittance: mit.Float, extra: mit.Float) -> None:
             known = dr.detach(transmittance) > 0
-            dr.backward_from(
-                _log_derivative_factor(known, a, transmittance) * transmittance + b * extra
-            )
+            factor = _log_derivative_factor(known, sums[0], transmittance)
+            dr.backward_from(factor * transmittance + sums[1] * extra)
 
         visit_sheets(rays, inputs, start, vertex.endpoints[1], active, {}, act)
+
+    sums = sums[0] + again[0], sums[1] + again[1]
+    pull_segment(vertex.endpoints[0], vertex.active, sums)
+    pull_segment(vertex.endpoints[2], vertex.is_visible & ~vertex.shares_segment, own)
 
 
 def push(
@@ -524,15 +493,9 @@ def push(
             near = _VertexNeighbours.read(inputs, records, number, depth)
             vertex = _evaluate_vertex(rays, inputs, records, antennas, number, near)
             path = vertex.to_contribution()
-            values = (
-                vertex.incident_factor,
-                vertex.optical_length,
-                path.power,
-                vertex.connection.distance,
-                path.u,
-                path.v,
-                vertex.scattering_factor,
-            )
+            segment = vertex.incident_factor, vertex.optical_length
+            ending = path.power, vertex.connection.distance, path.u, path.v
+            values = *segment, *ending, vertex.scattering_factor
             # u and v also enter the pattern; by default their tangents would be cleared once
             # propagated.
             tangents = dr.forward_to(*values, flags=dr.ADFlag.ClearEdges)
@@ -548,16 +511,14 @@ def push(
             growth, longer = growth + by_segment[0], longer + by_segment[1]
             more = by_end[0] + dr.select(vertex.shares_segment, by_segment[0], 0.0)
             further = by_end[1] + dr.select(vertex.shares_segment, by_segment[1], 0.0)
+        detached = (dr.detach(value) for value in (path.range, path.u, path.v))
         scatter(
-            PathContribution(
-                vertex.frame, found, *(dr.detach(x) for x in path.differentiable_values[1:])
-            ),
+            PathContribution(vertex.frame, found, *detached),
             (power + (growth + more) * found, 0.5 * (longer + distance + further), u, v),
             vertex.is_visible,
         )
-        growth = growth + _log_derivative_factor(
-            vertex.has_next, scattered, vertex.scattering_factor
-        )
+        scattering = vertex.scattering_factor
+        growth = growth + _log_derivative_factor(vertex.has_next, scattered, scattering)
         return (growth, longer), pending
 
     _sweep_vertices(rays, records, sweep, None)
@@ -570,9 +531,8 @@ def _push_sheets(
 
     def act(carry: Carry, transmittance: mit.Float, extra: mit.Float) -> None:
         tangents = dr.forward_to(transmittance, extra, flags=dr.ADFlag.ClearEdges)
-        known = dr.detach(transmittance) > 0
         carry["growth"] = carry["growth"] + _log_derivative_factor(
-            known, dr.detach(tangents[0]), transmittance
+            dr.detach(transmittance) > 0, dr.detach(tangents[0]), transmittance
         )
         carry["longer"] = carry["longer"] + dr.detach(tangents[1])
 
@@ -601,17 +561,13 @@ def _sweep_vertices(
         pending: further state that is carried, and returned at the end.
         backwards: True to begin at the far end.
     """
-    last = opaque(records.depth - 1)
-    zero: Sums = (
-        dr.zeros(mi.Float, records.path_count),
-        dr.zeros(mi.Float, records.path_count),
-    )
+    last, lanes = opaque(records.depth - 1), records.path_count
+    zero: Sums = dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes)
     with dr.suspend_grad():
         if records.depth == 1:
             return sweep(mi.UInt32(0), zero, pending)[1]
-        state = rays.loop(
-            (dr.zeros(mi.UInt32, records.path_count), zero, pending),
+        return rays.loop(
+            (dr.zeros(mi.UInt32, lanes), zero, pending),
             lambda done, *_: done <= last,
             lambda done, *carried: (done + 1, *sweep(last - done if backwards else done, *carried)),
-        )
-        return state[2]
+        )[2]

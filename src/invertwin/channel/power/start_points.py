@@ -34,6 +34,8 @@ from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.surface_point import SurfacePoint, interpolate_position
 from invertwin.errors import InputError
 
+Reference = tuple[Geometry, Link]  # that define the densities instead of the scene
+
 
 @dataclass(frozen=True)
 class StartPoints:
@@ -63,11 +65,7 @@ class RaySampler:
     """
 
     def __init__(
-        self,
-        rays: RayScene,
-        samples: int,
-        seed: int,
-        reference: tuple[Geometry, Link] | None = None,
+        self, rays: RayScene, samples: int, seed: int, reference: Reference | None = None
     ) -> None:
         self.rays, self.spheres, self.origins = rays, rays.spheres, rays.tx
         if reference:
@@ -94,31 +92,21 @@ class RaySampler:
         axis, height, _ = self.spheres.cap(own, centre)
         jitter = uniform_pair(index, self.seed)
         column, row = cell % self.columns, cell // self.columns
-        disk = mi.warp.square_to_uniform_disk_concentric(
-            mi.Point2f(
-                (mi.Float(column) + jitter[0]) / self.columns,
-                (mi.Float(row) + jitter[1]) / self.rows,
-            )
-        )
+        x = (mi.Float(column) + jitter[0]) / self.columns
+        y = (mi.Float(row) + jitter[1]) / self.rows
+        disk = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(x, y))
         depth = dr.squared_norm(disk) * height
         spread = dr.sqrt(height * (2 - depth))
         local = mi.Vector3f(disk.x * spread, disk.y * spread, 1 - depth)
         direction = dr.normalize(mi.Frame3f(axis).to_world(local))
         group = own // self.spheres.group_size
-        found, around = self.spheres.group_density(
-            rays, group, centre, direction, mi.Bool(True), own
-        )
+        every = mi.Bool(True)
+        found, around = self.spheres.group_density(rays, group, centre, direction, every, own)
         density = per_block * (found + around / (4 * dr.pi))
         centre = gather_points(rays.tx, frame)
-        hit = trace_to_surface(
-            rays,
-            inputs,
-            mi.Ray3f(centre, direction),
-            mi.Bool(True),
-            (index, self.transmission_seed),
-            coherent=True,
-            stratified_bits=_stratified_bits(column, row),
-        )
+        ray, key = mi.Ray3f(centre, direction), (index, self.transmission_seed)
+        bits = _stratified_bits(column, row)
+        hit = trace_to_surface(rays, inputs, ray, every, key, coherent=True, stratified_bits=bits)
         point = integrand.compute_interaction(inputs, hit.point)
         cosine = dr.maximum(dr.abs(dr.dot(point.normal, direction)), 1e-6)
         distance = dr.squared_norm(point.position - centre)
@@ -150,11 +138,7 @@ class AreaSampler:
     """
 
     def __init__(
-        self,
-        rays: RayScene,
-        samples: int,
-        seed: int,
-        reference: tuple[Geometry, Link] | None = None,
+        self, rays: RayScene, samples: int, seed: int, reference: Reference | None = None
     ) -> None:
         geometry = reference[0] if reference else rays.geometry
         if len(geometry.faces) != len(rays.geometry.faces):
@@ -179,14 +163,12 @@ class AreaSampler:
         rays = self.rays
         frame, number = index // self.per_frame, index % self.per_frame
         jitter, _ = uniform_pair(index, self.seeds[0])
-        uniform = (mi.Float(number) + jitter) / self.per_frame
-        face, pmf = self.distribution.sample_pmf(uniform)
+        face, pmf = self.distribution.sample_pmf((mi.Float(number) + jitter) / self.per_frame)
         b = mi.warp.square_to_uniform_triangle(mi.Point2f(*uniform_pair(index, self.seeds[1])))
         triangle = p0, p1, p2 = rays.corners(face)
         area = 0.5 * dr.norm(dr.cross(p1 - p0, p2 - p0))
         position = interpolate_position(triangle, b.x, b.y)
-        passed = trace_transmission(
-            rays, inputs, gather_points(rays.tx, frame), position, mi.Bool(True)
-        )
+        tx = gather_points(rays.tx, frame)
+        passed = trace_transmission(rays, inputs, tx, position, mi.Bool(True))
         weight = dr.select(passed.transmittance > 0, area / (pmf * self.per_frame), 0.0)
         return StartPoints(frame, SurfacePoint(face, b.x, b.y), weight, passed)

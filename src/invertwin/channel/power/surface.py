@@ -220,8 +220,7 @@ class ScatteringLawTables:
     ) -> tuple[mit.Float, mit.Bool]:
         """Compute the cosine outside an interface (Snell), and the mask of total reflections."""
         inside = dr.detach(cosine) < 0
-        index = self.value("index", row, active)
-        square = 1 - dr.square(index) * (1 - dr.square(cosine))
+        square = 1 - dr.square(self.value("index", row, active)) * (1 - dr.square(cosine))
         total = inside & (dr.detach(square) <= 1e-6)
         refracted = dr.sqrt(dr.select(inside & ~total, square, 1.0))
         return dr.select(inside, refracted, cosine), total
@@ -271,8 +270,7 @@ class ScatteringLawTables:
             row: rows of the surfaces.
             active: mask of active lanes.
         """
-        exponent = self.exponent(0, row, active)
-        return 2 / dr.maximum(exponent, 1.0)
+        return 2 / dr.maximum(self.exponent(0, row, active), 1.0)
 
     def is_refracting(self, row: mit.UInt32) -> mit.Bool:
         """Test whether surfaces are interfaces of refracting bodies.

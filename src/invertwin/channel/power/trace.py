@@ -48,19 +48,13 @@ def strip_scene_derivatives(geometry: Geometry, link: Link) -> tuple[Geometry, L
         geometry: scene as flat tables.
         link: antennas.
     """
-    tables = dict(
-        zip(
-            DIFFERENTIABLE,
-            map(strip_derivatives, differentiable_tables(geometry, link)),
-            strict=True,
-        )
-    )
+    values = map(strip_derivatives, differentiable_tables(geometry, link))
+    tables = dict(zip(DIFFERENTIABLE, values, strict=True))
     rows = {name: tables.pop(name) for name in SCATTERING_TABLES}
     rows["depolarisation"] = strip_derivatives(geometry.surfaces.depolarisation)
     rows = replace(geometry.surfaces, **rows)
-    return replace(geometry, vertices=tables.pop("vertices"), surfaces=rows), replace(
-        link, **tables
-    )
+    bare = replace(geometry, vertices=tables.pop("vertices"), surfaces=rows)
+    return bare, replace(link, **tables)
 
 
 class PowerTracer:
@@ -104,8 +98,7 @@ class PowerTracer:
             require_no_interreflection(
                 self.rays, self.fixed, self._walk, self.curves, sampling.depth, seed
             )
-        per_lane = _BYTES_PER_VERTEX * sampling.depth
-        self.chunk = max(1, int(sampling.memory_budget) // per_lane)
+        self.chunk = max(1, int(sampling.memory_budget) // (_BYTES_PER_VERTEX * sampling.depth))
 
     def inputs(
         self, tables: dict[str, mit.Float] | None = None, *, joint_antennas: bool = True

@@ -46,9 +46,8 @@ class SegmentTransmission:
 
     def then(self, other: SegmentTransmission) -> SegmentTransmission:
         """Transmission of this segment followed by another."""
-        return SegmentTransmission(
-            self.transmittance * other.transmittance, self.extra_length + other.extra_length
-        )
+        transmittance = self.transmittance * other.transmittance
+        return SegmentTransmission(transmittance, self.extra_length + other.extra_length)
 
 
 class _SheetState(TypedDict):
@@ -87,9 +86,8 @@ def trace_transmission(
         active: mask of active lanes.
     """
     if not inputs.surfaces.has_sheets:
-        return SegmentTransmission(
-            dr.select(rays.is_clear(start, end, active), 1.0, 0.0), mi.Float(0.0)
-        )
+        clear = rays.is_clear(start, end, active)
+        return SegmentTransmission(dr.select(clear, 1.0, 0.0), mi.Float(0.0))
     lanes = dr.width(active)
     initial = {"transmittance": dr.ones(mi.Float, lanes), "extra": dr.zeros(mi.Float, lanes)}
 
@@ -100,9 +98,8 @@ def trace_transmission(
     done, blocked = visit_sheets(
         rays, inputs, lambda: start, lambda: end, active, initial, multiply
     )
-    return SegmentTransmission(
-        dr.select(active & ~blocked, done["transmittance"], 0.0), done["extra"]
-    )
+    transmittance = dr.select(active & ~blocked, done["transmittance"], 0.0)
+    return SegmentTransmission(transmittance, done["extra"])
 
 
 def visit_sheets(
@@ -139,19 +136,15 @@ def visit_sheets(
 
     def body(state: _SheetState) -> tuple[_SheetState]:
         at, carry = state["at"], state["carry"].copy()
-        ray = mi.Ray3f(
-            mi.Point3f(origin + offset * at), mi.Vector3f(offset), 1 - RAY_EPSILON - at, 0.0, []
-        )
+        begin, reach = mi.Point3f(origin + offset * at), 1 - RAY_EPSILON - at
+        ray = mi.Ray3f(begin, mi.Vector3f(offset), reach, 0.0, [])
         hit = rays.find_nearest(ray, state["active"])
         found = hit.valid
         face = dr.select(found, hit.point.face, rays.fallback_face)
         with dr.resume_grad():
             sheet = _sheet_transmission(inputs, face, start(), end(), found)
-            visit(
-                carry,
-                dr.select(found, sheet.transmittance, 1.0),
-                dr.select(found, sheet.extra_length, 0.0),
-            )
+            extra = dr.select(found, sheet.extra_length, 0.0)
+            visit(carry, dr.select(found, sheet.transmittance, 1.0), extra)
         following: _SheetState = {
             "at": dr.select(found, at + hit.t + RAY_EPSILON, at),
             "count": state["count"] + 1,
@@ -248,9 +241,8 @@ def trace_to_surface(
         state["b1"] = dr.select(ends, hit.point.b1, state["b1"])
         state["b2"] = dr.select(ends, hit.point.b2, state["b2"])
         state["valid"] = state["valid"] | ends
-        state["transmittance"] = dr.select(
-            passes, state["transmittance"] * sheet.transmittance, state["transmittance"]
-        )
+        passed = state["transmittance"] * sheet.transmittance
+        state["transmittance"] = dr.select(passes, passed, state["transmittance"])
         state["extra"] = dr.select(passes, state["extra"] + sheet.extra_length, state["extra"])
         odds = dr.select(passes, probability, dr.select(ends, 1 - probability, 1.0))
         state["probability"] = state["probability"] * odds
@@ -262,12 +254,9 @@ def trace_to_surface(
 
     first = _initial_surface_state(rays, ray, hit.valid, lanes)
     (last,) = rays.loop((first,), lambda state: state["going"], body)
-    return SegmentHit(
-        last["valid"],
-        SurfacePoint(last["face"], last["b1"], last["b2"]),
-        SegmentTransmission(last["transmittance"], last["extra"]),
-        last["probability"],
-    )
+    point = SurfacePoint(last["face"], last["b1"], last["b2"])
+    passed = SegmentTransmission(last["transmittance"], last["extra"])
+    return SegmentHit(last["valid"], point, passed, last["probability"])
 
 
 def _initial_surface_state(

@@ -50,6 +50,11 @@ def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> mit.Fl
     return to_float(torch.nn.functional.pad(values.detach().to(torch.float32), (0, 1)))
 
 
+def to_vectors(kind: Any, values: Tensor) -> Any:
+    """Convert rows of three numbers to a Dr.Jit vector type, such as ``mi.Point3f`` (float32)."""
+    return kind(*(to_float(column) for column in values.T))
+
+
 def gather_points(
     table: mit.Float, index: mit.UInt32, active: mit.Bool | bool = True
 ) -> mit.Point3f:
@@ -102,8 +107,7 @@ def scramble_seed(seed: int, stream: int) -> mit.UInt32:
         seed: seed of the user.
         stream: number of the stream.
     """
-    state = np.random.SeedSequence([seed, stream]).generate_state(1)[0]
-    return opaque(int(state))
+    return opaque(int(np.random.SeedSequence([seed, stream]).generate_state(1)[0]))
 
 
 def uniform_pair(

@@ -33,10 +33,8 @@ def arrange_scenes(
     """
     owner = object_scene[geometry.topology.vertex_object]
     count = int(object_scene.max()) + 1
-    points, antennas = (
-        strip_derivatives(geometry.vertices),
-        torch.cat([strip_derivatives(link.tx), strip_derivatives(link.rx)]),
-    )
+    points = strip_derivatives(geometry.vertices)
+    antennas = torch.cat([strip_derivatives(link.tx), strip_derivatives(link.rx)])
     rows = owner[:, None].expand(-1, 3)
     low, high = (
         around.expand(count, 3).scatter_reduce(0, rows, points, how)
@@ -48,13 +46,12 @@ def arrange_scenes(
     def shift_positions(positions: Tensor) -> Tensor:
         return (positions + shift[:, None]).flatten(0, 1)
 
-    origin = None if link.range_origin is None else link.range_origin.repeat(count)
     moved_link = replace(
         link,
         tx=shift_positions(link.tx),
         rx=shift_positions(link.rx),
         rotations=link.rotations.repeat(count, 1, 1),
-        range_origin=origin,
+        range_origin=None if link.range_origin is None else link.range_origin.repeat(count),
     )
     return replace(geometry, vertices=vertices, object_scene=object_scene), moved_link
 

@@ -81,12 +81,9 @@ class BoundingSpheres:
         self._size = opaque(self.group_size)
         self._scenes: dict[str, mit.UInt32] | None = None
         if geometry.object_scene is not None:
-            members = np.bincount(of_object)
             columns = {"index": indices, "scene": scene[order], "first": first, "groups": groups}
-            self._scenes = {
-                name: to_index(torch.from_numpy(column))
-                for name, column in {**columns, "members": members}.items()
-            }
+            columns["members"] = np.bincount(of_object)
+            self._scenes = {n: to_index(torch.from_numpy(c)) for n, c in columns.items()}
 
     def table_entry(self, number: mit.UInt32) -> tuple[mit.UInt32, mit.UInt32]:
         """Look up table index and scene of objects in the order of the table.
@@ -96,10 +93,8 @@ class BoundingSpheres:
         """
         if self._scenes is None:
             return number, mi.UInt32(0)
-        index, scene = (
-            dr.gather(mi.UInt32, self._scenes[name], number) for name in ("index", "scene")
-        )
-        return index, scene
+        columns = self._scenes["index"], self._scenes["scene"]
+        return dr.gather(mi.UInt32, columns[0], number), dr.gather(mi.UInt32, columns[1], number)
 
     def scene_groups(self, scene: mit.UInt32) -> tuple[mit.UInt32, mit.UInt32]:
         """Look up the first group of a scene and the number of its groups.
@@ -109,10 +104,8 @@ class BoundingSpheres:
         """
         if self._scenes is None:
             return 0, self.group_count  # type: ignore[return-value]
-        first, groups = (
-            dr.gather(mi.UInt32, self._scenes[name], scene) for name in ("first", "groups")
-        )
-        return first, groups
+        columns = self._scenes["first"], self._scenes["groups"]
+        return dr.gather(mi.UInt32, columns[0], scene), dr.gather(mi.UInt32, columns[1], scene)
 
     def member_count(self, group: mit.UInt32) -> mit.UInt32:
         """Look up the number of objects in groups.

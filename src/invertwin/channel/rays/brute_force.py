@@ -55,14 +55,14 @@ class BruteForceIntersector:
         sides = p1 - p0, p2 - p0
         normal = torch.linalg.cross(*sides)
         square = normal.square().sum(1, keepdim=True)
-        along = (
-            torch.linalg.cross(sides[1], normal) / square,
-            torch.linalg.cross(normal, sides[0]) / square,
-        )
+        along = torch.linalg.cross(sides[1], normal), torch.linalg.cross(normal, sides[0])
         # No ray meets a triangle without area: products with NaN are not in any interval.
-        numbers = torch.stack([p0, normal, *along], dim=1).tolist()
+        numbers = torch.stack([p0, normal, *(axis / square for axis in along)], dim=1).tolist()
         self._pairs, self.test_count = len(pairs), len(rows)
-        self._patches = [[_opaque_vector(vector) for vector in row] for row in numbers]
+        self._patches = [
+            [mi.Vector3f(*(opaque(number, "Float") for number in vector)) for vector in row]
+            for row in numbers
+        ]
         #: Of every test, for its near and its far half: the triangle, and which corner comes first.
         self._halves = to_index(rows)
 
@@ -88,9 +88,8 @@ class BruteForceIntersector:
         beyond, rest = u + v > 1, 1 - u - v
         half = dr.gather(mi.Vector2u, self._halves, 2 * test + dr.select(beyond, 1, 0), valid)
         # Weights of the corners from the one that comes first.
-        weights = [
-            dr.select(beyond, other, own) for own, other in ((rest, -rest), (u, 1 - u), (v, 1 - v))
-        ]
+        pairs = (rest, -rest), (u, 1 - u), (v, 1 - v)
+        weights = [dr.select(beyond, other, own) for own, other in pairs]
         b1, b2 = (
             dr.select(
                 half.y == 0, weights[k], dr.select(half.y == 1, weights[k - 1], weights[k - 2])
@@ -122,10 +121,6 @@ class BruteForceIntersector:
         u, v = dr.dot(first, place), dr.dot(second, place)
         within = (u <= 1) & (v <= 1) if number < self._pairs else u + v <= 1
         return along, u, v, (along > 0) & (along < max_distance) & (u >= 0) & (v >= 0) & within
-
-
-def _opaque_vector(numbers: list[float]) -> mit.Vector3f:
-    return mi.Vector3f(*(opaque(number, "Float") for number in numbers))
 
 
 def _pair_parallelograms(triangles: Float64[Tensor, "n 3 3"]) -> list[tuple[int, int, int, int]]:

@@ -116,12 +116,9 @@ class DifferentiatedObjects:
             return number + 1, total + found
 
         lanes = dr.width(direction)
-        state = rays.loop(
-            (dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes)),
-            lambda number, _: number < self._count,
-            step,
-        )
-        return state[1] / mi.Float(self._count)
+        initial = dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes)
+        _, total = rays.loop(initial, lambda number, _: number < self._count, step)
+        return total / mi.Float(self._count)
 
     def may_receive_shadow(
         self, edge: mit.UInt32, origin: mit.Point3f, y0: mit.Vector3d, y1: mit.Vector3d
@@ -151,9 +148,8 @@ class DifferentiatedObjects:
             centre, radius = sphere.xyz - origin, sphere.w
             # Within the sector of directions through the edge, or near one of its rims.
             height = dr.dot(centre, normal)
-            inside = (dr.dot(dr.cross(first, centre), normal) >= 0) & (
-                dr.dot(dr.cross(centre, second), normal) >= 0
-            )
+            inside = dr.dot(dr.cross(first, centre), normal) >= 0
+            inside &= dr.dot(dr.cross(centre, second), normal) >= 0
             away = dr.select(inside, dr.abs(height), dr.inf)
             for rim in rims:
                 at = dr.maximum(dr.dot(centre, rim), 0.0)
@@ -163,9 +159,5 @@ class DifferentiatedObjects:
             return number + 1, found | (met & (rays.object_scene(owner) == scene))
 
         lanes = dr.width(edge)
-        state = rays.loop(
-            (dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Bool, lanes)),
-            lambda number, found: ~found & (number < self._count),
-            step,
-        )
-        return state[1]
+        initial = dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Bool, lanes)
+        return rays.loop(initial, lambda number, found: ~found & (number < self._count), step)[1]

@@ -15,6 +15,7 @@ from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import Topology
+from invertwin.channel.rows import Rows, concatenate_rows
 
 PLANE_TOLERANCE = 1e-9  # closer than this to a plane [m] is in it
 _MIN_PLANE_SINE = 1e-7  # least sine of the angle between two planes that cross
@@ -23,7 +24,7 @@ _MAX_HITS = 64  # surfaces that an edge may pass
 
 
 @dataclass(frozen=True)
-class IntersectionCurves:
+class IntersectionCurves(Rows):
     """Common segments of pairs of triangles.
 
     Attributes:
@@ -40,22 +41,6 @@ class IntersectionCurves:
     touching: Bool[Tensor, " n"]
     has_close_surfaces: bool = False
 
-    def select(self, mask: Bool[Tensor, " n"]) -> "IntersectionCurves":
-        """Select segments.
-
-        Args:
-            mask: True for the segments to keep.
-        """
-        rows = {k: v[mask] for k, v in vars(self).items() if isinstance(v, Tensor)}
-        return replace(self, **rows)
-
-
-_EMPTY = IntersectionCurves(
-    *(torch.zeros(0, dtype=torch.int64) for _ in range(2)),
-    *(torch.zeros(0, 3, dtype=torch.float64) for _ in range(2)),
-    touching=torch.zeros(0, dtype=torch.bool),
-)
-
 
 def find_possible_intersections(
     geometry: Geometry,
@@ -71,9 +56,8 @@ def find_possible_intersections(
     Returns:
         The pairs, and per object the bounds of all overlaps, low and high [m].
     """
-    moving, deforming = (
-        torch.tensor(flags) for flags in (geometry.differentiated, geometry.shape_differentiated)
-    )
+    moving = torch.tensor(geometry.differentiated)
+    deforming = torch.tensor(geometry.shape_differentiated)
     pairs = (moving[:, None] | moving).fill_diagonal_(False) | torch.diag(deforming)
     groups = geometry.topology.object_group
     pairs &= (groups[:, None] != groups) | deforming[:, None] | deforming
@@ -95,11 +79,10 @@ def find_overlapping_boxes(
     count = len(geometry.differentiated)
     owner = geometry.topology.vertex_object[:, None].expand(-1, 3)
     points = geometry.vertices.detach()
-    reduced = (
+    low, high = (
         points.new_zeros(count, 3).scatter_reduce(0, owner, points, how, include_self=False)
         for how in ("amin", "amax")
     )
-    low, high = reduced
     margin = 1e-5 * (high - low).amax().clamp_min(1.0)
     low, high = low - margin, high + margin
     for axis in range(3):
@@ -146,9 +129,7 @@ def find_intersection_curves(rays: RayScene) -> IntersectionCurves | None:
         met = pairs[geometry.face_object[first], geometry.face_object[second]]
         corners = topology.welded_faces[first], topology.welded_faces[second]
         met &= ~(corners[0][:, :, None] == corners[1][:, None]).flatten(1).any(1)
-        found = _EMPTY
-        if bool(met.any()):
-            found = intersect_triangles(points, topology, first[met], second[met])
+        found = intersect_triangles(points, topology, first[met], second[met])
         parts.append(found)
         if not len(found.first):
             break
@@ -156,12 +137,7 @@ def find_intersection_curves(rays: RayScene) -> IntersectionCurves | None:
         pairs_met = torch.stack(torch.broadcast_tensors(around[0][:, :, None], around[1][:, None]))
         pairs_met = pairs_met.flatten(1)
         pairs_met = pairs_met[:, (pairs_met >= 0).all(0)]
-    rows = {
-        name: torch.cat([getattr(part, name) for part in parts])
-        for name, value in vars(found).items()
-        if isinstance(value, Tensor)
-    }
-    return IntersectionCurves(**rows, has_close_surfaces=bool(others.any()))
+    return replace(concatenate_rows(parts), has_close_surfaces=bool(others.any()))
 
 
 def _trace_edges(
@@ -190,10 +166,8 @@ def _trace_edges(
         if not dr.width(lanes):
             break
         face = dr.gather(mi.UInt32, hit.point.face, lanes)
-        edge, start, offset, at, until, step = (
-            dr.gather(type(value), value, lanes)
-            for value in (edge, mi.Point3f(start), mi.Vector3f(offset), at, until, step)
-        )
+        columns = edge, mi.Point3f(start), mi.Vector3f(offset), at, until, step
+        edge, start, offset, at, until, step = (dr.gather(type(x), x, lanes) for x in columns)
         rows.append(to_torch(mi.Int32(edge)).long())
         faces.append(to_torch(mi.Int32(face)).long())
     return torch.cat(rows), torch.cat(faces)

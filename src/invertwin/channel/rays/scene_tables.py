@@ -171,13 +171,12 @@ def flatten(
             to a velocity, or an object that is a cloud.
     """
     objects = list(scene.objects.values())
-    require_surfaces(
-        scene,
-        "only power (deposit_power, the surrogate) is computed of clouds: mesh them for exact "
-        "signals",
-    )
+    only = "only power (deposit_power, the surrogate) is computed of clouds"
+    require_surfaces(scene, f"{only}: mesh them for exact signals")
     fitted = [n for n, o in scene.objects.items() if is_differentiated(o.velocity)]
-    moving = fitted or [n for n, o in scene.objects.items() if _is_moving(o)]
+    moving = fitted or [
+        n for n, o in scene.objects.items() if o.velocity is not None and bool(o.velocity.any())
+    ]
     if (fitted and motion != "free") or (moving and motion == "refused"):
         names = ", ".join(moving)
         what = "velocities without gradients, got" if fitted else "objects at rest, got"
@@ -186,13 +185,10 @@ def flatten(
             "and then replace(name, velocity=None), or simulate_chirps for motion within a frame"
         )
     parts = transform_vertices(objects)
-    vertices, topology = (
-        torch.cat(parts),
-        topology_of([item.mesh for item in objects], parts, scenes),
-    )
-    surfaces, face_surface = _collect_scattering_laws(
-        objects, SPEED_OF_LIGHT / wavelength, topology.face_object
-    )
+    vertices = torch.cat(parts)
+    topology = topology_of([item.mesh for item in objects], parts, scenes)
+    frequency, owner = SPEED_OF_LIGHT / wavelength, topology.face_object
+    surfaces, face_surface = _collect_scattering_laws(objects, frequency, owner)
     skins = surfaces.refraction.any(1)
     for number, name in enumerate(scene.objects) if bool(skins.any()) else ():
         own = topology.face_object == number
@@ -298,15 +294,11 @@ def _collect_scattering_laws(
             count += faces if per_face else 1
         first.append(rows[id(surface)][0])
         single.append(not per_face)
-    columns = {
-        field.name: torch.cat(
-            [
-                getattr(surface, field.name)[None if surface.diffuse.ndim == 0 else ...]
-                for _, surface in rows.values()
-            ]
-        )
-        for field in fields(ScatteringLaw)
-    }
+    columns: dict[str, Tensor] = {}
+    for name in (field.name for field in fields(ScatteringLaw)):
+        laws = (law for _, law in rows.values())
+        parts = [getattr(law, name)[None if law.diffuse.ndim == 0 else ...] for law in laws]
+        columns[name] = torch.cat(parts)
     face_surface = torch.tensor(first)[owner]
     if not all(single):
         # Triangles of an object lie side by side, each with a row of its own.
@@ -314,10 +306,6 @@ def _collect_scattering_laws(
         number = torch.arange(len(owner)) - (counts.cumsum(0) - counts)[owner]
         face_surface += torch.where(torch.tensor(single)[owner], 0, number)
     return ScatteringLaw(**columns), face_surface
-
-
-def _is_moving(item: Object) -> bool:
-    return item.velocity is not None and bool(item.velocity.any())
 
 
 def vertex_velocities(item: Object) -> Float64[Tensor, "v 3"]:

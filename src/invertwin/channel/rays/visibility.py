@@ -69,9 +69,8 @@ class ViewpointScene:
         self._viewpoint = viewpoint
         with tracing():
             self._topology = topology_of([item.mesh for item in objects], parts)
-            self._occluders = Occluders(
-                strip_derivatives(self._vertices), self._topology, strip_derivatives(viewpoint)
-            )
+            fixed, origin = strip_derivatives(self._vertices), strip_derivatives(viewpoint)
+            self._occluders = Occluders(fixed, self._topology, origin)
         self.face_object = self._topology.face_object
 
     @property
@@ -121,8 +120,7 @@ class ViewpointScene:
             across = cross(ends[:, 1] - ends[:, 0], ends[:, 0] - strip_derivatives(self._viewpoint))
             sides = [dot(point - ends[:, 0], across) for point in pair]
             turns = sides[0] * sides[1] >= 0
-        chosen = torch.nonzero(alone | turns)[:, 0]
-        first, second = topology.edges[chosen].unbind(1)
+        first, second = topology.edges[torch.nonzero(alone | turns)[:, 0]].unbind(1)
         return DiscontinuityCurves(
             points[first], points[second], first, second, is_intersection=False
         )

@@ -61,10 +61,8 @@ class PlateSection(CrossSection):
         """Compute σ [m²]."""
         wavelength = _wavelengths(frequencies)
         x, y, z = directions.T
-        lobes = [
-            torch.sinc(2 * side * part / wavelength)
-            for side, part in ((self.width, x), (self.height, y))
-        ]
+        sides = (self.width, x), (self.height, y)
+        lobes = [torch.sinc(2 * side * part / wavelength) for side, part in sides]
         peak = 4 * math.pi * (self.width * self.height / wavelength) ** 2
         return peak * (z * lobes[0] * lobes[1]) ** 2
 

@@ -114,13 +114,8 @@ def scatter_at_interfaces(
     radiated, reflected, transmitted = (torch.zeros_like(field) for _ in range(3))
     outside, conducting = patches.medium < 0, solids.conducting[patches.facet]
     rows = torch.nonzero(outside)[:, 0]
-    front = (
-        interfaces.rows(rows),
-        wave_number,
-        patches.normal[rows],
-        patches.direction[rows],
-        field[rows],
-    )
+    waves = patches.normal[rows], patches.direction[rows], field[rows]
+    front = interfaces.rows(rows), wave_number, *waves
     radiated = radiated.index_copy(0, rows, radiate_field(*front, scattering_direction[rows]))
     reflected = reflected.index_copy(0, rows, reflect_field(*front))
     rows = torch.nonzero(~outside & conducting)[:, 0]
@@ -132,12 +127,8 @@ def scatter_at_interfaces(
     )
     rows = torch.nonzero(~outside & ~conducting)[:, 0]
     inner, onward = _refract_at_faces(solids, interfaces, wave_number, patches, field, rows)
-    n, s, wave, roughness = (
-        patches.normal[rows],
-        scattering_direction[rows],
-        patches.wave_vector[rows],
-        interfaces.rows(rows),
-    )
+    n, s, wave = patches.normal[rows], scattering_direction[rows], patches.wave_vector[rows]
+    roughness = interfaces.rows(rows)
     outer = radiate_currents(wave_number, -n, wave, field[rows], inner, s)
     p = -dot(wave, n).real
     losses = [
@@ -145,11 +136,8 @@ def scatter_at_interfaces(
         for cosine in (p + dot(n, s), 2 * p)
     ]
     radiated = radiated.index_copy(0, rows, project_transverse(outer, s) * losses[0])
-    return InterfaceFields(
-        radiated,
-        reflected.index_copy(0, rows, inner * losses[1]),
-        transmitted.index_copy(0, rows, onward),
-    )
+    reflected = reflected.index_copy(0, rows, inner * losses[1])
+    return InterfaceFields(radiated, reflected, transmitted.index_copy(0, rows, onward))
 
 
 def _refract_at_faces(

@@ -12,7 +12,7 @@ cross-polar terms.
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -188,26 +188,21 @@ def trace_far_field(
                 f"signature, got {count}: "
                 "ray tubes jump at edges; detach the scene, or fit with power paths"
             )
-        if count > MAX_FACETS_BEAM_TRACING:
+        is_large = count > MAX_FACETS_BEAM_TRACING
+        if is_large:
             _check_inner_tubes(target)
-        spacing = (
-            None if count <= MAX_FACETS_BEAM_TRACING else target.wavelength / tubes_per_wavelength
-        )
+        spacing = target.wavelength / tubes_per_wavelength if is_large else None
         antenna_pairs = [(transmitters, transmitters if receivers is None else receivers)]
         if receivers is not None:
             antenna_pairs.append((receivers, transmitters))
-        found = [
-            _FarFieldTracer(target, *pair).trace_parts(depth, edges, spacing, boundary)
-            for pair in antenna_pairs
-        ]
+        tracers = [_FarFieldTracer(target, *pair) for pair in antenna_pairs]
+        found = [tracer.trace_parts(depth, edges, spacing, boundary) for tracer in tracers]
         # Reciprocity: mean over both directions, or over both cross-polar terms of one antenna.
         parts = {name: (found[0][name] + found[-1][name].mT) / 2 for name in found[0]}
-        uses_moments = edges > 0 and target.is_smooth_metal
-        residual = (
-            _residual_field(target, antenna_pairs, torch.stack([*parts.values()]).sum(0))
-            if uses_moments
-            else None
-        )
+        residual = None
+        if edges > 0 and target.is_smooth_metal:
+            modelled = torch.stack([*parts.values()]).sum(0)
+            residual = _residual_field(target, antenna_pairs, modelled)
         _warn_validity(scene, target, tubes_per_wavelength, spacing, residual is not None)
         return parts if residual is None else parts | {"rest": residual}
 
@@ -246,12 +241,11 @@ class _FarFieldTracer:
     ) -> dict[str, Tensor]:
         """Physical optics of every order, by beams or, with a tube width, by ray tubes."""
         orders = [list(self._zero_amplitudes()) for _ in range(depth)]
-        groups = (
+        for patch_orders, solids, members in (
             self._trace_beam_orders(depth, boundary)
             if tube_width is None
             else self._trace_tube_orders(depth, tube_width)
-        )
-        for patch_orders, solids, members in groups:
+        ):
             self._add_orders(orders, patch_orders, solids, members)
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
 
@@ -277,8 +271,7 @@ class _FarFieldTracer:
             rows = zip(orders, patch_orders, integrals, currents, strict=False)
             for order, patches, integral, current in rows:
                 strength = integral(k) * (k if target.is_smooth_metal else 1.0)
-                radiated = current * strength[:, None, None]
-                order[f] = order[f].index_add(0, patches.aspect, radiated)
+                order[f] = order[f].index_add(0, patches.aspect, current * strength[:, None, None])
 
     def _trace_beam_orders(self, depth: int, boundary: bool) -> Iterator[_PatchOrders]:
         """Trace few facets by clipped beams."""
@@ -293,10 +286,8 @@ class _FarFieldTracer:
         for first in find_illuminated_triangles(
             target.facets, target.is_unoccluded, -self.transmitters, tube_width
         ):
-            outside = [
-                first,
-                *trace_tubes(target.facets, target.occluders, first, tube_width, depth),
-            ]
+            tubes = trace_tubes(target.facets, target.occluders, first, tube_width, depth)
+            outside = [first, *tubes]
             for solids, members in target.interiors:
                 patch_orders = outside
                 if solids is not None:
@@ -324,10 +315,7 @@ class _FarFieldTracer:
                 through = patches.transmitted[:, None, None]
                 field = torch.where(through, transmitted[patches.parent], reflected[patches.parent])
                 field = field * patches.spreading[:, None, None]
-            receiver, surface_rows = (
-                self.receivers[patches.aspect],
-                interfaces.rows(patches.facet),
-            )
+            receiver, surface_rows = self.receivers[patches.aspect], interfaces.rows(patches.facet)
             if solids is None:
                 surface = (surface_rows, k, patches.normal, patches.direction, field)
                 radiated, reflected = radiate_field(*surface, receiver), reflect_field(*surface)
@@ -345,21 +333,16 @@ class _FarFieldTracer:
         topology = target.topology
         ends = target.vertices[topology.edges]
         wedges = find_wedges(target.facets.corners, ends, topology.edge_faces)
-        wedges = wedges.rows(target.interfaces[0].conducting[wedges.faces[:, 0]])
-        wedges = wedges.rows(select_body_edges(wedges, target.wavelength * _MIN_EDGE_RUN))
+        wedges = wedges.select(target.interfaces[0].conducting[wedges.faces[:, 0]])
+        wedges = wedges.select(select_body_edges(wedges, target.wavelength * _MIN_EDGE_RUN))
         found = {"edges 1": self._fringe_amplitudes(wedges)}
         plates = find_plates(wedges) if max_diffractions > 1 else []
         totals = [list(self._zero_amplitudes()) for _ in range(2, max_diffractions + 1)]
         every = torch.arange(len(self.transmitters))
         for f, k in enumerate(target.wave_numbers if plates else ()):
+            waves = -self.transmitters, self._incident_fields, self.receivers
             several = trace_multiple_diffractions(
-                plates,
-                k,
-                -self.transmitters,
-                self._incident_fields,
-                self.receivers,
-                max_diffractions,
-                target.is_unoccluded,
+                plates, k, *waves, max_diffractions, target.is_unoccluded
             )
             for total, radiated in zip(totals, several, strict=True):
                 total[f] = self._add_received(total[f], every, radiated)
@@ -377,13 +360,13 @@ class _FarFieldTracer:
             row = torch.arange(count).repeat(len(aspects))
             for antennas in (self.transmitters, self.receivers):
                 direction = antennas[aspect]
-                pieces = wedges.rows(row)
+                pieces = wedges.select(row)
                 keep = is_outside_wedge(pieces, direction)
                 grazing = keep & is_grazing_sheet(pieces, direction)
                 left_out += int(grazing.sum())
                 aspect, row = aspect[keep & ~grazing], row[keep & ~grazing]
             for antennas in (self.transmitters, self.receivers):
-                pieces = wedges.rows(row)
+                pieces = wedges.select(row)
                 outward = (pieces.normals - pieces.face_tangents).sum(1)
                 centre = (pieces.start + pieces.end) / 2
                 centre = centre + _EDGE_OFFSET * target.facets.size * normalize(outward, dim=1)
@@ -391,15 +374,14 @@ class _FarFieldTracer:
                 aspect, row = aspect[visible], row[visible]
                 if antennas is self.receivers:
                     break
-            pieces = wedges.rows(row)
+            pieces = wedges.select(row)
             d, s = -self.transmitters[aspect], self.receivers[aspect]
             centre, side = (pieces.start + pieces.end) / 2, pieces.end - pieces.start
             for f, k in enumerate(target.wave_numbers):
                 radiated = fringe_field(pieces, k, d, self._incident_fields[aspect], s)
                 wave = k * (s - d)
                 width = parallelogram_integral(wave, side, torch.zeros_like(side))
-                phase = dot(wave, centre)
-                scale = phasor(phase) * width * side.norm(dim=1)
+                scale = phasor(dot(wave, centre)) * width * side.norm(dim=1)
                 total[f] = self._add_received(total[f], aspect, radiated * scale[:, None, None])
         if left_out:
             warnings.warn(
@@ -437,7 +419,7 @@ def _residual_field(
     order = sorted(range(len(modelled)), key=lambda f: -target.wave_numbers[f])
     for f in track(order, "frequencies"):
         k = target.wave_numbers[f]
-        solver = mfie if mfie is not None and mfie.supports(k) else efie
+        solver = mfie if mfie is not None and mfie.elements(k) is not None else efie
         found = solver.solve_scattering(k, antenna_pairs)
         if found is not None:
             rest[f] = (found[0] + found[-1].mT) / 2 - modelled[f]
@@ -452,13 +434,10 @@ def _split_edges(wedges: Wedges, max_length: float) -> Wedges:
     pieces = (side.detach().norm(dim=1) / max_length).ceil().long().clamp_min(1)
     row = torch.repeat_interleave(pieces)
     number = torch.arange(len(row)) - (pieces.cumsum(0) - pieces)[row]
-    rows = wedges.rows(row)
+    rows = wedges.select(row)
     low, high = (number / pieces[row])[:, None], ((number + 1) / pieces[row])[:, None]
-    columns = vars(rows) | {
-        "start": rows.start + low * side[row],
-        "end": rows.start + high * side[row],
-    }
-    return Wedges(**columns)
+    ends = rows.start + low * side[row], rows.start + high * side[row]
+    return replace(rows, start=ends[0], end=ends[1])
 
 
 def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTarget:
@@ -497,25 +476,19 @@ def _smooth_interfaces(scene: Scene, topology: Topology, frequency: float) -> Sm
 
 
 def _warn_validity(
-    scene: Scene,
-    target: _FarFieldTarget,
-    density: float,
-    tube_width: float | None,
-    has_residual: bool,
+    scene: Scene, target: _FarFieldTarget, density: float, spacing: float | None, has_residual: bool
 ) -> None:
     """Issue warnings where the model is outside its range of validity."""
     found: list[str] = []
-    if tube_width is not None and density < 1:
+    if spacing is not None and density < 1:
         found.append(f"{density:g} tubes per wavelength are too few: use 1 or more, better 4")
     faces = target.topology.face_object
     neighbours = torch.nn.functional.pad(target.topology.edge_faces, (0, 1), value=-1)[:, :2]
-    neighbours = torch.where(
-        neighbours >= 0, neighbours, neighbours[:, :1]
-    )  # an open edge has one normal
+    # An open edge has one normal.
+    neighbours = torch.where(neighbours >= 0, neighbours, neighbours[:, :1])
     normal = target.facets.normal.detach()
-    angle = 2 * torch.asin(
-        (0.5 * (normal[neighbours[:, 0]] - normal[neighbours[:, 1]]).norm(dim=1)).clamp_max(1)
-    )
+    half_chord = 0.5 * (normal[neighbours[:, 0]] - normal[neighbours[:, 1]]).norm(dim=1)
+    angle = 2 * torch.asin(half_chord.clamp_max(1))
     ends = target.vertices.detach()[target.topology.edges]
     # A triangle of side ℓ with angles α to its neighbours is ℓα/√12 off the curved surface.
     sagittas = (ends[:, 1] - ends[:, 0]).norm(dim=1) * angle / math.sqrt(12)
@@ -538,10 +511,8 @@ def _warn_validity(
                 f"the facets of {name} are {sagitta * index:.2g} wavelengths off the curved "
                 "surface, more than 1/50: use a finer mesh"
             )
-        is_mixed = target.facets.solid[own].all() and not is_homogeneous(
-            target.interfaces[0].rows(own)
-        )
-        if bool(is_mixed):
+        is_mixed = not is_homogeneous(target.interfaces[0].rows(own))
+        if bool(target.facets.solid[own].all()) and is_mixed:
             found.append(
                 f"{name} is closed and its permittivity differs between triangles: only "
                 "its front face reflects"

@@ -10,6 +10,7 @@ aspect angle", IEEE TAP 14, 1966.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from invertwin.channel.em.plane_waves import cross, dot, parallelogram_integral
 from invertwin.channel.em.wedges import MIN_EDGE_ANGLE, Wedges
+from invertwin.channel.rows import concatenate_rows
 
 _SAMPLES_PER_EDGE = 16  # of the illuminated part of the last edge
 _TOLERANCE = 1e-6
@@ -76,14 +78,10 @@ def find_plates(wedges: Wedges) -> list[Wedges]:
     while left:
         plate, others, grown = [left[0]], left[1:], True
         while grown:
-            near = [
-                e
-                for e in others
-                if any(_are_coplanar_neighbours(wedges, e, other) for other in plate)
-            ]
-            plate, others, grown = (plate + near, [e for e in others if e not in near], bool(near))
+            near = [e for e in others if any(_are_coplanar_neighbours(wedges, e, p) for p in plate)]
+            plate, others, grown = plate + near, [e for e in others if e not in near], bool(near)
         left = others
-        edges = wedges.rows(torch.tensor(plate))
+        edges = wedges.select(torch.tensor(plate))
         if _is_convex(edges):
             found.append(_merge_collinear_edges(edges))
     return found
@@ -117,10 +115,10 @@ def _merge_collinear_edges(edges: Wedges) -> Wedges:
         left = [e for e in left if e not in line]
         points = torch.cat([edges.start[line], edges.end[line]])
         along = points @ (edges.end[line[0]] - edges.start[line[0]])
-        first = edges.rows(torch.tensor(line[:1]))
-        ends = {"start": points[along.argmin()][None], "end": points[along.argmax()][None]}
-        sides.append(vars(first) | ends)
-    return Wedges(**{name: torch.cat([side[name] for side in sides]) for name in sides[0]})
+        first, ends = edges.select(torch.tensor(line[:1])), (along.argmin(), along.argmax())
+        start, end = (points[number][None] for number in ends)
+        sides.append(replace(first, start=start, end=end))
+    return concatenate_rows(sides)
 
 
 def _diffract_sequence(
@@ -162,12 +160,9 @@ def _diffract_sequence(
     begin = low[row] + size * (torch.arange(len(row)) % _SAMPLES_PER_EDGE)
     point = start + (begin + size / 2)[:, None] * side
     # Mean of 1/√length over each piece, finite also where two edges meet.
-    roots = [
-        torch.lerp(ends[0].segment_lengths[row], ends[1].segment_lengths[row], t[:, None])
-        .clamp_min(0)
-        .sqrt()
-        for t in (begin, begin + size)
-    ]
+    lengths, others = (end.segment_lengths[row] for end in ends)
+    mixed = [torch.lerp(lengths, others, t[:, None]) for t in (begin, begin + size)]
+    roots = [length.clamp_min(0).sqrt() for length in mixed]
     spread = (2 / (roots[0] + roots[1]).clamp_min(1e-12)).prod(1)
     ray = _trace_back(wedges, sequence, [way[row] for way in directions], point)
     d, s, wave = incident[row], scattering_direction[row], directions[-1][row]
@@ -190,12 +185,7 @@ def _diffract_sequence(
 
 
 def _trace_along_plate(
-    wedges: Wedges,
-    sequence: list[int],
-    k: float,
-    incident: Tensor,
-    field: Tensor,
-    plate_normal: Tensor,
+    wedges: Wedges, sequence: list[int], k: float, incident: Tensor, field: Tensor, normal: Tensor
 ) -> tuple[list[Tensor], Tensor]:
     """Directions along the plate after each edge but the last, and field amplitudes there."""
     directions: list[Tensor] = []
@@ -203,21 +193,21 @@ def _trace_along_plate(
     amplitude = torch.ones(len(incident), 2, dtype=torch.complex128)
     for edge in sequence[:-1]:
         inward = wedges.face_tangents[edge, 0]
-        axis = cross(inward, plate_normal).expand_as(wave)
+        axis = cross(inward, normal).expand_as(wave)
         cosine = dot(wave, axis)
         sine = (1 - cosine**2).clamp_min(1e-12).sqrt()
         magnetic = dot(cross(wave[:, None], electric), axis[:, None])
         valid = sine > math.sin(MIN_EDGE_ANGLE)
         azimuth = torch.zeros_like(cosine)
         if not directions:
-            azimuth = torch.atan2(-dot(wave, plate_normal), -dot(wave, inward)) % (2 * math.pi)
-            valid &= dot(wave, plate_normal).abs() > math.sin(MIN_EDGE_ANGLE)
+            azimuth = torch.atan2(-dot(wave, normal), -dot(wave, inward)) % (2 * math.pi)
+            valid &= dot(wave, normal).abs() > math.sin(MIN_EDGE_ANGLE)
         # Hard half plane at φ = 0: both of its terms are 1/cos(φ′/2).
         hard = -((2 * math.pi * k) ** -0.5) / (sine * torch.cos(azimuth / 2)) * valid
         wave = cosine[:, None] * axis + sine[:, None] * inward
         directions.append(wave)
-        electric = plate_normal.expand(len(wave), 1, 3)
-        normalisation = dot(cross(wave, plate_normal.expand_as(wave)), axis)
+        electric = normal.expand(len(wave), 1, 3)
+        normalisation = dot(cross(wave, normal.expand_as(wave)), axis)
         phase = complex(math.cos(math.pi / 4), -math.sin(math.pi / 4))
         amplitude = amplitude * magnetic * (hard / normalisation)[:, None] * phase
     return directions, amplitude

@@ -8,7 +8,7 @@ is a plane wave.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,6 @@ from invertwin.channel.beams.beam_tracing import (
     IlluminatedPatches,
     concatenate_patches,
     exceeds_min_amplitude,
-    select_patches,
 )
 from invertwin.channel.em.dielectric_solids import DielectricSolids
 from invertwin.channel.em.plane_waves import (
@@ -42,6 +41,7 @@ from invertwin.channel.rcs.shooting_bouncing_rays import (
     ray_offset,
     subdivide_triangles,
 )
+from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.errors import InputError
 from invertwin.scene.material.fresnel import refractive_index
 
@@ -111,7 +111,7 @@ def group_smooth_faces(facets: Facets, edge_faces: Int64[Tensor, "edge k"]) -> S
 
 
 @dataclass(frozen=True)
-class _RayTubes:
+class _RayTubes(Rows):
     """Ray tubes at surfaces, with values at their three corners.
 
     Attributes:
@@ -174,8 +174,7 @@ def trace_inner_tubes(
             parts.append(inner)
             begun.append(tubes)
         found.append(concatenate_patches(parts))
-        names = [entry.name for entry in fields(_RayTubes)]
-        tubes = _RayTubes(**{n: torch.cat([getattr(some, n) for some in begun]) for n in names})
+        tubes = concatenate_rows(begun)
         if not len(found[-1].aspect):
             return found[:-1]
     return found
@@ -234,17 +233,9 @@ def _continue_tubes(
     normal = previous.normal[tubes.patch[row]]
     source_normal = torch.where(transmitted[:, None], -normal, normal)
     medium = torch.where(transmitted, behind[row], medium[row])
-    index = solids.permittivity_in(medium).sqrt()
-    return _DepartingTubes(
-        tubes.patch[row],
-        tubes.corners[row],
-        directions,
-        tubes.phases[row],
-        source_normal,
-        medium,
-        transmitted,
-        index,
-    )
+    index, own = solids.permittivity_in(medium).sqrt(), tubes.select(row)
+    waves = directions, own.phases, source_normal, medium, transmitted, index
+    return _DepartingTubes(own.patch, own.corners, *waves)
 
 
 def _trace_tubes(
@@ -262,22 +253,14 @@ def _trace_tubes(
 
     def directions_at(row: Tensor, points: Tensor) -> Tensor:
         where = departing.corners[row][:, None]
-        return normalize(
-            interpolate_vectors(departing.directions[row][:, None], where, points), dim=2
-        )
+        found = interpolate_vectors(departing.directions[row][:, None], where, points)
+        return normalize(found, dim=2)
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
         shape, many = points.shape[:2], row.repeat_interleave(points.shape[1])
         starts = (points + ray_offset(facets, departing.source_normal[row])[:, None]).flatten(0, 1)
-        found = _find_first_facets(
-            facets,
-            occluders,
-            solids,
-            departing.medium[many],
-            starts,
-            directions_at(row, points).flatten(0, 1),
-        )
-        return found.view(shape)
+        medium, ways = departing.medium[many], directions_at(row, points).flatten(0, 1)
+        return _find_first_facets(facets, occluders, solids, medium, starts, ways).view(shape)
 
     def visible_faces(row: Tensor, points: Tensor) -> Tensor:
         found = hit_facets(row, points)
@@ -321,13 +304,11 @@ def _find_first_facets(
         row = torch.nonzero(is_wrong_side())[:, 0]
         if not len(row):
             break
-        beyond = (along[row] * far)[:, None] * directions[row] + 2 * ray_offset(
-            facets, directions[row]
-        )
+        beyond = (along[row] * far)[:, None] * directions[row]
+        beyond = beyond + 2 * ray_offset(facets, directions[row])
         origins = origins.index_copy(0, row, origins[row] + beyond)
-        again, along_again = find_next_surface(
-            occluders, origins[row], origins[row] + far * directions[row]
-        )
+        ends = origins[row] + far * directions[row]
+        again, along_again = find_next_surface(occluders, origins[row], ends)
         found = found.index_copy(0, row, again)
         along = along.index_copy(0, row, along_again)
     return torch.where(is_wrong_side(), -1, found)
@@ -385,17 +366,15 @@ def _terminate_tubes(
     number = torch.arange(int(keep.sum()))
     fresh = torch.zeros_like(number, dtype=torch.bool)
     tubes = _RayTubes(number, ends[keep], directions[keep], normals[keep], phases[keep], fresh)
-    return select_patches(patches, keep), tubes
+    return patches.select(keep), tubes
 
 
 def _fit_wave_vector(wave_vector: Tensor, corners: Tensor, phases: Tensor) -> Tensor:
     """Correct K in the plane of three corners to match the phase differences there."""
     first, second = ((corners[:, n] - corners[:, 0]) for n in (1, 2))
     normal = cross(first, second)
-    short, long = (
-        (phases[:, n] - phases[:, 0] - dot(wave_vector, side))
-        for n, side in ((1, first), (2, second))
-    )
+    short = phases[:, 1] - phases[:, 0] - dot(wave_vector, first)
+    long = phases[:, 2] - phases[:, 0] - dot(wave_vector, second)
     slope = short[:, None] * cross(second, normal) + long[:, None] * cross(normal, first)
     return wave_vector + slope / dot(normal, normal)[:, None]
 
@@ -412,14 +391,9 @@ def _spreading_factor(
     a, b = a.mT, b.mT
     before, after = torch.linalg.det(a), torch.linalg.det(b)
     # b = J a; one caustic where det J < 0, two where both eigenvalues of J are negative.
-    trace = (
-        b[:, 0, 0] * a[:, 1, 1]
-        - b[:, 0, 1] * a[:, 1, 0]
-        + b[:, 1, 1] * a[:, 0, 0]
-        - b[:, 1, 0] * a[:, 0, 1]
-    ) / before
-    flipped = before * after < 0
-    caustics = torch.where(flipped, 1, torch.where(trace < 0, 2, 0))
+    trace = b[:, 0, 0] * a[:, 1, 1] - b[:, 0, 1] * a[:, 1, 0]
+    trace = (trace + b[:, 1, 1] * a[:, 0, 0] - b[:, 1, 0] * a[:, 0, 1]) / before
+    caustics = torch.where(before * after < 0, 1, torch.where(trace < 0, 2, 0))
     quarter = torch.tensor([1.0, 1j, -1.0], dtype=torch.complex128)[caustics]
     return (before / after).abs().sqrt() * quarter
 
@@ -452,9 +426,8 @@ def require_separate_conductors(facets: Facets, solids: DielectricSolids) -> Non
         other = metal[torch.tensor(others, dtype=torch.int64) % len(metal)]
         gap = torch.maximum(low[other] - high[facet], low[facet] - high[other])
         # Coplanar neighbours with a common side do not overlap.
-        overlaps = (gap < _CONTACT_TOLERANCE * facets.size).all(1) & (
-            (gap < -_CONTACT_TOLERANCE * facets.size).sum(1) > 1
-        )
+        overlaps = (gap < _CONTACT_TOLERANCE * facets.size).all(1)
+        overlaps &= (gap < -_CONTACT_TOLERANCE * facets.size).sum(1) > 1
         if bool(overlaps.any()):
             names = [solids.names[int(solids.owner[n])] for n in (facet, other[overlaps][0])]
             raise InputError(

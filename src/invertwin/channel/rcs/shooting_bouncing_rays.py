@@ -44,17 +44,9 @@ def find_illuminated_triangles(
         aspect = waves.repeat_interleave(len(number))
         row = torch.arange(len(number)).repeat(len(waves))
         facing = dot(facets.normal[number[row]].detach(), incident[aspect])
-        is_front = (facing < 0) | ~facets.solid[number[row]]
-        keep = is_front & (facing.abs() > 1e-9)
-        yield _illuminate_triangles(
-            facets,
-            is_unoccluded,
-            incident,
-            min_side,
-            aspect[keep],
-            number[row[keep]],
-            corners[row[keep]],
-        )
+        keep = ((facing < 0) | ~facets.solid[number[row]]) & (facing.abs() > 1e-9)
+        lit = aspect[keep], number[row[keep]], corners[row[keep]]
+        yield _illuminate_triangles(facets, is_unoccluded, incident, min_side, *lit)
 
 
 def _illuminate_triangles(
@@ -231,9 +223,8 @@ def _trace_next_order(
     normal, d = facets.normal[facet], directions[parent]
     facing = dot(normal, d)
     keep = (facing.abs() > 1e-9) & ~(facets.solid[facet] & (facing > 0))
-    parent, facet, corners, normal, d, facing = (
-        x[keep] for x in (parent, facet, corners, normal, d, facing)
-    )
+    columns = parent, facet, corners, normal, d, facing
+    parent, facet, corners, normal, d, facing = (column[keep] for column in columns)
     # The ray tracer finds the triangle; the intersection with its plane is computed in float64.
     distance = dot(normal[:, None], facets.corners[facet, :1] - corners) / facing[:, None]
     polygon = corners + distance[..., None] * d[:, None]

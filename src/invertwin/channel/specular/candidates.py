@@ -6,7 +6,6 @@ transmission.
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,13 +13,10 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.rays.arrays import to_float, to_index, to_torch
+from invertwin.channel.rays.arrays import to_float, to_index, to_torch, to_vectors
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.specular.image_method import Planes
+from invertwin.channel.specular.image_method import DIRECT, CandidateSurfaces, Planes
 from invertwin.errors import InputError
-
-if TYPE_CHECKING:  # CandidateSurfaces holds the planes
-    from invertwin.channel.specular.image_method import CandidateSurfaces
 
 _LANES = 1 << 20
 _MAX_SEQUENCES = 1_000_000  # limit of the exhaustive search
@@ -68,19 +64,16 @@ def enumerate_sequences(
         InputError: more than a million sequences.
     """
     known = planes.face_plane >= 0
-    options = torch.cat(
-        [
-            2 * planes.face_plane[interactions.reflect & known],
-            2 * planes.face_plane[interactions.transmit & known] + 1,
-        ]
-    ).unique()
+    mirrors = 2 * planes.face_plane[interactions.reflect & known]
+    sheets = 2 * planes.face_plane[interactions.transmit & known] + 1
+    options = torch.cat([mirrors, sheets]).unique()
     count = sum(len(options) ** step for step in range(1, depth + 1))
     if count > _MAX_SEQUENCES:
         raise InputError(
             f"expected at most {_MAX_SEQUENCES:,} sequences to test one by one, got {count:.3g} of "
             f"{len(planes)} planes and depth {depth}; give a number of rays, or a smaller depth"
         )
-    found, last = [], torch.zeros(1, 0, dtype=torch.int64)
+    found, last = [], DIRECT
     for _ in range(depth):
         row = torch.arange(len(last)).repeat_interleave(len(options))
         grown = torch.cat([last[row], options.repeat(len(last))[:, None]], 1)
@@ -91,9 +84,29 @@ def enumerate_sequences(
     return CandidateSequences(tuple(found), None)
 
 
+def find_sequences(
+    surfaces: CandidateSurfaces,
+    interactions: FaceInteractions,
+    origins: Float64[Tensor, "place 3"],
+    depth: int,
+    rays: int | None,
+    seed: int,
+) -> CandidateSequences:
+    """Find candidate sequences of up to ``depth`` steps by shooting rays, or enumerate all.
+
+    Args:
+        surfaces, interactions, origins, depth, seed: as of ``shoot_sequences``.
+        rays: number of rays from each origin; None enumerates all sequences.
+    """
+    if not depth or rays == 0:
+        return CandidateSequences((), None)
+    if rays is None:
+        return enumerate_sequences(surfaces.planes, interactions, depth)
+    return shoot_sequences(surfaces, interactions, origins, depth, rays, seed)
+
+
 def shoot_sequences(
-    surfaces: "CandidateSurfaces",
-    planes: Planes,
+    surfaces: CandidateSurfaces,
     interactions: FaceInteractions,
     origins: Float64[Tensor, "place 3"],
     depth: int,
@@ -112,7 +125,6 @@ def shoot_sequences(
 
     Args:
         surfaces: candidate surfaces of the scene.
-        planes: planes of the scene, relative to the same origin.
         interactions: interactions of the triangles.
         origins: origins of the rays [m].
         depth: maximum number of steps.
@@ -121,50 +133,45 @@ def shoot_sequences(
 
     Source: I. J. Good, "The population frequencies of species", Biometrika 40, 1953.
     """
-    tables = _SequenceTracer(surfaces, planes, interactions)
+    tables = _SequenceTracer(surfaces, interactions)
     # A ray may split at every step.
     branches = 2 ** (depth if bool(interactions.transmit.any()) else 0)
     chunk = max(1, _LANES // branches)
     leaves = torch.zeros(0, depth, dtype=torch.int64)
     count = torch.zeros(0, dtype=torch.int64)
-    none = torch.zeros(1, 0, dtype=torch.int64)
     for number, origin in enumerate(origins):
         rotation = _random_rotation(seed, number)
         for start in range(0, rays, chunk):
             index = torch.arange(start, min(start + chunk, rays))
             directions = _spiral_directions(index, rays) @ rotation.T
             prefix_index = torch.zeros(len(index), dtype=torch.int64)
-            row, row_count = tables.follow_rays(origin, directions, depth, none, prefix_index)
-            leaves, count = _merge_counts(torch.cat([leaves, row]), torch.cat([count, row_count]))
-    found: list[Tensor] = []
-    for length in range(1, depth + 1):
-        some = leaves[(leaves[:, length - 1] >= 0), :length]
-        found.append(some.unique(dim=0) if len(some) else some)
+            row, row_count = tables.follow_rays(origin, directions, depth, DIRECT, prefix_index)
+            leaves, group = torch.cat([leaves, row]).unique(dim=0, return_inverse=True)
+            both = torch.cat([count, row_count])
+            count = torch.zeros(len(leaves), dtype=torch.int64).index_add(0, group, both)
     missed_fraction = min(1.0, float((count == 1).sum()) / (rays * len(origins)))
-    return CandidateSequences(tuple(found), missed_fraction)
+    return CandidateSequences(_split_by_length(leaves, 1), missed_fraction)
 
 
 def shoot_sequences_from_edges(
-    surfaces: "CandidateSurfaces",
-    planes: Planes,
+    surfaces: CandidateSurfaces,
     interactions: FaceInteractions,
     origins: Float64[Tensor, "ray 3"],
     edge: Int64[Tensor, " ray"],
     depth: int,
     seed: int,
-) -> list[Int64[Tensor, "sequence column"]]:
+) -> tuple[Int64[Tensor, "sequence column"], ...]:
     """Find the sequences that rays from edges follow: edge number, then steps; by length from 1.
 
     Args:
         surfaces: candidate surfaces of the scene.
-        planes: planes of the scene, relative to the same origin.
         interactions: interactions of the triangles.
         origins: origins of the rays, whose directions are random [m].
         edge: edge number of each origin, from zero without gaps.
         depth: maximum number of steps.
         seed: random seed of the directions.
     """
-    tables = _SequenceTracer(surfaces, planes, interactions)
+    tables = _SequenceTracer(surfaces, interactions)
     branches = 2 ** (depth if bool(interactions.transmit.any()) else 0)
     draws = np.random.default_rng(seed).standard_normal((len(origins), 3))
     directions = normalize(torch.from_numpy(draws), dim=1)
@@ -173,16 +180,14 @@ def shoot_sequences_from_edges(
     for some in torch.arange(len(origins)).split(max(1, _LANES // branches)):
         rows, _ = tables.follow_rays(origins[some], directions[some], depth, prefix, edge[some])
         leaves = torch.cat([leaves, rows]).unique(dim=0)
-    found: list[Tensor] = []
-    for length in range(1, depth + 1):
-        some = leaves[leaves[:, length] >= 0, : length + 1]
-        found.append(some.unique(dim=0) if len(some) else some)
-    return found
+    return _split_by_length(leaves, 2)
 
 
-def _merge_counts(rows: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    alike, group = rows.unique(dim=0, return_inverse=True)
-    return alike, torch.zeros(len(alike), dtype=torch.int64).index_add(0, group, counts)
+def _split_by_length(leaves: Tensor, first: int) -> tuple[Tensor, ...]:
+    """Distinct sequences of each length, in tables of ``first`` columns and more."""
+    widths = range(first, leaves.shape[1] + 1)
+    found = (leaves[leaves[:, width - 1] >= 0, :width] for width in widths)
+    return tuple(some.unique(dim=0) if len(some) else some for some in found)
 
 
 def _spiral_directions(index: Tensor, count: int) -> Float64[Tensor, "n 3"]:
@@ -202,30 +207,20 @@ def _random_rotation(seed: int, number: int) -> Float64[Tensor, "3 3"]:
 class _SequenceTracer:
     """Traces rays through a scene and records the sequences of planes that they meet."""
 
-    def __init__(
-        self, surfaces: "CandidateSurfaces", planes: Planes, interactions: FaceInteractions
-    ) -> None:
-        self.surfaces = surfaces
-        self.planes = planes
-        self.interactions = interactions
-        self.normal = to_float(planes.normal)
-        self.face_plane = to_index(planes.face_plane.clamp_min(0))
+    def __init__(self, surfaces: CandidateSurfaces, interactions: FaceInteractions) -> None:
+        self.surfaces, self.planes, self.interactions = surfaces, surfaces.planes, interactions
+        self.normal = to_float(self.planes.normal)
+        self.face_plane = to_index(self.planes.face_plane.clamp_min(0))
 
     def follow_rays(
-        self,
-        position: Tensor,
-        directions: Tensor,
-        depth: int,
-        prefixes: Tensor,
-        prefix_index: Tensor,
+        self, position: Tensor, directions: Tensor, depth: int, prefixes: Tensor, parent: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Sequences of rays, padded with −1, and the number of rays that follow each.
 
-        Rays start from one position, or each from its own. They extend the rows ``prefix_index`` of
+        Rays start from one position, or each from its own. They extend the rows ``parent`` of
         ``prefixes``.
         """
-        local = (position - self.surfaces.origin).to(torch.float32)
-        origin = local.expand(len(directions), 3)
+        origin = (position - self.surfaces.origin).to(torch.float32).expand(len(directions), 3)
         direction = directions.to(torch.float32)
         # Sequences are a tree: each is the number of its parent and one more step.
         ended: list[tuple[Tensor, Tensor]] = []
@@ -235,10 +230,9 @@ class _SequenceTracer:
                 origin = origin + self.surfaces.margin * direction
             face, point, reflected = self._intersect_rays(origin, direction)
             hit = (face >= 0) & (self.planes.face_plane[face.clamp_min(0)] >= 0)
-            ended.append((prefixes, prefix_index[~hit]))
-            prefix_index, face, point, reflected, direction = (
-                column[hit] for column in (prefix_index, face, point, reflected, direction)
-            )
+            ended.append((prefixes, parent[~hit]))
+            columns = parent, face, point, reflected, direction
+            parent, face, point, reflected, direction = (column[hit] for column in columns)
             branches = []
             for mask, next_direction, bit in (
                 (self.interactions.reflect, reflected, 0),
@@ -246,20 +240,19 @@ class _SequenceTracer:
             ):
                 chosen = mask[face]
                 code = 2 * self.planes.face_plane[face[chosen]] + bit
-                branches.append((prefix_index[chosen], code, point[chosen], next_direction[chosen]))
+                branches.append((parent[chosen], code, point[chosen], next_direction[chosen]))
             stops = ~(self.interactions.reflect[face] | self.interactions.transmit[face])
-            ended.append((prefixes, prefix_index[stops]))
-            prefix_index, code, origin, direction = (
-                torch.cat(column) for column in zip(*branches, strict=True)
-            )
+            ended.append((prefixes, parent[stops]))
+            columns = zip(*branches, strict=True)
+            parent, code, origin, direction = (torch.cat(column) for column in columns)
             options = 2 * len(self.planes)
-            pair, prefix_index = (prefix_index * options + code).unique(return_inverse=True)
+            pair, parent = (parent * options + code).unique(return_inverse=True)
             prefixes = torch.cat([prefixes[pair // options], (pair % options)[:, None]], 1)
             if step == depth - 1:
-                ended.append((prefixes, prefix_index))
+                ended.append((prefixes, parent))
         rows, counts = [], []
-        for table, prefix_index in ended:
-            some, count = prefix_index.unique(return_counts=True)
+        for table, parent in ended:
+            some, count = parent.unique(return_counts=True)
             rows.append(torch.nn.functional.pad(table[some], (0, width - table.shape[1]), value=-1))
             counts.append(count)
         return torch.cat(rows), torch.cat(counts)
@@ -269,8 +262,7 @@ class _SequenceTracer:
         if not len(origin):
             none = torch.zeros(0, 3)
             return torch.zeros(0, dtype=torch.int64), none, none
-        start = mi.Point3f(*(to_float(origin[:, k].contiguous()) for k in range(3)))
-        ray_direction = mi.Vector3f(*(to_float(direction[:, k].contiguous()) for k in range(3)))
+        start, ray_direction = to_vectors(mi.Point3f, origin), to_vectors(mi.Vector3f, direction)
         hit = self.surfaces.scene.ray_intersect_preliminary(mi.Ray3f(start, ray_direction))
         valid = hit.is_valid()
         face = dr.select(valid, mi.Int32(hit.prim_index), -1)
@@ -279,9 +271,5 @@ class _SequenceTracer:
         point = start + ray_direction * dr.select(valid, hit.t, 0.0)
         reflected = ray_direction - 2 * dr.dot(ray_direction, normal) * normal
         dr.eval(face, point, reflected)
-        found = to_torch(face).long()
-        return found, _stack_components(point), _stack_components(reflected)
-
-
-def _stack_components(vector: object) -> Tensor:
-    return torch.stack([to_torch(vector[k]) for k in range(3)], 1)  # type: ignore[index]
+        ends = [torch.stack([to_torch(x) for x in vector], 1) for vector in (point, reflected)]
+        return to_torch(face).long(), ends[0], ends[1]

@@ -32,10 +32,7 @@ _MIN_SQUARED_SINE = 1e-18  # sin² of angles below this is zero
 
 
 def face_weight(
-    edge: Wedges,
-    next_edge: Wedges,
-    faces: Int64[Tensor, "row 2"],
-    direction: Float64[Tensor, "row 3"],
+    edge: Wedges, after: Wedges, faces: Int64[Tensor, "row 2"], direction: Float64[Tensor, "row 3"]
 ) -> Float64[Tensor, " row"]:
     """Weight of a wave from a corner along a face: cos² of its angles off the plane.
 
@@ -44,14 +41,14 @@ def face_weight(
 
     Args:
         edge: edge that radiates the wave.
-        next_edge: next edge of this face.
+        after: next edge of this face.
         faces: number of this face at either edge, 0 or 1.
         direction: unit vectors from the corner.
     """
     row = torch.arange(len(direction))
     high = dot(edge.normals[row, faces[:, 0]], direction) ** 2
     over = dot(edge.face_tangents[row, faces[:, 0]], direction).clamp_min(0.0) ** 2
-    beyond = dot(next_edge.face_tangents[row, faces[:, 1]], direction).clamp_max(0.0) ** 2
+    beyond = dot(after.face_tangents[row, faces[:, 1]], direction).clamp_max(0.0) ** 2
     return over * beyond / ((over + high) * (beyond + high)).clamp_min(1e-300)
 
 

@@ -80,12 +80,11 @@ def evaluate_diffracted_paths(
         wave_number: wave number k [1/m].
     """
     source, target = tx[candidates.tx], rx[candidates.rx]
-    legs = [
-        _AntennaLeg(wedge_scene, candidates.before, source),
-        _AntennaLeg(wedge_scene, _reverse_legs(candidates.after), target),
-    ]
+    after = PathLegs(candidates.after.faces.flip(1), candidates.after.transmitted.flip(1))
+    sides = (candidates.before, source), (after, target)
+    legs = [_AntennaLeg(wedge_scene, *side) for side in sides]
     angles = face_azimuths(wedge_scene, candidates)
-    incidence, departure = ([None, *angles[..., 1].T], [*angles[..., 0].T, None])
+    incidence, departure = [None, *angles[..., 1].T], [*angles[..., 0].T, None]
     edges = [
         wedge_scene.path_edge(row, pair, absorbing=candidates.absorbing)
         for row, pair in zip(candidates.edge.T, zip(incidence, departure, strict=True), strict=True)
@@ -96,42 +95,30 @@ def evaluate_diffracted_paths(
     segments = nodes[:, 1:] - nodes[:, :-1]
     length = segments.norm(dim=2).sum(1)
     # The field of the end of an edge has the delay of the path over that end.
-    phase = wave_number * (length - found.length)
-    delay_phasor = phasor(phase)[:, None, None]
+    delay_phasor = phasor(wave_number * (length - found.length))[:, None, None]
     arriving = legs[0].dyad(found.points[:, 0])
     # Reciprocity: the dyad after the edges is the transpose of that towards them.
     leaving = legs[1].dyad(found.points[:, -1]).mT
     slopes = torch.zeros_like(found.transfer).expand(2, -1, -1, -1)
     if found.slopes is not None:
         slopes = leaving @ (found.slopes * delay_phasor) @ arriving
-    axes = [
-        leg.rotate_axis(-edge_axis(edges[n].wedges)) for leg, n in zip(legs, (0, -1), strict=True)
-    ]
+    ends = zip(legs, (edges[0], edges[-1]), strict=True)
+    axes = [leg.rotate_axis(-edge_axis(edge.wedges)) for leg, edge in ends]
     directions = [normalize(segments, dim=2)[:, 1:-1]]
     directions.insert(0, torch.stack(legs[0].directions(edge_points[0]), 1))
     directions.append(-torch.stack(legs[1].directions(edge_points[-1]), 1).flip(1))
     points = [legs[0].interaction_points(edge_points[0]), torch.stack(edge_points, 1)]
     points.append(legs[1].interaction_points(edge_points[-1]).flip(1))
-    kinds = [
-        candidates.before.kinds,
-        torch.full_like(candidates.edge, DIFFRACTION),
-        candidates.after.kinds,
-    ]
+    bends = torch.full_like(candidates.edge, DIFFRACTION)
+    kinds = [candidates.before.kinds, bends, candidates.after.kinds]
     first = wedge_scene.detached_wedges.faces[candidates.edge, 0]
-    return DiffractedPaths(
-        candidates.tx,
-        candidates.rx,
-        candidates.edge,
-        torch.cat(points, 1),
-        torch.cat(kinds, 1),
-        torch.cat([candidates.before.faces, first, candidates.after.faces], 1),
-        torch.cat(directions, 1),
-        length,
-        leaving @ (found.transfer * delay_phasor) @ arriving,
-        slopes.transpose(0, 1),
-        torch.stack(axes, 1),
-        candidates.corner,
-    )
+    faces = [candidates.before.faces, first, candidates.after.faces]
+    numbers = candidates.tx, candidates.rx, candidates.edge
+    vertices = torch.cat(points, 1), torch.cat(kinds, 1), torch.cat(faces, 1)
+    ways = torch.cat(directions, 1)
+    transfer = leaving @ (found.transfer * delay_phasor) @ arriving
+    fields = transfer, slopes.transpose(0, 1), torch.stack(axes, 1)
+    return DiffractedPaths(*numbers, *vertices, ways, length, *fields, candidates.corner)
 
 
 def _edge_fields(
@@ -145,10 +132,6 @@ def _edge_fields(
     back = [replace(e, azimuth_in=e.azimuth, azimuth=e.azimuth_in) for e in reversed(edges)]
     found = diffract_round_corner(back, candidates.end, candidates.between[:, 0].flip(1), rx, tx, k)
     return replace(found, points=found.points.flip(1), transfer=found.transfer.mT)
-
-
-def _reverse_legs(legs: PathLegs) -> PathLegs:
-    return PathLegs(legs.faces.flip(1), legs.transmitted.flip(1))
 
 
 class _AntennaLeg(UnfoldedPaths):
@@ -175,8 +158,7 @@ class _AntennaLeg(UnfoldedPaths):
             normal, way = self.normal[:, step], ways[step]
             law = self.coefficients(self.faces[:, step], dot(normal, way).abs())
             s, before, after = (v[:, 0] for v in plane_of_incidence(normal, way))
-            passing = through[:, None]
-            both = torch.where(passing, before, after)
+            both = torch.where(through[:, None], before, after)
             strength_s = torch.where(through, law.transmission_s, law.reflection_s)
             strength_p = torch.where(through, law.transmission_p, law.reflection_p)
             across = s[:, :, None] * s[:, None]

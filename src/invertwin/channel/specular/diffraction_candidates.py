@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.em.plane_waves import dot
+from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.channel.specular.candidates import (
     FaceInteractions,
     enumerate_sequences,
@@ -37,21 +38,23 @@ from invertwin.channel.specular.edge_path_geometry import (
 )
 from invertwin.channel.specular.image_method import (
     find_unobstructed_paths,
-    image_positions,
     intersects_planes,
+    is_unobstructed,
     replace_zeros,
 )
 from invertwin.channel.specular.ray_paths import REFLECTION, TRANSMISSION, match_rows
 from invertwin.channel.specular.wedge_scene import WedgeScene, is_exterior
 
 Corner = Literal["first", "last"] | None
+_Antennas = tuple[Float64[Tensor, "tx 3"], Float64[Tensor, "rx 3"]]
+"""Positions of transmitters and receivers [m]."""
 _ROWS_AT_ONCE = 1 << 16
 _EDGE_FRACTIONS = (0.5, 0.1, 0.9)  # points on edges of the mutual visibility test
 _PLANE_TOLERANCE = 1e-6  # of the scene's size, or rad
 
 
 @dataclass(frozen=True)
-class PathLegs:
+class PathLegs(Rows):
     """Surfaces on the legs from the transmitter to the edge, or from the edge on; detached.
 
     Attributes:
@@ -67,13 +70,9 @@ class PathLegs:
         """Interaction types, numbers of ``KINDS``."""
         return torch.where(self.transmitted, TRANSMISSION, REFLECTION)
 
-    def rows(self, index: Tensor) -> "PathLegs":
-        """Select rows."""
-        return PathLegs(self.faces[index], self.transmitted[index])
-
 
 @dataclass(frozen=True)
-class DiffractionCandidates:
+class DiffractionCandidates(Rows):
     """Diffracted paths over equal numbers of edges, one row each; detached.
 
     Attributes:
@@ -96,12 +95,6 @@ class DiffractionCandidates:
     corner: Corner = None
     end: Int64[Tensor, " row"] | None = None
 
-    def rows(self, index: Tensor) -> "DiffractionCandidates":
-        """Select rows."""
-        columns = {n: v[index] for n, v in vars(self).items() if isinstance(v, Tensor)}
-        legs = {"before": self.before.rows(index), "after": self.after.rows(index)}
-        return replace(self, **columns, **legs)
-
 
 def find_diffraction_candidates(
     wedge_scene: WedgeScene,
@@ -119,12 +112,12 @@ def find_diffraction_candidates(
         wedge_scene: scene with sharp edges.
         interactions: interactions of the triangles.
         tx, rx: antenna positions [m].
-        order: maximum number of edges on a path, 1 to 3.
+        order: maximum number of edges on a path, 0 to 3.
         depth: maximum number of surfaces on a path over one edge.
         rays: number of rays from all edges together; None tests every sequence.
         seed: random seed of the rays.
     """
-    if not len(wedge_scene.detached_wedges.start):
+    if not order or not len(wedge_scene.detached_wedges.start):
         return
     tables = _edge_sequences(wedge_scene, interactions, depth, rays, seed)
     sides = [
@@ -137,7 +130,7 @@ def find_diffraction_candidates(
                 wedge_scene, sides[0][before], sides[1][surfaces - before], depth
             )
     if order > 1:
-        yield from _diffract_repeatedly(wedge_scene, tx, rx, order)
+        yield from _diffract_repeatedly(wedge_scene, (tx, rx), order)
 
 
 def _edge_sequences(
@@ -156,12 +149,10 @@ def _edge_sequences(
     else:
         edge = edges.repeat_interleave(-(-rays // count))
         fraction = np.random.default_rng(np.random.SeedSequence([seed, 1])).random(len(edge))
-        wedges = wedge_scene.detached_wedges.rows(edge)
+        wedges = wedge_scene.detached_wedges.select(edge)
         points = wedges.start + torch.from_numpy(fraction)[:, None] * (wedges.end - wedges.start)
         points = wedge_scene.offset_points(edge, points)
-        tables += shoot_sequences_from_edges(
-            surfaces, surfaces.planes, interactions, points, edge, depth, seed
-        )
+        tables += shoot_sequences_from_edges(surfaces, interactions, points, edge, depth, seed)
     # Planes that contain the edge are its faces.
     return [tables[0]] + [
         table[~_lies_in_plane(wedge_scene, table[:, 0], table[:, 1] >> 1)] for table in tables[1:]
@@ -179,36 +170,21 @@ def _lies_in_plane(wedge_scene: WedgeScene, edge: Tensor, plane: Tensor) -> Bool
 
 
 @dataclass(frozen=True)
-class _VisibleEdges:
+class _VisibleEdges(Rows):
     """Sequences that may connect edges to antennas, in the order of the edges.
 
     Attributes:
         antenna, edge: antenna and edge numbers.
         steps: planes and interactions from the edge to the antenna.
         image: image of the antenna in these planes [m].
-        positions: positions of all antennas [m].
+        position: position of the antenna [m].
     """
 
     antenna: Tensor
     edge: Tensor
     steps: Tensor
     image: Float64[Tensor, "row 3"]
-    positions: Float64[Tensor, "antenna 3"]
-
-    def rows(self, index: Tensor) -> "_VisibleEdges":
-        """Select rows."""
-        return _VisibleEdges(
-            self.antenna[index],
-            self.edge[index],
-            self.steps[index],
-            self.image[index],
-            self.positions,
-        )
-
-    @property
-    def antenna_positions(self) -> Tensor:
-        """Antenna position of each row [m]."""
-        return self.positions[self.antenna]
+    position: Float64[Tensor, "row 3"]
 
 
 def _find_visible_edges(wedge_scene: WedgeScene, table: Tensor, positions: Tensor) -> _VisibleEdges:
@@ -217,30 +193,21 @@ def _find_visible_edges(wedge_scene: WedgeScene, table: Tensor, positions: Tenso
     As a point moves along an edge, the line to the image intersects a plane along a straight line.
     """
     surfaces, wedges = wedge_scene.surfaces, wedge_scene.detached_wedges
-    parts: list[tuple[Tensor, ...]] = []
-    total = len(positions) * len(table)
-    for rows in torch.arange(total).split(_ROWS_AT_ONCE):
+    none = torch.zeros(0, dtype=torch.int64)
+    parts = [_VisibleEdges(none, none, table[:0, 1:], positions[:0], positions[:0])]
+    for rows in torch.arange(len(positions) * len(table)).split(_ROWS_AT_ONCE):
         antenna, row = rows // len(table), rows % len(table)
         edge, steps = table[row, 0], table[row, 1:]
-        images = _antenna_images(wedge_scene, positions[antenna], steps.flip(1))
+        images = surfaces.images(positions[antenna], steps.flip(1))
         image = images[-1] + surfaces.origin
-        keep = is_exterior(wedges.rows(edge), image)
+        keep = is_exterior(wedges.select(edge), image)
         if steps.shape[1]:
             ends = [end[edge] - surfaces.origin for end in (wedges.start, wedges.end)]
             keep &= _may_cross_planes(wedge_scene, steps.flip(1), images, ends)
-        parts.append((antenna[keep], edge[keep], steps[keep], image[keep]))
-    if not parts:
-        none = torch.zeros(0, dtype=torch.int64)
-        return _VisibleEdges(none, none, table[:0, 1:], positions[:0], positions)
-    antenna, edge, steps, image = (torch.cat(column) for column in zip(*parts, strict=True))
-    return _VisibleEdges(antenna, edge, steps, image, positions).rows(edge.argsort(stable=True))
-
-
-def _antenna_images(wedge_scene: WedgeScene, positions: Tensor, steps: Tensor) -> list[Tensor]:
-    """Images of positions, relative to the scene's origin."""
-    surfaces, plane = wedge_scene.surfaces, steps >> 1
-    point, normal = surfaces.planes.point[plane], surfaces.planes.normal[plane]
-    return image_positions(positions - surfaces.origin, point, normal, (steps & 1).bool())
+        found = _VisibleEdges(antenna, edge, steps, image, positions[antenna])
+        parts.append(found.select(keep))
+    found = concatenate_rows(parts)
+    return found.select(found.edge.argsort(stable=True))
 
 
 def _may_cross_planes(
@@ -258,9 +225,8 @@ def _may_cross_planes(
             direction = images[step + 1] - end
             slope = dot(direction, normal)
             fraction = dot(point - end, normal) / replace_zeros(slope)
-            valid.append(
-                (slope != 0) & (fraction > -_PLANE_TOLERANCE) & (fraction < 1 + _PLANE_TOLERANCE)
-            )
+            within = (fraction > -_PLANE_TOLERANCE) & (fraction < 1 + _PLANE_TOLERANCE)
+            valid.append((slope != 0) & within)
             points[number] = end + fraction[:, None] * direction
             local.append(torch.einsum("rx,rax->ra", points[number] - point, planes.axes[plane]))
         both = valid[0] & valid[1]
@@ -277,44 +243,34 @@ def _diffract_once(
     wedge_scene: WedgeScene, one: _VisibleEdges, other: _VisibleEdges, depth: int
 ) -> Iterator[DiffractionCandidates]:
     """Find paths over one edge."""
-    surfaces = one.steps.shape[1] + other.steps.shape[1]
+    surfaces, count = wedge_scene.surfaces, one.steps.shape[1] + other.steps.shape[1]
     for first, last in _match_edges(one, other, len(wedge_scene.detached_wedges.start)):
-        outbound, inbound = one.rows(first), other.rows(last)
-        points, valid = diffraction_points(
-            wedge_scene.detached_wedges.rows(outbound.edge), outbound.image, inbound.image
-        )
+        outbound, inbound = one.select(first), other.select(last)
+        wedges = wedge_scene.detached_wedges.select(outbound.edge)
+        points, valid = diffraction_points(wedges, outbound.image, inbound.image)
         valid &= wedge_scene.is_diffracting(outbound.edge, points)
         beside = wedge_scene.offset_points(outbound.edge, points)
         for side in (outbound, inbound):
-            steps = side.steps.flip(1)
             rows = torch.nonzero(valid)[:, 0]
-            images = _antenna_images(wedge_scene, side.antenna_positions[rows], steps[rows])
-            valid[rows] = intersects_planes(
-                wedge_scene.surfaces,
-                steps[rows],
-                images,
-                beside[rows] - wedge_scene.surfaces.origin,
-            )
+            steps, end = side.steps[rows].flip(1), beside[rows] - surfaces.origin
+            images = surfaces.images(side.position[rows], steps)
+            valid[rows] = intersects_planes(surfaces, steps, images, end)
         faces = [torch.full_like(side.steps, -1) for side in (outbound, inbound)]
         for side, side_faces in zip((outbound, inbound), faces, strict=True):
             rows = torch.nonzero(valid)[:, 0]
             valid[rows], side_faces[rows] = find_unobstructed_paths(
-                wedge_scene.surfaces,
-                side.steps[rows].flip(1),
-                side.antenna_positions[rows],
-                beside[rows],
+                surfaces, side.steps[rows].flip(1), side.position[rows], beside[rows]
             )
         if bool(valid.any()):
-            found = DiffractionCandidates(
+            yield DiffractionCandidates(
                 outbound.antenna,
                 inbound.antenna,
                 outbound.edge[:, None],
                 PathLegs(faces[0], (outbound.steps.flip(1) & 1).bool()),
                 PathLegs(faces[1].flip(1), (inbound.steps & 1).bool()),
                 torch.full((len(outbound.edge), 0, 2), -1),
-                absorbing=surfaces == depth > 0,
-            )
-            yield found.rows(torch.nonzero(valid)[:, 0])
+                absorbing=count == depth > 0,
+            ).select(torch.nonzero(valid)[:, 0])
 
 
 def _match_edges(
@@ -330,19 +286,18 @@ def _match_edges(
 
 
 def _diffract_repeatedly(
-    wedge_scene: WedgeScene, tx: Tensor, rx: Tensor, order: int
+    wedge_scene: WedgeScene, ends: _Antennas, order: int
 ) -> Iterator[DiffractionCandidates]:
     """Find paths over two edges, and over three if ``order`` is 3, with unobstructed legs."""
-    chains, between = _edge_pairs(wedge_scene)
-    pairs, pair_faces = chains, between
+    chains, between = pairs, pair_faces = _edge_pairs(wedge_scene)
     edges = torch.arange(len(wedge_scene.detached_wedges.start))[:, None]
     visible = []
-    for positions in (tx, rx):
+    for positions in ends:
         found = _find_visible_edges(wedge_scene, edges, positions)
         table = torch.zeros(len(positions), len(edges), dtype=torch.bool)
         table[found.antenna, found.edge] = True
         visible.append(table)
-    yield from _find_chain_paths(wedge_scene, tx, rx, visible, chains, between)
+    yield from _find_chain_paths(wedge_scene, ends, visible, chains, between)
     if order < 3 or not len(chains):
         return
     is_open = _are_mutually_visible(wedge_scene, pairs, pair_faces)
@@ -351,10 +306,11 @@ def _diffract_repeatedly(
     if not len(rows):
         return
     # In chunks: the number of chains is that of pairs, times the edges that may follow.
-    step = max(1, _ROWS_AT_ONCE * len(edges) // max(1, len(pairs)))
-    for part in rows.split(step):
-        chains, between = _extend_chains(pairs[part], pair_faces[part], pairs, pair_faces)
-        yield from _find_chain_paths(wedge_scene, tx, rx, visible, chains, between)
+    for part in rows.split(max(1, _ROWS_AT_ONCE * len(edges) // max(1, len(pairs)))):
+        row, pair = match_rows(pairs[part, 1], pairs[:, 0], int(pairs.max()) + 1)
+        chains = torch.cat([pairs[part][row], pairs[pair, 1:]], 1)
+        between = torch.cat([pair_faces[part][row], pair_faces[pair]], 1)
+        yield from _find_chain_paths(wedge_scene, ends, visible, chains, between)
 
 
 def _are_mutually_visible(
@@ -362,7 +318,7 @@ def _are_mutually_visible(
 ) -> Bool[Tensor, " pair"]:
     """Mask of pairs with a face between them, or with any of nine lines across unobstructed."""
     found = between[:, 0, 0] >= 0
-    wedges, none = wedge_scene.detached_wedges, torch.zeros(len(pairs), 0, dtype=torch.int64)
+    wedges = wedge_scene.detached_wedges
     for fraction, other_fraction in product(_EDGE_FRACTIONS, _EDGE_FRACTIONS):
         rows = torch.nonzero(~found)[:, 0]
         if not len(rows):
@@ -371,68 +327,49 @@ def _are_mutually_visible(
         for edge, position in zip(pairs[rows].T, (fraction, other_fraction), strict=True):
             point = wedges.start[edge] + position * (wedges.end[edge] - wedges.start[edge])
             points.append(wedge_scene.offset_points(edge, point))
-        found[rows] = find_unobstructed_paths(
-            wedge_scene.surfaces, none[rows], points[0], points[1]
-        )[0]
+        found[rows] = is_unobstructed(wedge_scene.surfaces, *points)
     return found
 
 
-def _extend_chains(
-    chains: Tensor, between: Tensor, pairs: Tensor, pair_faces: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Extend chains of edges by one edge."""
-    row, pair = match_rows(chains[:, -1], pairs[:, 0], int(pairs.max()) + 1)
-    found = torch.cat([chains[row], pairs[pair, 1:]], 1)
-    return found, torch.cat([between[row], pair_faces[pair]], 1)
-
-
 def _find_chain_paths(
-    wedge_scene: WedgeScene,
-    tx: Tensor,
-    rx: Tensor,
-    visible_edges: list[Tensor],
-    chains: Tensor,
-    between: Tensor,
+    wedge_scene: WedgeScene, ends: _Antennas, seen: list[Tensor], chains: Tensor, between: Tensor
 ) -> Iterator[DiffractionCandidates]:
     """Find paths over given chains of edges whose first and last edge the antennas see."""
     # Chains visible to an antenna at both ends.
-    visible = visible_edges[0].any(0)[chains[:, 0]] & visible_edges[1].any(0)[chains[:, -1]]
+    visible = seen[0].any(0)[chains[:, 0]] & seen[1].any(0)[chains[:, -1]]
     chains, between = chains[visible], between[visible]
     if not len(chains):
         return
-    links = torch.cartesian_prod(torch.arange(len(tx)), torch.arange(len(rx)))
+    links = torch.cartesian_prod(*(torch.arange(len(places)) for places in ends))
     for part in links.split(max(1, _ROWS_AT_ONCE // len(chains))):
-        mutual = (
-            visible_edges[0][part[:, 0]][:, chains[:, 0]]
-            & visible_edges[1][part[:, 1]][:, chains[:, -1]]
-        )
-        link, chain = torch.nonzero(mutual).T
+        from_tx = seen[0][part[:, 0]][:, chains[:, 0]]
+        link, chain = torch.nonzero(from_tx & seen[1][part[:, 1]][:, chains[:, -1]]).T
         if not len(link):
             continue
         none = torch.zeros(len(link), 0, dtype=torch.int64)
         legs = PathLegs(none, none.bool())
         source, target = part[link].unbind(1)
         found = DiffractionCandidates(source, target, chains[chain], legs, legs, between[chain])
-        rows = [wedge_scene.detached_wedges.rows(column) for column in found.edge.T]
-        points, valid = multiple_diffraction_points(rows, tx[source], rx[target])
+        rows = [wedge_scene.detached_wedges.select(column) for column in found.edge.T]
+        points, valid = multiple_diffraction_points(rows, ends[0][source], ends[1][target])
         # Without a face between two edges, each point must lie in the exterior of the other edge.
         for leg in range(chains.shape[1] - 1):
             for first, second in ((leg, leg + 1), (leg + 1, leg)):
                 outside = is_exterior(rows[first], points[:, second])
                 valid &= outside | (found.between[:, leg, 0] >= 0)
-        yield from _select_unobstructed(wedge_scene, found, tx, rx, points, valid)
-        yield from _find_corner_paths(wedge_scene, tx, rx, found)
+        yield from _select_unobstructed(wedge_scene, found, ends, points, valid)
+        yield from _find_corner_paths(wedge_scene, ends, found)
 
 
 def _find_corner_paths(
-    wedge_scene: WedgeScene, tx: Tensor, rx: Tensor, candidates: DiffractionCandidates
+    wedge_scene: WedgeScene, antennas: _Antennas, candidates: DiffractionCandidates
 ) -> Iterator[DiffractionCandidates]:
     """Find paths whose first or last edge is met in a corner, where its neighbour ends."""
     wedges = wedge_scene.detached_wedges
     ends = torch.stack([wedges.start, wedges.end], 1)
     sides: tuple[tuple[Corner, int, int, Tensor], ...] = (
-        ("first", 0, 1, tx[candidates.tx]),
-        ("last", -1, -2, rx[candidates.rx]),
+        ("first", 0, 1, antennas[0][candidates.tx]),
+        ("last", -1, -2, antennas[1][candidates.rx]),
     )
     for corner, own, other, antenna in sides:
         edge, neighbour = candidates.edge[:, own], candidates.edge[:, other]
@@ -443,46 +380,42 @@ def _find_corner_paths(
         faces = faces.flip(1) if corner == "first" else faces
         valid = (smallest < _PLANE_TOLERANCE * wedge_scene.surfaces.size) & (faces[:, 0] >= 0)
         rows = torch.nonzero(valid)[:, 0]
-        first, last = (wedges.rows(column[rows]) for column in (neighbour, edge))
+        first, last = (wedges.select(column[rows]) for column in (neighbour, edge))
         rows = rows[face_weight(first, last, faces[rows], (antenna - at)[rows]) > 0]
         if not len(rows):
             continue
-        part = replace(candidates.rows(rows), corner=corner, end=end[rows])
+        part = replace(candidates.select(rows), corner=corner, end=end[rows])
         numbers = range(candidates.edge.shape[1])
         main = numbers[1:] if corner == "first" else numbers[:-1]
-        source, target = tx[part.tx], rx[part.rx]
-        between = [wedges.rows(part.edge[:, n]) for n in main]
+        source, target = antennas[0][part.tx], antennas[1][part.rx]
+        between = [wedges.select(part.edge[:, n]) for n in main]
         if len(main) == 1:
             points, valid = diffraction_points(between[0], source, target)
             points = points[:, None]
         else:
             points, valid = multiple_diffraction_points(between, source, target)
         both = [points, at[rows, None]] if corner == "last" else [at[rows, None], points]
-        yield from _select_unobstructed(wedge_scene, part, tx, rx, torch.cat(both, 1), valid)
+        yield from _select_unobstructed(wedge_scene, part, antennas, torch.cat(both, 1), valid)
 
 
 def _select_unobstructed(
     wedge_scene: WedgeScene,
     candidates: DiffractionCandidates,
-    tx: Tensor,
-    rx: Tensor,
+    ends: _Antennas,
     points: Tensor,
     valid: Tensor,
 ) -> Iterator[DiffractionCandidates]:
     """Keep the valid paths over edge points with unobstructed straight legs."""
-    valid, none = valid.clone(), candidates.before.faces
-    nodes = [tx[candidates.tx]]
+    valid, nodes = valid.clone(), [ends[0][candidates.tx]]
     for edge, point in zip(candidates.edge.T, points.unbind(1), strict=True):
         valid &= wedge_scene.is_diffracting(edge, point)
         nodes.append(wedge_scene.offset_points(edge, point))
-    nodes.append(rx[candidates.rx])
+    nodes.append(ends[1][candidates.rx])
     for start, end in pairwise(nodes):
         rows = torch.nonzero(valid)[:, 0]
-        valid[rows], _ = find_unobstructed_paths(
-            wedge_scene.surfaces, none[rows], start[rows], end[rows]
-        )
+        valid[rows] = is_unobstructed(wedge_scene.surfaces, start[rows], end[rows])
     if bool(valid.any()):
-        yield candidates.rows(torch.nonzero(valid)[:, 0])
+        yield candidates.select(torch.nonzero(valid)[:, 0])
 
 
 def face_azimuths(
@@ -494,15 +427,9 @@ def face_azimuths(
         wedge_scene: scene with sharp edges.
         candidates: diffracted paths.
     """
-    opening = torch.stack(
-        [wedge_scene.detached_wedges.opening[n] for n in _edges_of_legs(candidates.edge)], 2
-    )
+    opening = wedge_scene.detached_wedges.opening[candidates.edge]
+    opening = torch.stack([opening[:, :-1], opening[:, 1:]], 2)  # before and after each leg
     return torch.where(candidates.between < 0, torch.nan, candidates.between * opening * torch.pi)
-
-
-def _edges_of_legs(edge: Tensor) -> tuple[Tensor, Tensor]:
-    """Edges before and after each leg between edges."""
-    return edge[:, :-1], edge[:, 1:]
 
 
 def _edge_pairs(
@@ -513,25 +440,23 @@ def _edge_pairs(
     Two edges with a face between them have one path along each side that they share.
     """
     wedges = wedge_scene.detached_wedges
-    count = len(wedges.start)
-    first, second = torch.nonzero(~torch.eye(count, dtype=torch.bool)).T
+    first, second = torch.nonzero(~torch.eye(len(wedges.start), dtype=torch.bool)).T
     offset = (wedges.start + wedges.end)[second] - (wedges.start + wedges.end)[first]
     rows, faces, shared = [], [], torch.zeros(len(first), dtype=torch.bool)
-    for one in (0, 1):
-        for other in (0, 1):
-            normal = wedges.normals[first, one]
-            parallel = dot(normal, wedges.normals[second, other]) > 1 - _PLANE_TOLERANCE**2
-            flat = dot(normal, offset).abs() < _PLANE_TOLERANCE * wedge_scene.surfaces.size
-            ahead = dot(offset, wedges.face_tangents[first, one]) > 0
-            behind = dot(offset, wedges.face_tangents[second, other]) < 0
-            rows_chosen = torch.nonzero(parallel & flat & ahead & behind)[:, 0]
-            shared[rows_chosen] = True
-            rows.append(torch.stack([first[rows_chosen], second[rows_chosen]], 1))
-            faces.append(torch.tensor([[one, other]]).expand(len(rows_chosen), 2))
+    for one, other in product((0, 1), (0, 1)):
+        normal = wedges.normals[first, one]
+        parallel = dot(normal, wedges.normals[second, other]) > 1 - _PLANE_TOLERANCE**2
+        flat = dot(normal, offset).abs() < _PLANE_TOLERANCE * wedge_scene.surfaces.size
+        ahead = dot(offset, wedges.face_tangents[first, one]) > 0
+        behind = dot(offset, wedges.face_tangents[second, other]) < 0
+        rows_chosen = torch.nonzero(parallel & flat & ahead & behind)[:, 0]
+        shared[rows_chosen] = True
+        rows.append(torch.stack([first[rows_chosen], second[rows_chosen]], 1))
+        faces.append(torch.tensor([[one, other]]).expand(len(rows_chosen), 2))
     # Other pairs: at least one end of each lies in the exterior of the other.
     free = ~shared
     for near, far in ((first, second), (second, first)):
-        outside = [is_exterior(wedges.rows(near), end[far]) for end in (wedges.start, wedges.end)]
+        outside = [is_exterior(wedges.select(near), end[far]) for end in (wedges.start, wedges.end)]
         free &= outside[0] | outside[1]
     rows.append(torch.stack([first[free], second[free]], 1))
     faces.append(torch.full((int(free.sum()), 2), -1))

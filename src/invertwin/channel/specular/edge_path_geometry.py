@@ -196,6 +196,12 @@ class Route:
         return (self.vertices[:, 1:] - self.vertices[:, :-1]).norm(dim=2)
 
     @property
+    def units(self) -> Float64[Tensor, "row leg 3"]:
+        """Unit vectors of the legs, from the transmitter on."""
+        offsets = self.vertices[:, 1:] - self.vertices[:, :-1]
+        return offsets / self.legs[..., None].clamp_min(1e-300)
+
+    @property
     def spread(self) -> Tensor:
         """Spreading factor √det H."""
         return _determinant(self.hessian).clamp_min(1e-300).sqrt()
@@ -203,10 +209,8 @@ class Route:
     @property
     def covariance(self) -> Float64[Tensor, "row edge edge"]:
         """Covariances Σ of the edges' apertures, towards growing azimuths of departure [m]."""
-        legs = self.legs
-        total, reached = legs.sum(1), legs.cumsum(1)
-        units = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(1e-300)
-        count = len(self.edges)
+        total, reached = self.legs.sum(1), self.legs.cumsum(1)
+        units, count = self.units, len(self.edges)
         found = [[total] * count for _ in range(count)]
         axes = [edge_axis(edge.wedges) for edge in self.edges]
         # Orthogonal to every edge and to the path, before and after the edge.
@@ -231,30 +235,20 @@ class Route:
         Args:
             wave_number: wave number k [1/m].
         """
-        found, legs = [], self.legs
-        units = (self.vertices[:, 1:] - self.vertices[:, :-1]) / legs[..., None].clamp_min(1e-300)
-        parameters = self._distance_parameters()
-        for number, edge in enumerate(self.edges):
-            incident, diffracted = units[:, number], units[:, number + 1]
-            diffraction = EdgeDiffraction(
-                edge.wedges,
-                incident,
-                diffracted,
-                _azimuth(edge.wedges, -incident, edge.azimuth_in),
-                _azimuth(edge.wedges, diffracted, edge.azimuth),
-                parameters[:, number] * cross(edge_axis(edge.wedges), incident).square().sum(1),
-                edge.face_coefficients,
-                None if edge.infinite else self.end_parameters(number, wave_number),
-                edge.absorbing,
-            )
-            found.append(diffraction)
-        return found
-
-    def _distance_parameters(self) -> Float64[Tensor, "row edge"]:
-        """Distance parameters over sin²β: L/sin²β = 1/P_ii [m]."""
+        found, units = [], self.units
+        # Distance parameters over sin²β are 1/P_ii.
         minors, whole = _cofactors(self.covariance)
         own = torch.diagonal(minors, dim1=1, dim2=2)
-        return whole.clamp_min(0)[:, None] / own.clamp_min(1e-300)
+        parameters = whole.clamp_min(0)[:, None] / own.clamp_min(1e-300)
+        for number, edge in enumerate(self.edges):
+            wedges, incident, diffracted = edge.wedges, units[:, number], units[:, number + 1]
+            azimuth_in = _azimuth(wedges, -incident, edge.azimuth_in)
+            angles = azimuth_in, _azimuth(wedges, diffracted, edge.azimuth)
+            length = parameters[:, number] * cross(edge_axis(wedges), incident).square().sum(1)
+            ends = None if edge.infinite else self.end_parameters(number, wave_number)
+            law = edge.face_coefficients, ends, edge.absorbing
+            found.append(EdgeDiffraction(wedges, incident, diffracted, *angles, length, *law))
+        return found
 
     @property
     def couplings(self) -> Float64[Tensor, "row edge edge"]:
@@ -331,14 +325,10 @@ def _shortest_length(wedges: Sequence[Wedges], first: Tensor, last: Tensor) -> T
     # smooth.
     offset, cosine = starts[:, 1] - starts[:, 0], dot(axes[0], axes[1])
     square = (1 - cosine**2).clamp_min(_MIN_LENGTH_FRACTION)
-    near = (
-        starts[:, 0]
-        + (dot(offset, axes[0] - cosine[:, None] * axes[1]) / square)[:, None] * axes[0]
-    )
-    crossing = (
-        cross(near - starts[:, 1], axes[1]).detach().norm(dim=1)
-        < _MIN_LENGTH_FRACTION * found.detach()
-    )
+    along = dot(offset, axes[0] - cosine[:, None] * axes[1]) / square
+    near = starts[:, 0] + along[:, None] * axes[0]
+    gap = cross(near - starts[:, 1], axes[1]).detach().norm(dim=1)
+    crossing = gap < _MIN_LENGTH_FRACTION * found.detach()
     over = (near - first).norm(dim=1) + (last - near).norm(dim=1)
     found = torch.where(crossing & (over.detach() < found.detach()), over, found)
     # A point on the adjacent line has no distance to it.
@@ -390,26 +380,22 @@ def find_route(
     vertices = _path_vertices(starts, axes, offsets, tx, rx)
     legs = (vertices[:, 1:] - vertices[:, :-1]).detach().norm(dim=2)
     slope = _length_gradient(vertices.detach(), axes.detach())
-    stationary = (legs > _MIN_LENGTH_FRACTION * legs.sum(1, keepdim=True)).all(1) & (
-        slope.abs() < 1e-6
-    ).all(1)
+    stationary = (legs > _MIN_LENGTH_FRACTION * legs.sum(1, keepdim=True)).all(1)
+    stationary &= (slope.abs() < 1e-6).all(1)
     return Route(edges, offsets, vertices, _length_hessian(vertices, axes), stationary)
 
 
 def _closest_offset(start: Tensor, axis: Tensor, first: Tensor, last: Tensor) -> Tensor:
     """Offset from a line's start at which the shortest path between two points touches it."""
     axial = [dot(point - start, axis) for point in (first, last)]
-    radial = [
-        (point - start - offset[:, None] * axis).norm(dim=-1)
-        for point, offset in zip((first, last), axial, strict=True)
-    ]
+    ends = zip((first, last), axial, strict=True)
+    radial = [(point - start - offset[:, None] * axis).norm(dim=-1) for point, offset in ends]
     fraction = radial[0] / (radial[0] + radial[1]).clamp_min(1e-300)
     return axial[0] + (axial[1] - axial[0]) * fraction
 
 
 def _path_vertices(starts: Tensor, axes: Tensor, offsets: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
-    points = starts + offsets[..., None] * axes
-    return torch.cat([tx[:, None], points, rx[:, None]], 1)
+    return torch.cat([tx[:, None], starts + offsets[..., None] * axes, rx[:, None]], 1)
 
 
 def _length_gradient(vertices: Tensor, axes: Tensor) -> Tensor:
@@ -488,14 +474,10 @@ def _minimise_length(starts: Tensor, axes: Tensor, tx: Tensor, rx: Tensor) -> Te
     none = torch.zeros_like(size)[:, None]
     for lift in _LIFTS:
         ups = lift * size[:, None] * torch.arange(starts.shape[1])
-        offsets = _iterate_offsets(
-            offsets,
-            torch.cat([starts, ups[..., None]], 2),
-            torch.nn.functional.pad(axes, (0, 1)),
-            torch.cat([tx, none], 1),
-            torch.cat([rx, ups[:, -1:]], 1),
-            _COARSE_TOLERANCE if lift else _FINE_TOLERANCE,
-        )
+        lines = torch.cat([starts, ups[..., None]], 2), torch.nn.functional.pad(axes, (0, 1))
+        ends = torch.cat([tx, none], 1), torch.cat([rx, ups[:, -1:]], 1)
+        tolerance = _COARSE_TOLERANCE if lift else _FINE_TOLERANCE
+        offsets = _iterate_offsets(offsets, *lines, *ends, tolerance)
     return offsets
 
 
@@ -516,9 +498,8 @@ def _iterate_offsets(
             point = starts[:, n] + moved[-1][:, None] * axes[:, n]
         relaxed = torch.stack(moved, 1)
         points = _path_vertices(starts, axes, relaxed, tx, rx)
-        newton = relaxed - _solve_tridiagonal(
-            _length_hessian(points, axes), _length_gradient(points, axes)
-        )
+        slope = _length_gradient(points, axes)
+        newton = relaxed - _solve_tridiagonal(_length_hessian(points, axes), slope)
         better = (length(newton) < length(relaxed))[:, None]
         offsets, before = torch.where(better, newton, relaxed), offsets
         found = found.index_copy(0, rows, offsets)

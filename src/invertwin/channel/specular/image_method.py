@@ -10,6 +10,7 @@ by four slightly shifted rays, and where they disagree, a float64 test over all 
 Source: derivations §10.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -27,14 +28,24 @@ from invertwin.channel.em.plane_waves import (
     reflect_vectors,
     triangle_normals,
 )
-from invertwin.channel.rays.arrays import opaque, to_double, to_float, to_index, to_torch
+from invertwin.channel.rays.arrays import (
+    opaque,
+    to_double,
+    to_float,
+    to_index,
+    to_torch,
+    to_vectors,
+)
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
+from invertwin.channel.rows import Rows
 
 _PLANE_TOLERANCE = 1e-5  # rad, and fraction of the scene's size: equal planes
 
 
+DIRECT = torch.zeros(1, 0, dtype=torch.int64)
+"""The sequence without steps, of the line of sight."""
 _LANES = 1 << 19
 _MAX_PAIRS = 1 << 22  # segments × triangles per chunk of the exact test
 _RAY_SPREAD = 4.0  # margins between the rays that test a segment
@@ -66,21 +77,9 @@ class CandidateSurfaces(Occluders):
     @cached_property
     def device_planes(self) -> dict[str, Any]:
         """Planes as flat Dr.Jit arrays."""
-        planes = self.planes
-        vectors = {
-            "point": planes.point,
-            "normal": planes.normal,
-            "first": planes.axes[:, 0],
-            "second": planes.axes[:, 1],
-        }
-        ends = {
-            "low0": planes.low[:, 0],
-            "low1": planes.low[:, 1],
-            "high0": planes.high[:, 0],
-            "high1": planes.high[:, 1],
-        }
-        tables = {name: to_double(value) for name, value in (vectors | ends).items()}
-        return tables | {"of_face": to_index(planes.face_plane.clamp_min(0))}
+        names = ("point", "normal", "axes", "low", "high")
+        tables = {name: to_double(getattr(self.planes, name)) for name in names}
+        return tables | {"of_face": to_index(self.planes.face_plane.clamp_min(0))}
 
     @cached_property
     def device_rim_widths(self) -> Any:
@@ -91,9 +90,21 @@ class CandidateSurfaces(Occluders):
         height = area / sides.norm(dim=2).amax(1).clamp_min(1e-300)
         return to_float(self.margin / height.clamp_min(1e-300))
 
+    def images(
+        self, positions: Float64[Tensor, "row 3"], steps: Int64[Tensor, "row step"]
+    ) -> list[Float64[Tensor, "row 3"]]:
+        """Images of positions after each step of sequences, relative to the local origin [m].
+
+        Args:
+            positions: positions in world axes [m].
+            steps: sequences, 2·plane + 1 for a transmission, 2·plane for a reflection.
+        """
+        point, normal = self.planes.point[steps >> 1], self.planes.normal[steps >> 1]
+        return image_positions(positions - self.origin, point, normal, (steps & 1).bool())
+
 
 @dataclass(frozen=True)
-class SpecularPaths:
+class SpecularPaths(Rows):
     """Specular paths with equal numbers of interactions; detached.
 
     Attributes:
@@ -106,10 +117,6 @@ class SpecularPaths:
     target: Int64[Tensor, " path"]
     faces: Int64[Tensor, "path step"]
     transmitted: Bool[Tensor, "path step"]
-
-    def rows(self, index: Tensor) -> "SpecularPaths":
-        """Select rows."""
-        return SpecularPaths(*(column[index] for column in vars(self).values()))
 
     def reverse(self) -> "SpecularPaths":
         """Return the paths from target to source."""
@@ -221,24 +228,25 @@ class UnfoldedPaths:
         return found
 
 
-def find_paths_between(
+def find_paths_along(
     surfaces: CandidateSurfaces,
-    steps: Int64[Tensor, "sequence step"],
-    source: Float64[Tensor, "3"],
+    sequences: Sequence[Int64[Tensor, "sequence step"]],
+    sources: Float64[Tensor, "source 3"],
     targets: Float64[Tensor, "target 3"],
-    source_index: int,
 ) -> list[SpecularPaths]:
-    """Find the paths that follow given sequences from one source to all targets.
+    """Find the paths from all sources to all targets: direct, and along given sequences.
 
     Args:
         surfaces: candidate surfaces of the scene.
-        steps: sequences, 2·plane + 1 for a transmission, 2·plane for a reflection.
-        source, targets: positions in world axes [m].
-        source_index: number of the source.
+        sequences: sequences by length, as ``steps`` of ``find_paths_from``.
+        sources, targets: positions in world axes [m].
     """
-    own = torch.zeros(len(targets), dtype=torch.int64)
-    found = find_paths_from(surfaces, steps, source[None], own, targets)
-    return [replace(some, source=torch.full_like(some.source, source_index)) for some in found]
+    own, found = torch.zeros(len(targets), dtype=torch.int64), []
+    for steps in (DIRECT, *sequences):
+        for number, source in enumerate(sources) if len(steps) else ():
+            for some in find_paths_from(surfaces, steps, source[None], own, targets):
+                found.append(replace(some, source=torch.full_like(some.source, number)))
+    return found
 
 
 def find_paths_from(
@@ -283,11 +291,8 @@ class _SequenceScreen:
         self.surfaces = surfaces
         self.length = steps.shape[1]
         self.count = len(steps)
-        planes = surfaces.planes
-        place = (sources - surfaces.origin).repeat_interleave(self.count, 0)
-        every = steps.repeat(len(sources), 1)
-        plane = every >> 1
-        seen = image_positions(place, planes.point[plane], planes.normal[plane], (every & 1).bool())
+        place = sources.repeat_interleave(self.count, 0)
+        seen = surfaces.images(place, steps.repeat(len(sources), 1))
         self.images = to_double(torch.stack(seen, 1))
         self.steps = to_index(steps) if self.length else None
 
@@ -296,11 +301,9 @@ class _SequenceScreen:
         lane = dr.arange(mi.UInt32, self.count * len(targets))
         count = opaque(self.count)
         target, row = lane // count, lane % count
-        positions = to_double(targets - self.surfaces.origin)
-        end = dr.gather(mi.Vector3d, positions, target)
-        first = (dr.gather(mi.UInt32, to_index(source_index), target) * count + row) * (
-            self.length + 1
-        )
+        end = dr.gather(mi.Vector3d, to_double(targets - self.surfaces.origin), target)
+        source = dr.gather(mi.UInt32, to_index(source_index), target)
+        first = (source * count + row) * (self.length + 1)
         active, corners, planes, normals = self._intersect_planes(row, first, end)
         valid = to_torch(self._is_unobstructed(first, active, [*corners, end], planes, normals))
         keep = torch.nonzero(valid)[:, 0]
@@ -323,8 +326,7 @@ class _SequenceScreen:
             plane, transmitted = code >> 1, (code & 1) == 1
             point = dr.gather(mi.Vector3d, table["point"], plane)
             normal = dr.gather(mi.Vector3d, table["normal"], plane)
-            image = dr.gather(mi.Vector3d, self.images, first + step + 1)
-            direction = image - position
+            direction = dr.gather(mi.Vector3d, self.images, first + step + 1) - position
             slope = dr.dot(direction, normal)
             active &= slope != 0
             fraction = dr.dot(point - position, normal) / dr.select(slope != 0, slope, 1.0)
@@ -334,10 +336,10 @@ class _SequenceScreen:
             active &= distance > dr.select(transmitted, tolerance, -tolerance)
             active &= distance < length - tolerance
             position = position + fraction * direction
-            for axis, bounds in (("first", "0"), ("second", "1")):
-                at = dr.dot(position - point, dr.gather(mi.Vector3d, table[axis], plane))
-                active &= at >= dr.gather(mi.Float64, table["low" + bounds], plane) - margin
-                active &= at <= dr.gather(mi.Float64, table["high" + bounds], plane) + margin
+            for axis in (2 * plane, 2 * plane + 1):
+                at = dr.dot(position - point, dr.gather(mi.Vector3d, table["axes"], axis))
+                active &= at >= dr.gather(mi.Float64, table["low"], axis) - margin
+                active &= at <= dr.gather(mi.Float64, table["high"], axis) + margin
             corners.insert(0, position)
             planes.insert(0, plane)
             normals.insert(0, normal)
@@ -385,7 +387,7 @@ class _SequenceScreen:
 
 
 @dataclass(frozen=True)
-class _SpecularSegments:
+class _SpecularSegments(Rows):
     """Straight segments of paths, one row each; planes are −1 at antennas.
 
     Attributes:
@@ -420,7 +422,7 @@ def intersects_planes(
     valid = torch.ones(len(target), dtype=torch.bool)
     for step in reversed(range(steps.shape[1])):
         plane, transmitted = steps[:, step] >> 1, (steps[:, step] & 1).bool()
-        point, normal, ray = (planes.point[plane], planes.normal[plane], images[step + 1] - x)
+        point, normal, ray = planes.point[plane], planes.normal[plane], images[step + 1] - x
         slope = dot(ray, normal)
         valid &= slope != 0
         share = dot(point - x, normal) / replace_zeros(slope)
@@ -455,9 +457,8 @@ def find_unobstructed_paths(
         return torch.zeros(0, dtype=torch.bool), torch.zeros_like(steps)
     planes, plane = surfaces.planes, steps >> 1
     point, normal = planes.point[plane], planes.normal[plane]
-    begin, target = source - surfaces.origin, targets - surfaces.origin
-    images = image_positions(begin, point, normal, (steps & 1).bool())
-    nodes = torch.stack([begin, *interaction_points(target, images, point, normal), target], 1)
+    images, target = surfaces.images(source, steps), targets - surfaces.origin
+    nodes = torch.stack([images[0], *interaction_points(target, images, point, normal), target], 1)
     none = torch.full((count, 1), -1)
     before, after = torch.cat([none, plane], 1), torch.cat([plane, none], 1)
     target_plane = none if target_planes is None else target_planes[:, None]
@@ -470,25 +471,34 @@ def find_unobstructed_paths(
     return valid.all(1) & separate, faces[:, :length]
 
 
+def is_unobstructed(
+    surfaces: CandidateSurfaces, start: Float64[Tensor, "row 3"], end: Float64[Tensor, "row 3"]
+) -> Bool[Tensor, " row"]:
+    """Mask of unobstructed straight lines.
+
+    Args:
+        surfaces: candidate surfaces of the scene.
+        start, end: positions in world axes [m].
+    """
+    return find_unobstructed_paths(surfaces, DIRECT.expand(len(start), 0), start, end)[0]
+
+
 def _test_segments(
     surfaces: CandidateSurfaces, segments: _SpecularSegments
 ) -> tuple[Tensor, Tensor]:
     """Return the triangle at the end of each segment, and a mask of unobstructed segments."""
-    direction = segments.end - segments.start
-    unit = normalize(direction, dim=1)
+    unit = normalize(segments.end - segments.start, dim=1)
     first = orthogonal_unit_vectors(unit)
     second = cross(unit, first)
     votes = torch.zeros(len(unit), dtype=torch.int64)
-    faces = torch.full_like(votes, -1)
+    faces, end_plane = torch.full_like(votes, -1), segments.plane.maximum(segments.target_plane)
     for number in range(4):  # the last ray is not shifted
         angle = torch.tensor(2.1 * number, dtype=torch.float64)
         offset = _RAY_SPREAD * surfaces.margin * (angle.cos() * first + angle.sin() * second)
         if number == 3:
             offset = torch.zeros_like(offset)
         start = segments.start + _shift_in_plane(surfaces, offset, unit, segments.plane_before)
-        end = segments.end + _shift_in_plane(
-            surfaces, offset, unit, torch.maximum(segments.plane, segments.target_plane)
-        )
+        end = segments.end + _shift_in_plane(surfaces, offset, unit, end_plane)
         face = _cast_rays(surfaces, start, end, segments)
         valid = torch.where(segments.plane >= 0, face >= 0, face == -1)
         votes += valid
@@ -496,8 +506,8 @@ def _test_segments(
     undecided = torch.nonzero((votes > 0) & (votes < 4))[:, 0]
     valid = votes == 4
     if len(undecided):
-        rows = _SpecularSegments(*(column[undecided] for column in vars(segments).values()))
-        valid[undecided], faces[undecided] = _test_exactly(surfaces, rows)
+        exact = _test_exactly(surfaces, segments.select(undecided))
+        valid[undecided], faces[undecided] = exact
     return faces, valid
 
 
@@ -525,9 +535,8 @@ def _cast_rays(
     end_plane = torch.maximum(segments.plane, segments.target_plane)
     excess = 2 * margin / dot(unit, planes.normal[end_plane.clamp_min(0)]).abs().clamp_min(1e-3)
     excess = torch.where(segments.plane >= 0, excess, torch.where(end_plane >= 0, -excess, -margin))
-    begin = (start + offset[:, None] * before).to(torch.float32)
-    origin = _mitsuba_vector(mi.Point3f, begin)
-    direction = _mitsuba_vector(mi.Vector3f, unit.to(torch.float32))
+    origin = to_vectors(mi.Point3f, start + offset[:, None] * before)
+    direction = to_vectors(mi.Vector3f, unit)
     reach = mi.Float(to_double((length + excess).clamp_min(0.0)))
     hit = surfaces.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction, reach, 0.0, []))
     valid = hit.is_valid()
@@ -536,10 +545,6 @@ def _cast_rays(
     expected = (face >= 0) & (planes.face_plane[face.clamp_min(0)] == segments.plane)
     expected &= distance > length - excess
     return torch.where(expected | (face < 0), face, -2)
-
-
-def _mitsuba_vector(kind: Any, values: Tensor) -> Any:
-    return kind(*(to_float(values[:, k]) for k in range(3)))
 
 
 def _test_exactly(
@@ -554,8 +559,7 @@ def _test_exactly(
     valid = torch.ones(len(segments.start), dtype=torch.bool)
     hit_faces = torch.full((len(valid),), -1)
     tolerance, rim = _EXACT_TOLERANCE * surfaces.size, 1e-9
-    rows = torch.arange(len(valid))
-    for row in rows.split(max(1, _MAX_PAIRS // len(a))):
+    for row in torch.arange(len(valid)).split(max(1, _MAX_PAIRS // len(a))):
         start, end = segments.start[row, None], segments.end[row, None]
         direction = end - start
         length = direction.norm(dim=2)
@@ -574,8 +578,7 @@ def _test_exactly(
         between = (fraction * length > tolerance) & (fraction * length < length - tolerance)
         crossing = between & (slope != 0) & ~ends & (own >= 0)
         blocked = crossing & (inside(start + fraction[..., None] * direction) >= -rim)
-        depth = torch.where(own == segments.plane[row, None], inside(end), -torch.inf)
-        best, face = depth.max(1)
+        best, face = torch.where(own == segments.plane[row, None], inside(end), -torch.inf).max(1)
         surface = segments.plane[row] >= 0
         hit_faces[row] = torch.where(surface, face, -1)
         valid[row] = ~blocked.any(1) & (~surface | (best >= -rim))
@@ -619,8 +622,7 @@ def find_planes(vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]) -
     valid = torch.nonzero(doubled_area > (1e-9 * size) ** 2)[:, 0]
     normal = normalize(area[valid], dim=1)
     # Same normal for both windings: the largest component is positive.
-    largest = normal.abs().argmax(1, keepdim=True)
-    normal = normal * normal.gather(1, largest).sign()
+    normal = normal * normal.gather(1, normal.abs().argmax(1, keepdim=True)).sign()
     offset = (normal * corners[valid, 0]).sum(1) / size
     key = (torch.cat([normal, offset[:, None]], 1) / _PLANE_TOLERANCE).round().numpy() + 0.0
     _, plane = np.unique(key, axis=0, return_inverse=True)
@@ -633,8 +635,7 @@ def find_planes(vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]) -
     corner = corners[valid[best]]
     sides = corner.roll(-1, 1) - corner
     # The shortest side of half a rectangle is a side of the rectangle.
-    shortest = sides.norm(dim=2).argmin(1)
-    first = normalize(sides[torch.arange(count), shortest], dim=1)
+    first = normalize(sides[torch.arange(count), sides.norm(dim=2).argmin(1)], dim=1)
     axes = torch.stack([first, torch.linalg.cross(normal[best], first)], 1)
     point = corners[valid[best], 0]
     coordinates = torch.einsum("fcx,fax->fca", corners[valid] - point[plane, None], axes[plane])

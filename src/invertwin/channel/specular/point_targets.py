@@ -80,15 +80,9 @@ def trace_point_targets(
     found = []
     for frame in range(link.frame_count):
         own = outbound.select(outbound.tx == frame), inbound.select(inbound.tx == frame)
-        first, last = _match_legs(own[0].rx, own[1].rx)
+        first, last = torch.nonzero(own[0].rx[:, None] == own[1].rx).unbind(1)
         found.append(_echo_paths(link, frame, own[0].select(first), own[1].select(last), strength))
     return concatenate_paths(found)
-
-
-def _match_legs(outbound: Tensor, inbound: Tensor) -> tuple[Tensor, Tensor]:
-    """Row pairs of outbound and inbound legs of the same target."""
-    first, second = torch.nonzero(outbound[:, None] == inbound).unbind(1)
-    return first, second
 
 
 def _echo_paths(

@@ -1,12 +1,13 @@
 """Table of ray paths between point antennas, the result of ``trace_paths``."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 
+from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.constants import SPEED_OF_LIGHT
 
 KINDS = ("", "reflection", "transmission", "diffraction", "metasurface")
@@ -15,7 +16,7 @@ REFLECTION, TRANSMISSION, DIFFRACTION, METASURFACE = 1, 2, 3, 4
 
 
 @dataclass(frozen=True, eq=False)
-class RayPaths:
+class RayPaths(Rows):
     """Ray paths between antennas: line of sight, reflected, transmitted and diffracted.
 
     Rows are sorted by transmitter, receiver and delay; a link may have any number, also none.
@@ -85,15 +86,6 @@ class RayPaths:
         """Number of the antenna pair; receivers vary fastest."""
         return self.tx * self.counts[1] + self.rx
 
-    def select(self, rows: Bool[Tensor, " path"] | Int64[Tensor, " some"]) -> "RayPaths":
-        """Select paths.
-
-        Args:
-            rows: mask or row numbers.
-        """
-        columns = {n: value[rows] for n, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **columns)
-
     def select_link(self, tx: int, rx: int) -> "RayPaths":
         """Select the paths of one link.
 
@@ -129,21 +121,13 @@ class RayPaths:
         width = torch.arange(self.kinds.shape[1])
         back = torch.where(width < depth, depth - 1 - width, width)
         rows = torch.arange(len(self))[:, None]
-        reversed_columns = {
-            n: getattr(self, n)[rows, back] for n in ("vertices", "kinds", "faces", "objects")
-        }
+        names = ("vertices", "kinds", "faces", "objects")
+        reversed_columns = {name: getattr(self, name)[rows, back] for name in names}
         if self.slopes is not None and self.axes is not None:
             reversed_columns |= {"slopes": self.slopes.mT.flip(1), "axes": self.axes.flip(1)}
-        return replace(
-            self,
-            counts=self.counts[::-1],
-            tx=self.rx,
-            rx=self.tx,
-            coefficient=self.coefficient.mT,
-            departure=self.arrival,
-            arrival=self.departure,
-            **reversed_columns,
-        ).sort_rows()
+        reversed_columns |= {"tx": self.rx, "rx": self.tx, "coefficient": self.coefficient.mT}
+        reversed_columns |= {"departure": self.arrival, "arrival": self.departure}
+        return replace(self, counts=self.counts[::-1], **reversed_columns).sort_rows()
 
     def __add__(self, other: "RayPaths") -> "RayPaths":
         return join_ray_paths([self, other])
@@ -157,18 +141,13 @@ def join_ray_paths(parts: Sequence[RayPaths]) -> RayPaths:
     """
     if any(part.slopes is not None for part in parts):
         parts = [_add_slopes(part) for part in parts]
-    first = parts[0]
     width = max((part.kinds.shape[1] for part in parts if len(part)), default=0)
     fill = {"vertices": 0.0, "kinds": 0, "faces": -1, "objects": -1}
-    columns: dict[str, Tensor] = {}
-    for name in (f.name for f in fields(RayPaths)):
-        values = [getattr(part, name) for part in parts]
-        if not isinstance(values[0], Tensor):
-            continue
-        if name in fill:
-            values = [_pad_columns(value, width, fill[name]) for value in values]
-        columns[name] = torch.cat(values)
-    return replace(first, **columns).sort_rows()
+    padded = {
+        name: torch.cat([_pad_columns(getattr(part, name), width, value) for part in parts])
+        for name, value in fill.items()
+    }
+    return concatenate_rows(parts, **padded).sort_rows()
 
 
 def _add_slopes(paths: RayPaths) -> RayPaths:

@@ -9,8 +9,9 @@ Source: derivations §10.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Complex128, Float64, Int64
@@ -27,12 +28,7 @@ from invertwin.channel.em.plane_waves import (
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.scene_tables import require_surfaces, vertex_velocities
 from invertwin.channel.rays.topology import Topology, topology_of
-from invertwin.channel.specular.candidates import (
-    CandidateSequences,
-    FaceInteractions,
-    enumerate_sequences,
-    shoot_sequences,
-)
+from invertwin.channel.specular.candidates import FaceInteractions, find_sequences
 from invertwin.channel.specular.diffracted_paths import evaluate_diffracted_paths
 from invertwin.channel.specular.diffraction_candidates import (
     DiffractionCandidates,
@@ -42,7 +38,7 @@ from invertwin.channel.specular.image_method import (
     CandidateSurfaces,
     SpecularPaths,
     UnfoldedPaths,
-    find_paths_between,
+    find_paths_along,
 )
 from invertwin.channel.specular.ray_paths import REFLECTION, TRANSMISSION, RayPaths, join_ray_paths
 from invertwin.channel.specular.wedge_scene import WedgeScene
@@ -63,10 +59,8 @@ _MAX_DEPTH, _MAX_EDGES = 6, 3
 _ROWS_AT_ONCE = 1 << 15
 _DIFFRACTED_ROWS_AT_ONCE = 1 << 13  # diffracted paths need more memory a row
 _UP = (0.0, 0.0, 1.0)
-_Columns = tuple[
-    Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None
-]
-"""Delay, coefficient, departure, arrival, vertices, kinds, faces, Doppler, slopes and axes."""
+_AT_REST = (0.0, 0.0, 0.0)
+_Columns = dict[str, Tensor]  # columns of `RayPaths` by name
 _VELOCITY_HINT = "give one vector, or one per antenna"
 
 
@@ -94,6 +88,11 @@ class PathScene:
     rx_velocity: Float64[Tensor, "rx 3"]
     frequency: float
 
+    def detach(self) -> "PathScene":
+        """Return the scene with positions that carry no derivatives."""
+        positions = {n: strip_derivatives(getattr(self, n)) for n in ("vertices", "tx", "rx")}
+        return replace(self, **positions)
+
 
 def trace_paths(
     scene: Scene,
@@ -105,8 +104,8 @@ def trace_paths(
     edges: int = 0,
     rays: int | None = 1_000_000,
     seed: int = 0,
-    tx_velocity: ArrayLike = (0.0, 0.0, 0.0),
-    rx_velocity: ArrayLike = (0.0, 0.0, 0.0),
+    tx_velocity: ArrayLike = _AT_REST,
+    rx_velocity: ArrayLike = _AT_REST,
 ) -> RayPaths:
     """Trace paths between point antennas: line of sight, reflections, transmissions, diffraction.
 
@@ -156,47 +155,23 @@ def trace_paths(
         interactions = face_interactions(path_scene)
         # Discrete: `torch.func` would claim the intermediate tensors.
         with _DisableFuncTorch():
-            surfaces = _candidate_surfaces(path_scene)
-            specular, missed = _find_specular(path_scene, surfaces, interactions, limit, rays, seed)
-            diffracted = (
-                _find_diffracted(path_scene, surfaces, interactions, edges, limit, rays, seed)
-                if edges
-                else []
-            )
+            bare = path_scene.detach()
+            antennas = torch.cat([bare.tx, bare.rx])
+            surfaces = CandidateSurfaces(bare.vertices, bare.topology, antennas)
+            specular, missed = _find_specular(bare, surfaces, interactions, limit, rays, seed)
+            ends, options = (bare.tx, bare.rx), (edges, limit, rays, seed)
+            wedges = _wedge_scene(bare, surfaces)
+            found = find_diffraction_candidates(wedges, interactions, *ends, *options)
+            diffracted = list(found)
         paths = [part for group in specular for part in evaluate_paths(path_scene, group)]
         wedge_scene = _wedge_scene(path_scene, surfaces)
-        paths += [
-            part
-            for candidates in diffracted
-            for part in _evaluate_diffracted(path_scene, wedge_scene, candidates)
-        ]
+        for candidates in diffracted:
+            paths += _evaluate_diffracted(path_scene, wedge_scene, candidates)
     return replace(join_ray_paths(paths), missed_fraction=missed)
 
 
-def _candidate_surfaces(path_scene: PathScene) -> CandidateSurfaces:
-    antennas = torch.cat([strip_derivatives(path_scene.tx), strip_derivatives(path_scene.rx)])
-    return CandidateSurfaces(strip_derivatives(path_scene.vertices), path_scene.topology, antennas)
-
-
-def _find_diffracted(
-    path_scene: PathScene,
-    surfaces: CandidateSurfaces,
-    interactions: FaceInteractions,
-    edges: int,
-    depth: int,
-    rays: int | None,
-    seed: int,
-) -> list[DiffractionCandidates]:
-    """Find the diffracted paths; detached."""
-    bare = replace(
-        _wedge_scene(path_scene, surfaces), vertices=strip_derivatives(path_scene.vertices)
-    )
-    ends = strip_derivatives(path_scene.tx), strip_derivatives(path_scene.rx)
-    return list(find_diffraction_candidates(bare, interactions, *ends, edges, depth, rays, seed))
-
-
 def _find_specular(
-    path_scene: PathScene,
+    bare: PathScene,
     surfaces: CandidateSurfaces,
     interactions: FaceInteractions,
     depth: int,
@@ -204,21 +179,10 @@ def _find_specular(
     seed: int,
 ) -> tuple[list[SpecularPaths], float | None]:
     """Find the specular paths, and the estimated fraction of missed directions."""
-    tx, rx = strip_derivatives(path_scene.tx), strip_derivatives(path_scene.rx)
-    swapped = len(rx) < len(tx)
-    sources, targets = (rx, tx) if swapped else (tx, rx)
-    if not depth:
-        sequences = CandidateSequences((), None)
-    elif rays is None:
-        sequences = enumerate_sequences(surfaces.planes, interactions, depth)
-    else:
-        sequences = shoot_sequences(
-            surfaces, surfaces.planes, interactions, sources, depth, rays, seed
-        )
-    found: list[SpecularPaths] = []
-    for steps in (torch.zeros(1, 0, dtype=torch.int64), *sequences.steps):
-        for number, source in enumerate(sources) if len(steps) else ():
-            found += find_paths_between(surfaces, steps, source, targets, number)
+    swapped = len(bare.rx) < len(bare.tx)
+    sources, targets = (bare.rx, bare.tx) if swapped else (bare.tx, bare.rx)
+    sequences = find_sequences(surfaces, interactions, sources, depth, rays, seed)
+    found = find_paths_along(surfaces, sequences.steps, sources, targets)
     return [group.reverse() if swapped else group for group in found], sequences.missed_fraction
 
 
@@ -227,8 +191,8 @@ def prepare_path_scene(
     tx: ArrayLike,
     rx: ArrayLike,
     frequency: float,
-    tx_velocity: ArrayLike,
-    rx_velocity: ArrayLike,
+    tx_velocity: ArrayLike = _AT_REST,
+    rx_velocity: ArrayLike = _AT_REST,
 ) -> PathScene:
     """Prepare a scene and antennas for the search for paths.
 
@@ -243,13 +207,12 @@ def prepare_path_scene(
     """
     objects = scene.objects.values()
     require_surfaces(scene)
-    ends = [_check_positions(place, what) for place, what in ((tx, "tx"), (rx, "rx"))]
-    speeds = [
-        _check_velocities(value, len(end), what)
-        for value, end, what in ((tx_velocity, ends[0], "tx"), (rx_velocity, ends[1], "rx"))
-    ]
-    vertices = [item.vertices for item in objects]
-    velocities = None
+    ends = _check_positions(tx, "tx"), _check_positions(rx, "rx")
+    speeds = (
+        _check_velocities(tx_velocity, len(ends[0]), "tx"),
+        _check_velocities(rx_velocity, len(ends[1]), "rx"),
+    )
+    vertices, velocities = [item.vertices for item in objects], None
     if any(item.velocity is not None for item in objects):
         velocities = torch.cat([vertex_velocities(item) for item in objects])
     return PathScene(
@@ -257,10 +220,8 @@ def prepare_path_scene(
         topology_of([item.mesh for item in objects], vertices),
         torch.cat(vertices),
         velocities,
-        ends[0],
-        ends[1],
-        speeds[0],
-        speeds[1],
+        *ends,
+        *speeds,
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True),
     )
 
@@ -297,25 +258,20 @@ def face_interactions(path_scene: PathScene) -> FaceInteractions:
 
 
 def _wedge_scene(path_scene: PathScene, surfaces: CandidateSurfaces) -> WedgeScene:
-    return WedgeScene(
-        path_scene.vertices,
-        path_scene.topology,
-        surfaces,
-        lambda faces, cosine: _face_coefficients(path_scene, faces, cosine),
-    )
+    coefficients = partial(_face_coefficients, path_scene)
+    return WedgeScene(path_scene.vertices, path_scene.topology, surfaces, coefficients)
 
 
 def _evaluate_diffracted(
     path_scene: PathScene, wedge_scene: WedgeScene, candidates: DiffractionCandidates
 ) -> list[RayPaths]:
     """Evaluate diffracted paths in chunks, as ``evaluate_paths``."""
-    return _evaluate_in_chunks(
-        path_scene,
-        candidates.tx,
-        candidates.rx,
-        _DIFFRACTED_ROWS_AT_ONCE,
-        lambda rows: _diffracted_columns(path_scene, wedge_scene, candidates.rows(rows)),
-    )
+
+    def columns(rows: Tensor) -> _Columns:
+        return _diffracted_columns(path_scene, wedge_scene, candidates.select(rows))
+
+    ends, size = (candidates.tx, candidates.rx), _DIFFRACTED_ROWS_AT_ONCE
+    return _evaluate_in_chunks(path_scene, *ends, size, columns)
 
 
 def _evaluate_in_chunks(
@@ -327,28 +283,17 @@ def _evaluate_in_chunks(
     found: list[RayPaths] = []
     for rows in torch.arange(len(tx)).split(size):
         values = checkpoint(columns, rows, use_reentrant=False) if heavy else columns(rows)
-        delay, coefficient, departure, arrival, vertices, kinds, faces = values[:7]
-        doppler, slopes, axes = values[7:]
-        found.append(
-            RayPaths(
-                (len(path_scene.tx), len(path_scene.rx)),
-                path_scene.frequency,
-                tx[rows],
-                rx[rows],
-                delay,
-                coefficient,
-                departure,
-                arrival,
-                vertices,
-                kinds,
-                faces,
-                path_scene.topology.face_object[faces],
-                path_scene.scene.names,
-                doppler,
-                slopes,
-                axes,
-            )
+        paths = RayPaths(
+            counts=(len(path_scene.tx), len(path_scene.rx)),
+            frequency=path_scene.frequency,
+            tx=tx[rows],
+            rx=rx[rows],
+            objects=path_scene.topology.face_object[values["faces"]],
+            names=path_scene.scene.names,
+            missed_fraction=None,
+            **values,
         )
+        found.append(paths)
     return found
 
 
@@ -358,57 +303,46 @@ def _diffracted_columns(
     """Columns of diffracted paths."""
     k = 2 * math.pi * path_scene.frequency / SPEED_OF_LIGHT
     found = evaluate_diffracted_paths(wedge_scene, candidates, path_scene.tx, path_scene.rx, k)
-    departure, arrival = found.directions[:, 0], -found.directions[:, -1]
+    ways = found.directions.unbind(1)
+    departure, arrival = ways[0], -ways[-1]
     up = torch.tensor(_UP, dtype=torch.float64)
-    sent, received = (
-        polarisations(direction, up).to(found.transfer) for direction in (departure, arrival)
-    )
+    sent, received = (polarisations(way, up).to(found.transfer) for way in (departure, arrival))
     matrix = torch.einsum("pri,pij,ptj->prt", received, found.transfer, sent)
     slopes = torch.einsum("pri,psij,ptj->psrt", received, found.slopes, sent)
     scale = SPEED_OF_LIGHT / path_scene.frequency / (4 * math.pi)
-    rate = _shortening_rate(
-        path_scene,
-        candidates.tx,
-        candidates.rx,
-        list(found.directions.unbind(1)),
-        found.points,
-        found.faces,
-    )
-    single = candidates.edge.shape[1] == 1
-    return (
-        found.length / SPEED_OF_LIGHT,
-        matrix * scale,
-        departure,
-        arrival,
-        found.points,
-        found.kinds,
-        found.faces,
-        path_scene.frequency / SPEED_OF_LIGHT * rate,
-        slopes * scale if single else None,
-        found.axes if single else None,
-    )
+    columns = {
+        "delay": found.length / SPEED_OF_LIGHT,
+        "coefficient": matrix * scale,
+        "departure": departure,
+        "arrival": arrival,
+        "vertices": found.points,
+        "kinds": found.kinds,
+        "faces": found.faces,
+        "doppler": _doppler_shifts(path_scene, found.tx, found.rx, ways, found.points, found.faces),
+    }
+    if candidates.edge.shape[1] > 1:
+        return columns
+    return columns | {"slopes": slopes * scale, "axes": found.axes}
 
 
-def _shortening_rate(
+def _doppler_shifts(
     path_scene: PathScene,
     tx: Tensor,
     rx: Tensor,
-    directions: list[Tensor],
+    directions: Sequence[Tensor],
     vertices: Float64[Tensor, "path vertex 3"],
     faces: Int64[Tensor, "path vertex"],
 ) -> Float64[Tensor, " path"]:
-    """Rate at which path lengths decrease [m/s]."""
-    rate = dot(directions[0], path_scene.tx_velocity[tx]) - dot(
-        directions[-1], path_scene.rx_velocity[rx]
-    )
+    """Doppler shifts [Hz], from the rate at which path lengths decrease."""
+    rate = dot(directions[0], path_scene.tx_velocity[tx])
+    rate = rate - dot(directions[-1], path_scene.rx_velocity[rx])
     if path_scene.velocities is not None and faces.shape[1]:
         triangles = path_scene.topology.faces[faces]
-        moved = interpolate_vectors(
-            path_scene.velocities[triangles], path_scene.vertices[triangles], vertices
-        )
+        corners, speeds = path_scene.vertices[triangles], path_scene.velocities[triangles]
+        moved = interpolate_vectors(speeds, corners, vertices)
         for step in range(faces.shape[1]):
             rate = rate + dot(directions[step + 1] - directions[step], moved[:, step])
-    return rate
+    return path_scene.frequency / SPEED_OF_LIGHT * rate
 
 
 def evaluate_paths(path_scene: PathScene, specular_paths: SpecularPaths) -> list[RayPaths]:
@@ -418,38 +352,34 @@ def evaluate_paths(path_scene: PathScene, specular_paths: SpecularPaths) -> list
         path_scene: scene and antennas.
         specular_paths: triangles that each path meets.
     """
-    return _evaluate_in_chunks(
-        path_scene,
-        specular_paths.source,
-        specular_paths.target,
-        _ROWS_AT_ONCE,
-        lambda rows: _specular_columns(path_scene, specular_paths.rows(rows)),
-    )
+
+    def columns(rows: Tensor) -> _Columns:
+        return _specular_columns(path_scene, specular_paths.select(rows))
+
+    ends = specular_paths.source, specular_paths.target
+    return _evaluate_in_chunks(path_scene, *ends, _ROWS_AT_ONCE, columns)
 
 
 def _specular_columns(path_scene: PathScene, paths: SpecularPaths) -> _Columns:
     """Columns of specular paths."""
     tx, rx = path_scene.tx[paths.source], path_scene.rx[paths.target]
-    unfolded = UnfoldedPaths(
-        path_scene.vertices, path_scene.topology, paths.faces, paths.transmitted, tx
-    )
+    moving = path_scene.vertices, path_scene.topology
+    unfolded = UnfoldedPaths(*moving, paths.faces, paths.transmitted, tx)
     distance = (rx - unfolded.image).norm(dim=1)
     units, vertices = unfolded.directions(rx), unfolded.interaction_points(rx)
     matrix = _transfer_matrix(path_scene, paths, units, unfolded.normal)
     scale = SPEED_OF_LIGHT / path_scene.frequency / (4 * math.pi) / distance
-    rate = _shortening_rate(path_scene, paths.source, paths.target, units, vertices, paths.faces)
-    return (
-        distance / SPEED_OF_LIGHT,
-        matrix * scale[:, None, None],
-        units[0],
-        -units[-1],
-        vertices,
-        torch.where(paths.transmitted, TRANSMISSION, REFLECTION),
-        paths.faces,
-        path_scene.frequency / SPEED_OF_LIGHT * rate,
-        None,
-        None,
-    )
+    ends = paths.source, paths.target
+    return {
+        "delay": distance / SPEED_OF_LIGHT,
+        "coefficient": matrix * scale[:, None, None],
+        "departure": units[0],
+        "arrival": -units[-1],
+        "vertices": vertices,
+        "kinds": torch.where(paths.transmitted, TRANSMISSION, REFLECTION),
+        "faces": paths.faces,
+        "doppler": _doppler_shifts(path_scene, *ends, units, vertices, paths.faces),
+    }
 
 
 def _transfer_matrix(
@@ -482,27 +412,16 @@ def _face_coefficients(
     path_scene: PathScene, faces: Int64[Tensor, " n"], cosine: Float64[Tensor, " n"]
 ) -> FieldCoefficients:
     """Field coefficients of triangles, with one evaluation per material."""
-    items = list(path_scene.scene.objects.values())
+    materials = [item.material for item in path_scene.scene.objects.values()]
     owner = path_scene.topology.face_object[faces]
-    first = torch.searchsorted(path_scene.topology.face_object, torch.arange(len(items)))
-    numbers: dict[int, int] = {}
-    material_number = torch.tensor(
-        [numbers.setdefault(id(item.material), len(numbers)) for item in items]
-    )
+    first = torch.searchsorted(path_scene.topology.face_object, torch.arange(len(materials)))
     found = [torch.zeros(len(faces), dtype=torch.complex128) for _ in range(4)]
-    evaluated: set[int] = set()
-    for number, item in enumerate(items):
-        kind = int(material_number[number])
-        if kind in evaluated:
-            continue
-        evaluated.add(kind)
-        rows = torch.nonzero(material_number[owner] == kind)[:, 0]
+    for material in {id(each): each for each in materials}.values():
+        rows = torch.nonzero(torch.tensor([each is material for each in materials])[owner])[:, 0]
         if not len(rows):
             continue
         triangle = faces[rows] - first[owner[rows]]
-        values = item.material.coefficients(path_scene.frequency, cosine[rows], triangle)
-        found = [
-            total.index_put((rows,), value.to(torch.complex128))
-            for total, value in zip(found, values, strict=True)
-        ]
+        values = material.coefficients(path_scene.frequency, cosine[rows], triangle)
+        pairs = zip(found, values, strict=True)
+        found = [total.index_put((rows,), value.to(torch.complex128)) for total, value in pairs]
     return FieldCoefficients(*found)

@@ -23,7 +23,7 @@ from invertwin.channel.em.wedges import (
 )
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.specular.edge_path_geometry import PathEdge
-from invertwin.channel.specular.image_method import CandidateSurfaces, find_unobstructed_paths
+from invertwin.channel.specular.image_method import CandidateSurfaces, is_unobstructed
 from invertwin.checks import strip_derivatives
 from invertwin.scene.material.fresnel import FieldCoefficients
 
@@ -33,14 +33,8 @@ TriangleCoefficients = Callable[[Int64[Tensor, " n"], Float64[Tensor, " n"]], Fi
 _OFFSET_MARGINS = 10.0  # margins of the ray scene: distance of rays' ends from an edge
 _GRAZING_TOLERANCE = 1e-9  # rad
 _EDGE_PIECES = 16  # pieces of an edge, each open or covered as a whole
-_DETOUR_ANGLES = (
-    0.1,
-    0.26,
-    0.42,
-    0.58,
-    0.74,
-    0.9,
-)  # corners of a detour round an edge, in its exterior
+# Corners of a detour round an edge, as shares of its exterior.
+_DETOUR_ANGLES = (0.1, 0.26, 0.42, 0.58, 0.74, 0.9)
 
 
 @dataclass(frozen=True)
@@ -89,7 +83,7 @@ class WedgeScene:
                 face.
             absorbing: True for faces that neither reflect nor transmit.
         """
-        wedges = self.wedges.rows(row)
+        wedges = self.wedges.select(row)
 
         def faces(face: int, cosine: Tensor) -> FieldCoefficients:
             return self.coefficients(wedges.faces[:, face], cosine)
@@ -105,9 +99,9 @@ class WedgeScene:
             row: numbers of wedges.
             points: points on the lines of the edges [m].
         """
-        wedges = self.detached_wedges.rows(row)
+        wedges = self.detached_wedges.select(row)
         side = wedges.end - wedges.start
-        fraction = dot(strip_derivatives(points) - wedges.start, side) / dot(side, side)
+        fraction = _edge_fractions(wedges, strip_derivatives(points))
         inset = (self.ray_offset / side.norm(dim=1)).clamp(max=0.25)
         fraction = torch.minimum(torch.maximum(fraction, inset), 1 - inset)
         outward = normalize((wedges.normals - wedges.face_tangents).sum(1), dim=1)
@@ -122,9 +116,7 @@ class WedgeScene:
             row: numbers of wedges.
             points: points on the lines of the edges [m].
         """
-        wedges = self.detached_wedges.rows(row)
-        side = wedges.end - wedges.start
-        fraction = dot(strip_derivatives(points) - wedges.start, side) / dot(side, side)
+        fraction = _edge_fractions(self.detached_wedges.select(row), strip_derivatives(points))
         return self._is_piece_open[row, (fraction * _EDGE_PIECES).long().clamp(0, _EDGE_PIECES - 1)]
 
     @cached_property
@@ -140,9 +132,8 @@ class WedgeScene:
             offset = self.ray_offset * (angle.cos() * into + angle.sin() * normal)
             stops.append((points + offset[:, None]).reshape(-1, 3))
         clear = torch.ones(len(stops[0]), dtype=torch.bool)
-        none = torch.zeros(len(clear), 0, dtype=torch.int64)
         for start, end in pairwise(stops):
-            clear &= find_unobstructed_paths(self.surfaces, none, start, end)[0]
+            clear &= is_unobstructed(self.surfaces, start, end)
         return clear.reshape(-1, _EDGE_PIECES)
 
 
@@ -164,8 +155,7 @@ def is_exterior(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Bool[Tensor
         angle < 2 * torch.pi - _GRAZING_TOLERANCE
     )
     axis = edge_axis(wedges).detach()
-    radial = offset - dot(offset, axis)[:, None] * axis
-    return ~inside & (radial.norm(dim=1) > 0)
+    return ~inside & ((offset - dot(offset, axis)[:, None] * axis).norm(dim=1) > 0)
 
 
 def clamp_to_edge(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 3"]:
@@ -175,6 +165,11 @@ def clamp_to_edge(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Float64[T
         wedges: sharp edges, one row each.
         points: positions, [row, 3] [m].
     """
+    fraction = _edge_fractions(wedges, points).clamp(0, 1)
+    return wedges.start + fraction[:, None] * (wedges.end - wedges.start)
+
+
+def _edge_fractions(wedges: Wedges, points: Tensor) -> Float64[Tensor, " row"]:
+    """Positions of points along edges, from 0 at the start to 1 at the end."""
     side = wedges.end - wedges.start
-    fraction = dot(points - wedges.start, side) / dot(side, side)
-    return wedges.start + fraction.clamp(0, 1)[:, None] * side
+    return dot(points - wedges.start, side) / dot(side, side)

@@ -116,8 +116,7 @@ class EFIEMatrix:
         wave = phasor(phase) * weights[:, None] / 2
         linear = torch.einsum("fqa,fqx,atx->fat", wave, offset + 0j, fields + 0j)
         corner_fields = torch.einsum("fvx,atx->fvat", corners - centroid[:, None], fields)
-        local = linear[:, None] - wave.sum(1)[:, None, :, None] * corner_fields
-        return self._combine_halves(local)
+        return self._combine_halves(linear[:, None] - wave.sum(1)[:, None, :, None] * corner_fields)
 
     def _combine_halves(self, local: Tensor) -> Tensor:
         """Combine half functions, given per triangle and corner, to basis functions."""
@@ -133,8 +132,7 @@ class EFIEMatrix:
             current: coefficients of the basis functions.
         """
         face, corner = self.basis.face, self.basis.corner
-        shape = (3 * len(self.faces), *current.shape[1:])
-        found = torch.zeros(shape, dtype=current.dtype)
+        found = torch.zeros(3 * len(self.faces), *current.shape[1:], dtype=current.dtype)
         for half, sign in ((0, 1.0), (1, -1.0)):
             found.index_add_(0, 3 * face[:, half] + corner[:, half], sign * current)
         return found.view(len(self.faces), 3, *current.shape[1:])
@@ -171,9 +169,8 @@ class EFIEMatrix:
         half_number = (3 * face + corner).T.ravel()
         sign = np.repeat([1.0, -1.0], self.count)
         halves = csr_array((sign, (row, half_number)), shape=(self.count, 3 * len(self.faces)))
-        parts = torch.cat(
-            [self._near_interactions(vertices, block) for block in pairs.split(_PAIRS_AT_ONCE)]
-        ).numpy()
+        blocks = pairs.split(_PAIRS_AT_ONCE)
+        parts = torch.cat([self._near_interactions(vertices, block) for block in blocks]).numpy()
         half_numbers = 3 * pairs.numpy()[:, :, None] + np.arange(3)
         rows = np.broadcast_to(half_numbers[:, 0, :, None], parts.shape).ravel()
         columns = np.broadcast_to(half_numbers[:, 1, None, :], parts.shape).ravel()
@@ -208,9 +205,8 @@ class EFIEMatrix:
             row = np.repeat(np.arange(self.count), 3)
             indices = (np.concatenate([row, row]), np.concatenate([p.ravel() for p in columns]))
             # Keep 32-bit integers and single precision.
-            parts.append(
-                csr_array((np.concatenate([v.ravel() for v in value]), indices), shape=shape)
-            )
+            values = np.concatenate([v.ravel() for v in value])
+            parts.append(csr_array((values, indices), shape=shape))
         scale = [1.0, 1.0, 1.0, -1 / self.k**2]
         total = torch.zeros(self.count, self.count, dtype=self.complex_dtype)
         bounds = torch.searchsorted(pairs[:, 0].contiguous(), torch.arange(count + 1))
@@ -229,9 +225,8 @@ class EFIEMatrix:
             for part, weight in zip(parts, scale, strict=True):
                 radiated = torch.from_numpy(part[:, 3 * begin :] @ flat)
                 tested = part[rows, 3 * begin : 3 * end].toarray()
-                found.addmm_(
-                    radiated.view(2 * self.count, -1), torch.from_numpy(tested).T, alpha=weight
-                )
+                radiated = radiated.view(2 * self.count, -1)
+                found.addmm_(radiated, torch.from_numpy(tested).T, alpha=weight)
             pair = found.view(self.count, 2, len(rows)).permute(2, 0, 1).contiguous()
             total[torch.from_numpy(rows)] += torch.view_as_complex(pair)
         return total
@@ -324,10 +319,9 @@ class EFIEMatrix:
         """
         pairs = self.near_pairs(vertices.detach())
         ends = (self.half_coefficients(left), self.half_coefficients(right))
-        aspects = torch.arange(left.shape[1]).split(_ASPECTS_AT_ONCE)
         parts = [
             self._bilinear_block(vertices, pairs, *(end[:, :, some] for end in ends))
-            for some in aspects
+            for some in torch.arange(left.shape[1]).split(_ASPECTS_AT_ONCE)
         ]
         return 1j * self.k * torch.cat(parts)
 
@@ -342,12 +336,10 @@ class EFIEMatrix:
             scale * products.new_tensor([1.0, 1, 1, 0]), scale * products.new_tensor([0.0, 0, 0, 1])
         )
         # The factor j/k of the divergence, squared, is −1/k².
-        strengths = [
-            torch.einsum("fcqz,fcap->fqapz", products * scale, half)
-            .flatten(0, 1)
-            .to(self.complex_dtype)
-            for half in (left, right)
-        ]
+        halves = (
+            torch.einsum("fcqz,fcap->fqapz", products * scale, half) for half in (left, right)
+        )
+        strengths = [half.flatten(0, 1).to(self.complex_dtype) for half in halves]
         bounds = torch.searchsorted(pairs[:, 0].contiguous(), torch.arange(count + 1))
         size = max(1, _ENTRIES_AT_ONCE // (9 * count))
 
@@ -361,9 +353,8 @@ class EFIEMatrix:
             mask = mask.repeat_interleave(3, 0).repeat_interleave(3, 1)
             kernel = self._greens_function(points[3 * begin : 3 * end], points) * mask
             kernel = torch.complex(kernel[0], kernel[1])
-            field = (kernel @ right_strengths.flatten(1)).view(
-                len(kernel), *right_strengths.shape[1:]
-            )
+            field = kernel @ right_strengths.flatten(1)
+            field = field.view(len(kernel), *right_strengths.shape[1:])
             block = left_strengths[3 * begin : 3 * end]
             return torch.einsum("eapz,eaqz->apq", block, field).to(torch.complex128)
 
@@ -393,9 +384,8 @@ class EFIEMatrix:
             current: coefficients of the basis functions.
         """
         points, products = self._quadrature_points(vertices)
-        moments = torch.einsum(
-            "fiqx,fic->fqcx", products[..., :3] + 0j, self.half_coefficients(current)
-        )
+        halves = self.half_coefficients(current)
+        moments = torch.einsum("fiqx,fic->fqcx", products[..., :3] + 0j, halves)
         return points.flatten(0, 1) + vertices.detach().mean(0), moments.flatten(0, 1)
 
     def interior_field_matrix(
@@ -421,10 +411,8 @@ class EFIEMatrix:
             return self._combine_halves(0.5j * self.k * part + 1j / self.k * charge[:, None])
 
         size = max(1, (_ENTRIES_AT_ONCE >> 6) // len(corners))
-        found = [
-            checkpoint(evaluate_chunk, chunk, use_reentrant=False)
-            for chunk in interior_points.split(size)
-        ]
+        chunks = interior_points.split(size)
+        found = [checkpoint(evaluate_chunk, chunk, use_reentrant=False) for chunk in chunks]
         return torch.cat(found, 1).flatten(1).T
 
 

@@ -51,9 +51,8 @@ class EFIESolver(CurrentSolver[ConformingMesh]):
     ) -> None:
         self.vertices, self.faces, self.solid, self.up = vertices, faces, solid, up
         corners = vertices[faces]
-        self.double_area_vectors = torch.linalg.cross(
-            corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        )
+        sides = corners[:, 1:] - corners[:, :1]
+        self.double_area_vectors = torch.linalg.cross(sides[:, 0], sides[:, 1])
         super().__init__(float(self.double_area_vectors.detach().norm(dim=1).sum() / 2))
 
     def build_elements(self, side: float) -> ConformingMesh | None:
@@ -115,9 +114,8 @@ class _EFIEEquation:
         """
         right = self._excitation(self.fixed_vertices, transmitters)
         inside = self._incident_fields(self.interior_points.detach(), transmitters)
-        right = right + self.interior_weight * torch.einsum(
-            "yn,yat->nat", self.interior_matrix.conj(), inside
-        )
+        interior = torch.einsum("yn,yat->nat", self.interior_matrix.conj(), inside)
+        right = right + self.interior_weight * interior
         return self._solve(right, adjoint=False)
 
     def _solve(self, right: Tensor, *, adjoint: bool) -> Tensor:
@@ -159,23 +157,17 @@ class _EFIEEquation:
             residual = torch.einsum("yn,nat->yat", interior, current)
             residual = self._incident_fields(self.interior_points, transmitters) - residual
             adjoint_field = torch.einsum("yn,nar->yar", interior.conj(), adjoint)
-            double_area = (
-                self.target.double_area_vectors[
-                    self.target.double_area_vectors.detach().norm(dim=1) > 0
-                ]
-                .norm(dim=1)
-                .sum()
-            )
-            weight = double_area / (2 * len(self.interior_matrix))
+            double_area = self.target.double_area_vectors
+            double_area = double_area[double_area.detach().norm(dim=1) > 0].norm(dim=1)
+            weight = double_area.sum() / (2 * len(self.interior_matrix))
             change = change + weight * torch.einsum("yar,yat->art", adjoint_field, residual)
         return value + scale * (change - change.detach())
 
     def conserves_power(self, current: Tensor, transmitters: Tensor) -> bool:
         """Test the power balance of the first wave's currents (optical theorem)."""
         point, moments = self.efie_matrix.sample_currents(self.fixed_vertices, current[:, 0])
-        return conserves_power(
-            self.k, point, moments, -transmitters[0], polarisations(transmitters, self.up)[0]
-        )
+        sent = polarisations(transmitters, self.up)[0]
+        return conserves_power(self.k, point, moments, -transmitters[0], sent)
 
 
 def _sample_interior_points(
@@ -187,9 +179,8 @@ def _sample_interior_points(
     if not len(closed):
         return torch.zeros(0, 3, dtype=torch.float64)
     wavelength = 2 * math.pi / wave_number
-    count = min(
-        _MAX_INTERIOR_POINTS, math.ceil(_INTERIOR_POINTS_PER_AREA * target.area / wavelength**2) + 8
-    )
+    count = math.ceil(_INTERIOR_POINTS_PER_AREA * target.area / wavelength**2) + 8
+    count = min(_MAX_INTERIOR_POINTS, count)
     # Spread evenly over the surface.
     closed = closed[:: max(1, len(closed) // count)]
     corners = target.vertices[target.faces]

@@ -84,9 +84,8 @@ def build_conforming_mesh(
     triangles: list[Index] = []
     for number, face in enumerate(faces):
         face_edges = edge[number]
-        inner, local = _triangulate_face(
-            tuple(int(n) for n in parts[face_edges]), _face_shape(vertices[face] / side)
-        )
+        shape = _face_shape(vertices[face] / side)
+        inner, local = _triangulate_face(tuple(int(n) for n in parts[face_edges]), shape)
         rim: list[Index] = []
         for corner in range(3):
             between = first[face_edges[corner]] + np.arange(parts[face_edges[corner]] - 1)
@@ -98,13 +97,8 @@ def build_conforming_mesh(
         triangles.append(local_numbers[local])
     parent_face = numbers.repeat([len(t) for t in triangles])
     used, small = np.unique(np.concatenate(triangles), return_inverse=True)
-    return ConformingMesh(
-        np.concatenate(parents)[used],
-        np.concatenate(weights)[used],
-        small.reshape(-1, 3),
-        parent_face,
-        has_merged,
-    )
+    interpolated = np.concatenate(parents)[used], np.concatenate(weights)[used]
+    return ConformingMesh(*interpolated, small.reshape(-1, 3), parent_face, has_merged)
 
 
 def _double_area_vectors(corners: Array) -> Array:
@@ -152,9 +146,8 @@ def _triangulate_face(
     corner = np.array([[0, 0], [shape[0], 0], shape[1:]])
     fractions = [np.arange(n)[:, None] / n for n in parts]
     following = np.roll(corner, -1, 0)
-    rim = np.concatenate(
-        [(1 - t) * p + t * q for t, p, q in zip(fractions, corner, following, strict=True)]
-    )
+    sides = zip(fractions, corner, following, strict=True)
+    rim = np.concatenate([(1 - t) * p + t * q for t, p, q in sides])
     # Slightly outwards, so that the rim's parts are sides of triangles.
     outwards = (following - corner)[:, ::-1] * [1, -1]
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
@@ -163,8 +156,7 @@ def _triangulate_face(
     count = len(rim)
 
     def triangulate() -> Index:
-        points = np.concatenate([rim + _BULGE * bulge, inner])
-        return Delaunay(points).simplices.astype(np.int64)
+        return Delaunay(np.concatenate([rim + _BULGE * bulge, inner])).simplices.astype(np.int64)
 
     for _ in range(_SMOOTHING_ROUNDS if len(inner) else 0):
         inner = _smooth_points(np.concatenate([rim, inner]), triangulate())[count:]
@@ -217,9 +209,8 @@ def _is_conforming(vertices: Array, faces: Index, min_gap: float) -> bool:
         near[np.arange(len(rows)), rows] = False
         one, other = np.nonzero(near)
         for pairs in np.array_split(np.arange(len(one)), len(one) // _PAIRS_AT_ONCE + 1):
-            if _triangles_touch(
-                vertices, faces[rows[one[pairs]]], faces[other[pairs]], min_gap
-            ).any():
+            ends = faces[rows[one[pairs]]], faces[other[pairs]]
+            if _triangles_touch(vertices, *ends, min_gap).any():
                 return False
     return True
 
@@ -232,16 +223,12 @@ def _triangles_touch(
     corners, beyond = vertices[one], vertices[other]
     normal = _double_area_vectors(beyond)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    sides = np.roll(beyond, -1, 1) - beyond
-    inwards = np.cross(normal[:, None], sides)
+    inwards = np.cross(normal[:, None], np.roll(beyond, -1, 1) - beyond)
     height = np.einsum("pvx,px->pv", corners - beyond[:, :1], normal)
 
     def projects_inside(points: Array) -> NDArray[np.bool_]:
-        return np.asarray(
-            (
-                np.einsum("px,psx->ps", points, inwards) > np.einsum("psx,psx->ps", beyond, inwards)
-            ).all(1)
-        )
+        level = np.einsum("psx,psx->ps", beyond, inwards)
+        return np.asarray((np.einsum("px,psx->ps", points, inwards) > level).all(1))
 
     touches = np.zeros(len(one), dtype=bool)
     for v in range(3):
@@ -258,10 +245,8 @@ def _triangles_touch(
             gap = _segment_distances(corners[:, v], corners[:, w], beyond[:, s], beyond[:, e])
             touches |= disjoint & (gap < min_gap)
             # A corner that lies on a side whose other end is a neighbour.
-            touches |= ~shared[:, v] & (
-                _segment_distances(corners[:, v], corners[:, v], beyond[:, s], beyond[:, e])
-                < min_gap
-            )
+            gap = _segment_distances(corners[:, v], corners[:, v], beyond[:, s], beyond[:, e])
+            touches |= ~shared[:, v] & (gap < min_gap)
     return touches
 
 
@@ -271,16 +256,13 @@ def _segment_distances(a: Array, b: Array, c: Array, d: Array) -> Array:
     Source: Ericson, Real-Time Collision Detection, §5.1.9.
     """
     first, second, offset = b - a, d - c, a - c
-    square, other, mixed = (
-        np.einsum("px,px->p", x, y) for x, y in ((first, first), (second, second), (first, second))
-    )
+    pairs = (first, first), (second, second), (first, second)
+    square, other, mixed = (np.einsum("px,px->p", x, y) for x, y in pairs)
     begin, end = (np.einsum("px,px->p", x, offset) for x in (first, second))
     minimum = 1e-30
     determinant = square * other - mixed**2
-    s = (mixed * end - begin * other) / np.where(
-        determinant > 1e-12 * square * other + minimum, determinant, np.inf
-    )
-    s = np.clip(s, 0, 1)
+    is_skew = determinant > 1e-12 * square * other + minimum
+    s = np.clip((mixed * end - begin * other) / np.where(is_skew, determinant, np.inf), 0, 1)
     t = np.clip((mixed * s + end) / np.maximum(other, minimum), 0, 1)
     s = np.clip((mixed * t - begin) / np.maximum(square, minimum), 0, 1)
     difference = offset + s[:, None] * first - t[:, None] * second

@@ -88,8 +88,7 @@ def build_cells(corners: Float64[np.ndarray, "facet 3 3"], side: float) -> Surfa
     """
     place, normal, area = _subdivide_triangles(corners, side / _PIECES_PER_SIDE)
     owner = _cluster_pieces(np.concatenate([place, _NORMAL_WEIGHT * side * normal], 1), area, side)
-    count = int(owner.max()) + 1
-    whole = np.bincount(owner, area, count).astype(np.float64)
+    whole = np.bincount(owner, area).astype(np.float64)
     centre = _cell_means(owner, area, place, whole)
     normals = _cell_means(owner, area, normal, whole)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -123,15 +122,13 @@ def _subdivide_triangles(corners: Array, longest: float) -> tuple[Array, Array, 
 def _cluster_pieces(feature: Array, area: Array, side: float) -> NDArray[np.int64]:
     """Assign pieces to cells by Lloyd's algorithm from area-weighted seeds; deterministic."""
     count = max(1, round(float(area.sum()) / side**2))
-    generator = np.random.default_rng(0)
-    order = generator.permutation(len(area))
+    order = np.random.default_rng(0).permutation(len(area))
     cumulative = np.cumsum(area[order]) / area.sum()
     # One seed per equal share of the area.
     chosen = order[np.searchsorted(cumulative, (np.arange(count) + 0.5) / count)]
     centre = feature[np.unique(chosen)]
     seeding = order[: _SEEDING_PIECES * count]
-    rounds = [seeding] * _SEEDING_ROUNDS + [order] * _FINAL_ROUNDS
-    for pieces in rounds:
+    for pieces in [seeding] * _SEEDING_ROUNDS + [order] * _FINAL_ROUNDS:
         owner = _find_nearest(centre, feature[pieces])
         cell_area = np.bincount(owner, area[pieces], len(centre)).astype(np.float64)
         occupied = cell_area > 0
@@ -151,8 +148,7 @@ def _cell_means(owner: NDArray[np.int64], area: Array, value: Array, cell_area: 
 
 
 def _tangent_axes(normal: Array) -> Array:
-    aside = np.eye(3)[np.abs(normal).argmin(1)]
-    first = np.cross(normal, aside)
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.asarray(np.stack([first, np.cross(normal, first)], 1), dtype=np.float64)
 
@@ -239,18 +235,13 @@ class _MFIEEquation:
         self.use_direct_solver = wave_count * _CELLS_PER_WAVE_DIRECT > len(cells.point)
         self.origin = torch.from_numpy(cells.point.mean(0))
         self.point = torch.from_numpy(cells.point) - self.origin
-        self.normal, self.tangents = (
-            torch.from_numpy(cells.normal),
-            torch.from_numpy(cells.tangents),
-        )
+        self.normal, self.tangents = map(torch.from_numpy, (cells.normal, cells.tangents))
         self.area, self.curvature = torch.from_numpy(cells.area), torch.from_numpy(cells.curvature)
         ball = torch.from_numpy(cells.inscribed_radius)
-        self.inner_depth = (_INNER_DEPTH_SHARE * ball).clamp_max(
-            _MAX_INNER_DEPTH * 2 * math.pi / wave_number
-        )
-        self.inner_weight = _INNER_WEIGHT * (
-            self.inner_depth >= _MIN_CELLS_PER_DEPTH * self.area.sqrt()
-        )
+        most = _MAX_INNER_DEPTH * 2 * math.pi / wave_number
+        self.inner_depth = (_INNER_DEPTH_SHARE * ball).clamp_max(most)
+        is_resolved = self.inner_depth >= _MIN_CELLS_PER_DEPTH * self.area.sqrt()
+        self.inner_weight = _INNER_WEIGHT * is_resolved
 
     @cached_property
     def matrix(self) -> Complex64[Tensor, "unknown unknown"]:
@@ -267,9 +258,8 @@ class _MFIEEquation:
             strength[torch.arange(len(rows)), rows] = 0
             inner = square - 2 * self.inner_depth[rows, None].float() * height
             inner = (inner + self.inner_depth[rows, None].float() ** 2).clamp_min(1e-20)
-            second = self.inner_weight[rows, None].to(torch.complex64) * _greens_gradient(
-                self.k, inner, weight
-            )
+            second = _greens_gradient(self.k, inner, weight)
+            second = self.inner_weight[rows, None].to(torch.complex64) * second
             combined = strength + second
             lower = strength * height + second * (height - self.inner_depth[rows, None].float())
             for a in (0, 1):
@@ -322,8 +312,7 @@ class _MFIEEquation:
     def _excitation(self, direction: Tensor, field: Tensor) -> Tensor:
         """n × H along both tangents of every cell, without phases: [axis, cell, aspect, field]."""
         magnetic = cross(direction[:, None], field)
-        along = cross(self.tangents, self.normal[:, None])
-        return torch.einsum("cix,atx->icat", along, magnetic)
+        return torch.einsum("cix,atx->icat", cross(self.tangents, self.normal[:, None]), magnetic)
 
     def _origin_phase(self, directions: Tensor) -> Tensor:
         """Phasor between the cells' centroid and the world's origin."""
@@ -360,9 +349,8 @@ def _solve_gmres(
     """Solve for all columns at once by GMRES (Saad and Schultz 1986)."""
     size = right.norm(dim=0)
     basis = [right / size]
-    upper = torch.zeros(
-        _MAX_ITERATIONS + 1, _MAX_ITERATIONS, right.shape[1], dtype=torch.complex128
-    )
+    shape = _MAX_ITERATIONS + 1, _MAX_ITERATIONS, right.shape[1]
+    upper = torch.zeros(shape, dtype=torch.complex128)
     coefficients = upper[:0]
     for iteration in range(1, _MAX_ITERATIONS + 1):
         vector_new = matrix @ basis[-1]

@@ -86,16 +86,10 @@ class CurrentSolver(ABC, Generic[Elements]):
             wave_count: number of waves to solve for.
         """
 
-    def supports(self, wave_number: float) -> bool:
-        """Test if a valid discretisation of allowed size exists.
-
-        Args:
-            wave_number: wave number k [1/m].
-        """
-        return self.elements(wave_number) is not None
-
     def elements(self, wave_number: float) -> Elements | None:
         """Return elements for a wave number; the previous ones are reused if fine enough.
+
+        None without a valid discretisation of allowed size.
 
         Args:
             wave_number: wave number k [1/m].
@@ -126,9 +120,8 @@ class CurrentSolver(ABC, Generic[Elements]):
         elements = self.elements(wave_number)
         if elements is None:
             return None
-        equation = self.assemble_equation(
-            elements, wave_number, 2 * sum(len(pair[0]) for pair in antenna_pairs)
-        )
+        wave_count = 2 * sum(len(pair[0]) for pair in antenna_pairs)
+        equation = self.assemble_equation(elements, wave_number, wave_count)
         found: list[Tensor] = []
         for transmitters, receivers in antenna_pairs:
             chunks: list[Tensor] = []
@@ -167,9 +160,8 @@ def conserves_power(
     radiated = torch.zeros(2, dtype=torch.float64)
     for z, weight in zip(nodes, node_weights * math.pi / len(nodes), strict=True):
         ring = math.sqrt(1 - z**2)
-        directions = torch.stack(
-            [ring * azimuths.cos(), ring * azimuths.sin(), torch.full_like(azimuths, z)], 1
-        )
+        heights = torch.full_like(azimuths, z)
+        directions = torch.stack([ring * azimuths.cos(), ring * azimuths.sin(), heights], 1)
         wave = phasor(wave_number * (directions @ offset.T))
         field = wave_number / (4 * math.pi) * torch.einsum("sc,ctx->stx", wave, current_moments)
         along = torch.einsum("stx,sx->st", field, directions + 0j)

@@ -1,0 +1,38 @@
+"""Tables with one row for each path, ray, edge or surface point."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self, TypeVar
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Base of tables: their tensors have one row each, and so do the tables in a table."""
+
+    def select(self, rows: Tensor) -> Self:
+        """Select rows.
+
+        Args:
+            rows: mask or row numbers.
+        """
+        columns = {n: v[rows] for n, v in vars(self).items() if isinstance(v, Tensor)}
+        tables = {n: v.select(rows) for n, v in vars(self).items() if isinstance(v, Rows)}
+        return replace(self, **columns, **tables)
+
+
+Table = TypeVar("Table", bound=Rows)
+
+
+def concatenate_rows(parts: Sequence[Table], **columns: Tensor) -> Table:
+    """Concatenate tables; what is not a tensor is taken from the first.
+
+    Args:
+        parts: one or more tables.
+        columns: columns that are joined otherwise.
+    """
+    names = [n for n, v in vars(parts[0]).items() if isinstance(v, Tensor) and n not in columns]
+    joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    return replace(parts[0], **joined, **columns)
