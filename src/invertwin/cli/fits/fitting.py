@@ -11,7 +11,6 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from invertwin import inversion
 from invertwin.capture import calibrate
 from invertwin.cli.fits.displays import StepRecorder, steps_path
 from invertwin.cli.fits.problem import (
@@ -30,6 +29,19 @@ from invertwin.cli.fits.shape_scores import CURVE_KEY, make_shape_metric
 from invertwin.cli.fits.spreading import fit_file_stem
 from invertwin.cli.schema import build
 from invertwin.errors import InputError
+from invertwin.inversion import (
+    Callback,
+    Checkpoint,
+    Observation,
+    Reconstruction,
+    Report,
+    Screening,
+    Stage,
+    Watch,
+    reconstruct,
+    report_progress,
+    search,
+)
 from invertwin.inversion.callbacks import stage_checkpoint_path
 from invertwin.inversion.fit import Fit
 from invertwin.radar.parameters import ClockOffset, RangeBias
@@ -56,7 +68,7 @@ def fit_all(
     """
     work = problem.work
     rows: dict[str, list[Row]] = {method: [] for method in problem.methods}
-    outcomes: dict[tuple[str, int], Callable[[], inversion.Reconstruction]] = {}
+    outcomes: dict[tuple[str, int], Callable[[], Reconstruction]] = {}
     for method, number in work:
         own = problem.kind.with_recording_of_start(problem, number, console)
         checkpoint = CHECKPOINT if len(work) == 1 else None
@@ -83,7 +95,7 @@ def run_fit(
     console: Console,
     checkpoint: str | None,
     show: Callable[[Fit, DisplayStep], None] | None = None,
-) -> tuple[Row, Callable[[], inversion.Reconstruction]]:
+) -> tuple[Row, Callable[[], Reconstruction]]:
     """Make one fit, or read what an interrupted run has kept of it.
 
     Args:
@@ -110,7 +122,7 @@ def run_fit(
         return row, lambda: again()[0]
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if method == OWN_METHOD else f", {method.replace('_', ' ')}")
-    with inversion.report_progress(name, sum(stage.steps for stage in stages), console) as shown:
+    with report_progress(name, sum(stage.steps for stage in stages), console) as shown:
         found, found_ends = again(shown)
     curve = [[row["step"] + 1, row[CURVE_KEY]] for row in found.history if CURVE_KEY in row]
     row = {
@@ -135,22 +147,22 @@ def run_fit(
 
 def _fit_or_search(
     problem: Problem,
-    stages: Sequence[inversion.Stage],
+    stages: Sequence[Stage],
     start: Start,
     index: int,
     folder: RunFolder,
     checkpoint: str,
     show: Callable[[Fit, DisplayStep], None] | None,
-    shown: Sequence[inversion.Report] = (),
-) -> tuple[inversion.Reconstruction, Row]:
+    shown: Sequence[Report] = (),
+) -> tuple[Reconstruction, Row]:
     """Fit, or search about the start; return what the row says of the search, too."""
     run, watch = problem.run, make_shape_metric(problem)
     every = run.measures.every if run.measures else 1
 
-    def callbacks(file: str) -> list[inversion.Callback]:
+    def callbacks(file: str) -> list[Callback]:
         for k in range(len(stages) - 1):
             folder.file(str(stage_checkpoint_path(Path(file), k)))
-        watching = [] if watch is None else [inversion.Watch(watch, every)]
+        watching = [] if watch is None else [Watch(watch, every)]
         kept = StepRecorder(
             folder.file(steps_path(file)),
             [name for name in dict.fromkeys(run.fitted_objects) if name in start.scene.names],
@@ -165,20 +177,18 @@ def _fit_or_search(
     how: dict[str, Any] = {"loss": build.build_loss(run), "schedule": stages, "seed": seed}
     how["optimizer"] = build.build_section(run, "optimizer")
     if run.search is None:
-        return inversion.reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
+        return reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
     part = f"{PARTS}/{Path(checkpoint).stem}_fit"
     starts = problem.kind.make_candidates(problem, start, torch.Generator().manual_seed(seed))
-    screening = inversion.Screening(starts, run.search.fits, run.search.shortlist)
-    found = inversion.search(
-        *given, screening, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how
-    )
+    screening = Screening(starts, run.search.fits, run.search.shortlist)
+    found = search(*given, screening, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how)
     return found.best, {"checkpoint": f"{part}{found.best_number}.pt", **found.to_metrics()}
 
 
-def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> inversion.Checkpoint:
+def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:
     """Goes on from its own unfinished part; open_run has settled what may be there."""
     every = problem.run.fit_settings.checkpoint_every
-    return inversion.Checkpoint(folder.file(name), every, resume=True)
+    return Checkpoint(folder.file(name), every, resume=True)
 
 
 def _fitted_values(modules: nn.ModuleList) -> Row:
@@ -216,10 +226,10 @@ def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> 
         bias, clock = RangeBias(), ClockOffset(capture.positions)
         own = replace(problem, run=run.apply_overrides(table))
         schedule, (model,) = own.run.fit_settings.build(), make_models(own)
-        with inversion.report_progress("calibration", schedule.steps, console) as shown:
-            found = inversion.reconstruct(
+        with report_progress("calibration", schedule.steps, console) as shown:
+            found = reconstruct(
                 Scene({table.object: target}),
-                inversion.Observation(model, capture, sensor=item.sensor, parameters=[bias, clock]),
+                Observation(model, capture, sensor=item.sensor, parameters=[bias, clock]),
                 [],
                 loss=build.build_loss(run),
                 optimizer=build.build_section(own.run, "optimizer"),
