@@ -145,8 +145,8 @@ def scene(parts: Parts, material: Material, theta: Tensor, wall: Material | None
 
 def radar() -> iw.Radar:
     """One transmitter and one receiver, aside of the origin."""
-    arrays = AntennaArray([[-0.1, 0.0, 0.0]]), AntennaArray([[0.1, 0.05, 0.0]])
-    return iw.Radar(*arrays, iw.FMCW(76e9, 1e9, 50e-6, 64), [[0.0, 0.0, 0.0]])
+    arrays = AntennaArray(vector(-0.1, 0, 0)[None]), AntennaArray(vector(0.1, 0.05, 0)[None])
+    return iw.Radar(*arrays, iw.FMCW(76e9, 1e9, 50e-6, 64), torch.zeros(1, 3).double())
 
 
 Mechanism = Callable[[Parts, Tensor], Tensor]
@@ -242,6 +242,7 @@ def evaluate(mechanism: Mechanism, parts: Parts) -> tuple[Tensor, Tensor]:
     with forward_ad.dual_level(), torch.no_grad():
         zero = torch.zeros((), dtype=torch.float64)
         found = forward_ad.unpack_dual(mechanism(parts, forward_ad.make_dual(zero, zero + 1)))
+        assert found.tangent is not None
         return found.primal.clone(), found.tangent.clone()
 
 
