@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Complex128, Float, Float64, Int64
 from torch import Tensor
 
+from invertwin.channel.rows import Rows
 from invertwin.checks import check_fields
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -125,7 +126,7 @@ class Link:
 
 
 @dataclass(frozen=True)
-class Paths:
+class Paths(Rows):
     """Propagation paths, one row each.
 
     ``coefficient`` leaves out the propagation phase: the channel response is
@@ -182,11 +183,6 @@ class Paths:
         way = self.last - link.rx[self.frame]
         local = torch.einsum("nij,ni->nj", link.rotations[self.frame], way)
         return local[:, :2] / way.norm(dim=1, keepdim=True)
-
-    def select(self, mask: Bool[Tensor, " path"] | Int64[Tensor, " select"]) -> "Paths":
-        """Only the paths of a mask, or of indices."""
-        rows = {n: value[mask] for n, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **rows)
 
     @property
     def has_field(self) -> Bool[Tensor, " path"]:

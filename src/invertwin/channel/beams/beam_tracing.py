@@ -209,19 +209,11 @@ def _trace_order(
     keep = (facet != departing.source_facet[source]) & (facing.abs() > 1e-9) & is_front
     source, facet = source[keep], facet[keep]
     normal = -facing[keep].sign()[:, None] * facets.normal[facet]
-    bounce = IlluminatedPatches(
-        departing.aspect[source],
-        facet,
-        normal,
-        departing.direction[source],
-        departing.phase_offset[source],
-        facets.corners[facet],
-        source,
-        departing.wave_vector[source],
-        departing.medium[source],
-        departing.transmitted[source],
-        torch.ones(len(source), dtype=torch.float64),
-    )
+    beams = _DepartingBeams(*(column[source] for column in departing))
+    hit = beams.aspect, facet, normal, beams.direction, beams.phase_offset, facets.corners[facet]
+    wave = beams.wave_vector, beams.medium, beams.transmitted
+    spreading = torch.ones(len(source), dtype=torch.float64)
+    bounce = IlluminatedPatches(*hit, source, *wave, spreading)
     if previous is not None:
         bounce = _clip_to_beams(facets, bounce, previous, departing)
     bounce = _remove_occluded(facets, bounce, None if previous is None else departing, solids)

@@ -86,10 +86,9 @@ def _boundary_paths(
 def _read_random_walk(trace: PowerTracer, records: PathRecords) -> Iterator[Paths]:
     """The paths of one point, of two and so on; the kernel says what arrives at the last point."""
     vertices = [records.read_vertex(mi.UInt32(number)) for number in range(records.depth)]
-    face, b1, b2, throughput, seen = (
-        torch.stack([to_torch(getattr(vertex, name)) for vertex in vertices], dim=1)
-        for name in ("face", "b1", "b2", "throughput", "is_visible")
-    )
+    names = ("face", "b1", "b2", "throughput", "is_visible")
+    columns = [[to_torch(getattr(vertex, name)) for vertex in vertices] for name in names]
+    face, b1, b2, throughput, seen = (torch.stack(column, dim=1) for column in columns)
     for count in range(1, records.depth + 1):
         lit = seen[:, count - 1].bool()
         weight = throughput[lit, count - 1].double()

@@ -198,15 +198,9 @@ class _CoverageTracer:
     ) -> list[CoverageBoundaryPaths]:
         """Boundary paths to illumination boundaries: path values times the boundary's area rate."""
         with _DisableFuncTorch():
+            search = self.receiving_surface, self.tx, self.sequences, self.powers
             groups = sample_illumination_boundaries(
-                self.surfaces,
-                self.receiving_surface,
-                self.tx,
-                self.sequences,
-                self.powers,
-                depth=self.depth,
-                samples=samples,
-                seed=seed,
+                self.surfaces, *search, depth=self.depth, samples=samples, seed=seed
             )
         boundary_paths: list[CoverageBoundaryPaths] = []
         for some in groups:
@@ -229,9 +223,8 @@ class _CoverageTracer:
         """Boundary paths where the scene intersects the surface: jump of values times area rate."""
         with _DisableFuncTorch():
             joint_topology = topology_of(self.meshes)
-            curve_points = sample_intersection_curves(
-                self.surfaces, self.receiving_surface, joint_topology, samples, seed
-            )
+            own, receiver = self.surfaces, self.receiving_surface
+            curve_points = sample_intersection_curves(own, receiver, joint_topology, samples, seed)
             if not len(curve_points.face):
                 return []
             offset = SIDE_OFFSET * self.surfaces.margin * curve_points.across

@@ -302,17 +302,11 @@ def _launch_past_edges(
             start = dot(point[:, -1] - image, normal[:, -1]) / slope
             offset_length = surfaces.margin * slope.sign()
             origin = image + start[:, None] * direction + offset_length[:, None] * normal[:, -1]
-        yield _RaysPastEdges(
-            origin,
-            direction,
-            length - start,
-            chains.source,
-            chains.target,
-            side,
-            torch.full_like(chains.source, count),
-            pad(chains.faces, (0, depth - count), value=-1),
-            pad(chains.transmitted, (0, depth - count), value=False),
-        ).select(valid)
+        rays = origin, direction, length - start, chains.source, chains.target, side
+        steps = torch.full_like(chains.source, count)
+        faces = pad(chains.faces, (0, depth - count), value=-1)
+        through = pad(chains.transmitted, (0, depth - count), value=False)
+        yield _RaysPastEdges(*rays, steps, faces, through).select(valid)
 
 
 def _follow_rays(
@@ -343,16 +337,10 @@ def _follow_rays(
             ray_offset = surfaces.margin * dot(next_direction, normal).sign()
             faces, through = part.faces.clone(), part.through.clone()
             faces[:, step], through[:, step] = hit, passes
-            branches.append(
-                replace(
-                    part,
-                    origin=hit_point + ray_offset[:, None] * normal,
-                    direction=next_direction,
-                    min_distance=part.min_distance - distance[rows],
-                    faces=faces,
-                    through=through,
-                )
-            )
+            origin = hit_point + ray_offset[:, None] * normal
+            left = part.min_distance - distance[rows]
+            part = replace(part, origin=origin, direction=next_direction, min_distance=left)
+            branches.append(replace(part, faces=faces, through=through))
         rays = concatenate_rows(branches)
         step += 1
 

@@ -220,15 +220,10 @@ class _SingleScatteringTracer:
         corners = stage.vertices[stage.topology.faces]
         for end, count in enumerate((samples, -(-samples // receivers))):
             with _DisableFuncTorch():
+                receiver, depth = ReceivingTriangles(self.is_scattering), self.depth - 1
+                search = receiver, self.antennas[end], self.sequences[end], self.powers
                 samples_by_length = sample_illumination_boundaries(
-                    self.surfaces,
-                    ReceivingTriangles(self.is_scattering),
-                    self.antennas[end],
-                    self.sequences[end],
-                    self.powers,
-                    depth=self.depth - 1,
-                    samples=count,
-                    seed=self.seed + 2 + end,
+                    self.surfaces, *search, depth=depth, samples=count, seed=self.seed + 2 + end
                 )
             for boundary_samples in samples_by_length:
                 moving = (stage.tx, stage.rx)[end], stage.vertices

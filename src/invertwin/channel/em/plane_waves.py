@@ -145,9 +145,8 @@ def radiate_field(
     total = radiate_currents(wave_number, normal, direction, field, reflected, scattered_direction)
     thin = torch.isfinite(interfaces.thickness) & ~interfaces.conducting
     if bool(thin.any()):
-        sheet = _radiate_sheet(
-            interfaces, wave_number, normal, direction, field, scattered_direction
-        )
+        wave = normal, direction, field, scattered_direction
+        sheet = _radiate_sheet(interfaces, wave_number, *wave)
         total = torch.where(thin[:, None, None], sheet, total)
     leaving = dot(normal, scattered_direction)
     attenuation = roughness_attenuation(interfaces, wave_number, leaving - dot(normal, direction))

@@ -162,10 +162,8 @@ class _CloudRays:
         back = points - self.origins[1][self.frame][:, None]
         return_length = back.norm(dim=2)
         rotation = link.rotations[self.frame]
-        towards = [
-            torch.einsum("rij,rkj->rki", rotation.mT @ self.rotation, vector)
-            for vector in (direction[:, None], back / return_length[..., None])
-        ]
+        ways, turn = (direction[:, None], back / return_length[..., None]), rotation.mT
+        towards = [torch.einsum("rij,rkj->rki", turn @ self.rotation, way) for way in ways]
         gain = link.tx_pattern.gain(towards[0]) * link.rx_pattern.gain(towards[1])
         scale = (link.wavelength / (4 * math.pi)) ** 2 * self.cloud.albedo / (4 * math.pi)
         (share,) = polarisation_shares(link, depolarising=False)

@@ -128,9 +128,8 @@ class DirectionSampler:
         if spheres.max_objects == 1:
             return sample.lobe_density
         group = spheres.face_group(face, active)
-        found, around = spheres.group_density(
-            self.rays, group, point.position, sample.omega, active, sample.target
-        )
+        line = point.position, sample.omega
+        found, around = spheres.group_density(self.rays, group, *line, active, sample.target)
         members, (_, groups) = mi.Float(spheres.member_count(group)), spheres.scene_groups(scene)
         # A try fails with the share of spheres that contain the point.
         failing = around / members

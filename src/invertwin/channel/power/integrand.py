@@ -318,9 +318,8 @@ def pull_interaction(
             interaction.
     """
     b1, b2 = point.b1, point.b2
-    first, second = (
-        dr.gather(mi.Vector4f, inputs.triangles, point.face * 3 + k, active).xyz for k in (1, 2)
-    )
+    rows = point.face * 3 + 1, point.face * 3 + 2
+    first, second = (dr.gather(mi.Vector4f, inputs.triangles, row, active).xyz for row in rows)
     crossed = dr.cross(first, second)
     scale = dr.rsqrt(dr.squared_norm(crossed))
     unit = crossed * scale

@@ -36,10 +36,8 @@ def arrange_scenes(
     points = strip_derivatives(geometry.vertices)
     antennas = torch.cat([strip_derivatives(link.tx), strip_derivatives(link.rx)])
     rows = owner[:, None].expand(-1, 3)
-    low, high = (
-        around.expand(count, 3).scatter_reduce(0, rows, points, how)
-        for around, how in ((antennas.amin(0), "amin"), (antennas.amax(0), "amax"))
-    )
+    low = antennas.amin(0).expand(count, 3).scatter_reduce(0, rows, points, "amin")
+    high = antennas.amax(0).expand(count, 3).scatter_reduce(0, rows, points, "amax")
     shift = _box_centres(count, (high - low).amax(0)) - 0.5 * (low + high)
     vertices = geometry.vertices + shift[owner]
 

@@ -79,10 +79,9 @@ def find_overlapping_boxes(
     count = len(geometry.differentiated)
     owner = geometry.topology.vertex_object[:, None].expand(-1, 3)
     points = geometry.vertices.detach()
-    low, high = (
-        points.new_zeros(count, 3).scatter_reduce(0, owner, points, how, include_self=False)
-        for how in ("amin", "amax")
-    )
+    none = points.new_zeros(count, 3)
+    low = none.scatter_reduce(0, owner, points, "amin", include_self=False)
+    high = none.scatter_reduce(0, owner, points, "amax", include_self=False)
     margin = 1e-5 * (high - low).amax().clamp_min(1.0)
     low, high = low - margin, high + margin
     for axis in range(3):
@@ -148,10 +147,8 @@ def _trace_edges(
     edge = to_index(torch.cat([edges, edges[extended]]))
     longer = to_index(torch.cat([extended, extended[extended]])) > 0
     back = dr.arange(mi.UInt32, dr.width(edge)) >= len(edges)
-    y0, y1 = (
-        gather_points(rays.vertices, dr.gather(mi.UInt32, ends, edge))
-        for ends in rays.topology.device_edges
-    )
+    vertices = (dr.gather(mi.UInt32, ends, edge) for ends in rays.topology.device_edges)
+    y0, y1 = (gather_points(rays.vertices, vertex) for vertex in vertices)
     start, offset = dr.select(back, y1, y0), dr.select(back, y0 - y1, y1 - y0)
     step = _EDGE_EXTENSION * (dr.norm(y0) + dr.norm(y1)) / dr.maximum(dr.norm(offset), 1e-30)
     step = dr.minimum(step + RAY_EPSILON, 0.5)

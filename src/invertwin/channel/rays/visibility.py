@@ -121,9 +121,8 @@ class ViewpointScene:
             sides = [dot(point - ends[:, 0], across) for point in pair]
             turns = sides[0] * sides[1] >= 0
         first, second = topology.edges[torch.nonzero(alone | turns)[:, 0]].unbind(1)
-        return DiscontinuityCurves(
-            points[first], points[second], first, second, is_intersection=False
-        )
+        ends = points[first], points[second]
+        return DiscontinuityCurves(*ends, first, second, is_intersection=False)
 
     def find_intersections(self) -> DiscontinuityCurves:
         """Curves in which two objects cross."""

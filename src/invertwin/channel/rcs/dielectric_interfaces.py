@@ -131,12 +131,11 @@ def scatter_at_interfaces(
     roughness = interfaces.rows(rows)
     outer = radiate_currents(wave_number, -n, wave, field[rows], inner, s)
     p = -dot(wave, n).real
-    losses = [
-        roughness_attenuation(roughness, wave_number, cosine)[:, None, None]
-        for cosine in (p + dot(n, s), 2 * p)
-    ]
-    radiated = radiated.index_copy(0, rows, project_transverse(outer, s) * losses[0])
-    reflected = reflected.index_copy(0, rows, inner * losses[1])
+    cosines = p + dot(n, s), 2 * p
+    losses = [roughness_attenuation(roughness, wave_number, cosine) for cosine in cosines]
+    outer = project_transverse(outer, s) * losses[0][:, None, None]
+    radiated = radiated.index_copy(0, rows, outer)
+    reflected = reflected.index_copy(0, rows, inner * losses[1][:, None, None])
     return InterfaceFields(radiated, reflected, transmitted.index_copy(0, rows, onward))
 
 

@@ -265,9 +265,8 @@ class _FarFieldTracer:
         for f in frequency_indices:
             k = target.wave_numbers[f]
             if not (target.is_smooth_metal and currents):
-                currents = self._patch_amplitudes(
-                    patch_orders, solids, target.interfaces[f], 1.0 if target.is_smooth_metal else k
-                )
+                skins, scale = target.interfaces[f], 1.0 if target.is_smooth_metal else k
+                currents = self._patch_amplitudes(patch_orders, solids, skins, scale)
             rows = zip(orders, patch_orders, integrals, currents, strict=False)
             for order, patches, integral, current in rows:
                 strength = integral(k) * (k if target.is_smooth_metal else 1.0)
@@ -291,9 +290,8 @@ class _FarFieldTracer:
             for solids, members in target.interiors:
                 patch_orders = outside
                 if solids is not None:
-                    patch_orders = trace_inner_tubes(
-                        target.smooth_faces, target.occluders, solids, outside, tube_width, depth
-                    )
+                    surface, options = target.smooth_faces, (outside, tube_width, depth)
+                    patch_orders = trace_inner_tubes(surface, target.occluders, solids, *options)
                 yield patch_orders, solids, members
 
     def _patch_amplitudes(

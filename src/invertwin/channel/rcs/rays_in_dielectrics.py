@@ -166,9 +166,8 @@ def trace_inner_tubes(
             parts.append(_to_complex(outer_orders[order]))
             begun.append(_launch_inner_tubes(surface, solids, outer_orders[order]))
         if tubes is not None:
-            inner, tubes = _trace_tubes(
-                surface, occluders, solids, found[-1], tubes, min_tube_width
-            )
+            last = found[-1]
+            inner, tubes = _trace_tubes(surface, occluders, solids, last, tubes, min_tube_width)
             if parts:
                 tubes = replace(tubes, patch=tubes.patch + len(parts[0].aspect))
             parts.append(inner)
@@ -252,9 +251,8 @@ def _trace_tubes(
     departing = _DepartingTubes(*(x[_has_area(facets, departing.corners)] for x in departing))
 
     def directions_at(row: Tensor, points: Tensor) -> Tensor:
-        where = departing.corners[row][:, None]
-        found = interpolate_vectors(departing.directions[row][:, None], where, points)
-        return normalize(found, dim=2)
+        directions, corners = departing.directions[row], departing.corners[row]
+        return normalize(interpolate_vectors(directions[:, None], corners[:, None], points), dim=2)
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
         shape, many = points.shape[:2], row.repeat_interleave(points.shape[1])

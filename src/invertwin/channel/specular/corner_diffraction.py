@@ -93,9 +93,8 @@ def diffract_round_corner(
     if last.azimuth_in is None:
         raise ValueError("no face lies between both edges")
     azimuth = exterior_azimuth(last.wedges, leg, 0)
-    final = EdgeDiffraction(
-        last.wedges, leg, leg, last.azimuth_in, azimuth, length * sine**2, last.face_coefficients
-    )
+    angles, reduced = (last.azimuth_in, azimuth), length * sine**2
+    final = EdgeDiffraction(last.wedges, leg, leg, *angles, reduced, last.face_coefficients)
     orders: tuple[DyadDerivative, ...] = ("value", "out") if len(before) == 1 else ("value",)
     fields = transfer_dyads(route, first, wave_number, orders)
     dyads = diffraction_dyads(final, wave_number, ("value", "in"))

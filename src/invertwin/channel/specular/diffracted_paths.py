@@ -138,9 +138,8 @@ class _AntennaLeg(UnfoldedPaths):
     """Unfolded legs between an antenna and an edge."""
 
     def __init__(self, wedge_scene: WedgeScene, legs: PathLegs, position: Tensor) -> None:
-        super().__init__(
-            wedge_scene.vertices, wedge_scene.topology, legs.faces, legs.transmitted, position
-        )
+        moving = wedge_scene.vertices, wedge_scene.topology
+        super().__init__(*moving, legs.faces, legs.transmitted, position)
         self.coefficients = wedge_scene.coefficients
 
     def rotate_axis(self, axis: Tensor) -> Tensor:

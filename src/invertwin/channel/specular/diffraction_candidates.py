@@ -126,9 +126,8 @@ def find_diffraction_candidates(
     ]
     for surfaces in range(len(tables)):
         for before in range(surfaces + 1):
-            yield from _diffract_once(
-                wedge_scene, sides[0][before], sides[1][surfaces - before], depth
-            )
+            ends = sides[0][before], sides[1][surfaces - before]
+            yield from _diffract_once(wedge_scene, *ends, depth)
     if order > 1:
         yield from _diffract_repeatedly(wedge_scene, (tx, rx), order)
 
@@ -154,9 +153,8 @@ def _edge_sequences(
         points = wedge_scene.offset_points(edge, points)
         tables += shoot_sequences_from_edges(surfaces, interactions, points, edge, depth, seed)
     # Planes that contain the edge are its faces.
-    return [tables[0]] + [
-        table[~_lies_in_plane(wedge_scene, table[:, 0], table[:, 1] >> 1)] for table in tables[1:]
-    ]
+    own = [_lies_in_plane(wedge_scene, table[:, 0], table[:, 1] >> 1) for table in tables[1:]]
+    return [tables[0], *(table[~mask] for table, mask in zip(tables[1:], own, strict=True))]
 
 
 def _lies_in_plane(wedge_scene: WedgeScene, edge: Tensor, plane: Tensor) -> Bool[Tensor, " row"]:
@@ -262,15 +260,12 @@ def _diffract_once(
                 surfaces, side.steps[rows].flip(1), side.position[rows], beside[rows]
             )
         if bool(valid.any()):
-            yield DiffractionCandidates(
-                outbound.antenna,
-                inbound.antenna,
-                outbound.edge[:, None],
-                PathLegs(faces[0], (outbound.steps.flip(1) & 1).bool()),
-                PathLegs(faces[1].flip(1), (inbound.steps & 1).bool()),
-                torch.full((len(outbound.edge), 0, 2), -1),
-                absorbing=count == depth > 0,
-            ).select(torch.nonzero(valid)[:, 0])
+            numbers = outbound.antenna, inbound.antenna, outbound.edge[:, None]
+            before = PathLegs(faces[0], (outbound.steps.flip(1) & 1).bool())
+            after = PathLegs(faces[1].flip(1), (inbound.steps & 1).bool())
+            legs = before, after, torch.full((len(outbound.edge), 0, 2), -1)
+            found = DiffractionCandidates(*numbers, *legs, absorbing=count == depth > 0)
+            yield found.select(torch.nonzero(valid)[:, 0])
 
 
 def _match_edges(

@@ -276,9 +276,8 @@ def find_paths_from(
             target = target + begin
             chosen, source = part[sequence], source_index[target]
             plane = None if target_planes is None else target_planes[target]
-            valid, faces = find_unobstructed_paths(
-                surfaces, chosen, sources[source], targets[target], plane
-            )
+            ends = sources[source], targets[target]
+            valid, faces = find_unobstructed_paths(surfaces, chosen, *ends, plane)
             transmitted = (chosen[valid] & 1).bool()
             found.append(SpecularPaths(source[valid], target[valid], faces[valid], transmitted))
     return found

@@ -92,9 +92,8 @@ class _EFIEEquation:
         self.vertices = (target.vertices[torch.from_numpy(mesh.parent_vertices)] * weights).sum(1)
         self.fixed_vertices = self.vertices.detach()
         self.interior_points = _sample_interior_points(target, self.vertices, mesh, wave_number)
-        self.interior_matrix = self.efie_matrix.interior_field_matrix(
-            self.fixed_vertices, self.interior_points.detach()
-        )
+        inside = self.interior_points.detach()
+        self.interior_matrix = self.efie_matrix.interior_field_matrix(self.fixed_vertices, inside)
         # Interior fields have the same total weight as those on the surface.
         self.interior_weight = target.area / max(1, len(self.interior_matrix))
         # Column-major memory, overwritten by LAPACK.
