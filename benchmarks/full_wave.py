@@ -89,7 +89,7 @@ SEVEN_POINTS = _seven_points()
 
 
 def sheets(squares: Sequence[tuple[Any, Any, Any]], step: float) -> Grid:
-    """Parallelograms (a corner and two sides) as one mesh without seams.
+    """Parallelograms (a corner and two sides) as one mesh without mesh_topology.
 
     Args:
         squares: normals are the vector products of the sides.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from invertwin.checks import checked_tensor, strip_derivatives
 from invertwin.errors import InputError
-from invertwin.scene import seams
+from invertwin.scene import mesh_topology
 
 
 @dataclass(frozen=True)
@@ -67,10 +67,10 @@ class Mesh:
     def summary(self) -> "MeshSummary":
         """Return its size and topology, of welded vertices and divided edges as rays meet them."""
         points = strip_derivatives(self.vertices).numpy()
-        places = seams.separate_groups(points, np.zeros(len(points), dtype=np.int64))
-        welded = seams.weld_vertices(places)[strip_derivatives(self.faces).numpy()]
-        ends, _, _ = seams.half_edges(welded, places)
-        _, _, counts = seams.unique_edges(ends, len(places))
+        places = mesh_topology.separate_groups(points, np.zeros(len(points), dtype=np.int64))
+        welded = mesh_topology.weld_vertices(places)[strip_derivatives(self.faces).numpy()]
+        ends, _, _ = mesh_topology.half_edges(welded, places)
+        _, _, counts = mesh_topology.unique_edges(ends, len(places))
         x, y, z = np.ptp(points, axis=0).tolist()
         edges = int((counts == 1).sum()), int((counts > 2).sum())
         return MeshSummary((x, y, z), len(self.faces), *edges)

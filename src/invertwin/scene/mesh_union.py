@@ -14,9 +14,9 @@ from annotated_types import MinLen
 from jaxtyping import Int64
 
 from invertwin.checks import is_differentiated, strip_derivatives
-from invertwin.scene import seams
+from invertwin.scene import mesh_topology
 from invertwin.scene.mesh import Mesh, concatenate_meshes
-from invertwin.scene.winding import find_inward_faces
+from invertwin.scene.mesh_topology import find_inward_faces
 
 _SAME_AREA = 1e-9  # relative change of the area of parts that only stand side by side
 
@@ -44,9 +44,9 @@ def unite_parts(mesh: Mesh) -> Mesh:
         mesh: parts of one material, without derivatives.
     """
     points = strip_derivatives(mesh.vertices).numpy()
-    places = seams.separate_groups(points, np.zeros(len(points), dtype=np.int64))
-    welded = seams.weld_vertices(places)[strip_derivatives(mesh.faces).numpy()]
-    part = seams.find_parts(welded, places)
+    places = mesh_topology.separate_groups(points, np.zeros(len(points), dtype=np.int64))
+    welded = mesh_topology.weld_vertices(places)[strip_derivatives(mesh.faces).numpy()]
+    part = mesh_topology.find_parts(welded, places)
     bodies, united = list[manifold3d.Manifold](), np.zeros(len(welded), dtype=bool)
     for number in _touching_parts(welded, part, places):
         own = part == number
@@ -61,7 +61,7 @@ def unite_parts(mesh: Mesh) -> Mesh:
     area = sum(body.surface_area() for body in bodies)
     if abs(whole.surface_area() - area) <= _SAME_AREA * area:
         return mesh
-    outer = whole.as_original().simplify(seams.WELD_TOLERANCE * size).to_mesh64()
+    outer = whole.as_original().simplify(mesh_topology.WELD_TOLERANCE * size).to_mesh64()
     vertices = np.asarray(outer.vert_properties, dtype=np.float64)
     faces = np.asarray(outer.tri_verts, dtype=np.int64)
     kept = welded[~united & (part >= 0)]
@@ -73,7 +73,7 @@ def unite_parts(mesh: Mesh) -> Mesh:
 
 
 def _touching_parts(
-    welded: Int64[np.ndarray, "f 3"], part: Int64[np.ndarray, " f"], places: seams.Points
+    welded: Int64[np.ndarray, "f 3"], part: Int64[np.ndarray, " f"], places: mesh_topology.Points
 ) -> list[int]:
     """Numbers of parts whose boxes overlap those of others."""
     count = part.max(initial=-1) + 1
@@ -83,12 +83,12 @@ def _touching_parts(
     np.maximum.at(high, part[real], places[welded[real]].max(1))
     meets = np.ones((count, count), dtype=bool)
     for axis in range(3):
-        meets &= low[:, None, axis] <= high[None, :, axis] + seams.WELD_TOLERANCE
+        meets &= low[:, None, axis] <= high[None, :, axis] + mesh_topology.WELD_TOLERANCE
     return np.flatnonzero((meets & meets.T).sum(1) > 1).tolist()
 
 
 def _closed_body(
-    faces: Int64[np.ndarray, "f 3"], points: seams.Points
+    faces: Int64[np.ndarray, "f 3"], points: mesh_topology.Points
 ) -> manifold3d.Manifold | None:
     """Return a part as a body; None for open parts and cavities."""
     if find_inward_faces(faces, points).any():

@@ -11,7 +11,7 @@ from invertwin.channel.rays.rigid_groups import find_rigid_groups
 from invertwin.channel.rays.topology import edges_of, topology_of
 from invertwin.scene import Mesh, box, merge_meshes, plate, rotation_from_vector, sphere
 from invertwin.scene.mesh import concatenate_meshes
-from invertwin.scene.seams import WELD_TOLERANCE, separate_groups, weld_vertices
+from invertwin.scene.mesh_topology import WELD_TOLERANCE, separate_groups, weld_vertices
 
 HALF = math.pi / 2
 TURNS = ((0, 0, 0), (0, 2 * HALF, 0), (0, HALF, 0), (0, -HALF, 0), (HALF, 0, 0), (-HALF, 0, 0))

@@ -285,7 +285,7 @@ def test_a_box_on_the_floor_has_no_edges_there():
 
 
 def test_a_leak_between_coplanar_faces_is_none():
-    """Behind a wall in many pieces, nothing passes along its seams."""
+    """Behind a wall in many pieces, nothing passes along its mesh_topology."""
     around = Scene({"wall": Object(plate(3.0, 3.0, divisions=8), METAL)})
     tx = float64([0.0, 0.0, -3.0])
     share = torch.linspace(-1.0, 1.0, 101, dtype=torch.float64)

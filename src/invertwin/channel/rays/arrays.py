@@ -51,7 +51,12 @@ def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> mit.Fl
 
 
 def to_vectors(kind: Any, values: Tensor) -> Any:
-    """Convert rows of three numbers to a Dr.Jit vector type, such as ``mi.Point3f`` (float32)."""
+    """Convert rows of three numbers to a Dr.Jit vector type.
+
+    Args:
+        kind: type of the result, such as ``mi.Point3f`` (float32).
+        values: rows of three numbers.
+    """
     return kind(*(to_float(column) for column in values.T))
 
 

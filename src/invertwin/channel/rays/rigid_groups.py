@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from invertwin.checks import is_differentiated, strip_derivatives
-from invertwin.scene.seams import WELD_TOLERANCE, find_vertices_on_edges
+from invertwin.scene.mesh_topology import WELD_TOLERANCE, find_vertices_on_edges
 
 _MAX_CACHED_PAIRS = 10_000
 _SAME_MOTION = 1e-9  # relative difference of velocities that count as one

@@ -18,9 +18,9 @@ from invertwin.channel.rays.arrays import to_float, to_index, to_signed
 from invertwin.channel.rays.backend import VARIANTS, backend, mi, mit
 from invertwin.channel.rays.rigid_groups import find_rigid_groups
 from invertwin.checks import strip_derivatives
-from invertwin.scene import seams
+from invertwin.scene import mesh_topology
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.winding import find_inward_faces
+from invertwin.scene.mesh_topology import find_inward_faces
 
 _MAX_CACHED_TOPOLOGIES = 8
 _MIN_SMOOTH_ANGLE, _MAX_SMOOTH_ANGLE = (
@@ -57,8 +57,8 @@ class Topology:
         # Vertices of triangles, the first of each object among them, and the object of each.
         first = torch.searchsorted(owner[used], torch.arange(int(owner.max()) + 1))
         self.used_vertices = used.numpy(), first.numpy(), owner[used].numpy()
-        places = seams.separate_groups(vertices.numpy(), groups[owner.numpy()])
-        welded = seams.weld_vertices(places)[faces.numpy()]
+        places = mesh_topology.separate_groups(vertices.numpy(), groups[owner.numpy()])
+        welded = mesh_topology.weld_vertices(places)[faces.numpy()]
         #: Vertices of triangles, where vertices at one place count as one.
         self.welded_faces: Int64[Tensor, "f 3"] = torch.from_numpy(welded)
         tables = edge_tables(welded, places)
@@ -263,9 +263,8 @@ def edges_of(
     """Edges of a triangle mesh, with opposite vertex and number of every triangle at the edge.
 
     Coincident vertices of one group count as one, and an edge ends where vertices of others lie on
-    it (``seams``), so that split vertices and T-junctions make no false open edges. The other two
-    tables have as many columns as the edge with most triangles, at least 2; absent
-    ones are −1.
+    it, so that split vertices and T-junctions make no false open edges. The other two tables have
+    as many columns as the edge with most triangles, at least 2; absent ones are −1.
 
     Args:
         faces: vertex indices of triangles.
@@ -273,8 +272,8 @@ def edges_of(
         groups: group of each vertex, from 0; only those of one group are welded. None = all.
     """
     groups = np.zeros(len(points), dtype=np.int64) if groups is None else groups
-    places = seams.separate_groups(points, groups)
-    return edge_tables(seams.weld_vertices(places)[faces], places)
+    places = mesh_topology.separate_groups(points, groups)
+    return edge_tables(mesh_topology.weld_vertices(places)[faces], places)
 
 
 def edge_tables(
@@ -286,8 +285,8 @@ def edge_tables(
         faces: welded vertices of triangles.
         places: positions in units of the size of their group.
     """
-    ends, apex, triangle = seams.half_edges(faces, places)
-    edges, group, counts = seams.unique_edges(ends, len(places))
+    ends, apex, triangle = mesh_topology.half_edges(faces, places)
+    edges, group, counts = mesh_topology.unique_edges(ends, len(places))
     order = np.argsort(group, kind="stable")
     start = np.repeat(np.cumsum(counts) - counts, counts)
     opposite = np.full((len(edges), counts.max(initial=2)), -1, dtype=np.int64)

@@ -6,7 +6,7 @@ import torch
 
 from invertwin.channel.rays.topology import topology_of
 from invertwin.scene import Mesh, box, merge_meshes, sphere
-from invertwin.scene.winding import find_inward_faces
+from invertwin.scene.mesh_topology import find_inward_faces
 
 
 def volume(mesh):
