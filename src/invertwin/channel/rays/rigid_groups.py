@@ -45,19 +45,18 @@ def find_rigid_groups(
     """
     fixed = [strip_derivatives(points) for points in vertices]
     moves = np.array([is_differentiated(points) for points in vertices])
-    low = torch.stack([points.amin(0) for points in fixed]).numpy()
-    high = torch.stack([points.amax(0) for points in fixed]).numpy()
+    start = np.cumsum([0, *map(len, fixed)])[:-1]
+    low, high = (f.reduceat(torch.cat(fixed).numpy(), start) for f in (np.minimum, np.maximum))
     reach = WELD_TOLERANCE * np.linalg.norm(high - low, axis=1)[:, None]
     near = ((low - reach)[:, None] <= (high + reach)[None]).all(2)
     near &= near.T & (moves[:, None] == moves)
     if scenes is not None:
         near &= np.equal.outer(scenes, scenes)
-    pairs = [
-        (a, b)
-        for a, b in np.argwhere(np.triu(near, 1)).tolist()
-        if _keep_together(_find_contacts((faces[a], faces[b]), (fixed[a], fixed[b])),
-                          vertices[a], vertices[b])
-    ]  # fmt: skip
+    pairs = []
+    for a, b in np.argwhere(np.triu(near, 1)).tolist():
+        contacts = _find_contacts((faces[a], faces[b]), (fixed[a], fixed[b]))
+        if _keep_together(contacts, vertices[a], vertices[b]):
+            pairs.append((a, b))
     rows = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     graph = coo_array((np.ones(len(rows)), tuple(rows.T)), shape=(len(faces),) * 2)
     return connected_components(graph, directed=False)[1].astype(np.int64)

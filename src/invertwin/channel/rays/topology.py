@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -194,13 +194,9 @@ def topology_of(
         groups = np.arange(len(meshes))
         if vertices is not None:
             groups = find_rigid_groups(faces, vertices, scenes)
-        shared = np.bincount(groups)[groups] > 1
-        # Joined objects in the world; else in their own frames, where no pose changes a seam.
-        points = [
-            strip_derivatives(vertices[n] if vertices is not None and shared[n] else mesh.vertices)
-            for n, mesh in enumerate(meshes)
-        ]
-        relative = _relative_distances(points, groups, shared) if shared.any() else None
+        joined = np.flatnonzero(np.bincount(groups)[groups] > 1).tolist()
+        world = {} if vertices is None else {n: strip_derivatives(vertices[n]) for n in joined}
+        relative = _relative_distances(world, groups) if world else None
         # The entry holds the face tensors, so that their ids stay theirs.
         key = (VARIANTS[backend()], groups.tobytes(), *map(id, faces))
         _, known, found = _topologies.get(key, (faces, None, None))
@@ -211,7 +207,10 @@ def topology_of(
             starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
             own = [strip_derivatives(f) + start for f, start in zip(faces, starts, strict=False)]
             objects = [torch.full((len(f),), n) for n, f in enumerate(own)]
-            found = Topology(torch.cat(own), torch.cat(objects), torch.cat(points), groups)
+            # Joined objects in the world; else in their own frames, where no pose changes a seam.
+            fixed = [strip_derivatives(mesh.vertices) for mesh in meshes]
+            points = torch.cat([world.get(n, own_frame) for n, own_frame in enumerate(fixed)])
+            found = Topology(torch.cat(own), torch.cat(objects), points, groups)
             _topologies[key] = faces, relative, found
         while len(_topologies) > _MAX_CACHED_TOPOLOGIES:
             _topologies.popitem(last=False)
@@ -243,15 +242,14 @@ def _turn_outwards(
 
 
 def _relative_distances(
-    points: Sequence[Tensor], groups: np.ndarray, shared: np.ndarray
+    points: Mapping[int, Tensor], groups: np.ndarray
 ) -> Float64[Tensor, "row 16"]:
     """Distances from corners of each joined object to those of the first one of its group [m].
 
     They stay while the objects of a group move as one body, of which the seams stay as they are.
     """
     first, rows = dict[int, Tensor](), []
-    for number in np.flatnonzero(shared).tolist():
-        own = points[number]
+    for number, own in points.items():
         own = own[torch.linspace(0, len(own) - 1, 4).long()]
         rows.append(torch.cdist(own, first.setdefault(groups[number], own)).flatten())
     return torch.stack(rows)
