@@ -162,8 +162,9 @@ class _CloudRays:
         back = points - self.origins[1][self.frame][:, None]
         return_length = back.norm(dim=2)
         rotation = link.rotations[self.frame]
-        ways, turn = (direction[:, None], back / return_length[..., None]), rotation.mT
-        towards = [torch.einsum("rij,rkj->rki", turn @ self.rotation, way) for way in ways]
+        ways = direction[:, None], back / return_length[..., None]
+        turn = rotation.mT @ self.rotation
+        towards = [torch.einsum("rij,rkj->rki", turn, way) for way in ways]
         gain = link.tx_pattern.gain(towards[0]) * link.rx_pattern.gain(towards[1])
         scale = (link.wavelength / (4 * math.pi)) ** 2 * self.cloud.albedo / (4 * math.pi)
         (share,) = polarisation_shares(link, depolarising=False)

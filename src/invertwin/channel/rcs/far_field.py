@@ -290,8 +290,8 @@ class _FarFieldTracer:
             for solids, members in target.interiors:
                 patch_orders = outside
                 if solids is not None:
-                    surface, options = target.smooth_faces, (outside, tube_width, depth)
-                    patch_orders = trace_inner_tubes(surface, target.occluders, solids, *options)
+                    bodies = target.smooth_faces, target.occluders, solids
+                    patch_orders = trace_inner_tubes(*bodies, outside, tube_width, depth)
                 yield patch_orders, solids, members
 
     def _patch_amplitudes(
