@@ -268,7 +268,7 @@ def set_fields(holder: object, **values: object) -> None:
 
     Args:
         holder: the dataclass.
-        **values: by the names of the fields.
+        values: by the names of the fields.
     """
     for name, value in values.items():
         object.__setattr__(holder, name, value)

@@ -80,7 +80,7 @@ class DetectedObject:
             position: Where it is [m].
             deviations: Standard deviations of its coordinates.
             sure: Probability that it exists.
-            *motion: Its velocity [m/s] and track.
+            motion: Its velocity [m/s] and track.
         """
         return cls(name, "point", {"point": 1.0}, position, None, deviations, sure, *motion)
 

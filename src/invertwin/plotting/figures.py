@@ -30,7 +30,7 @@ def row_of_axes(count: int, size: tuple[float, float], **options: Any) -> tuple[
     Args:
         count: Number of axes.
         size: Width and height [inch].
-        **options: As for ``Figure.subplots``.
+        options: As for ``Figure.subplots``.
     """
     figure = Figure(figsize=size, layout="constrained")
     return figure, list(figure.subplots(1, count, squeeze=False, **options)[0])
