@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.checks import (
@@ -178,6 +178,25 @@ class Camera:
         """
         local = self.to_camera_axes(points, frame)
         return self.principal_point + self.focal * local[:, :2] / local[:, 2:]
+
+
+def object_numbers(names: Sequence[str], objects: Sequence[str]) -> Int64[Tensor, " object"]:
+    """Numbers of the objects that a mask shows.
+
+    Args:
+        names: All objects, in order.
+        objects: Those of the mask.
+
+    Raises:
+        InputError: None, or an unknown one.
+    """
+    missing = [name for name in objects if name not in names]
+    if missing or not objects:
+        raise InputError(
+            f"expected names of objects among {', '.join(names)}, got "
+            f"{', '.join(missing) or 'none'}; name those that the mask shows"
+        )
+    return torch.tensor([names.index(name) for name in objects])
 
 
 class CameraPose(RigidMotion):

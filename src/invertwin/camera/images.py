@@ -14,13 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.camera.camera import Camera
+from invertwin.camera.camera import Camera, object_numbers
 from invertwin.channel import DiscontinuityCurves, ViewpointScene
 from invertwin.checks import strip_derivatives
-from invertwin.errors import InputError
 from invertwin.limits import Count
 from invertwin.scene.scene import Scene
 
@@ -72,25 +71,6 @@ def silhouettes(
         return torch.isin(owner, numbers).double()
 
     return _render_images(scene, camera, evaluate_mask, sampling, seed, crossings=True)
-
-
-def object_numbers(names: Sequence[str], objects: Sequence[str]) -> Int64[Tensor, " object"]:
-    """Numbers of the objects that a mask shows.
-
-    Args:
-        names: All objects, in order.
-        objects: Those of the mask.
-
-    Raises:
-        InputError: None, or an unknown one.
-    """
-    missing = [name for name in objects if name not in names]
-    if missing or not objects:
-        raise InputError(
-            f"expected names of objects among {', '.join(names)}, got "
-            f"{', '.join(missing) or 'none'}; name those that the mask shows"
-        )
-    return torch.tensor([names.index(name) for name in objects])
 
 
 def depths(

@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.camera.camera import Camera
-from invertwin.camera.images import object_numbers
+from invertwin.camera.camera import Camera, object_numbers
 from invertwin.channel import ViewpointScene
 from invertwin.checks import checked_number
 from invertwin.scene.scene import Scene

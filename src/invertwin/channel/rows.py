@@ -2,17 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
+
+Table = TypeVar("Table", bound="Rows")
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
     """Base of tables: their tensors have one row each, and so do the tables in a table."""
 
-    def select(self, rows: Tensor) -> Self:
+    def select(self: Table, rows: Tensor) -> Table:
         """Select rows.
 
         Args:
@@ -21,9 +23,6 @@ class Rows:
         columns = {n: v[rows] for n, v in vars(self).items() if isinstance(v, Tensor)}
         tables = {n: v.select(rows) for n, v in vars(self).items() if isinstance(v, Rows)}
         return replace(self, **columns, **tables)
-
-
-Table = TypeVar("Table", bound=Rows)
 
 
 def concatenate_rows(parts: Sequence[Table], **columns: Tensor) -> Table:
