@@ -12,7 +12,7 @@ derivative without boundary paths.
 import math
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -74,7 +74,7 @@ class Cells(ReceiverLocations):
     sampling: CellSampling
     is_random: ClassVar[bool] = True
 
-    def with_sampling(self, sampling: CellSampling) -> Self:
+    def with_sampling(self, sampling: CellSampling) -> "Cells":
         """The same cells with other numbers of points.
 
         Args:

@@ -260,7 +260,8 @@ def find_inward_faces(
     """
     inward = np.zeros(len(faces), dtype=bool)
     if not _is_consistent(faces, len(points)):
-        agreeing, part = map(np.asarray, igl.bfs_orient(np.ascontiguousarray(faces)))
+        oriented = igl.bfs_orient(np.ascontiguousarray(faces))
+        agreeing, part = (np.asarray(found).astype(np.int64) for found in oriented)
         turned = (agreeing != faces).any(1)
         counts, turns = np.bincount(part), np.bincount(part, weights=turned)
         if ((turns > 0) & (turns < counts)).any():

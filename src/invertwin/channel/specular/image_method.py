@@ -230,7 +230,7 @@ class UnfoldedPaths:
 
 def find_paths_along(
     surfaces: CandidateSurfaces,
-    sequences: Sequence[Int64[Tensor, "sequence step"]],
+    sequences: Sequence[Int64[Tensor, "_ _"]],
     sources: Float64[Tensor, "source 3"],
     targets: Float64[Tensor, "target 3"],
 ) -> list[SpecularPaths]:
