@@ -66,7 +66,13 @@ class ReceivingSurface(Occluders):
     def find_received(
         self, rays: "_RaysPastEdges", face: Tensor, max_distance: Tensor
     ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Rows and triangles of surface crossings past the edge and before the next surface."""
+        """Rows and triangles of surface crossings past the edge and before the next surface.
+
+        Args:
+            rays: rays past edges.
+            face: triangle of the scene that each ray hits; not used.
+            max_distance: distance of that triangle [m].
+        """
         rows, reach = torch.arange(len(rays.edge_point)), rays.min_distance.clamp_min(0.0)
         for _ in range(_MAX_SURFACE_HITS):
             ahead = torch.nonzero(reach < max_distance[rows])[:, 0]
@@ -95,7 +101,13 @@ class ReceivingTriangles:
     def find_received(
         self, rays: "_RaysPastEdges", face: Tensor, distance: Tensor
     ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Rows and triangles that receive power at the ends of segments."""
+        """Rows and triangles that receive power at the ends of segments.
+
+        Args:
+            rays: rays past edges.
+            face: triangle that each ray hits (−1: none).
+            distance: distance of that triangle [m].
+        """
         hit = (face >= 0) & self.is_receiving[face.clamp_min(0)] & (distance > rays.min_distance)
         rows = torch.nonzero(hit)[:, 0]
         yield rows, face[rows]

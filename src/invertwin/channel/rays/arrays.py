@@ -51,7 +51,12 @@ def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> mit.Fl
 
 
 def to_vectors(kind: Any, values: Tensor) -> Any:
-    """Convert rows of three numbers to a Dr.Jit vector type, such as ``mi.Point3f`` (float32)."""
+    """Convert rows of three numbers to Dr.Jit vectors (detached, float32).
+
+    Args:
+        kind: type of the vectors, such as ``mi.Point3f``.
+        values: numbers, [row, 3].
+    """
     return kind(*(to_float(column) for column in values.T))
 
 
