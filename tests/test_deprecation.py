@@ -4,6 +4,7 @@ import ast
 import importlib
 import inspect
 import operator
+import os
 import pickle
 import warnings
 from collections.abc import Iterator
@@ -134,7 +135,8 @@ def test_a_radar_that_is_moved_is_one_that_is_transformed():
         DeprecationWarning, match=r"Radar\.moved → Radar\.transform_rigidly$"
     ) as told:
         old = device.moved(turn, shift)
-    assert told[0].filename == __file__
+    if not os.environ.get("INVERTWIN_CHECK_TYPES"):  # whose wrappers stand between
+        assert told[0].filename == __file__
     new = radar().transform_rigidly(turn, shift)
     assert torch.equal(old.positions, new.positions)
     assert torch.equal(old.rotations, new.rotations)

@@ -8,6 +8,7 @@
 # %matplotlib inline
 import math
 import tempfile
+import warnings
 from pathlib import Path
 
 import torch
@@ -19,7 +20,8 @@ from invertwin.scene import rotation_from_vector
 # %% [markdown]
 # ## A file
 # A mug: a tube with a bottom, 92 mm high. It has many narrow triangles: on a smooth metal, coarse facets would glint
-# like a disco ball, and a warning is issued.
+# like a disco ball, and a warning is issued. The tube stands in its bottom, as parts of such files often do: `load_mesh`
+# leaves out what lies inside, and says so in a warning.
 
 # %%
 tube = trimesh.creation.annulus(r_min=36.0, r_max=40.0, height=90.0, sections=512)
@@ -28,8 +30,9 @@ bottom.apply_translation([0.0, 0.0, -45.0])
 with tempfile.TemporaryDirectory() as folder:
     file = Path(folder, "mug.stl")
     trimesh.util.concatenate([tube, bottom]).export(file)
-    mug = iw.load_mesh(file, unit="mm")
-print(mug.summary())
+    with warnings.catch_warnings(record=True, action="always") as issued:
+        mug = iw.load_mesh(file, unit="mm")
+print(*(entry.message for entry in issued), mug.summary(), sep="\n")
 
 # %% [markdown]
 # Without `unit` the mug would be 92 m high, and `load_mesh` would warn. The file has z up, the radar frame has y up.
