@@ -1,6 +1,7 @@
 """Files: round trips, scene geometry as Mitsuba reads it, one-line errors, safe writes."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -551,4 +552,32 @@ def test_other_abaqus_files_are_refused_in_one_line(tmp_path, old, new):
     file.write_text(ABAQUS.replace(old, new))
     with pytest.raises(InputError, match=r"expected a readable \.inp mesh") as caught:
         load_mesh(file)
+    assert "\n" not in str(caught.value)
+
+
+UCD = """\
+# AVS UCD
+5 2 0 0 0
+10 0.0 0.0 0.0
+11 1.0 0.0 0.0
+12 1.0 1.0 0.0
+13 0.0 1.0 0.0
+14 2.0 0.0 0.5
+1 1 quad 10 11 12 13
+2 1 tri 11 14 12
+"""
+
+
+def test_cells_of_an_ucd_file(tmp_path):
+    (tmp_path / "plate.inp").write_text(UCD)
+    mesh = load_mesh(tmp_path / "plate.inp")
+    assert len(mesh.faces) == 3
+    assert mesh.area == pytest.approx(1.0 + 0.5 * math.hypot(1.0, 0.5))
+
+
+@pytest.mark.parametrize(("old", "new"), [("2 1 tri", "2 1 hex"), ("14 12", "15 12"), ("0.5", "x")])
+def test_other_ucd_files_are_refused_in_one_line(tmp_path, old, new):
+    (tmp_path / "plate.inp").write_text(UCD.replace(old, new))
+    with pytest.raises(InputError, match=r"expected a readable \.inp mesh") as caught:
+        load_mesh(tmp_path / "plate.inp")
     assert "\n" not in str(caught.value)

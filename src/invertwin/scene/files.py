@@ -1,6 +1,7 @@
 """Read meshes and scene geometry from files, and write them."""
 
 import math
+import re
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping
@@ -36,6 +37,7 @@ MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".inp")
 _CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # corners of shell elements by the digit in their type
 Unit = Literal["m", "cm", "mm", "um", "in", "ft"]
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
+_UCD_HEADER = re.compile(r"(#.*\n|\s)*(\d+\s+){4}\d+\s*\n")  # counts: nodes, cells, data
 _LARGE = 100.0  # size of a suspicious mesh [m]
 CONCRETE = RoughDielectric(permittivity=5.24)
 """Default material of a scene file (ITU-R P.2040 concrete)."""
@@ -47,12 +49,12 @@ def load_mesh(file: str | Path, unit: Unit = "m") -> Mesh:
     Vertices at equal positions are merged, unused vertices are dropped, the rest keep their order.
     Closed parts that overlap or touch become one surface, which a warning says.
     All parts of the file become one mesh (`load_parts` separates them); axes are kept. A mesh
-    larger than 100 m causes a warning, since it may be in millimetres. From an Abaqus file (.inp)
-    the corners of shell elements are read, in the coordinates of their definition; quadrilaterals
-    are split.
+    larger than 100 m causes a warning, since it may be in millimetres. From Abaqus and AVS UCD
+    files (.inp) the corners of shell elements are read, in the coordinates of their definition;
+    quadrilaterals are split.
 
     Args:
-        file: path of an OBJ, PLY, STL, glTF or Abaqus file; the suffix determines the format.
+        file: path of an OBJ, PLY, STL, glTF, Abaqus or AVS UCD file; the suffix tells the format.
         unit: length unit of the file
 
     Raises:
@@ -253,8 +255,24 @@ def save_scene_xml(path: str | Path, scene: Scene) -> None:
 def _load_trimesh_scene(path: Path) -> trimesh.Scene:
     if path.suffix.lower() != ".inp":
         return trimesh.load_scene(path, process=False)
-    vertices, faces = _abaqus(path.read_text(encoding="utf-8-sig"))
+    text = path.read_text(encoding="utf-8-sig")
+    vertices, faces = _ucd(text) if _UCD_HEADER.match(text) else _abaqus(text)
     return trimesh.Scene(trimesh.Trimesh(vertices, faces, process=False))
+
+
+def _ucd(text: str) -> tuple[np.ndarray, np.ndarray]:
+    """Parse vertices and triangles of the cells of an AVS UCD file; quadrilaterals are split."""
+    lines = [line.split() for line in text.splitlines() if line.strip() and line[0] != "#"]
+    nodes, cells = int(lines[0][0]), int(lines[0][1])
+    places = {words[0]: (n, words[1:4]) for n, words in enumerate(lines[1 : 1 + nodes])}
+    faces: list[list[int]] = []
+    for _, _, kind, *corners in lines[1 + nodes : 1 + nodes + cells]:
+        if kind not in ("tri", "quad"):
+            raise ValueError(f"cells of type {kind}, no shells")
+        used = [places[corner][0] for corner in corners]
+        faces += [[used[0], used[k], used[k + 1]] for k in range(1, len(used) - 1)]
+    vertices = np.array([place for _, place in places.values()], dtype=np.float64)
+    return vertices, np.array(faces, dtype=np.int64)
 
 
 def _abaqus(text: str) -> tuple[np.ndarray, np.ndarray]:
