@@ -76,19 +76,21 @@ def separate_groups(points: Points, groups: Groups) -> Points:
 
 
 def half_edges(
-    faces: Int64[np.ndarray, "f 3"], places: Points
+    faces: Int64[np.ndarray, "f 3"], places: Points, owner: Int64[np.ndarray, " f"] | int = 0
 ) -> tuple[Int64[np.ndarray, "h 2"], Int64[np.ndarray, " h"], Int64[np.ndarray, " h"]]:
     """Return the sides of triangles: ends in ascending order, opposite vertex, and triangle.
 
-    Slivers and repetitions of a triangle have no sides. A side on which vertices of other edges
+    Slivers and repetitions of a triangle in one object have no sides. A side on which vertices of other edges
     lie is several, from one to the next.
 
     Args:
         faces: welded vertices of each triangle.
         places: positions in units of the size of their group.
+        owner: object of each triangle.
     """
     number = np.flatnonzero(~_is_sliver(places[faces]))
-    number = number[np.sort(_unique_rows(np.sort(faces[number], axis=1))[0])]
+    kinds = np.sort(faces, axis=1) + np.reshape(owner, (-1, 1)) * len(places)
+    number = number[np.sort(_unique_rows(kinds[number])[0])]
     corners = faces[number]
     ends = np.concatenate([np.sort(corners[:, [a, b]], axis=1) for a, b, _ in _CORNERS])
     apex = np.concatenate([corners[:, c] for _, _, c in _CORNERS])

@@ -133,6 +133,13 @@ def test_panels_at_rest_are_one_surface():
     assert ((apart.edge_faces >= 0).sum(1) == 1).sum() == 24
 
 
+def test_blocks_that_touch_in_a_face_stay_closed():
+    one, other = box(0.2), box(0.2)
+    points = [one.vertices, other.vertices + float64(0.2, 0, 0)]
+    assert find_rigid_groups([one.faces, other.faces], points).tolist() == [0, 0]
+    assert topology_of([one, other], points).open_objects == set()
+
+
 def test_panels_of_several_scenes_are_apart():
     faces, points, _ = panels()
     groups = find_rigid_groups(faces, points, scenes=[0, 0, 0, 1, 1, 1])

@@ -61,7 +61,7 @@ class Topology:
         welded = mesh_topology.weld_vertices(places)[faces.numpy()]
         #: Vertices of triangles, where vertices at one place count as one.
         self.welded_faces: Int64[Tensor, "f 3"] = torch.from_numpy(welded)
-        tables = edge_tables(welded, places)
+        tables = edge_tables(welded, places, face_object.numpy())
         # Of each object, side by side: samples that follow this order are spread over its surface.
         order = torch.from_numpy(morton_order(vertices[tables[0]].mean(1).numpy()))
         order = order[owner[tables[0][order, 0]].argsort(stable=True)]
@@ -275,15 +275,16 @@ def edges_of(
 
 
 def edge_tables(
-    faces: np.ndarray, places: np.ndarray
+    faces: np.ndarray, places: np.ndarray, owner: np.ndarray | int = 0
 ) -> tuple[Int64[Tensor, "e 2"], Int64[Tensor, "e k"], Int64[Tensor, "e k"]]:
     """Edges as ``edges_of`` returns them, of welded faces.
 
     Args:
         faces: welded vertices of triangles.
         places: positions in units of the size of their group.
+        owner: object of each triangle.
     """
-    ends, apex, triangle = mesh_topology.half_edges(faces, places)
+    ends, apex, triangle = mesh_topology.half_edges(faces, places, owner)
     edges, group, counts = mesh_topology.unique_edges(ends, len(places))
     order = np.argsort(group, kind="stable")
     start = np.repeat(np.cumsum(counts) - counts, counts)
