@@ -80,8 +80,8 @@ def half_edges(
 ) -> tuple[Int64[np.ndarray, "h 2"], Int64[np.ndarray, " h"], Int64[np.ndarray, " h"]]:
     """Return the sides of triangles: ends in ascending order, opposite vertex, and triangle.
 
-    Slivers and repetitions of a triangle in one object have no sides. A side on which vertices of other edges
-    lie is several, from one to the next.
+    Slivers and repetitions of a triangle in one object have no sides. A side on which vertices of
+    other edges lie is several, from one to the next.
 
     Args:
         faces: welded vertices of each triangle.
