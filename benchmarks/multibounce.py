@@ -166,7 +166,7 @@ def rays_cast(task: Task, samples: int, depth: int) -> int:
 
         return patch.object(Occluders, name, call)
 
-    with counted("nearest"), counted("clear"):
+    with counted("find_nearest"), counted("is_clear"):
         forward(task, samples, depth)
     return int(counter[0])
 
