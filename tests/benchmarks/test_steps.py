@@ -7,7 +7,7 @@ import pytest
 
 @pytest.mark.slow
 def test_the_parts_of_a_step_add_up(steps, tmp_path, monkeypatch):
-    problem = steps.problem_of
+    problem = steps.build_problem
 
     def small(run, console):
         table = run.reconstruct.model_copy(update={"samples": 20_000, "boundary_samples": 4_000})
