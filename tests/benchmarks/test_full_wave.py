@@ -28,6 +28,7 @@ def test_errors_count_where_the_truth_is_bright(full_wave):
     assert errors["phase_deg"] == pytest.approx(np.degrees(0.1))
 
 
+@pytest.mark.slow
 def test_a_dihedral_across_its_crease(full_wave):
     metrics = full_wave.measure(["dihedral"])
     for polarisation in "VH":

@@ -143,7 +143,6 @@ def test_images_of_a_box_behind_a_post(model, tangent, still):
     assert report.interior.relative_l1 >= still
 
 
-@pytest.mark.claim
 @pytest.mark.slow
 def test_images_of_a_camera_that_moves():
     tangent = {"translation": [1.0, 0.5, 0.3], "rotation": [0.1, 0.2, 0.3]}

@@ -45,8 +45,12 @@ def here(monkeypatch):
     ("text", "fits"),
     [
         (MANY, [("full", 0), ("full", 1), ("fixed", 0), ("fixed", 1)]),
-        (EVERY, [("full", 0), ("full", 1)]),
-        (RADIO + RADIO_STARTS, [(mode, k) for mode in ("full", "bare") for k in (0, 1)]),
+        pytest.param(EVERY, [("full", 0), ("full", 1)], marks=pytest.mark.slow),
+        pytest.param(
+            RADIO + RADIO_STARTS,
+            [(mode, k) for mode in ("full", "bare") for k in (0, 1)],
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["variants", "a recording for every start", "received levels"],
 )

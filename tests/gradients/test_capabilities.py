@@ -598,7 +598,8 @@ def marks_of(cell: tuple[str, str]) -> list[pytest.MarkDecorator]:
     parameter, mechanism = cell
     if cell == ("translation", "bounces boundary"):
         return [pytest.mark.slow, pytest.mark.claim]
-    many = mechanism == "coherent" and parameter in {"pose", "scale", "vertices", "radar position"}
+    long = {"pose", "scale", "vertices", "radar position"}
+    many = mechanism in ("coherent", "mirrored") and parameter in long
     return [pytest.mark.slow] if many or mechanism.startswith("bounces") else []
 
 
