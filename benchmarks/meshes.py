@@ -32,7 +32,7 @@ from torch.autograd import forward_ad
 import invertwin as iw
 from invertwin.camera import Camera, ImageSampling, silhouettes
 from invertwin.channel import deposit_power, trace_paths
-from invertwin.channel.rays.topology import edges_of
+from invertwin.channel.rays.topology import edge_tables
 from invertwin.links import CellSampling, MapPlane, PropagationSettings, Transmitters
 from invertwin.scene import (
     AntennaArray,
@@ -44,6 +44,7 @@ from invertwin.scene import (
     merge_meshes,
     rotation_from_vector,
 )
+from invertwin.scene.mesh_topology import weld_faces
 
 Parts = list[Mesh]
 REQUIRED: Required = {"worst_ratio": ("<=", 0.01), "topology_seconds": ("<=", 2.0)}
@@ -299,7 +300,7 @@ def topology_seconds(count: int) -> float:
     times = []
     for points, triangles in ((places, faces), (soup, torch.arange(len(soup)).reshape(-1, 3))):
         start = perf_counter()
-        edges, _, beside = edges_of(triangles.numpy(), points.numpy())
+        edges, _, beside = edge_tables(*weld_faces(points.numpy(), triangles.numpy()))
         times.append(perf_counter() - start)
         assert len(edges) == 3 * count**2
         assert bool((beside >= 0).all())

@@ -17,7 +17,7 @@ from invertwin.scene.scene import Scene
 
 
 class _ImageMap(ForwardModel):
-    """What models of a camera's images share."""
+    """Base of the models of a camera's images."""
 
     sampling: ImageSampling
     scatter: float | None

@@ -67,8 +67,7 @@ class Mesh:
     def summary(self) -> "MeshSummary":
         """Return its size and topology, of welded vertices and divided edges as rays meet them."""
         points = strip_derivatives(self.vertices).numpy()
-        places = mesh_topology.separate_groups(points, np.zeros(len(points), dtype=np.int64))
-        welded = mesh_topology.weld_vertices(places)[strip_derivatives(self.faces).numpy()]
+        welded, places = mesh_topology.weld_faces(points, strip_derivatives(self.faces).numpy())
         ends, _, _ = mesh_topology.half_edges(welded, places)
         _, _, counts = mesh_topology.unique_edges(ends, len(places))
         x, y, z = np.ptp(points, axis=0).tolist()

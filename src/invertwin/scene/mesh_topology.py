@@ -24,7 +24,21 @@ Groups: TypeAlias = Int64[np.ndarray, " v"]
 # Of a hash of three numbers: odd constants of good mixing.
 _MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 _MAX_PARTS = 2000  # whose boxes are compared in pairs
-_CORNERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+
+
+def weld_faces(
+    points: Points, faces: Int64[np.ndarray, "f 3"], groups: Groups | None = None
+) -> tuple[Int64[np.ndarray, "f 3"], Points]:
+    """Return triangles by welded vertices, and positions in units of the size of their group.
+
+    Args:
+        points: positions [m].
+        faces: vertices of each triangle.
+        groups: group of each vertex, from 0; only those of one group are welded. None = one.
+    """
+    groups = np.zeros(len(points), dtype=np.int64) if groups is None else groups
+    places = separate_groups(points, groups)
+    return weld_vertices(places)[faces], places
 
 
 def weld_vertices(places: Points) -> Int64[np.ndarray, " v"]:
@@ -39,8 +53,7 @@ def weld_vertices(places: Points) -> Int64[np.ndarray, " v"]:
     pairs = first[tree.query_pairs(WELD_TOLERANCE, output_type="ndarray")]
     welded = first[inverse]
     if len(pairs):
-        graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(places),) * 2)
-        chain = connected_components(graph, directed=False)[1][welded]
+        chain = label_components(pairs, len(places))[welded]
         lowest = np.full(chain.max() + 1, len(places))
         np.minimum.at(lowest, chain, welded)
         welded = lowest[chain]
@@ -56,6 +69,41 @@ def _unique_rows(
     if not np.array_equal(rows[first][inverse], rows):  # two kinds with one hash
         _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     return first, inverse.ravel()
+
+
+def label_components(pairs: Int64[np.ndarray, "n 2"], count: int) -> Int64[np.ndarray, " node"]:
+    """Return the number of the connected component of each node.
+
+    Args:
+        pairs: connected nodes.
+        count: number of nodes.
+    """
+    graph = coo_array((np.ones(len(pairs), dtype=bool), tuple(pairs.T)), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def overlapping_boxes(
+    low: Float64[np.ndarray, "n 3"], high: Float64[np.ndarray, "n 3"]
+) -> Bool[np.ndarray, "n n"]:
+    """Mask of pairs of different boxes that overlap or touch.
+
+    Args:
+        low: lower corners.
+        high: upper corners.
+    """
+    meets = ~np.eye(len(low), dtype=bool)
+    for axis in range(3):
+        meets &= low[:, None, axis] <= high[:, axis]
+    return meets & meets.T
+
+
+def triangle_sides(faces: Int64[np.ndarray, "f 3"]) -> Int64[np.ndarray, "h 2"]:
+    """Return the ends of the sides of triangles in their direction: all first sides, and so on.
+
+    Args:
+        faces: vertices of each triangle.
+    """
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def separate_groups(points: Points, groups: Groups) -> Points:
@@ -92,10 +140,9 @@ def half_edges(
     kinds = np.sort(faces, axis=1) + np.reshape(owner, (-1, 1)) * len(places)
     number = number[np.sort(_unique_rows(kinds[number])[0])]
     corners = faces[number]
-    ends = np.concatenate([np.sort(corners[:, [a, b]], axis=1) for a, b, _ in _CORNERS])
-    apex = np.concatenate([corners[:, c] for _, _, c in _CORNERS])
-    triangle = np.tile(number, 3)
-    return _split_at_vertices(ends, apex, triangle, places)
+    ends = np.sort(triangle_sides(corners), axis=1)
+    apex = corners[:, [2, 0, 1]].T.ravel()
+    return _split_at_vertices(ends, apex, np.tile(number, 3), places)
 
 
 def _is_sliver(corners: Float64[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, " f"]:
@@ -133,10 +180,9 @@ def _split_at_vertices(
     inner = np.ones(len(stations), dtype=bool)
     inner[first] = inner[first + pieces] = False
     stations[inner] = vertex
-    piece = np.repeat(np.arange(len(ends)), pieces[group])
-    step = np.arange(len(piece)) - np.repeat(
-        np.cumsum(pieces[group]) - pieces[group], pieces[group]
-    )
+    count = pieces[group]
+    piece = np.repeat(np.arange(len(ends)), count)
+    step = np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count)
     at = first[group[piece]] + step
     return np.sort(np.stack([stations[at], stations[at + 1]], 1), 1), apex[piece], triangle[piece]
 
@@ -169,8 +215,7 @@ def find_parts(faces: Int64[np.ndarray, "f 3"], places: Points) -> Int64[np.ndar
     ends, _, triangle = half_edges(faces, places)
     _, group, counts = unique_edges(ends, len(places))
     pairs = _pairs_of_triangles(triangle, group, counts)
-    graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(faces),) * 2)
-    label, found = connected_components(graph, directed=False)[1], np.full(len(faces), -1)
+    label, found = label_components(pairs, len(faces)), np.full(len(faces), -1)
     real = np.unique(triangle)
     found[real] = np.unique(label[real], return_inverse=True)[1].ravel()
     return found
@@ -198,9 +243,8 @@ def _near_other_parts(
         pairs: its two triangles.
         places: positions in units of the size of their group.
     """
-    ones, count = np.ones(len(pairs), dtype=bool), int(pairs.max(initial=-1)) + 1
-    graph = coo_array((ones, tuple(pairs.T)), shape=(count, count))
-    part = connected_components(graph, directed=False)[1][pairs[:, 0]]
+    ones, part = np.ones(len(pairs), dtype=bool), label_components(pairs, int(pairs.max()) + 1)
+    part = part[pairs[:, 0]]
     order = np.argsort(part, kind="stable")
     present, start = np.unique(part[order], return_index=True)
     if len(present) == 1:
@@ -210,8 +254,7 @@ def _near_other_parts(
     ends = places[edges]
     low = np.minimum.reduceat(ends.min(1)[order], start) - WELD_TOLERANCE
     high = np.maximum.reduceat(ends.max(1)[order], start) + WELD_TOLERANCE
-    meets = (low[:, None] <= high).all(2)
-    one, other = np.nonzero(meets & meets.T & ~np.eye(len(low), dtype=bool))
+    one, other = np.nonzero(overlapping_boxes(low, high))
     reach = np.full_like(low, np.inf), np.full_like(high, -np.inf)
     np.minimum.at(reach[0], one, np.maximum(low[one], low[other]))
     np.maximum.at(reach[1], one, np.minimum(high[one], high[other]))
@@ -273,8 +316,8 @@ def find_inward_faces(
 
 def _is_consistent(faces: Int64[np.ndarray, "f 3"], vertex_count: int) -> bool:
     """Test that no two triangles run along an edge in the same direction."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    code = ends[:, 0] * vertex_count + ends[:, 1]
+    start, end = triangle_sides(faces).T
+    code = start * vertex_count + end
     return len(np.unique(code)) == len(code)
 
 

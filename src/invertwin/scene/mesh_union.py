@@ -16,7 +16,6 @@ from jaxtyping import Int64
 from invertwin.checks import is_differentiated, strip_derivatives
 from invertwin.scene import mesh_topology
 from invertwin.scene.mesh import Mesh, concatenate_meshes
-from invertwin.scene.mesh_topology import find_inward_faces
 
 _SAME_AREA = 1e-9  # relative change of the area of parts that only stand side by side
 
@@ -44,8 +43,7 @@ def unite_parts(mesh: Mesh) -> Mesh:
         mesh: parts of one material, without derivatives.
     """
     points = strip_derivatives(mesh.vertices).numpy()
-    places = mesh_topology.separate_groups(points, np.zeros(len(points), dtype=np.int64))
-    welded = mesh_topology.weld_vertices(places)[strip_derivatives(mesh.faces).numpy()]
+    welded, places = mesh_topology.weld_faces(points, strip_derivatives(mesh.faces).numpy())
     part = mesh_topology.find_parts(welded, places)
     bodies, united = list[manifold3d.Manifold](), np.zeros(len(welded), dtype=bool)
     for number in _touching_parts(welded, part, places):
@@ -81,17 +79,15 @@ def _touching_parts(
     real = part >= 0
     np.minimum.at(low, part[real], places[welded[real]].min(1))
     np.maximum.at(high, part[real], places[welded[real]].max(1))
-    meets = np.ones((count, count), dtype=bool)
-    for axis in range(3):
-        meets &= low[:, None, axis] <= high[None, :, axis] + mesh_topology.WELD_TOLERANCE
-    return np.flatnonzero((meets & meets.T).sum(1) > 1).tolist()
+    meets = mesh_topology.overlapping_boxes(low, high + mesh_topology.WELD_TOLERANCE)
+    return np.flatnonzero(meets.any(1)).tolist()
 
 
 def _closed_body(
     faces: Int64[np.ndarray, "f 3"], points: mesh_topology.Points
 ) -> manifold3d.Manifold | None:
     """Return a part as a body; None for open parts and cavities."""
-    if find_inward_faces(faces, points).any():
+    if mesh_topology.find_inward_faces(faces, points).any():
         return None
     used, local = np.unique(faces, return_inverse=True)
     mesh = manifold3d.Mesh64(

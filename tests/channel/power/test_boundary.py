@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_power
-from invertwin.channel.rays.topology import edges_of
+from invertwin.channel.rays.topology import edge_tables
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, sphere
+from invertwin.scene.mesh_topology import weld_faces
 from scenes import GRID, WAVELENGTH, float64, link, occluder, relative, shift_error, thing
 
 WALL = thing(plate(2.0, 2.0, divisions=2), (0, 0, 2))
@@ -115,18 +116,20 @@ def test_objects_that_start_at_one_place_may_part():
 def test_edges_of_a_mesh_with_split_vertices():
     cube = box(1.0)
     for mesh in (cube, halves(cube)):
-        edges, opposite, _ = edges_of(mesh.faces.numpy(), mesh.vertices.numpy())
+        edges, opposite, _ = edge_tables(*weld_faces(mesh.vertices.numpy(), mesh.faces.numpy()))
         assert len(edges) == 18
         assert opposite.shape == (18, 2)
         assert (opposite >= 0).all()
-    edges, opposite, _ = edges_of(plain().faces.numpy(), plain().vertices.numpy())
+    edges, opposite, _ = edge_tables(*weld_faces(plain().vertices.numpy(), plain().faces.numpy()))
     assert sorted((opposite >= 0).sum(1).tolist()) == [1, 1, 1, 1, 2]
-    _, opposite, _ = edges_of(finned(plain()).faces.numpy(), finned(plain()).vertices.numpy())
+    _, opposite, _ = edge_tables(
+        *weld_faces(finned(plain()).vertices.numpy(), finned(plain()).faces.numpy())
+    )
     assert opposite.shape[1] == 3
 
 
 def test_edges_of_a_mesh_that_is_a_point():
-    edges, opposite, _ = edges_of(np.array([[0, 1, 2]]), np.zeros((3, 3)))
+    edges, opposite, _ = edge_tables(*weld_faces(np.zeros((3, 3)), np.array([[0, 1, 2]])))
     assert len(edges) == 0
     assert len(opposite) == 0
 

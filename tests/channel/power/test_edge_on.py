@@ -6,8 +6,9 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from invertwin.channel import Grid, Sampling, deposit_power
-from invertwin.channel.rays.topology import edges_of
+from invertwin.channel.rays.topology import edge_tables
 from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, rotation_from_vector
+from invertwin.scene.mesh_topology import weld_faces
 from scenes import float64, link, relative, thing
 
 GRID = Grid(0.0, 100.0, 1, u_start=-0.6, u_step=0.1, u_count=13)
@@ -16,7 +17,7 @@ GRID = Grid(0.0, 100.0, 1, u_start=-0.6, u_step=0.1, u_count=13)
 def test_every_edge_knows_the_triangles_beside_it():
     cube = box(1.0)
     faces = cube.faces
-    edges, opposite, beside = edges_of(faces.numpy(), cube.vertices.numpy())
+    edges, opposite, beside = edge_tables(*weld_faces(cube.vertices.numpy(), faces.numpy()))
     assert beside.shape == opposite.shape == (18, 2)
     for ends, apexes, triangles in zip(edges, opposite, beside, strict=True):
         for apex, triangle in zip(apexes, triangles, strict=True):
@@ -26,7 +27,7 @@ def test_every_edge_knows_the_triangles_beside_it():
     # Every triangle lies beside its three edges.
     assert torch.bincount(beside.ravel()).tolist() == [3] * len(faces)
     single = plate(1.0, 1.0)
-    _, opposite, beside = edges_of(single.faces.numpy(), single.vertices.numpy())
+    _, opposite, beside = edge_tables(*weld_faces(single.vertices.numpy(), single.faces.numpy()))
     assert torch.equal(opposite < 0, beside < 0)
     assert sorted((beside >= 0).sum(1).tolist()) == [1, 1, 1, 1, 2]
 

@@ -8,10 +8,10 @@ import torch
 from torch.autograd import forward_ad
 
 from invertwin.channel.rays.rigid_groups import find_rigid_groups
-from invertwin.channel.rays.topology import edges_of, topology_of
+from invertwin.channel.rays.topology import edge_tables, topology_of
 from invertwin.scene import Mesh, box, merge_meshes, plate, rotation_from_vector, sphere
 from invertwin.scene.mesh import concatenate_meshes
-from invertwin.scene.mesh_topology import WELD_TOLERANCE, separate_groups, weld_vertices
+from invertwin.scene.mesh_topology import WELD_TOLERANCE, separate_groups, weld_faces, weld_vertices
 
 HALF = math.pi / 2
 TURNS = ((0, 0, 0), (0, 2 * HALF, 0), (0, HALF, 0), (0, -HALF, 0), (HALF, 0, 0), (-HALF, 0, 0))
@@ -33,7 +33,7 @@ def plates_of_a_box(side=0.4):
 
 def table(mesh):
     """Number of edges by number of triangles."""
-    _, _, faces = edges_of(mesh.faces.numpy(), mesh.vertices.detach().numpy())
+    _, _, faces = edge_tables(*weld_faces(mesh.vertices.detach().numpy(), mesh.faces.numpy()))
     numbers, counts = (faces >= 0).sum(1).unique(return_counts=True)
     return dict(zip(numbers.tolist(), counts.tolist(), strict=True))
 
@@ -71,7 +71,7 @@ def test_an_edge_ends_where_vertices_lie_on_it():
     """A long side of one triangle against two short ones of others: a T-junction."""
     vertices = float64([0, 0, 0], [2, 0, 0], [1, 1, 0], [0.5, 0, 0], [1, -1, 0])
     mesh = Mesh(vertices, torch.tensor([[0, 1, 2], [0, 4, 3], [3, 4, 1]]))
-    edges, apexes, faces = edges_of(mesh.faces.numpy(), vertices.numpy())
+    edges, apexes, faces = edge_tables(*weld_faces(vertices.numpy(), mesh.faces.numpy()))
     rows = {tuple(edge): k for k, edge in enumerate(edges.tolist())}
     assert (0, 1) not in rows
     for pair, below in (((0, 3), 1), ((1, 3), 2)):

@@ -246,7 +246,7 @@ def _sample_edges(
     edge_faces = topology.edge_faces
     # Coplanar triangles of one object are one surface.
     plane = torch.where(edge_faces >= 0, planes[edge_faces.clamp_min(0)], -1)
-    flat = (plane == plane[:, :1]).all(1) & (edge_faces >= 0).all(1) & (edge_faces.shape[1] > 1)
+    flat = (plane == plane[:, :1]).all(1) & (edge_faces >= 0).all(1)
     edge = torch.nonzero(~flat)[:, 0]
     ends = surfaces.exact_vertices[topology.edges[edge]]
     length = (ends[:, 1] - ends[:, 0]).norm(dim=1)

@@ -86,8 +86,6 @@ class InteriorSilhouetteSampler:
         topology = self.rays.topology
         along = dr.normalize(y1 - y0)
         start, span = mi.Float(0.0), mi.Float(dr.pi)
-        if len(topology.device_edge_apexes) < 2:
-            return start, span
         x, y = self._azimuth_axes(edge, y0, along)
         apex = dr.gather(mi.Int32, topology.device_edge_apexes[1], edge)
         offset = self.rays.exact_vertex(mi.UInt32(dr.maximum(apex, 0))) - y0

@@ -13,13 +13,17 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch.autograd import forward_ad
 
 from invertwin.checks import is_differentiated, strip_derivatives
-from invertwin.scene.mesh_topology import WELD_TOLERANCE, find_vertices_on_edges
+from invertwin.scene.mesh_topology import (
+    WELD_TOLERANCE,
+    find_vertices_on_edges,
+    label_components,
+    overlapping_boxes,
+    triangle_sides,
+)
 
 _MAX_CACHED_PAIRS = 10_000
 _SAME_MOTION = 1e-9  # relative difference of velocities that count as one
@@ -45,21 +49,18 @@ def find_rigid_groups(
     """
     fixed = [strip_derivatives(points) for points in vertices]
     moves = np.array([is_differentiated(points) for points in vertices])
-    start = np.cumsum([0, *map(len, fixed)])[:-1]
-    low, high = (f.reduceat(torch.cat(fixed).numpy(), start) for f in (np.minimum, np.maximum))
+    start, points = np.cumsum([0, *map(len, fixed)])[:-1], torch.cat(fixed).numpy()
+    low, high = (f.reduceat(points, start) for f in (np.minimum, np.maximum))
     reach = WELD_TOLERANCE * np.linalg.norm(high - low, axis=1)[:, None]
-    near = ((low - reach)[:, None] <= (high + reach)[None]).all(2)
-    near &= near.T & (moves[:, None] == moves)
+    near = overlapping_boxes(low - reach, high + reach) & (moves[:, None] == moves)
     if scenes is not None:
         near &= np.equal.outer(scenes, scenes)
     pairs = []
-    for a, b in np.argwhere(np.triu(near, 1)).tolist():
+    for a, b in np.argwhere(np.triu(near)).tolist():
         contacts = _find_contacts((faces[a], faces[b]), (fixed[a], fixed[b]))
         if _keep_together(contacts, vertices[a], vertices[b]):
             pairs.append((a, b))
-    rows = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    graph = coo_array((np.ones(len(rows)), tuple(rows.T)), shape=(len(faces),) * 2)
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+    return label_components(np.array(pairs, dtype=np.int64).reshape(-1, 2), len(faces))
 
 
 def _find_contacts(faces: tuple[Tensor, Tensor], points: tuple[Tensor, Tensor]) -> Contacts:
@@ -86,8 +87,7 @@ def _find_contacts(faces: tuple[Tensor, Tensor], points: tuple[Tensor, Tensor]) 
         corners = points[number][triangles]
         inside = (corners.amin(1) <= high + margin) & (corners.amax(1) >= low - margin)
         used = (strip_derivatives(triangles)[inside.all(1)] + offset).numpy()
-        sides = np.concatenate([used[:, [0, 1]], used[:, [1, 2]], used[:, [2, 0]]])
-        edges.append(np.unique(np.sort(sides, axis=1), axis=0))
+        edges.append(np.unique(np.sort(triangle_sides(used), axis=1), axis=0))
     parts = []
     for own, other in ((0, 1), (1, 0)):
         row, vertex, share = find_vertices_on_edges(edges[own], np.unique(edges[other]), places)

@@ -114,12 +114,9 @@ class ViewpointScene:
         beside, apex = topology.edge_faces, topology.edge_apexes
         alone = (beside >= 0).sum(1) != 2
         ends = points[topology.edges]
-        pair = [points[apex[:, k].clamp_min(0)] for k in range(min(2, apex.shape[1]))]
-        turns = torch.zeros(len(beside), dtype=torch.bool)
-        if len(pair) == 2:
-            across = cross(ends[:, 1] - ends[:, 0], ends[:, 0] - strip_derivatives(self._viewpoint))
-            sides = [dot(point - ends[:, 0], across) for point in pair]
-            turns = sides[0] * sides[1] >= 0
+        across = cross(ends[:, 1] - ends[:, 0], ends[:, 0] - strip_derivatives(self._viewpoint))
+        one, other = (dot(points[apex[:, k].clamp_min(0)] - ends[:, 0], across) for k in range(2))
+        turns = one * other >= 0
         first, second = topology.edges[torch.nonzero(alone | turns)[:, 0]].unbind(1)
         ends = points[first], points[second]
         return DiscontinuityCurves(*ends, first, second, is_intersection=False)

@@ -481,7 +481,7 @@ def _warn_validity(
     if spacing is not None and density < 1:
         found.append(f"{density:g} tubes per wavelength are too few: use 1 or more, better 4")
     faces = target.topology.face_object
-    neighbours = torch.nn.functional.pad(target.topology.edge_faces, (0, 1), value=-1)[:, :2]
+    neighbours = target.topology.edge_faces[:, :2]
     # An open edge has one normal.
     neighbours = torch.where(neighbours >= 0, neighbours, neighbours[:, :1])
     normal = target.facets.normal.detach()
