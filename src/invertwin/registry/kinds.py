@@ -464,9 +464,11 @@ class Registry:
     def _load_kinds(self) -> dict[str, KindGroup]:
         """The groups, the library's own kinds before those of plugins."""
         if self._waiting is not None:
+            made = [pkgutil.resolve_name(f"{module}:register") for module in self.built_in]
+        if self._waiting is not None:  # the modules build tables, which may have loaded the kinds
             waiting, self._waiting = self._waiting, None
-            for module in self.built_in:
-                pkgutil.resolve_name(f"{module}:register")(self)
+            for register in made:
+                register(self)
             for entry in waiting:
                 self._add_kind(*entry)
         return self.groups
