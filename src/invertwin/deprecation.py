@@ -2,9 +2,11 @@
 
 import inspect
 import sys
+import tomllib
 import warnings
-from collections.abc import Callable, Mapping
-from functools import partial, reduce, wraps
+from collections.abc import Callable
+from functools import cache, partial, reduce, wraps
+from importlib.resources import files
 from typing import Any, TypeVar, cast
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -21,21 +23,20 @@ def warn_renamed(old: str, new: str, stacklevel: int = 3) -> None:
     warnings.warn(f"deprecated: {old} → {new}", DeprecationWarning, stacklevel=stacklevel)
 
 
-def rename_attributes(module: str, names: Mapping[str, str]) -> None:
-    """Let a module find attributes by their old names, with a warning.
+def rename_attributes(module: str) -> None:
+    """Let a module find attributes by the old names of ``renamed.toml``, with a warning.
 
     It sets the module's ``__getattr__``, so that type checkers know the new names alone.
 
     Args:
         module: dotted name of the module, ``__name__``.
-        names: old names and the new ones: names of the module itself, or dotted paths from the
-            package, such as ``discovery.MovingBody``.
     """
     package = module.partition(".")[0]
     found = vars(sys.modules[module])
     find_present = found.get("__getattr__")
 
     def find_attribute(name: str) -> Any:
+        names = read_renamed_attributes().get(module, {})
         if name not in names:
             if find_present is not None:
                 return find_present(name)
@@ -46,6 +47,13 @@ def rename_attributes(module: str, names: Mapping[str, str]) -> None:
         return reduce(getattr, full.split(".")[1:], sys.modules[package])
 
     found["__getattr__"] = find_attribute
+
+
+@cache
+def read_renamed_attributes() -> dict[str, dict[str, str]]:
+    """Read old names of modules and the new ones, by dotted name of the module."""
+    text = files(__name__.partition(".")[0]).joinpath("renamed.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
 
 
 class RenamedMember:
