@@ -22,7 +22,7 @@ from invertwin.runtime import doctor, threads
 __version__ = "0.4.0"
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-rename_attributes(__name__, {"MotionMap": "RangeDopplerMap"})
+rename_attributes(__name__)
 
 # Libraries read how many threads to start while they are being loaded.
 threads.set_thread_environment()

@@ -271,4 +271,4 @@ def _hann_window(count: int) -> Tensor:
 
 
 rename_members(Signature, section="cross_section")
-rename_attributes(__name__, {"aspects": "aspect_directions", "decibels": "to_dbsm"})
+rename_attributes(__name__)

@@ -82,7 +82,7 @@ class Camera:
         field_of_view: float,
         up: ArrayLike = (0.0, 0.0, 1.0),
     ) -> "Camera":
-        """Return upright cameras that look at a point.
+        """Return upright cameras that look at a point; +y is on the left of one that looks along x.
 
         Args:
             positions: positions [frame, 3] or [3] [m].

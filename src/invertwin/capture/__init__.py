@@ -32,17 +32,7 @@ from invertwin.capture.readers.touchstone import load_touchstone as load_touchst
 from invertwin.capture.track import Track as Track
 from invertwin.deprecation import rename_attributes, rename_members
 
-rename_attributes(
-    __name__,
-    {
-        "MeasuredSection": "MeasuredRcs",
-        "Messages": "BagMessages",
-        "faults_of": "find_faults",
-        "load_section": "load_rcs",
-        "settings_of": "make_settings",
-        "shown_ranges": "search_ranges",
-    },
-)
+rename_attributes(__name__)
 rename_members(BagMessages, stacked="stack")
 rename_members(Capture, recalibrated="recalibrate")
 rename_members(ChirpCapture, capture="to_capture", loops="select_chirps", placed="with_poses")

@@ -46,7 +46,7 @@ def backproject(
 def locate(
     capture: Capture, center: Float64[Tensor, "3"], radius: float = 0.6, step: float = 0.01
 ) -> Float64[Tensor, "3"]:
-    """Find the brightest point of the backprojected image in a horizontal square.
+    """Find the brightest point of the backprojected image in a horizontal square, along x and y.
 
     Args:
         capture: range profiles.

@@ -13,6 +13,7 @@ from torch import Tensor
 from invertwin.capture.range_interpolation import RangeInterpolator
 from invertwin.capture.readers.netcdf import read_dataset, write_dataset
 from invertwin.capture.readers.radar_fields import (
+    convert_old_axes,
     radar_fields,
     radar_from_fields,
     read_tensor,
@@ -38,7 +39,7 @@ class Capture:
     ``range_profile`` (frame, range), analytic signals at radio frequency; beside it the radar's
     pose in every frame, its arrays and waveform. Where known, it also holds the time of each frame
     on the radar's clock, the track of the radar, and surveyed positions of targets. Every variable
-    carries its unit.
+    carries its unit. Axes of the radar are x forward, y left, z up; the attribute ``axes`` says so.
 
     Attributes:
         dataset: the labelled arrays. Not to be changed in place.
@@ -133,7 +134,8 @@ class Capture:
         """Read what `save` wrote.
 
         A damaged file can hang or crash the libraries that read it. So a child process tries it
-        first, within limits of time and memory; that takes about a second.
+        first, within limits of time and memory; that takes about a second. Files of versions whose
+        axes were x left, y up, z ahead name none; they are turned to x forward, y left, z up.
 
         Args:
             path: file.
@@ -143,7 +145,7 @@ class Capture:
             InputError: no such file, a truncated file, or one that holds no capture.
         """
         with convert_read_errors(path, "a capture", "record or save it again"):
-            return cls(read_dataset(Path(path), trusted=trusted))
+            return cls(convert_old_axes(read_dataset(Path(path), trusted=trusted)))
 
     def save(self, path: str | Path) -> None:
         """Write NetCDF (HDF5), bit for bit; an interrupted write leaves an old file as it was.

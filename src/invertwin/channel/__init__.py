@@ -48,26 +48,7 @@ from invertwin.channel.specular.ray_paths import RayPaths as RayPaths
 from invertwin.channel.specular.trace_paths import trace_paths as trace_paths
 from invertwin.deprecation import rename_attributes, rename_members
 
-rename_attributes(
-    __name__,
-    {
-        "Curves": "DiscontinuityCurves",
-        "Pattern": "GainPattern",
-        "REST": "channel.sampling.ALL_OTHERS",
-        "Sight": "ViewpointScene",
-        "alone": "runtime.concurrency.tracer_lock",
-        "densities_of": "channel.sampling.resolve_densities",
-        "differentiated": "checks.is_differentiated",
-        "interference": "combine_coherently",
-        "lit_fractions": "visible_fractions",
-        "torch_threads": "runtime.concurrency.torch_threads",
-        "trace_chains": "trace_facet_paths",
-        "trace_echoes": "trace_point_targets",
-        "trace_scattered": "trace_single_scattering",
-        "trace_signature": "trace_far_field",
-        "without_echoes": "as_absorbers",
-    },
-)
+rename_attributes(__name__)
 rename_members(DiscontinuityCurves, crossing="is_intersection")
 rename_members(PanelCells, places="centers")
 rename_members(

@@ -65,12 +65,12 @@ class Grid:
 
     @property
     def u(self) -> Float64[Tensor, " u"]:
-        """Bin centres of the first direction cosine (x right)."""
+        """Bin centres of the first direction cosine (along y, to the left)."""
         return self._axis(self.u_start, self.u_step, self.u_count)
 
     @property
     def v(self) -> Float64[Tensor, " v"]:
-        """Bin centres of the second direction cosine (y up)."""
+        """Bin centres of the second direction cosine (along z, up)."""
         return self._axis(self.v_start, self.v_step, self.v_count)
 
     @staticmethod
@@ -86,13 +86,13 @@ class Link:
         tx: Phase centre of the transmitters, world coordinates [m].
         rx: Phase centre of the receivers [m]. Where it equals ``tx`` in every frame and both carry
             gradients, they count as one antenna, and ``tx`` gets the whole gradient.
-        rotations: Columns are the radar's x (right), y (up), z (boresight) axes in the world.
+        rotations: Columns are the radar's x (boresight), y (left), z (up) axes in the world.
         tx_pattern: Power pattern of one transmitter in the radar frame.
         rx_pattern: Power pattern of one receiver.
         wavelength: [m].
         shared_visibility: One visibility test from ``tx`` serves both antennas (V·V = V); the
             boundary then has one term instead of two (derivations §3).
-        tx_jones: Polarisation of the transmitters, about the radar's y axis.
+        tx_jones: Polarisation of the transmitters, about the radar's z axis.
         rx_jones: That of the receivers.
         range_origin: Range from which each frame counts that of its maps [m]; None = 0.
     """
@@ -182,7 +182,7 @@ class Paths(Rows):
         """
         way = self.last - link.rx[self.frame]
         local = torch.einsum("nij,ni->nj", link.rotations[self.frame], way)
-        return local[:, :2] / way.norm(dim=1, keepdim=True)
+        return local[:, 1:] / way.norm(dim=1, keepdim=True)
 
     @property
     def has_field(self) -> Bool[Tensor, " path"]:

@@ -164,6 +164,15 @@ def check(file: FileArgument, backend: BackendOption = None) -> None:
     console.print(line, markup=False, soft_wrap=True)
 
 
+@app.command()
+def convert(files: FilesArgument) -> None:
+    """Rewrite run files of the first frame (x right, y up) in today's: x ahead, y left, z up."""
+    from invertwin_convert import run_convert
+
+    for line in run_convert(files):
+        console.print(line, markup=False, soft_wrap=True)
+
+
 @_command_with(ResumableOptions)
 def demo(options: ResumableOptions) -> None:
     """Find a hidden letter from its radar echoes."""

@@ -332,5 +332,5 @@ def _check_starts_and_stages(run: RunFile, scene: Scene) -> None:
 def _is_separable(radar: Radar) -> bool:
     """Return whether the virtual array is a product of a row and a column."""
     places = (radar.virtual_positions / (1e-3 * radar.waveform.wavelength)).round()
-    x, y, both = (len(part.unique(dim=0)) for part in (places[:, :1], places[:, 1:2], places))
-    return x * y == both
+    y, z, both = (len(part.unique(dim=0)) for part in (places[:, 1:2], places[:, 2:], places))
+    return y * z == both

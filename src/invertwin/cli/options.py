@@ -132,7 +132,7 @@ class RecordingOptions(OutputOptions):
         int | None, typer.Option(help="1: rows of the board grow upwards, -1: downwards.")
     ] = None
     azimuth: Annotated[
-        int | None, typer.Option(help="1: columns grow to the right, -1: to the left.")
+        int | None, typer.Option(help="1: columns grow to the radar's left (y), -1: right.")
     ] = None
     lanes: Annotated[
         int | None, typer.Option(help="2 or 4 LVDS lanes, where the settings do not say.")
@@ -179,14 +179,11 @@ class TwinOptions(RecordingOptions):
 
     low: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="Corner of the ground that is searched, m; default: all that is seen."),
+        typer.Option(help="Corner x y of the ground searched, m; default: all that is seen."),
     ] = None
     high: Annotated[tuple[float, float] | None, typer.Option(help="Opposite corner, m.")] = None
     range_max: Annotated[
         float | None, typer.Option(help="m; default: the last range with echoes.")
-    ] = None
-    up: Annotated[
-        Literal["y", "z"] | None, typer.Option(help="The world axis that points up; default: y.")
     ] = None
     level: Annotated[
         float | None, typer.Option(help="Height of the ground, m; default: 0.6 below the radars.")

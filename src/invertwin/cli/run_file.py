@@ -22,6 +22,8 @@ from invertwin.registry.section import prefix_errors as prefix_errors
 from invertwin.registry.section import require_section as require_section
 from invertwin.storage.untrusted import convert_read_errors
 
+FRAME = 2
+"""Of run files: x ahead, y to the left, z up. Those of the first frame had no such key."""
 _MAX_ERRORS = 20  # in one line
 # Sections and kinds of the package in experiments/studies.
 _STUDY_NAMES = ("methods", "loss_scan", "openradar", "rail_sar", "vehicle", "shape_space")
@@ -61,8 +63,17 @@ def load_run(path: Path) -> Any:
         InputError: The file is missing, is not TOML, or does not fit the schema; the message
             names the key's path, what is allowed there and the nearest match, in one line.
     """
+    return validate_run(parse_toml(path, read_text(path)), path)
+
+
+def read_text(path: Path) -> str:
+    """The text of a run file, its line ends as they are.
+
+    Raises:
+        InputError: The file is missing or is no text.
+    """
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_bytes().decode("utf-8")
     except FileNotFoundError:
         raise InputError(
             f"{path}: expected a run file, got a path that does not exist; check the path"
@@ -72,12 +83,23 @@ def load_run(path: Path) -> Any:
         raise InputError(
             f"{path}: expected a readable run file, got an error: {reason}; give a TOML text file"
         ) from None
+
+
+def parse_toml(path: Path, text: str) -> dict[str, Any]:
+    """The tables of a run file.
+
+    Args:
+        path: Of the file, for errors.
+        text: What is in it.
+
+    Raises:
+        InputError: It is not TOML.
+    """
     with convert_read_errors(path, "a run file in TOML", "simplify it"):
         try:
-            raw = tomllib.loads(text)
+            return tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             raise InputError(_syntax_error_message(path, text, str(error))) from None
-    return validate_run(raw, path)
 
 
 def is_run_file(path: Path) -> bool:
@@ -103,8 +125,13 @@ def validate_run(raw: dict[str, Any], source: Path) -> Any:
     """The run file of parsed TOML; `source` names it in errors and anchors relative paths.
 
     Raises:
-        InputError: It does not fit the schema.
+        InputError: It does not fit the schema, or states no frame.
     """
+    if "task" in raw and "frame" not in raw:
+        raise InputError(
+            f"{source}: expected frame = {FRAME} (x ahead, y to the left, z up), got a run file of "
+            f"the first frame, which had no such key; convert it: invertwin convert {source}"
+        )
     try:
         from invertwin.cli.schema import RunFile
 
@@ -184,6 +211,8 @@ def _explain_error(error: ErrorDetails) -> str:
         case "literal_error":
             allowed = [t.strip(" '") for t in context["expected"].replace(" or ", ", ").split(",")]
             advice = _suggest_name(str(error["input"]), allowed, "choose one")
+            if len(allowed) == 1:
+                return f"{path}: expected {allowed[0]}, got {got}; correct the value"
             return f"{path}: expected one of {', '.join(allowed)}, got {got}; {advice}"
         case "missing":
             return f"{path}: expected a value, got nothing; add the key `{error['loc'][-1]}`"

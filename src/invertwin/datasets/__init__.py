@@ -15,13 +15,5 @@ from invertwin.datasets.reader import SampleDataset as SampleDataset
 from invertwin.datasets.shards import DatasetManifest as DatasetManifest
 from invertwin.deprecation import rename_attributes, rename_members
 
-rename_attributes(
-    __name__,
-    {
-        "KEPT": "UNCHANGED",
-        "Manifest": "DatasetManifest",
-        "Samples": "SampleDataset",
-        "seen_triangles": "triangle_visibility",
-    },
-)
+rename_attributes(__name__)
 rename_members(Distribution, ends="extreme_values")

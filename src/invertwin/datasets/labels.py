@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
@@ -14,6 +15,10 @@ from invertwin.radar.radar import Radar
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.mesh import concatenate_meshes
 
+_VECTORS = ("low", "high", "center", "size", "velocity", "positions", "joint")
+_MATRICES = ("pose", "rotation", "rotations")
+# Where x forward, y left, z up are among old axes, x left, y up, z ahead; 1 of poses stays last.
+_OLD_AXES = [2, 0, 1, 3]
 _POINTS = 256  # at least so many on every object
 _R2_STEPS = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
 
@@ -71,12 +76,35 @@ def object_labels(
 def radar_labels(radar: Radar) -> dict[str, Any]:
     """Poses of the radar in every frame: ``positions`` [m] and ``rotations`` in the world.
 
-    The columns of a rotation are the radar's axes: right, up, boresight.
+    The columns of a rotation are the radar's axes: boresight, left, up.
     """
     axes = radar.rotations
     if axes is None:
         axes = torch.eye(3, dtype=torch.float64).expand(radar.frame_count, 3, 3)
     return {"positions": radar.positions.tolist(), "rotations": axes.tolist()}
+
+
+def convert_old_labels(labels: Any, name: str = "") -> Any:
+    """Labels with x forward, y left, z up, from those with x left, y up, z ahead.
+
+    Objects' own axes turn with those of the world, those of mesh files too: vectors become P p,
+    rotations P R Pᵀ.
+
+    Args:
+        labels: of a sample, or a part of them.
+        name: key of the part.
+    """
+    if isinstance(labels, dict):
+        return {
+            key: convert_old_labels(item, "joint" if name == "joints" else key)
+            for key, item in labels.items()
+        }
+    if name in _MATRICES:
+        order = _OLD_AXES[: np.shape(labels)[-1]]
+        return np.array(labels)[..., order, :][..., order].tolist()
+    if name in _VECTORS:
+        return np.array(labels)[..., _OLD_AXES[:3]].tolist()
+    return [convert_old_labels(item) for item in labels] if name == "objects" else labels
 
 
 def triangle_visibility(scene: Scene, radar: Radar) -> dict[str, Float[Tensor, "frame face"]]:

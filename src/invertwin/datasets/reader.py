@@ -11,7 +11,13 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from invertwin.datasets.shards import DatasetManifest, locate_members, read_manifests
+from invertwin.datasets.labels import convert_old_labels
+from invertwin.datasets.shards import (
+    OLD_FORMAT,
+    DatasetManifest,
+    locate_members,
+    read_manifests,
+)
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.storage.untrusted import convert_read_errors
@@ -22,8 +28,10 @@ class SampleDataset(Dataset[Any]):
 
     A sample is a dict: ``index``, its arrays as tensors by name (``beat``, ``map``, …), ``labels``
     (``invertwin.datasets.object_labels`` says what is in them) and ``run``, the run file that
-    simulates it again. It works in every kind of worker of a DataLoader: nothing is read, and no
-    file is open, before the first sample is asked for.
+    simulates it again. Axes are x forward, y left, z up; labels and paths of an old data set, whose
+    axes are x left, y up, z ahead, are turned; `invertwin convert` rewrites its run files. It works
+    in every kind of worker of a DataLoader: nothing is read, and no file is open, before the first
+    sample is asked for.
 
     Args:
         folder: Of the data set, or of all of its parts.
@@ -102,6 +110,15 @@ class SampleDataset(Dataset[Any]):
                 if name in self._keep:
                     opened.seek(start)
                     found[name] = _decode(opened.read(size), kind)
+        return self._turn(found) if self.manifest.format == OLD_FORMAT else found
+
+    def _turn(self, found: dict[str, Any]) -> dict[str, Any]:
+        """Turn an old sample to x forward, y left, z up."""
+        if "labels" in found:
+            found["labels"] = convert_old_labels(found["labels"])
+        for name, info in self.manifest.arrays.items():
+            if name in found and "xyz" in info.dims:
+                found[name] = found[name].roll(1, info.dims.index("xyz"))
         return found
 
 

@@ -21,7 +21,10 @@ from invertwin.errors import InputError
 from invertwin.storage.untrusted import convert_read_errors
 
 MANIFEST = "manifest.json"
-FORMAT = "invertwin data set 1"
+FORMAT = "invertwin data set 2"
+"""Its axes are x forward, y left, z up."""
+OLD_FORMAT = "invertwin data set 1"
+"""Its axes are x left, y up, z ahead."""
 _DIGITS = 8  # of a sample's number
 
 
@@ -153,7 +156,8 @@ def read_manifests(folder: Path) -> list[tuple[Path, DatasetManifest]]:
     for file in files:
         with convert_read_errors(file, "the manifest of a data set"):
             manifest = DatasetManifest.model_validate_json(file.read_bytes())
-        if manifest.format != FORMAT or any(Path(s.name).name != s.name for s in manifest.shards):
+        known = manifest.format in (FORMAT, OLD_FORMAT)
+        if not known or any(Path(s.name).name != s.name for s in manifest.shards):
             raise InputError(f"expected {FORMAT!r}, got {file} of another format; make it again")
         found.append((file.parent, manifest))
     if not found:
@@ -161,7 +165,7 @@ def read_manifests(folder: Path) -> list[tuple[Path, DatasetManifest]]:
             f"expected a data set, got {folder} without {MANIFEST}; give a folder that invertwin "
             "dataset has completed"
         )
-    if len({(m.fingerprint, m.samples, m.part[1]) for _, m in found}) > 1:
+    if len({(m.format, m.fingerprint, m.samples, m.part[1]) for _, m in found}) > 1:
         raise InputError(
             f"expected parts of one data set, got those of several in {folder}; make them with "
             "one run file and one number of parts"

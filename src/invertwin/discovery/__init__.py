@@ -17,18 +17,7 @@ from invertwin.discovery.shapes.primitives import SHAPE_KINDS as SHAPE_KINDS
 from invertwin.discovery.shapes.primitives import PrimitiveModel as PrimitiveModel
 from invertwin.discovery.shapes.primitives import ShapeParameters as ShapeParameters
 
-rename_attributes(
-    __name__,
-    {
-        "Figure": "ShapeParameters",
-        "KINDS": "SHAPE_KINDS",
-        "Picture": "GroundImage",
-        "Primitive": "PrimitiveModel",
-        "Thing": "DetectedObject",
-        "Track": "ObjectTrack",
-        "still_capture": "average_chirps",
-    },
-)
+rename_attributes(__name__)
 rename_members(DetectedEcho, rate="range_rate")
 rename_members(DetectedObject, confidence="existence_probability", figure="shape", row="to_metrics")
 rename_members(GroundImage, places="positions", views="view_counts")

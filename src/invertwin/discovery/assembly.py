@@ -14,7 +14,6 @@ from invertwin.discovery.imaging.reflectivity import thin_map
 from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters, Shapes
 from invertwin.discovery.shapes.prisms import OutlineModel, make_shape_model
 from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
-from invertwin.inversion.initialisation.detections import Ground
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar
 from invertwin.scene import Scene
@@ -47,7 +46,6 @@ class ShapeLikelihood:
         power: observed maps [frame, range, u, v].
         loss: negative log-likelihood of maps.
         bins_per_draw: number of correlated bins per independent draw.
-        ground: ground plane.
         level: height of the ground [m].
         seed: seed of the rays.
     """
@@ -57,7 +55,6 @@ class ShapeLikelihood:
     power: Float[Tensor, "frame range u v"]
     loss: HeavyTailedLoss
     bins_per_draw: float
-    ground: Ground
     level: float
     seed: int
 
@@ -68,7 +65,7 @@ class ShapeLikelihood:
             shapes: shape parameters.
         """
         named = {f"object_{number}": shape for number, shape in enumerate(shapes, 1)}
-        return {n: make_shape_model(n, one, self.ground, self.level) for n, one in named.items()}
+        return {n: make_shape_model(n, one, self.level) for n, one in named.items()}
 
     @cached_property
     def coarse_maps(self) -> "CoarseMaps":

@@ -107,7 +107,7 @@ def find_hypotheses(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[Sh
     found = [[ShapeHypothesis(shape, 1.0)] for shape in shapes]
     for changed in (
         *propose_kinds(likelihood, shapes),
-        rotate_headed_shapes(shapes, math.pi, likelihood.ground),
+        rotate_headed_shapes(shapes, math.pi),
     ):
         if not changed:
             continue
@@ -159,17 +159,17 @@ def widen_deviations(
         hypotheses: hypotheses of the shape, the best first.
     """
     found, figure = dict(deviations), hypotheses[0].shape
-    middle = shape_center(figure, likelihood.ground, likelihood.level)
+    middle = shape_center(figure, likelihood.level)
     farther = 0.0
     if figure.has_free_height:
         distance = float((likelihood.radar.positions.detach() - middle).norm(dim=1).mean())
         farther = deviations["height"] ** 2 / (2 * distance)
-    for number, axis in enumerate(likelihood.ground.plane_axes):
+    for number, axis in enumerate("xy"):
         away = sum(
             r.probability * (r.shape.position[number] - figure.position[number]) ** 2
             for r in hypotheses
         )
-        found["xyz"[axis]] = math.hypot(deviations["xyz"[axis]], math.sqrt(away), farther)
+        found[axis] = math.hypot(deviations[axis], math.sqrt(away), farther)
     return found
 
 

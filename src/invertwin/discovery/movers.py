@@ -111,11 +111,11 @@ def _channel_coherence(
     moving = recording.beat - recording.beat.mean(1, keepdim=True)
     slow = range_doppler(moving.to(torch.complex128), radar, grid, chirps)
     channels = compensate_tdm(slow, radar, chirps)[0, row, :, :, column].flatten()
-    x, y = radar.virtual_positions[:, 0], radar.virtual_positions[:, 1]
+    y, z = radar.virtual_positions[:, 1], radar.virtual_positions[:, 2]
     # Fine enough that the nearest direction costs less than a thousandth.
-    cosines = [torch.linspace(-1, 1, 257 if len(p.unique()) > 1 else 1) for p in (x, y)]
+    cosines = [torch.linspace(-1, 1, 257 if len(p.unique()) > 1 else 1) for p in (y, z)]
     u, v = (torch.zeros(1).double() if len(c) == 1 else c.double() for c in cosines)
-    steer = aperture(radar).beams(u, v, x, y)
+    steer = aperture(radar).beams(u, v, y, z)
     return float((steer @ (channels / channels.abs())).abs().max() / len(channels))
 
 

@@ -38,19 +38,19 @@ class DetectedEcho:
 class MovingBody(nn.Module):
     """A rigid body in motion: place, size, velocity, turn, and how much of its echo is diffuse.
 
-    Its axes are across the line of sight to the start, up, and along this line. The body moves in
-    the plane of the first and the last axis. Its height is fitted if the antennas resolve it.
+    Its axes are along the line of sight to the start, across this line, and up. The body moves in
+    the plane of the first two axes. Its height is fitted if the antennas resolve it.
     Motion across the line of sight and a turn look much alike: hold the turn of a body that does
     not turn. The module puts the body into a scene: where it is in the middle of the frame, and
     with a velocity of each of its vertices.
 
     Attributes:
         echo: Where it started.
-        place: parameter [2], of the body's nearest point from the start, across and along [m].
+        place: parameter [2], of the body's nearest point from the start, along and across [m].
         height: parameter [], the same, up [m]; fitted if the radar has several rows of antennas.
-        velocity: parameter [2], across and along [m/s].
+        velocity: parameter [2], along and across [m/s].
         spin: parameter [], turn about the axis up [rad/s].
-        size: parameter [3], logarithms of factors on the object's size across, up and along.
+        size: parameter [3], logarithms of factors on the object's size along, across and up.
         diffuse: parameter [], logit of the diffuse share of the reflected power.
     """
 
@@ -87,25 +87,25 @@ class MovingBody(nn.Module):
         link = radar.link()
         along = echo.position - 0.5 * (link.tx + link.rx)[0]
         along = along / along.norm()
-        across = torch.linalg.cross(link.rotations[0, :, 1], along)
+        across = torch.linalg.cross(link.rotations[0, :, 2], along)
         across = across / across.norm()
-        self._axes = torch.stack([across, torch.linalg.cross(along, across), along], dim=1)
+        self._axes = torch.stack([along, across, torch.linalg.cross(along, across)], dim=1)
         self._start = echo.position
         vertices = scene[object].mesh.vertices.detach()
         self._first_extent = vertices.amax(0) - vertices.amin(0)
         zeros = torch.zeros(2, dtype=torch.float64)
         self.place = nn.Parameter(zeros.clone())
         self.height = nn.Parameter(zeros[0].clone())
-        self.velocity = nn.Parameter(torch.tensor([0.0, echo.range_rate], dtype=torch.float64))
+        self.velocity = nn.Parameter(torch.tensor([echo.range_rate, 0.0], dtype=torch.float64))
         self.spin = nn.Parameter(zeros[0].clone())
         self.size = nn.Parameter(torch.zeros(3, dtype=torch.float64))
         self.diffuse = nn.Parameter(torch.tensor(share, dtype=torch.float64).logit())
         if center is not None:
             offset = (center - self._center_at()).detach() @ self._axes
-            self.place.data.copy_(offset[[0, 2]])
-            self.height.data.copy_(offset[1])
+            self.place.data.copy_(offset[:2])
+            self.height.data.copy_(offset[2])
         held = dict(self.named_parameters())
-        rows = len(radar.virtual_positions[:, 1].unique())
+        rows = len(radar.virtual_positions[:, 2].unique())
         if set(free) - (set(held) - {"height"}):
             raise InputError(
                 f"expected names among {', '.join(n for n in held if n != 'height')}, got "
@@ -130,7 +130,7 @@ class MovingBody(nn.Module):
         pose = rigid(self._axes, center)
         placed = scene.replace(self.object, mesh=mesh, pose=pose, material=material)
         lever = placed[self.object].vertices - center
-        turn = torch.linalg.cross((self.spin * self._axes[:, 1]).expand_as(lever), lever)
+        turn = torch.linalg.cross((self.spin * self._axes[:, 2]).expand_as(lever), lever)
         return placed.replace(self.object, velocity=self._axes @ self._velocity_vector + turn)
 
     def values(self) -> dict[str, Tensor]:
@@ -145,17 +145,17 @@ class MovingBody(nn.Module):
             }
 
     def _center_at(self, time: float = 0.0) -> Float64[Tensor, "3"]:
-        depth = 0.5 * self._extent[2]
-        offset = torch.stack([self.place[0], self.height, self.place[1] + depth])
+        depth = 0.5 * self._extent[0]
+        offset = torch.stack([self.place[0] + depth, self.place[1], self.height])
         return self._start + self._axes @ (offset + self._velocity_vector * time)
 
     @property
     def _velocity_vector(self) -> Tensor:
-        return torch.stack([self.velocity[0], torch.zeros_like(self.spin), self.velocity[1]])
+        return torch.stack([*self.velocity, torch.zeros_like(self.spin)])
 
     @property
     def _extent(self) -> Tensor:
-        """Full size across, up and along [m]."""
+        """Full size along, across and up [m]."""
         return self._first_extent * self.size.exp()
 
 

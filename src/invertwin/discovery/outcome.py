@@ -11,7 +11,6 @@ from invertwin.capture import ChannelCalibration
 from invertwin.channel import Grid
 from invertwin.discovery.shapes.primitives import ShapeParameters
 from invertwin.discovery.shapes.prisms import make_shape_model
-from invertwin.inversion.initialisation.detections import Ground
 from invertwin.scene import Object, Scene
 
 
@@ -114,7 +113,7 @@ class GroundImage:
     """Image of the ground.
 
     Attributes:
-        positions: positions along the two axes of the ground [m].
+        positions: x and y of every point [m].
         strength: radar cross-section at every position, or brightness of a backprojected image.
         view_counts: number of radar positions that see each position; zero is "never seen".
     """
@@ -130,7 +129,6 @@ class Twin:
 
     Attributes:
         objects: objects in order of existence probability; moving ones last.
-        ground: ground plane of the image.
         level: Height of the ground [m].
         image: image of the echoes and of unobserved regions.
         predicted: predicted maps of the objects with the background; None if only positions were
@@ -142,7 +140,6 @@ class Twin:
     """
 
     objects: tuple[DetectedObject, ...]
-    ground: Ground
     level: float
     image: GroundImage | None = None
     predicted: Float[Tensor, "frame range u v"] | None = None
@@ -159,7 +156,7 @@ class Twin:
         objects: dict[str, Object] = {}
         for thing in self.objects:
             if thing.shape is not None:
-                item = make_shape_model(thing.name, thing.shape, self.ground, self.level).item
+                item = make_shape_model(thing.name, thing.shape, self.level).item
                 mesh = type(item.mesh)(item.mesh.vertices.detach(), item.mesh.faces)
                 objects[thing.name] = Object(mesh, thing.shape.material)
         return Scene(objects) if objects else None

@@ -9,11 +9,11 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.discovery.shapes.primitives import SIZE_LIMITS, ShapeParameters
-from invertwin.inversion.initialisation.detections import Ground, label_groups
+from invertwin.inversion.initialisation.detections import label_groups
 
 _YAW_COUNT = 45  # candidate yaws of a rectangle over a quarter turn
 _TRIMMED_FRACTION = 0.05  # fraction of the weight beyond each side of a rectangle
-_PERSON_SIZE = 0.66, 0.32, 1.75  # usual length, width and height [m]
+_PERSON_SIZE = 0.32, 0.66, 1.75  # usual length, width and height [m]
 # Minimum extent, and margin of the usual extents [m].
 _MIN_PERSON_EXTENT, _PERSON_MARGIN = 0.12, 0.25
 MAX_CORNER_EXTENT = 0.15
@@ -71,20 +71,21 @@ def enclosing_rectangle(
     Args:
         positions: positions on the ground [point, 2] [m].
         weight: weight of every point.
-        yaw: yaw of the first side, from the first axis towards the second [rad].
+        yaw: yaw of the first side, from x towards y [rad].
 
     Returns:
         The tightness is the weighted mean of 1/(d + 3 cm), d the distance to the nearest side.
     """
     c, s = math.cos(yaw), math.sin(yaw)
-    first, second = positions.unbind(1)
-    own = torch.stack([c * first + s * second, c * second - s * first], 1)
+    x, y = positions.unbind(1)
+    own = torch.stack([c * x + s * y, c * y - s * x], 1)
     ends = torch.stack([_trimmed_ends(own[:, axis], weight) for axis in range(2)])
     middle, sides = ends.mean(1), ends[:, 1] - ends[:, 0]
     away = (0.5 * sides - (own - middle).abs()).abs().amin(1)
     tight = float((weight / (away + 0.03)).sum() / weight.sum())
-    x, y = middle.tolist()
-    return torch.tensor([c * x - s * y, s * x + c * y], dtype=torch.float64), sides, tight
+    first, second = middle.tolist()
+    center = c * first - s * second, s * first + c * second
+    return torch.tensor(center, dtype=torch.float64), sides, tight
 
 
 def _trimmed_ends(coordinates: Tensor, weight: Tensor) -> Tensor:
@@ -98,7 +99,6 @@ def _trimmed_ends(coordinates: Tensor, weight: Tensor) -> Tensor:
 def propose_shapes(
     positions: Float64[Tensor, "point 2"],
     weight: Float64[Tensor, " point"],
-    ground: Ground,
     *,
     step: float,
     height: float,
@@ -109,7 +109,6 @@ def propose_shapes(
     Args:
         positions: positions on the ground [point, 2] [m].
         weight: weight of every point.
-        ground: ground plane.
         step: point spacing of the image [m].
         height: height of the radars above the ground, at which objects are observed [m].
     """
@@ -126,8 +125,7 @@ def propose_shapes(
         # The image is about one step wider than the object.
         length, width = (max(float(side), 0.02) for side in sides)
         x, y = middle.tolist()
-        yaw = ground.yaw_sign * turn
-        rows.append(ShapeParameters("box", (x, y), yaw, length, width, 1.5 * height))
+        rows.append(ShapeParameters("box", (x, y), turn, length, width, 1.5 * height))
     spread = max(float(smallest[0][1].mean()), 0.02)
     x, y = smallest[0][0].tolist()
     rows.append(ShapeParameters("cylinder", (x, y), 0.0, spread, spread, 1.5 * height))
@@ -135,8 +133,7 @@ def propose_shapes(
     middle, sides, _ = smallest[0]
     if float(sides.max()) < MAX_CORNER_EXTENT:
         rows += propose_headings(ShapeParameters("corner", (x, y), height=height))
-    yaw = ground.yaw_sign * smallest[1]
-    around = ShapeParameters("box", (x, y), yaw, *sides.clamp_min(0.02).tolist())
+    around = ShapeParameters("box", (x, y), smallest[1], *sides.clamp_min(0.02).tolist())
     return rows + propose_people_and_vehicles(around)
 
 
@@ -158,8 +155,8 @@ def propose_people_and_vehicles(box: ShapeParameters) -> list[ShapeParameters]:
     long, short = max(box.length, box.width), min(box.length, box.width)
     rows: list[ShapeParameters] = []
     if (
-        _MIN_PERSON_EXTENT < long < _PERSON_SIZE[0] + _PERSON_MARGIN
-        and short < _PERSON_SIZE[1] + _PERSON_MARGIN
+        _MIN_PERSON_EXTENT < long < _PERSON_SIZE[1] + _PERSON_MARGIN
+        and short < _PERSON_SIZE[0] + _PERSON_MARGIN
     ):
         length, width, height = _PERSON_SIZE
         upright = replace(box, kind="person", length=length, width=width, height=height)

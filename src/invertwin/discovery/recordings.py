@@ -41,7 +41,6 @@ from invertwin.discovery.shapes.primitives import Shapes, shape_center
 from invertwin.discovery.tracks import track_moving_targets
 from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
-from invertwin.inversion.initialisation.detections import Ground
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar, SampledWaveform
 from invertwin.scene import Scene
@@ -60,7 +59,6 @@ def twin(
     low: Sequence[float] | None = None,
     high: Sequence[float] | None = None,
     range_max: float | None = None,
-    ground: Ground | None = None,
     level: float | None = None,
     height: float | None = None,
     rays: int = 2000,
@@ -77,10 +75,9 @@ def twin(
 
     Args:
         recording: recording of radars at known positions.
-        low, high: opposite corners of the search region on the ground, along its two axes [m]; None
-            = the whole visible region.
+        low, high: opposite corners of the search region on the ground, x and y [m]; None = the
+            whole visible region.
         range_max: maximum range [m]; None = the last range with echoes.
-        ground: ground plane with its upward axis; None = y.
         level: height of the ground [m]; None = 0.6 m below the radars.
         height: height of the image above the ground [m]; None = that of the radars. Echoes come
             from about this height if objects are as tall as the radars; state less for lower
@@ -91,37 +88,35 @@ def twin(
     Raises:
         InputError: A region invisible to all radars, or too large for its resolution.
     """
-    plane = ground or Ground()
     checked_count(rays, "rays", 100)
     capture = average_chirps(recording)
     if isinstance(recording, ChirpCapture) and recording.real:
         range_max = min(range_max or math.inf, recording.max_range)
     radar = capture.radar()
-    base = float(radar.positions.detach()[:, plane.up_axis].mean())
+    base = float(radar.positions.detach()[:, 2].mean())
     floor = base - _DEFAULT_RADAR_HEIGHT if level is None else level
     floor = checked_number(floor, "level of the ground [m]", -math.inf)
-    plane_at = base if height is None else floor + checked_number(height, "height [m]", 0.0)
+    image_height = base if height is None else floor + checked_number(height, "height [m]", 0.0)
     reach = _search_range(capture, range_max)
     if reach is None:
-        moving = _find_moving_targets(recording, range_max, plane)
+        moving = _find_moving_targets(recording, range_max)
         said = "nothing that stands still is above the noise" if moving else _NO_SIGNAL_NOTE
-        return Twin(_sort_objects(moving), plane, floor, notes=(said,))
-    places, step = _image_points(radar, plane, plane_at, reach, low, high)
+        return Twin(_sort_objects(moving), floor, notes=(said,))
+    places, step = _image_points(radar, image_height, reach, low, high)
     gains = calibrate_on_scene(capture, radar.grid(*reach), places)
     if gains is not None:
         recording, capture = gains.apply(recording), gains.apply(capture)
-    moving = _find_moving_targets(recording, range_max, plane)
+    moving = _find_moving_targets(recording, range_max)
     if is_dense_track(capture):
         # Average over frames, where all of them have an echo.
         far = torch.cdist(places, radar.positions.detach())
         places = places[(far.amin(1) > reach[0]) & (far.amax(1) < reach[1])]
         separation = 4 * max(step, radar.waveform.wavelength)
         found, image = locate_coherent_points(capture, places, separation)
-        flat, views = places[:, list(plane.plane_axes)], _count_views(radar, places, None)
-        picture = GroundImage(flat, image, views)
-        return Twin(_sort_objects([*found, *moving]), plane, floor, picture)
+        picture = GroundImage(places[:, :2], image, _count_views(radar, places, None))
+        return Twin(_sort_objects([*found, *moving]), floor, picture)
     grid = radar.grid(*reach)
-    still = _find_static_objects(capture, radar, grid, plane, floor, places, step, rays, seed)
+    still = _find_static_objects(capture, radar, grid, floor, places, step, rays, seed)
     notes = () if gains is None else (_CALIBRATION_NOTE.format(phase_spread(gains, radar)),)
     objects = _sort_objects([*still.objects, *moving])
     return replace(still, objects=objects, notes=(*notes, *still.notes), calibration=gains)
@@ -151,7 +146,7 @@ def average_chirps(recording: Capture | ChirpCapture) -> Capture:
 
 
 def _find_moving_targets(
-    recording: Capture | ChirpCapture, range_max: float | None, ground: Ground
+    recording: Capture | ChirpCapture, range_max: float | None
 ) -> list[DetectedObject]:
     """Detect moving targets in chirp trains, and track them if the frame period is known."""
     if isinstance(recording, Capture) or recording.chirps.count == 1:
@@ -160,7 +155,7 @@ def _find_moving_targets(
     near = _LEAKAGE_CELLS * radar.waveform.range_resolution
     grid = radar.grid(near, min(range_max or math.inf, recording.max_range))
     if recording.frame_period is not None and recording.frame_count > 2:
-        return track_moving_targets(recording, grid, ground)
+        return track_moving_targets(recording, grid)
     return [
         one
         for one in detect_moving_targets(recording, grid)
@@ -183,7 +178,6 @@ def _find_static_objects(
     capture: Capture,
     radar: Radar,
     grid: Grid,
-    ground: Ground,
     level: float,
     positions: Tensor,
     step: float,
@@ -199,7 +193,6 @@ def _find_static_objects(
         power,
         HeavyTailedLoss(estimate_background(power)),
         count_bins_per_draw(radar, grid),
-        ground,
         level,
         seed,
     )
@@ -207,8 +200,8 @@ def _find_static_objects(
     held = held if frames >= 2 * _HELD_OUT_EVERY else []
     fitted = one.select_frames([k for k in range(frames) if k not in held]) if held else one
     coarse = fitted.coarse_maps.grid
-    flat = positions[:, list(ground.plane_axes)]
-    height = float(positions[:, ground.up_axis].mean()) - level
+    flat = positions[:, :2]
+    height = float(positions[:, 2].mean()) - level
     response = compute_response(fitted.radar, coarse, positions)
     lattice = ImageGrid(flat, step, response, max(height, 0.1))
     aside = one.select_frames(held) if held else None
@@ -219,7 +212,7 @@ def _find_static_objects(
     if not shapes:
         seen = GroundImage(flat, picture, _count_views(radar, positions, None))
         nothing = level_map.expand_as(power)
-        return Twin((), ground, level, seen, nothing, power, grid, (_NO_SIGNAL_NOTE,))
+        return Twin((), level, seen, nothing, power, grid, (_NO_SIGNAL_NOTE,))
     notes: tuple[str, ...] = ()
     if aside is not None:
         shapes = fit_outlines(fitted, aside, shapes)
@@ -234,7 +227,6 @@ def _find_static_objects(
         among = find_hypotheses(one, shapes)
     return Twin(
         _describe_objects(one, found, shapes, among),
-        ground,
         level,
         GroundImage(flat, picture, _count_views(radar, positions, one.build_scene(shapes))),
         one.predict(shapes) + level_map,
@@ -257,7 +249,7 @@ def _describe_objects(
             f"object_{k}",
             shape.effective_kind,
             kind_probabilities(among),
-            shape_center(shape, likelihood.ground, likelihood.level),
+            shape_center(shape, likelihood.level),
             shape,
             widen_deviations(likelihood, _select_prefix(errors, f"object_{k}."), among),
             probability,
@@ -330,15 +322,13 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
 
 def _image_points(
     radar: Radar,
-    ground: Ground,
     height: float,
     ranges: tuple[float, float],
     low: Sequence[float] | None,
     high: Sequence[float] | None,
 ) -> tuple[Float64[Tensor, "point 3"], float]:
     """Return visible image points on the ground [m], and their distance."""
-    axes = list(ground.plane_axes)
-    at = radar.positions.detach()[:, axes]
+    at = radar.positions.detach()[:, :2]
     corners = [at.amin(0) - ranges[1], at.amax(0) + ranges[1]]
     for k, given in enumerate((low, high)):
         if given is not None:
@@ -355,7 +345,7 @@ def _image_points(
         steps = [cell * torch.arange(count, dtype=torch.float64) for count in counts]
         flat = torch.cartesian_prod(corners[0][0] + steps[0], corners[0][1] + steps[1])
         places = torch.zeros(len(flat), 3, dtype=torch.float64)
-        places[:, axes], places[:, ground.up_axis] = flat, height
+        places[:, :2], places[:, 2] = flat, height
         near = torch.zeros(len(flat), dtype=torch.bool)
         for place, axis in _boresights(radar):
             way = places - place
@@ -391,5 +381,5 @@ def _count_views(
 
 def _boresights(radar: Radar) -> list[tuple[Tensor, Tensor]]:
     """Return position and boresight of every frame."""
-    axes = radar.link().rotations.detach()[:, :, 2]
+    axes = radar.link().rotations.detach()[:, :, 0]
     return list(zip(radar.positions.detach(), axes, strict=True))

@@ -27,7 +27,6 @@ from invertwin.discovery.shapes.primitives import (
     rotate_shape,
 )
 from invertwin.discovery.shapes.prisms import PrismParameters, prism_contour
-from invertwin.inversion.initialisation.detections import Ground
 
 _MAX_SHAPES = 24  # maximum number of objects
 _BIRTH_ROUNDS = 3  # rounds of births
@@ -47,7 +46,7 @@ class ImageGrid:
     """Image points on the ground with their responses.
 
     Attributes:
-        positions: positions on the ground [point, 2] [m].
+        positions: x and y on the ground [point, 2] [m].
         step: distance of neighbours [m].
         response: response of the points in thinned maps.
         height: height of the radars above the ground [m].
@@ -87,11 +86,6 @@ class ShapeSearch:
     fitted_frames: ShapeLikelihood
     held_out_frames: ShapeLikelihood | None
     image_grid: ImageGrid
-
-    @property
-    def ground(self) -> Ground:
-        """Ground plane."""
-        return self.fitted_frames.ground
 
     def evidence(self, shapes: Shapes) -> float:
         """Compute the evidence of shapes on the fitted frames.
@@ -193,10 +187,10 @@ class ShapeSearch:
         nothing = (power - loss.level[:, None, None]).clamp_min(rest)
         saved = loss.bin_losses(rest, power) - loss.bin_losses(nothing, power)
         gain = lattice.response.average_over_bins(saved)
-        at = one.radar.positions.detach()[:, list(self.ground.plane_axes)]
+        at = one.radar.positions.detach()[:, :2]
         direction = torch.nn.functional.normalize(at[:, None] - lattice.positions, dim=2)
         yaws = [k * math.pi / 8 for k in range(16)]
-        cosines = (direction @ corner_direction(yaw, self.ground) for yaw in yaws)
+        cosines = (direction @ corner_direction(yaw) for yaw in yaws)
         score = torch.stack([((c > _MIN_CORNER_COSINE) * gain).sum(0) for c in cosines])
         found = list[ShapeParameters]()
         for _ in range(_CORNERS_PER_ROUND):
@@ -262,9 +256,7 @@ class ShapeSearch:
             group: strength of every point [m²], zero outside the group.
         """
         lattice = self.image_grid
-        rows = propose_shapes(
-            lattice.positions, group, self.ground, step=lattice.step, height=lattice.height
-        )
+        rows = propose_shapes(lattice.positions, group, step=lattice.step, height=lattice.height)
         total = float(group.sum())
         return [replace(row, brightness=max(total / mean_rcs(row), 1e-4)) for row in rows]
 
@@ -315,7 +307,7 @@ class ShapeSearch:
             shapes: fitted shapes.
         """
         turns = (0.5 * math.pi, math.pi, 1.5 * math.pi)
-        others = [rotate_headed_shapes(shapes, turn, self.ground) for turn in turns]
+        others = [rotate_headed_shapes(shapes, turn) for turn in turns]
         return self.select_likeliest(shapes, [rows for rows in others if rows])
 
     def select_likeliest(
@@ -367,7 +359,7 @@ class ShapeSearch:
             tried += 1
             if max(shape.length, shape.width) < _MIN_SPLIT_SIZE or len(found) == _MAX_SHAPES:
                 continue
-            pairs = propose_splits(shape, self.ground)
+            pairs = propose_splits(shape)
             pair = max(pairs, key=lambda two, rest=rest: self.evidence([*rest, *two]))
             # The cuts are dense enough for the right one to be more likely before a fit.
             if self.evidence([*rest, *pair]) < self.evidence(found):
@@ -388,14 +380,14 @@ class ShapeSearch:
             pairs = [
                 (a, b)
                 for a, b in combinations(found, 2)
-                if (a, b) not in tried and shape_gap(a, b, self.ground) < _MAX_MERGE_GAP
+                if (a, b) not in tried and shape_gap(a, b) < _MAX_MERGE_GAP
             ]
             if not pairs:
                 return found
-            a, b = min(pairs, key=lambda pair: shape_gap(*pair, self.ground))
+            a, b = min(pairs, key=lambda pair: shape_gap(*pair))
             tried.add((a, b))
             rest = [shape for shape in found if shape is not a and shape is not b]
-            boxes = [enclosing_box((a, b), turn, self.ground) for turn in _BOX_YAWS]
+            boxes = [enclosing_box((a, b), turn) for turn in _BOX_YAWS]
             least = min(boxes, key=lambda one: one.length * one.width)
             one = self.select_best(rest, [*boxes, *propose_people_and_vehicles(least)])
             if self.evidence([*rest, one]) < self.evidence(found) - _MAX_EVIDENCE_DEFICIT:
@@ -448,17 +440,16 @@ def propose_kinds(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[Shap
     ]
 
 
-def rotate_headed_shapes(shapes: Shapes, rotation: float, ground: Ground) -> list[ShapeParameters]:
+def rotate_headed_shapes(shapes: Shapes, rotation: float) -> list[ShapeParameters]:
     """Rotate people and vehicles; empty if there are none.
 
     Args:
         shapes: present shapes.
-        rotation: rotation about the vertical [rad].
-        ground: ground plane.
+        rotation: rotation about z [rad].
     """
     fronts = [shape.kind in ("person", "vehicle") for shape in shapes]
     pairs = zip(shapes, fronts, strict=True)
-    rows = [rotate_shape(one, rotation, ground) if front else one for one, front in pairs]
+    rows = [rotate_shape(one, rotation) if front else one for one, front in pairs]
     return rows if any(fronts) else []
 
 
@@ -520,16 +511,15 @@ def convert_kind(shape: ShapeParameters, kind: str) -> ShapeParameters:
     return replace(shape, kind=kind, length=across, width=across, height=max(high, 0.05))
 
 
-def enclosing_box(shapes: Shapes, yaw: float, ground: Ground) -> ShapeParameters:
+def enclosing_box(shapes: Shapes, yaw: float) -> ShapeParameters:
     """Return a box around shapes.
 
     Args:
         shapes: shapes to merge.
         yaw: yaw of the box [rad].
-        ground: ground plane.
     """
-    corners = torch.cat([outline_corners(shape, ground) for shape in shapes])
-    c, s = math.cos(ground.yaw_sign * yaw), math.sin(ground.yaw_sign * yaw)
+    corners = torch.cat([outline_corners(shape) for shape in shapes])
+    c, s = math.cos(yaw), math.sin(yaw)
     own = corners @ torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
     low, high = own.amin(0), own.amax(0)
     x, y = (0.5 * (low + high)).tolist()
@@ -540,22 +530,19 @@ def enclosing_box(shapes: Shapes, yaw: float, ground: Ground) -> ShapeParameters
     return ShapeParameters("box", position, yaw, length, width, tall, brightest.brightness)
 
 
-def propose_splits(
-    shape: ShapeParameters, ground: Ground
-) -> list[tuple[ShapeParameters, ShapeParameters]]:
+def propose_splits(shape: ShapeParameters) -> list[tuple[ShapeParameters, ShapeParameters]]:
     """Propose two boxes in place of one shape: cuts across either side at three positions, one box
     slim.
 
     Args:
         shape: shape to split.
-        ground: ground plane.
 
     Returns:
         For each cut both of full width, and either one slim, along each edge or the middle of the
         shape.
     """
-    box = enclosing_box((shape,), shape.yaw if shape.is_rectangular else 0.0, ground)
-    c, s = math.cos(ground.yaw_sign * box.yaw), math.sin(ground.yaw_sign * box.yaw)
+    box = enclosing_box((shape,), shape.yaw if shape.is_rectangular else 0.0)
+    c, s = math.cos(box.yaw), math.sin(box.yaw)
 
     def part(along: int, share: float, away: float, wide: float, off: float) -> ShapeParameters:
         """Return a part of the box; sides are fractions of the whole, offsets are in half sides."""
@@ -581,29 +568,25 @@ def propose_splits(
     return found
 
 
-def shape_gap(first: ShapeParameters, second: ShapeParameters, ground: Ground) -> float:
+def shape_gap(first: ShapeParameters, second: ShapeParameters) -> float:
     """Compute the gap between two shapes, to a few centimetres [m].
 
     Args:
         first, second: shape parameters.
-        ground: ground plane.
     """
     share = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None, None]
     sides: list[Tensor] = []
     for shape in (first, second):
-        corners = outline_corners(shape, ground)
+        corners = outline_corners(shape)
         sides.append((corners + share * (corners.roll(1, 0) - corners)).flatten(0, 1))
     return float(torch.cdist(sides[0], sides[1]).min())
 
 
-def outline_corners(
-    shape: ShapeParameters, ground: Ground, count: int = 16
-) -> Float64[Tensor, "corner 2"]:
+def outline_corners(shape: ShapeParameters, count: int = 16) -> Float64[Tensor, "corner 2"]:
     """Return the corners of a shape on the ground [m], or of a polygon for round shapes.
 
     Args:
         shape: shape parameters.
-        ground: ground plane.
         count: number of corners of the polygon.
     """
     if isinstance(shape, PrismParameters):
@@ -612,7 +595,7 @@ def outline_corners(
     if not shape.is_rectangular:
         turns = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
         return middle + 0.5 * shape.length * torch.stack([turns.cos(), turns.sin()], dim=1)
-    c, s = math.cos(ground.yaw_sign * shape.yaw), math.sin(ground.yaw_sign * shape.yaw)
+    c, s = math.cos(shape.yaw), math.sin(shape.yaw)
     half = 0.5 * torch.tensor([shape.length, shape.width], dtype=torch.float64)
     signs = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]], dtype=torch.float64)
     return middle + (signs * half) @ torch.tensor([[c, s], [-s, c]], dtype=torch.float64)

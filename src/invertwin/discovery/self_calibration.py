@@ -74,7 +74,7 @@ def phase_spread(calibration: ChannelCalibration, radar: Radar) -> float:
         calibration: calibration of the channels.
         radar: radar with its array and wavelength.
     """
-    elements = radar.virtual_positions[:, :2] / require_sampled_waveform(radar).wavelength
+    elements = radar.virtual_positions[:, 1:] / require_sampled_waveform(radar).wavelength
     extent = elements.amax(0) - elements.amin(0)
     steps = [
         torch.arange(-1.0, 1.0, 1 / (16 * float(e)) if e > 0 else 2.0).double() for e in extent
@@ -139,7 +139,7 @@ def _channel_phasors(
     found = []
     for origin, axes in zip(radar.positions.detach(), radar.link().rotations.detach(), strict=True):
         seen = torch.nn.functional.normalize(positions - origin, dim=1) @ axes
-        path = seen[:, :2] @ radar.virtual_positions[:, :2].T
+        path = seen[:, 1:] @ radar.virtual_positions[:, 1:].T
         phase = -2 * math.pi / require_sampled_waveform(radar).wavelength * path
         found.append(torch.polar(torch.ones_like(phase), phase))
     return found

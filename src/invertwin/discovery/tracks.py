@@ -12,7 +12,6 @@ from invertwin.capture import ChirpCapture
 from invertwin.channel import Grid
 from invertwin.discovery.imaging.point_detections import detect_moving_targets
 from invertwin.discovery.outcome import DetectedObject, ObjectTrack
-from invertwin.inversion.initialisation.detections import Ground
 
 _MAX_SQUARED_DISTANCE = 16.3  # gate: 0.1 % quantile of χ² with three degrees of freedom
 _ACCELERATION_DEVIATION = 1.0  # standard deviation of the acceleration of a target [m/s²]
@@ -47,9 +46,7 @@ class _KalmanTrack:
     missed_frames: int = 0
 
 
-def track_moving_targets(
-    recording: ChirpCapture, grid: Grid, ground: Ground
-) -> list[DetectedObject]:
+def track_moving_targets(recording: ChirpCapture, grid: Grid) -> list[DetectedObject]:
     """Track moving targets through all frames, the most probable first, at their last positions.
 
     Detections of a frame are assigned to tracks jointly (global nearest neighbour). A target keeps
@@ -62,7 +59,6 @@ def track_moving_targets(
     Args:
         recording: chirp trains with a known frame period.
         grid: bins of range and direction.
-        ground: ground plane of the motion.
     """
     assert recording.frame_period is not None
     step, spread = _motion_model(recording.frame_period)
@@ -73,7 +69,7 @@ def track_moving_targets(
             for one in detect_moving_targets(recording, grid, frame)
             if one.existence_probability > _MIN_EXISTENCE_PROBABILITY
         ]
-        seen = [_make_measurement(one, recording, ground, frame) for one in found]
+        seen = [_make_measurement(one, recording, frame) for one in found]
         for path in live:
             state, error = path.states[-1]
             path.predictions.append((step @ state, step @ error @ step.T + spread))
@@ -82,7 +78,7 @@ def track_moving_targets(
         live = [path for path in live if path.missed_frames <= _MAX_MISSED_FRAMES]
         live += [_start_track(one) for one in seen if one not in taken]
     paths = [path for path in (*ended, *live) if len(path.measurements) >= _MIN_TRACK_FRAMES]
-    objects = [_to_detected_object(path, step, recording.frame_period, ground) for path in paths]
+    objects = [_to_detected_object(path, step, recording.frame_period) for path in paths]
     objects.sort(key=lambda one: -one.existence_probability)
     return [replace(one, name=f"mover_{k}") for k, one in enumerate(objects, 1)]
 
@@ -97,11 +93,10 @@ def _motion_model(period: float) -> tuple[Tensor, Tensor]:
 
 
 def _make_measurement(
-    detection: DetectedObject, recording: ChirpCapture, ground: Ground, frame: int
+    detection: DetectedObject, recording: ChirpCapture, frame: int
 ) -> _TrackMeasurement:
-    axes = list(ground.plane_axes)
     sight = detection.position - recording.radar().positions[frame].detach()
-    along = torch.nn.functional.normalize(sight[axes], dim=0)
+    along = torch.nn.functional.normalize(sight[:2], dim=0)
     across = torch.stack([-along[1], along[0]])
     distance = float(sight.norm())
     assert detection.velocity is not None
@@ -113,7 +108,7 @@ def _make_measurement(
     matrix = torch.zeros(3, 4, dtype=torch.float64)
     matrix[:2, :2] = torch.eye(2, dtype=torch.float64)
     matrix[2, 2:] = along
-    value = torch.cat([detection.position[axes], torch.tensor([rate], dtype=torch.float64)])
+    value = torch.cat([detection.position[:2], torch.tensor([rate], dtype=torch.float64)])
     return _TrackMeasurement(frame, detection, value, matrix, noise)
 
 
@@ -162,9 +157,7 @@ def _update_tracks(
     return [measurements[column] for column in pairs.values()]
 
 
-def _to_detected_object(
-    path: _KalmanTrack, transition: Tensor, period: float, ground: Ground
-) -> DetectedObject:
+def _to_detected_object(path: _KalmanTrack, transition: Tensor, period: float) -> DetectedObject:
     """Convert a smoothed track to an object; frames after its last detection are dropped."""
     count = path.measurements[-1].frame - path.first_frame + 1
     states = path.states[:count]
@@ -173,15 +166,13 @@ def _to_detected_object(
         gain = torch.linalg.solve(wide, transition @ error).T
         later, surer = states[k + 1]
         states[k] = (state + gain @ (later - ahead), error + gain @ (surer - wide) @ gain.T)
-    axes = list(ground.plane_axes)
-    heights = [one.detection.position[ground.up_axis] for one in path.measurements]
+    heights = [one.detection.position[2] for one in path.measurements]
     values = torch.stack([state for state, _ in states])
     spreads = torch.stack([error.diagonal().clamp_min(0.0).sqrt() for _, error in states])
     positions, velocities = (torch.zeros(count, 3, dtype=torch.float64) for _ in range(2))
-    positions[:, axes], positions[:, ground.up_axis] = values[:, :2], torch.stack(heights).mean()
-    velocities[:, axes] = values[:, 2:]
-    names = ["xyz"[axis] for axis in axes]
-    names += [f"velocity_{name}" for name in names]
+    positions[:, :2], positions[:, 2] = values[:, :2], torch.stack(heights).mean()
+    velocities[:, :2] = values[:, 2:]
+    names = ["x", "y", "velocity_x", "velocity_y"]
     sure = sum(one.detection.existence_probability for one in path.measurements) / count
     frames = torch.arange(path.first_frame, path.first_frame + count, dtype=torch.float64)
     deviations = dict(zip(names, spreads.T, strict=True))

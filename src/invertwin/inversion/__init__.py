@@ -53,36 +53,7 @@ from invertwin.scene.remeshing import remesh as remesh
 from invertwin.scene.remeshing import require_edge_length as require_edge_length
 from invertwin.scene.scene import displace as displace
 
-rename_attributes(
-    __name__,
-    {
-        "Agreement": "GradientAgreement",
-        "Bump": "GaussianBump",
-        "Check": "GradcheckSettings",
-        "Echo": "discovery.DetectedEcho",
-        "FirstPose": "InitialPoseEstimator",
-        "Guess": "InitialEstimate",
-        "MoverMaps": "discovery.MovingTargetMaps",
-        "MoverTwin": "discovery.MovingTargetFit",
-        "MovingBody": "discovery.MovingBody",
-        "Residual": "PoseError",
-        "Topology": "TopologyCounts",
-        "displaced": "displace",
-        "fit_at": "prepare_fit",
-        "line_of": "make_line",
-        "losses_along": "evaluate_losses",
-        "nearby": "sample_nearby_poses",
-        "of_point": "discovery.point_response",
-        "planned": "plan_error_bars",
-        "posed": "place_at_poses",
-        "remeshed": "remesh",
-        "require_edge": "require_edge_length",
-        "residual": "pose_error",
-        "strongest_mover": "discovery.detect_strongest_target",
-        "topology": "count_topology",
-        "watched": "report_progress",
-    },
-)
+rename_attributes(__name__)
 rename_members(
     Fit,
     annealed="is_unblurred",

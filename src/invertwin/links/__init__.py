@@ -28,18 +28,7 @@ from invertwin.links.spreads import rician_factor as rician_factor
 from invertwin.links.transmitters import TransmitterPosition as TransmitterPosition
 from invertwin.links.transmitters import Transmitters as Transmitters
 
-rename_attributes(
-    __name__,
-    {
-        "PlacedPanel": "PanelPlacement",
-        "Places": "ReceiverLocations",
-        "Points": "ReceiverPoints",
-        "Received": "LinkStatistics",
-        "Reception": "PropagationSettings",
-        "Terminals": "AntennaMount",
-        "ray_paths_of": "ray_paths_from_sionna",
-    },
-)
+rename_attributes(__name__)
 rename_members(
     AntennaMount, advances="element_advances", slopes="element_slopes", weights="element_weights"
 )

@@ -27,14 +27,12 @@ from invertwin.runtime.memory import require_memory
 from invertwin.scene import AntennaArray
 
 _VALUES_PER_CHUNK = 1 << 21
-_VERTICAL = (0.0, 0.0, 1.0)  # of V in ``RayPaths``
-_UP = (0.0, 1.0, 0.0)  # of V in the frame of an array
+_UP = (0.0, 0.0, 1.0)  # of V in ``RayPaths``, and in the frame of an array
 _ROTATION_STEP = 1e-4  # rad: half the step over which fields of antennas are compared
 
 
-def _default_axes() -> Tensor:
-    """Axes of an array whose y axis is the world's z, and whose boresight is the world's x."""
-    return torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+def _world_axes() -> Tensor:
+    return torch.eye(3, dtype=torch.float64)
 
 
 def _isotropic_element() -> AntennaArray:
@@ -45,20 +43,20 @@ def _isotropic_element() -> AntennaArray:
 class AntennaMount:
     """Antenna array mounted at each position of transmitters, or of receivers.
 
-    V and H of the array's polarisation are about its y axis. By default a terminal is one isotropic
-    element for V, and y is the world's z axis.
+    V and H of the array's polarisation are about its z axis. By default a terminal is one isotropic
+    element for V, and its axes are the world's: it looks along x.
 
     Attributes:
         array: Elements about each place.
-        rotations: Columns are the array's x, y and z axes in the world: one for all [3, 3], or one
-            for each place [place, 3, 3].
+        rotations: Columns are the array's x (boresight), y and z axes in the world: one for all
+            [3, 3], or one for each place [place, 3, 3].
 
     Raises:
         InputError: Rotations of another shape, or that are not orthonormal.
     """
 
     array: AntennaArray = field(default_factory=_isotropic_element)
-    rotations: Float64[Tensor, "*place 3 3"] = field(default_factory=_default_axes)
+    rotations: Float64[Tensor, "*place 3 3"] = field(default_factory=_world_axes)
 
     def __post_init__(self) -> None:
         do = "give the axes as columns, for all or for each place"
@@ -82,8 +80,8 @@ class AntennaMount:
         gain = self.array.pattern.gain(local)
         lit = gain > 0  # a root of zero has no derivative
         strength = torch.where(lit, torch.where(lit, gain, 1.0).sqrt(), 0.0)
-        own = polarisations(local, torch.tensor(_UP, dtype=torch.float64))
-        basis = polarisations(direction, torch.tensor(_VERTICAL, dtype=torch.float64))
+        up = torch.tensor(_UP, dtype=torch.float64)
+        own, basis = polarisations(local, up), polarisations(direction, up)
         change = torch.einsum("pwi,pij,pbj->pwb", basis, turn, own).to(torch.complex128)
         jones = self.array.jones
         mixed = jones.evaluate(local).expand(len(local), -1, -1)
@@ -108,7 +106,7 @@ class AntennaMount:
             axis: Unit vectors in the world.
             wave_number: k [1/m].
         """
-        up = torch.tensor(_VERTICAL, dtype=torch.float64)
+        up = torch.tensor(_UP, dtype=torch.float64)
 
         moved = torch.linalg.cross(axis, direction)
         kept = axis * (axis * direction).sum(1, keepdim=True)

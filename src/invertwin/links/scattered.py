@@ -239,5 +239,5 @@ class _RotatedPattern(Pattern):
         cosine = torch.linspace(-1, 1, COSINE_COUNT, dtype=torch.float64)[:, None]
         phi = 2 * torch.pi * torch.arange(_ANGLES, dtype=torch.float64) / _ANGLES - torch.pi
         sine = (1 - cosine**2).clamp_min(0).sqrt()
-        parts = sine * phi.cos(), sine * phi.sin(), cosine.expand(-1, _ANGLES)
+        parts = cosine.expand(-1, _ANGLES), sine * phi.cos(), sine * phi.sin()
         return self.gain(torch.stack(parts, -1))

@@ -16,16 +16,7 @@ from invertwin.models.radio import RadioMap as RadioMap
 from invertwin.models.radio import ResponseMap as ResponseMap
 from invertwin.models.rcs import RcsMap as RcsMap
 
-rename_attributes(
-    __name__,
-    {
-        "ChainField": "FacetField",
-        "ChainMap": "FacetMap",
-        "ForwardModel": "forward_model.ForwardModel",
-        "MotionMap": "RangeDopplerMap",
-        "SignatureMap": "RcsMap",
-    },
-)
+rename_attributes(__name__)
 rename_members(RadioMap, looks_about="realisations_about", reception="propagation")
 rename_members(RadioMap, received="link_statistics")
 rename_members(RangeDopplerMap, around="crop_around", expected="predict_paths", of="from_chirps")

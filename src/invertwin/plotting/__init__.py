@@ -34,14 +34,4 @@ from invertwin.plotting.signatures import rcs_image as rcs_image
 from invertwin.plotting.signatures import rcs_profile as rcs_profile
 from invertwin.plotting.turntable import turntable as turntable
 
-rename_attributes(
-    __name__,
-    {
-        "Panel": "MapPanel",
-        "focused": "rcs_image",
-        "located": "transmitter_fits",
-        "profile": "rcs_profile",
-        "sections": "rcs_curves",
-        "slopes": "rcs_derivatives",
-    },
-)
+rename_attributes(__name__)

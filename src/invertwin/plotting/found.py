@@ -19,8 +19,9 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
         dynamic_range: Level of the brightest colour above the darkest [dB].
     """
     figure, (axes,) = row_of_axes(1, (7.5, 6.2))
-    names = [f"{'xyz'[axis]} [m]" for axis in twin.ground.plane_axes]
-    axes.set(xlabel=names[0], ylabel=names[1], aspect="equal", facecolor="black")
+    # As a map lies on the table of somebody at the radar: ahead is up, the left is left.
+    axes.set(xlabel="y [m], to the left", ylabel="x [m]", aspect="equal", facecolor="black")
+    axes.invert_xaxis()
     if twin.image is not None and len(twin.image.positions):
         places, strength = numbers(twin.image.positions), numbers(twin.image.strength)
         # A single glint would leave all else dark.
@@ -29,27 +30,27 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
         blind = numbers(twin.image.view_counts) == 0
         side = 72 * 5 / max(float(np.ptp(places, axis=0).max()), 1e-6) * _grid_step(places)
         style = {"s": max(1.3 * side, 1.0) ** 2, "marker": "s", "linewidths": 0}
-        dots = axes.scatter(*places[~blind].T, c=level[~blind], cmap="magma", **style)
-        axes.scatter(*places[blind].T, color="0.75", label="never seen", **style)
+        dots = axes.scatter(*places[~blind, ::-1].T, c=level[~blind], cmap="magma", **style)
+        axes.scatter(*places[blind, ::-1].T, color="0.75", label="never seen", **style)
         figure.colorbar(dots, label="echoes, dB below bright ones", shrink=0.8)
     for thing in twin.objects:
-        x, y = (float(thing.position[axis]) for axis in twin.ground.plane_axes)
-        at = x, y
+        x, y = thing.position[:2].tolist()
+        at = y, x
         tint = color(0) if thing.existence_probability > 0.5 else "0.5"
         if thing.shape is not None:
-            corners = numbers(outline_corners(thing.shape, twin.ground))
+            corners = numbers(outline_corners(thing.shape))[:, ::-1]
             axes.plot(*np.concatenate([corners, corners[:1]]).T, color=tint, linewidth=1.5)
-        spread = [thing.deviations.get("xyz"[axis]) for axis in twin.ground.plane_axes]
+        spread = [thing.deviations.get(axis) for axis in "yx"]
         if None not in spread:
             width, height = (4 * float(value or 0.0) for value in spread)
             axes.add_patch(Ellipse(at, width, height, fill=False, color=tint))
         if thing.track is not None:
-            path = numbers(thing.track.positions)[:, list(twin.ground.plane_axes)]
+            path = numbers(thing.track.positions)[:, [1, 0]]
             axes.plot(*path.T, color=tint, linewidth=1.0, marker=".", markersize=3)
         if thing.velocity is not None:
-            speed = [float(thing.velocity[axis]) for axis in twin.ground.plane_axes]
-            if math.hypot(*speed) > 0:
-                axes.annotate("", (x + speed[0], y + speed[1]), at, arrowprops={"arrowstyle": "->"})
+            ahead, left = thing.velocity[:2].tolist()
+            if math.hypot(ahead, left) > 0:
+                axes.annotate("", (y + left, x + ahead), at, arrowprops={"arrowstyle": "->"})
         axes.annotate(
             f"{thing.name}: {thing.kind}",
             at,

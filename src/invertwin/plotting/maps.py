@@ -19,7 +19,7 @@ from invertwin.inversion.confidence.realisations import coarsen_map
 from invertwin.plotting.figures import add_colorbar, label_axes, numbers, row_of_axes
 from invertwin.radar import DopplerMaps
 
-U_LABEL, V_LABEL = "direction cosine u (to the right)", "direction cosine v (up)"
+U_LABEL, V_LABEL = "direction cosine u (to the left)", "direction cosine v (up)"
 RATE_LABEL = "range rate [m/s], away > 0"
 _MIN_POWER = 1e-30  # power that stands for none in dB
 
@@ -256,7 +256,24 @@ def _draw_image(cell: Any, title: str, panel: MapPanel, values: NDArray, **style
         **style,
     )
     label_axes(cell, title, panel.label)
+    if panel.label in (U_LABEL, V_LABEL):
+        _add_degrees(cell, "azimuth" if panel.label == U_LABEL else "elevation")
+    if panel.label == U_LABEL:
+        cell.invert_xaxis()  # the left of the radar is on the left
     return image
+
+
+def _add_degrees(cell: Any, name: str) -> None:
+    """Add an axis of degrees above the axis of a direction cosine."""
+    scale = cell.secondary_xaxis(
+        "top",
+        functions=(
+            lambda cosine: np.rad2deg(np.arcsin(np.clip(cosine, -1, 1))),
+            lambda angle: np.sin(np.deg2rad(np.clip(angle, -90, 90))),
+        ),
+    )
+    scale.tick_params(labelsize=6, pad=1)
+    scale.set_xlabel(f"{name} [°]", fontsize=7, labelpad=2)
 
 
 def _bin_edges(positions: Tensor) -> tuple[float, float]:

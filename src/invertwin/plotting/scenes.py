@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import permutations
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.collections import LineCollection
@@ -20,9 +21,13 @@ _BACKGROUND = "#b9bec7"
 _OUTLINE = "#c0143c"
 _MARKED_SHARE = 0.015  # of a view: objects that look smaller get a mark
 _TRACK_COUNT = 24  # radar positions: more of them are drawn as dots
-_HANDEDNESS_NOTE = "drawn with the radar's right to the right: mirrored against right-handed axes"
-# What runs across, up, and in depth: 0, 1, 2 = the radar's right, up, boresight.
-_VIEWS = {"from the radar": (0, 1, 2), "from above": (0, 2, 1), "from the side": (2, 1, 0)}
+# What runs to the right and up, and where the eye is: 0, 1, 2 = the radar's boresight, left, up;
+# −1 where it runs the other way.
+_VIEWS = {
+    "from the radar": ((1, -1), (2, 1), (0, -1)),
+    "from above": ((1, -1), (0, 1), (2, 1)),
+    "from the right": ((0, 1), (2, 1), (1, -1)),
+}
 
 
 def scene(
@@ -34,14 +39,13 @@ def scene(
 ) -> Figure:
     """Three views of a scene in a row; several scenes are one column each.
 
-    Each view looks along the world axis nearest to the radar's boresight, up or right. Its x is to
-    the right, as in maps; somebody who stands at the radar, and the viewer, have it on the left.
-    The figure says so.
+    Each view looks along the world axis nearest to the radar's boresight, down, or left. What is
+    on the left of somebody who stands at the radar is on the left, as in maps and the viewer.
 
     Args:
         scenes: What is drawn, by title.
         radar: Its positions are marked, and its mean axes are those of the views; of several
-            radars, those of the first. None takes the world's axes: right x, up y, ahead z.
+            radars, those of the first. None takes the world's axes: ahead x, left y, up z.
         highlight: Names of the objects that are drawn in colour, the others grey; None is all.
         outline: Objects whose sharp edges are drawn on top in red, such as the truth.
     """
@@ -70,7 +74,7 @@ def scene(
     for axes, (k, title) in zip(grid.flat, (c for row in cells for c in row), strict=True):
         colors = _colors(drawn[title], highlight)
         _draw(axes, drawn[title], colors, edges, marks[k], views[k], windows[k])
-        label_axes(axes, f"{title}, {views[k].title}", f"{'xyz'[views[k].plane[0]]} [m]")
+        label_axes(axes, f"{title}, {views[k].title}", views[k].axis_label(0))
     names = {name: c for shapes in drawn.values() for name, c in _colors(shapes, highlight).items()}
     _legend(figure, names, bool(edges), places)
     return figure
@@ -87,28 +91,34 @@ class _OrthographicView:
     """
 
     title: str
-    axes: tuple[int, int, int]
-    signs: tuple[int, int, int]
+    axes: tuple[int, ...]
+    signs: tuple[int, ...]
 
     @property
     def plane(self) -> list[int]:
         return list(self.axes[:2])
 
+    def axis_label(self, which: Literal[0, 1]) -> str:
+        """Name the axis across (0) or up (1), and where it grows if not to the right or up."""
+        where = f", to the {('left', 'bottom')[which]}" if self.signs[which] < 0 else ""
+        return f"{'xyz'[self.axes[which]]} [m]{where}"
+
 
 def _views(radar: Radar | None) -> list[_OrthographicView]:
-    """The views along the world axes nearest to the radar's right, up and boresight."""
+    """The views along the world axes nearest to the radar's boresight, left and up."""
     turned = radar is not None and radar.rotations is not None
     frame = numbers(radar.rotations.mean(0)) if turned else np.eye(3)  # type: ignore[union-attr]
-    orders = [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)]
+    orders = list(permutations(range(3)))
     nearest = max(orders, key=lambda order: sum(abs(frame[k, c]) for c, k in enumerate(order)))
     sign = [-1 if frame[k, c] < 0 else 1 for c, k in enumerate(nearest)]
-    views = []
-    for title, (across, up, depth) in _VIEWS.items():
-        # The eye is in front of the radar, above, or on the right.
-        towards = sign[depth] * (-1 if depth == 2 else 1)
-        axes = nearest[across], nearest[up], nearest[depth]
-        views.append(_OrthographicView(title, axes, (sign[across], sign[up], towards)))
-    return views
+    return [
+        _OrthographicView(
+            title,
+            tuple(nearest[c] for c, _ in axes),
+            tuple(way * sign[c] for c, way in axes),
+        )
+        for title, axes in _VIEWS.items()
+    ]
 
 
 def _shapes(scene: Scene) -> dict[str, Shape]:
@@ -173,7 +183,7 @@ def _draw(
         ends = window[c] + window[c + 2] / 2 * np.array([-1, 1])
         set_limits(*ends[:: view.signs[c]])
     axes.set_aspect("equal")
-    axes.set_ylabel(f"{'xyz'[plane[1]]} [m]", fontsize=8)
+    axes.set_ylabel(view.axis_label(1), fontsize=8)
 
 
 def _draw_marks(positions: NDArray) -> dict[str, Any]:
@@ -200,6 +210,4 @@ def _legend(
         ncols=6,
         fontsize=8,
         frameon=False,
-        title=_HANDEDNESS_NOTE,
-        title_fontsize=7,
     )

@@ -68,18 +68,7 @@ from invertwin.radar.waveform import SampledWaveform as SampledWaveform
 from invertwin.radar.waveform import SteppedFrequency as SteppedFrequency
 from invertwin.radar.waveform import Waveform as Waveform
 
-rename_attributes(
-    __name__,
-    {
-        "RadarPath": "RadarTrajectory",
-        "chosen_surrogate": "resolve_surrogate",
-        "peak_of": "find_peak",
-        "points_csv": "format_points_csv",
-        "points_of": "detect_points",
-        "sharp_map": "high_resolution_map",
-        "snapshots_of": "doppler_snapshots",
-    },
-)
+rename_attributes(__name__)
 rename_members(
     DopplerMaps,
     everything="total_power",

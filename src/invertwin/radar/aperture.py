@@ -18,26 +18,26 @@ _FLATNESS = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Aperture:
-    """Virtual array on the grid of its distinct x and y positions.
+    """Virtual array on the grid of its distinct y and z positions.
 
     Attributes:
-        x: distinct x positions [m].
         y: distinct y positions [m].
-        column: index into ``x`` of each virtual element, TX-major.
-        row: index into ``y`` of each virtual element.
-        x_taper: Window along x.
+        z: distinct z positions [m].
+        column: index into ``y`` of each virtual element, TX-major.
+        row: index into ``z`` of each virtual element.
         y_taper: Window along y.
+        z_taper: Window along z.
         counts: number of virtual elements at each position of the grid.
         wavelength: wavelength [m].
     """
 
-    x: Float64[Tensor, " x"]
     y: Float64[Tensor, " y"]
+    z: Float64[Tensor, " z"]
     column: Int64[Tensor, " virtual"]
     row: Int64[Tensor, " virtual"]
-    x_taper: Float64[Tensor, " x"]
     y_taper: Float64[Tensor, " y"]
-    counts: Float64[Tensor, "x y"]
+    z_taper: Float64[Tensor, " z"]
+    counts: Float64[Tensor, "y z"]
     wavelength: float
 
     @property
@@ -56,7 +56,7 @@ class Aperture:
 
     def check_directions(self, grid: Grid) -> None:
         """Raise if the grid does not resolve an axis along which the array extends."""
-        for name, places, bins in (("u", self.x, grid.u_count), ("v", self.y, grid.v_count)):
+        for name, places, bins in (("u", self.y, grid.u_count), ("v", self.z, grid.v_count)):
             if len(places) > 1 and bins == 1:
                 raise InputError(
                     f"expected a grid that resolves {name}, got 1 bin; the array extends along "
@@ -66,14 +66,14 @@ class Aperture:
     @property
     def weight(self) -> Float64[Tensor, " virtual"]:
         """Taper of the virtual elements, with a sum of 1."""
-        weight = self.x_taper[self.column] * self.y_taper[self.row]
+        weight = self.y_taper[self.column] * self.z_taper[self.row]
         return weight / weight.sum()
 
-    def plane(self, channels: Complex[Tensor, "*batch virtual"]) -> Complex[Tensor, "*batch x y"]:
+    def plane(self, channels: Complex[Tensor, "*batch virtual"]) -> Complex[Tensor, "*batch y z"]:
         """Return channels on the grid of positions; co-located ones are averaged, empty positions
         are 0.
         """
-        index = (self.column * len(self.y) + self.row).to(channels.device)
+        index = (self.column * len(self.z) + self.row).to(channels.device)
         plane = channels.new_zeros(*channels.shape[:-1], self.counts.numel())
         plane = plane.index_add(-1, index, channels).unflatten(-1, self.counts.shape)
         return plane / self.counts.clamp_min(1).to(plane.device, plane.real.dtype)
@@ -81,12 +81,12 @@ class Aperture:
     def steering(
         self, cosines: Float64[Tensor, " node"], positions: Float64[Tensor, " place"]
     ) -> Complex[Tensor, "node place"]:
-        """Return phasors exp(+jk u x) that compensate the beat phase of an element at x for a
+        """Return phasors exp(+jk u y) that compensate the beat phase of an element at y for a
         source at u.
 
         Args:
             cosines: direction cosines u.
-            positions: positions x of the elements [m].
+            positions: positions y of the elements [m].
         """
         phase = 2 * math.pi / self.wavelength * cosines[:, None] * positions[None]
         return torch.polar(torch.ones_like(phase), phase)
@@ -95,25 +95,25 @@ class Aperture:
         self,
         u: Float64[Tensor, " u"],
         v: Float64[Tensor, " v"],
-        x: Float64[Tensor, " element"],
         y: Float64[Tensor, " element"],
+        z: Float64[Tensor, " element"],
     ) -> Complex[Tensor, "direction element"]:
         """Return ``steering`` of planar elements towards all pairs of direction cosines, u slowest.
 
         Args:
-            u: direction cosines along x.
-            v: direction cosines along y.
-            x: positions of the elements along x [m].
+            u: direction cosines along y.
+            v: direction cosines along z.
             y: positions of the elements along y [m].
+            z: positions of the elements along z [m].
         """
-        return (self.steering(u, x)[:, None] * self.steering(v, y)).flatten(0, 1)
+        return (self.steering(u, y)[:, None] * self.steering(v, z)).flatten(0, 1)
 
 
 def aperture(radar: Radar) -> Aperture:
     """Return the radar's virtual array on its distinct positions.
 
     Raises:
-        InputError: The array is not planar in the radar's x-y plane, so that u and v do not
+        InputError: The array is not planar in the radar's y-z plane, so that u and v do not
             determine its response.
     """
     key = tuple(tuple(place) for place in radar.virtual_positions.cpu().tolist())
@@ -123,18 +123,18 @@ def aperture(radar: Radar) -> Aperture:
 @lru_cache(maxsize=8)
 def _aperture(key: tuple[tuple[float, ...], ...], wavelength: float, window: str) -> Aperture:
     places = torch.tensor(key, dtype=torch.float64)
-    depth = float(places[:, 2].max() - places[:, 2].min()) / wavelength
+    depth = float(places[:, 0].max() - places[:, 0].min()) / wavelength
     if depth > _FLATNESS:
         raise InputError(
-            f"expected a virtual array in the radar's x-y plane, got one {depth:.2g} wavelengths "
-            "deep along z; turn the radar's rotation instead of its elements"
+            f"expected a virtual array in the radar's y-z plane, got one {depth:.2g} wavelengths "
+            "deep along x; turn the radar's rotation instead of its elements"
         )
-    x, column = _distinct_positions(places[:, 0], wavelength)
-    y, row = _distinct_positions(places[:, 1], wavelength)
-    counts = torch.zeros(len(x), len(y), dtype=torch.float64)
+    y, column = _distinct_positions(places[:, 1], wavelength)
+    z, row = _distinct_positions(places[:, 2], wavelength)
+    counts = torch.zeros(len(y), len(z), dtype=torch.float64)
     counts.index_put_((column, row), torch.ones(len(places), dtype=torch.float64), accumulate=True)
-    tapers = _position_taper(window, x), _position_taper(window, y)
-    return Aperture(x, y, column, row, *tapers, counts, wavelength)
+    tapers = _position_taper(window, y), _position_taper(window, z)
+    return Aperture(y, z, column, row, *tapers, counts, wavelength)
 
 
 # Depth of an array along boresight, in wavelengths, that (u, v) steering may neglect.

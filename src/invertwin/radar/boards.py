@@ -28,9 +28,12 @@ ElementGrid = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(
 class Board:
     """Element positions of a board in half wavelengths.
 
-    Columns (x) and rows (y) are those of the source, except that the sign of the columns of
+    Columns and rows are those of the source, except that the sign of the columns of
     ``antGeometry0`` is reversed, so that they grow with the element numbers. Define other boards by
     a new ``Board``.
+
+    A drawing of the antenna side shows the board as a person sees it who faces the radar. Its right
+    is the left of the radar, which looks out: columns lie along y and rows along z.
 
     Differs from the source: the sources count the columns and rows of TX and of RX from separate
     origins of unknown distance. Here TX and RX are each centred at the origin of the radar frame,
@@ -83,16 +86,17 @@ class Board:
         polarisation: Polarised | None = None,
         leakage: float | ArrayLike = 0.0,
     ) -> TxRxArrays:
-        """Return TX and RX elements in the radar frame (x right, y up, z boresight).
+        """Return TX and RX elements in the radar frame (x boresight, y left, z up).
 
         Public sources disagree on the upward direction, for example for the xWR1843's middle
         transmitter, and on the sign of phases. So the sign of elevation has no default where it
         matters. To determine it, place a reflector above the board: its spectrum must peak at v >
-        0. Likewise for left and right.
+        0. Likewise a reflector to the left of the radar must peak at u > 0.
 
         Args:
-            elevation: +1 = rows grow upwards (y), −1 = downwards; required if the board has rows.
-            azimuth: +1 = columns grow to the right (x), −1 = to the left.
+            elevation: +1 = rows grow upwards (z), −1 = downwards; required if the board has rows.
+            azimuth: +1 = columns grow to the left of the radar (y), the right of a person who faces
+                it; −1 = to its right.
             transmitters: numbers from 1 of the active elements, in this order; None = all.
             receivers: numbers from 1 of the active RX elements; None = all.
             pattern: gain of every element, isotropic by default.
@@ -122,7 +126,7 @@ class Board:
         ) -> AntennaArray:
             grid = torch.tensor(grid_positions, dtype=torch.float64)
             grid = (grid - grid.mean(dim=0)) * torch.tensor(signs, dtype=torch.float64) * unit
-            positions = torch.cat([grid, torch.zeros_like(grid[:, :1])], dim=1)
+            positions = torch.cat([torch.zeros_like(grid[:, :1]), grid], dim=1)
             own = self.polarisation if polarisation is None else polarisation
             chosen = positions[self._indices(grid_positions, numbers, name)]
             return AntennaArray(chosen, pattern, own, leakage)

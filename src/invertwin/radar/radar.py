@@ -41,7 +41,7 @@ _MAX_CHANNELS = 1e6
 class Radar:
     """Antenna arrays, a waveform, and one or more poses.
 
-    Element positions are in the radar frame (x right, y up, z boresight); ``positions`` is the
+    Element positions are in the radar frame (x boresight, y left, z up); ``positions`` is the
     origin of that frame in the world and the columns of ``rotations`` are its axes. The phase
     centre of an array is the mean of its element positions.
 
@@ -53,7 +53,7 @@ class Radar:
         positions: World position of the radar in each frame [m]; may carry a gradient.
         rotations: orientation in each frame; None = world axes.
         window: Taper of the samples before the range transform.
-        array_window: Taper of the virtual array along x and along y.
+        array_window: Taper of the virtual array along y and along z.
         shared_visibility: one visibility test for both antennas; None = if the phase centres are at
             most 0.1 m apart.
         range_bias: bias of all ranges of the surrogate [m]; may carry a gradient. Exact signals
@@ -119,11 +119,11 @@ class Radar:
 
     @property
     def aperture(self) -> tuple[float, float]:
-        """Extent of the virtual array along x and y plus half a wavelength [m]."""
+        """Extent of the virtual array along y and z plus half a wavelength [m]."""
         places = self.virtual_positions
         extent = places.amax(0) - places.amin(0)
         half = 0.5 * self.waveform.wavelength
-        return float(extent[0]) + half, float(extent[1]) + half
+        return float(extent[1]) + half, float(extent[2]) + half
 
     @property
     def beamwidth(self) -> tuple[float, float]:
@@ -265,7 +265,7 @@ class Radar:
         Args:
             range_min: minimum range [m], at least 0 without a range origin.
             range_max: maximum range [m].
-            u_max: maximum direction cosine to the right; the map is symmetric.
+            u_max: maximum direction cosine to the left; the map is symmetric.
             v_max: maximum direction cosine upwards; the map is symmetric.
             oversample: bins per resolution cell.
 
@@ -332,7 +332,7 @@ class Radar:
 
     def _warn_about_spacing(self) -> None:
         wavelength = self.waveform.wavelength
-        for axis, name in enumerate("xy"):
+        for axis, name in ((1, "y"), (2, "z")):
             places = torch.unique((self.virtual_positions[:, axis] / wavelength * 1e3).round())
             if len(places) < 2:
                 continue
@@ -385,7 +385,7 @@ def _checked_origin(value: object, frames: int) -> Tensor:
 
 
 def _checked_rotations(value: object, frames: int) -> Tensor:
-    do = "its columns are the radar's x (right), y (up) and z (boresight) axes in the world"
+    do = "its columns are the radar's x (boresight), y (left) and z (up) axes in the world"
     rotations = checked_tensor(value, (frames, 3, 3), "radar rotations", do)
     fixed = rotations.detach()
     error = (fixed.mT @ fixed - torch.eye(3, dtype=torch.float64, device=fixed.device)).abs()

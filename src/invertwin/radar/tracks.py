@@ -25,34 +25,34 @@ def line(start: Point, stop: Point, count: Count) -> Float64[Tensor, "frame 3"]:
 def arc(
     center: Point, radius: Positive, start: Angle, stop: Angle, count: Count
 ) -> Float64[Tensor, "frame 3"]:
-    """Return a horizontal arc about `center`; 0° is on its −z side, 90° on its +x side.
+    """Return a horizontal arc about `center`; 0° is on its −x side, 90° on its +y side.
 
     Args:
         center, radius: centre [3] and radius [m].
-        start: first angle; 0 is on the −z side of the centre.
-        stop: last angle; 90° is on the +x side.
+        start: first angle; 0 is on the −x side of the centre.
+        stop: last angle; 90° is on the +y side.
         count: number of positions.
     """
     angle = _linspace(start, stop, count)
-    return _point(center) + radius * torch.stack([angle.sin(), 0 * angle, -angle.cos()], dim=1)
+    return _point(center) + radius * torch.stack([-angle.cos(), angle.sin(), 0 * angle], dim=1)
 
 
 def grid(
     center: Point, size: tuple[NonNegative, NonNegative], count: tuple[Count, Count]
 ) -> Float64[Tensor, "frame 3"]:
-    """Return an upright rectangle of positions in the x-y plane through `center`; y runs fastest.
+    """Return an upright rectangle of positions in the y-z plane through `center`; z runs fastest.
 
     Args:
         center: centre [3] [m].
-        size: size along x, y [m].
-        count: number of positions along x, y.
+        size: size along y, z [m].
+        count: number of positions along y, z.
     """
     _require_positions(count[0] * count[1])
-    x, y = (
+    y, z = (
         (_linspace(-0.5, 0.5, n) if n > 1 else torch.zeros(1, dtype=torch.float64)) * length
         for n, length in zip(count, size, strict=True)
     )
-    return _point(center) + torch.nn.functional.pad(torch.cartesian_prod(x, y), (0, 1))
+    return _point(center) + torch.nn.functional.pad(torch.cartesian_prod(y, z), (1, 0))
 
 
 def _point(value: Point) -> Tensor:

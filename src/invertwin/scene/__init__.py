@@ -64,12 +64,14 @@ from invertwin.scene.people.motion import TrajectoryMotion as TrajectoryMotion
 from invertwin.scene.people.person import person as person
 from invertwin.scene.polarisation import JonesTable as JonesTable
 from invertwin.scene.pose import compose as compose
+from invertwin.scene.pose import from_frame as from_frame
 from invertwin.scene.pose import look_at as look_at
 from invertwin.scene.pose import quaternion_from_vector as quaternion_from_vector
 from invertwin.scene.pose import rigid as rigid
 from invertwin.scene.pose import rotation_angle as rotation_angle
 from invertwin.scene.pose import rotation_from_quaternion as rotation_from_quaternion
 from invertwin.scene.pose import rotation_from_vector as rotation_from_vector
+from invertwin.scene.pose import to_frame as to_frame
 from invertwin.scene.pose import vector_from_quaternion as vector_from_quaternion
 from invertwin.scene.rooms import room as room
 from invertwin.scene.scene import Object as Object
@@ -94,19 +96,7 @@ from invertwin.scene.shapes import sphere as sphere
 from invertwin.scene.shapes import text as text
 from invertwin.scene.shapes import trihedral as trihedral
 
-rename_attributes(
-    __name__,
-    {
-        "Along": "TrajectoryMotion",
-        "InMotion": "MovingScene",
-        "Mover": "ObjectMotion",
-        "Spline": "SplineTrajectory",
-        "Surface": "ScatteringLaw",
-        "Table": "TabulatedPattern",
-        "Turning": "AxisRotation",
-        "joined": "merge_meshes",
-    },
-)
+rename_attributes(__name__)
 rename_members(BodyTemplate, posed="apply_pose", rotations_of="estimate_rotations", scaled="scale")
 rename_members(DensityGrid, even="from_optical_depth", of_object="from_object")
 rename_members(DistanceGrid, of_mesh="from_mesh", sampled="from_function")

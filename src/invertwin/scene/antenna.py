@@ -1,12 +1,12 @@
 """Antennas: gain patterns and arrays of elements, in the radar frame.
 
-The radar frame is x right, y up, z boresight. A direction is a unit vector in this frame that
-points away from the antenna; θ is its angle to z, φ = atan2(y, x).
+The radar frame is x boresight, y left, z up. A direction is a unit vector in this frame that
+points away from the antenna; θ is its angle to x, φ = atan2(z, y).
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -20,6 +20,7 @@ from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Count, NonNegative, Positive
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.polarisation import JonesTable, Polarisation
+from invertwin.scene.pose import Basis
 
 Polarised = str | ArrayLike | JonesTable
 _MAX_ELEMENTS = 1e5
@@ -78,7 +79,7 @@ class Cosine(Pattern):
 
     def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Return the linear power gain."""
-        return self._gain_of_cosine(direction[..., 2])
+        return self._gain_of_cosine(direction[..., 0])
 
     def table(self) -> Float64[Tensor, "2049 1"]:
         """Return the gain over cosθ."""
@@ -101,9 +102,10 @@ class TabulatedPattern(Pattern):
     in cosθ, 1/1024, is 2.5° at boresight and finer elsewhere.
 
     Attributes:
-        theta: n ≥ 2 ascending angles to z [rad], from 0 to at most π; the gain beyond is 0.
-        phi: m ascending angles around z [rad], spanning less than 2π; m = 1 for a pattern that is
-            symmetric about z. Between the last and the first it continues periodically.
+        theta: n ≥ 2 ascending angles to x [rad], from 0 to at most π; the gain beyond is 0.
+        phi: m ascending angles around x, from y towards z [rad], spanning less than 2π; m = 1 for a
+            pattern that is symmetric about x. Between the last and the first it continues
+            periodically.
         gains: linear power gain at these angles.
 
     Raises:
@@ -167,13 +169,13 @@ class TabulatedPattern(Pattern):
         """Return the linear power gain, bilinear between the nodes of `table`."""
         grid = self._grid.to(direction)
         x, y, z = direction.unbind(-1)
-        height = (z.clamp(-1, 1) + 1) / 2 * (COSINE_COUNT - 1)
+        height = (x.clamp(-1, 1) + 1) / 2 * (COSINE_COUNT - 1)
         row = height.detach().to(torch.int64).clamp(max=COSINE_COUNT - 2)
         up = height - row
         count = grid.shape[1]
         # atan2 has no gradient on the axis; φ is arbitrary there.
-        on_axis = (x == 0) & (y == 0)
-        turn = (torch.atan2(y, torch.where(on_axis, 1.0, x)) + torch.pi) / (2 * torch.pi) * count
+        on_axis = (y == 0) & (z == 0)
+        turn = (torch.atan2(z, torch.where(on_axis, 1.0, y)) + torch.pi) / (2 * torch.pi) * count
         cell = turn.detach().to(torch.int64)
         across = turn - cell
         column, neighbour = cell % count, (cell + 1) % count
@@ -194,7 +196,7 @@ class AntennaArray:
         positions: element positions in the radar frame [m].
         pattern: gain of every element.
         polarisation: "V", "H", "circular" (right-hand) or a Jones vector (V, H) of all elements or
-            of each. V lies in the plane of the direction and the radar's y axis, H perpendicular to
+            of each. V lies in the plane of the direction and the radar's z axis, H perpendicular to
             it. In Python also a `JonesTable` over direction.
         leakage: field of the orthogonal polarisation over that of the nominal one, of all elements
             or of each. The gain includes both.
@@ -228,11 +230,15 @@ class AntennaArray:
         jones = Polarisation.from_jones(self.polarisation, self.leakage, len(positions))
         set_fields(self, positions=positions, jones=jones)
 
+    def change_basis(self, basis: Basis) -> "AntennaArray":
+        """Return the array with positions along other axes."""
+        return replace(self, positions=basis.vectors(self.positions))
+
 
 def linear_array(
     count: Count,
     spacing: Positive,
-    axis: Literal["x", "y"] = "x",
+    axis: Literal["y", "z"] = "y",
     pattern: Pattern | None = None,
     polarisation: Polarised = "V",
     leakage: float | ArrayLike = 0.0,
@@ -242,7 +248,7 @@ def linear_array(
     Args:
         count: number of elements.
         spacing: distance between neighbours [m].
-        axis: direction of the row.
+        axis: direction of the row, y (to the left) or z (up).
         pattern: gain of every element, isotropic by default.
         polarisation: "V", "H", "circular" or a Jones vector (V, H), see `AntennaArray`.
         leakage: field of the orthogonal polarisation over that of the nominal one.
@@ -250,9 +256,11 @@ def linear_array(
     Raises:
         InputError: no elements, a spacing that is not positive, or another axis.
     """
-    if axis not in ("x", "y"):
-        raise InputError(f"expected axis x or y, got {axis!r}; arrays lie in the x-y plane")
-    counts = (count, 1) if axis == "x" else (1, count)
+    if axis not in ("y", "z"):
+        raise InputError(
+            f"expected axis y or z, got {axis!r}; arrays lie in the y-z plane, and x is boresight"
+        )
+    counts = (count, 1) if axis == "y" else (1, count)
     return planar_array(counts, (spacing, spacing), pattern, polarisation, leakage)
 
 
@@ -263,11 +271,11 @@ def planar_array(
     polarisation: Polarised = "V",
     leakage: float | ArrayLike = 0.0,
 ) -> AntennaArray:
-    """Build a grid of elements, centred at the origin of the radar frame; y runs fastest.
+    """Build a grid of elements, centred at the origin of the radar frame; z runs fastest.
 
     Args:
-        count: elements along x, y.
-        spacing: distance between neighbours along x, y [m].
+        count: elements along y, z.
+        spacing: distance between neighbours along y, z [m].
         pattern: gain of every element, isotropic by default.
         polarisation: "V", "H", "circular" or a Jones vector (V, H), see `AntennaArray`.
         leakage: field of the orthogonal polarisation over that of the nominal one.
@@ -276,10 +284,10 @@ def planar_array(
         InputError: no elements, or a spacing that is not positive.
     """
     require_at_most(count[0] * count[1], _MAX_ELEMENTS, "antenna elements", "lower count", "count")
-    x = _centre_positions(count[0], spacing[0], "elements along x")
-    y = _centre_positions(count[1], spacing[1], "elements along y")
-    plane = torch.cartesian_prod(x, y)
-    positions = torch.cat([plane, torch.zeros_like(plane[:, :1])], dim=1)
+    y = _centre_positions(count[0], spacing[0], "elements along y")
+    z = _centre_positions(count[1], spacing[1], "elements along z")
+    plane = torch.cartesian_prod(y, z)
+    positions = torch.cat([torch.zeros_like(plane[:, :1]), plane], dim=1)
     gain = Isotropic() if pattern is None else pattern
     return AntennaArray(positions, gain, polarisation, leakage)
 

@@ -1,12 +1,14 @@
 """Clouds of point scatterers in a box, for objects with an unknown surface."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.checks import checked_number, checked_tensor, set_fields
 from invertwin.errors import InputError
+from invertwin.scene.pose import Basis
 from invertwin.scene.shape_models.lattice import Lattice
 
 
@@ -54,3 +56,10 @@ class Cloud:
     def spacing(self) -> Float64[Tensor, "3"]:
         """Distance of neighbouring nodes [m] along each axis."""
         return (self.high - self.low) / (self.low.new_tensor(self.density.shape) - 1)
+
+    def change_basis(self, basis: Basis) -> "Cloud":
+        """Return the cloud along other axes."""
+        ends = torch.stack([basis.vectors(self.low), basis.vectors(self.high)])
+        density = self.density.permute(basis.order)
+        density = density.flip([axis for axis, sign in enumerate(basis.signs) if sign < 0])
+        return replace(self, low=ends.amin(0), high=ends.amax(0), density=density)

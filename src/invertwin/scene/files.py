@@ -34,6 +34,7 @@ from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, existing_file, safe_reader
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".inp")
+_Y_UP = (".gltf", ".glb")  # glTF 2.0, section 3.4: our (x, y, z) is its (x, z, −y)
 _CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # corners of shell elements by the digit in their type
 Unit = Literal["m", "cm", "mm", "um", "in", "ft"]
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
@@ -48,7 +49,8 @@ def load_mesh(file: str | Path, unit: Unit = "m") -> Mesh:
 
     Vertices at equal positions are merged, unused vertices are dropped, the rest keep their order.
     Closed parts that overlap or touch become one surface, which a warning says.
-    All parts of the file become one mesh (`load_parts` separates them); axes are kept. A mesh
+    All parts of the file become one mesh (`load_parts` separates them). Axes are kept, except those
+    of glTF, whose standard says y up: they are turned about x to z up, as Blender does. A mesh
     larger than 100 m causes a warning, since it may be in millimetres. From Abaqus and AVS UCD
     files (.inp) the corners of shell elements are read, in the coordinates of their definition;
     quadrilaterals are split.
@@ -68,7 +70,7 @@ def load_parts(file: str | Path, unit: Unit = "m") -> dict[str, Mesh]:
     """Load the parts of an OBJ, PLY, STL or glTF file, one for each name and material.
 
     Names are those of the file, of its objects or, in OBJ, of its materials; duplicates are
-    numbered. All parts are in the frame of the file.
+    numbered. All parts are in the frame of the file, with z up for glTF as in `load_mesh`.
 
     Args:
         file: path of an OBJ, PLY, STL or glTF file; the suffix determines the format.
@@ -112,6 +114,8 @@ def _load_with(
     with convert_read_errors(path, f"a readable {path.suffix} mesh"):
         for name, part in split(_load_trimesh_scene(path)).items():
             vertices = np.asarray(part.vertices, dtype=np.float64).reshape(-1, 3)
+            if path.suffix.lower() in _Y_UP:
+                vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
             faces = np.asarray(part.faces, dtype=np.int64).reshape(-1, 3)
             found[name] = vertices * _METRES[unit], faces
     try:
@@ -146,7 +150,8 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
     """Write a mesh, or all objects of a scene, as PLY (float64) or GLB (float32).
 
     A GLB file has the objects by name, and their materials by class name, metallic or not, which
-    Blender and other programs import.
+    Blender and other programs import. Its axes are (x, z, −y), since glTF says y up; Blender shows
+    the coordinates of the scene again. A PLY file has the axes of the scene.
 
     The write is atomic: a failure leaves an existing file unchanged.
 
@@ -173,13 +178,15 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
     )
     looks = {id(material): _viewer_material(material) for *_, material in parts.values()}
     written = trimesh.Scene()
+    glb = file.suffix.lower() in _Y_UP
     for name, (vertices, faces, material) in parts.items():
-        mesh = trimesh.Trimesh(vertices.detach().cpu().numpy(), faces.cpu().numpy(), process=False)
+        points = vertices.detach().cpu().numpy()
+        points = points[:, [0, 2, 1]] * [1, 1, -1] if glb else points
+        mesh = trimesh.Trimesh(points, faces.cpu().numpy(), process=False)
         if material is not None:
             mesh.visual = TextureVisuals(material=looks[id(material)])
         written.add_geometry(mesh, geom_name=name, node_name=name)
     with replace_file(file) as part:
-        glb = file.suffix.lower() == ".glb"
         part.write_bytes(export_glb(written) if glb else _ply(written.to_mesh()))
 
 
@@ -416,8 +423,9 @@ def _shape(element: ElementTree.Element, folder: Path) -> Mesh:
             warnings.simplefilter("ignore", PhysicsWarning)
             mesh = load_mesh(folder / _property(element, "string", "filename", ""))
     elif kind == "rectangle":
-        facing_back = shapes.plate(2.0, 2.0)
-        mesh = Mesh(facing_back.vertices, facing_back.faces.flip(1))
+        # Mitsuba's rectangle lies in the x-y plane and faces +z; ours in y-z faces −x.
+        upright = shapes.plate(2.0, 2.0)
+        mesh = Mesh(upright.vertices[:, [1, 2, 0]], upright.faces.flip(1))
     elif kind == "cube":
         mesh = shapes.box(2.0)
     elif kind == "sphere":

@@ -1,7 +1,7 @@
 """Triangle meshes as tensors."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor
 from invertwin.checks import checked_tensor, strip_derivatives
 from invertwin.errors import InputError
 from invertwin.scene import mesh_topology
+from invertwin.scene.pose import Basis
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,11 @@ class Mesh:
         """Surface area [m²], without gradient."""
         a, b, c = self.vertices.detach()[self.faces].unbind(1)
         return 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
+
+    def change_basis(self, basis: Basis) -> "Mesh":
+        """Return the mesh along other axes, of the same normals in space."""
+        faces = self.faces.flip(1) if basis.is_reflection else self.faces
+        return replace(self, vertices=basis.vectors(self.vertices), faces=faces)
 
 
 def concatenate_meshes(parts: Annotated[Sequence[Mesh], MinLen(1)]) -> Mesh:

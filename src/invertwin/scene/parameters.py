@@ -192,7 +192,7 @@ class RigidMotion(nn.Module):
         return {"rotation": Entries("rotation", slice(1, None))}
 
     def named_coordinates(self, name: str) -> list[Coordinate]:
-        """Return x, y, z and the rotations about these world axes: pitch, yaw, roll [rad].
+        """Return x, y, z and the rotations about these world axes: roll, pitch, yaw [rad].
 
         Args:
             name: name of the moving object.
@@ -200,7 +200,7 @@ class RigidMotion(nn.Module):
         found = position_coordinates(name, "translation", self._axes)
         free = self._rotation_axes[1:]
         w, r = self.rotation.detach()[0], self.rotation.detach()[1:]
-        for turn, axis in zip(("pitch", "yaw", "roll"), torch.eye(3, dtype=r.dtype), strict=True):
+        for turn, axis in zip(("roll", "pitch", "yaw"), torch.eye(3, dtype=r.dtype), strict=True):
             if axis @ free:
                 # The product of the quaternion (1, axis/2) and the present one (w, r/2).
                 change = torch.cat([-axis @ r[:, None] / 4, w * axis + axis.cross(r, 0) / 2])

@@ -71,9 +71,9 @@ class JonesTable:
 
     Attributes:
         theta: n ≥ 2 ascending angles to boresight [rad], from 0.
-        phi: m ascending angles around boresight [rad], spanning less than 2π; m = 1 for vectors
-            that do not depend on it.
-        vectors: Jones vectors (V, H) of each direction, about the radar's y axis [n, m, 2].
+        phi: m ascending angles around boresight, from y towards z [rad], spanning less than 2π;
+            m = 1 for vectors that do not depend on it.
+        vectors: Jones vectors (V, H) of each direction, about the radar's z axis [n, m, 2].
 
     Raises:
         InputError: wrong shapes, angles that do not ascend, a vector of length zero, derivatives.
@@ -111,13 +111,13 @@ class JonesTable:
         """
         x, y, z = direction.unbind(-1)
         # Neither the radius nor atan2 has a gradient on the axis; φ is arbitrary there.
-        on_axis = (x == 0) & (y == 0)
-        radius = torch.where(on_axis, 0.0, torch.where(on_axis, 1.0, x**2 + y**2).sqrt())
-        row, up = _locate_nodes(self.theta, torch.atan2(radius, z))
-        azimuth = torch.atan2(y, torch.where(on_axis, 1.0, x))
+        on_axis = (y == 0) & (z == 0)
+        radius = torch.where(on_axis, 0.0, torch.where(on_axis, 1.0, y**2 + z**2).sqrt())
+        row, up = _locate_nodes(self.theta, torch.atan2(radius, x))
+        phi = torch.atan2(z, torch.where(on_axis, 1.0, y))
         around = torch.cat([self.phi, self.phi[:1] + 2 * math.pi])
-        azimuth = self.phi[0] + (azimuth - self.phi[0]) % (2 * math.pi)
-        column, across = _locate_nodes(around, azimuth)
+        phi = self.phi[0] + (phi - self.phi[0]) % (2 * math.pi)
+        column, across = _locate_nodes(around, phi)
         after = (column + 1) % len(self.phi)
         found = torch.zeros(len(direction), 2, dtype=torch.complex128)
         for line, share in ((row, 1 - up), (row + 1, up)):

@@ -1,7 +1,15 @@
-"""Rotations and rigid transforms as matrices, differentiable and free of singularities."""
+"""Rotations and rigid transforms as matrices, differentiable and free of singularities.
 
-from collections.abc import Sequence
+Our frame is x forward, y left, z up, right-handed. ROS (REP 103), ISO 8855, Sionna RT, Blender and
+CAD files need no change: they are x forward, y left, z up, or have no forward axis and z up.
+`to_frame` converts to the axes of other programs.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
+from types import MappingProxyType
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Float64
@@ -89,7 +97,7 @@ def rigid(
 def look_at(
     positions: Float[Tensor, "n 3"] | Sequence[Sequence[float]], target: ArrayLike
 ) -> Float64[Tensor, "n 3 3"]:
-    """Return rotations whose boresight (third column) points at a target, x level, y upwards.
+    """Return rotations whose boresight (first column) points at a target, y level, z upwards.
 
     Args:
         positions: positions of the radar [*, 3] [m].
@@ -101,17 +109,146 @@ def look_at(
     places = checked_tensor(positions, (None, 3), "positions [m]", "give x, y, z of each")
     aim = checked_tensor(target, (3,), "target [m]", "give x, y, z")
     boresight = aim - places
-    right = torch.linalg.cross(boresight.new_tensor([[0.0, 1.0, 0.0]]), boresight)
-    if bool((right.norm(dim=1) < 1e-6 * (1 + boresight.norm(dim=1))).any()):
+    left = torch.linalg.cross(boresight.new_tensor([[0.0, 0.0, 1.0]]), boresight)
+    if bool((left.norm(dim=1) < 1e-6 * (1 + boresight.norm(dim=1))).any()):
         raise InputError(
             "expected a target that is not straight above or below a position, got "
             f"{aim.tolist()}; move it or give rotations"
         )
     boresight = boresight / boresight.norm(dim=1, keepdim=True)
-    right = right / right.norm(dim=1, keepdim=True)
-    return torch.stack([right, torch.linalg.cross(boresight, right), boresight], dim=-1)
+    left = left / left.norm(dim=1, keepdim=True)
+    return torch.stack([boresight, left, torch.linalg.cross(boresight, left)], dim=-1)
 
 
 def compose(*transforms: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
     """Compose transforms from first to last."""
     return reduce(lambda first, second: second @ first, transforms)
+
+
+FrameName = Literal["ti", "opencv", "smpl", "unity"]
+
+_AXES: Mapping[str, tuple[str, str, str]] = MappingProxyType(
+    {
+        # x right, y forward, z up (TI MMWAVE-L-SDK, mpdProc_SceneryParams: X is left (negative) to
+        # right, Y near to far, Z = 0 the floor).
+        "ti": ("-y", "x", "z"),
+        # x right, y down, z forward (OpenCV manual, calib3d: the pinhole camera model).
+        "opencv": ("-y", "-z", "x"),
+        # y up, the body faces +z, its left is +x (Loper et al. 2015, the template of SMPL); our
+        # bodies face −x.
+        "smpl": ("-y", "z", "-x"),
+        # Left-handed: x right, y up, z forward (Unity manual, "Rotation and orientation").
+        "unity": ("-y", "z", "x"),
+    }
+)
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Axes of a frame in terms of those of another.
+
+    Attributes:
+        order: axis of the other frame along which each axis lies.
+        signs: −1 for the opposite direction, else 1.
+    """
+
+    order: tuple[int, ...]
+    signs: tuple[int, ...]
+
+    @property
+    def inverse(self) -> "Basis":
+        """Axes of the other frame in terms of these."""
+        order = tuple(self.order.index(axis) for axis in range(3))
+        return Basis(order, tuple(self.signs[axis] for axis in order))
+
+    @property
+    def is_reflection(self) -> bool:
+        """Whether one of the two frames is left-handed."""
+        return float(torch.linalg.det(self.vectors(torch.eye(3).double()))) < 0
+
+    def vectors(self, values: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Return points or vectors along these axes."""
+        return values[..., list(self.order)] * values.new_tensor(self.signs)
+
+    def poses(self, values: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+        """Return poses M T M⁻¹: the axes of the world and of the body change alike."""
+        order, signs = [*self.order, 3], values.new_tensor([*self.signs, 1])
+        return values[..., order, :][..., order] * signs[:, None] * signs
+
+
+@runtime_checkable
+class Convertible(Protocol):
+    """Value with coordinates."""
+
+    def change_basis(self, basis: Basis) -> Any:
+        """Return the value along other axes."""
+        ...
+
+
+def to_frame(value: Convertible | ArrayLike, frame: FrameName) -> Any:
+    """Convert coordinates from our frame to that of another program.
+
+    Ours is x forward, y left, z up. The others: ``ti`` (mmWave SDK point clouds): x right,
+    y forward, z up; ``opencv``: x right, y down, z forward; ``smpl``: y up, the body faces z, its
+    left is x, whereas our bodies face −x; ``unity``: left-handed, x right, y up, z forward. ROS,
+    ISO 8855, Sionna RT, Blender and CAD files need no conversion.
+
+    A pose becomes M T M⁻¹, since the axes of the body change with those of the world. In a
+    left-handed frame triangles are wound the other way round, so that normals still point outwards.
+    Rotation vectors are not vectors there: convert their poses.
+
+    Args:
+        value: points or vectors [*, 3], poses [*, 4, 4], a mesh, an object, a scene or an antenna
+            array. An array's pattern and polarisation refer to boresight and stay.
+        frame: name of the frame to convert to.
+
+    Returns:
+        The converted value, of the same type; lists become tensors. The simulation understands
+        scenes and arrays in our frame only.
+
+    Raises:
+        InputError: an unknown frame, or a value of another type or shape.
+    """
+    return _convert(value, _basis_of(frame))
+
+
+def from_frame(value: Convertible | ArrayLike, frame: FrameName) -> Any:
+    """Convert coordinates from the frame of another program to ours, the inverse of `to_frame`.
+
+    Args:
+        value: as in `to_frame`, in the other program's frame.
+        frame: name of that frame.
+
+    Raises:
+        InputError: an unknown frame, or a value of another type or shape.
+    """
+    return _convert(value, _basis_of(frame).inverse)
+
+
+def _basis_of(frame: str) -> Basis:
+    if frame not in _AXES:
+        raise InputError(
+            f"expected a frame among {', '.join(_AXES)}, got {frame!r}; choose one (ROS, ISO 8855, "
+            "Sionna RT, Blender and CAD files have ours)"
+        )
+    axes = _AXES[frame]
+    order = tuple("xyz".index(axis[-1]) for axis in axes)
+    return Basis(order, tuple(-1 if axis.startswith("-") else 1 for axis in axes))
+
+
+def _convert(value: Convertible | ArrayLike, basis: Basis) -> Convertible | Tensor:
+    if isinstance(value, Convertible):
+        return value.change_basis(basis)
+    do = "give points [*, 3], poses [*, 4, 4], a mesh, an object, a scene or an antenna array"
+    known = isinstance(value, Tensor) and value.is_floating_point()
+    try:
+        tensor = torch.as_tensor(value, dtype=None if known else torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"expected coordinates, got {type(value).__name__}; {do}") from None
+    if tensor.shape[-2:] == (4, 4):
+        return basis.poses(tensor)
+    if tensor.shape[-1:] != (3,):
+        raise InputError(
+            f"expected coordinates of shape [*, 3] or [*, 4, 4], got {list(tensor.shape)}; {do}"
+        )
+    return basis.vectors(tensor)

@@ -41,17 +41,17 @@ def room(
 ) -> dict[str, Object]:
     """Build a closed room with furniture: objects by name, for ``Scene({**room(), …})``.
 
-    The floor is the plane y = 0, with y up. The room reaches from −width/2 to width/2 along x and
-    from 0 to depth along z; a radar at (0, 1, 0.1) facing z observes all of it. The middle is free,
-    at least 0.5 m to either side of x = 0. The room is deterministic.
+    The floor is the plane z = 0, with z up. The room reaches from 0 to depth along x and from
+    −width/2 to width/2 along y; a radar at (0.1, 0, 1) facing x observes all of it. The middle is
+    free, at least 0.5 m to either side of y = 0. The room is deterministic.
 
     Walls, ceiling and floor are sheets of plasterboard, ceiling board and concrete; the table
     and the chairs are of wood, the shelf of chipboard (ITU-R P.2040-3). All have rough surfaces.
 
     Args:
-        width: size along x, at least 4 [m].
-        depth: size along z, at least 4 [m].
-        height: size along y, at least 2.1 [m].
+        width: size along y, at least 4 [m].
+        depth: size along x, at least 4 [m].
+        height: size along z, at least 2.1 [m].
         furniture: names among table, chair_1, chair_2, shelf and sofa.
 
     Raises:
@@ -66,25 +66,25 @@ def room(
             f"expected furniture among {', '.join(_FURNITURE)}, got {furniture!r}; give a list"
         )
     sides = {
-        "floor": _panel([0, 0, d / 2], [0, 0, d / 2], [w / 2, 0, 0]),
-        "ceiling": _panel([0, h, d / 2], [w / 2, 0, 0], [0, 0, d / 2]),
-        "wall_front": _panel([0, h / 2, 0], [w / 2, 0, 0], [0, h / 2, 0]),
-        "wall_back": _panel([0, h / 2, d], [0, h / 2, 0], [w / 2, 0, 0]),
-        "wall_left": _panel([-w / 2, h / 2, d / 2], [0, h / 2, 0], [0, 0, d / 2]),
-        "wall_right": _panel([w / 2, h / 2, d / 2], [0, 0, d / 2], [0, h / 2, 0]),
+        "floor": _panel([d / 2, 0, 0], [d / 2, 0, 0], [0, w / 2, 0]),
+        "ceiling": _panel([d / 2, 0, h], [0, w / 2, 0], [d / 2, 0, 0]),
+        "wall_front": _panel([0, 0, h / 2], [0, w / 2, 0], [0, 0, h / 2]),
+        "wall_back": _panel([d, 0, h / 2], [0, 0, h / 2], [0, w / 2, 0]),
+        "wall_right": _panel([d / 2, -w / 2, h / 2], [0, 0, h / 2], [d / 2, 0, 0]),
+        "wall_left": _panel([d / 2, w / 2, h / 2], [d / 2, 0, 0], [0, 0, h / 2]),
     }
     # Keep a small gap between furniture and walls.
     placed = {
-        "table": (_table(0.8, 0.74, 1.4), [w / 2 - 0.85, d / 2]),
-        "chair_1": (_chair(), [w / 2 - 0.85, d / 2 - 1.0]),
-        "chair_2": (_chair(is_reversed=True), [w / 2 - 0.85, d / 2 + 1.0]),
-        "shelf": (_shelf(0.9, 1.9, 0.35), [w / 2 - 0.6, d - 0.2]),
-        "sofa": (_sofa(), [-w / 2 + 0.5, d / 2]),
+        "table": (_table(1.4, 0.8, 0.74), [d / 2, w / 2 - 0.85]),
+        "chair_1": (_chair(), [d / 2 - 1.0, w / 2 - 0.85]),
+        "chair_2": (_chair(is_reversed=True), [d / 2 + 1.0, w / 2 - 0.85]),
+        "shelf": (_shelf(0.35, 0.9, 1.9), [d - 0.2, w / 2 - 0.6]),
+        "sofa": (_sofa(), [d / 2, -w / 2 + 0.5]),
     }
     found = {name: Object(mesh, _material(name)) for name, mesh in sides.items()}
     for name in furniture:
-        mesh, (x, z) = placed[name]
-        found[name] = Object(mesh, _material(name), rigid(translation=[x, 0.0, z]))
+        mesh, (x, y) = placed[name]
+        found[name] = Object(mesh, _material(name), rigid(translation=[x, y, 0.0]))
     return found
 
 
@@ -106,44 +106,44 @@ def _boxes(*parts: tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 def _legs(
-    x: float, z: float, top: float
+    x: float, y: float, top: float
 ) -> list[tuple[tuple[float, float, float], tuple[float, float, float]]]:
     """Return four legs that end just below the top."""
     high = top - 1e-3
-    places = [(sx * x, sz * z) for sx in (-1, 1) for sz in (-1, 1)]
-    return [((_LEG, high, _LEG), (px, 1e-3 + high / 2, pz)) for px, pz in places]
+    places = [(sx * x, sy * y) for sy in (-1, 1) for sx in (-1, 1)]
+    return [((_LEG, _LEG, high), (px, py, 1e-3 + high / 2)) for px, py in places]
 
 
 def _table(x: float, y: float, z: float) -> Mesh:
-    legs = _legs(x / 2 - _LEG, z / 2 - _LEG, y - _TOP - 1e-3)
-    return _boxes(((x, _TOP, z), (0, y - _TOP / 2, 0)), *legs)
+    legs = _legs(x / 2 - _LEG, y / 2 - _LEG, z - _TOP - 1e-3)
+    return _boxes(((x, y, _TOP), (0, 0, z - _TOP / 2)), *legs)
 
 
 def _chair(*, is_reversed: bool = False) -> Mesh:
-    """Return a chair whose back is at −z, or at z."""
+    """Return a chair whose back is at −x, or at x."""
     back = 0.19 if is_reversed else -0.19
     return _boxes(
-        ((0.42, _TOP, 0.42), (0, 0.45, 0)),
-        ((0.42, 0.45, _TOP), (0, 0.70, back)),
+        ((0.42, 0.42, _TOP), (0, 0, 0.45)),
+        ((_TOP, 0.42, 0.45), (back, 0, 0.70)),
         *_legs(0.18, 0.18, 0.43),
     )
 
 
 def _shelf(x: float, y: float, z: float) -> Mesh:
-    """Return a back, two sides and boards between them, open to −z."""
-    inner = x - 2 * _TOP - 2e-3
-    step = (y - _TOP - 2e-3) / (_SHELF_BOARDS - 1)
+    """Return a back, two sides and boards between them, open to −x."""
+    inner = y - 2 * _TOP - 2e-3
+    step = (z - _TOP - 2e-3) / (_SHELF_BOARDS - 1)
     levels = [2e-3 + _TOP / 2 + step * number for number in range(_SHELF_BOARDS)]
-    sides = [((_TOP, y, z), (sign * (x - _TOP) / 2, y / 2 + 1e-3, 0.0)) for sign in (-1, 1)]
-    boards = [((inner, _TOP, z - 0.02), (0.0, level, -0.01)) for level in levels]
-    return _boxes(*sides, *boards, ((inner, y, 0.01), (0.0, y / 2 + 1e-3, z / 2 - 5e-3 + 1e-3)))
+    sides = [((x, _TOP, z), (0.0, sign * (y - _TOP) / 2, z / 2 + 1e-3)) for sign in (-1, 1)]
+    boards = [((x - 0.02, inner, _TOP), (-0.01, 0.0, level)) for level in levels]
+    return _boxes(*sides, *boards, ((0.01, inner, z), (x / 2 - 5e-3 + 1e-3, 0.0, z / 2 + 1e-3)))
 
 
 def _sofa() -> Mesh:
-    """Return a seat, a back at −x and two arms, 1.9 m along z."""
+    """Return a seat, a back at −y and two arms, 1.9 m along x."""
     return _boxes(
-        ((0.66, 0.42, 1.58), (0.09, 0.212, 0.0)),
-        ((0.18, 0.82, 1.9), (-0.34, 0.412, 0.0)),
-        ((0.66, 0.6, 0.15), (0.09, 0.302, -0.87)),
-        ((0.66, 0.6, 0.15), (0.09, 0.302, 0.87)),
+        ((1.58, 0.66, 0.42), (0.0, 0.09, 0.212)),
+        ((1.9, 0.18, 0.82), (0.0, -0.34, 0.412)),
+        ((0.15, 0.66, 0.6), (-0.87, 0.09, 0.302)),
+        ((0.15, 0.66, 0.6), (0.87, 0.09, 0.302)),
     )

@@ -16,7 +16,15 @@ from invertwin.scene.cloud import Cloud
 from invertwin.scene.material.roughness import ROUGH_LOBE_WIDTH, lobe_exponent
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.pose import compose, rigid, rotation_from_vector
+from invertwin.scene.pose import (
+    Basis,
+    FrameName,
+    compose,
+    from_frame,
+    rigid,
+    rotation_from_vector,
+    to_frame,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +105,16 @@ class Object:
         offsets = self.velocity * time @ self.transform[:3, :3]
         mesh = Mesh(self.mesh.vertices + offsets, self.mesh.faces)
         return replace(self, mesh=mesh, velocity=None)
+
+    def change_basis(self, basis: Basis) -> "Object":
+        """Return the object along other axes, those of its own frame included."""
+        return replace(
+            self,
+            mesh=self.mesh.change_basis(basis),
+            pose=None if self.pose is None else basis.poses(self.pose),
+            velocity=None if self.velocity is None else basis.vectors(self.velocity),
+            cloud=None if self.cloud is None else self.cloud.change_basis(basis),
+        )
 
 
 def transform_vertices(objects: Sequence[Object]) -> list[Float64[Tensor, "v 3"]]:
@@ -205,6 +223,19 @@ class Scene:
     def advance(self, time: float) -> "Scene":
         """Return the scene with all objects displaced by their velocities for `time` [s]."""
         return Scene({name: value.advance(time) for name, value in self.objects.items()})
+
+    def change_basis(self, basis: Basis) -> "Scene":
+        """Return the scene along other axes."""
+        moved = {name: value.change_basis(basis) for name, value in self.objects.items()}
+        return replace(self, objects=moved)
+
+    def to_frame(self, frame: FrameName) -> "Scene":
+        """Return the scene in the frame of another program, see `invertwin.scene.to_frame`."""
+        return to_frame(self, frame)
+
+    def from_frame(self, frame: FrameName) -> "Scene":
+        """Return the scene in our frame, given in that of another program."""
+        return from_frame(self, frame)
 
 
 def warn_if_purely_specular(scene: Scene, frequency: float) -> None:

@@ -1,4 +1,7 @@
-"""Built-in meshes, centred at the origin, with outward normals."""
+"""Built-in meshes, centred at the origin, with outward normals.
+
+Fronts face −x, towards a radar that looks along +x; z is up, y to the left of who looks along +x.
+"""
 
 import math
 from collections.abc import Sequence
@@ -22,11 +25,11 @@ _MAX_LETTERS = 100  # outlines are merged one by one
 
 
 def plate(width: Positive, height: Positive, divisions: Count = 1) -> Mesh:
-    """Build a rectangle in the plane z = 0 that faces −z.
+    """Build a rectangle in the plane x = 0 that faces −x.
 
     Args:
-        width: size along x [m].
-        height: size along y [m].
+        width: size along y [m].
+        height: size along z [m].
         divisions: number of cells along each side, two triangles each.
 
     Raises:
@@ -36,7 +39,7 @@ def plate(width: Positive, height: Positive, divisions: Count = 1) -> Mesh:
     n = checked_count(divisions, "divisions", 1)
     _require_triangles(2 * n**2, "divisions")
     points, faces = _lattice(n)
-    # The lattice faces +z; reversed triangles face −z.
+    # The lattice faces +x; reversed triangles face −x.
     plane = (points / n - 0.5) * size
     return _mesh(np.column_stack([plane, np.zeros(len(plane))]), faces[:, ::-1])
 
@@ -53,7 +56,7 @@ def box(size: Positive | Sequence[Positive], divisions: Count = 1) -> Mesh:
     """
     sizes = [size] * 3 if isinstance(size, int | float) else list(size)
     given = checked_tensor(sizes, (3,), "box size", "give one number or three")
-    extent = np.asarray(given.tolist())
+    extent = np.asarray(given.tolist())[[1, 2, 0]]
     for length in extent:
         _length(float(length), "box size [m]")
     n = checked_count(divisions, "divisions", 1)
@@ -94,11 +97,11 @@ def sphere(radius: Positive, subdivisions: Annotated[int, Ge(0), Le(8)] = 4) -> 
 def cylinder(
     radius: Positive, height: Positive, sections: Annotated[int, Ge(3), Le(10_000)] = 32
 ) -> Mesh:
-    """Build a closed upright cylinder with its axis along y.
+    """Build a closed upright cylinder with its axis along z.
 
     Args:
         radius: radius [m].
-        height: size along y [m].
+        height: size along z [m].
         sections: number of flat sides.
 
     Raises:
@@ -107,14 +110,14 @@ def cylinder(
     sizes = _length(radius, "cylinder radius [m]"), _length(height, "cylinder height [m]")
     count = checked_count(sections, "sections", 3)
     tube = trimesh.creation.cylinder(sizes[0], sizes[1], sections=count)
-    # Rotation about x: z to y.
+    # Rotation of its axis to the second of the drawing's axes.
     return _mesh(tube.vertices[:, [0, 2, 1]] * [1, 1, -1], tube.faces)
 
 
 def dihedral(edge: Positive, opening: Angle = math.pi / 2) -> Mesh:
-    """Build two square plates that meet on the y axis and open to −z.
+    """Build two square plates that meet on the z axis and open to −x.
 
-    Its boresight is −z. At a right angle every double-bounce echo has the range of the y axis.
+    Its boresight is −x. At a right angle every double-bounce echo has the range of the z axis.
 
     Args:
         edge: edge length of the plates [m].
@@ -126,15 +129,15 @@ def dihedral(edge: Positive, opening: Angle = math.pi / 2) -> Mesh:
     length = _length(edge, "dihedral edge [m]")
     half = checked_number(opening, "opening [rad]", 0.0, math.pi, open_low=True) / 2
     tips = [(s * length * math.sin(half), -length * math.cos(half)) for s in (-1, 1)]
-    vertices = [(x, y * length / 2, z) for x, z in (tips[0], (0.0, 0.0), tips[1]) for y in (-1, 1)]
+    vertices = [(y, z * length / 2, x) for y, x in (tips[0], (0.0, 0.0), tips[1]) for z in (-1, 1)]
     return _mesh(np.array(vertices), np.array([(0, 1, 3), (0, 3, 2), (2, 3, 5), (2, 5, 4)]))
 
 
 def trihedral(edge: Positive) -> Mesh:
     """Build a corner reflector: three right-angled triangles with the apex at the origin, open to
-    −z.
+    −x.
 
-    Its boresight is −z, one of the inner edges lies in the half plane x = 0, y > 0, and every
+    Its boresight is −x, one of the inner edges lies in the half plane y = 0, z > 0, and every
     triple-bounce echo has the range of the apex. Its peak radar cross-section is 4π edge⁴/3λ².
 
     Args:
@@ -157,12 +160,14 @@ def text(
     depth: Positive = 0.12,
     max_edge: Positive = 0.06,
 ) -> Mesh:
-    """Build extruded bold text, watertight, readable from −z with x to the right and y up.
+    """Build extruded bold text, watertight, which reads correctly from −x.
+
+    The first letter has the largest y, since +y is to the left of who looks along +x; z is up.
 
     Args:
         text: line of text.
-        size: height of its bounding box along y [m].
-        depth: thickness along z [m].
+        size: height of its bounding box along z [m].
+        depth: thickness along x [m].
         max_edge: longest edge of a triangle [m].
 
     Raises:
@@ -181,7 +186,9 @@ def text(
     start, end = flat.edges[np.sort(open_edges)].T
     walls = [(start, end, end + count), (start, end + count, start + count)]
     faces = np.concatenate([cap[:, ::-1], cap + count, *(np.column_stack(w) for w in walls)])
-    return _mesh(*_split_long_edges(np.concatenate([front, back]), faces, longest))
+    points, faces = _split_long_edges(np.concatenate([front, back]), faces, longest)
+    # Letters run to the right, which is −y; mirrored triangles are reversed to face outwards.
+    return _mesh(points * [-1, 1, 1], faces[:, ::-1])
 
 
 def _length(value: object, what: str) -> float:
@@ -193,11 +200,12 @@ def _require_triangles(count: float, at: str, do: str = "") -> None:
     require_at_most(count, _MAX_TRIANGLES, "triangles of a shape", do, at)
 
 
-def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    # Copies, since torch does not accept the negative strides of reversed views.
+def _mesh(drawn: np.ndarray, faces: np.ndarray) -> Mesh:
+    """Return a mesh from drawn coordinates (y, z, x): the plane that faces the radar, and depth."""
+    # C order, since torch does not accept the negative strides of reversed views.
     return Mesh(
-        torch.from_numpy(np.array(vertices, dtype=np.float64)),
-        torch.from_numpy(np.array(faces, dtype=np.int64)),
+        torch.from_numpy(np.array(drawn[:, [2, 0, 1]], dtype=np.float64, order="C")),
+        torch.from_numpy(np.array(faces, dtype=np.int64, order="C")),
     )
 
 

@@ -25,21 +25,7 @@ from invertwin.viewer.panels import MEASURED as MEASURED
 from invertwin.viewer.panels import SIMULATED as SIMULATED
 from invertwin.viewer.server import Viewer as Viewer
 
-rename_attributes(
-    __name__,
-    {
-        "Body": "DisplayMesh",
-        "Guard": "AccessGuard",
-        "Layer": "DisplayLayer",
-        "Link": "InteractiveSensor",
-        "Maps": "DisplayMaps",
-        "Step": "DisplayStep",
-        "body_of": "display_mesh",
-        "display_of": "build_display",
-        "policy": "content_security_policy",
-        "show_scene": "show",
-    },
-)
+rename_attributes(__name__)
 rename_members(AccessGuard, before="wrap_handler")
 rename_members(Display, at_step="show_step")
 rename_members(DisplayMaps, at="maps_of_frame", of="from_spectra")

@@ -142,8 +142,8 @@ class Display:
     layers: Sequence[DisplayLayer]
     steps: Sequence[DisplayStep] = ()
     maps: Mapping[str, DisplayMaps] = field(default_factory=dict)
-    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    ahead: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    ahead: tuple[float, float, float] = (1.0, 0.0, 0.0)
 
     @property
     def box(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

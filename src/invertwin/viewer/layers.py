@@ -90,7 +90,7 @@ def radar_layers(
     u = torch.tensor([-1.0, 1.0, 1.0, -1.0]).double() * _largest_cosine(grid and grid.u)
     v = torch.tensor([-1.0, -1.0, 1.0, 1.0]).double() * _largest_cosine(grid and grid.v)
     w = (1 - u.square() - v.square()).clamp_min(0.0).sqrt()
-    corners = torch.stack([u, v, w], dim=1) * length
+    corners = torch.stack([w, u, v], dim=1) * length
     lines = []
     for k in chosen:
         ends = places[k] + corners @ axes[k].T
@@ -183,12 +183,12 @@ def build_display(
     if layers and places:
         middle = np.concatenate([x.points for x in layers]).mean(0)
         length = float(np.linalg.norm(np.concatenate(places).mean(0) - middle))
-    up, ahead = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    up, ahead = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
     for name, (radar, grid) in radars.items():
         layers += radar_layers(radar, grid, length, name)
     for radar, _ in list(radars.values())[:1]:
         axes = radar.link().rotations.detach().mean(0)
-        up, ahead = _unit_vector(axes[:, 1], up), _unit_vector(axes[:, 2], ahead)
+        up, ahead = _unit_vector(axes[:, 2], up), _unit_vector(axes[:, 0], ahead)
     return Display(title, layers, up=up, ahead=ahead)
 
 

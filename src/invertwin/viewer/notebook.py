@@ -87,8 +87,9 @@ def radar_html(radar: Radar) -> str:
     """
     places = 1e3 * radar.virtual_positions.detach()
     figure, (axes,) = row_of_axes(1, (4, 2.5))
-    axes.plot(places[:, 0].numpy(), places[:, 1].numpy(), ".")
-    axes.set(xlabel="x [mm]", ylabel="y [mm]", title="virtual array")
+    axes.plot(places[:, 1].numpy(), places[:, 2].numpy(), ".")
+    axes.set(xlabel="y [mm], to the left", ylabel="z [mm]", title="virtual array")
+    axes.invert_xaxis()
     return _figure_and_table(figure, "places of the virtual elements", _radar_rows(radar))
 
 

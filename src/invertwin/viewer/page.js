@@ -185,7 +185,7 @@
     const place = own.places[position], found = new Map([paths, visible, edges, feeding].map((x) => [x, []]));
     if (place && surfaces.length) {
       const corners = sight.triangles(surfaces), clear = sight.seen(corners, place);
-      const [right, , front] = [0, 1, 2].map((n) => own.rotations[position].map((row) => row[n]));
+      const [front, left] = [0, 1].map((n) => own.rotations[position].map((row) => row[n]));
       const before = (point) => sight.dot(sight.minus(point, place), front) > 0 && clear(point);
       const most = Math.min(1500, Math.ceil(3e8 / corners.length));  // tests that take a moment
       found.set(visible, sight.spread(corners, most).filter(before));
@@ -195,7 +195,7 @@
         const near = sight.spread(corners, 20000).filter((point) => {
           const away = sight.minus(point, place), range = Math.hypot(...away);
           const row = (range - own.origins[position] - own.grid[0]) / own.grid[1];
-          const column = own.shape[1] > 1 ? (sight.dot(away, right) / range - own.grid[2]) / own.grid[3] : 0;
+          const column = own.shape[1] > 1 ? (sight.dot(away, left) / range - own.grid[2]) / own.grid[3] : 0;
           return Math.abs(row - chosen[0]) <= 1 && Math.abs(column - chosen[1]) <= 1;
         });
         const apart = Math.ceil((2 * near.length) / most);

@@ -24,29 +24,29 @@ class MapPanels:
         shown: Names of the pictures.
 
     Attributes:
-        right: The direction in which u grows.
+        left: The direction in which u grows.
         offset: From the middle of the scene to that of the pictures.
     """
 
     def __init__(self, server: Any, display: Display, shown: Sequence[str]) -> None:
         low, high = display.box
         up, ahead = np.array(display.up), np.array(display.ahead)
-        self.right, self.offset = np.cross(up, ahead), np.zeros(3)
+        self.left, self.offset = np.cross(up, ahead), np.zeros(3)
         self._shape = (1, 1)
         self._nodes: dict[str, Any] = {}
         self._places: dict[str, Any] = {}
         if not shown:
             return
         self._size = 0.5 * (float(np.linalg.norm(high - low)) or 1.0)
-        self._axes = self.right, up
+        self._axes = self.left, up
         self.offset = up * (float((high - low) @ np.abs(up)) / 2 + 0.65 * self._size)
         self._known: dict[str, tuple[Any, Any]] = {}
-        # The picture's right, which is that of u, its foot, and what is behind it.
-        turn = _quaternion(np.stack([self.right, -up, -ahead], axis=1))
+        # The image's first axis, which is that of u, its foot, and what is behind it.
+        turn = _quaternion(np.stack([self.left, -up, -ahead], axis=1))
         for number, name in enumerate(shown):
             # The first one stands on the left of who looks along the radar.
             across = 1.1 * self._size * ((len(shown) - 1) / 2 - number)
-            place = (low + high) / 2 + self.offset + across * self.right
+            place = (low + high) / 2 + self.offset + across * self.left
             self._places[name] = place
             self._nodes[name] = server.scene.add_image(
                 f"/maps/{name}",
@@ -77,11 +77,11 @@ class MapPanels:
     ) -> Callable[[Any], None]:
         def handle_click(event: Any) -> None:
             origin, toward = np.array(event.ray_origin), np.array(event.ray_direction)
-            right, up = self._axes
-            normal = np.cross(right, up)
+            left, up = self._axes
+            normal = np.cross(left, up)
             distance = (self._places[name] - origin) @ normal / (toward @ normal)
             away = origin + distance * toward - self._places[name]
-            shares = 0.5 + away @ np.stack([up, right], axis=1) / self._size
+            shares = 0.5 + away @ np.stack([up, left], axis=1) / self._size
             found = np.floor(shares * self._shape).astype(int).clip(0, np.array(self._shape) - 1)
             choose((int(found[0]), int(found[1])))
 

@@ -190,8 +190,8 @@ class Viewer:
         middle = (low + high) / 2
         up, ahead = np.array(display.up), np.array(display.ahead)
         # The window's own panel covers its right, where u falls.
-        camera.look_at = middle + 0.6 * self._panels.offset - 0.3 * self._size * self._panels.right
-        back = 0.15 * up - 1.6 * ahead + 0.25 * self._panels.right
+        camera.look_at = middle + 0.6 * self._panels.offset - 0.3 * self._size * self._panels.left
+        back = 0.15 * up - 1.6 * ahead + 0.25 * self._panels.left
         camera.position = camera.look_at + self._size * back
         camera.up = up
 

@@ -99,7 +99,8 @@ def read_track(path: str | Path, topic: str) -> Track:
     """Read where something was over time, such as the radar, from messages that hold its pose.
 
     These are ``Odometry``, ``PoseStamped``, ``PoseWithCovarianceStamped``, ``TransformStamped`` and
-    ``PointStamped``. Repeated times count once.
+    ``PointStamped``. Repeated times count once. Positions are as in the messages: bodies have x
+    forward, y left, z up in ROS (REP 103), as radars have here.
 
     Args:
         path: A ``.bag`` file of ROS 1, or the folder of a bag of ROS 2.
@@ -130,7 +131,8 @@ def read_track(path: str | Path, topic: str) -> Track:
 
 @safe_reader("a bag of ROS 1 or ROS 2")
 def read_clouds(path: str | Path, topic: str) -> list[dict[str, Float64[Tensor, " point"]]]:
-    """Read all point clouds of a topic of ``sensor_msgs/PointCloud2``.
+    """Read all point clouds of a topic of ``sensor_msgs/PointCloud2``, along the axes of ROS, which
+    are those of our radars.
 
     Args:
         path: A ``.bag`` file of ROS 1, or the folder of a bag of ROS 2.

@@ -1,6 +1,7 @@
 """Samples in NumPy, HDF5 or MATLAB files, described by a small TOML file beside them."""
 
 import tomllib
+import warnings
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -13,8 +14,9 @@ import tomli_w
 import torch
 
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
+from invertwin.capture.readers.radar_fields import FRAME, OLD_AXES
 from invertwin.checks import checked_tensor
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.scene.antenna import AntennaArray
 from invertwin.storage.folders import replace_file
@@ -34,6 +36,7 @@ _KEYS = {
     "settings": {field.name for field in fields(ChirpSettings)} - _KNOWN_FROM_DATA,
     "radar": {"board", "elevation", "azimuth", "tx_positions", "rx_positions"},
 }
+_PLACES = {"positions", "look_at", "tx_positions", "rx_positions", "range_center"}
 _SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 
 
@@ -47,18 +50,19 @@ def load_described_board(
     """The elements that recorded described samples: a board as it is mounted, or TX and RX.
 
     The description's ``[radar]`` says it: ``board``, ``elevation`` and ``azimuth`` of a preset, or
-    ``tx_positions`` and ``rx_positions`` [m].
+    ``tx_positions`` and ``rx_positions`` [m], along the axes that `read_chirps` explains.
 
     Args:
         path: the TOML file.
         board: name of a preset; None = as described.
-        elevation: channels of the preset along y; None = as described.
-        azimuth: channels of the preset along x; None = as described.
+        elevation: sign of the preset's rows along z, as in `Board.arrays`; None = as described.
+        azimuth: sign of its columns along y; None = as described.
 
     Raises:
         InputError: neither the arguments nor the description say which.
     """
-    described = _load_chirp_description(Path(path)).get("radar", {})
+    description, axes = _load_chirp_description(Path(path))
+    described = description.get("radar", {})
     if board is None:
         board, tx, rx = (described.get(key) for key in ("board", "tx_positions", "rx_positions"))
         if (board is None) == (tx is None or rx is None):
@@ -68,7 +72,7 @@ def load_described_board(
                 "invertwin.radar.boards, or list the elements"
             )
         if board is None:
-            return element_array(tx, "TX"), element_array(rx, "RX")
+            return element_array(tx, "TX", axes), element_array(rx, "RX", axes)
     return Mounting(
         board,
         described.get("elevation") if elevation is None else elevation,
@@ -81,6 +85,8 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
     """Read every chirp of described samples.
 
     The description, in SI units::
+
+        frame = 2                 # x forward, y left, z up; without it x left, y up, z ahead
 
         [data]
         file = "adc.npy"          # or .npz, .h5, .hdf5, .mat, beside the description
@@ -109,7 +115,7 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
         InputError: no file, a damaged one, unknown or missing keys, or dimensions that do not fit.
     """
     path = Path(path)
-    description = _load_chirp_description(path)
+    description, _ = _load_chirp_description(path)
     data, given = description["data"], description["settings"]
     array = load_array(path.parent / str(data["file"]), data.get("variable"), trusted=trusted)
     real = array.dtype.kind != "c"
@@ -175,6 +181,7 @@ def write_chirps(
     named = {} if target.suffix == ".npy" else {"variable": "adc"}
     settings = {name: getattr(s, name) for name in sorted(_KEYS["settings"])}
     description: dict[str, Any] = {
+        "frame": FRAME,
         "data": {"file": file, **named, "dimensions": CHIRP_DIMS},
         "settings": {name: value for name, value in settings.items() if value is not None},
     }
@@ -185,42 +192,54 @@ def write_chirps(
         part.write_text(tomli_w.dumps(description), encoding="utf-8")
 
 
-def element_array(positions: Any, name: str) -> AntennaArray:
+def element_array(positions: Any, name: str, axes: list[int]) -> AntennaArray:
     """Elements that a description lists.
 
     Args:
         positions: of the elements [m].
         name: of the array, for the error.
+        axes: of the description, see `load_description`.
 
     Raises:
         InputError: no points.
     """
     do = "give one [x, y, z] in metres per element in [radar]"
-    return AntennaArray(checked_tensor(positions, (None, 3), f"{name} positions", do))
+    return AntennaArray(checked_tensor(positions, (None, 3), f"{name} positions", do)[:, axes])
 
 
-def _load_chirp_description(path: Path) -> dict[str, dict[str, Any]]:
-    description = load_description(path, _KEYS)
+def _load_chirp_description(path: Path) -> tuple[dict[str, dict[str, Any]], list[int]]:
+    description, axes = load_description(path, _KEYS)
     if "file" not in description.get("data", {}) or "settings" not in description:
         raise InputError(
             f"expected [data] with a file and [settings] in {path.name}, got none; add them"
         )
-    return description
+    return description, axes
 
 
-def load_description(path: Path, keys: Mapping[str, set[str]]) -> dict[str, dict[str, Any]]:
-    """The sections of a description.
+def load_description(
+    path: Path, keys: Mapping[str, set[str]]
+) -> tuple[dict[str, dict[str, Any]], list[int]]:
+    """The sections of a description, and where x forward, y left, z up are among its axes.
+
+    Those are its axes if it says ``frame = 2`` above its sections. One that does not is old: its
+    axes are x left, y up, z ahead. Where it states places, a `PhysicsWarning` says so.
 
     Args:
         path: the TOML file.
         keys: those that each section may have.
 
     Raises:
-        InputError: no such file, no TOML, or other sections or keys.
+        InputError: no such file, no TOML, or another frame, other sections or keys.
     """
     existing_file(path, "a TOML description")
     with convert_read_errors(path, "TOML", "give the description of the data, not the data"):
         description = tomllib.loads(path.read_text(encoding="utf-8"))
+    frame = description.pop("frame", None)
+    if frame not in (None, FRAME):
+        raise InputError(
+            f"expected frame = {FRAME} in {path.name}, got {frame!r}; give places along x forward, "
+            "y left, z up"
+        )
     for section, given in description.items():
         known = keys.get(section)
         if known is None or not isinstance(given, dict) or not set(given) <= known:
@@ -229,7 +248,17 @@ def load_description(path: Path, keys: Mapping[str, set[str]]) -> dict[str, dict
                 f"expected sections {', '.join(keys)} with the keys of the documentation in "
                 f"{path.name}, got {wrong}; known keys: {sorted(known or keys)}"
             )
-    return description
+    if frame is not None:
+        return description, [0, 1, 2]
+    places = ", ".join(sorted(_PLACES.intersection(description.get("radar", {}))))
+    if places:
+        warnings.warn(
+            f"{places} in {path.name} along x left, y up, z ahead, as before version 0.4, are "
+            f"turned; write frame = {FRAME} above its sections if x is ahead, y left and z up",
+            PhysicsWarning,
+            stacklevel=2,
+        )
+    return description, OLD_AXES
 
 
 def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray:

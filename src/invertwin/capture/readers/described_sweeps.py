@@ -61,6 +61,8 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     `path` is one Touchstone file (.s1p, .s2p), the sweep of a radar at the origin: S11 of one port,
     else S21. Or it is a description, in SI units. That of an analyser::
 
+        frame = 2                     # x forward, y left, z up; without it x left, y up, z ahead
+
         [data]
         files = "rail_*.s2p"          # in the order of their names; or a list; or file = "one.s2p"
 
@@ -71,12 +73,14 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
 
         [radar]
         positions = "rail.csv"        # x, y, z [m] of every file; or a list of points
-        look_at = [0.0, 0.0, 2.0]     # boresight; without it the axes of the world
-        tx_positions = [[-0.1, 0, 0]] # about each position, in the radar frame
-        rx_positions = [[0.1, 0, 0]]
+        look_at = [2.0, 0.0, 0.0]     # boresight; without it the axes of the world
+        tx_positions = [[0, 0.1, 0]]  # about each position, in the radar frame
+        rx_positions = [[0, -0.1, 0]]
         range_origin = -0.45          # what cables add to all ranges is taken off
 
     That of a phase history, whose values may be names of variables of the data file::
+
+        frame = 2
 
         [data]
         file = "pass.mat"             # or .npy, .npz, .h5, .hdf5
@@ -103,14 +107,14 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
             other, or frequencies that are not equally spaced.
     """
     path = Path(path)
-    if TOUCHSTONE.fullmatch(path.suffix):
-        description: dict[str, dict[str, Any]] = {"data": {"file": path.name}}
-    else:
-        description = load_description(path, _KEYS)
+    description: dict[str, dict[str, Any]] = {"data": {"file": path.name}}
+    axes = [0, 1, 2]
+    if not TOUCHSTONE.fullmatch(path.suffix):
+        description, axes = load_description(path, _KEYS)
     data, sweep, radar = (description.get(name, {}) for name in ("data", "sweep", "radar"))
     files = _find_data_files(path.parent, data)
     tx, rx = (
-        element_array(radar.get(f"{end}_positions", [[0.0, 0.0, 0.0]]), end.upper())
+        element_array(radar.get(f"{end}_positions", [[0.0, 0.0, 0.0]]), end.upper(), axes)
         for end in ("tx", "rx")
     )
     source = _SweepFile(files[0], trusted)
@@ -122,10 +126,10 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     frequencies, beat = _select_band(frequencies, beat, sweep.get("band"))
     start, step = _frequency_spacing(frequencies)
     waveform = SteppedFrequency(start, step, len(frequencies), sweep.get("dwell", _DWELL))
-    places = _load_positions(source, radar.get("positions"), len(beat))
-    toward = radar.get("look_at")
+    places = _load_positions(source, radar.get("positions"), len(beat))[:, axes]
+    toward, center = (_parse_point(radar, name, axes) for name in ("look_at", "range_center"))
     device = Radar(tx, rx, waveform, places, None if toward is None else look_at(places, toward))
-    return Capture.from_beat(beat, _set_range_origin(device, source, radar))
+    return Capture.from_beat(beat, _set_range_origin(device, source, radar, center))
 
 
 def _select_band(
@@ -312,12 +316,22 @@ def _read_position_rows(file: Path) -> list[list[float]]:
         return [[float(row[axis]) for axis in "xyz"] for row in csv.DictReader(text.splitlines())]
 
 
-def _set_range_origin(device: Radar, source: _SweepFile, radar: dict[str, Any]) -> Radar:
+def _parse_point(radar: dict[str, Any], name: str, axes: list[int]) -> Float64[Tensor, "3"] | None:
+    """A point in the world that a description may state."""
+    if name not in radar:
+        return None
+    do = "give x, y, z in metres"
+    return checked_tensor(radar[name], (3,), f"{name} in [radar]", do)[axes]
+
+
+def _set_range_origin(
+    device: Radar, source: _SweepFile, radar: dict[str, Any], center: Tensor | None
+) -> Radar:
     """The radar with the range origin of its data."""
-    if "range_origin" in radar and "range_center" in radar:
+    if "range_origin" in radar and center is not None:
         raise InputError("expected range_origin or range_center in [radar], got both; remove one")
-    if "range_center" in radar:
-        return device.center_on(radar["range_center"])
+    if center is not None:
+        return device.center_on(center)
     if "range_origin" not in radar:
         return device
     given = np.ravel(source.values(radar["range_origin"])).astype(float)

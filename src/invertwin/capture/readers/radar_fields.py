@@ -20,6 +20,11 @@ WAVEFORMS: dict[str, type[Waveform]] = {
 }
 """Dataclasses that a file may name. Add one of your own to keep what it has measured."""
 
+FRAME = 2
+"""Number of the axes x forward, y left, z up. Files without it have x left, y up, z ahead."""
+OLD_AXES = [2, 0, 1]
+"""Where x forward, y left, z up are among the axes of a file that states none."""
+_AXES = "x forward, y left, z up"
 _VISIBILITY = {None: "auto", True: "shared", False: "separate"}
 
 
@@ -39,6 +44,7 @@ def radar_fields(radar: Radar) -> tuple[dict[str, xr.DataArray], dict[str, Any]]
     if radar.range_origin is not None:
         variables["range_origin"] = to_data_array(("frame",), radar.range_origin, "m")
     attributes: dict[str, Any] = {
+        "axes": _AXES,
         "waveform": kind,
         **asdict(waveform),  # type: ignore[call-overload]
         "window": radar.window,
@@ -59,6 +65,7 @@ def radar_from_fields(dataset: xr.Dataset) -> Radar:
     Raises:
         InputError: a missing or unknown attribute or variable.
     """
+    _get_choice(dataset.attrs, "axes", {_AXES: None})
     visibility = {name: shared for shared, name in _VISIBILITY.items()}
     return Radar(
         transmitters=_array_from_fields("tx", dataset),
@@ -71,6 +78,18 @@ def radar_from_fields(dataset: xr.Dataset) -> Radar:
         shared_visibility=_get_choice(dataset.attrs, "visibility", visibility),
         range_origin=read_tensor(dataset, "range_origin") if "range_origin" in dataset else None,
     )
+
+
+def convert_old_axes(dataset: xr.Dataset) -> xr.Dataset:
+    """The dataset with x forward, y left, z up: positions become P p, rotations P R Pᵀ.
+
+    Args:
+        dataset: of a file; one that states its axes stays as it is.
+    """
+    if "axes" in dataset.attrs:
+        return dataset
+    orders = {dim: OLD_AXES for dim in ("axis", "radar_axis") if dim in dataset.dims}
+    return dataset.isel(orders).assign_attrs(axes=_AXES)
 
 
 def _waveform(attributes: Mapping[Hashable, Any]) -> Waveform:

@@ -108,12 +108,12 @@ def _outline_cells(points: Float64[Tensor, "v 3"], antenna: Float64[Tensor, "3"]
     """Cells of the bounding rectangle of points seen from an antenna, at their nearest depth."""
     centre = points.mean(0)
     normal = torch.nn.functional.normalize(antenna - centre, dim=0)
-    right = orthogonal_unit_vectors(normal)
-    axes = torch.stack([right, cross(normal, right), normal], 1)
+    aside = orthogonal_unit_vectors(normal)
+    axes = torch.stack([normal, aside, cross(normal, aside)], 1)
     local = (points - centre) @ axes
     low, high = local.amin(0), local.amax(0)
-    center = centre + axes @ torch.cat([0.5 * (low + high)[:2], high[2:]])
-    size = (high - low).detach()[:2] / _CELLS_PER_SIDE
+    center = centre + axes @ torch.cat([high[:1], 0.5 * (low + high)[1:]])
+    size = (high - low).detach()[1:] / _CELLS_PER_SIDE
     steps = torch.arange(_CELLS_PER_SIDE, dtype=torch.float64) - 0.5 * (_CELLS_PER_SIDE - 1)
     offsets = torch.cartesian_prod(steps, steps) * size
     return PanelCells(center, axes, offsets, (float(size[0]), float(size[1])))

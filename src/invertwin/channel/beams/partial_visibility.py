@@ -37,9 +37,9 @@ class PanelCells:
 
     Attributes:
         center: centre of the panel in world axes [m].
-        axes: panel axes x, y and normal as columns, in world axes.
-        offsets: centres of the cells along x and y [m].
-        size: size of a cell along x and y [m].
+        axes: normal and panel axes y, z as columns, in world axes.
+        offsets: centres of the cells along y and z [m].
+        size: size of a cell along y and z [m].
     """
 
     center: Float64[Tensor, "3"]
@@ -50,7 +50,7 @@ class PanelCells:
     @property
     def centers(self) -> Float64[Tensor, "cell 3"]:
         """Centres of the cells in world axes [m]."""
-        return self.center + self.offsets @ self.axes[:, :2].T
+        return self.center + self.offsets @ self.axes[:, 1:].T
 
     @property
     def radius(self) -> float:
@@ -129,7 +129,7 @@ def _find_silhouette_edges(
     vertices: Tensor, topology: Topology, observers: Tensor, cells: PanelCells, reach: float
 ) -> _ShadowingEdges:
     """Find silhouette edges whose shadow boundaries lie within reach of the panel's centre."""
-    normal = cells.axes[:, 2]
+    normal = cells.axes[:, 0]
     found: list[_ShadowingEdges] = []
     count = len(topology.edges)
     for rows in torch.arange(len(observers)).split(max(1, _PAIRS_AT_ONCE // max(1, count))):
@@ -178,11 +178,11 @@ def _project_edges(
     points = ends[:, :1] + edges.interval[:, :, None] * (ends[:, 1] - ends[:, 0])[:, None]
     fraction = _edge_ray_fractions(edges, vertices, observers, cells)
     projection = observer[:, None] + (points - observer[:, None]) / fraction[..., None]
-    planar = (projection - cells.center) @ cells.axes[:, :2]
+    planar = (projection - cells.center) @ cells.axes[:, 1:]
     # The normal of the plane of observer and edge determines the shadowed side.
     plane = cross(points[:, 0] - observer, points[:, 1] - observer)
     sign = dot(plane, vertices[edges.apex] - ends[:, 0]).detach().sign()
-    shadow_side = sign[:, None] * (plane @ cells.axes[:, :2])
+    shadow_side = sign[:, None] * (plane @ cells.axes[:, 1:])
     return torch.cat([planar, (planar[:, 0] + shadow_side)[:, None]], 1)
 
 
@@ -190,7 +190,7 @@ def _edge_ray_fractions(
     edges: _ShadowingEdges, vertices: Tensor, observers: Tensor, cells: PanelCells
 ) -> Float64[Tensor, "row 2"]:
     """Positions of edge ends between observer and panel's plane, from 0 to 1."""
-    normal = cells.axes[:, 2]
+    normal = cells.axes[:, 0]
     height = (observers[edges.observer] - cells.center) @ normal
     ends = ((vertices[edges.ends] - cells.center) @ normal) / height[:, None]
     return 1 - (ends[:, :1] + edges.interval * (ends[:, 1:] - ends[:, :1]))
@@ -237,8 +237,8 @@ def _select_visible_edges(
     nearest = start + fraction[:, None] * side
     _, n = _shadow_distances(shadows, nearest)
     observer = observers[edges.observer]
-    foot = cells.center + nearest @ cells.axes[:, :2].T
-    step = _RAY_OFFSET * (foot - observer).norm(dim=1, keepdim=True) * (n @ cells.axes[:, :2].T)
+    foot = cells.center + nearest @ cells.axes[:, 1:].T
+    step = _RAY_OFFSET * (foot - observer).norm(dim=1, keepdim=True) * (n @ cells.axes[:, 1:].T)
     # Position of the edge between the observer and its shadow.
     first, last = _edge_ray_fractions(edges, vertices, observers, cells).unbind(1)
     limit = 1 / ((1 - fraction) / first + fraction / last)

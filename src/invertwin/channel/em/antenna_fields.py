@@ -8,7 +8,7 @@ from invertwin.channel.em.plane_waves import cross, polarisations
 from invertwin.channel.paths import Link
 from invertwin.scene.polarisation import Polarisation
 
-_UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)  # of the radar
+_UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)  # of the radar
 
 
 def antenna_fields(

@@ -238,7 +238,7 @@ def _antenna_silhouette_paths(
             transmission=passed if fixed.surfaces.has_sheets else None,
         )
         if not isinstance(at_receiver, bool):
-            state = walk.update_state(state, u=departure.x, v=departure.y, to_receiver=~at_receiver)
+            state = walk.update_state(state, u=departure.y, v=departure.z, to_receiver=~at_receiver)
         # Anew for each side: a derivative consumes the graph of the velocity.
         yield (speed if number == 0 else locate_shadow()[1]), state, run
 

@@ -122,7 +122,7 @@ class _CloudRays:
             origins=(origins[0], origins[1]),
             rotation=rotation,
             frame=torch.arange(link.frame_count).repeat_interleave(count),
-            box_points=cloud.low + numbers[:, :3] * (cloud.high - cloud.low),
+            box_points=cloud.low + numbers[:, :3].roll(1, 1) * (cloud.high - cloud.low),
             jitter=numbers[:, 3],
             steps=steps,
         )
@@ -170,7 +170,7 @@ class _CloudRays:
         (share,) = polarisation_shares(link, depolarising=False)
         scale = scale * share.for_bounces(1)
         power = scale * weight[:, None] * gain * scattered / return_length.square()
-        columns = [power, 0.5 * (distance + return_length), towards[1][..., 0], towards[1][..., 1]]
+        columns = [power, 0.5 * (distance + return_length), towards[1][..., 1], towards[1][..., 2]]
         return frame.reshape(-1), *(column.reshape(-1) for column in columns)  # type: ignore[return-value]
 
     def _clip_to_box(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:

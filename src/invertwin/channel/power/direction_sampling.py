@@ -13,7 +13,7 @@ import torch
 
 from invertwin.channel.power.integrand import SurfaceInteraction
 from invertwin.channel.power.surface import ScatteringLawTables, gaussian, opaque_row
-from invertwin.channel.rays.arrays import to_float
+from invertwin.channel.rays.arrays import tangent_frame, to_float
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.bounding_spheres import sample_cap
 from invertwin.channel.rays.ray_scene import RayScene
@@ -147,7 +147,7 @@ class DirectionSampler:
         numbers: list[mit.Float],
     ) -> mit.Vector3f:
         local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(numbers[2], numbers[3]))
-        omega = mi.Frame3f(facing).to_world(local)
+        omega = tangent_frame(facing).to_world(local)
         specular = 2 * dr.dot(incident, facing) * facing - incident
         limit = self._lobe_fraction(point, 0)
         for number, present in enumerate(self.surfaces.has_lobe):
@@ -184,7 +184,7 @@ class DirectionSampler:
         """Sample a direction beyond the surface about Snell's; zero if there is none."""
         here, beyond, variance = self._refractive_indices(point, incident)
         gauss = mi.warp.square_to_std_normal(mi.Point2f(numbers[2], numbers[3])) * dr.sqrt(variance)
-        frame = mi.Frame3f(mi.Vector3f(point.normal))
+        frame = tangent_frame(point.normal)
         local = frame.to_local(mi.Vector3f(incident))
         x, y = ((gauss[k] - here * local[k]) / beyond for k in range(2))
         rest = 1 - x * x - y * y

@@ -188,13 +188,13 @@ class PatternTable:
         if self.constant_gain is not None:
             return mi.Float(self.constant_gain)
         rows, columns = self.shape
-        t = (dr.clip(direction.z, -1.0, 1.0) + 1) * (0.5 * (rows - 1))
+        t = (dr.clip(direction.x, -1.0, 1.0) + 1) * (0.5 * (rows - 1))
         row = dr.minimum(mi.UInt32(dr.detach(t)), rows - 2)
         along = t - mi.Float(row)
         if columns == 1:
             low, high = (dr.gather(mi.Float, self.values, line) for line in (row, row + 1))
             return low + (high - low) * along
-        s = (dr.atan2(direction.y, direction.x) / (2 * dr.pi) + 0.5) * columns
+        s = (dr.atan2(direction.z, direction.y) / (2 * dr.pi) + 0.5) * columns
         column = dr.minimum(mi.UInt32(dr.detach(s)), columns - 1)
         across = s - mi.Float(column)
         nearby = (column + 1) % columns

@@ -15,7 +15,12 @@ from invertwin.channel.power.silhouettes import (
     is_not_grazing,
     trace_past_edge,
 )
-from invertwin.channel.rays.arrays import gather_points, scramble_seed, uniform_pair
+from invertwin.channel.rays.arrays import (
+    gather_points,
+    sample_sphere,
+    scramble_seed,
+    uniform_pair,
+)
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.differentiated_objects import NO_TARGET, DifferentiatedObjects
 from invertwin.channel.rays.ray_scene import RayScene
@@ -212,8 +217,7 @@ class InteriorSilhouetteSampler:
         """Sample a tangential direction; return it and its probability per solid angle."""
         first, second = uniform_pair(index, self.seeds[1])
         if not self.importance_sampling:
-            sphere = mi.warp.square_to_uniform_sphere(mi.Point2f(first, second))
-            return sphere, mi.Float(1 / (4 * dr.pi))
+            return sample_sphere(first, second), mi.Float(1 / (4 * dr.pi))
         along = dr.normalize(y1 - y0)
         x, y = self._azimuth_axes(edge, y0, along)
         start, span = self._tangential_azimuths(edge, y0, y1)

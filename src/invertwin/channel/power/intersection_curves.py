@@ -26,6 +26,7 @@ from invertwin.channel.power.transmission import (
 from invertwin.channel.rays.arrays import (
     gather_points,
     opaque,
+    sample_sphere,
     scramble_seed,
     to_index,
     to_points,
@@ -139,8 +140,7 @@ class IntersectionCurveSampler:
         antenna = inputs.antenna_position(frame, receiver)
         incident = dr.normalize(antenna - x)
         if deep:
-            numbers = mi.Point2f(*uniform_pair(index, self.seeds[1]))
-            sphere = mi.Vector3f(mi.warp.square_to_uniform_sphere(numbers))
+            sphere = sample_sphere(*uniform_pair(index, self.seeds[1]))
             incident = dr.select(count > 0, sphere, incident)
         origin = _offset_into_wedge(interactions[0], normals, incident).position
         transmission = trace_transmission(rays, inputs, origin, antenna, valid & (count == 0))
@@ -231,8 +231,8 @@ class _IncidentSubpath:
             length = dr.select(deep, done["optical_length"], length)
             self.keys = {
                 "to_receiver": self.other_end,
-                "u": dr.select(deep, done["u"], departure.x),
-                "v": dr.select(deep, done["v"], departure.y),
+                "u": dr.select(deep, done["u"], departure.y),
+                "v": dr.select(deep, done["v"], departure.z),
                 "previous_vertices": count,
             }
         self.incident, self.length = incident, length

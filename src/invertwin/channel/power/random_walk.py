@@ -326,8 +326,8 @@ def connect_path(
     found = integrand.connect_antenna(
         inputs, frame, point, incident, receiver, is_same_antenna=monostatic, antenna=antenna
     )
-    u: mit.Float = found.direction.x  # type: ignore[assignment]
-    v: mit.Float = found.direction.y  # type: ignore[assignment]
+    u: mit.Float = found.direction.y  # type: ignore[assignment]
+    v: mit.Float = found.direction.z  # type: ignore[assignment]
     if receiver is not True:
         u, v = dr.select(receiver, u, state["u"]), dr.select(receiver, v, state["v"])
     bounces = state["number"] + state.get("previous_vertices", 0)

@@ -78,7 +78,7 @@ class _VertexFactors:
         end, passed = self.connection, self.transmission
         power = self.throughput * end.factor * passed.transmittance * self.polarisation_factor
         length = 0.5 * (self.length + end.distance + passed.extra_length)
-        u, v = end.direction.x, end.direction.y
+        u, v = end.direction.y, end.direction.z
         return PathContribution(self.frame, power, length, u, v)  # type: ignore[arg-type]
 
 

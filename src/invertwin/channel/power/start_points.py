@@ -23,6 +23,7 @@ from invertwin.channel.power.transmission import (
 from invertwin.channel.rays.arrays import (
     gather_points,
     scramble_seed,
+    tangent_frame,
     to_float,
     to_points,
     uniform_pair,
@@ -98,7 +99,7 @@ class RaySampler:
         depth = dr.squared_norm(disk) * height
         spread = dr.sqrt(height * (2 - depth))
         local = mi.Vector3f(disk.x * spread, disk.y * spread, 1 - depth)
-        direction = dr.normalize(mi.Frame3f(axis).to_world(local))
+        direction = dr.normalize(tangent_frame(axis).to_world(local))
         group = own // self.spheres.group_size
         every = mi.Bool(True)
         found, around = self.spheres.group_density(rays, group, centre, direction, every, own)

@@ -126,3 +126,27 @@ def uniform_pair(
     """
     first, second = mi.sample_tea_32(index, seed)
     return mi.Float(first >> 8) * 2.0**-24, mi.Float(second >> 8) * 2.0**-24
+
+
+def tangent_frame(normal: mit.Vector3f) -> Any:
+    """Build a frame about a unit normal.
+
+    Mitsuba's tangents single out z. Here they single out the boresight, x: draws of a seed follow
+    the scene where its axes are permuted.
+
+    Args:
+        normal: third axis of the frame.
+    """
+    turned = mi.Frame3f(mi.Vector3f(normal.y, normal.z, normal.x))
+    s, t = (mi.Vector3f(v.z, v.x, v.y) for v in (turned.s, turned.t))
+    return mi.Frame3f(s, t, mi.Vector3f(normal))
+
+
+def sample_sphere(first: mit.Float, second: mit.Float) -> mit.Vector3f:
+    """Sample a direction uniformly.
+
+    Args:
+        first, second: uniform numbers; the first one counts from the boresight.
+    """
+    sphere = mi.warp.square_to_uniform_sphere(mi.Point2f(first, second))
+    return mi.Vector3f(sphere.z, sphere.x, sphere.y)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.channel.rays.arrays import opaque, to_float, to_index
+from invertwin.channel.rays.arrays import opaque, tangent_frame, to_float, to_index
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import morton_order
@@ -234,7 +234,7 @@ def sample_cap(axis: mit.Vector3f, height: mit.Float, numbers: list[mit.Float]) 
     depth = numbers[0] * height
     sine = dr.sqrt(dr.maximum(depth * (2 - depth), 0.0))
     s, c = dr.sincos(2 * dr.pi * numbers[1])
-    return dr.normalize(mi.Frame3f(axis).to_world(mi.Vector3f(c * sine, s * sine, 1 - depth)))
+    return dr.normalize(tangent_frame(axis).to_world(mi.Vector3f(c * sine, s * sine, 1 - depth)))
 
 
 def _cap_height(sine: mit.Float) -> mit.Float:

@@ -291,5 +291,5 @@ def morton_order(positions: np.ndarray) -> np.ndarray:
     if not len(positions):
         return np.zeros(0, dtype=np.int64)
     cells = ((positions - positions.min(0)) / (np.ptp(positions) or 1.0) * 1023).astype(np.int64)
-    bits = (cells[..., None] >> np.arange(10)) & 1
+    bits = (cells[..., [1, 2, 0], None] >> np.arange(10)) & 1  # boresight in the highest bits
     return np.argsort((bits << (3 * np.arange(10) + np.arange(3)[:, None])).sum((1, 2)))

@@ -50,8 +50,8 @@ class PlateSection(CrossSection):
     """Physical optics of a rectangle: 4πA²/λ² cos²θ with a sin(x)/x along each side.
 
     Attributes:
-        width: side along x [m].
-        height: side along y [m].
+        width: side along y [m].
+        height: side along z [m].
     """
 
     width: Positive
@@ -61,10 +61,10 @@ class PlateSection(CrossSection):
         """Compute σ [m²]."""
         wavelength = _wavelengths(frequencies)
         x, y, z = directions.T
-        sides = (self.width, x), (self.height, y)
+        sides = (self.width, y), (self.height, z)
         lobes = [torch.sinc(2 * side * part / wavelength) for side, part in sides]
         peak = 4 * math.pi * (self.width * self.height / wavelength) ** 2
-        return peak * (z * lobes[0] * lobes[1]) ** 2
+        return peak * (x * lobes[0] * lobes[1]) ** 2
 
 
 @dataclass(frozen=True)
@@ -189,12 +189,12 @@ def _logarithmic_derivatives(z: complex, count: int) -> NDArray[np.complex128]:
 class DihedralByMoments(CrossSection):
     """Square dihedral from the field of an infinite one, by a 2D method of moments.
 
-    σ = (2a²/λ) σ_2D, for directions orthogonal to the y axis. The ends of the plates along y are
+    σ = (2a²/λ) σ_2D, for directions orthogonal to the z axis. The ends of the plates along z are
     not modelled in two dimensions.
 
     Attributes:
         edge: side of the plates [m].
-        polarisation: "V" = E along y, "H" = H along y.
+        polarisation: "V" = E along z, "H" = H along z.
     """
 
     edge: Positive
@@ -203,7 +203,7 @@ class DihedralByMoments(CrossSection):
     def section(self, frequencies: Tensor, directions: Tensor) -> Tensor:
         """Compute σ [m²]."""
         rows = []
-        flat = directions[:, [0, 2]].numpy()
+        flat = directions[:, :2].numpy()
         for frequency in frequencies.tolist():
             wavelength = SPEED_OF_LIGHT / frequency
             nodes = self._nodes(wavelength)
@@ -216,7 +216,7 @@ class DihedralByMoments(CrossSection):
         """End points of the segments, from one free edge through the crease to the other."""
         count = math.ceil(self.edge / wavelength * _SEGMENTS_PER_WAVELENGTH)
         along = np.linspace(-1, 1, 2 * count + 1) * self.edge / math.sqrt(2)
-        return np.column_stack([along, -np.abs(along)])
+        return np.column_stack([-np.abs(along), along])
 
 
 def strip_section_tm(

@@ -13,11 +13,16 @@ from invertwin.cli.commands.look import AnyRecording, read_recording
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.options import TwinOptions
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
-from invertwin.cli.run_file import is_run_file, load_run, prefix_file_errors, require_section
+from invertwin.cli.run_file import (
+    FRAME,
+    is_run_file,
+    load_run,
+    prefix_file_errors,
+    require_section,
+)
 from invertwin.cli.schema import build
 from invertwin.cli.schema.recordings import SimulatedData
 from invertwin.discovery import Twin, average_chirps, twin
-from invertwin.inversion.initialisation.detections import Ground
 from invertwin.inversion.metrics import compare_shapes
 from invertwin.plotting import found as pictures
 from invertwin.plotting import spectrum
@@ -26,7 +31,7 @@ from invertwin.storage.run_folder import RunFolder
 
 _MIN_EXISTENCE_PROBABILITY = 0.5  # confidence of things that are counted
 # Of the command line; they win over those of a run file.
-_TWIN_OPTION_NAMES = ("low", "high", "range_max", "level", "height", "up", "rays", "seed")
+_TWIN_OPTION_NAMES = ("low", "high", "range_max", "level", "height", "rays", "seed")
 
 
 def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
@@ -44,9 +49,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
         options = table | options
     else:
         _, recording = read_recording(arguments)
-    ground = Ground(options.get("up", "y"))
-    rest = {name: value for name, value in options.items() if name != "up"}
-    found = twin(recording, ground=ground, **rest)
+    found = twin(recording, **options)
     sure = sum(one.existence_probability > _MIN_EXISTENCE_PROBABILITY for one in found.objects)
     metrics: dict[str, Any] = {
         "task": "twin",
@@ -116,13 +119,12 @@ def _score_twin(scene: Scene, truth: Scene) -> dict[str, Any]:
 
 
 def _object_table(twin: Twin) -> ReportTable:
-    up = twin.ground.up_axis
-    heads = ["thing", "kind", "confidence", *(f"{'xyz'[axis]} [m]" for axis in range(3))]
+    heads = ["thing", "kind", "confidence", *(f"{axis} [m]" for axis in "xyz")]
     heads += ["± [m]", "yaw [°]", "length, width, height [m]", "speed [m/s]"]
     rows: list[list[Any]] = []
     for thing in twin.objects:
         figure = thing.shape
-        along = [*("xyz"[axis] for axis in range(3) if axis != up), "range", "across"]
+        along = ("x", "y", "range", "across")
         known = [thing.deviations[name] for name in along if name in thing.deviations]
         size, yaw, rate = None, None, None
         if figure is not None:
@@ -150,15 +152,11 @@ def _describe_as_run(twin: Twin, folder: RunFolder) -> dict[str, Any]:
     assert twin.grid is not None
     assert twin.scene is not None
     scene: dict[str, Any] = {}
-    axis = twin.ground.up_axis
     for thing in twin.objects:
         if (figure := thing.shape) is None:
             continue
-        turn = [0.0, 0.0, 0.0]
-        turn[axis] = math.degrees(figure.yaw)
-        sides = [figure.length] * 3
-        sides[twin.ground.plane_axes[1]] = figure.width
-        sides[axis] = figure.height
+        turn = [0.0, 0.0, math.degrees(figure.yaw)]
+        sides = [figure.length, figure.width, figure.height]
         shape: dict[str, Any] = {"shape": "sphere", "radius": 0.5 * figure.length}
         if figure.kind in ("person", "vehicle", "corner", "prism"):
             item = twin.scene.objects[thing.name]
@@ -169,8 +167,6 @@ def _describe_as_run(twin: Twin, folder: RunFolder) -> dict[str, Any]:
             shape = {"shape": "box", "size": sides, "rotation_deg": turn}
         elif figure.kind == "cylinder":
             shape = {"shape": "cylinder", "radius": 0.5 * figure.length, "height": figure.height}
-            if twin.ground.up == "z":
-                shape["rotation_deg"] = [90.0, 0.0, 0.0]
         material = figure.material
         described: dict[str, Any] = {"kind": "rough_conductor"}
         if isinstance(material, RoughDielectric):
@@ -181,6 +177,7 @@ def _describe_as_run(twin: Twin, folder: RunFolder) -> dict[str, Any]:
     last = grid.range_start + grid.range_step * (grid.range_count - 1)
     return {
         "task": "reconstruct",
+        "frame": FRAME,
         "title": "What was found",
         "scene": scene,
         "data": {"kind": "capture", "file": "capture.nc"},

@@ -231,7 +231,7 @@ def _draw_turntable(fitted: BestFit, name: str) -> bytes:
     scenes = {"truth": problem.truth} if name in problem.known_objects else {}
     scenes |= {"start": fitted.start, "twin": fitted.twin}
     turns = problem.first_sensor.sensor.rotations
-    up = (0.0, 1.0, 0.0) if turns is None else turns.detach().mean(0)[:, 1]
+    up = (0.0, 0.0, 1.0) if turns is None else turns.detach().mean(0)[:, 2]
     found = {key: scene[name] for key, scene in scenes.items()}
     meshes = {key: Mesh(item.vertices, item.mesh.faces) for key, item in found.items()}
     return plotting.turntable(meshes, up)

@@ -12,7 +12,7 @@ from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Regist
 from invertwin.registry.section import PrintableText, Section, raise_key_error
 from invertwin.registry.section import key as described
 
-_DATASET_SECTIONS = ("task", "seed", "dataset", "vary")  # of the data set itself
+_DATASET_SECTIONS = ("task", "frame", "seed", "dataset", "vary")  # of the data set itself
 _KeyPathText = Annotated[PrintableText, MinLen(1)]
 _KeyPaths = FormOf((_KeyPathText, Annotated[list[_KeyPathText], MinLen(1)]))
 

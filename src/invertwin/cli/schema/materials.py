@@ -19,7 +19,7 @@ from invertwin.storage.untrusted import read_npy
 
 
 class TextureFile(Section):
-    """Values from an image, laid over the object as seen along its own z axis."""
+    """Values from an image, laid over the object as seen along its own x axis, its z axis up."""
 
     image: InputPath = key(
         "NumPy file (.npy) of rows of pixels, top row first, read at the middle of each triangle"

@@ -28,8 +28,8 @@ class AntennaTable(Section):
         '"V", "H", "circular" (right-hand) or two numbers (V, H)', "V"
     )
     orientation: Orientation | None = key(
-        "look_at or rotation_deg of its axes (x right, y up, z ahead); without it y is the world's "
-        "z axis and it looks along x",
+        "look_at or rotation_deg of its axes (x ahead, y left, z up); without it they are the "
+        "world's",
         None,
     )
 

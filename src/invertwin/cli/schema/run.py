@@ -119,6 +119,7 @@ class _RunFile(Section):
     """A whole run file; which sections a command needs is checked by the command."""
 
     task: Annotated[str, NameOf("task")] = key("what the file is for")
+    frame: Literal[2] = key("axes: 2 = x ahead, y to the left, z up")
     title: PrintableText = key("heading of the report", "")
     note: str = key("shown in the report", "")
     seed: Seed = key("seed of all random numbers", 0)

@@ -41,7 +41,7 @@ _LEAKAGE_HELP = "field of the orthogonal polarisation over that of the wanted on
 
 
 class ArrayTable(ConstructorTable):
-    """Antenna elements in the radar frame (x right, y up, z boresight)."""
+    """Antenna elements in the radar frame (x boresight, y left, z up)."""
 
     center: Vector = key("m, in the radar frame", [0.0, 0.0, 0.0])
     polarisation: PolarisationValue = key(_POLARISATION_HELP, "V")
@@ -59,7 +59,11 @@ class BoardTable(ConstructorTable):
     elevation: Literal[-1, 1] | None = key(
         "1 = rows grow upwards, -1 = downwards; required where there are several rows", None
     )
-    azimuth: Literal[-1, 1] = key("1 = columns grow to the right, -1 = to the left", 1)
+    azimuth: Literal[-1, 1] = key(
+        "1 = columns grow to the left of the radar (y), the right of who faces it, -1 = to its "
+        "right",
+        1,
+    )
     transmitters: ElementNumbers | None = key(
         "numbers from 1 in the order of sending; without it all, or those of the recording", None
     )
@@ -124,7 +128,7 @@ class RadarPoseTable(ConstructorTable):
     )
 
     def poses(self, frames: int) -> tuple[Tensor, Tensor]:
-        """Positions [frame, 3]; columns are the radar's right, up and boresight axes [frame, 3, 3].
+        """Positions [frame, 3]; columns are the radar's boresight, left and up axes [frame, 3, 3].
 
         Args:
             frames: Number of frames, where one position holds for all.

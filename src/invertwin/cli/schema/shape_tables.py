@@ -215,7 +215,7 @@ def follow_spline(
     Args:
         times: when each place is reached, rising; the frame must end before the last [s].
         places: x, y and z of each [m].
-        heading: turn it about the vertical, so that its front, −z, looks where it goes.
+        heading: turn it about the vertical, so that its front, −x, looks where it goes.
     """
     return TrajectoryMotion(SplineTrajectory(times, places), heading)
 
@@ -272,7 +272,7 @@ def body_joints(
     """Joint angles of an object with shape = "body", from those it has.
 
     Args:
-        joints: by name: the components of the rotation vector that are fitted, such as ["y"].
+        joints: by name: the components of the rotation vector that are fitted, such as ["z"].
 
     Raises:
         InputError: The object is no body, or has no such joint.

@@ -96,11 +96,11 @@ def map_axes(radar: Radar, grid: Grid) -> list[MapAxis]:
     waveform, array = require_sampled_waveform(radar), aperture(radar)
     window = unit_window(radar.window, waveform.samples)
     sample = torch.arange(waveform.samples, dtype=torch.float64) / waveform.max_range
-    x, y = array.x[array.column] / waveform.wavelength, array.y[array.row] / waveform.wavelength
+    y, z = array.y[array.column] / waveform.wavelength, array.z[array.row] / waveform.wavelength
     return [
         MapAxis(window, sample, grid.range_start, grid.range_step, grid.range_count),
-        MapAxis(array.weight, x, grid.u_start, grid.u_step, grid.u_count),
-        MapAxis(array.weight, y, grid.v_start, grid.v_step, grid.v_count),
+        MapAxis(array.weight, y, grid.u_start, grid.u_step, grid.u_count),
+        MapAxis(array.weight, z, grid.v_start, grid.v_step, grid.v_count),
     ]
 
 

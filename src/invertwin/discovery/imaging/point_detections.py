@@ -48,7 +48,7 @@ def detect_moving_targets(
     aways = torch.nn.functional.normalize(points.position.detach().double() - origin, dim=1)
     rates = points.velocity + aways @ own_velocity
     # Clutter removal subtracts the mean only; a direction is known to a fraction of a beam.
-    beam = direction_cell(aperture(radar).x, radar)
+    beam = direction_cell(aperture(radar).y, radar)
     blur = float(own_velocity.norm()) * beam * _DIRECTION_ERROR_BEAMS
     moves = rates.abs() > cell + blur
     cells = torch.tensor([radar.waveform.range_resolution, cell], dtype=torch.float64)

@@ -75,7 +75,7 @@ def thin_map(
     array = aperture(radar)
     cells = [
         radar.waveform.range_resolution,
-        *(direction_cell(p, radar) for p in (array.x, array.y)),
+        *(direction_cell(p, radar) for p in (array.y, array.z)),
     ]
     steps = [
         max(1, round(cell / step)) if count > 1 else 1
@@ -141,7 +141,7 @@ def compute_response(
         gain = link.tx_pattern.gain(seen[0]) * link.rx_pattern.gain(seen[1])
         gain = gain * radar.waveform.wavelength**2 / (4 * torch.pi) ** 3
         strength = (gain / (lengths[0] * lengths[1]) ** 2).numpy()
-        where = (0.5 * (lengths[0] + lengths[1]), seen[1][:, 0], seen[1][:, 1])
+        where = (0.5 * (lengths[0] + lengths[1]), seen[1][:, 1], seen[1][:, 2])
         row, value = np.zeros((len(positions), 1), dtype=np.int64), np.ones((len(positions), 1))
         inside = np.ones((len(positions), 1), dtype=bool)
         for table, place in zip(tables, where, strict=True):

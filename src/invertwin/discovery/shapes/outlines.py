@@ -29,13 +29,11 @@ def fit_outlines(
         shapes: fitted shapes.
     """
     cell = fitted.radar.waveform.range_resolution
-    touching = _group_touching(fitted, shapes, _MAX_GAP_CELLS * cell)
+    touching = _group_touching(shapes, _MAX_GAP_CELLS * cell)
     parts = [part for part in touching if _is_outline_candidate(part, _MIN_LENGTH_CELLS * cell)]
     if not parts:
         return list(shapes)
-    starts = [
-        merge_into_prism(_select_solid(part), fitted.ground, fitted.level, cell) for part in parts
-    ]
+    starts = [merge_into_prism(_select_solid(part), fitted.level, cell) for part in parts]
     freed = [one for part in parts for one in part]
     new, _ = fitted.fit([*starts, *_remove_shapes(shapes, freed)], _FIT_STEPS)
     found = list(shapes)
@@ -47,15 +45,13 @@ def fit_outlines(
     return found
 
 
-def _group_touching(
-    likelihood: ShapeLikelihood, shapes: Shapes, max_gap: float
-) -> list[list[ShapeParameters]]:
+def _group_touching(shapes: Shapes, max_gap: float) -> list[list[ShapeParameters]]:
     """Group shapes connected by gaps smaller than a limit [m]."""
     count = len(shapes)
     near = np.zeros((count, count))
     for a in range(count):
         for b in range(a):
-            near[a, b] = shape_gap(shapes[a], shapes[b], likelihood.ground) < max_gap
+            near[a, b] = shape_gap(shapes[a], shapes[b]) < max_gap
     total, labels = connected_components(near, directed=False)
     return [[shapes[k] for k in np.flatnonzero(labels == part).tolist()] for part in range(total)]
 

@@ -11,7 +11,6 @@ from jaxtyping import Float64
 from torch import Tensor, nn
 
 from invertwin.checks import check_fields
-from invertwin.inversion.initialisation.detections import Ground
 from invertwin.limits import Positive
 from invertwin.scene import (
     Material,
@@ -41,7 +40,7 @@ _CORNER_FALLOFF = CORNER_EXPONENT - 2  # in addition to the cos² of any plate
 _CORNER_PLATE_SIDE = 0.03  # side of the plate that represents a corner reflector [m]
 _MIN_SIZES, _MAX_SIZES = (0.01, 0.01, 0.01), (10.0, 10.0, 10.0)
 SIZE_LIMITS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
-    "person": ((0.4, 0.2, 1.2), (0.9, 0.5, 2.1)),
+    "person": ((0.2, 0.4, 1.2), (0.5, 0.9, 2.1)),
     "vehicle": ((3.0, 1.4, 1.2), (6.5, 2.3, 2.6)),
     "corner": (
         (_CORNER_PLATE_SIDE, _CORNER_PLATE_SIDE, 0.01),
@@ -84,11 +83,11 @@ class ShapeParameters:
             hanging arms. A vehicle is a car of usual proportions. A corner is a bright plate that
             reflects on one side, towards the opening of a corner reflector. A prism has vertical
             sides and any outline, see ``PrismParameters``.
-        position: position along the two axes of the ground [m].
-        yaw: rotation about the vertical, except for round shapes [rad]. At yaw 0, a vehicle faces
-            x; a person and a corner face −z if y is up, and y if z is up.
-        length: size along its first axis; the diameter of round shapes [m].
-        width: size along its second axis, of shapes with a yaw and of prisms [m].
+        position: x and y on the ground [m].
+        yaw: rotation about z, except for round shapes [rad]. At yaw 0, a vehicle faces x; a person
+            and a corner face −x.
+        length: size along x at yaw 0; the diameter of round shapes [m].
+        width: size along y at yaw 0, of shapes with a yaw and of prisms [m].
         height: height of the shape above the ground; for a sphere and a corner that of its centre
             [m].
         brightness: see ``Matte``.
@@ -149,13 +148,12 @@ class UnknownShape(nn.Module):
 
     Args:
         name: name of the object.
-        ground: ground plane with its upward axis.
         level: height of the ground [m].
-        position: initial position along the two axes of the ground [m].
+        position: initial x and y [m].
         brightness: initial brightness, see ``Matte``.
 
     Attributes:
-        place: parameter [2], position [m].
+        place: parameter [2], x and y [m].
         strength: parameter, a tenth of the logarithm of the brightness.
     """
 
@@ -163,15 +161,10 @@ class UnknownShape(nn.Module):
     TURN_SCALE, SIZE_SCALE, STRENGTH_SCALE = 2.0, 3.0, 10.0
 
     def __init__(
-        self,
-        name: str,
-        ground: Ground,
-        level: float,
-        position: tuple[float, float],
-        brightness: float,
+        self, name: str, level: float, position: tuple[float, float], brightness: float
     ) -> None:
         super().__init__()
-        self.object, self.ground, self.level = name, ground, level
+        self.object, self.level = name, level
         self.place = nn.Parameter(torch.tensor(position, dtype=torch.float64))
         strength = math.log(brightness) / self.STRENGTH_SCALE
         self.strength = nn.Parameter(torch.tensor(strength, dtype=torch.float64))
@@ -198,8 +191,8 @@ class UnknownShape(nn.Module):
         """Return the two coordinates of its position."""
         along = torch.eye(2, dtype=torch.float64)
         return [
-            Coordinate(f"{self.object}.{'xyz'[axis]}", "m", {"place": row}, 0.1)
-            for axis, row in zip(self.ground.plane_axes, along, strict=True)
+            Coordinate(f"{self.object}.{axis}", "m", {"place": row}, 0.1)
+            for axis, row in zip("xy", along, strict=True)
         ]
 
     def brightness_coordinate(self) -> Coordinate:
@@ -215,7 +208,6 @@ class PrimitiveModel(UnknownShape):
     Args:
         name: name of the object.
         start: initial shape parameters.
-        ground: ground plane with its upward axis.
         level: height of the ground [m].
 
     Attributes:
@@ -224,10 +216,8 @@ class PrimitiveModel(UnknownShape):
             its height in m.
     """
 
-    def __init__(
-        self, name: str, start: ShapeParameters, ground: Ground, level: float = 0.0
-    ) -> None:
-        super().__init__(name, ground, level, start.position, start.brightness)
+    def __init__(self, name: str, start: ShapeParameters, level: float = 0.0) -> None:
+        super().__init__(name, level, start.position, start.brightness)
         self.kind: ShapeKind = start.kind
         self.round = start.has_free_height
         self.low, self.high = SIZE_LIMITS.get(start.kind, (_MIN_SIZES, _MAX_SIZES))
@@ -262,34 +252,24 @@ class PrimitiveModel(UnknownShape):
 
     def mesh(self) -> Mesh:
         """Return the shape in the world, differentiable with respect to all parameters."""
-        unit = _unit_mesh(self.kind, self.ground.up)
-        first, second = self.ground.plane_axes
-        up = self.ground.up_axis
-        size = self.sides
-        sides = [size[0]] * 3
-        if not self.round:
-            sides[up] = size[2]
-        if self.kind in _RECTANGULAR_KINDS:
-            sides[second] = size[1]
-        middle = [self.level + 0.5 * size[2]] * 3
+        unit = _unit_mesh(self.kind)
+        length, width, height = self.sides
+        if self.kind not in _RECTANGULAR_KINDS:
+            width = length
         if self.round:
-            middle[up] = self.level + self.size[2]
-        middle[first], middle[second] = self.place.unbind()
-        local = unit.vertices * torch.stack(sides)
+            height = length
+        middle = self.level + (self.size[2] if self.round else 0.5 * height)
+        x, y, z = (unit.vertices * torch.stack([length, width, height])).unbind(-1)
         yaw = self.TURN_SCALE * self.turn
         c, s = yaw.cos(), yaw.sin()
-        # As ``Ground.yaw_rotation``: about y from z to x, about z from x to y.
-        sign = self.ground.yaw_sign
-        columns = list(local.unbind(-1))
-        a, b = columns[first], columns[second]
-        columns[first], columns[second] = c * a - sign * s * b, sign * s * a + c * b
-        return Mesh(torch.stack(columns, dim=-1) + torch.stack(middle), unit.faces)
+        local = torch.stack([c * x - s * y, s * x + c * y, z], dim=-1)
+        return Mesh(local + torch.cat([self.place, middle[None]]), unit.faces)
 
     @property
     def item(self) -> Object:
         """Return the object, differentiable with respect to all parameters."""
         if self.kind == "corner":
-            brightness = self.brightness * _mark_front_triangles(self.ground.up)
+            brightness = self.brightness * _mark_front_triangles()
             return Object(self.mesh(), Matte(brightness, _CORNER_FALLOFF))
         return super().item
 
@@ -323,67 +303,52 @@ class PrimitiveModel(UnknownShape):
         return [*rows, self.brightness_coordinate()]
 
 
-def shape_center(shape: ShapeParameters, ground: Ground, level: float) -> Float64[Tensor, "3"]:
+def shape_center(shape: ShapeParameters, level: float) -> Float64[Tensor, "3"]:
     """Return the centre of a shape [m].
 
     Args:
         shape: shape parameters.
-        ground: ground plane.
         level: height of the ground [m].
     """
-    position = torch.zeros(3, dtype=torch.float64)
-    position[list(ground.plane_axes)] = torch.tensor(shape.position, dtype=torch.float64)
     half = shape.height if shape.has_free_height else 0.5 * shape.height
-    position[ground.up_axis] = level + half
-    return position
+    return torch.tensor([*shape.position, level + half], dtype=torch.float64)
 
 
-def corner_direction(yaw: float, ground: Ground) -> Float64[Tensor, "2"]:
+def corner_direction(yaw: float) -> Float64[Tensor, "2"]:
     """Return the direction along the ground in which a corner opens.
 
     Args:
         yaw: yaw of the corner [rad].
-        ground: ground plane.
     """
-    c, s = math.cos(ground.yaw_sign * yaw), math.sin(ground.yaw_sign * yaw)
-    ahead = -1.0 if ground.up == "y" else 1.0
-    return ahead * torch.tensor([-s, c], dtype=torch.float64)
+    return -torch.tensor([math.cos(yaw), math.sin(yaw)], dtype=torch.float64)
 
 
-def rotate_shape(shape: ShapeParameters, rotation: float, ground: Ground) -> ShapeParameters:
+def rotate_shape(shape: ShapeParameters, rotation: float) -> ShapeParameters:
     """Rotate a shape about the mean of its surface, not about its centre.
 
     Args:
         shape: shape parameters.
         rotation: increase of its yaw [rad].
-        ground: ground plane.
     """
-    unit = _unit_mesh(shape.kind, ground.up).vertices.mean(0)[list(ground.plane_axes)]
+    unit = _unit_mesh(shape.kind).vertices.mean(0)[:2]
     x, y = (unit * torch.tensor([shape.length, shape.width], dtype=torch.float64)).tolist()
-    before, after = ground.yaw_sign * shape.yaw, ground.yaw_sign * (shape.yaw + rotation)
     rows = [
         (math.cos(a) * x - math.sin(a) * y, math.sin(a) * x + math.cos(a) * y)
-        for a in (before, after)
+        for a in (shape.yaw, shape.yaw + rotation)
     ]
     first, second = (p + a - b for p, a, b in zip(shape.position, *rows, strict=True))
     return replace(shape, position=(first, second), yaw=shape.yaw + rotation)
 
 
 @cache
-def _unit_mesh(kind: str, up: str) -> Mesh:
+def _unit_mesh(kind: str) -> Mesh:
     """Return the mesh of a shape of unit size about the origin."""
     if kind in ("wall", "box"):
         return box(1.0)
     if kind in ("sphere", "point"):
         return sphere(0.5, 2)
-    upright = {"person": _person_mesh, "vehicle": _vehicle_mesh, "corner": _corner_mesh}.get(
-        kind, _cylinder_mesh
-    )()
-    # Quarter rotation about x: y to z.
-    return upright if up == "y" else Mesh(upright.vertices @ _Y_TO_Z_ROTATION, upright.faces)
-
-
-_Y_TO_Z_ROTATION = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
+    builders = {"person": _person_mesh, "vehicle": _vehicle_mesh, "corner": _corner_mesh}
+    return builders.get(kind, _cylinder_mesh)()
 
 
 def _cylinder_mesh() -> Mesh:
@@ -391,7 +356,7 @@ def _cylinder_mesh() -> Mesh:
 
 
 def _person_mesh() -> Mesh:
-    """Return a person with hanging arms facing −z, stretched to a cube."""
+    """Return a person with hanging arms facing −x, stretched to a cube."""
     body = person(spacing=0.05)
     turns = torch.eye(3, dtype=torch.float64).repeat(len(body.names), 1, 1)
     for side in ("left", "right"):
@@ -431,19 +396,18 @@ _VEHICLE_LAYERS = (
 def _vehicle_layer(high: float, rear: float, front: float, wide: float) -> list[list[float]]:
     """Return the corners of one layer of a car: a rectangle with cut corners."""
     cut, aside = 0.07, 0.3 * wide
-    rows = [(front, aside), (front - cut, 0.5 * wide), (rear + cut, 0.5 * wide), (rear, aside)]
-    rows += [(x, -z) for x, z in reversed(rows)]
-    return [[x, high - 0.5, z] for x, z in rows]
+    rows = [(front, -aside), (front - cut, -0.5 * wide), (rear + cut, -0.5 * wide), (rear, -aside)]
+    rows += [(x, -y) for x, y in reversed(rows)]
+    return [[x, y, high - 0.5] for x, y in rows]
 
 
 def _corner_mesh() -> Mesh:
-    """Return a plate that faces −z."""
-    return box((1.0, 1.0, 0.1))
+    """Return a plate that faces −x."""
+    return box((0.1, 1.0, 1.0))
 
 
 @cache
-def _mark_front_triangles(up: str) -> Float64[Tensor, " triangle"]:
+def _mark_front_triangles() -> Float64[Tensor, " triangle"]:
     """Return 1 for triangles of a corner's plate on its open side, else 0."""
-    mesh = _unit_mesh("corner", up)
-    ahead = mesh.vertices[:, 2] < 0 if up == "y" else mesh.vertices[:, 1] > 0
-    return ahead[mesh.faces].all(1).double()
+    mesh = _unit_mesh("corner")
+    return (mesh.vertices[:, 0] < 0)[mesh.faces].all(1).double()

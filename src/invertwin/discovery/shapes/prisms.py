@@ -14,7 +14,6 @@ from invertwin.discovery.shapes.primitives import (
     Shapes,
     UnknownShape,
 )
-from invertwin.inversion.initialisation.detections import Ground
 from invertwin.scene import DistanceGrid, Mesh, iso_surface, signed_distance
 from invertwin.scene.parameters import Coordinate
 from invertwin.scene.shape_models.lattice import Lattice
@@ -29,31 +28,27 @@ class PrismParameters(ShapeParameters):
     """Shape with vertical sides and any outline, without a yaw.
 
     Attributes:
-        distances: signed distances to the outline at nodes on the ground, negative inside [m].
+        distances: signed distances to the outline at nodes along x and y, negative inside [m].
         spacing: node spacing [m].
-        middle: centre of the nodes along the two axes of the ground [m].
+        middle: x and y of the centre of the nodes [m].
     """
 
-    distances: Float64[Tensor, "a b"]
+    distances: Float64[Tensor, "x y"]
     spacing: float
     middle: tuple[float, float]
 
 
-def merge_into_prism(
-    shapes: Shapes, ground: Ground, level: float, spacing: float
-) -> PrismParameters:
+def merge_into_prism(shapes: Shapes, level: float, spacing: float) -> PrismParameters:
     """Merge shapes into one prism: their union, with the height of the largest.
 
     Args:
         shapes: shapes to merge.
-        ground: ground plane.
         level: height of the ground [m].
         spacing: minimum node spacing [m].
     """
-    up, axes = ground.up_axis, list(ground.plane_axes)
     with torch.no_grad():
-        meshes = [make_shape_model("", one, ground, level).item.mesh for one in shapes]
-    points = torch.cat([mesh.vertices for mesh in meshes])[:, axes]
+        meshes = [make_shape_model("", one, level).item.mesh for one in shapes]
+    points = torch.cat([mesh.vertices for mesh in meshes])[:, :2]
     low, high = points.amin(0), points.amax(0)
     step = max(spacing, float((high - low).max()) / (_MAX_NODES - 2 * _MARGIN_NODES))
     counts = [math.ceil(float(side) / step) + 2 * _MARGIN_NODES + 1 for side in high - low]
@@ -64,10 +59,10 @@ def merge_into_prism(
     ]
     grid_points = torch.cartesian_prod(*lines)
     nodes = torch.zeros(len(grid_points), 3, dtype=torch.float64)
-    nodes[:, axes] = grid_points
+    nodes[:, :2] = grid_points
     parts: list[Tensor] = []
     for mesh in meshes:
-        nodes[:, up] = 0.5 * (mesh.vertices[:, up].amin() + mesh.vertices[:, up].amax())
+        nodes[:, 2] = 0.5 * (mesh.vertices[:, 2].amin() + mesh.vertices[:, 2].amax())
         parts.append(signed_distance(mesh, nodes))
     largest = max(shapes, key=lambda one: one.length * one.width)
     x, y = middle.tolist()
@@ -88,7 +83,6 @@ class OutlineModel(UnknownShape):
     Args:
         name: name of the object.
         start: initial shape parameters.
-        ground: ground plane with its upward axis.
         level: height of the ground [m].
 
     Attributes:
@@ -97,16 +91,14 @@ class OutlineModel(UnknownShape):
         size: parameter, a third of the logarithm of the height.
     """
 
-    def __init__(
-        self, name: str, start: PrismParameters, ground: Ground, level: float = 0.0
-    ) -> None:
-        super().__init__(name, ground, level, start.middle, start.brightness)
+    def __init__(self, name: str, start: PrismParameters, level: float = 0.0) -> None:
+        super().__init__(name, level, start.middle, start.brightness)
         self.start = start
         counts = torch.tensor(start.distances.shape, dtype=torch.float64)
         half = torch.ones(3, dtype=torch.float64)
-        half[list(ground.plane_axes)] = 0.5 * start.spacing * (counts - 1)
+        half[:2] = 0.5 * start.spacing * (counts - 1)
         # Equal distances at two heights keep the sides vertical.
-        same = torch.stack([start.distances] * 2, dim=ground.up_axis)
+        same = torch.stack([start.distances] * 2, dim=2)
         self.sides = DistanceGrid(name, (-half).tolist(), half.tolist(), same, _SMOOTHING)
         size = math.log(start.height) / self.SIZE_SCALE
         self.size = nn.Parameter(torch.tensor(size, dtype=torch.float64))
@@ -120,12 +112,12 @@ class OutlineModel(UnknownShape):
     def shape(self) -> PrismParameters:
         """Return its present shape parameters."""
         with torch.no_grad():
-            sides = self.mesh().vertices[:, list(self.ground.plane_axes)]
+            sides = self.mesh().vertices[:, :2]
             low, high = sides.amin(0), sides.amax(0)
             x, y = (0.5 * (low + high)).tolist()
             length, width = (high - low).tolist()
             a, b = self.place.tolist()
-            distances = self.sides.distances.select(self.ground.up_axis, 0).clone()
+            distances = self.sides.distances[:, :, 0].clone()
         return replace(
             self.start,
             position=(x, y),
@@ -139,20 +131,18 @@ class OutlineModel(UnknownShape):
 
     def mesh(self) -> Mesh:
         """Return the surface in the world, differentiable with respect to all parameters."""
-        up, grid = self.ground.up_axis, self.sides.lattice
+        grid = self.sides.lattice
         low, high, counts = grid.low.clone(), grid.high.clone(), list(grid.counts)
-        place = torch.zeros(3, dtype=torch.float64)
-        place[up] = self.level
-        place = place.index_put((torch.tensor(self.ground.plane_axes),), self.place)
+        place = torch.cat([self.place, self.place.new_tensor([self.level])])
         step, tall = self.start.spacing, float(self.height.detach())
-        counts[up] = math.ceil(tall / step) + 4
-        low[up], high[up] = -2 * step, tall + 2 * step
+        counts[2] = math.ceil(tall / step) + 4
+        low[2], high[2] = -2 * step, tall + 2 * step
 
         def signed_distance_field(points: Tensor) -> Tensor:
             local = points - place
-            beside = local.index_fill(1, torch.tensor([up]), 0.0)
+            beside = local.index_fill(1, torch.tensor([2]), 0.0)
             half = 0.5 * self.height
-            above = (local[:, up] - half).abs() - half
+            above = (local[:, 2] - half).abs() - half
             return torch.maximum(self.sides.distance(beside), above)
 
         at = place.detach()
@@ -172,19 +162,18 @@ class OutlineModel(UnknownShape):
 
 
 def make_shape_model(
-    name: str, shape: ShapeParameters, ground: Ground, level: float
+    name: str, shape: ShapeParameters, level: float
 ) -> PrimitiveModel | OutlineModel:
     """Build the module of an unknown shape.
 
     Args:
         name: name of the object.
         shape: initial shape parameters.
-        ground: ground plane.
         level: height of the ground [m].
     """
     if isinstance(shape, PrismParameters):
-        return OutlineModel(name, shape, ground, level)
-    return PrimitiveModel(name, shape, ground, level)
+        return OutlineModel(name, shape, level)
+    return PrimitiveModel(name, shape, level)
 
 
 def prism_contour(prism: PrismParameters) -> Float64[Tensor, "corner 2"]:

@@ -93,7 +93,7 @@ def candidate_rotations(module: nn.Module, twin: Scene) -> Iterator[Float64[Tens
     def rotate_object(vector: Tensor) -> Mesh:
         return _world_mesh(displace(item, torch.zeros(3, dtype=torch.float64), vector))
 
-    for axis, name in zip(own, ("pitch", "yaw", "roll"), strict=True):
+    for axis, name in zip(own[[1, 2, 0]], ("pitch", "yaw", "roll"), strict=True):
         if name not in free:
             continue
         alike = (

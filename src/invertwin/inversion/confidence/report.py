@@ -10,7 +10,7 @@ from invertwin.inversion.metrics import pose_error
 from invertwin.inversion.reconstruction import Reconstruction
 from invertwin.scene.scene import Object
 
-_COORDINATES = ("x", "y", "z", "pitch", "yaw", "roll")
+_COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 def confidence_metrics(fit: Reconstruction, truth: Mapping[str, Object]) -> dict[str, Any]:

@@ -7,7 +7,6 @@ its heading. The fit refines them. Not differentiable.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float64, Int64
@@ -19,7 +18,7 @@ from torch import Tensor
 from invertwin.capture.backprojection import backproject
 from invertwin.capture.capture import Capture
 from invertwin.channel import Grid, Sampling
-from invertwin.checks import ArrayLike, check_fields, checked_number
+from invertwin.checks import ArrayLike, checked_number
 from invertwin.errors import InputError
 from invertwin.radar.processing.detection import ordered_statistics_cfar, peaks
 from invertwin.radar.radar import Radar
@@ -35,48 +34,14 @@ _CFAR_RANK = 0.25  # rank among the training cells, most of which may contain th
 _POINTS_PER_CHUNK = 20_000  # points of an image per chunk
 
 
-@dataclass(frozen=True)
-class Ground:
-    """Ground plane, defined by the upward world axis."""
-
-    up: Literal["y", "z"] = "y"
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-
-    @property
-    def up_axis(self) -> int:
-        """Index of the upward axis."""
-        return "xyz".index(self.up)
-
-    @property
-    def plane_axes(self) -> tuple[int, int]:
-        """Indices of the two axes of the plane."""
-        return (0, 2) if self.up == "y" else (0, 1)
-
-    @property
-    def yaw_sign(self) -> float:
-        """1 if a positive yaw turns the first axis of the plane to the second, else −1."""
-        return -1.0 if self.up == "y" else 1.0
-
-    def yaw_rotation(self, yaw: float) -> Float64[Tensor, "3 3"]:
-        """Return the rotation by a yaw [rad] about the upward axis."""
-        vector = torch.zeros(3, dtype=torch.float64)
-        vector[self.up_axis] = yaw
-        return rotation_from_vector(vector)
-
-
-_DEFAULT_GROUND = Ground()
-
-
 @dataclass(frozen=True, eq=False)
 class GroundRectangle:
-    """Rectangle of an object on the ground.
+    """Rectangle of an object on the ground, the plane of x and y.
 
     Attributes:
         center: middle of the points' extents in world axes [m].
-        yaw: rotation of its sides about the vertical [rad], in [0, π/2) from a fit.
-        size: side lengths along its first and second axis [m].
+        yaw: rotation of its sides about z [rad], in [0, π/2) from a fit.
+        size: side lengths at yaw 0 along x and along y [m].
     """
 
     center: Float64[Tensor, "3"]
@@ -205,12 +170,17 @@ def find_largest_group(points: Float64[Tensor, "point 3"], gap: float) -> Float6
     return points[labels == torch.bincount(labels).argmax()]
 
 
+def yaw_rotation(yaw: float) -> Float64[Tensor, "3 3"]:
+    """Return the rotation by a yaw [rad] about z.
+
+    Args:
+        yaw: angle, positive from x towards y [rad].
+    """
+    return rotation_from_vector(torch.tensor([0.0, 0.0, yaw], dtype=torch.float64))
+
+
 def fit_rectangle(
-    points: Float64[Tensor, "point 3"],
-    radar: Radar,
-    *,
-    ground: Ground = _DEFAULT_GROUND,
-    resolution: float = 0.1,
+    points: Float64[Tensor, "point 3"], radar: Radar, *, resolution: float = 0.1
 ) -> GroundRectangle:
     """Fit a rectangle in the ground plane to points on its near sides, an L shape.
 
@@ -225,7 +195,6 @@ def fit_rectangle(
     Args:
         points: positions in world axes [point, 3] [m].
         radar: radar whose positions determine the near sides.
-        ground: ground plane.
         resolution: distance below which points count as on a side [m].
 
     Raises:
@@ -235,7 +204,7 @@ def fit_rectangle(
         raise InputError(f"expected at least 3 points, got {len(points)}; use pose = 'position'")
 
     def score(found: GroundRectangle) -> float:
-        axes = ground.yaw_rotation(found.yaw)[:, ground.plane_axes]
+        axes = yaw_rotation(found.yaw)[:, :2]
         offsets = (points - found.center) @ axes
         away = (radar.positions.detach().mean(0) - found.center) @ axes
         half = torch.tensor(found.size).double() / 2
@@ -246,23 +215,18 @@ def fit_rectangle(
         return float((1 / sides.clamp_min(resolution)).sum())
 
     yaws = torch.linspace(0, math.pi / 2, _YAW_COUNT, dtype=torch.float64)[:-1].tolist()
-    return max((_bounding_rectangle(points, yaw, ground) for yaw in yaws), key=score)
+    return max((_bounding_rectangle(points, yaw) for yaw in yaws), key=score)
 
 
-def principal_rectangle(
-    points: Float64[Tensor, "point 3"], *, ground: Ground = _DEFAULT_GROUND
-) -> GroundRectangle:
+def principal_rectangle(points: Float64[Tensor, "point 3"]) -> GroundRectangle:
     """Fit a rectangle along the points' principal axes in the ground plane.
 
     Args:
         points: positions [point, 3] [m].
-        ground: ground plane.
     """
-    _, axes = torch.linalg.eigh(torch.cov(points[:, ground.plane_axes].T))
-    first = axes[:, 1]
-    # The image of the first ground axis under a yaw about y is (cos, −sin) in (x, z).
-    yaw = math.atan2(ground.yaw_sign * float(first[1]), float(first[0]))
-    return _bounding_rectangle(points, yaw, ground)
+    _, axes = torch.linalg.eigh(torch.cov(points[:, :2].T))
+    x, y = axes[:, 1].tolist()
+    return _bounding_rectangle(points, math.atan2(y, x))
 
 
 def estimate_position(points: Float64[Tensor, "point 3"]) -> Float64[Tensor, "3"]:
@@ -271,7 +235,7 @@ def estimate_position(points: Float64[Tensor, "point 3"]) -> Float64[Tensor, "3"
 
 
 def candidate_poses(
-    item: Object, rectangle: GroundRectangle, radar: Radar, *, ground: Ground = _DEFAULT_GROUND
+    item: Object, rectangle: GroundRectangle, radar: Radar
 ) -> list[Float64[Tensor, "4 4"]]:
     """Return the four poses of an object of known size in a rectangle.
 
@@ -284,24 +248,23 @@ def candidate_poses(
         item: object whose present pose gives attitude and height.
         rectangle: rectangle around its points.
         radar: radar with its positions.
-        ground: ground plane.
     """
     center = item.center.detach()
     start = item.transform.detach()
     level = item.vertices.detach() - center
     where = radar.positions.detach().mean(0)
-    axes = ground.yaw_rotation(rectangle.yaw)[:, ground.plane_axes]
+    axes = yaw_rotation(rectangle.yaw)[:, :2]
     half = torch.tensor(rectangle.size).double() / 2
     away = (where - rectangle.center) @ axes
     poses = []
     for quarter in range(4):
-        rotation = ground.yaw_rotation(rectangle.yaw + quarter * math.pi / 2)
+        rotation = yaw_rotation(rectangle.yaw + quarter * math.pi / 2)
         own = (level @ rotation.T) @ axes
         # Middle of the object whose near side is that of the rectangle.
         near = torch.where(away > 0, half - own.amax(0), -half - own.amin(0))
         middle = -0.5 * (own.amax(0) + own.amin(0))
         position = rectangle.center + axes @ torch.where(away.abs() > half, near, middle)
-        position[ground.up_axis] = center[ground.up_axis]
+        position[2] = center[2]
         poses.append(rigid(rotation, position - rotation @ center) @ start)
     return poses
 
@@ -348,9 +311,7 @@ def select_pose(
     return scenes[losses.index(min(losses))], losses
 
 
-def estimate_scale(
-    item: Object, rectangle: GroundRectangle, *, ground: Ground = _DEFAULT_GROUND
-) -> float:
+def estimate_scale(item: Object, rectangle: GroundRectangle) -> float:
     """Estimate a scale: the longer side of a rectangle over that of an object.
 
     The longer side is visible from most positions; the far end of the other is often hidden.
@@ -358,9 +319,8 @@ def estimate_scale(
     Args:
         item: object of known shape.
         rectangle: rectangle around its points.
-        ground: ground plane.
     """
-    extent = item.vertices.detach()[:, ground.plane_axes]
+    extent = item.vertices.detach()[:, :2]
     return max(rectangle.size) / float((extent.amax(0) - extent.amin(0)).max())
 
 
@@ -397,9 +357,9 @@ def estimate_density(
     return DensityGrid(name, low, high, density)
 
 
-def _bounding_rectangle(points: Tensor, yaw: float, ground: Ground) -> GroundRectangle:
+def _bounding_rectangle(points: Tensor, yaw: float) -> GroundRectangle:
     """Return the rectangle at a yaw around all but the outermost points."""
-    axes = ground.yaw_rotation(yaw)[:, ground.plane_axes]
+    axes = yaw_rotation(yaw)[:, :2]
     middle = points.median(0).values
     places = (points - middle) @ axes
     ends = (_TRIMMED_FRACTION, 1 - _TRIMMED_FRACTION)
@@ -419,22 +379,22 @@ def _incoherent_power(maps: Tensor, radar: Radar, grid: Grid, points: Tensor) ->
         seen = (to_rx / to_rx.norm(dim=1, keepdim=True)) @ link.rotations[frame].detach()
         places = (
             (ranges - origins[frame] - grid.range_start) / grid.range_step,
-            (seen[:, 0] - grid.u_start) / grid.u_step * (grid.u_count > 1),
-            (seen[:, 1] - grid.v_start) / grid.v_step * (grid.v_count > 1),
+            (seen[:, 1] - grid.u_start) / grid.u_step * (grid.u_count > 1),
+            (seen[:, 2] - grid.v_start) / grid.v_step * (grid.v_count > 1),
         )
         # Beyond the outer bins the map falls to zero within one bin.
         sampled = map_coordinates(
             maps[frame].numpy(), torch.stack(places).numpy(), order=1, mode="grid-constant"
         )
-        total += torch.from_numpy(sampled) * ranges**4 * (seen[:, 2] > 0)
+        total += torch.from_numpy(sampled) * ranges**4 * (seen[:, 0] > 0)
     return total / radar.frame_count
 
 
 def _unresolved_height(radar: Radar, grid: Grid) -> int | None:
-    """Return the world axis nearest to the radar's y axis, if directions have at most one axis."""
+    """Return the world axis nearest to the radar's z axis, if directions have at most one axis."""
     if grid.u_count > 1 and grid.v_count > 1:
         return None
-    return int(radar.link().rotations.detach()[0, :, 1].abs().argmax())
+    return int(radar.link().rotations.detach()[0, :, 2].abs().argmax())
 
 
 def _require_echoes(image: Tensor) -> Tensor:

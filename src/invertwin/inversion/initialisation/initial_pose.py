@@ -12,7 +12,6 @@ from invertwin.capture import Capture
 from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.inversion.initialisation.detections import (
-    Ground,
     candidate_poses,
     detect_echoes,
     estimate_position,
@@ -61,7 +60,6 @@ class InitialPoseEstimator:
         pose: estimated attitude: near sides of a rectangle, principal axes, position only, or known
             pose with an unknown density
         scale: whether the size is estimated from the rectangle
-        up: upward world axis
         false_alarm: false-alarm probability of a cell, for points
         step: node spacing of the image [m]
         gap: maximum gap between echoes of one object [m]
@@ -75,7 +73,6 @@ class InitialPoseEstimator:
     method: Literal["points", "image"] = "points"
     pose: Literal["rectangle", "axes", "position", "known"] = "rectangle"
     scale: bool = False
-    up: Literal["y", "z"] = "y"
     false_alarm: Annotated[float, Gt(0), Lt(1)] = 1e-6
     step: Positive = 0.1
     gap: Positive = 1.0
@@ -119,26 +116,26 @@ class InitialPoseEstimator:
         else:
             points = find_bright_nodes(capture, grid, self.low, self.high, step=self.step)
         points = find_largest_group(points, self.gap)
-        plane, item, radar = Ground(self.up), scene[name], capture.radar()
+        item, radar = scene[name], capture.radar()
         if self.pose == "position":
             shift = estimate_position(points) - item.center.detach()
-            shift[plane.up_axis] = 0.0
+            shift[2] = 0.0
             moved = rigid(translation=shift) @ item.transform
             return InitialEstimate(scene.replace(name, pose=moved), len(points))
         if self.pose == "axes":
-            rectangle = principal_rectangle(points, ground=plane)
+            rectangle = principal_rectangle(points)
         else:
             resolution = radar.waveform.range_resolution
-            rectangle = fit_rectangle(points, radar, ground=plane, resolution=resolution)
+            rectangle = fit_rectangle(points, radar, resolution=resolution)
         if self.scale:
-            factor = estimate_scale(item, rectangle, ground=plane)
+            factor = estimate_scale(item, rectangle)
             middle = item.mesh.center
             mesh = Mesh(middle + (item.mesh.vertices - middle) * factor, item.mesh.faces)
             scene = scene.replace(name, mesh=mesh)
         scene, losses = select_pose(
             scene,
             name,
-            candidate_poses(scene[name], rectangle, radar, ground=plane),
+            candidate_poses(scene[name], rectangle, radar),
             radar,
             capture,
             grid,

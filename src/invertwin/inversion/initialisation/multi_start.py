@@ -113,7 +113,7 @@ def pose_grid(
     high: Point,
     step: Positive,
     turns: Count = 4,
-    axis: Point = (0.0, 1.0, 0.0),
+    axis: Point = (0.0, 0.0, 1.0),
 ) -> Iterator[Object]:
     """Yield copies of an object on a grid over a box of poses.
 

@@ -47,7 +47,7 @@ def sample_nearby_poses(
         return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
 
     def draw_direction(letters: str) -> Tensor:
-        vector = torch.randn(3, generator=generator, dtype=torch.float64)
+        vector = torch.randn(3, generator=generator, dtype=torch.float64).roll(1)
         vector = vector * torch.tensor([letter in letters for letter in "xyz"])
         return vector / vector.norm()
 

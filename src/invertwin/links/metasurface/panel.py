@@ -51,9 +51,9 @@ class Metasurface:
 
     Attributes:
         position: Of its centre [m].
-        axes: Columns are its x and y axes and its normal, in the world.
-        phase: Of the elements along x and y [rad]; 0 = those of a mirror that turns the field over.
-        spacing: Of the elements, along x and y alike [m]; a cell is as large. Half a wavelength
+        axes: Columns are its normal and its y and z axes, in the world.
+        phase: Of the elements along y and z [rad]; 0 = those of a mirror that turns the field over.
+        spacing: Of the elements, along y and z alike [m]; a cell is as large. Half a wavelength
             and less sum up to the integral over a plate.
         amplitude: Of the elements, one or one for each; 1 = all that falls on a cell is scattered.
         bits: Phases are rounded to 2^bits values; derivatives pass straight through. None does not
@@ -67,7 +67,7 @@ class Metasurface:
 
     position: Float64[Tensor, "3"]
     axes: Float64[Tensor, "3 3"]
-    phase: Float64[Tensor, "x y"]
+    phase: Float64[Tensor, "y z"]
     spacing: float
     amplitude: float | Float64[Tensor, "_ _"] = 1.0
     bits: int | None = None
@@ -77,8 +77,8 @@ class Metasurface:
         what = "of a metasurface"
         place = checked_tensor(self.position, (3,), f"position {what} [m]", "give x, y, z")
         axes = checked_tensor(self.axes, (3, 3), f"axes {what}", "give them as columns")
-        check_orthonormal(axes, f"axes {what}", "give x, y and the normal")
-        do = "give one for each element, along x and y"
+        check_orthonormal(axes, f"axes {what}", "give the normal, y and z")
+        do = "give one for each element, along y and z"
         phase = checked_tensor(self.phase, (None, None), f"phases {what} [rad]", do)
         if not phase.numel():
             raise InputError(f"expected at least one element {what}, got none; {do}")
@@ -95,7 +95,7 @@ class Metasurface:
 
     @property
     def cells(self) -> PanelCells:
-        """The cells of the elements; x runs slowest."""
+        """The cells of the elements; y runs slowest."""
         offsets = [
             (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * self.spacing
             for count in self.phase.shape
@@ -190,7 +190,7 @@ def _element_waves(
     """Wave of each place at each element, over its phase at the centre, and its obliquity."""
     whole = (positions - panel.position) @ panel.axes
     reach = whole.norm(dim=1, keepdim=True)
-    shift = -whole[:, :2] @ cells.offsets.T
+    shift = -whole[:, 1:] @ cells.offsets.T
     if far_field:
         later, length = shift / reach, reach.expand_as(shift)
     else:
@@ -199,11 +199,11 @@ def _element_waves(
         length = (reach.square() + squares).sqrt()
         later = squares / (length + reach)
     if panel.pattern is None:
-        obliquity = whole[:, 2:].clamp_min(0) / length
+        obliquity = whole[:, :1].clamp_min(0) / length
     else:
-        aside = whole[:, None, :2] - (0 if far_field else cells.offsets)
-        up = whole[:, None, 2:].expand(-1, len(cells.offsets), 1)
-        toward = torch.cat([aside.expand(*up.shape[:2], 2), up], 2) / length[..., None]
+        aside = whole[:, None, 1:] - (0 if far_field else cells.offsets)
+        ahead = whole[:, None, :1].expand(-1, len(cells.offsets), 1)
+        toward = torch.cat([ahead, aside.expand(*ahead.shape[:2], 2)], 2) / length[..., None]
         gain = panel.pattern.gain(toward)
         some = gain > 0  # a root of zero has no derivative
         # Of a cell of λ/2, π is the gain that takes all of what falls on it.
@@ -276,7 +276,7 @@ def _paths_over_panel(
     units = [normalize(way, dim=1) for way in ways]
     up = torch.tensor(_UP, dtype=torch.float64)
     sent, received = (polarisations(unit, up) for unit in units)
-    normal = panel.axes[:, 2]
+    normal = panel.axes[:, 0]
     turned = sent - 2 * (sent @ normal)[..., None] * normal
     one = torch.ones(len(link), 1, dtype=torch.int64)
     return RayPaths(
@@ -311,8 +311,8 @@ def _check_positions(value: ArrayLike, what: str) -> Tensor:
 def _require_clearance(panel: Metasurface, positions: Tensor) -> None:
     local = (positions.detach() - panel.position.detach()) @ panel.axes.detach()
     half = 0.5 * panel.spacing * torch.tensor(panel.phase.shape, dtype=torch.float64)
-    beyond = (local[:, :2].abs() - half).clamp_min(0)
-    if float((beyond.square().sum(1) + local[:, 2].square()).min()) < panel.spacing**2:
+    beyond = (local[:, 1:].abs() - half).clamp_min(0)
+    if float((beyond.square().sum(1) + local[:, 0].square()).min()) < panel.spacing**2:
         raise InputError(
             "expected antennas at least a spacing away from a metasurface, got one on it; move it"
         )

@@ -135,7 +135,7 @@ class PanelPlacement(nn.Module):
         tx: The transmitter that is focused [m].
         target: On what [m].
         frequency: [Hz].
-        counts: Elements along x and y whose own phases are fitted; None = of none: those are
+        counts: Elements along y and z whose own phases are fitted; None = of none: those are
             the matter of ``ElementPhases``.
         along: Place on the path at the start [m].
         yaw: Turn about the vertical away from the wall's normal, at the start [rad].
@@ -145,7 +145,7 @@ class PanelPlacement(nn.Module):
 
     Attributes:
         along, yaw, spread: Parameters.
-        shift: Parameter, [x, y] of the elements [rad], where ``counts`` are given.
+        shift: Parameter, [y, z] of the elements [rad], where ``counts`` are given.
 
     Raises:
         InputError: Wrong shapes or numbers.
@@ -186,7 +186,7 @@ class PanelPlacement(nn.Module):
         self._keep_inside()
         place, normal = self.path.locate(self.along)
         turned = normal * self.yaw.cos() + torch.linalg.cross(_UP, normal) * self.yaw.sin()
-        axes = torch.stack([torch.linalg.cross(_UP, turned), _UP, turned], 1)
+        axes = torch.stack([turned, torch.linalg.cross(_UP, turned), _UP], 1)
         offsets = panel.cells.offsets
         half = 0.5 * panel.spacing * torch.tensor(panel.phase.shape, dtype=torch.float64)
         wave_number = 2 * math.pi * self._frequency / SPEED_OF_LIGHT
@@ -214,10 +214,10 @@ class ElementPhases(nn.Module):
     """A module Metasurface → Metasurface that adds a phase to each element.
 
     Args:
-        counts: Elements along x and y.
+        counts: Elements along y and z.
 
     Attributes:
-        shift: Parameter, [x, y] [rad].
+        shift: Parameter, [y, z] [rad].
     """
 
     def __init__(self, counts: Sequence[int]) -> None:

@@ -16,7 +16,7 @@ def beamform(
 ) -> Float[Tensor, "frame range u v"]:
     """Compute the Bartlett power spectrum at the grid's directions.
 
-    Steering is exp(+jk(u x + v y)) on the beat signal, whose phase falls as the element moves
+    Steering is exp(+jk(u y + v z)) on the beat signal, whose phase falls as the element moves
     towards the target. Normalised by the sum of the weights: a point target of |a|² peaks at
     |a|². Along an axis that the grid does not resolve, the power of the elements is averaged.
 
@@ -39,7 +39,7 @@ def beamform(
     array.check_resolved(grid)
     if array.is_separable:
         return _separable_power(channels, array, grid)
-    both = array.beams(grid.u, grid.v, array.x[array.column], array.y[array.row]) * array.weight
+    both = array.beams(grid.u, grid.v, array.y[array.column], array.z[array.row]) * array.weight
     power = (both.to(channels) @ channels).abs().square().unflatten(1, (grid.u_count, grid.v_count))
     return power.movedim(-1, 1)
 
@@ -66,11 +66,11 @@ def _separable_power(
         return (array.steering(cosines, places) * (weight / weight.sum())).to(channels)
 
     if grid.v_count > 1:
-        v = steer(grid.v, array.y, array.y_taper * array.counts.sum(0))
-        plane = torch.einsum("vy,frxy->frxv", v, plane)
+        v = steer(grid.v, array.z, array.z_taper * array.counts.sum(0))
+        plane = torch.einsum("vz,fryz->fryv", v, plane)
     if grid.u_count > 1:
-        u = steer(grid.u, array.x, array.x_taper * array.counts.sum(1))
-        plane = torch.einsum("ux,frxv->fruv", u, plane)
+        u = steer(grid.u, array.y, array.y_taper * array.counts.sum(1))
+        plane = torch.einsum("uy,fryv->fruv", u, plane)
     power = plane.abs().square()
     if grid.u_count == 1:
         power = power.mean(2, keepdim=True)

@@ -234,14 +234,14 @@ def world_positions(
         radar: radar with the poses of the frames.
         frame: index of the pose of each point.
         ranges: ranges from the midpoint of the phase centres [m].
-        u: direction cosines along the radar's x.
-        v: direction cosines along the radar's y.
+        u: direction cosines along the radar's y.
+        v: direction cosines along the radar's z.
     """
     ahead = (1 - u.square() - v.square()).clamp(min=0).sqrt()
     link = radar.link()
     origin = (0.5 * (link.tx + link.rx)).detach().cpu()
     length = ranges + radar.origins.cpu()[frame]
-    local = length[:, None] * torch.stack([u, v, ahead], dim=1)
+    local = length[:, None] * torch.stack([ahead, u, v], dim=1)
     return origin[frame] + (link.rotations.detach().cpu()[frame] @ local[..., None])[..., 0]
 
 

@@ -28,17 +28,17 @@ class _Snapshots:
     Attributes:
         values: snapshots [snapshot, element].
         array: The whole virtual array.
-        x, y: Positions of the elements in the radar frame [m].
+        y, z: Positions of the elements in the radar frame [m].
     """
 
     values: Complex128[Tensor, "frame range snapshot element"]
     array: Aperture
-    x: Float64[Tensor, " element"]
     y: Float64[Tensor, " element"]
+    z: Float64[Tensor, " element"]
 
     def manifold(self, grid: Grid) -> Complex128[Tensor, "direction element"]:
-        """Return beat phases across the array of a source in each direction: exp(−jk(ux + vy))."""
-        return self.array.beams(grid.u, grid.v, self.x, self.y).conj().to(self.values.device)
+        """Return beat phases across the array of a source in each direction: exp(−jk(uy + vz))."""
+        return self.array.beams(grid.u, grid.v, self.y, self.z).conj().to(self.values.device)
 
     def covariance(self) -> Complex128[Tensor, "frame range element element"]:
         """Return the mean of x xᴴ over the snapshots."""
@@ -66,7 +66,7 @@ def capon(
         radar: radar with its array, without window; its poses are unused.
         grid: grid with its directions.
         loading: Diagonal loading δ in units of the mean power of an element.
-        smoothing: elements of the subarrays along x and y over whose shifts the covariance is
+        smoothing: elements of the subarrays along y and z over whose shifts the covariance is
             averaged (spatial smoothing, which decorrelates coherent targets); None = none.
         forward_backward: whether to average with the reversed array, which doubles the snapshots.
 
@@ -113,7 +113,7 @@ def music(
         grid: grid with its directions.
         sources: number of sources in every bin, or the criterion that estimates it: ``mdl`` or
             ``aic``.
-        smoothing: Elements of the subarrays along x and y; None = no smoothing, see ``capon``.
+        smoothing: Elements of the subarrays along y and z; None = no smoothing, see ``capon``.
         forward_backward: whether to average with the reversed array, which doubles the snapshots.
 
     Raises:
@@ -245,33 +245,33 @@ def _snapshots(
         raise InputError(f"expected {what} with frames and snapshots, got none; {do}")
     array = aperture(radar)
     array.check_directions(grid)
-    rows, columns = len(array.y), len(array.x)
+    rows, columns = len(array.z), len(array.y)
     taken = array.counts.flatten() > 0
     channels = profile.to(torch.complex128).flatten(2, 3).movedim(-1, 1)
     plane = array.plane(channels).flatten(-2)[..., taken.to(channels.device)]
-    x = array.x.repeat_interleave(rows)[taken]
-    y = array.y.repeat(columns)[taken]
-    uniform = bool(taken.all()) and _is_uniform(array.x) and _is_uniform(array.y)
+    y = array.y.repeat_interleave(rows)[taken]
+    z = array.z.repeat(columns)[taken]
+    uniform = bool(taken.all()) and _is_uniform(array.y) and _is_uniform(array.z)
     if (smoothing is not None or forward_backward) and not uniform:
         raise InputError(
             "expected a uniform rectangle of virtual elements for smoothing and "
-            f"forward_backward, got {len(x)} elements on a {columns} × {rows} grid of places; "
+            f"forward_backward, got {len(y)} elements on a {columns} × {rows} grid of places; "
             "leave both out for this array"
         )
     if smoothing is not None:
         if not (1 <= smoothing[0] <= columns and 1 <= smoothing[1] <= rows):
             raise InputError(
                 f"expected subarrays of 1..{columns} × 1..{rows} elements, got {smoothing}; give "
-                "the elements along x and along y"
+                "the elements along y and along z"
             )
         shifted = plane.unflatten(-1, (columns, rows))
         shifted = shifted.unfold(-2, smoothing[0], 1).unfold(-2, smoothing[1], 1)
         plane = shifted.flatten(2, 4).flatten(-2, -1)
-        x, y = (p.unflatten(0, (columns, rows))[: smoothing[0], : smoothing[1]] for p in (x, y))
-        x, y = x.flatten(), y.flatten()
+        y, z = (p.unflatten(0, (columns, rows))[: smoothing[0], : smoothing[1]] for p in (y, z))
+        y, z = y.flatten(), z.flatten()
     if forward_backward:
         plane = torch.cat([plane, plane.flip(-1).conj()], dim=-2)
-    return _Snapshots(plane, array, x, y)
+    return _Snapshots(plane, array, y, z)
 
 
 def _is_uniform(positions: Float64[Tensor, " place"]) -> bool:

@@ -38,7 +38,7 @@ class Peak:
     Attributes:
         range: range [m].
         velocity: range rate, positive for receding targets [m/s].
-        u, v: Direction cosines to the right and up; 0 where not resolved.
+        u, v: Direction cosines to the left and up; 0 where not resolved.
         power: received over transmitted power, or squared counts.
     """
 

@@ -196,8 +196,8 @@ def _share_beam(radar: Radar, one: tuple[float, float], other: tuple[float, floa
 
 def _plane_wave(radar: Radar, grid: Grid, u: float, v: float) -> Complex128[Tensor, " channel"]:
     """Return the channels of a plane wave; an unresolved axis has no phase."""
-    x, y, _ = radar.virtual_positions.T
-    path = u * x * (grid.u_count > 1) + v * y * (grid.v_count > 1)
+    _, y, z = radar.virtual_positions.T
+    path = u * y * (grid.u_count > 1) + v * z * (grid.v_count > 1)
     phase = -2 * math.pi / radar.waveform.wavelength * path.double()
     return torch.polar(torch.ones_like(phase), phase)
 

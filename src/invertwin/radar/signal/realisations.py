@@ -31,7 +31,8 @@ class SpeckleRealisations:
         waveform, array, link = require_sampled_waveform(radar), aperture(radar), radar.link()
         self._shape, self._array = radar.shape, array
         places = torch.cat([paths.first, paths.last], dim=1)
-        mixed = places @ torch.sqrt(torch.tensor([2.0, 3, 5, 7, 11, 13], dtype=torch.float64))
+        # Independent weights tell points apart; another order would draw other amplitudes.
+        mixed = places @ torch.sqrt(torch.tensor([5.0, 2, 3, 13, 7, 11], dtype=torch.float64))
         points, self._point = torch.unique((mixed / _POINT_TOLERANCE).round(), return_inverse=True)
         self._count = len(points)
         u, v = paths.direction_cosines(link).unbind(1)
@@ -53,8 +54,8 @@ class SpeckleRealisations:
         cycles = torch.arange(waveform.samples) - 0.5 * (waveform.samples - 1)
         phase = 2 * math.pi * cycles[:, None] * (ranges / waveform.max_range)
         self._ramp = torch.polar(torch.ones_like(phase), phase).to(torch.complex64)
-        self._across = array.steering(u, array.x).conj().to(torch.complex64)
-        self._up = array.steering(v, array.y).conj().to(torch.complex64)
+        self._across = array.steering(u, array.y).conj().to(torch.complex64)
+        self._up = array.steering(v, array.z).conj().to(torch.complex64)
 
     def beat(self, seed: int) -> Complex64[Tensor, "frame tx rx sample"]:
         """Return the beat signals of one realisation, without noise.
@@ -68,7 +69,7 @@ class SpeckleRealisations:
         for rows in self._frames:
             cells = torch.zeros(math.prod(self._cells), dtype=torch.complex64)
             cells.index_add_(0, self._cell[rows], self._field[rows] * drawn[self._point[rows]])
-            plane = torch.einsum("ruy,ux->xyr", cells.view(self._cells) @ self._up, self._across)
+            plane = torch.einsum("ruz,uy->yzr", cells.view(self._cells) @ self._up, self._across)
             frames.append(plane[self._array.column, self._array.row] @ self._ramp.T)
         return torch.stack(frames).unflatten(1, self._shape[1:])
 

@@ -101,7 +101,7 @@ def array_point_spread(
         du: offsets in u.
         dv: offsets in v.
     """
-    response = array.steering(du, array.x) @ _array_weights(array) @ array.steering(dv, array.y).T
+    response = array.steering(du, array.y) @ _array_weights(array) @ array.steering(dv, array.z).T
     return response.abs().square()
 
 
@@ -115,14 +115,14 @@ def paired_array_spread(
         du: offset in u of each point.
         dv: offset in v of each point.
     """
-    along, up = array.steering(du, array.x), array.steering(dv, array.y)
+    along, up = array.steering(du, array.y), array.steering(dv, array.z)
     response = ((along @ _array_weights(array)) * up).sum(1)
     return response.real.square() + response.imag.square()
 
 
 def _array_weights(array: Aperture) -> Tensor:
     """Return weights of the grid positions, with a sum of 1."""
-    weight = array.counts * array.x_taper[:, None] * array.y_taper[None]
+    weight = array.counts * array.y_taper[:, None] * array.z_taper[None]
     return (weight / weight.sum()).to(torch.complex128)
 
 

@@ -122,9 +122,9 @@ def _beam_weights(
     """Return the contributions of each transmitter's elements to the beams for a unit field."""
     array = aperture(radar)
     array.check_directions(grid)
-    x, y = radar.virtual_positions[:, 0], radar.virtual_positions[:, 1]
-    toward = array.beams(grid.u, grid.v, x, y) * array.weight
-    waves = -2 * math.pi / radar.waveform.wavelength * direction[:, :2] @ torch.stack([x, y])
+    y, z = radar.virtual_positions[:, 1], radar.virtual_positions[:, 2]
+    toward = array.beams(grid.u, grid.v, y, z) * array.weight
+    waves = -2 * math.pi / radar.waveform.wavelength * direction[:, 1:] @ torch.stack([y, z])
     arriving = torch.polar(torch.ones_like(waves), waves)
     receivers = radar.shape[2]
     pairs = zip(arriving.split(receivers, 1), toward.split(receivers, 1), strict=True)

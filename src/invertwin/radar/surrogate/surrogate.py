@@ -68,7 +68,7 @@ class Surrogate:
             aperture).
         range_width: standard deviation of the added Gaussian [range cells].
         angle_width: standard deviation of the added Gaussian in u and v [beamwidths λ/D].
-        aperture_radius: radius for "airy" [m]; None = half the virtual aperture along x and y.
+        aperture_radius: radius for "airy" [m]; None = half the virtual aperture along y and z.
 
     Raises:
         InputError: An unknown kernel, a negative width, or a radius that is not positive.

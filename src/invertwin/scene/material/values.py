@@ -54,10 +54,10 @@ class Texture:
 
     @classmethod
     def from_projection(cls, image: ArrayLike, mesh: Mesh) -> "Texture":
-        """Project an image onto a mesh along its z axis.
+        """Project an image onto a mesh along its x axis, upright as seen from a radar at −x.
 
-        The left and right borders are at the minimum and maximum x of the mesh, bottom and top at
-        the minimum and maximum y, in the object's own frame.
+        The left and right borders are at the maximum and minimum y of the mesh, bottom and top at
+        the minimum and maximum z, in the object's own frame.
 
         Args:
             image: values of the pixels [row, column].
@@ -66,15 +66,17 @@ class Texture:
         Raises:
             InputError: a mesh without width or height, or a bad image.
         """
-        corners = mesh.vertices.detach()[:, :2]
-        low = corners.min(0).values
-        size = corners.max(0).values - low
+        corners = mesh.vertices.detach()[:, 1:]
+        low, high = corners.min(0).values, corners.max(0).values
+        size = high - low
         if not bool((size > 0).all()):
             raise InputError(
-                "expected a mesh with width and height along its x and y axes for a texture, "
+                "expected a mesh with width and height along its y and z axes for a texture, "
                 f"got {size.tolist()} m; give uv coordinates"
             )
-        return cls(_checked_image(image), (corners - low) / size, mesh.faces)
+        # +y is on the left of who looks along x.
+        uv = torch.stack([high[0] - corners[:, 0], corners[:, 1] - low[1]], 1) / size
+        return cls(_checked_image(image), uv, mesh.faces)
 
     @property
     def values(self) -> Float64[Tensor, " f"]:

@@ -11,9 +11,9 @@ from invertwin.errors import InputError
 from invertwin.scene.people.body import BodyTemplate
 
 _STEP = 0.05  # step of a phenotype for its central difference
-# Anny's bodies face −y, z up; here they face −z, y up.
+# Anny's bodies face −y, z up; here they face −x, z up.
 _ANNY_TO_BODY_AXES = torch.tensor(
-    [[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64
+    [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64
 )
 
 
@@ -23,7 +23,7 @@ def load_anny(
     """Load a body of the model Anny (Apache-2.0), which the optional extra ``anny`` installs.
 
     The joints are its 104 bones by their names, such as ``upperarm01.L`` and ``lowerarm01.L``; the
-    rest pose is Anny's, rotated to face −z, y up. The first use of Anny prepares files for about a
+    rest pose is Anny's, rotated to face −x, z up. The first use of Anny prepares files for about a
     minute.
 
     Args:

@@ -22,6 +22,10 @@ _DO = "give arrays of one template"
 _SINGLE_JOINT_WEIGHT = 0.95  # skinning weight of a vertex dominated by one joint
 _EXACT = 1e-12  # tolerance of the Newton steps [m]
 _MAX_REFINEMENTS = 4  # Newton steps of least squares
+# SMPL's bodies face z, y up, their left at x; here they face −x, z up.
+_SMPL_TO_BODY_AXES = torch.tensor(
+    [[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +231,7 @@ class SkinnedBody(ObjectModule):
         rotation: initial rotation vectors [j, 3] [rad]; None = rest pose.
         shape: initial shape coordinates [n]; None = zero.
         joints: free joints, by name or index, or a mapping from their names to the free components
-            of the rotation vector, such as "y" for an elbow; None = all.
+            of the rotation vector, such as "z" for an elbow; None = all.
 
     Attributes:
         rotation: parameter [j, 3], rotation vector of every joint in the frame of its parent
@@ -303,7 +307,7 @@ class SkinnedBody(ObjectModule):
         rotations = rotation_from_vector(turns)
         for joint in self._joints.values():
             free = self._free[joint]
-            axis = torch.randn(3, generator=generator, dtype=torch.float64) * free
+            axis = torch.randn(3, generator=generator, dtype=torch.float64).roll(1) * free
             change = angle * axis / axis.norm()
             # A hinge keeps its axis.
             rotations[joint] = (
@@ -387,6 +391,8 @@ def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
 
     It reads ``v_template`` [v, 3], ``f``, ``weights`` [v, j], ``kintree_table`` [2, j],
     ``J_regressor`` [j, v], ``shapedirs`` [v, 3, n] and, if there, ``posedirs`` [v, 3, 9 (j − 1)].
+    SMPL's bodies face z, y up; the template faces −x, z up. A joint's rotation vector (x, y, z) of
+    SMPL is (−z, −x, y) here.
 
     Args:
         file: path of the file.
@@ -407,7 +413,8 @@ def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
             f"expected {', '.join(names)} in {path.name}, got no {', '.join(missing)}; "
             "give a file of SMPL's layout"
         )
-    rest = checked_tensor(arrays["v_template"], (None, 3), "v_template", _DO)
+    turn = _SMPL_TO_BODY_AXES
+    rest = checked_tensor(arrays["v_template"], (None, 3), "v_template", _DO) @ turn.T
     table = arrays["kintree_table"].astype(np.int64)
     if table.ndim != 2 or len(table) != 2:
         raise InputError(
@@ -416,8 +423,16 @@ def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
         )
     count = table.shape[1]
     directions = checked_tensor(arrays["shapedirs"], (len(rest), 3, None), "shapedirs", _DO)
-    directions = directions[..., : checked_count(shapes, "shape coordinates", 1)]
+    directions = turn @ directions[..., : checked_count(shapes, "shape coordinates", 1)]
     regressor = checked_tensor(arrays["J_regressor"], (count, len(rest)), "J_regressor", _DO)
+    poses = None
+    if "posedirs" in arrays:
+        columns = (len(rest), 3, 9 * (count - 1))
+        poses = checked_tensor(arrays["posedirs"], columns, "posedirs", _DO)
+        # The correctives and the rotation matrices that they belong to turn alike.
+        poses = torch.einsum(
+            "ab,cd,ef,vbjdf->vajce", turn, turn, turn, poses.unflatten(2, (-1, 3, 3))
+        ).flatten(2)
     return BodyTemplate(
         rest,
         torch.from_numpy(arrays["f"].astype(np.int64)),
@@ -427,5 +442,5 @@ def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
         regressor @ rest,
         directions,
         torch.einsum("jv,van->jan", regressor, directions),
-        torch.from_numpy(arrays["posedirs"].astype(np.float64)) if "posedirs" in arrays else None,
+        poses,
     )

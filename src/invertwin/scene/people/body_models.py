@@ -23,7 +23,7 @@ def body_template(
     height: Positive = 1.75,
     spacing: Positive = 0.03,
 ) -> BodyTemplate:
-    """Return the template of a body, y up, facing −z; arguments as in `body`.
+    """Return the template of a body, z up, facing −x; arguments as in `body`.
 
     Args:
         model: person or anny.
@@ -43,7 +43,7 @@ def body(
     spacing: Positive = 0.03,
     angles: Annotated[Mapping[str, Point], RADIANS] = _AT_REST,
 ) -> Mesh:
-    """Build an articulated body with one skin, y up, facing −z, in the frame of its model.
+    """Build an articulated body with one skin, z up, facing −x, with the origin of its model.
 
     Args:
         model: person = procedural, arms held out at rest; anny = from the extra `anny`.

@@ -46,7 +46,7 @@ Posture = tuple[Float64[Tensor, "j 3 3"], Float64[Tensor, "3"]]
 
 @dataclass(frozen=True, eq=False)
 class Walking:
-    """Person who walks straight ahead along −z of the object's frame, or on the spot.
+    """Person who walks straight ahead along −x of the object's frame, or on the spot.
 
     The object's pose is that of the pelvis of a standing person, see ``standing_height``.
     ``MovingScene`` applies the motion.
@@ -93,10 +93,10 @@ class Walking:
         found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
         cycle = math.cos(2 * math.pi * phase)
         yaw, roll = math.radians(4.0 * v) * cycle, -_evaluate_series(curves["tilt"], phase)
-        pelvis = rotation_about_axis("y", yaw) @ rotation_about_axis("z", roll)
+        pelvis = rotation_about_axis("z", yaw) @ rotation_about_axis("x", roll)
         lean = math.radians(_swing(v, 8.0)) * (math.sin(2 * math.pi * (2 * phase - 0.1)) - 1)
-        twist = rotation_about_axis("y", -_evaluate_series(curves["thorax"], phase))
-        chest = twist @ rotation_about_axis("x", lean)
+        twist = rotation_about_axis("z", -_evaluate_series(curves["thorax"], phase))
+        chest = twist @ rotation_about_axis("y", lean)
         found[self.body.joint("pelvis")] = pelvis
         found[self.body.joint("chest")] = pelvis.T @ chest
         for side, later in (("right", 0.0), ("left", 0.5)):
@@ -104,9 +104,9 @@ class Walking:
             swing = 9.88 * v
             arm = math.radians(3.0 - swing / 2 - swing * math.cos(2 * math.pi * own))
             turns = {
-                "hip": rotation_about_axis("x", _evaluate_series(curves["hip"], own)),
-                "knee": rotation_about_axis("x", -_evaluate_series(curves["knee"], own)),
-                "shoulder": rotation_about_axis("x", arm) @ hanging_arm_rotation(side),
+                "hip": rotation_about_axis("y", _evaluate_series(curves["hip"], own)),
+                "knee": rotation_about_axis("y", -_evaluate_series(curves["knee"], own)),
+                "shoulder": rotation_about_axis("y", arm) @ hanging_arm_rotation(side),
                 "elbow": elbow_rotation(side, _evaluate_series(curves["elbow"], own)),
             }
             for name, turn in turns.items():
@@ -125,7 +125,7 @@ class Walking:
         side = _swing(v, 0.128) * math.sin(turn * (phase - 0.1))
         rise = 0.015 * v * (math.sin(turn * (2 * phase - 0.35)) - 1)
         ahead = _swing(v, 0.084) * math.sin(turn * 2 * (phase + 0.625 - support))
-        return scale * torch.tensor([side, rise, -ahead], dtype=torch.float64)
+        return scale * torch.tensor([-ahead, side, rise], dtype=torch.float64)
 
     def posture(self, time: float) -> Posture:
         """Return joint rotations in the frames of their parents, and the shift of the pelvis [m].
@@ -135,7 +135,7 @@ class Walking:
         """
         phase = self.phase + time / self.period
         way = 0.0 if self.on_spot else self.speed * time
-        shift = self.pelvis_offset(phase) + torch.tensor([0.0, 0.0, -way], dtype=torch.float64)
+        shift = self.pelvis_offset(phase) + torch.tensor([-way, 0.0, 0.0], dtype=torch.float64)
         return self.rotations(phase), shift
 
     def __call__(self, item: Object, time: float) -> Object:
@@ -150,7 +150,7 @@ class Walking:
 
 def standing_height(body: BodyTemplate) -> float:
     """Return the height of a body's origin above the soles of its rest pose [m]."""
-    return -float(body.vertices[:, 1].min())
+    return -float(body.vertices[:, 2].min())
 
 
 def leg_length(body: BodyTemplate) -> float:
@@ -205,7 +205,7 @@ def hanging_arm_rotation(side: str) -> Float64[Tensor, "3 3"]:
     Args:
         side: side, left or right.
     """
-    return rotation_about_axis("z", _HANGING if side == "left" else -_HANGING)
+    return rotation_about_axis("x", _HANGING if side == "left" else -_HANGING)
 
 
 def elbow_rotation(side: str, angle: float) -> Float64[Tensor, "3 3"]:
@@ -215,7 +215,7 @@ def elbow_rotation(side: str, angle: float) -> Float64[Tensor, "3 3"]:
         side: side, left or right.
         angle: flexion [rad].
     """
-    return rotation_about_axis("y", -angle if side == "left" else angle)
+    return rotation_about_axis("z", -angle if side == "left" else angle)
 
 
 def _swing(v: float, slope: float) -> float:

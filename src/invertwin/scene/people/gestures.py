@@ -45,7 +45,7 @@ _WAVE = math.radians(30.0)  # swing of the forearm to either side
 class Sitting:
     """Person who sits down, or stands up: the reverse motion.
 
-    Feet are fixed; the seat is behind the person, who faces −z of the object's frame. The object's
+    Feet are fixed; the seat is behind the person, who faces −x of the object's frame. The object's
     pose is that of the pelvis of a standing person, see ``standing_height``. ``MovingScene``
     applies the motion.
 
@@ -90,20 +90,20 @@ class Sitting:
         lean = _LEAN * (lowered - upright)
         shoulder, elbow = (angle * _minimum_jerk(u) for angle in _LAP)
         found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
-        pelvis = rotation_about_axis("x", -lean / 2)
+        pelvis = rotation_about_axis("y", -lean / 2)
         found[self.body.joint("pelvis")] = pelvis
-        found[self.body.joint("chest")] = rotation_about_axis("x", -lean / 2)
+        found[self.body.joint("chest")] = rotation_about_axis("y", -lean / 2)
         for side in ("left", "right"):
             turns = {
-                "hip": pelvis.T @ rotation_about_axis("x", bent),
-                "knee": rotation_about_axis("x", -bent),
-                "shoulder": rotation_about_axis("x", lean + shoulder) @ hanging_arm_rotation(side),
+                "hip": pelvis.T @ rotation_about_axis("y", bent),
+                "knee": rotation_about_axis("y", -bent),
+                "shoulder": rotation_about_axis("y", lean + shoulder) @ hanging_arm_rotation(side),
                 "elbow": elbow_rotation(side, elbow),
             }
             for name, turn in turns.items():
                 found[self.body.joint(f"{side}_{name}")] = turn
-        hip = self.body.joints[self.body.joint("left_hip")] * torch.tensor([0.0, 1.0, 1.0])
-        away = [0.0, thigh * (math.cos(bent) - 1), thigh * math.sin(bent)]
+        hip = self.body.joints[self.body.joint("left_hip")] * torch.tensor([1.0, 0.0, 1.0])
+        away = [thigh * math.sin(bent), 0.0, thigh * (math.cos(bent) - 1)]
         return found, hip - pelvis @ hip + torch.tensor(away, dtype=torch.float64)
 
     def __call__(self, item: Object, time: float) -> Object:
@@ -118,7 +118,7 @@ class Sitting:
     def _leg(self) -> tuple[float, float]:
         """Return the height of the knee above the sole, and the length of the thigh [m]."""
         hip, knee = (self.body.joints[self.body.joint(f"left_{name}")] for name in ("hip", "knee"))
-        return float(knee[1]) + standing_height(self.body), float((hip - knee).norm())
+        return float(knee[2]) + standing_height(self.body), float((hip - knee).norm())
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,8 +174,8 @@ class Waving:
         sign = 1.0 if self.side == "right" else -1.0
         # Held out to the side, forearm upwards: the arm of the rest pose with a bent elbow.
         raised = {
-            "shoulder": rotation_about_axis("z", 0.0),
-            "elbow": rotation_about_axis("z", sign * (math.pi / 2 + swing)),
+            "shoulder": rotation_about_axis("x", 0.0),
+            "elbow": rotation_about_axis("x", sign * (math.pi / 2 + swing)),
         }
         for name, turn in raised.items():
             row = self.body.joint(f"{self.side}_{name}")

@@ -175,7 +175,7 @@ class TrajectoryMotion:
 
     Attributes:
         trajectory: trajectory of the object.
-        heading: whether to rotate the object about the vertical, so that its front, −z, faces the
+        heading: whether to rotate the object about the vertical, so that its front, −x, faces the
             direction of motion.
     """
 
@@ -195,13 +195,13 @@ class TrajectoryMotion:
         turn = None
         if self.heading:
             ahead = self.trajectory.velocity(time)
-            if math.hypot(float(ahead[0]), float(ahead[2])) < _MIN_HEADING_SPEED:
+            if math.hypot(float(ahead[0]), float(ahead[1])) < _MIN_HEADING_SPEED:
                 raise InputError(
                     f"expected a level velocity for a heading, got {ahead.tolist()} m/s at "
                     f"{time:g} s; move its places, or leave out heading"
                 )
-            # −z rotated about y by θ is (−sin θ, 0, −cos θ).
-            angle = torch.atan2(-ahead[0], -ahead[2])
-            turn = rotation_from_vector(torch.stack([0 * angle, angle, 0 * angle]))
+            # −x rotated about z by θ is (−cos θ, −sin θ, 0).
+            angle = torch.atan2(-ahead[1], -ahead[0])
+            turn = rotation_from_vector(torch.stack([0 * angle, 0 * angle, angle]))
         motion = rigid(turn, self.trajectory.position(time))
         return replace(item, pose=compose(item.transform, motion))
