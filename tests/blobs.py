@@ -19,12 +19,12 @@ BINS = torch.linspace(-2.0, 2.0, 200, dtype=torch.float64)
 
 @dataclass(frozen=True, eq=False)
 class Blob(ForwardModel):
-    """Power over x: a Gaussian about the object's centre, over a level; speckle bin by bin.
+    """Power over y: a Gaussian about the object's centre, over a level; speckle bin by bin.
 
     Attributes:
         frames: All alike.
         known: Whether the model gives looks.
-        even: The sign of x has no effect.
+        even: The sign of y has no effect.
         sampling: Unused.
     """
 
@@ -34,10 +34,10 @@ class Blob(ForwardModel):
     sampling: Sampling = Sampling(depth=1, boundary=False)
 
     def predict(self, scene: Scene, sensor: Any, seed: int) -> Tensor:
-        x = scene["ball"].center[0]
-        power = 0.05 + torch.exp(-((BINS - x) ** 2) / 0.08)
+        y = scene["ball"].center[1]
+        power = 0.05 + torch.exp(-((BINS - y) ** 2) / 0.08)
         if self.even:
-            power = power + torch.exp(-((BINS + x) ** 2) / 0.08)
+            power = power + torch.exp(-((BINS + y) ** 2) / 0.08)
         return power.expand(self.frames, -1)[..., None, None]
 
     def observe(self, recording: Tensor) -> Tensor:
@@ -57,14 +57,14 @@ class Blob(ForwardModel):
         return look
 
 
-def scene(x: float = 0.0) -> Scene:
-    """A ball at x."""
-    return Scene({"ball": thing(sphere(0.1, 1), (x, 0.0, 1.0))})
+def scene(y: float = 0.0) -> Scene:
+    """A ball at y."""
+    return Scene({"ball": thing(sphere(0.1, 1), (1.0, y, 0.0))})
 
 
-def deviation(x: float, frames: int) -> float:
-    """The least standard deviation of x that speckle allows: the Cramér–Rao bound."""
-    place = torch.tensor(x, dtype=torch.float64, requires_grad=True)
+def deviation(y: float, frames: int) -> float:
+    """The least standard deviation of y that speckle allows: the Cramér–Rao bound."""
+    place = torch.tensor(y, dtype=torch.float64, requires_grad=True)
 
     def level(value: Tensor) -> Tensor:
         return (0.05 + torch.exp(-((BINS - value) ** 2) / 0.08)).log()
@@ -77,11 +77,11 @@ def deviation(x: float, frames: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Needle(Blob):
-    """Shows where the object's own x axis points, but hardly at which end."""
+    """Shows where the object's own y axis points, but hardly at which end."""
 
     def predict(self, scene: Scene, sensor: Any, seed: int) -> Tensor:
-        way = scene["ball"].transform[:3, 0]
-        power = 0.05 + sum(torch.exp(-((BINS - s * way[2]) ** 2) / 0.08) for s in (1.0, -1.0))
+        way = scene["ball"].transform[:3, 1]
+        power = 0.05 + sum(torch.exp(-((BINS - s * way[0]) ** 2) / 0.08) for s in (1.0, -1.0))
         assert isinstance(power, Tensor)
         return power.expand(self.frames, -1)[..., None, None]
 
@@ -97,6 +97,6 @@ class Ripple(Blob):
     period: float = 0.2
 
     def predict(self, scene: Scene, sensor: Any, seed: int) -> Tensor:
-        turn = 2 * torch.pi * scene["ball"].center[0] / self.period
+        turn = 2 * torch.pi * scene["ball"].center[1] / self.period
         power = 1 + 0.16 * self.period * torch.sin(turn + torch.pi * BINS)
         return power.expand(self.frames, -1)[..., None, None]

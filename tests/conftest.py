@@ -1,8 +1,11 @@
-"""What every test shares: run-time shape checks, the data folder, the markers."""
+"""What every test shares: run-time shape checks, the data folder, the markers, a browser."""
 
+import importlib.util
 import os
+import shutil
 from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from jaxtyping import config, install_import_hook
@@ -23,7 +26,7 @@ if "PYTEST_XDIST_WORKER" in os.environ and hasattr(os, "sched_setaffinity"):
 # tower of PEP 484: an int is welcome where a float is expected.
 if os.environ.get("INVERTWIN_CHECK_TYPES"):
     install_import_hook(
-        ["invertwin", "invertwin_studies"],
+        ["invertwin", "invertwin_convert", "invertwin_studies"],
         "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
     )
 
@@ -97,3 +100,60 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if doctor.gpu_name() is None:
         for item in marked:
             item.add_marker(pytest.mark.skip(reason="no NVIDIA GPU on this machine"))
+
+
+INSTALL = "run: make test-browser"
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """A browser without a window. Chromium and Playwright are optional: tests skip without them."""
+    for extra in ("viser", "playwright"):
+        if importlib.util.find_spec(extra) is None:
+            pytest.skip(f"needs the package {extra}; {INSTALL}")
+    from playwright.sync_api import (  # pyright: ignore[reportMissingImports]
+        Error,
+        sync_playwright,
+    )
+
+    # Debian's, or what `playwright install chromium` has fetched.
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+    flags = ["--no-sandbox", "--enable-unsafe-swiftshader", "--use-angle=swiftshader"]
+    with sync_playwright() as playwright:
+        try:
+            browser = playwright.chromium.launch(executable_path=found, args=flags)
+        except Error:
+            pytest.skip(f"needs Chromium; {INSTALL}")
+        yield browser
+        browser.close()
+
+
+class Watched:
+    """A page whose errors and requests are noted."""
+
+    def __init__(self, browser: Any) -> None:
+        self.page = browser.new_page(viewport={"width": 1024, "height": 640})
+        self.errors: list[str] = []
+        self.requests: list[str] = []
+        self.received: list[bytes] = []
+        self.page.on("console", self._said)
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("dialog", lambda dialog: self.errors.append(dialog.message))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("websocket", self._connected)
+
+    def _said(self, message: Any) -> None:
+        if message.type == "error":
+            self.errors.append(message.text)
+
+    def _connected(self, socket: Any) -> None:
+        self.requests.append(socket.url)
+        socket.on("framereceived", lambda frame: self.received.append(frame))
+
+
+@pytest.fixture
+def watched(chromium: Any) -> Iterator[Watched]:
+    """A fresh page."""
+    found = Watched(chromium)
+    yield found
+    found.page.close()

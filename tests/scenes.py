@@ -49,12 +49,18 @@ def occluder(**materials: Material) -> Scene:
     """A plate 1 m away, turned a little, and a wall 2 m away: visibility changes with both."""
     return Scene(
         {
-            "wall": thing(plate(2.0, 2.0, divisions=2), (0, 0, 2), material=materials.get("wall")),
+            "wall": thing(plate(2.0, 2.0, divisions=2), (2, 0, 0), material=materials.get("wall")),
             "occluder": thing(
-                plate(0.4, 0.3), (0.1, 0.05, 1), (0.1, 0.2, 0), materials.get("occluder")
+                plate(0.4, 0.3), (1, 0.1, 0.05), (0, 0.1, 0.2), materials.get("occluder")
             ),
         }
     )
+
+
+def level_plate(width: float, depth: float, divisions: int = 1) -> Mesh:
+    """A plate that lies in the plane z = 0: its width along x, its depth along y."""
+    mesh = plate(width, depth, divisions)
+    return Mesh(mesh.vertices[:, [1, 2, 0]], mesh.faces)
 
 
 def link(
@@ -66,7 +72,7 @@ def link(
     wavelength: float = WAVELENGTH,
     shared: bool | None = None,
 ) -> Link:
-    """Antennas at the given places, looking along z; visibility is shared if they coincide."""
+    """Antennas at the given places, looking along x; visibility is shared if they coincide."""
     places = tx if isinstance(tx, Tensor) else float64(tx)
     others = places if rx is None else rx if isinstance(rx, Tensor) else float64(rx)
     if rotations is None:

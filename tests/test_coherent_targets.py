@@ -34,8 +34,8 @@ from scenes import float64, radar, relative, thing
 METAL = PerfectConductor()
 DEVICE = radar()
 GRID = DEVICE.grid(2.4, 3.6, 0.3)
-AT = (0.1, 0.0, 3.0)
-TOWARDS = math.atan2(AT[0], AT[2])  # a turn about y that makes a target there face the radar
+AT = (3.0, 0.1, 0.0)
+TOWARDS = math.atan2(AT[1], AT[0])  # a turn about z that makes a target there face the radar
 MESHES = {"trihedral": (trihedral(0.05), 3), "dihedral": (dihedral(0.05), 2)}
 MESHES["plate"] = plate(0.05, 0.05), 1
 
@@ -46,7 +46,7 @@ def alone(mesh: Mesh, turn: Sequence[float] = (0.0, 0.0, 0.0), at: Sequence[floa
 
 def walled(scene: Scene) -> Scene:
     """The scene with a rough board behind it."""
-    return Scene({**scene.objects, "board": thing(plate(1.5, 1.5), (0.0, 0.0, 3.4))})
+    return Scene({**scene.objects, "board": thing(plate(1.5, 1.5), (3.4, 0.0, 0.0))})
 
 
 def decibel(found: Tensor, truth: Tensor) -> Tensor:
@@ -64,7 +64,7 @@ def test_peak_and_lobe_are_those_of_the_field(name):
     model = SurrogateMap(GRID, sampling=drawn, coherent=["target"])
     tops, worst = [], 0.0
     for degrees in (-10, -5, -2, -1, 0, 1, 2, 5, 10):
-        scene = alone(mesh, (0.0, math.radians(degrees) + TOWARDS, 0.0))
+        scene = alone(mesh, (0.0, 0.0, math.radians(degrees) + TOWARDS))
         field = FacetMap(GRID, sampling=drawn).predict(scene, DEVICE, 0)
         rough = replace(model, coherent=()).predict(
             as_absorbers(walled(scene), ["target"]), DEVICE, 1
@@ -85,7 +85,7 @@ def test_peak_and_lobe_are_those_of_the_field(name):
 def test_straight_on_a_target_is_as_strong_as_sampled_rays_say(name, low):
     """Within 0.3 dB, peak and total. Lobes, whose bounces add in power, fail."""
     mesh, depth = MESHES[name]
-    scene = alone(mesh, (0.0, TOWARDS, 0.0))
+    scene = alone(mesh, (0.0, 0.0, TOWARDS))
     drawn = Sampling(depth=depth, samples=60_000, conductor_samples=60_000, boundary=False)
     paths = trace_field(scene, DEVICE.link(), sampling=drawn, seed=1)
     truth = exact_spectrum(beat_signal(paths, DEVICE), DEVICE, GRID)
@@ -103,8 +103,8 @@ def test_two_targets_in_one_cell_are_the_mean_over_wavelengths():
     model = SurrogateMap(GRID, sampling=Sampling(3), coherent=["target", "other"])
     wave, fields, maps = DEVICE.waveform.wavelength, [], []
     for shift in torch.linspace(0, 0.5 * wave, 9)[:-1]:
-        scene = alone(trihedral(0.05), at=(0.06, 0.0, 3.0))
-        other = thing(trihedral(0.04), (0.0, 0.0, 3.0 + float(shift)), material=METAL)
+        scene = alone(trihedral(0.05), at=(3.0, 0.06, 0.0))
+        other = thing(trihedral(0.04), (3.0 + float(shift), 0.0, 0.0), material=METAL)
         scene = Scene({**scene.objects, "other": other})
         # Each by itself: beams of both together would see one another.
         beats = [
@@ -126,8 +126,8 @@ def test_on_a_rough_wall_a_target_is_the_mean_over_speckle():
     """A corner that leans on a wall, in one cell with it: sums of powers, shadow included."""
     scene = Scene(
         {
-            "target": thing(trihedral(0.025), (0.0, 0.0, 3.0), material=METAL),
-            "wall": thing(plate(1.5, 1.5), (0.0, 0.0, 3.02)),
+            "target": thing(trihedral(0.025), (3.0, 0.0, 0.0), material=METAL),
+            "wall": thing(plate(1.5, 1.5), (3.02, 0.0, 0.0)),
         }
     )
     drawn = Sampling(depth=1, samples=200_000, boundary_samples=0, points_per_m2=4000.0)
@@ -155,16 +155,16 @@ def test_the_loss_of_a_place_falls_steadily_where_fields_fringe():
     wide = Surrogate(range_width=2.0)
     smooth = SurrogateMap(GRID, wide, drawn, coherent=["target", "still"])
     fringed = FacetMap(GRID, wide, drawn)
-    still = thing(trihedral(0.05), (0.06, 0.0, 3.0), material=METAL)
+    still = thing(trihedral(0.05), (3.0, 0.06, 0.0), material=METAL)
 
-    def at(z: float) -> Scene:
-        return Scene({**alone(trihedral(0.05), at=(0.0, 0.0, 3.0 + z)).objects, "still": still})
+    def at(x: float) -> Scene:
+        return Scene({**alone(trihedral(0.05), at=(3.0 + x, 0.0, 0.0)).objects, "still": still})
 
     for model, steady in ((smooth, True), (fringed, False)):
         truth = model.predict(at(0.0), DEVICE, 0)
         losses = [
-            float((model.predict(at(float(z)), DEVICE, 0) - truth).square().mean())
-            for z in torch.linspace(0.0003, 0.04, 30)
+            float((model.predict(at(float(x)), DEVICE, 0) - truth).square().mean())
+            for x in torch.linspace(0.0003, 0.04, 30)
         ]
         assert bool((torch.tensor(losses).diff() > 0).all()) == steady
 
@@ -173,13 +173,13 @@ def test_a_stretched_wavelength_widens_the_basin_of_a_turn():
     """Of a plate, 8° to 1.6° off: sidelobes are minima of the loss, but not at four wavelengths."""
     model = SurrogateMap(GRID, sampling=Sampling(1), coherent=["target"])
     turns = torch.linspace(math.radians(1.6), math.radians(8), 33)
-    truth = model.predict(alone(plate(0.05, 0.05), (0.0, TOWARDS, 0.0)), DEVICE, 0)
+    truth = model.predict(alone(plate(0.05, 0.05), (0.0, 0.0, TOWARDS)), DEVICE, 0)
     minima = {}
     for stretch in (1.0, 4.0):
         own = replace(model, stretch=stretch)
         losses = []
         for turn in turns.tolist():
-            found = own.predict(alone(plate(0.05, 0.05), (0.0, TOWARDS + turn, 0.0)), DEVICE, 0)
+            found = own.predict(alone(plate(0.05, 0.05), (0.0, 0.0, TOWARDS + turn)), DEVICE, 0)
             losses.append(float((found - truth).square().mean()))
         slopes = torch.tensor(losses).diff()
         minima[stretch] = int(((slopes[:-1] < 0) & (slopes[1:] > 0)).sum())
@@ -190,11 +190,11 @@ def test_a_stretched_wavelength_widens_the_basin_of_a_turn():
 def test_the_map_has_derivatives_with_the_edges_of_beams():
     """By place and turn; with beams' edges fixed the derivative by turns is wrong."""
     model = SurrogateMap(GRID, sampling=Sampling(3, boundary_samples=0), coherent=["target"])
-    tangents = {"place": (0.3, 0.2, 0.5, 0.0, 0.0, 0.0), "turn": (0.0, 0.0, 0.0, 0.6, 0.7, 0.2)}
+    tangents = {"place": (0.5, 0.3, 0.2, 0.0, 0.0, 0.0), "turn": (0.0, 0.0, 0.0, 0.2, 0.6, 0.7)}
 
     def predicted(theta: Tensor, tangent: Tensor, model: SurrogateMap) -> Tensor:
         at = theta * tangent
-        base = float64([0.1, 0.12, 0.0])
+        base = float64([0.0, 0.1, 0.12])
         pose = rigid(rotation_from_vector(base + at[3:]), float64(AT) + at[:3])
         scene = Scene({"target": Object(trihedral(0.05), METAL, pose)})
         return model.predict(scene, DEVICE, 0).double()
@@ -223,8 +223,8 @@ def test_gradient_checks_hold_before_a_rough_wall():
     report = gradcheck(
         SurrogateMap(grid, wide, drawn, coherent=["target"]),
         Pose("target"),
-        {"rotation": float64([0.6, 0.7, 0.2])},
-        scene=walled(alone(trihedral(0.05), (0.1, 0.12, 0.0))),
+        {"rotation": float64([0.2, 0.6, 0.7])},
+        scene=walled(alone(trihedral(0.05), (0.0, 0.1, 0.12))),
         sensor=DEVICE,
         settings=GradcheckSettings(repeats=1, difference_samples=30_000, noise=0.01, max_pairs=4),
     )
@@ -236,7 +236,7 @@ def test_gradient_checks_hold_before_a_rough_wall():
 def test_batches_and_references_have_the_targets_of_single_maps():
     drawn = Sampling(depth=1, samples=100_000, boundary_samples=0)
     model = SurrogateMap(GRID, sampling=drawn, coherent=["target"], stretch=2.0)
-    scenes = [walled(alone(plate(0.05, 0.05), at=(x, 0.0, 3.0))) for x in (0.0, 0.1)]
+    scenes = [walled(alone(plate(0.05, 0.05), at=(3.0, y, 0.0))) for y in (0.0, 0.1)]
     both = model.predict_batch(scenes, DEVICE, 0)
     for found, scene in zip(both, scenes, strict=True):
         single = model.predict(scene, DEVICE, 0)
@@ -259,7 +259,7 @@ def test_looks_have_other_phases_of_targets():
     """Their mean is the map; a target alone is the same in all of them."""
     few = Sampling(depth=3, samples=50_000, boundary_samples=0, points_per_m2=2000.0)
     model = SurrogateMap(GRID, sampling=few, coherent=["target"])
-    scene = walled(alone(trihedral(0.02), at=(0.1, 0.0, 3.3)))
+    scene = walled(alone(trihedral(0.02), at=(3.3, 0.1, 0.0)))
     look = model.realisations(scene, DEVICE, 0)
     assert look is not None
     found = torch.stack([look(number, 0.0) for number in range(48)])
@@ -285,9 +285,9 @@ def test_targets_are_given_by_names_and_the_stretch_needs_some():
 def test_echoes_of_one_target_in_different_cells_add_in_power():
     """Two plates of one object, 0.6 m apart: |Σ fields|² of both cells, none between."""
     near, far = plate(0.04, 0.04), plate(0.04, 0.04)
-    points = torch.cat([near.vertices, far.vertices + float64([0.05, 0.0, 0.6])])
+    points = torch.cat([near.vertices, far.vertices + float64([0.6, 0.05, 0.0])])
     both = Mesh(points, torch.cat([near.faces, far.faces + len(near.vertices)]))
-    pair = Scene({"target": thing(both, (0.0, 0.0, 2.7), material=METAL)})
+    pair = Scene({"target": thing(both, (2.7, 0.0, 0.0), material=METAL)})
     drawn = Sampling(depth=1)
     found = SurrogateMap(GRID, sampling=drawn, coherent=["target"]).predict(pair, DEVICE, 0)
     truth = FacetMap(GRID, sampling=drawn).predict(pair, DEVICE, 0)
@@ -299,7 +299,7 @@ def test_arrays_that_are_no_product_and_other_kernels_serve_too():
     one = AntennaArray(torch.zeros(1, 3, dtype=torch.float64))
     steps = 1.95e-3 * torch.arange(8, dtype=torch.float64)
     zero = torch.zeros_like(steps)
-    places = torch.cat([torch.stack([steps, zero, zero], 1), torch.stack([zero, steps, zero], 1)])
+    places = torch.cat([torch.stack([zero, steps, zero], 1), torch.stack([zero, zero, steps], 1)])
     waveform = FMCW(76e9, 2e9, 50e-6, 64)
     scene = alone(trihedral(0.05))
     for arrays, kernels in (

@@ -53,9 +53,9 @@ def test_offsets_move_along_one_coordinate(basin):
     with torch.no_grad():
         far = basin.Place(18.0, 0.0, beam)(task.scene)["panel"]
         aside = basin.Place(0.0, 3.0, beam)(task.scene)["panel"]
-    assert float(far.center[2]) == pytest.approx(basin.DISTANCE + 18 * cell)
+    assert float(far.center[0]) == pytest.approx(basin.DISTANCE + 18 * cell)
     assert float(aside.center.norm()) == pytest.approx(basin.DISTANCE)
-    assert float(aside.center[0]) == pytest.approx(basin.DISTANCE * 3 * beam)
+    assert float(aside.center[1]) == pytest.approx(basin.DISTANCE * 3 * beam)
     along = (aside.vertices - aside.center) @ aside.center
     assert float(along.abs().max()) < 1e-9
 

@@ -6,11 +6,12 @@ import pytest
 
 RUN = """
 task = "dataset"
+frame = 2
 
 [scene.ball]
 shape = "sphere"
 radius = 0.2
-position = [0.0, 0.0, 1.6]
+position = [1.6, 0.0, 0.0]
 material = { kind = "rough_dielectric", permittivity = 4.0 }
 
 [radar]
@@ -32,7 +33,7 @@ samples = 3
 shard = 1
 
 [[vary]]
-key = "scene.ball.position[0]"
+key = "scene.ball.position[1]"
 kind = "uniform"
 low = -0.3
 high = 0.3

@@ -20,7 +20,7 @@ def test_rooms_hold_one_to_six_things_that_do_not_touch(rooms):
         for k, one in enumerate(room.things):
             if one.kind == "corner":
                 continue
-            low = float(one.item().vertices[:, 1].min())
+            low = float(one.item().vertices[:, 2].min())
             assert low == pytest.approx(0.0, abs=1e-9) or one.kind == "sphere"
             for other in room.things[k + 1 :]:
                 assert math.dist(one.place, other.place) > one.reach + other.reach
@@ -29,11 +29,11 @@ def test_rooms_hold_one_to_six_things_that_do_not_touch(rooms):
 
 def test_a_corner_echoes_where_it_opens_unless_something_hides_it(rooms):
     """Its peak is that of the closed form; the range that of its apex."""
-    corner = rooms.Thing("corner", (0.4, -0.3), -math.pi / 2, (0.05, 0.05, 0.05), 0.6, 1.0)
+    corner = rooms.Thing("corner", (-0.3, 0.4), -math.pi / 2, (0.05, 0.05, 0.05), 0.6, 1.0)
     # The middle of the room lies off; the first place is straight ahead, the second behind.
     room = rooms.Room(0, (corner,), (0.0, math.pi), 20.0)
     radar = room.radar()
-    away = iw.Scene({"away": rooms.Thing("box", (0, 2), 0.0, (0.3, 0.3, 0.3), 0.15, 4.0).item()})
+    away = iw.Scene({"away": rooms.Thing("box", (2, 0), 0.0, (0.3, 0.3, 0.3), 0.15, 4.0).item()})
     beat = corner.echo(radar, away)
     power = beat.abs().square().mean((1, 2, 3))
     assert power[1] < 1e-4 * power[0]
@@ -44,7 +44,7 @@ def test_a_corner_echoes_where_it_opens_unless_something_hides_it(rooms):
     expected = gain * rooms.CHIRP.wavelength**2 * peak / (4 * math.pi) ** 3 / float(way.norm()) ** 4
     assert float(power[0]) == pytest.approx(expected, rel=0.15)
     hidden = iw.Scene(
-        {"box": rooms.Thing("box", (1.0, -0.3), 0.0, (0.3, 1.2, 0.9), 0.6, 4.0).item()}
+        {"box": rooms.Thing("box", (-0.3, 1.0), 0.0, (0.9, 0.3, 1.2), 0.6, 4.0).item()}
     )
     assert float(corner.echo(radar, hidden)[0].abs().max()) == 0.0
 
@@ -61,7 +61,7 @@ def test_pairs_are_one_to_one_and_near(rooms):
     [(0.8, 0.3, 0.5, 0.0), (0.3, 0.8, 0.5 - math.pi / 2, 0.0), (0.8, 0.3, 0.7, 0.2)],
 )
 def test_yaw_is_that_of_the_longer_side(rooms, length, width, yaw, off):
-    true = rooms.Thing("box", (0.0, 0.0), 0.5, (0.8, 1.0, 0.3), 0.5, 4.0)
+    true = rooms.Thing("box", (0.0, 0.0), 0.5, (0.8, 0.3, 1.0), 0.5, 4.0)
     found = ShapeParameters("box", (0.0, 0.0), yaw, length, width, 1.0)
     assert rooms.yaw_error(true, found) == pytest.approx(off, abs=1e-9)
 

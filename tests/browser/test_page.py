@@ -75,7 +75,7 @@ def test_the_slider_moves_mesh_and_map_and_no_name_acts(
         if kind == "recording":
             assert apart(scene, f"recording_{key.lower()}") <= APART
             assert apart(maps, f"simulated_{key.lower()}") <= APART
-    # Who looks along z with y up has x to the left.
+    # Who looks along x with z up has y to the left.
     assert columns[0] < columns[1] - 50
     u = 0.8 / math.hypot(0.8, 2.0)
     assert bright == pytest.approx([0.5 - u / 1.2, 0.5], abs=0.05)
@@ -119,10 +119,10 @@ def test_a_click_lights_what_feeds_a_bin_for_every_sensor_and_position(
 ):
     slider = opened(watched, page_html(display, links), tmp_path / "page.html")
     page = watched.page
-    slider.press("End")  # the ball is at x = 0.8, z = 2
+    slider.press("End")  # the ball is at x = 2, y = 0.8
     for group in ("what is seen", "boundary paths"):
         page.get_by_role("checkbox", name=group).click()
-    ball = np.array([0.8, 0.0, 2.0])
+    ball = np.array([2.0, 0.8, 0.0])
     for number, (name, link) in enumerate(links.items()):
         page.get_by_label("sensor").select_option(str(number))
         assert page.get_by_label("sensor").locator("option").nth(number).inner_text() == name
@@ -132,7 +132,7 @@ def test_a_click_lights_what_feeds_a_bin_for_every_sensor_and_position(
             axes = link.radar.link().rotations[frame].numpy()
             toward = ball - place
             distance = float(np.linalg.norm(toward))
-            u = float(toward @ axes[:, 0]) / distance
+            u = float(toward @ axes[:, 1]) / distance
             box, grid = picture_of(page, "simulated").bounding_box(), link.grid
             up = ((distance - 0.3 - grid.range_start) / grid.range_step + 0.5) / grid.range_count
             left = ((u - grid.u_start) / grid.u_step + 0.5) / grid.u_count

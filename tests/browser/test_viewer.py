@@ -36,18 +36,18 @@ RATE = 5.0  # maps a second, with 20 000 triangles
 def viewer(chromium: Any):
     array = planar_array((16, 4), (1.9e-3, 1.9e-3))
     waveform = FMCW(77e9, 2e9, 50e-6, 128)
-    places = torch.tensor([[0.0, 0.0, 0.0], [0.8, 0.0, 0.0]], dtype=torch.float64)
+    places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.8, 0.0]], dtype=torch.float64)
     radar = Radar(planar_array((1, 1), (1.9e-3, 1.9e-3)), array, waveform, places)
     grid = radar.grid(1.0, 4.5, 0.5, 0.5)
     material = RoughDielectric(4.0)
-    ball = Object(sphere(0.3, 5), material, rigid(translation=[0.0, 0.0, 2.0]))
-    wall = Object(plate(3.0, 2.4), material, rigid(translation=[0.0, 0.0, 3.3]))
+    ball = Object(sphere(0.3, 5), material, rigid(translation=[2.0, 0.0, 0.0]))
+    wall = Object(plate(3.0, 2.4), material, rigid(translation=[3.3, 0.0, 0.0]))
     scene = Scene({"ball": ball, "wall": wall})
     assert len(ball.mesh.faces) >= 20_000
     link = InteractiveSensor(scene, radar, grid)
-    truth = scene.replace("ball", pose=rigid(translation=[0.1, 0.0, 2.1]))
+    truth = scene.replace("ball", pose=rigid(translation=[2.1, 0.1, 0.0]))
     measured = torch.stack([link.predict_map(truth, k)[..., None] for k in range(2)])
-    begun, away = display_mesh(ball), np.array([0.1, 0.0, 0.0], np.float32)
+    begun, away = display_mesh(ball), np.array([0.0, 0.1, 0.0], np.float32)
     steps = [
         DisplayStep(
             k,
@@ -109,7 +109,7 @@ def test_the_map_follows_what_a_person_drags(watched, viewer, pictures, note):
     page.wait_for_timeout(1000)
     center = viewer._center
     begun = np.array(viewer._gizmo.position)
-    x, y = seen_at(viewer, center + np.array([0.3 * viewer._size, 0.0, 0.0]))
+    x, y = seen_at(viewer, center + np.array([0.0, 0.3 * viewer._size, 0.0]))
     page.mouse.move(x, y)
     page.wait_for_timeout(300)
     page.mouse.down()
@@ -162,7 +162,7 @@ def test_the_slider_moves_the_mesh(watched, viewer, pictures, blue):
         columns.append(blue(page.screenshot(clip=whole)))
         # Below what viser says where there is no GPU.
         scenes[f"viewer_step_{number}"] = page.screenshot(clip=whole | {"y": 192, "height": 448})
-    away = [seen_at(viewer, [-0.1 * k, 0.0, 2.0])[0] for k in (5, 0)]
+    away = [seen_at(viewer, [2.0, -0.1 * k, 0.0])[0] for k in (5, 0)]
     assert max([apart(png, name) for name, png in scenes.items()]) <= APART
     assert columns[0] - columns[1] == pytest.approx(away[0] - away[1], rel=0.25)
     assert watched.errors == []
@@ -175,13 +175,13 @@ def test_a_click_on_a_map_lights_the_points_that_feed_it(watched, viewer, pictur
     page.get_by_role("slider").first.press("End")
     page.wait_for_timeout(2500)
     grid = viewer._links[""].grid
-    # The last step has the ball at x = -0.5 m.
+    # The last step has the ball at y = -0.5 m.
     row = round((math.hypot(0.5, 2.0) - 0.3 - grid.range_start) / grid.range_step)
     column = round((-0.5 / math.hypot(0.5, 2.0) - grid.u_start) / grid.u_step)
     panels = viewer._panels
-    right, up = panels._axes
+    left, up = panels._axes
     shares = (np.array([column, row]) + 0.5) / [grid.u_count, grid.range_count] - 0.5
-    place = panels._places["simulated"] + panels._size * (shares[0] * right + shares[1] * up)
+    place = panels._places["simulated"] + panels._size * (shares[0] * left + shares[1] * up)
     page.mouse.click(*seen_at(viewer, place))
     page.wait_for_timeout(2500)
     page.screenshot(path=str(pictures / "clicked.png"))
@@ -210,13 +210,13 @@ def test_each_sensor_has_its_maps_and_its_points(watched, pictures, chromium):
         now = viewer._panels._known["simulated"][0]
         assert now.shape == other.grid.shape[:2]
         assert np.abs(now / now.max() - before / before.max()).max() > 0.5
-        # From x = -2.5 m, along x, the ball at x = 0.8 m is straight ahead.
+        # From y = -2.5 m, along y, the ball at y = 0.8 m is straight ahead.
         row = round((3.3 - 0.3 - other.grid.range_start) / other.grid.range_step)
         viewer._update_state(bin=(row, other.grid.u_count // 2))
         page.wait_for_timeout(2500)
         fed = viewer._nodes["chosen bin"].points
         assert len(fed) > 3
-        assert np.linalg.norm(fed - [0.5, 0.0, 2.0], axis=1).max() < 0.15
+        assert np.linalg.norm(fed - [2.0, 0.5, 0.0], axis=1).max() < 0.15
     assert watched.errors == []
 
 

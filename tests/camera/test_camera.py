@@ -33,6 +33,14 @@ def test_looking_is_upright_and_as_wide_as_asked():
     assert float(cosine.arccos()) == pytest.approx(0.9)
 
 
+def test_a_picture_is_what_somebody_at_the_camera_sees():
+    """Along x, z up: +y is on the left; 0.5 m at 2 m are a quarter of the focal length."""
+    along_x = Camera.look_at([0, 0, 0], [1, 0, 0], width=40, height=30, field_of_view=math.pi / 2)
+    found = along_x.project(float64([[2.0, 0.5, 0.0], [2.0, 0.0, 0.5]]), 0)
+    torch.testing.assert_close(found, float64([[15.0, 15.0], [20.0, 10.0]]))
+    assert torch.equal(along_x.rotations[0], float64([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
+
+
 def test_moved_keeps_cameras_to_each_other():
     pose = CameraPose([0.1, 0.2, 0.3], [0.2, -0.3, 0.4])
     moved = pose(CAMERA)

@@ -24,12 +24,14 @@ from invertwin.scene import (
     sphere,
 )
 from invertwin.scene.parameters import Pose
-from scenes import float64
+from scenes import float64, level_plate
 
 METAL = PerfectConductor()
 RADIUS = 0.4
 BALL = sphere(RADIUS, 4)
-AHEAD = Camera(torch.zeros(3).double(), torch.eye(3).double(), 40, 30, 60.0)
+# Looks along x: −y is on its right, −z down.
+AXES = float64([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+AHEAD = Camera(torch.zeros(3).double(), AXES, 40, 30, 60.0)
 FINE = ImageSampling(samples=64)
 NEAR_BOX = Camera.look_at([2.5, 1.0, 1.4], [0.0, 0.0, 0.1], width=12, height=9, field_of_view=0.5)
 CROWD = Scene(
@@ -40,13 +42,13 @@ CROWD = Scene(
             rigid(rotation_from_vector(float64([0.1, 0.2, 0.4])), [0.05, 0.1, 0.2]),
         ),
         "post": Object(box((0.1, 0.1, 0.8)), METAL, rigid(translation=[0.6, 0.1, 0.25])),
-        "floor": Object(plate(6.0, 6.0), METAL, rigid(translation=[0.0, 0.0, -0.15])),
+        "floor": Object(level_plate(6.0, 6.0), METAL, rigid(translation=[0.0, 0.0, -0.15])),
     }
 )
 
 
 def ball_at(distance: Tensor) -> Scene:
-    place = torch.stack([0 * distance, 0 * distance, distance])
+    place = torch.stack([distance, 0 * distance, 0 * distance])
     return Scene({"ball": Object(BALL, METAL, rigid(translation=place))})
 
 
@@ -82,20 +84,20 @@ def test_a_ball_is_a_disc_that_shrinks_as_it_goes_away():
 
 def test_the_focal_length_scales_the_disc():
     focal = float64(60.0).requires_grad_()
-    camera = Camera(torch.zeros(3).double(), torch.eye(3).double(), 40, 30, focal)
+    camera = Camera(torch.zeros(3).double(), AXES, 40, 30, focal)
     silhouettes(ball_at(float64(2.0)), camera, ["ball"], FINE, 0).sum().backward()
     assert focal.grad is not None
     assert float(focal.grad) == pytest.approx(2 * disc(2.0) / 60.0, rel=5e-3)
 
 
 def test_depth_of_a_plane_is_linear_over_its_inverse():
-    tilt = rotation_from_vector(float64([0.1, 0.2, 0.0]))
-    wall = Scene({"wall": Object(plate(9.0, 9.0), METAL, rigid(tilt, [0.0, 0.0, 3.0]))})
+    tilt = rotation_from_vector(float64([0.0, 0.1, 0.2]))
+    wall = Scene({"wall": Object(plate(9.0, 9.0), METAL, rigid(tilt, [3.0, 0.0, 0.0]))})
     found = depths(wall, AHEAD, 50.0, ImageSampling(256), 0)[0]
-    normal = tilt[:, 2]
+    normal = tilt[:, 0]
     v, u = torch.meshgrid(torch.arange(30.0) + 0.5, torch.arange(40.0) + 0.5, indexing="ij")
-    ways = torch.stack([(u - 20) / 60, (v - 15) / 60, torch.ones_like(u)], 2).double()
-    torch.testing.assert_close(found, 3 * normal[2] / (ways @ normal), rtol=2e-4, atol=0)
+    ways = torch.stack([torch.ones_like(u), (20 - u) / 60, (15 - v) / 60], 2).double()
+    torch.testing.assert_close(found, 3 * normal[0] / (ways @ normal), rtol=2e-4, atol=0)
 
 
 def test_nothing_is_as_deep_as_far():
@@ -168,7 +170,7 @@ def test_a_mask_ends_where_objects_cross(monkeypatch):
 
     def area(height: Tensor, samples: int = 64) -> Tensor:
         place = torch.stack([0 * height, 0 * height, height])
-        floor = Object(plate(6.0, 6.0), METAL)
+        floor = Object(level_plate(6.0, 6.0), METAL)
         scene = Scene({"ball": Object(BALL, METAL, rigid(translation=place)), "floor": floor})
         return silhouettes(scene, camera, ["ball"], ImageSampling(samples), 0).sum()
 

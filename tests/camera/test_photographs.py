@@ -8,13 +8,15 @@ from invertwin.errors import InputError
 from invertwin.models.camera import DepthMap
 from invertwin.scene import Object, PerfectConductor, Scene, plate, rigid
 
-AHEAD = Camera(torch.zeros(3).double(), torch.eye(3).double(), 40, 30, 60.0)
-FACING = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+# Looks along x: −y is on its right, −z down.
+AXES = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]).double()
+AHEAD = Camera(torch.zeros(3).double(), AXES, 40, 30, 60.0)
+FACING = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
 # Two squares at 2 m and 3 m; the nearer covers 12 by 12 pixels about the middle of the image.
 WORLD = Scene(
     {
-        "near": Object(plate(0.4, 0.4), PerfectConductor(), rigid(FACING, [0.0, 0.0, 2.0])),
-        "far": Object(plate(1.6, 0.8), PerfectConductor(), rigid(FACING, [0.0, 0.0, 3.0])),
+        "near": Object(plate(0.4, 0.4), PerfectConductor(), rigid(FACING, [2.0, 0.0, 0.0])),
+        "far": Object(plate(1.6, 0.8), PerfectConductor(), rigid(FACING, [3.0, 0.0, 0.0])),
     }
 )
 

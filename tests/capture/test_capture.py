@@ -1,12 +1,15 @@
 """Captures: what they hold, their files, and what is refused."""
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import xarray as xr
 
 from invertwin.capture import Capture, Track, read
+from invertwin.capture.readers.netcdf import write_dataset
 from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar.processing.beamforming import exact_spectrum
@@ -110,6 +113,73 @@ def test_range_profiles_round_trip_with_track_and_survey(tmp_path):
     assert loaded.survey is not None
     assert torch.equal(loaded.survey, survey)
     assert loaded.dataset["range"].attrs["units"] == "m"
+
+
+def test_an_old_file_of_beat_samples_is_turned(tmp_path):
+    """A radar at 3 m ahead, 1 m to the left, 2 m up, turned to the left by 90°."""
+    turn = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
+    beat = np.arange(8.0).reshape(1, 2, 1, 4)
+    variables = {
+        "beat_real": (("frame", "tx", "rx", "sample"), beat),
+        "beat_imag": (("frame", "tx", "rx", "sample"), -beat),
+        "position": (("frame", "axis"), [[1.0, 2.0, 3.0]]),
+        "rotation": (("frame", "axis", "radar_axis"), [turn]),
+        "tx_position": (("tx", "radar_axis"), [[5e-4, 2e-4, 1e-4], [0.0, 0.0, 0.0]]),
+        "rx_position": (("rx", "radar_axis"), [[-5e-4, 0.0, 0.0]]),
+    }
+    attributes = {
+        **{"waveform": "FMCW", "start_frequency": 76e9, "bandwidth": 1e9, "duration": 40e-6},
+        **{"samples": 4, "window": "hann", "array_window": "hann", "visibility": "shared"},
+        **{"tx_pattern": "isotropic", "rx_pattern": "isotropic"},
+    }
+    old = xr.Dataset(variables, attrs=attributes)
+    old.to_netcdf(tmp_path / "old.nc", engine="h5netcdf")
+    capture = Capture.load(tmp_path / "old.nc")
+    radar = capture.radar()
+    assert radar.positions.tolist() == [[3.0, 1.0, 2.0]]
+    ahead, left, up = radar.link().rotations[0].mT.tolist()
+    assert ahead == [0.0, 1.0, 0.0]
+    assert left == [-1.0, 0.0, 0.0]
+    assert up == [0.0, 0.0, 1.0]
+    assert radar.transmitters.positions.tolist() == [[1e-4, 5e-4, 2e-4], [0.0, 0.0, 0.0]]
+    assert radar.receivers.positions.tolist() == [[0.0, -5e-4, 0.0]]
+    assert torch.equal(capture.beat, torch.from_numpy(beat * (1 - 1j)))
+    capture.save(tmp_path / "new.nc")
+    again = Capture.load(tmp_path / "new.nc")
+    assert again.dataset.attrs["axes"] == "x forward, y left, z up"
+    xr.testing.assert_identical(again.dataset, capture.dataset)
+
+
+def test_an_old_file_of_range_profiles_is_turned(tmp_path):
+    track = torch.tensor([[1.0, 2.0, 3.0], [1.5, 2.5, 3.5]]).double()
+    survey = torch.tensor([[4.0, 5.0, 6.0]]).double()
+    path = Track(torch.tensor([-1.0, 5.0]).double(), track)
+    new = profile_capture(track=path, survey=survey).dataset
+    dims = ("track_time", "axis")
+    old = new.assign(
+        position=(("frame", "axis"), [[7.0, 8.0, 9.0]] * FRAMES),
+        track_position=(dims, [[2.0, 3.0, 1.0], [2.5, 3.5, 1.5]]),
+        survey=(("target", "axis"), [[5.0, 6.0, 4.0]]),
+    )
+    del old.attrs["axes"]
+    write_dataset(old, tmp_path / "old.nc")
+    found = Capture.load(tmp_path / "old.nc")
+    assert found.track is not None
+    assert torch.equal(found.track.positions, track)
+    assert found.survey is not None
+    assert torch.equal(found.survey, survey)
+    assert found.radar().positions.tolist() == [[9.0, 7.0, 8.0]] * FRAMES
+    assert torch.equal(found.range_profile, profile_capture().range_profile)
+
+
+def test_the_file_of_an_earlier_version_is_turned():
+    """``two_frames.nc`` is from before 0.4: its arrays lie along x, along which the radar moves."""
+    radar = Capture.load(Path(__file__).with_name("two_frames.nc")).radar()
+    assert radar.positions.tolist() == [[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]]
+    assert radar.transmitters.positions.tolist() == [[0.0, -0.001, 0.0], [0.0, 0.001, 0.0]]
+    assert radar.receivers.positions[:, 1].tolist() == [-0.002, 0.0, 0.002]
+    assert not radar.receivers.positions[:, [0, 2]].any()
+    assert torch.equal(radar.link().rotations, torch.eye(3).double().expand(2, 3, 3))
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
@@ -270,6 +340,7 @@ def test_grids_that_the_profiles_cannot_fill_are_refused():
     ("change", "message"),
     [
         (lambda d: d.assign_attrs(waveform="chirp"), "waveform to be one of FMCW, Impulse"),
+        (lambda d: d.assign_attrs(axes="x left"), "axes to be one of x forward, y left, z up, got"),
         (lambda d: d.assign_attrs(bandwidth=1.0), "in Hz"),
         (lambda d: d.drop_vars("beat"), "either beat or range_profile"),
         (lambda d: d.drop_vars("rotation"), "a variable 'rotation'"),

@@ -19,7 +19,7 @@ from invertwin.radar.waveform import FMCW, Impulse
 from invertwin.scene.antenna import AntennaArray
 
 CHIRP = FMCW(77e9, 2e9, 50e-6, 128)
-PLACE = torch.tensor([0.3, -0.1, 1.5], dtype=torch.float64)
+PLACE = torch.tensor([1.5, 0.3, -0.1], dtype=torch.float64)
 
 
 def radar(frames=2):
@@ -42,7 +42,7 @@ def errors():
 
 
 def recorded(frames=2):
-    clutter = 0.5 * echo(torch.tensor([0.0, 0.0, 4.0]).double(), frames)
+    clutter = 0.5 * echo(torch.tensor([4.0, 0.0, 0.0]).double(), frames)
     phases = torch.exp(1j * torch.arange(frames, dtype=torch.float64))[:, None, None, None]
     beat = errors()[:, :, None] * (phases * echo(PLACE, frames) + clutter)
     return Capture.from_beat(beat, radar(frames))
@@ -132,7 +132,7 @@ def test_channels_that_cannot_be_calibrated_are_refused(unchecked):
 
 def test_a_reflector_must_be_where_the_radar_measures(unchecked):
     with pytest.raises(InputError, match="reflector within"):
-        estimate_channels(recorded(), [0.0, 0.0, 50.0])
+        estimate_channels(recorded(), [50.0, 0.0, 0.0])
     with pytest.raises(InputError, match="world position of the reflector"):
         estimate_channels(recorded(), [0.0, 1.0])
     silent = Capture.from_beat(recorded().beat * 0, radar())

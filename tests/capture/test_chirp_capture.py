@@ -9,7 +9,7 @@ from invertwin.radar import Chirps
 from scenes import radar
 
 CHIRPS = Chirps(6, 60e-6)
-DEVICE = radar([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
+DEVICE = radar([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]])
 
 
 def beat() -> torch.Tensor:

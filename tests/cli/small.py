@@ -10,6 +10,7 @@ from invertwin.cli import app
 
 RUN = """
 task = "reconstruct"
+frame = 2
 seed = 3
 
 [scene.plate]
@@ -17,23 +18,23 @@ shape = "plate"
 width = 0.4
 height = 0.3
 divisions = 3
-position = [0.0, 0.0, 1.2]
+position = [1.2, 0.0, 0.0]
 material = { kind = "rough_dielectric", permittivity = 4.0 }
 
 [scene.wall]
 shape = "plate"
 width = 2.0
 height = 2.0
-position = [0.0, 0.0, 1.6]
+position = [1.6, 0.0, 0.0]
 material = { kind = "rough_dielectric", permittivity = 4.0 }
 
 [truth.plate]
-position = [0.02, 0.01, 1.2]
+position = [1.2, 0.02, 0.01]
 
 [radar]
 waveform = { kind = "fmcw", start_frequency = 76e9, bandwidth = 2e9, duration = 5e-5, samples = 64 }
 receivers = { kind = "planar", count = [6, 4], spacing = [1.9e-3, 1.9e-3] }
-positions = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]
+positions = [[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]]
 
 [radar.transmitters]
 kind = "positions"
@@ -76,7 +77,7 @@ distance = [0.05, 0.08]
 GRADCHECK = """
 [gradcheck]
 parameter = { kind = "translation", object = "plate" }
-tangent = { translation = [1.0, 0.0, 0.0] }
+tangent = { translation = [0.0, 1.0, 0.0] }
 depth = 2
 step = 1e-2
 samples = 50_000
@@ -86,7 +87,7 @@ difference_samples = 50_000
 max_pairs = 4
 """
 
-BEHIND = RUN.replace("1.2]", "-1.2]").replace("1.6]", "-1.6]").replace("snr_db = 20.0", "")
+BEHIND = RUN.replace("[1.2", "[-1.2").replace("[1.6", "[-1.6").replace("snr_db = 20.0", "")
 MATERIAL = 'material = { kind = "perfect_conductor" }\n'
 
 

@@ -45,7 +45,7 @@ def test_help_names_the_commands(monkeypatch, capsys):
 )
 def test_bad_input_is_one_line_and_code_2(run_file, monkeypatch, capfd, arguments, said):
     folder = run_file.parent
-    (folder / "unknown.toml").write_text(RUN.replace("position = [0.0, 0.0, 1.2]", "positoin = 1"))
+    (folder / "unknown.toml").write_text(RUN.replace("position = [1.2, 0.0, 0.0]", "positoin = 1"))
     (folder / "mesh.toml").write_text(RUN + '[scene.car]\nfile = "car.obj"\n' + MATERIAL)
     (folder / "check.toml").write_text(RUN + GRADCHECK)
     (folder / "behind.toml").write_text(BEHIND)
@@ -96,7 +96,7 @@ def test_simulate_of_nothing_visible_is_silence(run_file, monkeypatch):
 
 @pytest.mark.slow
 def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
-    landscape = '[landscape]\nobject = "plate"\naxis = [0.0, 0.0, 1.0]\npoints = 3\n'
+    landscape = '[landscape]\nobject = "plate"\naxis = [1.0, 0.0, 0.0]\npoints = 3\n'
     run_file.write_text(RUN + landscape + "exact_points = 21\n")
     assert call(monkeypatch, "reconstruct", run_file, "--seed", "5", "-o", "fit") == 0
     out = run_file.parent / "fit"
@@ -153,7 +153,7 @@ def test_gradcheck_of_several_files(run_file, monkeypatch, capsys):
     files = []
     for name in ("first", "second"):
         files.append(run_file.with_name(f"{name}.toml"))
-        files[-1].write_text(RUN.replace("[0.02, 0.01, 1.2]", "[0.0, 0.0, 1.2]") + GRADCHECK)
+        files[-1].write_text(RUN.replace("[1.2, 0.02, 0.01]", "[1.2, 0.0, 0.0]") + GRADCHECK)
     assert call(monkeypatch, "gradcheck", *files) == 0
     out = run_file.parent / "out" / "gradcheck"
     scenes = read_metrics(out)["scenes"]

@@ -156,8 +156,8 @@ def test_one_line_code_2_and_results_untouched(folder, monkeypatch, capfd, text,
 
 
 def shapes() -> dict[str, Mesh]:
-    """Meshes that are odd but mean something, all in the x-y plane or near it."""
-    corners = [[-0.2, -0.2, 0.0], [0.2, -0.2, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, -0.2]]
+    """Meshes that are odd but mean something, all in the y-z plane or near it."""
+    corners = [[0.0, -0.2, -0.2], [0.0, 0.2, -0.2], [0.0, 0.0, 0.2], [-0.2, 0.0, 0.0]]
     fins = [[0, 2, 1], [0, 1, 3], [0, 3, 1]]  # three faces on one edge
     return {
         "open": Mesh(torch.tensor(corners).double(), torch.tensor([[0, 2, 1]])),
@@ -171,7 +171,7 @@ def shapes() -> dict[str, Mesh]:
 def test_odd_meshes_are_fitted(run_file, monkeypatch, name):
     save_mesh(run_file.with_name("odd.ply"), shapes()[name])
     start, stop = RUN.index("[scene.plate]"), RUN.index("[scene.wall]")
-    placed = f"position = [0.0, 0.0, 1.2]\n{MATERIAL.replace('perfect_conductor', 'ROUGH')}"
+    placed = f"position = [1.2, 0.0, 0.0]\n{MATERIAL.replace('perfect_conductor', 'ROUGH')}"
     placed = placed.replace('kind = "ROUGH"', 'kind = "rough_dielectric", permittivity = 4.0')
     text = RUN[:start] + f'[scene.plate]\nfile = "odd.ply"\n{placed}\n' + RUN[stop:]
     run_file.write_text(text)
@@ -186,8 +186,8 @@ def test_odd_meshes_are_fitted(run_file, monkeypatch, name):
 @pytest.mark.slow
 def test_start_out_of_sight_ends_without_an_exception(run_file, monkeypatch):
     # The data hold the wall alone; the plate stands where the grid does not reach.
-    text = RUN.replace("[0.02, 0.01, 1.2]", "[0.0, 0.0, 9.0]").replace("steps = 8", "steps = 2")
-    text = text.replace("position = [0.0, 0.0, 1.2]", "position = [0.0, 0.0, 9.0]")
+    text = RUN.replace("[1.2, 0.02, 0.01]", "[9.0, 0.0, 0.0]").replace("steps = 8", "steps = 2")
+    text = text.replace("position = [1.2, 0.0, 0.0]", "position = [9.0, 0.0, 0.0]")
     run_file.write_text(text)
     assert call(monkeypatch, "reconstruct", run_file) == 0
     metrics = read_metrics(run_file.parent / "out" / "small")
@@ -198,7 +198,7 @@ def test_start_out_of_sight_ends_without_an_exception(run_file, monkeypatch):
 @pytest.mark.slow
 def test_isotropic_antenna_sees_behind_itself(run_file, monkeypatch):
     text = BEHIND.replace('kind = "cosine", exponent = 1.0', 'kind = "isotropic"')
-    run_file.write_text(text.replace("[0.02, 0.01, 1.2]", "[0.02, 0.01, -1.2]"))
+    run_file.write_text(text.replace("[1.2, 0.02, 0.01]", "[-1.2, 0.02, 0.01]"))
     assert call(monkeypatch, "simulate", run_file) == 0
     metrics = read_metrics(run_file.parent / "out" / "small")
     assert metrics["peak_range_m"] == pytest.approx(1.2, abs=0.5)

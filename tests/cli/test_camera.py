@@ -11,6 +11,7 @@ from invertwin.errors import InputError
 
 CHECK = """
 task = "gradcheck"
+frame = 2
 
 [scene.box]
 shape = "box"

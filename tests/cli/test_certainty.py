@@ -14,7 +14,7 @@ def test_a_run_states_verdict_and_error_bars(run_file, monkeypatch, capsys):
         ratio = metrics["within_95"][name] / metrics["standard_deviations"][name]
         assert ratio == pytest.approx(1.998, abs=0.001)
     # A range cell is 75 mm; two looks at a plate before a wall tell its range to a fraction of it.
-    assert 1e-4 < metrics["standard_deviations"]["plate.z"] < 0.03
+    assert 1e-4 < metrics["standard_deviations"]["plate.x"] < 0.03
     assert metrics["verdict"] in ("consistent", "inconsistent")
     assert (metrics["loss_excess"] > 3.5) == (metrics["verdict"] == "inconsistent")
     said = " ".join(capsys.readouterr().out.split())
@@ -31,12 +31,12 @@ def test_a_search_about_a_bad_start_finds_the_right_place(run_file, monkeypatch,
 [search]
 object = "plate"
 kind = "given"
-positions = [[0.02, 0.01, 1.18], [0.4, 0.0, 1.4]]
+positions = [[1.18, 0.02, 0.01], [1.4, 0.4, 0.0]]
 
 [loss]
 kind = "likelihood"
 """
-    begun = RUN.replace("position = [0.0, 0.0, 1.2]", "position = [-0.5, 0.0, 1.45]")
+    begun = RUN.replace("position = [1.2, 0.0, 0.0]", "position = [1.45, -0.5, 0.0]")
     run_file.write_text(begun + search)
     assert call(monkeypatch, "reconstruct", run_file, "-o", "out") == 0
     metrics = read_metrics(run_file.parent / "out")
@@ -57,9 +57,9 @@ def test_every_start_with_a_recording_of_its_own(run_file, monkeypatch):
     # Other speckle, other losses, other errors.
     assert first["loss"] != pytest.approx(second["loss"], rel=1e-3)
     inside = [
-        abs(row["errors"]["plate.z"]) <= row["within_95"]["plate.z"] for row in (first, second)
+        abs(row["errors"]["plate.x"]) <= row["within_95"]["plate.x"] for row in (first, second)
     ]
-    assert metrics["coverage_95"]["z"] == sum(inside) / 2
+    assert metrics["coverage_95"]["x"] == sum(inside) / 2
     assert set(metrics["coverage_95"]) == {"x", "y", "z"}
-    assert metrics["stated_over_observed"]["z"] > 0
-    assert metrics["errors"]["plate.z"] in (first["errors"]["plate.z"], second["errors"]["plate.z"])
+    assert metrics["stated_over_observed"]["x"] > 0
+    assert metrics["errors"]["plate.x"] in (first["errors"]["plate.x"], second["errors"]["plate.x"])

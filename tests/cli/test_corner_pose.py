@@ -30,5 +30,5 @@ def test_a_plan_takes_the_model_of_the_last_stage(repository, tmp_path, monkeypa
     assert call(monkeypatch, "plan", file, "-o", tmp_path / "out") == 0
     metrics = read_metrics(tmp_path / "out")
     # Powers tell the place to a millimetre, phases to less than a tenth.
-    assert metrics["standard_deviations"]["corner.y"] < 2e-4
+    assert metrics["standard_deviations"]["corner.z"] < 2e-4
     assert metrics["unobserved"][0].startswith("corner.roll")

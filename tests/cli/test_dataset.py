@@ -28,20 +28,21 @@ from invertwin.runtime.engines import run_jobs
 ANYWHERE = Path("rooms.toml")
 RUN = """
 task = "dataset"
+frame = 2
 seed = 1
 
 [scene.ball]
 shape = "sphere"
 radius = 0.2
-position = [0.0, 0.0, 1.6]
-velocity = [0.0, 0.0, 1.0]
+position = [1.6, 0.0, 0.0]
+velocity = [1.0, 0.0, 0.0]
 material = { kind = "rough_dielectric", permittivity = 4.0 }
 
 [scene.wall]
 shape = "plate"
 width = 2.0
 height = 2.0
-position = [0.0, 0.0, 2.4]
+position = [2.4, 0.0, 0.0]
 material = { kind = "rough_dielectric", permittivity = 4.0 }
 
 [radar]
@@ -75,8 +76,8 @@ masks = true
 [[vary]]
 key = "scene.ball.position"
 kind = "uniform"
-low = [-0.3, 0.0, 1.0]
-high = [0.3, 0.0, 2.0]
+low = [1.0, -0.3, 0.0]
+high = [2.0, 0.3, 0.0]
 
 [[vary]]
 key = ["scene.ball.material.permittivity", "scene.wall.material.permittivity"]
@@ -223,7 +224,7 @@ def test_samples_hold_signals_and_true_labels(whole):
         assert sample["map"].shape[:2] == (1, 4)
         assert (ball["name"], ball["class"]) == ("ball", "thing")
         assert [row[3] for row in ball["pose"][:3]] == own["scene"]["ball"]["position"]
-        assert ball["velocity"] == [0.0, 0.0, 1.0]
+        assert ball["velocity"] == [1.0, 0.0, 0.0]
         # A little less than half of a ball is seen: cos of the cone that touches it.
         x, y, z = own["scene"]["ball"]["position"]
         share = 0.5 * (1 - 0.2 / (x * x + y * y + z * z) ** 0.5)
@@ -292,9 +293,9 @@ def test_joints_of_a_body_are_where_its_skin_is():
         "anna": {
             "shape": "body",
             "spacing": 0.05,
-            "position": [0.5, 0.0, 3.0],
-            "rotation_deg": [0.0, 90.0, 0.0],
-            "angles_deg": {"right_elbow": [0.0, 90.0, 0.0]},
+            "position": [3.0, 0.5, 0.0],
+            "rotation_deg": [0.0, 0.0, 90.0],
+            "angles_deg": {"right_elbow": [0.0, 0.0, 90.0]},
             "material": {"kind": "rough_dielectric", "permittivity": 20.0},
         }
     }
@@ -302,9 +303,9 @@ def test_joints_of_a_body_are_where_its_skin_is():
     run = validate_run(raw, ANYWHERE)
     scene = build.true_scene(run)
     joints = joint_positions(run.scene["anna"], scene["anna"])
-    assert joints["pelvis"].tolist() == pytest.approx([0.5, 0.0, 3.0])
-    # Turned by 90° about y, what was at +x is now at −z.
-    assert joints["right_elbow"].tolist() == pytest.approx([0.5, 0.45, 3.0 - 0.47], abs=1e-6)
+    assert joints["pelvis"].tolist() == pytest.approx([3.0, 0.5, 0.0])
+    # Turned by 90° about z, what was at +y is now at −x.
+    assert joints["right_elbow"].tolist() == pytest.approx([3.0 - 0.47, 0.5, 0.45], abs=1e-6)
     skin = scene["anna"].vertices
     for place in joints.values():
         assert (skin - place).norm(dim=1).min() < 0.16
@@ -411,7 +412,7 @@ def test_names_with_dots_stand_in_quotes():
 
 def test_paths_are_written_where_they_are_asked_for(tmp_path):
     text = RUN.replace("[chirps]\ncount = 4\ninterval = 6e-5\n", "")
-    text = text.replace("velocity = [0.0, 0.0, 1.0]\n", "")
+    text = text.replace("velocity = [1.0, 0.0, 0.0]\n", "")
     text = text.replace("masks = true", "paths = true").replace("samples = 5", "samples = 1")
     run = validate_run(tomllib.loads(text), tmp_path / "run.toml")
     (tmp_path / "a.tar").write_bytes(make_shard((to_toml(run), 0, 1)))
@@ -427,7 +428,7 @@ furniture = ["table", "chair_1", "sofa"]
 materials = {}
 
 [truth.sofa]
-position = [-1.5, 0.0, 3.0]
+position = [3.0, -1.5, 0.0]
 
 [[vary]]
 key = ["room.width", "room.depth"]
@@ -445,7 +446,7 @@ kind = "choice"
 values = [{ kind = "rough_dielectric", itu = "wood" }, { kind = "rough_conductor" }]
 
 [[vary]]
-key = "truth.sofa.position[2]"
+key = "truth.sofa.position[0]"
 kind = "uniform"
 low = 1.5
 high = 3.0
@@ -462,14 +463,14 @@ def test_rooms_are_drawn_and_their_furniture_is_labelled():
         counts.add(len(made.furniture))
         assert ("chair_1" in objects) == (len(made.furniture) == 3)
         assert objects["ball"]["class"] == "thing"
-        width, place = made.width, item.truth["sofa"].position[2]
+        width, place = made.width, item.truth["sofa"].position[0]
         assert 4.5 <= width == made.depth <= 6.0
-        right = objects["wall_right"]["oriented_box"]["center"]
-        assert right == pytest.approx([width / 2, 1.3, width / 2])
+        left = objects["wall_left"]["oriented_box"]["center"]
+        assert left == pytest.approx([width / 2, width / 2, 1.3])
         sofa = objects["sofa"]["oriented_box"]
-        assert sofa["center"][2] == pytest.approx(place)
+        assert sofa["center"][0] == pytest.approx(place)
         assert 1.5 <= place <= 3.0
-        assert sofa["size"] == pytest.approx([0.85, 0.822, 1.9], abs=0.01)
+        assert sofa["size"] == pytest.approx([1.9, 0.85, 0.822], abs=0.01)
     assert floors == {"rough_dielectric", "rough_conductor"}
     assert counts == {2, 3}
 

@@ -33,8 +33,8 @@ SEARCH = """
 [search]
 kind = "grid"
 object = "plate"
-low = [-1.0, -1.0, 1.0]
-high = [1.0, 1.0, 2.0]
+low = [1.0, -1.0, -1.0]
+high = [2.0, 1.0, 1.0]
 step = 0.5
 """
 CASES = {
@@ -45,7 +45,7 @@ CASES = {
     "data.points_per_m2": (RUN + BOX, "size = 0.2", "size = 2000.0"),
     "scene.plate.divisions": (RUN, "divisions = 3", "divisions = 300_000"),
     "parameters[1].counts": (RUN + LATTICE, "[4, 4, 4]", "[400, 400, 4000]"),
-    "search.step": (RUN + SEARCH, "high = [1.0,", "high = [1000.0,"),
+    "search.step": (RUN + SEARCH, "high = [2.0,", "high = [1000.0,"),
     # what measures
     "radar.receivers.count": (RUN, "count = [6, 4]", "count = [60_000, 4_000]"),
     "radar.waveform": (RUN, "samples = 64 }", "samples = 2_000_000_000 }"),

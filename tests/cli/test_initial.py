@@ -53,7 +53,7 @@ def test_a_fit_has_one_start(repository, tmp_path, monkeypatch, capsys):
 
 def test_a_box_without_echoes_is_named(repository, tmp_path, monkeypatch, capsys):
     file = tmp_path / "small.toml"
-    text = smaller(repository, **{"low = [-4.0, -1.0, 4.5]": "low = [4.8, -1.0, 11.8]"})
+    text = smaller(repository, **{"low = [4.5, -4.0, -1.0]": "low = [11.8, 4.8, -1.0]"})
     file.write_text(text, encoding="utf-8")
     assert call(monkeypatch, "reconstruct", file, "--out", tmp_path / "found") != 0
     assert "initial: expected echoes within the box" in capsys.readouterr().err
@@ -61,7 +61,7 @@ def test_a_box_without_echoes_is_named(repository, tmp_path, monkeypatch, capsys
 
 def test_a_size_is_guessed_also_of_an_object_whose_true_shape_is_another(repository, tmp_path):
     text = smaller(repository, **{"[initial]": "[initial]\nscale = true"})
-    parts = '\n\n[[truth.truck.parts]]\nshape = "box"\nsize = [4.4, 1.0, 1.6]\n\n[radar]'
+    parts = '\n\n[[truth.truck.parts]]\nshape = "box"\nsize = [1.6, 4.4, 1.0]\n\n[radar]'
     text = text.replace("\n\n[radar]", parts)
     run = validate_run(tomllib.loads(text), tmp_path / "run.toml")
     console = Console(quiet=True)

@@ -134,7 +134,7 @@ def test_finer_directions_and_points(recording, monkeypatch, method):
     assert point["range_m"] == pytest.approx(3.0, abs=0.03)
     assert point["velocity_m_s"] == pytest.approx(RATE, abs=0.05 * velocity_span(RADAR, CHIRPS))
     assert point["u"] == pytest.approx(0.3, abs=0.03)
-    assert point["x_m"] == pytest.approx(0.9, abs=0.1)
+    assert point["y_m"] == pytest.approx(0.9, abs=0.1)
     assert read_metrics(recording / "plain")["points"] >= 1
 
 
@@ -172,7 +172,7 @@ def test_channels_are_calibrated_on_a_reflector(recording, monkeypatch):
     other = ChirpData(moving.to(torch.complex64), SETTINGS)
     described_arrays.write_chirps("other.toml", other, "other.npy", ARRAYS)
 
-    reflector = ["--reflector", "0", "0", "2.5"]
+    reflector = ["--reflector", "2.5", "0", "0"]
     assert call(monkeypatch, "look", "reflector.toml", *reflector, "-o", "bench") == 0
     found = ChannelCalibration.load("bench/channels.json").gains
     torch.testing.assert_close(found, ChannelCalibration(gains).gains, atol=2e-3, rtol=0)
@@ -217,7 +217,7 @@ def test_channels_are_calibrated_on_a_reflector(recording, monkeypatch):
         (["adc.toml", "--chirp", "16"], ["number from 0 to 15"]),
         (["adc.toml", "--range-max", "900"], ["--range-max within"]),
         (["adc.toml", "--channels", "bench.cfg"], ["expected a calibration", "bench.cfg"]),
-        (["adc.toml", "--reflector", "0", "0", "90"], ["reflector within"]),
+        (["adc.toml", "--reflector", "90", "0", "0"], ["reflector within"]),
         (["adc.toml", "--method", "music", "--sources", "12"], ["fewer than the 12 elements"]),
         (["."], ["openradar.npz"]),
     ],
@@ -334,9 +334,9 @@ def swept(frames: int = 3) -> None:
         rows = zip(frequencies / 1e9, response.real, response.imag, strict=True)
         lines = [f"{f:.9f} {a:.9e} {b:.9e}" for f, a, b in rows]
         Path(f"at_{frame}.s1p").write_text("\n".join(["# GHz S RI R 50", *lines]))
-    places = [[0.0, 0.0, 0.2 * frame] for frame in range(frames)]
+    places = [[0.2 * frame, 0.0, 0.0] for frame in range(frames)]
     Path("rail.toml").write_text(
-        f'[data]\nfiles = "at_*.s1p"\n[sweep]\n[radar]\npositions = {places}\n'
+        f'frame = 2\n[data]\nfiles = "at_*.s1p"\n[sweep]\n[radar]\npositions = {places}\n'
     )
 
 
@@ -354,7 +354,7 @@ def test_sweeps_of_an_analyser(tmp_path, monkeypatch):
     assert (found["frames"], found["channels"]) == (3, 1)
     assert found["peak_range_m"] == pytest.approx(2.6, abs=0.04)
     with Path("rail.toml").open("a") as file:
-        file.write("range_center = [0.0, 0.0, 103.0]\n")
+        file.write("range_center = [103.0, 0.0, 0.0]\n")
     assert call(monkeypatch, "look", "rail.toml", "-o", "far") == 0
     found = read_metrics(tmp_path / "far")
     assert found["peak_range_m"] == pytest.approx(3.0, abs=0.04)  # as the samples say

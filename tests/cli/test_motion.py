@@ -21,12 +21,13 @@ from invertwin.scene import MovingScene, Scene, Waving
 
 RUN = """
 task = "simulate"
+frame = 2
 seed = 1
 
 [scene.person]
 shape = "body"
 spacing = 0.05
-position = [0.0, 0.95, 3.0]
+position = [3.0, 0.0, 0.95]
 material = { kind = "rough_dielectric", permittivity = 4.0 }
 motion = [{ kind = "walking", speed = 1.4 }]
 
@@ -34,31 +35,31 @@ motion = [{ kind = "walking", speed = 1.4 }]
 shape = "plate"
 width = 0.4
 height = 0.1
-position = [0.0, 1.5, 0.0]
+position = [0.0, 0.0, 1.5]
 material = { kind = "rough_dielectric", permittivity = 4.0 }
 
 [[scene.fan.motion]]
 kind = "turning"
-axis = [0.0, 0.0, 1.0]
+axis = [1.0, 0.0, 0.0]
 rate = 20.0
 
 [[scene.fan.motion]]
 kind = "along"
 times = [0.0, 1.0]
-places = [[0.5, 0.0, 2.0], [0.5, 0.0, 3.0]]
+places = [[2.0, 0.5, 0.0], [3.0, 0.5, 0.0]]
 
 [scene.wall]
 shape = "plate"
 width = 2.0
 height = 2.0
-position = [0.0, 1.0, 5.0]
+position = [5.0, 0.0, 1.0]
 material = { kind = "rough_dielectric", permittivity = 4.0 }
 
 [radar]
 waveform = { kind = "fmcw", start_frequency = 77e9, bandwidth = 1e9, duration = 5e-5, samples = 64 }
 transmitters = { kind = "positions", positions = [[0.0, 0.0, 0.0]] }
 receivers = { kind = "linear", count = 2, spacing = 1.935e-3 }
-positions = [[0.0, 1.0, 0.0]]
+positions = [[0.0, 0.0, 1.0]]
 
 [grid]
 range_min = 0.5
@@ -91,18 +92,18 @@ def test_objects_do_what_their_tables_say():
     motion = build_moving_scene(run, scene)
     assert isinstance(motion, MovingScene)
     ahead = motion(1.0)["person"].center - motion(0.0)["person"].center
-    assert float(ahead[2]) == pytest.approx(-1.4, abs=0.1)
+    assert float(ahead[0]) == pytest.approx(-1.4, abs=0.1)
     fan = motion(0.05)["fan"]
     corner = scene["fan"].mesh.vertices[0]
     turn = torch.tensor(20.0 * 0.05)
     turned = torch.stack(
         [
-            turn.cos() * corner[0] - turn.sin() * corner[1],
-            turn.sin() * corner[0] + turn.cos() * corner[1],
-            corner[2],
+            corner[0],
+            turn.cos() * corner[1] - turn.sin() * corner[2],
+            turn.sin() * corner[1] + turn.cos() * corner[2],
         ]
     )
-    place = turned + torch.tensor([0.5, 1.5, 2.05])
+    place = turned + torch.tensor([2.05, 0.5, 1.5])
     assert torch.allclose(fan.vertices[0], place.double(), atol=1e-6)
     assert torch.equal(motion(0.05)["wall"].vertices, scene["wall"].vertices)
 
@@ -127,7 +128,7 @@ def test_a_person_can_wave_while_walking():
     assert isinstance(mover, Waving)
     assert mover.during is not None
     way = motion(1.0)["person"].center - motion(0.0)["person"].center
-    assert float(way[2]) == pytest.approx(-1.2, abs=0.1)
+    assert float(way[0]) == pytest.approx(-1.2, abs=0.1)
 
 
 def test_labels_are_those_of_the_start_with_the_mean_velocity():
@@ -136,12 +137,12 @@ def test_labels_are_those_of_the_start_with_the_mean_velocity():
     velocity = begun["fan"].velocity
     assert velocity is not None
     assert torch.allclose(
-        velocity.reshape(-1, 3).mean(0), torch.tensor([0.0, 0.0, 1.0]).double(), atol=1e-6
+        velocity.reshape(-1, 3).mean(0), torch.tensor([1.0, 0.0, 0.0]).double(), atol=1e-6
     )
     joints = joint_positions_at_start(run, begun)["person"]
     assert set(joints) > {"left_knee", "right_elbow"}
     # The right foot lands: that leg is ahead.
-    assert float(joints["right_knee"][2]) < float(joints["left_knee"][2]) - 0.2
+    assert float(joints["right_knee"][0]) < float(joints["left_knee"][0]) - 0.2
     middle = begun["person"].vertices.mean(0)
     assert float((joints["pelvis"] - middle).norm()) < 0.2
 
@@ -152,8 +153,8 @@ def test_a_data_set_has_these_labels():
     )
     files = make_sample(read(text), 0)
     labels = {row["name"]: row for row in json.loads(files["labels.json"])["objects"]}
-    assert labels["fan"]["velocity"] == pytest.approx([0.0, 0.0, 1.0], abs=1e-6)
-    assert labels["person"]["velocity"][2] < -0.5
+    assert labels["fan"]["velocity"] == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
+    assert labels["person"]["velocity"][0] < -0.5
     assert labels["wall"]["velocity"] == [0.0, 0.0, 0.0]
     assert "left_knee" in labels["person"]["joints"]
 
@@ -167,7 +168,7 @@ def test_a_data_set_has_these_labels():
             r"person.*motion\[1\].*one motion of a person",
         ),
         ({"person": {"motion": [{"kind": "walking", "speed": 9.0}]}}, r"motion\[0\].*speed"),
-        ({"fan": {"velocity": [0.0, 0.0, 1.0]}}, r"scene\.fan.*no velocity"),
+        ({"fan": {"velocity": [1.0, 0.0, 0.0]}}, r"scene\.fan.*no velocity"),
     ],
 )
 def test_what_cannot_move_so_is_refused(changes, message):

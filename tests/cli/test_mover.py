@@ -8,6 +8,7 @@ from cli.small import RUN, call, read_metrics
 
 OPENRADAR = """\
 task = "reconstruct"
+frame = 2
 
 [scene.mover]
 shape = "sphere"
@@ -63,7 +64,7 @@ def test_a_twin_of_the_recording_is_nearer_to_it_than_a_point(
         assert set(found) == {"magnitude", "power", "level"}
         for name in ("twin", "bare_psf"):
             assert found["magnitude"][name] == metrics[f"{prefix}{name}_correlation"]
-    assert metrics["twin"]["velocity_m_s"][2] == pytest.approx(0.59, abs=0.05)
+    assert metrics["twin"]["velocity_m_s"][0] == pytest.approx(0.59, abs=0.05)
     report = (tmp_path / "out" / "report.html").read_text()
     assert report.count("<img") == 5
     assert "0.947" in report  # the point target's
@@ -128,10 +129,10 @@ def test_a_simulated_mover_is_scored_against_its_truth(write, tmp_path, monkeypa
     scene = OPENRADAR[OPENRADAR.index("[scene.mover]") : OPENRADAR.index("[data]")]
     sensor = RUN[RUN.index("[radar]") : RUN.index("[[parameters]]")]
     parts = (
-        'task = "reconstruct"\nseed = 2',
+        'task = "reconstruct"\nframe = 2\nseed = 2',
         scene.replace("0.25", "0.1"),
-        "[truth.mover]\nposition = [0.1, 0.0, 1.4]\nvelocity = [0.0, 0.0, -1.5]",
-        sensor.replace(", [0.1, 0.0, 0.0]]", "]"),
+        "[truth.mover]\nposition = [1.4, 0.1, 0.0]\nvelocity = [-1.5, 0.0, 0.0]",
+        sensor.replace(", [0.0, 0.1, 0.0]]", "]"),
         "[chirps]\ncount = 32\ninterval = 2.5e-4",
         OPENRADAR[OPENRADAR.index("[[parameters]]") :],
     )

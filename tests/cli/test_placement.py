@@ -11,6 +11,7 @@ from invertwin.errors import InputError
 
 ROOM = """
 task = "reconstruct"
+frame = 2
 seed = 1
 
 [scene.screen]
@@ -18,7 +19,7 @@ shape = "plate"
 width = 3.0
 height = 3.0
 position = [0.5, 0.0, 1.35]
-rotation_deg = [90.0, 0.0, 0.0]
+rotation_deg = [0.0, 0.0, -90.0]
 material = { kind = "perfect_conductor" }
 
 [placement]

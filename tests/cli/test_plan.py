@@ -4,11 +4,11 @@ import pytest
 
 from cli.small import RUN, call, read_metrics
 
-PLANE = RUN.replace('object = "plate"\n', 'object = "plate"\naxes = ["x", "z"]\n', 1)
+PLANE = RUN.replace('object = "plate"\n', 'object = "plate"\naxes = ["x", "y"]\n', 1)
 PLAN = """
 [plan]
 fits = 3
-candidates = [[0.1, 0.0, 0.0], [-0.2, 0.1, 0.0]]
+candidates = [[0.0, 0.1, 0.0], [0.0, -0.2, 0.1]]
 
 [loss]
 kind = "likelihood"
@@ -21,15 +21,15 @@ def test_a_plan_states_error_bars_and_ranks_positions(run_file, monkeypatch, cap
     run_file.write_text(PLANE + PLAN)
     assert call(monkeypatch, "plan", run_file, "-o", "out") == 0
     metrics = read_metrics(run_file.parent / "out")
-    names = ["plate.x", "plate.z"]
+    names = ["plate.x", "plate.y"]
     assert list(metrics["standard_deviations"]) == names
-    assert metrics["units"] == {"plate.x": "m", "plate.z": "m"}
+    assert metrics["units"] == {"plate.x": "m", "plate.y": "m"}
     # Range cells of 75 mm: range is told to a fraction of them, the place across less well.
-    assert 1e-4 < metrics["standard_deviations"]["plate.z"] < 0.03
-    assert metrics["standard_deviations"]["plate.x"] > metrics["standard_deviations"]["plate.z"]
+    assert 1e-4 < metrics["standard_deviations"]["plate.x"] < 0.03
+    assert metrics["standard_deviations"]["plate.y"] > metrics["standard_deviations"]["plate.x"]
     first, second = metrics["candidates"]
     # A position that is there already shares its speckle; one elsewhere is new.
-    assert first["position"] == pytest.approx([-0.2, 0.1, 0.0])
+    assert first["position"] == pytest.approx([0.0, -0.2, 0.1])
     assert first["share"] < second["share"]
     assert metrics["simulated_fits"] == 3
     for name in names:

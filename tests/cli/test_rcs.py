@@ -11,6 +11,7 @@ from invertwin.errors import InputError
 
 PLATE = """
 task = "rcs"
+frame = 2
 [scene.plate]
 shape = "plate"
 width = 0.05
@@ -18,7 +19,7 @@ height = 0.05
 material = { kind = "perfect_conductor" }
 [rcs]
 frequencies = { start = 29e9, stop = 31e9, count = 5 }
-theta_deg = { start = 170.0, stop = 190.0, count = 21 }
+phi_deg = { start = 170.0, stop = 190.0, count = 21 }
 profile = true
 edges = 0
 image = { extent = 0.2, pixels = 16 }
@@ -64,7 +65,7 @@ def test_check_says_what_a_signature_needs(tmp_path, capsys):
     ("change", "key"),
     [
         (("count = 5", "count = 2_000_000_000"), "rcs.frequencies"),
-        (("count = 21", "count = 900_000_000"), "rcs.theta_deg"),
+        (("count = 21", "count = 900_000_000"), "rcs.phi_deg"),
         (("pixels = 16", "pixels = 90_000"), "rcs.image.pixels"),
     ],
 )
@@ -126,7 +127,7 @@ def test_measurements_of_other_angles_are_refused(tmp_path):
     [
         ('channel = "HH"', 'channel = "RL"', "rcs.cases.pattern.channel: expected a channel of"),
         ('kind = "plate", width', 'kind = "cone", width', "reference.kind: expected one of"),
-        ("edges = 0", "edges = 0\nphi_deg = [0.0, 1.0]", "rcs.phi_deg: expected one angle or as"),
+        ("edges = 0", "edges = 0\ntheta_deg = [0.0, 1.0]", "rcs.phi_deg: expected one angle or as"),
         ("edges = 0", "edge = 0", "did you mean `edges`"),
         ("frequencies = {", "frequency = {", "did you mean `frequencies`"),
     ],
@@ -166,9 +167,9 @@ step = 1e-5
 )
 
 
-@pytest.mark.parametrize("across", ["theta_deg = {", "theta_deg = 175.0 # {"])
+@pytest.mark.parametrize("across", ["phi_deg = {", "phi_deg = 175.0 # {"])
 def test_derivatives_of_a_signature_are_checked(tmp_path, across):
-    (tmp_path / "slopes.toml").write_text(SLOPES.replace("theta_deg = {", across))
+    (tmp_path / "slopes.toml").write_text(SLOPES.replace("phi_deg = {", across))
     run("gradcheck", tmp_path / "slopes.toml", "-o", tmp_path / "out")
     found = metrics(tmp_path / "out")["scenes"]["slopes"]
     assert found["full"]["relative_l1"] < 1e-6

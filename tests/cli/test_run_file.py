@@ -24,7 +24,7 @@ def letter(**changes):
 
 
 def run(**changes):
-    return {"task": "reconstruct", "scene": {"letter": letter()}} | changes
+    return {"task": "reconstruct", "frame": 2, "scene": {"letter": letter()}} | changes
 
 
 def error_of(raw) -> str:
@@ -50,7 +50,7 @@ def radar(**changes):
 @pytest.mark.parametrize(
     ("raw", "parts"),
     [
-        (run(sede=1), ["sede: ", "task, title, note, seed", "did you mean `seed`?"]),
+        (run(sede=1), ["sede: ", "task, frame, title, note, seed", "did you mean `seed`?"]),
         (
             run(scene={"letter": {"shape": "text", "text": "A", "materail": ROUGH}}),
             [

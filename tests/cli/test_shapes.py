@@ -38,9 +38,9 @@ rate = 0.004
 name = "field"
 kind = "distance_grid"
 object = "plate"
-low = [-0.3, -0.3, -0.1]
-high = [0.3, 0.3, 0.1]
-counts = [7, 7, 5]
+low = [-0.1, -0.3, -0.3]
+high = [0.1, 0.3, 0.3]
+counts = [5, 7, 7]
 
 [reconstruct]
 steps = 3
@@ -207,8 +207,8 @@ def test_labels_tell_whose_a_measure_is():
 def test_the_true_shape_stands_where_the_object_stands(tmp_path):
     run = check(shapes(), tmp_path)
     truth = build.true_scene(run)["plate"]
-    assert truth.center.tolist() == pytest.approx([0.02, 0.01, 1.2])
-    assert float(truth.vertices[:, 0].max() - truth.vertices[:, 0].min()) == pytest.approx(0.3)
+    assert truth.center.tolist() == pytest.approx([1.2, 0.02, 0.01])
+    assert float(truth.vertices[:, 1].max() - truth.vertices[:, 1].min()) == pytest.approx(0.3)
 
 
 def test_a_run_with_stages_survives_the_way_to_toml(tmp_path):

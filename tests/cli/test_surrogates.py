@@ -59,7 +59,7 @@ def test_no_gradient_check_of_exact_signals(tmp_path, monkeypatch, capsys):
     (tmp_path / "check.toml").write_text(
         named('surrogate = "exact"')
         + '[gradcheck]\nparameter = { kind = "translation", object = "plate" }\n'
-        + "tangent = { translation = [1, 0, 0] }\nstep = 1e-2\n"
+        + "tangent = { translation = [0, 1, 0] }\nstep = 1e-2\n"
     )
     assert call(monkeypatch, "gradcheck", tmp_path / "check.toml", "-o", tmp_path / "out") == 2
     assert "surrogate.exact: expected a smooth map" in " ".join(capsys.readouterr().err.split())

@@ -21,14 +21,14 @@ def looks_from(*positions) -> Radar:
 
 def turned(angle: float, position) -> torch.Tensor:
     c, s = math.cos(angle), math.sin(angle)
-    rotation = torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], dtype=torch.float64)
+    rotation = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     return rigid(rotation, torch.tensor(position, dtype=torch.float64))
 
 
 def scene() -> Scene:
-    speed = torch.tensor([0.0, 0.0, -1.5], dtype=torch.float64)
-    crate = Object(box([0.4, 0.2, 0.6]), PAINT, turned(math.pi / 4, [0.5, 0.0, 3.0]), speed)
-    wall = Object(plate(2.0, 2.0, 4), PAINT, turned(0.0, [0.0, 0.0, 5.0]))
+    speed = torch.tensor([-1.5, 0.0, 0.0], dtype=torch.float64)
+    crate = Object(box([0.6, 0.4, 0.2]), PAINT, turned(math.pi / 4, [3.0, 0.5, 0.0]), speed)
+    wall = Object(plate(2.0, 2.0, 4), PAINT, turned(0.0, [5.0, 0.0, 0.0]))
     return Scene({"crate": crate, "wall": wall})
 
 
@@ -37,11 +37,11 @@ def test_boxes_poses_and_velocities():
     crate, wall = object_labels(scene(), triangle_visibility(scene(), device), {"crate": "box"}, {})
     assert (crate["name"], crate["class"], wall["class"]) == ("crate", "box", "wall")
     half = (0.2 + 0.3) * math.sqrt(0.5)
-    assert crate["box"]["low"] == pytest.approx([0.5 - half, -0.1, 3.0 - half])
-    assert crate["box"]["high"] == pytest.approx([0.5 + half, 0.1, 3.0 + half])
+    assert crate["box"]["low"] == pytest.approx([3.0 - half, 0.5 - half, -0.1])
+    assert crate["box"]["high"] == pytest.approx([3.0 + half, 0.5 + half, 0.1])
     own = crate["oriented_box"]
-    assert own["size"] == pytest.approx([0.4, 0.2, 0.6])
-    assert own["center"] == pytest.approx([0.5, 0.0, 3.0])
+    assert own["size"] == pytest.approx([0.6, 0.4, 0.2])
+    assert own["center"] == pytest.approx([3.0, 0.5, 0.0])
     # Corners of the oriented box are those of the object.
     signs = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3)
     size, axes, center = (
@@ -49,17 +49,17 @@ def test_boxes_poses_and_velocities():
     )
     corners, there = signs * size @ axes.mT, scene()["crate"].vertices - center
     assert torch.cdist(corners, there).amin(1).max() < 1e-6
-    assert crate["velocity"] == [0.0, 0.0, -1.5]
+    assert crate["velocity"] == [-1.5, 0.0, 0.0]
     assert wall["velocity"] == [0.0, 0.0, 0.0]
     assert (wall["triangles"]["first"], wall["triangles"]["count"]) == (12, 32)
-    assert crate["pose"][0][3] == 0.5
+    assert crate["pose"][1][3] == 0.5
 
 
 def test_a_box_hides_its_back_and_a_part_of_the_wall():
-    facing = Object(box([0.4, 0.2, 0.6]), PAINT, turned(0.0, [0.0, 0.0, 3.0]))
-    wall = Object(plate(2.0, 2.0, 4), PAINT, turned(0.0, [0.0, 0.0, 5.0]))
+    facing = Object(box([0.6, 0.4, 0.2]), PAINT, turned(0.0, [3.0, 0.0, 0.0]))
+    wall = Object(plate(2.0, 2.0, 4), PAINT, turned(0.0, [5.0, 0.0, 0.0]))
     pair = Scene({"crate": facing, "wall": wall})
-    device = looks_from([0.0, 0.0, 0.0], [10.0, 0.0, 3.0])
+    device = looks_from([0.0, 0.0, 0.0], [3.0, 10.0, 0.0])
     crate, screen = object_labels(pair, triangle_visibility(pair, device), {}, {})
     areas = {"front": 0.4 * 0.2, "side": 0.6 * 0.2, "top": 0.4 * 0.6}
     whole = 2 * sum(areas.values())
@@ -72,12 +72,12 @@ def test_a_box_hides_its_back_and_a_part_of_the_wall():
 
 
 def test_masks_say_which_triangles():
-    facing = Scene({"crate": Object(box(1.0), PAINT, turned(0.0, [0.0, 0.0, 3.0]))})
+    facing = Scene({"crate": Object(box(1.0), PAINT, turned(0.0, [3.0, 0.0, 0.0]))})
     masks = triangle_visibility(facing, looks_from([0.0, 0.0, 0.0]))["crate"]
     mesh = facing["crate"].mesh
     a, b, c = mesh.vertices[mesh.faces].unbind(1)
     normals = torch.linalg.cross(b - a, c - a)
-    front = normals[:, 2] < -0.5
+    front = normals[:, 0] < -0.5
     assert masks.shape == (1, 12)
     assert torch.equal(masks[0], front.float())
 

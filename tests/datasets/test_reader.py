@@ -102,6 +102,93 @@ def test_a_data_loader_reads_it(tmp_path, context):
     assert sorted(torch.cat(batches)[:, 0, 0].tolist()) == list(range(10))
 
 
+def labels_of(place, size, velocity, pose, rotation, joint, device, axes):
+    """Labels of one object at a place and a radar at another."""
+    crate = {
+        "name": "crate",
+        "class": "box",
+        "pose": pose,
+        "box": {"low": place, "high": size},
+        "oriented_box": {"center": place, "size": size, "rotation": rotation},
+        "velocity": velocity,
+        "triangles": {"first": 0, "count": 12},
+        "seen": [0.5, 0.25, 0.125],
+        "joints": {"left hand": joint},
+    }
+    radar = {"positions": [device, device], "rotations": [axes, axes]}
+    return {"index": 0, "objects": [crate], "radar": radar}
+
+
+def one_sample(folder, format, labels, first):
+    """A data set of one sample with labels and the first points of its paths."""
+    folder.mkdir()
+    members = {
+        "paths_first.npy": npy_bytes(np.array(first)),
+        "labels.json": json.dumps(labels).encode(),
+        "run.toml": b'task = "simulate"',
+    }
+    content = pack_shard([(0, members)])
+    (folder / shard_name(0)).write_bytes(content)
+    paths = ArrayInfo(dims=["path", "xyz"], unit="m")
+    manifest = DatasetManifest(
+        format=format,
+        samples=1,
+        part=(1, 1),
+        fingerprint="ab",
+        versions={},
+        arrays={"paths_first": paths},
+        shards=[describe_shard(shard_name(0), 0, 1, content)],
+    )
+    (folder / "manifest.json").write_text(manifest.model_dump_json())
+    return folder
+
+
+def test_old_labels_are_turned_and_new_ones_stay(tmp_path):
+    """A crate 3 m ahead, 1 m to the left and 2 m up, turned to the left by 90°."""
+    old = labels_of(
+        place=[1.0, 2.0, 3.0],
+        size=[0.5, 0.75, 0.25],
+        velocity=[-1.0, 0.0, -4.0],
+        pose=[
+            [0.0, 0.0, 1.0, 1.0],
+            [0.0, 1.0, 0.0, 2.0],
+            [-1.0, 0.0, 0.0, 3.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ],
+        rotation=[[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]],
+        joint=[0.1, 0.2, 0.3],
+        device=[7.0, 8.0, 9.0],
+        axes=[[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.0, -0.8, 0.6]],
+    )
+    new = labels_of(
+        place=[3.0, 1.0, 2.0],
+        size=[0.25, 0.5, 0.75],
+        velocity=[-4.0, -1.0, 0.0],
+        pose=[
+            [0.0, -1.0, 0.0, 3.0],
+            [1.0, 0.0, 0.0, 1.0],
+            [0.0, 0.0, 1.0, 2.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ],
+        rotation=[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+        joint=[0.3, 0.1, 0.2],
+        device=[9.0, 7.0, 8.0],
+        axes=[[0.6, 0.0, -0.8], [0.0, 1.0, 0.0], [0.8, 0.0, 0.6]],
+    )
+    (early,) = SampleDataset(
+        one_sample(
+            tmp_path / "old", "invertwin data set 1", old, [[4.0, 5.0, 6.0], [1.0, 2.0, 3.0]]
+        )
+    )
+    (late,) = SampleDataset(
+        one_sample(tmp_path / "new", FORMAT, new, [[6.0, 4.0, 5.0], [3.0, 1.0, 2.0]])
+    )
+    for sample in (early, late):
+        assert sample["labels"] == new
+        assert sample["paths_first"].tolist() == [[6.0, 4.0, 5.0], [3.0, 1.0, 2.0]]
+        assert sample["run"] == 'task = "simulate"'
+
+
 def test_a_damaged_shard_is_told(tmp_path):
     found = SampleDataset(written(tmp_path, [(0, 10)]))
     found.check()

@@ -57,7 +57,7 @@ def test_parts_that_are_none_are_refused(part, said):
 def manifest(**changes) -> str:
     shard = describe_shard("shard-000000.tar", 0, 2, pack_shard(samples(0, 2))).model_dump()
     whole = {
-        "format": "invertwin data set 1",
+        "format": "invertwin data set 2",
         "samples": 2,
         "part": [1, 1],
         "fingerprint": "ab",
@@ -74,6 +74,10 @@ def test_parts_are_found_and_those_of_other_sets_refused(tmp_path):
         (tmp_path / name / "manifest.json").write_text(manifest(part=[int(name[5]), 2]))
     assert [found.part[0] for _, found in read_manifests(tmp_path)] == [1, 2]
     (tmp_path / name / "manifest.json").write_text(manifest(part=[2, 2], fingerprint="cd"))
+    with pytest.raises(InputError, match="parts of one data set"):
+        read_manifests(tmp_path)
+    old = manifest(part=[2, 2], format="invertwin data set 1")
+    (tmp_path / name / "manifest.json").write_text(old)
     with pytest.raises(InputError, match="parts of one data set"):
         read_manifests(tmp_path)
 

@@ -51,9 +51,9 @@ def recorded(place, velocity, radius, seed):
 @pytest.fixture(scope="module")
 def frame():
     """A point in motion and a stronger one at rest."""
-    velocity = float64(0.0, 0.0, 2.0)
-    start = float64(-0.5, 0.0, 2.8) - velocity * 0.5 * float(CHIRPS.times(2)[-1, 0])
-    places = torch.stack([start, float64(0.8, 0.0, 1.6)])
+    velocity = float64(2.0, 0.0, 0.0)
+    start = float64(2.8, -0.5, 0.0) - velocity * 0.5 * float(CHIRPS.times(2)[-1, 0])
+    places = torch.stack([start, float64(1.6, 0.8, 0.0)])
     paths = paths_of(RADAR, places, float64(1.0, 50.0))
     motion = torch.stack([velocity, 0 * velocity])
     return noisy(moving_beat(replace(paths, velocity=motion), RADAR, CHIRPS))
@@ -79,7 +79,7 @@ def test_the_strongest_mover_is_found_beside_what_stands_still(frame):
     assert echo.u == pytest.approx(-0.5 / away, abs=0.03)
     assert echo.coherence > 0.99
     torch.testing.assert_close(
-        echo.position, echo.range * float64(echo.u, 0.0, math.sqrt(1 - echo.u**2))
+        echo.position, echo.range * float64(math.sqrt(1 - echo.u**2), echo.u, 0.0)
     )
     near = WHOLE.crop_around(echo.range, echo.range_rate, 4, RADAR)
     power = near.observe(frame)
@@ -99,7 +99,7 @@ def test_a_point_that_moves_on_is_where_its_rate_takes_it(frame):
 
 
 def test_without_a_mover_there_is_nothing_to_fit():
-    beat = beat_signal(paths_of(RADAR, float64(0.0, 0.0, 2.0)[None], float64(1.0)), RADAR)
+    beat = beat_signal(paths_of(RADAR, float64(2.0, 0.0, 0.0)[None], float64(1.0)), RADAR)
     still = noisy(beat[:, None].repeat(1, CHIRPS.count, 1, 1, 1))
     with pytest.raises(InputError, match="no echo above the noise"):
         detect_strongest_target(still, WHOLE)
@@ -131,8 +131,8 @@ def test_the_body_starts_with_its_front_at_the_echo_and_moves_rigidly(frame):
     assert float(vertices.norm(dim=1).min()) == pytest.approx(echo.range, abs=1e-3)
     with torch.no_grad():
         body.spin.add_(3.0)
-        body.velocity.add_(float64(0.7, 0.0))
-        body.size.add_(float64(0.5, 0.1, -0.2))
+        body.velocity.add_(float64(0.0, 0.7))
+        body.size.add_(float64(-0.2, 0.5, 0.1))
     with torch.no_grad():
         twin = body(scene)["ball"]
     assert twin.velocity is not None
@@ -143,9 +143,9 @@ def test_the_body_starts_with_its_front_at_the_echo_and_moves_rigidly(frame):
     moved = body(scene, time=0.5)["ball"].center.detach() - twin.center
     torch.testing.assert_close(moved, 0.5 * twin.velocity.mean(0), rtol=0, atol=1e-6)
     # One row of antennas: nothing moves upwards, and the body turns about the axis up.
-    assert not twin.velocity[:, 1].any()
+    assert not twin.velocity[:, 2].any()
     extent = body.values()["extent_m"].tolist()
-    assert extent == pytest.approx([0.2 * math.exp(x) for x in (0.5, 0.1, -0.2)], rel=1e-6)
+    assert extent == pytest.approx([0.2 * math.exp(x) for x in (-0.2, 0.5, 0.1)], rel=1e-6)
 
 
 def test_materials_without_a_diffuse_share_are_refused(frame):
@@ -164,7 +164,7 @@ def test_materials_without_a_diffuse_share_are_refused(frame):
 @pytest.mark.slow
 def test_a_twin_finds_place_and_motion_in_exact_signals():
     """A ball that fills several range cells, at mean power: 12 looks of other phases."""
-    place, velocity, radius = (-0.4, 0.0, 2.6), (0.0, 0.0, 1.6), 0.3
+    place, velocity, radius = (2.6, -0.4, 0.0), (1.6, 0.0, 0.0), 0.3
     frames = [recorded(place, velocity, radius, seed) for seed in range(12)]
     records = [ChirpCapture(beat, RADAR, CHIRPS) for beat in frames]
     echo = detect_strongest_target(records[0], WHOLE)
@@ -192,7 +192,7 @@ def test_a_twin_finds_place_and_motion_in_exact_signals():
     # Along the line of sight; a row of antennas hardly sees motion across it.
     center, motion = found["position_m"], found["velocity_m_s"]
     assert float(center @ motion / center.norm()) == pytest.approx(1.6 * 2.6 / 2.63, abs=0.05)
-    assert found["extent_m"][2] > 0.3
+    assert found["extent_m"][0] > 0.3
     many = replace(near, sampling=replace(near.sampling, samples=20_000))
     with torch.no_grad():
         shown = many.predict(body(scene), RADAR, 5)

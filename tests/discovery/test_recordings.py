@@ -12,7 +12,6 @@ from invertwin.discovery.imaging.point_detections import is_dense_track
 from invertwin.discovery.search import ShapeSearch
 from invertwin.discovery.shapes.primitives import ShapeParameters
 from invertwin.errors import InputError
-from invertwin.inversion.initialisation.detections import Ground
 from invertwin.radar import Chirps, add_noise
 from invertwin.scene import (
     AntennaArray,
@@ -36,9 +35,9 @@ HEIGHT = 0.6
 def around(count: int) -> iw.Radar:
     """A board at places about the middle, looking at it."""
     turns = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
-    out = torch.stack([turns.cos(), 0 * turns, turns.sin()], dim=1)
-    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(out)
-    axes = torch.stack([torch.linalg.cross(up, -out), up, -out], dim=-1)
+    out = torch.stack([turns.sin(), turns.cos(), 0 * turns], dim=1)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(out)
+    axes = torch.stack([-out, torch.linalg.cross(up, -out), up], dim=-1)
     patch = Cosine(1.0)
     return iw.Radar(
         linear_array(2, 4 * HALF, pattern=patch),
@@ -50,8 +49,8 @@ def around(count: int) -> iw.Radar:
 
 
 def thing(mesh, place: tuple[float, float], height: float, yaw: float = 0.0) -> iw.Object:
-    turn = rotation_from_vector(torch.tensor([0.0, yaw, 0.0], dtype=torch.float64))
-    where = torch.tensor([place[0], height, place[1]], dtype=torch.float64)
+    turn = rotation_from_vector(torch.tensor([0.0, 0.0, yaw], dtype=torch.float64))
+    where = torch.tensor([*place, height], dtype=torch.float64)
     return iw.Object(mesh, PAINT, rigid(turn, where))
 
 
@@ -61,8 +60,8 @@ def room() -> Twin:
     radar = around(12)
     scene = iw.Scene(
         {
-            "box": thing(box((0.5, 0.9, 0.3)), (-0.35, 0.2), 0.45, 0.5),
-            "post": thing(cylinder(0.12, 1.0), (0.5, -0.3), 0.5),
+            "box": thing(box((0.3, 0.5, 0.9)), (0.2, -0.35), 0.45, 0.5),
+            "post": thing(cylinder(0.12, 1.0), (-0.3, 0.5), 0.5),
         }
     )
     grid = radar.grid(0.5, 3.5)
@@ -76,18 +75,18 @@ def test_what_stands_in_a_room_is_found(room: Twin):
     assert len(room.objects) == 2
     by_kind = {one.kind: one for one in room.objects}
     assert set(by_kind) == {"box", "cylinder"}
-    for kind, place in (("box", (-0.35, 0.2)), ("cylinder", (0.5, -0.3))):
+    for kind, place in (("box", (0.2, -0.35)), ("cylinder", (-0.3, 0.5))):
         one = by_kind[kind]
-        assert math.dist(one.position[[0, 2]].tolist(), place) < 0.03
+        assert math.dist(one.position[:2].tolist(), place) < 0.03
         assert one.existence_probability > 0.95
-        for axis, value in ((0, place[0]), (2, place[1])):
-            assert abs(float(one.position[axis]) - value) < 4 * one.deviations["xz"[axis // 2]]
+        for axis, value in enumerate(place):
+            assert abs(float(one.position[axis]) - value) < 4 * one.deviations["xy"[axis]]
         assert sum(one.probabilities.values()) == pytest.approx(1.0)
     figure = by_kind["box"].shape
     assert figure is not None
     sides = sorted((figure.length, figure.width))
     assert sides == pytest.approx([0.3, 0.5], abs=0.05)
-    long_way = figure.yaw if figure.length > figure.width else figure.yaw + math.pi / 2
+    long_way = figure.yaw if figure.width > figure.length else figure.yaw + math.pi / 2
     assert abs(math.remainder(long_way - 0.5, math.pi)) < math.radians(4)
 
 
@@ -97,10 +96,10 @@ def test_what_is_likelier_something_else_becomes_that(monkeypatch):
     monkeypatch.setattr(
         ShapeSearch,
         "run",
-        lambda _: [ShapeParameters("box", (0.1, 0.2), 0.3, 0.3, 0.25, 1.0, 0.05)],
+        lambda _: [ShapeParameters("box", (0.2, 0.1), 0.3, 0.25, 0.3, 1.0, 0.05)],
     )
     radar = around(8)
-    scene = iw.Scene({"post": thing(cylinder(0.2, 1.0), (0.1, 0.2), 0.5)})
+    scene = iw.Scene({"post": thing(cylinder(0.2, 1.0), (0.2, 0.1), 0.5)})
     grid = radar.grid(0.5, 3.5)
     beat = iw.simulate(scene, radar, grid, seed=3, sampling=CHAIN, snr_db=10.0).beat
     (one,) = twin(
@@ -110,13 +109,13 @@ def test_what_is_likelier_something_else_becomes_that(monkeypatch):
     assert (one.kind, one.shape.kind) == ("cylinder", "cylinder")
     assert one.probabilities["cylinder"] > 0.5
     assert one.shape.length == pytest.approx(0.4, abs=0.04)
-    assert {"x", "z", "length", "height", "brightness"} == set(one.deviations)
+    assert {"x", "y", "length", "height", "brightness"} == set(one.deviations)
 
 
 @pytest.mark.slow
 def test_the_inside_of_a_box_is_never_seen(room: Twin):
     assert room.image is not None
-    inside = (room.image.positions - torch.tensor([-0.35, 0.2])).norm(dim=1) < 0.1
+    inside = (room.image.positions - torch.tensor([0.2, -0.35])).norm(dim=1) < 0.1
     assert int(inside.sum()) > 5
     assert int(room.image.view_counts[inside].max()) == 0
     assert int(room.image.view_counts.max()) > 4
@@ -145,12 +144,12 @@ def test_noise_is_nothing():
 @pytest.mark.slow
 def test_one_small_ball_is_one_thing():
     radar = around(8)
-    scene = iw.Scene({"ball": thing(sphere(0.02, 3), (0.3, 0.1), HEIGHT)})
+    scene = iw.Scene({"ball": thing(sphere(0.02, 3), (0.1, 0.3), HEIGHT)})
     sampling = iw.Sampling(depth=1, points_per_m2=2e4, boundary=False)
     found = iw.simulate(scene, radar, radar.grid(0.5, 3.0), seed=1, sampling=sampling, snr_db=10.0)
     seen = twin(Capture.from_beat(found.beat, radar), low=(-1.0, -1.0), high=(1.0, 1.0), level=0.0)
     (one,) = seen.objects
-    assert math.dist(one.position[[0, 2]].tolist(), (0.3, 0.1)) < 0.03
+    assert math.dist(one.position[:2].tolist(), (0.1, 0.3)) < 0.03
 
 
 @pytest.mark.slow
@@ -158,8 +157,8 @@ def test_two_in_one_cell_are_not_more_than_two():
     radar = around(8)
     scene = iw.Scene(
         {
-            "one": thing(sphere(0.02, 3), (0.3, 0.1), HEIGHT),
-            "other": thing(sphere(0.02, 3), (0.3, 0.125), HEIGHT),
+            "one": thing(sphere(0.02, 3), (0.1, 0.3), HEIGHT),
+            "other": thing(sphere(0.02, 3), (0.125, 0.3), HEIGHT),
         }
     )
     sampling = iw.Sampling(depth=1, points_per_m2=2e4, boundary=False)
@@ -167,7 +166,7 @@ def test_two_in_one_cell_are_not_more_than_two():
     seen = twin(Capture.from_beat(found.beat, radar), low=(-1.0, -1.0), high=(1.0, 1.0), level=0.0)
     assert 1 <= len(seen.objects) <= 2
     for one in seen.objects:
-        assert math.dist(one.position[[0, 2]].tolist(), (0.3, 0.1125)) < 0.04
+        assert math.dist(one.position[:2].tolist(), (0.1125, 0.3)) < 0.04
 
 
 @pytest.mark.slow
@@ -178,10 +177,10 @@ def test_what_moves_and_what_stands_at_one_range_are_two():
     moving = iw.Object(
         sphere(0.1, 3),
         PAINT,
-        rigid(translation=[0.8, 0.0, 1.6]),
-        velocity=torch.tensor([0.0, 0.0, 1.5], dtype=torch.float64),
+        rigid(translation=[1.6, 0.8, 0.0]),
+        velocity=torch.tensor([1.5, 0.0, 0.0], dtype=torch.float64),
     )
-    resting = iw.Object(sphere(0.1, 3), PAINT, rigid(translation=[-0.8, 0.0, 1.6]))
+    resting = iw.Object(sphere(0.1, 3), PAINT, rigid(translation=[1.6, -0.8, 0.0]))
     chirps = Chirps(64, 60e-6)
     sampling = iw.Sampling(depth=1, points_per_m2=3000.0, boundary=False)
     scene = iw.Scene({"moving": moving, "resting": resting})
@@ -195,12 +194,12 @@ def test_what_moves_and_what_stands_at_one_range_are_two():
     way = math.hypot(0.8, 1.6)
     assert float(mover.position.norm()) == pytest.approx(way - 0.08, abs=0.1)
     assert float(mover.velocity.norm()) == pytest.approx(1.5 * 1.6 / way, abs=0.3)
-    assert float(mover.position[0]) > 0.3
+    assert float(mover.position[1]) > 0.3
     assert (
         min(one.existence_probability for one in movers) > 0.05
     )  # no line for what is not believed
     # The echo comes from the front of the ball, three quarters of its radius before the middle.
-    truth = (1 - 0.075 / way) * torch.tensor([0.8, 0.0, 1.6], dtype=torch.float64)
+    truth = (1 - 0.075 / way) * torch.tensor([1.6, 0.8, 0.0], dtype=torch.float64)
     sight = torch.nn.functional.normalize(truth, dim=0)
     along = float((mover.position - truth) @ sight)
     across = float((mover.position - truth - along * sight).norm())
@@ -209,7 +208,7 @@ def test_what_moves_and_what_stands_at_one_range_are_two():
     (rest,) = [
         one for one in found.objects if one.velocity is None and one.existence_probability > 0.5
     ]
-    assert math.dist(rest.position[[0, 2]].tolist(), (-0.8, 1.6)) < 0.2
+    assert math.dist(rest.position[:2].tolist(), (1.6, -0.8)) < 0.2
 
 
 @pytest.mark.data
@@ -218,7 +217,7 @@ def test_both_reflectors_on_the_rail_are_found(data_folder):
 
     capture = rail_sar.read(data_folder / "rail_sar")
     assert is_dense_track(capture)
-    found = twin(capture, ground=Ground("z"), level=0.0, height=0.0)
+    found = twin(capture, level=0.0, height=0.0)
     survey = torch.tensor([[2.203936, -3.873749], [2.32899, 1.037974]], dtype=torch.float64)
     sure = [one.position[:2] for one in found.objects if one.existence_probability > 0.5]
     assert len(sure) == 2

@@ -196,7 +196,7 @@ _SETTINGS = ChirpSettings(
 
 def _captures() -> list[Files]:
     waveform = FMCW(77e9, 2e9, 5e-5, 8)
-    places = torch.tensor([[0.0, 0, 0], [0.1, 0, 0]], dtype=torch.float64)
+    places = torch.tensor([[0.0, 0, 0], [0, 0.1, 0]], dtype=torch.float64)
     generator = torch.Generator().manual_seed(1)
 
     def beat(folder: Path) -> str:
@@ -256,7 +256,8 @@ def _mats() -> list[Files]:
 
 
 _SWEEP = "# MHz S RI R 50\n100 0.5 0.1 0.2 0 0.2 0 1 1\n110 0.4 0 0.1 0 0.1 0 1 1\n"
-_RAIL = """[data]
+_RAIL = """frame = 2
+[data]
 files = "at_*.s2p"
 [sweep]
 background = "empty.s2p"
@@ -264,11 +265,12 @@ parameter = "S21"
 dwell = 1e-3
 [radar]
 positions = "rail.csv"
-look_at = [0.0, 0.0, 3.0]
-tx_positions = [[-0.1, 0.0, 0.0]]
-range_center = [0.0, 0.0, 2.0]
+look_at = [3.0, 0.0, 0.0]
+tx_positions = [[0.0, -0.1, 0.0]]
+range_center = [2.0, 0.0, 0.0]
 """
-_PASS = """[data]
+_PASS = """frame = 2
+[data]
 file = "pass.npz"
 variable = "fp"
 dimensions = ["sample", "frame"]
@@ -290,7 +292,7 @@ def _sweeps() -> list[Files]:
         return "pass.toml"
 
     files = {name: _SWEEP.encode() for name in ("at_0.s2p", "at_1.s2p", "empty.s2p")}
-    rail = {"rail.toml": _RAIL.encode(), **files, "rail.csv": b"x,y,z\n0,0,0\n0.1,0,0\n"}
+    rail = {"rail.toml": _RAIL.encode(), **files, "rail.csv": b"x,y,z\n0,0,0\n0,0.1,0\n"}
     return [rail, {"at_0.s2p": _SWEEP.encode()}, *_written(history)]
 
 

@@ -86,7 +86,7 @@ def field_radar(wavelength: float) -> Radar:
     """Four places of one antenna, at a long wave so that few samples resolve the fringes."""
     middle = SPEED_OF_LIGHT / wavelength
     one = AntennaArray(torch.zeros(1, 3, dtype=torch.float64), Cosine(2.0))
-    places = [[-0.3, -0.1, 0.0], [0.3, -0.1, 0.0], [-0.3, 0.1, 0.0], [0.3, 0.1, 0.0]]
+    places = [[0.0, -0.3, -0.1], [0.0, 0.3, -0.1], [0.0, -0.3, 0.1], [0.0, 0.3, 0.1]]
     return Radar(one, one, FMCW(middle - 0.5e9, 1e9, 50e-6, 32), float64(places))
 
 
@@ -127,16 +127,16 @@ def soft() -> Move:
     return Move(DensityGrid("occluder", [-x for x in reach], reach, ball), {"value": change})
 
 
-CORNERS = float64([[1.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.3]])
-ASIDE = {"translation": float64([0.9, 0.3, 0.1])}
+CORNERS = float64([[0.0, 1.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0], [0.3, 0.0, 0.0]])
+ASIDE = {"translation": float64([0.1, 0.9, 0.3])}
 GEOMETRY = {"translation", "pose", "scale", "vertices"}
 MOVES: dict[str, Move] = {
     "translation": Move(Translation("occluder"), ASIDE),
-    "pose": Move(Pose("occluder"), {"rotation": float64([0.2, 0.9, 0.6])}),
+    "pose": Move(Pose("occluder"), {"rotation": float64([0.6, 0.2, 0.9])}),
     "scale": Move(Scale("occluder"), {"log_scale": float64(1.0)}),
     "vertices": Move(Vertices("occluder", 4), {"offsets": CORNERS}),
     "radar position": Move(RadarPose(), ASIDE, "sensor"),
-    "radar rotation": Move(RadarPose(), {"rotation": float64([0.2, 0.9, 0.1])}, "sensor"),
+    "radar rotation": Move(RadarPose(), {"rotation": float64([0.1, 0.2, 0.9])}, "sensor"),
     "permittivity": material("permittivity", 4.0),
     # As lossy as it is dense, so that the derivative is no small difference of two angles.
     "conductivity": material("conductivity", 10.0),
@@ -153,7 +153,7 @@ MOVES: dict[str, Move] = {
 def clock() -> tuple[Radar, Move]:
     """A radar on a track, and the module that shifts its clock."""
     times = torch.linspace(0, 1, 3, dtype=torch.float64)
-    path = float64([[-0.5, 0.0, 0.0], [0.5, 0.1, 0.1]])
+    path = float64([[0.0, -0.5, 0.0], [0.1, 0.5, 0.1]])
     track = Track(float64([-0.5, 1.5]), path)
     radar = power_radar(track.interpolate(times).tolist())
     single = replace(radar, receivers=radar.transmitters)
@@ -292,7 +292,7 @@ def rough_case(parameter: str) -> Found:
 
 def section(scene: Scene) -> Tensor:
     """Radar cross-sections from in front, a little to the side."""
-    sides = float64([[0.3, 0.1, -1.0], [0.05, -0.2, -1.0]])
+    sides = float64([[-1.0, 0.3, 0.1], [-1.0, 0.05, -0.2]])
     return rcs(scene, sides, [1e9], edges=0).cross_section
 
 
@@ -311,7 +311,7 @@ def signature_case(parameter: str) -> Found:
 
 def between(scene: Scene, place: Tensor) -> Tensor:
     """Response and Doppler shifts between two antennas, which wall and occluder mirror."""
-    ends = place + float64([-0.07, 0.74, 0.19]), [-0.09, -0.46, 0.07]
+    ends = place + float64([0.19, -0.07, 0.74]), [0.07, -0.09, -0.46]
     paths = trace_paths(scene, *ends, 1e9, rays=4000)
     assert len(paths) == 3  # the line of sight, and one mirror each
     turn = torch.polar(torch.ones_like(paths.delay), -2e9 * math.pi * paths.delay)
@@ -326,7 +326,7 @@ def antenna_case(parameter: str) -> Found:
 
     def value(theta: Tensor) -> Tensor:
         if parameter == "object velocity":
-            speed = theta * float64([0.3, 0.2, 1.0])
+            speed = theta * float64([1.0, 0.3, 0.2])
             return between(scene.replace("wall", velocity=speed), radar.positions[0])
         changed = MOVES[parameter](scene, radar, theta)
         return between(changed[0], changed[1].positions[0])
@@ -338,14 +338,14 @@ def antenna_case(parameter: str) -> Found:
 
 # Cells between occluder and wall, where the occluder's shadow lies.
 CELLS_BEHIND = MapPlane(
-    float64([-0.47, -0.55, 1.7]), float64([1.2, 0, 0]), float64([0, 1.2, 0]), (2, 2)
+    float64([1.7, -0.47, -0.55]), float64([0, 1.2, 0]), float64([0, 0, 1.2]), (2, 2)
 )
 
 
 def covered(scene: Scene, place: Tensor, sampling: CellSampling, seed: int = 0) -> Tensor:
     """Mean power in cells, seen directly and by the mirror of the wall."""
     cells = replace(CELLS_BEHIND, sampling=sampling)
-    mast = Transmitters(place + float64([-0.07, 0.04, 0.19]))
+    mast = Transmitters(place + float64([0.19, -0.07, 0.04]))
     return cells.link_statistics(
         scene, mast, PropagationSettings(1e9, depth=1, rays=None), seed
     ).gain
@@ -359,7 +359,7 @@ def coverage_case(parameter: str) -> Found:
 
     def value(theta: Tensor, sampling: CellSampling, seed: int = 0) -> Tensor:
         if parameter == "object velocity":
-            moved = scene.replace("wall", velocity=theta * float64([0.3, 0.2, 1.0]))
+            moved = scene.replace("wall", velocity=theta * float64([1.0, 0.3, 0.2]))
             return covered(moved, radar.positions[0], sampling, seed)
         changed = MOVES[parameter](scene, radar, theta)
         return covered(changed[0], changed[1].positions[0], sampling, seed)
@@ -381,9 +381,9 @@ def coverage_case(parameter: str) -> Found:
     )
 
 
-MIRROR = thing(plate(1.0, 1.0), (0.9, 0.0, 1.3), (0.0, 1.4, 0.0), METAL)
+MIRROR = thing(plate(1.0, 1.0), (1.3, 0.9, 0.0), (0.0, 0.0, 1.4), METAL)
 AIR = Dielectric(1.0)
-RECEIVERS = float64([[0.3, 0.35, 0.7], [-0.2, -0.3, 0.6]])
+RECEIVERS = float64([[0.7, 0.3, 0.35], [0.6, -0.2, -0.3]])
 
 
 def strengths(out: RayPaths, home: RayPaths, turned: Tensor, *_: Tensor) -> Tensor:
@@ -398,7 +398,7 @@ def by_mirrors(scene: Scene, place: Tensor, sampling: Sampling, seed: int) -> Te
     rough = scene.replace("mirror", material=AIR)
     if rough["occluder"].cloud is None:
         rough = rough.replace("occluder", material=AIR)
-    tx = place + float64([-0.07, 0.04, 0.19])
+    tx = place + float64([0.19, -0.07, 0.04])
     return trace_single_scattering(
         scene,
         rough,
@@ -464,7 +464,7 @@ def target_map(scene: Scene, radar: Radar) -> Tensor:
 
 def target_case(parameter: str) -> Found:
     """A target past which a straight edge of the occluder's shadow goes."""
-    target = thing(plate(0.3, 0.15), (0.19, 0.1, 1.9), (0.05, 0.1, 0.0), METAL)
+    target = thing(plate(0.3, 0.15), (1.9, 0.19, 0.1), (0.0, 0.05, 0.1), METAL)
     scene = Scene({**occluder(occluder=ROUGH).objects, "wall": target})
     radar, moves = field_radar(0.3), MOVES[parameter]
 
@@ -478,8 +478,8 @@ def target_case(parameter: str) -> Found:
 
 # A mirror of elements at the wall; a corner of the occluder's shadow lies on it.
 PANEL = Metasurface(
-    float64([0.69, 0.37, 1.85]),
-    float64([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]),
+    float64([1.85, 0.69, 0.37]),
+    float64([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]),
     torch.zeros(20, 20, dtype=torch.float64),
     spacing=0.015,
 )
@@ -487,8 +487,12 @@ PANEL = Metasurface(
 
 def by_panel(scene: Scene, place: Tensor) -> Tensor:
     """What the panel sends from one antenna to another."""
-    tx, rx = place + float64([[-0.07, 0.04, 0.19]]), float64([[0.9, 0.6, 0.3]])
+    tx, rx = place + float64([[0.19, -0.07, 0.04]]), float64([[0.3, 0.9, 0.6]])
     return torch.view_as_real(panel_response(scene, PANEL, tx, rx, 1e10)).flatten()
+
+
+# Right, down and ahead of a camera that looks along x.
+LEVEL = float64([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def seen(scene: Scene, radar: Radar, sampling: ImageSampling, seed: int) -> Tensor:
@@ -496,7 +500,7 @@ def seen(scene: Scene, radar: Radar, sampling: ImageSampling, seed: int) -> Tens
 
     It is rolled: outlines along the rows of pixels move to other pixels all at once.
     """
-    axes = rotation_from_vector(float64([0.0, 0.0, 0.5]))
+    axes = rotation_from_vector(float64([0.5, 0.0, 0.0])) @ LEVEL
     axes = axes if radar.rotations is None else radar.rotations @ axes
     camera = Camera(radar.positions, axes, 6, 5, 9.0)
     mask = SilhouetteMap(("occluder",), sampling).predict(scene, camera, seed)
@@ -545,7 +549,7 @@ def changed(parameter: str, theta: Tensor) -> tuple[Scene, Radar]:
     )
     scene = occluder(wall=walls.get(parameter, COATED), occluder=METAL)
     if parameter == "object velocity":
-        return scene.replace("wall", velocity=theta * float64([0.3, 0.2, 1.0])), power_radar()
+        return scene.replace("wall", velocity=theta * float64([1.0, 0.3, 0.2])), power_radar()
     return MOVES[parameter](scene, power_radar(), theta)
 
 

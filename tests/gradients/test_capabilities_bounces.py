@@ -37,9 +37,9 @@ def alcove() -> Scene:
     """A wall and a side that see each other, past a plate."""
     return Scene(
         {
-            "wall": thing(plate(0.8, 0.6), (0.15, 0.0, 1.9), (0.0, 0.3, 0.0), ROUGH),
-            "side": thing(plate(0.8, 0.6), (-0.5, 0.0, 1.5), (0.0, -1.1, 0.0), ROUGH),
-            "occluder": thing(plate(0.25, 0.2), (-0.12, 0.02, 1.6), (0.0, -0.4, 0.0), ROUGH),
+            "wall": thing(plate(0.8, 0.6), (1.9, 0.15, 0.0), (0.0, 0.0, 0.3), ROUGH),
+            "side": thing(plate(0.8, 0.6), (1.5, -0.5, 0.0), (0.0, 0.0, -1.1), ROUGH),
+            "occluder": thing(plate(0.25, 0.2), (1.6, -0.12, 0.02), (0.0, 0.0, -0.4), ROUGH),
         }
     )
 
@@ -48,9 +48,9 @@ def room() -> Scene:
     """A wall and a floor, and a plate between them: more shadows, wider ones."""
     return Scene(
         {
-            "wall": thing(plate(2.4, 2.4), (0.0, 0.0, 2.5), material=ROUGH),
-            "floor": thing(plate(2.4, 2.4), (0.0, -1.0, 1.6), (math.pi / 2, 0.0, 0.0), ROUGH),
-            "occluder": thing(plate(0.6, 0.6), (0.25, -0.4, 1.8), material=ROUGH),
+            "wall": thing(plate(2.4, 2.4), (2.5, 0.0, 0.0), material=ROUGH),
+            "floor": thing(plate(2.4, 2.4), (1.6, 0.0, -1.0), (0.0, math.pi / 2, 0.0), ROUGH),
+            "occluder": thing(plate(0.6, 0.6), (1.8, 0.25, -0.4), material=ROUGH),
         }
     )
 

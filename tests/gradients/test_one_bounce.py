@@ -49,12 +49,12 @@ def test_gradient_is_that_of_converged_differences(file):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "axis", [pytest.param((1.0, 0.0, 0.0), marks=pytest.mark.claim), (0.0, 1.0, 0.0)], ids="xy"
+    "axis", [pytest.param((0.0, 1.0, 0.0), marks=pytest.mark.claim), (0.0, 0.0, 1.0)], ids="yz"
 )
 def test_a_fine_mesh_keeps_its_silhouette(axis):
     """Triangles nearly edge-on beside a silhouette must not block its own boundary rays."""
-    ball = thing(sphere(0.2, 5), (0.05, 0.02, 1.1))
-    scene = Scene({"wall": thing(plate(2.4, 2.4, divisions=2), (0, 0, 2)), "ball": ball})
+    ball = thing(sphere(0.2, 5), (1.1, 0.05, 0.02))
+    scene = Scene({"wall": thing(plate(2.4, 2.4, divisions=2), (2, 0, 0)), "ball": ball})
     seen = radar()
     model = SurrogateMap(
         seen.grid(0.7, 2.6, 0.6, oversample=1),

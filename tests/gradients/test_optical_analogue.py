@@ -27,24 +27,24 @@ from invertwin.scene import (
 )
 from scenes import WAVELENGTH, float64, relative, thing
 
-CAMERA = (-0.3, 0.0, 0.0)
-LIGHT, SIDE = (0.5, 0.2, 0.0), 0.3
+CAMERA = (0.0, -0.3, 0.0)
+LIGHT, SIDE = (0.0, 0.5, 0.2), 0.3
 PLACES = 12  # transmitters along each side of the light
 GRID = Grid(0.0, 1000.0, 1, u_start=-0.3, u_step=0.1, u_count=8)
 WHITE = RoughConductor(scattering=1.0)
-WALL = thing(plate(2.0, 1.4), (0.0, 0.0, 2.0), (0.0, 0.1, 0.0), WHITE)
-SCREEN = thing(plate(0.45, 0.35), (0.05, 0.05, 1.2), (0.1, 0.2, 0.4), WHITE)
+WALL = thing(plate(2.0, 1.4), (2.0, 0.0, 0.0), (0.0, 0.0, 0.1), WHITE)
+SCREEN = thing(plate(0.45, 0.35), (1.2, 0.05, 0.05), (0.4, 0.1, 0.2), WHITE)
 
 
 def ours(shift: Tensor, seed: int, samples: int, boundary: bool) -> Tensor:
     """Power by direction, the mean over the places of the light."""
     steps = (torch.arange(PLACES).double() + 0.5) / PLACES - 0.5
-    x, y = torch.meshgrid(steps * SIDE, steps * SIDE, indexing="ij")
-    tx = torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3) + float64(LIGHT)
+    y, z = torch.meshgrid(steps * SIDE, steps * SIDE, indexing="ij")
+    tx = torch.stack([0 * y, y, z], dim=-1).reshape(-1, 3) + float64(LIGHT)
     rotations = torch.eye(3, dtype=torch.float64).expand(len(tx), 3, 3)
     rx = float64(CAMERA).expand(len(tx), 3)
     antennas = Link(tx, rx, rotations, Cosine(1.0), Isotropic(), WAVELENGTH, False)
-    offset = torch.stack([shift, 0 * shift, 0 * shift])
+    offset = torch.stack([0 * shift, shift, 0 * shift])
     moved = Object(Mesh(SCREEN.vertices + offset, SCREEN.mesh.faces), WHITE)
     scene = Scene({"wall": WALL, "screen": moved})
     out = deposit_power(
@@ -90,8 +90,11 @@ def mitsuba(seeds: int, size: int = 128) -> tuple[Tensor, Tensor, float]:
                 "wall": quads(mi, WALL),
                 "screen": quads(mi, SCREEN),
                 "light": {
-                    "type": "rectangle",  # of side 2, facing +z
-                    "to_world": to_world().translate(LIGHT).scale([SIDE / 2, SIDE / 2, 1]),
+                    "type": "rectangle",  # of side 2, facing +z before it is turned
+                    "to_world": to_world()
+                    .translate(LIGHT)
+                    .rotate([0, 1, 0], 90)
+                    .scale([SIDE / 2, SIDE / 2, 1]),
                     "emitter": {"type": "area", "radiance": 1.0},
                 },
                 "sensor": {
@@ -99,7 +102,7 @@ def mitsuba(seeds: int, size: int = 128) -> tuple[Tensor, Tensor, float]:
                     "fov": fov,
                     "near_clip": 0.01,
                     "to_world": to_world().look_at(
-                        CAMERA, (CAMERA[0], CAMERA[1], 1.0), (0.0, 1.0, 0.0)
+                        CAMERA, (1.0, CAMERA[1], CAMERA[2]), (0.0, 0.0, 1.0)
                     ),
                     "film": {
                         "type": "hdrfilm",
@@ -120,7 +123,7 @@ def mitsuba(seeds: int, size: int = 128) -> tuple[Tensor, Tensor, float]:
         for seed in range(seeds):
             theta = mi.Float(0.0)
             dr.enable_grad(theta)
-            offset = mi.Point3f(theta, 0.0, 0.0)
+            offset = mi.Point3f(0.0, theta, 0.0)
             parameters[key] = dr.ravel(dr.unravel(mi.Point3f, still) + offset)
             parameters.update()
             image = mi.render(
@@ -135,16 +138,16 @@ def mitsuba(seeds: int, size: int = 128) -> tuple[Tensor, Tensor, float]:
         mi.set_variant(before)
     half = np.tan(np.radians(fov / 2))
     steps = ((np.arange(size) + 0.5) / size * 2 - 1) * half
-    x, y = np.meshgrid(-steps, -steps)
-    secant = np.sqrt(1 + x**2 + y**2)
-    t = torch.from_numpy((x / secant - GRID.u_start) / GRID.u_step)
+    y, z = np.meshgrid(-steps, -steps)
+    secant = np.sqrt(1 + y**2 + z**2)
+    t = torch.from_numpy((y / secant - GRID.u_start) / GRID.u_step)
     gap = (t[..., None] - torch.arange(GRID.u_count)).abs()
     spline = torch.where(
         gap < 0.5, 0.75 - gap**2, torch.where(gap < 1.5, 0.5 * (1.5 - gap) ** 2, 0.0)
     )
     weights = spline * torch.from_numpy(secant**-3.0)[..., None]
     binned = [
-        torch.einsum("syx,yxu->su", torch.from_numpy(np.stack(found)).double(), weights)
+        torch.einsum("szy,zyu->su", torch.from_numpy(np.stack(found)).double(), weights)
         for found in (images, slopes)
     ]
     slope = binned[1].mean(0)

@@ -36,15 +36,15 @@ from invertwin.scene.shape_models.lattice import Lattice
 from scenes import float64, radar, thing
 
 Line = tuple[Scene, nn.Module, dict[str, Tensor]]
-LOW, HIGH = [-0.45, -0.4, -0.35], [0.45, 0.4, 0.35]
+LOW, HIGH = [-0.35, -0.45, -0.4], [0.35, 0.45, 0.4]
 
 
 def before_a_wall(mesh: Mesh) -> Scene:
     """An object 1 m away, turned a little, in front of a wall 2 m away."""
     return Scene(
         {
-            "wall": thing(plate(2.4, 2.4, divisions=2), (0, 0, 2)),
-            "object": thing(mesh, (0.05, 0.02, 1.1), (0.1, 0.2, 0.05)),
+            "wall": thing(plate(2.4, 2.4, divisions=2), (2, 0, 0)),
+            "object": thing(mesh, (1.1, 0.05, 0.02), (0.05, 0.1, 0.2)),
         }
     )
 
@@ -55,28 +55,28 @@ def noise(shape: torch.Size, seed: int = 0) -> Tensor:
 
 def arm() -> BodyTemplate:
     """Two bars with a gap at the elbow: parts that cut through each other have no derivative."""
-    upper, lower = box([0.24, 0.1, 0.1]), box([0.3, 0.08, 0.08])
+    upper, lower = box([0.1, 0.24, 0.1]), box([0.08, 0.3, 0.08])
     parts = [
-        Mesh(upper.vertices - float64([0.2, 0, 0]), upper.faces),
-        Mesh(lower.vertices + float64([0.21, 0, 0]), lower.faces),
+        Mesh(upper.vertices - float64([0, 0.2, 0]), upper.faces),
+        Mesh(lower.vertices + float64([0, 0.21, 0]), lower.faces),
     ]
-    return articulated_template(parts, (-1, 0), [[-0.3, 0, 0], [0, 0, 0]])
+    return articulated_template(parts, (-1, 0), [[0, -0.3, 0], [0, 0, 0]])
 
 
 def skin() -> BodyTemplate:
     """A tall rounded body whose weights change smoothly from one joint to the next."""
     ball = sphere(0.1, 3)
-    vertices = ball.vertices * float64([1.0, 3.0, 1.0])
-    share = torch.sigmoid(vertices[:, 1] / 0.05)
+    vertices = ball.vertices * float64([1.0, 1.0, 3.0])
+    share = torch.sigmoid(vertices[:, 2] / 0.05)
     weights = torch.stack([1 - share, share], dim=1)
-    return BodyTemplate(vertices, ball.faces, weights, (-1, 0), float64([[0, -0.3, 0], [0, 0, 0]]))
+    return BodyTemplate(vertices, ball.faces, weights, (-1, 0), float64([[0, 0, -0.3], [0, 0, 0]]))
 
 
 def space() -> ShapeSpace:
     """A box that gets wider, and higher on one side."""
-    mesh = box([0.5, 0.3, 0.2], divisions=2)
-    wider = mesh.vertices * float64([1, 0, 0])
-    higher = mesh.vertices * float64([0, 1, 0]) * (mesh.vertices[:, :1] > 0)
+    mesh = box([0.2, 0.5, 0.3], divisions=2)
+    wider = mesh.vertices * float64([0, 1, 0])
+    higher = mesh.vertices * float64([0, 0, 1]) * (mesh.vertices[:, 1:2] > 0)
     return ShapeSpace(
         mesh.vertices, torch.stack([wider, higher], dim=-1), float64([0.5, 0.5]), mesh.faces
     )
@@ -84,18 +84,18 @@ def space() -> ShapeSpace:
 
 def distance_grid() -> Line:
     def ellipsoid(points: Tensor) -> Tensor:
-        return 0.2 * ((points / float64([0.3, 0.2, 0.2])).norm(dim=1) - 1)
+        return 0.2 * ((points / float64([0.2, 0.3, 0.2])).norm(dim=1) - 1)
 
-    module = DistanceGrid.from_function("object", LOW, HIGH, (13, 12, 11), ellipsoid)
+    module = DistanceGrid.from_function("object", LOW, HIGH, (11, 13, 12), ellipsoid)
     scene = before_a_wall(sphere(0.2, 1))
     # Values on one side fall: the surface moves outwards there.
-    change = -(module.lattice.nodes[..., 0] > 0.1).double()
+    change = -(module.lattice.nodes[..., 1] > 0.1).double()
     return scene, module, {"value": change}
 
 
 def neural_distance() -> Line:
     module = NeuralDistance(
-        "object", LOW, HIGH, (13, 12, 11), radius=0.22, width=8, frequency=3.0, seed=1
+        "object", LOW, HIGH, (11, 13, 12), radius=0.22, width=8, frequency=3.0, seed=1
     )
     weights = dict(module.named_parameters())
     name = "layers.2.weight"
@@ -123,9 +123,7 @@ def prior_latent() -> Line:
     # Seen from its side and a little from its front.
     start = before_a_wall(box(0.1))
     turned = rigid(
-        rotation_from_vector(float64([0.0, 0.6, 0.0]))
-        @ rotation_from_vector(float64([-math.pi / 2, 0.0, 0.0])),
-        float64([0.0, -0.1, 1.1]),
+        rotation_from_vector(float64([0.0, 0.0, 0.6 + math.pi / 2])), float64([1.1, 0.0, -0.1])
     )
     scene = start.replace("object", pose=turned)
     change = 8.0 * noise(torch.Size([prior.latent_size]), 6)
@@ -138,14 +136,14 @@ def latent() -> Line:
 
 
 def joint_angle() -> Line:
-    module = SkinnedBody("object", arm(), [[0, 0, 0.1], [0.0, 0.2, 0.5]])
-    turn = float64([[0, 0, 0], [0, 0.5, 3.0]])
+    module = SkinnedBody("object", arm(), [[0.1, 0, 0], [0.5, 0.0, 0.2]])
+    turn = float64([[0, 0, 0], [3.0, 0, 0.5]])
     return before_a_wall(box(0.1)), module, {"rotation": turn}
 
 
 def skinning() -> Line:
-    module = SkinnedBody("object", skin(), [[0, 0, 0.1], [0.0, 0.2, 0.5]])
-    turn = float64([[0, 0, 2.0], [0, 1.0, 4.0]])
+    module = SkinnedBody("object", skin(), [[0.1, 0, 0], [0.5, 0.0, 0.2]])
+    turn = float64([[2.0, 0, 0], [4.0, 0, 1.0]])
     return before_a_wall(box(0.1)), module, {"rotation": turn}
 
 

@@ -24,14 +24,14 @@ from invertwin.scene import (
     rigid,
     rotation_from_vector,
 )
-from scenes import float64
+from scenes import float64, level_plate
 
 FREQUENCY = 5e9
 METAL = PerfectConductor()
 RIGHT, WRONG = 0.015, 0.1
-UPRIGHT = rotation_from_vector(float64([math.pi / 2, 0.0, 0.0]))
+ACROSS = rotation_from_vector(float64([0.0, 0.0, -math.pi / 2]))
 TX = float64([0.3, -3.0, 1.4])
-FLOOR = Object(plate(40.0, 40.0), Slab.itu("concrete", thickness=0.2))
+FLOOR = Object(level_plate(40.0, 40.0), Slab.itu("concrete", thickness=0.2))
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def across(y: float, z: float = 1.2, count: int = 33) -> Tensor:
 
 
 def standing(width: float, height: float, at: Tensor) -> Object:
-    return Object(plate(width, height), METAL, rigid(UPRIGHT, at))
+    return Object(plate(width, height), METAL, rigid(ACROSS, at))
 
 
 def half_plane(value: Tensor) -> Scene:
@@ -104,7 +104,7 @@ def size(value: Tensor) -> Scene:
     """A plate that grows, before the receivers."""
     base = plate(1.0, 0.8)
     mesh = Mesh(base.vertices * (1 + value), base.faces)
-    return Scene({"plate": Object(mesh, METAL, rigid(UPRIGHT, float64([0.2, 0.0, 1.3])))})
+    return Scene({"plate": Object(mesh, METAL, rigid(ACROSS, float64([0.2, 0.0, 1.3])))})
 
 
 def blocker(value: Tensor) -> Scene:

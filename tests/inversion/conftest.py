@@ -16,7 +16,7 @@ from invertwin.scene.parameters import Translation
 from invertwin.simulation import simulate
 from scenes import float64, radar, thing
 
-OFFSET = float64([0.06, 0.0, -0.09])
+OFFSET = float64([-0.09, 0.06, 0.0])
 DRAWN = Sampling(depth=1, points_per_m2=3_000.0)
 
 
@@ -58,11 +58,11 @@ class Case:
 
 @pytest.fixture(scope="session")
 def case() -> Case:
-    places = [[x, 0.0, 0.0] for x in (-0.3, -0.1, 0.1, 0.3)]
+    places = [[0.0, y, 0.0] for y in (-0.3, -0.1, 0.1, 0.3)]
     scene = Scene(
         {
-            "plate": thing(plate(0.3, 0.3), (0.0, 0.0, 1.5), (0.0, 0.1, 0.0)),
-            "wall": thing(plate(1.6, 1.2), (0.0, 0.0, 2.1)),
+            "plate": thing(plate(0.3, 0.3), (1.5, 0.0, 0.0), (0.0, 0.0, 0.1)),
+            "wall": thing(plate(1.6, 1.2), (2.1, 0.0, 0.0)),
         }
     )
     device = radar(places, receivers=16)

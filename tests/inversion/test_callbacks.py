@@ -193,8 +193,8 @@ def log_loss(share):
 capture = Capture.load(folder + "/data.nc")
 radar = capture.radar()
 scene = Scene({
-    "plate": thing(plate(0.3, 0.3), (0.0, 0.0, 1.5), (0.0, 0.1, 0.0)),
-    "wall": thing(plate(1.6, 1.2), (0.0, 0.0, 2.1)),
+    "plate": thing(plate(0.3, 0.3), (1.5, 0.0, 0.0), (0.0, 0.0, 0.1)),
+    "wall": thing(plate(1.6, 1.2), (2.1, 0.0, 0.0)),
 })
 
 def stop(row):

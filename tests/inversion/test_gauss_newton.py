@@ -187,9 +187,11 @@ def test_a_penalty_takes_part_with_its_own_curvature():
 
 
 def test_a_displaced_plate_is_found_in_eight_steps(case):
-    """The same plate takes Adam 60 steps (test_reconstruction). The array tells nothing of y."""
-    module = Translation("plate", axes="xz")
+    """The same plate takes Adam 60 steps (test_reconstruction). The array tells nothing of z."""
+    module = Translation("plate", axes="xy")
     surrogate = case.settings()["surrogate"]
+    # With fewer bins a cell the surrogate is no mean, and where the fit ends is up to its seeds.
+    grid = case.radar.grid(1.0, 2.4, 0.5, oversample=2)
     solver = GaussNewton(module, alone(SpectrumLoss()), trust_radius=0.1)
     for step in range(8):
         left = max(0.0, 1 - step / 5)
@@ -199,17 +201,17 @@ def test_a_displaced_plate_is_found_in_eight_steps(case):
             simulated = surrogate_spectrum(
                 module(case.scene),
                 case.radar,
-                case.grid,
+                grid,
                 kernels,
                 sampling=Sampling(depth=1, samples=40_000, boundary_samples=10_000),
                 seed=step,
             )
-            measured = case.capture.spectrum(case.grid).float()
-            return [(simulated, kernels.blur(measured, case.radar, case.grid))]
+            measured = case.capture.spectrum(grid).float()
+            return [(simulated, kernels.blur(measured, case.radar, grid))]
 
         solver.step(maps)
     error = case.error(module(case.scene))
-    assert float(error[[0, 2]].norm()) < 0.02
+    assert float(error[:2].norm()) < 0.02
 
 
 def test_bad_input(unchecked):
@@ -235,7 +237,7 @@ def test_a_map_that_is_not_finite_is_reported_not_followed():
 
 
 def test_a_turned_pose_has_free_quaternion_numbers_only(case):
-    module = Pose("plate", axes="z", rotation_axes="y")
+    module = Pose("plate", axes="x", rotation_axes="z")
     measured = case.capture.spectrum(case.grid).float()
 
     def maps() -> MapPairs:
@@ -253,9 +255,9 @@ def test_a_turned_pose_has_free_quaternion_numbers_only(case):
     GaussNewton(module, alone(SpectrumLoss("likelihood"))).step(maps)
     assert [name for name, _ in module.named_parameters()] == names
     state = module.state_dict()
-    assert torch.equal(state["translation"][:2], torch.zeros(2, dtype=torch.float64))
-    assert torch.equal(state["rotation"][[1, 3]], torch.zeros(2, dtype=torch.float64))
-    assert float(state["translation"][2].abs()) > 0
+    assert torch.equal(state["translation"][1:], torch.zeros(2, dtype=torch.float64))
+    assert torch.equal(state["rotation"][[1, 2]], torch.zeros(2, dtype=torch.float64))
+    assert float(state["translation"][0].abs()) > 0
 
 
 class InterruptError(Exception):
@@ -266,11 +268,11 @@ class InterruptError(Exception):
 def test_reconstruct_takes_its_steps_and_resumes(case, tmp_path):
     def fitted(**changes: Any) -> Any:
         settings = case.settings(steps=4, optimizer=Optimizer("gauss_newton", rate=0.1))
-        module = Translation("plate", axes="xz")
+        module = Translation("plate", axes="xy")
         return fit(case.scene, case.radar, case.capture, module, **(settings | changes))
 
     whole = fitted()
-    assert float(case.error(whole.scene)[[0, 2]].norm()) < 0.05
+    assert float(case.error(whole.scene)[:2].norm()) < 0.05
     assert [row["step"] for row in whole.history] == [0, 1, 2, 3]
 
     def stop(row: dict[str, Any]) -> None:

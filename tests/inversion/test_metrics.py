@@ -72,8 +72,8 @@ def test_shifted_cubes_share_a_third():
 
 def test_parallel_plates():
     """Half of one within the threshold of the other: precision 1, recall 1/2."""
-    small, large = plate(1.0, 1.0), shifted(plate(2.0, 1.0), 0.5, 0, 0)
-    found = compare_shapes(small, shifted(large, 0, 0, 0.01), thresholds=(0.03,))
+    small, large = plate(1.0, 1.0), shifted(plate(2.0, 1.0), 0, 0.5, 0)
+    found = compare_shapes(small, shifted(large, 0.01, 0, 0), thresholds=(0.03,))
     assert found.fscore[0.03] == pytest.approx(2 / 3, abs=0.02)
     assert found.normal_consistency == pytest.approx(1.0)
     assert found.iou is None
@@ -82,9 +82,9 @@ def test_parallel_plates():
 
 
 def test_turned_normals():
-    turn = rotation_from_vector(float64([0, 0, 0.3]))
+    turn = rotation_from_vector(float64([0.3, 0, 0]))
     flat = plate(1.0, 1.0)
-    tilted = Mesh(flat.vertices @ rotation_from_vector(float64([0.3, 0, 0])).T, flat.faces)
+    tilted = Mesh(flat.vertices @ rotation_from_vector(float64([0, 0.3, 0])).T, flat.faces)
     found = compare_shapes(tilted, Mesh(flat.vertices @ turn.T, flat.faces))
     assert found.normal_consistency == pytest.approx(math.cos(0.3), abs=1e-9)
 

@@ -29,22 +29,22 @@ from invertwin.scene import (
 from invertwin.simulation import simulate
 from scenes import float64, radar, thing
 
-LOW, HIGH = [-0.4, -0.35, -0.35], [0.4, 0.35, 0.35]
-PLACES = float64([[x, y, 0.0] for x in (-0.4, 0.0, 0.4) for y in (-0.2, 0.2)])
+LOW, HIGH = [-0.35, -0.4, -0.35], [0.35, 0.4, 0.35]
+PLACES = float64([[0.0, y, z] for y in (-0.4, 0.0, 0.4) for z in (-0.2, 0.2)])
 
 
 def space() -> ShapeSpace:
     """A box that gets wider on both sides."""
-    mesh = box([0.4, 0.3, 0.2], divisions=2)
-    wider = (mesh.vertices * float64([1, 0, 0]))[..., None]
+    mesh = box([0.2, 0.4, 0.3], divisions=2)
+    wider = (mesh.vertices * float64([0, 1, 0]))[..., None]
     return ShapeSpace(mesh.vertices, wider, float64([0.25]), mesh.faces)
 
 
 def placed(mesh: Mesh) -> Scene:
     return Scene(
         {
-            "wall": thing(plate(2.0, 2.0, divisions=2), (0, 0, 2)),
-            "object": thing(mesh, (0.05, 0.0, 1.1), (0.0, 0.3, 0.0)),
+            "wall": thing(plate(2.0, 2.0, divisions=2), (2, 0, 0)),
+            "object": thing(mesh, (1.1, 0.05, 0.0), (0.0, 0.0, 0.3)),
         }
     )
 
@@ -100,20 +100,20 @@ def test_a_wide_box_is_found_in_the_space(wide):
 
 
 def ellipsoid(points: Tensor) -> Tensor:
-    return 0.15 * ((points / float64([0.25, 0.15, 0.15])).norm(dim=1) - 1)
+    return 0.15 * ((points / float64([0.15, 0.25, 0.15])).norm(dim=1) - 1)
 
 
 BALL = sphere(0.15, 2)
 LEFT, RIGHT = (
-    Mesh(box([0.2, 0.1, 0.1]).vertices + float64([x, 0, 0]), box(1.0).faces) for x in (-0.15, 0.15)
+    Mesh(box([0.1, 0.2, 0.1]).vertices + float64([0, y, 0]), box(1.0).faces) for y in (-0.15, 0.15)
 )
 SHAPES = {
-    "grid": lambda: DistanceGrid.from_function("object", LOW, HIGH, (13, 11, 11), ellipsoid),
-    "network": lambda: NeuralDistance("object", LOW, HIGH, (13, 11, 11), radius=0.15, width=8),
+    "grid": lambda: DistanceGrid.from_function("object", LOW, HIGH, (11, 13, 11), ellipsoid),
+    "network": lambda: NeuralDistance("object", LOW, HIGH, (11, 13, 11), radius=0.15, width=8),
     "lattice": lambda: LatticeDeformation("object", LOW, HIGH),
     "smooth": lambda: SmoothVertices("object", BALL),
     "body": lambda: SkinnedBody(
-        "object", articulated_template([LEFT, RIGHT], (-1, 0), [[-0.3, 0, 0], [0, 0, 0]])
+        "object", articulated_template([LEFT, RIGHT], (-1, 0), [[0, -0.3, 0], [0, 0, 0]])
     ),
 }
 

@@ -38,7 +38,7 @@ from invertwin.scene import (
     rigid,
     rotation_from_vector,
 )
-from scenes import float64
+from scenes import float64, level_plate
 
 FREQUENCY = 3.5e9
 SCALE = (SPEED_OF_LIGHT / FREQUENCY / (4 * math.pi)) ** 2
@@ -49,13 +49,14 @@ TX = float64([-2.0, 0.0, 3.0])
 
 
 def thing(width: float, height: float, at: Tensor, turn: object, material: Material) -> Object:
-    """A plate in the plane of its x and y axes, turned and placed."""
-    return Object(plate(width, height), material, rigid(rotation_from_vector(float64(turn)), at))
+    """A plate that would lie, turned and placed."""
+    pose = rigid(rotation_from_vector(float64(turn)), at)
+    return Object(level_plate(width, height), material, pose)
 
 
 def upright(width: float, height: float, at: Tensor, material: Material = METAL) -> Object:
     """A plate that stands across the x axis: its width along y, its height along z."""
-    return thing(height, width, at, [0.0, math.pi / 2, 0.0], material)
+    return Object(plate(width, height), material, rigid(translation=at))
 
 
 FAR = Scene({"far": upright(1.0, 1.0, float64([500.0, 0.0, 0.0]))})
@@ -129,7 +130,7 @@ def test_a_pattern_and_the_power_of_several_transmitters():
 
 
 def test_two_rays_over_a_ground():
-    ground = Scene({"ground": Object(plate(400.0, 400.0), METAL)})
+    ground = Scene({"ground": Object(level_plate(400.0, 400.0), METAL)})
     cells = MapPlane.horizontal([3.0, -1.0], [5.0, 1.0], 1.0, 2.0, CellSampling(points=900))
     found = cells.link_statistics(ground, Transmitters(TX), replace(DIRECT, depth=1), 0)
 

@@ -31,14 +31,14 @@ from invertwin.scene import (
     plate,
     rigid,
 )
-from scenes import float64
+from scenes import float64, level_plate
 
 FREQUENCY = 2.4e9
 WAVELENGTH = SPEED_OF_LIGHT / FREQUENCY
 METAL = PerfectConductor()
-GROUND = Scene({"ground": Object(plate(200.0, 200.0), METAL)})
+GROUND = Scene({"ground": Object(level_plate(200.0, 200.0), METAL)})
 ROOM = Scene({"room": Object(box((6.0, 5.0, 3.0)), Dielectric(5.0, 0.1, scattering=0.0))})
-SCREEN = Scene({"screen": Object(plate(2.0, 3.0), METAL, rigid(translation=[1.0, 0.0, 0.0]))})
+SCREEN = Scene({"screen": Object(plate(2.0, 3.0), METAL, rigid(translation=[0.0, 1.0, 0.0]))})
 
 
 def received(scene: Scene, tx: object, rx: Tensor, **how: object) -> Tensor:
@@ -83,10 +83,10 @@ def test_wide_bands_add_powers_and_narrow_ones_fields():
 
 @pytest.mark.parametrize("bandwidth", [0.0, 1e9])
 def test_edges_leave_no_jump_at_a_shadow(bandwidth):
-    tx = [0.2, 0.1, 3.0]
-    # The screen's edge at x = 0 throws a shadow to x = −0.2 at z = −3.
+    tx = [3.0, 0.2, 0.1]
+    # The screen's edge at y = 0 throws a shadow to y = −0.2 at x = −3.
     offsets = float64([-1e-6, 1e-6])
-    rx = torch.stack([-0.2 + offsets, 0.1 + 0 * offsets, -3.0 + 0 * offsets], 1)
+    rx = torch.stack([-3.0 + 0 * offsets, -0.2 + offsets, 0.1 + 0 * offsets], 1)
     with_edges = received(SCREEN, tx, rx, bandwidth=bandwidth, edges=1, depth=1)[0]
     without = received(SCREEN, tx, rx, bandwidth=bandwidth, depth=1)[0]
     assert abs(float(10 * (with_edges[0] / with_edges[1]).log10())) < 1e-3

@@ -35,12 +35,12 @@ from invertwin.scene import (
     rigid,
     rotation_from_vector,
 )
-from scenes import float64
+from scenes import float64, level_plate
 
 FREQUENCY = 3.5e9
 WAVELENGTH = SPEED_OF_LIGHT / FREQUENCY
 CHALK = RoughConductor(scattering=1.0)
-WALL = Scene({"wall": Object(plate(4.0, 4.0), CHALK)})
+WALL = Scene({"wall": Object(level_plate(4.0, 4.0), CHALK)})
 MAST = Transmitters(float64([0.5, 0.3, 2.0]))
 SPOTS = float64([[1.0, -0.5, 1.5], [-2.0, 0.0, 3.0]])
 CRATE = box(0.5)
@@ -87,12 +87,12 @@ def test_power_and_delays_are_those_of_the_integral():
 
 
 def test_pattern_of_receivers_has_axes_of_its_own():
-    turn = rotation_from_vector(float64([0.3, 2.8, 0.1]))  # looks at the wall, aslant
+    turn = rotation_from_vector(float64([0.1, 1.3, 0.3]))  # looks at the wall, aslant
     horn = AntennaMount(AntennaArray(float64([[0.0, 0.0, 0.0]]), Cosine(2.0)), turn)
     place = SPOTS[:1]
 
     def gain(points: Tensor, way: Tensor) -> Tensor:
-        cosine = ((points - place[0]) @ turn[:, 2]) / way
+        cosine = ((points - place[0]) @ turn[:, 0]) / way
         return torch.where(cosine > 0, 6 * cosine.clamp_min(0) ** 2, 0.0)
 
     reception = PropagationSettings(FREQUENCY, receivers=horn, rough=ONE_BOUNCE)
@@ -106,8 +106,10 @@ def test_pattern_of_receivers_has_axes_of_its_own():
 
 
 def test_smooth_share_mirrors_and_the_rest_scatters():
-    half = Scene({"wall": Object(plate(4.0, 4.0), RoughConductor(scattering=0.6, rms_slope=0.2))})
-    metal = Scene({"wall": Object(plate(4.0, 4.0), PerfectConductor())})
+    half = Scene(
+        {"wall": Object(level_plate(4.0, 4.0), RoughConductor(scattering=0.6, rms_slope=0.2))}
+    )
+    metal = Scene({"wall": Object(level_plate(4.0, 4.0), PerfectConductor())})
     reception = PropagationSettings(FREQUENCY, rough=ONE_BOUNCE)
     gains = {
         name: float(reception.rough_moments(scene, MAST, SPOTS, 0)[0, 0, 0])
@@ -179,11 +181,7 @@ def test_refusals_name_what_is_wrong():
         reception.link_statistics(WALL, turned, SPOTS, 0)
 
 
-MIRROR = Object(
-    plate(40.0, 40.0),
-    PerfectConductor(),
-    rigid(rotation_from_vector(float64([0.0, math.pi / 2, 0.0])), float64([3.0, 0.0, 0.0])),
-)
+MIRROR = Object(plate(40.0, 40.0), PerfectConductor(), rigid(translation=[3.0, 0.0, 0.0]))
 BESIDE_MIRROR = Scene({"wall": WALL.objects["wall"], "mirror": MIRROR})
 
 
@@ -219,7 +217,9 @@ def test_a_mirror_shows_the_wall_and_the_antennas_at_their_images(depth):
 
 def test_energy_that_meets_a_rough_plate_leaves_it_again():
     """Over all ways: what the plate gets directly and by the mirror crosses a far sphere."""
-    small = Object(plate(0.5, 0.5), CHALK, rigid(rotation_from_vector(float64([0.3, 0.2, 0.0]))))
+    small = Object(
+        level_plate(0.5, 0.5), CHALK, rigid(rotation_from_vector(float64([0.3, 0.2, 0.0])))
+    )
     scene = Scene({"wall": small, "mirror": MIRROR})
     tx = MAST.positions[0]
     normal = torch.linalg.cross(*(small.vertices[[1, 2]] - small.vertices[0]).unbind(0))
@@ -263,7 +263,7 @@ def test_what_heights_take_off_the_mirror_is_scattered():
 
     def scene(height: Tensor) -> Scene:
         gritty = RoughConductor(scattering=0.0, rms_slope=0.3, rms_height=height)
-        return Scene({**BESIDE_MIRROR.objects, "wall": Object(plate(4.0, 4.0), gritty)})
+        return Scene({**BESIDE_MIRROR.objects, "wall": Object(level_plate(4.0, 4.0), gritty)})
 
     def total(height: Tensor, depth: int) -> Tensor:
         how = PropagationSettings(FREQUENCY, depth=depth, rays=None, rough=ONE_BOUNCE)
@@ -306,12 +306,12 @@ def test_what_heights_take_off_the_mirror_is_scattered():
 def test_derivative_by_the_size_of_a_mirror():
     """At fixed visibility it is zero: only the rims of the mirrored beams move."""
     sampling = replace(ONE_BOUNCE, boundary_samples=40_000)
-    at, tilted = float64(1.0), rotation_from_vector(float64([0.0, math.pi / 2, 0.0]))
+    at = float64(1.0)
 
     def total(size: Tensor, sampling: Sampling) -> Tensor:
         glass = plate(2.0, 2.0)
         glass = replace(glass, vertices=glass.vertices * size)
-        mirror = Object(glass, PerfectConductor(), rigid(tilted, float64([3.0, 0.0, 1.2])))
+        mirror = Object(glass, PerfectConductor(), rigid(translation=[3.0, 0.0, 1.2]))
         scene = Scene({"wall": WALL.objects["wall"], "mirror": mirror})
         reception = PropagationSettings(FREQUENCY, depth=3, rays=None, rough=sampling)
         return reception.rough_moments(scene, MAST, float64([[-1.0, -0.5, 1.5]]), 0)[0, 0, 0]

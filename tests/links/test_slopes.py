@@ -21,31 +21,29 @@ from invertwin.scene import (
     linear_array,
     plate,
     rigid,
-    rotation_from_vector,
 )
-from scenes import float64
+from scenes import float64, level_plate
 
 FREQUENCY = 3.5e9
 TX = (-0.9, 0.4, 1.1)
-EDGE = Object(plate(20.0, 20.0), PerfectConductor(), rigid(translation=[10.0, 0.0, 0.0]))
+EDGE = Object(level_plate(20.0, 20.0), PerfectConductor(), rigid(translation=[10.0, 0.0, 0.0]))
 """In the plane z = 0, from x = 0 on; the other edges are far away."""
 SCREEN = Scene({"screen": EDGE})
 
 
 def upright(normal: float) -> Object:
-    """A wall whose plane is x = ``normal``, seen from its right."""
-    turn = rotation_from_vector(float64([0.0, math.pi / 2, 0.0]))
-    return Object(plate(8.0, 8.0), PerfectConductor(), rigid(turn, [normal, 0.0, 0.0]))
+    """A wall whose plane is x = ``normal``."""
+    return Object(plate(8.0, 8.0), PerfectConductor(), rigid(translation=[normal, 0.0, 0.0]))
 
 
 BEFORE_A_WALL = Scene({"screen": EDGE, "wall": upright(-2.0)})
 
 
 def looking(way: list[float], array: AntennaArray) -> AntennaMount:
-    """An array whose boresight is about along ``way``, its x axis about along the world's x."""
-    z = torch.nn.functional.normalize(float64(way), dim=0)
-    y = torch.nn.functional.normalize(torch.linalg.cross(z, float64([1.0, 0.2, 0.0])), dim=0)
-    return AntennaMount(array, torch.stack([torch.linalg.cross(y, z), y, z], 1))
+    """An array whose boresight is about along ``way``, its y axis about along the world's x."""
+    x = torch.nn.functional.normalize(float64(way), dim=0)
+    z = torch.nn.functional.normalize(torch.linalg.cross(x, float64([1.0, 0.2, 0.0])), dim=0)
+    return AntennaMount(array, torch.stack([x, torch.linalg.cross(z, x), z], 1))
 
 
 def beam() -> AntennaArray:

@@ -19,8 +19,8 @@ from invertwin.links import (
     ray_paths_from_sionna,
     rician_factor,
 )
-from invertwin.scene import Object, PerfectConductor, Scene, Slab, plate, rigid
-from scenes import float64
+from invertwin.scene import Object, PerfectConductor, Scene, Slab, rigid
+from scenes import float64, level_plate
 
 
 def made(delays: list[float], powers: list[float], directions: list[list[float]]) -> RayPaths:
@@ -78,8 +78,10 @@ def test_links_without_spread():
 
 
 def test_a_pane_in_the_way_leaves_a_straight_path():
-    panes = {"pane": Object(plate(9.0, 9.0), Slab.itu("glass", thickness=0.01))}
-    panes["wall"] = Object(plate(9.0, 9.0), PerfectConductor(), rigid(translation=[0.0, 0.0, -3.0]))
+    panes = {"pane": Object(level_plate(9.0, 9.0), Slab.itu("glass", thickness=0.01))}
+    panes["wall"] = Object(
+        level_plate(9.0, 9.0), PerfectConductor(), rigid(translation=[0.0, 0.0, -3.0])
+    )
     paths = trace_paths(Scene(panes), [0, 0, -1], [1, 0, 1], 3.5e9, rays=10_000)
     assert 0 < rician_factor(paths).item() < math.inf
     text = path_table(paths)

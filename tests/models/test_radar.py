@@ -37,7 +37,7 @@ def test_the_surrogate_correlates_with_the_mean_over_looks():
     """One look is mostly speckle; looks averaged over are the surrogate's map."""
     device = radar()
     grid = device.grid(0.7, 1.7, 0.7)
-    scene = Scene({"plate": thing(plate(0.6, 0.4), (0.1, 0.0, 1.2), (0.0, 0.5, 0.0))})
+    scene = Scene({"plate": thing(plate(0.6, 0.4), (1.2, 0.1, 0.0), (0.0, 0.0, 0.5))})
     drawn = Sampling(depth=1, samples=100_000, points_per_m2=600.0)
 
     def found(surrogate: str = "response", looks: int = 24) -> float:
@@ -47,7 +47,7 @@ def test_the_surrogate_correlates_with_the_mean_over_looks():
     assert found() >= 0.9
     assert found(looks=1) < found()
     # Another place is another map.
-    away = scene.replace("plate", pose=thing(plate(1, 1), (-0.4, 0.0, 1.5)).pose)
+    away = scene.replace("plate", pose=thing(plate(1, 1), (1.5, -0.4, 0.0)).pose)
     model = SurrogateMap(grid, sampling=Sampling(depth=1, points_per_m2=600.0))
     assert surrogate_correlation(away, device, model, seed=0) >= 0.9
     assert found("gaussian") < found()
@@ -55,7 +55,7 @@ def test_the_surrogate_correlates_with_the_mean_over_looks():
 
 def test_looks_of_conductors_are_all_the_same():
     device = radar()
-    scene = Scene({"plate": thing(plate(0.2, 0.2), (0, 0, 1.2), material=PerfectConductor())})
+    scene = Scene({"plate": thing(plate(0.2, 0.2), (1.2, 0, 0), material=PerfectConductor())})
     model = SurrogateMap(device.grid(0.7, 1.7, 0.7), sampling=Sampling(conductor_samples=5_000))
     few, many = (
         surrogate_correlation(scene, device, model, seed=0, realisations=looks) for looks in (1, 4)
@@ -130,10 +130,10 @@ MOVES = Sampling(depth=1, boundary=False, samples=20_000)
 
 def moving(speed: float = 8.0) -> Scene:
     """A small ball that moves away, beside a plate at rest."""
-    ball = thing(plate(0.05, 0.05), (-0.3, 0.0, 1.5))
-    still = thing(plate(0.3, 0.3), (0.4, 0.0, 1.9))
+    ball = thing(plate(0.05, 0.05), (1.5, -0.3, 0.0))
+    still = thing(plate(0.3, 0.3), (1.9, 0.4, 0.0))
     moves = Scene({"mover": ball, "still": still})
-    return moves.replace("mover", velocity=float64([0.0, 0.0, speed]))
+    return moves.replace("mover", velocity=float64([speed, 0.0, 0.0]))
 
 
 def motion(device: Radar, **changes: Any) -> RangeDopplerMap:
@@ -179,7 +179,7 @@ def test_derivatives_of_motion_are_those_of_differences():
     )
 
     def value(speed: torch.Tensor) -> torch.Tensor:
-        velocity = torch.stack([0 * speed, 0 * speed, speed])
+        velocity = torch.stack([speed, 0 * speed, 0 * speed])
         scene = moving().replace("mover", velocity=velocity)
         return (weights * model.predict(scene, device, 1)).sum()
 
@@ -215,7 +215,7 @@ def test_a_part_of_a_map_is_cut_around_an_echo():
 
 
 def corner() -> Scene:
-    item = thing(trihedral(0.05), (0.02, 0.0, 1.0), material=PerfectConductor())
+    item = thing(trihedral(0.05), (1.0, 0.02, 0.0), material=PerfectConductor())
     return Scene({"corner": item})
 
 
@@ -256,7 +256,7 @@ def test_chain_fields_are_the_range_profiles_of_a_recording():
     found = model.predict(corner(), device, 0)
     assert found.shape == truth.shape == (*found.shape[:3], 2)
     assert relative(found, truth) < 0.2
-    away = corner().replace("corner", pose=thing(plate(1, 1), (0.02, 0.0, 1.001)).pose)
+    away = corner().replace("corner", pose=thing(plate(1, 1), (1.001, 0.02, 0.0)).pose)
     assert relative(model.predict(away, device, 0), truth) > 1.0
 
 
@@ -369,13 +369,13 @@ def test_responses_are_those_of_the_paths():
 
 
 def test_a_batch_of_scenes_is_predicted_as_each_alone():
-    device = radar(((0.0, 0.0, 0.0), (0.2, 0.0, 0.0)))
+    device = radar(((0.0, 0.0, 0.0), (0.0, 0.2, 0.0)))
     grid = device.grid(0.7, 2.3, 0.5)
     drawn = Sampling(depth=2, samples=100_000, boundary_samples=20_000)
     model = SurrogateMap(grid, Surrogate(range_width=1.0), drawn)
     scenes = [
         occluder(),
-        occluder().replace("occluder", pose=thing(plate(1, 1), (0.2, 0, 1.3)).pose),
+        occluder().replace("occluder", pose=thing(plate(1, 1), (1.3, 0.2, 0)).pose),
     ]
     batch = model.predict_batch(scenes, device, 1)
     assert batch.shape == (2, 2, *grid.shape)

@@ -15,7 +15,7 @@ def map_of(paths: Paths, link: Link, grid: Grid) -> Tensor:
         rows = paths.frame == frame
         offset = paths.last[rows] - link.rx[frame]
         seen = (offset / offset.norm(dim=1, keepdim=True)) @ link.rotations[frame]
-        frames.append(deposit(paths.power[rows], paths.range[rows], seen[:, 0], seen[:, 1], grid))
+        frames.append(deposit(paths.power[rows], paths.range[rows], seen[:, 1], seen[:, 2], grid))
     return torch.stack(frames)
 
 

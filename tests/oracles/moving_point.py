@@ -61,7 +61,7 @@ def moving_point(
     Distance [m] and direction are those in the frame of each pose, from the middle of the phase
     centres, at the middle of the burst; the range rate [m/s] is positive away.
     """
-    ray = torch.tensor([u, v, math.sqrt(1 - u**2 - v**2)], dtype=torch.float64)
+    ray = torch.tensor([math.sqrt(1 - u**2 - v**2), u, v], dtype=torch.float64)
     middle = chirps.times(len(radar.transmitters.positions)).mean()
     link = radar.link()
     beats = []

@@ -120,7 +120,7 @@ def power_map(
     bounces: int,
     count: int,
 ) -> Array:
-    """Received over transmitted power by range L/2 and the x component of arrival at ``rx``."""
+    """Received over transmitted power by range L/2 and the y component of arrival at ``rx``."""
     out = np.zeros((ranges.count, cosines.count))
     scale = (wavelength / (4 * np.pi)) ** 2
     orders = [(p,) for p in plates] if bounces == 1 else list(permutations(plates, 2))
@@ -144,7 +144,7 @@ def power_map(
             for number, plate in enumerate(order):
                 back, on = -directions[number], directions[number + 1]
                 power = power * plate.scattered(back, on) * grids[number][1]
-            arrival = np.broadcast_to(-directions[-1][..., 0], power.shape)
+            arrival = np.broadcast_to(-directions[-1][..., 1], power.shape)
             _deposit(out, ranges, cosines, power, 0.5 * length, arrival)
     return out
 

@@ -12,7 +12,7 @@ from scenes import thing
 
 @pytest.mark.parametrize("name", [r"$\frac$", "_hidden", "a_b^c $ 5 $", "%s {x}"])
 def test_words_of_users_are_no_formulas(name):
-    ball = Scene({name: thing(sphere(0.1), (0.0, 0.0, 1.0))})
+    ball = Scene({name: thing(sphere(0.1), (1.0, 0.0, 0.0))})
     shown = plotting.scene({name: ball})
     words = [text.get_text() for text in shown.findobj(Text)]
     assert any(word.replace(r"\$", "$").strip() == name for word in words)

@@ -4,7 +4,6 @@ import numpy as np
 import torch
 
 from invertwin.discovery import DetectedObject, GroundImage, ShapeParameters, Twin
-from invertwin.inversion.initialisation.detections import Ground
 from invertwin.plotting import found
 
 
@@ -12,15 +11,15 @@ def test_the_ground_shows_things_movers_and_blind_places():
     places = torch.cartesian_prod(*[torch.arange(3, dtype=torch.float64)] * 2)
     views = torch.tensor([0, 1, 2, 3, 0, 1, 2, 3, 4])
     picture = GroundImage(places, torch.arange(9, dtype=torch.float64), views)
-    still = torch.tensor([0.5, 0.4, 1.5], dtype=torch.float64)
+    still = torch.tensor([1.5, 0.5, 0.4], dtype=torch.float64)
     figure = ShapeParameters("box", (0.5, 1.5), 0.2, 0.6, 0.3, 0.8, 0.1)
-    spread = {"x": 0.1, "z": 0.2}
+    spread = {"x": 0.2, "y": 0.1}
     box = DetectedObject("object_1", "box", {"box": 1.0}, still, figure, spread, 0.99)
-    moved = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    moved = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
     mover = DetectedObject(
         "mover_1", "point", {"point": 1.0}, 2 * moved, None, {"range": 0.1}, 0.4, moved
     )
-    drawn = found.ground(Twin((box, mover), Ground(), 0.0, picture))
+    drawn = found.ground(Twin((box, mover), 0.0, picture))
     axes = drawn.axes[0]
     texts = [text.get_text() for text in axes.texts]
     assert "object_1: box" in texts
@@ -32,4 +31,6 @@ def test_the_ground_shows_things_movers_and_blind_places():
     assert (ellipse.width, ellipse.height) == (0.4, 0.8)
     outline = np.asarray(axes.lines[0].get_xydata())
     assert len(outline) == 5
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "z [m]")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("y [m], to the left", "x [m]")
+    left, right = axes.get_xlim()
+    assert left > right

@@ -8,6 +8,7 @@ from invertwin import plotting
 from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.plotting import MapPanel
+from invertwin.plotting.figures import png_bytes
 from invertwin.radar import DopplerMaps
 from invertwin.radar.processing.doppler_maps import Peak
 
@@ -37,13 +38,20 @@ def decibels(values):
 
 def test_a_spectrum_is_summed_over_frames_and_the_other_direction():
     spectrum = power(GRID)
-    upper, lower = cells(plotting.spectrum({"data": spectrum}, GRID))
+    figure = plotting.spectrum({"data": spectrum}, GRID)
+    upper, lower = cells(figure)
     for axes, flat in ((upper, spectrum.sum((0, 3))), (lower, spectrum.sum((0, 2)))):
         np.testing.assert_allclose(shown(axes), decibels(flat / flat.max()), rtol=1e-12)
         assert axes.images[0].get_clim() == (-40, 0)
         assert axes.get_ylim() == pytest.approx((0.75, 2.25))
         assert axes.get_ylabel() == "range [m]"
-    assert upper.get_xlim() == pytest.approx((-0.5, 0.5))
+    assert upper.get_xlim() == pytest.approx((0.5, -0.5))  # +u, the left, is on the left
+    png_bytes(figure)  # limits of the degrees follow when it is drawn
+    (degrees,) = upper.child_axes
+    assert degrees.get_xlabel() == "azimuth [°]"
+    assert degrees.get_xlim() == pytest.approx((30.0, -30.0))
+    (degrees,) = lower.child_axes
+    assert degrees.get_xlabel() == "elevation [°]"
     assert lower.get_xlim() == pytest.approx((-0.15, 0.15))
     assert upper.get_title() == "data"
     assert lower.get_title() == ""

@@ -33,7 +33,7 @@ def at(x, y, z, mesh=None):
 
 def radar(positions, turn=0.0):
     array = linear_array(1, 1.0)
-    rotation = rotation_from_vector(torch.tensor([0.0, turn, 0.0], dtype=torch.float64))
+    rotation = rotation_from_vector(torch.tensor([0.0, 0.0, turn], dtype=torch.float64))
     rotations = rotation.expand(len(positions), 3, 3) if turn else None
     places = torch.tensor(positions, dtype=torch.float64)
     return Radar(array, array, FMCW(76e9, 2e9, 5e-5, 64), places, rotations)
@@ -50,19 +50,22 @@ def labels(figure):
 
 
 def test_three_views_show_an_object_where_it_is():
-    figure = plotting.scene(Scene({"cube": at(1.0, 2.0, 5.0)}), radar([[0.0, 0.0, 0.0]]))
+    figure = plotting.scene(Scene({"cube": at(5.0, 1.0, 2.0)}), radar([[0.0, 0.0, 0.0]]))
     views = {axes.get_title(): axes for axes in figure.axes}
-    ends = {"x": (0.5, 1.5), "y": (1.5, 2.5), "z": (4.5, 5.5)}
-    expected = {"from the radar": "xy", "from above": "xz", "from the side": "zy"}
+    ends = {"x": (4.5, 5.5), "y": (0.5, 1.5), "z": (1.5, 2.5)}
+    expected = {"from the radar": "yz", "from above": "yx", "from the right": "xz"}
     for title, (across, up) in expected.items():
         axes = views[f"scene, {title}"]
-        assert (axes.get_xlabel(), axes.get_ylabel()) == (f"{across} [m]", f"{up} [m]")
+        leftwards = across == "y"
+        assert axes.get_xlabel() == f"{across} [m]" + ", to the left" * leftwards
+        assert axes.get_ylabel() == f"{up} [m]"
         points, _ = painted(axes)
         assert (points[:, 0].min(), points[:, 0].max()) == pytest.approx(ends[across])
         assert (points[:, 1].min(), points[:, 1].max()) == pytest.approx(ends[up])
         seen = title != "from the radar"
         assert len(axes.lines) == seen
-        low, high = axes.get_xlim()
+        low, high = sorted(axes.get_xlim())
+        assert (axes.get_xlim()[0] > axes.get_xlim()[1]) == leftwards
         assert low < (0.0 if seen else 0.5)
         assert high > ends[across][1]
     (mark,) = views["scene, from above"].lines
@@ -71,32 +74,30 @@ def test_three_views_show_an_object_where_it_is():
 
 
 def test_views_follow_the_radar():
-    """A radar that looks along −z has the world's x on its left."""
-    figure = plotting.scene(Scene({"cube": at(0, 0, -5.0)}), radar([[0.0, 0.0, 0.0]] * 2, np.pi))
+    """A radar that looks along −x has the world's y on its right."""
+    figure = plotting.scene(Scene({"cube": at(-5.0, 0, 0)}), radar([[0.0, 0.0, 0.0]] * 2, np.pi))
     front, above, _ = figure.axes
-    assert front.get_xlim()[0] > front.get_xlim()[1]
+    assert front.get_xlim()[0] < front.get_xlim()[1]
     assert above.get_ylim()[0] > above.get_ylim()[1]
     assert labels(figure) == ["cube", "radar, 2 positions"]
 
 
-def test_the_views_are_mirrored_and_say_so():
-    """Who stands at the radar has +x on the left; in the picture it is on the right."""
-    scene = Scene({"box": at(1.0, 0.0, 4.0), "wall": at(0.0, 0.0, 6.0, plate(6.0, 4.0))})
+def test_what_is_on_the_left_is_drawn_on_the_left():
+    scene = Scene({"box": at(4.0, 1.0, 0.0), "wall": at(6.0, 0.0, 0.0, plate(6.0, 4.0))})
     figure = plotting.scene(scene, radar([[0.0, 0.0, 0.0]]), highlight=["box"])
-    ahead, up = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
-    assert np.cross(ahead, up) @ [1.0, 0.0, 0.0] == -1.0  # the right of who stands there is −x
+    ahead, up = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    assert np.cross(ahead, up) @ [0.0, 1.0, 0.0] == -1.0  # the right of who stands there is −y
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     shown = np.asarray(Image.open(buffer).convert("RGB"), float)
     frame = figure.axes[0].get_window_extent()
     front = shown[:, int(frame.x0) : int(frame.x1)]
     blue = np.nonzero(front[..., 2] - front[..., 0] > 60)[1]
-    assert blue.mean() > 0.55 * front.shape[1]
-    assert "mirrored" in figure.legends[0].get_title().get_text()
+    assert blue.mean() < 0.45 * front.shape[1]
 
 
 def test_what_is_near_is_painted_last():
-    near, far = at(0, 0, 2.0, plate(1.0, 1.0)), at(0, 0, 4.0, plate(1.0, 1.0))
+    near, far = at(2.0, 0, 0, plate(1.0, 1.0)), at(4.0, 0, 0, plate(1.0, 1.0))
     figure = plotting.scene(Scene({"near": near, "far": far}), highlight=["near"])
     _, faces = painted(figure.axes[0])
     blue, grey = np.array(to_rgb(plotting.PALETTE[0])), np.array(to_rgb("#b9bec7"))
@@ -111,9 +112,9 @@ def test_what_is_near_is_painted_last():
 
 
 def test_several_scenes_share_the_window_and_the_outline():
-    truth = Scene({"cube": at(0.3, 0, 5.0)})
-    scenes = {"start": Scene({"cube": at(0, 0, 5.0)}), "twin": truth}
-    places = [[0.1 * k, 0.0, 0.0] for k in range(30)]
+    truth = Scene({"cube": at(5.0, 0.3, 0)})
+    scenes = {"start": Scene({"cube": at(5.0, 0, 0)}), "twin": truth}
+    places = [[0.0, 0.1 * k, 0.0] for k in range(30)]
     figure = plotting.scene(scenes, radar(places), outline=truth)
     assert len(figure.axes) == 6
     start, twin = figure.axes[:2]
@@ -127,7 +128,7 @@ def test_several_scenes_share_the_window_and_the_outline():
 
 
 def test_small_objects_get_a_mark():
-    scene = Scene({"ball": at(1.0, 0, 3.0, box(0.01)), "wall": at(0, 0, 5.0, plate(4.0, 4.0))})
+    scene = Scene({"ball": at(3.0, 1.0, 0, box(0.01)), "wall": at(5.0, 0, 0, plate(4.0, 4.0))})
     figure = plotting.scene(scene, outline=Scene({"ball": scene["ball"]}))
     dot, cross = figure.axes[0].lines
     assert (dot.get_marker(), cross.get_marker()) == ("o", "+")
@@ -153,7 +154,7 @@ def test_splitting_keeps_the_area():
 @pytest.mark.slow
 def test_a_turntable_turns_once():
     """An eye on the axis of symmetry sees a cube of four equal sides four times."""
-    gif = plotting.turntable({"truth": box(1.0), "twin": box(1.0)}, up=[0.0, 1.0, 0.0])
+    gif = plotting.turntable({"truth": box(1.0), "twin": box(1.0)}, up=[0.0, 0.0, 1.0])
     image = Image.open(io.BytesIO(gif))
     assert getattr(image, "n_frames", 1) == 24
     frames = []

@@ -19,11 +19,12 @@ SCENE = """
 shape = "bush"
 radius = 0.15
 lean_deg = 10.0
-position = [0.0, 0.0, 1.2]
+position = [1.2, 0.0, 0.0]
 material = { kind = "foliage", share = 0.2 }
 """
 RUN = f"""
 task = "reconstruct"
+frame = 2
 survey = {{ count = 12, area = 4.0 }}
 {SCENE}
 [truth.hedge]
@@ -59,6 +60,7 @@ boundary_samples = 1000
 """
 MEASURED = f"""
 task = "reconstruct"
+frame = 2
 {SCENE}
 [data]
 kind = "npy"

@@ -60,7 +60,7 @@ def mimo(waveform: FMCW) -> Radar:
     """A column of 8 transmitters and a row of 12 receivers: the same virtual array."""
     half = 0.5 * waveform.wavelength
     return Radar(
-        linear_array(8, half, "y"),
+        linear_array(8, half, "z"),
         linear_array(12, half),
         waveform,
         torch.zeros(1, 3, dtype=torch.float64),

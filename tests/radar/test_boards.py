@@ -24,7 +24,7 @@ def virtual(name, elevation=1, azimuth=1):
     preset = board(name)
     tx, rx = preset.arrays(elevation=elevation, azimuth=azimuth)
     unit = 299792458.0 / preset.design_frequency / 2
-    return ((tx.positions[:, None] + rx.positions).reshape(-1, 3) / unit)[:, :2]
+    return ((tx.positions[:, None] + rx.positions).reshape(-1, 3) / unit)[:, 1:]
 
 
 def assert_same_layout(one, columns, rows):
@@ -98,14 +98,14 @@ def test_elements_can_be_chosen():
 
 def test_the_unit_follows_the_design_frequency():
     tx, _ = board("xWR1642", 60e9).arrays()
-    assert float(tx.positions[:, 0].diff()) == pytest.approx(2 * 299792458.0 / 60e9)
+    assert float(tx.positions[:, 1].diff()) == pytest.approx(2 * 299792458.0 / 60e9)
 
 
-def test_a_target_above_the_board_is_at_positive_v():
+def test_a_target_above_and_left_of_the_board_is_at_positive_u_and_v():
     tx, rx = board("xWR1843").arrays(elevation=1)
     chirp = FMCW(78e9, 2e9, 50e-6, 64)
     radar = Radar(tx, rx, chirp, torch.zeros(1, 3, dtype=torch.float64))
-    place = 3 * torch.tensor([0.2, 0.3, math.sqrt(1 - 0.13)], dtype=torch.float64)
+    place = 3 * torch.tensor([math.sqrt(1 - 0.13), 0.2, 0.3], dtype=torch.float64)
     ends = [(element - place).norm(dim=-1) for element in radar.elements()]
     delay = (ends[0][:, :, None] + ends[1][:, None])[..., None] / 299792458.0
     cycles = chirp.start_frequency * delay + chirp.slope * delay * chirp.sample_times
@@ -119,14 +119,14 @@ def test_a_target_above_the_board_is_at_positive_v():
 
 def test_rows_that_are_far_apart_are_warned_of():
     tx, rx = board("AWR2944").arrays(elevation=1)
-    with pytest.warns(PhysicsWarning, match="0.80 wavelengths apart along y"):
+    with pytest.warns(PhysicsWarning, match="0.80 wavelengths apart along z"):
         Radar(tx, rx, FMCW(76.5e9, 1e9, 50e-6, 64), torch.zeros(1, 3, dtype=torch.float64))
 
 
 def test_a_table_of_ones_own():
     mine = Board("mine", ((0.0, 0.0),), ((0.0, 0.0), (1.0, 0.0)), 24e9)
     _, rx = mine.arrays()
-    assert float(rx.positions[:, 0].diff()) == pytest.approx(299792458.0 / 48e9)
+    assert float(rx.positions[:, 1].diff()) == pytest.approx(299792458.0 / 48e9)
 
 
 @pytest.mark.parametrize(

@@ -129,8 +129,8 @@ def test_positions_from_lists_are_float64(unchecked):
 
 
 def test_shared_visibility_follows_the_distance():
-    def at(x: float) -> AntennaArray:
-        return AntennaArray(torch.tensor([[x, 0.0, 0.0]], dtype=torch.float64), Isotropic())
+    def at(y: float) -> AntennaArray:
+        return AntennaArray(torch.tensor([[0.0, y, 0.0]], dtype=torch.float64), Isotropic())
 
     assert small(receivers=at(0.09)).link().shared_visibility
     assert not small(receivers=at(0.2)).link().shared_visibility
@@ -138,11 +138,11 @@ def test_shared_visibility_follows_the_distance():
 
 
 def test_world_geometry():
-    """The second pose looks along world +x: radar z → x, radar x → −z, radar y stays."""
-    turn = rotation_from_vector(torch.tensor([0, math.pi / 2, 0], dtype=torch.float64))
+    """The second pose looks along world +y: radar x → y, radar y → −x, radar z stays."""
+    turn = rotation_from_vector(torch.tensor([0, 0, math.pi / 2], dtype=torch.float64))
     rotations = torch.stack([torch.eye(3, dtype=torch.float64), turn])
     receivers = AntennaArray(
-        torch.tensor([[0, 0, 0], [0.001, 0, 0], [0, 0.0015, 0]], dtype=torch.float64)
+        torch.tensor([[0, 0, 0], [0, 0.001, 0], [0, 0, 0.0015]], dtype=torch.float64)
     )
     radar = small(
         receivers=receivers,
@@ -152,19 +152,19 @@ def test_world_geometry():
     tx, rx = radar.elements()
     offsets = rx - torch.tensor([1.0, 2, 3], dtype=torch.float64)
     assert torch.allclose(tx[1, 0], torch.tensor([1.0, 2, 3], dtype=torch.float64))
-    assert offsets[0, 1].tolist() == pytest.approx([0.001, 0, 0], abs=1e-9)
-    assert offsets[1, 1].tolist() == pytest.approx([0, 0, -0.001], abs=1e-9)
-    assert offsets[1, 2].tolist() == pytest.approx([0, 0.0015, 0], abs=1e-9)
+    assert offsets[0, 1].tolist() == pytest.approx([0, 0.001, 0], abs=1e-9)
+    assert offsets[1, 1].tolist() == pytest.approx([-0.001, 0, 0], abs=1e-9)
+    assert offsets[1, 2].tolist() == pytest.approx([0, 0, 0.0015], abs=1e-9)
     assert torch.allclose(radar.link().rx, rx.mean(1))
-    boresight = radar.link().rotations[1] @ torch.tensor([0.0, 0, 1], dtype=torch.float64)
-    assert torch.allclose(boresight, torch.tensor([1.0, 0, 0], dtype=torch.float64))
+    boresight = radar.link().rotations[1] @ torch.tensor([1.0, 0, 0], dtype=torch.float64)
+    assert torch.allclose(boresight, torch.tensor([0.0, 1, 0], dtype=torch.float64))
 
 
 def test_virtual_positions_are_tx_major():
-    tx, rx = linear_array(2, 0.4 * LAMBDA, "y"), linear_array(3, 0.5 * LAMBDA)
+    tx, rx = linear_array(2, 0.4 * LAMBDA, "z"), linear_array(3, 0.5 * LAMBDA)
     virtual = small(transmitters=tx, receivers=rx).virtual_positions / LAMBDA
-    assert torch.allclose(virtual[:, 0], torch.tensor([-0.5, 0, 0.5] * 2).double())
-    assert torch.allclose(virtual[:, 1], torch.tensor([-0.2] * 3 + [0.2] * 3).double())
+    assert torch.allclose(virtual[:, 1], torch.tensor([-0.5, 0, 0.5] * 2).double())
+    assert torch.allclose(virtual[:, 2], torch.tensor([-0.2] * 3 + [0.2] * 3).double())
 
 
 def test_moved_turns_about_the_mean_position():

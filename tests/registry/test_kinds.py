@@ -144,7 +144,11 @@ def test_observations_have_sections_of_their_own_and_survive_the_way_to_toml(tmp
 
 
 def test_data_without_chirps_are_none_for_movers(tmp_path):
-    raw: dict = {"task": "reconstruct", "data": {"kind": "simulated", "points_per_m2": 1.0}}
+    raw: dict = {
+        "task": "reconstruct",
+        "frame": 2,
+        "data": {"kind": "simulated", "points_per_m2": 1.0},
+    }
     raw["scene"] = {"box": {"shape": "box", "size": 1.0, "material": {"kind": "rough_conductor"}}}
     with pytest.raises(InputError, match=r"data\.kind: expected data with chirps, got \"simulated"):
         build_chirp_capture(validate_run(raw, tmp_path / "run.toml").data)

@@ -26,8 +26,8 @@ def random_directions(count: int) -> Tensor:
 
 
 def direction(theta: float, phi: float) -> Tensor:
-    x, y = math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi)
-    return torch.tensor([x, y, math.cos(theta)], dtype=torch.float64)
+    y, z = math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi)
+    return torch.tensor([math.cos(theta), y, z], dtype=torch.float64)
 
 
 def read_table(table: Tensor, directions: Tensor) -> np.ndarray:
@@ -35,8 +35,8 @@ def read_table(table: Tensor, directions: Tensor) -> np.ndarray:
     rows, columns = table.shape
     values = []
     for x, y, z in directions.tolist():
-        row = (z + 1) / 2 * (rows - 1)
-        column = (math.atan2(y, x) + math.pi) / (2 * math.pi) * columns
+        row = (x + 1) / 2 * (rows - 1)
+        column = (math.atan2(z, y) + math.pi) / (2 * math.pi) * columns
         i, j = min(int(row), max(rows - 2, 0)), int(column)
         s, t = row - i, column - j
         corners = [
@@ -64,7 +64,7 @@ def smooth_gain(theta: Tensor, phi: Tensor) -> Tensor:
 def test_gain_integrates_to_the_full_sphere(pattern):
     cosine = -1 + (torch.arange(200_000, dtype=torch.float64) + 0.5) / 100_000
     sine = (1 - cosine**2).sqrt()
-    directions = torch.stack([sine, torch.zeros_like(sine), cosine], dim=1)
+    directions = torch.stack([cosine, sine, torch.zeros_like(sine)], dim=1)
     integral = 4 * math.pi * float(pattern.gain(directions).mean())
     assert integral == pytest.approx(4 * math.pi, rel=1e-5)
 
@@ -133,30 +133,30 @@ def test_measured_pattern_given_from_zero_to_two_pi():
 
 @pytest.mark.parametrize("exponent", [0.5, 3.0])
 def test_gradients_on_the_axis_and_at_the_horizon(exponent):
-    """Gradient of 2 (n + 1) zⁿ: 2 (n + 1) n along the axis; none behind or at the horizon."""
+    """Gradient of 2 (n + 1) xⁿ: 2 (n + 1) n along the axis; none behind or at the horizon."""
     found = gradients(Cosine(exponent))
     expected = torch.zeros(3, 3, dtype=torch.float64)
-    expected[0, 2] = 2 * (exponent + 1) * exponent
+    expected[0, 0] = 2 * (exponent + 1) * exponent
     torch.testing.assert_close(found, expected)
 
 
 def test_gradients_of_a_table_on_the_axis_and_at_the_horizon():
     """In front of the axis a slope along it; behind none; at the horizon a small one."""
     front, behind, horizon = gradients(lopsided())
-    assert front[:2].abs().max() < 1e-9 * front.abs().max()
+    assert front[1:].abs().max() < 1e-9 * front.abs().max()
     assert behind.abs().max() == 0.0
     # The gain falls to zero there as cos²θ, between nodes 2° apart.
-    assert horizon[:2].abs().max() < 1e-12
-    assert 0 <= float(horizon[2]) < 0.3
+    assert horizon[1:].abs().max() < 1e-12
+    assert 0 <= float(horizon[0]) < 0.3
 
 
 def gradients(pattern: Pattern) -> Tensor:
     """Derivatives of the gain on the axis, behind it, and at the horizon."""
     directions = torch.stack(
-        [direction(0.0, 0.0), direction(math.pi, 0.0), torch.eye(3, dtype=torch.float64)[0]]
+        [direction(0.0, 0.0), direction(math.pi, 0.0), torch.eye(3, dtype=torch.float64)[1]]
     )
     # The exact axis, which the sine of a rounded π misses.
-    directions[1] = torch.tensor([0.0, 0.0, -1.0])
+    directions[1] = torch.tensor([-1.0, 0.0, 0.0])
     directions.requires_grad_()
     pattern.gain(directions).sum().backward()
     assert directions.grad is not None
@@ -165,7 +165,7 @@ def gradients(pattern: Pattern) -> Tensor:
 
 def test_gradient_of_the_gain():
     points = random_directions(20)
-    points[:, 2] = points[:, 2].abs() + 0.01
+    points[:, 0] = points[:, 0].abs() + 0.01
     points.requires_grad_()
     assert torch.autograd.gradcheck(Cosine(2.5).gain, points)
     assert torch.autograd.gradcheck(lopsided().gain, points)
@@ -173,14 +173,14 @@ def test_gradient_of_the_gain():
 
 def test_arrays_are_centred():
     row = linear_array(4, 0.5)
-    assert row.positions[:, 0].tolist() == [-0.75, -0.25, 0.25, 0.75]
-    assert not row.positions[:, 1:].any()
+    assert row.positions[:, 1].tolist() == [-0.75, -0.25, 0.25, 0.75]
+    assert not row.positions[:, [0, 2]].any()
     assert isinstance(row.pattern, Isotropic)
-    column = linear_array(3, 0.1, axis="y", pattern=Cosine(1.0))
-    assert column.positions[:, 1].tolist() == pytest.approx([-0.1, 0.0, 0.1])
+    column = linear_array(3, 0.1, axis="z", pattern=Cosine(1.0))
+    assert column.positions[:, 2].tolist() == pytest.approx([-0.1, 0.0, 0.1])
     assert column.pattern == Cosine(1.0)
     plane = planar_array((2, 3), (1.0, 2.0))
-    assert plane.positions.tolist() == [[x, y, 0.0] for x in (-0.5, 0.5) for y in (-2.0, 0.0, 2.0)]
+    assert plane.positions.tolist() == [[0.0, y, z] for y in (-0.5, 0.5) for z in (-2.0, 0.0, 2.0)]
 
 
 def one(*numbers: float) -> Tensor:
@@ -219,7 +219,11 @@ def one(*numbers: float) -> Tensor:
         (lambda: AntennaArray(torch.zeros(4, 2)), r"element positions as numbers of shape"),
         (lambda: AntennaArray(one(0, 0, 0)[None] / 0), "finite element positions"),
         (lambda: AntennaArray(torch.zeros(1, 3), "isotropic"), "expected a Pattern, got str"),  # pyright: ignore[reportArgumentType]
-        (lambda: linear_array(0, 0.1), "elements along x"),
+        (lambda: linear_array(0, 0.1), "elements along y"),
+        (
+            lambda: linear_array(2, 0.1, axis="x"),  # pyright: ignore[reportArgumentType]
+            "axis y or z, got 'x'; .*x is boresight",
+        ),
         (lambda: linear_array(2, 0.0), "element spacing"),
         (lambda: planar_array((2, 2), (0.1, -0.1)), "element spacing"),
     ],

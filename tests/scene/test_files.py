@@ -56,7 +56,11 @@ def test_other_programs_meshes_are_read(tmp_path, suffix):
     loaded = load_mesh(path)
     # STL repeats every corner: merging finds the same 26 vertices and no seam.
     assert loaded.vertices.shape == mesh.vertices.shape
-    assert np.allclose(triangles(loaded), triangles(mesh), atol=1e-7)
+    # glTF is y up: its (x, y, z) is our (x, −z, y).
+    expected = triangles(mesh)
+    if suffix in ("gltf", "glb"):
+        expected = expected[..., [0, 2, 1]] * [1, -1, 1]
+    assert np.allclose(triangles(loaded), expected, atol=1e-7)
     assert as_trimesh(loaded).is_watertight
 
 
@@ -112,6 +116,20 @@ def test_glb_keeps_names_and_materials(tmp_path):
     assert len(load_mesh(tmp_path / "scene.glb").faces) == sum(
         len(item.mesh.faces) for item in scene.objects.values()
     )
+
+
+def test_glb_stands_upright_where_y_is_up(tmp_path):
+    block = box([0.1, 0.2, 3.0])
+    mast = Mesh(block.vertices + torch.tensor([5.0, 1.0, 1.5]), block.faces)
+    save_mesh(tmp_path / "mast.glb", mast)
+    stored = trimesh.load_scene(tmp_path / "mast.glb").to_mesh().vertices
+    # It is 5 m ahead, 1 m to the left and 3 m high. Blender's importer turns (x, y, z) to
+    # (x, −z, y) again.
+    assert np.allclose(np.ptp(stored, axis=0), [0.1, 3.0, 0.2])
+    assert np.allclose(stored.mean(0), [5.0, 1.5, -1.0])
+    back = load_mesh(tmp_path / "mast.glb")
+    assert np.allclose(triangles(back), triangles(mast), atol=1e-6)
+    assert as_trimesh(back).volume == pytest.approx(0.06, rel=1e-5)
 
 
 def test_scene_is_saved_in_the_world(tmp_path):

@@ -8,6 +8,7 @@ import torch
 from invertwin.errors import InputError
 from invertwin.scene import (
     compose,
+    look_at,
     quaternion_from_vector,
     rigid,
     rotation_angle,
@@ -89,6 +90,19 @@ def test_compose_applies_the_first_first():
     point = vector(1.0, 0.0, 0.0, 1.0)
     assert (compose(turn, move) @ point)[:3].tolist() == pytest.approx([1.0, 1.0, 0.0])
     assert (compose(move, turn) @ point)[:3].tolist() == pytest.approx([0.0, 2.0, 0.0])
+
+
+def test_looking_ahead_is_the_identity_and_y_stays_level():
+    position = [[0.0, 0.0, 1.0]]
+    targets = ([5.0, 0.0, 1.0], [0.0, 5.0, 1.0], [3.0, 0.0, 0.0])
+    ahead, left, down = (look_at(position, target)[0] for target in targets)
+    assert torch.equal(ahead, IDENTITY)
+    assert left.T.tolist() == [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    assert torch.allclose(down[:, 0], vector(3.0, 0.0, -1.0) / math.sqrt(10))
+    assert down[:, 1].tolist() == [0.0, 1.0, 0.0]
+    assert down[2, 2] > 0
+    with pytest.raises(InputError, match="not straight above or below"):
+        look_at(position, [0.0, 0.0, 3.0])
 
 
 def test_zero_quaternion_is_refused():

@@ -11,9 +11,9 @@ from invertwin.radar import FMCW, Radar
 from invertwin.scene import AntennaArray, RoughDielectric, Scene, room
 from scenes import float64
 
-SIDES = ("floor", "ceiling", "wall_front", "wall_back", "wall_left", "wall_right")
+SIDES = ("floor", "ceiling", "wall_front", "wall_back", "wall_right", "wall_left")
 PIECES = ("table", "chair_1", "chair_2", "shelf", "sofa")
-PLACE = float64([[0.0, 1.0, 0.1]])
+PLACE = float64([[0.1, 0.0, 1.0]])
 
 
 def radar() -> Radar:
@@ -24,7 +24,9 @@ def radar() -> Radar:
 def test_a_room_is_closed_and_faces_inwards():
     made = room(4.5, 6.5, 2.5)
     assert tuple(made) == (*SIDES, *PIECES)
-    middle = float64([0.0, 1.25, 3.25])
+    assert made["wall_left"].center.tolist() == [3.25, 2.25, 1.25]
+    assert made["wall_back"].center.tolist() == [6.5, 0.0, 1.25]
+    middle = float64([3.25, 0.0, 1.25])
     area, volume = 0.0, 0.0
     for name in SIDES:
         corners = made[name].vertices[made[name].mesh.faces]
@@ -46,12 +48,12 @@ def test_furniture_stands_inside_apart_and_leaves_the_middle_free(size):
     for name in PIECES:
         points = made[name].vertices
         low, high = points.amin(0), points.amax(0)
-        assert 0 < float(low[1]) < 0.01, name
-        assert float(points[:, 0].abs().max()) < width / 2, name
-        assert float(low[2]) > 0.3, name
-        assert float(high[2]) < depth, name
-        assert float(high[1]) < height, name
-        assert float(points[:, 0].abs().min()) > 0.5, name
+        assert 0 < float(low[2]) < 0.01, name
+        assert float(points[:, 1].abs().max()) < width / 2, name
+        assert float(low[0]) > 0.3, name
+        assert float(high[0]) < depth, name
+        assert float(high[2]) < height, name
+        assert float(points[:, 1].abs().min()) > 0.5, name
         bounds[name] = (low, high)
     names = list(bounds)
     for number, one in enumerate(names):

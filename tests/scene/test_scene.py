@@ -29,7 +29,7 @@ def vector(*numbers: float) -> torch.Tensor:
 
 
 def placed() -> torch.Tensor:
-    return rigid(rotation_from_vector(vector(0.0, math.pi / 2, 0.0)), vector(0.0, 0.0, 3.0))
+    return rigid(rotation_from_vector(vector(0.0, 0.0, math.pi / 2)), vector(3.0, 0.0, 0.0))
 
 
 def test_object_without_pose_stays_where_its_mesh_is():
@@ -39,10 +39,10 @@ def test_object_without_pose_stays_where_its_mesh_is():
 
 def test_pose_places_the_vertices():
     item = Object(PLATE, METAL, pose=placed())
-    # A quarter turn about y sends x to −z.
-    assert item.vertices[:, 2].amin() == pytest.approx(2.5)
-    assert item.vertices[:, 0].abs().max() < 1e-15
-    assert item.center.tolist() == pytest.approx([0.0, 0.0, 3.0])
+    # A quarter turn about z sends y to −x.
+    assert item.vertices[:, 0].amin() == pytest.approx(2.5)
+    assert item.vertices[:, 1].abs().max() < 1e-15
+    assert item.center.tolist() == pytest.approx([3.0, 0.0, 0.0])
 
 
 def test_vertices_are_differentiable_in_mesh_and_pose():
@@ -59,9 +59,9 @@ def test_vertices_are_differentiable_in_mesh_and_pose():
 
 
 def test_rigid_motion_is_in_world_axes():
-    item = Object(PLATE, METAL, pose=placed(), velocity=vector(0.0, 0.0, -10.0))
+    item = Object(PLATE, METAL, pose=placed(), velocity=vector(-10.0, 0.0, 0.0))
     moved = item.advance(0.1)
-    assert torch.allclose(moved.vertices, item.vertices + vector(0.0, 0.0, -1.0))
+    assert torch.allclose(moved.vertices, item.vertices + vector(-1.0, 0.0, 0.0))
     assert torch.equal(moved.mesh.vertices, PLATE.vertices)
     assert torch.equal(item.advance(0.0).vertices, item.vertices)
 

@@ -45,11 +45,11 @@ def longest_edge(mesh: Mesh) -> float:
 @pytest.mark.parametrize("divisions", [1, 4])
 def test_plate_faces_the_radar(divisions):
     mesh = plate(2.0, 1.0, divisions)
-    assert extent(mesh) == [2.0, 1.0, 0.0]
+    assert extent(mesh) == [0.0, 2.0, 1.0]
     assert torch.equal(mesh.center, torch.zeros(3, dtype=torch.float64))
     assert len(mesh.faces) == 2 * divisions**2
     assert area(mesh) == pytest.approx(2.0)
-    assert (crosses(mesh)[:, 2] < 0).all()
+    assert (crosses(mesh)[:, 0] < 0).all()
 
 
 @pytest.mark.parametrize("divisions", [1, 3])
@@ -75,46 +75,46 @@ def test_sphere_converges():
 def test_cylinder_stands_upright():
     mesh = cylinder(0.2, 0.9, 64)
     assert unmatched_edges(mesh) == 0
-    assert extent(mesh)[1] == pytest.approx(0.9)
+    assert extent(mesh)[2] == pytest.approx(0.9)
     # That of a prism of 64 sides.
     base = 32 * math.sin(2 * math.pi / 64) * 0.2**2
     assert volume(mesh) == pytest.approx(0.9 * base)
-    assert torch.linalg.vector_norm(mesh.vertices[:, [0, 2]], dim=1).max() == pytest.approx(0.2)
+    assert torch.linalg.vector_norm(mesh.vertices[:, :2], dim=1).max() == pytest.approx(0.2)
 
 
 def test_dihedral_is_a_right_angle_open_to_the_radar():
     mesh = dihedral(0.3)
     assert area(mesh) == pytest.approx(2 * 0.3**2)
     normals = torch.nn.functional.normalize(crosses(mesh), dim=1)
-    left, right = normals[:2].mean(0), normals[2:].mean(0)
+    right, left = normals[:2].mean(0), normals[2:].mean(0)
     assert float(left @ right) == pytest.approx(0.0, abs=1e-12)
-    assert left[2] < 0
-    assert left.tolist() == pytest.approx((right * torch.tensor([-1, 1, 1])).tolist())
-    # The fold is the y axis and lies farthest from the radar.
-    fold = mesh.vertices[mesh.vertices[:, 0] == 0]
-    assert fold[:, 2].tolist() == [0.0, 0.0]
-    assert mesh.vertices[:, 2].max() == 0.0
+    assert left[0] < 0
+    assert left.tolist() == pytest.approx((right * torch.tensor([1, -1, 1])).tolist())
+    # The fold is the z axis and lies farthest from the radar.
+    fold = mesh.vertices[mesh.vertices[:, 1] == 0]
+    assert fold[:, 0].tolist() == [0.0, 0.0]
+    assert mesh.vertices[:, 0].max() == 0.0
 
 
 def test_a_dihedral_opens():
     mesh = dihedral(0.3, math.radians(120))
-    left, right = (mesh.vertices[i] - mesh.vertices[2] for i in (0, 4))
+    right, left = (mesh.vertices[i] - mesh.vertices[2] for i in (0, 4))
     assert float(left.norm()) == pytest.approx(0.3)
     assert float(left @ right) / 0.3**2 == pytest.approx(math.cos(math.radians(120)))
-    assert left[2] == right[2] < 0
+    assert left[0] == right[0] < 0
 
 
 def test_trihedral_returns_to_where_it_came_from():
     mesh = trihedral(0.3)
     assert mesh.vertices[0].tolist() == [0.0, 0.0, 0.0]
-    assert mesh.vertices[1:, 2].tolist() == pytest.approx([-0.3 / math.sqrt(3)] * 3)
-    assert mesh.vertices[1:].sum(0)[:2].tolist() == pytest.approx([0.0, 0.0], abs=1e-15)
+    assert mesh.vertices[1:, 0].tolist() == pytest.approx([-0.3 / math.sqrt(3)] * 3)
+    assert mesh.vertices[1:].sum(0)[1:].tolist() == pytest.approx([0.0, 0.0], abs=1e-15)
     assert torch.linalg.vector_norm(mesh.vertices[1:], dim=1).tolist() == pytest.approx([0.3] * 3)
     normals = torch.nn.functional.normalize(crosses(mesh), dim=1)
     identity = torch.eye(3, dtype=torch.float64)
     assert torch.allclose(normals @ normals.T, identity, atol=1e-14)
     # All three faces look at the radar, and three mirrors reverse any direction.
-    assert normals[:, 2].tolist() == pytest.approx([-1 / math.sqrt(3)] * 3)
+    assert normals[:, 0].tolist() == pytest.approx([-1 / math.sqrt(3)] * 3)
     mirrors = identity
     for normal in normals:
         mirrors = (identity - 2 * torch.outer(normal, normal)) @ mirrors
@@ -124,24 +124,24 @@ def test_trihedral_returns_to_where_it_came_from():
 def test_letter_has_a_hole_and_no_crack():
     mesh = text("A")
     assert unmatched_edges(mesh) == 0
-    assert extent(mesh)[1:] == pytest.approx([0.6, 0.12])
+    assert extent(mesh)[::2] == pytest.approx([0.12, 0.6])
     assert mesh.center.tolist() == pytest.approx([0.0] * 3, abs=1e-12)
     assert longest_edge(mesh) <= 0.06 * (1 + 1e-9)
     # Euler characteristic of a closed surface: 2 − 2 × number of holes.
     edges = 3 * len(mesh.faces) // 2
     assert len(mesh.vertices) - edges + len(mesh.faces) == 0
-    front = crosses(mesh)[:, 2] < -1e-12
-    assert (mesh.vertices[mesh.faces[front]][..., 2] == -0.06).all()
-    front_area = -float(crosses(mesh)[front, 2].sum() / 2)
+    front = crosses(mesh)[:, 0] < -1e-12
+    assert (mesh.vertices[mesh.faces[front]][..., 0] == -0.06).all()
+    front_area = -float(crosses(mesh)[front, 0].sum() / 2)
     assert volume(mesh) == pytest.approx(front_area * 0.12)
 
 
 def test_text_reads_from_the_radar():
-    # The vertical bar of an L stands at small x, its foot at small y.
+    # Left is +y: the vertical bar of an L stands at large y, its foot at small z.
     vertices = text("L").vertices
-    top = vertices[vertices[:, 1] > 0.1]
-    foot = vertices[vertices[:, 1] < -0.25]
-    assert top[:, 0].max() < 0.0 < foot[:, 0].max()
+    top = vertices[vertices[:, 2] > 0.1]
+    foot = vertices[vertices[:, 2] < -0.25]
+    assert top[:, 1].min() > 0.0 > foot[:, 1].min()
 
 
 @pytest.mark.parametrize(("string", "characteristic"), [("L", 2), ("B", -2), ("Oi", 4), ("8%", 0)])

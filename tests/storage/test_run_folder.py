@@ -20,6 +20,7 @@ def make_run(**changes) -> RunFile:
     material = {"kind": "rough_dielectric", "permittivity": 4.0}
     raw = {
         "task": "reconstruct",
+        "frame": 2,
         "title": 'A "quoted" title \\ with ✓ and ü',
         "scene": {
             "letter one": {"shape": "text", "text": "A", "material": material},
@@ -28,14 +29,14 @@ def make_run(**changes) -> RunFile:
                 "material": {"kind": "perfect_conductor"},
             },
         },
-        "truth": {"letter one": {"position": [0.1, 0, 2]}},
+        "truth": {"letter one": {"position": [2, 0.1, 0]}},
         "parameters": [{"kind": "pose", "object": "letter one"}],
         "radar": {
             "waveform": {"kind": "impulse", "center_frequency": 4e9, "bandwidth": 1.4e9},
             "transmitters": {"kind": "positions", "positions": [[0, 0, 0]]},
             "receivers": {"kind": "linear", "count": 16, "spacing": 1.9e-3},
-            "positions": {"kind": "line", "start": [0, 0, 0], "stop": [1, 0, 0], "count": 3},
-            "orientation": {"look_at": [0, 0, 2.5]},
+            "positions": {"kind": "line", "start": [0, 0, 0], "stop": [0, 1, 0], "count": 3},
+            "orientation": {"look_at": [2.5, 0, 0]},
         },
     }
     return validate_run(raw | changes, Path("run.toml"))

@@ -20,7 +20,7 @@ samples = 20_000
 LOSS_SCAN = """
 [loss_scan]
 object = "plate"
-axis = [0.0, 0.0, 1.0]
+axis = [1.0, 0.0, 0.0]
 span = 4e-3
 points = 41
 wide_points = 5
@@ -28,7 +28,7 @@ sources = 3
 smoothing = [4, 3]
 samples = 20_000
 """
-CHECK = RUN.replace("[0.02, 0.01, 1.2]", "[0.0, 0.0, 1.2]") + GRADCHECK + METHODS
+CHECK = RUN.replace("[1.2, 0.02, 0.01]", "[1.2, 0.0, 0.0]") + GRADCHECK + METHODS
 SCAN = (
     RUN.replace('task = "reconstruct"', 'task = "loss-scan"').replace("snr_db = 20.0\n", "")
     + LOSS_SCAN

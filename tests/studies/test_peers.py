@@ -19,11 +19,11 @@ from invertwin_studies.peers.edge_sampling import edge_sampling_derivative
 from invertwin_studies.peers.music import MusicMap
 from invertwin_studies.peers.sionna import sionna_derivative, sionna_version
 
-ALONG = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+ALONG = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 
 def slide(scene, radar, theta):
-    """The plate moved along x by θ."""
+    """The plate moved along y by θ."""
     moved = compose(scene["plate"].transform, rigid(translation=ALONG * theta))
     return scene.replace("plate", pose=moved), radar
 
@@ -33,11 +33,11 @@ SURROGATE = Surrogate(range_kernel="gaussian")
 
 def scene(turn=0.0):
     rough = RoughDielectric(permittivity=4.0)
-    turned = rotation_from_vector(torch.tensor([0.0, turn, 0.0], dtype=torch.float64))
+    turned = rotation_from_vector(torch.tensor([0.0, 0.0, turn], dtype=torch.float64))
     return Scene(
         {
-            "plate": Object(plate(0.4, 0.3, 2), rough, rigid(turned, (0.05, 0.0, 1.2))),
-            "wall": Object(plate(2.0, 2.0, 2), rough, rigid(translation=(0.0, 0.0, 1.6))),
+            "plate": Object(plate(0.4, 0.3, 2), rough, rigid(turned, (1.2, 0.05, 0.0))),
+            "wall": Object(plate(2.0, 2.0, 2), rough, rigid(translation=(1.6, 0.0, 0.0))),
         }
     )
 
@@ -64,7 +64,7 @@ def test_paths_in_bins_are_what_the_kernel_deposits(radar, grid):
         seed=3,
     )
     ray = torch.nn.functional.normalize(paths.first - link.tx[paths.frame], dim=1)
-    found = binned(paths.frame, paths.power, paths.range, ray[:, 0], ray[:, 1], grid)
+    found = binned(paths.frame, paths.power, paths.range, ray[:, 1], ray[:, 2], grid)
     expected = deposit_power(
         scene(0.2),
         link,

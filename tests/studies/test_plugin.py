@@ -72,7 +72,7 @@ def test_a_bare_wheel_lacks_the_commands(tmp_path):
 def test_the_wheel_holds_no_studies(repository):
     project = tomllib.loads((repository / "pyproject.toml").read_text())
     wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
-    assert wheel["packages"] == ["src/invertwin"]
+    assert wheel["packages"] == ["src/invertwin", "src/invertwin_convert"]
     assert not any("studies" in source for source in wheel["force-include"])
     studies = tomllib.loads((repository / "experiments/studies/pyproject.toml").read_text())
     plugins = studies["project"]["entry-points"]["invertwin.plugins"]

@@ -34,7 +34,7 @@ def cloud():
     generator = torch.Generator().manual_seed(3)
     u, r = torch.rand(2, POINTS + EDGE, generator=generator, dtype=torch.float64)
     u, r = 0.5 * u - 0.3, 4.2 + 0.5 * r
-    points = r[:, None] * torch.stack([u, torch.zeros_like(u), (1 - u**2).sqrt()], 1)
+    points = r[:, None] * torch.stack([(1 - u**2).sqrt(), u, torch.zeros_like(u)], 1)
     return points, r, torch.arange(POINTS + EDGE) >= POINTS
 
 
@@ -54,7 +54,7 @@ def paths_of(points, delay, power, boundary, draws=DRAWS):
 
 
 def shaped(points, r, power, radar, grid):
-    u, v = points[:, 0] / r, points[:, 1] / r
+    u, v = points[:, 1] / r, points[:, 2] / r
     return Surrogate("gaussian", "airy").shape(deposit(power, r, u, v, grid)[None], radar, grid)[0]
 
 
@@ -139,7 +139,7 @@ def test_extra_width_and_offset(view):
     one = torch.ones(1, dtype=torch.float64)
     paths = paths_of(points, 2 * r / SPEED_OF_LIGHT, one, boundary, draws=1)
     wide = random_phase_spectrum(paths, radar, grid, seed=0, range_width=1.5)
-    spread = deposit(one, r, points[:, 0] / r, points[:, 1] / r, grid)[None]
+    spread = deposit(one, r, points[:, 1] / r, points[:, 2] / r, grid)[None]
     smooth = Surrogate("gaussian", "airy", range_width=1.5).shape(spread, radar, grid)
     assert (wide - smooth).abs().max() < 0.02 * smooth.max()
     far = paths_of(points, 2 * (r + 9) / SPEED_OF_LIGHT, one, boundary, draws=1)

@@ -27,14 +27,14 @@ GRID = Grid(1.0, 0.05, 60, -0.5, 0.05, 21)
 
 def scene() -> Scene:
     material = RoughDielectric(4.0)
-    cube = Object(box((0.4, 0.4, 0.4)), material, rigid(translation=[0.3, 0.0, 2.0]))
-    wall = Object(plate(2.0, 2.0), material, rigid(translation=[0.0, 0.0, 3.0]))
+    cube = Object(box((0.4, 0.4, 0.4)), material, rigid(translation=[2.0, 0.3, 0.0]))
+    wall = Object(plate(2.0, 2.0), material, rigid(translation=[3.0, 0.0, 0.0]))
     return Scene({"a/cube": cube, "wall": wall})
 
 
 def radar() -> Radar:
     array = planar_array((16, 1), (1.9e-3, 1.9e-3))
-    places = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], dtype=torch.float64)
+    places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]], dtype=torch.float64)
     one = planar_array((1, 1), (1.9e-3, 1.9e-3))
     return Radar(one, array, FMCW(77e9, 1.5e9, 5e-5, 128), places)
 
@@ -57,11 +57,11 @@ def display() -> Display:
 def test_layers_are_where_things_are():
     found = {layer.name: layer for layer in display().layers}
     assert list(found) == ["twin/a/cube", "twin/wall", "truth/a/cube", "radar", "beams"]
-    assert found["twin/a/cube"].points.min(0) == pytest.approx([0.1, -0.2, 1.8], abs=1e-6)
-    assert found["radar"].points.tolist() == [[0, 0, 0], [0.5, 0, 0]]
+    assert found["twin/a/cube"].points.min(0) == pytest.approx([1.8, 0.1, -0.2], abs=1e-6)
+    assert found["radar"].points.tolist() == [[0, 0, 0], [0, 0.5, 0]]
     # A beam is as wide as the map, and as long as the scene is far.
     end = found["beams"].points[1]
-    assert abs(end[0]) / np.linalg.norm(end) == pytest.approx(0.5, rel=0.01)
+    assert abs(end[1]) / np.linalg.norm(end) == pytest.approx(0.5, rel=0.01)
     assert display().groups == {"twin": True, "truth": True, "radar": True, "beams": False}
 
 
@@ -147,7 +147,7 @@ def test_ellipsoids_hold_95_percent():
 def test_a_link_says_what_feeds_a_bin_and_follows():
     link = InteractiveSensor(scene(), radar(), GRID)
     before = link.predict_map(link.scene, 0)
-    moved = link.move_object("a/cube", rigid(translation=torch.tensor([0.0, 0.0, 0.25]).double()))
+    moved = link.move_object("a/cube", rigid(translation=torch.tensor([0.25, 0.0, 0.0]).double()))
     after = link.predict_map(moved, 0)
     near = 1.0 + 0.05 * int(before.amax(1)[:28].argmax())
     assert near == pytest.approx(1.8, abs=0.06)

@@ -43,7 +43,7 @@ def answered(viewer: Viewer, path: str = "/", **given: str) -> http.client.HTTPR
 
 
 def cube() -> Scene:
-    pose = rigid(translation=torch.tensor([0.0, 0.0, 2.0]).double())
+    pose = rigid(translation=torch.tensor([2.0, 0.0, 0.0]).double())
     return Scene({"cube": Object(box((0.2, 0.2, 0.2)), RoughDielectric(4.0), pose)})
 
 

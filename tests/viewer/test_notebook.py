@@ -27,8 +27,8 @@ def shown_html(value: object) -> str:
 
 
 def scene() -> Scene:
-    pose = rigid(translation=torch.tensor([0.0, 0.0, 2.0]).double())
-    return Scene({EVIL: Object(box((0.4, 0.3, 0.2)), RoughDielectric(4.0), pose)})
+    pose = rigid(translation=torch.tensor([2.0, 0.0, 0.0]).double())
+    return Scene({EVIL: Object(box((0.2, 0.4, 0.3)), RoughDielectric(4.0), pose)})
 
 
 def radar() -> Radar:
@@ -45,8 +45,8 @@ def test_a_scene_shows_its_objects_and_runs_no_name():
     assert shown.startswith('<img alt="three views of the scene" src="data:image/png;base64,')
     name, count, material, size, middle = cells(shown)
     assert name == "&lt;script&gt;alert(1)&lt;/script&gt;"
-    assert (count, material, size) == ("12", "RoughDielectric", "0.4 × 0.3 × 0.2")
-    assert middle == "0, 0, 2"
+    assert (count, material, size) == ("12", "RoughDielectric", "0.2 × 0.4 × 0.3")
+    assert middle == "2, 0, 0"
 
 
 def test_a_running_ipython_gets_the_pages(monkeypatch):
@@ -76,7 +76,7 @@ def fit(folder, callbacks=(), steps=6):
     beat = simulate(scene(), radar(), grid, seed=1, sampling=Sampling(1, 5000)).beat
     capture = Capture.from_beat(beat, radar())
     model = SurrogateMap(grid, sampling=Sampling(1, 5000, 1000))
-    begun = scene().replace(EVIL, pose=rigid(translation=torch.tensor([0.1, 0.0, 2.05]).double()))
+    begun = scene().replace(EVIL, pose=rigid(translation=torch.tensor([2.05, 0.1, 0.0]).double()))
     return capture, reconstruct(
         begun,
         Observation(model, capture, sensor=radar()),

@@ -24,14 +24,14 @@ FINE = Grid(1.0, 0.01, 200, -0.5, 0.05, 21)
 
 
 def links() -> dict[str, InteractiveSensor]:
-    """One sensor at the origin, and one of a single position 0.4 m to the right."""
-    ball = Object(sphere(0.2, 3), RoughDielectric(4.0), rigid(translation=[0.0, 0.0, 1.8]))
+    """One sensor at the origin, and one of a single position 0.4 m to the left."""
+    ball = Object(sphere(0.2, 3), RoughDielectric(4.0), rigid(translation=[1.8, 0.0, 0.0]))
     array = planar_array((16, 1), (1.9e-3, 1.9e-3))
     one = planar_array((1, 1), (1.9e-3, 1.9e-3))
     scene = Scene({"ball": ball})
     found = {}
-    for name, grid, x in (("a", GRID, 0.0), ("b", FINE, 0.4)):
-        places = torch.tensor([[x, 0.0, 0.0]], dtype=torch.float64).expand(1 if x else 30, 3)
+    for name, grid, y in (("a", GRID, 0.0), ("b", FINE, 0.4)):
+        places = torch.tensor([[0.0, y, 0.0]], dtype=torch.float64).expand(1 if y else 30, 3)
         radar = Radar(one, array, FMCW(77e9, 1.5e9, 5e-5, 128), places)
         found[name] = InteractiveSensor(scene, radar, grid)
     return found
@@ -49,7 +49,7 @@ def peak(own: SensorMaps, step: int) -> tuple[float, float]:
 def test_maps_follow_the_steps_of_every_sensor():
     made = links()
     body = display_mesh(made["a"].scene["ball"])
-    away = np.array([0.0, 0.0, 0.4], np.float32)
+    away = np.array([0.4, 0.0, 0.0], np.float32)
     steps = [
         DisplayStep(k, str(k), {"ball": DisplayMesh(body.vertices + k * away, body.faces)})
         for k in (0, 1)
@@ -64,15 +64,15 @@ def test_maps_follow_the_steps_of_every_sensor():
         near, straight = peak(found["a"], step)
         assert near == pytest.approx(1.6 + 0.4 * step, abs=0.06)
         assert straight == pytest.approx(0.0, abs=0.06)
-        z = 1.8 + 0.4 * step
-        near, left = peak(found["b"], step)
-        assert near == pytest.approx(np.hypot(0.4, z) - 0.2, abs=0.06)
-        assert left == pytest.approx(-0.4 / np.hypot(0.4, z), abs=0.06)
+        x = 1.8 + 0.4 * step
+        near, u = peak(found["b"], step)
+        assert near == pytest.approx(np.hypot(0.4, x) - 0.2, abs=0.06)
+        assert u == pytest.approx(-0.4 / np.hypot(0.4, x), abs=0.06)
     # Two hundred ranges in blocks of three.
     assert found["b"].simulated is not None
     assert found["b"].simulated.shape == (2, 1, 67, 21)
     assert found["b"].grid == pytest.approx((1.01, 0.03, -0.5, 0.05))
-    assert found["b"].positions == pytest.approx(np.array([[0.4, 0.0, 0.0]]))
+    assert found["b"].positions == pytest.approx(np.array([[0.0, 0.4, 0.0]]))
 
 
 def test_what_was_measured_stands_beside_it_and_needs_no_model():

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from invertwin.capture import (
+    Capture,
     ChirpData,
     ChirpSettings,
     bag_topics,
@@ -15,6 +16,9 @@ from invertwin.capture import (
     read_track,
 )
 from invertwin.errors import InputError
+from invertwin.radar import FMCW, Chirps, Radar
+from invertwin.scene import linear_array, planar_array
+from oracles.moving_point import moving_beat
 
 pytest.importorskip("rosbags", reason="pip install -e '.[ros]'")
 from rosbags.rosbag1 import Writer as Writer1
@@ -141,6 +145,24 @@ def test_clouds_have_their_fields(bag):
     assert [one["x"].tolist() for one in clouds] == [[n, n] for n in (0.0, 1.0, 2.0)]
     assert clouds[0]["y"].tolist() == [0.0, 1.0]
     assert clouds[0]["doppler"].tolist() == [-0.5, -0.5]
+
+
+def test_places_of_ros_are_places_of_ours(bag):
+    """x forward, y left, z up: a point to the left of a radar and above it is at u > 0, v > 0."""
+    assert read_track(bag, "/pose").positions.tolist() == [[0.1 * n, 1.0, -2.0] for n in range(3)]
+    cloud = read_clouds(bag, "/cloud")[2]
+    point = torch.stack([cloud[name] for name in "xyz"], dim=1)[1]
+    assert point.tolist() == [2.0, 1.0, 2.0]
+    waveform = FMCW(77e9, 1e9, 50e-6, 64)
+    half = waveform.wavelength / 2
+    arrays = linear_array(1, half), planar_array((8, 8), (half, half))
+    radar = Radar(*arrays, waveform, torch.zeros(1, 3, dtype=torch.float64))
+    beat = moving_beat(radar, Chirps(1, 60e-6), lambda times: point.expand(*times.shape, 3))
+    grid = radar.grid(2.0, 4.0)
+    power = Capture.from_beat(beat[:, 0], radar).spectrum(grid)[0]
+    at = np.unravel_index(int(power.argmax()), power.shape)
+    found = (float(axis[k]) for axis, k in zip((grid.ranges, grid.u, grid.v), at, strict=True))
+    assert tuple(found) == pytest.approx((3.0, 1 / 3, 2 / 3), abs=0.1)
 
 
 def test_what_is_not_there_is_named(bag):

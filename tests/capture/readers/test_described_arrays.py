@@ -33,6 +33,8 @@ SETTINGS = ChirpSettings(
 )
 FILES = ["adc.npy", "adc.npz", "adc.h5", "adc.hdf5", "adc.mat"]
 TOML = """\
+frame = 2
+
 [data]
 file = "adc.npy"
 dimensions = ["tx", "frame", "rx", "sample"]
@@ -147,15 +149,15 @@ def test_a_description_becomes_a_capture(described):
     tx, _ = board("xWR1843").arrays(elevation=1)
     assert torch.equal(capture.radar().transmitters.positions, tx.positions)
     down = read(described(), board=load_described_board(described(), elevation=-1))
-    assert torch.equal(down.radar().transmitters.positions[:, 1], -tx.positions[:, 1])
+    assert torch.equal(down.radar().transmitters.positions[:, 2], -tx.positions[:, 2])
     other = board("xWR1443").arrays(elevation=1, azimuth=-1)
     given = read(described(), board=other)
     assert torch.equal(given.radar().receivers.positions, other[1].positions)
 
 
 def test_elements_may_be_listed(described):
-    tx = [[0.004 * i, 0.0, 0.0] for i in range(3)]
-    rx = [[0.001 * i, 0.0, 0.0] for i in range(4)]
+    tx = [[0.0, 0.004 * i, 0.0] for i in range(3)]
+    rx = [[0.0, 0.001 * i, 0.0] for i in range(4)]
     listed = f"tx_positions = {tx}\nrx_positions = {rx}\n"
     preset = 'board = "xWR1843"\nelevation = 1\n'
     capture = read(described(None, preset, listed))
@@ -169,9 +171,31 @@ def test_elements_may_be_listed(described):
         read(described(None, preset, preset + listed))
 
 
+def test_elements_survive_and_those_of_an_old_description_are_turned(tmp_path):
+    """Elements to the left, above and ahead, as versions before 0.4 wrote them, and as now."""
+    elements = board("xWR1843").arrays(elevation=1, transmitters=[1, 3, 2])
+    write_chirps(tmp_path / "adc.toml", chirps(), "adc.npy", elements)
+    new = (tmp_path / "adc.toml").read_text()
+    assert new.startswith("frame = 2\n")
+    read_back = load_described_board(tmp_path / "adc.toml")
+    assert isinstance(read_back, tuple)
+    for found, array in zip(read_back, elements, strict=True):
+        assert torch.equal(found.positions, array.positions)
+    listed = "tx_positions = [[0.002, 0.001, 0.0]]\nrx_positions = [[-0.002, 0.0, 0.003]]\n"
+    old = new.partition("[radar]\n")[0].removeprefix("frame = 2\n") + "[radar]\n" + listed
+    (tmp_path / "adc.toml").write_text(old)
+    with pytest.warns(PhysicsWarning, match="tx_positions in adc.toml along x left, y up, z ahead"):
+        turned = load_described_board(tmp_path / "adc.toml")
+    assert isinstance(turned, tuple)
+    tx, rx = turned
+    assert tx.positions.tolist() == [[0.0, 0.002, 0.001]]
+    assert rx.positions.tolist() == [[0.003, -0.002, 0.0]]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
+        ("frame = 2", "frame = 1", "expected frame = 2 in adc.toml, got 1"),
         ("[radar]", "[antenna]", r"got \[antenna\]"),
         ("slope", "slop", "with the keys of the documentation"),
         ("slope = 60e12\n", "", "start_frequency, slope and sample_rate"),

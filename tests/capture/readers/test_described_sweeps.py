@@ -15,11 +15,12 @@ from invertwin.capture.readers.described_sweeps import read_sweeps
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar import SteppedFrequency, range_profile
+from invertwin.radar.waveform import PhysicsWarning
 
 FREQUENCIES = 4e9 + 10e6 * np.arange(101)  # 15 m unambiguous, 0.15 m cells
-TARGET, WALL = np.array([0.3, 0.0, 3.0]), np.array([-1.0, 0.5, 6.0])
-TX, RX = np.array([-0.1, 0.0, 0.0]), np.array([0.1, 0.0, 0.0])
-RAIL = [np.array([x, 0.0, 0.0]) for x in np.linspace(-0.4, 0.4, 17)]
+TARGET, WALL = np.array([3.0, 0.3, 0.0]), np.array([6.0, -1.0, 0.5])
+TX, RX = np.array([0.0, -0.1, 0.0]), np.array([0.0, 0.1, 0.0])
+RAIL = [np.array([0.0, y, 0.0]) for y in np.linspace(-0.4, 0.4, 17)]
 
 
 def response(place, *points, cables=0.0):
@@ -41,6 +42,8 @@ def touchstone(file, s21, frequencies=FREQUENCIES):
 
 
 DESCRIPTION = """\
+frame = 2
+
 [data]
 files = "rail_*.s2p"
 
@@ -49,9 +52,9 @@ background = "empty.s2p"
 
 [radar]
 positions = "rail.csv"
-look_at = [0.0, 0.0, 3.0]
-tx_positions = [[-0.1, 0.0, 0.0]]
-rx_positions = [[0.1, 0.0, 0.0]]
+look_at = [3.0, 0.0, 0.0]
+tx_positions = [[0.0, -0.1, 0.0]]
+rx_positions = [[0.0, 0.1, 0.0]]
 """
 
 
@@ -64,7 +67,7 @@ def rail(tmp_path):
     lines = ["file,x,y,z", *(f"{n},{x},{y},{z}" for n, (x, y, z) in enumerate(RAIL))]
     (tmp_path / "rail.csv").write_text("\n".join(lines) + "\n")
     path = tmp_path / "rail.toml"
-    path.write_text(DESCRIPTION.replace("look_at = [0.0, 0.0, 3.0]\n", ""))
+    path.write_text(DESCRIPTION.replace("look_at = [3.0, 0.0, 0.0]\n", ""))
     return path
 
 
@@ -99,10 +102,10 @@ def test_a_rail_of_sweeps_images_the_target(rail):
     radar = capture.radar()
     assert radar.shape == (17, 1, 1)
     assert torch.allclose(radar.positions, torch.tensor(np.array(RAIL)))
-    x, z = torch.meshgrid(
-        torch.linspace(-1, 1, 81).double(), torch.linspace(2, 5, 61).double(), indexing="ij"
+    x, y = torch.meshgrid(
+        torch.linspace(2, 5, 61).double(), torch.linspace(-1, 1, 81).double(), indexing="ij"
     )
-    points = torch.stack([x, 0 * x, z], dim=-1)
+    points = torch.stack([x, y, 0 * x], dim=-1)
     image = backproject(capture, points).abs()
     found = points.flatten(0, 1)[image.argmax()]
     assert (found - torch.tensor(TARGET)).norm() < 0.03
@@ -129,21 +132,46 @@ def test_boresight_is_turned_to_a_point(rail):
     rail.write_text(DESCRIPTION)
     radar = read_sweeps(rail).radar()
     assert radar.rotations is not None
-    toward = torch.tensor([0.0, 0.0, 3.0]) - radar.positions
+    toward = torch.tensor([3.0, 0.0, 0.0]) - radar.positions
     assert torch.allclose(
-        radar.rotations[:, :, 2], toward / toward.norm(dim=1, keepdim=True), atol=1e-9
+        radar.rotations[:, :, 0], toward / toward.norm(dim=1, keepdim=True), atol=1e-9
     )
+
+
+def test_an_old_description_is_turned(rail):
+    """Without a frame x is left, y up, z ahead, in the description and in the file it names."""
+    rail.write_text(DESCRIPTION.replace("[radar]", "[radar]\nrange_center = [4.0, 0.2, 0.1]"))
+    new = read_sweeps(rail).radar()
+    old = """\
+positions = "rail.csv"
+range_center = [0.2, 0.1, 4.0]
+look_at = [0.0, 0.0, 3.0]
+tx_positions = [[-0.1, 0.0, 0.0]]
+rx_positions = [[0.1, 0.0, 0.0]]
+"""
+    rail.write_text(
+        DESCRIPTION.partition("[radar]\n")[0].removeprefix("frame = 2\n") + "[radar]\n" + old
+    )
+    lines = ["z,x,y", *(f"{x},{y},{z}" for x, y, z in RAIL)]
+    (rail.parent / "rail.csv").write_text("\n".join(lines) + "\n")
+    with pytest.warns(PhysicsWarning, match="look_at, positions, range_center, rx_positions"):
+        found = read_sweeps(rail).radar()
+    for name in ("positions", "rotations", "origins"):
+        assert torch.equal(getattr(found, name), getattr(new, name)), name
+    assert torch.equal(found.transmitters.positions, new.transmitters.positions)
+    assert torch.equal(found.receivers.positions, new.receivers.positions)
+    assert found.receivers.positions.tolist() == [[0.0, 0.1, 0.0]]
 
 
 def test_cables_are_an_origin(tmp_path):
     """0.45 m of cable more than the calibration knows, each way."""
     touchstone(tmp_path / "one.s2p", response(np.zeros(3), TARGET, cables=0.45))
     (tmp_path / "one.toml").write_text(
-        '[data]\nfile = "one.s2p"\n[sweep]\n[radar]\nrange_origin = -0.45\n'
-        "tx_positions = [[-0.1, 0, 0]]\nrx_positions = [[0.1, 0, 0]]\n"
+        'frame = 2\n[data]\nfile = "one.s2p"\n[sweep]\n[radar]\nrange_origin = -0.45\n'
+        "tx_positions = [[0, -0.1, 0]]\nrx_positions = [[0, 0.1, 0]]\n"
     )
     capture = read_sweeps(tmp_path / "one.toml")
-    at = torch.tensor([[0.3, 0.0, 3.0], [0.3, 0.0, 3.45]], dtype=torch.float64)
+    at = torch.tensor([[3.0, 0.3, 0.0], [3.45, 0.3, 0.0]], dtype=torch.float64)
     image = backproject(capture, at)
     assert abs(image[0] - 1e-3) < 3e-5
     assert abs(image[1]) < 1e-4
@@ -171,6 +199,8 @@ def test_files_must_be_swept_alike(rail):
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
+        ("frame = 2", "frame = 3", "expected frame = 2 in rail.toml, got 3"),
+        ("[radar]", "[radar]\nlook_at = 3.0", "look_at in \\[radar\\] as numbers of shape"),
         ('files = "rail_*.s2p"', 'files = "rails_*.s2p"', "expected files 'rails_"),
         ('files = "rail_*.s2p"', "", "either file or files in \\[data\\], got neither"),
         ('positions = "rail.csv"', "", "expected positions of 17 frames"),
@@ -189,8 +219,10 @@ def test_descriptions_that_do_not_fit_are_one_line(rail, old, new, match):
         read_sweeps(rail)
 
 
-# A pass of 10° at 1 km, as phase histories of SAR are stored: z up, centred on the scene.
+# A pass of 10° at 1 km, as phase histories of SAR are stored: z up as ours, centred on the scene.
 GOTCHA = """\
+frame = 2
+
 [data]
 file = "{file}"
 variable = "{of}fp"
@@ -245,6 +277,16 @@ def test_phase_histories_image_a_point(tmp_path, kind):
     assert float(image.max()) == pytest.approx(1.0, abs=0.05)
     capture.save(tmp_path / "pass.nc")
     assert torch.equal(Capture.load(tmp_path / "pass.nc").radar().origins, capture.radar().origins)
+
+
+def test_variables_of_an_old_description_are_turned(tmp_path):
+    arrays = history([1.0, 2.0, 0.0])
+    np.savez(tmp_path / "pass.npz", **arrays)
+    path = tmp_path / "pass.toml"
+    path.write_text(GOTCHA.format(file="pass.npz", of="").removeprefix("frame = 2\n"))
+    expected = np.stack([arrays[name] for name in "zxy"], axis=1)
+    with pytest.warns(PhysicsWarning, match="positions in pass.toml .*; write frame = 2"):
+        assert read_sweeps(path).radar().positions.tolist() == expected.tolist()
 
 
 def test_a_centre_stands_for_the_origins(tmp_path):

@@ -35,12 +35,12 @@ METAL = PerfectConductor()
 DRAWN = Sampling(depth=3)
 
 
-def beside(x: float, z: float = 1.0) -> Scene:
+def beside(y: float, x: float = 1.0) -> Scene:
     """A trihedral 1.5 m away, and a rough box before or beside it."""
     return Scene(
         {
-            "corner": thing(trihedral(0.05), (0.02, 0.0, 1.5), (0.05, 0.1, 0.0), METAL),
-            "box": thing(box((0.3, 0.3, 0.1)), (x, 0.0, z)),
+            "corner": thing(trihedral(0.05), (1.5, 0.02, 0.0), (0.0, 0.05, 0.1), METAL),
+            "box": thing(box((0.1, 0.3, 0.3)), (x, y, 0.0)),
         }
     )
 
@@ -74,7 +74,7 @@ def test_pairs_sum_to_the_square_of_the_field(stretch):
 @pytest.mark.parametrize(("mesh", "depth", "low"), [(dihedral(0.05), 2, 3.01), (None, 3, 7.78)])
 def test_powers_alone_are_low_by_the_number_of_chains(mesh, depth, low):
     """Of 2 ways in phase 3.01 dB, of 6 chains 7.78 dB."""
-    antennas = link(((0.0, 0.0, -20.0),), wavelength=WAVELENGTH)
+    antennas = link(((-20.0, 0.0, 0.0),), wavelength=WAVELENGTH)
     target = Scene({"target": thing(mesh or trihedral(0.05), material=METAL)})
     paths = trace_target(target, "target", antennas, sampling=Sampling(depth=depth))
     last = trace_target(target, "target", antennas, sampling=Sampling(depth=depth - 1))
@@ -82,7 +82,7 @@ def test_powers_alone_are_low_by_the_number_of_chains(mesh, depth, low):
     assert (chains.delay - chains.delay[0]).abs().max() * SPEED_OF_LIGHT < 1e-4
     # Plates of the dihedral are two triangles each: a way ends on the left one or on the right one.
     ways = (
-        [chains.last[:, 0] < 0, chains.last[:, 0] > 0] if mesh else torch.eye(6, dtype=torch.bool)
+        [chains.last[:, 1] < 0, chains.last[:, 1] > 0] if mesh else torch.eye(6, dtype=torch.bool)
     )
     powers = [combine_coherently(chains.select(way), antennas, always).power.sum() for way in ways]
     ratio = combine_coherently(chains, antennas, always).power.sum() / torch.stack(powers).sum()
@@ -91,10 +91,10 @@ def test_powers_alone_are_low_by_the_number_of_chains(mesh, depth, low):
 
 def test_a_stretched_wavelength_keeps_the_peak_and_widens_the_lobe():
     """Of a plate: straight on as ever, at 3° as a plate at 1° is."""
-    antennas = link(((0.0, 0.0, -4.0),), wavelength=WAVELENGTH)
+    antennas = link(((-4.0, 0.0, 0.0),), wavelength=WAVELENGTH)
 
     def power(turn: float, stretch: float) -> float:
-        scene = Scene({"plate": thing(plate(0.05, 0.05), turn=(0.0, turn, 0.0), material=METAL)})
+        scene = Scene({"plate": thing(plate(0.05, 0.05), turn=(0.0, 0.0, turn), material=METAL)})
         paths = trace_target(scene, "plate", antennas, sampling=Sampling(1), stretch=stretch)
         return float(combine_coherently(paths, antennas, always, stretch=stretch).power.sum())
 
@@ -109,14 +109,14 @@ def test_what_stands_before_a_target_hides_it_smoothly():
     """A straight edge that passes a target takes its light off in proportion."""
     antennas = link(wavelength=WAVELENGTH)
 
-    def strength(x: float) -> float:
-        paths = trace_target(beside(x), "corner", antennas, sampling=DRAWN)
+    def strength(y: float) -> float:
+        paths = trace_target(beside(y), "corner", antennas, sampling=DRAWN)
         return float(paths.coefficient.abs().sum())
 
     whole = strength(0.3)
     assert strength(-0.05) == 0.0
     assert strength(0.3) == pytest.approx(strength(2.0), rel=1e-12)
-    shares = [strength(float(x)) / whole for x in torch.linspace(0.145, 0.185, 9)]
+    shares = [strength(float(y)) / whole for y in torch.linspace(0.145, 0.185, 9)]
     steps = torch.tensor(shares).diff()
     assert shares[0] < 0.3
     assert shares[-1] > 0.7
@@ -133,7 +133,7 @@ def test_what_stands_behind_or_is_black_hides_nothing():
 
 def test_separate_antennas_each_need_sight():
     """A box before the receiver alone hides the target, too."""
-    antennas = link(((-1.0, 0.0, 0.0),), ((0.0, 0.0, 0.0),), wavelength=WAVELENGTH)
+    antennas = link(((0.0, -1.0, 0.0),), ((0.0, 0.0, 0.0),), wavelength=WAVELENGTH)
     paths = trace_target(beside(0.0), "corner", antennas, sampling=DRAWN)
     assert not paths.has_field.any()
 
@@ -191,7 +191,7 @@ def _posed(theta: Tensor, eye: Tensor) -> Tensor:
 
 
 def test_a_link_of_many_frames_keeps_them_apart():
-    places = float64([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.1, -0.2]])
+    places = float64([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0], [-0.2, 0.0, 0.1]])
     antennas = link(places, wavelength=WAVELENGTH)
     scene = Scene({"corner": beside(1.0)["corner"]})
     whole = combine_coherently(

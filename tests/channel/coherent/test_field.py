@@ -35,8 +35,8 @@ def response(paths: Paths, antennas: Link) -> Tensor:
 
 
 def cross_section(scene: Scene, distance: float, wavelength: float, samples: int) -> float:
-    """σ [m²] of a target at the origin, seen from −z."""
-    antennas = link(((0.0, 0.0, -distance),), wavelength=wavelength)
+    """σ [m²] of a target at the origin, seen from −x."""
+    antennas = link(((-distance, 0.0, 0.0),), wavelength=wavelength)
     paths = trace_field(
         scene,
         antennas,
@@ -61,7 +61,7 @@ def test_plate_twelve_degrees_off():
     angle, wavelength = math.radians(12), SPEED_OF_LIGHT / 77e9
     x = 2 * math.pi / wavelength * 0.2 * math.sin(angle)
     truth = 4 * math.pi * 0.2**4 / wavelength**2 * (math.cos(angle) * math.sin(x) / x) ** 2
-    scene = Scene({"plate": thing(plate(0.2, 0.2), turn=(0.0, angle, 0.0), material=METAL)})
+    scene = Scene({"plate": thing(plate(0.2, 0.2), turn=(0.0, 0.0, angle), material=METAL)})
     assert decibels(cross_section(scene, 2e3, wavelength, 1_000_000), truth) < 0.5
 
 
@@ -75,7 +75,7 @@ def test_a_large_plate_reflects_with_minus_one():
     """The image of the antenna, seen through a beam narrow enough to spare the plate's edge."""
     distance, wavelength = 5.0, 0.1
     antennas = link(wavelength=wavelength, pattern=Cosine(20.0))
-    scene = Scene({"mirror": thing(plate(8.0, 8.0), (0, 0, distance), material=METAL)})
+    scene = Scene({"mirror": thing(plate(8.0, 8.0), (distance, 0, 0), material=METAL)})
     found = response(
         trace_field(
             scene,
@@ -92,8 +92,8 @@ def test_a_large_plate_reflects_with_minus_one():
 
 def test_phase_holds_at_long_range():
     """Below 1e-3 rad at 77 GHz and 200 m, from float64 vertices."""
-    scene = Scene({"plate": thing(plate(0.3, 0.2), (40.0, -30.0, 193.6), (0.1, 0.4, 0.2), METAL)})
-    antennas = link(((0.01, 0.02, 0.03),), ((-0.2, 0.1, 0.0),), shared=True)
+    scene = Scene({"plate": thing(plate(0.3, 0.2), (193.6, 40.0, -30.0), (0.2, 0.1, 0.4), METAL)})
+    antennas = link(((0.03, 0.01, 0.02),), ((0.0, -0.2, 0.1),), shared=True)
     paths = trace_field(
         scene,
         antennas,
@@ -116,7 +116,7 @@ def test_phase_holds_at_long_range():
 @pytest.mark.parametrize("material", [METAL, RoughDielectric(4.0)], ids=["coherent", "rough"])
 def test_fields_are_reciprocal(material):
     scene = occluder(wall=material, occluder=material)
-    there = link(((-0.3, 0.1, 0.0),), ((0.3, 0.0, 0.1),))
+    there = link(((0.0, -0.3, 0.1),), ((0.1, 0.3, 0.0),))
     back = replace(there, tx=there.rx, rx=there.tx)
     found = [
         response(
@@ -134,7 +134,7 @@ def test_fields_are_reciprocal(material):
 
 
 def test_power_is_reciprocal():
-    there = link(((-0.3, 0.1, 0.0),), ((0.3, 0.0, 0.1),))
+    there = link(((0.0, -0.3, 0.1),), ((0.1, 0.3, 0.0),))
     back = replace(there, tx=there.rx, rx=there.tx)
     found = [
         deposit_power(
@@ -152,7 +152,7 @@ def test_power_is_reciprocal():
 @pytest.mark.parametrize("distance", [2.0, 8.0])
 def test_radar_equation_of_a_small_rough_plate(distance):
     """P = (λ/4π)² R(0)/π A / r⁴, hence r⁻⁴; R = 1/9 for ε = 4."""
-    scene = Scene({"plate": thing(plate(0.05, 0.05), (0, 0, distance))})
+    scene = Scene({"plate": thing(plate(0.05, 0.05), (distance, 0, 0))})
     found = deposit_power(
         scene,
         link(),
@@ -171,9 +171,9 @@ def test_what_leaves_is_at_most_what_arrived(tilt):
     angles = 2 * math.pi * (torch.arange(24).double() + 0.5) / 24
     mu, phi = torch.meshgrid(cosines, angles, indexing="ij")
     sine = (1 - mu**2).sqrt()
-    around = torch.stack([sine * phi.cos(), sine * phi.sin(), -mu], dim=-1).reshape(-1, 3)
+    around = torch.stack([-mu, sine * phi.cos(), sine * phi.sin()], dim=-1).reshape(-1, 3)
     count, distance = len(around), 10.0
-    tx = distance * float64([[math.sin(tilt), 0.0, -math.cos(tilt)]]).expand(count, 3)
+    tx = distance * float64([[-math.cos(tilt), math.sin(tilt), 0.0]]).expand(count, 3)
     scene = Scene({"plate": thing(plate(0.05, 0.05), material=PerfectConductor(0.6))})
     power = deposit_power(
         scene,
@@ -200,7 +200,7 @@ def test_rough_points_stay_on_their_surface():
         torch.equal(getattr(fixed, name), getattr(draw_rough_points(moved, 500.0, seed=2), name))
         for name in ("face", "b1", "b2", "phase")
     )
-    antennas = link(((0.0, 0.0, 0.0), (0.4, 0.1, 0.0)))
+    antennas = link(((0.0, 0.0, 0.0), (0.0, 0.4, 0.1)))
     paths = trace_field(
         Scene({"wall": scene["wall"]}),
         antennas,
@@ -220,9 +220,9 @@ def test_rough_points_stay_on_their_surface():
 @pytest.mark.parametrize("density", [400.0, 4_000.0])
 def test_mean_power_of_rough_fields_is_the_power_map(density):
     """E|Σ a exp(−jkL)|² over phases, frames as independent looks, within 2 %."""
-    scene = Scene({"plate": thing(plate(0.3, 0.3), (0.0, 0.0, 1.0), (0.0, 0.5, 0.0))})
-    x, y = torch.meshgrid(torch.arange(16.0) * 0.1, torch.arange(8.0) * 0.1, indexing="ij")
-    places = torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3).double() - 0.4
+    scene = Scene({"plate": thing(plate(0.3, 0.3), (1.0, 0.0, 0.0), (0.0, 0.0, 0.5))})
+    y, z = torch.meshgrid(torch.arange(16.0) * 0.1, torch.arange(8.0) * 0.1, indexing="ij")
+    places = torch.stack([0 * y, y, z], dim=-1).reshape(-1, 3).double() - 0.4
     antennas = link(places)
     truth = deposit_power(
         scene,
@@ -251,15 +251,15 @@ def test_mean_power_of_rough_fields_is_the_power_map(density):
 
 
 def two_plates() -> Scene:
-    left = thing(plate(0.3, 0.3), (-0.2, 0.0, 1.0), (0.0, 0.5, 0.0))
-    return Scene({"left": left, "right": thing(plate(0.2, 0.2), (0.2, 0.0, 0.9))})
+    right = thing(plate(0.3, 0.3), (1.0, -0.2, 0.0), (0.0, 0.0, 0.5))
+    return Scene({"right": right, "left": thing(plate(0.2, 0.2), (0.9, 0.2, 0.0))})
 
 
 def test_a_density_for_each_object_keeps_the_mean_power():
     """Two densities, one, and the power map; the standard errors of the 40 seeds are 1.5 %."""
     scene = two_plates()
-    x, y = torch.meshgrid(torch.arange(16.0) * 0.1, torch.arange(8.0) * 0.1, indexing="ij")
-    antennas = link(torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3).double() - 0.4)
+    y, z = torch.meshgrid(torch.arange(16.0) * 0.1, torch.arange(8.0) * 0.1, indexing="ij")
+    antennas = link(torch.stack([0 * y, y, z], dim=-1).reshape(-1, 3).double() - 0.4)
     exact = Sampling(depth=1, samples=64_000, boundary_samples=0)
     truth = float(deposit_power(scene, antennas, ONE_BIN, sampling=exact, seed=0).sum())
 
@@ -271,8 +271,8 @@ def test_a_density_for_each_object_keeps_the_mean_power():
         ]
         return float(torch.stack(looks).abs().square().mean(0).sum()) / truth
 
-    assert mean({"left": 400.0, "*": 4_000.0}) == pytest.approx(1, abs=0.04)
-    assert mean({"left": 4_000.0, "right": 400.0}) == pytest.approx(1, abs=0.04)
+    assert mean({"right": 400.0, "*": 4_000.0}) == pytest.approx(1, abs=0.04)
+    assert mean({"right": 4_000.0, "left": 400.0}) == pytest.approx(1, abs=0.04)
     assert mean(1_000.0) == pytest.approx(1, abs=0.04)
 
 
@@ -280,15 +280,15 @@ def test_points_of_an_object_depend_on_its_own_density_only():
     scene = two_plates()
     many, mixed, few = (
         draw_rough_points(scene, densities, seed=2)
-        for densities in (4_000.0, {"left": 500.0, "*": 4_000.0}, 500.0)
+        for densities in (4_000.0, {"right": 500.0, "*": 4_000.0}, 500.0)
     )
-    right = len(scene["left"].mesh.faces)
-    for alone, side in ((few, mixed.face[:, 0] < right), (many, mixed.face[:, 0] >= right)):
-        same = alone.face[:, 0] < right if alone is few else alone.face[:, 0] >= right
+    left = len(scene["right"].mesh.faces)
+    for alone, side in ((few, mixed.face[:, 0] < left), (many, mixed.face[:, 0] >= left)):
+        same = alone.face[:, 0] < left if alone is few else alone.face[:, 0] >= left
         for name in ("face", "b1", "b2", "weight", "phase"):
             assert torch.equal(getattr(mixed, name)[side], getattr(alone, name)[same])
     assert set(mixed.weight.tolist()) == {1 / 500, 1 / 4_000}
-    named = draw_rough_points(scene, {"left": 500.0, "right": 500.0}, seed=2)
+    named = draw_rough_points(scene, {"right": 500.0, "left": 500.0}, seed=2)
     pairs = zip(vars(named).values(), vars(few).values(), strict=True)
     assert all(torch.equal(a, b) for a, b in pairs)
 
@@ -296,9 +296,9 @@ def test_points_of_an_object_depend_on_its_own_density_only():
 @pytest.mark.parametrize(
     ("densities", "said"),
     [
-        ({"lef": 500.0, "*": 200.0}, r"objects of the scene \(left, right\), .*got 'lef'"),
-        ({"left": 500.0}, r"every rough object, got none of right; .*\"\*\""),
-        ({"left": 500.0, "right": 0.0}, r"points_per_m2 > 0"),
+        ({"righ": 500.0, "*": 200.0}, r"objects of the scene \(right, left\), .*got 'righ'"),
+        ({"right": 500.0}, r"every rough object, got none of left; .*\"\*\""),
+        ({"right": 500.0, "left": 0.0}, r"points_per_m2 > 0"),
     ],
 )
 def test_densities_of_what_is_not_there_are_refused(densities, said):

@@ -49,16 +49,16 @@ def section(mesh: Mesh, antennas: Link, **options) -> float:
     ],
     ids=["dihedral", "trihedral"],
 )
-@pytest.mark.parametrize("receiver", [None, ((0.03, 0.0, -DISTANCE),)], ids=["one", "two"])
+@pytest.mark.parametrize("receiver", [None, ((-DISTANCE, 0.03, 0.0),)], ids=["one", "two"])
 def test_corners_are_as_strong_as_they_are(mesh, expected, receiver):
-    antennas = link(((0.0, 0.0, -DISTANCE),), receiver, wavelength=WAVELENGTH)
+    antennas = link(((-DISTANCE, 0.0, 0.0),), receiver, wavelength=WAVELENGTH)
     assert section(mesh, antennas) == pytest.approx(10 * math.log10(expected), abs=0.3)
     single = section(mesh, antennas, depth=1)
     assert single < 10 * math.log10(expected) - 20
 
 
 def test_seeds_change_places_not_the_echo():
-    antennas = link(((0.0, 0.0, -DISTANCE),), wavelength=WAVELENGTH)
+    antennas = link(((-DISTANCE, 0.0, 0.0),), wavelength=WAVELENGTH)
     scene = Scene({"a": thing(trihedral(EDGE), material=METAL)})
     first, again, other = (
         response(paths_of(scene, antennas, seed=seed), antennas) for seed in (1, 1, 2)
@@ -69,7 +69,7 @@ def test_seeds_change_places_not_the_echo():
 
 def test_three_bounces_have_the_delay_of_the_apex():
     """The whole aperture of the corner is at one length: that of its apex and back."""
-    antennas = link(((0.0, 0.0, -2.0),), wavelength=WAVELENGTH)
+    antennas = link(((-2.0, 0.0, 0.0),), wavelength=WAVELENGTH)
     scene = Scene({"a": thing(trihedral(EDGE), material=METAL)})
     lengths = paths_of(scene, antennas).delay * SPEED_OF_LIGHT
     two = paths_of(scene, antennas, depth=2)
@@ -79,7 +79,7 @@ def test_three_bounces_have_the_delay_of_the_apex():
 
 
 def test_both_ways_are_equal():
-    there = link(((0.1, 0.0, -2.0),), ((-0.2, 0.1, -2.2),), wavelength=WAVELENGTH)
+    there = link(((-2.0, 0.1, 0.0),), ((-2.2, -0.2, 0.1),), wavelength=WAVELENGTH)
     back = replace(there, tx=there.rx, rx=there.tx)
     scene = Scene({"a": thing(trihedral(EDGE), material=METAL)})
     ways = [response(paths_of(scene, antennas), antennas) for antennas in (there, back)]
@@ -88,9 +88,9 @@ def test_both_ways_are_equal():
 
 def test_an_image_of_the_antenna_is_as_far_as_the_path_is_long():
     """So that the length to every element follows from ``first``."""
-    antennas = link(((0.0, 0.0, -2.0),), wavelength=WAVELENGTH)
-    moved = link(((0.004, 0.002, -2.0),), wavelength=WAVELENGTH)
-    scene = Scene({"a": thing(trihedral(EDGE), (0.01, 0.0, 0.0), material=METAL)})
+    antennas = link(((-2.0, 0.0, 0.0),), wavelength=WAVELENGTH)
+    moved = link(((-2.0, 0.004, 0.002),), wavelength=WAVELENGTH)
+    scene = Scene({"a": thing(trihedral(EDGE), (0.0, 0.01, 0.0), material=METAL)})
     paths = paths_of(scene, antennas)
     lengths = (paths.first - moved.tx).norm(dim=1) + (paths.last - moved.rx).norm(dim=1)
     shifted = replace(paths, delay=lengths / SPEED_OF_LIGHT)
@@ -99,25 +99,25 @@ def test_an_image_of_the_antenna_is_as_far_as_the_path_is_long():
 
 
 def test_a_sheet_before_a_corner_weakens_and_delays():
-    antennas = link(((0.0, 0.0, -2.0),), wavelength=WAVELENGTH)
+    antennas = link(((-2.0, 0.0, 0.0),), wavelength=WAVELENGTH)
     corner = {"a": thing(trihedral(EDGE), material=METAL)}
-    board = thing(plate(0.5, 0.5), (0, 0, -1.0), material=Slab(2.7, 0.05, thickness=0.01))
+    board = thing(plate(0.5, 0.5), (-1.0, 0, 0), material=Slab(2.7, 0.05, thickness=0.01))
     bare = paths_of(Scene(corner), antennas)
     behind = paths_of(Scene({**corner, "board": board}), antennas)
-    coherent = behind.select((behind.last[:, 2] > -0.1) & (behind.first[:, 2] > -0.1))
+    coherent = behind.select((behind.last[:, 0] > -0.1) & (behind.first[:, 0] > -0.1))
     strength = float(response(coherent, antennas).abs() / response(bare, antennas).abs())
     assert 0.1 < strength < 0.9
     assert float(coherent.delay.mean() - bare.delay.mean()) * SPEED_OF_LIGHT > 0.005
 
 
 def test_nothing_is_mirrored_twice_by_one_plate():
-    antennas = link(((0.0, 0.0, -2.0),), wavelength=WAVELENGTH)
+    antennas = link(((-2.0, 0.0, 0.0),), wavelength=WAVELENGTH)
     scene = Scene({"a": thing(plate(0.1, 0.1), material=METAL)})
     assert len(paths_of(scene, antennas, depth=3)) == len(paths_of(scene, antennas, depth=1))
 
 
 def test_derivatives_of_mirrored_paths_are_refused():
-    antennas = link(((0.0, 0.0, -2.0),), wavelength=WAVELENGTH)
+    antennas = link(((-2.0, 0.0, 0.0),), wavelength=WAVELENGTH)
     shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     corner = trihedral(EDGE)
     moved = Scene({"a": thing(Mesh(corner.vertices + shift, corner.faces), material=METAL)})
@@ -133,7 +133,7 @@ def test_places_far_from_the_antennas_do_not_meet_themselves():
         )
         * float(antennas.tx[0].norm()) ** 2
         for antennas in (
-            link(((0.0, 0.0, -distance),), wavelength=SPEED_OF_LIGHT / 1e9)
+            link(((-distance, 0.0, 0.0),), wavelength=SPEED_OF_LIGHT / 1e9)
             for distance in (20.0, 400.0)
         )
     )

@@ -35,7 +35,7 @@ LEFT = (0.5**0.5, -(0.5**0.5) * 1j)
 
 def antennas(sent: Any, received: Any, *places: Any, leakage: float = 0.0) -> Link:
     """Antennas of two polarisations, 20 m before the origin unless said otherwise."""
-    where = places or (((0.0, 0.0, -DISTANCE),),)
+    where = places or (((-DISTANCE, 0.0, 0.0),),)
     jones = [Polarisation.from_jones(value, leakage, 1) for value in (sent, received)]
     found = link(*where, wavelength=WAVELENGTH)
     return replace(found, tx_jones=jones[0], rx_jones=jones[1])
@@ -43,7 +43,7 @@ def antennas(sent: Any, received: Any, *places: Any, leakage: float = 0.0) -> Li
 
 def response(mesh: Mesh, between: Link, turn: float = 0.0, depth: int = 2) -> complex:
     """The field of a metal object that is rolled about the line of sight."""
-    scene = Scene({"a": thing(mesh, turn=(0.0, 0.0, turn), material=METAL)})
+    scene = Scene({"a": thing(mesh, turn=(turn, 0.0, 0.0), material=METAL)})
     paths = traced(scene, between, depth=depth)
     return complex(summed(paths))
 
@@ -91,8 +91,8 @@ def test_a_dihedral_turns_the_sign_between_v_and_h():
 )
 def test_fields_are_those_of_the_signature(mesh, depth):
     """Sign and phase of all four polarisations; near fields of 20 m bend the phase by 0.05."""
-    scene = Scene({"a": thing(mesh, turn=(0.0, 0.1, 0.3), material=METAL)})
-    truth = rcs(scene, [[0.0, 0.0, -1.0]], [77e9], edges=0, depth=depth, up=[0.0, 1.0, 0.0]).matrix[
+    scene = Scene({"a": thing(mesh, turn=(0.3, 0.0, 0.1), material=METAL)})
+    truth = rcs(scene, [[-1.0, 0.0, 0.0]], [77e9], edges=0, depth=depth, up=[0.0, 0.0, 1.0]).matrix[
         0, 0
     ]
     found = torch.tensor(
@@ -117,8 +117,8 @@ def test_handedness():
 @pytest.mark.parametrize(
     "places",
     [
-        (((0.1, 0.3, -2.0),), ((-0.2, 0.1, -2.2),)),
-        (((0.1, 0.3, -2.0),),),
+        (((-2.0, 0.1, 0.3),), ((-2.2, -0.2, 0.1),)),
+        (((-2.0, 0.1, 0.3),),),
     ],
     ids=["apart", "one place"],
 )
@@ -127,7 +127,7 @@ def test_both_ways_are_equal(pair, places):
     back = replace(
         there, tx=there.rx, rx=there.tx, tx_jones=there.rx_jones, rx_jones=there.tx_jones
     )
-    turned = thing(trihedral(EDGE), turn=(0.1, 0.2, 0.4), material=METAL)
+    turned = thing(trihedral(EDGE), turn=(0.4, 0.1, 0.2), material=METAL)
     # Few rays, of which none grazes an edge: there rounding decides who sees what.
     ways = [
         complex(summed(traced(Scene({"a": turned}), way, depth=3, samples=2000)))
@@ -139,7 +139,7 @@ def test_both_ways_are_equal(pair, places):
 
 def test_polarisation_does_not_matter_where_nothing_turns_it():
     """A plate square to antennas of one place: V, H and any linear one alike."""
-    scene = Scene({"a": thing(plate(0.2, 0.1), (0.05, 0.02, 0), material=METAL)})
+    scene = Scene({"a": thing(plate(0.2, 0.1), (0, 0.05, 0.02), material=METAL)})
     fields = [summed(traced(scene, antennas(p, p))) for p in ("V", "H", (0.6, 0.8))]
     assert float((fields[0] - fields[1]).abs()) < 1e-12 * float(fields[0].abs())
     assert float((fields[0] - fields[2]).abs()) < 1e-12 * float(fields[0].abs())
@@ -153,11 +153,11 @@ def test_a_table_of_one_vector_is_that_vector():
     )
     scene = Scene(
         {
-            "metal": thing(dihedral(EDGE), turn=(0.1, 0.0, 0.5), material=METAL),
-            "rough": thing(plate(0.05, 0.05), (0.1, 0, 0), material=Dielectric(4.0)),
+            "metal": thing(dihedral(EDGE), turn=(0.5, 0.1, 0.0), material=METAL),
+            "rough": thing(plate(0.05, 0.05), (0, 0.1, 0), material=Dielectric(4.0)),
         }
     )
-    places = ((0.1, 0.3, -2.0),), ((-0.2, 0.1, -2.2),)
+    places = ((-2.0, 0.1, 0.3),), ((-2.2, -0.2, 0.1),)
     found = [traced(scene, antennas(j, j, *places)) for j in (table, (0.6, 0.8j))]
     assert torch.allclose(found[0].coefficient, found[1].coefficient, rtol=1e-9, atol=1e-20)
     assert len(found[0]) > 100
@@ -170,7 +170,7 @@ def test_a_table_follows_the_direction():
     for aside, kept in ((0.0, "V"), (0.5, "H")):
         direction = math.atan(aside)
         scene = Scene(
-            {"a": thing(plate(0.02, 0.02), (aside * DISTANCE, 0, 0), (0, direction, 0), METAL)}
+            {"a": thing(plate(0.02, 0.02), (0, aside * DISTANCE, 0), (0, 0, direction), METAL)}
         )
         strength = {p: abs(complex(summed(traced(scene, antennas(table, p))))) for p in "VH"}
         assert strength["V" if kept == "H" else "H"] < 1e-6 * strength[kept]
@@ -180,9 +180,9 @@ def test_elements_that_leak_are_mixtures():
     """Every channel is what a radar of those two elements alone would hear."""
     scene = Scene(
         {
-            "metal": thing(dihedral(EDGE), turn=(0.0, 0.0, 0.4), material=METAL),
+            "metal": thing(dihedral(EDGE), turn=(0.4, 0.0, 0.0), material=METAL),
             "rough": thing(
-                plate(0.05, 0.05), (0.1, 0, 0), material=Dielectric(4.0, depolarisation=0.2)
+                plate(0.05, 0.05), (0, 0.1, 0), material=Dielectric(4.0, depolarisation=0.2)
             ),
         }
     )

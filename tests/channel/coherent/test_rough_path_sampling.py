@@ -22,19 +22,19 @@ def scene() -> Scene:
     """A plate behind a screen, which a glossy wall shows."""
     return Scene(
         {
-            "screen": thing(plate(0.8, 0.8), (0.0, 0.0, 1.0)),
+            "screen": thing(plate(0.8, 0.8), (1.0, 0.0, 0.0)),
             "wall": thing(
-                plate(2.0, 1.0), (1.4, 0.0, 1.6), (0.0, math.pi / 2, 0.0),
+                plate(2.0, 1.0), (1.6, 1.4, 0.0), (0.0, 0.0, math.pi / 2),
                 RoughConductor(scattering=0.3, rms_slope=0.15),
             ),
-            "item": thing(plate(0.3, 0.3), (0.0, 0.0, 2.0), (0.0, 0.5, 0.0)),
+            "item": thing(plate(0.3, 0.3), (2.0, 0.0, 0.0), (0.0, 0.0, 0.5)),
         }
     )  # fmt: skip
 
 
-def antennas(*x: float) -> Link:
+def antennas(*y: float) -> Link:
     """Poses along a rail."""
-    return link(tuple((value, 0.0, 0.0) for value in x))
+    return link(tuple((0.0, value, 0.0) for value in y))
 
 
 def by_area(geometry: Geometry, count: int, seed: int) -> SurfacePaths:

@@ -18,24 +18,24 @@ WAVE = 0.02
 def corner(front: bool = False) -> Scene:
     """A wall and a floor that do not touch, and perhaps a board before them."""
     objects = {
-        "wall": thing(plate(0.8, 0.8), (0.0, 0.0, 1.8), (0.0, 0.15, 0.0), RoughDielectric(4.0)),
+        "wall": thing(plate(0.8, 0.8), (1.8, 0.0, 0.0), (0.0, 0.0, 0.15), RoughDielectric(4.0)),
         "floor": thing(
-            plate(0.8, 0.8), (0.0, -0.6, 1.2), (1.4, 0.0, 0.0),
+            plate(0.8, 0.8), (1.2, 0.0, -0.6), (0.0, 1.4, 0.0),
             RoughDielectric(5.0, 0.0, 0.5, 0.8),
         ),
     }  # fmt: skip
     if front:
         objects["board"] = thing(
-            plate(0.3, 0.3), (0.1, -0.1, 1.0), (0.2, 0.4, 0.0), Slab(2.7, 0.05, thickness=0.01)
+            plate(0.3, 0.3), (1.0, 0.1, -0.1), (0.0, 0.2, 0.4), Slab(2.7, 0.05, thickness=0.01)
         )
     return Scene(objects)
 
 
 def looks() -> Link:
     """Poses too far apart for speckle to agree, on a rail too short for the power to change."""
-    x, y = torch.meshgrid(torch.arange(4.0) * 0.03, torch.arange(4.0) * 0.03, indexing="ij")
-    places = torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3).double() - 0.045
-    return link(places, places + float64([0.25, 0.0, 0.0]), wavelength=WAVE)
+    y, z = torch.meshgrid(torch.arange(4.0) * 0.03, torch.arange(4.0) * 0.03, indexing="ij")
+    places = torch.stack([0 * y, y, z], dim=-1).reshape(-1, 3).double() - 0.045
+    return link(places, places + float64([0.0, 0.25, 0.0]), wavelength=WAVE)
 
 
 def expected(scene: Scene, antennas: Link, depth: int) -> Tensor:
@@ -102,7 +102,7 @@ def test_mean_power_of_rough_path_fields_is_the_power_map():
 
 def test_paths_stay_while_the_radar_moves():
     scene = corner()
-    antennas = [link(((x, 0.0, 0.0),), ((x + 0.25, 0.0, 0.0),)) for x in (0.0, 0.07)]
+    antennas = [link(((0.0, y, 0.0),), ((0.0, y + 0.25, 0.0),)) for y in (0.0, 0.07)]
     few = Sampling(depth=3, points_per_m2=10.0, rough_paths=2_000)
     fixed = draw_speckle(scene, antennas[0], few, seed=1)
     paths = [

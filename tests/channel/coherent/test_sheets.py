@@ -21,8 +21,8 @@ from scenes import link
 
 def test_fields_pass_sheets_as_power_does():
     sheet = Slab(permittivity=2.5, conductivity=0.1, thickness=0.02)
-    board = Object(plate(2.0, 2.0), sheet, rigid(translation=[0.0, 0.0, 1.0]))
-    target = Object(plate(0.4, 0.4), RoughDielectric(4.0), rigid(translation=[0.0, 0.0, 2.0]))
+    board = Object(plate(2.0, 2.0), sheet, rigid(translation=[1.0, 0.0, 0.0]))
+    target = Object(plate(0.4, 0.4), RoughDielectric(4.0), rigid(translation=[2.0, 0.0, 0.0]))
     scene = Scene({"board": board, "target": target})
     antennas = link(((0.0, 0.0, 0.0),))
     with torch.no_grad():
@@ -48,9 +48,9 @@ def test_fields_pass_sheets_as_power_does():
 
 
 def test_a_moving_silhouette_of_a_coherent_field_past_a_sheet_is_refused():
-    board = Object(plate(2.0, 2.0), Slab(2.5, thickness=0.02), rigid(translation=[0.0, 0.0, 1.0]))
+    board = Object(plate(2.0, 2.0), Slab(2.5, thickness=0.02), rigid(translation=[1.0, 0.0, 0.0]))
     mesh = plate(0.4, 0.4)
-    vertices = (mesh.vertices + torch.tensor([0.0, 0.0, 2.0])).requires_grad_()
+    vertices = (mesh.vertices + torch.tensor([2.0, 0.0, 0.0])).requires_grad_()
     mirror = Object(Mesh(vertices, mesh.faces), PerfectConductor())
     with pytest.raises(InputError, match="expected no sheets where a derivative of coherent"):
         trace_field(

@@ -8,10 +8,10 @@ from torch import Tensor
 from invertwin.channel import RayPaths, Sampling, trace_single_scattering
 from invertwin.channel.coverage import single_scattering as module
 from invertwin.scene import Dielectric, PerfectConductor, RoughConductor, Scene, box, plate
-from scenes import float64, thing
+from scenes import float64, level_plate, thing
 
-FLOOR = thing(plate(4.0, 4.0), material=RoughConductor(scattering=1.0, rms_slope=0.5))
-WALL = thing(plate(9.0, 9.0), (3.0, 0, 0), (0, math.pi / 2, 0), PerfectConductor(math.pi))
+FLOOR = thing(level_plate(4.0, 4.0), material=RoughConductor(scattering=1.0, rms_slope=0.5))
+WALL = thing(plate(9.0, 9.0), (3.0, 0, 0), material=PerfectConductor(math.pi))
 SCENE = Scene({"floor": FLOOR, "wall": WALL})
 TX = float64([[0.5, 0.3, 2.0], [0.0, 0.0, 1.0]])
 PLACES = float64([[1.0, -0.5, 1.5], [-1.0, 0.0, 1.0], [0.2, 0.9, 0.7]])

@@ -27,12 +27,11 @@ from invertwin.scene import (
     Scene,
     Slab,
     box,
-    plate,
     rigid,
     rotation_from_vector,
 )
 from invertwin.scene.material.slab import slab_coefficients
-from scenes import complex128, float64
+from scenes import complex128, float64, level_plate
 
 METAL = PerfectConductor()
 SIDE, THICKNESS = 0.1, 0.03
@@ -51,7 +50,7 @@ def alone(material: Material, **place: float) -> Scene:
 
 
 def on_metal(material: Material, gap: float = 0.0) -> Scene:
-    return Scene({"block": block(material, gap), "floor": Object(plate(SIDE, SIDE), METAL)})
+    return Scene({"block": block(material, gap), "floor": Object(level_plate(SIDE, SIDE), METAL)})
 
 
 def far(scene: Scene, frequencies: object = 30e9, **options: object) -> Tensor:
@@ -132,7 +131,7 @@ def test_metal_against_a_block_and_behind_one(loss, gap):
 def test_metal_inside_a_block_hides_what_is_behind():
     """A plate at half the depth of a lossless block of ε = 4: r = (r₁ − e)/(1 − r₁ e)."""
     place = rigid(translation=float64([0.0, 0.0, THICKNESS / 2]))
-    inside = Object(plate(SIDE, SIDE), METAL, place)
+    inside = Object(level_plate(SIDE, SIDE), METAL, place)
     scene = Scene({"block": block(RefractingBody(4.0)), "plate": inside})
     k = 2 * math.pi * 30e9 / SPEED_OF_LIGHT
     back = cmath.exp(-2j * k * 2.0 * THICKNESS / 2)
@@ -232,7 +231,7 @@ def test_reciprocity(few, monkeypatch):
     scene = Scene(
         {
             "block": Object(box((0.03, 0.02, 0.02)), RefractingBody(2.5, loss_tangent=0.01), turn),
-            "floor": Object(plate(0.04, 0.04), METAL),
+            "floor": Object(level_plate(0.04, 0.04), METAL),
         }
     )
     sent, received = [[0.3, 0.1, 1.0]], [[-0.5, 0.2, 0.8]]
@@ -259,7 +258,7 @@ def power(theta: Tensor) -> Tensor:
         RefractingBody(2.5 + epsilon, 0.05 + sigma, loss_tangent=0.01),
         pose,
     )
-    floor = Object(plate(0.05, 0.05), METAL, rigid(translation=float64([0.0, 0.0, -0.02])))
+    floor = Object(level_plate(0.05, 0.05), METAL, rigid(translation=float64([0.0, 0.0, -0.02])))
     scene = Scene({"block": body, "floor": floor})
     found = iw.rcs(scene, [[0.25, 0.1, 1.0]], 31e9, depth=3, edges=0)
     return found.matrix.abs().square().sum()
@@ -294,7 +293,7 @@ def test_derivatives_by_conductivity_differ_between_frequencies_of_one_permittiv
 
 @pytest.mark.parametrize("inner", [RefractingBody(4.0), Slab(3.0, thickness=1e-3)])
 def test_dielectrics_inside_a_clear_solid_are_refused(inner):
-    mesh = plate(0.01, 0.01) if isinstance(inner, Slab) else box(0.01)
+    mesh = level_plate(0.01, 0.01) if isinstance(inner, Slab) else box(0.01)
     place = rigid(translation=float64([0.0, 0.0, THICKNESS / 2]))
     scene = Scene({"block": block(RefractingBody(2.5)), "core": Object(mesh, inner, place)})
     with pytest.raises(InputError, match="against block, got the dielectric core; leave a gap"):
@@ -319,7 +318,7 @@ def test_values_per_triangle_show_the_front_alone():
 
 def test_open_meshes_and_conductors_have_no_inside():
     """A half space, and metal to 1e-12 as before solids were entered (commit 5b65aad)."""
-    half = Object(plate(SIDE, SIDE), RefractingBody(2.5))
+    half = Object(level_plate(SIDE, SIDE), RefractingBody(2.5))
     found = iw.rcs(Scene({"half": half}), BROADSIDE, 30e9, edges=0)
     assert set(found.parts) == {f"order {n}" for n in range(1, 6)}
     assert float(found.parts["order 3"].abs().max()) == 0

@@ -35,29 +35,29 @@ from invertwin.scene import (
 from scenes import float64, link, thing
 
 RANGES = Grid(0.4, 0.15, 24)
-BLOCK, WALL = box((0.3, 0.4, 0.2)), plate(2.0, 2.0)
+BLOCK, WALL = box((0.2, 0.3, 0.4)), plate(2.0, 2.0)
 PLACES = (0.0, 0.3, -0.2)
-BISTATIC = link(((0, 0, -0.2), (0.3, 0, 0)), rx=((0.17, 0.2, -0.2), (0.41, 0.1, 0)))
+BISTATIC = link(((-0.2, 0, 0), (0, 0.3, 0)), rx=((-0.2, 0.17, 0.2), (0, 0.41, 0.1)))
 Make = Callable[[Tensor], Scene]
 
 
 def before_a_wall(x: Tensor) -> Scene:
-    block = thing(BLOCK, (0.0, 0.1, 1.0), (0.2, 0.3, 0.1))
-    pose = compose(block.transform, rigid(translation=x * float64([1, 0.3, 0.5])))
-    return Scene({"block": Object(BLOCK, block.material, pose), "wall": thing(WALL, (0, 0, 2))})
+    block = thing(BLOCK, (1.0, 0.0, 0.1), (0.1, 0.2, 0.3))
+    pose = compose(block.transform, rigid(translation=x * float64([0.5, 1, 0.3])))
+    return Scene({"block": Object(BLOCK, block.material, pose), "wall": thing(WALL, (2, 0, 0))})
 
 
 def sunk_into_the_floor(x: Tensor) -> Scene:
     """A block that slides through the floor: what moves is the curve in which they meet."""
-    block = thing(BLOCK, (0.0, -0.4, 1.2), (0.1, 0.5, 0.05))
-    pose = compose(block.transform, rigid(translation=x * float64([1, 0.3, 0.4])))
-    floor = thing(WALL, (0, -0.5, 1.4), (1.4, 0, 0))
+    block = thing(BLOCK, (1.2, 0.0, -0.4), (0.05, 0.1, 0.5))
+    pose = compose(block.transform, rigid(translation=x * float64([0.4, 1, 0.3])))
+    floor = thing(WALL, (1.4, 0, -0.5), (0, 1.4, 0))
     return Scene({"block": Object(BLOCK, block.material, pose), "floor": floor})
 
 
 def behind_a_sheet(x: Tensor) -> Scene:
     pane = thing(
-        plate(0.5, 0.6), (0.05, 0.0, 0.45), (0.1, 0.3, 0), Slab(2.7, 0.05, thickness=0.0125)
+        plate(0.5, 0.6), (0.45, 0.05, 0.0), (0, 0.1, 0.3), Slab(2.7, 0.05, thickness=0.0125)
     )
     return Scene({**before_a_wall(x).objects, "pane": pane})
 
@@ -67,7 +67,7 @@ def many_blocks(x: Tensor) -> Scene:
     spots = [(0.4 * (n % 4) - 0.6, 0.4 * (n // 4) - 0.5) for n in range(9 + int(10 * x.abs()))]
     small = box((0.15, 0.15, 0.15))
     blocks = {
-        str(n): thing(small, (a, b, 1.4), (0.3, 0.2, 0.1 * n)) for n, (a, b) in enumerate(spots)
+        str(n): thing(small, (1.4, a, b), (0.1 * n, 0.3, 0.2)) for n, (a, b) in enumerate(spots)
     }
     return Scene({**before_a_wall(x).objects, **blocks})
 
@@ -106,11 +106,11 @@ def spread(values: Tensor) -> float:
 
 
 CASES = {
-    "one_bounce": (before_a_wall, link(((0, 0, -0.2),)), 1),
+    "one_bounce": (before_a_wall, link(((-0.2, 0, 0),)), 1),
     "bistatic_poses": (before_a_wall, BISTATIC, 2),
-    "contact": (sunk_into_the_floor, link(((0.2, 0.3, -0.2),)), 1),
-    "sheet": (behind_a_sheet, link(((0, 0, -0.2), (0.3, 0, 0))), 2),
-    "groups": (many_blocks, link(((0, 0, -0.2),)), 2),
+    "contact": (sunk_into_the_floor, link(((-0.2, 0.2, 0.3),)), 1),
+    "sheet": (behind_a_sheet, link(((-0.2, 0, 0), (0, 0.3, 0))), 2),
+    "groups": (many_blocks, link(((-0.2, 0, 0),)), 2),
 }
 
 
@@ -133,7 +133,7 @@ def test_maps_and_derivatives_are_those_of_the_scenes_alone(case):
 @pytest.mark.parametrize("field", ["boundary", "contacts"])
 def test_boundary_terms_are_what_makes_derivatives_right(field):
     """Without silhouettes, or without the curves where surfaces meet, they are others."""
-    around = link(((0.2, 0.3, -0.2),))
+    around = link(((-0.2, 0.2, 0.3),))
     whole = Sampling(depth=1, samples=40_000, boundary_samples=40_000)
     part = replace(whole, **{field: False})
     slopes = [
@@ -145,7 +145,7 @@ def test_boundary_terms_are_what_makes_derivatives_right(field):
 
 def test_forward_mode_agrees_with_reverse_mode():
     drawn = Sampling(depth=2, samples=10_000, boundary_samples=10_000)
-    around, along = link(((0, 0, -0.2),)), float64([1.0, -0.5, 2.0])
+    around, along = link(((-0.2, 0, 0),)), float64([2.0, 1.0, -0.5])
 
     def maps(x: Tensor) -> Tensor:
         scenes = [before_a_wall(place) for place in x]
@@ -166,7 +166,7 @@ def test_poses_of_the_antennas_have_the_gradient_of_all_scenes():
     drawn = Sampling(depth=1, samples=50_000, boundary_samples=50_000)
     slopes = []
     for at_once in (False, True):
-        tx = float64([[0.03, 0.0, -0.2]]).requires_grad_()
+        tx = float64([[-0.2, 0.03, 0.0]]).requires_grad_()
         around = link(tx)
         scenes = [before_a_wall(place) for place in float64(PLACES)]
         if at_once:
@@ -188,7 +188,7 @@ def test_no_path_comes_from_another_scene():
         plates = {
             str(n): Object(plate(0.5, 0.5), RoughDielectric(4.0), rigid(translation=at))
             for n, at in enumerate(
-                (torch.stack([place, place * 0, place * 0 + 1.0]), float64([0.0, 0.6, 1.2]))
+                (torch.stack([place * 0 + 1.0, place, place * 0]), float64([1.2, 0.0, 0.6]))
             )
         }
         scenes.append(Scene(plates))
@@ -201,12 +201,12 @@ def test_no_path_comes_from_another_scene():
 def test_boundary_terms_are_right_in_large_batches_of_small_distant_things():
     """Coordinates count from the middle of all boxes, here a kilometre away from some."""
     around, far = link(((0, 0, 0),)), Grid(140.0, 4.0, 60)
-    ball, ground = sphere(0.05, 4), thing(plate(500, 500), (0, 0, 210))
+    ball, ground = sphere(0.05, 4), thing(plate(500, 500), (210, 0, 0))
 
     def slopes(count: int, seed: int, *, boundary: bool) -> Tensor:
         size = torch.ones(count, dtype=torch.float64).requires_grad_()
         drawn = Sampling(depth=1, samples=10_000, boundary_samples=10_000, boundary=boundary)
-        pose = rigid(translation=float64([0, 2, 200]))
+        pose = rigid(translation=float64([200, 0, 2]))
         scenes = [
             Scene(
                 {
@@ -231,8 +231,8 @@ def test_boundary_terms_are_right_in_large_batches_of_small_distant_things():
 
 
 def test_scenes_far_and_near_get_as_many_boundary_samples():
-    near, around = before_a_wall(float64(0.0)), link(((0, 0, -0.2),), rx=((0.17, 0.2, -0.2),))
-    away = rigid(translation=float64([0.0, 0.0, 20.0]))
+    near, around = before_a_wall(float64(0.0)), link(((-0.2, 0, 0),), rx=((-0.2, 0.17, 0.2),))
+    away = rigid(translation=float64([20.0, 0.0, 0.0]))
     far = {
         f"far {name}": Object(item.mesh, item.material, compose(item.transform, away))
         for name, item in near.objects.items()
@@ -255,7 +255,7 @@ def test_scenes_far_and_near_get_as_many_boundary_samples():
 
 def test_one_scene_is_a_batch():
     drawn = Sampling(depth=2, samples=20_000, boundary=False)
-    scene, around = before_a_wall(float64(0.1)), link(((0, 0, -0.2),))
+    scene, around = before_a_wall(float64(0.1)), link(((-0.2, 0, 0),))
     (one,) = deposit_batch([scene], around, RANGES, sampling=drawn, seed=1)
     alone = deposit_power(scene, around, RANGES, sampling=drawn, seed=1)
     torch.testing.assert_close(one, alone, rtol=1e-2, atol=1e-4 * float(alone.max()))
@@ -274,7 +274,7 @@ def test_what_a_batch_cannot_do_is_refused():
     many = Sampling(depth=1, samples=2**30)
     with pytest.raises(InputError, match="fewer scenes or"):
         deposit_batch([scene] * 3, around, RANGES, sampling=many, seed=1)
-    moving = scene.replace("block", velocity=float64([1.0, 0.0, 0.0]))
+    moving = scene.replace("block", velocity=float64([0.0, 1.0, 0.0]))
     with pytest.raises(InputError, match="block of scene 1"):
         deposit_batch([scene, moving], around, RANGES, sampling=few, seed=1)
     sunk = [sunk_into_the_floor(place) for place in float64(PLACES).requires_grad_()]

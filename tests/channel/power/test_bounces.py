@@ -36,19 +36,19 @@ KINDS = ("opaque", "sheet", "body")
 
 def leaves(bistatic: bool, kind: str) -> dict[str, Tensor]:
     """Everything that a map can be differentiated by, in two frames."""
-    turns = [rotation_from_vector(float64(v)) for v in ([0.05, 0.1, 0.0], [0.0, -0.1, 0.2])]
-    front = box((0.4, 0.4, 0.2)).vertices + float64([0.05, 0.0, 0.8])
+    turns = [rotation_from_vector(float64(v)) for v in ([0.0, 0.05, 0.1], [0.2, 0.0, -0.1])]
+    front = box((0.2, 0.4, 0.4)).vertices + float64([0.8, 0.05, 0.0])
     values = {
         "wall": occluder()["wall"].vertices,
         "front": front if kind == "body" else occluder()["occluder"].vertices,
-        "tx": float64([[0.0, 0.0, 0.0], [0.2, 0.1, -0.1]]),
+        "tx": float64([[0.0, 0.0, 0.0], [-0.1, 0.2, 0.1]]),
         "rotations": torch.stack(turns),
         "permittivity": float64(3.0),
         "conductivity": float64(0.05),
         "rms_slope": float64(0.3),
     }
     if bistatic:
-        values["rx"] = values["tx"] + float64([0.3, 0.0, 0.05])
+        values["rx"] = values["tx"] + float64([0.05, 0.3, 0.0])
     return {name: value.clone().requires_grad_() for name, value in values.items()}
 
 
@@ -67,12 +67,12 @@ def built(values: dict[str, Tensor], kind: str) -> tuple[Scene, Link]:
         material = Slab(*medium, thickness=0.01, **roughness)
     elif kind == "body":
         material = RefractingBody(*medium, **roughness)
-    mesh = box((0.4, 0.4, 0.2)) if kind == "body" else occluder()["occluder"].mesh
+    mesh = box((0.2, 0.4, 0.4)) if kind == "body" else occluder()["occluder"].mesh
     scene = Scene(
         {
             "wall": Object(Mesh(values["wall"], occluder()["wall"].mesh.faces), rough),
             "front": Object(Mesh(values["front"], mesh.faces), material),
-            "floor": thing(plate(1.6, 1.4, divisions=2), (0.1, -0.9, 1.0), (1.5, 0, 0), rough),
+            "floor": thing(plate(1.6, 1.4, divisions=2), (1.0, 0.1, -0.9), (0, 1.5, 0), rough),
         }
     )
     return scene, link(values["tx"], values.get("rx"), values["rotations"], Cosine(1.0))
@@ -200,17 +200,17 @@ def test_a_depth_out_of_range_is_named(depth):
 
 def hidden(shift: Tensor) -> Scene:
     """A small plate behind a large one, which sees a side wall that the radar sees too."""
-    item = thing(plate(0.3, 0.3), (0.0, 0.0, 2.0), (0.0, 0.5, 0.0))
+    item = thing(plate(0.3, 0.3), (2.0, 0.0, 0.0), (0.0, 0.0, 0.5))
     return Scene(
         {
-            "screen": thing(plate(0.8, 0.8), (0.0, 0.0, 1.0)),
-            "side": thing(plate(2.0, 1.0), (1.4, 0.0, 1.6), (0.0, math.pi / 2, 0.0)),
+            "screen": thing(plate(0.8, 0.8), (1.0, 0.0, 0.0)),
+            "side": thing(plate(2.0, 1.0), (1.6, 1.4, 0.0), (0.0, 0.0, math.pi / 2)),
             "item": Object(Mesh(item.vertices + shift, item.mesh.faces), item.material),
         }
     )
 
 
-@pytest.mark.parametrize("rx", [None, ((0.01, 0.0, 0.0),)], ids=["monostatic", "bistatic"])
+@pytest.mark.parametrize("rx", [None, ((0.0, 0.01, 0.0),)], ids=["monostatic", "bistatic"])
 def test_what_is_wholly_hidden_has_no_gradient_until_something_shows_it(rx):
     shift = float64([0.0, 0.0, 0.0]).requires_grad_()
     for depth in (1, 2, 3):
@@ -225,7 +225,7 @@ def test_what_is_wholly_hidden_has_no_gradient_until_something_shows_it(rx):
 
 def test_nothing_to_see_is_zeros_at_any_depth():
     shift = float64([0.0, 0.0, 0.0]).requires_grad_()
-    behind = link(rotations=torch.diag(float64([-1.0, 1.0, -1.0]))[None], pattern=Cosine(1.0))
+    behind = link(rotations=torch.diag(float64([-1.0, -1.0, 1.0]))[None], pattern=Cosine(1.0))
     out = deposit_power(hidden(shift), behind, GRID, sampling=replace(COUNTS, depth=3), seed=3)
     assert not out.any()
     assert not torch.autograd.grad(out.sum(), shift)[0].any()
@@ -240,7 +240,7 @@ def turned(mesh: Mesh) -> Mesh:
 
 
 def body_map(mesh: Mesh) -> Tensor:
-    body = thing(mesh, (0.0, 0.0, 1.0), material=RefractingBody(2.5))
+    body = thing(mesh, (1.0, 0.0, 0.0), material=RefractingBody(2.5))
     sampling = replace(COUNTS, depth=2)
     return deposit_power(Scene({"block": body}), link(), GRID, sampling=sampling, seed=3)
 
@@ -268,7 +268,7 @@ def test_explicit_paths_refuse_what_they_cannot_do():
             sampling=Sampling(depth=2, samples=100_000, boundary_samples=0, points_per_m2=100.0),
             seed=0,
         )
-    moving = occluder().replace("occluder", velocity=float64([1.0, 0.0, 0.0]))
+    moving = occluder().replace("occluder", velocity=float64([0.0, 1.0, 0.0]))
     with pytest.raises(InputError, match="expected depth 1 for objects in motion, got 2"):
         trace_field(
             moving,

@@ -14,15 +14,15 @@ from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, sp
 from invertwin.scene.mesh_topology import weld_faces
 from scenes import GRID, WAVELENGTH, float64, link, occluder, relative, shift_error, thing
 
-WALL = thing(plate(2.0, 2.0, divisions=2), (0, 0, 2))
+WALL = thing(plate(2.0, 2.0, divisions=2), (2, 0, 0))
 ACROSS = Grid(1.5, 1.0, 2, u_start=-0.6, u_step=0.1, u_count=13)
 COUNTS = Sampling(depth=1, samples=4_000, boundary_samples=40_000)
 
 
 def shadow_rate(screens: dict[str, Mesh], antennas: Link, boundary: bool = True) -> Tensor:
-    """∂map/∂x of screens that slide together in front of the wall."""
+    """∂map/∂y of screens that slide together in front of the wall."""
     shift = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    offset = torch.stack([0.1 + shift, 0.05 + 0 * shift, 1 + 0 * shift])
+    offset = torch.stack([1 + 0 * shift, 0.1 + shift, 0.05 + 0 * shift])
     scene = Scene(
         {"wall": WALL}
         | {
@@ -59,7 +59,7 @@ def finned(mesh: Mesh) -> Mesh:
     """A third triangle on the diagonal, behind the plate: a non-manifold edge."""
     faces = mesh.faces
     shared = sorted(set(faces[0].tolist()) & set(faces[1].tolist()))
-    apex = mesh.vertices[shared].mean(0) + float64([0.02, 0.05, 0.1])
+    apex = mesh.vertices[shared].mean(0) + float64([0.1, 0.02, 0.05])
     vertices = torch.cat([mesh.vertices, apex[None]])
     fin = torch.tensor([[*shared, len(mesh.vertices)]])
     return Mesh(vertices, torch.cat([faces, fin]))
@@ -83,10 +83,10 @@ def test_meshing_does_not_change_the_shadow(change):
 
 
 def test_two_objects_that_touch_are_one_screen():
-    left, right = plate(0.2, 0.3), plate(0.2, 0.3)
+    right, left = plate(0.2, 0.3), plate(0.2, 0.3)
     parts = {
-        "left": Mesh(left.vertices - float64([0.1, 0, 0]), left.faces),
-        "right": Mesh(right.vertices + float64([0.1, 0, 0]), right.faces),
+        "right": Mesh(right.vertices - float64([0, 0.1, 0]), right.faces),
+        "left": Mesh(left.vertices + float64([0, 0.1, 0]), left.faces),
     }
     assert relative(shadow_rate(parts, link()), shadow_rate({"screen": plain()}, link())) < 0.06
 
@@ -97,9 +97,9 @@ def test_objects_that_start_at_one_place_may_part():
     def rate(start: float) -> Tensor:
         shift = torch.tensor(start, dtype=torch.float64, requires_grad=True)
         still, moving = PARTED
-        place = torch.stack([shift, 0 * shift, 1 + 0 * shift])
+        place = torch.stack([1 + 0 * shift, shift, 0 * shift])
         screen = Object(Mesh(moving.vertices + place, moving.faces), RoughDielectric(4.0))
-        scene = Scene({"wall": WALL, "still": thing(still, (0, 0, 1)), "moving": screen})
+        scene = Scene({"wall": WALL, "still": thing(still, (1, 0, 0)), "moving": screen})
         out = deposit_power(scene, link(), ACROSS, sampling=COUNTS, seed=1)
         return torch.stack(
             [torch.autograd.grad(out[0, 0, u, 0], shift, retain_graph=True)[0] for u in range(13)]
@@ -139,7 +139,7 @@ def test_separate_antennas_tend_to_shared_visibility():
     shared = shadow_rate({"screen": plain()}, link())
     gaps = []
     for distance in (0.3, 0.03, 0.003):
-        half = float64([[0.5 * distance, 0.0, 0.0]])
+        half = float64([[0.0, 0.5 * distance, 0.0]])
         apart = shadow_rate({"screen": plain()}, link(-half, half))
         gaps.append(relative(apart, shared))
     assert gaps[2] < 0.06
@@ -152,7 +152,7 @@ def test_a_later_call_does_not_disturb_an_earlier_one():
     faces = plain().faces
 
     def at(x: float) -> Tensor:
-        place = torch.stack([x + shift, 0.05 + 0 * shift, 1 + 0 * shift])
+        place = torch.stack([1 + 0 * shift, x + shift, 0.05 + 0 * shift])
         screen = Object(Mesh(plain().vertices + place, faces), RoughDielectric(4.0))
         scene = Scene({"wall": WALL, "screen": screen})
         return (
@@ -181,10 +181,10 @@ def test_second_derivatives_are_refused():
 @pytest.mark.parametrize(
     ("scene", "antennas"),
     [
-        (occluder(), link(((0.0, 0.0, 5.0),), ((0.1, 0.0, 5.0),), wavelength=WAVELENGTH)),
+        (occluder(), link(((5.0, 0.0, 0.0),), ((5.0, 0.1, 0.0),), wavelength=WAVELENGTH)),
         (Scene({"ball": thing(sphere(1.0))}), link()),
-        (Scene({"plate": thing(slivered(plain()), (0, 0, 1)), "wall": WALL}), link()),
-        (Scene({"flat": thing(plate(1.0, 1.0), (0, 0, 1), (0.0, np.pi / 2, 0.0))}), link()),
+        (Scene({"plate": thing(slivered(plain()), (1, 0, 0)), "wall": WALL}), link()),
+        (Scene({"flat": thing(plate(1.0, 1.0), (1, 0, 0), (0.0, 0.0, np.pi / 2))}), link()),
     ],
     ids=["all behind", "inside a ball", "zero-area triangle", "plate seen edge-on"],
 )

@@ -7,12 +7,12 @@ import torch
 from invertwin.channel import Grid, Sampling, deposit_paths, deposit_power, trace_power
 from scenes import GRID, float64, link, occluder, relative
 
-PLACES = ((0.0, 0.0, 0.0), (0.2, 0.1, -0.1))
+PLACES = ((0.0, 0.0, 0.0), (-0.1, 0.2, 0.1))
 
 
 def test_explicit_paths_fall_where_sampled_ones_do():
     """Bin by bin, with separate antennas and a turned radar."""
-    antennas = link(PLACES, ((0.1, 0.0, 0.0), (0.3, 0.1, -0.1)))
+    antennas = link(PLACES, ((0.0, 0.1, 0.0), (-0.1, 0.3, 0.1)))
     drawn = Sampling(depth=2, samples=5_000, boundary=False)
     truth = deposit_power(occluder(), antennas, GRID, sampling=drawn, seed=3)
     paths = trace_power(occluder(), antennas, sampling=drawn, seed=3)

@@ -33,13 +33,13 @@ def test_every_edge_knows_the_triangles_beside_it():
 
 
 def rate(tilt: float) -> Tensor:
-    """∂map/∂x of a box whose left face lies nearly in the plane of the antenna."""
-    cube = box((0.3, 0.4, 0.2))
-    turned = cube.vertices @ rotation_from_vector(float64([0.0, tilt, 0.0])).T
-    wall = thing(plate(2.0, 2.0, divisions=2), (0.0, 0.0, 2.0), (0.0, 0.1, 0.0))
+    """∂map/∂y of a box whose right face lies nearly in the plane of the antenna."""
+    cube = box((0.2, 0.3, 0.4))
+    turned = cube.vertices @ rotation_from_vector(float64([0.0, 0.0, tilt])).T
+    wall = thing(plate(2.0, 2.0, divisions=2), (2.0, 0.0, 0.0), (0.0, 0.0, 0.1))
     with forward_ad.dual_level():
         shift = forward_ad.make_dual(float64(0.0), float64(1.0))
-        offset = torch.stack([0.15 + shift, 0.05 + 0 * shift, 1.0 + 0 * shift])
+        offset = torch.stack([1.0 + 0 * shift, 0.15 + shift, 0.05 + 0 * shift])
         item = Object(Mesh(turned + offset, cube.faces), RoughDielectric(4.0))
         out = deposit_power(
             Scene({"wall": wall, "box": item}),

@@ -39,11 +39,11 @@ def table(values: Tensor, cosine: float) -> float:
 def test_a_wall_behind_a_board_is_fainter_and_later(angle):
     """By T(θ)², and by twice the extra length of the path, which is once that of the range."""
     board = Slab(2.7, 0.05, thickness=0.0125)
-    direction = float64([math.sin(angle), 0.0, math.cos(angle)])
+    direction = float64([math.cos(angle), math.sin(angle), 0.0])
     wall = thing(plate(0.05, 0.05), (2 * direction).tolist(), material=WHITE)
     bare = Scene({"wall": wall})
     covered = Scene(
-        {"wall": wall, "board": thing(plate(2.0, 2.0), (0.0, 0.0, 1.0), material=board)}
+        {"wall": wall, "board": thing(plate(2.0, 2.0), (1.0, 0.0, 0.0), material=board)}
     )
     behind = Grid(1.9, 0.01, 40)
     maps = [
@@ -74,7 +74,7 @@ def slopes(still: dict[str, Object], item: Object, depth: int, seeds: int) -> li
     found = []
     for seed in range(seeds):
         with forward_ad.dual_level():
-            shift = forward_ad.make_dual(float64([0.0, 0.0, 0.0]), float64([1.0, 0.0, 0.0]))
+            shift = forward_ad.make_dual(float64([0.0, 0.0, 0.0]), float64([0.0, 1.0, 0.0]))
             mesh = Mesh(item.mesh.vertices + shift, item.mesh.faces)
             moved = still | {"target": Object(mesh, item.material, item.pose)}
             out = deposit_power(Scene(moved), link(), grid, sampling=sampling, seed=seed)
@@ -82,13 +82,13 @@ def slopes(still: dict[str, Object], item: Object, depth: int, seeds: int) -> li
     return found
 
 
-WALL = {"wall": thing(plate(4.0, 4.0), (0.0, 0.0, 3.0))}
+WALL = {"wall": thing(plate(4.0, 4.0), (3.0, 0.0, 0.0))}
 
 
 def test_a_board_in_front_adds_little_noise():
     """What passes it is spread as evenly as what meets it; thrown dice would add 30 times more."""
-    target = thing(plate(0.5, 0.4), (0.1, 0.05, 2.0), (0.1, 0.2, 0.0))
-    board = thing(plate(3.0, 3.0), (0.0, 0.0, 1.0), (0.0, 0.1, 0.0), Slab(2.7, thickness=0.0125))
+    target = thing(plate(0.5, 0.4), (2.0, 0.1, 0.05), (0.0, 0.1, 0.2))
+    board = thing(plate(3.0, 3.0), (1.0, 0.0, 0.0), (0.0, 0.0, 0.1), Slab(2.7, thickness=0.0125))
     bare, covered = (
         noise(slopes(still, target, 1, seeds=8)) for still in (WALL, WALL | {"board": board})
     )
@@ -100,7 +100,7 @@ def test_a_board_in_front_adds_little_noise():
 def test_objects_that_are_sheets_all_round_add_bounded_noise():
     """Against white ones: a box of its derivative, what is faint of that of the white one."""
     pane = Slab(2.7, thickness=0.0125, scattering=1.0)
-    at = (0.1, 0.05, 2.0), (0.1, 0.2, 0.0)
+    at = (2.0, 0.1, 0.05), (0.0, 0.1, 0.2)
 
     def ratios(shape: Mesh, depth: int) -> tuple[float, float]:
         hollow, full = (slopes(WALL, thing(shape, *at, m), depth, 16) for m in (pane, WHITE))
@@ -115,7 +115,7 @@ def test_objects_that_are_sheets_all_round_add_bounded_noise():
 def block(index: float, thickness: float, near: float, slope: float, width: float) -> Object:
     """A box across the boresight, without losses."""
     body = RefractingBody(index**2, rms_slope=slope)
-    return thing(box((width, width, thickness)), (0.0, 0.0, near + thickness / 2), material=body)
+    return thing(box((thickness, width, width)), (near + thickness / 2, 0.0, 0.0), material=body)
 
 
 INDEX, THICK, NEAR, FAR = 1.6, 0.2, 0.5, 0.5
@@ -127,9 +127,9 @@ def test_what_has_passed_a_body_is_late_and_spread_from_nearer():
 
     def received(depth: float, *bodies: Object) -> tuple[float, float]:
         """Power and mean length by way of a wall that the receiver sees for itself."""
-        wall = thing(plate(0.2, 0.2), (0.0, 0.0, depth), material=WHITE)
+        wall = thing(plate(0.2, 0.2), (depth, 0.0, 0.0), material=WHITE)
         scene = Scene({"wall": wall} | {f"body {k}": item for k, item in enumerate(bodies)})
-        antennas = link(((0.0, 0.0, 0.0),), ((0.0, 0.3, depth - 0.3),))
+        antennas = link(((0.0, 0.0, 0.0),), ((depth - 0.3, 0.0, 0.3),))
         paths = trace_power(
             scene,
             antennas,
@@ -138,9 +138,9 @@ def test_what_has_passed_a_body_is_late_and_spread_from_nearer():
             ),
             seed=1,
         )
-        on = (paths.last[:, 2] - depth).abs() < 1e-6
+        on = (paths.last[:, 0] - depth).abs() < 1e-6
         if bodies:
-            on &= (paths.first[:, 2] - NEAR).abs() < 1e-6
+            on &= (paths.first[:, 0] - NEAR).abs() < 1e-6
         power = paths.power[on]
         return float(power.sum()), float((power * 2 * paths.range[on]).sum() / power.sum())
 
@@ -159,7 +159,7 @@ def test_a_wall_is_seen_through_a_body_and_back():
 
     def echo(depth: float, **bodies: Object) -> tuple[Tensor, Tensor]:
         """Power of every seed, and its mean distance."""
-        wall = thing(plate(0.3, 0.3), (0.0, 0.0, depth), material=WHITE)
+        wall = thing(plate(0.3, 0.3), (depth, 0.0, 0.0), material=WHITE)
         scene, grid = Scene({"wall": wall, **bodies}), Grid(depth - 0.03, 0.01, 30)
         maps = [
             deposit_power(
@@ -187,17 +187,17 @@ def test_a_wall_is_seen_through_a_body_and_back():
 
 
 def leaving(index: float) -> Tensor:
-    """What enters a box by its front and leaves it by the face at its right."""
+    """What enters a box by its front and leaves it by the face at its left."""
     body = RefractingBody(index**2, rms_slope=0.05)
-    scene = Scene({"body": thing(box(0.4), (0.0, 0.0, 1.0), material=body)})
-    antennas = link(((-1.0, 0.0, 0.0),), ((0.6, 0.0, 1.9),))
+    scene = Scene({"body": thing(box(0.4), (1.0, 0.0, 0.0), material=body)})
+    antennas = link(((0.0, -1.0, 0.0),), ((1.9, 0.6, 0.0),))
     paths = trace_power(
         scene,
         antennas,
         sampling=Sampling(depth=2, samples=400_000, boundary_samples=0, boundary=False),
         seed=0,
     )
-    rows = ((paths.first[:, 2] - 0.8).abs() < 1e-6) & ((paths.last[:, 0] - 0.2).abs() < 1e-6)
+    rows = ((paths.first[:, 0] - 0.8).abs() < 1e-6) & ((paths.last[:, 1] - 0.2).abs() < 1e-6)
     return paths.power[rows]
 
 
@@ -211,9 +211,9 @@ def test_beyond_the_critical_angle_nothing_leaves():
 def test_refraction_shifts_a_ray_as_snell_says():
     """Where paths meet the wall, against Snell's law from where they entered."""
     thickness, near, far = 0.2, 0.8, 0.4
-    wall = thing(plate(2.0, 1.0), (0.7, 0.0, near + thickness + far), material=WHITE)
+    wall = thing(plate(2.0, 1.0), (near + thickness + far, 0.7, 0.0), material=WHITE)
     scene = Scene({"body": block(INDEX, thickness, near, slope=0.03, width=3.0), "wall": wall})
-    rx = float64([0.7, 0.0, near + thickness + 0.05])
+    rx = float64([near + thickness + 0.05, 0.7, 0.0])
     antennas = link(((0.0, 0.0, 0.0),), rx[None])
     paths = trace_power(
         scene,
@@ -221,21 +221,21 @@ def test_refraction_shifts_a_ray_as_snell_says():
         sampling=Sampling(depth=3, samples=400_000, boundary_samples=0, boundary=False),
         seed=0,
     )
-    on = (paths.first[:, 2] - near).abs() < 1e-6
-    on &= (paths.last[:, 2] - near - thickness - far).abs() < 1e-6
+    on = (paths.first[:, 0] - near).abs() < 1e-6
+    on &= (paths.last[:, 0] - near - thickness - far).abs() < 1e-6
     first, last = paths.first[on], paths.last[on]
     # Without what the receiver's place favours.
     to_rx = rx - last
-    weight = paths.power[on] * to_rx.square().sum(1) ** 1.5 / -to_rx[:, 2]
+    weight = paths.power[on] * to_rx.square().sum(1) ** 1.5 / -to_rx[:, 0]
     inwards = torch.nn.functional.normalize(first, dim=1)
-    within = inwards[:, :2] / INDEX
+    within = inwards[:, 1:] / INDEX
     within = within / (1 - within.square().sum(1, keepdim=True)).sqrt()
-    bent = first[:, :2] + thickness * within + far * inwards[:, :2] / inwards[:, 2:]
-    straight = first[:, :2] + (thickness + far) * inwards[:, :2] / inwards[:, 2:]
-    oblique = (inwards[:, 2] > 0.75) & (inwards[:, 2] < 0.9)
-    side = torch.nn.functional.normalize(first[:, :2], dim=1)
+    bent = first[:, 1:] + thickness * within + far * inwards[:, 1:] / inwards[:, :1]
+    straight = first[:, 1:] + (thickness + far) * inwards[:, 1:] / inwards[:, :1]
+    oblique = (inwards[:, 0] > 0.75) & (inwards[:, 0] < 0.9)
+    side = torch.nn.functional.normalize(first[:, 1:], dim=1)
     gaps = [
-        float((((last[:, :2] - p) * side).sum(1) * weight)[oblique].sum() / weight[oblique].sum())
+        float((((last[:, 1:] - p) * side).sum(1) * weight)[oblique].sum() / weight[oblique].sum())
         for p in (bent, straight)
     ]
     assert abs(gaps[0]) < 0.005
@@ -249,8 +249,8 @@ from invertwin.scene import RoughConductor, Scene, Slab, plate
 from scenes import link, thing
 
 white = RoughConductor(scattering=1.0)
-wall = thing(plate(0.5, 0.5), (0.0, 0.0, 2.0), material=white)
-board = thing(plate(0.6, 0.6), (0.0, 0.0, 1.0), material=Slab(2.7, 0.05, thickness=0.0125))
+wall = thing(plate(0.5, 0.5), (2.0, 0.0, 0.0), material=white)
+board = thing(plate(0.6, 0.6), (1.0, 0.0, 0.0), material=Slab(2.7, 0.05, thickness=0.0125))
 found = deposit_power(
     Scene({"wall": wall, "board": board}), link(), Grid(1.8, 0.05, 12),  # without the board
     sampling=Sampling(depth=2, samples=100_000, boundary_samples=0), seed=0, scheme=sys.argv[1],

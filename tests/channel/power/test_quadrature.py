@@ -24,13 +24,13 @@ from scenes import WAVELENGTH, float64, link, relative
 RANGES, COSINES = Axis(0.5, 0.15, 20), Axis(-1.0, 0.2, 11)
 GRID = Grid(0.5, 0.15, 20, u_start=-1.0, u_step=0.2, u_count=11)
 WHITE, GLOSSY = RoughConductor(scattering=1.0), RoughDielectric(4.0, 0.0, 0.6, 0.9)
-TX, RX = (-0.2, 0.1, 0.0), (0.25, 0.0, 0.05)
+TX, RX = (0.0, -0.2, 0.1), (0.05, 0.25, 0.0)
 # Name: sides, centre, rotation vector, material.
 TWO = {
-    "wall": ((1.2, 1.0), (0.0, 0.0, 1.8), (0.0, 0.2, 0.0), GLOSSY),
-    "side": ((0.9, 0.8), (-0.9, 0.1, 1.0), (0.0, -1.2, 0.1), WHITE),
+    "wall": ((1.2, 1.0), (1.8, 0.0, 0.0), (0.0, 0.0, 0.2), GLOSSY),
+    "side": ((0.9, 0.8), (1.0, -0.9, 0.1), (0.1, 0.0, -1.2), WHITE),
 }
-THREE = TWO | {"screen": ((0.3, 0.4), (-0.15, 0.05, 1.05), (0.2, 0.5, 0.3), WHITE)}
+THREE = TWO | {"screen": ((0.3, 0.4), (1.05, -0.15, 0.05), (0.3, 0.2, 0.5), WHITE)}
 
 
 def both(layout: dict[str, Any]) -> tuple[Scene, list[Plate]]:
@@ -42,7 +42,7 @@ def both(layout: dict[str, Any]) -> tuple[Scene, list[Plate]]:
         axes = rotation.numpy()
         rough = {"permittivity": 4.0, "diffuse": 0.6, "width": 0.9} if material is GLOSSY else {}
         plates.append(
-            Plate(np.array(centre), axes[:, 0] * sides[0], axes[:, 1] * sides[1], **rough)
+            Plate(np.array(centre), axes[:, 1] * sides[0], axes[:, 2] * sides[1], **rough)
         )
     return Scene(objects), plates
 

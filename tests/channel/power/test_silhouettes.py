@@ -69,7 +69,7 @@ def ridges(*tops: tuple[float, float]) -> Mesh:
 
 def strip(line: list[tuple[float, float]]) -> Mesh:
     """A strip 0.4 m wide over a line of (depth, height)."""
-    vertices = float64([(x, height, depth) for depth, height in line for x in (-0.2, 0.2)])
+    vertices = float64([(depth, y, height) for depth, height in line for y in (-0.2, 0.2)])
     faces = [
         f
         for k in range(0, len(line) * 2 - 2, 2)
@@ -81,10 +81,10 @@ def strip(line: list[tuple[float, float]]) -> Mesh:
 @pytest.mark.parametrize("depths", [(0.0, 0.1), (0.1, 0.0)], ids=["hidden behind", "hidden before"])
 def test_of_two_ridges_a_micrometre_apart_one_casts_the_shadow(depths):
     """Thirty metres away; both would count where rays that pass above one miss the other."""
-    wall = thing(plate(2.0, 2.0), (0.0, 0.0, 32.0))
+    wall = thing(plate(2.0, 2.0), (32.0, 0.0, 0.0))
     lower, higher = ((depth, height) for depth, height in zip(depths, (0.0, 1e-6), strict=True))
     both, one = (
-        thing(ridges(*sorted(tops)), (0.0, 0.0, 30.0)) for tops in ([lower, higher], [higher])
+        thing(ridges(*sorted(tops)), (30.0, 0.0, 0.0)) for tops in ([lower, higher], [higher])
     )
     behind, sampling = Grid(31.5, 0.1, 20), Sampling(depth=1, samples=4, boundary_samples=20_000)
     found, truth = (growth([body], wall, behind, sampling, 1).sum() for body in (both, one))
@@ -94,10 +94,10 @@ def test_of_two_ridges_a_micrometre_apart_one_casts_the_shadow(depths):
 
 def test_a_shadow_falls_on_what_its_own_mesh_rises_to_behind_the_edge():
     """A ridge before a slope, as one mesh and cut where neither antenna sees it."""
-    wall = thing(plate(2.0, 2.0), (0.0, 0.0, 5.0))
+    wall = thing(plate(2.0, 2.0), (5.0, 0.0, 0.0))
     line = [(0.0, -0.2), (0.0, 0.0), (0.05, -0.1), (0.3, 0.1), (0.3, -0.2)]
     whole, first, last = (
-        thing(strip(part), (0.0, 0.0, 3.0)) for part in (line, line[:3], line[2:])
+        thing(strip(part), (3.0, 0.0, 0.0)) for part in (line, line[:3], line[2:])
     )
     slope, sampling = Grid(3.1, 0.02, 10), Sampling(depth=1, samples=4, boundary_samples=20_000)
     found, truth = (
@@ -109,8 +109,8 @@ def test_a_shadow_falls_on_what_its_own_mesh_rises_to_behind_the_edge():
 
 def test_a_large_object_does_not_drown_a_small_one():
     """A ball of 5 cm at 200 m, before 500 m of ground."""
-    ground = thing(plate(100.0, 500.0), (0.0, -1.0, 250.0), (-math.pi / 2, 0.0, 0.0))
-    ball = thing(sphere(0.05, subdivisions=3), (0.0, -0.5, 200.0))
+    ground = thing(plate(100.0, 500.0), (250.0, 0.0, -1.0), (0.0, -math.pi / 2, 0.0))
+    ball = thing(sphere(0.05, subdivisions=3), (200.0, 0.0, -0.5))
     grid = Grid(150.0, 2.0, 180)
     sampling = Sampling(depth=1, samples=50_000, boundary_samples=50_000)
     derivatives = [growth([ball], ground, grid, sampling, seed) for seed in range(8)]

@@ -7,14 +7,14 @@ from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Scene, box
 from scenes import WAVELENGTH, float64, link, thing
 
-WIDE, SMALL = box((4.0, 0.1, 0.2)), box((0.1, 0.1, 0.1))
+WIDE, SMALL = box((0.2, 4.0, 0.1)), box((0.1, 0.1, 0.1))
 
 
-def apart(count: int, tx: object = ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))):
+def apart(count: int, tx: object = ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))):
     objects, owners = {}, []
     for number in range(count):
-        objects[f"a{number}"] = thing(WIDE, (0.1 * number, 0, 2))
-        objects[f"b{number}"] = thing(SMALL, (0, 0.2, 1 + 0.3 * number))
+        objects[f"a{number}"] = thing(WIDE, (2, 0.1 * number, 0))
+        objects[f"b{number}"] = thing(SMALL, (1 + 0.3 * number, 0, 0.2))
         owners += [number, number]
     given, around = flatten(Scene(objects), WAVELENGTH), link(tx)
     return given, around, *arrange_scenes(given, around, torch.tensor(owners))
@@ -44,7 +44,7 @@ def test_scenes_and_antennas_move_as_a_whole():
 
 
 def test_derivatives_pass():
-    tx = float64([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]).requires_grad_()
+    tx = float64([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).requires_grad_()
     _, _, _, links = apart(3, tx)
     links.tx.sum().backward()
     assert tx.grad is not None

@@ -16,7 +16,7 @@ RANGES = Grid(1.0, 0.05, 80)
 
 
 def moved_box(shift: Tensor) -> Mesh:
-    mesh = box((0.4, 0.5, 0.3))
+    mesh = box((0.3, 0.4, 0.5))
     return Mesh(mesh.vertices + shift, mesh.faces)
 
 
@@ -156,9 +156,9 @@ def test_maps_and_derivatives_are_those_of_the_tree(divisions, monkeypatch):
     """A box before a wall: 14 triangles, and 30 where the wall is divided."""
 
     def result() -> tuple[Tensor, Tensor]:
-        wall = thing(plate(2.0, 2.0, divisions=divisions), (0.0, 0.0, 3.0))
+        wall = thing(plate(2.0, 2.0, divisions=divisions), (3.0, 0.0, 0.0))
         shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-        front = thing(moved_box(shift), (0.1, 0.0, 2.0))
+        front = thing(moved_box(shift), (2.0, 0.1, 0.0))
         scene = Scene({"wall": wall, "front": front})
         sampling = Sampling(depth=2, samples=100_000, boundary_samples=50_000)
         out = deposit_power(scene, link(), RANGES, sampling=sampling, seed=1)

@@ -17,10 +17,10 @@ from invertwin.scene import Mesh, Object, RoughConductor, RoughDielectric, Scene
 from scenes import WAVELENGTH, float64, link, thing
 
 METAL, PAINT = RoughConductor(scattering=1.0), RoughDielectric(4.0)
-FLAT = (math.pi / 2, 0.0, 0.0)  # a plate that lies
+FLAT = (0.0, math.pi / 2, 0.0)  # a plate that lies
 
 
-def told(*, antennas: Any = ((0.0, 1.0, 0.0),), moving: Any = "", **objects: Any) -> bool:
+def told(*, antennas: Any = ((0.0, 0.0, 1.0),), moving: Any = "", **objects: Any) -> bool:
     """Whether a scene gives a warning that names the first two objects."""
     if moving:
         item = objects[moving]
@@ -37,11 +37,11 @@ def told(*, antennas: Any = ((0.0, 1.0, 0.0),), moving: Any = "", **objects: Any
 
 
 def floor(divisions: int = 1) -> Object:
-    return thing(plate(4.0, 4.0, divisions=divisions), (0.0, 0.0, 2.0), FLAT, PAINT)
+    return thing(plate(4.0, 4.0, divisions=divisions), (2.0, 0.0, 0.0), FLAT, PAINT)
 
 
 def rug(height: float, divisions: int = 1, at: tuple[float, float] = (0.3, 2.1)) -> Object:
-    return thing(plate(0.6, 0.4, divisions=divisions), (at[0], height, at[1]), FLAT, METAL)
+    return thing(plate(0.6, 0.4, divisions=divisions), (at[1], at[0], height), FLAT, METAL)
 
 
 @pytest.mark.parametrize("divisions", [(1, 1), (12, 1), (1, 12), (30, 25)])
@@ -54,13 +54,13 @@ def test_a_rug_in_the_plane_of_the_floor_is_told(divisions):
 
 
 def test_whatever_the_plane_and_the_distance():
-    turn = (0.4, 0.3, 0.2)
+    turn = (0.2, 0.4, 0.3)
     for scale in (1.0, 300.0):
-        wall = thing(plate(2 * scale, 2 * scale), (0.0, 0.0, 2 * scale), turn, PAINT)
-        sign = thing(plate(0.5 * scale, 0.3 * scale), (0.0, 0.0, 2 * scale), turn, METAL)
+        wall = thing(plate(2 * scale, 2 * scale), (2 * scale, 0.0, 0.0), turn, PAINT)
+        sign = thing(plate(0.5 * scale, 0.3 * scale), (2 * scale, 0.0, 0.0), turn, METAL)
         assert told(wall=wall, sign=sign)
         pose = sign.transform.clone()
-        pose[:3, 3] -= 1e-4 * scale * pose[:3, 2]
+        pose[:3, 3] -= 1e-4 * scale * pose[:3, 0]
         assert not told(wall=wall, sign=Object(sign.mesh, METAL, pose))
 
 
@@ -74,14 +74,14 @@ def test_what_makes_no_difference_is_not_told():
 
 def test_what_is_hidden_is_not_told():
     """The underside of a box on the floor, two boxes side by side, a rug under a box."""
-    chest = thing(box((0.5, 0.4, 0.5)), (0.0, 0.2, 2.0), material=METAL)
+    chest = thing(box((0.5, 0.5, 0.4)), (2.0, 0.0, 0.2), material=METAL)
     assert not told(floor=floor(), chest=chest, moving="chest")
     # From below a ray meets either.
-    assert told(floor=floor(), chest=chest, antennas=[(0.0, -1.0, 0.0)])
-    next_one = thing(box((0.5, 0.4, 0.5)), (0.5, 0.2, 2.0), material=PAINT)
+    assert told(floor=floor(), chest=chest, antennas=[(0.0, 0.0, -1.0)])
+    next_one = thing(box((0.5, 0.5, 0.4)), (2.0, 0.5, 0.2), material=PAINT)
     assert not told(chest=chest, next_one=next_one, moving="chest")
     assert not told(floor=floor(), rug=rug(0.0, at=(0.0, 2.0)), chest=thing(
-        box((0.9, 0.4, 0.9)), (0.0, 0.21, 2.0), material=METAL
+        box((0.9, 0.9, 0.4)), (2.0, 0.0, 0.21), material=METAL
     ))  # fmt: skip
 
 
@@ -94,9 +94,9 @@ def test_only_what_has_moved_is_looked_at_again(monkeypatch):
         return true(rays, pairs)
 
     monkeypatch.setattr(coplanar, "_find_visible_pairs", spy)
-    items = {"floor": floor(), "rug": rug(0.0), "box": thing(box(0.2), (-1.0, 0.5, 2.0))}
+    items = {"floor": floor(), "rug": rug(0.0), "box": thing(box(0.2), (2.0, -1.0, 0.5))}
     lifted = Object(items["rug"].mesh, METAL, rug(0.01).pose)
-    moved = Object(items["box"].mesh, PAINT, rigid(translation=(-1.0, 0.6, 2.0)))
+    moved = Object(items["box"].mesh, PAINT, rigid(translation=(2.0, -1.0, 0.6)))
     assert told(**items)
     assert told(**items)
     assert told(**(items | {"box": moved}))
@@ -107,8 +107,8 @@ def test_only_what_has_moved_is_looked_at_again(monkeypatch):
 
 
 def test_any_antenna_that_sees_it_counts():
-    for places, seen in (([(0.0, 1.0, 0.0)], False), ([(0.0, 1.0, 0.0), (0.0, 1.0, 1.0)], True)):
-        screen = thing(plate(6.0, 6.0), (0.0, 0.0, 0.5))
+    for places, seen in (([(0.0, 0.0, 1.0)], False), ([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)], True)):
+        screen = thing(plate(6.0, 6.0), (0.5, 0.0, 0.0))
         pair = {"floor": floor(), "rug": rug(0.0, at=(0.0, 2.0))}
         assert told(**pair, screen=screen, antennas=places) == seen
 
@@ -116,7 +116,7 @@ def test_any_antenna_that_sees_it_counts():
 def test_triangles_that_cross_like_a_star_overlap():
     def triangle(material: RoughConductor | RoughDielectric, turned: float) -> Object:
         angles = float64([0.0, 2.0, 4.0]) * math.pi / 3 + turned
-        corners = torch.stack([angles.cos(), angles.sin(), torch.full((3,), 2.0)], 1).double()
+        corners = torch.stack([torch.full((3,), 2.0), angles.cos(), angles.sin()], 1).double()
         return Object(Mesh(corners, torch.tensor([[0, 1, 2]])), material)
 
     assert told(one=triangle(PAINT, 0.0), other=triangle(METAL, math.pi / 3))
@@ -126,12 +126,12 @@ def test_scenes_of_a_batch_are_told_by_their_own_antennas():
     from invertwin.channel import Grid, Sampling
     from invertwin.channel.power.deposit import deposit_batch
 
-    shift = rigid(translation=(0.1, 0.0, 0.0))
+    shift = rigid(translation=(0.0, 0.1, 0.0))
     good, bad = (Scene({"floor": floor(), "rug": rug(h)}) for h in (0.01, 0.0))
     moved = Scene(
         {n: Object(o.mesh, o.material, shift @ o.transform) for n, o in good.objects.items()}
     )
     grid, sampling = Grid(0.5, 0.1, 40), Sampling(depth=1, samples=1000)
-    deposit_batch([good, moved], link(((0.0, 1.0, 0.0),)), grid, sampling=sampling, seed=1)
+    deposit_batch([good, moved], link(((0.0, 0.0, 1.0),)), grid, sampling=sampling, seed=1)
     with pytest.warns(PhysicsWarning, match="floor of scene 1 and rug of scene 1 lie in one plane"):
-        deposit_batch([good, bad], link(((0.0, 1.0, 0.0),)), grid, sampling=sampling, seed=1)
+        deposit_batch([good, bad], link(((0.0, 0.0, 1.0),)), grid, sampling=sampling, seed=1)

@@ -22,17 +22,17 @@ from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, ri
 from scenes import GRID, WAVELENGTH, float64, link, thing
 
 OBJECTS = {
-    "wall": thing(plate(2.0, 2.0), (0.0, 0.0, 2.4)),
-    "screen": thing(plate(0.5, 0.4), (0.1, 0.05, 1.5), (0.1, 0.2, 0.0)),
-    "aside": thing(plate(2.0, 3.0), (1.4, 0.0, 2.0), (0.0, 1.3, 0.0)),
-    "before": thing(box(0.2), (-0.1, 0.1, 0.9), (0.3, 0.2, 0.1)),
+    "wall": thing(plate(2.0, 2.0), (2.4, 0.0, 0.0)),
+    "screen": thing(plate(0.5, 0.4), (1.5, 0.1, 0.05), (0.0, 0.1, 0.2)),
+    "aside": thing(plate(2.0, 3.0), (2.0, 1.4, 0.0), (0.0, 0.0, 1.3)),
+    "before": thing(box(0.2), (0.9, -0.1, 0.1), (0.1, 0.3, 0.2)),
 }
 
 
 def slope(moved: str, depth: int, seed: int) -> Tensor:
     """Derivative of a map while one object moves obliquely and all others are at rest."""
     with forward_ad.dual_level():
-        shift = forward_ad.make_dual(float64([0.0, 0.0, 0.0]), float64([1.0, 0.5, 0.3]))
+        shift = forward_ad.make_dual(float64([0.0, 0.0, 0.0]), float64([0.3, 1.0, 0.5]))
         item = OBJECTS[moved]
         mesh = Mesh(item.mesh.vertices + shift, item.mesh.faces)
         scene = Scene(OBJECTS | {moved: Object(mesh, item.material, item.pose)})
@@ -69,12 +69,12 @@ def drawn(scene: Scene, samples: int = 4000) -> tuple[Tensor, Tensor]:
 
 def test_samples_go_where_something_moves():
     """Outlines of a wall and of a ball at rest take none of what a small ball in motion needs."""
-    place = float64([0.3, 0.0, 2.0]).requires_grad_()
+    place = float64([2.0, 0.3, 0.0]).requires_grad_()
     matt = RoughDielectric(4.0)
     scene = Scene(
         {
-            "wall": thing(plate(4.0, 4.0), (0.0, 0.0, 3.0)),
-            "still": thing(sphere(0.3, 3), (-0.6, 0.0, 2.0)),
+            "wall": thing(plate(4.0, 4.0), (3.0, 0.0, 0.0)),
+            "still": thing(sphere(0.3, 3), (2.0, -0.6, 0.0)),
             "moving": Object(sphere(0.05, 3), matt, rigid(translation=place)),
         }
     )
@@ -84,12 +84,12 @@ def test_samples_go_where_something_moves():
 
 
 def test_a_thing_at_rest_before_one_that_moves_is_sampled():
-    place = float64([0.0, 0.0, 2.0]).requires_grad_()
+    place = float64([2.0, 0.0, 0.0]).requires_grad_()
     scene = Scene(
         {
             "moving": Object(plate(2.0, 2.0), RoughDielectric(4.0), rigid(translation=place)),
-            "still": thing(plate(0.3, 0.3), (0.1, 0.0, 1.0)),
-            "behind": thing(plate(6.0, 6.0), (0.0, 0.0, 4.0)),
+            "still": thing(plate(0.3, 0.3), (1.0, 0.1, 0.0)),
+            "behind": thing(plate(6.0, 6.0), (4.0, 0.0, 0.0)),
         }
     )
     edges, shadows = drawn(scene)
@@ -100,12 +100,12 @@ def test_a_thing_at_rest_before_one_that_moves_is_sampled():
 
 
 def reach(offset: Callable[[float], list[float]]) -> list[bool]:
-    """Whether an edge along y at a distance of one is asked for a ball in some places."""
+    """Whether an edge along z at a distance of one is asked for a ball in some places."""
     found = []
     for at in (0.0, 0.05, 0.15, 0.4):
         place = float64(offset(at)).requires_grad_()
         ball = Object(sphere(0.1, 2), RoughDielectric(4.0), rigid(translation=place))
-        scene = Scene({"edge": thing(plate(0.5, 0.5), (0.25, 0.0, 1.0)), "ball": ball})
+        scene = Scene({"edge": thing(plate(0.5, 0.5), (1.0, 0.25, 0.0)), "ball": ball})
         with tracing():
             rays = RayScene(flatten(scene, WAVELENGTH), link(), differentiate_antennas=False)
             assert rays.differentiated_objects is not None
@@ -115,7 +115,7 @@ def reach(offset: Callable[[float], list[float]]) -> list[bool]:
                 rays.differentiated_objects.may_receive_shadow(edge, mi.Point3f(0.0), y0, y1)
             ).bool()
             ends = rays.geometry.vertices.detach()[rays.topology.edges[:5]]
-            upright = (ends[..., 0].abs() < 1e-9).all(1)
+            upright = (ends[..., 1].abs() < 1e-9).all(1)
             assert int(upright.sum()) == 1
             found.append(bool(asked[upright]))
     return found
@@ -123,9 +123,9 @@ def reach(offset: Callable[[float], list[float]]) -> list[bool]:
 
 def test_a_ball_is_asked_for_where_a_shadow_may_reach_it():
     """Beside the sector of directions through an edge, beyond its end, and before it."""
-    assert reach(lambda at: [at, 0.0, 2.0]) == [True, True, False, False]
-    assert reach(lambda at: [0.0, 0.5 + at, 2.0]) == [True, True, False, False]
-    assert reach(lambda at: [0.0, 0.0, 1.0 - at]) == [True, True, False, False]
+    assert reach(lambda at: [2.0, at, 0.0]) == [True, True, False, False]
+    assert reach(lambda at: [2.0, 0.0, 0.5 + at]) == [True, True, False, False]
+    assert reach(lambda at: [1.0 - at, 0.0, 0.0]) == [True, True, False, False]
 
 
 @pytest.mark.parametrize("moves", [False, True])
@@ -158,17 +158,17 @@ def test_a_scene_of_which_nothing_or_all_moves_asks_nobody():
             assert rays.differentiated_objects is None
 
 
-@pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (0.5, 0.0, 2.05)])
+@pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (2.05, 0.5, 0.0)])
 def test_lines_towards_what_moves_are_as_likely_as_said(at):
     """From afar, and from within one of the spheres."""
     matt, count = RoughDielectric(4.0), 4_000_000
     balls = {
         f"ball {k}": Object(sphere(size, 2), matt, rigid(translation=place.requires_grad_()))
         for k, (size, place) in enumerate(
-            [(0.3, float64([0.5, 0.0, 2.0])), (0.5, float64([-0.2, 0.1, 1.5]))]
+            [(0.3, float64([2.0, 0.5, 0.0])), (0.5, float64([1.5, -0.2, 0.1]))]
         )
     }
-    scene = Scene({"wall": thing(plate(4.0, 4.0), (0.0, 0.0, 3.0)), **balls})
+    scene = Scene({"wall": thing(plate(4.0, 4.0), (3.0, 0.0, 0.0)), **balls})
     with tracing():
         movers = RayScene(
             flatten(scene, WAVELENGTH), link(), differentiate_antennas=False
@@ -196,11 +196,11 @@ def test_shadows_of_things_at_rest_on_what_moves_are_found_more_often(monkeypatc
     """A small ball behind a screen's edge, which only a wall shows: fewer samples are void."""
 
     def kept() -> int:
-        place = float64([0.25, 0.0, 1.35]).requires_grad_()
+        place = float64([1.35, 0.25, 0.0]).requires_grad_()
         scene = Scene(
             {
-                "wall": thing(plate(2.0, 1.2), (-1.0, 0.0, 1.4), (0.0, -1.57, 0.0)),
-                "screen": thing(plate(1.0, 1.2), (0.3, 0.0, 1.0)),
+                "wall": thing(plate(2.0, 1.2), (1.4, -1.0, 0.0), (0.0, 0.0, -1.57)),
+                "screen": thing(plate(1.0, 1.2), (1.0, 0.3, 0.0)),
                 "ball": Object(sphere(0.05, 2), RoughDielectric(4.0), rigid(translation=place)),
             }
         )
@@ -221,9 +221,9 @@ def test_shadows_of_things_at_rest_on_what_moves_are_found_more_often(monkeypatc
 
 def test_directions_to_something_small_and_far_are_as_likely_as_said():
     """A ball of 5 cm at 200 m, whose cap is lower than a float32 near one resolves."""
-    place = float64([0.0, 0.0, 200.0]).requires_grad_()
+    place = float64([200.0, 0.0, 0.0]).requires_grad_()
     ball = Object(sphere(0.05, 2), RoughDielectric(4.0), rigid(translation=place))
-    scene = Scene({"wall": thing(plate(4.0, 4.0), (0.0, 0.0, 3.0)), "ball": ball})
+    scene = Scene({"wall": thing(plate(4.0, 4.0), (3.0, 0.0, 0.0)), "ball": ball})
     with tracing():
         movers = RayScene(
             flatten(scene, WAVELENGTH), link(), differentiate_antennas=False

@@ -15,7 +15,7 @@ from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Mesh, Object, Scene, box, plate, rigid, sphere
 from scenes import WAVELENGTH, link, thing
 
-FLOOR = thing(plate(4.0, 4.0), turn=(math.pi / 2, 0, 0))
+FLOOR = thing(plate(4.0, 4.0), turn=(0, math.pi / 2, 0))
 
 
 def met(still: Object, moving: Object, *, deforming: bool = False) -> IntersectionCurves | None:
@@ -36,17 +36,17 @@ def length(found: IntersectionCurves, touching: bool = False) -> float:
 
 @pytest.mark.parametrize("divisions", [3, 5])
 def test_balls_meet_in_a_circle(divisions):
-    balls = [thing(sphere(0.25, divisions), (x, 0, 1.5), (0.1, x, 0)) for x in (-0.12, 0.12)]
+    balls = [thing(sphere(0.25, divisions), (1.5, y, 0), (0, 0.1, y)) for y in (-0.12, 0.12)]
     found = met(*balls)
     assert found is not None
     circle = 2 * math.pi * math.sqrt(0.25**2 - 0.12**2)
     assert length(found) == pytest.approx(circle, rel=0.2 / 4 ** (divisions - 2))
-    assert float((found.start[:, 0]).abs().max()) < 0.01
+    assert float((found.start[:, 1]).abs().max()) < 0.01
 
 
 @pytest.mark.parametrize("depth", [0.1, 1e-3, 1e-6, 1e-8])
 def test_a_box_sunk_into_the_floor_meets_it_around_itself(depth):
-    found = met(FLOOR, thing(box([0.5, 0.4, 0.3], 2), (0, 0.2 - depth, 0), (0, 0.5, 0)))
+    found = met(FLOOR, thing(box([0.3, 0.5, 0.4], 2), (0, 0, 0.2 - depth), (0, 0, 0.5)))
     assert found is not None
     assert length(found) == pytest.approx(1.6, rel=1e-9)
     assert not found.touching.any()
@@ -54,7 +54,7 @@ def test_a_box_sunk_into_the_floor_meets_it_around_itself(depth):
 
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_a_box_that_stands_on_the_floor_touches_it(up):
-    found = met(FLOOR, thing(box([0.5, 0.4, 0.3], 2), (0, 0.2 * up, 0), (0, 0.5, 0)))
+    found = met(FLOOR, thing(box([0.3, 0.5, 0.4], 2), (0, 0, 0.2 * up), (0, 0, 0.5)))
     assert found is not None
     assert found.has_close_surfaces
     assert found.touching.all()
@@ -62,16 +62,16 @@ def test_a_box_that_stands_on_the_floor_touches_it(up):
 
 
 def test_a_box_above_the_floor_meets_nothing():
-    found = met(FLOOR, thing(box([0.5, 0.4, 0.3], 2), (0, 0.2 + 1e-8, 0), (0, 0.5, 0)))
+    found = met(FLOOR, thing(box([0.3, 0.5, 0.4], 2), (0, 0, 0.2 + 1e-8), (0, 0, 0.5)))
     assert found is not None
     assert found.has_close_surfaces
     assert len(found.first) == 0
-    assert met(FLOOR, thing(box([0.5, 0.4, 0.3]), (0, 0.21, 0))) is None
+    assert met(FLOOR, thing(box([0.3, 0.5, 0.4]), (0, 0, 0.21))) is None
 
 
 def test_an_edge_that_lies_in_a_plane_crosses_it_once():
-    wall, fin = thing(plate(0.9, 0.7), (0, 0.02, 1.5)), thing(plate(0.6, 0.5, 2), (0, 0, 1.5))
-    turned = Object(fin.mesh, fin.material, thing(plate(1, 1), (0, 0, 1.5), (0, 1.2, 0)).pose)
+    wall, fin = thing(plate(0.9, 0.7), (1.5, 0, 0.02)), thing(plate(0.6, 0.5, 2), (1.5, 0, 0))
+    turned = Object(fin.mesh, fin.material, thing(plate(1, 1), (1.5, 0, 0), (0, 0, 1.2)).pose)
     found = met(wall, turned)
     assert found is not None
     assert length(found) == pytest.approx(0.5, rel=1e-9)
@@ -79,19 +79,19 @@ def test_an_edge_that_lies_in_a_plane_crosses_it_once():
 
 def test_a_mesh_meets_itself_only_where_its_shape_changes():
     parts = [
-        thing(plate(0.6, 0.5, 3), (0, 0, 1.5), (0, turn, 0.2)).vertices for turn in (0.9, -0.6)
+        thing(plate(0.6, 0.5, 3), (1.5, 0, 0), (0.2, 0, turn)).vertices for turn in (0.9, -0.6)
     ]
     faces = plate(0.6, 0.5, 3).faces
     crossed = Mesh(torch.cat(parts), torch.cat([faces, faces + len(parts[0])]))
     found = met(FLOOR, thing(crossed), deforming=True)
     assert found is not None
     assert length(found) > 0.4
-    away = Object(crossed, FLOOR.material, rigid(translation=[0.0, 3.0, 0.0]))
+    away = Object(crossed, FLOOR.material, rigid(translation=[0.0, 0.0, 3.0]))
     assert met(FLOOR, away) is None
 
 
 def test_nothing_is_looked_for_where_nothing_moves():
-    balls = Scene({name: thing(sphere(0.25, 2), (x, 0, 1.5)) for name, x in (("a", 0), ("b", 0.1))})
+    balls = Scene({name: thing(sphere(0.25, 2), (1.5, y, 0)) for name, y in (("a", 0), ("b", 0.1))})
     assert find_intersection_curves(RayScene(flatten(balls, WAVELENGTH), link())) is None
 
 

@@ -56,13 +56,13 @@ def test_a_shared_material_gets_the_derivatives_of_all_its_objects():
 
 
 def test_what_moves_is_said_of_each_object():
-    turn = rigid(translation=(0.0, 0.0, 1.0)).requires_grad_()
+    turn = rigid(translation=(1.0, 0.0, 0.0)).requires_grad_()
     shape = Mesh(box(0.1).vertices.clone().requires_grad_(), box(0.1).faces)
     matt = RoughDielectric(4.0)
     found = flatten(
         Scene(
             {
-                "still": thing(box(0.2), (1.0, 0.0, 0.0)),
+                "still": thing(box(0.2), (0.0, 1.0, 0.0)),
                 "placed": Object(box(0.3), matt, turn),
                 "shaped": Object(shape, matt),
                 "bare": Object(box(0.1), matt),

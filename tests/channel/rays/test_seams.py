@@ -14,7 +14,7 @@ from invertwin.scene.mesh import concatenate_meshes
 from invertwin.scene.mesh_topology import WELD_TOLERANCE, separate_groups, weld_faces, weld_vertices
 
 HALF = math.pi / 2
-TURNS = ((0, 0, 0), (0, 2 * HALF, 0), (0, HALF, 0), (0, -HALF, 0), (HALF, 0, 0), (-HALF, 0, 0))
+TURNS = ((0, 0, 0), (0, 0, 2 * HALF), (0, 0, HALF), (0, 0, -HALF), (0, HALF, 0), (0, -HALF, 0))
 
 
 def float64(*values):
@@ -27,7 +27,7 @@ def plates_of_a_box(side=0.4):
     for turn in TURNS:
         part = plate(side, side)
         rotation = rotation_from_vector(float64(*turn))
-        parts.append(Mesh((part.vertices - float64(0, 0, side / 2)) @ rotation.T, part.faces))
+        parts.append(Mesh((part.vertices - float64(side / 2, 0, 0)) @ rotation.T, part.faces))
     return parts
 
 
@@ -63,7 +63,7 @@ def test_a_crack_wider_than_the_tolerance_stays_open():
     size = float((merge_meshes([one, other]).summary().extent[0]) * math.sqrt(3))
     for width, closed in ((0.3 * WELD_TOLERANCE * size, True), (3 * WELD_TOLERANCE * size, False)):
         parts = plates_of_a_box()
-        parts[0] = Mesh(parts[0].vertices - width * float64(0, 0, 1), parts[0].faces)
+        parts[0] = Mesh(parts[0].vertices - width * float64(1, 0, 0), parts[0].faces)
         assert (1 not in table(merge_meshes(parts))) == closed
 
 
@@ -179,7 +179,7 @@ def test_a_seam_is_found_again_where_objects_slide():
     shape = topology_of(parts, points)
     turned = [own @ rotation_from_vector(float64(0.1, 0.2, 0.3)).T + 1.0 for own in points]
     assert topology_of(parts, turned) is shape
-    slid = [own + (0.1 if k == 5 else 0.0) * float64(1, 0, 0) for k, own in enumerate(points)]
+    slid = [own + (0.1 if k == 5 else 0.0) * float64(0, 1, 0) for k, own in enumerate(points)]
     other = topology_of(parts, slid)
     assert other is not shape
     assert int((other.edge_faces >= 0).sum()) != int((shape.edge_faces >= 0).sum())

@@ -19,7 +19,7 @@ from invertwin.channel.rcs.closed_forms import strip_section_te, strip_section_t
 from invertwin.constants import SPEED_OF_LIGHT
 from scenes import float64
 
-AHEAD = float64([[0.0, 0.0, -1.0]])
+AHEAD = float64([[-1.0, 0.0, 0.0]])
 WAVELENGTH = 0.01
 BAND = float64([SPEED_OF_LIGHT / WAVELENGTH])
 
@@ -39,7 +39,7 @@ def test_peaks(oracle, expected):
 
 def test_a_corner_returns_less_off_its_axis_and_nothing_along_its_plates():
     angles = float64([0.0, 0.2, 0.4])
-    directions = torch.stack([angles.sin(), 0 * angles, -angles.cos()], 1)
+    directions = torch.stack([-angles.cos(), angles.sin(), 0 * angles], 1)
     levels = TrihedralSection(0.1).section(BAND, directions)[0]
     assert bool((levels.diff() < 0).all())
 

@@ -54,7 +54,7 @@ METAL = PerfectConductor()
 WAVELENGTH = 0.01
 FREQUENCY = SPEED_OF_LIGHT / WAVELENGTH
 K = 2 * math.pi / WAVELENGTH
-UP = float64([0.0, 1.0, 0.0])
+UP = float64([0.0, 0.0, 1.0])
 
 
 @pytest.fixture(autouse=True)
@@ -90,7 +90,8 @@ def turned(x: float, y: float, z: float, place: object = (0.0, 0.0, 0.0)) -> Ten
 
 
 def random_directions(count: int, seed: int = 0) -> Tensor:
-    return normalize(torch.from_numpy(np.random.default_rng(seed).normal(size=(count, 3))), dim=1)
+    drawn = torch.from_numpy(np.random.default_rng(seed).normal(size=(count, 3)))
+    return normalize(drawn[:, [2, 0, 1]], dim=1)  # y, z and x are drawn in this order
 
 
 def dbsm(amplitude: Tensor) -> Tensor:
@@ -99,7 +100,7 @@ def dbsm(amplitude: Tensor) -> Tensor:
 
 def crowd(kind: str) -> Scene:
     """Small scenes with shadows and several bounces."""
-    leaf = turned(0.3, 0.2, 0.1, (0.02, 0.01, -0.06))
+    leaf = turned(0.1, 0.3, 0.2, (-0.06, 0.02, 0.01))
     if kind == "metal":
         return Scene(
             {
@@ -304,10 +305,10 @@ def test_edges_bring_a_plate_to_the_method_of_moments(channel):
     """A strip of 4 wavelengths, 15 long, 20° to 60° off its flash: with E and H along it."""
     width, height = 4 * WAVELENGTH, 15 * WAVELENGTH
     angles = torch.deg2rad(torch.linspace(20, 60, 41, dtype=torch.float64))
-    directions = torch.stack([angles.sin(), torch.zeros_like(angles), -angles.cos()], 1)
-    line = np.linspace(-0.5, 0.5, 97)[:, None] * [width, 0.0]
+    directions = torch.stack([-angles.cos(), angles.sin(), torch.zeros_like(angles)], 1)
+    line = np.linspace(-0.5, 0.5, 97)[:, None] * [0.0, width]
     solve = (strip_section_tm, strip_section_te)[channel]
-    exact = torch.from_numpy(solve(line, K, directions[:, [0, 2]].numpy()))
+    exact = torch.from_numpy(solve(line, K, directions[:, :2].numpy()))
     exact = 10 * torch.log10(2 * height**2 / WAVELENGTH * exact)
     parts = traced(metal(plate(width, height)), directions, depth=1, edges=2)
     strength = [parts["order 1"], parts["order 1"] + parts["edges 1"]]
@@ -323,7 +324,7 @@ def test_creases_between_facets_of_a_flat_or_smooth_surface_are_no_edges():
     ball = traced(metal(sphere(0.03, 4)), random_directions(3), depth=1, edges=1)
     assert float(ball["edges 1"].abs().max()) == 0
     fine, coarse = (
-        total(metal(plate(0.05, 0.05, divisions=n)), [[0.3, 0.1, -1.0]], depth=1, edges=2)
+        total(metal(plate(0.05, 0.05, divisions=n)), [[-1.0, 0.3, 0.1]], depth=1, edges=2)
         for n in (1, 3)
     )
     assert torch.allclose(fine, coarse, rtol=1e-6)
@@ -388,7 +389,7 @@ def test_edges_of_bodies_stay(size):
 
 
 def test_closed_forms_at_boresight():
-    ahead = [[0.0, 0.0, -1.0]]
+    ahead = [[-1.0, 0.0, 0.0]]
     a = 0.1
     for scene, expected, tolerance in (
         (metal(plate(a, a)), 4 * math.pi * a**4 / WAVELENGTH**2, 1e-6),
@@ -400,7 +401,7 @@ def test_closed_forms_at_boresight():
 
 
 def test_a_rolled_dihedral_turns_the_polarisation():
-    found = total(metal(dihedral(0.1), turned(0, 0, math.pi / 4)), [[0.0, 0.0, -1.0]])[0]
+    found = total(metal(dihedral(0.1), turned(math.pi / 4, 0, 0)), [[-1.0, 0.0, 0.0]])[0]
     expected = 10 * math.log10(8 * math.pi * 0.1**4 / WAVELENGTH**2)
     assert float(dbsm(found[0, 1])) == pytest.approx(expected, abs=0.01)
     assert float(dbsm(found[0, 0])) < expected - 35
@@ -491,21 +492,21 @@ def test_two_runs_are_equal():
 
 def test_a_large_plate_scatters_twice_what_it_meets():
     """Its mirror image and its shadow: ∫|S|² dω over all directions is 2A cosθ."""
-    side, towards = 8 * WAVELENGTH, float64([[0.3, 0.1, -1.0]])
+    side, towards = 8 * WAVELENGTH, float64([[-1.0, 0.3, 0.1]])
     towards = towards / towards.norm()
     n = 160
-    z = (torch.arange(n, dtype=torch.float64) + 0.5) / n * 2 - 1
+    x = (torch.arange(n, dtype=torch.float64) + 0.5) / n * 2 - 1
     phi = (torch.arange(2 * n, dtype=torch.float64) + 0.5) / n * math.pi
-    zz, pp = torch.meshgrid(z, phi, indexing="ij")
-    rho = (1 - zz**2).sqrt()
-    out = torch.stack([rho * pp.cos(), rho * pp.sin(), zz], -1).reshape(-1, 3)
+    xx, pp = torch.meshgrid(x, phi, indexing="ij")
+    rho = (1 - xx**2).sqrt()
+    out = torch.stack([xx, rho * pp.cos(), rho * pp.sin()], -1).reshape(-1, 3)
     found = total(metal(plate(side, side)), towards.expand(len(out), 3), out, depth=1)
     power = float(found[:, :, 0].abs().square().sum(1).mean() * 4 * math.pi)
-    assert power == pytest.approx(2 * side**2 * abs(float(towards[0, 2])), rel=0.05)
+    assert power == pytest.approx(2 * side**2 * abs(float(towards[0, 0])), rel=0.05)
 
 
 def test_triple_bounces_of_a_corner_grow_with_the_square_of_the_frequency():
-    direction = float64([[0.1, 0.15, -1.0]])
+    direction = float64([[-1.0, 0.1, 0.15]])
     found = [
         traced(metal(trihedral(0.1)), direction, frequency=f * FREQUENCY)["order 3"][0, 0, 0]
         for f in (1.0, 2.0)
@@ -518,10 +519,10 @@ def test_triple_bounces_of_a_corner_grow_with_the_square_of_the_frequency():
 )
 def test_each_order_has_the_delay_of_its_vertex(mesh, order):
     """The phase of plate, crease and apex, moved by 0.3 m: exp(−2jk·0.3) at every frequency."""
-    for place, scale in (((0, 0, 0.3), 2 * 0.3), ((0.0, 0.0, -0.2), -2 * 0.2)):
+    for place, scale in (((0.3, 0, 0), 2 * 0.3), ((-0.2, 0.0, 0.0), -2 * 0.2)):
         for frequency in (FREQUENCY, 1.13 * FREQUENCY):
             here, there = (
-                traced(metal(mesh, pose), [[0.0, 0.0, -1.0]], frequency=frequency)[f"order {order}"]
+                traced(metal(mesh, pose), [[-1.0, 0.0, 0.0]], frequency=frequency)[f"order {order}"]
                 for pose in (None, turned(0, 0, 0, place))
             )
             k = 2 * math.pi * frequency / SPEED_OF_LIGHT
@@ -530,15 +531,15 @@ def test_each_order_has_the_delay_of_its_vertex(mesh, order):
 
 def test_a_large_mirror_turns_the_field_over():
     """Γ = −1: S = −jA/λ, of which the image source sends −1."""
-    found = total(metal(plate(0.1, 0.1)), [[0.0, 0.0, -1.0]])[0]
+    found = total(metal(plate(0.1, 0.1)), [[-1.0, 0.0, 0.0]])[0]
     assert torch.allclose(found.diagonal(), torch.full_like(found[0], -1j * 0.01 / WAVELENGTH))
 
 
 def test_what_is_behind_does_not_count():
     front = Object(plate(0.1, 0.1), METAL)
-    small = Object(plate(0.03, 0.03), METAL, turned(0.2, 0.1, 0, (0, 0, 0.05)))
-    alone = total(Scene({"front": front}), [[0.0, 0.0, -1.0]])
-    both = total(Scene({"front": front, "behind": small}), [[0.0, 0.0, -1.0]])
+    small = Object(plate(0.03, 0.03), METAL, turned(0, 0.2, 0.1, (0.05, 0, 0)))
+    alone = total(Scene({"front": front}), [[-1.0, 0.0, 0.0]])
+    both = total(Scene({"front": front, "behind": small}), [[-1.0, 0.0, 0.0]])
     assert torch.allclose(both, alone, atol=1e-12)
 
 
@@ -547,12 +548,12 @@ def test_an_array_of_few_facets_is_differentiable():
 
     def power(theta: Tensor) -> Tensor:
         angle = math.pi / 4 + theta[0]
-        first = torch.stack([angle.sin(), angle.new_zeros(()), -angle.cos()]) * (0.05 + theta[2])
-        second = float64([-(0.5**0.5), 0.0, -(0.5**0.5)]) * 0.05
-        up = float64([0.0, 0.05, 0.0])
+        first = torch.stack([-angle.cos(), angle.sin(), angle.new_zeros(())]) * (0.05 + theta[2])
+        second = float64([-(0.5**0.5), -(0.5**0.5), 0.0]) * 0.05
+        up = float64([0.0, 0.0, 0.05])
         corners = torch.stack([0 * up, up, second, second + up, first, first + up])
         mesh = Mesh(corners, torch.tensor([(0, 2, 3), (0, 3, 1), (0, 1, 5), (0, 5, 4)]))
-        shift = torch.stack([theta[1] + 0.01, theta[1], theta[1] * 0 - 0.08])
+        shift = torch.stack([theta[1] * 0 - 0.08, theta[1] + 0.01, theta[1]])
         leaf = plate(0.02, 0.02)
         scene = Scene(
             {
@@ -560,7 +561,7 @@ def test_an_array_of_few_facets_is_differentiable():
                 "leaf": Object(Mesh(leaf.vertices + shift, leaf.faces), METAL),
             }
         )
-        return total(scene, [[0.08, 0.1, -1.0]])[0, 0, 0].abs().square()
+        return total(scene, [[-1.0, 0.08, 0.1]])[0, 0, 0].abs().square()
 
     start = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(power(start), start)
@@ -585,34 +586,34 @@ def test_an_array_of_few_facets_is_differentiable():
 )
 def test_warnings_where_the_physics_ends(scene, options, text):
     with pytest.warns(PhysicsWarning, match=text):
-        total(scene, [[1.0, 0.0, -0.1]], depth=1, **options)
+        total(scene, [[-0.1, 1.0, 0.0]], depth=1, **options)
 
 
 def test_rough_surfaces_and_clouds_are_refused():
     with pytest.raises(
         InputError, match="smooth surfaces in a signature, got RoughDielectric for a"
     ):
-        total(Scene({"a": Object(plate(1, 1), RoughDielectric(4.0))}), [[0.0, 0.0, -1.0]])
+        total(Scene({"a": Object(plate(1, 1), RoughDielectric(4.0))}), [[-1.0, 0.0, 0.0]])
     cloud = Cloud(float64([-1, -1, -1]), float64([1, 1, 1]), torch.ones(2, 2, 2).double())
     with pytest.raises(InputError, match="got clouds for a"):
-        total(Scene({"a": Object(box(1.0), METAL, cloud=cloud)}), [[0.0, 0.0, -1.0]])
+        total(Scene({"a": Object(box(1.0), METAL, cloud=cloud)}), [[-1.0, 0.0, 0.0]])
 
 
 def test_derivatives_of_many_facets_are_refused():
     ball = sphere(0.05, 3)
     mesh = Mesh(ball.vertices.clone().requires_grad_(), ball.faces)
     with pytest.raises(InputError, match="at most 24 triangles for derivatives of a signature"):
-        total(metal(mesh), [[0.0, 0.0, -1.0]])
+        total(metal(mesh), [[-1.0, 0.0, 0.0]])
 
 
 def test_triangles_without_area_and_empty_views_give_zeros():
     flat = Mesh(
-        float64([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.05, 0, 0]]),
+        float64([[0, 0, 0], [0, 0.1, 0], [0, 0, 0.1], [0, 0.05, 0]]),
         torch.tensor([[0, 2, 1], [0, 1, 3]]),
     )
     lone = Mesh(flat.vertices[:3], flat.faces[:1])
-    found = [total(metal(mesh), [[0.1, 0.2, -1.0]], edges=0) for mesh in (flat, lone)]
+    found = [total(metal(mesh), [[-1.0, 0.1, 0.2]], edges=0) for mesh in (flat, lone)]
     assert torch.allclose(found[0], found[1])
-    assert torch.isfinite(total(metal(flat), [[0.1, 0.2, -1.0]], edges=2)).all()
-    edge_on = total(metal(lone), [[1.0, 0.0, 0.0]])
+    assert torch.isfinite(total(metal(flat), [[-1.0, 0.1, 0.2]], edges=2)).all()
+    edge_on = total(metal(lone), [[0.0, 1.0, 0.0]])
     assert float(edge_on.abs().max()) == 0

@@ -14,7 +14,8 @@ from invertwin.channel.specular.diffracted_paths import evaluate_diffracted_path
 from invertwin.channel.specular.diffraction_candidates import find_diffraction_candidates
 from invertwin.channel.specular.image_method import CandidateSurfaces
 from invertwin.channel.specular.wedge_scene import WedgeScene
-from invertwin.scene import Mesh, box, plate
+from invertwin.scene import Mesh, box
+from scenes import level_plate
 
 K = 2 * math.pi
 TX = torch.tensor([1.0, 0.7, -20.0], dtype=torch.float64)
@@ -70,7 +71,7 @@ def test_behind_a_plate_and_its_corner_as_by_kirchhoff():
     share = torch.linspace(0.0, 1.0, 7, dtype=torch.float64)[:, None]
     first, last = torch.tensor([[0.2, 0.3, 15.0], [7.0, 6.5, 15.0]], dtype=torch.float64)
     rx = first + share * (last - first)
-    found, lit = behind(surroundings(plate(6.0, 6.0)), rx)
+    found, lit = behind(surroundings(level_plate(6.0, 6.0)), rx)
     assert not lit[0]
     assert lit[-1]
     for field, place in zip(found, rx, strict=True):
@@ -85,7 +86,7 @@ def test_steps_across_the_corner_are_small():
     steps = torch.linspace(-0.5, 0.5, 101, dtype=torch.float64) + 1e-4
     corner = 3.0 + (3.0 - TX[:2]) * 15 / 20  # where the straight way over it ends
     rx = torch.stack([corner[0] + steps, corner[1] + 0.6 * steps + 0.05, 0 * steps + 15], 1)
-    field, lit = behind(surroundings(plate(6.0, 6.0)), rx)
+    field, lit = behind(surroundings(level_plate(6.0, 6.0)), rx)
     assert 0 < int(lit.sum()) < len(lit)
     step = (field[1:] - field[:-1]).norm(dim=(1, 2)) / field[0].norm()
     assert step.max() < 0.03
@@ -93,14 +94,14 @@ def test_steps_across_the_corner_are_small():
 
 def test_edges_in_many_pieces_are_the_same():
     rx = torch.tensor([[0.4, 0.3, 15.0], [4.0, 5.0, 15.0]], dtype=torch.float64)
-    whole, _ = behind(surroundings(plate(6.0, 6.0)), rx)
-    pieces = surroundings(plate(6.0, 6.0, divisions=3))
+    whole, _ = behind(surroundings(level_plate(6.0, 6.0)), rx)
+    pieces = surroundings(level_plate(6.0, 6.0, divisions=3))
     assert len(pieces.wedges.start) == 4
     torch.testing.assert_close(behind(pieces, rx)[0], whole, rtol=1e-12, atol=1e-14)
 
 
 def test_derivative_by_the_size_of_a_plate():
-    mesh = plate(1.0, 1.0)
+    mesh = level_plate(1.0, 1.0)
     x, y = torch.meshgrid(*[torch.linspace(-6.03, 6.1, 5, dtype=torch.float64)] * 2, indexing="ij")
     rx = torch.stack([x, y, 0 * x + 15.0], -1).reshape(-1, 3)
 
@@ -117,18 +118,18 @@ def test_derivative_by_the_size_of_a_plate():
 
 def test_what_stands_before_an_edge_hides_it():
     rx = torch.tensor([[0.0, 0.0, 15.0]], dtype=torch.float64)
-    screen = plate(6.0, 6.0)
+    screen = level_plate(6.0, 6.0)
     moved = Mesh(
-        plate(1.0, 12.0).vertices + torch.tensor([2.6, 0.0, 2.0], dtype=torch.float64),
-        plate(1.0, 12.0).faces,
+        level_plate(1.0, 12.0).vertices + torch.tensor([2.6, 0.0, 2.0], dtype=torch.float64),
+        level_plate(1.0, 12.0).faces,
     )
     with tracing():
         (free,) = sent_by(surroundings(screen), TX[None], rx)
         (hidden,) = sent_by(surroundings(screen, moved), TX[None], rx)
     assert len(free.rx) == 4
-    on_right = (hidden.points[:, 0, 0] - 3.0).abs() < 1e-9
+    on_side = (hidden.points[:, 0, 0] - 3.0).abs() < 1e-9
     on_screen = hidden.points[:, 0, 2].abs() < 1e-9
-    assert not bool((on_right & on_screen).any())
+    assert not bool((on_side & on_screen).any())
     assert int(on_screen.sum()) == 3
 
 
@@ -157,5 +158,5 @@ def test_solids_and_order():
 def test_an_antenna_on_the_line_of_an_edge_gets_finite_fields(order):
     on_line = torch.tensor([[5.0, 1.0, 0.0]], dtype=torch.float64)
     with tracing():
-        found = sent_by(surroundings(plate(2.0, 2.0)), on_line, on_line + 1.0, order)
+        found = sent_by(surroundings(level_plate(2.0, 2.0)), on_line, on_line + 1.0, order)
     assert all(torch.isfinite(part.transfer.abs()).all() for part in found)

@@ -21,12 +21,12 @@ from invertwin.scene import (
     rigid,
     rotation_from_vector,
 )
-from scenes import float64
+from scenes import float64, level_plate
 
 FREQUENCY = 5.8e9
 METAL = PerfectConductor()
 CONCRETE, GLASS = Slab.itu("concrete", thickness=0.1), Slab.itu("glass", thickness=0.02)
-UPRIGHT = rotation_from_vector(float64([math.pi / 2, 0.0, 0.0]))
+ACROSS_Y = rotation_from_vector(float64([0.0, 0.0, -math.pi / 2]))
 TX, RX = float64([0.4, -4.0, 1.5]), float64([-0.3, 5.0, 0.8])
 MIRROR = float64([1.0, 1.0, -1.0])
 NAMES = {"": 0, "R": 1, "T": 2, "D": 3}
@@ -35,14 +35,14 @@ NAMES = {"": 0, "R": 1, "T": 2, "D": 3}
 def scene(wall: Material = METAL, floor: Material = METAL, **others: Object) -> Scene:
     """An upright wall above a floor."""
     objects = {
-        "floor": Object(plate(60.0, 60.0), floor),
-        "wall": Object(plate(2.0, 3.0), wall, rigid(UPRIGHT, float64([0.3, 0.2, 2.0]))),
+        "floor": Object(level_plate(60.0, 60.0), floor),
+        "wall": Object(plate(2.0, 3.0), wall, rigid(ACROSS_Y, float64([0.3, 0.2, 2.0]))),
     }
     return Scene(objects | others)
 
 
 def pane(material: Material = CONCRETE, size: float = 40.0) -> Object:
-    return Object(plate(size, size), material, rigid(UPRIGHT, float64([0.0, -2.0, 2.0])))
+    return Object(plate(size, size), material, rigid(ACROSS_Y, float64([0.0, -2.0, 2.0])))
 
 
 def trace(around: Scene, tx: Tensor = TX, rx: Tensor = RX, **options: Any) -> RayPaths:
@@ -195,12 +195,12 @@ def test_a_lost_link_gives_zeros_and_zero_gradients():
 @pytest.mark.slow
 def test_gradients_are_differences():
     """By the wall's place and turn, its size, the floor's height and the antennas."""
-    base, ground = plate(2.0, 3.0), plate(60.0, 60.0)
+    base, ground = plate(2.0, 3.0), level_plate(60.0, 60.0)
 
     def value(change: Tensor) -> Tensor:
-        size = torch.stack([1 + change[0], 1 - change[1], change[2]])
+        size = torch.stack([change[2], 1 + change[0], 1 - change[1]])
         pose = rigid(
-            rotation_from_vector(float64([math.pi / 2, 0.0, 0.0]) + change[3:6]),
+            rotation_from_vector(float64([0.0, 0.0, -math.pi / 2]) + change[3:6]),
             float64([0.3, 0.2, 2.0]) + change[6:9],
         )
         height = torch.stack([0 * change[9], 0 * change[9], change[9]])
@@ -225,7 +225,7 @@ def test_gradients_are_differences():
 
 def test_forward_mode_of_torch_func_agrees_with_reverse_mode():
     def value(shift: Tensor) -> Tensor:
-        wall = scene().replace("wall", pose=rigid(UPRIGHT, float64([0.3, 0.2, 2.0]) + shift))
+        wall = scene().replace("wall", pose=rigid(ACROSS_Y, float64([0.3, 0.2, 2.0]) + shift))
         return torch.view_as_real(response(trace(wall, depth=1))).square().sum()
 
     zero, way = torch.zeros(3, dtype=torch.float64), float64([0.6, -0.3, 0.5])
@@ -237,14 +237,14 @@ def test_forward_mode_of_torch_func_agrees_with_reverse_mode():
 
 def test_doppler_is_that_of_moved_geometry():
     angular = float64([0.3, -0.4, 0.5])
-    turned = plate(2.0, 3.0).vertices @ UPRIGHT.T
+    turned = plate(2.0, 3.0).vertices @ ACROSS_Y.T
     velocity = torch.linalg.cross(angular.expand(4, 3), turned) + float64([0.5, 2.0, -1.0])
     down = float64([0.0, 0.0, -3.0])
     moving = Scene(
         {
-            "floor": Object(plate(60.0, 60.0), METAL, velocity=down),
+            "floor": Object(level_plate(60.0, 60.0), METAL, velocity=down),
             "wall": Object(
-                plate(2.0, 3.0), METAL, rigid(UPRIGHT, float64([0.3, 0.2, 2.0])), velocity
+                plate(2.0, 3.0), METAL, rigid(ACROSS_Y, float64([0.3, 0.2, 2.0])), velocity
             ),
         }
     )
@@ -263,10 +263,10 @@ def test_doppler_is_that_of_moved_geometry():
 
 def test_seams_do_not_diffract():
     """Two plates side by side are one; so are they with their vertices in common."""
-    left = Object(plate(2.0, 2.0), METAL, rigid(UPRIGHT, float64([-1.0, 0.2, 2.0])))
-    right = Object(plate(2.0, 2.0), METAL, rigid(UPRIGHT, float64([1.0, 0.2, 2.0])))
+    left = Object(plate(2.0, 2.0), METAL, rigid(ACROSS_Y, float64([-1.0, 0.2, 2.0])))
+    right = Object(plate(2.0, 2.0), METAL, rigid(ACROSS_Y, float64([1.0, 0.2, 2.0])))
     both = trace(Scene({"left": left, "right": right}), depth=1)
-    whole = Object(plate(4.0, 2.0), METAL, rigid(UPRIGHT, float64([0.0, 0.2, 2.0])))
+    whole = Object(plate(4.0, 2.0), METAL, rigid(ACROSS_Y, float64([0.0, 0.2, 2.0])))
     one = trace(Scene({"whole": whole}), depth=1)
     assert not bool((both.vertices[:, 0, 0].abs() < 1e-6).any())
     torch.testing.assert_close(response(both), response(one), rtol=1e-2, atol=0)
@@ -287,11 +287,11 @@ def test_a_box_on_the_floor_has_no_edges_there():
 def test_a_leak_between_coplanar_faces_is_none():
     """Behind a wall in many pieces, nothing passes along its mesh_topology."""
     around = Scene({"wall": Object(plate(3.0, 3.0, divisions=8), METAL)})
-    tx = float64([0.0, 0.0, -3.0])
+    tx = float64([-3.0, 0.0, 0.0])
     share = torch.linspace(-1.0, 1.0, 101, dtype=torch.float64)
-    seams = torch.stack([share, torch.zeros(101).double(), torch.full((101,), 3.0).double()], 1)
+    seams = torch.stack([torch.full((101,), 3.0).double(), share, torch.zeros(101).double()], 1)
     paths = trace(around, tx, seams, depth=1)
-    outside = paths.vertices[:, 0, :2].abs().amax(1)
+    outside = paths.vertices[:, 0, 1:].abs().amax(1)
     assert len(paths) == 4 * 101
     torch.testing.assert_close(outside, torch.full_like(outside, 1.5))
     assert float(paths.length.min()) > 6.0

@@ -27,19 +27,18 @@ from invertwin.scene import (
     dihedral,
     fresnel_coefficients,
     merge_meshes,
-    plate,
     rigid,
     rotation_from_vector,
     slab_coefficients,
     sphere,
     trihedral,
 )
-from scenes import float64, thing
+from scenes import float64, level_plate, thing
 
 FREQUENCY = 5.8e9
 WAVELENGTH = SPEED_OF_LIGHT / FREQUENCY
 METAL = PerfectConductor()
-GROUND = Scene({"ground": Object(plate(200.0, 200.0), METAL)})
+GROUND = Scene({"ground": Object(level_plate(200.0, 200.0), METAL)})
 HEIGHTS = ([-25.0, 0.0, 2.0], [25.0, 0.0, 1.5])
 
 
@@ -75,14 +74,14 @@ def test_two_rays_over_a_conducting_ground(rays):
 
 def test_two_rays_over_earth():
     earth = Dielectric(15.0, 0.01, scattering=0.0)
-    scene = Scene({"ground": Object(plate(200.0, 200.0), earth)})
+    scene = Scene({"ground": Object(level_plate(200.0, 200.0), earth)})
     paths = trace(scene, *HEIGHTS)
     sine = 3.5 / math.hypot(50, 3.5)
     r = fresnel_coefficients(earth.complex_permittivity(FREQUENCY), float64([sine]))
     strength = WAVELENGTH / (4 * math.pi * math.hypot(50, 3.5))
     found = paths.coefficient[1] / strength
     torch.testing.assert_close(found[0, 0], r.reflection_p[0], rtol=1e-9, atol=0)
-    # φ of waves to the right points the other way than of those that come from there.
+    # φ of waves along x points the other way than of those that come from there.
     torch.testing.assert_close(found[1, 1], -r.reflection_s[0], rtol=1e-9, atol=0)
 
 
@@ -101,10 +100,10 @@ def test_line_of_sight_is_friis():
 def test_corners_send_back_what_comes(plates, depth):
     """Image theory: a corner of plates acts as the point-mirrored source, exactly."""
     shape = dihedral(2.0) if plates == 2 else trihedral(2.0)
-    turned = rigid(rotation_from_vector(float64([0.02, 0.2, 0.1])), float64([0.2, 0.1, 4.0]))
+    turned = rigid(rotation_from_vector(float64([0.1, 0.02, 0.2])), float64([4.0, 0.2, 0.1]))
     corner = Object(shape, METAL, turned)
     scene = Scene({"corner": corner})
-    tx, rx = [0.1, 0.0, 0.0], [-0.1, 0.1, 0.05]
+    tx, rx = [0.0, 0.1, 0.0], [0.05, -0.1, 0.1]
     paths = trace(scene, tx, rx, depth=depth)
     last = paths.select(paths.depth == plates)
     faces = corner.vertices[corner.mesh.faces]
@@ -192,7 +191,7 @@ def test_more_rays_miss_less():
 
 def test_the_way_back_is_the_way_forth():
     panel = thing(
-        plate(1.0, 1.5), (0.2, 0.1, 0.3), (0.4, 0.3, 0.2), Slab(3.0, 0.02, thickness=0.02)
+        level_plate(1.0, 1.5), (0.2, 0.1, 0.3), (0.4, 0.3, 0.2), Slab(3.0, 0.02, thickness=0.02)
     )
     scene = Scene({"panel": panel, "room": Object(box((5.0, 4.0, 3.0)), Dielectric(5.0, 0.1))})
     tx, rx = [1.3, -1.1, 0.7], [[-1.4, 0.9, -0.6], [0.4, 1.2, -1.0]]
@@ -216,7 +215,7 @@ def test_inside_of_a_wall_nothing_gets_out():
 
 
 def test_a_lost_link_gives_zeros_and_zero_gradients():
-    wall = Scene({"wall": Object(plate(50.0, 50.0), METAL)})
+    wall = Scene({"wall": Object(level_plate(50.0, 50.0), METAL)})
     rx = float64([0.3, 0.2, -2.0]).requires_grad_()
     paths = trace(wall, [0.0, 0.0, 2.0], rx, depth=2)
     assert len(paths) == 0
@@ -230,7 +229,9 @@ def test_a_lost_link_gives_zeros_and_zero_gradients():
 def test_on_a_plate_the_field_is_that_of_a_conductor():
     """E along a conductor vanishes on it, E across doubles."""
     turn = rotation_from_vector(float64([0.3, 0.7, 0.2]))
-    wall = Scene({"wall": Object(plate(3.0, 3.0), METAL, rigid(turn, float64([0.1, 0.2, 0.3])))})
+    wall = Scene(
+        {"wall": Object(level_plate(3.0, 3.0), METAL, rigid(turn, float64([0.1, 0.2, 0.3])))}
+    )
     place = turn @ float64([0.4, -0.3, 0.0]) + float64([0.1, 0.2, 0.3])
     paths = trace(wall, [1.0, 0.5, 4.0], place, depth=2)
     assert paths.depth.tolist() == [0, 1]
@@ -248,18 +249,19 @@ def test_on_a_plate_the_field_is_that_of_a_conductor():
 
 
 def test_coplanar_and_doubled_faces_count_once():
-    one = Scene({"wall": Object(plate(3.0, 3.0), METAL)})
-    many = plate(3.0, 3.0, divisions=6)
+    one = Scene({"wall": Object(level_plate(3.0, 3.0), METAL)})
+    many = level_plate(3.0, 3.0, divisions=6)
     twice = Mesh(many.vertices, torch.cat([many.faces, many.faces.flip(1)]))
     halves = [
-        Object(plate(1.5, 3.0), METAL, rigid(translation=[x, 0.0, 0.0])) for x in (-0.75, 0.75)
+        Object(level_plate(1.5, 3.0), METAL, rigid(translation=[x, 0.0, 0.0]))
+        for x in (-0.75, 0.75)
     ]
     ends = [0.5, 0.5, 2.0], [[-0.5, -0.5, 2.0], [0.2, 0.4, 1.0], [0.3, 0.1, 3.0]]
     expected = trace(one, *ends)
     for scene in (
         Scene({"wall": Object(many, METAL)}),
         Scene({"wall": Object(twice, METAL)}),
-        Scene({"wall": Object(merge_meshes([twice, plate(3.0, 3.0)]), METAL)}),
+        Scene({"wall": Object(merge_meshes([twice, level_plate(3.0, 3.0)]), METAL)}),
         Scene({"left": halves[0], "right": halves[1]}),
     ):
         found = trace(scene, *ends)
@@ -272,7 +274,7 @@ def test_the_seam_of_two_triangles_is_tight(turn):
     """Paths that meet the diagonal of a plate exactly: none is lost, none slips through."""
     rotation = rotation_from_vector(float64(turn))
     pose = rigid(rotation, float64([0.3, 0.2, 0.7]))
-    wall = Scene({"wall": Object(plate(2.0, 2.0), METAL, pose)})
+    wall = Scene({"wall": Object(level_plate(2.0, 2.0), METAL, pose)})
     share = torch.linspace(-0.9, 0.9, 200, dtype=torch.float64)
     corners = wall["wall"].vertices
     faces = wall["wall"].mesh.faces
@@ -288,7 +290,7 @@ def test_the_seam_of_two_triangles_is_tight(turn):
 
 
 def test_rough_surfaces_mirror_nothing():
-    scene = Scene({"ground": Object(plate(200.0, 200.0), RoughDielectric(4.0))})
+    scene = Scene({"ground": Object(level_plate(200.0, 200.0), RoughDielectric(4.0))})
     assert trace(scene, *HEIGHTS).depth.tolist() == [0]
     share = Dielectric(15.0, 0.01, scattering=0.6)
     whole = Dielectric(15.0, 0.01, scattering=0.0)
@@ -303,7 +305,9 @@ def slab(thickness: float = 0.05) -> Slab:
 @pytest.mark.parametrize("angle", [0.0, 0.6, 1.2])
 def test_a_slab_lets_through_what_it_should(angle):
     """Both polarisations, and the phase: that of the slab less that of as much air."""
-    board = Scene({"board": thing(plate(60.0, 60.0), turn=(0.0, angle, 0.0), material=slab())})
+    board = Scene(
+        {"board": thing(level_plate(60.0, 60.0), turn=(0.0, angle, 0.0), material=slab())}
+    )
     paths = trace(board, [0.1, 0.0, -1.5], [0.1, 0.0, 2.0], depth=2)
     assert paths.depth.tolist() == [1]
     assert paths.kinds.tolist() == [[2]]
@@ -322,7 +326,7 @@ def test_a_slab_lets_through_what_it_should(angle):
 def test_a_slab_of_air_is_not_there():
     scene = room(Dielectric(5.0, 0.1))
     ends = [1.3, -1.1, 0.7], [-1.4, 0.9, -0.6]
-    air = thing(plate(20.0, 20.0), (0.2, 0.1, 0.3), (0.4, 0.3, 0.2), Slab(1.0, thickness=0.2))
+    air = thing(level_plate(20.0, 20.0), (0.2, 0.1, 0.3), (0.4, 0.3, 0.2), Slab(1.0, thickness=0.2))
     with_air = trace(Scene({**scene.objects, "air": air}), *ends, depth=3)
     through = with_air.select((with_air.kinds == 2).any(1))
     assert len(through) > 3
@@ -337,7 +341,7 @@ def test_a_slab_of_air_is_not_there():
 
 def test_two_boards_multiply_and_a_wall_between_them_mirrors():
     boards = {
-        name: thing(plate(3.0, 3.0), (0.0, 0.0, z), material=slab())
+        name: thing(level_plate(3.0, 3.0), (0.0, 0.0, z), material=slab())
         for name, z in (("near", 1.0), ("far", 2.0))
     }
     paths = trace(Scene(boards), [0.0, 0.0, 0.0], [0.0, 0.0, 3.0], depth=4)
@@ -354,7 +358,7 @@ def test_layers_of_one_material_are_one_slab():
     two = Multilayer([Layer(4.0, 0.05, thickness=0.02), Layer(4.0, 0.05, thickness=0.03)])
     found = [
         trace(
-            Scene({"board": thing(plate(9.0, 9.0), turn=(0.3, 0.2, 0.0), material=material)}),
+            Scene({"board": thing(level_plate(9.0, 9.0), turn=(0.3, 0.2, 0.0), material=material)}),
             [0.0, 0.0, -1.5],
             [[0.1, 0.4, 2.0], [0.3, 0.1, -1.0]],
         )
@@ -366,7 +370,7 @@ def test_layers_of_one_material_are_one_slab():
 
 def test_values_of_each_triangle_count():
     """Two halves of one wall, dry and wet."""
-    wall = plate(2.0, 2.0, divisions=2)
+    wall = level_plate(2.0, 2.0, divisions=2)
     left = wall.vertices[wall.faces].mean(1)[:, 0] < 0
     mixed = Dielectric(torch.where(left, 4.0, 25.0).double(), scattering=0.0)
     dry, wet = Dielectric(4.0, scattering=0.0), Dielectric(25.0, scattering=0.0)
@@ -393,7 +397,7 @@ def test_gradients_are_differences():
             {
                 "room": Object(outer, wall),
                 "box": Object(inner, METAL),
-                "board": thing(plate(1.5, 1.5), (-0.3, 0.1, 0.2), (0.3, 1.2, 0.0), board),
+                "board": thing(level_plate(1.5, 1.5), (-0.3, 0.1, 0.2), (0.3, 1.2, 0.0), board),
             }
         )
         tx = float64([1.3, -1.1, 0.7]) + change[48:51]
@@ -424,12 +428,12 @@ def test_forward_mode_agrees():
 
 
 def test_doppler_is_that_of_moved_geometry():
-    spinning = plate(2.0, 2.0)
+    spinning = level_plate(2.0, 2.0)
     angular = float64([0.3, -0.4, 0.5])
     velocity = torch.linalg.cross(angular.expand(4, 3), spinning.vertices) + float64([0.5, 2, -1])
     panel = Object(spinning, METAL, rigid(translation=[0.0, 0.0, 3.0]), velocity)
     wall = Object(
-        plate(9.0, 9.0), METAL, rigid(translation=[0.0, 0.0, -2.0]), float64([0.0, 0.0, -3.0])
+        level_plate(9.0, 9.0), METAL, rigid(translation=[0.0, 0.0, -2.0]), float64([0.0, 0.0, -3.0])
     )
     scene = Scene({"panel": panel, "wall": wall})
     tx, rx = float64([0.2, 0.1, 0.5]), float64([-0.3, 0.2, 0.1])
@@ -513,7 +517,9 @@ def walk(places: Tensor, plane: Scene, edges: int) -> Tensor:
 
 def test_shadows_have_no_edge_with_diffraction():
     """Half of the field on the boundary of a half plane, and no jump there."""
-    half = Scene({"half": Object(plate(60.0, 60.0), METAL, rigid(translation=[-30.0, 0.0, 0.0]))})
+    half = Scene(
+        {"half": Object(level_plate(60.0, 60.0), METAL, rigid(translation=[-30.0, 0.0, 0.0]))}
+    )
     x = torch.linspace(-0.5, 0.5, 41, dtype=torch.float64) + 1e-4
     places = torch.stack([x, torch.zeros(41).double(), torch.full((41,), 6.0).double()], 1)
     optics, whole = walk(places, half, 0), walk(places, half, 1)
@@ -529,7 +535,7 @@ def test_shadows_have_no_edge_with_diffraction():
 
 def test_the_size_of_a_plate_has_a_derivative_with_diffraction():
     def value(size: Tensor, edges: int) -> Tensor:
-        base = plate(1.0, 1.0)
+        base = level_plate(1.0, 1.0)
         mesh = Mesh(base.vertices * (1 + size), base.faces)
         scene = Scene({"plate": Object(mesh, METAL, rigid(translation=[0.05, 0.02, 0.0]))})
         found = trace(scene, [0.1, 0.2, 2.0], [0.3, -0.1, 1.5], edges=edges)
@@ -561,7 +567,7 @@ def test_four_edges_are_too_many():
 
 
 def test_padded_links_may_be_empty():
-    wall = Scene({"wall": Object(plate(50.0, 50.0), METAL)})
+    wall = Scene({"wall": Object(level_plate(50.0, 50.0), METAL)})
     paths = trace(wall, [[0, 0, 2.0], [0, 0, 1.0]], [[1, 0, -1.0], [1, 0, 1.0], [0, 1, 1.0]])
     row, filled = paths.pad_links()
     assert row.shape == (2, 3, 2)

@@ -34,7 +34,7 @@ def test_units_limits_and_defaults_are_shown():
     assert rows["u_max"] == [
         "number > 0, ≤ 1",
         "1.0",
-        "maximum direction cosine to the right; the map is symmetric",
+        "maximum direction cosine to the left; the map is symmetric",
     ]
 
 

@@ -37,7 +37,7 @@ ROUGHNESS = {
 
 def read(material: dict[str, Any], folder: Path = Path(), **changes):
     wall = {"shape": "plate", "width": 1.0, "height": 2.0, "material": material}
-    raw = {"task": "reconstruct", "scene": {"wall": wall}} | changes
+    raw = {"task": "reconstruct", "frame": 2, "scene": {"wall": wall}} | changes
     return validate_run(raw, folder / "run.toml")
 
 
@@ -233,7 +233,7 @@ def test_materials_of_a_scene_file_take_no_images(tmp_path):
         "file": "room.xml",
         "material": {"kind": "dielectric", "permittivity": {"image": "x.npy"}},
     }
-    run = validate_run({"task": "simulate", "scene_file": table}, tmp_path / "run.toml")
+    run = validate_run({"task": "simulate", "frame": 2, "scene_file": table}, tmp_path / "run.toml")
     with pytest.raises(
         InputError, match=r"scene_file\.material\.permittivity: expected permittivity as a number"
     ):

@@ -30,12 +30,12 @@ SIMULATED = 'kind = "simulated"\ndepth = 1\npoints_per_m2 = 2e3\nsnr_db = 20.0\n
 TRAIN = (
     (
         RUN[: RUN.index("[radar]")].replace(
-            "position = [0.0, 0.0, 1.2]", "position = [0.2, 0, 1.2]\n"
+            "position = [1.2, 0.0, 0.0]", "position = [1.2, 0.2, 0]\n"
         )
         + """
 [radar]
 board = { name = "xWR1642", transmitters = [2, 1], pattern = { kind = "cosine", exponent = 1.0 } }
-positions = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]
+positions = [[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]]
 
 [radar.waveform]
 kind = "fmcw"
@@ -62,7 +62,7 @@ points_per_m2 = 300.0
 snr_db = 20.0
 """
     )
-    .replace("[truth.plate]\nposition = [0.02, 0.01, 1.2]\n", "")
+    .replace("[truth.plate]\nposition = [1.2, 0.02, 0.01]\n", "")
     .replace('task = "reconstruct"', 'task = "simulate"')
 )
 
@@ -91,7 +91,7 @@ def test_a_board_of_ones_own():
     radar = radar_of({"waveform": WAVE, "board": table})
     half = 299792458.0 / 77e9 / 2
     steps = radar.transmitters.positions.diff(dim=0)[0]
-    torch.testing.assert_close(steps, torch.tensor([4 * half, half, 0], dtype=torch.float64))
+    torch.testing.assert_close(steps, torch.tensor([0, 4 * half, half], dtype=torch.float64))
     assert len(radar.virtual_positions) == 8
 
 
@@ -244,7 +244,7 @@ def test_raw_files_are_data_of_a_fit(train, run_file, monkeypatch):
     monkeypatch.chdir(train)
     table = f'kind = "dca1000"\nfile = "{train}/raw/capture.bin"\n'
     table += f'settings = "{train}/raw/capture.cfg"\nboard = {{ name = "xWR1642" }}\n'
-    table += "positions = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]\n"
+    table += "positions = [[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]]\n"
     run_file.write_text(MEASURED.replace(SIMULATED, table).replace("steps = 8", "steps = 2"))
     assert call(monkeypatch, "reconstruct", run_file, "-o", "fit") == 0
     assert read_metrics(Path("fit"))["loss"] < 1
@@ -266,21 +266,21 @@ def test_recordings_get_poses_and_calibrated_channels(train, tmp_path):
     changes = {
         "channels": str(tmp_path / "channels.json"),
         "chirp": 2,
-        "positions": [[0, 0, -1]],
-        "orientation": {"rotation_deg": [0, 90, 0]},
+        "positions": [[-1, 0, 0]],
+        "orientation": {"rotation_deg": [0, 0, 90]},
     }
     second = build_capture(data_table(**table, frame=1))
     assert torch.equal(second.beat, plain.beat[1:])
     placed = build_capture(data_table(**table, **changes))
     expected = chirps.samples[:, 2] / ChannelCalibration(gains).gains[..., None]
     torch.testing.assert_close(placed.beat, expected)
-    assert placed.radar().positions.tolist() == [[0, 0, -1], [0, 0, -1]]
+    assert placed.radar().positions.tolist() == [[-1, 0, 0], [-1, 0, 0]]
     assert placed.radar().range_origin is None
-    far = build_capture(data_table(**table, **changes, range_center=[0.0, 3.0, 3.0]))
+    far = build_capture(data_table(**table, **changes, range_center=[3.0, 0.0, 3.0]))
     assert far.radar().origins.tolist() == pytest.approx([5.0, 5.0], abs=0.01)  # of a wide board
     rotations = placed.radar().rotations
     assert rotations is not None
-    assert rotations[1, :, 2].tolist() == pytest.approx([1, 0, 0])
+    assert rotations[1, :, 0].tolist() == pytest.approx([0, 1, 0])
 
 
 @pytest.mark.parametrize(
@@ -292,7 +292,7 @@ def test_recordings_get_poses_and_calibrated_channels(train, tmp_path):
         ({"frame": 2}, r"data\.frame: expected a number below 2, got 2"),
         ({"channels": "none.json"}, r"data\.channels: .*none\.json"),
         ({"board": {"name": "xWR1642", "transmitters": [1]}}, r"data\.board: .*remove the key"),
-        ({"orientation": {"look_at": [0, 1, 0]}}, r"data\.orientation\.look_at: "),
+        ({"orientation": {"look_at": [0, 0, 1]}}, r"data\.orientation\.look_at: "),
     ],
 )
 def test_recordings_that_do_not_fit_are_refused(train, changes, message):
@@ -350,17 +350,18 @@ def test_samples_are_kept_as_they_are(tmp_path):
 # A plate 100 m away, of which the data are centred on its first place.
 FAR = """
 task = "reconstruct"
+frame = 2
 
 [scene.plate]
 shape = "plate"
 width = 1.0
 height = 0.8
 divisions = 3
-position = [0.0, 0.0, 99.4]
+position = [99.4, 0.0, 0.0]
 material = { kind = "rough_dielectric", permittivity = 4.0 }
 
 [truth.plate]
-position = [0.0, 0.0, 100.1]
+position = [100.1, 0.0, 0.0]
 
 [grid]
 range_min = -8.0
@@ -369,7 +370,7 @@ range_max = 8.0
 [[parameters]]
 kind = "translation"
 object = "plate"
-axes = ["z"]
+axes = ["x"]
 
 [surrogate]
 range_width = 2.0
@@ -383,8 +384,8 @@ FAR_RADAR = """
 waveform = { kind = "stepped", start_frequency = 9.7e9, step = 3e6, samples = 100, dwell = 1e-6 }
 transmitters = { kind = "linear", count = 1, spacing = 1.0 }
 receivers = { kind = "linear", count = 1, spacing = 1.0 }
-positions = [[-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 1.0]]
-range_center = [0.0, 0.0, 100.0]
+positions = [[0.0, -3.0, 0.0], [0.0, 0.0, 0.0], [1.0, 3.0, 0.0]]
+range_center = [100.0, 0.0, 0.0]
 """
 
 
@@ -406,7 +407,7 @@ def test_a_far_scene_is_fitted_by_sweeps_that_are_centred_on_it(tmp_path, monkey
         r0=radar.origins.numpy(),
     )
     Path("pass.toml").write_text(
-        '[data]\nfile = "pass.npz"\nvariable = "fp"\ndimensions = ["frame", "sample"]\n'
+        'frame = 2\n[data]\nfile = "pass.npz"\nvariable = "fp"\ndimensions = ["frame", "sample"]\n'
         "conjugate = true\n[sweep]\nstart_frequency = 9.7e9\nstep = 3e6\n"
         '[radar]\npositions = "places"\nrange_origin = "r0"\n'
     )
@@ -421,13 +422,13 @@ def test_a_far_scene_is_fitted_by_sweeps_that_are_centred_on_it(tmp_path, monkey
 def test_the_path_of_the_radar_is_refined_along(tmp_path, monkeypatch):
     """Beside the plate, with an error bar of its own, and held by a heavy odometry."""
     monkeypatch.chdir(tmp_path)
-    path = '[[parameters]]\nkind = "radar_path"\nsteps = 1\ndrift = 0.02\naxes = ["z"]\n'
+    path = '[[parameters]]\nkind = "radar_path"\nsteps = 1\ndrift = 0.02\naxes = ["x"]\n'
     short = RUN.replace("steps = 8\n", "steps = 4\n").replace("samples = 20_000", "samples = 4_000")
     for name, more in (("free", ""), ("held", "weight = 1e3\n")):
         Path(f"{name}.toml").write_text(short + path + more)
         assert call(monkeypatch, "reconstruct", f"{name}.toml", "-o", name) == 0
     free, held = (read_metrics(tmp_path / name) for name in ("free", "held"))
-    assert free["standard_deviations"]["radar.step1.z"] > 0
+    assert free["standard_deviations"]["radar.step1.x"] > 0
     moved = [row["parameters"]["radar.displacements"] for row in (free, held)]
-    assert abs(moved[1][0][2]) < abs(moved[0][0][2])
-    assert moved[0][0][:2] == [0.0, 0.0]
+    assert abs(moved[1][0][0]) < abs(moved[0][0][0])
+    assert moved[0][0][1:] == [0.0, 0.0]

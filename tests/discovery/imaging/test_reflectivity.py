@@ -22,9 +22,9 @@ CHIRP = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=64)
 def radar() -> iw.Radar:
     """Six places about the middle, looking at it."""
     turns = torch.arange(6, dtype=torch.float64) * (torch.pi / 3)
-    out = torch.stack([turns.cos(), 0 * turns, turns.sin()], dim=1)
-    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(out)
-    axes = torch.stack([torch.linalg.cross(up, -out), up, -out], dim=-1)
+    out = torch.stack([turns.sin(), turns.cos(), 0 * turns], dim=1)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(out)
+    axes = torch.stack([-out, torch.linalg.cross(up, -out), up], dim=-1)
     half = CHIRP.wavelength / 2
     patch = Cosine(1.0)
     sender, receivers = linear_array(1, half, pattern=patch), linear_array(8, half, pattern=patch)
@@ -56,7 +56,7 @@ def echo(device: iw.Radar, place: torch.Tensor, section: float) -> torch.Tensor:
 def test_a_point_answers_as_the_radar_equation_says():
     device = radar()
     grid = device.grid(0.8, 3.5)
-    place = torch.tensor([[0.21, 0.0, -0.13]], dtype=torch.float64)
+    place = torch.tensor([[-0.13, 0.21, 0.0]], dtype=torch.float64)
     found = compute_response(device, grid, place).predict_maps(
         torch.tensor([0.5], dtype=torch.float64)
     )
@@ -72,8 +72,8 @@ def test_two_points_closer_than_a_beam_are_two_in_the_image():
     grid = device.grid(0.8, 3.5)
     line = torch.arange(-0.5, 0.51, 0.05, dtype=torch.float64)
     flat = torch.cartesian_prod(line, line)
-    places = torch.stack([flat[:, 0], 0 * flat[:, 0], flat[:, 1]], dim=1)
-    at = torch.tensor([[-0.1, 0.0, 0.0], [0.2, 0.0, 0.1]], dtype=torch.float64)
+    places = torch.cat([flat, 0 * flat[:, :1]], dim=1)
+    at = torch.tensor([[0.0, -0.1, 0.0], [0.1, 0.2, 0.0]], dtype=torch.float64)
     power = echo(device, at[0], 1.0) + echo(device, at[1], 0.3)
     power = power + 1e-6 * power.max()
     some, coarse = thin_map(power, device, grid)

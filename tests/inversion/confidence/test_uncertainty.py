@@ -23,8 +23,8 @@ from invertwin.scene.parameters import Coordinate
 from scenes import float64
 
 
-def fitted(model: Blob, seed: int = 0, axes: str = "x", loss: Any = LAW) -> Reconstruction:
-    """A fit of one look at a ball at x = 0.1."""
+def fitted(model: Blob, seed: int = 0, axes: str = "y", loss: Any = LAW) -> Reconstruction:
+    """A fit of one look at a ball at y = 0.1."""
     look = replace(model, known=True).realisations(scene(0.1), None, 0)
     assert look is not None
     return reconstruct(
@@ -39,13 +39,13 @@ def fitted(model: Blob, seed: int = 0, axes: str = "x", loss: Any = LAW) -> Reco
 
 def test_errors_are_those_that_speckle_allows():
     found = fitted(Blob()).uncertainty
-    assert found.names == ("ball.x",)
+    assert found.names == ("ball.y",)
     assert found.units == ("m",)
     assert found.unobserved == ()
     # 64 looks tell it to 9 %.
-    assert found.deviations["ball.x"] == pytest.approx(deviation(0.1, 4), rel=0.25)
+    assert found.deviations["ball.y"] == pytest.approx(deviation(0.1, 4), rel=0.25)
     # Student's law with 63 degrees of freedom.
-    assert found.interval(0.95)["ball.x"] == pytest.approx(1.998 * found.deviations["ball.x"], 1e-3)
+    assert found.interval(0.95)["ball.y"] == pytest.approx(1.998 * found.deviations["ball.y"], 1e-3)
     assert (found.count, found.source) == (64, "looks")
 
 
@@ -54,29 +54,29 @@ def test_errors_are_those_that_speckle_allows():
 def test_stated_errors_hold():
     """Over 60 recordings: 95 % of errors within the intervals, and as wide as stated."""
     fits = [fitted(Blob(), seed) for seed in range(60)]
-    errors = [float(fit.scene["ball"].center[0].detach()) - 0.1 for fit in fits]
+    errors = [float(fit.scene["ball"].center[1].detach()) - 0.1 for fit in fits]
     inside = [
-        abs(e) <= fit.uncertainty.interval()["ball.x"] for e, fit in zip(errors, fits, strict=True)
+        abs(e) <= fit.uncertainty.interval()["ball.y"] for e, fit in zip(errors, fits, strict=True)
     ]
     assert sum(inside) >= 53
     spread = float(torch.tensor(errors).std())
-    assert fits[0].uncertainty.deviations["ball.x"] == pytest.approx(spread, rel=0.3)
+    assert fits[0].uncertainty.deviations["ball.y"] == pytest.approx(spread, rel=0.3)
 
 
 def test_without_looks_the_frames_tell():
     found = fitted(Blob(frames=40, known=False)).uncertainty
     assert (found.count, found.source) == (40, "frames")
-    assert found.deviations["ball.x"] == pytest.approx(deviation(0.1, 40), rel=0.35)
-    assert found.interval()["ball.x"] > 2.02 * found.deviations["ball.x"]
+    assert found.deviations["ball.y"] == pytest.approx(deviation(0.1, 40), rel=0.35)
+    assert found.interval()["ball.y"] > 2.02 * found.deviations["ball.y"]
 
 
 def test_what_has_no_effect_is_not_observed_and_named():
-    found = fitted(Blob(), axes="xz").uncertainty
+    found = fitted(Blob(), axes="xy").uncertainty
     (told,) = found.unobserved
-    assert told.startswith("ball.z: not observed; ")
-    assert told.endswith(" of the information of ball.x")
-    assert found.deviations["ball.z"] >= 0.5
-    assert found.deviations["ball.x"] == pytest.approx(deviation(0.1, 4), rel=0.25)
+    assert told.startswith("ball.x: not observed; ")
+    assert told.endswith(" of the information of ball.y")
+    assert found.deviations["ball.x"] >= 0.5
+    assert found.deviations["ball.y"] == pytest.approx(deviation(0.1, 4), rel=0.25)
     assert abs(float(found.correlations[0, 1])) < 0.1
 
 
@@ -84,10 +84,10 @@ def test_a_direction_whose_loss_falls_again_is_not_observed():
     """Two spans away, 0.2 m, lies the next of many equal minima, or the slope of one."""
     steady = fitted(Ripple(period=2.0)).uncertainty
     assert steady.unobserved == ()
-    assert 0.025 < steady.deviations["ball.x"] < 0.1
+    assert 0.025 < steady.deviations["ball.y"] < 0.1
     repeated = fitted(Ripple(period=0.2)).uncertainty
-    assert repeated.unobserved == ("ball.x: not observed",)
-    assert repeated.deviations["ball.x"] > 1.0
+    assert repeated.unobserved == ("ball.y: not observed",)
+    assert repeated.deviations["ball.y"] > 1.0
 
 
 class Mixed(nn.Module):
@@ -104,7 +104,7 @@ class Mixed(nn.Module):
     def forward(self, scene: Scene) -> Scene:
         way = self.shares[0] + self.shares[1]
         zero = torch.zeros_like(way)
-        moved = {"translation": torch.stack([way, zero, zero])}
+        moved = {"translation": torch.stack([zero, way, zero])}
         return torch.func.functional_call(Translation("ball"), moved, (scene,))
 
 
@@ -130,7 +130,7 @@ def test_a_mixed_direction_is_named_with_its_parts():
 def test_modules_name_theircoordinates():
     named = nn.ModuleList(
         [
-            Pose("ball", rotation=[0.0, 0.4, 0.0], axes="x", rotation_axes="y"),
+            Pose("ball", rotation=[0.0, 0.0, 0.4], axes="y", rotation_axes="z"),
             Scale("ball", 2.0),
             RangeBias(),
             nn.Linear(1, 2, bias=False),
@@ -139,12 +139,12 @@ def test_modules_name_theircoordinates():
     )
     found = {c.name: c for c in iterate_coordinates(named)}
     assert list(found) == [
-        *("ball.x", "ball.yaw", "ball.scale", "range_bias", "3.weight[0]", "3.weight[1]")
+        *("ball.y", "ball.yaw", "ball.scale", "range_bias", "3.weight[0]", "3.weight[1]")
     ]
     assert found["ball.yaw"].unit == "rad"
     # A factor of 2 grows by 1 where its logarithm grows by a half.
     assert float(found["ball.scale"].tangents["1.log_scale"]) == pytest.approx(0.5)
-    assert [c.name for c in RadarPose(axes="", rotation_axes="z").coordinates()] == ["radar.roll"]
+    assert [c.name for c in RadarPose(axes="", rotation_axes="x").coordinates()] == ["radar.roll"]
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -16,15 +16,15 @@ def fitted(data: Tensor, start: float = 0.05, model: Blob | None = None) -> Reco
     return reconstruct(
         scene(start),
         Observation(model or Blob(), data, sensor=None),
-        Translation("ball", axes="x"),
+        Translation("ball", axes="y"),
         loss=LAW,
         optimizer=Optimizer("gauss_newton", rate=0.1),
         schedule=Schedule(8),
     )
 
 
-def look(seed: int, x: float = 0.1) -> Tensor:
-    drawn = Blob().realisations(scene(x), None, 0)
+def look(seed: int, y: float = 0.1) -> Tensor:
+    drawn = Blob().realisations(scene(y), None, 0)
     assert drawn is not None
     return drawn(seed, 0.0)
 
@@ -39,7 +39,7 @@ def test_right_ends_are_consistent():
 
 def test_a_wrong_minimum_is_not():
     """The blob is out of reach: the fit ends where it began, and says so."""
-    found = fitted(look(0, x=1.4), start=-1.0)
+    found = fitted(look(0, y=1.4), start=-1.0)
     assert found.status != "diverged"
     verdict = found.verdict
     assert verdict.word == "inconsistent"
@@ -53,11 +53,11 @@ def test_a_wrong_minimum_is_not():
 
 
 class Dark(Blob):
-    """Shows nothing right of a border."""
+    """Shows nothing left of a border."""
 
     def predict(self, scene: Scene, sensor: Any, seed: int) -> Tensor:
         power = super().predict(scene, sensor, seed)
-        return power * (scene["ball"].center[0] < 0).to(power)
+        return power * (scene["ball"].center[1] < 0).to(power)
 
 
 def test_a_start_that_shows_nothing_is_lost():
@@ -79,7 +79,7 @@ def test_without_looks_it_is_not_known():
 def test_an_end_worse_than_its_start_says_so():
     found = fitted(look(0), start=0.1)
     with torch.no_grad():
-        next(found.parameters.parameters())[0] += 0.5
+        next(found.parameters.parameters())[1] += 0.5
     assert found.verdict.word == "worse"
 
 

@@ -25,8 +25,8 @@ from invertwin.scene.parameters import MaterialValues
 from invertwin.simulation import simulate
 from scenes import float64, radar, thing
 
-SCENE = Scene({"ball": thing(sphere(0.2, 2), (0, 0, 1))})
-AHEAD = float64([0.0, 0.0, 1.0])
+SCENE = Scene({"ball": thing(sphere(0.2, 2), (1, 0, 0))})
+AHEAD = float64([1.0, 0.0, 0.0])
 THETA = torch.tensor(0.03, dtype=torch.float64)
 
 
@@ -38,8 +38,8 @@ def ball() -> DistanceGrid:
 
 
 def test_a_parameter_moves_by_theta_times_its_change():
-    line = make_line(Translation("ball"), {"translation": float64([1.0, 0.0, -2.0])}, SCENE)
-    assert torch.allclose(line.evaluate(THETA)["ball"].center, float64([0.03, 0.0, 0.94]))
+    line = make_line(Translation("ball"), {"translation": float64([-2.0, 1.0, 0.0])}, SCENE)
+    assert torch.allclose(line.evaluate(THETA)["ball"].center, float64([0.94, 0.03, 0.0]))
     assert torch.equal(line.evaluate_end(0.03)["ball"].center, line.evaluate(THETA)["ball"].center)
 
 
@@ -140,7 +140,7 @@ def test_losses_along_a_line_are_least_at_the_truth():
 
 
 def test_a_line_leaves_its_module_alone():
-    module = Translation("ball", [0.1, 0.0, 0.0])
-    line = make_line(module, float64([1.0, 0.0, 0.0]), SCENE)
-    assert float(line.evaluate_end(0.5)["ball"].center[0]) == pytest.approx(0.6)
-    assert module.translation.tolist() == [0.1, 0.0, 0.0]
+    module = Translation("ball", [0.0, 0.1, 0.0])
+    line = make_line(module, float64([0.0, 1.0, 0.0]), SCENE)
+    assert float(line.evaluate_end(0.5)["ball"].center[1]) == pytest.approx(0.6)
+    assert module.translation.tolist() == [0.0, 0.1, 0.0]

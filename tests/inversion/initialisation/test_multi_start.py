@@ -17,26 +17,26 @@ from scenes import float64, thing
 
 @dataclass(frozen=True, eq=False)
 class Mirrored(Blob):
-    """Shows x and, as bright or somewhat darker, −x: which is which is hard to tell."""
+    """Shows y and, as bright or somewhat darker, −y: which is which is hard to tell."""
 
     share: float = 1.0
 
     def predict(self, scene: Scene, sensor: Any, seed: int) -> Tensor:
-        x = scene["ball"].center[0]
-        blobs = [torch.exp(-((BINS - s * x) ** 2) / 0.08) for s in (1, -1)]
+        y = scene["ball"].center[1]
+        blobs = [torch.exp(-((BINS - s * y) ** 2) / 0.08) for s in (1, -1)]
         power = 0.05 + blobs[0] + self.share * blobs[1]
         return power.expand(self.frames, -1)[..., None, None]
 
 
 def found(model: Blob, places: list[float], seed: int = 0) -> Search:
-    """Fits to a ball at x = 0.8 from starts at some places."""
+    """Fits to a ball at y = 0.8 from starts at some places."""
     look = model.realisations(scene(0.8), None, 0)
     assert look is not None
-    starts = [scene(x)["ball"] for x in places]
+    starts = [scene(y)["ball"] for y in places]
     return search(
         scene(),
         Observation(model, look(seed, 0.0), sensor=None),
-        Translation("ball", axes="x"),
+        Translation("ball", axes="y"),
         {"ball": starts},
         loss=LAW,
         optimizer=Optimizer("gauss_newton", rate=0.1),
@@ -45,7 +45,7 @@ def found(model: Blob, places: list[float], seed: int = 0) -> Search:
 
 
 def places_of(search: Search) -> list[float]:
-    return [float(end.scene["ball"].center[0].detach()) for end in search.minima]
+    return [float(end.scene["ball"].center[1].detach()) for end in search.minima]
 
 
 def test_two_minima_that_look_alike_are_both_listed():
@@ -77,16 +77,16 @@ def test_a_right_competitor_is_not_rejected(seed):
 
 
 def test_half_turns_are_tried_without_being_asked():
-    bar = Scene({"ball": thing(box([0.4, 0.1, 0.2]), (0.0, 0.0, 1.0), (0.0, 0.3, 0.0))})
+    bar = Scene({"ball": thing(box([0.2, 0.4, 0.1]), (1.0, 0.0, 0.0), (0.0, 0.0, 0.3))})
     vertices = bar["ball"].mesh.vertices * float64([1.0, 1.0, 1.0])
-    vertices[vertices[:, 0] > 0] *= 0.5  # so that both ends differ
+    vertices[vertices[:, 1] > 0] *= 0.5  # so that both ends differ
     bar = bar.replace("ball", mesh=type(bar["ball"].mesh)(vertices, bar["ball"].mesh.faces))
     look = Needle().realisations(bar, None, 0)
     assert look is not None
     result = search(
         bar,
         Observation(Needle(), look(0, 0.0), sensor=None),
-        Pose("ball", axes="", rotation_axes="y"),
+        Pose("ball", axes="", rotation_axes="z"),
         {"ball": [bar["ball"]]},
         loss=LAW,
         optimizer=Optimizer("gauss_newton", rate=0.1),
@@ -94,7 +94,7 @@ def test_half_turns_are_tried_without_being_asked():
     )
     assert len(result.minima) == 2
     (told,) = result.ambiguities
-    assert "180.0° about y" in told or "179." in told
+    assert "180.0° about z" in told or "179." in told
 
 
 def test_a_grid_of_poses_covers_its_box():
@@ -117,7 +117,7 @@ def test_random_starts_serve_as_well():
     generator = torch.Generator().manual_seed(1)
     starts: list[Object] = list(
         sample_nearby_poses(
-            scene(0.8)["ball"], 3, distance=(0.05, 0.1), axes="x", generator=generator
+            scene(0.8)["ball"], 3, distance=(0.05, 0.1), axes="y", generator=generator
         )
     )
     look = Blob().realisations(scene(0.8), None, 0)
@@ -125,7 +125,7 @@ def test_random_starts_serve_as_well():
     result = search(
         scene(),
         Observation(Blob(), look(0, 0.0), sensor=None),
-        Translation("ball", axes="x"),
+        Translation("ball", axes="y"),
         {"ball": starts},
         loss=LAW,
         optimizer=Optimizer("gauss_newton", rate=0.1),

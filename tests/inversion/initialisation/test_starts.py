@@ -31,10 +31,10 @@ def test_poses_are_as_far_off_as_asked_and_repeat():
 
 
 def test_offsets_keep_to_their_axes_and_turns_to_theirs():
-    up = torch.tensor([0.0, 3.0, 0.0], dtype=torch.float64)
-    for copy in drawn(axes="xz", rotation_axis=up):
-        assert float(copy.center[1]) == pytest.approx(2.0, abs=1e-12)
-        torch.testing.assert_close(copy.transform[1, :3], ITEM.transform[1, :3])
+    up = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
+    for copy in drawn(axes="xy", rotation_axis=up):
+        assert float(copy.center[2]) == pytest.approx(3.0, abs=1e-12)
+        torch.testing.assert_close(copy.transform[2, :3], ITEM.transform[2, :3])
 
 
 def test_a_displaced_object_turns_about_its_centre():

@@ -23,7 +23,7 @@ TX = float64([1.0, -2.5, 2.0])
 
 def coverage(count: int) -> Coverage:
     """Receivers behind a screen."""
-    turn = rotation_from_vector(float64([math.pi / 2, 0.0, 0.0]))
+    turn = rotation_from_vector(float64([0.0, 0.0, -math.pi / 2]))
     pose = rigid(turn, float64([0.5, 0.0, 1.35]))
     scene = Scene({"screen": Object(plate(3.0, 3.0), PerfectConductor(), pose)})
     generator = torch.Generator().manual_seed(2)

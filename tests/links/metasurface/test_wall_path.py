@@ -61,7 +61,7 @@ def test_a_placed_panel_stays_focused():
         assert float(left.abs().max()) < 1e-9
         assert float(torch.linalg.det(placed.axes)) == pytest.approx(1.0)
         inward = path.locate(float64(along))[1]
-        assert float(placed.axes[:, 2] @ inward) == pytest.approx(math.cos(yaw))
+        assert float(placed.axes[:, 0] @ inward) == pytest.approx(math.cos(yaw))
 
 
 def test_what_is_fitted_has_names():

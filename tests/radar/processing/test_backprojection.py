@@ -29,8 +29,8 @@ def track(waveform) -> Radar:
     """2 × 4 elements along 0.3 m of a bent track, turning on the way."""
     half = 0.5 * waveform.wavelength
     along = torch.linspace(-0.15, 0.15, 41, dtype=torch.float64)
-    places = torch.stack([along, 0.1 * along.square(), 0.02 * torch.sin(9 * along)], dim=1)
-    turns = [rotation_from_vector(torch.tensor([0.0, -0.2 * x, 0.1 * x])) for x in along]
+    places = torch.stack([0.02 * torch.sin(9 * along), along, 0.1 * along.square()], dim=1)
+    turns = [rotation_from_vector(torch.tensor([0.1 * y, 0.0, -0.2 * y])) for y in along]
     return Radar(
         linear_array(2, 4 * half),
         linear_array(4, half),
@@ -65,13 +65,13 @@ def plain(beat, radar, points):
 
 def test_points_along_a_track(track, point_paths):
     """conj(a) at each place, with a sharp peak; equal to the plain sum everywhere."""
-    points = torch.tensor([[0.1, 0.0, 1.5], [-0.4, 0.05, 2.1]], dtype=torch.float64)
+    points = torch.tensor([[1.5, 0.1, 0.0], [2.1, -0.4, 0.05]], dtype=torch.float64)
     beat = recorded(point_paths, track, points, [1.0, 0.5j])
     image = backproject_beat(beat, track, points.reshape(2, 1, 3))
     assert image.shape == (2, 1)
     expected = torch.tensor([[1.0], [-0.5j]], dtype=torch.complex128)
     assert (image - expected).abs().max() < 0.05
-    away = torch.tensor([[0.02, 0, 0], [0, 0, 0.25], [0.3, 0, 0.3]], dtype=torch.float64)
+    away = torch.tensor([[0, 0.02, 0], [0.25, 0, 0], [0.3, 0.3, 0]], dtype=torch.float64)
     assert backproject_beat(beat, track, points[0] + away).abs().max() < 0.15
     mixed = torch.cat([points, points[0] + 0.1 * away, points[1] + away])
     difference = backproject_beat(beat, track, mixed) - plain(beat, track, mixed)
@@ -86,10 +86,10 @@ def test_near_field_of_an_array(waveform, point_paths):
         waveform,
         torch.zeros(1, 3, dtype=torch.float64),
     )
-    point = torch.tensor([[0.03, 0.0, 0.25]], dtype=torch.float64)
+    point = torch.tensor([[0.25, 0.03, 0.0]], dtype=torch.float64)
     beat = recorded(point_paths, radar, point, [1.0])
     offset = torch.linspace(-0.02, 0.02, 81, dtype=torch.float64)
-    line = point + torch.nn.functional.pad(offset[:, None], (0, 2))
+    line = point + torch.nn.functional.pad(offset[:, None], (1, 1))
     image = backproject_beat(beat, radar, line).abs()
     assert image.argmax() == 40
     assert image[40] == pytest.approx(1.0, abs=0.01)
@@ -101,17 +101,17 @@ def test_near_field_of_an_array(waveform, point_paths):
 def test_far_away_it_is_the_range_profile(linear, point_paths):
     """One frame of one channel: the same number as the windowed transform at that range."""
     radar = replace(linear, receivers=linear_array(1, 1.0))
-    points = torch.tensor([[0.0, 0.0, 4.3]], dtype=torch.float64)
+    points = torch.tensor([[4.3, 0.0, 0.0]], dtype=torch.float64)
     beat = recorded(point_paths, radar, points, [1.0])
     grid = radar.grid(3, 6)
-    places = torch.nn.functional.pad(grid.ranges[:, None], (2, 0))
+    places = torch.nn.functional.pad(grid.ranges[:, None], (0, 2))
     image = backproject_beat(beat, radar, places).abs()
     profile = range_profile(beat, radar, grid)[0, 0, 0].abs()
     assert torch.allclose(image, profile, atol=2e-3)
 
 
 def test_captures_of_beat_samples(track, point_paths):
-    points = torch.tensor([[0.1, 0.0, 1.5]], dtype=torch.float64)
+    points = torch.tensor([[1.5, 0.1, 0.0]], dtype=torch.float64)
     beat = recorded(point_paths, track, points, [1.0])
     image = backproject(Capture.from_beat(beat, track), points)
     assert torch.allclose(image, backproject_beat(beat, track, points))
@@ -121,10 +121,10 @@ def test_gradients():
     """In the signal, the points and the poses; a low carrier keeps differences accurate."""
     waveform = FMCW(1e9, 0.2e9, 1e-6, 12)
     still = torch.zeros(2, 3, dtype=torch.float64)
-    radar = Radar(linear_array(2, 0.1, "y"), linear_array(2, 0.1), waveform, still)
+    radar = Radar(linear_array(2, 0.1, "z"), linear_array(2, 0.1), waveform, still)
     generator = torch.Generator().manual_seed(0)
     beat = torch.randn(2, 2, 2, 12, dtype=torch.complex128, generator=generator)
-    points = torch.tensor([[0.3, 0.2, 2.0], [-0.5, 0.1, 3.3]], dtype=torch.float64)
+    points = torch.tensor([[2.0, 0.3, 0.2], [3.3, -0.5, 0.1]], dtype=torch.float64)
     positions = 0.1 * torch.randn(2, 3, dtype=torch.float64, generator=generator)
     assert torch.autograd.gradcheck(
         lambda b, x, p: backproject_beat(b, replace(radar, positions=p), x),
@@ -133,7 +133,7 @@ def test_gradients():
 
 
 def test_gradient_at_77_ghz_is_that_of_the_plain_sum(track, point_paths):
-    points = torch.tensor([[0.1, 0.0, 1.5]], dtype=torch.float64)
+    points = torch.tensor([[1.5, 0.1, 0.0]], dtype=torch.float64)
     beat = recorded(point_paths, track, points, [1.0])
     near = (points + 4e-4).requires_grad_()
     grads = [
@@ -145,7 +145,7 @@ def test_gradient_at_77_ghz_is_that_of_the_plain_sum(track, point_paths):
 
 def test_wrong_input(linear):
     beat = torch.zeros(1, 1, 16, 64, dtype=torch.complex128)
-    far = torch.tensor([[0.0, 0.0, 9.7]], dtype=torch.float64)
+    far = torch.tensor([[9.7, 0.0, 0.0]], dtype=torch.float64)
     with pytest.raises(InputError, match="unambiguous range"):
         backproject_beat(beat, linear, far)
     with pytest.raises(InputError, match=r"beat signal \(frame, tx, rx, sample\) of shape"):

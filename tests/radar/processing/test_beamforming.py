@@ -14,13 +14,13 @@ from invertwin.scene.antenna import AntennaArray, linear_array
 from invertwin.scene.pose import rotation_from_vector
 
 U, V, DISTANCE = 0.3, -0.2, 5.0
-TARGET = DISTANCE * torch.tensor([U, V, math.sqrt(1 - U**2 - V**2)], dtype=torch.float64)
+TARGET = DISTANCE * torch.tensor([math.sqrt(1 - U**2 - V**2), U, V], dtype=torch.float64)
 
 
 def scattered_array(radar: Radar) -> AntennaArray:
     """A planar array that is no product of a row and a column: its corners are missing."""
     places = radar.receivers.positions
-    corner = (places / places.amax(0).clamp(min=1e-9)).abs()[:, :2].sum(1) > 1.6
+    corner = (places / places.amax(0).clamp(min=1e-9)).abs()[:, 1:].sum(1) > 1.6
     return AntennaArray(places[~corner])
 
 
@@ -52,8 +52,8 @@ def test_target_off_both_axes(radar, point_paths):
 
 def test_turned_radar_sees_the_same(planar, point_paths):
     """Directions are those of the radar frame, wherever it looks."""
-    turn = rotation_from_vector(torch.tensor([0.4, -0.8, 0.3], dtype=torch.float64))
-    place = torch.tensor([[1.0, -2, 3]], dtype=torch.float64)
+    turn = rotation_from_vector(torch.tensor([0.3, 0.4, -0.8], dtype=torch.float64))
+    place = torch.tensor([[3.0, 1, -2]], dtype=torch.float64)
     moved = replace(planar, positions=place, rotations=turn[None])
     grid = planar.grid(4.5, 5.5)
     maps = [
@@ -70,11 +70,11 @@ def test_separable_equals_the_plain_sum(mimo, point_paths):
     profile = range_profile(beat_signal(paths, mimo), mimo, grid)
     found = beamform(profile, mimo, grid)[0]
     array = aperture(mimo)
-    weight = array.x_taper[array.column] * array.y_taper[array.row]
+    weight = array.y_taper[array.column] * array.z_taper[array.row]
     places = mimo.virtual_positions
     k = 2 * math.pi / mimo.waveform.wavelength
     for i, j in ((3, 5), (30, 11), (20, 16)):
-        phase = k * (grid.u[i] * places[:, 0] + grid.v[j] * places[:, 1])
+        phase = k * (grid.u[i] * places[:, 1] + grid.v[j] * places[:, 2])
         steering = weight / weight.sum() * torch.polar(torch.ones_like(phase), phase)
         expected = (steering @ profile[0].flatten(0, 1)).abs().square()
         assert torch.allclose(found[:, i, j], expected)
@@ -102,7 +102,7 @@ def test_overlapping_virtual_elements(waveform, point_paths):
     )
     array = aperture(radar)
     assert array.counts[:, 0].tolist() == [1, 2, 2, 2, 1]
-    target = DISTANCE * torch.tensor([U, 0, math.sqrt(1 - U**2)], dtype=torch.float64)
+    target = DISTANCE * torch.tensor([math.sqrt(1 - U**2), U, 0], dtype=torch.float64)
     grid = radar.grid(4.5, 5.5, oversample=8)
     power = exact_spectrum(
         beat_signal(point_paths(radar, target, torch.tensor([1.0])), radar), radar, grid
@@ -138,9 +138,9 @@ def test_wrong_input(planar):
         beamform(torch.zeros(1, 1, 96, 3, dtype=torch.complex128), planar, grid)
     profile = torch.zeros(1, 1, 96, grid.range_count, dtype=torch.complex128)
     places = planar.receivers.positions.clone()
-    places[:, 2] = torch.linspace(0, 0.01, 96)
+    places[:, 0] = torch.linspace(0, 0.01, 96)
     deep = replace(planar, receivers=AntennaArray(places))
-    with pytest.raises(InputError, match="x-y plane"):
+    with pytest.raises(InputError, match="y-z plane"):
         beamform(profile, deep, grid)
     few = replace(planar, receivers=scattered_array(planar))
     count = len(few.receivers.positions)

@@ -141,12 +141,12 @@ CHIRPS = Chirps(count=32, interval=50e-6)
 @pytest.fixture(scope="module")
 def radar() -> Radar:
     half = 0.5 * WAVE.wavelength
-    turns = [[0.0, 0.0, 0.0], [0.1, -0.5, 0.2]]
+    turns = [[0.0, 0.0, 0.0], [0.2, 0.1, -0.5]]
     return Radar(
         linear_array(2, 4 * half),
         planar_array((4, 4), (half, half)),
         WAVE,
-        torch.tensor([[0.0, 0, 0], [1.0, -2, 0.5]], dtype=torch.float64),
+        torch.tensor([[0.0, 0, 0], [0.5, 1.0, -2]], dtype=torch.float64),
         torch.stack([rotation_from_vector(torch.tensor(t).double()) for t in turns]),
     )
 
@@ -175,7 +175,7 @@ def test_points_of_movers(radar):
             assert found.v[row] == pytest.approx(v, abs=0.1 * radar.beamwidth[1])
             # Less what falls between the bins of range rate, range and direction.
             assert -3 < 10 * math.log10(found.power[row] / amplitude**2) < 0.3
-            ray = torch.tensor([u, v, math.sqrt(1 - u**2 - v**2)], dtype=torch.float64)
+            ray = torch.tensor([math.sqrt(1 - u**2 - v**2), u, v], dtype=torch.float64)
             link = radar.link()
             place = 0.5 * (link.tx + link.rx)[frame] + link.rotations[frame] @ ray * distance
             assert (found.position[row] - place).norm() < 0.12
@@ -232,12 +232,12 @@ def test_points_refuse_gradients_and_other_shapes(radar, unchecked):
 @pytest.mark.usefixtures("unchecked")
 def test_peaks_of_a_map_are_placed_in_the_world():
     """Two bumps at one range that differ in direction alone, and one beside the detected cells."""
-    turn = rotation_from_vector(torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64))
+    turn = rotation_from_vector(torch.tensor([0.0, 0.0, 0.3], dtype=torch.float64))
     radar = Radar(
         linear_array(1, 0.01),
         planar_array((8, 8), (0.0019, 0.0019)),
         FMCW(77e9, 1e9, 50e-6, 64),
-        torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64),
+        torch.tensor([[3.0, 1.0, 2.0]], dtype=torch.float64),
         turn[None],
     )
     grid = Grid(2.0, 0.1, 30, u_start=-0.5, u_step=0.05, u_count=21, v_start=-0.5, v_step=0.05,
@@ -256,7 +256,7 @@ def test_peaks_of_a_map_are_placed_in_the_world():
     places = torch.stack([found.range, found.u, found.v], dim=1)[order]
     torch.testing.assert_close(places, true[:2], atol=2e-3, rtol=0.0)
     assert not found.velocity.any()
-    local = torch.stack([found.u, found.v, (1 - found.u**2 - found.v**2).sqrt()], dim=1)
+    local = torch.stack([(1 - found.u**2 - found.v**2).sqrt(), found.u, found.v], dim=1)
     expected = radar.positions + (found.range[:, None] * local) @ turn.T
     offset = radar.transmitters.positions.mean(0) + radar.receivers.positions.mean(0)
     torch.testing.assert_close(found.position, expected + 0.5 * (turn @ offset))

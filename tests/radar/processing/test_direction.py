@@ -31,7 +31,7 @@ def waves(radar: Radar, directions, snapshots: int, seed: int, noise: float = 0.
     generator = torch.Generator().manual_seed(seed)
     directions = torch.tensor(directions, dtype=torch.float64).reshape(-1, 2)
     k = 2 * math.pi / radar.waveform.wavelength
-    phase = -k * (directions @ radar.virtual_positions[:, :2].T)
+    phase = -k * (directions @ radar.virtual_positions[:, 1:].T)
     sources = 1 if coherent else len(directions)
     turn = 2 * math.pi * torch.rand(snapshots, sources, dtype=torch.float64, generator=generator)
     signal = torch.exp(1j * turn).expand(-1, len(directions)) @ torch.exp(1j * phase)
@@ -60,7 +60,7 @@ def test_capon_of_one_source_is_its_closed_form(linear):
     power = capon(waves(linear, [[0.2, 0]], 1, 0), linear, grid, loading=loading)
     assert power.shape == (1, 1, 361, 1)
     k = 2 * math.pi / linear.waveform.wavelength
-    phase = k * (grid.u[:, None] - 0.2) * linear.virtual_positions[:, 0]
+    phase = k * (grid.u[:, None] - 0.2) * linear.virtual_positions[:, 1]
     overlap = torch.exp(1j * phase).sum(1).abs().square()
     expected = loading / (elements - overlap / (elements + loading))
     assert torch.allclose(power[0, 0, :, 0], expected, rtol=1e-9)
@@ -160,9 +160,9 @@ def test_forward_backward_of_a_uniform_array_keeps_the_directions(linear):
 def test_arrays_with_gaps_and_shared_places(waveform):
     """2 × 3 elements with a shared place and a gap: MUSIC works, smoothing is refused."""
     half = 0.5 * waveform.wavelength
-    places = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]], dtype=torch.float64) * half
+    places = torch.tensor([[0.0, 0, 0], [0, 1, 0], [0, 3, 0]], dtype=torch.float64) * half
     radar = Radar(linear_array(2, half), AntennaArray(places), waveform, torch.zeros(1, 3).double())
-    assert len(torch.unique(radar.virtual_positions[:, 0].mul(1e6).round())) == 5
+    assert len(torch.unique(radar.virtual_positions[:, 1].mul(1e6).round())) == 5
     profile = waves(radar, [[0.3, 0.0]], 20, 6, noise=1e-3)
     grid = line()
     for power in (music(profile, radar, grid, sources=1), capon(profile, radar, grid)):

@@ -144,7 +144,7 @@ def test_transmitters_at_once_need_nothing():
 def test_moving_paths_have_the_same_signal(point_paths):
     """What ``moving_beat`` makes of a moving point is the closed form that these tests use."""
     radar, rate = mimo(), 9.0
-    ray = torch.tensor([U, 0.0, math.sqrt(1 - U**2)], dtype=torch.float64)
+    ray = torch.tensor([math.sqrt(1 - U**2), U, 0.0], dtype=torch.float64)
     start = (4.0 - rate * CHIRPS.times(4).mean()) * ray
     paths = point_paths(radar, start, torch.tensor([1.0]))
     beat = moving_beat(replace(paths, velocity=rate * ray[None]), radar, CHIRPS)
@@ -154,8 +154,8 @@ def test_moving_paths_have_the_same_signal(point_paths):
 def test_frames_have_their_own_poses():
     """Two frames with other places and attitudes of the radar see the same in their frames."""
     one = mimo(2, 2)
-    turn = rotation_from_vector(torch.tensor([0.2, -0.5, 0.3], dtype=torch.float64))
-    places = torch.tensor([[0.0, 0, 0], [1.0, -2, 0.5]], dtype=torch.float64)
+    turn = rotation_from_vector(torch.tensor([0.3, 0.2, -0.5], dtype=torch.float64))
+    places = torch.tensor([[0.0, 0, 0], [0.5, 1.0, -2]], dtype=torch.float64)
     both = replace(one, positions=places, rotations=torch.stack([torch.eye(3).double(), turn]))
     beat = mover(both, CHIRPS, -2.0)
     grid = both.grid(3, 5)
@@ -265,7 +265,7 @@ class Boards:
 
     def degrees_off(self, spectrum, grid) -> float:
         ends = [
-            torch.cat([place, (1 - place.square().sum()).clamp(min=0).sqrt()[None]])
+            torch.cat([(1 - place.square().sum()).clamp(min=0).sqrt()[None], place])
             for place in (self.seen(spectrum, grid)[1], self.truth)
         ]
         return math.degrees(math.acos(min(1.0, float(ends[0] @ ends[1]))))

@@ -51,7 +51,7 @@ def moving(velocity, material=None):
     ball = Object(
         sphere(0.1, subdivisions=2),
         material or RoughDielectric(4.0),
-        rigid(translation=[0.2, 0.1, 3.0]),
+        rigid(translation=[3.0, 0.2, 0.1]),
         torch.tensor(velocity, dtype=torch.float64),
     )
     return Scene({"ball": ball})
@@ -68,7 +68,7 @@ def test_doppler_equals_moved_geometry(tdm, material):
     """The same cube, whether the points move or the whole scene is traced anew."""
     chirps = Chirps(count=4, interval=80e-6, tdm=tdm)
     # Sideways little enough that no point crosses the terminator.
-    scene = moving([0.0, 0.0, -3.0], material)
+    scene = moving([-3.0, 0.0, 0.0], material)
     options: dict[str, Any] = {"seed": 1, "sampling": replace(FEW, conductor_samples=4000)}
     moved = simulate_chirps(scene, RADAR, chirps, **options)
     traced = simulate_chirps(scene, RADAR, chirps, retrace=True, **options)
@@ -79,7 +79,7 @@ def test_doppler_equals_moved_geometry(tdm, material):
 
 
 def test_a_rotating_body_has_a_velocity_per_vertex():
-    spin = torch.tensor([0.0, 20.0, 0.0], dtype=torch.float64)  # rad/s
+    spin = torch.tensor([0.0, 0.0, 20.0], dtype=torch.float64)  # rad/s
     scene = moving([0.0, 0.0, 0.0])
     arms = scene["ball"].vertices - scene["ball"].center
     turning = scene.replace("ball", velocity=torch.linalg.cross(spin.expand_as(arms), arms))
@@ -96,8 +96,8 @@ def test_phase_of_an_approaching_mirror_falls_by_4_pi_v_t_over_lambda():
     mirror = Object(
         plate(0.05, 0.05),
         PerfectConductor(),
-        rigid(translation=[0.0, 0.0, 3.0]),
-        torch.tensor([0.0, 0.0, -speed], dtype=torch.float64),
+        rigid(translation=[3.0, 0.0, 0.0]),
+        torch.tensor([-speed, 0.0, 0.0], dtype=torch.float64),
     )
     alone = AntennaArray(torch.zeros(1, 3, dtype=torch.float64), Isotropic())
     radar = Radar(alone, alone, WAVE, torch.zeros(1, 3, dtype=torch.float64))
@@ -115,7 +115,7 @@ def test_phase_of_an_approaching_mirror_falls_by_4_pi_v_t_over_lambda():
 
 
 def test_transmitters_that_take_turns_see_the_scene_at_their_own_times():
-    scene = moving([0.0, 0.0, -3.0])
+    scene = moving([-3.0, 0.0, 0.0])
     turns = simulate_chirps(scene, RADAR, Chirps(3, 80e-6), seed=1, sampling=FEW)
     together = simulate_chirps(scene, RADAR, Chirps(5, 80e-6, tdm=False), seed=1, sampling=FEW)
     # Slot 2k of the turns is TX 0 in loop k, slot 2k + 1 is TX 1.
@@ -152,9 +152,9 @@ def test_any_motion_as_a_function_of_time(name):
     def way(times):
         t = times[..., None]
         if name == "accelerating":
-            return torch.tensor([0.2, 0.1, 4.5]) + t * torch.tensor([5.0, 0, -30]) + 25 * t**2
+            return torch.tensor([4.5, 0.2, 0.1]) + t * torch.tensor([-30, 5.0, 0]) + 25 * t**2
         angle = 700 * t
-        return torch.cat([0.3 + 0.15 * angle.sin(), 0 * t, 4.4 + 0.15 * angle.cos()], dim=-1)
+        return torch.cat([4.4 + 0.15 * angle.cos(), 0.3 + 0.15 * angle.sin(), 0 * t], dim=-1)
 
     scene = ball_on(way)
     drawn = Sampling(depth=1, conductor_samples=100_000, boundary_samples=0)
@@ -184,7 +184,7 @@ def test_any_motion_as_a_function_of_time(name):
 
 
 def test_a_function_of_time_is_what_velocities_are():
-    scene = moving([1.0, 0.0, -3.0])
+    scene = moving([-3.0, 1.0, 0.0])
     options: dict[str, Any] = {"seed": 1, "sampling": FEW}
     by_velocity = simulate_chirps(scene, RADAR, CHIRPS, retrace=True, **options)
     by_function = simulate_chirps(scene.advance, RADAR, CHIRPS, **options)
@@ -193,7 +193,7 @@ def test_a_function_of_time_is_what_velocities_are():
 
 def test_impairments_of_moving_scenes():
     """The front end's own numbers on top; phase noise follows the paths of the frame's start."""
-    scene = moving([0.0, 0.0, -3.0])
+    scene = moving([-3.0, 0.0, 0.0])
     options: dict[str, Any] = {"seed": 1, "sampling": FEW}
     front = Impairments(snr_db=20, gain_std_db=1.0)
     for retrace in (False, True):
@@ -224,8 +224,8 @@ def test_objects_and_triangles_stay():
 def test_every_sample_has_its_own_delay(waveform, point_paths):
     """A point at 40 m/s in all waveforms whose samples are taken in time."""
     radar = replace(RADAR, waveform=waveform)
-    start = torch.tensor([[0.5, -0.2, 1.9]], dtype=torch.float64)
-    velocity = torch.tensor([[10.0, 5.0, -38.0]], dtype=torch.float64)
+    start = torch.tensor([[1.9, 0.5, -0.2]], dtype=torch.float64)
+    velocity = torch.tensor([[-38.0, 10.0, 5.0]], dtype=torch.float64)
     paths = replace(point_paths(radar, start, torch.tensor([1 - 2j])), velocity=velocity)
     found = moving_beat(paths, radar, CHIRPS)
     for chirp, starts in enumerate(CHIRPS.times(2).tolist()):
@@ -241,8 +241,8 @@ def test_every_sample_has_its_own_delay(waveform, point_paths):
 
 def test_ofdm_sees_where_its_symbols_start(point_paths):
     radar = replace(RADAR, waveform=OFDM(77e9, 3e7, 32))
-    start = torch.tensor([[0.5, -0.2, 1.9]], dtype=torch.float64)
-    velocity = torch.tensor([[0.0, 5.0, -38.0]], dtype=torch.float64)
+    start = torch.tensor([[1.9, 0.5, -0.2]], dtype=torch.float64)
+    velocity = torch.tensor([[-38.0, 0.0, 5.0]], dtype=torch.float64)
     paths = point_paths(radar, start, torch.ones(1))
     chirps = Chirps(3, 1e-4, tdm=False)
     found = moving_beat(replace(paths, velocity=velocity), radar, chirps)
@@ -253,11 +253,11 @@ def test_ofdm_sees_where_its_symbols_start(point_paths):
 
 def test_frames_and_empty_frames(point_paths):
     """Every frame sees its own paths from its own place."""
-    places = torch.tensor([[0.0, 0, 0], [0.3, 0.1, -0.2], [0, 0, 0]], dtype=torch.float64)
+    places = torch.tensor([[0.0, 0, 0], [-0.2, 0.3, 0.1], [0, 0, 0]], dtype=torch.float64)
     radar = replace(RADAR, positions=places)
-    points = torch.tensor([[0.5, -0.2, 1.9], [0.1, 0.3, 2.5]], dtype=torch.float64)
+    points = torch.tensor([[1.9, 0.5, -0.2], [2.5, 0.1, 0.3]], dtype=torch.float64)
     paths = point_paths(radar, points, torch.ones(2), torch.tensor([1, 0]))
-    paths = replace(paths, velocity=torch.tensor([[1.0, 2, 3]]).double().expand(2, 3))
+    paths = replace(paths, velocity=torch.tensor([[3.0, 1, 2]]).double().expand(2, 3))
     found = moving_beat(paths, radar, CHIRPS)
     for frame, row in ((0, 1), (1, 0)):
         alone = radar.frames([frame])
@@ -276,7 +276,7 @@ def test_gradients_of_moving_points(point_paths):
     """In places, velocities and coefficients, at a low carrier where differences are accurate."""
     radar = replace(RADAR, waveform=FMCW(1e9, 0.2e9, 50e-6, 12))
     paths = point_paths(
-        radar, torch.tensor([[0.5, -0.2, 1.9], [0.1, 0.3, 2.5]]), torch.tensor([1.0, 2 - 1j])
+        radar, torch.tensor([[1.9, 0.5, -0.2], [2.5, 0.1, 0.3]]), torch.tensor([1.0, 2 - 1j])
     )
 
     def signal(coefficient, first, velocity):
@@ -292,7 +292,7 @@ def test_gradients_of_moving_points(point_paths):
         )
         return moving_beat(moved, radar, Chirps(2, 80e-6), tolerance=1e-13)
 
-    velocity = torch.tensor([[0.01, 0.0, -0.03], [0.02, 0.01, 0.0]], dtype=torch.float64)
+    velocity = torch.tensor([[-0.03, 0.01, 0.0], [0.0, 0.02, 0.01]], dtype=torch.float64)
     inputs = [paths.coefficient.clone(), paths.first.clone(), velocity]
     inputs = [value.requires_grad_() for value in inputs]
     assert torch.autograd.gradcheck(
@@ -301,14 +301,14 @@ def test_gradients_of_moving_points(point_paths):
 
 
 def test_motion_that_no_ramp_follows_is_refused(point_paths):
-    paths = point_paths(RADAR, torch.tensor([[0.0, 0.0, 2.0]]), torch.ones(1))
-    wild = replace(paths, velocity=torch.tensor([[3e5, 0.0, 0.0]], dtype=torch.float64))
+    paths = point_paths(RADAR, torch.tensor([[2.0, 0.0, 0.0]]), torch.ones(1))
+    wild = replace(paths, velocity=torch.tensor([[0.0, 3e5, 0.0]], dtype=torch.float64))
     with pytest.raises(InputError, match="near to a line over a ramp"):
         moving_beat(wild, RADAR, CHIRPS)
 
 
 def test_range_is_warned_of_once(point_paths):
-    paths = point_paths(RADAR, torch.tensor([[0.0, 0.0, 20.0]]), torch.ones(1))
+    paths = point_paths(RADAR, torch.tensor([[20.0, 0.0, 0.0]]), torch.ones(1))
     paths = replace(paths, velocity=torch.ones_like(paths.first))
     with pytest.warns(PhysicsWarning, match="1 of 1 paths") as caught:
         moving_beat(paths, RADAR, CHIRPS)
@@ -317,10 +317,10 @@ def test_range_is_warned_of_once(point_paths):
 
 def test_range_rate_is_the_derivative_of_the_range(point_paths):
     """By forward mode, against differences; bistatic paths too."""
-    far = AntennaArray(torch.tensor([[2.0, 0.0, 0.5]], dtype=torch.float64), Isotropic())
+    far = AntennaArray(torch.tensor([[0.5, 2.0, 0.0]], dtype=torch.float64), Isotropic())
     radar = replace(RADAR, transmitters=far)
-    points = torch.tensor([[0.5, -0.2, 1.9], [0.1, 0.3, 2.5]], dtype=torch.float64)
-    velocity = torch.tensor([[1.0, -2.0, 3.0], [0.0, 5.0, -40.0]], dtype=torch.float64)
+    points = torch.tensor([[1.9, 0.5, -0.2], [2.5, 0.1, 0.3]], dtype=torch.float64)
+    velocity = torch.tensor([[3.0, 1.0, -2.0], [-40.0, 0.0, 5.0]], dtype=torch.float64)
     coefficient = torch.ones(2)
     assert not range_rate(point_paths(radar, points, coefficient), radar).any()
     found = range_rate(replace(point_paths(radar, points, coefficient), velocity=velocity), radar)
@@ -340,8 +340,8 @@ def test_order_of_transmitters():
 
 def test_order_reaches_signals_and_compensation(point_paths):
     """TX 1 first: its columns are those of one slot earlier, and TDM compensation knows it."""
-    start = torch.tensor([[0.5, -0.2, 1.9]], dtype=torch.float64)
-    velocity = torch.tensor([[0.0, 0.0, -6.0]], dtype=torch.float64)
+    start = torch.tensor([[1.9, 0.5, -0.2]], dtype=torch.float64)
+    velocity = torch.tensor([[-6.0, 0.0, 0.0]], dtype=torch.float64)
     paths = replace(point_paths(RADAR, start, torch.ones(1)), velocity=velocity)
     turned = Chirps(8, 80e-6, order=(1, 0))
     plain = moving_beat(paths, RADAR, Chirps(16, 80e-6, tdm=False))
@@ -393,11 +393,11 @@ def test_bad_timing_and_static_simulation_are_refused():
     with pytest.raises(InputError, match="interval above 0, got 0"):
         Chirps(4, 0.0)
     with pytest.raises(InputError, match="simulate_chirps"):
-        simulate(moving([0.0, 0.0, 1.0]), RADAR, RADAR.grid(2.0, 4.0), seed=1)
+        simulate(moving([1.0, 0.0, 0.0]), RADAR, RADAR.grid(2.0, 4.0), seed=1)
 
 
 def test_paths_of_several_bounces_are_refused(point_paths):
-    paths = point_paths(RADAR, torch.tensor([[0.0, 0.0, 2.0]]), torch.ones(1))
+    paths = point_paths(RADAR, torch.tensor([[2.0, 0.0, 0.0]]), torch.ones(1))
     bent = replace(paths, last=paths.last + 1.0, velocity=torch.ones_like(paths.last))
     with pytest.raises(InputError, match="one bounce"):
         moving_beat(bent, RADAR, CHIRPS)

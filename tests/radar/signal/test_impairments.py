@@ -43,7 +43,7 @@ def recorder(frames: int = 1, transmitters: int = 1, receivers: int = 1, wavefor
     waveform = waveform or FMCW(76.5e9, 0.25e9, 20e-6, 128)
     half = 0.5 * waveform.wavelength
     return Radar(
-        linear_array(transmitters, half, "y"),
+        linear_array(transmitters, half, "z"),
         linear_array(receivers, half),
         waveform,
         torch.zeros(frames, 3, dtype=torch.float64),
@@ -54,7 +54,7 @@ def scatterers(radar: Radar, point_paths, count: int = 40, seed: int = 0):
     """Points 3 to 70 m ahead in the first frame."""
     generator = torch.Generator().manual_seed(seed)
     across, ahead = torch.rand(2, count, generator=generator, dtype=torch.float64)
-    points = torch.stack([across - 0.5, 0 * across, 3 + 67 * ahead], 1)
+    points = torch.stack([3 + 67 * ahead, across - 0.5, 0 * across], 1)
     return point_paths(
         radar, points, torch.randn(count, dtype=torch.complex128, generator=generator)
     )
@@ -124,7 +124,7 @@ def test_skirt_of_a_target(point_paths):
     """Beside its peak a target has L(f) · 4 sin²(πfτ) of its power per noise bandwidth."""
     frames, distance, peak = 600, 48 * 0.599584916, 48
     radar = replace(recorder(frames), window="hann")
-    point = torch.tensor([0.0, 0.0, distance]).expand(frames, 3)
+    point = torch.tensor([distance, 0.0, 0.0]).expand(frames, 3)
     paths = point_paths(radar, point, torch.ones(frames), torch.arange(frames))
     level = -100.0
     beat = noisy_oscillator_beat(paths, radar, PhaseNoise((1e5, 1e6), (level, level)), seed=7)
@@ -169,7 +169,7 @@ def test_every_path_has_the_residual_of_its_delay(waveform, point_paths):
 
 def test_one_delay_and_no_paths(point_paths):
     radar = recorder()
-    one = point_paths(radar, torch.tensor([0.0, 0, 20]), torch.ones(1))
+    one = point_paths(radar, torch.tensor([20.0, 0, 0]), torch.ones(1))
     residual = residual_phase(FLAT, radar, float(one.delay[0]), seed=1)
     expected = (
         beat_signal(one, radar) * torch.polar(torch.ones_like(residual), residual)[:, :, None]
@@ -206,7 +206,7 @@ def test_gradient_through_phase_noise(point_paths):
 
 def test_range_warning_counts_all_paths_once(point_paths):
     radar = recorder()
-    paths = point_paths(radar, torch.tensor([[0.0, 0, 20], [0, 0, 90]]), torch.ones(2))
+    paths = point_paths(radar, torch.tensor([[20.0, 0, 0], [90, 0, 0]]), torch.ones(2))
     with pytest.warns(PhysicsWarning, match="1 of 2 paths") as caught:
         noisy_oscillator_beat(paths, radar, FLAT, seed=1)
     assert len(caught) == 1
@@ -262,7 +262,7 @@ def test_phase_noise_of_a_train(point_paths):
     """Every path of a moving scene has the residual of its delay, in every ramp."""
     radar = recorder(transmitters=2, receivers=2)
     paths = scatterers(radar, point_paths, 12)
-    paths = replace(paths, velocity=torch.tensor([[0.0, 1.0, -20.0]]).double().expand(12, 3))
+    paths = replace(paths, velocity=torch.tensor([[-20.0, 0.0, 1.0]]).double().expand(12, 3))
     clean = moving_beat(paths, radar, TRAIN)
     found = noisy_oscillator_beat(paths, radar, FLAT, seed=9, chirps=TRAIN)
     assert found.shape == (1, 6, 2, 2, 128)
@@ -278,8 +278,8 @@ def test_phase_noise_of_a_train(point_paths):
 
 def test_a_train_with_everything(point_paths):
     radar = recorder(2, 2, 3)
-    paths = point_paths(radar, torch.tensor([[0.0, 0.5, 20], [1, 0, 23]]), torch.tensor([3.0, 2j]))
-    paths = replace(paths, velocity=torch.tensor([[0.0, 1.0, -20.0]]).double().expand(2, 3))
+    paths = point_paths(radar, torch.tensor([[20.0, 0, 0.5], [23, 1, 0]]), torch.tensor([3.0, 2j]))
+    paths = replace(paths, velocity=torch.tensor([[-20.0, 0.0, 1.0]]).double().expand(2, 3))
     adc, leakage = ADC(10, 30.0), Leakage(2e-9, -3.0)
     everything = Impairments(FLAT, leakage, 0.5, 0.1, snr_db=20, adc=adc)
     found = everything.record(paths, radar, seed=11, chirps=TRAIN)
@@ -341,7 +341,7 @@ def test_leakage_is_a_path_of_that_delay(waveform, point_paths):
     leakage = Leakage(2 * distance / SPEED_OF_LIGHT, -34.0)
     path = point_paths(
         radar,
-        torch.tensor([0, 0, distance], dtype=torch.float64),
+        torch.tensor([distance, 0, 0], dtype=torch.float64),
         torch.full((1,), 10**-1.7, dtype=torch.float64),
     )
     expected = beat_signal(path, radar)

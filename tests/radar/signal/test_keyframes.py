@@ -26,7 +26,7 @@ from invertwin.simulation import simulate_chirps
 from scenes import float64
 
 PAINT = RoughDielectric(4.0)
-WALL = Object(plate(2.0, 2.0), PAINT, rigid(translation=[0.0, 0.0, 3.0]))
+WALL = Object(plate(2.0, 2.0), PAINT, rigid(translation=[3.0, 0.0, 0.0]))
 FEW = Sampling(depth=1, points_per_m2=300.0, conductor_samples=3_000)
 CHIRPS = Chirps(8, 60e-6)
 
@@ -34,13 +34,13 @@ CHIRPS = Chirps(8, 60e-6)
 def radar() -> Radar:
     chirp = FMCW(77e9, 1e9, 40e-6, 64)
     half = chirp.wavelength / 2
-    return Radar(linear_array(2, 4 * half), linear_array(4, half), chirp, float64([[0, 0, 0.0]]))
+    return Radar(linear_array(2, 4 * half), linear_array(4, half), chirp, float64([[0.0, 0, 0]]))
 
 
 def rotor(time: float, material: object = PAINT) -> Scene:
     """A blade that turns 30 times a second before a wall, 0.2 m off its axis at most."""
-    turn = rotation_from_vector(float64([0.0, 0.0, 2 * math.pi * 30 * time + 0.3]))
-    blade = Object(box((0.4, 0.05, 0.02)), material, rigid(turn, [0.1, 0.1, 1.5]))  # type: ignore[arg-type]
+    turn = rotation_from_vector(float64([2 * math.pi * 30 * time + 0.3, 0.0, 0.0]))
+    blade = Object(box((0.02, 0.4, 0.05)), material, rigid(turn, [1.5, 0.1, 0.1]))  # type: ignore[arg-type]
     return Scene({"wall": WALL, "blade": blade})
 
 
@@ -64,8 +64,8 @@ def test_where_nothing_is_hidden_delays_are_exact():
     """A plate that turns and comes nearer, alone: its amplitudes hardly change."""
 
     def falling(time: float) -> Scene:
-        turn = rotation_from_vector(float64([0.1, 40.0 * time, 0.0]))
-        pose = rigid(turn, [0.1, 0.0, 2.0 - 5.0 * time + 300 * time**2])
+        turn = rotation_from_vector(float64([0.0, 0.1, 40.0 * time]))
+        pose = rigid(turn, [2.0 - 5.0 * time + 300 * time**2, 0.1, 0.0])
         return Scene({"plate": Object(plate(0.3, 0.3), PAINT, pose)})
 
     truth = simulate_chirps(falling, radar(), CHIRPS, seed=1, sampling=FEW)
@@ -80,10 +80,10 @@ def test_conductors_and_velocities_are_followed_too():
         {
             "wall": WALL,
             "post": Object(
-                box((0.2, 0.5, 0.2)),
+                box((0.2, 0.2, 0.5)),
                 PerfectConductor(),
-                rigid(translation=[0.2, 0.0, 1.2]),
-                velocity=float64([0.0, 0.0, -3.0]),
+                rigid(translation=[1.2, 0.2, 0.0]),
+                velocity=float64([-3.0, 0.0, 0.0]),
             ),
         }
     )

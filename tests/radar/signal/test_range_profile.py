@@ -31,7 +31,7 @@ from oracles.beat import beat as direct_beat
 def cloud(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     points = torch.rand(count, 3, generator=generator, dtype=torch.float64)
-    points = points * torch.tensor([2.0, 1.0, 3.0]) + torch.tensor([-1.0, -0.5, 1.5])
+    points = points * torch.tensor([3.0, 2.0, 1.0]) + torch.tensor([1.5, -1.0, -0.5])
     return points, torch.randn(count, generator=generator, dtype=torch.complex128)
 
 
@@ -54,12 +54,12 @@ def track(waveform: FMCW) -> Radar:
     """Two turned poses of a 2 × 3 MIMO radar, TX and RX beside each other."""
     half = 0.5 * waveform.wavelength
     rotations = torch.stack(
-        [rotation_from_vector(torch.tensor(r).double()) for r in ([0.1, 0.2, 0.3], [0, -0.4, 0.1])]
+        [rotation_from_vector(torch.tensor(r).double()) for r in ([0.3, 0.1, 0.2], [0.1, 0, -0.4])]
     )
     receivers = linear_array(3, half)
-    receivers = replace(receivers, positions=receivers.positions + torch.tensor([0.05, 0.02, 0]))
-    positions = torch.tensor([[0, 0, 0], [0.3, 0.1, -0.2]], dtype=torch.float64)
-    return Radar(linear_array(2, half, "y"), receivers, waveform, positions, rotations)
+    receivers = replace(receivers, positions=receivers.positions + torch.tensor([0, 0.05, 0.02]))
+    positions = torch.tensor([[0, 0, 0], [-0.2, 0.3, 0.1]], dtype=torch.float64)
+    return Radar(linear_array(2, half, "z"), receivers, waveform, positions, rotations)
 
 
 @pytest.mark.parametrize(
@@ -106,12 +106,12 @@ def test_phase_at_200_m_in_exact_arithmetic(point_paths):
     waveform = FMCW(77e9, 0.3e9, 40e-6, 1024)
     half = 0.5 * waveform.wavelength
     radar = Radar(
-        linear_array(2, half, "y"),
+        linear_array(2, half, "z"),
         linear_array(8, half),
         waveform,
-        torch.tensor([[0.1, 0.2, 0.3]], dtype=torch.float64),
+        torch.tensor([[0.3, 0.1, 0.2]], dtype=torch.float64),
     )
-    point = torch.tensor([[31.7, -12.3, 197.1]], dtype=torch.float64)
+    point = torch.tensor([[197.1, 31.7, -12.3]], dtype=torch.float64)
     paths = point_paths(radar, point, torch.tensor([1.0]))
     found = beat_signal(paths, radar)[0]
     tx, rx = radar.elements()
@@ -271,7 +271,7 @@ def test_radar_equation(point_paths, linear, fractional):
     distance = 4.0 + (0.37 * waveform.range_resolution if fractional else 0.0)
     gain, area = 10.0, 1.0
     expected = gain**2 * waveform.wavelength**2 * area / ((4 * math.pi) ** 3 * distance**4)
-    direction = torch.tensor([0.3, 0.0, math.sqrt(1 - 0.09)], dtype=torch.float64)
+    direction = torch.tensor([math.sqrt(1 - 0.09), 0.3, 0.0], dtype=torch.float64)
     coefficient = torch.tensor([math.sqrt(expected) * complex(math.cos(1), math.sin(1))])
     paths = point_paths(linear, direction * distance, coefficient)
     grid = linear.grid(3, 5, oversample=16)
@@ -291,7 +291,7 @@ def test_near_field_lengths_are_exact(point_paths, waveform):
         waveform,
         torch.zeros(1, 3, dtype=torch.float64),
     )
-    point = torch.tensor([0.02, 0.01, 0.06], dtype=torch.float64)
+    point = torch.tensor([0.06, 0.02, 0.01], dtype=torch.float64)
     signal = beat_signal(point_paths(radar, point, torch.tensor([1.0])), radar)
     tx, rx = radar.elements()
     length = (point - tx[0, 0]).norm() + (point - rx[0]).norm(dim=-1)
@@ -299,19 +299,19 @@ def test_near_field_lengths_are_exact(point_paths, waveform):
     cycles = waveform.start_frequency * delay - 0.5 * waveform.slope * delay.square()
     expected = torch.polar(torch.ones_like(cycles), 2 * math.pi * cycles)
     assert (signal[0, 0, :, 0] - expected).abs().max() < 1e-8
-    plane = length.mean() - radar.virtual_positions[:, 0] * point[0] / point.norm()
+    plane = length.mean() - radar.virtual_positions[:, 1] * point[1] / point.norm()
     assert (plane - length).abs().max() > waveform.wavelength
 
 
 def test_phase_falls_as_the_element_moves_towards_the_target(point_paths, linear):
     """Beat coefficient conj(a), phase +2π f0 τ: shorter delay, lower phase."""
     signal = beat_signal(
-        point_paths(linear, torch.tensor([3.0, 0, 3.0]), torch.tensor([1j])), linear
+        point_paths(linear, torch.tensor([3.0, 3.0, 0]), torch.tensor([1j])), linear
     )
     step = (signal[0, 0, 1:, 0] * signal[0, 0, :-1, 0].conj()).angle().mean()
     assert step == pytest.approx(-math.pi * math.sqrt(0.5), rel=0.05)
     one = linear.frames([0])
-    plain = beat_signal(point_paths(one, torch.tensor([3.0, 0, 3.0]), torch.tensor([1.0])), one)
+    plain = beat_signal(point_paths(one, torch.tensor([3.0, 3.0, 0]), torch.tensor([1.0])), one)
     assert torch.allclose(signal, -1j * plain)
 
 
@@ -345,7 +345,7 @@ def test_ofdm_in_the_time_domain(point_paths):
     received = torch.fft.fft(echoes[prefix:])
     found = waveform.beat(received, symbols)
     points = torch.zeros(2, 3, dtype=torch.float64)
-    points[:, 2] = shifts.double() * waveform.range_resolution
+    points[:, 0] = shifts.double() * waveform.range_resolution
     expected = beat_signal(point_paths(radar, points, coefficient), radar)
     assert (found - expected).norm() < 1e-6 * expected.norm()
     assert torch.allclose(waveform.receive_symbols(expected[0, 0, 0], symbols), received, atol=1e-6)
@@ -370,7 +370,7 @@ def test_profile_of_a_target_on_a_bin_is_its_coefficient(point_paths, linear):
     radar = replace(linear, receivers=linear_array(1, 1.0))
     grid = radar.grid(1, 4)
     distance = float(grid.ranges[11])
-    paths = point_paths(radar, torch.tensor([0, 0, distance]), torch.tensor([2.5e-3]))
+    paths = point_paths(radar, torch.tensor([distance, 0, 0]), torch.tensor([2.5e-3]))
     profile = range_profile(beat_signal(paths, radar), radar, grid)[0, 0, 0].abs()
     assert profile.argmax() == 11
     assert profile[11] == pytest.approx(2.5e-3, rel=1e-6)
@@ -410,7 +410,7 @@ def test_noise_needs_one_level(linear):
 
 
 def test_beyond_the_unambiguous_range_warns(point_paths, linear):
-    paths = point_paths(linear, torch.tensor([0, 0, 10.0]), torch.tensor([1.0]))
+    paths = point_paths(linear, torch.tensor([10.0, 0, 0]), torch.tensor([1.0]))
     with pytest.warns(PhysicsWarning, match=r"1 of 1 paths .* 9\.59 m"):
         beat_signal(paths, linear)
 

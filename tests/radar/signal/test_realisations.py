@@ -10,11 +10,11 @@ from invertwin.simulation import simulate
 from scenes import float64, radar, relative, thing
 
 SAMPLING = Sampling(depth=1, boundary=False, points_per_m2=3_000.0)
-SCENE = Scene({"plate": thing(plate(0.5, 0.4), (0.1, 0.0, 1.5), (0.0, 0.3, 0.0))})
+SCENE = Scene({"plate": thing(plate(0.5, 0.4), (1.5, 0.1, 0.0), (0.0, 0.0, 0.3))})
 
 
 def test_looks_have_the_statistics_of_exact_recordings():
-    device = radar([[-0.2, 0.0, 0.0], [0.2, 0.0, 0.0]], receivers=8)
+    device = radar([[0.0, -0.2, 0.0], [0.0, 0.2, 0.0]], receivers=8)
     grid = device.grid(1.0, 2.0, 0.6)
     looks = SpeckleRealisations(
         trace_field(SCENE, device.link(), sampling=SAMPLING, seed=1), device
@@ -50,7 +50,7 @@ def _excess(maps: torch.Tensor) -> torch.Tensor:
 
 def test_frames_share_speckle_as_far_as_they_are_near():
     """The plate's 0.5 m at 1.5 m let speckle go after λR/(2 · 0.5 m) = 6 mm."""
-    device = radar([[0.0, 0.0, 0.0], [0.0003, 0.0, 0.0], [0.1, 0.0, 0.0]], receivers=1)
+    device = radar([[0.0, 0.0, 0.0], [0.0, 0.0003, 0.0], [0.0, 0.1, 0.0]], receivers=1)
     grid = device.grid(1.2, 1.8)
     looks = SpeckleRealisations(
         trace_field(SCENE, device.link(), sampling=SAMPLING, seed=1), device

@@ -16,9 +16,9 @@ from invertwin.radar.surrogate.range_doppler import range_doppler_power
 from invertwin.radar.waveform import FMCW
 from invertwin.scene.pose import look_at
 
-PLACES = torch.tensor([[-0.4, 0.0, 2.9], [0.9, 0.2, 2.4], [0.1, -0.3, 3.3]], dtype=torch.float64)
+PLACES = torch.tensor([[2.9, -0.4, 0.0], [2.4, 0.9, 0.2], [3.3, 0.1, -0.3]], dtype=torch.float64)
 VELOCITIES = torch.tensor(
-    [[0.2, 0.0, 1.4], [-0.6, 0.1, -1.1], [0.0, 0.0, 0.0]], dtype=torch.float64
+    [[1.4, 0.2, 0.0], [-1.1, -0.6, 0.1], [0.0, 0.0, 0.0]], dtype=torch.float64
 )
 POWERS = torch.tensor([1.0, 0.5, 0.2], dtype=torch.float64)
 
@@ -81,7 +81,7 @@ def test_transmitters_are_compensated_for_the_bin_not_for_the_point():
     off = torch.tensor([-2.0, 0.0, 2.0], dtype=torch.float64)
     found = range_doppler_power(paths, 0 * toward, radar, grid, chirps, off)[0, ..., 0].amax(1)
     peaks = grid.u[found.argmax(1)]
-    assert float(peaks[1]) == pytest.approx(float(toward[0, 0]), abs=grid.u_step)
+    assert float(peaks[1]) == pytest.approx(float(toward[0, 1]), abs=grid.u_step)
     assert float((peaks[0] - peaks[2]).abs()) > 1.5 * grid.u_step
     at_once = replace(chirps, tdm=False)
     found = range_doppler_power(paths, 0 * toward, radar, grid, at_once, off)[0, ..., 0].amax(1)
@@ -95,8 +95,8 @@ def test_world_and_frames_turn_with_the_radar():
     here = range_doppler_power(
         paths_of(radar, PLACES, POWERS), VELOCITIES, radar, grid, chirps, rates
     )
-    shift = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    turn = look_at(torch.zeros(1, 3, dtype=torch.float64), [1.0, 0.0, 1.0])[0]
+    shift = torch.tensor([3.0, 1.0, 2.0], dtype=torch.float64)
+    turn = look_at(torch.zeros(1, 3, dtype=torch.float64), [1.0, 1.0, 0.0])[0]
     radars = replace(
         radar,
         positions=torch.stack([torch.zeros(3, dtype=torch.float64), shift]),

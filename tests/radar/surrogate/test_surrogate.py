@@ -36,13 +36,13 @@ def cloud(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     u, v, r = torch.rand(3, count, generator=generator, dtype=torch.float64)
     u, v, r = 0.6 * u - 0.3, 0.6 * v - 0.3, 4 + r
-    points = r[:, None] * torch.stack([u, v, (1 - u**2 - v**2).sqrt()], 1)
+    points = r[:, None] * torch.stack([(1 - u**2 - v**2).sqrt(), u, v], 1)
     return points, 0.2 + torch.rand(count, generator=generator, dtype=torch.float64)
 
 
 def deposited(points: torch.Tensor, power: torch.Tensor, grid: Grid) -> torch.Tensor:
     r = points.norm(dim=-1)
-    return deposit(power, r, points[:, 0] / r, points[:, 1] / r, grid)[None]
+    return deposit(power, r, points[:, 1] / r, points[:, 2] / r, grid)[None]
 
 
 def expected_exact(radar: Radar, points, power, grid, point_paths) -> torch.Tensor:
@@ -55,7 +55,7 @@ def expected_exact(radar: Radar, points, power, grid, point_paths) -> torch.Tens
 
 def hexagon(radar: Radar) -> Radar:
     places = radar.receivers.positions
-    inside = (places / places.amax(0).clamp(min=1e-9))[:, :2].norm(dim=-1) < 1.1
+    inside = (places / places.amax(0).clamp(min=1e-9))[:, 1:].norm(dim=-1) < 1.1
     return replace(radar, receivers=AntennaArray(places[inside]))
 
 
@@ -355,8 +355,8 @@ def test_impulse_is_a_gaussian_pulse():
 def test_exact_signals_of_a_scene_agree_with_the_surrogate(mimo):
     """Ray-traced: the rough points' exact spectra, summed in power, are the surrogate's map."""
     pose = rigid(
-        rotation_from_vector(torch.tensor([0.2, 0.3, 0.1], dtype=torch.float64)),
-        torch.tensor([0.5, -0.4, 3.0], dtype=torch.float64),
+        rotation_from_vector(torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)),
+        torch.tensor([3.0, 0.5, -0.4], dtype=torch.float64),
     )
     scene = Scene({"plate": Object(plate(0.5, 0.3), RoughDielectric(5.0), pose)})
     grid = mimo.grid(2.6, 3.6, 0.5, 0.5)
@@ -435,8 +435,8 @@ def test_wrong_input(planar):
 def test_power_is_never_negative(oversample, below, planar):
     grid = planar.grid(3.5, 4.5, 0.4, 0.4, oversample=oversample)
     plates = {
-        str(k): Object(plate(0.05, 0.05), RoughDielectric(4.0), rigid(translation=[x, 0.1, 4.0]))
-        for k, x in enumerate((-0.5, 0.2))
+        str(k): Object(plate(0.05, 0.05), RoughDielectric(4.0), rigid(translation=[4.0, y, 0.1]))
+        for k, y in enumerate((-0.5, 0.2))
     }
     scene, drawn = Scene(plates), Sampling(depth=1, samples=20_000)
     deposit = deposit_power(scene, planar.link(), grid, sampling=drawn, seed=1)

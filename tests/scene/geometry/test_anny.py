@@ -13,7 +13,7 @@ from invertwin.errors import InputError
 from invertwin.scene import load_anny, rotation_from_vector
 from scenes import float64
 
-TURN = float64([[-1, 0, 0], [0, 0, 1], [0, 1, 0]])
+TURN = float64([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 
 
 class Stick:
@@ -49,10 +49,10 @@ def stick(monkeypatch):
 @pytest.mark.usefixtures("stick")
 def test_a_model_becomes_a_template_in_our_axes():
     template = load_anny({"age": 0.0}, ["height"])
-    # Anny's people face −y, z up; ours face −z, y up.
-    skin = 1.5 * float64([[0, 0, 0], [-0.1, 1, -0.2], [0, 2, 0]])
+    # Anny's people face −y, z up; ours face −x, z up.
+    skin = 1.5 * float64([[0, 0, 0], [-0.2, -0.1, 1], [0, 0, 2]])
     assert torch.allclose(template.vertices, skin)
-    assert torch.allclose(template.joints, float64([[0, 0, 0], [0, 1.5, 0]]))
+    assert torch.allclose(template.joints, float64([[0, 0, 0], [0, 0, 1.5]]))
     assert torch.allclose(template.weights, float64([[1, 0], [0.25, 0.75], [0, 1]]))
     assert template.names == ("root", "head")
     assert template.parents == (-1, 0)
@@ -61,7 +61,7 @@ def test_a_model_becomes_a_template_in_our_axes():
     still = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
     taller, joints = template.apply_pose(still, float64([0.3]))
     assert torch.allclose(taller, 1.8 * skin / 1.5)
-    assert torch.allclose(joints[1], float64([0, 1.8, 0]))
+    assert torch.allclose(joints[1], float64([0, 0, 1.8]))
 
 
 @pytest.mark.usefixtures("stick")

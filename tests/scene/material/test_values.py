@@ -64,9 +64,10 @@ def test_texture_laid_over_a_plate():
     texture = Texture.from_projection(pixels, wall)
     middles = wall.vertices[wall.faces].mean(1)
     for place, value in zip(middles, texture.values, strict=True):
-        column, row = int(place[0] > 0), int(place[1] < 0)
+        # +y is on the left of who looks along x.
+        column, row = int(place[1] < 0), int(place[2] < 0)
         assert abs(float(value) - float(pixels[row, column])) < 1  # bilinear, nearest wins
-    flat = Mesh(wall.vertices * torch.tensor([1.0, 0.0, 1.0]), wall.faces)
+    flat = Mesh(wall.vertices * torch.tensor([1.0, 1.0, 0.0]), wall.faces)
     with pytest.raises(InputError, match="width and height"):
         Texture.from_projection(pixels, flat)
 

@@ -53,6 +53,10 @@ def smpl(count: int = 20, joints: int = 4, seed: int = 0) -> dict[str, Any]:
     }
 
 
+# SMPL's bodies face z, y up; ours face −x, z up.
+TURN = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
 def reference(model: dict[str, Any], rotations: np.ndarray, betas: np.ndarray) -> np.ndarray:
     """SMPL's own recipe, with 4 × 4 matrices, vertex by vertex."""
     shaped = model["v_template"] + model["shapedirs"][..., : len(betas)] @ betas
@@ -110,10 +114,10 @@ def test_smpl_layout_against_its_own_recipe(tmp_path):
     assert template.parents == (-1, 0, 1, 0)
     draw = np.random.default_rng(1)
     turns, betas = 0.7 * draw.normal(size=(4, 3)), draw.normal(size=10)
-    body = SkinnedBody("arm", template, turns, betas)
+    body = SkinnedBody("arm", template, turns @ TURN.T, betas)
     rotations = np.stack([rotation_from_vector(float64(v)).numpy() for v in turns])
     found = body(SCENE)["arm"].mesh.vertices.detach().numpy()
-    np.testing.assert_allclose(found, reference(model, rotations, betas), atol=1e-12)
+    np.testing.assert_allclose(found, reference(model, rotations, betas) @ TURN.T, atol=1e-12)
     assert set(body.values()) == {"arm.joint_rotation", "arm.shape"}
 
 

@@ -20,8 +20,8 @@ from scenes import float64
 
 BODY = person(spacing=0.05)
 HIGH = standing_height(BODY)
-STANDING = Object(BODY.mesh({}), RoughDielectric(4.0), rigid(translation=[0.0, HIGH, 3.0]))
-ANKLE = int((BODY.vertices - float64([0.10, -0.90, 0.0])).norm(dim=1).argmin())
+STANDING = Object(BODY.mesh({}), RoughDielectric(4.0), rigid(translation=[3.0, 0.0, HIGH]))
+ANKLE = int((BODY.vertices - float64([0.0, 0.10, -0.90])).norm(dim=1).argmin())
 
 
 def places(walk: Walking, steps: int = 100) -> torch.Tensor:
@@ -35,7 +35,7 @@ def test_every_part_moves_on_at_the_set_speed(speed):
     walk = Walking(BODY, speed)
     first, last = walk(STANDING, 0.1).vertices, walk(STANDING, 0.1 + walk.period).vertices
     away = (last - first) / walk.period
-    assert torch.allclose(away, float64([0.0, 0.0, -speed]).expand_as(away), atol=1e-9)
+    assert torch.allclose(away, float64([-speed, 0.0, 0.0]).expand_as(away), atol=1e-9)
     spot = Walking(BODY, speed, on_spot=True)
     again = spot(STANDING, spot.period).vertices
     assert torch.allclose(again, spot(STANDING, 0.0).vertices, atol=1e-9)
@@ -59,7 +59,7 @@ def test_left_is_half_a_cycle_behind_right():
         for phase in (0.0, 0.3, 0.71):
             early, late = walk.rotations(phase), walk.rotations(phase + 0.5)
             assert torch.allclose(early[right], late[left], atol=1e-12)
-    mirror = float64([-1.0, 1.0, 1.0])
+    mirror = float64([1.0, -1.0, 1.0])
     here, there = (BODY.apply_pose(walk.rotations(phase))[1] for phase in (0.3, 0.8))
     for name in ("shoulder", "elbow", "hip", "knee"):
         right, left = (BODY.joint(f"{side}_{name}") for side in ("right", "left"))
@@ -72,7 +72,7 @@ def test_angles_pass_the_published_control_points():
 
     def bent(joint: str, phase: float) -> float:
         turn = walk.rotations(phase)[BODY.joint(joint)]
-        return math.degrees(math.atan2(float(turn[2, 1]), float(turn[1, 1])))
+        return math.degrees(math.atan2(float(turn[0, 2]), float(turn[2, 2])))
 
     for phase, angle in ((0.9, 25.0), (0.5, -15.0)):
         assert bent("right_hip", phase) == pytest.approx(angle, abs=2.0)
@@ -82,17 +82,17 @@ def test_angles_pass_the_published_control_points():
 
 def test_the_right_foot_lands_ahead_and_the_left_arm_swings_with_it():
     joints = BODY.apply_pose(Walking(BODY, 1.4).rotations(0.0))[1]
-    z = {name: float(joints[BODY.joint(name), 2]) for name in BODY.names}
-    assert z["right_knee"] < z["left_knee"] - 0.2
-    assert z["left_elbow"] < z["right_elbow"] - 0.05
-    assert z["right_hip"] < z["left_hip"]
+    x = {name: float(joints[BODY.joint(name), 0]) for name in BODY.names}
+    assert x["right_knee"] < x["left_knee"] - 0.2
+    assert x["left_elbow"] < x["right_elbow"] - 0.05
+    assert x["right_hip"] < x["left_hip"]
 
 
 @pytest.mark.parametrize("speed", [1.4, 1.8])
 def test_feet_are_about_three_times_as_fast_as_the_person(speed):
     walk = Walking(BODY, speed)
     course = places(walk)
-    ahead = -course[:, ANKLE, 2].diff() * 100 / walk.period
+    ahead = -course[:, ANKLE, 0].diff() * 100 / walk.period
     assert 2.5 < float(ahead.max()) / speed < 3.5
     # It stands for the first half of the cycle, and is nearly as slow as the floor.
     assert float(ahead[10:50].square().mean().sqrt()) / speed < 0.25
@@ -101,10 +101,10 @@ def test_feet_are_about_three_times_as_fast_as_the_person(speed):
 def test_the_torso_keeps_its_speed_and_feet_keep_to_the_floor():
     walk = Walking(BODY, 1.4)
     course = places(walk)
-    low = course[:, :, 1].amin(1)
+    low = course[:, :, 2].amin(1)
     assert -0.06 < float(low.min()) < float(low.max()) < 0.02
-    waist = int((BODY.vertices - float64([0.0, 0.05, -0.12])).norm(dim=1).argmin())
-    ahead = -course[:, waist, 2].diff() * 100 / walk.period / 1.4
+    waist = int((BODY.vertices - float64([-0.12, 0.0, 0.05])).norm(dim=1).argmin())
+    ahead = -course[:, waist, 0].diff() * 100 / walk.period / 1.4
     assert 0.7 < float(ahead.min()) < 0.95
     assert 1.05 < float(ahead.max()) < 1.3
 

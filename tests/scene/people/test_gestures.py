@@ -23,13 +23,13 @@ from scenes import float64
 
 BODY = person(spacing=0.05)
 HIGH = standing_height(BODY)
-STANDING = Object(BODY.mesh({}), RoughDielectric(4.0), rigid(translation=[0.0, HIGH, 3.0]))
+STANDING = Object(BODY.mesh({}), RoughDielectric(4.0), rigid(translation=[3.0, 0.0, HIGH]))
 
 
 def joints(motion: Sitting | Waving, time: float, body=BODY) -> dict[str, torch.Tensor]:
-    """Places of the joints above a floor at y = 0 [m]."""
+    """Places of the joints above a floor at z = 0 [m]."""
     rotations, shift = motion.posture(time)
-    places = body.apply_pose(rotations)[1] + shift + float64([0.0, standing_height(body), 0.0])
+    places = body.apply_pose(rotations)[1] + shift + float64([0.0, 0.0, standing_height(body)])
     return dict(zip(body.names, places, strict=True))
 
 
@@ -43,15 +43,15 @@ def test_the_seat_carries_the_thighs_of_a_person_who_sits(height, seat):
     body = person(height, 0.05)
     motion = Sitting(body, seat)
     hip = joints(motion, 2.0, body)["left_hip"]
-    assert float(hip[1]) - seat == pytest.approx(0.088 * height / 1.75, abs=1e-9)
+    assert float(hip[2]) - seat == pytest.approx(0.088 * height / 1.75, abs=1e-9)
     start = joints(motion, 0.0, body)["left_hip"]
-    assert float(start[1]) == pytest.approx((0.955 - 0.06) * height / 1.75, abs=0.02)
-    assert float(hip[2] - start[2]) > 0.3  # the seat is behind
+    assert float(start[2]) == pytest.approx((0.955 - 0.06) * height / 1.75, abs=0.02)
+    assert float(hip[0] - start[0]) > 0.3  # the seat is behind
 
 
 def test_feet_rest_and_shanks_stay_upright():
     motion = Sitting(BODY, 0.45)
-    ankle = vertex([0.10, -0.90, 0.0])
+    ankle = vertex([0.0, 0.10, -0.90])
     course = torch.stack([motion(STANDING, 0.1 * k).vertices[ankle] for k in range(21)])
     assert float((course - course[0]).abs().max()) < 1e-6
 
@@ -62,7 +62,7 @@ def test_the_trunk_leans_until_the_seat_carries_the_person():
     def lean(time: float) -> float:
         found = joints(motion, time)
         up = found["neck"] - found["chest"]
-        return math.degrees(math.atan2(-float(up[2]), float(up[1])))
+        return math.degrees(math.atan2(-float(up[0]), float(up[2])))
 
     assert lean(0.5) == pytest.approx(0.0, abs=1e-6)
     assert lean(2.2) == pytest.approx(40.0, abs=1e-4)
@@ -71,7 +71,7 @@ def test_the_trunk_leans_until_the_seat_carries_the_person():
     reached, end = joints(motion, 2.2), joints(motion, 3.0)
     assert torch.allclose(reached["left_hip"], end["left_hip"], atol=1e-6)
     # Over the feet, or nearly, as the seat is reached: people do not fall onto it.
-    assert float(reached["neck"][2]) < float(reached["left_hip"][2]) - 0.2
+    assert float(reached["neck"][0]) < float(reached["left_hip"][0]) - 0.2
 
 
 def test_standing_up_is_sitting_down_backwards():
@@ -86,12 +86,12 @@ def test_standing_up_is_sitting_down_backwards():
 def test_the_forearm_swings_beside_the_head(side):
     motion = Waving(BODY, side, rate=1.5)
     sign = 1.0 if side == "right" else -1.0
-    hand = vertex([sign * 0.72, 0.45, 0.0])
+    hand = vertex([0.0, sign * 0.72, 0.45])
     heights, aside = [], []
     for k in range(61):
         place = motion(STANDING, 1.0 + k / 30).vertices[hand]
-        heights.append(float(place[1]))
-        aside.append(sign * float(place[0]))
+        heights.append(float(place[2]))
+        aside.append(sign * float(place[1]))
     assert min(heights) > HIGH + 0.6
     turns = sum(a < 0.47 <= b for a, b in pairwise(aside))
     assert turns == 3  # 1.5 Hz for two seconds
@@ -99,7 +99,7 @@ def test_the_forearm_swings_beside_the_head(side):
     other = "left" if side == "right" else "right"
     rest = [joints(motion, t)[f"{other}_elbow"] for t in (0.0, 1.7)]
     assert torch.allclose(rest[0], rest[1])
-    assert float(rest[0][1]) < HIGH + 0.25
+    assert float(rest[0][2]) < HIGH + 0.25
 
 
 def test_a_person_who_walks_can_wave():
@@ -121,7 +121,7 @@ def test_a_person_who_walks_can_wave():
 )
 def test_velocities_do_not_jump(motion):
     step = 2e-3
-    rows = [vertex([0.0, 0.5, -0.1]), vertex([0.72, 0.45, 0.0]), vertex([0.1, -0.06, 0.1])]
+    rows = [vertex([-0.1, 0.0, 0.5]), vertex([0.0, 0.72, 0.45]), vertex([0.1, 0.1, -0.06])]
     course = torch.stack([motion(STANDING, step * k).vertices[rows] for k in range(950)])
     speeds = course.diff(dim=0) / step
     assert float(speeds.norm(dim=-1).max()) > 0.5

@@ -10,7 +10,7 @@ from invertwin.scene import BodyTemplate, Scene, SkinnedBody, box, person, rotat
 from scenes import float64, thing
 
 TEMPLATE = person()
-SCENE = Scene({"person": thing(box(0.1), (0, 0, 2))})
+SCENE = Scene({"person": thing(box(0.1), (2, 0, 0))})
 
 
 def volume(vertices: torch.Tensor) -> float:
@@ -22,48 +22,48 @@ def test_a_person_has_one_closed_skin_and_human_measures():
     edges = torch.cat([TEMPLATE.faces[:, [k, (k + 1) % 3]] for k in range(3)])
     there, back = ({(int(a), int(b)) for a, b in part} for part in (edges, edges.flip(1)))
     assert there == back  # every edge has a triangle on either side
-    tall = TEMPLATE.vertices[:, 1].amax() - TEMPLATE.vertices[:, 1].amin()
+    tall = TEMPLATE.vertices[:, 2].amax() - TEMPLATE.vertices[:, 2].amin()
     assert float(tall) == pytest.approx(1.75, abs=0.05)
     assert 0.05 < volume(TEMPLATE.vertices) < 0.1  # m³, that is 50 to 100 kg
     assert len(TEMPLATE.vertices) < 4000
     half = person(height=0.9, spacing=0.03)
-    assert float(half.vertices[:, 1].amax() / TEMPLATE.vertices[:, 1].amax()) == pytest.approx(
+    assert float(half.vertices[:, 2].amax() / TEMPLATE.vertices[:, 2].amax()) == pytest.approx(
         0.9 / 1.75, abs=0.01
     )
 
 
 def test_left_is_the_mirror_image_of_right():
-    flip = float64([-1.0, 1.0, 1.0])
+    flip = float64([1.0, -1.0, 1.0])
     for name in ("shoulder", "elbow", "hip", "knee"):
         left, right = (
             TEMPLATE.joints[TEMPLATE.joint(f"{side}_{name}")] for side in ("left", "right")
         )
         assert torch.equal(left, flip * right)
-        assert float(left[0]) < 0
+        assert float(left[1]) < 0
     gaps = torch.cdist(TEMPLATE.vertices * flip, TEMPLATE.vertices).amin(1)
     assert float(gaps.max()) < 0.02
 
 
 def test_an_elbow_carries_the_hand_and_nothing_else():
-    turns = TEMPLATE.rotations({"left_elbow": [0.0, -math.pi / 2, 0.0]})
+    turns = TEMPLATE.rotations({"left_elbow": [0.0, 0.0, -math.pi / 2]})
     body = SkinnedBody("person", TEMPLATE, turns)
     moved = body(SCENE)["person"].mesh.vertices.detach()
-    hand = int(TEMPLATE.vertices[:, 0].argmin())
+    hand = int(TEMPLATE.vertices[:, 1].argmin())
     elbow = TEMPLATE.joints[TEMPLATE.joint("left_elbow")]
     turn = rotation_from_vector(turns[TEMPLATE.joint("left_elbow")])
     assert torch.allclose(moved[hand], elbow + turn @ (TEMPLATE.vertices[hand] - elbow), atol=1e-6)
-    assert float(moved[hand, 2]) < -0.3  # ahead of the person
-    rest = TEMPLATE.vertices[:, 0] > -0.35
+    assert float(moved[hand, 0]) < -0.3  # ahead of the person
+    rest = TEMPLATE.vertices[:, 1] > -0.35
     assert torch.allclose(moved[rest], TEMPLATE.vertices[rest], atol=2e-3)
     assert volume(moved) == pytest.approx(volume(TEMPLATE.vertices), rel=0.02)
 
 
 def test_only_the_free_axes_have_a_derivative():
-    body = SkinnedBody("person", TEMPLATE, joints={"left_elbow": "y", "left_hip": "xz"})
+    body = SkinnedBody("person", TEMPLATE, joints={"left_elbow": "z", "left_hip": "xy"})
     body(SCENE)["person"].vertices.square().sum().backward()
     assert body.rotation.grad is not None
     free = {(TEMPLATE.names[int(j)], "xyz"[int(k)]) for j, k in body.rotation.grad.nonzero()}
-    assert free == {("left_elbow", "y"), ("left_hip", "x"), ("left_hip", "z")}
+    assert free == {("left_elbow", "z"), ("left_hip", "x"), ("left_hip", "y")}
     assert set(body.values()) == {"person.left_elbow", "person.left_hip"}
 
 

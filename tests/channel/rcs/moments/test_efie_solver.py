@@ -26,7 +26,14 @@ from invertwin.signatures import aspect_directions
 from scenes import float64
 
 METAL = PerfectConductor()
-TOWARDS = aspect_directions([0.4, 2.5], 0.3)
+
+
+def from_front(theta: float | list[float], phi: float) -> Tensor:
+    """Directions at angles θ to x, which plates are square to, and φ about it."""
+    return aspect_directions(theta, phi)[:, [2, 0, 1]]
+
+
+TOWARDS = from_front([0.4, 2.5], 0.3)
 
 
 def metal(mesh: Mesh) -> Scene:
@@ -60,7 +67,7 @@ def test_derivatives_are_those_of_the_solution(mesh):
 
     def power(vertices: Tensor) -> Tensor:
         scene = metal(Mesh(vertices, mesh.faces))
-        received = aspect_directions([1.4, 2.0], 1.3)
+        received = from_front([1.4, 2.0], 1.3)
         found = rcs(scene, TOWARDS, SPEED_OF_LIGHT, receivers=received)
         assert "rest" in found.parts
         return found.matrix.abs().square().flatten()
@@ -84,7 +91,7 @@ def test_derivatives_are_those_of_the_solution(mesh):
 @pytest.mark.filterwarnings("ignore::invertwin.errors.PhysicsWarning")
 def test_antennas_may_be_exchanged():
     bent = metal(dihedral(0.8, 1.4))
-    received = aspect_directions([1.4, 2.0], 1.3)
+    received = from_front([1.4, 2.0], 1.3)
     there = rcs(bent, TOWARDS, SPEED_OF_LIGHT, receivers=received).matrix
     back = rcs(bent, received, SPEED_OF_LIGHT, receivers=TOWARDS).matrix
     assert float((there - back.mT).abs().max()) < 1e-6 * float(there.abs().max())
@@ -110,7 +117,7 @@ def test_a_box_at_a_resonance_of_its_inside(monkeypatch):
 @pytest.mark.filterwarnings("ignore::invertwin.errors.PhysicsWarning")
 def test_what_crosses_is_left_to_bounces():
     crossing = merge_meshes(
-        [plate(0.8, 0.8), Mesh(plate(0.8, 0.8).vertices[:, [0, 2, 1]], plate(0.8, 0.8).faces)]
+        [plate(0.8, 0.8), Mesh(plate(0.8, 0.8).vertices[:, [2, 1, 0]], plate(0.8, 0.8).faces)]
     )
     for mesh, edges in ((crossing, 2), (plate(9.0, 9.0), 2), (plate(0.8, 0.8), 0)):
         assert "rest" not in rcs(metal(mesh), TOWARDS, SPEED_OF_LIGHT, edges=edges).parts
@@ -120,22 +127,22 @@ def test_what_crosses_is_left_to_bounces():
 def test_derivatives_of_seams_are_refused():
     beside = Scene(
         {
-            "left": Object(plate(0.8, 0.8), METAL),
-            "right": Object(plate(0.8, 0.8), METAL, rigid(translation=float64([0.8, 0.0, 0.0]))),
+            "right": Object(plate(0.8, 0.8), METAL),
+            "left": Object(plate(0.8, 0.8), METAL, rigid(translation=float64([0.0, 0.8, 0.0]))),
         }
     )
     found = rcs(beside, TOWARDS, SPEED_OF_LIGHT)
     assert "rest" in found.parts
     leaf = plate(0.8, 0.8)
-    every = torch.cat([leaf.vertices, leaf.vertices + float64([0.8, 0.0, 0.0])])
+    every = torch.cat([leaf.vertices, leaf.vertices + float64([0.0, 0.8, 0.0])])
     faces = torch.cat([leaf.faces, leaf.faces + len(leaf.vertices)])
     places, index = every.round(decimals=9).unique(dim=0, return_inverse=True)
     assert len(places) == 6
     whole = rcs(metal(Mesh(places, index[faces])), TOWARDS, SPEED_OF_LIGHT).matrix
     assert float((found.matrix - whole).abs().max()) < 1e-6 * float(whole.abs().max())
-    place = float64([0.8, 0.0, 0.0]).requires_grad_()
+    place = float64([0.0, 0.8, 0.0]).requires_grad_()
     moved = Scene(
-        dict(beside.objects) | {"right": Object(plate(0.8, 0.8), METAL, rigid(translation=place))}
+        dict(beside.objects) | {"left": Object(plate(0.8, 0.8), METAL, rigid(translation=place))}
     )
     with pytest.raises(InputError, match="merge the vertices, or give edges=0"):
         rcs(moved, TOWARDS, SPEED_OF_LIGHT)
@@ -144,5 +151,5 @@ def test_derivatives_of_seams_are_refused():
 def test_currents_that_do_not_keep_the_power_are_not_used(monkeypatch):
     monkeypatch.setattr(meshed, "conserves_power", lambda *_: False)
     with pytest.warns(PhysicsWarning, match="do not conserve power"):
-        found = rcs(metal(plate(0.8, 0.8)), aspect_directions(0.4, 0.3), SPEED_OF_LIGHT)
+        found = rcs(metal(plate(0.8, 0.8)), from_front(0.4, 0.3), SPEED_OF_LIGHT)
     assert "rest" not in found.parts

@@ -35,14 +35,14 @@ class Foliage(Material):
 
 
 def bush(radius: Positive, lean: Angle = 0.0) -> Mesh:
-    """A ball that leans to the right.
+    """A ball that leans to the left.
 
     Args:
         radius: m.
         lean: of its axis.
     """
     mesh = sphere(radius, 1)
-    shift = torch.tensor([np.tan(lean), 0.0, 0.0]) * mesh.vertices[:, 1:2]
+    shift = torch.tensor([0.0, np.tan(lean), 0.0]) * mesh.vertices[:, 2:]
     return Mesh(mesh.vertices + shift, mesh.faces)
 
 
