@@ -1,7 +1,7 @@
 """Rooms whose walls mirror, people in them, and what a radar records of them.
 
-The world has x ahead of the radar, y to its right and z up; the radar is at zero. Recordings are
-those of what moves: signals of the empty room are taken away.
+The radar is at zero and looks along x; y is left, z up. Recordings are those of what moves:
+signals of the empty room are taken away.
 """
 
 import math
@@ -44,14 +44,14 @@ class Room:
     """Where walls and cabinet are, and of what.
 
     Attributes:
-        left, right: y of the side walls [m].
+        right, left: y of the side walls [m].
         back: x of the wall ahead [m].
-        permittivity: Of left, right and back wall.
+        permittivity: Of right, left and back wall.
         cabinet: x and y of the middle of a metal cabinet [m].
     """
 
-    left: Tensor
     right: Tensor
+    left: Tensor
     back: Tensor
     permittivity: Float64[Tensor, "3"]
     cabinet: Float64[Tensor, "2"]
@@ -69,11 +69,11 @@ def random_room(seed: int, low: float, high: float) -> Room:
     def between(a: float, b: float, *shape: int) -> Tensor:
         return a + (b - a) * torch.rand(shape, generator=random, dtype=torch.float64)
 
-    left, right, back = -between(1.6, 3.2), between(1.6, 3.2), between(4.8, 7.0)
+    right, left, back = -between(1.6, 3.2), between(1.6, 3.2), between(4.8, 7.0)
     permittivity = low * (high / low) ** between(0.0, 1.0, 3)
     x, y = between(2.0, 3.6), between(0.2, 0.8)
     side = 1 - 2 * float(torch.rand((), generator=random) < 0.5)
-    return Room(left, right, back, permittivity, torch.stack([x, side * y]))
+    return Room(right, left, back, permittivity, torch.stack([x, side * y]))
 
 
 def scene_of(room: Room) -> iw.Scene:
@@ -84,13 +84,13 @@ def scene_of(room: Room) -> iw.Scene:
     """
     zero = torch.zeros((), dtype=torch.float64)
     wide, tall = plate(16.0, 4.0), 1.0
-    across = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)  # faces −x or x
-    along = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)  # faces ±y
+    across = torch.eye(3, dtype=torch.float64)  # faces −x
+    along = torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]], dtype=torch.float64)  # faces ±y
     materials = [Dielectric(value, scattering=0.0) for value in room.permittivity]
     up = torch.full((), tall, dtype=torch.float64)
     places = {
-        "left": (along, [zero + 4, room.left, up]),
         "right": (along, [zero + 4, room.right, up]),
+        "left": (along, [zero + 4, room.left, up]),
         "back": (across, [room.back, zero, up]),
     }
     objects = {
@@ -106,13 +106,11 @@ def radar() -> iw.Radar:
     """A board of 2 × 8 channels that looks ahead."""
     chirp = iw.FMCW(start_frequency=77e9, bandwidth=1e9, duration=40e-6, samples=160)
     half, patch = chirp.wavelength / 2, Cosine(1.0)
-    axes = torch.tensor([[[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]], dtype=torch.float64)
     return iw.Radar(
         linear_array(2, 8 * half, pattern=patch),
         linear_array(8, half, pattern=patch),
         chirp,
         torch.zeros(1, 3, dtype=torch.float64),
-        axes,
     )
 
 
@@ -127,13 +125,13 @@ def _shapes() -> list[Tensor]:
     for side in ("left", "right"):
         standing[BODY.joint(f"{side}_shoulder")] = hanging_arm_rotation(side)
     sat, shift = Sitting(BODY, 0.45).posture(2.0)
-    low = BODY.vertices[:, 1].min()
+    low = BODY.vertices[:, 2].min()
     found = []
     for turns, away in ((standing, 0 * shift), (sat, shift), (still, 0 * shift)):
         skin, joints = BODY.apply_pose(turns)
-        tips = skin[[int(BODY.vertices[:, 0].argmin()), int(BODY.vertices[:, 0].argmax())]]
+        tips = skin[[int(BODY.vertices[:, 1].argmin()), int(BODY.vertices[:, 1].argmax())]]
         x, y, z = (torch.cat([joints, tips]) + away).unbind(-1)
-        found.append(torch.stack([z, x, y - low - HEIGHT], dim=-1))
+        found.append(torch.stack([x, y, z - low - HEIGHT], dim=-1))
     return found
 
 
@@ -166,7 +164,7 @@ def inside(room: Room, places: Tensor) -> Tensor:
     off = (places - room.cabinet).abs() - torch.tensor(CABINET[:2]) / 2
     bearing = y.abs() / places.norm(dim=-1)
     free = (x > 1.2) & (x < room.back - MARGIN) & (bearing < WIDEST)
-    free = free & (y > room.left + MARGIN) & (y < room.right - MARGIN)
+    free = free & (y > room.right + MARGIN) & (y < room.left - MARGIN)
     return free & (off > 0.3).any(-1)
 
 
@@ -183,8 +181,8 @@ def recorded(room: Room, count: int, seed: int) -> Samples:
     for number in range(count):
         random = torch.Generator().manual_seed(derive_seed(seed, number))
         tried = torch.rand((400, 2), generator=random, dtype=torch.float64)
-        corner = torch.stack([torch.zeros_like(room.left), room.left])
-        far = torch.stack([room.back, room.right])
+        corner = torch.stack([torch.zeros_like(room.right), room.right])
+        far = torch.stack([room.back, room.left])
         tried = corner + tried * (far - corner)
         place = tried[int(inside(room, tried).nonzero()[0, 0])]
         posture = int(torch.randint(3, (), generator=random))

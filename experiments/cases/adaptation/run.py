@@ -151,7 +151,7 @@ def in_room(number: int, net: network.Finder, plan: Plan, folder: Path) -> dict[
         "true": _listed(true),
         "wall_errors_m": {
             name: abs(float(getattr(room, name) - getattr(true, name)))
-            for name in ("left", "right", "back")
+            for name in ("right", "left", "back")
         },
         "cabinet_error_m": float((room.cabinet - true.cabinet).norm()),
     }
@@ -199,7 +199,7 @@ def figure(rows: list[dict[str, Any]]) -> Figure:
     for number, (axes, row) in enumerate(zip(plans, rows, strict=True)):
         _plan(axes, row["true"], "0.6", "room")
         _plan(axes, row["twin"], PALETTE[1], "twin")
-        axes.set(aspect="equal", xlim=(-3.6, 3.6), ylim=(-0.4, 7.4), xticks=[], yticks=[])
+        axes.set(aspect="equal", xlim=(3.6, -3.6), ylim=(-0.4, 7.4), xticks=[], yticks=[])
         axes.set_title(f"room {number}", fontsize=8)
     plans[0].legend(fontsize=7, loc="lower left")
     axes = below.subplots()
@@ -217,7 +217,7 @@ def figure(rows: list[dict[str, Any]]) -> Figure:
 
 
 def _plan(axes: Axes, room: dict[str, Any], color: str, name: str) -> None:
-    """Walls and cabinet from above, the radar below."""
+    """Walls and cabinet from above, the radar below: ahead is up, the left is left."""
     left, right, back = room["left"], room["right"], room["back"]
     axes.plot([left, left, right, right], [0, back, back, 0], color=color, label=name)
     x, y = room["cabinet"]

@@ -27,8 +27,8 @@ STEPS, RATE = 40, 0.01
 
 
 START = Room(
-    left=torch.tensor(-2.4, dtype=torch.float64),
-    right=torch.tensor(2.4, dtype=torch.float64),
+    right=torch.tensor(-2.4, dtype=torch.float64),
+    left=torch.tensor(2.4, dtype=torch.float64),
     back=torch.tensor(5.9, dtype=torch.float64),
     permittivity=torch.full((3,), 20.0, dtype=torch.float64),
     cabinet=torch.tensor([2.8, 0.5], dtype=torch.float64),
@@ -79,7 +79,7 @@ def predicted(room: Room, places: Tensor, blur: float = 1.0) -> Tensor:
 
 def _beam(sent: Tensor, received: Tensor, directions: Tensor) -> Tensor:
     """Power of the array for waves that leave and arrive along some directions [path, u]."""
-    tx, rx = RADAR.transmitters.positions[:, 0], RADAR.receivers.positions[:, 0]
+    tx, rx = RADAR.transmitters.positions[:, 1], RADAR.receivers.positions[:, 1]
     taper = torch.hamming_window(len(tx) * len(rx), periodic=False, dtype=torch.float64)
     turns = 2 * math.pi / float(RADAR.link().wavelength)
     phase = sent[:, None] * tx.repeat_interleave(len(rx))
@@ -181,7 +181,7 @@ def _tries(near: bool) -> list[Callable[[Room], list[Room]]]:
 
         return tried
 
-    lines = [line("back", 4.7, 7.15), line("left", -3.3, -1.45), line("right", 1.5, 3.35)]
+    lines = [line("back", 4.7, 7.15), line("right", -3.3, -1.45), line("left", 1.5, 3.35)]
     return [*lines, spots, *(wall(number) for number in range(3))]
 
 

@@ -66,8 +66,9 @@ def robot() -> tuple[Camera, iw.Radar]:
     camera = Camera.look_at(
         EYE, [3.0, 0.0, 1.0], width=96, height=72, field_of_view=math.radians(60)
     )
-    # Columns of a camera are right, down, ahead; those of a radar are x, up, ahead.
-    axes = camera.rotations @ torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+    # Columns of a camera are right, down, ahead; those of a radar are ahead, left, up.
+    right, down, ahead = camera.rotations.unbind(-1)
+    axes = torch.stack([ahead, -right, -down], dim=-1)
     chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=50e-6, samples=256)
     half = chirp.wavelength / 2
     patch = Cosine(2.0)
@@ -93,8 +94,9 @@ def view(seed: int) -> View:
 
     place = torch.tensor([between(3.0, 4.5), between(-0.8, 0.8), between(0.7, 1.5)])
     yaw, scale = between(-math.pi / 3, math.pi / 3), math.exp(between(-0.3, 0.3))
+    lying = rotation_from_vector(torch.tensor([0.0, math.pi / 2, 0.0], dtype=torch.float64))
     around = {
-        "floor": iw.Object(plate(8.0, 6.0), PAINT, rigid(translation=[4.0, 0.0, 0.0])),
+        "floor": iw.Object(plate(6.0, 8.0), PAINT, rigid(lying, [4.0, 0.0, 0.0])),
         "wall": iw.Object(box((0.1, 6.0, 3.0)), PAINT, rigid(translation=[6.5, 0.0, 1.5])),
         "post": iw.Object(
             box((0.06, 0.06, 2.5)),
@@ -256,6 +258,7 @@ def figure(rows: Sequence[dict[str, Any]]) -> Figure:
     heard.imshow(
         power, origin="lower", aspect="auto", extent=ends, vmin=power.max() - 35, cmap="viridis"
     )
+    heard.invert_xaxis()  # the left is left, as in the camera's image
     heard.set_title("radar: range [m] over direction", fontsize=9)
     for axes, kind, unit in zip(bars, ("position", "yaw"), ("m", "°"), strict=True):
         for number, sensors in enumerate(("start", *SENSORS)):

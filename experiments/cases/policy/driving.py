@@ -157,7 +157,7 @@ def radar_at(state: Float64[Tensor, "world 4"]) -> iw.Radar:
     x, y, heading, _ = state.unbind(-1)
     c, s, zero = heading.cos(), heading.sin(), torch.zeros_like(heading)
     left, up = torch.stack([-s, c, zero], -1), torch.stack([zero, zero, zero + 1], -1)
-    axes = torch.stack([left, up, torch.stack([c, s, zero], -1)], dim=-1)
+    axes = torch.stack([torch.stack([c, s, zero], -1), left, up], dim=-1)
     place = torch.stack([x, y], -1) + origins(len(state))
     position = torch.cat([place, zero[:, None] + 0.5 * HEIGHT], dim=-1)
     return iw.Radar(tx, rx, chirp, position, axes)
@@ -349,9 +349,9 @@ def _cells() -> tuple[Tensor, Tensor, float, float]:
         -1, *radar.shape[1:], -1
     )
     profile = range_profile(single, radar, grid)[:, 0, 0]
-    x, y, _ = radar.virtual_positions.unbind(-1)
+    _, y, z = radar.virtual_positions.unbind(-1)
     array = aperture(radar)
-    beams = array.beams(grid.u, grid.v, x, y) * array.weight
+    beams = array.beams(grid.u, grid.v, y, z) * array.weight
     mean = float(profile.abs().square().sum(0).mean() * beams.abs().square().sum(1).mean())
     return profile, beams, mean, radar.waveform.max_range / grid.range_step * 2 / grid.u_step
 

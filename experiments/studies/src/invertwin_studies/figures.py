@@ -78,6 +78,7 @@ def derivatives(panels: Sequence[Derivative], grid: Grid) -> Figure:
                 vmax=limit,
                 cmap="RdBu_r",
             )
+            cell.invert_xaxis()  # the left of the radar is on the left
             cell.set_title(panel.title if row == 0 else "", fontsize=9)
             cell.set_xlabel(U_LABEL if row == len(views) - 1 else "", fontsize=7)
             cell.set_ylabel(label if k % columns == 0 else "", fontsize=7)

@@ -160,9 +160,9 @@ def _spread(
     wavenumber = 2 * math.pi / radar.waveform.wavelength
     square = field.real.new_zeros(len(rows), grid.u_count, grid.v_count)
     if grid.u_count > 1:
-        square = square + (radii[0] * (grid.u - ray[:, :1])).square()[:, :, None]
+        square = square + (radii[0] * (grid.u - ray[:, 1:2])).square()[:, :, None]
     if grid.v_count > 1:
-        square = square + (radii[1] * (grid.v - ray[:, 1:2])).square()[:, None]
+        square = square + (radii[1] * (grid.v - ray[:, 2:])).square()[:, None]
     # An infinitesimal offset: the root has no derivative at 0.
     across = airy_field(wavenumber * (square + 1e-24).sqrt()).flatten(1)
     return (along.T * field) @ across.to(field)

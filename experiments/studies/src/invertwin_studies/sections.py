@@ -24,7 +24,7 @@ class Methods(Section):
         6e3, gt=0, description="rough points per m² of the exact signals that MUSIC is given"
     )
     sources: int = Field(6, ge=1, description="of MUSIC, in every range bin")
-    smoothing: Subarray = Field([8, 6], description="elements along x, y of the subarrays of MUSIC")
+    smoothing: Subarray = Field([8, 6], description="elements along y, z of the subarrays of MUSIC")
     samples: int = Field(
         400_000, ge=1, description="rays of the other ray tracers, and as many points on edges"
     )
@@ -62,5 +62,5 @@ class LossScan(Section):
     wide_span: float = Field(0.4, gt=0, description="m on either side, surrogate alone")
     wide_points: int = Field(41, ge=3, description="on that line")
     sources: int = Field(6, ge=1, description="of MUSIC, in every range bin")
-    smoothing: Subarray = Field([8, 6], description="elements along x, y of the subarrays of MUSIC")
+    smoothing: Subarray = Field([8, 6], description="elements along y, z of the subarrays of MUSIC")
     samples: int = Field(200_000, ge=1, description="rays of the surrogate at each point")

@@ -120,7 +120,7 @@ def _echo(
     found = radar_equation(geometry, link, frame, [met])
     local = torch.einsum("nij,ni->nj", link.rotations[frame], ray)
     strength = found.power * reach.square() / slope.abs().clamp_min(1e-6)
-    return _Echo(strength, 0.5 * found.length, local[:, 0], local[:, 1])
+    return _Echo(strength, 0.5 * found.length, local[:, 1], local[:, 2])
 
 
 def _interior(
@@ -144,7 +144,7 @@ def _interior(
     place = torch.rand(count, 2, generator=generator, dtype=torch.float64) - 0.5
     u, v = place[:, 0] * widths[0], place[:, 1] * widths[1]
     forward = (1 - u.square() - v.square()).clamp_min(0).sqrt()
-    local = torch.stack([u, v, forward], dim=1)
+    local = torch.stack([forward, u, v], dim=1)
     ray = torch.einsum("nij,nj->ni", link.rotations[frame], local)
     face = _hit(rays, link.tx[frame], ray)
     lit = (face >= 0) & (forward > 1e-3)

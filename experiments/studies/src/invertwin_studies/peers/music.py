@@ -33,7 +33,7 @@ class MusicMap:
         grid: Bins.
         speckle: Rough points, the same wherever the scene moves.
         sources: Per range bin.
-        smoothing: Elements of the subarrays along x and y.
+        smoothing: Elements of the subarrays along y and z.
         seed: Of coherent paths.
     """
 

@@ -111,7 +111,7 @@ def _paths(
     )
     place = radar.link().tx[frame].detach().tolist()
     room.add(rt.Transmitter("tx", place))
-    room.add(rt.Receiver("rx", [place[0] + _BESIDE, *place[1:]]))
+    room.add(rt.Receiver("rx", [place[0], place[1] + _BESIDE, place[2]]))
     solver = rt.PathSolver()
     solver.loop_mode = "evaluated"  # the other mode refuses a derivative from outside
     paths = solver(
@@ -153,8 +153,8 @@ def _binned_derivative(
             torch.zeros(len(power), dtype=torch.int64),
             power,
             0.5 * SPEED_OF_LIGHT * delay,
-            local[:, 0],
             local[:, 1],
+            local[:, 2],
             grid,
         )
         tangent = forward_ad.unpack_dual(total).tangent

@@ -26,9 +26,6 @@ WAVEFORM = Impulse(center_frequency=3.95e9, bandwidth=1.5e9)
 """Middle of the nominal band 3.1–4.8 GHz. The bandwidth is the one whose range cell, c/2B = 0.10 m,
 is the half-power width of the echo of reflector 1; the nominal 1.7 GHz would give 0.09 m."""
 
-# The rail runs along −y and the antenna looks along +x: x right = +y, y up = +z, z boresight = +x.
-_ROTATION = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-
 _DIMENSIONS = {
     "scan_data": 2,
     "scan_timestamps": 1,
@@ -47,7 +44,8 @@ def read(
 
     Scan times are seconds since the first scan. The scans become analytic signals along range;
     then their mean over the scans, the echo of everything that does not change, is removed. The
-    radar's position at a scan is the track's at scan time + clock offset.
+    radar's position at a scan is the track's at scan time + clock offset. The rail runs along −y
+    and the antenna looks along +x, so that the track's axes are the radar's.
 
     Args:
         folder: where the file lies.
@@ -79,11 +77,10 @@ def read(
     times = torch.from_numpy(clock[valid])
     positions = track.interpolate(times + clock_offset)
     antenna = AntennaArray(torch.zeros(1, 3, dtype=torch.float64))
-    rotation = torch.tensor(_ROTATION, dtype=torch.float64)
     return Capture.from_range_profile(
         torch.from_numpy(profile),
         torch.from_numpy(arrays["range_bins"].astype(np.float64)) - range_bias,
-        Radar(antenna, antenna, WAVEFORM, positions, rotation.repeat(len(positions), 1, 1)),
+        Radar(antenna, antenna, WAVEFORM, positions),
         times,
         track=track,
         clock_offset=clock_offset,
