@@ -122,8 +122,8 @@ class Place(nn.Module):
         distance = DISTANCE + WAVEFORM.range_resolution * self.cells
         angle = torch.asin((self._beamwidth * self.beamwidths).clamp(-0.95, 0.95))
         zero = torch.zeros_like(angle)
-        place = distance * torch.stack([torch.sin(angle), zero, torch.cos(angle)])
-        turn = rotation_from_vector(torch.stack([zero, angle, zero]))
+        place = distance * torch.stack([torch.cos(angle), torch.sin(angle), zero])
+        turn = rotation_from_vector(torch.stack([zero, zero, angle]))
         return scene.replace("panel", pose=rigid(turn, place))
 
 
@@ -142,7 +142,7 @@ class Task:
     def draw(seed: int) -> "Task":
         """Speckle and noise of a seed."""
         rail = torch.zeros(LOOKS, 3, dtype=torch.float64)
-        rail[:, 1] = RAIL_STEP * (torch.arange(LOOKS) - 0.5 * (LOOKS - 1))
+        rail[:, 2] = RAIL_STEP * (torch.arange(LOOKS) - 0.5 * (LOOKS - 1))
         receivers = linear_array(16, WAVEFORM.wavelength / 2)
         transmitter = AntennaArray(torch.zeros(1, 3, dtype=torch.float64))
         radar = Radar(transmitter, receivers, WAVEFORM, rail)

@@ -71,9 +71,9 @@ RADAR = Radar(
     torch.zeros(1, 3, dtype=torch.float64),
 )
 GRID = RADAR.grid(0.5, 4.0)
-TURN = rotation_from_vector(torch.tensor([0.2, 0.3, 0.1], dtype=torch.float64))
-WALL = Object(plate(3.0, 3.0), PAINT, rigid(translation=torch.tensor([0.0, 0.0, 2.5]).double()))
-BLOCK = box((0.3, 0.4, 0.2))
+TURN = rotation_from_vector(torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64))
+WALL = Object(plate(3.0, 3.0), PAINT, rigid(translation=torch.tensor([2.5, 0.0, 0.0]).double()))
+BLOCK = box((0.2, 0.3, 0.4))
 
 
 def scene_at(place: Tensor) -> Scene:
@@ -84,7 +84,7 @@ def scene_at(place: Tensor) -> Scene:
 def places(count: int, number: int) -> Tensor:
     """Where the blocks of so many scenes stand; a little further in every call."""
     across = torch.linspace(-0.4, 0.4, count + 1, dtype=torch.float64)[:count] + 1e-3 * number
-    return torch.stack([across, 0.1 + 0 * across, 1.5 - 0.3 * across], dim=1)
+    return torch.stack([1.5 - 0.3 * across, across, 0.1 + 0 * across], dim=1)
 
 
 class Steps:

@@ -53,16 +53,17 @@ COUNTED = {
 }
 RUN = """
 task = "reconstruct"
+frame = 2
 seed = 1
 
 [scene.ball]
 shape = "sphere"
 radius = 0.15
-position = [0.0, 0.0, 2.0]
+position = [2.0, 0.0, 0.0]
 material = { kind = "rough_dielectric", permittivity = 4.0 }
 
 [truth.ball]
-position = [0.03, 0.0, 2.04]
+position = [2.04, 0.03, 0.0]
 
 [radar]
 waveform = { kind = "fmcw", start_frequency = 77e9, bandwidth = 2e9, duration = 5e-5, samples = 64 }
@@ -84,7 +85,7 @@ depth = 1
 [[parameters]]
 kind = "translation"
 object = "ball"
-axes = ["x", "z"]
+axes = ["x", "y"]
 
 [loss]
 kind = "likelihood"
@@ -103,7 +104,7 @@ samples = 4_000
 boundary_samples = 1_000
 checkpoint_every = 1
 """
-MANY = RUN + '\n[starts]\nobject = "ball"\ncount = 2\ndistance = [0.03, 0.05]\naxes = ["x", "z"]\n'
+MANY = RUN + '\n[starts]\nobject = "ball"\ncount = 2\ndistance = [0.03, 0.05]\naxes = ["x", "y"]\n'
 STAGED = (
     RUN + "\n[[stages]]\nreconstruct = { steps = 4 }\n\n[[stages]]\nreconstruct = { steps = 3 }\n"
 )

@@ -70,12 +70,12 @@ class Task:
         """A body in front of a wall and above a floor; it hides parts of both from each other."""
         rough = RoughDielectric(permittivity=4.0)
         objects = {
-            "wall": Object(plate(4.0, 3.0, divisions=4), rough, placed(0.0, 0.5, 4.0)),
-            "floor": Object(plate(4.0, 4.0, divisions=4), rough, lying(0.0, -1.0, 2.5)),
-            "body": Object(body, rough, placed(0.2, -0.4, 3.2)),
+            "wall": Object(plate(4.0, 3.0, divisions=4), rough, placed(4.0, 0.0, 0.5)),
+            "floor": Object(plate(4.0, 4.0, divisions=4), rough, lying(2.5, 0.0, -1.0)),
+            "body": Object(body, rough, placed(3.2, 0.2, -0.4)),
         }
         receivers = linear_array(16, WAVEFORM.wavelength / 2)
-        offset = torch.tensor([1.5, 0.4, 0.0], dtype=torch.float64)
+        offset = torch.tensor([0.0, 1.5, 0.4], dtype=torch.float64)
         radar = Radar(
             single(-0.8, 0.6),
             replace(receivers, positions=receivers.positions + offset),
@@ -106,13 +106,13 @@ def placed(x: float, y: float, z: float) -> Tensor:
 def lying(x: float, y: float, z: float) -> Tensor:
     """A pose that turns a plate's face upwards."""
     pose = placed(x, y, z)
-    pose[:3, :3] = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    pose[:3, :3] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     return pose
 
 
-def single(x: float, y: float = 0.0) -> AntennaArray:
+def single(y: float, z: float = 0.0) -> AntennaArray:
     """One isotropic antenna."""
-    return AntennaArray(torch.tensor([[x, y, 0.0]], dtype=torch.float64), Isotropic())
+    return AntennaArray(torch.tensor([[0.0, y, z]], dtype=torch.float64), Isotropic())
 
 
 class Estimator:

@@ -38,7 +38,7 @@ METRES = (1.5, 30.0, 100.0, 500.0)
 SAMPLES, SEEDS = 200_000, 4
 TOLERANCE = 0.01
 RADIUS, BUMPS, HEIGHT = 0.3, 12.0, 0.15  # m, per radius, of the radius
-ASIDE = (0.12, -0.07, 1.0)  # direction of the ball
+ASIDE = (1.0, 0.12, -0.07)  # direction of the ball
 BEHIND = 2.0  # how much further the wall is [m]
 STEP = 1e-4  # relative change of size, of the truth's differences
 AZIMUTHS, NODES = 16_384, 8  # of the integral within the outline
@@ -54,8 +54,8 @@ class Task:
         self.mesh = Mesh(RADIUS * ball.vertices * (1 + HEIGHT * waves), ball.faces)
         aside = torch.tensor(ASIDE, dtype=torch.float64)
         self.centre = metres * aside / aside.norm()
-        depth = float(self.centre[2]) + BEHIND
-        stretch = depth / float(self.centre[2])
+        depth = float(self.centre[0]) + BEHIND
+        stretch = depth / float(self.centre[0])
         self.wall = Object(plate(4.0, 4.0), PAINT, rigid(translation=stretch * self.centre))
         origin = torch.zeros(1, 3, dtype=torch.float64)
         turn = torch.eye(3, dtype=torch.float64)[None]
@@ -79,20 +79,20 @@ class Task:
 
     def _hidden(self, size: float) -> float:
         """Power of the wall's part in the shadow."""
-        centre, depth = self.centre.numpy(), float(self.wall.center[2])
+        centre, depth = self.centre.numpy(), float(self.wall.center[0])
         corners = self.mesh.vertices.numpy() * size + centre
-        shadow = corners[:, :2] * (depth / corners[:, 2:]) - centre[:2] * (depth / centre[2])
+        shadow = corners[:, 1:] * (depth / corners[:, :1]) - centre[1:] * (depth / centre[0])
         outline = furthest(shadow, self.mesh.faces.numpy())
         nodes, weights = np.polynomial.legendre.leggauss(NODES)
         share = 0.5 * (nodes + 1)
         radius = outline[:, None] * share
         angle = 2 * math.pi * np.arange(len(outline))[:, None] / len(outline)
-        flat = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * radius], -1)
+        flat = np.stack([0 * radius, radius * np.cos(angle), radius * np.sin(angle)], -1)
         position = torch.from_numpy(flat.reshape(-1, 3)) + self.wall.center
         area = 0.5 * weights * radius * outline[:, None] * (2 * math.pi / len(outline))
         geometry = flatten(Scene({"wall": self.wall}), self.link.wavelength)
         still = torch.zeros(len(position), dtype=torch.int64)
-        normal = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(len(position), 3)
+        normal = torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64).expand(len(position), 3)
         place = MaterialPoints(
             position, normal, torch.ones(len(position), dtype=torch.float64), still
         )

@@ -164,7 +164,7 @@ def reflectors(
 def paths_of(radar: Radar, points: Tensor, amplitudes: Tensor, rates: Tensor) -> Paths:
     """Field paths of points, in every frame."""
     u, v = points[:, 1], points[:, 2]
-    rays = torch.stack([u, v, (1 - u**2 - v**2).sqrt()], 1)
+    rays = torch.stack([(1 - u**2 - v**2).sqrt(), u, v], 1)
     places, velocity = points[:, :1] * rays, rates[:, None] * rays
     frames, count = radar.frame_count, len(points)
     link = radar.link()
@@ -190,8 +190,8 @@ def objects(radar: Radar, farthest: float, chance: Chance) -> Paths:
     nearest = max(5 * cell, 0.5)
     near = float(chance.uniform(nearest, max(0.4 * farthest, 1.1 * nearest)))
     size = min(0.3 * farthest, 0.5)
-    thing = iw.Object(box([size] * 3), PAINT, rigid(translation=[0.2 * near, 0.0, near + size]))
-    wall = iw.Object(plate(2.0, 1.5), PAINT, rigid(translation=[0.0, 0.0, 0.8 * farthest]))
+    thing = iw.Object(box([size] * 3), PAINT, rigid(translation=[near + size, 0.2 * near, 0.0]))
+    wall = iw.Object(plate(2.0, 1.5), PAINT, rigid(translation=[0.8 * farthest, 0.0, 0.0]))
     scene = iw.Scene({"box": thing, "wall": wall})
     sampling = iw.Sampling(depth=1, points_per_m2=400)
     paths = trace_field(scene, radar.link(), sampling=sampling, seed=int(chance.integers(2**31)))

@@ -55,8 +55,8 @@ class Boxes:
         while side**3 < count:
             side += 1
         number = torch.arange(count)
-        cells = torch.stack([number % side, number // side % side, number // side**2], dim=1)
-        middle = torch.tensor([side / 2, side / 2, -side], dtype=torch.float64)
+        cells = torch.stack([number // side**2, number % side, number // side % side], dim=1)
+        middle = torch.tensor([-side, side / 2, side / 2], dtype=torch.float64)
         places, one = 0.4 * (cells - middle), box((0.2, 0.2, 0.2))
         self.items = list(zip([one] * count, places, strict=True))
         if joined:
@@ -66,7 +66,7 @@ class Boxes:
 
     def call(self, number: int, depth: int, samples: int = SAMPLES) -> float:
         """Seconds of a map and its derivative, with other places and another seed each time."""
-        shift = torch.tensor([1e-3 * number, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
+        shift = torch.tensor([0.0, 1e-3 * number, 0.0], dtype=torch.float64, requires_grad=True)
         objects = {
             str(n): Object(mesh, PAINT, rigid(translation=place + shift))
             for n, (mesh, place) in enumerate(self.items)

@@ -48,10 +48,10 @@ from invertwin.scene.mesh_topology import weld_faces
 
 Parts = list[Mesh]
 REQUIRED: Required = {"worst_ratio": ("<=", 0.01), "topology_seconds": ("<=", 2.0)}
-SIZE = (0.4, 0.5, 0.3)  # m
+SIZE = (0.3, 0.4, 0.5)  # m
 SAMPLES = 1_000_000
 PAINT, METAL = iw.RoughDielectric(4.0, diffuse=1.0), iw.PerfectConductor()
-WAY, TURN = (0.3, 0.2, -0.4), (0.2, -0.1, 0.3)  # m and rad for one unit of the parameter
+WAY, TURN = (-0.4, 0.3, 0.2), (0.3, 0.2, -0.1)  # m and rad for one unit of the parameter
 FREQUENCY = 3.5e9
 
 
@@ -63,13 +63,13 @@ def vector(*values: float) -> Tensor:
 def plates() -> Parts:
     """Six plates, each turned to its face of the box."""
     half, parts = math.pi / 2, []
-    turns = ((0, 0, 0), (0, math.pi, 0), (0, half, 0), (0, -half, 0), (half, 0, 0), (-half, 0, 0))
+    turns = ((0, 0, 0), (0, 0, math.pi), (0, 0, half), (0, 0, -half), (0, half, 0), (0, -half, 0))
     x, y, z = SIZE
-    sizes = ((x, y, z), (x, y, z), (z, y, x), (z, y, x), (x, z, y), (x, z, y))
+    sizes = ((y, z, x), (y, z, x), (x, z, y), (x, z, y), (y, x, z), (y, x, z))
     for turn, (width, height, depth) in zip(turns, sizes, strict=True):
         part = iw.plate(width, height)
         rotation = rotation_from_vector(vector(*turn))
-        parts.append(Mesh((part.vertices - vector(0, 0, depth / 2)) @ rotation.T, part.faces))
+        parts.append(Mesh((part.vertices - vector(depth / 2, 0, 0)) @ rotation.T, part.faces))
     return parts
 
 
@@ -94,12 +94,12 @@ def meshes() -> dict[str, Parts]:
     flipped = clean.faces.clone()
     flipped[::3] = flipped[::3].flip(1)
     joined = plates()
-    crack = [Mesh(joined[0].vertices - vector(0, 0, 1e-9), joined[0].faces), *joined[1:]]
+    crack = [Mesh(joined[0].vertices - vector(1e-9, 0, 0), joined[0].faces), *joined[1:]]
     x, y, z = SIZE
-    left, right = iw.box((0.7 * x, y, z)), iw.box((0.6 * x, y, z))
+    right, left = iw.box((x, 0.7 * y, z)), iw.box((x, 0.6 * y, z))
     halves = [
-        Mesh(left.vertices - vector(0.15 * x, 0, 0), left.faces),
-        Mesh(right.vertices + vector(0.2 * x, 0, 0), right.faces),
+        Mesh(right.vertices - vector(0, 0.15 * y, 0), right.faces),
+        Mesh(left.vertices + vector(0, 0.2 * y, 0), left.faces),
     ]
     other = torch.cat([
         torch.stack([quad[0], quad[1], quad[3], quad[1], quad[2], quad[3]]).reshape(2, 3)
@@ -133,20 +133,20 @@ def outline(pair: Tensor) -> list[Tensor]:
 def scene(parts: Parts, material: Material, theta: Tensor, wall: Material | None) -> iw.Scene:
     """The box, moved and turned by the parameter, before a wall."""
     turn = rotation_from_vector(theta * vector(*TURN)) @ rotation_from_vector(
-        vector(0.15, 0.5, 0.1)
+        vector(0.1, 0.15, 0.5)
     )
-    pose = iw.rigid(turn, vector(0, 0, 1.4) + theta * vector(*WAY))
+    pose = iw.rigid(turn, vector(1.4, 0, 0) + theta * vector(*WAY))
     objects = {f"part {k}": iw.Object(part, material, pose) for k, part in enumerate(parts)}
     if wall is not None:
         objects["wall"] = iw.Object(
-            iw.plate(2.0, 2.0), wall, iw.rigid(translation=vector(0, 0, 2.4))
+            iw.plate(2.0, 2.0), wall, iw.rigid(translation=vector(2.4, 0, 0))
         )
     return iw.Scene(objects)
 
 
 def radar() -> iw.Radar:
     """One transmitter and one receiver, aside of the origin."""
-    arrays = AntennaArray(vector(-0.1, 0, 0)[None]), AntennaArray(vector(0.1, 0.05, 0)[None])
+    arrays = AntennaArray(vector(0, -0.1, 0)[None]), AntennaArray(vector(0, 0.1, 0.05)[None])
     return iw.Radar(*arrays, iw.FMCW(76e9, 1e9, 50e-6, 64), torch.zeros(1, 3).double())
 
 
@@ -168,7 +168,7 @@ def power(material: Material, depth: int) -> Mechanism:
 def signature(material: Material, edges: int) -> Mechanism:
     """Cross-sections from three sides."""
     ways = torch.nn.functional.normalize(
-        torch.stack([vector(0.2, 0.1, -1.0), vector(-0.3, 0.4, -1.0), vector(-0.5, -0.4, 1.0)])
+        torch.stack([vector(-1.0, 0.2, 0.1), vector(-1.0, -0.3, 0.4), vector(1.0, -0.5, -0.4)])
     )
 
     def compute(parts: Parts, theta: Tensor) -> Tensor:
@@ -179,15 +179,15 @@ def signature(material: Material, edges: int) -> Mechanism:
 
 def links(depth: int, edges: int) -> Mechanism:
     """Power gains of links past the box, or around the transmitter where it mirrors."""
-    rx = torch.stack([vector(0.1, 0.05, 2.2), vector(-0.1, 0.1, 2.3), vector(0.35, -0.1, 2.0)])
+    rx = torch.stack([vector(2.2, 0.1, 0.05), vector(2.3, -0.1, 0.1), vector(2.0, 0.35, -0.1)])
     if depth:
         across = torch.linspace(-1.5, 1.5, 9, dtype=torch.float64)
-        rx = torch.cartesian_prod(across, across, vector(0.3))
+        rx = torch.cartesian_prod(vector(0.3), across, across)
 
     def compute(parts: Parts, theta: Tensor) -> Tensor:
         around = scene(parts, METAL, theta, None)
         paths = trace_paths(
-            around, vector(0.03, 0.02, 0.0), rx, FREQUENCY, depth=depth, edges=edges, rays=None
+            around, vector(0.0, 0.03, 0.02), rx, FREQUENCY, depth=depth, edges=edges, rays=None
         )
         turn = torch.polar(torch.ones_like(paths.delay), -2 * math.pi * FREQUENCY * paths.delay)
         total = torch.zeros(len(rx), 2, dtype=torch.complex128)
@@ -203,9 +203,9 @@ def coverage(material: Material, depth: int) -> Mechanism:
     def compute(parts: Parts, theta: Tensor) -> Tensor:
         cells = CellSampling(400, 40_000)
         plane = MapPlane(
-            vector(-1.03, -1.11, 2.37), vector(2, 0, 0), vector(0, 2, 0), (4, 4), cells
+            vector(2.37, -1.03, -1.11), vector(0, 2, 0), vector(0, 0, 2), (4, 4), cells
         )
-        mast = Transmitters(vector(0.03, 0.02, 0.0))
+        mast = Transmitters(vector(0.0, 0.03, 0.02))
         settings = PropagationSettings(FREQUENCY, depth=depth, rays=None)
         return plane.link_statistics(scene(parts, material, theta, METAL), mast, settings, 0).gain
 
@@ -215,7 +215,7 @@ def coverage(material: Material, depth: int) -> Mechanism:
 def mask(parts: Parts, theta: Tensor) -> Tensor:
     """The box in a camera's image."""
     camera = Camera.look_at(
-        [0.2, 0.1, 0.0], [0.0, 0.0, 1.4], width=16, height=16, field_of_view=0.8
+        [0.0, 0.2, 0.1], [1.4, 0.0, 0.0], width=16, height=16, field_of_view=0.8
     )
     names = [f"part {k}" for k in range(len(parts))]
     whole = scene(parts, METAL, theta, METAL)

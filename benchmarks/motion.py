@@ -44,7 +44,7 @@ REQUIRED: Required = {
 }
 BODY = person()
 SKIN = RoughDielectric(permittivity=4.0)
-PLACE = [0.2, standing_height(BODY), 4.0]
+PLACE = [4.0, 0.2, standing_height(BODY)]
 STANDING = iw.Object(BODY.mesh({}), SKIN, rigid(translation=PLACE))
 walking = MovingScene(
     iw.Scene({**room(), "person": STANDING}), {"person": Walking(BODY, SPEED, phase=0.8)}
@@ -55,7 +55,7 @@ def sensor() -> iw.Radar:
     """Two transmitters and four receivers at the front wall."""
     chirp = iw.FMCW(start_frequency=77e9, bandwidth=1e9, duration=40e-6, samples=256)
     half = chirp.wavelength / 2
-    place = torch.tensor([[0.0, 1.0, 0.1]], dtype=torch.float64)
+    place = torch.tensor([[0.1, 0.0, 1.0]], dtype=torch.float64)
     return iw.Radar(linear_array(2, 4 * half), linear_array(4, half), chirp, place)
 
 

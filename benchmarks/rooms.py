@@ -28,7 +28,7 @@ import json
 import math
 import statistics
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -88,7 +88,7 @@ class Thing:
 
     Attributes:
         kind: Among ``KINDS``, or corner.
-        place: x and z of its middle [m].
+        place: x and y of its middle [m].
         yaw: About the vertical [rad].
         size: Along its own x, y and z [m]; the inner edges of a corner.
         lift: Of its middle above the floor [m]; of the apex of a corner.
@@ -106,19 +106,19 @@ class Thing:
     def reach(self) -> float:
         """Radius of a circle around it [m]."""
         round_ = self.kind in ("cylinder", "sphere")
-        return 0.5 * (self.size[0] if round_ else math.hypot(self.size[0], self.size[2]))
+        return 0.5 * (self.size[0] if round_ else math.hypot(self.size[0], self.size[1]))
 
     def item(self) -> iw.Object:
         """The thing as an object."""
         if self.kind in ("wall", "box"):
             mesh = box(self.size)
         elif self.kind == "cylinder":
-            mesh = cylinder(0.5 * self.size[0], self.size[1])
+            mesh = cylinder(0.5 * self.size[0], self.size[2])
         elif self.kind == "sphere":
             mesh = sphere(0.5 * self.size[0], 3)
         else:
             body = _standing()
-            tall = self.size[1] / float(body.vertices[:, 1].max() - body.vertices[:, 1].min())
+            tall = self.size[2] / float(body.vertices[:, 2].max() - body.vertices[:, 2].min())
             mesh = Mesh(tall * body.vertices, body.faces)
         pose = rigid(self.turn, self.middle)
         return iw.Object(mesh, RoughDielectric(permittivity=self.permittivity), pose)
@@ -126,12 +126,12 @@ class Thing:
     @property
     def turn(self) -> Tensor:
         """How it stands [3, 3]."""
-        return rotation_from_vector(torch.tensor([0.0, self.yaw, 0.0], dtype=torch.float64))
+        return rotation_from_vector(torch.tensor([0.0, 0.0, self.yaw], dtype=torch.float64))
 
     @property
     def middle(self) -> Tensor:
         """Its middle [m]."""
-        return torch.tensor([self.place[0], self.lift, self.place[1]], dtype=torch.float64)
+        return torch.tensor([*self.place, self.lift], dtype=torch.float64)
 
     def echo(self, radar: iw.Radar, scene: iw.Scene) -> Tensor:
         """The beat signal of a corner reflector: the amplitude of its field, as from its apex.
@@ -147,7 +147,7 @@ class Thing:
         with warnings.catch_warnings():
             # Edges seen at grazing are left out: they are 40 dB below what matters.
             warnings.simplefilter("ignore", PhysicsWarning)
-            found = iw.rcs(corner, away @ self.turn, band, up=(0.0, 1.0, 0.0), edges=1)
+            found = iw.rcs(corner, away @ self.turn, band, up=(0.0, 0.0, 1.0), edges=1)
         frequency = CHIRP.start_frequency + CHIRP.step * torch.arange(CHIRP.samples).double()
         # Smooth over frequency, with the apex for its origin.
         spline = make_interp_spline(band.numpy(), found.matrix[:, :, 0, 0].numpy())
@@ -170,6 +170,12 @@ class Thing:
         return beat
 
 
+def _place(uniform: Callable[[float, float], float]) -> tuple[float, float]:
+    """A place in the room, x and y [m]."""
+    y, x = uniform(-1.8, 1.8), uniform(-1.8, 1.8)
+    return x, y
+
+
 def _standing() -> Mesh:
     """A person with hanging arms, about the middle of its box."""
     turns = torch.eye(3, dtype=torch.float64).repeat(len(BODY.names), 1, 1)
@@ -186,7 +192,7 @@ class Room:
     Attributes:
         number: Of the room, which seeds everything.
         things: What stands in it.
-        turns: Directions from the middle to the places of the radar [rad].
+        turns: Directions from the middle to the places of the radar, from y towards x [rad].
         snr_db: Of samples.
     """
 
@@ -213,27 +219,29 @@ class Room:
             kind = KINDS[int(uniform(0, len(KINDS)))]
             lift = None
             if kind == "wall":
-                size = uniform(0.8, 2.0), uniform(0.6, 1.5), 0.02
+                wide, tall = uniform(0.8, 2.0), uniform(0.6, 1.5)
+                size = 0.02, wide, tall
             elif kind == "box":
-                size = uniform(0.25, 0.9), uniform(0.4, 1.2), uniform(0.25, 0.7)
+                wide, tall, deep = uniform(0.25, 0.9), uniform(0.4, 1.2), uniform(0.25, 0.7)
+                size = deep, wide, tall
             elif kind == "cylinder":
                 across = uniform(0.16, 0.6)
-                size = across, uniform(0.4, 1.5), across
+                size = across, across, uniform(0.4, 1.5)
             elif kind == "sphere":
                 across = uniform(0.2, 0.6)
                 size = across, across, across
-                lift = uniform(0.5 * size[1], 1.0)
+                lift = uniform(0.5 * size[2], 1.0)
             else:
                 span = _standing().vertices
-                wide, tall, deep = (span.amax(0) - span.amin(0)).tolist()
+                deep, wide, tall = (span.amax(0) - span.amin(0)).tolist()
                 part = 0.88 + 0.24 * float(torch.rand((), generator=stature))
-                size = part * float(wide), part * float(tall), part * float(deep)
+                size = part * float(deep), part * float(wide), part * float(tall)
             thing = Thing(
                 kind,
-                (uniform(-1.8, 1.8), uniform(-1.8, 1.8)),
+                _place(uniform),
                 uniform(-math.pi, math.pi),
                 size,
-                0.5 * size[1] if lift is None else lift,
+                0.5 * size[2] if lift is None else lift,
                 uniform(2.5, 8.0),
             )
             free = (math.dist(thing.place, o.place) - thing.reach - o.reach > GAP for o in things)
@@ -245,10 +253,10 @@ class Room:
         snr_db = uniform(0.0, 20.0)
         while number % 2 == 1:
             edge, towards = uniform(0.03, 0.06), turns[int(uniform(0, count))]
-            place = uniform(-1.8, 1.8), uniform(-1.8, 1.8)
-            out = AWAY * math.cos(towards) - place[0], AWAY * math.sin(towards) - place[1]
-            # Its boresight is −z; a yaw takes z towards x.
-            yaw = math.atan2(-out[0], -out[1])
+            place = _place(uniform)
+            out = AWAY * math.sin(towards) - place[0], AWAY * math.cos(towards) - place[1]
+            # Its boresight is −x; a yaw takes x towards y.
+            yaw = math.atan2(-out[1], -out[0])
             thing = Thing("corner", place, yaw, (edge, edge, edge), uniform(0.3, 1.0), 1.0)
             free = (math.dist(thing.place, o.place) - thing.reach - o.reach > GAP for o in things)
             if all(free):
@@ -260,9 +268,9 @@ class Room:
         """The board at all its places, looking at the middle."""
         turns = torch.tensor(self.turns, dtype=torch.float64)
         zero = torch.zeros_like(turns)
-        out = torch.stack([turns.cos(), zero, turns.sin()], dim=-1)
-        up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(out)
-        axes = torch.stack([torch.linalg.cross(up, -out), up, -out], dim=-1)
+        out = torch.stack([turns.sin(), turns.cos(), zero], dim=-1)
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(out)
+        axes = torch.stack([-out, torch.linalg.cross(up, -out), up], dim=-1)
         half, patch = CHIRP.wavelength / 2, Cosine(1.0)
         return iw.Radar(
             linear_array(2, 4 * half, pattern=patch),
@@ -292,7 +300,7 @@ class Room:
         twin = iw.twin(capture, low=(-HALF, -HALF), high=(HALF, HALF), level=0.0, seed=self.number)
         seconds = perf_counter() - begin
         sure = [thing for thing in twin.objects if thing.existence_probability > 0.5]
-        places = [(float(t.position[0]), float(t.position[2])) for t in sure]
+        places = [(float(t.position[0]), float(t.position[1])) for t in sure]
         pairs = matched([thing.place for thing in self.things], places)
         rows = [
             self._judged(self.things[a], sure[b], math.dist(self.things[a].place, places[b]))
@@ -323,7 +331,7 @@ class Room:
         row: dict[str, Any] = {"kind": true.kind, "called": found.kind, "error": error}
         row["scores"] = [
             abs(float(found.position[axis]) - at) / found.deviations[name]
-            for axis, name, at in ((0, "x", true.place[0]), (2, "z", true.place[1]))
+            for axis, name, at in ((0, "x", true.place[0]), (1, "y", true.place[1]))
         ]
         if true.kind in ("wall", "box") and figure.is_rectangular:
             row["yaw_error"] = yaw_error(true, figure)
@@ -341,9 +349,9 @@ def yaw_error(true: Thing, found: Any) -> float:
     def longer(yaw: float, length: float, width: float) -> float:
         return yaw if length >= width else yaw + math.pi / 2
 
-    sides = sorted((true.size[0], true.size[2]))
+    sides = sorted(true.size[:2])
     period = math.pi / 2 if sides[1] < 1.15 * sides[0] else math.pi
-    off = longer(true.yaw, true.size[0], true.size[2])
+    off = longer(true.yaw, *true.size[:2])
     off = (longer(found.yaw, found.length, found.width) - off) % period
     return min(off, period - off)
 
@@ -383,10 +391,10 @@ def conventional(
         [ordered_statistics_cfar(frame, false_alarm=1e-6, rank=0.25) for frame in power.amax(3)]
     )
     points = peaks(power, seen, radar, grid).position.double()
-    points = points[(points[:, [0, 2]].abs() < HALF).all(1)]
+    points = points[(points[:, :2].abs() < HALF).all(1)]
     if len(points) < least:
         return []
-    points[:, 1] = 0.0
+    points[:, 2] = 0.0
     tree = KDTree(points.numpy())
     counts = torch.tensor([len(near) for near in tree.query_ball_point(points.numpy(), gap)])
     core = points[counts >= least]
@@ -397,7 +405,7 @@ def conventional(
     for number in range(int(labels.max()) + 1):
         own: Tensor = core[labels == number]
         middle = principal_rectangle(own).center if len(own) > 2 else own.mean(0)
-        found.append((float(middle[0]), float(middle[2])))
+        found.append((float(middle[0]), float(middle[1])))
     return found
 
 

@@ -85,7 +85,7 @@ def run_of(number: int, run: RunFile) -> RunFile:
     truth = run.truth["car"].model_copy(
         update={"parts": [part.model_copy(update={"coefficients": shape})]}
     )
-    there = [DISTANCE * math.cos(bearing), 0.0, DISTANCE * math.sin(bearing)]
+    there = [DISTANCE * math.sin(bearing), DISTANCE * math.cos(bearing), 0.0]
     start = run.scene["car"].model_copy(
         update={"position": there, "rotation_deg": _turned(truth.rotation_deg, side * ANGLE_DEG)}
     )
@@ -95,7 +95,7 @@ def run_of(number: int, run: RunFile) -> RunFile:
 def _turned(rotation_deg: Sequence[float] | None, heading_deg: float) -> list[float]:
     """A rotation vector, followed by a turn about the vertical."""
     first = Rotation.from_rotvec(rotation_deg or [0.0] * 3, degrees=True)
-    turn = Rotation.from_rotvec([0.0, heading_deg, 0.0], degrees=True)
+    turn = Rotation.from_rotvec([0.0, 0.0, heading_deg], degrees=True)
     return (turn * first).as_rotvec(degrees=True).tolist()
 
 

@@ -108,18 +108,19 @@ def case(name: str, chirps: int = CHIRPS, points: int = POINTS) -> Case:
     """One of ``CASES``; the same every time."""
     draw = torch.Generator().manual_seed(7)
     spread = torch.rand(points, 3, generator=draw, dtype=torch.float64)
-    start = torch.tensor([-4.0, -1.0, 4.0]) + torch.tensor([8.0, 2.0, 30.0]) * spread
+    # Random numbers are drawn for y, z and x, in this order.
+    start = torch.tensor([4.0, -4.0, -1.0]) + torch.tensor([30.0, 8.0, 2.0]) * spread.roll(1, 1)
     coefficient = torch.randn(points, generator=draw, dtype=torch.complex128)
     heading = torch.nn.functional.normalize(
-        torch.randn(2, points, 3, generator=draw, dtype=torch.float64), dim=-1
+        torch.randn(2, points, 3, generator=draw, dtype=torch.float64).roll(1, -1), dim=-1
     )
     amount = torch.rand(2, points, 1, generator=draw, dtype=torch.float64)
     speed = (10 + 20 * amount[0]) * heading[0]
     acceleration = (3 + 2 * amount[1]) * GRAVITY * heading[1]
     # Blades turn about the vertical axis of bodies that fly.
     radius, phase = 0.15 * spread[:, 0].sqrt(), 2 * math.pi * spread[:, 1]
-    hub = torch.tensor([1.0, 0.5, 6.0]) + 10 * spread[:, 2:] * torch.tensor([0.2, 0.0, 1.0])
-    body = torch.tensor([9.0, 0.0, -12.0], dtype=torch.float64)
+    hub = torch.tensor([6.0, 1.0, 0.5]) + 10 * spread[:, 2:] * torch.tensor([1.0, 0.2, 0.0])
+    body = torch.tensor([-12.0, 9.0, 0.0], dtype=torch.float64)
 
     def static(times: Tensor) -> Tensor:
         return start.expand(*times.shape, 3)
@@ -130,7 +131,7 @@ def case(name: str, chirps: int = CHIRPS, points: int = POINTS) -> Case:
 
     def rotating(times: Tensor) -> Tensor:
         angle = phase + 2 * math.pi * 100 * times
-        blade = torch.stack([angle.cos(), torch.zeros_like(angle), angle.sin()], dim=-1)
+        blade = torch.stack([angle.sin(), angle.cos(), torch.zeros_like(angle)], dim=-1)
         return hub + body * times[..., None] + radius[:, None] * blade
 
     ways: dict[str, Trajectory] = {
@@ -162,7 +163,7 @@ def transforms(paths: int, repeats: int) -> dict[str, float]:
     """Error and time of the library's sums; the direct ones are done once, for some channels."""
     radar, draw = board(), torch.Generator().manual_seed(3)
     spread = torch.rand(paths, 3, generator=draw, dtype=torch.float64)
-    points = torch.tensor([-4.0, -1.0, 3.0]) + torch.tensor([8.0, 2.0, 30.0]) * spread
+    points = torch.tensor([3.0, -4.0, -1.0]) + torch.tensor([30.0, 8.0, 2.0]) * spread.roll(1, 1)
     listed = point_paths(radar, points, torch.randn(paths, generator=draw, dtype=torch.complex128))
     found = beat_signal(listed, radar)
     times = []

@@ -50,11 +50,11 @@ COUNTED = {
 
 def fitted(optimizer: Optimizer, depth: int, seed: int, steps: int) -> Tensor:
     """Where a fit finds a ball [m]."""
-    ball = iw.Object(BALL, RoughDielectric(4.0), rigid(translation=[0.1, 0.0, 2.1]))
+    ball = iw.Object(BALL, RoughDielectric(4.0), rigid(translation=[2.1, 0.1, 0.0]))
     scene = iw.Scene({"ball": ball})
     chirp = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=64)
     arrays = linear_array(1, 1e-3), linear_array(8, 1.92e-3)
-    places = torch.tensor([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]], dtype=torch.float64)
+    places = torch.tensor([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0]], dtype=torch.float64)
     radar = iw.Radar(*arrays, chirp, positions=places)
     grid = radar.grid(range_min=1.5, range_max=2.8, u_max=0.5)
     few = iw.Sampling(depth=1, points_per_m2=1e3)
@@ -62,9 +62,9 @@ def fitted(optimizer: Optimizer, depth: int, seed: int, steps: int) -> Tensor:
     sampling = iw.Sampling(depth=depth, samples=4000, boundary_samples=1000)
     model = iw.SurrogateMap(grid, iw.Surrogate(range_width=3.0, angle_width=1.0), sampling)
     found = iw.reconstruct(
-        scene.replace("ball", pose=rigid(translation=[0.15, 0.0, 2.15])),
+        scene.replace("ball", pose=rigid(translation=[2.15, 0.15, 0.0])),
         iw.Observation(model, data.capture),
-        Translation("ball", axes="xz"),  # a row of antennas does not tell y
+        Translation("ball", axes="xy"),  # a row of antennas does not tell z
         loss=iw.SpectrumLoss(kind="likelihood"),
         optimizer=optimizer,
         schedule=iw.Schedule(steps),

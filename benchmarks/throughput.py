@@ -111,13 +111,13 @@ class Task:
 def at(distance: float) -> Tensor:
     """A pose on the boresight."""
     pose = torch.eye(4, dtype=torch.float64)
-    pose[2, 3] = distance
+    pose[0, 3] = distance
     return pose
 
 
-def single(x: float) -> AntennaArray:
+def single(y: float) -> AntennaArray:
     """One isotropic antenna."""
-    return AntennaArray(torch.tensor([[x, 0.0, 0.0]], dtype=torch.float64), Isotropic())
+    return AntennaArray(torch.tensor([[0.0, y, 0.0]], dtype=torch.float64), Isotropic())
 
 
 def speed(task: Task, samples: int, boundary_samples: int, steps: int) -> dict[str, float]:
@@ -214,7 +214,7 @@ def sionna_calls(target: Mesh, rays: int) -> Callable[[int], int] | None:
 
     mesh = mi.Mesh("target", vertex_count=len(target.vertices), face_count=len(target.faces))
     parameters = mi.traverse(mesh)
-    vertices = target.vertices + torch.tensor([0.0, 0.0, 2.0])
+    vertices = target.vertices + torch.tensor([2.0, 0.0, 0.0])
     parameters["vertex_positions"] = mi.Float(vertices.float().numpy().ravel())
     parameters["faces"] = mi.UInt32(target.faces.numpy().astype(np.uint32).ravel())
     parameters.update()
@@ -225,7 +225,7 @@ def sionna_calls(target: Mesh, rays: int) -> Callable[[int], int] | None:
     antenna = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
     scene.tx_array = scene.rx_array = antenna
     scene.add(rt.Transmitter("tx", [0.0, 0.0, 0.0]))
-    scene.add(rt.Receiver("rx", [0.01, 0.0, 0.0]))
+    scene.add(rt.Receiver("rx", [0.0, 0.01, 0.0]))
     solver = rt.PathSolver()
 
     def call(seed: int) -> int:

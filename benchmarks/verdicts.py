@@ -52,7 +52,7 @@ CAR = Path(__file__).resolve().parents[1] / "experiments" / "car.ply"
 KINDS = ("L", "A", "box", "car")
 PLACE, TURN = 0.05, math.radians(10.0)  # of a right end
 FAR, STEP, TURNS = 1.0, 0.4, 6  # of starts [m], of the grid of starts [m], turns at each place
-UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 PAINT = RoughDielectric(permittivity=4.0)
 CHIRP = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=50e-6, samples=128)
 SAMPLING = iw.Sampling(depth=1, samples=40_000, boundary_samples=8_000)
@@ -68,7 +68,7 @@ SETTINGS = repr((PLACE, TURN, FAR, STEP, TURNS, CHIRP, SAMPLING, WIDTHS, FIT))
 def radar() -> iw.Radar:
     """Twelve places on a rail of 2.2 m, eight antennas along it."""
     rail = torch.zeros(12, 3, dtype=torch.float64)
-    rail[:, 0] = torch.linspace(-1.1, 1.1, 12)
+    rail[:, 1] = torch.linspace(-1.1, 1.1, 12)
     transmitter = AntennaArray(torch.zeros(1, 3, dtype=torch.float64))
     return iw.Radar(transmitter, linear_array(8, CHIRP.wavelength / 2), CHIRP, rail)
 
@@ -101,19 +101,21 @@ class Trial:
 
         kind, facing = KINDS[number % len(KINDS)], math.pi
         if kind == "box":
-            mesh = box([uniform(0.4, 0.7), uniform(0.3, 0.5), uniform(0.2, 0.35)])
+            wide, tall, deep = uniform(0.4, 0.7), uniform(0.3, 0.5), uniform(0.2, 0.35)
+            mesh = box([deep, wide, tall])
         elif kind == "car":
             car = load_mesh(str(CAR))
-            standing = rotation_from_vector(torch.tensor([-math.pi / 2, 0, 0], dtype=torch.float64))
-            mesh = Mesh(0.2 * (car.vertices - car.center) @ standing.T, car.faces)
+            broadside = rotation_from_vector(math.pi / 2 * UP)
+            mesh = Mesh(0.2 * (car.vertices - car.center) @ broadside.T, car.faces)
         else:
             # From its edge a letter shows next to nothing.
             mesh, facing = text(kind, size=0.6, depth=0.12), math.radians(50)
         turn = rotation_from_vector(uniform(-facing, facing) * UP)
-        place = torch.tensor([uniform(-0.3, 0.3), 0.0, uniform(1.9, 2.4)], dtype=torch.float64)
+        left, ahead = uniform(-0.3, 0.3), uniform(1.9, 2.4)
+        place = torch.tensor([ahead, left, 0.0], dtype=torch.float64)
         item = iw.Object(mesh, PAINT, rigid(turn, place - turn @ mesh.center))
-        wall = iw.Object(plate(3.6, 1.6), PAINT, rigid(translation=[0.0, 0.0, 3.9]))
-        limits: dict[str, Any] = {"distance": (0.0, FAR), "angle": (0.0, math.pi), "axes": "xz"}
+        wall = iw.Object(plate(3.6, 1.6), PAINT, rigid(translation=[3.9, 0.0, 0.0]))
+        limits: dict[str, Any] = {"distance": (0.0, FAR), "angle": (0.0, math.pi), "axes": "xy"}
         (start,) = sample_nearby_poses(item, rotation_axis=UP, generator=chance, **limits)
         parts = 1 if kind in ("L", "car") else 2
         return Trial(number, kind, iw.Scene({"object": item, "wall": wall}), start, parts)
@@ -138,14 +140,14 @@ class Trial:
         capture = iw.Capture.from_beat(data.beat, sensor)
         seen = iw.Observation(iw.SurrogateMap(grid, WIDTHS, SAMPLING), capture, sensor=sensor)
         known = self.truth.replace("object", pose=self.start.transform)
-        pose = Pose("object", axes="xz", rotation_axes="y")
+        pose = Pose("object", axes="xy", rotation_axes="z")
         fit = iw.reconstruct(known, seen, pose, seed=self.number, **FIT)
         row: dict[str, Any] = {"number": self.number, "kind": self.kind, "start": self.error(known)}
         row |= {"fit": self._judged(fit), "fit_seconds": perf_counter() - begin}
         low, high = ([float(c) + s * FAR for c in self.start.center] for s in (-1, 1))
-        low[1] = high[1] = float(self.start.center[1])
+        low[2] = high[2] = float(self.start.center[2])
         starts = [self.start, *pose_grid(self.start, low, high, STEP, TURNS)]
-        pose = Pose("object", axes="xz", rotation_axes="y")
+        pose = Pose("object", axes="xy", rotation_axes="z")
         found = iw.search(known, seen, pose, {"object": starts}, seed=self.number, **FIT)
         row |= {"search": self._judged(found.best), "ambiguities": found.ambiguities}
         row["ends"] = [

@@ -17,15 +17,15 @@ folder.mkdir(parents=True, exist_ok=True)
 
 def at(x: float, y: float, z: float, yaw: float = 0.0) -> torch.Tensor:
     """A pose: position [m] and turn about the vertical [rad]."""
-    return iw.rigid(rotation_from_vector(torch.tensor([0.0, yaw, 0.0])), torch.tensor([x, y, z]))
+    return iw.rigid(rotation_from_vector(torch.tensor([0.0, 0.0, yaw])), torch.tensor([x, y, z]))
 
 
-# The radar sits at the origin and looks along z; x is right, y is up.
+# The radar sits at the origin and looks along x; y is left, z is up.
 paint = iw.RoughDielectric(permittivity=4.0)
 scene = iw.Scene(
     {
-        "letter": iw.Object(iw.text("A", size=0.6), paint, at(0.3, 0.0, 2.5, yaw=0.3)),
-        "wall": iw.Object(iw.plate(3.0, 2.4), paint, at(0.0, 0.0, 3.3)),
+        "letter": iw.Object(iw.text("A", size=0.6), paint, at(2.5, 0.3, 0.0, yaw=0.3)),
+        "wall": iw.Object(iw.plate(3.0, 2.4), paint, at(3.3, 0.0, 0.0)),
     }
 )
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=50e-6, samples=128)

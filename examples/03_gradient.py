@@ -17,12 +17,12 @@ folder.mkdir(parents=True, exist_ok=True)
 
 
 def at(x: float, y: float, z: float, yaw: float = 0.0) -> torch.Tensor:
-    return iw.rigid(rotation_from_vector(torch.tensor([0.0, yaw, 0.0])), torch.tensor([x, y, z]))
+    return iw.rigid(rotation_from_vector(torch.tensor([0.0, 0.0, yaw])), torch.tensor([x, y, z]))
 
 
 paint = iw.RoughDielectric(permittivity=4.0)
-letter = iw.Object(iw.text("A"), paint, at(0.1, 0.0, 2.5, yaw=0.2))
-scene = iw.Scene({"letter": letter, "wall": iw.Object(iw.plate(3, 2.4), paint, at(0, 0, 3.3))})
+letter = iw.Object(iw.text("A"), paint, at(2.5, 0.1, 0.0, yaw=0.2))
+scene = iw.Scene({"letter": letter, "wall": iw.Object(iw.plate(3, 2.4), paint, at(3.3, 0, 0))})
 chirp = iw.FMCW(start_frequency=76e9, bandwidth=2e9, duration=50e-6, samples=128)
 row = iw.linear_array(16, chirp.wavelength / 2)
 radar = iw.Radar(iw.linear_array(1, 1.0), row, chirp, positions=[[0.0, 0.0, 0.0]])
@@ -30,9 +30,9 @@ grid = radar.grid(range_min=2.0, range_max=3.8, u_max=0.5)
 
 sampling = iw.Sampling(depth=1, samples=1_000_000, boundary_samples=250_000)
 model = iw.SurrogateMap(grid, sampling=sampling)
-# θ moves the letter to the right. The differences are the truth: two maps, 8 mm apart.
+# θ moves the letter to the left. The differences are the truth: two maps, 8 mm apart.
 report = iw.gradcheck(
-    model, iw.Translation("letter"), {"translation": [1.0, 0.0, 0.0]}, scene=scene, sensor=radar,
+    model, iw.Translation("letter"), {"translation": [0.0, 1.0, 0.0]}, scene=scene, sensor=radar,
     settings=GradcheckSettings(repeats=2, difference_samples=2_000_000, max_pairs=4),
 )  # fmt: skip
 

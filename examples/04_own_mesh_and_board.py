@@ -21,8 +21,8 @@ else:  # no mesh given: make one, as another program would
     file = folder / "ball.ply"
     save_mesh(file, sphere(0.1, subdivisions=5))
 
-# OBJ, PLY, STL or glTF; metres. The file's origin goes to (0.4, 0, 2) m.
-ball = iw.Object(iw.load_mesh(file), iw.PerfectConductor(), iw.rigid(translation=[0.4, 0.0, 2.0]))
+# OBJ, PLY, STL or glTF; metres. The file's origin goes to (2, 0.4, 0) m.
+ball = iw.Object(iw.load_mesh(file), iw.PerfectConductor(), iw.rigid(translation=[2.0, 0.4, 0.0]))
 scene = iw.Scene({"ball": ball})
 
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=3.6e9, duration=60e-6, samples=256)
@@ -31,7 +31,7 @@ patch = Cosine(exponent=3.0)  # power pattern of one antenna; ~75° between half
 transmitters = iw.linear_array(2, 2 * wavelength, pattern=patch)
 receivers = iw.linear_array(4, wavelength / 2, pattern=patch)
 # Arrays are given about their own centre; on the board they lie side by side.
-receivers = iw.scene.AntennaArray(receivers.positions - torch.tensor([0.0, 0.01, 0.0]), patch)
+receivers = iw.scene.AntennaArray(receivers.positions - torch.tensor([0.0, 0.0, 0.01]), patch)
 radar = iw.Radar(transmitters, receivers, chirp, positions=[[0.0, 0.0, 0.0]])
 grid = radar.grid(range_min=0.5, range_max=4.0)
 
@@ -50,5 +50,5 @@ nearest = min(ball.vertices, key=torch.linalg.norm)  # a smooth ball shines ther
 figure = iw.plotting.spectrum(spectrum, grid, relative=False, dynamic_range=60.0)
 figure.savefig(folder / "ball.png", dpi=100)
 print(f"strongest echo: R = {grid.ranges[row]:.2f} m, u = {grid.u[column]:+.2f}")
-print(f"nearest point:  R = {nearest.norm():.2f} m, u = {nearest[0] / nearest.norm():+.2f}")
+print(f"nearest point:  R = {nearest.norm():.2f} m, u = {nearest[1] / nearest.norm():+.2f}")
 print(f"picture: {folder / 'ball.png'}")

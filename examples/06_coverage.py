@@ -37,7 +37,7 @@ zero, one, step = torch.tensor([0.0, 1.0, 0.02]).double()
 
 
 def gain(shift: torch.Tensor, sampling: CellSampling) -> torch.Tensor:
-    """Mean gain of cells of 25 cm at 1.2 m, with the cupboard moved to the right."""
+    """Mean gain of cells of 25 cm at 1.2 m, with the cupboard moved along x."""
     plane = MapPlane.horizontal([0.05, 0.05], [7.8, 5.8], 1.2, 0.25, sampling)
     moved = scene.replace("cupboard", pose=cupboard + shift * at(1, 0, 0).triu(1))
     return iw.RadioMap(plane, reception, "gain").predict(moved, mast, seed=0)[0]
