@@ -10,12 +10,12 @@ import invertwin as iw
 
 # %% [markdown]
 # ## The scene
-# The radar is at the origin. x is right, y is up, and z points away from the radar. All lengths are in metres.
+# The radar is at the origin. x points away from the radar, y is left, and z is up. All lengths are in metres.
 
 # %%
 paint = iw.RoughDielectric(permittivity=4.0)
-crate = iw.Object(iw.box((0.4, 0.4, 0.3)), paint, iw.rigid(translation=[0.2, 0.0, 2.2]))
-wall = iw.Object(iw.plate(3.0, 2.0), paint, iw.rigid(translation=[0.0, 0.0, 3.2]))
+crate = iw.Object(iw.box((0.3, 0.4, 0.4)), paint, iw.rigid(translation=[2.2, 0.2, 0.0]))
+wall = iw.Object(iw.plate(3.0, 2.0), paint, iw.rigid(translation=[3.2, 0.0, 0.0]))
 truth = iw.Scene({"crate": crate, "wall": wall})
 
 # %% [markdown]
@@ -29,7 +29,7 @@ radar = iw.Radar(
     iw.linear_array(2, 4 * chirp.wavelength),
     iw.linear_array(8, chirp.wavelength / 2),
     chirp,
-    positions=[[x, y, 0.0] for x in (-0.6, -0.2, 0.2, 0.6) for y in (-0.2, 0.2)],
+    positions=[[0.0, y, z] for y in (-0.6, -0.2, 0.2, 0.6) for z in (-0.2, 0.2)],
 )
 grid = radar.grid(range_min=1.4, range_max=3.6, u_max=0.6)
 
@@ -49,14 +49,14 @@ capture = recorded.capture
 # first it is blurred, which widens the basin of attraction; the blur is removed step by step.
 
 # %%
-start = truth.replace("crate", pose=iw.rigid(translation=[0.0, 0.0, 2.35]))
+start = truth.replace("crate", pose=iw.rigid(translation=[2.35, 0.0, 0.0]))
 blur = iw.Surrogate(range_width=3.0, angle_width=1.5)
 rays = iw.Sampling(depth=1, samples=50_000, boundary_samples=8_000)
 model = iw.SurrogateMap(grid, blur, rays)
 fit = iw.reconstruct(
     start,
     iw.Observation(model, capture),
-    iw.Translation("crate", axes="xz"),
+    iw.Translation("crate", axes="xy"),
     schedule=iw.Schedule(steps=50),
     seed=1,
 )

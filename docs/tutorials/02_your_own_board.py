@@ -23,8 +23,8 @@ from invertwin.scene import sphere
 
 # %%
 foam = iw.RoughDielectric(permittivity=4.0)
-still = iw.Object(sphere(0.15), foam, iw.rigid(translation=[0.8, 0.0, 2.5]))
-comes = iw.Object(sphere(0.15), foam, iw.rigid(translation=[-0.4, 0.0, 3.5]), [0.0, 0.0, -2.0])
+still = iw.Object(sphere(0.15), foam, iw.rigid(translation=[2.5, 0.8, 0.0]))
+comes = iw.Object(sphere(0.15), foam, iw.rigid(translation=[3.5, -0.4, 0.0]), [-2.0, 0.0, 0.0])
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=1.536e9, duration=25.6e-6, samples=128)
 transmitters, receivers = board("xWR1642").arrays()
 radar = iw.Radar(transmitters, receivers, chirp, positions=[[0.0, 0.0, 0.0]])
@@ -82,8 +82,8 @@ iw.plotting.range_doppler(maps)
 # %%
 points = detect_points(recording.beat, seen, grid, recording.chirps, frame=0)
 for number in points.power.argsort(descending=True)[:4].tolist():
-    x, _, z = points.position[number].tolist()
-    print(f"{points.velocity[number]:+.1f} m/s at x = {x:+.2f} m, z = {z:.2f} m")
+    x, y, _ = points.position[number].tolist()
+    print(f"{points.velocity[number]:+.1f} m/s at x = {x:.2f} m, y = {y:+.2f} m")
 
 # %% [markdown]
 # The nearest side of each ball is found. Both range rates are right to a tenth of a metre a second; that of the

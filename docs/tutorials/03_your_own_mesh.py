@@ -35,14 +35,14 @@ with tempfile.TemporaryDirectory() as folder:
 print(*(entry.message for entry in issued), mug.summary(), sep="\n")
 
 # %% [markdown]
-# Without `unit` the mug would be 92 m high, and `load_mesh` would warn. The file has z up, the radar frame has y up.
-# A pose rotates the mug upright and puts it 1.5 m away: first a rotation about x, then a translation.
+# Without `unit` the mug would be 92 m high, and `load_mesh` would warn. The file has z up, as the
+# world has. A pose turns the mug by 30° about z and puts it 1.5 m away: first the rotation, then the translation.
 
 # %%
-upright = rotation_from_vector(torch.tensor([-math.pi / 2, 0.0, 0.0]))
-pose = iw.rigid(upright, torch.tensor([0.2, 0.0, 1.5]))
+yaw = rotation_from_vector(torch.tensor([0.0, 0.0, math.radians(30.0)]))
+pose = iw.rigid(yaw, torch.tensor([1.5, 0.2, 0.0]))
 scene = iw.Scene({"mug": iw.Object(mug, iw.PerfectConductor(), pose)})
-height = scene["mug"].vertices[:, 1]
+height = scene["mug"].vertices[:, 2]
 assert abs(float(height.max() - height.min()) - 0.092) < 1e-6
 
 # %% [markdown]

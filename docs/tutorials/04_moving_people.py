@@ -19,12 +19,12 @@ from invertwin.scene import MovingScene, Walking, person, standing_height
 # %%
 body = person(spacing=0.05)
 skin = iw.RoughDielectric(permittivity=8.0)
-place = iw.rigid(translation=[0.0, standing_height(body), 5.0])
+place = iw.rigid(translation=[5.0, 0.0, standing_height(body)])
 scene = iw.Scene({"person": iw.Object(body.mesh({}), skin, place)})
 walk = MovingScene(scene, {"person": Walking(body, speed=1.0)})
 step = walk(1.0)["person"].center - walk(0.0)["person"].center
-print(f"after a second: {-float(step[2]):.2f} m nearer")
-assert abs(float(step[2]) + 1.0) < 0.1
+print(f"after a second: {-float(step[0]):.2f} m nearer")
+assert abs(float(step[0]) + 1.0) < 0.1
 
 # %% [markdown]
 # ## Three quarters of a second of chirps
@@ -33,7 +33,7 @@ assert abs(float(step[2]) + 1.0) < 0.1
 # %%
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=0.5e9, duration=30e-6, samples=64)
 antenna = iw.linear_array(1, chirp.wavelength / 2)
-radar = iw.Radar(antenna, antenna, chirp, positions=[[0.0, 1.0, 0.0]])
+radar = iw.Radar(antenna, antenna, chirp, positions=[[0.0, 0.0, 1.0]])
 train = Chirps(count=3072, interval=0.25e-3)
 beat = iw.simulate_chirps(
     walk,

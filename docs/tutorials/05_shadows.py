@@ -18,8 +18,8 @@ from invertwin.inversion import GradcheckSettings, evaluate_losses, make_line
 
 # %%
 paint, dark = iw.RoughDielectric(permittivity=5.0), iw.RoughDielectric(permittivity=2.0)
-front = iw.Object(iw.plate(0.5, 0.5), dark, iw.rigid(translation=[0.1, 0.0, 2.2]))
-wall = iw.Object(iw.plate(3.0, 2.0), paint, iw.rigid(translation=[0.0, 0.0, 3.2]))
+front = iw.Object(iw.plate(0.5, 0.5), dark, iw.rigid(translation=[2.2, 0.1, 0.0]))
+wall = iw.Object(iw.plate(3.0, 2.0), paint, iw.rigid(translation=[3.2, 0.0, 0.0]))
 scene = iw.Scene({"plate": front, "wall": wall})
 chirp = iw.FMCW(start_frequency=76e9, bandwidth=2e9, duration=50e-6, samples=128)
 row = iw.linear_array(16, chirp.wavelength / 2)
@@ -28,7 +28,7 @@ grid = radar.grid(range_min=1.8, range_max=3.8, u_max=0.5)
 
 # %% [markdown]
 # ## Three derivatives of one map
-# θ moves the plate to the right, in metres. `gradcheck` computes the derivative of every bin of the map by three
+# θ moves the plate to the left, in metres. `gradcheck` computes the derivative of every bin of the map by three
 # methods: the difference of two maps, which is the truth; invertwin; and invertwin without boundary paths, which
 # equals automatic differentiation of a ray tracer.
 
@@ -37,7 +37,7 @@ rays = iw.Sampling(depth=1, samples=400_000, boundary_samples=100_000)
 report = iw.gradcheck(
     iw.SurrogateMap(grid, sampling=rays),
     iw.Translation("plate"),
-    {"translation": [1.0, 0.0, 0.0]},
+    {"translation": [0.0, 1.0, 0.0]},
     scene=scene,
     sensor=radar,
     settings=GradcheckSettings(repeats=1, difference_samples=1_000_000, max_pairs=3, noise=0.05),
@@ -74,7 +74,7 @@ data = iw.simulate(scene, radar, grid, seed=1, sampling=few)
 capture = data.capture
 model = iw.SurrogateMap(grid, iw.Surrogate(range_width=2.0, angle_width=1.0), rays)
 seen = iw.Observation(model, capture)
-line = make_line(iw.Translation("plate"), {"translation": [1.0, 0.0, 0.0]}, scene)
+line = make_line(iw.Translation("plate"), {"translation": [0.0, 1.0, 0.0]}, scene)
 shifts = torch.linspace(-0.4, 0.4, 9)
 losses = evaluate_losses(line, shifts.tolist(), seen, seed=1)
 iw.plotting.convergence(losses.tolist())

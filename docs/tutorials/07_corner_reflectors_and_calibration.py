@@ -23,14 +23,14 @@ from invertwin.signatures import aspect_directions, to_dbsm
 
 # %%
 corner = iw.Scene({"corner": iw.Object(trihedral(0.1), iw.PerfectConductor())})
-degrees = torch.linspace(160.0, 200.0, 41, dtype=torch.float64)
-found = iw.rcs(corner, aspect_directions(torch.deg2rad(degrees), math.pi / 2), [77e9])
+degrees = torch.linspace(70.0, 110.0, 41, dtype=torch.float64)
+found = iw.rcs(corner, aspect_directions(torch.deg2rad(degrees), math.pi), [77e9])
 curves = {
     "all": found.dbsm[0, :, 0, 0],
     "three bounces": to_dbsm(found.parts["order 3"])[0, :, 0, 0],
 }
 iw.plotting.rcs_curves(
-    {"trihedral of 10 cm at 77 GHz": curves}, degrees - 180, "angle from the axis [°]"
+    {"trihedral of 10 cm at 77 GHz": curves}, degrees - 90, "angle from the axis [°]"
 )
 
 # %%
@@ -53,7 +53,7 @@ radar = iw.Radar(
     [[0.0, 0.0, 0.0]],
 )
 grid = radar.grid(range_min=1.5, range_max=3.0, u_max=0.8)
-place = [0.5, 0.0, 2.2]
+place = [2.2, 0.5, 0.0]
 ball = iw.Object(sphere(0.05, 5), iw.PerfectConductor(), iw.rigid(translation=place))
 clean = iw.simulate(
     iw.Scene({"ball": ball}),
@@ -98,5 +98,5 @@ sharp = mended.spectrum(grid) / mended.spectrum(grid).max()
 assert float((sharp - clean.spectrum / clean.spectrum.max()).abs().max()) < 0.02
 
 # %% [markdown]
-# On the command line: `invertwin look adc.bin … --reflector 0.5 0 2.2` writes `count_channels.json`, and `--channels
+# On the command line: `invertwin look adc.bin … --reflector 2.2 0.5 0` writes `count_channels.json`, and `--channels
 # channels.json` divides the gains out of another recording.

@@ -22,7 +22,7 @@ from invertwin.scene import Slab
 
 # %% [markdown]
 # ## The room
-# Here z is up. The room is 6 m × 4 m, and the screen stands between the transmitter and the far corner.
+# The room is 6 m × 4 m, and the screen stands between the transmitter and the far corner.
 
 # %%
 room = iw.Object(

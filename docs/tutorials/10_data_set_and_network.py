@@ -22,12 +22,13 @@ import invertwin as iw
 
 # %%
 RUN = """
+frame = 2
 task = "dataset"
 seed = 1
 [scene.crate]
 shape = "box"
 size = 0.4
-position = [0.0, 0.0, 2.0]
+position = [2.0, 0.0, 0.0]
 material = { kind = "rough_dielectric", permittivity = 4.0 }
 [radar]
 waveform = { kind = "fmcw", start_frequency = 77e9, bandwidth = 0.5e9, duration = 50e-6, samples = 32 }
@@ -48,8 +49,8 @@ shard = 40
 [[vary]]
 key = "scene.crate.position"
 kind = "uniform"
-low = [-0.9, 0.0, 1.6]
-high = [0.9, 0.0, 3.4]
+low = [1.6, -0.9, 0.0]
+high = [3.4, 0.9, 0.0]
 """
 
 # %% [markdown]
@@ -61,12 +62,10 @@ high = [0.9, 0.0, 3.4]
 
 # %%
 def example(sample: dict) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the input and target of the network: map in decibels, position of the crate (x, z)."""
+    """Return the input and target of the network: map in decibels, position of the crate (x, y)."""
     level = sample["map"][0, :, :, 0].clamp_min(1e-12).log10()
     crate = next(row for row in sample["labels"]["objects"] if row["name"] == "crate")
-    return (level - level.max()).clamp_min(-3.0), torch.tensor(crate["oriented_box"]["center"])[
-        [0, 2]
-    ]
+    return (level - level.max()).clamp_min(-3.0), torch.tensor(crate["oriented_box"]["center"][:2])
 
 
 with tempfile.TemporaryDirectory() as folder:
@@ -111,10 +110,11 @@ print(
 )
 figure = Figure(figsize=(4.5, 4), layout="constrained")
 axes = figure.subplots()
-axes.plot(*places[100:].T, "o", label="true")
-axes.plot(*found.T, "x", label="by the network")
-axes.plot(*torch.stack([places[100:], found], 1).permute(2, 1, 0), color="0.7")
-axes.set(xlabel="x [m]", ylabel="z [m]", aspect="equal")
+axes.plot(*places[100:].T.flip(0), "o", label="true")
+axes.plot(*found.T.flip(0), "x", label="by the network")
+axes.plot(*torch.stack([places[100:], found], 1).permute(2, 1, 0).flip(0), color="0.7")
+axes.set(xlabel="y [m], to the left", ylabel="x [m]", aspect="equal")
+axes.invert_xaxis()
 axes.legend()
 figure
 

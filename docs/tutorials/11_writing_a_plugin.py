@@ -83,7 +83,7 @@ from foliage import Foliage  # type: ignore  # noqa: E402
 # Twice the share is twice the power.
 
 # %%
-bush = iw.Object(sphere(0.3), Foliage(0.05), iw.rigid(translation=[0.0, 0.0, 2.0]))
+bush = iw.Object(sphere(0.3), Foliage(0.05), iw.rigid(translation=[2.0, 0.0, 0.0]))
 scene = iw.Scene({"bush": bush})
 chirp = iw.FMCW(start_frequency=77e9, bandwidth=2e9, duration=50e-6, samples=128)
 radar = iw.Radar(
@@ -146,11 +146,12 @@ assert abs(share - 0.05) < 0.015
 
 # %%
 RUN = """
+frame = 2
 task = "simulate"
 [scene.bush]
 shape = "sphere"
 radius = 0.3
-position = [0.0, 0.0, 2.0]
+position = [2.0, 0.0, 0.0]
 material = { kind = "foliage", share = 0.07 }
 [radar]
 positions = [[0.0, 0.0, 0.0]]
