@@ -463,8 +463,8 @@ class Registry:
 
     def _load_kinds(self) -> dict[str, KindGroup]:
         """The groups, the library's own kinds before those of plugins."""
-        if self._waiting is not None:
-            made = [pkgutil.resolve_name(f"{module}:register") for module in self.built_in]
+        modules = () if self._waiting is None else self.built_in
+        made = [pkgutil.resolve_name(f"{module}:register") for module in modules]
         if self._waiting is not None:  # the modules build tables, which may have loaded the kinds
             waiting, self._waiting = self._waiting, None
             for register in made:
