@@ -152,3 +152,14 @@ def test_data_without_chirps_are_none_for_movers(tmp_path):
     raw["scene"] = {"box": {"shape": "box", "size": 1.0, "material": {"kind": "rough_conductor"}}}
     with pytest.raises(InputError, match=r"data\.kind: expected data with chirps, got \"simulated"):
         build_chirp_capture(validate_run(raw, tmp_path / "run.toml").data)
+
+
+def test_a_table_may_be_asked_for_before_anything_else():
+    """Modules of kinds build tables of kinds when they are imported, in any order."""
+    program = (
+        "import invertwin.cli.commands.look; from invertwin.registry.kinds import registry; "
+        "print(registry.kind_table('data', 'simulated'))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-500:]
+    assert "simulated" in done.stdout.lower()
