@@ -1,6 +1,11 @@
-"""Physical constants in SI units (CODATA 2018)."""
+"""Physical constants in SI units (CODATA 2018), and the mark of our axes in files."""
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
 VACUUM_PERMEABILITY = 1.256_637_062_12e-6  # H/m
 VACUUM_PERMITTIVITY = 8.854_187_812_8e-12  # F/m
 BOLTZMANN = 1.380_649e-23  # J/K
+
+FRAME = 2
+"""Mark of the axes x forward, y left, z up. Files without one have x left, y up, z ahead."""
+OLD_AXES = (2, 0, 1)
+"""Places of x forward, y left, z up among the axes of a file without a mark."""

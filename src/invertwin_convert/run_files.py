@@ -25,9 +25,10 @@ from scipy.spatial.transform import Rotation
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, InlineTable, Item, Table
 
-from invertwin.cli.run_file import FRAME, parse_toml, prefix_errors, read_text, validate_run
+from invertwin.cli.run_file import parse_toml, prefix_errors, read_text, validate_run
 from invertwin.cli.schema.keys import JsonSchema, json_schema
 from invertwin.cli.schema.variation import parse_key_path, set_values
+from invertwin.constants import FRAME
 from invertwin.errors import InputError
 from invertwin.registry.section import KeyInputError
 from invertwin.storage.folders import convert_os_errors, replace_file
@@ -35,7 +36,7 @@ from invertwin.storage.untrusted import read_npy
 
 KeyPath = tuple[str | int, ...]
 Frame = np.ndarray
-"""What a frame does to the components of a vector [3, 3]."""
+"""Signed permutation of the components of a vector [3, 3]."""
 
 _KEEP: Frame = np.eye(3, dtype=int)
 _TURN: Frame = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
@@ -175,7 +176,7 @@ class _Turn:
 
     @property
     def composes(self) -> bool:
-        """Whether more than the axis of the rotation changes."""
+        """True where more than the axis of the rotation changes."""
         return self.outer is not self.own
 
     def __call__(self, value: Any) -> Any:
@@ -207,7 +208,7 @@ class _Pair:
 
 
 class _Conversion:
-    """What changes in a run file.
+    """Conversion of one run file.
 
     Args:
         raw: The run file.
@@ -344,7 +345,7 @@ class _Conversion:
         return None
 
     def _is_override(self, node: JsonSchema, value: Any) -> bool:
-        """Whether a table holds what differs from the section of its name."""
+        """Test if a table holds what differs from the section of its name."""
         free = any(form.get("additionalProperties") is True for form in self._forms(node))
         return free and isinstance(value, dict)
 
@@ -398,7 +399,7 @@ class _Conversion:
         return isinstance(value, list) and any(set(found) <= set(_AXES) for found in letters)
 
     def _holds_vectors(self, node: JsonSchema, key: str, value: Any) -> bool:
-        """Whether a value is a vector, a list of vectors, or a table of vectors by name."""
+        """Test if a value is a vector, a list of vectors, or a table of vectors by name."""
         forms = self._forms(node)
         if isinstance(value, dict):
             maps = [form["additionalProperties"] for form in forms if _is_map(form)]
@@ -418,7 +419,7 @@ class _Conversion:
         return False
 
     def _shape_frame(self, table: Any, outer: Frame, name: str | None = None) -> Frame:
-        """What becomes of a shape's own frame.
+        """Change of a shape's own frame.
 
         Args:
             table: Of the shape.
@@ -435,14 +436,14 @@ class _Conversion:
         return _TURN if shape in _BUILT_IN else _KEEP
 
     def _has_numbered_parts(self, table: Any, name: str | None) -> bool:
-        """Whether vertices or triangles of a shape are named by their numbers, or seen on it."""
+        """Test if vertices or triangles of a shape are named by number, or seen on it."""
         check = self.raw.get("gradcheck", {})
         free = check.get("parameter", {})
         numbered = free.get("kind") == "vertices" and free.get("object") == name
         return numbered or _has_lists(table.get("material", {}))
 
     def _object_frame(self, name: str) -> Frame:
-        """What becomes of the own frame of an object: of the room they turn, of files they stay."""
+        """Change of an object's own frame: those of the room turn, those of files stay."""
         return self.frames.get(name, _TURN if "room" in self.raw else _KEEP)
 
     def _fitted_frame(self) -> Frame:
@@ -606,7 +607,7 @@ class _Conversion:
 
 @dataclass(frozen=True)
 class _Inside:
-    """What becomes of a drawn table, which holds vectors."""
+    """Conversion of a drawn table, which holds vectors."""
 
     run: _Conversion
     key: str
@@ -621,7 +622,7 @@ class _Inside:
 
 
 def _has_z_up(raw: Mapping[str, Any]) -> bool:
-    """Whether z is up in the world of an old run file."""
+    """Test if z is up in the world of an old run file."""
     if any(raw.get(section, {}).get("up") == "z" for section in ("twin", "initial")):
         return True
     if raw.get("data", {}).get("kind") in _RECORDINGS_WITH_Z_UP:
@@ -631,7 +632,7 @@ def _has_z_up(raw: Mapping[str, Any]) -> bool:
 
 
 def _has_lists(value: Any) -> bool:
-    """Whether a material has values by triangle, or an image."""
+    """Test if a material has values by triangle, or an image."""
     if isinstance(value, dict):
         return "image" in value or any(map(_has_lists, value.values()))
     return isinstance(value, list) and any(not isinstance(i, dict) or _has_lists(i) for i in value)

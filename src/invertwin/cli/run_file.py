@@ -16,14 +16,13 @@ import tomli_w
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
+from invertwin.constants import FRAME
 from invertwin.errors import InputError
 from invertwin.registry.section import TAG_MARK
 from invertwin.registry.section import prefix_errors as prefix_errors
 from invertwin.registry.section import require_section as require_section
 from invertwin.storage.untrusted import convert_read_errors
 
-FRAME = 2
-"""Of run files: x ahead, y to the left, z up. Those of the first frame had no such key."""
 _MAX_ERRORS = 20  # in one line
 # Sections and kinds of the package in experiments/studies.
 _STUDY_NAMES = ("methods", "loss_scan", "openradar", "rail_sar", "vehicle", "shape_space")

@@ -10,6 +10,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.channel import visible_points
+from invertwin.constants import OLD_AXES
 from invertwin.deprecation import rename_arguments
 from invertwin.radar.radar import Radar
 from invertwin.scene import Mesh, Scene
@@ -17,8 +18,6 @@ from invertwin.scene.mesh import concatenate_meshes
 
 _VECTORS = ("low", "high", "center", "size", "velocity", "positions", "joint")
 _MATRICES = ("pose", "rotation", "rotations")
-# Where x forward, y left, z up are among old axes, x left, y up, z ahead; 1 of poses stays last.
-_OLD_AXES = [2, 0, 1, 3]
 _POINTS = 256  # at least so many on every object
 _R2_STEPS = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
 
@@ -100,10 +99,10 @@ def convert_old_labels(labels: Any, name: str = "") -> Any:
             for key, item in labels.items()
         }
     if name in _MATRICES:
-        order = _OLD_AXES[: np.shape(labels)[-1]]
+        order = [*OLD_AXES, 3][: np.shape(labels)[-1]]  # the 1 of poses stays last
         return np.array(labels)[..., order, :][..., order].tolist()
     if name in _VECTORS:
-        return np.array(labels)[..., _OLD_AXES[:3]].tolist()
+        return np.array(labels)[..., OLD_AXES].tolist()
     return [convert_old_labels(item) for item in labels] if name == "objects" else labels
 
 

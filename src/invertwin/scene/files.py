@@ -29,12 +29,14 @@ from invertwin.scene.material.radio_materials import radio_bsdf, read_radio_mate
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.mesh_union import unite_parts
+from invertwin.scene.pose import Basis
 from invertwin.scene.scene import Object, Scene
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, existing_file, safe_reader
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".inp")
-_Y_UP = (".gltf", ".glb")  # glTF 2.0, section 3.4: our (x, y, z) is its (x, z, −y)
+_Y_UP = (".gltf", ".glb")
+_GLTF = Basis((0, 2, 1), (1, 1, -1))  # glTF 2.0, section 3.4: our (x, y, z) is its (x, z, −y)
 _CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # corners of shell elements by the digit in their type
 Unit = Literal["m", "cm", "mm", "um", "in", "ft"]
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
@@ -115,7 +117,7 @@ def _load_with(
         for name, part in split(_load_trimesh_scene(path)).items():
             vertices = np.asarray(part.vertices, dtype=np.float64).reshape(-1, 3)
             if path.suffix.lower() in _Y_UP:
-                vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
+                vertices = _GLTF.inverse.vectors(torch.from_numpy(vertices)).numpy()
             faces = np.asarray(part.faces, dtype=np.int64).reshape(-1, 3)
             found[name] = vertices * _METRES[unit], faces
     try:
@@ -180,9 +182,9 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
     written = trimesh.Scene()
     glb = file.suffix.lower() in _Y_UP
     for name, (vertices, faces, material) in parts.items():
-        points = vertices.detach().cpu().numpy()
-        points = points[:, [0, 2, 1]] * [1, 1, -1] if glb else points
-        mesh = trimesh.Trimesh(points, faces.cpu().numpy(), process=False)
+        points = vertices.detach().cpu()
+        points = _GLTF.vectors(points) if glb else points
+        mesh = trimesh.Trimesh(points.numpy(), faces.cpu().numpy(), process=False)
         if material is not None:
             mesh.visual = TextureVisuals(material=looks[id(material)])
         written.add_geometry(mesh, geom_name=name, node_name=name)

@@ -163,7 +163,7 @@ class Basis:
 
     @property
     def is_reflection(self) -> bool:
-        """Whether one of the two frames is left-handed."""
+        """True where one of the two frames is left-handed."""
         return float(torch.linalg.det(self.vectors(torch.eye(3).double()))) < 0
 
     def vectors(self, values: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:

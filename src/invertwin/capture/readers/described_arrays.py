@@ -14,8 +14,8 @@ import tomli_w
 import torch
 
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
-from invertwin.capture.readers.radar_fields import FRAME, OLD_AXES
 from invertwin.checks import checked_tensor
+from invertwin.constants import FRAME, OLD_AXES
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.scene.antenna import AntennaArray
@@ -258,7 +258,7 @@ def load_description(
             PhysicsWarning,
             stacklevel=2,
         )
-    return description, OLD_AXES
+    return description, list(OLD_AXES)
 
 
 def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray:

@@ -9,6 +9,7 @@ import torch
 import xarray as xr
 from torch import Tensor
 
+from invertwin.constants import OLD_AXES
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
@@ -20,10 +21,6 @@ WAVEFORMS: dict[str, type[Waveform]] = {
 }
 """Dataclasses that a file may name. Add one of your own to keep what it has measured."""
 
-FRAME = 2
-"""Number of the axes x forward, y left, z up. Files without it have x left, y up, z ahead."""
-OLD_AXES = [2, 0, 1]
-"""Where x forward, y left, z up are among the axes of a file that states none."""
 _AXES = "x forward, y left, z up"
 _VISIBILITY = {None: "auto", True: "shared", False: "separate"}
 
@@ -88,7 +85,7 @@ def convert_old_axes(dataset: xr.Dataset) -> xr.Dataset:
     """
     if "axes" in dataset.attrs:
         return dataset
-    orders = {dim: OLD_AXES for dim in ("axis", "radar_axis") if dim in dataset.dims}
+    orders = {dim: list(OLD_AXES) for dim in ("axis", "radar_axis") if dim in dataset.dims}
     return dataset.isel(orders).assign_attrs(axes=_AXES)
 
 

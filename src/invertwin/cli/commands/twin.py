@@ -14,7 +14,6 @@ from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.options import TwinOptions
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
 from invertwin.cli.run_file import (
-    FRAME,
     is_run_file,
     load_run,
     prefix_file_errors,
@@ -22,6 +21,7 @@ from invertwin.cli.run_file import (
 )
 from invertwin.cli.schema import build
 from invertwin.cli.schema.recordings import SimulatedData
+from invertwin.constants import FRAME
 from invertwin.discovery import Twin, average_chirps, twin
 from invertwin.inversion.metrics import compare_shapes
 from invertwin.plotting import found as pictures

@@ -15,17 +15,13 @@ from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh, concatenate_meshes
 from invertwin.scene.parameters import Entries, ObjectModule, axes_mask, free_part
-from invertwin.scene.pose import rotation_angle, rotation_from_vector
+from invertwin.scene.pose import from_frame, rotation_angle, rotation_from_vector
 from invertwin.storage.untrusted import read_arrays, safe_reader
 
 _DO = "give arrays of one template"
 _SINGLE_JOINT_WEIGHT = 0.95  # skinning weight of a vertex dominated by one joint
 _EXACT = 1e-12  # tolerance of the Newton steps [m]
 _MAX_REFINEMENTS = 4  # Newton steps of least squares
-# SMPL's bodies face z, y up, their left at x; here they face −x, z up.
-_SMPL_TO_BODY_AXES = torch.tensor(
-    [[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -413,7 +409,7 @@ def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
             f"expected {', '.join(names)} in {path.name}, got no {', '.join(missing)}; "
             "give a file of SMPL's layout"
         )
-    turn = _SMPL_TO_BODY_AXES
+    turn: Tensor = from_frame(torch.eye(3, dtype=torch.float64), "smpl").T
     rest = checked_tensor(arrays["v_template"], (None, 3), "v_template", _DO) @ turn.T
     table = arrays["kintree_table"].astype(np.int64)
     if table.ndim != 2 or len(table) != 2:
