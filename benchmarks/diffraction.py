@@ -12,6 +12,12 @@ boundary, at oblique incidence, over the field; `reciprocity.<case>` what change
 change places. `slope_jump` is the step of the field's derivative at a shadow boundary where the
 source's field has a slope, with the slope term, over the derivative.
 
+`vertical_db` is the largest deviation of links along the world's z axis past the edge of a wide
+screen from the Fresnel integral, of V and of H antennas that look at each other; `turned_db` is
+what changes when scene and antennas are turned to the horizontal. `vertical_isotropic_db` is the
+largest excess over the Fresnel integral of isotropic elements for V about the link, whose
+polarisation is not defined on it.
+
 A receiver walks round a conducting cube of five wavelengths in steps of a twentieth of a
 wavelength. Wherever a path comes or goes between two steps, the place is found to 1e-4 of a
 wavelength. `jump_db_next` is the largest jump of the field there, of either polarisation of the
@@ -50,6 +56,7 @@ from full_wave import SIDE as SOLVED_SIDE
 from jaxtyping import Complex128, Float64
 from report import MetricTable, Required, write
 from rich.table import Table
+from scipy.special import fresnel
 from torch import Tensor
 
 from invertwin.channel.em.plane_waves import cross, dot, plane_of_incidence, reflect_vectors
@@ -72,9 +79,11 @@ from invertwin.channel.specular.diffraction_candidates import (
 )
 from invertwin.channel.specular.edge_path_geometry import PathEdge, diffract_over_edges
 from invertwin.channel.specular.image_method import CandidateSurfaces
+from invertwin.channel.specular.trace_paths import trace_paths
 from invertwin.channel.specular.wedge_scene import WedgeScene
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.scene import box
+from invertwin.links import AntennaMount, frequency_response
+from invertwin.scene import AntennaArray, Mesh, Object, PerfectConductor, Scene, box
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
 from invertwin.scene.material.slab import SlabLayer, slab_coefficients
 from oracles.exact_wedge import (
@@ -95,6 +104,9 @@ REQUIRED: Required = {
     "point_source.3": ("<=", 2e-3),
     "jump": ("<=", 1e-6),
     "reciprocity": ("<=", 1e-9),
+    "vertical_db": ("<=", 0.5),
+    "turned_db": ("<=", 1e-9),
+    "vertical_isotropic_db": ("<=", 1.0),
     "jump_db_next": ("<=", 1.0),
     "full_wave": ("<=", 0.035),
     "full_wave_with_phases": ("<=", 0.035),
@@ -105,6 +117,9 @@ SIDE, RADIUS, HEIGHT = 5.0, 6.0, 0.7  # of the cube, and of the way round it, in
 PLACES = ((9.0, 5.3, 1.1), (9.0, 8.3, 2.1), (9.0, 7.3, 4.1))  # of the transmitter
 STEP = 1e-6  # of differences, in wavelengths
 HALVINGS = 9  # of a step in which a path comes or goes
+VERTICAL_FREQUENCY, VERTICAL_REACH = 1e9, 10.0  # Hz; m from either antenna to the screen
+EDGE_HEIGHTS = (0.003, 0.03, 0.3)  # m beyond the line between the antennas
+OFFSETS = (0.0, 0.01, 0.05, 0.2, 1.0)  # m of the receiver, along the edge
 
 
 @dataclass(frozen=True)
@@ -405,6 +420,55 @@ def slope_jump(*, corrected: bool = True) -> float:
     return float((gradient[1] - gradient[0]).abs() / gradient.abs().mean())
 
 
+def vertical_links(
+    polarisation: str, *, isotropic: bool = False, turn: Float64[Tensor, "3 3"] | None = None
+) -> list[float]:
+    """Compute levels of vertical links past an edge over the Fresnel integral [dB].
+
+    Args:
+        polarisation: of the elements, about the x axis, or about the link.
+        isotropic: True for antennas whose z axis is along the link, False for those that look
+            along it.
+        turn: rotation of the scene and of the antennas.
+    """
+    turn = torch.eye(3, dtype=torch.float64) if turn is None else turn
+    array = AntennaArray(torch.zeros(1, 3, dtype=torch.float64), polarisation=polarisation)
+    x, y, z = torch.eye(3, dtype=torch.float64)
+    axes = [(x, y, z)] * 2 if isotropic else [(z, y, -x), (-z, y, x)]
+    ends = [AntennaMount(array, turn @ torch.stack(some, 1)) for some in axes]
+    wavelength, levels = SPEED_OF_LIGHT / VERTICAL_FREQUENCY, []
+    for height, offset in product(EDGE_HEIGHTS, OFFSETS):
+        corners = [[-200.0, -200.0, 0.0], [200.0, -200.0, 0.0], [200.0, height, 0.0]]
+        points = torch.tensor([*corners, [-200.0, height, 0.0]], dtype=torch.float64)
+        screen = Mesh(points @ turn.T, torch.tensor([[0, 1, 2], [0, 2, 3]]))
+        scene = Scene({"screen": Object(screen, PerfectConductor())})
+        sites = torch.tensor([[0, 0, -VERTICAL_REACH], [offset, 0, VERTICAL_REACH]]).double()
+        tx, rx = sites @ turn.T
+        paths = trace_paths(scene, tx, rx, VERTICAL_FREQUENCY, depth=0, edges=1, rays=None)
+        response = frequency_response(paths, [VERTICAL_FREQUENCY], tx=ends[0], rx=ends[1])
+        distance = float((rx - tx).norm())
+        sine, cosine = fresnel(height * math.sqrt(8 / (wavelength * distance)))
+        knife = math.hypot(0.5 - sine, 0.5 - cosine) / math.sqrt(2)
+        free = wavelength / (4 * math.pi * distance)
+        levels.append(20 * math.log10(float(response.abs()) / (knife * free)))
+    return levels
+
+
+def vertical_deviations() -> dict[str, float]:
+    """Compute deviations of vertical links, and of the same links turned to the horizontal [dB]."""
+    turn = torch.tensor([[0.0, 0.0, 1.0], [0.6, 0.8, 0.0], [-0.8, 0.6, 0.0]], dtype=torch.float64)
+    kinds = [("V", False), ("H", False), ("V", True)]
+    upright, turned = (
+        np.array([vertical_links(name, isotropic=own, turn=by) for name, own in kinds])
+        for by in (None, turn)
+    )
+    return {
+        "vertical_db": float(np.abs(upright[:2]).max()),
+        "turned_db": float(np.abs(upright - turned).max()),
+        "vertical_isotropic_db": float(upright[2].max()),
+    }
+
+
 def _across(field: Tensor, way: Tensor) -> Tensor:
     return field - dot(field, way + 0j)[:, None] * way
 
@@ -696,6 +760,7 @@ def measure() -> dict[str, Any]:
         "reciprocity": {name: max(map(reciprocity, some)) for name, some in cases.items()},
         "slope_jump": slope_jump(),
         "slope_jump_plain": slope_jump(corrected=False),
+        **vertical_deviations(),
         "jump_db_next": largest_jump(3),
         "jump_db_second": largest_jump(2),
         "jump_db_first": largest_jump(1),
@@ -720,6 +785,10 @@ def table(metrics: dict[str, Any]) -> Table:
     page.row("jump_optics", metrics["jump_optics"], ".2f", "the least one without diffraction")
     page.row("slope_jump", metrics["slope_jump"], ".1e", "of the derivative at a boundary")
     page.row("slope_jump_plain", metrics["slope_jump_plain"], ".2f", "without the slope term")
+    page.row("vertical_db", metrics["vertical_db"], ".2f", "vertical links past an edge, V and H")
+    page.row("turned_db", metrics["turned_db"], ".1e", "the same, turned to the horizontal")
+    text = "excess of isotropic elements whose z axis is along the link"
+    page.row("vertical_isotropic_db", metrics["vertical_isotropic_db"], ".2f", text)
     page.row("jump_db_next", metrics["jump_db_next"], ".2f", "round a cube, up to three edges")
     page.row("jump_db_second", metrics["jump_db_second"], ".2f", "up to two edges")
     page.row("jump_db_first", metrics["jump_db_first"], ".2f", "up to one edge")

@@ -34,6 +34,15 @@ def test_slope_term_smooths_the_derivative(diffraction):
     assert diffraction.slope_jump(corrected=False) > 0.1
 
 
+def test_vertical_links_past_an_edge(diffraction, monkeypatch):
+    monkeypatch.setattr(diffraction, "EDGE_HEIGHTS", (0.003,))
+    monkeypatch.setattr(diffraction, "OFFSETS", (0.01, 0.2))
+    found = diffraction.vertical_deviations()
+    assert 0.1 < found["vertical_db"] < 0.5
+    assert found["turned_db"] < 1e-9
+    assert found["vertical_isotropic_db"] < 1.0
+
+
 @pytest.mark.slow
 def test_field_about_a_cube(diffraction):
     found = diffraction.ring_error()
@@ -63,6 +72,9 @@ def test_table_says_what_must_hold(diffraction):
         "reciprocity": {"lossy": 1e-15},
         "slope_jump": 1e-4,
         "slope_jump_plain": 0.2,
+        "vertical_db": 0.6,
+        "turned_db": 1e-11,
+        "vertical_isotropic_db": 0.9,
         "jump_db_next": 0.5,
         "jump_db_second": 2.3,
         "jump_db_first": 5.0,
@@ -81,5 +93,7 @@ def test_table_says_what_must_hold(diffraction):
     }
     assert "NO" in lines["wedge.3"]
     assert "NO" in lines["full_wave_with_phases"]
-    for name in ("jump.lossy", "reciprocity.lossy", "jump_db_next", "full_wave", "point_source.3"):
+    assert "NO" in lines["vertical_db"]
+    holding = ("jump.lossy", "reciprocity.lossy", "jump_db_next", "full_wave", "point_source.3")
+    for name in (*holding, "turned_db", "vertical_isotropic_db"):
         assert "yes" in lines[name]

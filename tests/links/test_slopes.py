@@ -22,6 +22,7 @@ from invertwin.scene import (
     plate,
     rigid,
 )
+from invertwin.scene.antenna import Pattern
 from scenes import float64, level_plate
 
 FREQUENCY = 3.5e9
@@ -153,3 +154,96 @@ def test_gradients_of_the_power(array):
         dual = power(forward_ad.make_dual(source.detach(), way))
         forward = forward_ad.unpack_dual(dual).tangent
     torch.testing.assert_close(forward, source.grad @ way)
+
+
+REACH = 10.0
+"""Distance from the screen to an antenna below it, and to one above it [m]."""
+UPWARDS = float64([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+DOWNWARDS = float64([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+
+
+def past_the_edge(beyond: float, source: Tensor, place: Tensor) -> RayPaths:
+    """Paths along about the world's z axis past an edge along y, ``beyond`` the axis."""
+    shift = rigid(translation=[200.0 - beyond, 0.0, 0.0])
+    scene = Scene({"screen": Object(level_plate(400.0, 400.0), PerfectConductor(), shift)})
+    return trace_paths(scene, source, place, 1e9, depth=0, edges=1, rays=None)
+
+
+def vertical_response(paths: RayPaths, tx: AntennaMount, rx: AntennaMount) -> Tensor:
+    """Response over that of free space between isotropic antennas."""
+    free = SPEED_OF_LIGHT / 1e9 / (4 * math.pi * 2 * REACH)
+    return frequency_response(paths, [1e9], tx=tx, rx=rx).flatten()[0] / free
+
+
+def element(pattern: Pattern, polarisation: str = "V") -> AntennaArray:
+    return AntennaArray(torch.zeros(1, 3, dtype=torch.float64), pattern, polarisation)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.01, 0.05, 0.2])
+def test_isotropic_elements_do_not_amplify_about_their_pole(offset):
+    for beyond in (1e-5, 0.003, 0.03):
+        paths = past_the_edge(beyond, float64([0, 0, -REACH]), float64([0, offset, REACH]))
+        # On the boundary of the shadow, half of the field arrives, if polarisations agree.
+        found = vertical_response(paths, AntennaMount(), AntennaMount())
+        assert float(found.abs()) < 0.55
+
+
+def test_slopes_about_the_pole_of_an_isotropic_element():
+    zone, angle = 0.1, float64([1e-7, 0.01, 0.05, 0.2, 1.0])
+    way = torch.stack([angle.sin(), 0 * angle, angle.cos()], 1)
+    # Along H, at 1 rad/rad: V turns about the ray by the cotangent of its angle to the axis.
+    turn = torch.linalg.cross(way, float64([0.0, 1.0, 0.0]).expand_as(way))
+    index, zones = torch.zeros(5, dtype=torch.int64), torch.full((5,), zone).double()
+    found = AntennaMount().element_slopes(way, index, turn, 20.0, zones)[:, 0]
+    assert float(found[:, 0].abs().max()) < 1e-7
+    speed = 1 / angle.tan()
+    expected = speed / (zone * speed).square().clamp_min(1)
+    # Closer than the step of the difference, slopes are smaller still.
+    torch.testing.assert_close(found[1:, 1].abs(), expected[1:], rtol=1e-4, atol=0)
+    assert float(found[0].abs().max()) < 0.02
+
+
+class Dipole(Pattern):
+    """Short dipole along z."""
+
+    def gain(self, direction):
+        return 1.5 * direction[..., :2].square().sum(-1)
+
+    def table(self):
+        cosine = torch.linspace(-1, 1, 101, dtype=torch.float64)[:, None]
+        phi = 2 * math.pi * torch.arange(100, dtype=torch.float64) / 100 - math.pi
+        return 1.5 * (1 - (1 - cosine**2) * phi.sin() ** 2)
+
+
+@pytest.mark.parametrize("beyond", [0.0, 1e-4, 0.003])
+def test_field_of_a_dipole_past_an_edge_in_its_null(beyond):
+    """The edge cuts the odd field about the null: Kirchhoff's integral of x/s over x > 0."""
+    paths = past_the_edge(beyond, float64([0, 0, -REACH]), float64([0, 0, REACH]))
+    ends = AntennaMount(element(Dipole())), AntennaMount(ONE, DOWNWARDS)
+    found = vertical_response(paths, *ends)
+    wave_number = 2 * math.pi * 1e9 / SPEED_OF_LIGHT
+    truth = math.sqrt(1.5) / REACH * math.sqrt(REACH / 2 / (2 * math.pi * wave_number))
+    assert float(found.abs()) == pytest.approx(truth, rel=0.01)
+    plain = vertical_response(replace(paths, slopes=None, axes=None), *ends)
+    assert float(plain.abs()) < 0.1 * truth
+
+
+@pytest.mark.parametrize("beyond", [0.003, -0.3], ids=["shadow", "light"])
+def test_gradients_on_the_vertical(beyond):
+    source, place = float64([0, 0, -REACH]).requires_grad_(), float64([0, 0, REACH])
+    ends = AntennaMount(beam(), UPWARDS), AntennaMount(element(Cosine(2.0)), DOWNWARDS)
+
+    def power(source: Tensor, *ends: AntennaMount) -> Tensor:
+        response = vertical_response(past_the_edge(beyond, source, place), *ends)
+        return torch.view_as_real(response).square().sum()
+
+    (found,) = torch.autograd.grad(power(source, *ends), source)
+    with torch.no_grad():
+        steps = 1e-5 * torch.eye(3, dtype=torch.float64)
+        sides = [[power(source + sign * by, *ends) for by in steps] for sign in (1, -1)]
+    truth = (torch.stack(sides[0]) - torch.stack(sides[1])) / 2e-5
+    torch.testing.assert_close(found, truth, rtol=1e-4, atol=1e-6 * float(truth.abs().max()))
+    # Fields of isotropic elements have no derivative on their axis, but nothing infinite comes out.
+    for mount in (AntennaMount(), AntennaMount(element(Dipole()))):
+        (own,) = torch.autograd.grad(power(source, mount, mount), source)
+        assert bool(torch.isfinite(own).all())

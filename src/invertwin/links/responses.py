@@ -75,7 +75,9 @@ class AntennaMount:
             direction: Unit vectors in the world, away from the terminal.
             index: Its number.
         """
-        turn = self._rotations_of(index)
+        return self._turned_weights(direction, self._rotations_of(index))
+
+    def _turned_weights(self, direction: Tensor, turn: Tensor) -> Tensor:
         local = torch.einsum("pij,pi->pj", turn, direction)
         gain = self.array.pattern.gain(local)
         lit = gain > 0  # a root of zero has no derivative
@@ -94,35 +96,35 @@ class AntennaMount:
         index: Int64[Tensor, " path"],
         axis: Float64[Tensor, "path 3"],
         wave_number: float,
+        zone: Float64[Tensor, " path"],
     ) -> Complex128[Tensor, "path element 2"]:
         """Derivative of the field of each element as directions turn about axes [1/rad].
 
         The field turns with them: what is alike on all sides of an axis has none. The elements'
         places count, by the phase from element to element.
 
+        In the far zone of an antenna, its field changes across the first Fresnel zone by less than
+        its peak. Where a model changes faster, as the polarisation V of an isotropic element about
+        the z axis of its array, the derivative is attenuated: it vanishes on that axis.
+
         Args:
             direction: Unit vectors in the world, away from the terminal.
             index: Its number.
             axis: Unit vectors in the world.
             wave_number: k [1/m].
+            zone: Radius of the first Fresnel zone about each direction [rad].
         """
-        up = torch.tensor(_UP, dtype=torch.float64)
-
+        turn = self._rotations_of(index)
+        # An antenna that turns back has the field of a direction that turns, in the basis here. A
+        # difference works in every mode of differentiation, and for patterns that are tables.
+        generator = torch.linalg.cross(axis[:, None], _world_axes()[None])
+        back = torch.linalg.matrix_exp(_ROTATION_STEP * generator)
+        later, earlier = (self._turned_weights(direction, by @ turn) for by in (back, back.mT))
+        slope = (later - earlier) / (2 * _ROTATION_STEP)
+        change = (zone[:, None, None] * torch.view_as_real(slope).flatten(2)).square().sum(2)
+        peak = self.array.pattern.table().max().clamp_min(1e-300)
+        slope = slope * (peak / torch.maximum(change, peak))[..., None]
         moved = torch.linalg.cross(axis, direction)
-        kept = axis * (axis * direction).sum(1, keepdim=True)
-        basis = polarisations(direction, up)
-        # A difference works in every mode of differentiation, and for patterns that are tables.
-        sides = []
-        for sine in (_ROTATION_STEP, -_ROTATION_STEP):
-            cosine = math.sqrt(1 - sine**2)
-            way = direction * cosine + moved * sine + kept * (1 - cosine)
-            # What the basis there is over the one here, turned with the direction.
-            across = torch.linalg.cross(axis[:, None].expand_as(basis), basis)
-            along = axis[:, None] * (basis @ axis[..., None])
-            turned = basis * cosine + across * sine + along * (1 - cosine)
-            change = turned @ polarisations(way, up).mT
-            sides.append(self.element_weights(way, index) @ change.to(torch.complex128).mT)
-        slope = (sides[0] - sides[1]) / (2 * _ROTATION_STEP)
         ahead = 1j * wave_number * self.element_advances(moved, index)[..., None]
         return slope + ahead * self.element_weights(direction, index)
 
@@ -179,9 +181,12 @@ def _slope_diffraction(
     rows = torch.nonzero(axes.detach().flatten(1).abs().amax(1) > 0)[:, 0]
     k = 2 * math.pi * paths.frequency / SPEED_OF_LIGHT
     ways, places = (paths.departure[rows], paths.arrival[rows]), (paths.tx[rows], paths.rx[rows])
-    ends = list(zip((tx, rx), ways, places, axes[rows].unbind(1), strict=True))
-    even = [end.element_weights(way, place) for end, way, place, _ in ends]
-    uneven = [end.element_slopes(way, place, axis, k) for end, way, place, axis in ends]
+    # On a shadow boundary |∂D/∂φ′| = √(2kL/π) |D|: slope over coefficient is the radius over π.
+    zones = math.pi * torch.linalg.matrix_norm(slopes[rows])
+    zones = zones / torch.linalg.matrix_norm(paths.coefficient[rows]).clamp_min(1e-300)[:, None]
+    ends = list(zip((tx, rx), ways, places, axes[rows].unbind(1), zones.unbind(1), strict=True))
+    even = [end.element_weights(way, place) for end, way, place, *_ in ends]
+    uneven = [end.element_slopes(way, place, axis, k, zone) for end, way, place, axis, zone in ends]
     by_tx, by_rx = slopes[rows].unbind(1)
     added = torch.einsum("pri,pij,ptj->prt", even[1], by_tx, uneven[0])
     added = added + torch.einsum("pri,pij,ptj->prt", uneven[1], by_rx, even[0])
