@@ -304,7 +304,7 @@ def test_wrong_shapes_are_refused(part, message):
 
 
 def test_wrong_dimensions_are_refused(unchecked):
-    with pytest.raises(InputError, match="expected dimensions frame, tx, rx, sample, got shape"):
+    with pytest.raises(InputError, match="expected dimensions frame, tx, rx, sample of shape"):
         Capture.from_beat(beat_capture().beat[:, 0], fmcw_radar())
 
 

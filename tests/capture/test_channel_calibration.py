@@ -126,7 +126,7 @@ def test_channels_that_cannot_be_calibrated_are_refused(unchecked):
         ChannelCalibration(errors() * torch.nan)
     with pytest.raises(InputError, match="finite gains"):
         ChannelCalibration(errors()[0])
-    with pytest.raises(InputError, match=r"data of \(2, 4\) TX and RX"):
+    with pytest.raises(InputError, match=r"data .* of shape \[any, 2, 4, any\]"):
         ChannelCalibration(errors()[:2]).apply(recorded())
 
 

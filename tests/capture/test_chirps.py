@@ -68,9 +68,9 @@ def test_turns_of_a_simulation_become_the_order_of_sending():
         sent = settings.chirps.times(3)[:, slot]
         torch.testing.assert_close(sent, turns.times(3)[:, element])
     for order in ((0, 1), (0, 1, 3), (0, 0, 1)):
-        with pytest.raises(InputError, match="transmitters 0 to 2, each once"):
+        with pytest.raises(InputError, match="names each of 3 transmitters once"):
             adc_counts(beat, settings, 10.0, order)
-        with pytest.raises(InputError, match="transmitters 0 to 2, each once"):
+        with pytest.raises(InputError, match="names each of 3 transmitters once"):
             make_settings(chirp, 3, 2, order=order)
 
 

@@ -19,6 +19,7 @@ from cli.small import BEHIND, GRADCHECK, MATERIAL, RUN, STARTS, call, read_metri
 from invertwin.cli import app
 from invertwin.cli import terminal as running
 from invertwin.cli.run_file import load_run
+from invertwin.runtime.progress import track
 
 
 def test_help_names_the_commands(monkeypatch, capsys):
@@ -341,9 +342,9 @@ def test_a_log_tells_the_time_that_is_left(monkeypatch):
     monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=lambda: float(next(now))))
     written = io.StringIO()
     log = Console(file=written, width=100)
-    with running.count_progress(log, "landscape", 10) as advance:
-        for _ in range(10):
-            advance()
+    with running.show_progress(log):
+        for _ in track(range(10), "landscape"):
+            pass
     lines = written.getvalue().splitlines()
     assert lines
     odd = [line for line in lines if not re.fullmatch(r"landscape: \d+ of 10, .* left", line)]

@@ -8,7 +8,7 @@ import torch
 
 from cli.small import RUN, call, read_metrics
 from invertwin.capture import Capture
-from invertwin.cli.fits.problem import Problem, SensorData, make_models
+from invertwin.cli.fits.problem import Problem, SensorData
 from invertwin.cli.fits.radar_maps import RadarMaps
 from invertwin.cli.fits.radar_models import blur_end_step, make_unblurred_models
 from invertwin.cli.run_file import validate_run
@@ -29,7 +29,7 @@ def test_run_files_name_targets_and_their_stretch(tmp_path):
     capture = Capture.from_beat(torch.zeros(*radar.shape, 64, dtype=torch.complex64), radar)
     sight = SensorData(capture, radar, build.grid(run.grid, radar))
     problem = Problem(run, scene, scene, frozenset(), {"": sight}, None, RadarMaps())
-    (model,) = make_models(problem)
+    (model,) = problem.kind.models(problem)
     assert isinstance(model, SurrogateMap)
     assert (model.coherent, model.stretch) == (("plate",), 2.0)
     assert model.kernels.range_width == 2.0

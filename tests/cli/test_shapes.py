@@ -5,18 +5,29 @@ import tomllib
 import pytest
 from PIL import Image
 from rich.console import Console
+from torch import nn
 
 from cli.small import RUN, call, read_metrics
 from invertwin.cli.fits.kinds import build_problem
-from invertwin.cli.fits.problem import OWN_METHOD, Problem, make_schedule, method_run, stage_runs
+from invertwin.cli.fits.problem import (
+    OWN_METHOD,
+    Fits,
+    Problem,
+    Start,
+    make_schedule,
+    method_run,
+    stage_runs,
+)
 from invertwin.cli.fits.radar_maps import RadarMaps
 from invertwin.cli.fits.radar_models import blur_end_step
 from invertwin.cli.fits.shape_scores import is_shape_key, score_shape, shape_label
-from invertwin.cli.fits.writing import BestFit, make_tables
+from invertwin.cli.fits.writing import make_tables
 from invertwin.cli.run_file import to_toml, validate_run
 from invertwin.cli.schema import build
 from invertwin.cli.schema.shape_tables import shape_regularizers
 from invertwin.errors import InputError
+from invertwin.inversion import Reconstruction
+from invertwin.inversion.confidence.realisations import FitResult
 from invertwin.scene import Mesh, PriorShape
 from invertwin.scene.files import load_mesh
 
@@ -155,7 +166,7 @@ def test_parts_and_holes_are_told_where_the_surface_is_closed(tmp_path, monkeypa
     assert "Euler number, 2 less for every hole through a part, start" in said
 
 
-@pytest.mark.parametrize(("voxel", "said"), [(1e-5, "at most 200000000 voxels"), (9.0, "none")])
+@pytest.mark.parametrize(("voxel", "said"), [(1e-5, "at most 200,000,000 voxels"), (9.0, "none")])
 def test_voxels_of_a_wrong_size_are_refused_before_the_fit(
     voxel, said, tmp_path, monkeypatch, capsys
 ):
@@ -168,6 +179,14 @@ def test_voxels_of_a_wrong_size_are_refused_before_the_fit(
     assert "step 1" not in shown.out
 
 
+def fits_that_end(problem, rows, twin):
+    """Fits whose best one has ended at a twin."""
+    result = FitResult.__new__(FitResult)  # no table asks for it
+    found = Reconstruction(twin, [], nn.ModuleList(), [], "budget", 1, 0.0, result)
+    start = Start(problem.scene)
+    return Fits(problem, {OWN_METHOD: rows}, lambda *_: found, rows[0], start, found)
+
+
 def test_a_twin_that_has_collapsed_has_no_measures(tmp_path):
     problem = build_problem(check(letters(), tmp_path), Console(quiet=True))
     start = problem.scene
@@ -177,7 +196,7 @@ def test_a_twin_that_has_collapsed_has_no_measures(tmp_path):
     assert found["start_chamfer_m"] > 0
     assert not {"chamfer_m", "chamfer_seen_m", "iou"} & set(found)
     metrics = {"steps": 1, "status": "budget", "verdict": "worse", "parameters": {}, **found}
-    result = make_tables(BestFit(problem, metrics, {OWN_METHOD: [found]}, start, twin, {}, []))[0]
+    result = make_tables(fits_that_end(problem, [found], twin), metrics)[0]
     assert ["Chamfer distance, mean of both directions [m]", None] in result.rows
 
 
@@ -188,8 +207,7 @@ def test_a_start_that_is_lost_says_so_in_the_table(tmp_path):
         for k, (loss, lost) in enumerate([(0.7, False), (1.0, True)])
     ]
     metrics = {"steps": 9, "status": "converged", "verdict": "unknown", "parameters": {}}
-    fitted = BestFit(problem, metrics, {OWN_METHOD: rows}, problem.scene, problem.scene, {}, [])
-    starts = make_tables(fitted)[1]
+    starts = make_tables(fits_that_end(problem, rows, problem.scene), metrics)[1]
     ended = starts.columns.index("ended as")
     assert [row[ended] for row in starts.rows] == [
         "the loss no longer falls",

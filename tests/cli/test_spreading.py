@@ -34,7 +34,7 @@ def here(monkeypatch):
 
     def done_here(work, given, **_):
         for number, job in enumerate(given):
-            jobs.append((job.mode, job.start))
+            jobs.append(job)
             yield number, work(job)
 
     monkeypatch.setattr(spreading, "run_jobs", done_here)
@@ -99,8 +99,8 @@ def goes_on(run, mode, start, folder):
 
 
 def test_a_worker_goes_on_from_the_calibration():
-    job = spreading.FitJob(goes_on, SHORT, "full", 1, {CALIBRATED: b"seed "})
-    assert spreading.run_fit_job(job) == {f"{PARTS}/full_01.json": b"seed 3"}
+    made = spreading.run_fit_job(goes_on, SHORT, {CALIBRATED: b"seed "}, ("full", 1))
+    assert made == {f"{PARTS}/full_01.json": b"seed 3"}
 
 
 @pytest.mark.parametrize("options", [("--workers", "2"), ("--engine", "ray")])

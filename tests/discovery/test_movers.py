@@ -113,7 +113,7 @@ def test_correlation_ignores_gain_and_knows_three_scales(unchecked):
         assert correlation(one, other, scale) < 0.9
     root = torch.corrcoef(torch.stack([one.sqrt().flatten(), other.sqrt().flatten()]))[0, 1]
     assert correlation(one, other) == pytest.approx(float(root), abs=1e-6)
-    with pytest.raises(InputError, match="expected maps of one shape"):
+    with pytest.raises(InputError, match="expected a map like the measured one"):
         CorrelationLoss()(one, other[1:])
     with pytest.raises(InputError, match="'volts'"):
         correlation(one, other, "volts")

@@ -66,7 +66,7 @@ def test_looks_of_conductors_are_all_the_same():
 def test_a_correlation_needs_looks():
     device = radar()
     model = SurrogateMap(device.grid(0.5, 2.5))
-    with pytest.raises(InputError, match="expected looks >= 1, got 0"):
+    with pytest.raises(InputError, match="expected realisations as an integer >= 1, got 0"):
         surrogate_correlation(occluder(), device, model, seed=0, realisations=0)
 
 
@@ -340,7 +340,7 @@ def test_measured_levels_have_the_shape_of_the_map():
     assert model.observe([[-50.0, -60.0, -70.0]] * 2).shape == (2, 3)
     with pytest.raises(InputError, match="measured received power"):
         model.observe([-50.0, -60.0])
-    with pytest.raises(InputError, match="quantity among received_power"):
+    with pytest.raises(InputError, match="quantity to be one of received_power"):
         RadioMap(SPOTS, PropagationSettings(2.4e9), "rssi")  # type: ignore[arg-type]
 
 

@@ -156,7 +156,7 @@ def test_a_derivative_of_zero_and_one_without_directions():
 
 
 def test_maps_and_grids_that_do_not_fit_are_refused():
-    with pytest.raises(InputError, match=r"expected a map \[frame, 3, 5, 1\]"):
+    with pytest.raises(InputError, match=r"expected a map of shape \[any, 3, 5, 1\]"):
         plotting.spectrum(power(GRID), ROW)
     with pytest.raises(InputError, match="at least one map, got none"):
         plotting.spectrum({}, ROW)

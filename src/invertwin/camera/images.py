@@ -105,30 +105,26 @@ def _render_images(
     *,
     crossings: bool,
 ) -> Tensor:
-    every = [
-        _ImageRenderer(scene, camera, n, ray_value, sampling, seed).render(crossings)
-        for n in range(len(camera.positions))
-    ]
-    return torch.stack(every)
+    images, fixed = [], camera.detach()
+    for number, position in enumerate(camera.positions):
+        random = np.random.default_rng(np.random.SeedSequence([seed, number]))
+        sight = ViewpointScene(scene, position)
+        one = _ImageRenderer(camera, fixed, number, sight, ray_value, sampling, random)
+        images.append(one.render(crossings))
+    return torch.stack(images)
 
 
+@dataclass(eq=False)
 class _ImageRenderer:
     """Renderer of one image."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        camera: Camera,
-        number: int,
-        ray_value: RayValue,
-        sampling: ImageSampling,
-        seed: int,
-    ) -> None:
-        self.camera, self.number = camera, number
-        self.ray_value, self.sampling = ray_value, sampling
-        self.sight = ViewpointScene(scene, camera.positions[number])
-        self.random = np.random.default_rng(np.random.SeedSequence([seed, number]))
-        self.fixed = camera.detach()
+    camera: Camera
+    fixed: Camera  # without derivatives
+    number: int
+    sight: ViewpointScene
+    ray_value: RayValue
+    sampling: ImageSampling
+    random: np.random.Generator
 
     def render(self, crossings: bool) -> Float64[Tensor, "row column"]:
         """Return the mean over each pixel, with the derivative of outlines."""

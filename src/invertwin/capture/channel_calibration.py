@@ -12,7 +12,7 @@ from torch import Tensor
 from invertwin.capture.capture import BEAT_DIMS, Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.readers.radar_fields import to_data_array
-from invertwin.checks import checked_tensor
+from invertwin.checks import check_shape, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar.radar import require_sampled_waveform
@@ -94,12 +94,10 @@ class ChannelCalibration:
         Raises:
             InputError: range profiles, or another number of channels.
         """
-        beat, expected = capture.beat, tuple(self.gains.shape)
-        if tuple(beat.shape[-3:-1]) != expected:
-            raise InputError(
-                f"expected data of {expected} TX and RX elements as in the calibration, got "
-                f"{tuple(beat.shape[-3:-1])}; calibrate with the same elements"
-            )
+        beat = capture.beat
+        expected = (*[None] * (beat.ndim - 3), *self.gains.shape, None)
+        what = "data (frame, …, tx, rx, sample) of the elements that were calibrated"
+        check_shape(beat, expected, what, "calibrate with the same elements")
         beat = (beat / self.gains[:, :, None]).to(beat.dtype)
         if isinstance(capture, ChirpCapture):
             return replace(capture, beat=beat)

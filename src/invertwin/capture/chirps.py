@@ -18,7 +18,7 @@ from invertwin.checks import check_fields, check_shape, checked_number
 from invertwin.errors import InputError
 from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.radar.radar import Radar
-from invertwin.radar.signal.chirps import Chirps
+from invertwin.radar.signal.chirps import Chirps, check_order
 from invertwin.radar.waveform import FMCW, PhysicsWarning
 
 CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")
@@ -227,7 +227,7 @@ def adc_counts(
     if beat.ndim == 4:
         beat = beat[:, None].expand(-1, settings.loops, -1, -1, -1)
     if order is not None:
-        beat = beat[:, :, _check_order(order, beat.shape[2])]
+        beat = beat[:, :, check_order(order, beat.shape[2])]
     top = 2 ** (settings.bits - 1) - 1
     parts = torch.view_as_real(beat.to(torch.complex128).resolve_conj()) * (top / full_scale)
     parts = parts.round().clamp(-top - 1, top)
@@ -280,7 +280,7 @@ def make_settings(
         for given in (transmitters, receivers)
     )
     if order is not None:
-        senders = [senders[turn] for turn in _check_order(order, len(senders))]
+        senders = [senders[turn] for turn in check_order(order, len(senders))]
     others.setdefault("loops", 1)
     rate = waveform.samples / waveform.duration
     nearest = round(rate)
@@ -294,12 +294,3 @@ def make_settings(
         adc_start_time=adc_start_time,
         **others,
     )
-
-
-def _check_order(order: Sequence[int], transmitters: int) -> list[int]:
-    if sorted(order) != list(range(transmitters)):
-        raise InputError(
-            f"expected an order of the transmitters 0 to {transmitters - 1}, each once, got "
-            f"{tuple(order)}; use Chirps.order of the simulation"
-        )
-    return list(order)

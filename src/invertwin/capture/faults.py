@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Complex, Complex128, Float64, Int64
+from scipy.signal.windows import blackmanharris
 from scipy.special import gammainccinv, gammaincinv
 from torch import Tensor
 
@@ -498,9 +499,7 @@ def _strongest_range_rates(beat: _LimitedBeat) -> _Rates:
 
 def _blackman_harris_window(count: int) -> Float64[Tensor, " sample"]:
     """The four-term window of Blackman and Harris: sidelobes of −92 dB."""
-    turn = 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
-    terms = (0.35875, -0.48829, 0.14128, -0.01168)
-    return sum((a * torch.cos(k * turn) for k, a in enumerate(terms)), torch.zeros(count)) / count
+    return torch.from_numpy(blackmanharris(count, sym=False)) / count
 
 
 def _adjacent_lines(tapered: _Rates, frequency: float) -> Complex128[Tensor, "rate channel line"]:

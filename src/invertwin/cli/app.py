@@ -223,13 +223,9 @@ def view(
 @_command_with(ResumableOptions)
 def gradcheck(options: ResumableOptions, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
+    from invertwin.cli.commands.gradcheck import run_gradcheck
 
-    def run_command(*given: Any) -> list[ReportTable]:
-        from invertwin.cli.commands.gradcheck import run_gradcheck
-
-        return run_gradcheck(*given)
-
-    run_each(options, files, "gradcheck", _gradcheck_sections, run_command)
+    run_each(options, files, "gradcheck", _gradcheck_sections, run_gradcheck)
 
 
 def _gradcheck_sections(run: Any) -> tuple[str, ...]:
@@ -244,13 +240,9 @@ def _gradcheck_sections(run: Any) -> tuple[str, ...]:
 @_command_with(ResumableOptions)
 def rcs(options: ResumableOptions, files: FilesArgument) -> None:
     """Compute radar signatures: cross-sections, range profiles, images."""
+    from invertwin.cli.commands.rcs import run_rcs
 
-    def run_command(*given: Any) -> list[ReportTable]:
-        from invertwin.cli.commands.rcs import run_rcs
-
-        return run_rcs(*given)
-
-    run_each(options, files, "rcs", ("rcs",), run_command)
+    run_each(options, files, "rcs", ("rcs",), run_rcs)
 
 
 @app.command()

@@ -50,13 +50,11 @@ class ReportView:
     note: str = "Drag to turn, wheel to come nearer, shift and drag to move."
 
 
+ReportParts = Sequence[ReportTable | ReportPicture | ReportView]
+
+
 def report_html(
-    title: str,
-    status: str,
-    note: str,
-    parts: Sequence[ReportTable | ReportPicture | ReportView],
-    again: str,
-    files: Mapping[str, str],
+    title: str, status: str, note: str, parts: ReportParts, again: str, files: Mapping[str, str]
 ) -> str:
     """The report as one HTML text that loads nothing from elsewhere.
 
@@ -92,7 +90,7 @@ def write_report(
     metrics: Mapping[str, Any],
     title: str,
     status: str,
-    parts: Sequence[ReportTable | ReportPicture | ReportView],
+    parts: ReportParts,
     *,
     again: str,
     note: str = "",

@@ -6,12 +6,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -26,6 +24,7 @@ from invertwin.storage.run_folder import RunFolder, open_run
 _LOG_INTERVAL = 10.0  # between lines of progress in a log
 Result = dict[str, Any]
 """Numbers of one run file."""
+Sections = Sequence[str] | Callable[[Any], Sequence[str]]  # that a command needs, of a run file
 
 
 @contextmanager
@@ -56,10 +55,7 @@ def run_folder(
 
 
 def load_runs(
-    files: Sequence[Path],
-    options: RunOptions,
-    command: str,
-    sections: Sequence[str] | Callable[[Any], Sequence[str]],
+    files: Sequence[Path], options: RunOptions, command: str, sections: Sections
 ) -> dict[str, Any]:
     """Run files by stem, with the sections that the command cannot do without.
 
@@ -127,7 +123,7 @@ def run_each(
     options: ResumableOptions,
     files: Sequence[Path],
     command: str,
-    sections: Sequence[str] | Callable[[Any], Sequence[str]],
+    sections: Sections,
     work: Callable[..., list[ReportTable]],
 ) -> None:
     """Work on several run files with one report.
@@ -148,35 +144,6 @@ def run_each(
             say = status.update if console.is_terminal else limit_rate()
             tables = work(RunBatch(runs, {file.stem: file for file in files}, folder), say)
         print_tables(tables)
-
-
-@contextmanager
-def count_progress(console: Console, name: str, total: int) -> Iterator[Callable[[], None]]:
-    """Progress with the time that is left: a bar, or a line now and then where no terminal is.
-
-    Args:
-        console: Console to print on.
-        name: Name of the counted items.
-        total: Number of items.
-
-    Yields:
-        A function to be called after each of them.
-    """
-    if not console.is_terminal:
-        begin, done = time.monotonic(), 0
-        say = limit_rate(console, begin)
-
-        def advance() -> None:
-            nonlocal done
-            done += 1
-            left = format_duration((time.monotonic() - begin) / done * (total - done))
-            say(f"{name}: {done} of {total}, {left} left")
-
-        yield advance
-        return
-    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as bar:
-        yield partial(bar.advance, bar.add_task("", total=total))
 
 
 @contextmanager

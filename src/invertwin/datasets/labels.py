@@ -50,7 +50,8 @@ def object_labels(
         low, high = own.amin(0), own.amax(0)
         still = torch.zeros(1, 3, dtype=torch.float64)
         velocity = still if item.velocity is None else item.velocity.reshape(-1, 3)
-        areas = _triangle_areas(item.mesh)
+        a, b, c = own.detach()[item.mesh.faces].unbind(1)
+        areas = 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
         found: dict[str, Any] = {
             "name": name,
             "class": classes.get(name, name),
@@ -77,10 +78,8 @@ def radar_labels(radar: Radar) -> dict[str, Any]:
 
     The columns of a rotation are the radar's axes: boresight, left, up.
     """
-    axes = radar.rotations
-    if axes is None:
-        axes = torch.eye(3, dtype=torch.float64).expand(radar.frame_count, 3, 3)
-    return {"positions": radar.positions.tolist(), "rotations": axes.tolist()}
+    rotations = radar.link().rotations
+    return {"positions": radar.positions.tolist(), "rotations": rotations.tolist()}
 
 
 def convert_old_labels(labels: Any, name: str = "") -> Any:
@@ -140,8 +139,3 @@ def _sample_triangles(mesh: Mesh) -> Float64[Tensor, "face point 3"]:
     u, v = torch.where(over, 1 - u, u), torch.where(over, 1 - v, v)
     shares = torch.stack([1 - u - v, u, v], dim=1)
     return torch.einsum("pk,fkx->fpx", shares, mesh.vertices[mesh.faces])
-
-
-def _triangle_areas(mesh: Mesh) -> Float64[Tensor, " face"]:
-    a, b, c = mesh.vertices.detach()[mesh.faces].unbind(1)
-    return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)

@@ -93,6 +93,9 @@ class ShapeHypothesis:
     probability: float
 
 
+Hypotheses = Sequence[ShapeHypothesis]
+
+
 def find_hypotheses(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[ShapeHypothesis]]:
     """Return alternative hypotheses of every shape with all others fixed; the shape itself comes
     first.
@@ -130,7 +133,7 @@ def find_hypotheses(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[Sh
     ]
 
 
-def kind_probabilities(hypotheses: Sequence[ShapeHypothesis]) -> dict[str, float]:
+def kind_probabilities(hypotheses: Hypotheses) -> dict[str, float]:
     """Return the probability of every kind.
 
     Args:
@@ -144,9 +147,7 @@ def kind_probabilities(hypotheses: Sequence[ShapeHypothesis]) -> dict[str, float
 
 
 def widen_deviations(
-    likelihood: ShapeLikelihood,
-    deviations: Mapping[str, float],
-    hypotheses: Sequence[ShapeHypothesis],
+    likelihood: ShapeLikelihood, deviations: Mapping[str, float], hypotheses: Hypotheses
 ) -> dict[str, float]:
     """Widen the standard deviations of a shape by errors that its derivatives do not show.
 

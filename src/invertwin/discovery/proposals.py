@@ -17,12 +17,11 @@ _PERSON_SIZE = 0.32, 0.66, 1.75  # usual length, width and height [m]
 # Minimum extent, and margin of the usual extents [m].
 _MIN_PERSON_EXTENT, _PERSON_MARGIN = 0.12, 0.25
 MAX_CORNER_EXTENT = 0.15
+_Values = Float64[Tensor, " point"]  # one at every point
 """Maximum side of a group proposed as a corner reflector [m]."""
 
 
-def bright_weights(
-    strength: Float64[Tensor, " point"], fraction: float = 0.02
-) -> Float64[Tensor, " chosen"]:
+def bright_weights(strength: _Values, fraction: float = 0.02) -> Float64[Tensor, " chosen"]:
     """Compute weights of image points; weak points have weight zero.
 
     Echo strengths differ by orders of magnitude, but even a weak object is stronger than the
@@ -41,8 +40,8 @@ def bright_weights(
 
 
 def group_bright_points(
-    positions: Float64[Tensor, "point 2"], weight: Float64[Tensor, " point"], max_gap: float
-) -> list[Float64[Tensor, " point"]]:
+    positions: Float64[Tensor, "point 2"], weight: _Values, max_gap: float
+) -> list[_Values]:
     """Group bright points linked by steps of at most a gap; return their weights over all points.
 
     Args:
@@ -64,7 +63,7 @@ def group_bright_points(
 
 
 def enclosing_rectangle(
-    positions: Float64[Tensor, "point 2"], weight: Float64[Tensor, " point"], yaw: float
+    positions: Float64[Tensor, "point 2"], weight: _Values, yaw: float
 ) -> tuple[Float64[Tensor, "2"], Float64[Tensor, "2"], float]:
     """Return centre [m], sides [m] and tightness of the rectangle at a yaw around bright points.
 
@@ -97,11 +96,7 @@ def _trimmed_ends(coordinates: Tensor, weight: Tensor) -> Tensor:
 
 
 def propose_shapes(
-    positions: Float64[Tensor, "point 2"],
-    weight: Float64[Tensor, " point"],
-    *,
-    step: float,
-    height: float,
+    positions: Float64[Tensor, "point 2"], weight: _Values, *, step: float, height: float
 ) -> list[ShapeParameters]:
     """Propose shapes for bright points: boxes of two yaws, round shapes, and people, vehicles and
     corner reflectors that fit the extent.

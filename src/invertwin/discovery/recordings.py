@@ -14,7 +14,7 @@ from invertwin.channel import Grid, ViewpointScene
 from invertwin.checks import checked_count, checked_number, checked_tensor
 from invertwin.discovery.assembly import ShapeLikelihood, make_sampling
 from invertwin.discovery.certainty import (
-    ShapeHypothesis,
+    Hypotheses,
     existence_probabilities,
     find_hypotheses,
     kind_probabilities,
@@ -51,13 +51,14 @@ _FINAL_FIT_STEPS = 50  # steps of the final fit
 _MAX_IMAGE_POINTS = 40_000  # maximum number of points of an image
 _MIN_EXISTENCE_PROBABILITY = 0.05  # less probable moving targets are dropped
 _HELD_OUT_EVERY = 4  # every fourth frame is held out, where there are twice as many
+_Corner = Sequence[float] | None  # x and y [m]; None = all that is seen
 
 
 def twin(
     recording: Capture | ChirpCapture,
     *,
-    low: Sequence[float] | None = None,
-    high: Sequence[float] | None = None,
+    low: _Corner = None,
+    high: _Corner = None,
     range_max: float | None = None,
     level: float | None = None,
     height: float | None = None,
@@ -102,7 +103,7 @@ def twin(
         moving = _find_moving_targets(recording, range_max)
         said = "nothing that stands still is above the noise" if moving else _NO_SIGNAL_NOTE
         return Twin(_sort_objects(moving), floor, notes=(said,))
-    places, step = _image_points(radar, image_height, reach, low, high)
+    places, step = image_points(radar, image_height, reach, low, high)
     gains = calibrate_on_scene(capture, radar.grid(*reach), places)
     if gains is not None:
         recording, capture = gains.apply(recording), gains.apply(capture)
@@ -116,7 +117,7 @@ def twin(
         picture = GroundImage(places[:, :2], image, _count_views(radar, places, None))
         return Twin(_sort_objects([*found, *moving]), floor, picture)
     grid = radar.grid(*reach)
-    still = _find_static_objects(capture, radar, grid, floor, places, step, rays, seed)
+    still = _find_static_objects(capture, grid, floor, places, step, rays, seed)
     notes = () if gains is None else (_CALIBRATION_NOTE.format(phase_spread(gains, radar)),)
     objects = _sort_objects([*still.objects, *moving])
     return replace(still, objects=objects, notes=(*notes, *still.notes), calibration=gains)
@@ -176,7 +177,6 @@ _IMAGE_BETTER_NOTE = (
 
 def _find_static_objects(
     capture: Capture,
-    radar: Radar,
     grid: Grid,
     level: float,
     positions: Tensor,
@@ -186,16 +186,10 @@ def _find_static_objects(
 ) -> Twin:
     """Find the shapes that explain the maps of a recording."""
     power = capture.spectrum(grid).detach().float()
-    frames = radar.frame_count
-    one = ShapeLikelihood(
-        SurrogateMap(grid, sampling=make_sampling(frames, rays)),
-        radar,
-        power,
-        HeavyTailedLoss(estimate_background(power)),
-        count_bins_per_draw(radar, grid),
-        level,
-        seed,
-    )
+    radar, frames = capture.radar(), capture.frame_count
+    model = SurrogateMap(grid, sampling=make_sampling(frames, rays))
+    loss, draw = HeavyTailedLoss(estimate_background(power)), count_bins_per_draw(radar, grid)
+    one = ShapeLikelihood(model, radar, power, loss, draw, level, seed)
     held = list(range(_HELD_OUT_EVERY - 1, frames, _HELD_OUT_EVERY))
     held = held if frames >= 2 * _HELD_OUT_EVERY else []
     fitted = one.select_frames([k for k in range(frames) if k not in held]) if held else one
@@ -225,39 +219,25 @@ def _find_static_objects(
     if any(new is not old for new, old in zip(likelier, shapes, strict=True)):
         shapes, found = one.fit(likelier, _FINAL_FIT_STEPS)
         among = find_hypotheses(one, shapes)
-    return Twin(
-        _describe_objects(one, found, shapes, among),
-        level,
-        GroundImage(flat, picture, _count_views(radar, positions, one.build_scene(shapes))),
-        one.predict(shapes) + level_map,
-        power,
-        grid,
-        notes,
-    )
+    objects = _describe_objects(one, found, shapes, among)
+    seen = GroundImage(flat, picture, _count_views(radar, positions, one.build_scene(shapes)))
+    return Twin(objects, level, seen, one.predict(shapes) + level_map, power, grid, notes)
 
 
 def _describe_objects(
-    likelihood: ShapeLikelihood,
-    fit: Reconstruction,
-    shapes: Shapes,
-    hypotheses: Sequence[Sequence[ShapeHypothesis]],
+    likelihood: ShapeLikelihood, fit: Reconstruction, shapes: Shapes, among: Sequence[Hypotheses]
 ) -> tuple[DetectedObject, ...]:
     """Return fitted shapes as objects with error bars, kinds and existence probabilities."""
     errors = standard_deviations(likelihood, fit)
-    return tuple(
-        DetectedObject(
-            f"object_{k}",
-            shape.effective_kind,
-            kind_probabilities(among),
-            shape_center(shape, likelihood.level),
-            shape,
-            widen_deviations(likelihood, _select_prefix(errors, f"object_{k}."), among),
-            probability,
-        )
-        for k, (shape, among, probability) in enumerate(
-            zip(shapes, hypotheses, existence_probabilities(likelihood, shapes), strict=True), 1
-        )
-    )
+    found, present = [], existence_probabilities(likelihood, shapes)
+    for k, (shape, own, probability) in enumerate(zip(shapes, among, present, strict=True), 1):
+        name, kinds, start = f"object_{k}", kind_probabilities(own), f"object_{k}."
+        center = shape_center(shape, likelihood.level)
+        mine = {n.removeprefix(start): v for n, v in errors.items() if n.startswith(start)}
+        wide = widen_deviations(likelihood, mine, own)
+        kind = shape.effective_kind
+        found.append(DetectedObject(name, kind, kinds, center, shape, wide, probability))
+    return tuple(found)
 
 
 def _image_likelihood_gain(
@@ -281,10 +261,6 @@ def _sort_objects(things: list[DetectedObject]) -> tuple[DetectedObject, ...]:
     return tuple(
         sorted(things, key=lambda one: (one.velocity is not None, -one.existence_probability))
     )
-
-
-def _select_prefix(errors: dict[str, float], prefix: str) -> dict[str, float]:
-    return {n.removeprefix(prefix): v for n, v in errors.items() if n.startswith(prefix)}
 
 
 def _search_range(capture: Capture, range_max: float | None) -> tuple[float, float] | None:
@@ -320,14 +296,20 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
     return first, min(limit, float(grid.ranges[loud[-1]]) + 10 * cell)
 
 
-def _image_points(
-    radar: Radar,
-    height: float,
-    ranges: tuple[float, float],
-    low: Sequence[float] | None,
-    high: Sequence[float] | None,
+def image_points(
+    radar: Radar, height: float, ranges: tuple[float, float], low: _Corner, high: _Corner
 ) -> tuple[Float64[Tensor, "point 3"], float]:
-    """Return visible image points on the ground [m], and their distance."""
+    """Return visible image points on the ground [m], and their distance.
+
+    Args:
+        radar: radar with its positions.
+        height: z of the points [m].
+        ranges: smallest and largest distance from a radar position [m].
+        low, high: opposite corners of the region, x and y [m]; None = as far as the ranges.
+
+    Raises:
+        InputError: corners in the wrong order, or a region that no radar sees.
+    """
     at = radar.positions.detach()[:, :2]
     corners = [at.amin(0) - ranges[1], at.amax(0) + ranges[1]]
     for k, given in enumerate((low, high)):

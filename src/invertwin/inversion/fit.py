@@ -378,7 +378,7 @@ class Fit:
                 return "diverged"
             self._keep_if_better(number, before)
             row: dict[str, Any] = {"step": self._before + step, "stage": self.number}
-            row |= {"loss": number, "values": _parameter_values(self.modules)}
+            row |= {"loss": number, "values": parameter_values(self.modules)}
             self._update_progress(step=step + 1)
             for callback in callbacks:
                 row |= callback.annotate(self)
@@ -493,7 +493,7 @@ def _has_diverged(loss: float, history: list[dict[str, Any]]) -> bool:
     return not math.isfinite(loss) or loss > most
 
 
-def _parameter_values(modules: nn.ModuleList) -> dict[str, Any]:
+def parameter_values(modules: nn.ModuleList) -> dict[str, Any]:
     """Return the named parameters as plain numbers; long ones (vertices) are in the checkpoint
     only.
     """

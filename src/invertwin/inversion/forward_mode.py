@@ -1,6 +1,7 @@
 """Forward-mode derivatives of functions of a module's parameters."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 import torch.autograd.forward_ad as forward_ad
@@ -9,14 +10,20 @@ from torch import Tensor, nn
 from invertwin.runtime.concurrency import tracer_lock
 
 
-class _Evaluation(nn.Module):
-    """Module whose call evaluates a function of another module's parameters."""
+class Evaluation(nn.Module):
+    """Module whose call evaluates a function of another module's parameters.
 
-    def __init__(self, module: nn.Module, function: Callable[[], list[Tensor]]) -> None:
+    Args:
+        module: the other module; its parameters are named `module.…` here.
+        function: what is evaluated.
+    """
+
+    def __init__(self, module: nn.Module, function: Callable[[], Any]) -> None:
         super().__init__()
         self.module, self._function = module, function
 
-    def forward(self) -> list[Tensor]:
+    def forward(self) -> Any:
+        """Return the value of the function."""
         return self._function()
 
 
@@ -38,6 +45,6 @@ def map_tangents(
         for name, tangent in tangents.items():
             value = module.get_parameter(name).detach()
             duals[f"module.{name}"] = forward_ad.make_dual(value, tangent.to(value))
-        found = torch.func.functional_call(_Evaluation(module, maps), duals, ())
+        found = torch.func.functional_call(Evaluation(module, maps), duals, ())
         pairs = [forward_ad.unpack_dual(result) for result in found]
         return [torch.zeros_like(p) if t is None else t for p, t in pairs]

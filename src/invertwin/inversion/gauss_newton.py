@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor, nn
 from torch.autograd import grad
 
-from invertwin.checks import checked_count
+from invertwin.checks import checked_count, checked_number
 from invertwin.errors import InputError
 from invertwin.inversion.forward_mode import map_tangents
 from invertwin.inversion.loss import CURVED, MapPairs, Objective
@@ -19,6 +19,7 @@ _MAX_DAMPING_TRIALS = 4  # trials of one step with increasing damping
 _DAMPING_DECREASE, _DAMPING_INCREASE = 0.3, 4.0  # after an accepted and after a rejected step
 _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e3
 _LOSS_TOLERANCE = 1e-3  # relative noise of two evaluations on equal samples
+_Penalty = Callable[[], Tensor] | None  # terms of the loss beside the maps
 
 
 class GaussNewton:
@@ -68,13 +69,11 @@ class GaussNewton:
                     f"expected a SpectrumLoss for Gauss–Newton, got {type(loss).__name__}; "
                     "give one, or another kind of optimiser"
                 )
-        if not self._parameters or not (trust_radius > 0 and damping > 0):
-            raise InputError(
-                "expected parameters to fit, trust_radius > 0 and damping > 0, got "
-                f"{len(self._parameters)}, {trust_radius} and {damping}; a radius of 0.3 suits "
-                "metres and radians"
-            )
-        self.objective, self.damping = objective, damping
+        if not self._parameters:
+            raise InputError("expected parameters to fit, got 0, none of them free; free some")
+        checked_number(trust_radius, "trust_radius", 0.0, open_low=True)
+        self.objective = objective
+        self.damping = checked_number(damping, "damping", 0.0, open_low=True)
         own = dict(trust_radii or {})
         radii = [
             torch.full((p.numel(),), own.get(p, trust_radius), dtype=torch.float64)
@@ -85,9 +84,7 @@ class GaussNewton:
         self._known: tuple[Tensor, Tensor] | None = None  # H, and the mask of its parameters
         self._age = 0  # number of steps with the present H
 
-    def step(
-        self, maps: Callable[[], MapPairs], penalty: Callable[[], Tensor] | None = None
-    ) -> float:
+    def step(self, maps: Callable[[], MapPairs], penalty: _Penalty = None) -> float:
         """Take one step, and return the loss before it.
 
         Args:
@@ -216,9 +213,7 @@ class GaussNewton:
         return {n: part.reshape(p.shape) for (n, p), part in named if part.any()}
 
 
-def _evaluate_loss(
-    objective: Objective, maps: Callable[[], MapPairs], penalty: Callable[[], Tensor] | None
-) -> float:
+def _evaluate_loss(objective: Objective, maps: Callable[[], MapPairs], penalty: _Penalty) -> float:
     """Evaluate the loss with its penalty; infinite for parameters outside their bounds."""
     with torch.no_grad():
         try:

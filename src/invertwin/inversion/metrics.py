@@ -16,6 +16,7 @@ from torch import Tensor
 from invertwin.channel import visible_points
 from invertwin.checks import ArrayLike, checked_count, checked_number
 from invertwin.errors import InputError
+from invertwin.runtime.memory import require_at_most
 from invertwin.scene import Itu, Material
 from invertwin.scene.material.materials import select_layer
 from invertwin.scene.material.values import Value, evaluate_value
@@ -307,11 +308,7 @@ def _shared_volume(
     # Voxel centres on a lattice of the frame, so that both meshes are voxelised equally.
     first = np.floor(both.min(0) / edge).astype(np.int64)
     shape = np.ceil(both.max(0) / edge).astype(np.int64) - first
-    if math.prod(map(int, shape)) > _MAX_VOXELS:
-        raise InputError(
-            f"expected at most {_MAX_VOXELS} voxels, got {' × '.join(map(str, shape))}; "
-            "give a larger voxel"
-        )
+    require_at_most(math.prod(map(int, shape)), _MAX_VOXELS, "voxels", "give a larger voxel")
     inside = [_mark_inside_voxels(mesh, first, shape, edge) for mesh in (found, truth)]
     joint, shared = inside[0] | inside[1], inside[0] & inside[1]
     if keep is not None:

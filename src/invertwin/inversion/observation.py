@@ -121,6 +121,13 @@ class Observation:
         """Return the data in the form of the model's maps."""
         return self.data if isinstance(self.data, Tensor) else self.model.observe(self.data)
 
+    def initial_sensor(self) -> Any:
+        """Return the sensor with its unknowns at their initial values."""
+        sensor = self.sensor
+        for unknown in name_unknowns(self.parameters).values():
+            sensor = unknown.build_module(sensor)(sensor)
+        return sensor
+
 
 def _sensor_of_recording(data: Any, model: ForwardModel) -> Any:
     """Return the radar of a recording; None for models without a sensor."""

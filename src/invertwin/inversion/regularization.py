@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from invertwin.checks import check_shape
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
@@ -41,13 +42,10 @@ class Laplacian:
         Raises:
             InputError: A mesh with another number of vertices.
         """
-        found = len(scene[self.object].mesh.vertices)
-        if found != len(self.start):
-            raise InputError(
-                f"expected the {len(self.start)} vertices of the initial shape of {self.object} "
-                f"for its Laplacian, got {found}; give one shape of each object"
-            )
-        moved = (scene[self.object].mesh.vertices - self.start) / self.unit
+        vertices = scene[self.object].mesh.vertices
+        what = f"vertices of {self.object} as those of its initial shape, for its Laplacian,"
+        check_shape(vertices, self.start.shape, what, "give one shape of each object")
+        moved = (vertices - self.start) / self.unit
         jump = moved[self.edges[:, 0]] - moved[self.edges[:, 1]]
         return 0.5 * self.weight * (self.weights * jump.square().sum(1)).sum()
 

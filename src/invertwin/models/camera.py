@@ -15,6 +15,8 @@ from invertwin.limits import Positive
 from invertwin.models.noise import add_white_errors
 from invertwin.scene.scene import Scene
 
+_Images = Float64[Tensor, "frame row column"]  # of every frame
+
 
 class _ImageMap(ForwardModel):
     """Base of the models of a camera's images."""
@@ -57,13 +59,11 @@ class SilhouetteMap(_ImageMap):
     sampling: ImageSampling = field(default_factory=ImageSampling)
     scatter: float | None = None
 
-    def predict(
-        self, scene: Scene, sensor: Camera, seed: int
-    ) -> Float64[Tensor, "frame row column"]:
+    def predict(self, scene: Scene, sensor: Camera, seed: int) -> _Images:
         """The masks. See ``ForwardModel.predict``."""
         return silhouettes(scene, sensor, self.objects, self.sampling, seed)
 
-    def observe(self, recording: ArrayLike) -> Float64[Tensor, "frame row column"]:
+    def observe(self, recording: ArrayLike) -> _Images:
         """Measured masks, [frame, row, column] or [row, column], from 0 to 1.
 
         Raises:
@@ -95,13 +95,11 @@ class DepthMap(_ImageMap):
     sampling: ImageSampling = field(default_factory=ImageSampling)
     scatter: float | None = None
 
-    def predict(
-        self, scene: Scene, sensor: Camera, seed: int
-    ) -> Float64[Tensor, "frame row column"]:
+    def predict(self, scene: Scene, sensor: Camera, seed: int) -> _Images:
         """The depths. See ``ForwardModel.predict``."""
         return depths(scene, sensor, self.far, self.sampling, seed)
 
-    def observe(self, recording: ArrayLike) -> Float64[Tensor, "frame row column"]:
+    def observe(self, recording: ArrayLike) -> _Images:
         """Measured depths, [frame, row, column] or [row, column] [m], at most ``far``.
 
         Raises:

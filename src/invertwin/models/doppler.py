@@ -12,6 +12,7 @@ from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.channel import Grid, Paths, Sampling, trace_power
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel, Realisations
+from invertwin.models.noise import noisy_realisations
 from invertwin.radar.processing.doppler import range_doppler_angle, velocity_axis
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
@@ -22,6 +23,7 @@ from invertwin.seeds import derive_seed
 from invertwin.simulation import simulate_chirps
 
 _LOOK_POINTS = 300  # of the largest moving surface
+_Maps = Float[Tensor, "frame velocity range u v"]  # power of every frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +80,7 @@ class RangeDopplerMap(ForwardModel):
                 "one bounce and fixed visibility"
             )
 
-    def predict(
-        self, scene: Scene, sensor: Radar, seed: int
-    ) -> Float[Tensor, "frame velocity range u v"]:
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> _Maps:
         """The expected power of what moves. See ``ForwardModel.predict``.
 
         Raises:
@@ -95,9 +95,7 @@ class RangeDopplerMap(ForwardModel):
         assert paths.velocity is not None
         return self.predict_paths(paths.select((paths.velocity.detach() != 0).any(1)), sensor)
 
-    def predict_paths(
-        self, paths: Paths, radar: Radar
-    ) -> Float[Tensor, "frame velocity range u v"]:
+    def predict_paths(self, paths: Paths, radar: Radar) -> _Maps:
         """Compute the map of moving paths. See ``range_doppler_power``.
 
         Args:
@@ -107,7 +105,7 @@ class RangeDopplerMap(ForwardModel):
         assert paths.velocity is not None
         return range_doppler_power(paths, paths.velocity, radar, self.grid, self.chirps, self.rates)
 
-    def observe(self, recording: ChirpCapture) -> Float[Tensor, "frame velocity range u v"]:
+    def observe(self, recording: ChirpCapture) -> _Maps:
         """The measured power of what moves.
 
         Raises:
@@ -134,25 +132,18 @@ class RangeDopplerMap(ForwardModel):
         begun = Scene({**still, **moving})
         area = max(item.mesh.area for item in moving.values())
         drawn = Sampling(depth=1, boundary=False, points_per_m2=_LOOK_POINTS / area)
-        shape = (sensor.frame_count, self.chirps.count, *sensor.shape[1:])
+        assert isinstance(sensor.waveform, SampledWaveform)
+        channels = (*sensor.shape[1:], sensor.waveform.samples)
+        shape = (sensor.frame_count, self.chirps.count, *channels)
 
         def to_map(beat: Tensor) -> Tensor:
             return self.observe(ChirpCapture(beat, sensor, self.chirps))
 
-        def white(key: int) -> Tensor:
-            assert isinstance(sensor.waveform, SampledWaveform)
-            generator = torch.Generator().manual_seed(key)
-            size = (*shape, sensor.waveform.samples)
-            return torch.randn(size, dtype=torch.complex128, generator=generator)
-
-        share = float(to_map(white(seed)).mean())
-
-        def look(number: int, noise: float) -> Tensor:
+        def simulate_beat(number: int) -> Tensor:
             own = derive_seed(number, 0)
-            beat = simulate_chirps(begun, sensor, self.chirps, seed=own, sampling=drawn)
-            return to_map(beat + (noise / share) ** 0.5 * white(derive_seed(number, 1)))
+            return simulate_chirps(begun, sensor, self.chirps, seed=own, sampling=drawn)
 
-        return look
+        return noisy_realisations(simulate_beat, to_map, shape, seed, dtype=torch.complex128)
 
     def crop_around(
         self, range_: float, rate: float, cells: int, radar: Radar

@@ -1,6 +1,7 @@
 """Forward models of a few flat conductors: coherent beam tracing."""
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -59,14 +60,8 @@ class FacetMap(ForwardModel):
         """The map with other noise each time; None for waveforms without samples."""
         if not isinstance(sensor.waveform, SampledWaveform):
             return None
-        beat = self._beat(scene, sensor)
-        return noisy_realisations(
-            lambda _: beat,
-            lambda signal: self._to_map(signal, sensor),
-            sensor,
-            seed,
-            holds_fields=self.holds_fields,
-        )
+        beat, to_map = self._beat(scene, sensor), partial(self._to_map, sensor=sensor)
+        return noisy_realisations(lambda _: beat, to_map, beat.shape, seed, self.holds_fields)
 
     @property
     def has_blur(self) -> bool:

@@ -6,34 +6,31 @@ import torch
 from torch import Tensor
 
 from invertwin.forward_model import Realisations
-from invertwin.radar.radar import Radar
-from invertwin.radar.waveform import SampledWaveform
 from invertwin.seeds import derive_seed
 
 
 def noisy_realisations(
     simulate_beat: Callable[[int], Tensor],
     to_map: Callable[[Tensor], Tensor],
-    sensor: Radar,
+    shape: tuple[int, ...],
     seed: int,
-    *,
     holds_fields: bool = False,
+    dtype: torch.dtype = torch.complex64,
 ) -> Realisations:
     """Return realisations of a map with receiver noise.
 
     Args:
         simulate_beat: function of a realisation's number that returns its beat signal.
         to_map: function that turns a beat signal into a map, as the model observes it.
-        sensor: radar with a sampled waveform.
+        shape: of a beat signal.
         seed: seed of the noise that calibrates the level of a bin.
         holds_fields: whether maps hold parts of fields, not power.
+        dtype: of the noise.
     """
-    assert isinstance(sensor.waveform, SampledWaveform)
-    shape = (*sensor.shape, sensor.waveform.samples)
 
     def white_noise(key: int) -> Tensor:
         generator = torch.Generator().manual_seed(key)
-        return torch.randn(shape, dtype=torch.complex64, generator=generator)
+        return torch.randn(shape, dtype=dtype, generator=generator)
 
     whole = to_map(white_noise(seed))
     share = float((whole.square() if holds_fields else whole).mean())

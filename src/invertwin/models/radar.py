@@ -16,11 +16,12 @@ from invertwin.channel import (
     Sampling,
     Speckle,
     as_absorbers,
+    deposit_batch,
     draw_speckle,
     trace_field,
     trace_target,
 )
-from invertwin.checks import set_fields
+from invertwin.checks import checked_count, set_fields
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel, Realisations
@@ -31,8 +32,8 @@ from invertwin.radar.signal.range_profile import beat_signal
 from invertwin.radar.signal.realisations import SpeckleRealisations
 from invertwin.radar.surrogate.surrogate import (
     Surrogate,
+    deposit_targets,
     resolve_surrogate,
-    surrogate_spectra,
     surrogate_spectrum,
 )
 from invertwin.radar.waveform import SampledWaveform
@@ -100,18 +101,9 @@ class SurrogateMap(ForwardModel):
         if self._reference is not None:
             fixed, device, scheme = self._reference
             reference = (fixed, device.link())
-        return surrogate_spectrum(
-            scene,
-            sensor,
-            self.grid,
-            self.kernels,
-            sampling=self.sampling,
-            seed=seed,
-            scheme=scheme,
-            reference=reference,
-            coherent=self.coherent,
-            stretch=self.stretch,
-        )
+        how: dict[str, Any] = {"sampling": self.sampling, "seed": seed, "scheme": scheme}
+        how |= {"reference": reference, "coherent": self.coherent, "stretch": self.stretch}
+        return surrogate_spectrum(scene, sensor, self.grid, self.kernels, **how)
 
     def predict_batch(
         self, scenes: Sequence[Scene], sensor: Radar, seed: int
@@ -134,16 +126,14 @@ class SurrogateMap(ForwardModel):
                 "expected a model for predictions, got one that was made for differences of one "
                 "scene; use predict, or the model that for_differences was called of"
             )
-        return surrogate_spectra(
-            scenes,
-            sensor,
-            self.grid,
-            self.kernels,
-            sampling=self.sampling,
-            seed=seed,
-            coherent=self.coherent,
-            stretch=self.stretch,
-        )
+        rest = [as_absorbers(scene, self.coherent) for scene in scenes]
+        deposit = deposit_batch(rest, sensor.link(), self.grid, sampling=self.sampling, seed=seed)
+        if self.coherent:
+            how = sensor, self.grid, self.kernels, self.sampling, self.coherent, self.stretch
+            targets = [torch.stack(deposit_targets(scene, *how)).sum(0) for scene in scenes]
+            deposit = deposit + torch.stack(targets)
+        spectra = self.kernels.shape(deposit.flatten(0, 1), sensor, self.grid)
+        return spectra.clamp_min(0.0).reshape(deposit.shape)
 
     def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
         """The measured power spectrum of a capture."""
@@ -182,12 +172,11 @@ class SurrogateMap(ForwardModel):
                 total = total + phasor * target.to(total)
             return total
 
-        return noisy_realisations(
-            simulate_beat,
-            lambda beat: exact_spectrum(beat, sensor, self.grid).to(torch.float32),
-            sensor,
-            seed,
-        )
+        def to_map(beat: Tensor) -> Tensor:
+            return exact_spectrum(beat, sensor, self.grid).to(torch.float32)
+
+        shape = (*sensor.shape, sensor.waveform.samples)
+        return noisy_realisations(simulate_beat, to_map, shape, seed)
 
     @property
     def has_blur(self) -> bool:
@@ -296,10 +285,7 @@ def surrogate_correlation(
     Raises:
         InputError: No looks.
     """
-    if realisations < 1:
-        raise InputError(
-            f"expected looks >= 1, got {realisations}; 16 looks leave a quarter of the speckle"
-        )
+    checked_count(realisations, "realisations", 1)
     if all(item.material.coherent for item in scene.objects.values()):
         realisations = 1
     exact = ExactMap(model.grid, model.sampling)

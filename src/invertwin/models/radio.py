@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, check_choice, checked_number, checked_tensor, set_fields
+from invertwin.checks import ArrayLike, check_fields, checked_number, checked_tensor, set_fields
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel, Realisations
+from invertwin.limits import NonNegative
 from invertwin.links.metasurface.coverage import Coverage
 from invertwin.links.metasurface.panel import Metasurface, panel_response
 from invertwin.links.places import ReceiverLocations
@@ -135,18 +136,16 @@ class RadioMap(ForwardModel):
     )
     floor_db: float = -200.0
     noise_dbm: float = -100.0
-    scatter: float | None = None
+    scatter: NonNegative | None = None
     without: Sequence[str] = ()
 
     redraws: ClassVar[bool] = False
     holds_fields: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check_choice(self.quantity, QUANTITIES, "a quantity among")
+        check_fields(self)
         checked_number(self.floor_db, "floor [dB]", -math.inf)
         checked_number(self.noise_dbm, "noise [dBm]", -math.inf)
-        if self.scatter is not None:
-            checked_number(self.scatter, "scatter of data", 0.0)
 
     def link_statistics(self, scene: Scene, sensor: Transmitters, seed: int) -> LinkStatistics:
         """Gain and delay spread, before any decibels.

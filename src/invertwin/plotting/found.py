@@ -28,11 +28,14 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
         top = max(float(np.quantile(strength, 0.998)), 1e-300)
         level = np.clip(10 * np.log10(np.maximum(strength, 1e-30) / top), -dynamic_range, 0)
         blind = numbers(twin.image.view_counts) == 0
-        side = 72 * 5 / max(float(np.ptp(places, axis=0).max()), 1e-6) * _grid_step(places)
+        gaps = np.diff(np.unique(places[:, 1]))
+        step = float(gaps.min()) if len(gaps) else 0.1
+        side = 72 * 5 / max(float(np.ptp(places, axis=0).max()), 1e-6) * step
         style = {"s": max(1.3 * side, 1.0) ** 2, "marker": "s", "linewidths": 0}
         dots = axes.scatter(*places[~blind, ::-1].T, c=level[~blind], cmap="magma", **style)
         axes.scatter(*places[blind, ::-1].T, color="0.75", label="never seen", **style)
         figure.colorbar(dots, label="echoes, dB below bright ones", shrink=0.8)
+    box = {"boxstyle": "round", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
     for thing in twin.objects:
         x, y = thing.position[:2].tolist()
         at = y, x
@@ -51,20 +54,8 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
             ahead, left = thing.velocity[:2].tolist()
             if math.hypot(ahead, left) > 0:
                 axes.annotate("", (y + left, x + ahead), at, arrowprops={"arrowstyle": "->"})
-        axes.annotate(
-            f"{thing.name}: {thing.kind}",
-            at,
-            fontsize=7,
-            xytext=(14, 14),
-            textcoords="offset points",
-            bbox={"boxstyle": "round", "facecolor": "white", "alpha": 0.8, "linewidth": 0},
-        )
+        text = f"{thing.name}: {thing.kind}"
+        axes.annotate(text, at, (14, 14), textcoords="offset points", fontsize=7, bbox=box)
     if twin.image is not None and bool((twin.image.view_counts == 0).any()):
         axes.legend(fontsize=7, loc="upper right")
     return figure
-
-
-def _grid_step(positions: np.ndarray) -> float:
-    """The distance of neighbouring places along the second axis."""
-    gaps = np.diff(np.unique(positions[:, 1]))
-    return float(gaps.min()) if len(gaps) else 0.1

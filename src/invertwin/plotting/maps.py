@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from invertwin.channel import Grid
+from invertwin.checks import check_shape
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.inversion.confidence.realisations import coarsen_map
@@ -206,11 +207,7 @@ def _title_maps(maps: Maps) -> Mapping[str, Tensor]:
 
 def _views(power: Tensor, grid: Grid) -> list[MapPanel]:
     """Range × azimuth and range × elevation where they are resolved, else range × frame."""
-    if tuple(power.shape[1:]) != grid.shape:
-        raise InputError(
-            f"expected a map [frame, {', '.join(map(str, grid.shape))}] on the grid, got "
-            f"{list(power.shape)}; give the grid that the map was made on"
-        )
+    check_shape(power, (None, *grid.shape), "a map", "give the grid that it was made on")
     views = []
     if grid.u_count > 1:
         views.append(MapPanel(power.sum((0, 3)), grid.ranges, grid.u, U_LABEL))
@@ -248,13 +245,8 @@ def _limit(panel: MapPanel) -> float:
 
 
 def _draw_image(cell: Any, title: str, panel: MapPanel, values: NDArray, **style: Any) -> Any:
-    image = cell.imshow(
-        values,
-        origin="lower",
-        aspect="auto",
-        extent=(*_bin_edges(panel.across), *_bin_edges(panel.ranges)),
-        **style,
-    )
+    extent = (*_bin_edges(panel.across), *_bin_edges(panel.ranges))
+    image = cell.imshow(values, origin="lower", aspect="auto", extent=extent, **style)
     label_axes(cell, title, panel.label)
     if panel.label in (U_LABEL, V_LABEL):
         _add_degrees(cell, "azimuth" if panel.label == U_LABEL else "elevation")

@@ -38,16 +38,9 @@ def floor_plan(
     low, high = (numbers(corner) for corner in corners)
     top = max(float(value.max()) for value in levels.values())
     image: Any = None
+    place = {"origin": "lower", "extent": (low[0], high[0], low[1], high[1]), "aspect": "equal"}
     for axes, (title, value) in zip(cells, levels.items(), strict=True):
-        image = axes.imshow(
-            numbers(value).T,
-            origin="lower",
-            extent=(low[0], high[0], low[1], high[1]),
-            vmin=top - _SPAN,
-            vmax=top,
-            cmap="viridis",
-            aspect="equal",
-        )
+        image = axes.imshow(numbers(value).T, vmin=top - _SPAN, vmax=top, cmap="viridis", **place)
         _draw_walls(axes, scene, height, 1.5)
         axes.plot(*numbers(tx)[:2], "^", color="white", markeredgecolor="black", label="sender")
         if title != next(iter(levels)):

@@ -1,6 +1,7 @@
 """Figures of radar signatures: cross-sections over aspect or frequency, profiles, images."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -55,15 +56,10 @@ def _lines(
 ) -> None:
     """Curves with a legend; dashed are those whose names begin so."""
     for number, (name, curve) in enumerate(curves.items()):
-        axes.plot(
-            numbers(across),
-            numbers(curve),
-            "--" if name.startswith(dashed) else "-",
-            marker="." if len(curve) < 8 else "",
-            color=color(number),
-            lw=1.1,
-            label=legible(name),
-        )
+        line = "--" if name.startswith(dashed) else "-"
+        look: dict[str, Any] = {"color": color(number), "lw": 1.1, "label": legible(name)}
+        look["marker"] = "." if len(curve) < 8 else ""
+        axes.plot(numbers(across), numbers(curve), line, **look)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
 

@@ -39,14 +39,8 @@ def paint(axes: Any, shapes: Sequence[tuple[Shape, str]], eye: NDArray, longest:
     triangles, color = np.concatenate(polygons), np.concatenate(colors)
     order = np.argsort(triangles[:, :, 2].mean(axis=1))
     # Edges in the face's own colour close the hairlines between neighbouring triangles.
-    axes.add_collection(
-        PolyCollection(
-            list(triangles[order][:, :, :2]),
-            facecolors=color[order],
-            edgecolors=color[order],
-            linewidths=0.3,
-        )
-    )
+    drawn, tint = list(triangles[order][:, :, :2]), color[order]
+    axes.add_collection(PolyCollection(drawn, facecolors=tint, edgecolors=tint, linewidths=0.3))
 
 
 def small_triangles(triangles: NDArray, longest: float) -> NDArray:

@@ -14,6 +14,7 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import taper
 
 _FLATNESS = 0.05
+_Elements = Float64[Tensor, " element"]  # coordinates [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +93,7 @@ class Aperture:
         return torch.polar(torch.ones_like(phase), phase)
 
     def beams(
-        self,
-        u: Float64[Tensor, " u"],
-        v: Float64[Tensor, " v"],
-        y: Float64[Tensor, " element"],
-        z: Float64[Tensor, " element"],
+        self, u: Float64[Tensor, " u"], v: Float64[Tensor, " v"], y: _Elements, z: _Elements
     ) -> Complex[Tensor, "direction element"]:
         """Return ``steering`` of planar elements towards all pairs of direction cosines, u slowest.
 

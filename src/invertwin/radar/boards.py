@@ -22,6 +22,7 @@ from invertwin.scene.antenna import AntennaArray, Isotropic, Pattern, Polarised
 
 TxRxArrays = tuple[AntennaArray, AntennaArray]  # TX and RX
 ElementGrid = Annotated[Sequence[Annotated[Sequence[float], Len(2, 2)]], MinLen(1)]
+_Numbers = Sequence[int] | None  # of elements from 1; None = all
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,8 @@ class Board:
         *,
         elevation: int | None = None,
         azimuth: int = 1,
-        transmitters: Sequence[int] | None = None,
-        receivers: Sequence[int] | None = None,
+        transmitters: _Numbers = None,
+        receivers: _Numbers = None,
         pattern: Pattern | None = None,
         polarisation: Polarised | None = None,
         leakage: float | ArrayLike = 0.0,
@@ -121,9 +122,7 @@ class Board:
         unit = SPEED_OF_LIGHT / self.design_frequency / 2
         pattern = Isotropic() if pattern is None else pattern
 
-        def array(
-            grid_positions: ElementGrid, numbers: Sequence[int] | None, name: str
-        ) -> AntennaArray:
+        def array(grid_positions: ElementGrid, numbers: _Numbers, name: str) -> AntennaArray:
             grid = torch.tensor(grid_positions, dtype=torch.float64)
             grid = (grid - grid.mean(dim=0)) * torch.tensor(signs, dtype=torch.float64) * unit
             positions = torch.cat([torch.zeros_like(grid[:, :1]), grid], dim=1)
@@ -133,7 +132,7 @@ class Board:
 
         return array(self.transmitters, transmitters, "TX"), array(self.receivers, receivers, "RX")
 
-    def _indices(self, positions: ElementGrid, chosen: Sequence[int] | None, name: str) -> Tensor:
+    def _indices(self, positions: ElementGrid, chosen: _Numbers, name: str) -> Tensor:
         numbers = list(range(1, len(positions) + 1)) if chosen is None else list(chosen)
         wrong = [number for number in numbers if not 1 <= number <= len(positions)]
         if wrong or not numbers or len(set(numbers)) < len(numbers):
@@ -162,15 +161,13 @@ class Mounting:
     board: Board | str
     elevation: int | None = None
     azimuth: int = 1
-    transmitters: Sequence[int] | None = None
-    receivers: Sequence[int] | None = None
+    transmitters: _Numbers = None
+    receivers: _Numbers = None
     pattern: Pattern | None = None
     polarisation: Polarised | None = None
     leakage: float = 0.0
 
-    def arrays(
-        self, transmitters: Sequence[int] | None = None, receivers: Sequence[int] | None = None
-    ) -> TxRxArrays:
+    def arrays(self, transmitters: _Numbers = None, receivers: _Numbers = None) -> TxRxArrays:
         """Return active TX (in the order of transmission) and RX elements: its own, or those of a
         recording.
 
@@ -190,15 +187,10 @@ class Mounting:
                     f"the recording's settings say {list(recorded)}"
                 )
         found = board(self.board) if isinstance(self.board, str) else self.board
-        return found.arrays(
-            elevation=self.elevation,
-            azimuth=self.azimuth,
-            transmitters=transmitters or self.transmitters,
-            receivers=receivers or self.receivers,
-            pattern=self.pattern,
-            polarisation=self.polarisation,
-            leakage=self.leakage,
-        )
+        how = {name: value for name, value in vars(self).items() if name != "board"}
+        how["transmitters"] = transmitters or self.transmitters
+        how["receivers"] = receivers or self.receivers
+        return found.arrays(**how)
 
 
 def _row(*columns: float) -> tuple[tuple[float, float], ...]:

@@ -211,12 +211,8 @@ class Radar:
         if paths.matrix is None:
             return paths.coefficient
         sent, received = self.transmitters.jones.mixtures, self.receivers.jones.mixtures
-        expected = received.shape[1], sent.shape[1]
-        if tuple(paths.matrix.shape[1:]) != expected:
-            raise InputError(
-                f"expected paths between {expected[1]} and {expected[0]} polarisations, got "
-                f"{list(paths.matrix.shape[1:])}; trace with the link of the same radar"
-            )
+        expected, do = (None, received.shape[1], sent.shape[1]), "trace with the link of this radar"
+        check_shape(paths.matrix, expected, "paths (path, received, sent polarisation)", do)
         return torch.einsum("r,prt,t->p", received[receiver], paths.matrix, sent[transmitter])
 
     def transform_rigidly(

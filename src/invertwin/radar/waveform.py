@@ -28,6 +28,8 @@ from invertwin.limits import (
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
 SIGMA_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
+_Samples = Complex[Tensor, "*batch sample"]  # beat or symbols
+_Values = Float64[Tensor, " point"]  # one at every point
 
 
 class Waveform(ABC):
@@ -57,9 +59,7 @@ class Waveform(ABC):
         return SPEED_OF_LIGHT / (2 * self.bandwidth)
 
     @abstractmethod
-    def range_response(
-        self, distance: Float64[Tensor, " point"], window: str
-    ) -> Float64[Tensor, " point"]:
+    def range_response(self, distance: _Values, window: str) -> _Values:
         """Return the power of a point target at a distance from its range, peak 1.
 
         Args:
@@ -102,9 +102,7 @@ class SampledWaveform(Waveform):
         """Unambiguous range of complex samples, N c/2B = c/(2 step) [m]."""
         return self.samples * self.range_resolution
 
-    def range_response(
-        self, distance: Float64[Tensor, " point"], window: str
-    ) -> Float64[Tensor, " point"]:
+    def range_response(self, distance: _Values, window: str) -> _Values:
         """Return |Σ w_n exp(2πj n d/R_max) / Σ w_n|², the power of a point target at range offset
         d.
 
@@ -247,8 +245,8 @@ class OFDM(SampledWaveform):
         return self.bandwidth
 
     def receive_symbols(
-        self, beat: Complex[Tensor, "*batch sample"], symbols: Complex[Tensor, "*#batch sample"]
-    ) -> Complex[Tensor, "*batch sample"]:
+        self, beat: _Samples, symbols: Complex[Tensor, "*#batch sample"]
+    ) -> _Samples:
         """Return Y = H X, the receiver's FFT output for these symbols.
 
         Args:
@@ -262,10 +260,8 @@ class OFDM(SampledWaveform):
 
     @rename_arguments(received="received_symbols")
     def beat(
-        self,
-        received_symbols: Complex[Tensor, "*batch sample"],
-        symbols: Complex[Tensor, "*#batch sample"],
-    ) -> Complex[Tensor, "*batch sample"]:
+        self, received_symbols: _Samples, symbols: Complex[Tensor, "*#batch sample"]
+    ) -> _Samples:
         """Return conj(Y / X), the samples of ``range_profile``.
 
         Args:
@@ -306,9 +302,7 @@ class Impulse(Waveform):
     center_frequency: Frequency
     bandwidth: Bandwidth
 
-    def range_response(
-        self, distance: Float64[Tensor, " point"], window: str
-    ) -> Float64[Tensor, " point"]:
+    def range_response(self, distance: _Values, window: str) -> _Values:
         """Return the power of the pulse beside the target's range, peak 1.
 
         Args:
@@ -357,9 +351,7 @@ def unit_window(name: str, count: int) -> Float64[Tensor, " sample"]:
     return weight / weight.sum()
 
 
-def gaussian_response(
-    waveform: Waveform, distance: Float64[Tensor, " point"]
-) -> Float64[Tensor, " point"]:
+def gaussian_response(waveform: Waveform, distance: _Values) -> _Values:
     """Return a Gaussian whose full width at half maximum is one range cell, peak 1.
 
     Args:

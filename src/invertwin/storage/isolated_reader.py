@@ -202,29 +202,26 @@ _READERS: dict[str, Callable[[str, str], StoredArrays]] = {
 
 
 def _pack_arrays(stored: StoredArrays) -> "list[np.ndarray]":
-    """Plain arrays; the last is text that names the others by their number."""
+    """Plain arrays; the last is text that says whose values or attribute each other is."""
     import numpy as np
 
+    labels: list[tuple[Any, ...]] = []  # name, dimensions, key of an attribute
     arrays: list[np.ndarray] = []
 
-    def add_array(name: str, value: Any) -> int:
+    def add_array(value: Any, *label: Any) -> None:
         array = np.asarray(value)
         if array.dtype.hasobject:
-            raise ValueError(f"{name} holds objects, not numbers or text")
+            raise ValueError(f"{label[2] or label[0]} holds objects, not numbers or text")
+        labels.append(label)
         arrays.append(array)
-        return len(arrays) - 1
 
-    def add_arrays(values: dict[str, Any]) -> dict[str, int]:
-        return {name: add_array(name, value) for name, value in values.items()}
-
-    names = {
-        "arrays": [
-            [name, array.dimensions, add_array(name, array.values), add_arrays(array.attributes)]
-            for name, array in stored.arrays.items()
-        ],
-        "attributes": add_arrays(stored.attributes),
-    }
-    return [*arrays, np.asarray(json.dumps(names))]
+    for name, array in stored.arrays.items():
+        add_array(array.values, name, array.dimensions, None)
+        for key, value in array.attributes.items():
+            add_array(value, name, (), key)
+    for key, value in stored.attributes.items():
+        add_array(value, None, (), key)
+    return [*arrays, np.asarray(json.dumps(labels))]
 
 
 def _unpack_arrays(content: bytes) -> StoredArrays:
@@ -232,18 +229,12 @@ def _unpack_arrays(content: bytes) -> StoredArrays:
 
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         *packed, text = archive.values()
-    names = json.loads(text.item())
-
-    def attributes(numbers: dict[str, int]) -> dict[str, Any]:
-        found = {name: packed[number] for name, number in numbers.items()}
+    found = StoredArrays({}, {})
+    for value, (name, dimensions, key) in zip(packed, json.loads(text.item()), strict=True):
+        if key is None:
+            found.arrays[name] = StoredArray(tuple(dimensions), value, {})
+            continue
+        own = found.attributes if name is None else found.arrays[name].attributes
         # A number of NumPy stays one; text of NumPy is text.
-        return {
-            name: value.item() if value.ndim == 0 and value.dtype.kind == "U" else value[()]
-            for name, value in found.items()
-        }
-
-    arrays = {
-        name: StoredArray(tuple(dimensions), packed[number], attributes(own))
-        for name, dimensions, number, own in names["arrays"]
-    }
-    return StoredArrays(arrays, attributes(names["attributes"]))
+        own[key] = value.item() if value.ndim == 0 and value.dtype.kind == "U" else value[()]
+    return found

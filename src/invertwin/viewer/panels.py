@@ -43,21 +43,16 @@ class MapPanels:
         self._known: dict[str, tuple[Any, Any]] = {}
         # The image's first axis, which is that of u, its foot, and what is behind it.
         turn = _quaternion(np.stack([self.left, -up, -ahead], axis=1))
+        empty = np.zeros((8, 8, 3), np.uint8)
+        unlit = {"cast_shadow": False, "receive_shadow": False}
         for number, name in enumerate(shown):
             # The first one stands on the left of who looks along the radar.
             across = 1.1 * self._size * ((len(shown) - 1) / 2 - number)
             place = (low + high) / 2 + self.offset + across * self.left
             self._places[name] = place
+            sides, pose = (self._size, self._size), {"wxyz": turn, "position": place}
             self._nodes[name] = server.scene.add_image(
-                f"/maps/{name}",
-                np.zeros((8, 8, 3), np.uint8),
-                self._size,
-                self._size,
-                format="png",
-                cast_shadow=False,
-                receive_shadow=False,
-                wxyz=turn,
-                position=place,
+                f"/maps/{name}", empty, *sides, format="png", **pose, **unlit
             )
             server.scene.add_label(
                 f"/maps/{name}/label", name, position=(0.0, -0.55 * self._size, 0.0)

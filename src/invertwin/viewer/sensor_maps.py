@@ -97,15 +97,9 @@ def _collect_maps(
         radar = sensor.radar.frames(frames)
         places, rotations, origins = radar.positions, radar.link().rotations, radar.origins
     rows, columns = _block_axis(ranges, blocks[0]), _block_axis(across, blocks[1])
-    return SensorMaps(
-        frames,
-        (*rows, *columns),
-        to_float32(places),
-        to_float32(rotations),
-        to_float32(origins),
-        measured,
-        None if simulated is None else max_pool(simulated),
-    )
+    place, turn, origin = (to_float32(values) for values in (places, rotations, origins))
+    pooled = None if simulated is None else max_pool(simulated)
+    return SensorMaps(frames, (*rows, *columns), place, turn, origin, measured, pooled)
 
 
 def _simulate_maps(display: Display, sensor: InteractiveSensor, frames: list[int]) -> Tensor | None:

@@ -284,18 +284,10 @@ class Viewer:
         node = "/" + "/".join(part.replace("/", "∕") for part in layer.name.split("/", 1))
         how: dict[str, Any] = {"visible": visible}
         if layer.kind == "surface":
-            made = scene.add_mesh_simple(
-                node,
-                layer.points,
-                layer.faces,
-                color=layer.color,
-                opacity=None if layer.opacity == 1 else layer.opacity,
-                flat_shading=True,
-                side="double",
-                cast_shadow=False,
-                receive_shadow=False,
-                **how,
-            )
+            how |= {"color": layer.color, "opacity": None if layer.opacity == 1 else layer.opacity}
+            how |= {"cast_shadow": False, "receive_shadow": False}
+            look = {"flat_shading": True, "side": "double"}
+            made = scene.add_mesh_simple(node, layer.points, layer.faces, **look, **how)
         elif layer.kind == "lines":
             pairs = layer.points.reshape(-1, 2, 3)
             thick = {"thickness": 1.5, "thickness_units": "screen"}
@@ -306,15 +298,9 @@ class Viewer:
                 radius = np.linalg.norm(layer.points - middle, axis=1).max()
                 scene.add_label(f"{node}/radius", f"95 %: {1e3 * radius:.2g} mm", position=middle)
         else:
-            made = scene.add_point_cloud(
-                node,
-                layer.points,
-                colors=layer.color,
-                point_size=0.006 * size * self._size,
-                point_shape="circle",
-                precision="float32",
-                **how,
-            )
+            how |= {"point_size": 0.006 * size * self._size, "point_shape": "circle"}
+            how |= {"colors": layer.color, "precision": "float32"}
+            made = scene.add_point_cloud(node, layer.points, **how)
         self._nodes[layer.name] = made
 
     def _run_worker(self) -> None:
@@ -365,7 +351,8 @@ class Viewer:
             maps |= {SIMULATED: to_float32(link.predict_map(scene, state.frame))}
         self._panels.show(maps, state.bin)
         if state.bin is not None:
-            self._bin.value = self._describe_bin(state.sensor, *state.bin)
+            (row, column), (ranges, across) = state.bin, self._axes_of(state.sensor)
+            self._bin.value = f"range {ranges[row]:.2f} m, u {across[column]:.3f}"
         if link is None or scene is None:
             return
         now = time.perf_counter()
@@ -384,11 +371,6 @@ class Viewer:
             return grid.ranges.tolist(), grid.u.tolist()
         maps = self._display.maps[sensor]
         return maps.ranges, maps.across
-
-    def _describe_bin(self, sensor: str, row: int, column: int) -> str:
-        """A bin in words."""
-        ranges, across = self._axes_of(sensor)
-        return f"range {ranges[row]:.2f} m, u {across[column]:.3f}"
 
     def _show_paths(self, sample: PositionSample, chosen: tuple[int, int] | None) -> None:
         points = to_float32(sample.points)

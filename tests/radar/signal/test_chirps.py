@@ -368,8 +368,8 @@ def test_order_reaches_signals_and_compensation(point_paths):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Chirps(2, 1e-4, order=(0, 2)), "every transmitter from 0 once"),
-        (lambda: Chirps(2, 1e-4, order=(1, 1)), "every transmitter from 0 once"),
+        (lambda: Chirps(2, 1e-4, order=(0, 2)), "each of 2 transmitters once, from 0"),
+        (lambda: Chirps(2, 1e-4, order=(1, 1)), "each of 2 transmitters once, from 0"),
         (lambda: Chirps(2, 1e-4, tdm=False, order=(1, 0)), "send at once"),
         (lambda: Chirps(2, 1e-4, order=(1, 0)).times(3), "order of 3 transmitters"),
     ],

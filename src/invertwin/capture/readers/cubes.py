@@ -10,8 +10,11 @@ from jaxtyping import Complex
 from torch import Tensor
 
 from invertwin.errors import InputError
+from invertwin.radar.signal.chirps import check_order
 
 _Beat = Complex[Tensor, "frame chirp tx rx sample"]
+_Order = Sequence[int] | None  # of the turns of transmitters
+_Pulses = Complex[Tensor, "frame pulse rx sample"]  # cube of OpenRadar
 
 
 def to_radarsimpy(beat: _Beat) -> Complex[Tensor, "channel chirp sample"]:
@@ -42,9 +45,7 @@ def from_radarsimpy(
     return baseband.unflatten(0, (-1, transmitters, receivers)).transpose(2, 3).transpose(1, 2)
 
 
-def to_openradar(
-    beat: _Beat, order: Sequence[int] | None = None
-) -> Complex[Tensor, "frame pulse rx sample"]:
+def to_openradar(beat: _Beat, order: _Order = None) -> _Pulses:
     """Samples as OpenRadar's ``adc_data``: [frames, chirps, receivers, samples].
 
     Transmitters take turns within a loop, so its chirps are loops × transmitters;
@@ -58,14 +59,11 @@ def to_openradar(
     Raises:
         InputError: An order that does not name every transmitter once.
     """
-    return beat[:, :, _check_transmit_order(order, beat.shape[2])].flatten(1, 2)
+    turns = range(beat.shape[2]) if order is None else order
+    return beat[:, :, check_order(turns, beat.shape[2])].flatten(1, 2)
 
 
-def from_openradar(
-    adc_data: Complex[Tensor, "frame pulse rx sample"],
-    transmitters: int,
-    order: Sequence[int] | None = None,
-) -> _Beat:
+def from_openradar(adc_data: _Pulses, transmitters: int, order: _Order = None) -> _Beat:
     """Convert a cube of OpenRadar, organised there or made by ``to_openradar``.
 
     Args:
@@ -78,18 +76,8 @@ def from_openradar(
             transmitter once.
     """
     _check_divides(adc_data.shape[1], transmitters, "chirps", "transmitters")
-    places = _check_transmit_order(order, transmitters).argsort()
-    return adc_data.unflatten(1, (-1, transmitters))[:, :, places]
-
-
-def _check_transmit_order(order: Sequence[int] | None, transmitters: int) -> Tensor:
-    turns = list(range(transmitters)) if order is None else list(order)
-    if sorted(turns) != list(range(transmitters)):
-        raise InputError(
-            f"expected an order that names each of {transmitters} transmitters once, from 0, got "
-            f"{turns}; take Chirps.order"
-        )
-    return torch.tensor(turns)
+    turns = check_order(range(transmitters) if order is None else order, transmitters)
+    return adc_data.unflatten(1, (-1, transmitters))[:, :, torch.tensor(turns).argsort()]
 
 
 def _check_divides(size: int, parts: int, what: str, of: str) -> None:

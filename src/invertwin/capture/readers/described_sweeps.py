@@ -39,6 +39,7 @@ _KEYS = {
 }
 _DWELL = 1e-3  # s, of an analyser whose filter is 1 kHz wide
 _SPACING_TOLERANCE = 0.01  # of a step: how far a frequency may be off; then a phase is right to 4°
+_Frequencies = Float64[Tensor, " sample"]  # of a sweep [Hz]
 
 
 def describes_sweeps(path: str | Path) -> bool:
@@ -133,9 +134,7 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
 
 
 def _select_band(
-    frequencies: Float64[Tensor, " sample"],
-    beat: Complex128[Tensor, "frame tx rx sample"],
-    band: Any,
+    frequencies: _Frequencies, beat: Complex128[Tensor, "frame tx rx sample"], band: Any
 ) -> tuple[Float64[Tensor, " part"], Complex128[Tensor, "frame tx rx part"]]:
     """Select the frequencies within a band [Hz], and their samples."""
     if band is None:
@@ -217,7 +216,7 @@ def _find_data_files(folder: Path, data: dict[str, Any]) -> list[Path]:
 
 def _load_touchstone_sweeps(
     files: list[Path], sweep: dict[str, Any], folder: Path
-) -> tuple[Float64[Tensor, " sample"], Complex128[Tensor, "frame 1 1 sample"]]:
+) -> tuple[_Frequencies, Complex128[Tensor, "frame 1 1 sample"]]:
     """Frequencies, and the beat signal of every file less the background."""
     frequencies, first = _load_parameter(files[0], sweep)
     rows = [first, *(_load_response(file, sweep, frequencies) for file in files[1:])]
@@ -255,9 +254,7 @@ def _load_response(file: Path, sweep: dict[str, Any], frequencies: Tensor) -> Te
     return response
 
 
-def _load_frequencies(
-    source: _SweepFile, sweep: dict[str, Any], samples: int
-) -> Float64[Tensor, " sample"]:
+def _load_frequencies(source: _SweepFile, sweep: dict[str, Any], samples: int) -> _Frequencies:
     """Frequencies of the samples of a phase history."""
     if "frequencies" in sweep:
         given = np.ravel(source.values(sweep["frequencies"]))
@@ -271,7 +268,7 @@ def _load_frequencies(
     return float(sweep["start_frequency"]) + float(sweep["step"]) * count
 
 
-def _frequency_spacing(frequencies: Float64[Tensor, " sample"]) -> tuple[float, float]:
+def _frequency_spacing(frequencies: _Frequencies) -> tuple[float, float]:
     """First frequency and step of equally spaced ones [Hz]."""
     count = len(frequencies)
     if count < 2:

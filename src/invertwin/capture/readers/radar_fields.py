@@ -9,6 +9,7 @@ import torch
 import xarray as xr
 from torch import Tensor
 
+from invertwin.checks import check_shape
 from invertwin.constants import OLD_AXES
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
@@ -112,11 +113,8 @@ def to_data_array(dims: tuple[str, ...], value: Tensor, unit: str) -> xr.DataArr
     Raises:
         InputError: another number of dimensions.
     """
-    if value.ndim != len(dims):
-        raise InputError(
-            f"expected dimensions {', '.join(dims)}, got shape {tuple(value.shape)}; "
-            "give one size for each of them"
-        )
+    what, do = f"dimensions {', '.join(dims)}", "give one size for each of them"
+    check_shape(value, [None] * len(dims), what, do)
     values = value.detach().cpu().resolve_conj().numpy().copy()
     return xr.DataArray(values, dims=dims, attrs={"units": unit})
 

@@ -236,20 +236,16 @@ def _divisors(number: int) -> list[int]:
 
 def _apply_changes(changes: dict[str, Any], settings: ChirpSettings) -> ChirpSettings | None:
     """The settings with changes, if a device could have recorded them."""
-    if changes.get("samples", _MIN_BLOCK_SAMPLES) < _MIN_BLOCK_SAMPLES:
-        return None
-    if any(getattr(settings, name, None) == value for name, value in changes.items()):
+    short = changes.get("samples", _MIN_BLOCK_SAMPLES) < _MIN_BLOCK_SAMPLES
+    if short or any(getattr(settings, name, None) == value for name, value in changes.items()):
         return None
     try:
         made = change_settings(settings, changes)
     except InputError:  # the ramp does not hold the samples
         return None
-    if layout_error(made) is not None:
-        return None
     ramps = made.loops * len(made.transmit_order) * (made.idle_time + made.ramp_time)
-    if made.frame_period is not None and ramps > made.frame_period * (1 + 1e-9):
-        return None
-    return made
+    late = made.frame_period is not None and ramps > made.frame_period * (1 + 1e-9)
+    return None if late or layout_error(made) is not None else made
 
 
 def measure_evidence(words: np.ndarray, settings: ChirpSettings) -> LayoutEvidence:

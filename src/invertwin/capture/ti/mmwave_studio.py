@@ -53,15 +53,12 @@ def read_studio(path: str | Path) -> ChirpSettings:
         _require_equal(mode, "raw", "a recording in raw mode (dataLoggingMode)", do)
         path = _sibling_path(path, str(content["configUsed"]))
         content = _load_json(path)
+    do = "save the settings again with mmWave Studio"
     try:
-        return _parse_settings(content, device)
+        with convert_read_errors(path, "the keys of mmWave Studio", do):
+            return _parse_settings(content, device)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from error
-    except (KeyError, TypeError, ValueError, ArithmeticError) as error:
-        raise InputError(
-            f"expected the keys of mmWave Studio in {path.name}, got none or another value for "
-            f"{error}; save the settings again with mmWave Studio"
-        ) from error
 
 
 @safe_reader("a setup of mmWave Studio", "save it again with mmWave Studio")

@@ -28,7 +28,6 @@ from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.cli.schema.radio_tables import ReceivedData
 from invertwin.cli.schema.recordings import build_chirp_capture
 from invertwin.cli.schema.shape_tables import MovingTargetParameter
-from invertwin.inversion.observation import name_unknowns
 from invertwin.models.radar import SurrogateMap
 from invertwin.runtime.memory import format_gigabytes, free_memory
 from invertwin.runtime.progress import format_duration
@@ -42,6 +41,7 @@ _FIT_TASKS = ("reconstruct", "demo")
 _SIMULATION_TASKS = ("simulate", "dataset")
 _STEPS, _STARTS = "reconstruct.steps", ("transmitter_starts.count", "placement.starts")
 _COUNT_HEADS = ("needs", "how many", "key")
+_Needs = tuple[list[ReportTable], str]  # resources and meshes, and a line with the time
 
 
 def run_check(run: RunFile) -> tuple[list[ReportTable], str]:
@@ -66,9 +66,7 @@ def run_check(run: RunFile) -> tuple[list[ReportTable], str]:
     return _make_tables(found, truth, seconds, work)
 
 
-def _make_tables(
-    found: ResourceEstimate, scene: Scene, seconds: float, work: str
-) -> tuple[list[ReportTable], str]:
+def _make_tables(found: ResourceEstimate, scene: Scene, seconds: float, work: str) -> _Needs:
     rows = [[part.name, part.count, part.memory / 1e9, part.key] for part in found.memory_items]
     heads = ("needs", "how many", "GB", "key")
     line = (
@@ -79,7 +77,7 @@ def _make_tables(
     return [needs, _mesh_table(scene)], line
 
 
-def _check_other_data(run: RunFile) -> tuple[list[ReportTable], str]:
+def _check_other_data(run: RunFile) -> _Needs:
     """Check fits to other data than radar maps: the time of one map of each stage."""
     if isinstance(run.data, ReceivedData):
         # Data that know no more than the fit are simulated in the time of one map.
@@ -87,9 +85,7 @@ def _check_other_data(run: RunFile) -> tuple[list[ReportTable], str]:
         run = run.model_copy(update={"data": run.data.model_copy(update=known)})
     problem = build_problem(run, Console(quiet=True))
     observation = make_observations(problem, problem.starts()[0])[0]
-    sensor = observation.sensor
-    for unknown in name_unknowns(observation.parameters).values():
-        sensor = unknown.build_module(sensor)(sensor)
+    sensor = observation.initial_sensor()
     rows: list[list[object]] = []
     seconds, maps = 0.0, 0.0
     for method in problem.methods:
@@ -105,7 +101,7 @@ def _check_other_data(run: RunFile) -> tuple[list[ReportTable], str]:
     return [ReportTable("Estimate", _COUNT_HEADS, rows), _mesh_table(problem.scene)], line
 
 
-def _check_checked_map(run: RunFile) -> tuple[list[ReportTable], str]:
+def _check_checked_map(run: RunFile) -> _Needs:
     """Check a gradient check of `[map]` or `[placement]`, whose memory is constant."""
     scene, check = build.scene(run), require_section(run, "gradcheck", run.task)
     model, sensor = checked_map(run, scene)
@@ -117,7 +113,7 @@ def _check_checked_map(run: RunFile) -> tuple[list[ReportTable], str]:
     return [ReportTable("Estimate", _COUNT_HEADS, rows), _mesh_table(scene)], line
 
 
-def _check_image(run: RunFile) -> tuple[list[ReportTable], str]:
+def _check_image(run: RunFile) -> _Needs:
     """Check `[image]`, whose memory is constant: the time of one image."""
     scene, check = build.scene(run), require_section(run, "gradcheck", run.task)
     model, camera = build.build_section(run, "image"), build.build_section(run, "camera")
@@ -140,7 +136,7 @@ def _time_call(work: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
-def _check_rcs(run: RunFile) -> tuple[list[ReportTable], str]:
+def _check_rcs(run: RunFile) -> _Needs:
     """Check `[rcs]`: extrapolate its time from one aspect and a few more."""
     table, scene = require_section(run, "rcs", run.task), build.scene(run)
     found = estimate_rcs_resources(run, scene)

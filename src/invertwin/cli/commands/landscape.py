@@ -1,6 +1,6 @@
 """Loss landscapes: the exact signal's loss beside the surrogate's, along a line."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,14 +10,15 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from invertwin import plotting
-from invertwin.cli.fits.problem import Problem, make_models
+from invertwin.cli.fits.problem import Problem
 from invertwin.cli.run_file import require_section
 from invertwin.cli.schema import RunFile, SimulatedData, build
-from invertwin.cli.terminal import count_progress
+from invertwin.cli.terminal import show_progress
 from invertwin.inversion import Observation
 from invertwin.inversion.gradcheck.lines import ParameterLine, evaluate_losses, make_line
 from invertwin.inversion.loss import relative_error
 from invertwin.models.radar import BeatMap
+from invertwin.runtime.progress import track
 from invertwin.scene import Scene, Translation
 
 
@@ -33,14 +34,14 @@ def plot_landscape(problem: Problem, console: Console) -> tuple[Figure, dict[str
     wide = np.linspace(-table.span, table.span, table.points)
     model, first = BeatMap(item.grid, channels=(slice(1), slice(1))), item.sensor.frames([0])
     beat = Observation(model, item.recording.beat[:1, :1, :1], sensor=first, loss=relative_error)
-    with count_progress(console, "loss landscape, exact signal", len(fine)) as advance:
-        exact = evaluate_exact_losses(run, line, fine, beat, advance)
-    model, loss = make_models(problem)[0], build.build_loss(run)
+    with show_progress(console):
+        exact = evaluate_exact_losses(run, line, fine, beat)
+    model, loss = problem.kind.models(problem)[0], build.build_loss(run)
     smooth = {}
     for name, share in (("first widths", 1.0), ("no extra width", 0.0)):
         seen = Observation(model.scale_blur(share), item.recording, sensor=item.sensor, loss=loss)
-        with count_progress(console, f"loss landscape, {name}", len(wide)) as advance:
-            offsets = iterate_and_advance(wide, advance)
+        with show_progress(console):
+            offsets = track(wide.tolist(), f"loss landscape, {name}")
             losses = evaluate_losses(line, offsets, seen, seed=run.seed).numpy()
         smooth[f"surrogate, {name}"] = wide, losses
     minima = {"exact": exact, **{name: losses for name, (_, losses) in smooth.items()}}
@@ -57,19 +58,8 @@ def make_object_line(truth: Scene, name: str, axis: Sequence[float]) -> tuple[Pa
     return make_line(Translation(name), unit / unit.norm(), truth), along
 
 
-def iterate_and_advance(offsets: Iterable[float], advance: Callable[[], None]) -> Iterator[float]:
-    """The offsets of a line, and a call whenever one is done."""
-    for offset in offsets:
-        yield offset
-        advance()
-
-
 def evaluate_exact_losses(
-    run: RunFile,
-    line: ParameterLine,
-    offsets: np.ndarray,
-    observation: Observation,
-    advance: Callable[[], None] = lambda: None,
+    run: RunFile, line: ParameterLine, offsets: np.ndarray, observation: Observation
 ) -> np.ndarray:
     """Losses of exact signals along a line, with the rough points of the simulated data."""
     data = require_section(run, "data", "the loss landscape")
@@ -77,6 +67,5 @@ def evaluate_exact_losses(
     drawn = {"samples": data.samples, "points_per_m2": data.points_per_m2, "boundary": False}
     observation = replace(observation, model=observation.model.with_sampling(depth=1, **drawn))
     seed = run.seed if data.seed is None else data.seed
-    return evaluate_losses(
-        line, iterate_and_advance(offsets, advance), observation, seed=seed
-    ).numpy()
+    told = track(offsets.tolist(), "loss landscape, exact signal")
+    return evaluate_losses(line, told, observation, seed=seed).numpy()

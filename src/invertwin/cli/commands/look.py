@@ -44,7 +44,6 @@ from invertwin.registry.kinds import load_plugins, registry
 from invertwin.storage.run_folder import RunFolder
 
 AnyRecording = Capture | ChirpCapture
-_FILE_SUFFIXES = ".bin, .setup.json, .toml, .s1p, .s2p, .nc or .npz"
 
 
 def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
@@ -132,26 +131,21 @@ def read_recording(options: RecordingOptions) -> tuple[str, AnyRecording]:
         return _read_plugin_recording(options, path if path.is_dir() else path.parent)
     if is_sweeps(path):
         return "sweeps", read(path)
-    readers = {".nc": "netcdf", ".toml": "arrays", ".bin": "dca1000", ".json": "dca1000"}
-    if ending not in readers:
-        raise InputError(
-            f"expected a recording that ends in {_FILE_SUFFIXES}, got {path.name}; convert it"
-        )
-    board = None
+    raw, board, settings = ending in (".bin", ".json"), None, options.config
     if ending == ".toml":
         stated = options.board, options.elevation, options.azimuth
         board = described_arrays.load_described_board(path, *stated)
-    elif ending != ".nc":
+    elif raw:
         board = _require_board(options, options.board)
-    settings = options.config
     if options.change:
-        if readers[ending] != "dca1000":
+        if not raw:
             raise InputError(
                 f"expected --set with a .bin or .setup.json, got {path.name}; correct its own file"
             )
-        found = ti.read_settings(options.config or path)
-        settings = ti.change_settings(found, _parse_changes(options.change))
-    return readers[ending], read(path, settings, board=board, lanes=options.lanes)
+        known = ti.read_settings(options.config or path)
+        settings = ti.change_settings(known, _parse_changes(options.change))
+    found = read(path, settings, board=board, lanes=options.lanes)
+    return {".nc": "netcdf", ".toml": "arrays"}.get(ending, "dca1000"), found
 
 
 def _parse_changes(given: list[str]) -> dict[str, Any]:

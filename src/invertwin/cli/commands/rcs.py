@@ -27,6 +27,8 @@ _MIN_LEVEL = -200.0  # dBsm that rounding leaves where there is no field
 _MATCH_TOLERANCE = 1e-6
 _MAX_PANELS = 4
 _RcsMetrics = dict[str, Any]
+_MeasuredRows = tuple[Tensor, Tensor, Tensor, tuple[int, int]]  # frequency, aspect, level, channel
+_Measured = Mapping[str, _MeasuredRows]  # by frequency and channel
 
 
 def run_rcs(batch: RunBatch, say: Callable[[str], None]) -> list[ReportTable]:
@@ -105,9 +107,6 @@ def _case_error(table: RcsTable, name: str, found: Signature) -> float:
     return float(error.square().mean().sqrt() if case.statistic == "rms" else error.abs().max())
 
 
-_MeasuredRows = tuple[Tensor, Tensor, Tensor, tuple[int, int]]  # frequency, aspect, level, channel
-
-
 def _load_measurements(
     table: RcsTable, found: Signature
 ) -> tuple[dict[str, _MeasuredRows], list[str]]:
@@ -149,7 +148,7 @@ def _match_measurement(
     return keys
 
 
-def _mean_differences(levels: Tensor, measured: Mapping[str, _MeasuredRows]) -> dict[str, float]:
+def _mean_differences(levels: Tensor, measured: _Measured) -> dict[str, float]:
     """Mean absolute differences from the measurements in dB."""
     return {
         key: float((levels[frequency, aspect, i, j] - known).abs().mean())
@@ -158,11 +157,7 @@ def _mean_differences(levels: Tensor, measured: Mapping[str, _MeasuredRows]) -> 
 
 
 def _draw_pictures(
-    name: str,
-    table: RcsTable,
-    found: Signature,
-    measured: Mapping[str, _MeasuredRows],
-    folder: RunFolder,
+    name: str, table: RcsTable, found: Signature, measured: _Measured, folder: RunFolder
 ) -> dict[str, str]:
     """Draw the results; return file names and titles."""
     shown = {name: "Radar cross-section"}

@@ -122,10 +122,10 @@ def _write(
 ) -> tuple[list[ReportTable], str]:
     """Write the report, the display and the meshes of the best fit."""
     problem, best, run = fits.problem, fits.best, fits.problem.run
-    start, twin = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
+    twin = replace_clouds(fits.found.scene)
     summary = problem.kind.summary(fits, metrics, folder)
     steps = displays.load_steps(folder.file(displays.steps_path(best["checkpoint"])))
-    display = displays.make_fit_display(problem, start, twin, fits.maps, confidence, steps)
+    display = displays.make_fit_display(fits, confidence, steps)
     display.save(folder.file(displays.VIEW_FILE))
     sensors = dict(zip(problem.sensor_data, fits.found.sensors, strict=True))
     depth = run.fit_settings.depth

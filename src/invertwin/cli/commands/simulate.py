@@ -5,7 +5,6 @@ import time
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import torch
 from matplotlib.figure import Figure
 
@@ -21,6 +20,7 @@ from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.models.radar import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, doppler_maps, velocity_span
+from invertwin.radar.processing.doppler_maps import find_peak
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
@@ -79,9 +79,13 @@ def _simulate_frames(
     Capture.from_beat(found.beat, radar).save(folder.file("capture.nc"))
     one_bounce = replace(model, sampling=Sampling(1, points_per_m2=data.points_per_m2))
     alike = surrogate_correlation(scene, radar.frames([0]), one_bounce, seed=run.seed)
+    peak, power = find_peak(found.spectrum.sum(0), grid), float(found.spectrum.max())
     metrics = {
         "paths": len(found.paths),
-        **_find_peak(found.spectrum, grid),
+        "peak_power_db": 10 * math.log10(power) if power > 0 else None,  # of a single frame
+        "peak_range_m": peak.range,
+        "peak_u": peak.u,
+        "peak_v": peak.v,
         "surrogate_correlation": alike,
         "wall_seconds": seconds,
     }
@@ -113,16 +117,3 @@ def _simulate_moving_frames(
         "wall_seconds": seconds,
     }
     return beat, metrics, plotting.range_doppler(maps), "doppler"
-
-
-def _find_peak(spectrum: torch.Tensor, grid: Grid) -> dict[str, float | None]:
-    """Find the bin of largest power summed over frames, and the peak of a single frame in dB."""
-    total = spectrum.sum(0)
-    r, u, v = np.unravel_index(int(total.argmax()), total.shape)
-    peak = float(spectrum.max())
-    return {
-        "peak_power_db": 10 * math.log10(peak) if peak > 0 else None,
-        "peak_range_m": float(grid.ranges[r]),
-        "peak_u": float(grid.u[u]),
-        "peak_v": float(grid.v[v]),
-    }

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from invertwin import viewer
-from invertwin.cli.fits.problem import Problem, SensorData, Start
+from invertwin.cli.fits.problem import Fits, Problem, SensorData, Start
 from invertwin.errors import InputError
 from invertwin.inversion import Callback
 from invertwin.inversion.fit import Fit
@@ -24,10 +24,11 @@ VIEW_FILE = "view.npz"
 _MAX_STEPS = 24  # of a fit, that are kept
 
 
+@dataclass
 class StepRecorder(Callback):
-    """Keeps where a fit stood, in a file beside its checkpoint.
+    """Record of where a fit stood, in a file beside its checkpoint.
 
-    Args:
+    Attributes:
         file: The file.
         names: Objects that are kept.
         total: Steps of all stages.
@@ -35,58 +36,52 @@ class StepRecorder(Callback):
         show: Is told of every step that is kept.
     """
 
-    def __init__(
-        self,
-        file: Path,
-        names: Collection[str],
-        total: int,
-        every: int,
-        show: Callable[[Fit, viewer.DisplayStep], None] | None,
-    ) -> None:
-        self._file, self._names, self._show = file, names, show
-        self._apart, self._every = math.ceil(total / _MAX_STEPS), every
-        self._steps: list[viewer.DisplayStep] = []
-        self._written = 0
+    file: Path
+    names: Collection[str]
+    total: int
+    every: int
+    show: Callable[[Fit, viewer.DisplayStep], None] | None
+    _steps: list[viewer.DisplayStep] = field(default_factory=list)
+    _written: int = 0
 
     def begin(self, fit: Fit) -> None:
         """Note the start, or read what an interrupted run has kept."""
         if not self._steps:
-            self._steps = load_steps(self._file)
+            self._steps = load_steps(self.file)
         if not self._steps:
-            self._keep(fit, viewer.DisplayStep(0, "start", self._display_meshes(fit.twin())))
+            self._keep(fit, 0, "start")
 
     def step(self, fit: Fit, row: dict[str, Any]) -> None:
         """Keep some of the steps."""
         number = row["step"] + 1
         # Steps after the checkpoint from which the fit goes on are done again.
         self._steps = [step for step in self._steps if step.number < number]
-        if number % self._apart == 0:
-            label = f"step {number}, loss {row['loss']:.4g}"
+        if number % math.ceil(self.total / _MAX_STEPS) == 0:
             # Parameters that the scene refuses have no picture; the fit ends as diverged.
             with suppress(InputError):
-                self._keep(fit, viewer.DisplayStep(number, label, self._display_meshes(fit.twin())))
-        if fit.progress.step % self._every == 0:
+                self._keep(fit, number, f"step {number}, loss {row['loss']:.4g}")
+        if fit.progress.step % self.every == 0:
             self._write()
 
     def end(self, fit: Fit) -> None:
         """Write what is kept."""
         self._write()
 
-    def _keep(self, fit: Fit, step: viewer.DisplayStep) -> None:
-        self._steps.append(step)
-        if self._show is not None:
-            self._show(fit, step)
+    def _keep(self, fit: Fit, number: int, label: str) -> None:
+        self._steps.append(viewer.DisplayStep(number, label, self._display_meshes(fit.twin())))
+        if self.show is not None:
+            self.show(fit, self._steps[-1])
 
     def _write(self) -> None:
-        if self._written != self._steps[-1].number or not self._file.exists():
+        if self._written != self._steps[-1].number or not self.file.exists():
             self._written = self._steps[-1].number
-            viewer.Display("", [], self._steps).save(self._file)
+            viewer.Display("", [], self._steps).save(self.file)
 
     def _display_meshes(self, scene: Scene) -> dict[str, viewer.DisplayMesh]:
         scene = replace_clouds(scene)
         before = self._steps[-1].bodies if self._steps else {}
         found = {}
-        for name in self._names:
+        for name in self.names:
             body = viewer.display_mesh(scene[name])
             if name in before and np.array_equal(body.faces, before[name].faces):
                 body = viewer.DisplayMesh(body.vertices, before[name].faces)  # kept once
@@ -113,29 +108,22 @@ def load_steps(file: Path) -> list[viewer.DisplayStep]:
 
 
 def make_fit_display(
-    problem: Problem,
-    start: Scene,
-    twin: Scene,
-    maps: Mapping[str, Sequence[Tensor]],
-    metrics: Mapping[str, Any],
-    steps: Sequence[viewer.DisplayStep],
+    fits: Fits, metrics: Mapping[str, Any], steps: Sequence[viewer.DisplayStep]
 ) -> viewer.Display:
-    """A display of a fit that has ended.
+    """Make the display of the best fit.
 
     Args:
-        problem: What was fitted.
-        start: From where.
-        twin: What was found.
-        maps: "measured" and "twin" of every sensor.
-        metrics: Its error bars.
-        steps: Those that were kept.
+        fits: all fits, with maps by "measured" and "twin".
+        metrics: error bars of the best one.
+        steps: its steps that were kept.
     """
-    display = make_problem_display(problem, twin)
-    names = [name for name in problem.run.fitted_objects if name in start.names]
+    start, twin = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
+    display = make_problem_display(fits.problem, twin)
+    names = [name for name in fits.problem.run.fitted_objects if name in start.names]
     more = viewer.scene_layers(start, "start", fitted=names, fitted_only=True)
     layers = [*display.layers, *more, *viewer.ellipsoid_layers(twin, metrics)]
-    spectra = {viewer.MEASURED: maps["measured"], viewer.SIMULATED: maps["twin"]}
-    seen = make_sensor_maps(problem, spectra)
+    spectra = {viewer.MEASURED: fits.maps["measured"], viewer.SIMULATED: fits.maps["twin"]}
+    seen = make_sensor_maps(fits.problem, spectra)
     return replace(display, layers=layers, steps=steps, maps=seen)
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from torch import nn
 
 from invertwin.capture import calibrate
 from invertwin.cli.fits.displays import StepRecorder, steps_path
@@ -19,7 +18,6 @@ from invertwin.cli.fits.problem import (
     Problem,
     Row,
     Start,
-    make_models,
     make_observations,
     make_schedule,
     make_unknowns,
@@ -43,7 +41,7 @@ from invertwin.inversion import (
     search,
 )
 from invertwin.inversion.callbacks import stage_checkpoint_path
-from invertwin.inversion.fit import Fit
+from invertwin.inversion.fit import Fit, parameter_values
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.scene import Scene
 from invertwin.seeds import derive_seed
@@ -132,7 +130,7 @@ def run_fit(
         "lost": found.is_uninformative,
         "steps": found.steps,
         "seconds": time.perf_counter() - begin,
-        "values": _fitted_values(found.parameters),
+        "values": parameter_values(found.parameters),
         "checkpoint": found_ends.pop("checkpoint", checkpoint),
         **found_ends,
         **own.kind.score_fit(own, start, found),
@@ -191,15 +189,6 @@ def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoi
     return Checkpoint(folder.file(name), every, resume=True)
 
 
-def _fitted_values(modules: nn.ModuleList) -> Row:
-    """Fitted values by name; vertices are in the mesh file and the checkpoint."""
-    rows: Row = {}
-    for module in modules:
-        found: dict[str, torch.Tensor] = getattr(module, "values", dict)()
-        rows |= {name: value.tolist() for name, value in found.items() if value.numel() <= 16}
-    return rows
-
-
 def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> Problem:
     """The problem with range bias and clock offset found on an object whose position is known.
 
@@ -225,7 +214,7 @@ def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> 
     else:
         bias, clock = RangeBias(), ClockOffset(capture.positions)
         own = replace(problem, run=run.apply_overrides(table))
-        schedule, (model,) = own.run.fit_settings.build(), make_models(own)
+        schedule, (model,) = own.run.fit_settings.build(), own.kind.models(own)
         with report_progress("calibration", schedule.steps, console) as shown:
             found = reconstruct(
                 Scene({table.object: target}),

@@ -87,10 +87,6 @@ class MovingTarget(DataKind):
         self._build_body(problem, table, Start(scene), scene)
         return problem
 
-    def prepare(self, problem: Problem, folder: RunFolder, console: Console) -> Problem:
-        """The problem as it is: its echo is the initial estimate, sought in ``[initial]``'s box."""
-        return problem
-
     def with_method(self, problem: Problem, method: str) -> Problem:
         """The problem of a method; the first half has its own echo."""
         found = super().with_method(problem, method)

@@ -54,7 +54,7 @@ class PanelCoverage(DataKind):
     title: ClassVar[str] = "Placement of a metasurface"
     unused: ClassVar[tuple[str, ...]] = (
         *("radar", "grid", "chirps", "data", "calibration", "landscape", "measures", "model"),
-        *("starts", "map"),
+        *("starts", "map", "initial"),
     )
 
     def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:

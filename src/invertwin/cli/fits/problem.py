@@ -224,11 +224,6 @@ class DataKind(ABC):
 
     def prepare(self, problem: Problem, folder: RunFolder, console: Console) -> Problem:
         """The problem after what comes before all fits: calibration, an initial estimate."""
-        if problem.run.initial is not None:
-            raise InputError(
-                "initial: expected data of a radar, or of transmitters, with [initial], got none; "
-                "remove it"
-            )
         return problem
 
     def with_recording_of_start(self, problem: Problem, number: int, console: Console) -> Problem:
@@ -305,7 +300,7 @@ def make_observations(problem: Problem, start: Start | None = None) -> list[Obse
     """
     kind, begun = problem.kind, start or Start(problem.scene)
     own = _build_unknowns(problem, begun, of_sensors=True)
-    sensors = zip(make_models(problem), problem.sensor_data.items(), strict=True)
+    sensors = zip(problem.kind.models(problem), problem.sensor_data.items(), strict=True)
     return [
         Observation(
             model,
@@ -336,11 +331,6 @@ def _build_unknowns(problem: Problem, start: Start, *, of_sensors: bool) -> dict
     }
 
 
-def make_models(problem: Problem) -> list[ForwardModel]:
-    """The forward models that are fitted, one for every sensor."""
-    return problem.kind.models(problem)
-
-
 def make_schedule(problem: Problem) -> list[Stage]:
     """The stages of a fit, as the library takes them."""
     fitted, found = fitted_tables(problem.run), []
@@ -349,7 +339,7 @@ def make_schedule(problem: Problem) -> list[Stage]:
         free = [fitted[name] for name in names or fitted]
         finer = partial(remesh, edge_length=table.remesh or 0.0)
         counts = {k: v for k, v in (table.reconstruct or {}).items() if k in SamplingBase.made_from}
-        models = make_models(replace(problem, run=run))
+        models = problem.kind.models(replace(problem, run=run))
         if counts:
             models = [m.with_sampling(**counts) if hasattr(m, "sampling") else m for m in models]
         stage = Stage(

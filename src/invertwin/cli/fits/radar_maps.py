@@ -21,7 +21,7 @@ from invertwin.cli.fits.problem import (
     sensor_runs,
 )
 from invertwin.cli.fits.shape_scores import is_shape_key
-from invertwin.cli.fits.writing import START_COLUMNS, summarise_maps
+from invertwin.cli.fits.writing import START_COLUMNS, describe_outcome, draw_pictures, make_tables
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion import Reconstruction, Unknown
@@ -109,4 +109,6 @@ class RadarMaps(DataKind):
 
     def summary(self, fits: Fits, metrics: Row, folder: RunFolder) -> Summary:
         """See ``DataKind.summary``."""
-        return summarise_maps(fits, metrics, folder)
+        result, *tables = make_tables(fits, metrics)
+        outcome = describe_outcome(fits.problem.run, metrics)
+        return Summary(outcome, result, draw_pictures(fits, metrics, folder), tables)

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -51,25 +52,6 @@ class FitWorkers:
         return None if engine == "processes" and count is None else cls(engine, count or 1)
 
 
-@dataclass(frozen=True)
-class FitJob:
-    """One fit.
-
-    Attributes:
-        fit_one: Fits; a function of a module.
-        run_toml: The run file.
-        mode: The run's own way to fit, or a variant.
-        start: Number of the start.
-        files: What the fit goes on from, such as the calibration, by path in the folder.
-    """
-
-    fit_one: FitFunction
-    run_toml: str
-    mode: str
-    start: int
-    files: Mapping[str, bytes]
-
-
 def distribute_fits(
     fit_one: FitFunction,
     run: RunFile,
@@ -99,12 +81,9 @@ def distribute_fits(
     text, begun = to_minimal_toml(run), f"{PARTS}/calibration.pt"
     path = folder.path / UNFINISHED / begun
     files = {begun: path.read_bytes()} if path.exists() else {}
-    jobs = [
-        FitJob(fit_one, text, mode, start, files)
-        for mode, start in fits
-        if folder.read_json(f"{fit_file_stem(mode, start)}.json") is None
-    ]
-    found = run_jobs(run_fit_job, jobs, engine=workers.engine, workers=workers.count)
+    jobs = [fit for fit in fits if folder.read_json(f"{fit_file_stem(*fit)}.json") is None]
+    work = partial(run_fit_job, fit_one, text, files)
+    found = run_jobs(work, jobs, engine=workers.engine, workers=workers.count)
     with show_progress(console), closing(found) as done:
         for _ in track(jobs, "fits"):
             _, made = next(done)
@@ -123,19 +102,24 @@ def fit_file_stem(mode: str, start: int) -> str:
     return f"{PARTS}/{mode}_{start:02d}"
 
 
-def run_fit_job(job: FitJob) -> dict[str, bytes]:
-    """The files of a fit by their path in the run's folder: what a worker does.
+def run_fit_job(
+    fit_one: FitFunction, run_toml: str, files: Mapping[str, bytes], job: tuple[str, int]
+) -> dict[str, bytes]:
+    """Return the files of a fit by their path in the run's folder: what a worker does.
 
     Args:
-        job: The fit.
+        fit_one: fits; a function of a module.
+        run_toml: the run file.
+        files: what the fit goes on from, such as the calibration, by path in the folder.
+        job: way to fit, and number of the start.
     """
-    run = validate_run(tomllib.loads(job.run_toml), Path("run.toml"))
+    run = validate_run(tomllib.loads(run_toml), Path("run.toml"))
     with tempfile.TemporaryDirectory() as scratch, warnings.catch_warnings():
         warnings.simplefilter("ignore", PhysicsWarning)  # told once, where the run began
-        with open_run(Path(scratch, "fit"), {"run": job.run_toml}) as folder:
-            for name, content in job.files.items():
+        with open_run(Path(scratch, "fit"), {"run": run_toml}) as folder:
+            for name, content in files.items():
                 folder.write_bytes(name, content)
-            job.fit_one(run, job.mode, job.start, folder)
+            fit_one(run, *job, folder)
             inside = folder.path / UNFINISHED
             made = [str(path.relative_to(inside)) for path in (inside / PARTS).iterdir()]
-            return {name: (inside / name).read_bytes() for name in made if name not in job.files}
+            return {name: (inside / name).read_bytes() for name in made if name not in files}

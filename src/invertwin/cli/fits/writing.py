@@ -2,13 +2,10 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
-import torch
-
 from invertwin import plotting
-from invertwin.cli.fits.problem import INTERIOR_ONLY, OWN_METHOD, Fits, Problem, Row, Summary
+from invertwin.cli.fits.problem import INTERIOR_ONLY, OWN_METHOD, Fits, Problem, Row
 from invertwin.cli.fits.radar_models import blur_end_step
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.fits.shape_scores import CURVE_KEY, is_shape_key, shape_label, short_label
@@ -42,68 +39,41 @@ START_COLUMNS = load_texts("starts") | {
 """Heads of the table of starts; what metrics.json says of the best one."""
 
 
-@dataclass(frozen=True)
-class BestFit:
-    """The best fit of a run, beside all others."""
-
-    problem: Problem
-    metrics: dict[str, Any]
-    rows: Mapping[str, list[dict[str, Any]]]  # of every fit, by mode
-    start: Scene
-    twin: Scene
-    maps: Mapping[str, list[torch.Tensor]]  # by what they show, one for every sensor
-    residuals: list[torch.Tensor]  # of the best one, one for every sensor or none
-
-    @property
-    def fits_by_method(self) -> list[tuple[str, list[dict[str, Any]]]]:
-        """The fits of every way to fit, by its name in words."""
-        own = "with boundary terms" if self.problem.run.fit_settings.boundary else "interior only"
-        if set(self.rows) - {OWN_METHOD, INTERIOR_ONLY}:
-            own = "as the run says"
-        return [
-            (own if mode == OWN_METHOD else mode.replace("_", " "), fits)
-            for mode, fits in self.rows.items()
-        ]
-
-
-def summarise_maps(fits: Fits, metrics: Row, folder: RunFolder) -> Summary:
-    """Summary of fits to maps of radars; its pictures are written.
+def make_tables(fits: Fits, metrics: Row) -> list[ReportTable]:
+    """Make the tables that are printed and shown in the report.
 
     Args:
-        fits: All fits of the run.
-        metrics: Numbers of the run.
-        folder: Gets the pictures.
+        fits: all fits of a run to maps of radars.
+        metrics: numbers of the run.
     """
-    scenes = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
-    residuals = fits.found.verdict.residuals
-    fitted = BestFit(fits.problem, metrics, fits.rows, *scenes, fits.maps, residuals)
-    result, *tables = make_tables(fitted)
-    outcome = describe_outcome(fits.problem.run, metrics)
-    return Summary(outcome, result, draw_pictures(fitted, folder), tables)
-
-
-def make_tables(fitted: BestFit) -> list[ReportTable]:
-    """Tables that are printed, and shown in the report."""
-    metrics = fitted.metrics
-    tables = [_result_table(fitted.problem.run, metrics)]
-    for way, fits in fitted.fits_by_method:
-        if len(fits) > 1:
-            keys = [key for key in START_COLUMNS if key in fits[0]]
+    tables = [_result_table(fits.problem.run, metrics)]
+    for way, rows in _rows_by_way(fits):
+        if len(rows) > 1:
+            keys = [key for key in START_COLUMNS if key in rows[0]]
             cells: list[list[Any]] = []
-            for row in fits:
+            for row in rows:
                 told = (_format_status(key, row[key], row.get("lost", False)) for key in keys)
                 cells.append([row["start"] + 1, *told])
             heads = ["start", *(START_COLUMNS[key] for key in keys)]
             tables.append(ReportTable(f"Starts, {way}", heads, cells))
-    if len(fitted.fits_by_method) > 1 and any(is_shape_key(key) for key in metrics):
-        tables.append(_method_table(fitted))
-    tables += [_pose_table(fitted), error_bar_table(metrics)]
+    if len(fits.rows) > 1 and any(is_shape_key(key) for key in metrics):
+        tables.append(_method_table(fits))
+    tables += [_pose_table(fits, metrics), error_bar_table(metrics)]
     moves = [[k + _UNITS.get(k.split(".")[-1], ""), v] for k, v in metrics["parameters"].items()]
     if moves:
         tables.append(ReportTable("Moves from the start", ["parameter", "value"], moves))
     if "initial_seconds" in metrics:
-        tables.append(_refinement_table(fitted.problem.run, metrics))
+        tables.append(_refinement_table(fits.problem.run, metrics))
     return tables
+
+
+def _rows_by_way(fits: Fits) -> list[tuple[str, list[Row]]]:
+    """The rows of every way to fit, by its name in words."""
+    own = "with boundary terms" if fits.problem.run.fit_settings.boundary else "interior only"
+    if set(fits.rows) - {OWN_METHOD, INTERIOR_ONLY}:
+        own = "as the run says"
+    names = {method: method.replace("_", " ") for method in fits.rows} | {OWN_METHOD: own}
+    return [(names[method], rows) for method, rows in fits.rows.items()]
 
 
 def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
@@ -133,28 +103,30 @@ def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
     return ReportTable("Result", ["quantity", "value"], rows)
 
 
-def _method_table(fitted: BestFit) -> ReportTable:
+def _method_table(fits: Fits) -> ReportTable:
     """Measures of the shape by each way to fit, means over the starts."""
-    first = fitted.fits_by_method[0][1][0]
+    ways = _rows_by_way(fits)
+    first = ways[0][1][0]
     begun = [key for key in first if key.startswith("start_") and is_shape_key(key)]
     keys = [key.removeprefix("start_") for key in begun]
     cells: list[list[Any]] = [["start", *(first[key] for key in begun)]]
-    for way, fits in fitted.fits_by_method:
-        means = [[row[key] for row in fits if key in row] for key in keys]
+    for way, rows in ways:
+        means = [[row[key] for row in rows if key in row] for key in keys]
         cells.append([way, *(sum(v) / len(v) if v else None for v in means)])
     return ReportTable("Ways to fit", ["fit", *(short_label(key) for key in keys)], cells)
 
 
-def _pose_table(fitted: BestFit) -> ReportTable:
+def _pose_table(fits: Fits, metrics: Row) -> ReportTable:
     """Positions and turns of the fitted objects."""
-    problem, cells = fitted.problem, []
+    problem, cells = fits.problem, []
+    ends = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
     for name in dict.fromkeys(problem.run.fitted_objects):
         known = name in problem.known_objects
-        scenes = [fitted.start, fitted.twin, *([problem.truth] if known else [])]
+        scenes = [*ends, *([problem.truth] if known else [])]
         centers = [scene[name].center.detach().tolist() for scene in scenes]
         for i, axis in enumerate("xyz"):
             cells.append([f"{name}.{axis} [m]", *(_round_zero(center[i]) for center in centers)])
-        if known and "rotation_error_deg" in fitted.metrics:
+        if known and "rotation_error_deg" in metrics:
             off = [pose_error(scene[name], problem.truth[name]) for scene in scenes]
             angles = [_round_zero(math.degrees(found.angle)) if found else None for found in off]
             cells.append([f"{name}, angle to the truth [°]", *angles])
@@ -181,13 +153,19 @@ def _refinement_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
     return ReportTable("What the refinement added", columns, rows, legend.format(**metrics))
 
 
-def draw_pictures(fitted: BestFit, folder: RunFolder) -> list[ReportPicture]:
-    """Write the pictures of the best fit; return those of the report."""
-    problem, metrics = fitted.problem, fitted.metrics
+def draw_pictures(fits: Fits, metrics: Row, folder: RunFolder) -> list[ReportPicture]:
+    """Write the pictures of the best fit; return those of the report.
+
+    Args:
+        fits: all fits of a run to maps of radars.
+        metrics: numbers of the run.
+        folder: gets the pictures.
+    """
+    problem, by_way = fits.problem, _rows_by_way(fits)
+    ends = {"start": replace_clouds(fits.start.scene), "twin": replace_clouds(fits.found.scene)}
     run, truth, fitted_names = problem.run, problem.truth, problem.run.fitted_objects
     known = {k: truth[k] for k in truth.names if k in problem.known_objects and k in fitted_names}
-    scenes = {"truth": truth} if known else {}
-    scenes |= {"start": fitted.start, "twin": fitted.twin}
+    scenes = ({"truth": truth} if known else {}) | ends
     outline = Scene(known) if known else None
     radars = [item.sensor for item in problem.sensor_data.values()]
     figure = plotting.scene(scenes, radars, highlight=fitted_names, outline=outline)
@@ -195,15 +173,16 @@ def draw_pictures(fitted: BestFit, folder: RunFolder) -> list[ReportPicture]:
     data = "exact simulation" if isinstance(run.data, SimulatedData) else "measured"
     titles = {"measured": f"data ({data})", "start": "surrogate, start", "twin": "surrogate, twin"}
     for number, (name, item) in enumerate(problem.sensor_data.items()):
-        titled = {titles[key]: maps[number] for key, maps in fitted.maps.items()}
+        titled = {titles[key]: maps[number] for key, maps in fits.maps.items()}
         file = f"spectra_{name}" if name else "spectra"
         figure = plotting.spectrum(titled, item.grid)
         found.append(save_picture(folder, file, figure, note="spectra"))
-    for (name, item), apart in zip(problem.sensor_data.items(), fitted.residuals, strict=False):
+    residuals = fits.found.verdict.residuals
+    for (name, item), apart in zip(problem.sensor_data.items(), residuals, strict=False):
         figure = plotting.residuals(apart, item.grid)
         file = f"residuals_{name}" if name else "residuals"
         found.append(save_picture(folder, file, figure, note="residuals"))
-    losses = {way: [row["losses"] for row in fits] for way, fits in fitted.fits_by_method}
+    losses = {way: [row["losses"] for row in rows] for way, rows in by_way}
     annealed, notes = blur_end_step(run), load_texts("notes")
     before = metrics["start_loss_sharp"] if annealed else None
     figure, note = plotting.convergence(losses, annealed=annealed, before=before), ""
@@ -212,8 +191,8 @@ def draw_pictures(fitted: BestFit, folder: RunFolder) -> list[ReportPicture]:
         note = notes["loss"] + (notes["loss_sharp"].format(**metrics) if told else "")
     found.append(save_picture(folder, "loss", figure, note=note))
     if run.measures is not None:
-        folder.write_bytes("turntable.gif", _draw_turntable(fitted, run.measures.object))
-        curves = {way: [_shape_curve(row) for row in fits] for way, fits in fitted.fits_by_method}
+        folder.write_bytes("turntable.gif", _draw_turntable(problem, ends, run.measures.object))
+        curves = {way: [_shape_curve(row) for row in rows] for way, rows in by_way}
         if any(curve for fits in curves.values() for curve in fits):
             figure = plotting.convergence(losses, curves)
             found.append(save_picture(folder, "convergence", figure))
@@ -225,11 +204,9 @@ def draw_pictures(fitted: BestFit, folder: RunFolder) -> list[ReportPicture]:
     return found
 
 
-def _draw_turntable(fitted: BestFit, name: str) -> bytes:
+def _draw_turntable(problem: Problem, ends: Mapping[str, Scene], name: str) -> bytes:
     """The object from all around, moving."""
-    problem = fitted.problem
-    scenes = {"truth": problem.truth} if name in problem.known_objects else {}
-    scenes |= {"start": fitted.start, "twin": fitted.twin}
+    scenes = ({"truth": problem.truth} if name in problem.known_objects else {}) | dict(ends)
     turns = problem.first_sensor.sensor.rotations
     up = (0.0, 0.0, 1.0) if turns is None else turns.detach().mean(0)[:, 2]
     found = {key: scene[name] for key, scene in scenes.items()}

@@ -4,7 +4,7 @@ from torch import Tensor
 
 from invertwin.cli.run_file import prefix_errors
 from invertwin.cli.schema import RunFile
-from invertwin.cli.schema.shape_tables import ObjectTable, body_template_of, joint_positions
+from invertwin.cli.schema.shape_tables import ObjectTable, joint_positions, require_body
 from invertwin.errors import InputError
 from invertwin.scene import MovingScene, ObjectMotion, Scene, Sitting, Walking, Waving
 from invertwin.scene.people.body import BodyTemplate
@@ -94,17 +94,8 @@ def _build_motions(table: ObjectTable) -> list[ObjectMotion]:
                     "expected one motion of a person, or waving after another, got two; remove one"
                 )
             given: dict[type, object] = {type(mover): mover for mover in earlier}
-            body = earlier[0].body if earlier else _require_body(table)
+            got = "another; give it this shape, or choose another motion"
+            body = earlier[0].body if earlier else require_body(table, got)
             found = [mover for mover in found if mover not in earlier]
             found.append(row.build({BodyTemplate: body, **given}))
     return found
-
-
-def _require_body(table: ObjectTable) -> BodyTemplate:
-    template = body_template_of(table)
-    if template is None:
-        raise InputError(
-            'expected an object with shape = "body", got another; give it this shape, or choose '
-            "another motion"
-        )
-    return template

@@ -104,16 +104,10 @@ class Placement(Section):
         seed = run_seed if self.seed is None else self.seed
         count = self.receivers.scored if scored else self.receivers.count
         with prefix_errors("placement"):
-            return Coverage.of(
-                scene,
-                torch.tensor(self.transmitter, dtype=torch.float64),
-                self.receivers.draw(count, derive_seed(seed, int(scored))),
-                self.frequency,
-                self.share,
-                depth=self.depth,
-                edges=self.edges,
-                seed=seed,
-            )
+            tx = torch.tensor(self.transmitter, dtype=torch.float64)
+            points = self.receivers.draw(count, derive_seed(seed, int(scored)))
+            how = {"depth": self.depth, "edges": self.edges, "seed": seed}
+            return Coverage.of(scene, tx, points, self.frequency, self.share, **how)
 
     def path(self) -> WallPath:
         """Positions where the panel may stand."""
@@ -139,19 +133,11 @@ class Placement(Section):
             trial: Position on the path [m], yaw and half widths of the beam [rad].
             phases: Whether it holds phases of its elements, too.
         """
-        along, yaw, spread = trial
-        return PanelPlacement(
-            self.path(),
-            coverage.tx,
-            self.focus(coverage),
-            self.frequency,
-            self.panel.counts if phases else None,
-            along=along,
-            yaw=yaw,
-            spread=spread,
-            yaw_limit=math.radians(self.yaw_limit_deg),
-            spread_limit=math.radians(self.spread_limit_deg),
-        )
+        start: dict[str, Any] = dict(zip(("along", "yaw", "spread"), trial, strict=True))
+        start["yaw_limit"] = math.radians(self.yaw_limit_deg)
+        start["spread_limit"] = math.radians(self.spread_limit_deg)
+        focus, counts = self.focus(coverage), self.panel.counts if phases else None
+        return PanelPlacement(self.path(), coverage.tx, focus, self.frequency, counts, **start)
 
     def focus(self, coverage: Coverage) -> Tensor:
         """The point on which the panel is focused [3] [m]."""

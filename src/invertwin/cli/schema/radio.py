@@ -111,29 +111,23 @@ class TransmitterStartsTable(Section):
             InputError: No room in the box.
         """
         generator = torch.Generator().manual_seed(seed if self.seed is None else self.seed)
-        low, high = (torch.tensor(c, dtype=torch.float64) for c in (self.low, self.high))
-        return _sample_free_positions(scene, (low, high), self.count, self.clear, generator)
+        box = torch.tensor([self.low, self.high], dtype=torch.float64)
+        found: list[Tensor] = []
+        meshes = [Mesh(item.vertices.detach(), item.mesh.faces) for item in scene.objects.values()]
+        # The room is no solid object: it holds the whole box.
+        around = [bool((signed_distance(mesh, box) < 0).all()) for mesh in meshes]
+        for _ in range(_MAX_DRAWS):
+            share = torch.rand(1, 3, generator=generator, dtype=torch.float64)
+            place = box[0] + share * (box[1] - box[0])
+            off = zip((float(signed_distance(mesh, place)) for mesh in meshes), around, strict=True)
+            if all(abs(d) >= self.clear and (d > 0 or held) for d, held in off):
+                found.append(place)
+            if len(found) == self.count:
+                return torch.cat(found)
+        raise InputError(
+            f"expected room for {self.count} starts in the box, found {len(found)}; widen the box, "
+            "or lower `clear`"
+        )
 
 
 AnyMap = Annotated[Any, TableOf(RadioMap, MapTable, ("propagation",), checked=False)]
-
-
-def _sample_free_positions(
-    scene: Scene, box: tuple[Tensor, Tensor], count: int, clear: float, generator: torch.Generator
-) -> Tensor:
-    found: list[Tensor] = []
-    meshes = [Mesh(item.vertices.detach(), item.mesh.faces) for item in scene.objects.values()]
-    # The room is no solid object: it holds the whole box.
-    around = [bool((signed_distance(mesh, torch.stack(box)) < 0).all()) for mesh in meshes]
-    for _ in range(_MAX_DRAWS):
-        share = torch.rand(1, 3, generator=generator, dtype=torch.float64)
-        place = box[0] + share * (box[1] - box[0])
-        off = [float(signed_distance(mesh, place)) for mesh in meshes]
-        if all(abs(d) >= clear and (d > 0 or held) for d, held in zip(off, around, strict=True)):
-            found.append(place)
-        if len(found) == count:
-            return torch.cat(found)
-    raise InputError(
-        f"expected room for {count} starts in the box, found {len(found)}; widen the box, or lower "
-        "`clear`"
-    )

@@ -186,7 +186,23 @@ class _RunFile(Section):
     )
 
     @model_validator(mode="after")
-    def _check_object_names(self) -> "_RunFile":
+    def _check_sections(self, info: Any) -> "_RunFile":
+        self._check_object_names()
+        self._check_gradcheck_sections()
+        self._check_variant_names()
+        self._check_parameter_names()
+        self._check_joint_starts()
+        self._check_learned_shapes()
+        self._check_overrides(info.context)
+        if self.vary and self.dataset is None:
+            raise_key_error("expected a section [dataset] with it, got none; add it", "vary")
+        if self.dataset is not None:
+            self._require_simulated_data()
+        # Its errors begin at the table that draws what is wrong.
+        check_samples(self, self.dump_without_dataset(), info)
+        return self
+
+    def _check_object_names(self) -> None:
         if self.scene_file is None:
             known = [*self.scene, *({} if self.room is None else self.room.build())]
             if not known:
@@ -196,13 +212,11 @@ class _RunFile(Section):
                 if name not in known:
                     context = {"path": path, "name": name, "known": known}
                     raise PydanticCustomError("unknown_object", "unknown object", context)
-        return self
 
-    @model_validator(mode="after")
-    def _check_gradcheck_sections(self) -> "_RunFile":
+    def _check_gradcheck_sections(self) -> None:
         seen = next((n for n in ("image", "map") if getattr(self, n) is not None), None)
         if self.gradcheck is None or (self.rcs is None and seen is None):
-            return self
+            return
         if seen is not None:
             own = ("depth", "samples", "boundary_samples", "scheme")
             given = [f"gradcheck.{n}" for n in own if n in self.gradcheck.model_fields_set]
@@ -210,7 +224,7 @@ class _RunFile(Section):
             for path in [*given, *(n for n in sorted(others) if getattr(self, n))]:
                 what = f"expected nothing with [{seen}], which has its own, got a value; remove it"
                 raise_key_error(what, path)
-            return self
+            return
         if self.gradcheck.acts_on == "sensor":
             raise_key_error(
                 "expected a parameter of the scene with [rcs], got radar_pose; turn the scene",
@@ -222,10 +236,8 @@ class _RunFile(Section):
             raise_key_error(
                 "expected nothing with [rcs], which draws no paths, got a value; remove it", path
             )
-        return self
 
-    @model_validator(mode="after")
-    def _check_variant_names(self) -> "_RunFile":
+    def _check_variant_names(self) -> None:
         for name in self.variants:
             if name in _RESERVED_NAMES or not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", name):
                 raise_key_error(
@@ -233,10 +245,8 @@ class _RunFile(Section):
                     f"{', '.join(_RESERVED_NAMES)}, got {json.dumps(name)}; choose another",
                     "variants",
                 )
-        return self
 
-    @model_validator(mode="after")
-    def _check_parameter_names(self) -> "_RunFile":
+    def _check_parameter_names(self) -> None:
         names = [table.name or table.kind for table in self.parameters]
         free = {n for n, t in zip(names, self.parameters, strict=True) if t.kind == "vertices"}
         doubled = next((name for name in names if names.count(name) > 1), None)
@@ -259,10 +269,8 @@ class _RunFile(Section):
                     "none; add one, or remove `remesh`",
                     f"stages[{i}].remesh",
                 )
-        return self
 
-    @model_validator(mode="after")
-    def _check_joint_starts(self) -> "_RunFile":
+    def _check_joint_starts(self) -> None:
         if self.starts is not None and self.starts.joint_deg > 0:
             name = self.starts.object
             if not any(p.kind == "body" and p.object == name for p in self.parameters):
@@ -271,10 +279,8 @@ class _RunFile(Section):
                     "got none; add one, or remove `joint_deg`",
                     "starts.joint_deg",
                 )
-        return self
 
-    @model_validator(mode="after")
-    def _check_learned_shapes(self) -> "_RunFile":
+    def _check_learned_shapes(self) -> None:
         unknowns = self.parameter_tables.values()
         learned: list[Any] = [table for table in unknowns if isinstance(table, LearnedTable)]
         for parameter in learned:
@@ -285,29 +291,16 @@ class _RunFile(Section):
                 raise_key_error(got, f"scene.{name}.scale")
             if self.initial is not None and self.initial.object == name and self.initial.scale:
                 raise_key_error(f"expected false {why}, got true; remove it", "initial.scale")
-        return self
 
-    @model_validator(mode="after")
-    def _check_overrides(self, info: Any) -> "_RunFile":
+    def _check_overrides(self, context: Any) -> None:
         """Every stage and variant makes a run that is right; errors begin at its own path."""
-        check = partial(_overrides_model(type(self)).model_validate, context=info.context)
+        check = partial(_overrides_model(type(self)).model_validate, context=context)
         check({"stages": [self._dump_with_overrides(stage) for stage in self.stages]})
         variants = {name: self._dump_with_overrides(own) for name, own in self.variants.items()}
         for name, run in check({"variants": variants}).variants.items():
             self.variants[name] = self.variants[name].with_resolved_paths(run)
         if self.calibration is not None:
             check({"calibration": self._dump_with_overrides(self.calibration)})
-        return self
-
-    @model_validator(mode="after")
-    def _check_samples(self, info: Any) -> "_RunFile":
-        """Errors begin at the table that draws what is wrong."""
-        if self.vary and self.dataset is None:
-            raise_key_error("expected a section [dataset] with it, got none; add it", "vary")
-        if self.dataset is not None:
-            self._require_simulated_data()
-        check_samples(self, self.dump_without_dataset(), info)
-        return self
 
     def _require_simulated_data(self) -> None:
         """Refuse data that a data set cannot be made of."""

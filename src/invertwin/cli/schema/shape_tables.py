@@ -277,13 +277,8 @@ def body_joints(
     Raises:
         InputError: The object is no body, or has no such joint.
     """
-    found = body_template_of(table)
-    if found is None:
-        raise InputError(
-            f'expected an object with shape = "body", got {object}; give it this shape, or use '
-            'kind = "pose"'
-        )
-    return SkinnedBody.from_mesh(object, found, mesh, joints)
+    body = require_body(table, f'{object}; give it this shape, or use kind = "pose"')
+    return SkinnedBody.from_mesh(object, body, mesh, joints)
 
 
 def shape_regularizers(table: Any, module: nn.Module, scene: Scene | Radar) -> list[Regularizer]:
@@ -311,6 +306,22 @@ def body_template_of(table: Any) -> BodyTemplate | None:
     if getattr(table, "shape", None) != "body":
         return None
     return body_template(table.model, table.file, table.height, table.spacing).scale(table.scale)
+
+
+def require_body(table: Any, got: str) -> BodyTemplate:
+    """Return the body of an object's table in its rest pose.
+
+    Args:
+        table: table of the object.
+        got: what is given instead, and what to do, for the message.
+
+    Raises:
+        InputError: another shape.
+    """
+    found = body_template_of(table)
+    if found is None:
+        raise InputError(f'expected an object with shape = "body", got {got}')
+    return found
 
 
 def joint_positions(table: Any, item: Object, rotations: Tensor | None = None) -> dict[str, Tensor]:

@@ -103,8 +103,9 @@ def set_values(raw: dict[str, Any], values: Iterable[tuple[str, Any]]) -> dict[s
         else:
             holder[last] = copy.deepcopy(value)
     # Of a list the last ones first: the others keep their numbers until then.
-    for holder, last in sorted(removed, key=lambda row: row[1] if _is_index(row[1]) else -1)[::-1]:
-        if _is_index(last) or last in holder:
+    removed.sort(key=lambda row: row[1] if isinstance(row[1], int) else -1, reverse=True)
+    for holder, last in removed:
+        if isinstance(last, int) or last in holder:
             del holder[last]
     return changed
 
@@ -115,7 +116,7 @@ def _find_holder(raw: dict[str, Any], path: str) -> tuple[Any, Any]:
     holder: Any = raw
     for step in way:
         holder = _get_entry(holder, step, path)
-    if _is_index(last):
+    if isinstance(last, int):
         _get_entry(holder, last, path)
     elif not isinstance(holder, dict):
         raise InputError(f'{path}: expected a table before "{last}", got {holder}; correct the key')
@@ -140,7 +141,3 @@ def _get_entry(holder: Any, step: str | int, path: str) -> Any:
         f"({', '.join(known[:_MAX_LISTED_NAMES]) or 'none'}), "
         f'got "{step}"; ' + (f"did you mean `{close[0]}`?" if close else "add it")
     )
-
-
-def _is_index(step: str | int) -> bool:
-    return isinstance(step, int)

@@ -18,9 +18,10 @@ TAIL_DEGREES = 4.0
 """Degrees of freedom of the heavy-tailed speckle."""
 _MIN_POWER = 1e-30  # lower limit of power in logarithms
 _BACKGROUND_QUANTILE = 0.25  # quantile of a range bin that estimates the background
+_Maps = Float[Tensor, "frame range u v"]  # power of every frame
 
 
-def estimate_background(power: Float[Tensor, "frame range u v"]) -> Float64[Tensor, " range"]:
+def estimate_background(power: _Maps) -> Float64[Tensor, " range"]:
     """Estimate the level of noise and unmodelled clutter of every range bin.
 
     The lower quartile of exponentially distributed power is 0.288 of its mean. Objects that fill
@@ -119,19 +120,11 @@ class HeavyTailedLoss:
     level: Float64[Tensor, " range"]
     degrees: float = TAIL_DEGREES
 
-    def __call__(
-        self,
-        predicted: Float[Tensor, "frame range u v"],
-        observed: Float[Tensor, "frame range u v"],
-    ) -> Float[Tensor, ""]:
+    def __call__(self, predicted: _Maps, observed: _Maps) -> Float[Tensor, ""]:
         """Return the mean of ``bin_losses`` over all bins."""
         return self.bin_losses(predicted, observed).mean()
 
-    def bin_losses(
-        self,
-        predicted: Float[Tensor, "frame range u v"],
-        observed: Float[Tensor, "frame range u v"],
-    ) -> Float[Tensor, "frame range u v"]:
+    def bin_losses(self, predicted: _Maps, observed: _Maps) -> _Maps:
         """Compute the divergence of every bin from its predicted mean.
 
         Args:

@@ -1,6 +1,7 @@
 """Maximum-likelihood reflectivity image of all maps."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,10 +11,10 @@ from torch import Tensor
 
 from invertwin.channel import Grid
 from invertwin.discovery.imaging.likelihood import TAIL_DEGREES, MapAxis, map_axes
-from invertwin.errors import InputError
 from invertwin.inversion import speckle_weight
 from invertwin.radar import Radar
 from invertwin.radar.aperture import aperture
+from invertwin.runtime.memory import require_at_most
 from invertwin.runtime.progress import track
 
 _MIN_RELATIVE_RESPONSE = 1e-3  # relative to the peak of a response: smaller entries are dropped
@@ -21,6 +22,7 @@ _MIN_RESPONSE = 1e-30  # smaller responses are invisible points [1/m²]
 _TABLE_STEPS_PER_BIN = 32  # entries of a kernel's table per bin
 _TABLE_MIDDLE = 16 * _TABLE_STEPS_PER_BIN  # entry of lag 0
 _MAX_MATRIX_ENTRIES = 8e7  # entries of the matrix, 8 bytes each
+_Maps = Float64[Tensor, "frame range u v"]  # power of every frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +37,7 @@ class ImageResponse:
     matrix: sparse.csr_matrix
     shape: tuple[int, ...]
 
-    def predict_maps(
-        self, strength: Float64[Tensor, " point"]
-    ) -> Float64[Tensor, "frame range u v"]:
+    def predict_maps(self, strength: Float64[Tensor, " point"]) -> _Maps:
         """Predict the maps of scatterers.
 
         Args:
@@ -45,9 +45,7 @@ class ImageResponse:
         """
         return torch.from_numpy(self.matrix @ strength.numpy()).reshape(self.shape)
 
-    def average_over_bins(
-        self, values: Float64[Tensor, "frame range u v"]
-    ) -> Float64[Tensor, "frame point"]:
+    def average_over_bins(self, values: _Maps) -> Float64[Tensor, "frame point"]:
         """Average values over the bins of every point, frame by frame.
 
         Args:
@@ -73,26 +71,15 @@ def thin_map(
         grid: bins of the maps.
     """
     array = aperture(radar)
-    cells = [
-        radar.waveform.range_resolution,
-        *(direction_cell(p, radar) for p in (array.y, array.z)),
-    ]
-    steps = [
-        max(1, round(cell / step)) if count > 1 else 1
-        for cell, step, count in zip(
-            cells, (grid.range_step, grid.u_step, grid.v_step), grid.shape, strict=True
-        )
-    ]
-    some = power.detach().double()[:, :: steps[0], :: steps[1], :: steps[2]]
-    return some, replace(
-        grid,
-        range_step=grid.range_step * steps[0],
-        u_step=grid.u_step * steps[1],
-        v_step=grid.v_step * steps[2],
-        range_count=some.shape[1],
-        u_count=some.shape[2],
-        v_count=some.shape[3],
-    )
+    across, up = (direction_cell(places, radar) for places in (array.y, array.z))
+    some, changes = power.detach().double(), dict[str, Any]()
+    cells = {"range": radar.waveform.range_resolution, "u": across, "v": up}
+    for dim, (name, cell) in enumerate(cells.items(), 1):
+        step = getattr(grid, f"{name}_step")
+        stride = max(1, round(cell / step)) if some.shape[dim] > 1 else 1
+        some = some[(slice(None),) * dim + (slice(None, None, stride),)]
+        changes |= {f"{name}_step": stride * step, f"{name}_count": some.shape[dim]}
+    return some, replace(grid, **changes)
 
 
 def direction_cell(positions: Float64[Tensor, " point"], radar: Radar) -> float:
@@ -124,12 +111,9 @@ def compute_response(
     link, shape = radar.link(), (radar.frame_count, *grid.shape)
     tables = [_AxisResponseTable.from_axis(axis) for axis in map_axes(radar, grid)]
     pairs = np.prod([len(table.offsets) for table in tables])
-    estimate = len(positions) * radar.frame_count * pairs
-    if estimate > 4 * _MAX_MATRIX_ENTRIES:
-        raise InputError(
-            f"expected at most {4 * _MAX_MATRIX_ENTRIES:.0e} pairs of points and bins, got "
-            f"{estimate:.0e}; look at a smaller region, or with a coarser step"
-        )
+    estimate = float(len(positions) * radar.frame_count * pairs)
+    do = "look at a smaller region, or with a coarser step"
+    require_at_most(estimate, 4 * _MAX_MATRIX_ENTRIES, "pairs of points and bins", do)
     columns = np.arange(len(positions), dtype=np.int32)
     frames = []
     for frame in track(range(radar.frame_count), "responses of image points"):
@@ -161,8 +145,8 @@ def compute_response(
 
 def reconstruct_reflectivity(
     response: ImageResponse,
-    power: Float64[Tensor, "frame range u v"],
-    known_power: Float64[Tensor, "frame range u v"],
+    power: _Maps,
+    known_power: _Maps,
     *,
     steps: int = 40,
     degrees: float = TAIL_DEGREES,

@@ -347,12 +347,10 @@ def _unit_mesh(kind: str) -> Mesh:
         return box(1.0)
     if kind in ("sphere", "point"):
         return sphere(0.5, 2)
-    builders = {"person": _person_mesh, "vehicle": _vehicle_mesh, "corner": _corner_mesh}
-    return builders.get(kind, _cylinder_mesh)()
-
-
-def _cylinder_mesh() -> Mesh:
-    return cylinder(0.5, 1.0)
+    if kind == "corner":  # a plate that faces −x
+        return box((0.1, 1.0, 1.0))
+    builders = {"person": _person_mesh, "vehicle": _vehicle_mesh}
+    return builders[kind]() if kind in builders else cylinder(0.5, 1.0)
 
 
 def _person_mesh() -> Mesh:
@@ -399,11 +397,6 @@ def _vehicle_layer(high: float, rear: float, front: float, wide: float) -> list[
     rows = [(front, -aside), (front - cut, -0.5 * wide), (rear + cut, -0.5 * wide), (rear, -aside)]
     rows += [(x, -y) for x, y in reversed(rows)]
     return [[x, y, high - 0.5] for x, y in rows]
-
-
-def _corner_mesh() -> Mesh:
-    """Return a plate that faces −x."""
-    return box((0.1, 1.0, 1.0))
 
 
 @cache

@@ -118,16 +118,10 @@ class OutlineModel(UnknownShape):
             length, width = (high - low).tolist()
             a, b = self.place.tolist()
             distances = self.sides.distances[:, :, 0].clone()
-        return replace(
-            self.start,
-            position=(x, y),
-            length=length,
-            width=width,
-            height=float(self.height.detach()),
-            brightness=float(self.brightness.detach()),
-            distances=distances,
-            middle=(a, b),
-        )
+            height, brightness = float(self.height), float(self.brightness)
+        outline = {"position": (x, y), "middle": (a, b), "distances": distances}
+        sizes = {"length": length, "width": width, "height": height}
+        return replace(self.start, brightness=brightness, **outline, **sizes)
 
     def mesh(self) -> Mesh:
         """Return the surface in the world, differentiable with respect to all parameters."""

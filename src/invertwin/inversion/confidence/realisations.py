@@ -16,6 +16,7 @@ from invertwin.seeds import derive_seed
 
 _NOISE_BIN_FRACTION = 0.2  # weakest fraction of bins, in which noise is estimated
 _POOLING_LEVELS = 2  # halvings of the resolution for residuals
+_Looks = Sequence[list[Tensor]]  # a map of every observation each
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,16 +44,11 @@ class FitResult:
     """
 
     def __init__(
-        self,
-        fit: Fit,
-        maps: MapPairs | None = None,
-        realisations: Sequence[list[Tensor]] | None = None,
+        self, fit: Fit, maps: MapPairs | None = None, realisations: _Looks | None = None
     ) -> None:
         self.fit, self._maps, self._looks = fit, maps, realisations
 
-    def select_frames(
-        self, indices: Sequence[int], realisations: Sequence[list[Tensor]]
-    ) -> "FitResult":
+    def select_frames(self, indices: Sequence[int], realisations: _Looks) -> "FitResult":
         """Return the result for selected frames of every observation.
 
         Args:

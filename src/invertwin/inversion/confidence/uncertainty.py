@@ -161,14 +161,9 @@ class CovarianceEstimator:
         covariance = _sandwich_covariance(*parts)
         if frames is None:
             covariance = self._widen_covariance(covariance, spans)
-        return Uncertainty(
-            tuple(c.name for c in found),
-            tuple(c.unit for c in found),
-            covariance * square,
-            tuple(_describe_unobserved(found, covariance)),
-            count,
-            by,
-        )
+        names, units = tuple(c.name for c in found), tuple(c.unit for c in found)
+        blind = tuple(_describe_unobserved(found, covariance))
+        return Uncertainty(names, units, covariance * square, blind, count, by)
 
     def _widen_covariance(self, covariance: Tensor, spans: Tensor) -> Tensor:
         """Widen weak directions of the covariance (in spans) by profiles of the loss."""

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from invertwin.channel import Sampling
 from invertwin.deprecation import rename_members
 from invertwin.errors import InputError
+from invertwin.inversion.forward_mode import Evaluation
 from invertwin.inversion.gradcheck.tangents import ParameterChanges, parameter_changes
 from invertwin.inversion.loss import resolve_loss
 from invertwin.inversion.observation import Observation
@@ -57,7 +58,7 @@ class DistanceFieldLine(ParameterLine):
     def __init__(self, module: nn.Module, tangent: ParameterChanges, target: Any) -> None:
         """Define the line of a module with an ``object`` and a ``distance`` method."""
         super().__init__(module, tangent, target)
-        self._field, self._object = _DistanceModule(module), str(module.object)
+        self._object = str(module.object)
         with torch.no_grad():
             self._scene = module(target)
         self._mesh = self._scene[self._object].mesh
@@ -82,9 +83,10 @@ class DistanceFieldLine(ParameterLine):
     def _distance_and_gradient(self, theta: float, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Return the changed distance at points, and its spatial gradient."""
         at = positions.detach().requires_grad_()
-        moved = {f"shape.{n}": self._start[n] + theta * by for n, by in self._tangent.items()}
+        moved = {f"module.{n}": self._start[n] + theta * by for n, by in self._tangent.items()}
+        evaluation = Evaluation(self._module, lambda: self._module.distance(at))  # type: ignore[operator]
         with torch.enable_grad():
-            found = torch.func.functional_call(self._field, moved, (at,))
+            found = torch.func.functional_call(evaluation, moved, ())
             (slope,) = torch.autograd.grad(found.sum(), at)
         return found.detach(), slope
 
@@ -139,17 +141,6 @@ def evaluate_losses(
         model = model.for_differences(start, sensor, samples, "area")
         maps = (model.predict(line.evaluate_end(float(offset)), sensor, seed) for offset in offsets)
         return torch.stack([loss(predicted, observed) for predicted in maps])
-
-
-class _DistanceModule(nn.Module):
-    """Module whose call returns the signed distance of a shape."""
-
-    def __init__(self, shape: nn.Module) -> None:
-        super().__init__()
-        self.shape = shape
-
-    def forward(self, positions: Tensor) -> Tensor:
-        return self.shape.distance(positions)  # type: ignore[operator]
 
 
 rename_members(ParameterLine, at="evaluate", end="evaluate_end")

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from annotated_types import Gt, Lt
 from jaxtyping import Float64
@@ -132,15 +132,7 @@ class InitialPoseEstimator:
             middle = item.mesh.center
             mesh = Mesh(middle + (item.mesh.vertices - middle) * factor, item.mesh.faces)
             scene = scene.replace(name, mesh=mesh)
-        scene, losses = select_pose(
-            scene,
-            name,
-            candidate_poses(scene[name], rectangle, radar),
-            radar,
-            capture,
-            grid,
-            loss=loss,
-            surrogate=_POSE_SURROGATE,
-            seed=seed,
-        )
+        poses = candidate_poses(scene[name], rectangle, radar)
+        how: dict[str, Any] = {"loss": loss, "surrogate": _POSE_SURROGATE, "seed": seed}
+        scene, losses = select_pose(scene, name, poses, radar, capture, grid, **how)
         return InitialEstimate(scene, len(points), losses, rectangle.size)

@@ -24,7 +24,7 @@ from invertwin.inversion.confidence.ambiguities import (
 from invertwin.inversion.fit import Callback
 from invertwin.inversion.loss import Objective, resolve_loss
 from invertwin.inversion.metrics import pose_error
-from invertwin.inversion.observation import Observation, Unknowns, name_unknowns
+from invertwin.inversion.observation import Observation, Unknowns
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.inversion.reconstruction import Reconstruction, reconstruct
 from invertwin.inversion.regularization import Regularizer
@@ -71,6 +71,26 @@ class Screening:
     starts: Mapping[str, Sequence[Object]] | Sequence[Candidate]
     fits: Count = _FULL_FIT_COUNT
     shortlist: bool = False
+
+    def candidates(self, scene: Scene, observations: Sequence[Observation]) -> list[Candidate]:
+        """The starts as candidates.
+
+        Args:
+            scene: Scene as known.
+            observations: Recordings with their models, where starts are poses.
+
+        Raises:
+            InputError: There are none.
+        """
+        if not isinstance(self.starts, Mapping):
+            found = list(self.starts)
+        else:
+            poses = [(name, item) for name, items in self.starts.items() for item in items]
+            scenes = [scene.replace(name, pose=item.transform) for name, item in poses]
+            found = [Candidate(begun, observations) for begun in scenes]
+        if not found:
+            raise InputError("expected at least one start, got none; give poses of an object")
+        return found
 
 
 @dataclass(frozen=True)
@@ -179,7 +199,7 @@ def search(
     watched = [observations] if isinstance(observations, Observation) else list(observations)
     screening = starts if isinstance(starts, Screening) else Screening(starts)
     names = list(screening.starts) if isinstance(screening.starts, Mapping) else []
-    begun = _candidates(scene, watched, screening.starts)
+    begun = screening.candidates(scene, watched)
     stages = [*schedule] if isinstance(schedule, Sequence) else [schedule or Schedule()]
     score_start = _make_screening_loss(watched, loss, seed)
     losses = [score_start(candidate) for candidate in track(begun, "starts")]
@@ -230,27 +250,6 @@ def _compare_ends(
     return Search(ends[0], ends, scores, texts, number, tuple(names), tuple(losses))
 
 
-def _candidates(
-    scene: Scene,
-    observations: Sequence[Observation],
-    starts: Mapping[str, Sequence[Object]] | Sequence[Candidate],
-) -> list[Candidate]:
-    """The starts of a search as candidates.
-
-    Raises:
-        InputError: There are none.
-    """
-    if not isinstance(starts, Mapping):
-        found = list(starts)
-    else:
-        poses = [(name, item) for name, items in starts.items() for item in items]
-        scenes = [scene.replace(name, pose=item.transform) for name, item in poses]
-        found = [Candidate(begun, observations) for begun in scenes]
-    if not found:
-        raise InputError("expected at least one start, got none; give poses of an object")
-    return found
-
-
 def _make_screening_loss(
     observations: Sequence[Observation], loss: Callable[[Tensor, Tensor], Tensor] | None, seed: int
 ) -> Callable[[Candidate], float]:
@@ -265,19 +264,11 @@ def _make_screening_loss(
     def score(candidate: Candidate) -> float:
         with torch.no_grad():
             drawn = zip(models, candidate.observations, strict=True)
-            maps = [model.predict(candidate.scene, _initial_sensor(o), seed) for model, o in drawn]
+            maps = [model.predict(candidate.scene, o.initial_sensor(), seed) for model, o in drawn]
             visible = all(bool(power.any()) for power in maps)
             return float(objective(list(zip(maps, blurred, strict=True)))) if visible else math.inf
 
     return score
-
-
-def _initial_sensor(observation: Observation) -> Any:
-    """The sensor with its unknowns at their initial values."""
-    sensor = observation.sensor
-    for unknown in name_unknowns(observation.parameters).values():
-        sensor = unknown.build_module(sensor)(sensor)
-    return sensor
 
 
 def _reduce_samples(model: ForwardModel) -> ForwardModel:

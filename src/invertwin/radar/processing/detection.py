@@ -14,13 +14,14 @@ from scipy.stats import beta, f
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.checks import check_shape, is_differentiated
+from invertwin.checks import check_shape, checked_number, is_differentiated
 from invertwin.errors import InputError
 from invertwin.radar.processing.doppler import velocity_axis, velocity_span
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 
 _QUADRATURE = 4096  # quadrature nodes over the distribution of an order statistic
+_Values = Float64[Tensor, " point"]  # one at every point
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +38,11 @@ class PointCloud:
     """
 
     frame: Int64[Tensor, " point"]
-    range: Float64[Tensor, " point"]
-    velocity: Float64[Tensor, " point"]
-    u: Float64[Tensor, " point"]
-    v: Float64[Tensor, " point"]
-    power: Float64[Tensor, " point"]
+    range: _Values
+    velocity: _Values
+    u: _Values
+    v: _Values
+    power: _Values
     position: Float64[Tensor, "point 3"]
 
     def __len__(self) -> int:
@@ -108,8 +109,7 @@ def ordered_statistics_cfar(
     """
     band, count = _training_cells(power, guard, training, "ordered_statistics_cfar")
     _check_rates(false_alarm, looks)
-    if not 0 < rank <= 1:
-        raise InputError(f"expected a rank in (0, 1], got {rank:g}; 0.75 is usual")
+    checked_number(rank, "rank", 0.0, 1.0, open_low=True)
     numbers, index = count.unique(return_inverse=True)
     places = (rank * numbers - 1e-9).ceil().long()
     # Other cells are infinite, so last in order.
@@ -222,11 +222,7 @@ def _refine_points(
 
 
 def world_positions(
-    radar: Radar,
-    frame: Int64[Tensor, " point"],
-    ranges: Float64[Tensor, " point"],
-    u: Float64[Tensor, " point"],
-    v: Float64[Tensor, " point"],
+    radar: Radar, frame: Int64[Tensor, " point"], ranges: _Values, u: _Values, v: _Values
 ) -> Float64[Tensor, "point 3"]:
     """Return world positions of points in front of the radar [m].
 
@@ -311,7 +307,7 @@ def _ordered_factor(cells: int, rank: int, false_alarm: float, looks: int) -> fl
 
 def _refinement(
     power: Float64[Tensor, "frame velocity range u v"], cell: list[Tensor], axis: int, wrap: bool
-) -> Float64[Tensor, " point"]:
+) -> _Values:
     """Return the sub-bin peak offset along one axis, within half a bin, 0 at an edge."""
     size = power.shape[axis]
     here = cell[axis]

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Complex, Complex128, Float, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.checks import check_shape, checked_number
+from invertwin.checks import check_choice, check_shape, checked_number
 from invertwin.errors import InputError
 from invertwin.radar.aperture import Aperture, aperture
 from invertwin.radar.radar import Radar
@@ -19,6 +19,8 @@ from invertwin.radar.radar import Radar
 _SMALLEST_GAP = 1e-8
 # Tolerance of a uniform spacing, relative to it.
 _UNIFORMITY = 0.02
+_Subarray = tuple[int, int] | None  # elements along y and z; None = the whole array
+_Matrices = Complex128[Tensor, "*batch element element"]  # covariances
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +53,7 @@ def capon(
     grid: Grid,
     *,
     loading: float = 1e-2,
-    smoothing: tuple[int, int] | None = None,
+    smoothing: _Subarray = None,
     forward_backward: bool = False,
 ) -> Float64[Tensor, "frame range u v"]:
     """Compute the Capon (minimum variance) power spectrum: 1 / aᴴ (R + δI)⁻¹ a.
@@ -96,7 +98,7 @@ def music(
     grid: Grid,
     *,
     sources: int | str = "mdl",
-    smoothing: tuple[int, int] | None = None,
+    smoothing: _Subarray = None,
     forward_backward: bool = False,
 ) -> Float64[Tensor, "frame range u v"]:
     """Compute the MUSIC pseudospectrum: elements / aᴴ E Eᴴ a, with E the noise subspace; at least
@@ -164,8 +166,7 @@ def source_count(
         InputError: An unknown rule, or fewer snapshots than elements.
     """
     elements = eigenvalues.shape[-1]
-    if rule not in ("mdl", "aic"):
-        raise InputError(f"expected the rule mdl or aic, got {rule!r}; or give a number of sources")
+    check_choice(rule, ("mdl", "aic"), "a rule of", "or give a number of sources")
     if snapshots < elements:
         raise InputError(
             f"expected at least {elements} snapshots to count the sources on {elements} elements, "
@@ -192,11 +193,7 @@ class _SignalProjector(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        matrix: Complex128[Tensor, "*batch element element"],
-        chosen: Bool[Tensor, "*batch element"],
-    ) -> Complex128[Tensor, "*batch element element"]:
+    def forward(ctx: Any, matrix: _Matrices, chosen: Bool[Tensor, "*batch element"]) -> _Matrices:
         values, vectors = torch.linalg.eigh(matrix)
         ctx.save_for_backward(values, vectors, chosen)
         ctx.save_for_forward(values, vectors, chosen)
@@ -230,11 +227,7 @@ def _projector_change(values: Tensor, vectors: Tensor, chosen: Tensor, change: T
 
 
 def _snapshots(
-    profile: Tensor,
-    radar: Radar,
-    grid: Grid,
-    smoothing: tuple[int, int] | None,
-    forward_backward: bool,
+    profile: Tensor, radar: Radar, grid: Grid, smoothing: _Subarray, forward_backward: bool
 ) -> _Snapshots:
     """Return snapshots of the distinct elements, including shifted subarrays and the reversed
     array.

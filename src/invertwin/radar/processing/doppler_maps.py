@@ -29,6 +29,9 @@ _OWN_NOISE = 16
 _FALSE_ALARM_RATE = 1e-3
 _ROUNDING = 1e-12
 _BINS_AT_ONCE = 2e7  # bins of range rate, range, u, v per chunk
+_Cells = Bool[Tensor, "velocity range"]  # marked ones
+_Beat = Complex[Tensor, "frame chirp tx rx sample"]  # of every ramp
+_Cube = Complex[Tensor, "frame velocity tx rx range"]  # over range rate and range
 
 
 @dataclass(frozen=True)
@@ -85,11 +88,7 @@ class DopplerMaps:
 
 
 def doppler_maps(
-    beat: Complex[Tensor, "frame chirp tx rx sample"],
-    radar: Radar,
-    grid: Grid,
-    chirps: Chirps,
-    frame: int = 0,
+    beat: _Beat, radar: Radar, grid: Grid, chirps: Chirps, frame: int = 0
 ) -> DopplerMaps:
     """Compute range-Doppler and range-direction maps of one frame, with ``compensate_tdm``.
 
@@ -124,11 +123,7 @@ def doppler_maps(
 
 
 def _sum_range_rates(
-    cube: Complex[Tensor, "frame velocity tx rx range"],
-    radar: Radar,
-    grid: Grid,
-    chirps: Chirps,
-    candidates: Bool[Tensor, "velocity range"],
+    cube: _Cube, radar: Radar, grid: Grid, chirps: Chirps, candidates: _Cells
 ) -> tuple[Float64[Tensor, "range u v"], Peak]:
     """Sum power over all range rates, and return the strongest of the candidate cells."""
     cube = compensate_tdm(cube, radar, chirps)[0]
@@ -148,7 +143,7 @@ def _sum_range_rates(
 
 def _detect_moving_cells(
     moving: Float[Tensor, "velocity range"], flat: Float[Tensor, "velocity range"], looks: int
-) -> Bool[Tensor, "velocity range"]:
+) -> _Cells:
     """Detect cells above noise and drift."""
     moving, middle = moving.double(), len(flat) // 2
     rows = [noise_power(row, looks) for row in moving.T] if len(flat) >= _OWN_NOISE else [0.0]
@@ -189,11 +184,7 @@ def high_resolution_map(
 
 
 def doppler_snapshots(
-    beat: Complex[Tensor, "frame chirp tx rx sample"],
-    radar: Radar,
-    grid: Grid,
-    chirps: Chirps,
-    frame: int,
+    beat: _Beat, radar: Radar, grid: Grid, chirps: Chirps, frame: int
 ) -> Complex[Tensor, "velocity tx rx range"]:
     """Return the range-rate bins of one frame as snapshots for `high_resolution_map`.
 

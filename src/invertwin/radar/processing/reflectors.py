@@ -40,14 +40,12 @@ _ABOVE_SIDELOBES = 4.0
 # channels leave this residual.
 _MIN_RELATIVE_POWER = 0.1
 _FALSE_DIRECTION_RATE = 1e-3
+_Levels = Float64[Tensor, "velocity range"]  # mean over channels
+_Beat = Complex[Tensor, "frame chirp tx rx sample"]  # of every ramp
 
 
 def detect_points(
-    beat: Complex[Tensor, "frame chirp tx rx sample"],
-    radar: Radar,
-    grid: Grid,
-    chirps: Chirps | None,
-    frame: int,
+    beat: _Beat, radar: Radar, grid: Grid, chirps: Chirps | None, frame: int
 ) -> PointCloud:
     """Detect the reflectors in one frame by CFAR.
 
@@ -111,9 +109,7 @@ def noise_power(power: Float[Tensor, "*cell"], looks: int, empty: float = 0.5) -
     return level * looks / float(gammaincinv(looks, empty))
 
 
-def _find_cells(
-    flat: Float64[Tensor, "velocity range"], radar: Radar, grid: Grid, looks: int
-) -> list[tuple[int, int]]:
+def _find_cells(flat: _Levels, radar: Radar, grid: Grid, looks: int) -> list[tuple[int, int]]:
     """Return the range-rate and range bins of reflectors, the strongest first."""
     around = maximum_filter(flat.numpy(), 3, mode=("wrap", "nearest"))  # type: ignore[arg-type]
     found = _threshold_cells(flat, looks) & (flat == torch.from_numpy(around)) & (flat > 0)
@@ -131,9 +127,7 @@ def _find_cells(
     return chosen
 
 
-def _threshold_cells(
-    flat: Float64[Tensor, "velocity range"], looks: int
-) -> Bool[Tensor, "velocity range"]:
+def _threshold_cells(flat: _Levels, looks: int) -> Bool[Tensor, "velocity range"]:
     if len(flat) >= _MIN_RATES_2D:
         return cell_averaging_cfar(flat, looks=looks)
     how: Any = {"guard": _GUARD, "training": _TRAINING, "rank": _RANK, "looks": looks}

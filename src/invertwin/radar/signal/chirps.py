@@ -31,6 +31,7 @@ _INTERPOLATION_ERROR = 1e-6
 _MAX_INSTANTS = 33
 
 PointTrajectory = Callable[[float], Float64[Tensor, "path 3"]]
+_Ramp = Complex128[Tensor, "frame sender rx sample"]  # signals of one ramp
 
 
 @dataclass(frozen=True)
@@ -63,11 +64,7 @@ class Chirps:
                 f"expected no order of transmitters that send at once, got {self.order}; "
                 "leave it out, or set tdm=True"
             )
-        if sorted(self.order) != list(range(len(self.order))):
-            raise InputError(
-                f"expected an order that names every transmitter from 0 once, got {self.order}; "
-                "(0, 2, 1) is that of three whose last two are swapped"
-            )
+        check_order(self.order, len(self.order))
 
     def times(self, transmitters: int) -> Float64[Tensor, "chirp tx"]:
         """Return the first sample of every ramp [s], the first one at 0; columns are the radar's
@@ -98,6 +95,24 @@ class Chirps:
         """
         turns = transmitters if self.tdm else 1
         return wavelength / (4 * self.interval * turns)
+
+
+def check_order(order: Sequence[int], transmitters: int) -> list[int]:
+    """Return an order in which transmitters take turns, as a list.
+
+    Args:
+        order: numbers of the transmitters from 0.
+        transmitters: number of transmitters.
+
+    Raises:
+        InputError: not every transmitter once.
+    """
+    if sorted(order) != list(range(transmitters)):
+        raise InputError(
+            f"expected an order that names each of {transmitters} transmitters once, from 0, got "
+            f"{list(order)}; (0, 2, 1) is that of three whose last two are swapped"
+        )
+    return list(order)
 
 
 @rename_arguments(places="trajectory")
@@ -148,9 +163,7 @@ def moving_beat(
 
 
 def simulate_chirp_train(
-    chirps: Chirps,
-    transmitters: int,
-    ramp: Callable[[float, list[int]], Complex128[Tensor, "frame sender rx sample"]],
+    chirps: Chirps, transmitters: int, ramp: Callable[[float, list[int]], _Ramp]
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
     """Simulate the signals of all ramps of a train.
 
@@ -217,9 +230,7 @@ class ChirpTrain:
     trajectory: PointTrajectory
     tolerance: float = 1e-9
 
-    def simulate_ramp(
-        self, start: float, active_transmitters: Sequence[int]
-    ) -> Complex128[Tensor, "frame sender rx sample"]:
+    def simulate_ramp(self, start: float, active_transmitters: Sequence[int]) -> _Ramp:
         """Simulate one ramp with all receivers.
 
         Args:

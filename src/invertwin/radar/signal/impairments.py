@@ -229,14 +229,9 @@ class Impairments:
             factors = channel_errors(radar, self.gain_std_db, self.phase_std, seed=streams[1])
             beat = beat * factors[..., None].to(beat.device)
         if self.snr_db is not None or self.noise_figure_db is not None:
-            beat = add_noise(
-                beat,
-                radar,
-                seed=streams[2],
-                snr_db=self.snr_db,
-                noise_figure_db=self.noise_figure_db,
-                transmit_power=self.transmit_power,
-            )
+            names = ("snr_db", "noise_figure_db", "transmit_power")
+            levels = {name: getattr(self, name) for name in names}
+            beat = add_noise(beat, radar, seed=streams[2], **levels)
         return beat if self.adc is None else quantize(beat, radar, self.adc)
 
 

@@ -147,7 +147,8 @@ def range_profile(
     tapered = checked_beat(beat, radar) * window.to(beat.device, beat.real.dtype)
     bins = fft_bins(waveform, grid)
     if bins is None:
-        return tapered @ _range_matrix(waveform, grid).to(beat.device, beat.dtype)
+        cycles = torch.arange(waveform.samples)[:, None] * (grid.ranges / waveform.max_range)
+        return tapered @ torch.exp(-2j * math.pi * cycles).to(beat.device, beat.dtype)
     length, first = bins
     # Ranges outside the unambiguous interval are aliased.
     wanted = (first + torch.arange(grid.range_count, device=beat.device)) % length
@@ -207,8 +208,3 @@ def fft_bins(waveform: SampledWaveform, grid: Grid) -> tuple[int, int] | None:
     if on_bins and round(length) >= waveform.samples:
         return round(length), round(first)
     return None
-
-
-def _range_matrix(waveform: SampledWaveform, grid: Grid) -> Complex128[Tensor, "sample range"]:
-    cycles = torch.arange(waveform.samples)[:, None] * (grid.ranges / waveform.max_range)
-    return torch.exp(-2j * math.pi * cycles)

@@ -14,14 +14,12 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform, Waveform, gaussian_response
 
 _TABLE = 32  # table entries per cell of a response
+_Values = Float64[Tensor, " point"]  # one at every point
 
 
 def range_point_spread(
-    waveform: Waveform,
-    distance: Float64[Tensor, " point"],
-    window: str = "hamming",
-    kernel: str = "response",
-) -> Float64[Tensor, " point"]:
+    waveform: Waveform, distance: _Values, window: str = "hamming", kernel: str = "response"
+) -> _Values:
     """Return the power of a point target at a distance from its range, peak 1.
 
     Args:
@@ -66,7 +64,7 @@ def interpolate_response(
     )
 
 
-def dirichlet(waveform: Waveform, distance: Float64[Tensor, " point"]) -> Float64[Tensor, " point"]:
+def dirichlet(waveform: Waveform, distance: _Values) -> _Values:
     """Return the range response without a window, |sin(Nx) / (N sin x)|² with x = π d / R_max; peak
     1.
 
@@ -105,9 +103,7 @@ def array_point_spread(
     return response.abs().square()
 
 
-def paired_array_spread(
-    array: Aperture, du: Float64[Tensor, " point"], dv: Float64[Tensor, " point"]
-) -> Float64[Tensor, " point"]:
+def paired_array_spread(array: Aperture, du: _Values, dv: _Values) -> _Values:
     """Return the power of a point target at pairs of offsets in u and v from its direction, peak 1.
 
     Args:

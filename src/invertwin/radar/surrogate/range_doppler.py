@@ -59,7 +59,11 @@ def range_doppler_power(
     doppler = _doppler_response(off / velocity_span(radar, chirps), chirps, window)
     coupled = own_rates * _range_doppler_coupling(radar.waveform)
     shown = paths.range - radar.origins[paths.frame] + coupled
-    spread = _range_spread(shown, radar, grid)
+    spread = interpolate_response(
+        grid.ranges[:, None] - shown,
+        radar.waveform.range_resolution,
+        lambda places: radar.waveform.range_response(places, radar.window),
+    )
     steered = _beam_weights(direction, radar, grid)
     starts = 4 * math.pi / radar.waveform.wavelength * chirps.times(len(steered))[0]
     frames = []
@@ -93,16 +97,6 @@ def _range_doppler_coupling(waveform: Waveform) -> float:
     if isinstance(waveform, SteppedFrequency):
         return waveform.center_frequency * waveform.dwell / waveform.step
     return 0.0
-
-
-def _range_spread(
-    ranges: Float64[Tensor, " path"], radar: Radar, grid: Grid
-) -> Float64[Tensor, "range path"]:
-    return interpolate_response(
-        grid.ranges[:, None] - ranges,
-        radar.waveform.range_resolution,
-        lambda places: radar.waveform.range_response(places, radar.window),
-    )
 
 
 def _doppler_response(cycles: Tensor, chirps: Chirps, window: str) -> Tensor:

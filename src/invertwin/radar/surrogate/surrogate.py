@@ -18,13 +18,12 @@ from invertwin.channel import (
     Sampling,
     as_absorbers,
     combine_coherently,
-    deposit_batch,
     deposit_paths,
     deposit_power,
     trace_target,
     use_backend,
 )
-from invertwin.checks import check_choice, check_fields, checked_number
+from invertwin.checks import check_choice, check_fields, check_shape, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.aperture import Aperture, aperture
@@ -43,6 +42,8 @@ from invertwin.scene.scene import Scene
 # Minimum extent of tabulated kernels, so that short grids do not truncate them.
 _MIN_EXTENT = 64
 _DEFAULT_ANGLE_WIDTH = 1.5  # beamwidths of blur for an initial direction of unknown error
+_Values = Float64[Tensor, " point"]  # one at every point
+_Maps = Float[Tensor, "frame range u v"]  # power of every frame
 
 
 @dataclass(frozen=True)
@@ -140,9 +141,7 @@ class Surrogate:
         widths = {"range_width": self.range_width * share, "angle_width": self.angle_width * share}
         return replace(self, **widths)
 
-    def shape(
-        self, deposit: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
-    ) -> Float[Tensor, "frame range u v"]:
+    def shape(self, deposit: _Maps, radar: Radar, grid: Grid) -> _Maps:
         """Convolve deposited power with the point spread: the radar's mean over random phases.
 
         The convolution (peak 1) is divided in the Fourier domain by the transform sinc³ of the
@@ -170,9 +169,7 @@ class Surrogate:
             deposit = kernel.apply(deposit, [sigmas[dim] for dim in kernel.dims], offset)
         return deposit
 
-    def blur(
-        self, power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
-    ) -> Float[Tensor, "frame range u v"]:
+    def blur(self, power: _Maps, radar: Radar, grid: Grid) -> _Maps:
         """Blur a measured spectrum with the added Gaussian widths only.
 
         Args:
@@ -189,14 +186,7 @@ class Surrogate:
                 power = _identity_kernel(dim, count).apply(power, [sigma])
         return power
 
-    def spread(
-        self,
-        radar: Radar,
-        grid: Grid,
-        ranges: Float64[Tensor, " point"],
-        u: Float64[Tensor, " point"],
-        v: Float64[Tensor, " point"],
-    ) -> Float64[Tensor, " point"]:
+    def spread(self, radar: Radar, grid: Grid, ranges: _Values, u: _Values, v: _Values) -> _Values:
         """Return the point spread at offsets from its peak of 1, without added widths.
 
         Args:
@@ -223,15 +213,9 @@ class Surrogate:
         return power * paired_array_spread(array, u, v)
 
     def _kernels(self, radar: Radar, grid: Grid) -> "tuple[_SurrogateKernel, ...]":
-        return _kernels(
-            self.range_kernel,
-            self.angle_kernel,
-            airy_radii(radar, self.aperture_radius),
-            radar.waveform,
-            radar.window,
-            aperture(radar) if (grid.u_count > 1 or grid.v_count > 1) else None,
-            grid,
-        )
+        array = aperture(radar) if grid.u_count > 1 or grid.v_count > 1 else None
+        radii, sharp = airy_radii(radar, self.aperture_radius), self.scale_blur(0.0)
+        return _kernels(sharp, radii, radar.waveform, radar.window, array, grid)
 
     def _blur_sigmas(self, radar: Radar, grid: Grid) -> dict[int, float]:
         """Return the standard deviation of the added Gaussian along each map dimension, in bins."""
@@ -280,7 +264,7 @@ def surrogate_spectrum(
     reference: tuple[Scene, Link] | None = None,
     coherent: Sequence[str] = (),
     stretch: float = 1.0,
-) -> Float[Tensor, "frame range u v"]:
+) -> _Maps:
     """Compute the power spectrum of a scene, differentiable: deposit, then shape.
 
     Negative bins after shaping are set to zero. Coherent targets are deposited in addition to the
@@ -302,7 +286,7 @@ def surrogate_spectrum(
         InputError: See ``deposit_power`` and ``trace_target``.
     """
     link = radar.link()
-    parts = _deposit_targets(scene, radar, grid, surrogate, sampling, coherent, stretch)
+    parts = deposit_targets(scene, radar, grid, surrogate, sampling, coherent, stretch)
     if set(scene.objects) - set(coherent):
         if reference is not None:
             reference = as_absorbers(reference[0], coherent), reference[1]
@@ -312,7 +296,7 @@ def surrogate_spectrum(
     return surrogate.shape(torch.stack(parts).sum(0), radar, grid).clamp_min(0.0)
 
 
-def _deposit_targets(
+def deposit_targets(
     scene: Scene,
     radar: Radar,
     grid: Grid,
@@ -321,7 +305,20 @@ def _deposit_targets(
     names: Sequence[str],
     stretch: float,
 ) -> list[Float32[Tensor, "frame range u v"]]:
-    """Deposit coherent targets."""
+    """Deposit coherent targets, one map each.
+
+    Args:
+        scene: scene to simulate.
+        radar: arrays, waveform and poses.
+        grid: bins, see ``Radar.grid``.
+        surrogate: kernels, which say how far echoes overlap.
+        sampling: numbers of sampled paths.
+        names: objects whose echoes add coherently.
+        stretch: as in ``surrogate_spectrum``.
+
+    Raises:
+        InputError: see ``trace_target``.
+    """
     link, deposits = radar.link(), []
 
     def overlap(*gaps: Tensor) -> Tensor:
@@ -333,40 +330,6 @@ def _deposit_targets(
             powers = combine_coherently(fields, link, overlap, stretch=stretch)
             deposits.append(deposit_paths(powers, link, grid))
     return deposits
-
-
-def surrogate_spectra(
-    scenes: Sequence[Scene],
-    radar: Radar,
-    grid: Grid,
-    surrogate: Surrogate,
-    *,
-    sampling: Sampling,
-    seed: int,
-    coherent: Sequence[str] = (),
-    stretch: float = 1.0,
-) -> Float[Tensor, "scene frame range u v"]:
-    """Compute ``surrogate_spectrum`` of many scenes in one batch, see ``deposit_batch``.
-
-    Args:
-        scenes: scenes to simulate.
-        radar: arrays, waveform and poses, common to all scenes.
-        grid: Bins, see ``Radar.grid``.
-        surrogate: kernels and their added widths.
-        sampling: numbers of sampled paths of each scene.
-        seed: seed of the samples.
-        coherent, stretch: as in ``surrogate_spectrum``, in every scene.
-
-    Raises:
-        InputError: See ``deposit_batch`` and ``trace_target``.
-    """
-    rest = [as_absorbers(scene, coherent) for scene in scenes]
-    deposit = deposit_batch(rest, radar.link(), grid, sampling=sampling, seed=seed)
-    if coherent:
-        how = (radar, grid, surrogate, sampling, coherent, stretch)
-        targets = [torch.stack(_deposit_targets(scene, *how)).sum(0) for scene in scenes]
-        deposit = deposit + torch.stack(targets)
-    return surrogate.shape(deposit.flatten(0, 1), radar, grid).clamp_min(0.0).reshape(deposit.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -417,8 +380,7 @@ class _SurrogateKernel:
 
 @lru_cache(maxsize=16)
 def _kernels(
-    range_kernel: str,
-    angle_kernel: str,
+    surrogate: Surrogate,
     radii: tuple[float, float],
     waveform: Waveform,
     window: str,
@@ -426,8 +388,9 @@ def _kernels(
     grid: Grid,
 ) -> tuple[_SurrogateKernel, ...]:
     """Return the kernels without added widths, cached for the steps of a fit."""
+    angle_kernel = surrogate.angle_kernel
     lags = _lags(grid.range_count) * grid.range_step
-    spread = range_point_spread(waveform, lags, window, range_kernel)
+    spread = range_point_spread(waveform, lags, window, surrogate.range_kernel)
     kernels = [_compensate_spline((1,), (grid.range_count,), spread)]
     if array is None:
         return tuple(kernels)
@@ -513,8 +476,4 @@ def _warn_if_coarse(radar: Radar, grid: Grid, sigmas: dict[int, float]) -> None:
 
 
 def _check_map(power: Tensor, grid: Grid) -> None:
-    if tuple(power.shape[1:]) != grid.shape:
-        raise InputError(
-            f"expected a map of shape (frames, {', '.join(map(str, grid.shape))}), got "
-            f"{tuple(power.shape)}; use the grid that it was made on"
-        )
+    check_shape(power, (None, *grid.shape), "a map", "use the grid that it was made on")
