@@ -54,18 +54,28 @@ TRUTH = [0.4, -0.3, 0.0]
 def test_linear_maps_are_solved_in_a_few_steps(kind, gain):
     model, measured = Mixture([0.0, 0.0, 0.0]), Mixture(TRUTH)().detach()
     scale = 3.0 if gain == "fitted" else 1.0
-    solver = GaussNewton(model, alone(SpectrumLoss(kind, gain=gain)), damping=1e-4)
+    loss = SpectrumLoss(kind, gain=gain, background="none")
+    solver = GaussNewton(model, alone(loss), damping=1e-4)
     losses = [solver.step(lambda: [(model(), scale * measured)]) for _ in range(6)]
     assert torch.allclose(model.share.detach(), float64(TRUTH), atol=1e-4)
     assert losses[-1] < 1e-6 * losses[0]
     assert isinstance(model.share, nn.Parameter)
 
 
+def test_noise_of_unknown_level_is_fitted_beside_the_parameters():
+    """The map is nearly even, so that noise, gain and parameters are hard to tell apart."""
+    model, measured = Mixture([0.0, 0.0, 0.0]), Mixture(TRUTH)().detach()
+    solver = GaussNewton(model, alone(SpectrumLoss(gain="one")), damping=1e-4)
+    losses = [solver.step(lambda: [(model(), measured + 1.5)]) for _ in range(12)]
+    assert torch.allclose(model.share.detach(), float64(TRUTH), atol=2e-3)
+    assert losses[-1] < 1e-5 * losses[0]
+
+
 @pytest.mark.parametrize("kind", ["mse", "likelihood"])
 @pytest.mark.parametrize("background", ["none", "level", "static"])
 def test_curvature_is_the_second_derivative_at_the_truth(kind, background):
     """Where simulation and data agree, Gauss–Newton leaves nothing out."""
-    if kind == "likelihood" and background != "none":
+    if kind == "likelihood" and background == "static":
         return
     model = Mixture(TRUTH)
     measured, map_ = model().detach(), model().detach()
@@ -104,7 +114,8 @@ def test_what_a_gain_explains_tells_nothing():
 def test_a_fixed_coordinate_stays_to_the_last_bit():
     model = Mixture([0.1, 0.2, 0.123456789])
     measured = Mixture(TRUTH)().detach()
-    GaussNewton(model, alone(SpectrumLoss())).step(lambda: [(model(), measured)])
+    loss = SpectrumLoss(background="none")
+    GaussNewton(model, alone(loss)).step(lambda: [(model(), measured)])
     assert float(model.share[2].detach()) == 0.123456789
     assert float(model.share[0].detach()) != 0.1
 
@@ -138,7 +149,10 @@ def test_a_curvature_serves_several_steps():
     def asked(every: int) -> tuple[int, Tensor]:
         model, count = Mixture([0.0, 0.0, 0.0]), 0
         solver = GaussNewton(
-            model, alone(SpectrumLoss(gain="one")), damping=1e-4, curvature_every=every
+            model,
+            alone(SpectrumLoss(gain="one", background="none")),
+            damping=1e-4,
+            curvature_every=every,
         )
 
         def maps() -> MapPairs:
@@ -219,7 +233,7 @@ def test_bad_input(unchecked):
     many.translation = nn.Parameter(torch.zeros(65, dtype=torch.float64))
     with pytest.raises(InputError, match="expected a SpectrumLoss for Gauss–Newton, got function"):
         GaussNewton(model, alone(lambda a, b: a))  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="trust_radius > 0"):
+    with pytest.raises(InputError, match=r"trust_radius in \(0"):
         GaussNewton(model, alone(SpectrumLoss()), trust_radius=0.0)
     with pytest.raises(InputError, match="got 0,"):
         GaussNewton(nn.ReLU(), alone(SpectrumLoss()))

@@ -11,23 +11,25 @@ from jaxtyping import Float, Float64
 from numpy.typing import NDArray
 from torch import Tensor
 
-from invertwin.checks import check_choice
+from invertwin.checks import check_fields, check_shape
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.limits import Count, Positive
 
 _MIN_POSITIVE = 1e-38  # lower limit of logarithms
-_GAIN_STEPS = 8  # maximum number of iterations; three or four suffice
-# Relative step of the gain at which the iteration ends; the remaining error is below 1e-5.
+_GAIN_STEPS = 30  # maximum number of iterations at a resolution; three or four suffice
+_GAIN_CHANGES = -0.8, 2.0  # limits of a relative step
+# Relative step of gain and noise at which the iteration ends; the remaining error is its square.
 _GAIN_TOLERANCE = 1e-3
+_LITTLE_NOISE, _MIN_NOISE = 0.1, 5e-3  # of the floor: near zero, and none
+_INITIAL_NOISE = 0.1  # of the mean power
 _MAX_NEGATIVE = 0.1  # of the peak: less is rounding or interpolation of power
 _BINS_PER_BLOCK = 2**16  # bins per block, so that the working set fits a core's cache
 
-LOSS_KINDS = ("mse", "likelihood", "heavy_tailed")
-BACKGROUNDS = ("none", "level", "static")
 PowerArray = TypeVar("PowerArray", Tensor, NDArray[np.float32])
 _PowerBlock = tuple[Tensor, Tensor, Tensor]  # simulated map, its positive part, measured power
 MapPairs = Sequence[tuple[Tensor, Tensor]]
+_Map = Float[Tensor, "frame *map"]  # of one observation
 """The predicted and the observed map of every observation."""
 
 
@@ -82,13 +84,13 @@ class SpectrumLoss:
     """Multiscale difference of power maps.
 
     a, b are the simulated and the measured map; each level pools pairs of bins of the previous one,
-    and the loss is the mean over levels. The unknown overall gain g ≥ 0 minimises the loss in
-    closed form (``mse``) or by a short fixed-point iteration (the others); as a minimiser, it needs
-    no derivative.
+    and the loss is the mean over levels. The unknown overall gain g ≥ 0 and, of the likelihoods,
+    the unknown mean power n ≥ 0 of noise in a bin minimise the loss, in closed form (``mse``) or by
+    Newton's method (the others); as minimisers, they need no derivative.
 
     Attributes:
         kind: ``likelihood``: the Itakura–Saito divergence ``mean(q − log q − 1)``,
-            ``q = (b + n) / (g a + n)``, which is the likelihood of fully developed speckle (power
+            ``q = b / (g a + n)``, which is the likelihood of fully developed speckle (power
             with an exponential distribution, or gamma after averaging). It weighs weak and strong
             echoes by their information, so that the speckle of a strong reflector does not mask a
             weak one. ``heavy_tailed``: the same for speckle with an uncertain mean
@@ -97,11 +99,12 @@ class SpectrumLoss:
             are not power.
         levels: number of resolutions.
         gain: ``fitted``, or ``one`` for calibrated data.
-        background: ``mse`` only. Background to remove from both maps first, in closed form:
-            nothing, one common ``level``, or the ``static`` part, the mean over frames of every bin
-            (as clutter removal does).
-        floor: not for ``mse``. n over the mean of b: noise and sidelobes below it have little
-            weight.
+        background: ``none``, one common ``level``, or ``mse`` only the ``static`` part, the mean
+            over frames of every bin (as clutter removal does). Under ``mse`` it is removed from
+            both maps; the level of the likelihoods is n. ``auto``: ``level`` for the likelihoods,
+            else ``none``.
+        floor: not for ``mse``. Power over the mean of b that is added to b and to n: sidelobes
+            below it have little weight.
         degrees: ``heavy_tailed`` only. ν: equivalent number of looks that determine the mean of a
             bin.
 
@@ -110,34 +113,28 @@ class SpectrumLoss:
     likelihoods are ours.
 
     Raises:
-        InputError: No levels, an unknown choice, or a background with a likelihood.
+        InputError: No levels, an unknown choice, or a static background with a likelihood.
     """
 
     kind: Literal["mse", "likelihood", "heavy_tailed"] = "likelihood"
     levels: Count = 3
     gain: Literal["fitted", "one"] = "fitted"
-    background: Literal["none", "level", "static"] = "none"
+    background: Literal["auto", "none", "level", "static"] = "auto"
     floor: Positive = 0.01
     degrees: Positive = 4.0
 
     def __post_init__(self) -> None:
-        check_choice(self.kind, LOSS_KINDS, "kind among")
-        if self.levels < 1 or self.gain not in ("fitted", "one"):
+        check_fields(self)
+        if self.kind != "mse" and self.background == "static":
             raise InputError(
-                f"expected levels >= 1 and gain 'fitted' or 'one', got {self.levels} and "
-                f"{self.gain!r}; 3 levels and a fitted gain suit uncalibrated radars"
+                f"expected one level as the background with kind {self.kind!r}, got 'static'; give "
+                'kind="mse", or remove what stands still from the data'
             )
-        check_choice(self.background, BACKGROUNDS, "background among")
-        if self.kind != "mse" and (self.background != "none" or not self.floor > 0):
-            raise InputError(
-                f"expected no background and floor > 0 with kind {self.kind!r}, got "
-                f"{self.background!r} and {self.floor}; the floor stands for a background, or give "
-                'kind="mse"'
-            )
-        if not self.degrees > 0:
-            raise InputError(
-                f"expected degrees > 0, got {self.degrees}; 4 suits data with unmodelled echoes"
-            )
+
+    @property
+    def _has_level(self) -> bool:
+        """True if noise is fitted."""
+        return self.kind != "mse" and self.background != "none"
 
     @property
     def _tail_degrees(self) -> float:
@@ -155,9 +152,7 @@ class SpectrumLoss:
             return power
         return power * speckle_weight(power * inverse, self.degrees)
 
-    def __call__(
-        self, simulated: Float[Tensor, "frame *map"], measured: Float[Tensor, "frame *map"]
-    ) -> Float[Tensor, ""]:
+    def __call__(self, simulated: _Map, measured: _Map) -> Float[Tensor, ""]:
         """Return the loss: 0 for equal maps, 1 for an empty simulated map under ``mse``.
 
         Raises:
@@ -169,16 +164,13 @@ class SpectrumLoss:
         return self._squared_error(self._pyramid(simulated, measured))
 
     def curvature(
-        self,
-        simulated: Float[Tensor, "frame *map"],
-        measured: Float[Tensor, "frame *map"],
-        tangents: Float[Tensor, "p frame *map"],
+        self, simulated: _Map, measured: _Map, tangents: Float[Tensor, "p frame *map"]
     ) -> Float[Tensor, "p p"]:
         """Compute the Gauss–Newton matrix of the loss: its Hessian without second derivatives of
         the map.
 
         Under ``mse`` it is twice the matrix of squared residuals, else the Fisher information of
-        the speckle. A fitted gain is eliminated by a Schur complement.
+        the speckle. Fitted gain and noise are eliminated by a Schur complement.
 
         Args:
             simulated, measured: maps [frame, *map].
@@ -189,8 +181,8 @@ class SpectrumLoss:
         # The derivative of a map with respect to the logarithm of its gain is the map.
         rows = torch.cat([tangents, simulated.detach()[None].to(tangents)])
         rows = rows / self._normalisations(simulated, measured)[0]
-        gain = self._optimal_gain(pairs)
-        total = rows.new_zeros(len(rows), len(rows), dtype=torch.float64)
+        gain, noise = self._fit_gain(pairs)
+        count, total = len(tangents), torch.zeros((), dtype=torch.float64)
         for level, (a, b) in enumerate(pairs):
             if level > 0:
                 rows = halve_resolution(rows.flatten(0, 1)).unflatten(0, (len(rows), -1))
@@ -199,14 +191,17 @@ class SpectrumLoss:
                 weighed = torch.stack([self._subtract_background(row) for row in rows]).flatten(1)
             else:
                 weight = 1.0 / (1.0 + 2.0 / self._tail_degrees)
-                inverse = (a > 0) * gain / (gain * a.clamp_min(0.0) + self.floor)
-                weighed = (rows * inverse).flatten(1)
+                inverse = gain / (gain * a.clamp_min(0.0) + noise + self.floor)
+                weighed = torch.cat([rows * (a > 0), torch.ones_like(rows[:1])]) * inverse
+                weighed = weighed.flatten(1)
             product = (weighed @ weighed.T).double()
             total = total + weight * product / (weighed.shape[1] * len(pairs))
-        own, mixed = total[:-1, :-1], total[:-1, -1:]
-        if self.gain == "fitted" and float(total[-1, -1]) > 0:
-            own = own - mixed @ mixed.T / total[-1, -1]
-        return own
+        fitted = [count] * (self.gain == "fitted")
+        # Less noise is near its limit of zero, which keeps it from moving freely.
+        fitted += [count + 1] * (noise > _LITTLE_NOISE * self.floor)
+        inverse = torch.linalg.pinv(total[fitted][:, fitted], hermitian=True)
+        mixed = total[:count, fitted]
+        return total[:count, :count] - mixed @ inverse @ mixed.T
 
     def fitted_gain(self, simulated: Tensor, measured: Tensor) -> float:
         """Return the gain of the simulated map that minimises the loss.
@@ -216,8 +211,8 @@ class SpectrumLoss:
             measured: power [frame, *map].
         """
         unit, scale = self._normalisations(simulated, measured)
-        pairs = self._pyramid(simulated.detach(), measured)
-        return float(self._optimal_gain(pairs) * scale / unit)
+        gain, _ = self._fit_gain(self._pyramid(simulated.detach(), measured))
+        return float(gain * scale / unit)
 
     def _normalisations(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
         """Return the divisors of the simulated and the measured map."""
@@ -242,19 +237,18 @@ class SpectrumLoss:
             levels = [[self._subtract_background(m) for m in own] for own in levels]
         return list(zip(*levels, strict=True))
 
-    def _optimal_gain(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
-        """Return the gain that minimises the loss."""
-        gain = torch.ones(())
+    def _fit_gain(self, pairs: list[tuple[Tensor, Tensor]]) -> tuple[float, float]:
+        """Return the gain and the noise that minimise the loss."""
+        if self.kind != "mse":
+            return self._fit_likelihood([self._split_blocks(*pair) for pair in pairs])
         if self.gain == "one":
-            return gain
+            return 1.0, 0.0
         with torch.no_grad():
-            if self.kind == "mse":
-                norms = [b.square().mean().clamp_min(1e-30) for _, b in pairs]
-                both = list(zip(pairs, norms, strict=True))
-                mixed = torch.stack([(a * b).mean() / n for (a, b), n in both]).sum()
-                power = torch.stack([(a * a).mean() / n for (a, _), n in both]).sum()
-                return (mixed / power.clamp_min(1e-30)).clamp_min(0.0)
-            return gain * self._likelihood_gain([self._split_blocks(*pair) for pair in pairs])
+            norms = [b.square().mean().clamp_min(1e-30) for _, b in pairs]
+            both = list(zip(pairs, norms, strict=True))
+            mixed = torch.stack([(a * b).mean() / n for (a, b), n in both]).sum()
+            power = torch.stack([(a * a).mean() / n for (a, _), n in both]).sum()
+            return float((mixed / power.clamp_min(1e-30)).clamp_min(0.0)), 0.0
 
     def _split_blocks(self, a: Tensor, b: Tensor, scale: Any = 1.0) -> list[_PowerBlock]:
         """Return the positive parts of both maps in blocks, the measured one scaled and with the
@@ -266,37 +260,60 @@ class SpectrumLoss:
             for x, y in zip(*columns, strict=True)
         ]
 
-    def _likelihood_gain(self, levels: list[list[_PowerBlock]], unit: float = 1.0) -> float:
-        """Return the gain of a likelihood in units of ``unit``, by a secant method on its
-        logarithm.
+    def _fit_likelihood(
+        self, levels: list[list[_PowerBlock]], unit: float = 1.0
+    ) -> tuple[float, float]:
+        """Return the gain, in units of ``unit``, and the noise of a likelihood by Newton's method.
+
+        Both are fitted first to the coarse maps, which are fast and nearly do.
         """
-        if self.gain == "one":
-            return 1.0 / unit
-        floor = torch.as_tensor(self.floor).to(levels[0][0][0])
-        counts = [sum(len(a) for a, *_ in blocks) for blocks in levels]
-        log_gain, slope = -math.log(unit), 1.0
-        # Start with the coarse maps, which are fast and have nearly the final gain.
-        for first in (1, 0):
-            step, before = 0.0, 0.0
-            for _ in range(_GAIN_STEPS):
-                up, down = 0.0, 0.0
-                for blocks, count in zip(levels[first:], counts[first:], strict=True):
-                    for _, a, b in blocks:
-                        inverse = torch.add(floor, a, alpha=math.exp(log_gain)).reciprocal_()
-                        down += float(a @ inverse) / count
-                        data = self._weight_power(b, inverse)
-                        up += float(data @ inverse.square_().mul_(a)) / count
-                move = math.log(max(up, _MIN_POSITIVE) / max(down, _MIN_POSITIVE))
-                if step != 0:
-                    slope = min(max((before - move) / step, 0.1), 1.0)
-                before, step = move, move / slope
-                log_gain += step
-                if abs(step) < _GAIN_TOLERANCE:
+        values = torch.tensor([1 / unit, _INITIAL_NOISE * self._has_level], dtype=torch.float64)
+        fitted = [0] * (self.gain == "fitted") + [1] * self._has_level
+        for part in (levels[1:], levels):
+            for _ in range(_GAIN_STEPS if fitted and part else 0):
+                slope, hessian = self._differentiate_gain(part, *values.tolist())
+                # A loss is nearly quadratic in values that are too large, and in the logarithms of
+                # those that are too small. Absolute eigenvalues lead downhill from everywhere.
+                hessian = hessian - torch.diag(slope.clamp_min(0))
+                sizes, axes = torch.linalg.eigh(hessian[fitted][:, fitted])
+                step = axes @ (axes.T @ slope[fitted] / sizes.abs().clamp_min(_MIN_POSITIVE))
+                change = torch.zeros_like(values)
+                change[fitted] = step.clamp(*_GAIN_CHANGES)
+                values = values * torch.where(change > 0, change.exp(), 1 + change)
+                # Noise far below the floor does not matter.
+                change[1] *= values[1] / (values[1] + self.floor)
+                if float(change.abs().max()) < _GAIN_TOLERANCE:
                     break
-        return math.exp(log_gain)
+        gain, noise = values.tolist()
+        if 0 < noise < _LITTLE_NOISE * self.floor:
+            # On its way to zero, which a relative step never reaches.
+            slope, _ = self._differentiate_gain(levels, gain, _MIN_POSITIVE)
+            noise *= float(slope[1]) > 0 and noise > _MIN_NOISE * self.floor
+        return gain, noise
+
+    def _differentiate_gain(
+        self, levels: list[list[_PowerBlock]], gain: float, noise: float
+    ) -> tuple[Tensor, Tensor]:
+        """Derivatives of the negative loss and Hessian of the loss by relative gain and noise."""
+        slope, hessian = torch.zeros(2).double(), torch.zeros(2, 2).double()
+        for blocks in levels:
+            count = sum(len(a) for a, *_ in blocks)
+            for _, a, data in blocks:
+                inverse = (gain * a).add_(noise + self.floor).reciprocal_()
+                ratio = data * inverse
+                weighed = growth = self._weight_power(ratio)
+                if self.kind == "heavy_tailed":
+                    growth = weighed * (self.degrees / (self.degrees + ratio))
+                shares = torch.stack([a * inverse, inverse])
+                curved = shares * (growth + weighed).sub_(1)
+                slope += (shares @ weighed.sub(1)).double() / count
+                hessian += (curved @ shares.T).double() / count
+        scale = torch.tensor([gain, noise], dtype=torch.float64)
+        slope = slope * scale
+        return slope, hessian * scale * scale[:, None]
 
     def _squared_error(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
-        gain = self._optimal_gain(pairs)
+        gain, _ = self._fit_gain(pairs)
         norms = [b.detach().square().mean().clamp_min(1e-30) for _, b in pairs]
         terms = [(gain * a - b).square().mean() / n for (a, b), n in zip(pairs, norms, strict=True)]
         return torch.stack(terms).mean()
@@ -309,9 +326,9 @@ class SpectrumLoss:
             return _ScalarWithGradient.apply(simulated, value, slope)
         # For example a second derivative.
         pairs = self._pyramid(simulated, measured)
-        gain = self._optimal_gain(pairs)
+        gain, noise = self._fit_gain(pairs)
         ratios = [
-            (b.clamp_min(0.0) + self.floor) / (gain * a.clamp_min(0.0) + self.floor)
+            (b.clamp_min(0.0) + self.floor) / (gain * a.clamp_min(0.0) + noise + self.floor)
             for a, b in pairs
         ]
         terms = [speckle_divergence(q, self._tail_degrees).mean() for q in ratios]
@@ -328,14 +345,14 @@ class SpectrumLoss:
         unit, scale = self._normalisations(simulated, measured)
         maps = [self._resolutions(power) for power in (simulated.detach(), measured)]
         levels = [self._split_blocks(a, b, scale) for a, b in zip(*maps, strict=True)]
-        gain = self._likelihood_gain(levels, float(unit))
+        gain, noise = self._fit_likelihood(levels, float(unit))
         value, slope = 0.0, None
         for power, blocks in zip(reversed(maps[0]), reversed(levels), strict=True):
             factor = gain / (power.numel() * self.levels)
             own = torch.empty_like(power, memory_format=torch.contiguous_format)
             slopes = own.flatten().split(_BINS_PER_BLOCK)
             for (a, predicted, data), out in zip(blocks, slopes, strict=True):
-                inverse = predicted.mul_(gain).add_(self.floor).reciprocal_()
+                inverse = predicted.mul_(gain).add_(noise + self.floor).reciprocal_()
                 ratio = data.mul_(inverse)
                 value += float(speckle_divergence(ratio, self._tail_degrees).sum()) / power.numel()
                 inverse.addcmul_(inverse, self._weight_power(ratio), value=-1).mul_(factor)
@@ -431,7 +448,7 @@ class CorrelationLoss:
     scale: CorrelationScale = "magnitude"
 
     def __post_init__(self) -> None:
-        check_choice(self.scale, _SCALE_TRANSFORMS, "a scale of")
+        check_fields(self)
 
     def __call__(
         self, simulated: Float[Tensor, "*map"], measured: Float[Tensor, "*map"]
@@ -534,11 +551,7 @@ class Objective:
 
 
 def _check_shapes(simulated: Tensor, measured: Tensor) -> None:
-    if simulated.shape != measured.shape:
-        raise InputError(
-            f"expected maps of one shape, got {tuple(simulated.shape)} and "
-            f"{tuple(measured.shape)}; use one grid for both"
-        )
+    check_shape(simulated, measured.shape, "a map like the measured one", "use one grid for both")
 
 
 def _mean_magnitude(power: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """Verdicts: on right and wrong ends of a model without rays, whose looks are known."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -7,17 +8,26 @@ import torch
 from torch import Tensor
 
 from blobs import BINS, LAW, Blob, scene
-from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
+from invertwin.inversion import (
+    Observation,
+    Optimizer,
+    Reconstruction,
+    Schedule,
+    SpectrumLoss,
+    reconstruct,
+)
 from invertwin.scene import MaterialValues, RoughDielectric, Scene, Translation, sphere
 from scenes import thing
 
 
-def fitted(data: Tensor, start: float = 0.05, model: Blob | None = None) -> Reconstruction:
+def fitted(
+    data: Tensor, start: float = 0.05, model: Blob | None = None, loss: SpectrumLoss = LAW
+) -> Reconstruction:
     return reconstruct(
         scene(start),
         Observation(model or Blob(), data, sensor=None),
         Translation("ball", axes="y"),
-        loss=LAW,
+        loss=loss,
         optimizer=Optimizer("gauss_newton", rate=0.1),
         schedule=Schedule(8),
     )
@@ -39,7 +49,8 @@ def test_right_ends_are_consistent():
 
 def test_a_wrong_minimum_is_not():
     """The blob is out of reach: the fit ends where it began, and says so."""
-    found = fitted(look(0, y=1.4), start=-1.0)
+    assert fitted(look(0, y=1.4), start=-1.0).verdict.word == "lost"
+    found = fitted(look(0, y=1.4), start=-1.0, loss=replace(LAW, background="none"))
     assert found.status != "diverged"
     verdict = found.verdict
     assert verdict.word == "inconsistent"
