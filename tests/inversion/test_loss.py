@@ -155,7 +155,7 @@ def test_noise_of_any_level_leaves_the_gain(noise):
     data = -(3.0 * a + noise) * draws.log()
     loss = SpectrumLoss(levels=1, floor=1e-4)
     assert loss.fitted_gain(a, data) == pytest.approx(3.0, rel=0.03 + 0.01 * noise)
-    found, level = loss._fit_gain(loss._pyramid(a, data))
+    _, level = loss._fit_gain(loss._pyramid(a, data))
     assert level * float(data.mean()) == pytest.approx(noise, rel=0.02, abs=1e-3)
     if noise >= 1:
         assert SpectrumLoss(levels=1, background="none").fitted_gain(a, data) > 2 * 3.0
