@@ -15,6 +15,7 @@ from invertwin.models.radio import PanelMap as PanelMap
 from invertwin.models.radio import RadioMap as RadioMap
 from invertwin.models.radio import ResponseMap as ResponseMap
 from invertwin.models.rcs import RcsMap as RcsMap
+from invertwin.models.whitened import WhitenedMap as WhitenedMap
 
 rename_attributes(__name__)
 rename_members(RadioMap, looks_about="realisations_about", reception="propagation")
