@@ -131,11 +131,7 @@ def gradcheck(
             mean, or a map that does not depend on θ (all differences are zero).
     """
     settings = settings or GradcheckSettings()
-    if not model.is_smooth:
-        raise InputError(
-            f"expected a smooth model, got {type(model).__name__}, whose silhouettes of single "
-            "rough points have no derivative; use one such as SurrogateMap"
-        )
+    _require_smooth(model)
     line = make_line(module, tangent, scene if acts_on == "scene" else sensor)
     least, repeats = (_MIN_PAIRS, settings.repeats) if model.is_random else (1, 1)
 
@@ -160,17 +156,11 @@ def gradcheck(
             pairs, reached = _average_differences(difference, settings, progress)
         else:
             pairs, reached = difference(0)[None], 0.0
-        truth = pairs.mean(0)
-        if not truth.abs().sum() > 0:
-            raise InputError(
-                "expected a map that depends on θ, got differences that are all zero; check the "
-                "grid and what the parameter moves"
-            )
+        _require_change(truth := pairs.mean(0))
         half, far, farther = (
             torch.stack([difference(n, k * settings.step) for n in range(least)]).mean(0)
             for k in (0.5, 4.0, 8.0)
         )
-        whole = pairs[:least].mean(0)
     edges, contacts = less.get("interior_edges"), _drop_equal(less.get("contacts"), gradient)
     agree = partial(_measure_agreement, truth=truth, far=far, farther=farther)
     return GradientReport(
@@ -179,13 +169,34 @@ def gradcheck(
         no_interior_edges=None if edges is None else agree(edges),
         no_contact=None if contacts is None else agree(contacts),
         difference_noise=reached,
-        step_agreement=float((whole - half).abs().sum() / whole.abs().sum()),
+        step_agreement=_step_agreement(pairs[:least].mean(0), half),
         pairs=len(pairs),
         value=value,
         gradient=gradient,
         interior_gradient=interior_gradient,
         difference=truth,
     )
+
+
+def _require_smooth(model: ForwardModel) -> None:
+    if not model.is_smooth:
+        raise InputError(
+            f"expected a smooth model, got {type(model).__name__}, whose silhouettes of single "
+            "rough points have no derivative; use one such as SurrogateMap"
+        )
+
+
+def _require_change(difference: Tensor) -> None:
+    if not difference.abs().sum() > 0:
+        raise InputError(
+            "expected a map that depends on θ, got differences that are all zero; check the grid "
+            "and what the parameter moves"
+        )
+
+
+def _step_agreement(whole: Tensor, half: Tensor) -> float:
+    """Return ‖FD(ε) − FD(ε/2)‖₁ / ‖FD(ε)‖₁."""
+    return float((whole - half).abs().sum() / whole.abs().sum())
 
 
 def _drop_equal(ablated: Tensor | None, gradient: Tensor) -> Tensor | None:
@@ -223,10 +234,7 @@ def _average_differences(
     while len(pairs) < settings.max_pairs and (len(pairs) < _MIN_PAIRS or reached > settings.noise):
         pairs.append(difference(len(pairs)))
         if len(pairs) >= 2:
-            # ‖standard error of the mean‖₁ / ‖mean‖₁
-            error, mean = torch.std_mean(torch.stack(pairs), 0)
-            error = error.abs().sum() / math.sqrt(len(pairs))
-            reached = float(error / mean.abs().sum().clamp_min(1e-300))
+            reached = _relative_noise(torch.stack(pairs))
             if progress:
                 # Noise falls with the square root of the number of pairs.
                 enough = len(pairs) * (reached / max(settings.noise, 1e-9)) ** 2
@@ -235,6 +243,13 @@ def _average_differences(
                 noise = f"difference noise {reached:.4f}, about {left:.0f} s left"
                 progress(f"{len(pairs)} pairs, {noise}")
     return torch.stack(pairs), reached
+
+
+def _relative_noise(pairs: Tensor) -> float:
+    """‖standard error of the mean‖₁ / ‖mean‖₁."""
+    mean = pairs.mean(0)
+    error = pairs.std(0) / math.sqrt(len(pairs))
+    return float(error.abs().sum() / mean.abs().sum().clamp_min(1e-300))
 
 
 def _measure_agreement(
