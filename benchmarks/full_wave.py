@@ -3,7 +3,7 @@
     python benchmarks/full_wave.py [-o DIR]
     python benchmarks/full_wave.py --solve [BODY ...]
 
-Bodies of three to five wavelengths turn in front of a radar. Their scattering amplitudes S by
+Bodies of three to eight wavelengths turn in front of a radar. Their scattering amplitudes S by
 `invertwin.rcs` are held against those of the method of moments, which are stored in
 `benchmarks/full_wave_data`. `--solve` computes these anew with bempp-cl (`pip install bempp-cl`,
 some minutes a body): its function spaces, and its matrix of triangles that touch. That of the
@@ -32,6 +32,7 @@ import torch
 from jaxtyping import Complex128, Float64, Int64
 from report import MetricTable, Required, write
 from rich.table import Table
+from scipy.spatial import Delaunay
 from torch import Tensor
 
 from invertwin import Object, Scene, rcs
@@ -104,6 +105,11 @@ def sheets(squares: Sequence[tuple[Any, Any, Any]], step: float) -> Grid:
         faces += [np.stack([low, low + n + 1, low + n + 2], 1)]
         faces += [np.stack([low, low + n + 2, low + 1], 1)]
         points.append(spot)
+    return _merged(points, faces)
+
+
+def _merged(points: list[np.ndarray], faces: list[np.ndarray]) -> Grid:
+    """One mesh of several that meet."""
     every = np.concatenate(points)
     _, kept, index = np.unique(every.round(6), axis=0, return_index=True, return_inverse=True)
     return every[kept], index.ravel()[np.concatenate(faces)]
@@ -132,6 +138,69 @@ def ogive(length: float, radius: float, step: float) -> Grid:
     return np.array(points), np.array(
         [face for low, high in pairwise(rings) for face in _zipped(low, high)]
     )
+
+
+def polyhedron(
+    points: Float64[np.ndarray, "v 3"], polygons: Sequence[Sequence[int]], step: float
+) -> Grid:
+    """Plane convex polygons, meshed evenly, as one mesh.
+
+    Args:
+        points: corners.
+        polygons: numbers of the corners of each, anticlockwise from outside.
+        step: of the mesh.
+    """
+    spots, faces = [], []
+    for polygon in polygons:
+        corners = points[list(polygon)]
+        sides = np.roll(corners, -1, 0) - corners
+        lengths = np.linalg.norm(sides, axis=1)
+        normal = np.cross(sides[0], sides[1])
+        along = sides[0] / lengths[0]
+        axes = np.stack([along, np.cross(normal / np.linalg.norm(normal), along)], 1)
+        inwards = np.stack([axes @ [-y, x] for x, y in sides @ axes / lengths[:, None]])
+        parts = np.maximum(1, np.ceil(lengths / step - 1e-9)).astype(int)
+        rim = [
+            corner + np.outer(np.arange(n) / n, side)
+            for corner, side, n in zip(corners, sides, parts, strict=True)
+        ]
+        count = math.ceil(lengths.sum() / step)
+        i, j = (x.ravel() for x in np.mgrid[-count : count + 1, -count : count + 1])
+        lattice = np.stack([i + 0.5 * j, math.sqrt(0.75) * j], 1) * step
+        inner = corners.mean(0) + lattice @ axes.T
+        depth = np.einsum("psx,sx->ps", inner[:, None] - corners, inwards).min(1)
+        spot = np.concatenate([*rim, inner[depth > step / 2]])
+        found = Delaunay(spot @ axes).simplices.astype(np.int64)
+        first, second = (spot[found[:, n]] - spot[found[:, 0]] for n in (1, 2))
+        area = np.cross(first, second) @ normal
+        found[area < 0] = found[area < 0, ::-1]
+        faces.append(found[np.abs(area) > 1e-6 * np.abs(area).max()] + sum(map(len, spots)))
+        spots.append(spot)
+    return _merged(spots, faces)
+
+
+def wing(step: float) -> Grid:
+    """A tapered half wing of 4 × 2 × 0.24: plane above and below, sharp in front and behind.
+
+    Args:
+        step: of the mesh.
+    """
+    points = np.array(
+        [
+            (x, y, z)
+            for y, front, back in ((-2, 1.0, -1.0), (2, 0.3, -0.7))
+            for x, z in (
+                (front, 0),
+                (front - 0.3, 0.12),
+                (back + 0.3, 0.12),
+                (back, 0),
+                (back + 0.3, -0.12),
+                (front - 0.3, -0.12),
+            )
+        ]
+    )
+    strips = [(i, i + 6, (i + 1) % 6 + 6, (i + 1) % 6) for i in range(6)]
+    return polyhedron(points, [*strips, range(6), range(11, 5, -1)], step)
 
 
 def _zipped(low: list[int], high: list[int]) -> list[tuple[int, int, int]]:
@@ -193,6 +262,20 @@ def bodies() -> dict[str, Body]:
             {"straight": _cut(quarter, 0), "oblique": _cut(quarter, 30)},
         ),
         "ogive": Body(partial(ogive, 5.0, 1.0), 1 / 10, 1 / 16, 1, {"nose": _cut(quarter, 0)}),
+        "slender_ogive": Body(
+            partial(ogive, 8.0, 0.5), 1 / 14, 1 / 12, 1, {"nose": _cut(quarter, 0)}
+        ),
+        "wing": Body(
+            wing,
+            1 / 14,
+            5.0,
+            1,
+            {
+                "elevation": _cut(quarter, 0),
+                "azimuth": _cut(90, np.arange(0, 181)),
+                "shallow": _cut(84, np.arange(0, 181)),
+            },
+        ),
     }
 
 

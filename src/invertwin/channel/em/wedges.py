@@ -1,11 +1,16 @@
 """Wedges (sharp edges) and their fringe currents, the physical theory of diffraction (PTD).
 
 The fringe currents of Michaeli and Mitzner are the difference between an infinite wedge's field and
-that of physical optics, as electric and magnetic currents along the edge. Each face of a wedge has
-its own frame: x̂ into the face, n̂ outwards, t̂ = x̂ × n̂.
+that of physical optics, as electric and magnetic currents along the edge: integrals of the currents
+on strips of the faces across the edge. Each face of a wedge has its own frame: x̂ into the face, n̂
+outwards, t̂ = x̂ × n̂.
 
-Source: derivations §14; Michaeli, "Elimination of infinities in equivalent edge currents", IEEE TAP
-34, 1986; Mitzner, AFAL-TR-73-296, 1974.
+Source: derivations §14; Michaeli, "Equivalent edge currents for arbitrary aspects of observation",
+IEEE TAP 32, 1984; Mitzner, AFAL-TR-73-296, 1974; Johansen, "Uniform physical theory of diffraction
+equivalent edge currents for truncated wedge strips", IEEE TAP 44, 1996.
+
+Differs from the source: truncation multiplies the coefficients of endless strips by the share that
+a half plane's strip of that length has, which is exact for N = 2 and removes the pole of any wedge.
 """
 
 import math
@@ -13,14 +18,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Complex128, Float64, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
-from invertwin.channel.em.plane_waves import cross, dot
+from invertwin.channel.em.plane_waves import cross, dot, phasor
+from invertwin.channel.em.transition_functions import EXP_J_PI_4, transition
 from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.checks import strip_derivatives
 
@@ -31,6 +37,9 @@ _GENERIC_DIRECTION = torch.tensor([0.8123, 0.4571, 0.3623], dtype=torch.float64)
 _SWAPPED_FACES = torch.tensor([1, 0])
 _MIN_CREASE_ANGLE = 0.35  # rad between adjacent normals; less is a curved surface
 _POLE_WIDTH = 1e-5
+_MIN_PHASE = math.pi  # along a strip: over narrower faces currents go on round the next edge
+_TRANSITION_AT_ZERO = math.sqrt(math.pi) * EXP_J_PI_4
+_SHEET_TOLERANCE = 1e-6  # of an opening, over π
 _VERTEX_TOLERANCE = 1e-9  # of the body's size: edge ends closer than this coincide
 # Largest cosine between the outward directions of two edges that continue each other.
 _MAX_COLLINEAR_COSINE = -math.cos(math.radians(30.0))
@@ -222,7 +231,7 @@ def is_grazing_sheet(wedges: Wedges, direction: Float64[Tensor, "row 3"]) -> Ten
         wedges: sharp edges, one row each.
         direction: unit vectors from the edge, [row, 3].
     """
-    flat = wedges.opening > 2 - 1e-6
+    flat = wedges.opening > 2 - _SHEET_TOLERANCE
     return flat & (dot(wedges.normals[:, 0], direction).abs() < math.sin(MIN_EDGE_ANGLE))
 
 
@@ -260,6 +269,7 @@ def fringe_field(
     direction: Float64[Tensor, "row 3"],
     field: Float64[Tensor, "row 2 3"],
     scattered_direction: Float64[Tensor, "row 3"],
+    strip_lengths: Float64[Tensor, "row 2"],
 ) -> Tensor:
     """Far field F of the fringe currents per metre of edge, for both incident polarisations.
 
@@ -272,8 +282,11 @@ def fringe_field(
         direction: direction d of the incident wave.
         field: incident field E [V/m].
         scattered_direction: unit vector s towards the receiver.
+        strip_lengths: widths of both faces across the edge [m]. Strips of sheets count as endless,
+            since their multiple diffraction is computed by itself.
     """
     total = torch.zeros(len(direction), 2, 3, dtype=torch.complex128)
+    k = wave_number
     for face in (0, 1):
         axis = cross(wedges.face_tangents[:, face], wedges.normals[:, face])
         cos_in, cos_out = dot(axis, direction), dot(axis, scattered_direction)
@@ -281,37 +294,65 @@ def fringe_field(
         phi_in = exterior_azimuth(wedges, -direction, face)
         phi_out = exterior_azimuth(wedges, scattered_direction, face)
         mu = sin_out * torch.cos(phi_out) / sin_in
-        electric, magnetic = _fringe_coefficients(wedges.opening, phi_in, mu)
+        phase = k * strip_lengths[:, face] * sin_in
+        electric, magnetic = _fringe_coefficients(wedges.opening, phi_in, mu, phase)
         across = cross(scattered_direction, axis)
         e = dot(axis[:, None], field)
         h = dot(axis[:, None], cross(direction[:, None], field))
-        k = wave_number
         skew = mu * cos_in / sin_in - cos_out / sin_out * torch.cos(phi_out)
         current = (2j / (k * sin_in**2) * electric)[:, None] * e
         current = current + (2j / (k * sin_in) * magnetic * skew)[:, None] * h
         charge = (-2j / k * magnetic * torch.sin(phi_out) / (sin_in * sin_out))[:, None] * h
         total = total + current[..., None] * cross(scattered_direction, across)[:, None]
         total = total + charge[..., None] * across[:, None]
-    return 1j * wave_number / (4 * math.pi) * total
+    return 1j * k / (4 * math.pi) * total
 
 
-def _fringe_coefficients(opening: Tensor, azimuth: Tensor, mu: Tensor) -> tuple[Tensor, Tensor]:
+def _fringe_coefficients(
+    opening: Tensor, azimuth: Tensor, mu: Tensor, phase: Tensor
+) -> tuple[Tensor, Tensor]:
     """Fringe coefficients A and B of one face: those of the wedge less those of physical optics.
 
     Both have the same pole at cosφ′ + μ = 0, the direction of specular reflection. Their difference
-    is smooth there, so that evaluation a small step beside the pole is accurate enough.
+    is smooth there, so that evaluation a small step beside the pole is accurate enough. Where the
+    incident and the scattered wave run along the face, the difference has a pole of its own, which
+    the end of the strip limits.
     """
-    pole = torch.cos(azimuth) + mu
+    mu = torch.where((1 - mu).abs() < _POLE_WIDTH**2, 1 - _POLE_WIDTH**2, mu)
     step = 2 * _POLE_WIDTH / torch.sin(azimuth).abs().clamp_min(0.1)
-    azimuth = torch.where(pole.abs() < _POLE_WIDTH, azimuth + step, azimuth)
+    azimuth = torch.where((torch.cos(azimuth) + mu).abs() < _POLE_WIDTH, azimuth + step, azimuth)
     # arccos μ, complex for |μ| > 1 (beyond Keller's cone).
-    alpha = torch.arccos(mu.to(torch.complex128))
-    rest = math.pi - alpha
-    small = rest.abs() < 1e-7
-    rest = torch.where(small, torch.full_like(rest, 1e-7), rest)
-    rest = torch.where((alpha.abs() < 1e-7) & ~small, rest * (1 - 1e-7), rest)
+    rest = math.pi - torch.arccos(mu.to(torch.complex128))
+    rest = torch.where(rest.abs() < 1e-7, torch.full_like(rest, 1e-7), rest)
     delta = torch.cos(azimuth / opening) - torch.cos(rest / opening)
     optics = (azimuth < math.pi).double() / (torch.cos(azimuth) + mu)
     electric = torch.sin(azimuth / opening) / (opening * delta) - optics * torch.sin(azimuth)
     magnetic = torch.sin(rest / opening) / (opening * torch.sin(rest) * delta) - optics
-    return electric, magnetic
+    shares = _strip_shares(math.sqrt(2) * torch.cos(azimuth / 2).abs(), 1 - mu, phase)
+    is_solid = opening < 2 - _SHEET_TOLERANCE
+    shares = torch.where(is_solid, shares, torch.ones_like(shares))
+    return electric * shares[0], magnetic * shares[1]
+
+
+def _strip_shares(a: Tensor, square: Tensor, phase: Tensor) -> Complex128[Tensor, "2 row"]:
+    """Shares of the integrals of E- and H-polarised currents from the edge to the strip's end.
+
+    The fringe currents of a half plane are Fresnel integrals, and so are their integrals with the
+    phase of the scattered wave. With g the transition function and Λ the phase along the strip, the
+    shares of A and B are 1 + exp(−jb²Λ)/g(0) · (b g(b√Λ) − a g(a√Λ))/(a − b) and the same with
+    b g(a√Λ) − a g(b√Λ).
+
+    Args:
+        a: √2 |cos φ′/2|, zero where the incident wave runs along the face from its edge.
+        square: b² = 1 − μ, zero where the scattered wave runs along it; negative beyond.
+        phase: Λ = k ℓ sinβ′ of strips of width ℓ [rad].
+    """
+    phase = phase.clamp_min(_MIN_PHASE)
+    root, size = phase.sqrt(), square.abs().sqrt()
+    end_a, end_b = (transition(x * root) / _TRANSITION_AT_ZERO for x in (a, size))
+    # g of an imaginary argument −jy over g(0) is the conjugate of that of y.
+    beyond = square < 0
+    end_b = torch.where(beyond, end_b.conj(), end_b)
+    b = torch.where(beyond, -1j * size, size.to(torch.complex128))
+    ends = torch.stack([b * end_b - a * end_a, b * end_a - a * end_b])
+    return 1 + phasor(-square * phase) * ends / (a - b)

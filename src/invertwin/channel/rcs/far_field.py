@@ -58,6 +58,7 @@ from invertwin.channel.rays.topology import Topology, topology_of
 from invertwin.channel.rcs.dielectric_interfaces import scatter_at_interfaces
 from invertwin.channel.rcs.moments.efie_solver import EFIESolver
 from invertwin.channel.rcs.moments.mfie import MFIESolver
+from invertwin.channel.rcs.moments.solver import Refusal, warn_not_solved
 from invertwin.channel.rcs.plate_diffraction import find_plates, trace_multiple_diffractions
 from invertwin.channel.rcs.rays_in_dielectrics import (
     MAX_SMOOTH_ANGLE,
@@ -67,6 +68,7 @@ from invertwin.channel.rcs.rays_in_dielectrics import (
     trace_inner_tubes,
 )
 from invertwin.channel.rcs.shooting_bouncing_rays import find_illuminated_triangles, trace_tubes
+from invertwin.channel.rcs.surface_paths import face_path_lengths
 from invertwin.checks import is_differentiated
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
@@ -351,6 +353,12 @@ class _FarFieldTracer:
         target, total = self.target, list(self._zero_amplitudes())
         wedges = _split_edges(wedges, target.wavelength / _SEGMENTS_PER_WAVELENGTH)
         count = len(wedges.start)
+        middle = (wedges.start + wedges.end) / 2
+        bodies = target.facets, target.occluders
+        strips = torch.stack([
+            face_path_lengths(*bodies, wedges.faces[:, k], middle, wedges.face_tangents[:, k])
+            for k in (0, 1)
+        ], 1)  # fmt: skip
         left_out = 0
         some = torch.arange(len(self.transmitters))
         for aspects in some.split(max(1, _ROWS_AT_ONCE // max(1, count))) if count else ():
@@ -376,7 +384,8 @@ class _FarFieldTracer:
             d, s = -self.transmitters[aspect], self.receivers[aspect]
             centre, side = (pieces.start + pieces.end) / 2, pieces.end - pieces.start
             for f, k in enumerate(target.wave_numbers):
-                radiated = fringe_field(pieces, k, d, self._incident_fields[aspect], s)
+                waves = d, self._incident_fields[aspect], s
+                radiated = fringe_field(pieces, k, *waves, strips[row])
                 wave = k * (s - d)
                 width = parallelogram_integral(wave, side, torch.zeros_like(side))
                 scale = phasor(dot(wave, centre)) * width * side.norm(dim=1)
@@ -410,17 +419,24 @@ def _check_inner_tubes(target: _FarFieldTarget) -> None:
 def _residual_field(
     target: _FarFieldTarget, antenna_pairs: Sequence[tuple[Tensor, Tensor]], modelled: Tensor
 ) -> Tensor | None:
-    """Residual of rays and edges from the method of moments for small targets; zero for larger."""
+    """Residual of rays and edges from the method of moments; zero where currents are not solved."""
     efie = EFIESolver(target.vertices, target.topology.faces, target.facets.solid, target.up)
-    mfie = MFIESolver(target.facets.corners.detach(), target.up) if target.is_closed else None
+    corners = target.facets.corners.detach()
+    # Triangles resolve tips and slender parts better than finer cells do.
+    cells, finer_cells = MFIESolver(corners, target.up), MFIESolver(corners, target.up, range(1, 5))
+    solvers = [cells, efie, finer_cells] if target.is_closed else [efie]
     rest: dict[int, Tensor] = {}
     order = sorted(range(len(modelled)), key=lambda f: -target.wave_numbers[f])
     for f in track(order, "frequencies"):
-        k = target.wave_numbers[f]
-        solver = mfie if mfie is not None and mfie.elements(k) is not None else efie
-        found = solver.solve_scattering(k, antenna_pairs)
-        if found is not None:
-            rest[f] = (found[0] + found[-1].mT) / 2 - modelled[f]
+        refusals: list[Refusal] = []
+        for solver in solvers:
+            found = solver.solve_scattering(target.wave_numbers[f], antenna_pairs)
+            if not isinstance(found, Refusal):
+                rest[f] = (found[0] + found[-1].mT) / 2 - modelled[f]
+                break
+            refusals.append(found)
+        else:
+            warn_not_solved(target.wave_numbers[f], refusals)
     if not rest:
         return None
     return torch.stack([rest.get(f, torch.zeros_like(modelled[f])) for f in range(len(modelled))])

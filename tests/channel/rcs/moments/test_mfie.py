@@ -1,6 +1,7 @@
 """Small conductors whose currents are solved: against the Mie series, and where they are not."""
 
 import math
+import warnings
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel import SphereSection, trace_far_field
+from invertwin.channel.rcs.moments import efie_solver as meshed
 from invertwin.channel.rcs.moments import mfie as solved
 from invertwin.channel.rcs.moments import solver as currents
 from invertwin.constants import SPEED_OF_LIGHT
@@ -164,7 +166,9 @@ def test_a_thin_body_has_no_cells():
     flat = sphere(RADIUS, 4)
     disc = Mesh(flat.vertices * float64([1.0, 1.0, 0.02]), flat.faces)
     bodies = solved.MFIESolver(disc.vertices[disc.faces], UP)
-    assert bodies.solve_scattering(50.0, [(UP[None], UP[None])]) is None
+    refused = bodies.solve_scattering(50.0, [(UP[None], UP[None])])
+    assert isinstance(refused, currents.Refusal)
+    assert refused.by_size
 
 
 def test_frequencies_that_are_too_high_have_no_rest():
@@ -183,8 +187,67 @@ def test_frequencies_that_are_too_high_have_no_rest():
     assert float(found["rest"][0].abs().max()) > 0.01 * RADIUS
 
 
-def test_currents_that_do_not_keep_the_power_are_not_used(monkeypatch):
+SMALL = sphere(RADIUS, 2)
+TRIANGLES = SMALL.vertices, SMALL.faces, torch.ones(len(SMALL.faces), dtype=torch.bool)
+AXIS = float64([[1.0, 0.0, 0.0]])
+
+
+def test_cells_are_doubled_until_power_is_conserved(monkeypatch):
+    errors = iter([0.3, 0.06, 0.01])
+    monkeypatch.setattr(solved, "power_error", lambda *_: next(errors))
+    solver = solved.MFIESolver(SMALL.vertices[SMALL.faces], UP, range(5))
+    found = solver.solve_scattering(30.0, [(AXIS, AXIS)])
+    assert not isinstance(found, currents.Refusal)
+    assert next(errors, None) is None
+    counts = []
+    for refinement in range(3):
+        cells = solver.elements(30.0, refinement)
+        assert not isinstance(cells, currents.Refusal)
+        counts.append(len(cells.area))
+        equation = solver.assemble_equation(cells, 30.0, 2)
+        field = equation.far_field(equation.solve_currents(AXIS), AXIS, AXIS)
+        assert torch.equal(field, found[0]) == (refinement == 2)
+    assert counts == pytest.approx([250, 500, 1000], rel=0.01)
+
+
+@pytest.mark.parametrize("most", [12000, 100], ids=["triangles", "finer cells"])
+def test_after_refused_cells_triangles_are_solved_and_then_finer_cells(most, monkeypatch):
+    errors = iter([0.3, 0.01])
+    monkeypatch.setattr(solved, "power_error", lambda *_: next(errors))
+    monkeypatch.setattr(meshed, "MAX_UNKNOWNS", most)
+    found = field_of(Scene({"ball": Object(SMALL, METAL)}), 3.0, AXIS)
+    solver = (
+        solved.MFIESolver(SMALL.vertices[SMALL.faces], UP, range(1, 5))
+        if most == 100
+        else meshed.EFIESolver(*TRIANGLES, UP)
+    )
+    monkeypatch.setattr(solved, "power_error", lambda *_: 0.01)
+    expected = solver.solve_scattering(30.0, [(AXIS, AXIS)])
+    assert not isinstance(expected, currents.Refusal)
+    torch.testing.assert_close(found, (expected[0] + expected[0].mT) / 2, rtol=1e-6, atol=1e-9)
+    # Both are the ball's field, and not that of the first cells.
+    first = solved.MFIESolver(SMALL.vertices[SMALL.faces], UP)
+    coarse = first.solve_scattering(30.0, [(AXIS, AXIS)])
+    assert not isinstance(coarse, currents.Refusal)
+    assert 1e-4 < float((coarse[0] - found).abs().max() / found.abs().max()) < 0.1
+
+
+def test_a_refusal_names_every_reason(monkeypatch):
     monkeypatch.setattr(currents, "_POWER_TOLERANCE", 1e-9)
-    with pytest.warns(PhysicsWarning, match="do not conserve power"):
+    monkeypatch.setattr(solved, "MAX_CELLS", 1000)
+    monkeypatch.setattr(meshed, "MAX_UNKNOWNS", 1000)
+    off = r"power balance off by 0\.\d% on cells"
+    text = (
+        rf"at 2\.386 GHz currents not solved, because {off}, too many unknowns \(5120 > 1000\), "
+        rf"{off}, too many cells \(15\d\d > 1000\): bounces and edges alone are used"
+    )
+    with pytest.warns(PhysicsWarning, match=text):
         found = parts_of(BALL, 5.0, [[0.3, 0.5, 0.8]])
     assert "rest" not in found
+
+
+def test_conductors_that_are_merely_too_large_are_left_to_rays_silently():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", PhysicsWarning)
+        warnings.filterwarnings("ignore", "the facets of ball", PhysicsWarning)
+        assert "rest" not in parts_of(BALL, 25.0, [[0.3, 0.5, 0.8]])

@@ -15,7 +15,7 @@ from torch import Tensor
 from invertwin.channel.em.plane_waves import cross, dot, phasor, polarisations
 from invertwin.channel.rcs.moments.efie_matrix import EFIEMatrix, build_rwg_basis
 from invertwin.channel.rcs.moments.meshing import ConformingMesh, build_conforming_mesh
-from invertwin.channel.rcs.moments.solver import CurrentSolver, conserves_power
+from invertwin.channel.rcs.moments.solver import CurrentSolver, Refusal, power_error, too_many
 from invertwin.checks import is_differentiated
 from invertwin.errors import InputError
 from invertwin.scene import Mesh, signed_distance
@@ -41,6 +41,7 @@ class EFIESolver(CurrentSolver[ConformingMesh]):
     """
 
     MIN_SQUARES = 100
+    ELEMENTS = "triangles"
 
     def __init__(
         self,
@@ -55,14 +56,16 @@ class EFIESolver(CurrentSolver[ConformingMesh]):
         self.double_area_vectors = torch.linalg.cross(sides[:, 0], sides[:, 1])
         super().__init__(float(self.double_area_vectors.detach().norm(dim=1).sum() / 2))
 
-    def build_elements(self, side: float) -> ConformingMesh | None:
-        """Build a conforming mesh; None if it has too many unknowns."""
-        if max(self.area / side**2 * _MIN_UNKNOWNS_PER_SQUARE, len(self.faces)) > MAX_UNKNOWNS:
-            return None
+    def build_elements(self, side: float, refinement: int) -> ConformingMesh | Refusal:
+        """Build a conforming mesh, see ``CurrentSolver.build_elements``."""
+        side /= 2 ** (refinement / 2)
+        count = max(self.area / side**2 * _MIN_UNKNOWNS_PER_SQUARE, len(self.faces))
+        if refusal := too_many(count, MAX_UNKNOWNS, "unknowns"):
+            return refusal
         mesh = build_conforming_mesh(self.vertices.detach().numpy(), self.faces.numpy(), side)
-        if mesh is None or len(build_rwg_basis(mesh.faces).face) > MAX_UNKNOWNS:
-            return None
-        return mesh
+        if mesh is None:
+            return Refusal("no valid triangles, as surfaces cross or touch")
+        return too_many(len(build_rwg_basis(mesh.faces).face), MAX_UNKNOWNS, "unknowns") or mesh
 
     def assemble_equation(
         self, elements: ConformingMesh, wave_number: float, wave_count: int
@@ -162,11 +165,11 @@ class _EFIEEquation:
             change = change + weight * torch.einsum("yar,yat->art", adjoint_field, residual)
         return value + scale * (change - change.detach())
 
-    def conserves_power(self, current: Tensor, transmitters: Tensor) -> bool:
-        """Test the power balance of the first wave's currents (optical theorem)."""
+    def power_error(self, current: Tensor, transmitters: Tensor) -> float:
+        """Relative error of the power balance of the first wave's currents (optical theorem)."""
         point, moments = self.efie_matrix.sample_currents(self.fixed_vertices, current[:, 0])
         sent = polarisations(transmitters, self.up)[0]
-        return conserves_power(self.k, point, moments, -transmitters[0], sent)
+        return power_error(self.k, point, moments, -transmitters[0], sent)
 
 
 def _sample_interior_points(

@@ -13,6 +13,7 @@ where cells do not resolve the gap.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,7 +25,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from invertwin.channel.em.plane_waves import cross, dot, phasor, polarisations
-from invertwin.channel.rcs.moments.solver import CurrentSolver, conserves_power
+from invertwin.channel.rcs.moments.solver import CurrentSolver, Refusal, power_error, too_many
 
 _PIECES_PER_SIDE = 4.0  # side of a cell over the longest side of its pieces
 _SEEDING_PIECES = 40  # pieces per cell in the first rounds of clustering
@@ -193,30 +194,40 @@ class MFIESolver(CurrentSolver[SurfaceCells]):
     Args:
         corners: corners of the triangles of closed bodies, with outward normals [m].
         up: unit vector of the vertical axis, in one plane with V.
+        refinements: numbers of times that cells are doubled, tried in turn.
     """
 
     MIN_SQUARES = 250
+    ELEMENTS = "cells"
 
-    def __init__(self, corners: Float64[Tensor, "facet 3 3"], up: Float64[Tensor, "3"]) -> None:
+    def __init__(
+        self,
+        corners: Float64[Tensor, "facet 3 3"],
+        up: Float64[Tensor, "3"],
+        refinements: Sequence[int] = (0,),
+    ) -> None:
         self.corners, self.up = corners.numpy(), up
         sides = self.corners[:, 1:] - self.corners[:, :1]
         normals = np.cross(sides[:, 0], sides[:, 1])
-        super().__init__(float(np.linalg.norm(normals, axis=1).sum() / 2))
+        super().__init__(float(np.linalg.norm(normals, axis=1).sum() / 2), refinements)
 
-    def build_elements(self, side: float) -> SurfaceCells | None:
-        """Build cells fine enough for thin parts; None if there are too many."""
-        if self.area / side**2 > MAX_CELLS:
-            return None
+    def build_elements(self, side: float, refinement: int) -> SurfaceCells | Refusal:
+        """Build cells fine enough for thin parts, see ``CurrentSolver.build_elements``."""
+        if refusal := too_many(self.area / side**2, MAX_CELLS, self.ELEMENTS):
+            return refusal
         cells = build_cells(self.corners, side)
-        width = min(
+        widths = [
             float(np.quantile(cells.inscribed_radius, share)) / least
             for share, least in _WIDTH_QUANTILES
-        )
-        if width < side:
-            if self.area / width**2 > MAX_CELLS:
-                return None
-            cells = build_cells(self.corners, width)
-        return cells if cells.closed else None
+        ]
+        fine = min(side, *widths) / 2 ** (refinement / 2)
+        if refusal := too_many(self.area / fine**2, MAX_CELLS, self.ELEMENTS):
+            return refusal
+        if fine < side:
+            cells = build_cells(self.corners, fine)
+        if cells.closed:
+            return cells
+        return Refusal("cells of thin, overlapping or reversed bodies are not closed", by_size=True)
 
     def assemble_equation(
         self, elements: SurfaceCells, wave_number: float, wave_count: int
@@ -271,13 +282,9 @@ class _MFIEEquation:
         self_term = self.tangents @ self.curvature @ self.tangents.mT
         trace = self_term.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
         radius = (self.area / math.pi).sqrt()[:, None, None]
-        self_term = torch.eye(2, dtype=torch.float64) / 2 + radius / 4 * (
-            self_term - trace / 2 * torch.eye(2, dtype=torch.float64)
-        )
-        every = torch.arange(count)
-        for a in (0, 1):
-            for b in (0, 1):
-                matrix[a, every, b, every] += self_term[:, a, b].to(torch.complex64)
+        half = torch.eye(2, dtype=torch.float64) / 2
+        self_term = half + radius / 4 * (self_term - trace * half)
+        matrix.diagonal(dim1=1, dim2=3).add_(self_term.permute(1, 2, 0))
         return matrix.view(2 * count, 2 * count)
 
     @cached_property
@@ -336,11 +343,11 @@ class _MFIEEquation:
         received = polarisations(receivers, self.up).to(torch.complex128)
         return torch.einsum("arx,atx->art", received, field)
 
-    def conserves_power(self, current: Tensor, transmitters: Tensor) -> bool:
-        """Test the power balance of the first wave's currents (optical theorem)."""
+    def power_error(self, current: Tensor, transmitters: Tensor) -> float:
+        """Relative error of the power balance of the first wave's currents (optical theorem)."""
         moments = current[:, 0] * self.area[:, None, None]
         sent = polarisations(transmitters[:1], self.up)[0]
-        return conserves_power(self.k, self.point + self.origin, moments, -transmitters[0], sent)
+        return power_error(self.k, self.point + self.origin, moments, -transmitters[0], sent)
 
 
 def _solve_gmres(
