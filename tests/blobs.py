@@ -13,7 +13,7 @@ from invertwin.inversion import SpectrumLoss
 from invertwin.scene import Scene, sphere
 from scenes import thing
 
-LAW = SpectrumLoss("likelihood", levels=1, floor=1e-4)
+LAW = SpectrumLoss("likelihood", levels=1, floor=1e-4, background="none")
 BINS = torch.linspace(-2.0, 2.0, 200, dtype=torch.float64)
 
 

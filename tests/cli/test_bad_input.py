@@ -133,7 +133,7 @@ def folder(run_file, monkeypatch):
         ),
         pytest.param(
             RUN + '[loss]\nkind = "likelihood"\nbackground = "static"\n',
-            ["loss: ", "the floor stands for a background"],
+            ["loss: ", "expected one level as the background"],
             id="loss of two minds",
         ),
         pytest.param(
