@@ -269,7 +269,7 @@ def fringe_field(
     direction: Float64[Tensor, "row 3"],
     field: Float64[Tensor, "row 2 3"],
     scattered_direction: Float64[Tensor, "row 3"],
-    strip_lengths: Float64[Tensor, "row 2"],
+    strip_widths: Float64[Tensor, "row 2"],
 ) -> Tensor:
     """Far field F of the fringe currents per metre of edge, for both incident polarisations.
 
@@ -282,7 +282,7 @@ def fringe_field(
         direction: direction d of the incident wave.
         field: incident field E [V/m].
         scattered_direction: unit vector s towards the receiver.
-        strip_lengths: widths of both faces across the edge [m]. Strips of sheets count as endless,
+        strip_widths: widths of both faces across the edge [m]. Strips of sheets count as endless,
             since their multiple diffraction is computed by itself.
     """
     total = torch.zeros(len(direction), 2, 3, dtype=torch.complex128)
@@ -294,7 +294,7 @@ def fringe_field(
         phi_in = exterior_azimuth(wedges, -direction, face)
         phi_out = exterior_azimuth(wedges, scattered_direction, face)
         mu = sin_out * torch.cos(phi_out) / sin_in
-        phase = k * strip_lengths[:, face] * sin_in
+        phase = k * strip_widths[:, face] * sin_in
         electric, magnetic = _fringe_coefficients(wedges.opening, phi_in, mu, phase)
         across = cross(scattered_direction, axis)
         e = dot(axis[:, None], field)

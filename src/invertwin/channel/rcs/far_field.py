@@ -126,6 +126,23 @@ class _FarFieldTarget:
         inside = [solids.permittivity[number] for solids, _ in self.interiors if solids is not None]
         return max([1.0, *(float(refractive_index(e.detach())) for e in inside)])
 
+    @cached_property
+    def sharp_edges(self) -> Wedges:
+        """Sharp edges of conductors."""
+        ends = self.vertices[self.topology.edges]
+        wedges = find_wedges(self.facets.corners, ends, self.topology.edge_faces)
+        wedges = wedges.select(self.interfaces[0].conducting[wedges.faces[:, 0]])
+        return wedges.select(select_body_edges(wedges, self.wavelength * _MIN_EDGE_RUN))
+
+    @cached_property
+    def edge_pieces(self) -> tuple[Wedges, Float64[Tensor, "row 3"], Float64[Tensor, "row 2"]]:
+        """Pieces of sharp edges, their middles, and the widths of both faces across each [m]."""
+        pieces = _split_edges(self.sharp_edges, self.wavelength / _SEGMENTS_PER_WAVELENGTH)
+        middle, bodies = (pieces.start + pieces.end) / 2, (self.facets, self.occluders)
+        sides = zip(pieces.faces.unbind(1), pieces.face_tangents.unbind(1), strict=True)
+        widths = [face_path_lengths(*bodies, face, middle, inward) for face, inward in sides]
+        return pieces, middle, torch.stack(widths, 1)
+
     @property
     def is_smooth_metal(self) -> bool:
         """True if all objects are smooth metal, with fields independent of frequency."""
@@ -330,13 +347,8 @@ class _FarFieldTracer:
     def _trace_edges(self, max_diffractions: int) -> dict[str, Tensor]:
         """Contributions of sharp edges of conductors (PTD)."""
         target = self.target
-        topology = target.topology
-        ends = target.vertices[topology.edges]
-        wedges = find_wedges(target.facets.corners, ends, topology.edge_faces)
-        wedges = wedges.select(target.interfaces[0].conducting[wedges.faces[:, 0]])
-        wedges = wedges.select(select_body_edges(wedges, target.wavelength * _MIN_EDGE_RUN))
-        found = {"edges 1": self._fringe_amplitudes(wedges)}
-        plates = find_plates(wedges) if max_diffractions > 1 else []
+        found = {"edges 1": self._fringe_amplitudes()}
+        plates = find_plates(target.sharp_edges) if max_diffractions > 1 else []
         totals = [list(self._zero_amplitudes()) for _ in range(2, max_diffractions + 1)]
         every = torch.arange(len(self.transmitters))
         for f, k in enumerate(target.wave_numbers if plates else ()):
@@ -348,18 +360,11 @@ class _FarFieldTracer:
                 total[f] = self._add_received(total[f], every, radiated)
         return found | {f"edges {n}": torch.stack(t) for n, t in enumerate(totals, start=2)}
 
-    def _fringe_amplitudes(self, wedges: Wedges) -> Tensor:
+    def _fringe_amplitudes(self) -> Tensor:
         """First-order fringe currents of the edge pieces that both antennas see."""
         target, total = self.target, list(self._zero_amplitudes())
-        wedges = _split_edges(wedges, target.wavelength / _SEGMENTS_PER_WAVELENGTH)
-        count = len(wedges.start)
-        middle = (wedges.start + wedges.end) / 2
-        bodies = target.facets, target.occluders
-        strips = torch.stack([
-            face_path_lengths(*bodies, wedges.faces[:, k], middle, wedges.face_tangents[:, k])
-            for k in (0, 1)
-        ], 1)  # fmt: skip
-        left_out = 0
+        wedges, middle, strip_widths = target.edge_pieces
+        count, left_out = len(wedges.start), 0
         some = torch.arange(len(self.transmitters))
         for aspects in some.split(max(1, _ROWS_AT_ONCE // max(1, count))) if count else ():
             aspect = aspects.repeat_interleave(count)
@@ -374,18 +379,17 @@ class _FarFieldTracer:
             for antennas in (self.transmitters, self.receivers):
                 pieces = wedges.select(row)
                 outward = (pieces.normals - pieces.face_tangents).sum(1)
-                centre = (pieces.start + pieces.end) / 2
-                centre = centre + _EDGE_OFFSET * target.facets.size * normalize(outward, dim=1)
-                visible = target.is_unoccluded(centre, antennas[aspect])
+                offset = _EDGE_OFFSET * target.facets.size * normalize(outward, dim=1)
+                visible = target.is_unoccluded(middle[row] + offset, antennas[aspect])
                 aspect, row = aspect[visible], row[visible]
                 if antennas is self.receivers:
                     break
             pieces = wedges.select(row)
             d, s = -self.transmitters[aspect], self.receivers[aspect]
-            centre, side = (pieces.start + pieces.end) / 2, pieces.end - pieces.start
+            centre, side = middle[row], pieces.end - pieces.start
+            field, widths = self._incident_fields[aspect], strip_widths[row]
             for f, k in enumerate(target.wave_numbers):
-                waves = d, self._incident_fields[aspect], s
-                radiated = fringe_field(pieces, k, *waves, strips[row])
+                radiated = fringe_field(pieces, k, d, field, s, widths)
                 wave = k * (s - d)
                 width = parallelogram_integral(wave, side, torch.zeros_like(side))
                 scale = phasor(dot(wave, centre)) * width * side.norm(dim=1)

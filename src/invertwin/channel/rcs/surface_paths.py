@@ -37,7 +37,9 @@ def face_path_lengths(
     """
     size, first = facets.size, facets.normal[face]
     length, row = torch.zeros(len(face), dtype=torch.float64), torch.arange(len(face))
-    while len(row):
+    for _ in range(len(facets.normal)):  # no path crosses more triangles
+        if not len(row):
+            break
         corners, normal = facets.corners[face], facets.normal[face]
         inward = cross(normal[:, None], corners.roll(-1, 1) - corners)
         height = dot(point[:, None] - corners, inward).clamp_min(0)
