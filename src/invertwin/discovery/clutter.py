@@ -80,12 +80,7 @@ def reconstruct_among_clutter(
 
 
 def estimate_clutter(
-    scene: Scene,
-    observation: Observation,
-    fitted: Sequence[str],
-    *,
-    loss: SpectrumLoss | None = None,
-    seed: int = 0,
+    scene: Scene, observation: Observation, fitted: Sequence[str], *, seed: int = 0
 ) -> Float64[Tensor, "frame range u v"]:
     """Estimate the mean power of noise and of echoes that a scene does not explain.
 
@@ -97,7 +92,6 @@ def estimate_clutter(
         scene: what is known, fitted objects at their present places.
         observation: recording of a radar with a ``SurrogateMap``.
         fitted: names of the fitted objects.
-        loss: loss that determines gain and noise; None = ``SpectrumLoss()``.
         seed: seed of the predicted map.
 
     Returns:
@@ -114,7 +108,7 @@ def estimate_clutter(
     power = observation.observed_map()
     with torch.no_grad():
         predicted = model.scale_blur(0.0).predict(scene, radar, seed).clamp_min(0.0)
-    law = loss or SpectrumLoss()
+    law = SpectrumLoss()
     gain = law.fitted_gain(predicted, power)
     # The weakest range bin: a level fitted to the whole map would hold the clutter.
     noise = float(estimate_background(power).min()) + law.floor * float(power.mean())

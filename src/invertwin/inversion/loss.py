@@ -16,7 +16,7 @@ from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.limits import Count, Positive
 
-_MIN_POSITIVE = 1e-38  # lower limit of logarithms
+_MIN_POSITIVE = 1e-38  # lower limit of divisors, and noise as good as none
 _GAIN_STEPS = 30  # maximum number of iterations at a resolution; three or four suffice
 _GAIN_CHANGES = -0.8, 2.0  # limits of a relative step
 # Relative step of gain and noise at which the iteration ends; the remaining error is its square.
@@ -28,8 +28,8 @@ _BINS_PER_BLOCK = 2**16  # bins per block, so that the working set fits a core's
 
 PowerArray = TypeVar("PowerArray", Tensor, NDArray[np.float32])
 _PowerBlock = tuple[Tensor, Tensor, Tensor]  # simulated map, its positive part, measured power
-MapPairs = Sequence[tuple[Tensor, Tensor]]
 _Map = Float[Tensor, "frame *map"]  # of one observation
+MapPairs = Sequence[tuple[Tensor, Tensor]]
 """The predicted and the observed map of every observation."""
 
 
@@ -141,16 +141,11 @@ class SpectrumLoss:
         """Degrees of freedom ν of the speckle."""
         return self.degrees if self.kind == "heavy_tailed" else math.inf
 
-    def _weight_power(self, power: Tensor, inverse: Tensor | float = 1.0) -> Tensor:
-        """Weight power for gradients, see ``speckle_weight``; plain speckle has weight one.
-
-        Args:
-            power: measured power.
-            inverse: one over its mean.
-        """
+    def _weight_power(self, ratio: Tensor) -> Tensor:
+        """Weight power over its mean for gradients; plain speckle has weight one."""
         if self.kind == "likelihood":
-            return power
-        return power * speckle_weight(power * inverse, self.degrees)
+            return ratio
+        return ratio * speckle_weight(ratio, self.degrees)
 
     def __call__(self, simulated: _Map, measured: _Map) -> Float[Tensor, ""]:
         """Return the loss: 0 for equal maps, 1 for an empty simulated map under ``mse``.
@@ -285,10 +280,12 @@ class SpectrumLoss:
                 if float(change.abs().max()) < _GAIN_TOLERANCE:
                     break
         gain, noise = values.tolist()
-        if 0 < noise < _LITTLE_NOISE * self.floor:
-            # On its way to zero, which a relative step never reaches.
+        if noise <= _MIN_NOISE * self.floor:
+            return gain, 0.0
+        if noise < _LITTLE_NOISE * self.floor:
+            # Perhaps on its way to zero, which a relative step never reaches.
             slope, _ = self._differentiate_gain(levels, gain, _MIN_POSITIVE)
-            noise *= float(slope[1]) > 0 and noise > _MIN_NOISE * self.floor
+            noise = noise if float(slope[1]) > 0 else 0.0
         return gain, noise
 
     def _differentiate_gain(
