@@ -24,7 +24,6 @@ Fits are kept in `rows.jsonl` as they end; the same command goes on after an int
 import argparse
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -35,7 +34,7 @@ from verdicts import FIT, PAINT, SAMPLING, UP, WIDTHS, Trial, radar
 
 import invertwin as iw
 from invertwin.discovery import reconstruct_among_clutter
-from invertwin.inversion import pose_error, sample_nearby_poses
+from invertwin.inversion import sample_nearby_poses
 from invertwin.scene import Mesh, box, cylinder, rigid, sphere
 from invertwin.scene.parameters import Pose
 
@@ -96,8 +95,8 @@ def run(row: str, number: int) -> dict[str, Any]:
     fit = reconstruct_among_clutter if row in (*STRANGERS, "no_wall") else iw.reconstruct
     pose = Pose("object", axes="xy", rotation_axes="z")
     found = fit(model, observation, pose, seed=key, **FIT)
-    distance, angle = trial.error(found.scene)
     errors = end_errors(trial, found.scene)
+    distance, angle = math.hypot(*errors[:2]), errors[2]
     stated = found.uncertainty.deviations, found.uncertainty.interval()
     names = [f"object.{name}" for name in ("x", "y", "yaw")]
     return {
@@ -117,22 +116,8 @@ def run(row: str, number: int) -> dict[str, Any]:
 
 def end_errors(trial: Trial, scene: iw.Scene) -> list[float]:
     """Errors in x, y [m] and yaw [rad] from the nearest turn with the same surface."""
-    found = []
-    for k in range(trial.parts):
-        turned = rigid_about(trial.truth["object"], 2 * math.pi * k / trial.parts)
-        error = pose_error(scene["object"], turned)
-        assert error is not None
-        away = scene["object"].center - turned.center
-        found.append((error.angle, [float(away[0]), float(away[1]), error.angle]))
-    return min(found)[1]
-
-
-def rigid_about(item: iw.Object, angle: float) -> iw.Object:
-    """An object turned about the vertical through its centre."""
-    c, s = math.cos(angle), math.sin(angle)
-    turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    move = rigid(turn, item.center - turn @ item.center)
-    return replace(item, pose=move @ item.transform)
+    off = min(trial.pose_errors(scene), key=lambda error: error.angle)
+    return [float(off.offset[0]), float(off.offset[1]), off.angle]
 
 
 def measure(found: list[dict[str, Any]]) -> dict[str, Any]:

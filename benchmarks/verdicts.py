@@ -29,6 +29,7 @@ from report import MetricTable, Required, write
 
 import invertwin as iw
 from invertwin.inversion import Optimizer, displace, pose_error, pose_grid, sample_nearby_poses
+from invertwin.inversion.metrics import PoseError
 from invertwin.scene import (
     AntennaArray,
     Mesh,
@@ -122,14 +123,17 @@ class Trial:
 
     def error(self, found: iw.Scene) -> tuple[float, float]:
         """How far an end is from the truth [m, rad]."""
-        none, errors = torch.zeros(3, dtype=torch.float64), []
+        angle, distance = min((off.angle, off.distance) for off in self.pose_errors(found))
+        return distance, angle
+
+    def pose_errors(self, found: iw.Scene) -> Iterator[PoseError]:
+        """Errors from the truth, and from turns of it with the same surface."""
+        none = torch.zeros(3, dtype=torch.float64)
         for k in range(self.parts):
             alike = displace(self.truth["object"], none, 2 * math.pi * k / self.parts * UP)
             off = pose_error(found["object"], alike)
             assert off is not None
-            errors.append((off.angle, off.distance))
-        angle, distance = min(errors)
-        return distance, angle
+            yield off
 
     def row(self) -> dict[str, Any]:
         """Fit from the bad start, then search about it."""
