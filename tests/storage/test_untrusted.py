@@ -14,7 +14,13 @@ from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import build
 from invertwin.errors import InputError
 from invertwin.scene.files import load_mesh, load_scene_xml
-from invertwin.storage.untrusted import convert_read_errors, read_arrays, read_npy, safe_reader
+from invertwin.storage.untrusted import (
+    convert_read_errors,
+    read_arrays,
+    read_npy,
+    read_text,
+    safe_reader,
+)
 
 DESCRIPTION = """
 [data]
@@ -62,6 +68,24 @@ def test_text_of_any_kind_is_one_line(tmp_path, name, text, read):
         read(tmp_path / name)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 1_000
+
+
+@pytest.mark.parametrize("coding", ["utf-8", "utf-8-sig", "latin-1", "cp1252", "gbk", "shift-jis"])
+def test_comments_of_windows_tools_do_not_refuse_a_file(tmp_path, coding):
+    comment = {"gbk": "测量…", "shift-jis": "測定"}.get(coding, "23 °C, für Prüfling ±½")
+    comment += "…" if coding in ("utf-8", "cp1252") else ""
+    file = tmp_path / "sweep.s1p"
+    file.write_bytes(f"! {comment}\n# GHz S RI\n1 0.5 0\n".encode(coding))
+    lines = read_text(file, "a sweep").splitlines()
+    assert lines[0].startswith("!")
+    assert lines[1:] == ["# GHz S RI", "1 0.5 0"]
+
+
+def test_data_are_no_text(tmp_path):
+    file = tmp_path / "samples.cfg"
+    file.write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match="it is no text"):
+        read_text(file, "settings")
 
 
 def test_a_name_too_long_for_a_file_is_no_file():

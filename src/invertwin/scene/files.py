@@ -32,7 +32,7 @@ from invertwin.scene.mesh_union import unite_parts
 from invertwin.scene.pose import Basis
 from invertwin.scene.scene import Object, Scene
 from invertwin.storage.folders import replace_file
-from invertwin.storage.untrusted import convert_read_errors, existing_file, safe_reader
+from invertwin.storage.untrusted import convert_read_errors, existing_file, read_text, safe_reader
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".inp")
 _Y_UP = (".gltf", ".glb")
@@ -264,7 +264,7 @@ def save_scene_xml(path: str | Path, scene: Scene) -> None:
 def _load_trimesh_scene(path: Path) -> trimesh.Scene:
     if path.suffix.lower() != ".inp":
         return trimesh.load_scene(path, process=False)
-    text = path.read_text(encoding="utf-8-sig")
+    text = read_text(path, "an .inp mesh")
     vertices, faces = _ucd(text) if _UCD_HEADER.match(text) else _abaqus(text)
     return trimesh.Scene(trimesh.Trimesh(vertices, faces, process=False))
 

@@ -90,6 +90,9 @@ def existing_file(path: str | Path, what: str = "an existing file") -> Path:
 def read_text(path: str | Path, what: str) -> str:
     """A file as text, without a byte-order mark.
 
+    Numbers and keywords of settings are ASCII; what is no UTF-8 stands in comments, as Windows
+    tools write them.
+
     Args:
         path: The file.
         what: What it should be, for the error.
@@ -99,7 +102,14 @@ def read_text(path: str | Path, what: str) -> str:
     """
     file = existing_file(path, what)
     with convert_read_errors(file, what, "it is no text; name the settings, not the data"):
-        return file.read_text(encoding="utf-8-sig")
+        content = file.read_bytes()
+        if b"\0" in content:
+            raise ValueError("zero bytes")
+        try:
+            return content.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            # Not Latin-1: its letter 0x85 would end a line.
+            return content.decode("cp1252", errors="replace")
 
 
 def read_npy(path: str | Path) -> "np.ndarray":

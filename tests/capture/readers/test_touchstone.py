@@ -82,3 +82,77 @@ def test_three_ports_are_listed_row_by_row(tmp_path):
     file.write_text(f"# Hz S RI\n7 {values}\n")
     found = load_touchstone(file).parameters
     assert torch.equal(found.real[0], torch.arange(1.0, 10.0, dtype=torch.float64).reshape(3, 3))
+
+
+VERSION_2 = """! 23 °C, measured
+[Version] 2.0
+# GHz S RI R 50
+[Number of Ports] 2
+[Two-Port Data Order] {order}
+[Number of Frequencies] 2
+{more}[Network Data]
+{rows}
+{end}
+"""
+
+
+@pytest.mark.parametrize(
+    ("order", "more", "row", "end"),
+    [
+        ("21_12", "", "0.5 0 0 0.1 0.01 0 0.4 0", "[End]"),
+        ("12_21", "", "0.5 0 0.01 0 0 0.1 0.4 0", "[End]"),
+        ("21_12", "[Reference]\n50\n50\n", "0.5 0 0 0.1 0.01 0 0.4 0", "[End]"),
+        ("12_21", "[Number of Noise Frequencies] 1\n", "0.5 0 0.01 0 0 0.1\n0.4 0",
+         "[Noise Data]\n2 1 0.5 20 0.3\n[End]"),
+        ("12_21", "[Begin Information]\n[Note] 1 2 3\n[End Information]\n",
+         "0.5 0 0.01 0 0 0.1 0.4 0", "[End]"),
+    ],
+)  # fmt: skip
+def test_version_2_states_order_and_counts(tmp_path, order, more, row, end):
+    file = tmp_path / "horn.s2p"
+    rows = f"1 {row}\n2 {row}"
+    text = VERSION_2.format(order=order, more=more, rows=rows, end=end)
+    file.write_text(text, encoding="utf-8")
+    found = load_touchstone(file)
+    assert found.frequencies.tolist() == [1e9, 2e9]
+    assert found.resistance == 50
+    assert found.parameters[1].tolist() == [[0.5, 0.01], [0.1j, 0.4]]
+
+
+@pytest.mark.parametrize(
+    ("layout", "row"), [("Lower", "1 0 2 0 4 0 3 0 5 0 6 0"), ("Upper", "1 0 2 0 3 0 4 0 5 0 6 0")]
+)
+def test_triangles_of_symmetric_matrices(tmp_path, layout, row):
+    file = tmp_path / "hub.ts"
+    head = f"[Version] 2.1\n# Hz S RI\n[Number of Ports] 3\n[Matrix Format] {layout}\n"
+    file.write_text(
+        f"{head}[Number of Frequencies] 1\n[Reference] 75 75 75\n[Network Data]\n7 {row}"
+    )
+    found = load_touchstone(file)
+    assert found.resistance == 75
+    assert found.parameters[0].real.tolist() == [[1, 2, 3], [2, 4, 5], [3, 5, 6]]
+
+
+def test_lower_triangle_of_two_ports_holds_the_way_through(tmp_path):
+    file = tmp_path / "horn.s2p"
+    more, row = "[Matrix Format] Lower\n", "0.5 0 0 0.1 0.4 0"
+    text = VERSION_2.format(order="21_12", more=more, rows=f"1 {row}\n2 {row}", end="[End]")
+    file.write_text(text, encoding="utf-8")
+    assert load_touchstone(file).parameters[0].tolist() == [[0.5, 0.1j], [0.1j, 0.4]]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("[Number of Frequencies] 2", "[Number of Frequencies] 3"),
+        ("[Number of Ports] 2", "[Number of Ports] 1"),
+        ("[Network Data]", "[Mixed-Mode Order] D2,3 C2,3\n[Network Data]"),
+    ],
+)
+def test_version_2_that_contradicts_itself_is_refused(tmp_path, change):
+    file = tmp_path / "horn.s2p"
+    row = "0.5 0 0 0.1 0.01 0 0.4 0"
+    text = VERSION_2.format(order="21_12", more="", rows=f"1 {row}\n2 {row}", end="[End]")
+    file.write_text(text.replace(*change), encoding="utf-8")
+    with pytest.raises(InputError, match="a Touchstone file of 2 ports"):
+        load_touchstone(file)

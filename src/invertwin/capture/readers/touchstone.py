@@ -15,7 +15,7 @@ from invertwin.storage.untrusted import convert_read_errors, read_text
 
 _UNITS = {"HZ": 1.0, "KHZ": 1e3, "MHZ": 1e6, "GHZ": 1e9}
 _FORMATS = ("MA", "DB", "RI")
-_PORTS = re.compile(r"\.s(\d+)p", re.IGNORECASE)
+_PORTS = re.compile(r"\.(?:s(\d+)p|ts)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Touchstone:
     Attributes:
         frequencies: [Hz].
         parameters: S of every frequency, [frequency, port out, port in].
-        resistance: reference resistance [Ω].
+        resistance: reference resistance [Ω], of the first port where they differ.
     """
 
     frequencies: Float64[Tensor, " frequency"]
@@ -69,40 +69,89 @@ def load_rcs(file: str | Path) -> MeasuredRcs:
 
 
 def load_touchstone(file: str | Path) -> Touchstone:
-    """Read a Touchstone file of version 1 (.s1p, .s2p and so on); noise data are left out.
+    """Read a Touchstone file (.s1p, .s2p, .ts and so on), version 1 or 2; noise data are left out.
 
     Args:
-        file: its suffix tells the number of ports.
+        file: its suffix tells the number of ports, for ``.ts`` its keyword.
 
     Raises:
-        InputError: no such file, another suffix, parameters other than S, or a damaged file.
+        InputError: no such file, another suffix, parameters other than S, a mixed-mode order, or a
+            damaged file.
     """
     path = Path(file)
     ports = _PORTS.fullmatch(path.suffix)
-    if ports is None or not 1 <= int(ports[1]) <= 99:
+    if ports is None or int(ports[1] or 1) not in range(1, 100):
         raise InputError(f"expected a Touchstone file such as .s1p or .s2p, got {path.name}")
-    count = int(ports[1])
-    what = f"a Touchstone file of {count} ports"
+    what = f"a Touchstone file of {ports[1]} ports" if ports[1] else "a Touchstone file"
     text = read_text(path, what)
     with convert_read_errors(path, what):
         lines = [line.split("!")[0].strip() for line in text.splitlines()]
         options = next((line[1:].upper().split() for line in lines if line.startswith("#")), [])
         unit, kind, resistance = _parse_option_line(options)
-        numbers = [float(word) for line in lines if line[:1] not in "#[" for word in line.split()]
-        width = 1 + 2 * count**2
-        if len(numbers) % width and count != 2:
-            raise ValueError(f"{len(numbers)} numbers, no multiple of {width}")
-        rows = np.array(numbers[: len(numbers) // width * width]).reshape(-1, width)
-        # Noise data of two ports follow; their frequencies begin anew.
-        falls = np.nonzero(np.diff(rows[:, 0]) <= 0)[0]
-        rows = rows[: falls[0] + 1] if len(falls) else rows
-        if not len(rows) or not np.isfinite(rows).all():
+        keywords = _split_keywords(lines)
+        if "version" in keywords:
+            count, values = _read_version_2(keywords)
+            resistance = float((keywords.get("reference") or [resistance])[0])
+        else:
+            count, values = int(ports[1]), _read_version_1(lines, int(ports[1]))
+        if int(ports[1] or count) != count:
+            raise ValueError(f"{count} ports in its keyword")
+        if not len(values) or not np.isfinite(values).all():
             raise ValueError("no finite numbers")
-        matrix = _to_complex(rows[:, 1::2], rows[:, 2::2], kind).reshape(-1, count, count)
+        matrix = _to_complex(values[:, 1::2], values[:, 2::2], kind)
     # Two ports are listed as S11, S21, S12, S22; others row by row.
-    ordered = matrix.transpose(0, 2, 1) if count == 2 else matrix
-    frequencies, ordered = torch.from_numpy(rows[:, 0] * unit), torch.from_numpy(ordered.copy())
-    return Touchstone(frequencies, ordered, resistance)
+    if count == 2 and keywords.get("two-port data order") != ["12_21"] and matrix.shape[1] == 4:
+        matrix = matrix[:, [0, 2, 1, 3]]
+    filled = _fill_matrix(matrix, count, keywords.get("matrix format", ["full"])[0].lower())
+    return Touchstone(torch.from_numpy(values[:, 0] * unit), torch.from_numpy(filled), resistance)
+
+
+def _split_keywords(lines: list[str]) -> dict[str, list[str]]:
+    """Words after each keyword of version 2, on its line or on those that follow."""
+    words: dict[str, list[str]] = {}
+    keyword = ""
+    for line in lines:
+        if line.startswith("["):
+            keyword, line = line[1:].lower().split("]", 1)
+            words.setdefault(keyword, [])
+        if not line.startswith("#"):
+            words.setdefault(keyword, []).extend(line.split())
+    return words
+
+
+def _read_version_1(lines: list[str], count: int) -> np.ndarray:
+    """Rows of frequency and pairs of numbers."""
+    numbers = [float(word) for line in lines if line[:1] not in "#[" for word in line.split()]
+    width = 1 + 2 * count**2
+    if len(numbers) % width and count != 2:
+        raise ValueError(f"{len(numbers)} numbers, no multiple of {width}")
+    rows = np.array(numbers[: len(numbers) // width * width]).reshape(-1, width)
+    # Noise data of two ports follow; their frequencies begin anew.
+    falls = np.nonzero(np.diff(rows[:, 0]) <= 0)[0]
+    return rows[: falls[0] + 1] if len(falls) else rows
+
+
+def _read_version_2(keywords: dict[str, list[str]]) -> tuple[int, np.ndarray]:
+    """Number of ports, and rows of frequency and pairs of numbers; noise has its own keyword."""
+    if "mixed-mode order" in keywords:
+        raise ValueError("parameters of mixed modes; export those of single ports")
+    count, stated = (int(keywords[f"number of {name}"][0]) for name in ("ports", "frequencies"))
+    whole = keywords.get("matrix format", ["full"])[0].lower() == "full"
+    rows = np.array([float(word) for word in keywords["network data"]])
+    width = 1 + 2 * (count**2 if whole else count * (count + 1) // 2)
+    if len(rows) != width * stated:
+        raise ValueError(f"{len(rows)} numbers, not {stated} frequencies of {width}")
+    return count, rows.reshape(-1, width)
+
+
+def _fill_matrix(values: np.ndarray, count: int, layout: str) -> np.ndarray:
+    """Matrices [row, port, port] of values listed in full, or in one triangle of them."""
+    if layout == "full":
+        return values.reshape(-1, count, count)
+    rows, columns = np.tril_indices(count) if layout == "lower" else np.triu_indices(count)
+    filled = np.zeros((len(values), count, count), dtype=np.complex128)
+    filled[:, rows, columns] = filled[:, columns, rows] = values
+    return filled
 
 
 def _parse_option_line(words: list[str]) -> tuple[float, str, float]:
