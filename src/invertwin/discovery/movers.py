@@ -16,7 +16,12 @@ from invertwin.inversion.reconstruction import Reconstruction
 from invertwin.models.doppler import RangeDopplerMap
 from invertwin.radar.aperture import aperture
 from invertwin.radar.processing.detection import ordered_statistics_cfar, point_cloud
-from invertwin.radar.processing.doppler import compensate_tdm, range_doppler, velocity_axis
+from invertwin.radar.processing.doppler import (
+    compensate_tdm,
+    interpolate_rates,
+    range_doppler,
+    velocity_axis,
+)
 from invertwin.radar.radar import Radar
 from invertwin.scene.scene import Scene
 
@@ -110,7 +115,8 @@ def _channel_coherence(
     column = int((grid.ranges - range_).abs().argmin())
     moving = recording.beat - recording.beat.mean(1, keepdim=True)
     slow = range_doppler(moving.to(torch.complex128), radar, grid, chirps)
-    channels = compensate_tdm(slow, radar, chirps)[0, row, :, :, column].flatten()
+    rates = interpolate_rates(slow.abs().square().mean((2, 3))[0])
+    channels = compensate_tdm(slow, radar, chirps, rates)[0, row, :, :, column].flatten()
     y, z = radar.virtual_positions[:, 1], radar.virtual_positions[:, 2]
     # Fine enough that the nearest direction costs less than a thousandth.
     cosines = [torch.linspace(-1, 1, 257 if len(p.unique()) > 1 else 1) for p in (y, z)]

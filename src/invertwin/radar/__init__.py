@@ -21,6 +21,7 @@ from invertwin.radar.processing.direction import music as music
 from invertwin.radar.processing.direction import source_count as source_count
 from invertwin.radar.processing.doppler import Spectrogram as Spectrogram
 from invertwin.radar.processing.doppler import compensate_tdm as compensate_tdm
+from invertwin.radar.processing.doppler import interpolate_rates as interpolate_rates
 from invertwin.radar.processing.doppler import micro_doppler as micro_doppler
 from invertwin.radar.processing.doppler import range_doppler as range_doppler
 from invertwin.radar.processing.doppler import range_doppler_angle as range_doppler_angle

@@ -13,6 +13,7 @@ from invertwin.radar import (
     Radar,
     beamform,
     compensate_tdm,
+    interpolate_rates,
     micro_doppler,
     moving_beat,
     range_doppler,
@@ -92,6 +93,28 @@ def test_compensated_direction_within_the_axis(transmitters, part):
     assert power.shape == (1, 128, *grid.shape)
     assert power.max() == pytest.approx(1.0, rel=0.1)
     assert abs(direction(power, grid) - U) < 0.1 * radar.beamwidth[0]
+
+
+@pytest.mark.parametrize("loops", [8, 16])
+@pytest.mark.parametrize("part", [0.0, 0.25, 0.49])
+def test_the_rate_between_bins_turns_transmitters_too(loops, part):
+    """The phase at the middle of the bin is off by up to π/loops from transmitter to the last."""
+    radar, chirps = mimo(), Chirps(count=loops, interval=50e-6)
+    rate = (2 + part) / loops * velocity_span(radar, chirps)
+    grid = radar.grid(2, 6, oversample=4)
+    spectrum = range_doppler(mover(radar, chirps, rate), radar, grid, chirps)
+    power = spectrum.abs().square().mean((2, 3))[0]
+    offsets = interpolate_rates(power)
+    row, column = divmod(int(power.argmax()), grid.range_count)
+    assert offsets[row, column] * loops == pytest.approx(part, abs=0.03)
+    channels = compensate_tdm(spectrum, radar, chirps, offsets)[0, row, :, :, column]
+    y = radar.virtual_positions[:, 1]
+    plane = torch.exp(-2j * math.pi / WAVE.wavelength * U * y)
+    turned = (channels.flatten() / plane).angle()
+    assert (turned - turned[0]).abs().max() < 0.03
+    middle = compensate_tdm(spectrum, radar, chirps)[0, row, :, :, column].flatten() / plane
+    expected = 2 * math.pi * part / loops * 3 / 4  # of the last of four transmitters
+    assert float((middle[-1] / middle[0]).angle().abs()) == pytest.approx(expected, abs=0.03)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])

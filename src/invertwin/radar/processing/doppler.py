@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Complex, Float, Float64, Int64
+from jaxtyping import Complex, Float, Float64, Int64, Num
 from torch import Tensor
 
 from invertwin.channel import Grid
@@ -104,14 +104,15 @@ def compensate_tdm(
     spectrum: Complex[Tensor, "frame velocity tx rx range"],
     radar: Radar,
     chirps: Chirps,
-    fold: int | Int64[Tensor, "frame velocity range"] = 0,
+    fold: float | Num[Tensor, "*frame velocity range"] = 0,
 ) -> Complex[Tensor, "frame velocity tx rx range"]:
     """Remove the phase that moving targets gain between time-multiplexed transmitters.
 
     A chirp that starts t later has 2π f t more phase, with f the Doppler frequency, which biases
     beamforming. The phase depends on the true f, which a bin determines modulo the inverse loop
     time: ``fold`` is the number of spans of the velocity axis by which the target's range rate is
-    aliased.
+    aliased. Its fraction is the way from the centre of the bin, see ``interpolate_rates``: half a
+    bin of few chirps turns the last transmitter by up to π over their number.
 
     Args:
         spectrum: spectrum from ``range_doppler``.
@@ -133,6 +134,24 @@ def compensate_tdm(
     cycles = frequency[:, :, None, :] * starts[:, None]
     turn = torch.exp(-2j * math.pi * (cycles - cycles.round()))
     return spectrum * turn[:, :, :, None].to(spectrum)
+
+
+def interpolate_rates(
+    power: Float[Tensor, "velocity range"],
+) -> Float64[Tensor, "velocity range"]:
+    """Interpolate the range rate of the target in each bin, in spans from the centre of the bin.
+
+    A parabola through the logarithms of a bin and its neighbours has its vertex there, at most half
+    a bin away.
+
+    Args:
+        power: of ``range_doppler``, averaged over channels.
+    """
+    level = power.double().clamp_min(torch.finfo(torch.float64).tiny).log()
+    before, after = level.roll(1, 0), level.roll(-1, 0)
+    curvature = before - 2 * level + after
+    vertex = 0.5 * (before - after) / torch.where(curvature < 0, curvature, torch.inf)
+    return vertex.clamp(-0.5, 0.5) / len(power)
 
 
 def resolve_fold(

@@ -13,7 +13,12 @@ from torch import Tensor
 from invertwin.channel import Grid
 from invertwin.radar.processing.beamforming import beamform
 from invertwin.radar.processing.direction import capon, music
-from invertwin.radar.processing.doppler import compensate_tdm, range_doppler, velocity_axis
+from invertwin.radar.processing.doppler import (
+    compensate_tdm,
+    interpolate_rates,
+    range_doppler,
+    velocity_axis,
+)
 from invertwin.radar.processing.reflectors import noise_power
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
@@ -126,7 +131,8 @@ def _sum_range_rates(
     cube: _Cube, radar: Radar, grid: Grid, chirps: Chirps, candidates: _Cells
 ) -> tuple[Float64[Tensor, "range u v"], Peak]:
     """Sum power over all range rates, and return the strongest of the candidate cells."""
-    cube = compensate_tdm(cube, radar, chirps)[0]
+    rates = interpolate_rates(cube.abs().square().mean((2, 3))[0])
+    cube = compensate_tdm(cube, radar, chirps, rates)[0]
     velocities = velocity_axis(radar, chirps)
     chunk = max(1, int(_BINS_AT_ONCE / math.prod(grid.shape)))
     total = torch.zeros(grid.shape, dtype=torch.float64)
@@ -197,7 +203,8 @@ def doppler_snapshots(
     """
     radar = radar.frames([frame])
     cube = range_doppler(beat[frame : frame + 1], radar, grid, chirps, window="rectangular")
-    return compensate_tdm(cube, radar, chirps)[0]
+    rates = interpolate_rates(cube.abs().square().mean((2, 3))[0])
+    return compensate_tdm(cube, radar, chirps, rates)[0]
 
 
 def find_peak(spectrum: Float[Tensor, "range u v"], grid: Grid, velocity: float = 0.0) -> Peak:

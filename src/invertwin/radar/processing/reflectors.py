@@ -20,6 +20,7 @@ from invertwin.radar.processing.detection import (
 )
 from invertwin.radar.processing.doppler import (
     compensate_tdm,
+    interpolate_rates,
     range_doppler,
     velocity_axis,
     velocity_span,
@@ -64,22 +65,22 @@ def detect_points(
     radar, signal = radar.frames([frame]), beat[frame : frame + 1]
     if chirps is None:
         cube = range_profile(signal[:, 0], radar, grid)[:, None]
-        rates, span = torch.full((1,), math.nan, dtype=torch.float64), 0.0
+        rates = torch.full((1, grid.range_count), math.nan, dtype=torch.float64)
     else:
-        cube = compensate_tdm(range_doppler(signal, radar, grid, chirps), radar, chirps)
-        rates, span = velocity_axis(radar, chirps), velocity_span(radar, chirps)
+        cube = range_doppler(signal, radar, grid, chirps)
+        offsets = interpolate_rates(cube.abs().square().mean((2, 3))[0])
+        cube = compensate_tdm(cube, radar, chirps, offsets)
+        rates = velocity_axis(radar, chirps)[:, None] + offsets * velocity_span(radar, chirps)
     cube = cube[0].to(torch.complex128)
     looks = len(radar.virtual_positions)
     flat = cube.abs().square().mean((1, 2))
     noise = noise_power(flat, looks)
     rows: list[list[float]] = []
     for v, r in track(_find_cells(flat, radar, grid, looks), "points"):
-        beside = flat[[v - 1, v, (v + 1) % len(flat)], r]
-        rate = float(rates[v]) + _vertex(beside) * span / len(flat)
         near = [max(r - 1, 0), r, min(r + 1, grid.range_count - 1)]
         place = float(grid.ranges[r]) + _vertex(flat[v, near]) * grid.range_step
         directions = _resolve_directions(cube[v, :, :, r], radar, grid, noise)
-        rows += [[place, rate, *direction] for direction in directions]
+        rows += [[place, float(rates[v, r]), *direction] for direction in directions]
     table = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5)
     ranges, found, u, v, power = table.T
     frames = torch.zeros(len(table), dtype=torch.int64)
