@@ -72,7 +72,8 @@ def find_faults(
     if not any(found):
         # Both of them break phases and make ghosts, too.
         found.append(detect_phase_break(beat, real=real))
-        found.append(detect_ghosts(_strongest_range_rates(beat), waveform, real=real))
+        rates, opposite = _strongest_range_rates(beat), _strongest_range_rates(beat, -1)
+        found.append(detect_ghosts(rates, opposite, waveform, real=real))
     found.append(detect_iq_images(beat))
     shown = search_ranges(recording, range_min, range_max)
     found.append(detect_leakage(beat, waveform, radar.window, shown, real=real))
@@ -239,33 +240,53 @@ _MAX_RESIDUAL_FRACTION = 0.03
 _MIN_PEAK_TO_SURROUNDINGS = 10.0
 # Share of a spectrum without echoes; what its window leaves.
 _NOISE_ONLY_FRACTION, _WINDOW_FLOOR = 0.2, 1e-10
+_MAX_IQ_IMAGE = 0.7  # of the echo's amplitude
+_ODD_SAMPLES = (
+    ", half the unambiguous range away: odd samples differ from even ones (interleaved converters, "
+    "samples dropped or doubled); calibrate the converter, or read the samples in their right order"
+)
+_UNLIKE_IQ = (
+    " but for their sign, where the unambiguous range less its own is: I and Q differ in gain or "
+    "are not 90° apart, so that every echo has an image with the opposite direction and range "
+    "rate; balance I and Q, or look at half of the range (--range-max)"
+)
 _MIN_RELATIVE_ECHO = 1e-4  # of the strongest one's power, that is searched for ghosts
 
 
-def detect_ghosts(rates: _Rates, waveform: SampledWaveform, *, real: bool) -> Fault | None:
-    """Echoes whose copies lie half the unambiguous range away: odd samples unlike even ones.
+def detect_ghosts(
+    rates: _Rates, opposite: _Rates, waveform: SampledWaveform, *, real: bool
+) -> Fault | None:
+    """Echoes with copies: odd samples unlike even ones, or I unlike Q.
 
     Factors that alternate from sample to sample move a part of every echo by half the sampling
     rate. The copy has the echo's line shape, channels and range rates, times one factor g; of real
-    samples, and where I and Q alternate, also the conjugate at ``½ − f``. Such a copy is told from
+    samples, and where I and Q alternate, also the conjugate at ``½ − f``. Where I and Q differ in
+    gain, or by another phase than 90°, the conjugate is at ``−f``, with the opposite direction and
+    range rate, and weaker than the echo (else it is a pair). Such a copy is told from
     an echo of its own by what is left once ``g`` times the echo is taken away: noise, and at most
     3 % of the copy. The copy's energy is at least 100 times what noise and other echoes have beside
     it, below which chance agreement is frequent.
 
     Args:
         rates: Of ``_strongest_range_rates``.
+        opposite: The opposite range rates, where conjugates are.
         waveform: Its unambiguous range.
         real: Whether the samples were real.
     """
     count = rates.shape[-1]
-    tapered = rates * _blackman_harris_window(count)
-    power = torch.fft.fft(tapered, 4 * count).abs().square().flatten(0, 1).mean(0)
+    tapered, mirrored = (part * _blackman_harris_window(count) for part in (rates, opposite))
+    power, power_of_mirrored = (
+        torch.fft.fft(part, 4 * count).abs().square().flatten(0, 1).mean(0)
+        for part in (tapered, mirrored)
+    )
     looks, top = rates.shape[0] * rates.shape[1], float(power.max())
     own_half = power[: 2 * count] if real else power
     noise = max(noise_power(own_half, looks, _NOISE_ONLY_FRACTION), _WINDOW_FLOOR * top)
     highest = (power >= power.roll(1)) & (power > power.roll(-1))
     strong = highest & (power > _MIN_RELATIVE_ECHO * top) & (power > _MIN_GHOST_TO_NOISE * noise)
-    kinds = ((0.5, 1.0, False), (0.5, -1.0, True)) if not real else ((0.5, -1.0, True),)
+    kinds = (
+        [(0.5, -1.0, True)] if real else [(0.0, -1.0, True), (0.5, 1.0, False), (0.5, -1.0, True)]
+    )
     for place in torch.nonzero(strong)[:, 0].tolist():
         echo = place / (4 * count)
         own = _adjacent_lines(tapered, echo)
@@ -273,10 +294,11 @@ def detect_ghosts(rates: _Rates, waveform: SampledWaveform, *, real: bool) -> Fa
             at = (offset + sign * echo) % 1
             if abs((at - echo + 0.5) % 1 - 0.5) * count < _SELF_IMAGE_BINS:
                 continue
-            around = max(noise, _power_beside(power, at))
-            if _power_at(power, at) < _MIN_PEAK_TO_SURROUNDINGS * around:
+            searched, powers = (mirrored, power_of_mirrored) if conjugate else (tapered, power)
+            around = max(noise, _power_beside(powers, at))
+            if _power_at(powers, at) < _MIN_PEAK_TO_SURROUNDINGS * around:
                 continue
-            copy = _adjacent_lines(tapered, at)
+            copy = _adjacent_lines(searched, at)
             like = own.flip(-1).conj() if conjugate else own
             factor = torch.vdot(like.flatten(), copy.flatten()) / like.abs().square().sum()
             explained = float(factor.abs().square() * like.abs().square().sum())
@@ -285,17 +307,15 @@ def detect_ghosts(rates: _Rates, waveform: SampledWaveform, *, real: bool) -> Fa
             if (
                 explained > _MIN_GHOST_TO_NOISE * around
                 and left < chance + _MAX_RESIDUAL_FRACTION * explained
-                and float(factor.abs()) < 1.05
+                and float(factor.abs()) < (1.05 if offset else _MAX_IQ_IMAGE)
             ):
-                level = 20 * math.log10(float(factor.abs()))
-                return Fault(
-                    "ghosts",
+                level = -20 * math.log10(float(factor.abs()))
+                shown = (
                     f"the echo at {echo * waveform.max_range:.3g} m has a copy at "
-                    f"{at * waveform.max_range:.3g} m, {-level:.0f} dB weaker and alike in all "
-                    "channels, half the unambiguous range away: odd samples differ from even ones "
-                    "(interleaved converters, samples dropped or doubled); calibrate the "
-                    "converter, or read the samples in their right order",
+                    f"{at * waveform.max_range:.3g} m, {level:.0f} dB weaker and alike in all "
+                    "channels"
                 )
+                return Fault("ghosts", shown + (_ODD_SAMPLES if offset else _UNLIKE_IQ))
     return None
 
 
@@ -489,12 +509,18 @@ def _is_analytic(beat: _Beat) -> bool:
     return bool(power[count // 2 + 1 :].sum() < _WINDOW_FLOOR * power.sum())
 
 
-def _strongest_range_rates(beat: _LimitedBeat) -> _Rates:
-    """The strongest range rates of every frame, in which noise of many chirps is averaged."""
+def _strongest_range_rates(beat: _LimitedBeat, sign: int = 1) -> _Rates:
+    """The strongest range rates of every frame, in which noise of many chirps is averaged.
+
+    Args:
+        beat: samples.
+        sign: -1 = the opposite ones of these.
+    """
     rates = torch.fft.fft(beat.flatten(2, 3), dim=1) / math.sqrt(beat.shape[1])
     energy = rates.abs().square().sum((2, 3))
     best = energy.topk(min(_STRONGEST_RATES, beat.shape[1]), dim=1).indices
-    return torch.cat([frame[chosen] for frame, chosen in zip(rates, best, strict=True)])
+    pairs = zip(rates, sign * best % beat.shape[1], strict=True)
+    return torch.cat([frame[chosen] for frame, chosen in pairs])
 
 
 def _blackman_harris_window(count: int) -> Float64[Tensor, " sample"]:

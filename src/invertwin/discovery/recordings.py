@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -43,10 +43,12 @@ from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar, SampledWaveform
+from invertwin.radar.aperture import aperture
 from invertwin.scene import Scene
 
 _LEAKAGE_CELLS = 4  # range cells with leakage from transmitters to receivers
 _DEFAULT_RADAR_HEIGHT = 0.6  # default height of radars above the ground [m]
+_FEW_CHANNELS = 4  # along an axis of the array, whose maps have no taper
 _FINAL_FIT_STEPS = 50  # steps of the final fit
 _MAX_IMAGE_POINTS = 40_000  # maximum number of points of an image
 _MIN_EXISTENCE_PROBABILITY = 0.05  # less probable moving targets are dropped
@@ -91,6 +93,9 @@ def twin(
     """
     checked_count(rays, "rays", 100)
     capture = average_chirps(recording)
+    if max(map(len, (aperture(capture.radar()).y, aperture(capture.radar()).z))) <= _FEW_CHANNELS:
+        # A taper would leave two of four channels, and one of three: no direction.
+        capture = Capture(capture.dataset.assign_attrs(array_window="rectangular"))
     if isinstance(recording, ChirpCapture) and recording.real:
         range_max = min(range_max or math.inf, recording.max_range)
     radar = capture.radar()
@@ -188,7 +193,8 @@ def _find_static_objects(
     power = capture.spectrum(grid).detach().float()
     radar, frames = capture.radar(), capture.frame_count
     model = SurrogateMap(grid, sampling=make_sampling(frames, rays))
-    loss, draw = HeavyTailedLoss(estimate_background(power)), count_bins_per_draw(radar, grid)
+    level_of_bins = _estimate_background(power, radar, grid)
+    loss, draw = HeavyTailedLoss(level_of_bins), count_bins_per_draw(radar, grid)
     one = ShapeLikelihood(model, radar, power, loss, draw, level, seed)
     held = list(range(_HELD_OUT_EVERY - 1, frames, _HELD_OUT_EVERY))
     held = held if frames >= 2 * _HELD_OUT_EVERY else []
@@ -289,11 +295,17 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
     grid = radar.grid(first, limit)
     power = capture.spectrum(grid).detach().double()
     # Noise level: a running minimum over range.
-    strongest = power.amax((0, 2, 3)) / float(estimate_background(power).min())
+    strongest = power.amax((0, 2, 3)) / float(_estimate_background(power, radar, grid).min())
     loud = (strongest > 2 * math.log(power.numel()) + 5).nonzero()[:, 0]
     if not len(loud):
         return None
     return first, min(limit, float(grid.ranges[loud[-1]]) + 10 * cell)
+
+
+def _estimate_background(
+    power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
+) -> Float64[Tensor, " range"]:
+    return estimate_background(power, count_bins_per_draw(radar, replace(grid, range_count=1)))
 
 
 def image_points(

@@ -54,6 +54,16 @@ def test_the_background_is_the_mean_of_noise_beside_a_bright_thing():
     assert float(found[2]) < 4e-3
 
 
+def test_an_echo_that_fills_all_directions_is_not_its_own_background():
+    """As the beam of two to four receivers does, in one frame."""
+    power = -torch.rand(1, 60, 9, 1, dtype=torch.float64, generator=torch.manual_seed(0)).log()
+    power[:, 20:24] += 1e4
+    assert float(estimate_background(power)[21]) > 1e3
+    found = estimate_background(power, 4.5)
+    assert found.max() < 1.6
+    assert found.min() > 0.5
+
+
 def test_noise_has_as_many_draws_as_bins_over_the_shared_ones():
     """The variance of the mean power over a map is that of so many exponential draws."""
     device = radar(400)

@@ -18,19 +18,30 @@ TAIL_DEGREES = 4.0
 """Degrees of freedom of the heavy-tailed speckle."""
 _MIN_POWER = 1e-30  # lower limit of power in logarithms
 _BACKGROUND_QUANTILE = 0.25  # quantile of a range bin that estimates the background
+_BACKGROUND_DRAWS = 32  # least number of independent draws of a quartile
 _Maps = Float[Tensor, "frame range u v"]  # power of every frame
 
 
-def estimate_background(power: _Maps) -> Float64[Tensor, " range"]:
+def estimate_background(
+    power: _Maps, directions_per_draw: float = 0.0
+) -> Float64[Tensor, " range"]:
     """Estimate the level of noise and unmodelled clutter of every range bin.
 
     The lower quartile of exponentially distributed power is 0.288 of its mean. Objects that fill
-    less than three quarters of a range bin's directions, over all frames, hardly raise it.
+    less than three quarters of a range bin's directions, over all frames, hardly raise it. The beam
+    of a few receivers fills more; the quartile then is over the ranges around, too, so that it is
+    of 32 independent draws at least.
 
     Args:
         power: measured maps [frame, range, u, v].
+        directions_per_draw: number of correlated directions per independent draw; 0 = each range
+            alone.
     """
     flat = power.detach().double().movedim(1, 0).flatten(1)
+    reach = math.ceil(_BACKGROUND_DRAWS * directions_per_draw / flat.shape[1]) // 2
+    if reach:
+        around = torch.arange(len(flat))[:, None] + torch.arange(-reach, reach + 1)
+        flat = flat[around.clamp(0, len(flat) - 1)].flatten(1)
     level = torch.quantile(flat, _BACKGROUND_QUANTILE, dim=1) / -math.log(1 - _BACKGROUND_QUANTILE)
     return level.clamp_min(1e-12 * float(power.max()))
 
