@@ -44,3 +44,28 @@ def test_what_does_not_belong_together_is_refused(wrong, unchecked):
 def test_more_chirps_than_there_are_is_refused():
     with pytest.raises(InputError, match=r"shape \(2, 4, 1, 16\)"):
         ChirpCapture(beat(), DEVICE, CHIRPS).select_chirps(4, 4)
+
+
+def test_frames_of_one_ramp_are_one_train():
+    still = radar([[0.0, 0.0, 0.0]] * 6)
+    ramps = beat()[:1].movedim(0, 1)
+    whole = ChirpCapture(ramps, still, Chirps(1, 60e-6), frame_period=1e-3)
+    merged = whole.merge_single_ramps()
+    assert merged.beat.shape == (1, 6, 1, 16, 64)
+    assert torch.equal(merged.beat[0], ramps[:, 0])
+    assert merged.chirps.times(1)[:, 0].tolist() == pytest.approx([k * 1e-3 for k in range(6)])
+    assert merged.merge_single_ramps() is merged
+
+
+@pytest.mark.parametrize(
+    ("device", "chirps", "period"),
+    [
+        (radar([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]]), Chirps(1, 60e-6), 1e-3),
+        (radar([[0.0, 0.0, 0.0]] * 2), Chirps(1, 60e-6), None),
+        (radar([[0.0, 0.0, 0.0]] * 2), Chirps(6, 60e-6), 1e-3),
+    ],
+    ids=["moves", "no period", "trains"],
+)
+def test_other_frames_stay_apart(device, chirps, period):
+    whole = ChirpCapture(beat()[:, : chirps.count], device, chirps, frame_period=period)
+    assert whole.merge_single_ramps() is whole

@@ -106,9 +106,12 @@ def test_the_capture_that_it_writes_is_looked_at_again(recording, monkeypatch):
     assert call(monkeypatch, "look", "adc.toml", "--chirp", "3") == 0
     capture = Capture.load("out/adc/capture.nc")
     assert torch.equal(capture.beat, mover().samples[:, 3])
+    assert capture.dataset["beat"].attrs["units"] == "count"
     assert call(monkeypatch, "look", "out/adc/capture.nc", "-o", "again") == 0
     found = read_metrics(recording / "again")
     assert found["peak_range_m"] == pytest.approx(3.0, abs=0.06)
+    assert found["peak_counts_db"] > 20  # over one count, not over what was sent
+    assert "peak_power_db" not in found
     assert "mover_range_m" not in found
 
 
@@ -289,6 +292,25 @@ def test_one_chirp_has_points_of_several_reflectors(recording, monkeypatch):
         assert row["power_db"] == pytest.approx(20 * np.log10(amplitude), abs=1)
         assert np.isnan(row["velocity_m_s"])
     assert read_metrics(recording / "seen")["warnings"] == []
+
+
+def test_frames_of_one_ramp_show_what_shakes(recording, monkeypatch):
+    """A plate at 3 m that shakes at 37 Hz by 0.2 mm: side lines at ± 37 λ/2 m/s."""
+    frames, one = 256, replace(SETTINGS, loops=1, frames=256, frame_period=1e-3)
+    times = torch.arange(frames, dtype=torch.float64) * one.frame_period
+    ranges = 3.0 + 0.2e-3 * torch.sin(2 * np.pi * 37.0 * times)
+    beat = torch.cat([moving_point(RADAR, Chirps(1, 1e-6), float(r), 0.0, 0.3) for r in ranges])
+    noise = torch.randn(beat.shape, generator=torch.Generator().manual_seed(2), dtype=beat.dtype)
+    data = ChirpData((beat[::2] + 0.1 * noise[::2]).to(torch.complex64), one)
+    described_arrays.write_chirps("plate.toml", data, "plate.npy", ARRAYS)
+    assert call(monkeypatch, "look", "plate.toml", "-o", "seen") == 0
+    found = read_metrics(recording / "seen")
+    assert (found["frames"], found["chirps"]) == (1, frames)
+    assert found["warnings"] == ["reading: 256 frames of one ramp are shown as one train"]
+    assert found["moves"] is True
+    line = 37.0 * SETTINGS.waveform.wavelength / 2
+    assert abs(found["mover_velocity_m_s"]) == pytest.approx(line, rel=0.05)
+    assert found["mover_range_m"] == pytest.approx(3.0, abs=0.06)
 
 
 def test_nothing_moves_in_noise(recording, monkeypatch, capsys):

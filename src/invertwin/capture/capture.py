@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.storage.untrusted import convert_read_errors
 
+BeatUnit = Literal["1", "count"]
 BEAT_DIMS = ("frame", "tx", "rx", "sample")
 PROFILE_DIMS = ("frame", "range")
 
@@ -61,6 +63,8 @@ class Capture:
         beat: Complex[Tensor, "frame tx rx sample"] | np.ndarray,
         radar: Radar,
         times: Float64[Tensor, " frame"] | None = None,
+        *,
+        unit: BeatUnit = "1",
     ) -> "Capture":
         """Make a capture of the raw samples of an FMCW radar.
 
@@ -68,6 +72,7 @@ class Capture:
             beat: complex (I/Q) samples of every virtual channel; dtype and bits are kept.
             radar: what measured them.
             times: time of each frame [s].
+            unit: unit of the samples: "1", received over sent, or "count", of a file.
 
         Raises:
             InputError: real samples, or a shape that the radar does not have.
@@ -79,7 +84,7 @@ class Capture:
                 f"expected complex (I/Q) beat samples, got {got}; of real ADC samples take the "
                 "analytic signal (scipy.signal.hilbert) along the last axis first"
             )
-        return cls._assemble({"beat": to_data_array(BEAT_DIMS, samples, "1")}, radar, times)
+        return cls._assemble({"beat": to_data_array(BEAT_DIMS, samples, unit)}, radar, times)
 
     @classmethod
     def from_range_profile(

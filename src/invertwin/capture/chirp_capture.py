@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Complex, Float64
 from torch import Tensor
 
-from invertwin.capture.capture import Capture
+from invertwin.capture.capture import BeatUnit, Capture
 from invertwin.checks import check_shape
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
@@ -25,6 +25,7 @@ class ChirpCapture:
         frame_period: Time between the starts of two frames [s]; None = not known.
         real: Whether the samples were real: their analytic signal holds up to half the range.
         moving: Whether its echoes move, and so fade in the mean of a frame's chirps.
+        unit: unit of the samples: "1", received over sent, or "count", of a file.
 
     Raises:
         InputError: Samples that are not complex, or a shape that radar and timing do not have.
@@ -36,6 +37,7 @@ class ChirpCapture:
     frame_period: float | None = None
     real: bool = False
     moving: bool = False
+    unit: BeatUnit = "1"
 
     def __post_init__(self) -> None:
         frames, *elements = self.device.shape
@@ -60,6 +62,20 @@ class ChirpCapture:
     def max_range(self) -> float:
         """Range up to which the samples mean something [m]."""
         return self.device.range_limits[1] / (2 if self.real else 1)
+
+    def merge_single_ramps(self) -> "ChirpCapture":
+        """Return frames of one ramp, as vital signs are recorded, as one train of ramps.
+
+        The frames of a radar that stands still and whose frame period is known have range rates
+        then. Other recordings are returned as they are.
+        """
+        still = bool((self.device.positions == self.device.positions[:1]).all())
+        if self.frame_period is None or self.chirps.count > 1 or self.frame_count < 2 or not still:
+            return self
+        # Transmitters in turn send almost at once, compared with the frame period.
+        chirps = Chirps(self.frame_count, self.frame_period, tdm=False)
+        beat, device = self.beat.movedim(0, 1), self.device.frames([0])
+        return replace(self, beat=beat, device=device, chirps=chirps, frame_period=None)
 
     def select_chirps(self, first: int, count: int) -> "ChirpCapture":
         """A part of the chirps of every frame.
@@ -133,4 +149,4 @@ class ChirpCapture:
         times = None
         if self.frame_period is not None:
             times = torch.arange(self.frame_count, dtype=torch.float64) * self.frame_period
-        return Capture.from_beat(beat, self.device, times)
+        return Capture.from_beat(beat, self.device, times, unit=self.unit)

@@ -198,7 +198,8 @@ class ChirpData:
         if positions is None:
             positions = torch.zeros(self.frame_count, 3, dtype=torch.float64)
         radar = Radar(*board, settings.waveform, positions, rotations)
-        return ChirpCapture(self.beat, radar, settings.chirps, settings.frame_period, settings.real)
+        timing = settings.chirps, settings.frame_period
+        return ChirpCapture(self.beat, radar, *timing, real=settings.real, unit="count")
 
 
 def adc_counts(

@@ -92,6 +92,8 @@ def twin(
         InputError: A region invisible to all radars, or too large for its resolution.
     """
     checked_count(rays, "rays", 100)
+    if isinstance(recording, ChirpCapture):
+        recording = recording.merge_single_ramps()
     capture = average_chirps(recording)
     if max(map(len, (aperture(capture.radar()).y, aperture(capture.radar()).z))) <= _FEW_CHANNELS:
         # A taper would leave two of four channels, and one of three: no direction.

@@ -56,6 +56,19 @@ def test_noise_has_no_points(count):
     assert format_points_csv(found).startswith("range_m,velocity_m_s,u,v,power_db,x_m,y_m,z_m\n")
 
 
+@pytest.mark.parametrize("count", [1, 32])
+@pytest.mark.parametrize("place", [0.0, 0.15, 7.4])
+def test_what_lies_outside_of_the_grid_has_no_comb_of_sidelobes(count, place):
+    """An offset of the converter, leakage, an echo beyond: 20 dB above what is in the grid."""
+    chirps = Chirps(count, 40e-6)
+    inside = moving_point(RADAR, chirps, 3.0, 0.0, 0.2)
+    outside = moving_point(RADAR, chirps, place, 0.0, 0.0, amplitude=10.0)
+    beat = inside + outside + 1e-3 * noise(inside.shape)
+    found = detect_points(beat, RADAR, GRID, None if count == 1 else chirps, 0)
+    assert len(found) == 1
+    assert float(found.range[0]) == pytest.approx(3.0, abs=0.03)
+
+
 def test_noise_power_of_any_quantile():
     looks = noise(torch.Size([8, 40_000])).abs().square().mean(0)
     for empty in (0.2, 0.5):

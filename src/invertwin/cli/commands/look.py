@@ -55,6 +55,9 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
     said: list[str] = []
     with _collect_warnings(said):
         reader, recording = read_recording(options)
+    if isinstance(recording, ChirpCapture) and recording.merge_single_ramps() is not recording:
+        recording = recording.merge_single_ramps()
+        said.append(f"reading: {recording.chirps.count} frames of one ramp are shown as one train")
     as_recorded = recording
     recording, metrics = _calibrate_channels(options, recording, folder)
     capture, chirps = _to_capture(options, recording), None
@@ -81,6 +84,8 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
     if radar.range_origin is not None:
         metrics["range_origin_m"] = float(radar.range_origin.mean())
     shown, found = _make_panels(capture, chirps, grid, options.frame)
+    if capture.dataset.get("beat", capture.dataset).attrs.get("units") == "count":
+        found["peak_counts_db"] = found.pop("peak_power_db")
     metrics |= found
     if options.method != "bartlett":
         shown |= _high_resolution_panels(options, capture, chirps, grid)

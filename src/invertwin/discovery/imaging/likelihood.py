@@ -38,10 +38,10 @@ def estimate_background(
             alone.
     """
     flat = power.detach().double().movedim(1, 0).flatten(1)
-    reach = math.ceil(_BACKGROUND_DRAWS * directions_per_draw / flat.shape[1]) // 2
-    if reach:
-        around = torch.arange(len(flat))[:, None] + torch.arange(-reach, reach + 1)
-        flat = flat[around.clamp(0, len(flat) - 1)].flatten(1)
+    count = min(math.ceil(_BACKGROUND_DRAWS * directions_per_draw / flat.shape[1]), len(flat))
+    if count > 1:
+        first = (torch.arange(len(flat)) - count // 2).clamp(0, len(flat) - count)
+        flat = flat[first[:, None] + torch.arange(count)].flatten(1)
     level = torch.quantile(flat, _BACKGROUND_QUANTILE, dim=1) / -math.log(1 - _BACKGROUND_QUANTILE)
     return level.clamp_min(1e-12 * float(power.max()))
 

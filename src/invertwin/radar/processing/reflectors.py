@@ -25,7 +25,7 @@ from invertwin.radar.processing.doppler import (
     velocity_axis,
     velocity_span,
 )
-from invertwin.radar.radar import Radar
+from invertwin.radar.radar import Radar, require_sampled_waveform
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.signal.range_profile import range_profile
 from invertwin.radar.waveform import unit_window
@@ -40,6 +40,7 @@ _ABOVE_SIDELOBES = 4.0
 # Minimum relative power of a further direction in one cell: gain and phase errors of a board's
 # channels leave this residual.
 _MIN_RELATIVE_POWER = 0.1
+_OUTSIDE_ECHOES = 32  # strongest echoes outside of the grid whose sidelobes count
 _FALSE_DIRECTION_RATE = 1e-3
 _Levels = Float64[Tensor, "velocity range"]  # mean over channels
 _Beat = Complex[Tensor, "frame chirp tx rx sample"]  # of every ramp
@@ -63,20 +64,25 @@ def detect_points(
         frame: index of the frame.
     """
     radar, signal = radar.frames([frame]), beat[frame : frame + 1]
+    # What lies outside of the grid has sidelobes in it.
+    period = math.floor(require_sampled_waveform(radar).max_range / grid.range_step + 1e-9)
+    whole = replace(grid, range_count=max(grid.range_count, period))
     if chirps is None:
-        cube = range_profile(signal[:, 0], radar, grid)[:, None]
+        cube = range_profile(signal[:, 0], radar, whole)[:, None]
         rates = torch.full((1, grid.range_count), math.nan, dtype=torch.float64)
     else:
-        cube = range_doppler(signal, radar, grid, chirps)
-        offsets = interpolate_rates(cube.abs().square().mean((2, 3))[0])
+        cube = range_doppler(signal, radar, whole, chirps)
+    everywhere = cube[0].abs().square().double().mean((1, 2))
+    flat, cube = everywhere[:, : grid.range_count], cube[..., : grid.range_count]
+    if chirps is not None:
+        offsets = interpolate_rates(flat)
         cube = compensate_tdm(cube, radar, chirps, offsets)
         rates = velocity_axis(radar, chirps)[:, None] + offsets * velocity_span(radar, chirps)
     cube = cube[0].to(torch.complex128)
     looks = len(radar.virtual_positions)
-    flat = cube.abs().square().mean((1, 2))
     noise = noise_power(flat, looks)
     rows: list[list[float]] = []
-    for v, r in track(_find_cells(flat, radar, grid, looks), "points"):
+    for v, r in track(_find_cells(everywhere, radar, grid, looks), "points"):
         near = [max(r - 1, 0), r, min(r + 1, grid.range_count - 1)]
         place = float(grid.ranges[r]) + _vertex(flat[v, near]) * grid.range_step
         directions = _resolve_directions(cube[v, :, :, r], radar, grid, noise)
@@ -110,22 +116,38 @@ def noise_power(power: Float[Tensor, "*cell"], looks: int, empty: float = 0.5) -
     return level * looks / float(gammaincinv(looks, empty))
 
 
-def _find_cells(flat: _Levels, radar: Radar, grid: Grid, looks: int) -> list[tuple[int, int]]:
-    """Return the range-rate and range bins of reflectors, the strongest first."""
-    around = maximum_filter(flat.numpy(), 3, mode=("wrap", "nearest"))  # type: ignore[arg-type]
-    found = _threshold_cells(flat, looks) & (flat == torch.from_numpy(around)) & (flat > 0)
+def _find_cells(everywhere: _Levels, radar: Radar, grid: Grid, looks: int) -> list[tuple[int, int]]:
+    """Return the range-rate and range bins of reflectors, the strongest first.
+
+    Args:
+        everywhere: levels in the grid, then in the rest of the unambiguous range.
+        radar: radar with its windows.
+        grid: ranges of the search.
+        looks: number of independent looks.
+    """
+    flat, rest = everywhere[:, : grid.range_count], everywhere[:, grid.range_count :]
+    found = _threshold_cells(flat, looks) & _local_maxima(flat)
     places = torch.nonzero(found)
     places = places[flat[found].argsort(descending=True)]
-    left = torch.ones(len(places), dtype=torch.bool)
     reach, chosen = torch.zeros(len(places), dtype=torch.float64), []
+    outside = torch.nonzero(_local_maxima(rest)) if rest.numel() else places[:0]
+    outside = outside + torch.tensor([0, grid.range_count])
+    levels = everywhere[*outside.T]
+    for k in levels.argsort(descending=True)[:_OUTSIDE_ECHOES].tolist():
+        response = _sidelobe_response(places - outside[k], len(flat), radar, grid)
+        reach += (levels[k] * response).sqrt()
     for i, (v, r) in enumerate(places.tolist()):
         if flat[v, r] <= _ABOVE_SIDELOBES * reach[i].square():
-            left[i] = False
             continue
         chosen.append((v, r))
         response = _sidelobe_response(places - places[i], len(flat), radar, grid)
         reach += (flat[v, r] * response).sqrt()
     return chosen
+
+
+def _local_maxima(levels: _Levels) -> Bool[Tensor, "velocity range"]:
+    around = maximum_filter(levels.numpy(), 3, mode=("wrap", "nearest"))  # type: ignore[arg-type]
+    return (levels == torch.from_numpy(around)) & (levels > 0)
 
 
 def _threshold_cells(flat: _Levels, looks: int) -> Bool[Tensor, "velocity range"]:
