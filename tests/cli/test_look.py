@@ -1,6 +1,8 @@
 """`invertwin look`: recordings of every kind as pictures, numbers and captures; bad ones."""
 
+import html
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -74,6 +76,28 @@ def test_a_description_as_the_docs_have_it(recording, monkeypatch, repository):
     (recording / "own.toml").write_text(text)
     assert call(monkeypatch, "look", "own.toml") == 0
     assert read_metrics(recording / "out" / "own")["channels"] == 8
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["adc.bin", "--config", "bench.cfg", *BOARD],
+        ["bench.setup.json", *BOARD, "--set", "frames=2", "--set", "loops=16"],
+    ],
+    ids=["cfg", "changed"],
+)
+def test_the_command_of_the_report_is_the_same_run(recording, monkeypatch, arguments):
+    """It has range rates, too, which the capture in the folder has not."""
+    (recording / "some folder").mkdir()
+    folder = recording / "some folder" / "seen"
+    more = ["--range-max", "5", "--method", "capon"]
+    assert call(monkeypatch, "look", *arguments, *more, "-o", str(folder)) == 0
+    text = html.unescape((folder / "report.html").read_text())
+    (line,) = re.findall(r"<pre>invertwin (look .*)</pre>", text)
+    monkeypatch.chdir(folder)
+    assert call(monkeypatch, *shlex.split(line)) == 0
+    first, second = (read_metrics(path) for path in (folder, folder / "again"))
+    assert first == second
 
 
 @pytest.mark.parametrize(

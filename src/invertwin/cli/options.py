@@ -2,11 +2,12 @@
 
 import inspect
 import os
+import shlex
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
 import typer
 from rich.console import Console
@@ -145,6 +146,29 @@ class RecordingOptions(OutputOptions):
             "transmitters, loops, frames.",
         ),
     ] = None
+
+    def command(self, name: str, folder: Path) -> str:
+        """The command line that does the same from another folder.
+
+        Args:
+            name: of the command.
+            folder: where it is called; paths are relative to it.
+        """
+        words = [name]
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in ("out", "overwrite", "backend") or value in (field.default, None):
+                continue
+            kind = get_type_hints(type(self), include_extras=True)[field.name].__metadata__[0]
+            flags = [flag for flag in kind.param_decls or () if flag.startswith("--")]
+            flags = flags or [f"--{field.name.replace('_', '-')}"]
+            values = value if isinstance(value, list | tuple) else [value]
+            values = [os.path.relpath(v, folder) if isinstance(v, Path) else str(v) for v in values]
+            if isinstance(value, list):
+                words += [word for one in values for word in (flags[0], one)]
+            else:
+                words += [*([] if field.name == "recording" else flags[:1]), *values]
+        return shlex.join(words)
 
 
 @dataclass(frozen=True, kw_only=True)

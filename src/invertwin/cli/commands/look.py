@@ -112,7 +112,8 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
         tables.append(ReportTable("Warnings", ["fault", "evidence"], rows))
     drawn = save_picture(folder, "look", panels(shown), f"Frame {options.frame}", "doppler")
     status, parts = f"{radar.frame_count} frames, read as {reader}.", [*tables, drawn]
-    return write_report(folder, metrics, title, status, parts, again="look capture.nc", note=note)
+    again = options.command("look", folder.path)
+    return write_report(folder, metrics, title, status, parts, again=again, note=note)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import Any
 import tomli_w
 import torch
 
-from invertwin.capture import Capture, ChirpCapture
+from invertwin.capture import Capture
 from invertwin.cli.commands.look import AnyRecording, read_recording
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.options import TwinOptions
@@ -80,19 +80,13 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
         found.calibration.save(folder.file("channels.json"))
         still = found.calibration.apply(still)
     still.save(folder.file("capture.nc"))
-    # Movers are in the chirps alone, which a capture does not keep.
-    name = title if isinstance(recording, ChirpCapture) else "capture.nc"
-    again = " ".join(["twin", name, *_to_arguments(options)])
+    if isinstance(recording, Capture):
+        stated = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items()}
+        own = folder.path / "capture.nc"
+        arguments = replace(arguments, recording=own, config=None, board=None, **stated)
+    # Else movers are in the chirps alone, which a capture does not keep.
+    again = arguments.command("twin", folder.path)
     return write_report(folder, metrics, title, f"{said}.", parts, again=again)
-
-
-def _to_arguments(options: dict[str, Any]) -> list[str]:
-    """Return options in the form of the command line."""
-    found: list[str] = []
-    for name, value in options.items():
-        values = value if isinstance(value, list | tuple) else [value]
-        found += [f"--{name.replace('_', '-')}", *(str(number) for number in values)]
-    return found
 
 
 def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, dict[str, Any]]:
