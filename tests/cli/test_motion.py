@@ -117,6 +117,12 @@ def test_simulate_shows_who_comes_nearer(tmp_path, monkeypatch):
     assert -2.5 < metrics["mover_velocity_m_s"] < -0.5
 
 
+def test_a_single_motion_needs_no_list():
+    single = {"kind": "walking", "speed": 1.2}
+    one, listed = (read(person={"motion": given}) for given in (single, [single]))
+    assert one.scene["person"].motion == listed.scene["person"].motion
+
+
 def test_a_person_can_wave_while_walking():
     both = [{"kind": "walking", "speed": 1.2}, {"kind": "waving", "side": "left"}]
     run = read(person={"motion": both})

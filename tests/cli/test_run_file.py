@@ -226,6 +226,8 @@ def test_missing_file_folder_and_broken_toml_are_input_errors(tmp_path):
             load_run(path)
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="expected a run file, got a folder; name a file in it"):
+        load_run(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,8 @@ def read_text(path: Path) -> str:
     Raises:
         InputError: The file is missing or is no text.
     """
+    if path.is_dir():
+        raise InputError(f"{path}: expected a run file, got a folder; name a file in it")
     try:
         return path.read_bytes().decode("utf-8")
     except FileNotFoundError:

@@ -1,7 +1,10 @@
 """Automatic reconstruction: objects in a recording with uncertainties, without an initial guess."""
 
 from invertwin.deprecation import rename_attributes, rename_members
+from invertwin.discovery.clutter import Clutter as Clutter
+from invertwin.discovery.clutter import choose_result as choose_result
 from invertwin.discovery.clutter import estimate_clutter as estimate_clutter
+from invertwin.discovery.clutter import needs_clutter as needs_clutter
 from invertwin.discovery.clutter import reconstruct_among_clutter as reconstruct_among_clutter
 from invertwin.discovery.movers import MovingTargetFit as MovingTargetFit
 from invertwin.discovery.movers import MovingTargetMaps as MovingTargetMaps

@@ -1,7 +1,8 @@
 """Fits among things that the scene lacks: clutter is imaged, and counts as background."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -12,9 +13,17 @@ from invertwin.discovery.imaging.likelihood import estimate_background
 from invertwin.discovery.imaging.reflectivity import compute_response, reconstruct_reflectivity
 from invertwin.discovery.recordings import image_points
 from invertwin.errors import InputError
-from invertwin.inversion import Observation, Reconstruction, SpectrumLoss, prepare_fit, reconstruct
+from invertwin.forward_model import ForwardModel
+from invertwin.inversion import (
+    Callback,
+    Observation,
+    Reconstruction,
+    SpectrumLoss,
+    prepare_fit,
+    reconstruct,
+)
 from invertwin.inversion.observation import Unknowns, name_unknowns
-from invertwin.inversion.schedule import Schedule
+from invertwin.inversion.schedule import Schedule, make_stages
 from invertwin.models.radar import SurrogateMap
 from invertwin.models.whitened import WhitenedMap
 from invertwin.scene import Mesh, Scene, signed_distance
@@ -27,8 +36,10 @@ def reconstruct_among_clutter(
     observations: Observation | Sequence[Observation],
     parameters: Unknowns,
     *,
-    schedule: Schedule | None = None,
+    schedule: Schedule | Sequence[Schedule] | None = None,
     seed: int = 0,
+    callbacks: Callable[[int], Sequence[Callback]] = lambda number: (),
+    always: bool = True,
     **options: Any,
 ) -> Reconstruction:
     """Fit objects among things that the scene lacks.
@@ -41,19 +52,33 @@ def reconstruct_among_clutter(
         scene: initial scene.
         observations: recordings of one or several radars, each with a ``SurrogateMap``.
         parameters: modules Scene → Scene, as for ``reconstruct``.
-        schedule: schedule of each of the two fits, all frames in every step.
+        schedule: schedule of each of the two fits, or its stages; all frames in every step.
         seed: seed of all random numbers.
+        callbacks: observers of each of the two fits, given its number.
+        always: False = only if a fit without clutter is inconsistent with the data; the better of
+            the two results is returned, see ``choose_result``.
         options: further options of ``reconstruct``.
 
     Raises:
-        InputError: As ``reconstruct``; another model; random frames; no object that moves.
+        InputError: As ``reconstruct``; another model; random frames; new modules in a later stage;
+            no object that moves.
     """
     given = [observations] if isinstance(observations, Observation) else list(observations)
-    plan, unknowns = schedule or Schedule(), name_unknowns(parameters)
-    if plan.frames_per_step is not None:
+    unknowns = name_unknowns(parameters)
+    if not always:
+        plain = reconstruct(
+            scene, given, copy.deepcopy(unknowns), schedule=schedule, seed=seed, **options
+        )
+        if not needs_clutter(plain):
+            return plain
+        again: Any = {"schedule": schedule, "seed": seed, "callbacks": callbacks, **options}
+        return choose_result(plain, reconstruct_among_clutter(scene, given, unknowns, **again))
+    own = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(given)]
+    stages = make_stages(schedule, [*unknowns, *(name for found in own for name in found)])
+    if any(stage.frames_per_step is not None or stage.rebuilds_modules for stage in stages):
         raise InputError(
-            f"expected all frames in every step, got frames_per_step = {plan.frames_per_step}: "
-            "every frame has clutter of its own; leave it out"
+            "expected all frames and the same parameters in every step, got frames_per_step or a "
+            "stage that rebuilds: clutter is of all frames; leave them out"
         )
     fit = prepare_fit(scene, given, unknowns)
     objects, present = fit.apply_modules()[0].objects, fit.twin()
@@ -63,15 +88,22 @@ def reconstruct_among_clutter(
             "expected a parameter that moves an object, got none: clutter is what is away from the "
             "fitted objects; give a Pose or a shape, or use reconstruct"
         )
-    for blur in (1.0, 0.0):
-        whitened = []
-        for observation in given:
-            model = observation.model.scale_blur(blur)
-            clutter = estimate_clutter(
-                present, replace(observation, model=model), fitted, seed=seed
-            )
-            whitened.append(replace(observation, model=WhitenedMap(model, clutter)))
-        found = reconstruct(scene, whitened, unknowns, schedule=plan, seed=seed, **options)
+    for number, blur in enumerate((1.0, 0.0)):
+        blurred = [replace(o, model=o.model.scale_blur(blur)) for o in given]
+        clutter = [estimate_clutter(present, o, fitted, seed=seed).background for o in blurred]
+        whitened = _whiten([o.model for o in blurred], clutter)
+        found = reconstruct(
+            scene,
+            [replace(o, model=model) for o, model in zip(given, whitened, strict=True)],
+            unknowns,
+            schedule=[
+                replace(stage, models=_whiten([m.scale_blur(blur) for m in stage.models], clutter))
+                for stage in stages
+            ],
+            seed=seed,
+            callbacks=callbacks(number),
+            **options,
+        )
         present, modules = found.scene, list(found.parameters)
         unknowns = {
             name: replace(unknown, module=modules.pop(0)) for name, unknown in unknowns.items()
@@ -79,9 +111,66 @@ def reconstruct_among_clutter(
     return found
 
 
+def _whiten(models: Sequence[ForwardModel], backgrounds: Sequence[Tensor]) -> list[WhitenedMap]:
+    """Return models over backgrounds; none where a stage has no models of its own."""
+    return [WhitenedMap(*pair) for pair in zip(models, backgrounds, strict=False)]
+
+
+def needs_clutter(found: Reconstruction) -> bool:
+    """Return whether the data speak against a result, so that a fit among clutter may help."""
+    return found.verdict.word in ("inconsistent", "worse", "at a bound")
+
+
+def choose_result(plain: Reconstruction, among: Reconstruction) -> Reconstruction:
+    """Choose the better of two fits of the same parameters, without and among clutter.
+
+    That is the second one where the data do not speak against it, else the one with the lower loss
+    with clutter.
+
+    Args:
+        plain: result of ``reconstruct``.
+        among: result of ``reconstruct_among_clutter``.
+    """
+    if not needs_clutter(among):
+        return among
+    fit, losses = among.result.fit.copy(), []
+    with torch.no_grad():
+        for found in (plain, among):
+            fit.modules.load_state_dict(found.parameters.state_dict())
+            losses.append(float(fit.objective(fit.unblurred_maps(0))))
+    return among if losses[1] <= losses[0] else plain
+
+
+@dataclass(frozen=True, eq=False)
+class Clutter:
+    """Noise and echoes that a scene does not explain.
+
+    Attributes:
+        noise: mean power of noise in a bin, in the unit of the recording.
+        echoes: mean power of the echoes in every bin.
+        positions: points that reflect the echoes [m].
+        strengths: their radar cross-sections [m²], in the unit of the recording.
+    """
+
+    noise: float
+    echoes: Float64[Tensor, "frame range u v"]
+    positions: Float64[Tensor, "point 3"]
+    strengths: Float64[Tensor, " point"]
+
+    @property
+    def background(self) -> Float64[Tensor, "frame range u v"]:
+        """Mean power of both in every bin."""
+        return self.noise + self.echoes
+
+    @property
+    def strongest_position(self) -> Float64[Tensor, "3"]:
+        """The brightest point [m]."""
+        return self.positions[self.strengths.argmax()]
+
+
 def estimate_clutter(
     scene: Scene, observation: Observation, fitted: Sequence[str], *, seed: int = 0
-) -> Float64[Tensor, "frame range u v"]:
+) -> Clutter:
     """Estimate the mean power of noise and of echoes that a scene does not explain.
 
     The unexplained echoes are those of isotropic points at the height of the fitted objects, with
@@ -93,9 +182,6 @@ def estimate_clutter(
         observation: recording of a radar with a ``SurrogateMap``.
         fitted: names of the fitted objects.
         seed: seed of the predicted map.
-
-    Returns:
-        Mean power in every bin, in the unit of the recording.
 
     Raises:
         InputError: Another model.
@@ -121,4 +207,5 @@ def estimate_clutter(
         points = points[signed_distance(mesh, points) > margin]
     response = compute_response(radar, model.grid, points)
     known = (gain * predicted + noise).double()
-    return noise + response.predict_maps(reconstruct_reflectivity(response, power.double(), known))
+    strengths = reconstruct_reflectivity(response, power.double(), known)
+    return Clutter(noise, response.predict_maps(strengths), points, strengths)

@@ -103,6 +103,15 @@ def test_settings_survive_a_cfg(tmp_path, settings):
     assert path.read_bytes() == whole
 
 
+@pytest.mark.parametrize(
+    ("start", "lanes", "device"), [(60e9, 2, "xWR68xx"), (77e9, 2, "xWR18xx"), (77e9, 4, "xWR1443")]
+)
+def test_a_cfg_names_a_device_of_its_band(tmp_path, start, lanes, device):
+    path = tmp_path / "written.cfg"
+    write_cfg(path, replace(EXPECTED, start_frequency=start, lanes=lanes))
+    assert path.read_text().splitlines()[0] == f"% Platform:{device}"
+
+
 @pytest.mark.parametrize("settings", CASES)
 def test_settings_survive_mmwave_studio(tmp_path, settings):
     path = tmp_path / "written.mmwave.json"

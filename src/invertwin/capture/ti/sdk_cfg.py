@@ -19,6 +19,7 @@ _ARGUMENTS = {
     "lvdsStreamCfg": 2,
 }
 _UNIQUE_COMMANDS = ("channelCfg", "adcCfg", "frameCfg")
+_BAND_EDGE = 70e9  # Hz, between the devices of 60 and 77 GHz
 # Places of the numbers of a profile in its command.
 _PROFILE = (1, 2, 3, 4, 7, 9, 10)
 
@@ -134,7 +135,8 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
         InputError: the folder does not exist.
     """
     s = chirp_settings
-    devices = {2: "xWR18xx", 4: "xWR1443"}
+    low_band = s.start_frequency < _BAND_EDGE
+    devices = {2: "xWR68xx" if low_band else "xWR18xx", 4: "xWR1443"}
     start, idle, adc, end, slope, samples, rate = chirp_table.profile_texts(s)
     receivers = chirp_table.numbers_to_bits(s.receivers)
     lines = [

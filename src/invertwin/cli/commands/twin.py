@@ -23,6 +23,7 @@ from invertwin.cli.schema import build
 from invertwin.cli.schema.recordings import SimulatedData
 from invertwin.constants import FRAME
 from invertwin.discovery import Twin, average_chirps, twin
+from invertwin.discovery.shapes.primitives import MAX_DIELECTRIC_REFLECTANCE
 from invertwin.inversion.metrics import compare_shapes
 from invertwin.plotting import found as pictures
 from invertwin.plotting import spectrum
@@ -146,6 +147,9 @@ def _describe_as_run(twin: Twin, folder: RunFolder) -> dict[str, Any]:
     assert twin.grid is not None
     assert twin.scene is not None
     scene: dict[str, Any] = {}
+    # Of raw counts all are brighter than metal: their ratios are kept, the gain is fitted.
+    brightest = max((one.shape.brightness for one in twin.objects if one.shape), default=1.0)
+    dimming = min(1.0, MAX_DIELECTRIC_REFLECTANCE / brightest)
     for thing in twin.objects:
         if (figure := thing.shape) is None:
             continue
@@ -161,7 +165,7 @@ def _describe_as_run(twin: Twin, folder: RunFolder) -> dict[str, Any]:
             shape = {"shape": "box", "size": sides, "rotation_deg": turn}
         elif figure.kind == "cylinder":
             shape = {"shape": "cylinder", "radius": 0.5 * figure.length, "height": figure.height}
-        material = figure.material
+        material = replace(figure, brightness=dimming * figure.brightness).material
         described: dict[str, Any] = {"kind": "rough_conductor"}
         if isinstance(material, RoughDielectric):
             value = float(torch.as_tensor(material.permittivity))

@@ -13,6 +13,7 @@ from rich.console import Console
 from invertwin.capture import calibrate
 from invertwin.cli.fits.displays import StepRecorder, steps_path
 from invertwin.cli.fits.problem import (
+    AMONG_CLUTTER,
     OWN_METHOD,
     Fits,
     Problem,
@@ -26,6 +27,12 @@ from invertwin.cli.fits.problem import (
 from invertwin.cli.fits.shape_scores import CURVE_KEY, make_shape_metric
 from invertwin.cli.fits.spreading import fit_file_stem
 from invertwin.cli.schema import build
+from invertwin.discovery import (
+    choose_result,
+    estimate_clutter,
+    needs_clutter,
+    reconstruct_among_clutter,
+)
 from invertwin.errors import InputError
 from invertwin.inversion import (
     Callback,
@@ -81,7 +88,41 @@ def fit_all(
     own = problem.kind.with_recording_of_start(problem, number, console)
     own = problem.kind.with_method(own, OWN_METHOD)
     start, found = problem.starts()[number], outcomes[OWN_METHOD, number]()
-    return Fits(own, rows, lambda method, k: outcomes[method, k](), best, start, found)
+    fits = Fits(own, rows, lambda method, k: outcomes[method, k](), best, start, found)
+    return _fit_among_clutter(fits, folder, console)
+
+
+def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
+    """Make the best fit again among clutter if the data call for it, and keep the better one."""
+    problem, number = fits.problem, fits.best["start"]
+    wanted = problem.run.fit_settings.clutter
+    if wanted == "never" or not problem.kind.allows_clutter(problem):
+        return fits
+    if wanted == "auto" and not needs_clutter(fits.found):
+        return fits
+    try:
+        row, outcome = run_fit(problem, fits.start, number, AMONG_CLUTTER, folder, console, None)
+    except InputError as error:
+        if wanted == "always":
+            raise
+        notes = {**problem.notes, "clutter": {"kept": False, "refused": str(error)}}
+        return replace(fits, problem=replace(problem, notes=notes))
+    among = outcome()
+    kept = wanted == "always" or choose_result(fits.found, among) is among
+    observation = make_observations(problem, fits.start)[0]
+    moved = [
+        name for name in dict.fromkeys(problem.run.fitted_objects) if name in among.scene.names
+    ]
+    clutter = estimate_clutter(among.scene, observation, moved, seed=problem.run.seed)
+    summary = {
+        "kept": kept,
+        "share": float(clutter.echoes.sum() / observation.observed_map().sum()),
+        "strongest_m": clutter.strongest_position.tolist(),
+    }
+    rows = {**fits.rows, AMONG_CLUTTER: [row]}
+    problem = replace(problem, notes={**problem.notes, "clutter": summary})
+    fits = replace(fits, problem=problem, rows=rows)
+    return replace(fits, best=row, found=among) if kept else fits
 
 
 def run_fit(
@@ -113,14 +154,15 @@ def run_fit(
     checkpoint = checkpoint or f"{part}.pt"
     own = problem.kind.with_method(problem, method)
     stages = make_schedule(own)
-    again = partial(_fit_or_search, own, stages, start, index, folder, checkpoint, show)
+    again = partial(_fit_or_search, own, stages, start, index, folder, checkpoint, show, method)
     row = folder.read_json(f"{part}.json")
     if row is not None:
         # The checkpoints say what the fit found; nothing is fitted again.
         return row, lambda: again()[0]
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if method == OWN_METHOD else f", {method.replace('_', ' ')}")
-    with report_progress(name, sum(stage.steps for stage in stages), console) as shown:
+    steps = sum(stage.steps for stage in stages) * (2 if method == AMONG_CLUTTER else 1)
+    with report_progress(name, steps, console) as shown:
         found, found_ends = again(shown)
     curve = [[row["step"] + 1, row[CURVE_KEY]] for row in found.history if CURVE_KEY in row]
     row = {
@@ -151,6 +193,7 @@ def _fit_or_search(
     folder: RunFolder,
     checkpoint: str,
     show: Callable[[Fit, DisplayStep], None] | None,
+    method: str,
     shown: Sequence[Report] = (),
 ) -> tuple[Reconstruction, Row]:
     """Fit, or search about the start; return what the row says of the search, too."""
@@ -174,13 +217,21 @@ def _fit_or_search(
     seed = derive_seed(run.seed, index)
     how: dict[str, Any] = {"loss": build.build_loss(run), "schedule": stages, "seed": seed}
     how["optimizer"] = build.build_section(run, "optimizer")
+    if method == AMONG_CLUTTER:
+        # Every frame has clutter of its own.
+        how["schedule"] = [replace(stage, frames_per_step=None) for stage in stages]
+        part = f"{PARTS}/{Path(checkpoint).stem}_round"
+        found = reconstruct_among_clutter(
+            *given, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how
+        )
+        return found, {"checkpoint": f"{part}1.pt"}
     if run.search is None:
         return reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
     part = f"{PARTS}/{Path(checkpoint).stem}_fit"
     starts = problem.kind.make_candidates(problem, start, torch.Generator().manual_seed(seed))
     screening = Screening(starts, run.search.fits, run.search.shortlist)
-    found = search(*given, screening, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how)
-    return found.best, {"checkpoint": f"{part}{found.best_number}.pt", **found.to_metrics()}
+    ends = search(*given, screening, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how)
+    return ends.best, {"checkpoint": f"{part}{ends.best_number}.pt", **ends.to_metrics()}
 
 
 def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:

@@ -31,7 +31,7 @@ from invertwin.scene import Object, Scene, rigid
 from invertwin.seeds import derive_seed
 from invertwin.storage.run_folder import RunFolder
 
-OWN_METHOD, INTERIOR_ONLY = "full", "interior_only"
+OWN_METHOD, INTERIOR_ONLY, AMONG_CLUTTER = "full", "interior_only", "among_clutter"
 OF_SENSORS = ("radar_pose", "radar_path", "transmitter", "panel", "panel_phases")
 """Kinds of parameters that belong to a sensor."""
 _POSED = ("translation", "pose", "scale", "body", "vertices", "mover")
@@ -229,6 +229,10 @@ class DataKind(ABC):
     def with_recording_of_start(self, problem: Problem, number: int, console: Console) -> Problem:
         """The problem with the data of a start: the same for all, unless each has its own."""
         return problem
+
+    def allows_clutter(self, problem: Problem) -> bool:
+        """True if what the scene lacks can count as background."""
+        return False
 
     def starts(self, problem: Problem) -> list[Start]:
         """Starts of the fits: about the truth as ``[starts]`` says, or where the scene is."""

@@ -22,10 +22,11 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.shape_scores import is_shape_key
 from invertwin.cli.fits.writing import START_COLUMNS, describe_outcome, draw_pictures, make_tables
-from invertwin.cli.schema import RunFile, SimulatedData
+from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.forward_model import ForwardModel
-from invertwin.inversion import Reconstruction, Unknown
+from invertwin.inversion import Reconstruction, SpectrumLoss, Unknown
 from invertwin.inversion.confidence.report import confidence_metrics, error_bar_coverage
+from invertwin.models.radar import SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.runtime.memory import peak_memory
 from invertwin.scene import Scene
@@ -60,6 +61,14 @@ class RadarMaps(DataKind):
     def models(self, problem: Problem) -> list[ForwardModel]:
         """See ``DataKind.models``."""
         return radar_models.make_radar_models(problem)
+
+    def allows_clutter(self, problem: Problem) -> bool:
+        """True with the likelihood of mean power."""
+        loss = build.build_loss(problem.run)
+        likely = isinstance(loss, SpectrumLoss) and loss.kind != "mse"
+        models = all(isinstance(model, SurrogateMap) for model in self.models(problem))
+        shared = not radar_models.has_recording_per_start(problem.run)
+        return likely and models and shared and problem.run.search is None
 
     def sensor_unknowns(self, problem: Problem, name: str) -> dict[str, Any]:
         """Nuisances of a radar."""

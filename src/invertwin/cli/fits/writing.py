@@ -88,6 +88,8 @@ def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
         if "successes_interior_only" in metrics:
             text = f"{metrics['successes_interior_only']} of {count}"
             rows.append(["the same without boundary terms", text])
+    if "share" in metrics.get("clutter", {}):
+        rows.append(["echoes that the scene lacks", _describe_clutter(**metrics["clutter"])])
     skip = () if blur_end_step(run) else ("start_loss_sharp", "loss_sharp")
     rows.extend(map(list, quantity_table("", metrics, skip=skip).rows))
     made_of = {key: name for key, name in _MATERIAL_ERRORS.items() if key in metrics}
@@ -101,6 +103,12 @@ def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
     calibration = {k: _format_status(k, v) for k, v in metrics.get("calibration", {}).items()}
     rows.extend(map(list, quantity_table("", calibration, label_table="calibration").rows))
     return ReportTable("Result", ["quantity", "value"], rows)
+
+
+def _describe_clutter(kept: bool, share: float, strongest_m: list[float]) -> str:
+    place = ", ".join(f"{value:.2f}" for value in strongest_m)
+    use = "count as background" if kept else "but a fit among them is no better"
+    return f"{100 * share:.2g} % of the power, strongest at ({place}) m; {use}"
 
 
 def _method_table(fits: Fits) -> ReportTable:

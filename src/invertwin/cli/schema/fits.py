@@ -62,6 +62,11 @@ class ReconstructTable(Budget):
     nuisances: list[Literal["range_bias", "clock_offset"]] = key(
         "unknowns of the radar, fitted too", []
     )
+    clutter: Literal["auto", "always", "never"] = key(
+        "echoes that the scene does not explain count as background, about which the best fit is "
+        "made again: auto = where the data are inconsistent with it; with the likelihood only",
+        "auto",
+    )
     position_limit: Positive = key("m, largest error of a success", 0.03)
     rotation_limit_deg: Positive = key("largest error of a success", 3.0)
     axis: Vector | None = key(

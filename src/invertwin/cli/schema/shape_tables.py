@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import MinLen
+from pydantic import BeforeValidator
 from torch import Tensor, nn
 
 from invertwin.checks import ArrayLike, Point
@@ -73,9 +74,10 @@ class ShapePoseTable(ConstructorTable):
 class _ObjectProperties(ConstructorTable):
     material: Annotated[Any, OneOf("material")] = key("what it is made of")
     velocity: Vector | None = key("m/s", None)
-    motion: list[Annotated[Any, OneOf("motion")]] = key(
-        "what it does from the start of the frame on, one after the other; needs [chirps]", []
-    )
+    motion: Annotated[
+        list[Annotated[Any, OneOf("motion")]],
+        BeforeValidator(lambda given: [given] if isinstance(given, dict) else given),
+    ] = key("what it does from the start of the frame on, one after the other; needs [chirps]", [])
 
 
 class ObjectTable(ShapePoseTable, _ObjectProperties):

@@ -50,7 +50,8 @@ SIZE_LIMITS: dict[str, tuple[tuple[float, float, float], tuple[float, float, flo
 """Minimum and maximum length, width and height of kinds with specific sizes [m]."""
 _RECTANGULAR_KINDS = ("wall", "box", "person", "vehicle")
 _FREE_HEIGHT_KINDS = ("sphere", "point", "corner")
-_MAX_DIELECTRIC_REFLECTANCE = 0.9  # larger reflectances are metal
+MAX_DIELECTRIC_REFLECTANCE = 0.9
+"""Larger reflectances are metal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +123,7 @@ class ShapeParameters:
     @property
     def material(self) -> RoughDielectric | RoughConductor:
         """Nearest library material."""
-        if self.brightness > _MAX_DIELECTRIC_REFLECTANCE:
+        if self.brightness > MAX_DIELECTRIC_REFLECTANCE:
             return RoughConductor()
         root = math.sqrt(max(self.brightness, 1e-6))
         return RoughDielectric(permittivity=((1 + root) / (1 - root)) ** 2)
