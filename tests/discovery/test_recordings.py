@@ -24,6 +24,7 @@ from invertwin.scene import (
     rotation_from_vector,
     sphere,
 )
+from oracles.moving_point import moving_point
 
 CHIRP = iw.FMCW(start_frequency=77e9, bandwidth=4e9, duration=50e-6, samples=128)
 HALF = CHIRP.wavelength / 2
@@ -137,11 +138,27 @@ def test_noise_is_nothing():
     noise = torch.randn(4, 2, 4, 128, dtype=torch.complex128, generator=torch.manual_seed(0))
     found = twin(Capture.from_beat(1e-6 * noise, radar))
     assert found.objects == ()
-    assert found.notes == ("nothing is above the noise",)
+    (note,) = found.notes
+    assert note.startswith("nothing is above the noise from ")
+    assert "the brightest bin, at " in note
     assert found.scene is None
 
 
 @pytest.mark.slow
+def test_echoes_that_no_shape_explains_are_listed_as_points(monkeypatch):
+    radar = around(1)
+    noise = torch.randn(1, 2, 4, 128, dtype=torch.complex128, generator=torch.manual_seed(0))
+    echo = moving_point(radar, Chirps(1, 1e-4), 1.5, 0.0, 0.2)[:, 0]
+    monkeypatch.setattr(ShapeSearch, "run", lambda self: [])
+    found = twin(Capture.from_beat(echo + 1e-2 * noise, radar))
+    assert found.scene is None
+    assert found.notes[0].startswith("no shape explains the maps")
+    assert [one.kind for one in found.objects] == ["point"]
+    off = found.objects[0].position - radar.positions[0]
+    assert float(off.norm()) == pytest.approx(1.5, abs=0.03)
+    assert found.objects[0].deviations["across"] > 0
+
+
 def test_one_small_ball_is_one_thing():
     radar = around(8)
     scene = iw.Scene({"ball": thing(sphere(0.02, 3), (0.1, 0.3), HEIGHT)})

@@ -28,6 +28,7 @@ from invertwin.discovery.imaging.likelihood import (
 )
 from invertwin.discovery.imaging.point_detections import (
     detect_moving_targets,
+    detect_static_points,
     is_dense_track,
     locate_coherent_points,
     platform_velocities,
@@ -106,10 +107,10 @@ def twin(
     floor = checked_number(floor, "level of the ground [m]", -math.inf)
     image_height = base if height is None else floor + checked_number(height, "height [m]", 0.0)
     reach = _search_range(capture, range_max)
-    if reach is None:
+    if isinstance(reach, str):
         moving = _find_moving_targets(recording, range_max)
-        said = "nothing that stands still is above the noise" if moving else _NO_SIGNAL_NOTE
-        return Twin(_sort_objects(moving), floor, notes=(said,))
+        begin = "nothing that stands still" if moving else "nothing"
+        return Twin(_sort_objects(moving), floor, notes=(begin + reach,))
     places, step = image_points(radar, image_height, reach, low, high)
     gains = calibrate_on_scene(capture, radar.grid(*reach), places)
     if gains is not None:
@@ -175,7 +176,14 @@ _CALIBRATION_NOTE = (
     "the phases of the channels were {:.0f}° apart (root mean square, but for a ramp): they were "
     "calibrated on the scene itself"
 )
-_NO_SIGNAL_NOTE = "nothing is above the noise"
+_NO_SIGNAL_NOTE = (
+    " is above the noise from {:.2f} to {:.2f} m: the brightest bin, at {:.2f} m, is {:.1f} dB "
+    "over it, chance reaches {:.1f} dB; record more frames, or change what is searched"
+)
+_NO_SHAPE_NOTE = (
+    "no shape explains the maps better than noise does; what a detector finds in the first frame "
+    "is listed as points"
+)
 _IMAGE_BETTER_NOTE = (
     "the image explains frames that were held out better than the things do: shapes may be wrong, "
     "trust the image"
@@ -213,9 +221,11 @@ def _find_static_objects(
     level_map = one.loss.level[:, None, None].to(power)
     if not shapes:
         seen = GroundImage(flat, picture, _count_views(radar, positions, None))
-        nothing = level_map.expand_as(power)
-        return Twin((), level, seen, nothing, power, grid, (_NO_SIGNAL_NOTE,))
-    notes: tuple[str, ...] = ()
+        nothing, points = level_map.expand_as(power), tuple(detect_static_points(capture, grid))
+        nothing_found = "nothing" + _relate_to_noise(power, radar, grid)[2]
+        notes = (_NO_SHAPE_NOTE if points else nothing_found,)
+        return Twin(points, level, seen, nothing, power, grid, notes)
+    notes = ()
     if aside is not None:
         shapes = fit_outlines(fitted, aside, shapes)
         seen_there = compute_response(aside.radar, coarse, positions)
@@ -271,9 +281,9 @@ def _sort_objects(things: list[DetectedObject]) -> tuple[DetectedObject, ...]:
     )
 
 
-def _search_range(capture: Capture, range_max: float | None) -> tuple[float, float] | None:
-    """Return the ranges from the end of the leakage to just beyond the last echo [m]; None without
-    echoes.
+def _search_range(capture: Capture, range_max: float | None) -> tuple[float, float] | str:
+    """Return the ranges from the end of the leakage to just beyond the last echo [m]; without
+    echoes, a note that says what was searched.
 
     Args:
         capture: the recording.
@@ -296,12 +306,24 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
         )
     grid = radar.grid(first, limit)
     power = capture.spectrum(grid).detach().double()
-    # Noise level: a running minimum over range.
-    strongest = power.amax((0, 2, 3)) / float(_estimate_background(power, radar, grid).min())
-    loud = (strongest > 2 * math.log(power.numel()) + 5).nonzero()[:, 0]
+    strongest, chance, note = _relate_to_noise(power, radar, grid)
+    loud = (strongest > chance).nonzero()[:, 0]
     if not len(loud):
-        return None
+        return note
     return first, min(limit, float(grid.ranges[loud[-1]]) + 10 * cell)
+
+
+def _relate_to_noise(
+    power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
+) -> tuple[Float64[Tensor, " range"], float, str]:
+    """Return the strongest bin of each range over the noise, what chance reaches, and a note."""
+    # Noise level: a running minimum over range.
+    strongest = power.amax((0, 2, 3)).double()
+    strongest = strongest / float(_estimate_background(power, radar, grid).min())
+    chance = 2 * math.log(power.numel()) + 5
+    levels = (10 * math.log10(level) for level in (float(strongest.max()), chance))
+    places = (float(grid.ranges[k]) for k in (0, -1, int(strongest.argmax())))
+    return strongest, chance, _NO_SIGNAL_NOTE.format(*places, *levels)
 
 
 def _estimate_background(

@@ -20,6 +20,7 @@ _MIN_RELATIVE_PEAK = 0.1  # relative to the strongest: weaker peaks may be sidel
 _TARGET_SIDELOBE_LEVEL = 3e-3  # relative to the strongest target: weaker ones may be its sidelobes
 _NO_SIDELOBE_LEVEL = 0.5  # relative to the strongest: stronger peaks are no sidelobes
 _DIRECTION_ERROR_BEAMS = 0.3  # standard deviation of a direction in beamwidths
+_MAX_POINTS = 50  # strongest of one frame
 _POINTS_PER_CHUNK = 20_000  # points of an image per chunk
 
 
@@ -89,6 +90,27 @@ def detect_moving_targets(
     }
     found.sort(key=lambda target: -strength[target.name])
     return [replace(target, name=f"mover_{k}") for k, target in enumerate(found, 1)]
+
+
+def detect_static_points(capture: Capture, grid: Grid) -> list[DetectedObject]:
+    """Detect the reflectors in the first frame, the strongest first.
+
+    Args:
+        capture: recording with samples.
+        grid: bins of range and direction.
+    """
+    if "beat" not in capture.dataset:
+        return []
+    radar = capture.radar()
+    points = detect_points(capture.beat[:, None], radar, grid, None, 0)
+    beam, cell = direction_cell(aperture(radar).y, radar), radar.waveform.range_resolution
+    found = []
+    for number, k in enumerate(points.power.argsort(descending=True)[:_MAX_POINTS].tolist(), 1):
+        position = points.position[k].detach().double()
+        across = beam * float((position - radar.positions[0].detach()).norm())
+        deviations = {"range": 0.3 * cell, "across": _DIRECTION_ERROR_BEAMS * across}
+        found.append(DetectedObject.point(f"point_{number}", position, deviations, 1.0))
+    return found
 
 
 def platform_velocities(recording: ChirpCapture) -> Float64[Tensor, "frame 3"]:
