@@ -2,7 +2,7 @@
 
 import math
 import operator
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Sequence, Sized
 from functools import cache
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -83,6 +83,56 @@ def check_choice(value: object, known: Collection[str], what: str, do: str = "ch
     """
     if value not in known:
         raise InputError(f"expected {what} {', '.join(known)}, got {value!r}; {do}")
+
+
+def check_some(values: Sized, what: str, do: str) -> None:
+    """Raise unless there is one value or more.
+
+    Args:
+        values: the values.
+        what: one of them, for the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: no value.
+    """
+    if not len(values):
+        raise InputError(f"expected at least one {what}, got none; {do}")
+
+
+def checked_rows(value: object, what: str, do: str = "give x, y, z of each") -> Tensor:
+    """Convert one point or several to finite rows [point, 3], at least one; gradients are kept.
+
+    Args:
+        value: numbers [3] or [point, 3].
+        what: what the points are, for the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: wrong shape, NaN or infinite, or no point.
+    """
+    given = torch.as_tensor(value, dtype=torch.float64)
+    rows = checked_tensor(given[None] if given.ndim == 1 else given, (None, 3), what, do)
+    check_some(rows, f"row of {what}", do)
+    return rows
+
+
+def checked_ascending(value: object, what: str, do: str, least: int = 2) -> Tensor:
+    """Convert a value to finite numbers that ascend; gradients are kept.
+
+    Args:
+        value: tensor, array or sequence of numbers.
+        what: what they are, for the message.
+        do: what the user can do about it, for the message.
+        least: how many there must be.
+
+    Raises:
+        InputError: not numbers, too few, or some that do not ascend.
+    """
+    found = checked_tensor(value, (None,), what, do)
+    if len(found) < least or bool((found.diff() <= 0).any()):
+        raise InputError(f"expected at least {least} ascending {what}, got {found.tolist()}; {do}")
+    return found
 
 
 def refuse_batch(value: Tensor) -> Tensor:
@@ -272,6 +322,21 @@ def set_fields(holder: object, **values: object) -> None:
     """
     for name, value in values.items():
         object.__setattr__(holder, name, value)
+
+
+def refuse_derivatives(value: Tensor | None, what: str, do: str) -> None:
+    """Raise if derivatives flow through a tensor.
+
+    Args:
+        value: the tensor.
+        what: what it is, for the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: a tensor with derivatives.
+    """
+    if is_differentiated(value):
+        raise InputError(f"expected {what} without derivatives, got some; {do}")
 
 
 def is_differentiated(value: Tensor | None) -> bool:

@@ -3,9 +3,11 @@
 And what the command line says when it is interrupted.
 """
 
+import importlib
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 _MAX_LENGTH = 8_000  # characters of a line
 
@@ -29,6 +31,24 @@ class InputError(ValueError):
 
 class PhysicsWarning(UserWarning):
     """The input is valid, but its result will not mean what one may expect."""
+
+
+def import_optional(package: str, extra: str) -> Any:
+    """Import a package that comes with an extra only.
+
+    Args:
+        package: Its name.
+        extra: The extra of ours.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        return importlib.import_module(package)
+    except ImportError:
+        raise InputError(
+            f"expected the package {package}, got none; type: pip install 'invertwin[{extra}]'"
+        ) from None
 
 
 def to_one_line(text: str) -> str:

@@ -5,7 +5,7 @@ Nothing here imports torch, so that the command line can say what it offers with
 
 import difflib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, get_args
@@ -201,3 +201,16 @@ def raise_key_error(text: str, path: str = "") -> NoReturn:
         path: Of the key; without it the error is of the whole section.
     """
     raise PydanticCustomError("section", "{text}", {"text": text, "path": path})
+
+
+def suggest_name(given: str, allowed: Sequence[str], otherwise: str, cutoff: float = 0.5) -> str:
+    """What a user may have meant, as the end of an error.
+
+    Args:
+        given: The name.
+        allowed: Names that there are.
+        otherwise: What to do where none is alike.
+        cutoff: From which similarity on names are alike, up to 1.
+    """
+    close = difflib.get_close_matches(given, allowed, n=1, cutoff=cutoff)
+    return f"did you mean `{close[0]}`?" if close else otherwise
