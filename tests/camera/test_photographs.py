@@ -66,7 +66,7 @@ def test_infinite_depths_are_the_models_far_ones():
 
 
 def test_unknown_names_and_shares_are_refused():
-    with pytest.raises(InputError, match="among near, far, got post"):
+    with pytest.raises(InputError, match="among near, far, got 'post'"):
         photograph(WORLD, AHEAD, seed=0).mask("post")
     with pytest.raises(InputError, match="share of wrong labels"):
         photograph(WORLD, AHEAD, seed=0, wrong_labels=2.0)

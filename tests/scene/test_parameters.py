@@ -364,7 +364,7 @@ def test_initial_values_are_copied():
     [
         (lambda: Translation("block", [1.0, 2.0]), "initial translation"),
         (lambda: Translation("block", [1.0, 2.0, math.nan]), "finite initial translation"),
-        (lambda: Translation("floor")(scene()), r"\(block, wall\), got 'floor'"),
+        (lambda: Translation("floor")(scene()), "block, wall, got 'floor'"),
         (lambda: Pose("block", rotation=[0.0] * 4), "4 that are not all zero"),
         (lambda: Pose("block", rotation=[1.0] * 5), "rotation of 3 numbers, or 4"),
         (lambda: Pose("block", rotation=1.0), "initial rotation as numbers"),  # pyright: ignore[reportArgumentType]

@@ -87,7 +87,7 @@ def test_refused(values, said):
 @pytest.mark.parametrize(
     ("theta", "phi", "length", "said"),
     [
-        ([0.1, 1.0], [0.0], 1.0, "ascending theta from 0"),
+        ([0.1, 1.0], [0.0], 1.0, "theta from 0"),
         ([0.0, 1.0], [0.0, 7.0], 1.0, "less than 2 pi"),
         ([0.0, 1.0], [0.0], 0.0, "Jones vectors of some length"),
     ],

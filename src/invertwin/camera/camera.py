@@ -10,7 +10,9 @@ from torch import Tensor
 
 from invertwin.checks import (
     ArrayLike,
+    check_choice,
     check_orthonormal,
+    check_some,
     checked_count,
     checked_number,
     checked_tensor,
@@ -20,7 +22,8 @@ from invertwin.checks import (
 )
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
-from invertwin.scene.parameters import Coordinate, RigidMotion
+from invertwin.runtime.memory import require_at_most
+from invertwin.scene.parameters import RigidMotion
 
 _MAX_PIXELS = 1 << 26
 
@@ -63,8 +66,7 @@ class Camera:
         axes = checked_tensor(axes, (len(places), 3, 3), "rotations of a camera", do)
         check_orthonormal(axes, "rotations of a camera", do)
         pixels = checked_count(self.width, "width", 1) * checked_count(self.height, "height", 1)
-        if pixels > _MAX_PIXELS:
-            raise InputError(f"expected at most {_MAX_PIXELS:,} pixels, got {pixels:,}; bin them")
+        require_at_most(pixels, _MAX_PIXELS, "pixels", "bin them")
         focal = torch.as_tensor(self.focal, dtype=torch.float64)
         checked_number(float(focal.detach()), "focal length [pixel]", 0.0, open_low=True)
         middle = torch.tensor([self.width / 2, self.height / 2], dtype=torch.float64)
@@ -190,26 +192,17 @@ def object_numbers(names: Sequence[str], objects: Sequence[str]) -> Int64[Tensor
     Raises:
         InputError: None, or an unknown one.
     """
-    missing = [name for name in objects if name not in names]
-    if missing or not objects:
-        raise InputError(
-            f"expected names of objects among {', '.join(names)}, got "
-            f"{', '.join(missing) or 'none'}; name those that the mask shows"
-        )
+    check_some(objects, "object", "name those that the mask shows")
+    for name in objects:
+        check_choice(name, names, "objects among", "name those that the mask shows")
     return torch.tensor([names.index(name) for name in objects])
 
 
 class CameraPose(RigidMotion):
     """Rigid transform of all poses of a camera, see ``Camera.transform_rigidly``."""
 
+    moved = "camera"
+
     def forward(self, camera: Camera) -> Camera:
         """Return the moved camera."""
         return camera.transform_rigidly(self.rotation_matrix, self.shift)
-
-    def values(self) -> dict[str, Tensor]:
-        """Return translation [m] and rotation vector [rad] by name, for progress and reports."""
-        return self.named_values("camera")
-
-    def coordinates(self) -> list[Coordinate]:
-        """Return the free coordinates of position and rotation."""
-        return self.named_coordinates("camera")

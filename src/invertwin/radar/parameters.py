@@ -17,17 +17,11 @@ from invertwin.scene.parameters import Coordinate, RigidMotion, axes_mask, free_
 class RadarPose(RigidMotion):
     """Rigid transform of all poses of a radar, see `Radar.transform_rigidly`."""
 
+    moved = "radar"
+
     def forward(self, radar: Radar) -> Radar:
         """Return the moved radar."""
         return radar.transform_rigidly(self.rotation_matrix, self.shift)
-
-    def values(self) -> dict[str, Tensor]:
-        """Return translation [m] and rotation vector [rad] by name, for progress and reports."""
-        return self.named_values("radar")
-
-    def coordinates(self) -> list[Coordinate]:
-        """Return the free coordinates of position and rotation."""
-        return self.named_coordinates("radar")
 
 
 class RadarTrajectory(nn.Module):

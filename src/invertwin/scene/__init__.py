@@ -47,11 +47,12 @@ from invertwin.scene.parameters import Pose as Pose
 from invertwin.scene.parameters import Scale as Scale
 from invertwin.scene.parameters import Translation as Translation
 from invertwin.scene.parameters import Vertices as Vertices
-from invertwin.scene.people.anny_body import load_anny as load_anny
 from invertwin.scene.people.body import BodyTemplate as BodyTemplate
 from invertwin.scene.people.body import SkinnedBody as SkinnedBody
 from invertwin.scene.people.body import articulated_template as articulated_template
 from invertwin.scene.people.body import load_smpl as load_smpl
+from invertwin.scene.people.body_models import load_anny as load_anny
+from invertwin.scene.people.body_models import person as person
 from invertwin.scene.people.gait import Walking as Walking
 from invertwin.scene.people.gait import standing_height as standing_height
 from invertwin.scene.people.gestures import Sitting as Sitting
@@ -61,7 +62,6 @@ from invertwin.scene.people.motion import MovingScene as MovingScene
 from invertwin.scene.people.motion import ObjectMotion as ObjectMotion
 from invertwin.scene.people.motion import SplineTrajectory as SplineTrajectory
 from invertwin.scene.people.motion import TrajectoryMotion as TrajectoryMotion
-from invertwin.scene.people.person import person as person
 from invertwin.scene.polarisation import JonesTable as JonesTable
 from invertwin.scene.pose import compose as compose
 from invertwin.scene.pose import from_frame as from_frame
@@ -76,7 +76,6 @@ from invertwin.scene.pose import vector_from_quaternion as vector_from_quaternio
 from invertwin.scene.rooms import room as room
 from invertwin.scene.scene import Object as Object
 from invertwin.scene.scene import Scene as Scene
-from invertwin.scene.shape_models.deformation import LatticeDeformation as LatticeDeformation
 from invertwin.scene.shape_models.density import DensityGrid as DensityGrid
 from invertwin.scene.shape_models.distance import DistanceGrid as DistanceGrid
 from invertwin.scene.shape_models.distance import NeuralDistance as NeuralDistance
@@ -87,6 +86,7 @@ from invertwin.scene.shape_models.prior import ShapePrior as ShapePrior
 from invertwin.scene.shape_models.prior import load_prior as load_prior
 from invertwin.scene.shape_models.shape_space import LinearShape as LinearShape
 from invertwin.scene.shape_models.shape_space import ShapeSpace as ShapeSpace
+from invertwin.scene.shape_models.smooth_vertices import LatticeDeformation as LatticeDeformation
 from invertwin.scene.shape_models.smooth_vertices import SmoothVertices as SmoothVertices
 from invertwin.scene.shapes import box as box
 from invertwin.scene.shapes import cylinder as cylinder

@@ -15,11 +15,21 @@ from annotated_types import MinLen
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor, set_fields
+from invertwin.checks import (
+    ArrayLike,
+    check_choice,
+    check_some,
+    checked_count,
+    checked_number,
+    checked_tensor,
+    checked_type,
+    refuse_derivatives,
+    set_fields,
+)
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Count, NonNegative, Positive
 from invertwin.runtime.memory import require_at_most
-from invertwin.scene.polarisation import JonesTable, Polarisation
+from invertwin.scene.polarisation import JonesTable, Polarisation, checked_angles
 from invertwin.scene.pose import Basis
 
 Polarised = str | ArrayLike | JonesTable
@@ -119,15 +129,11 @@ class TabulatedPattern(Pattern):
 
     def __post_init__(self) -> None:
         do = "give theta [n], phi [m] in rad and linear gains [n, m]"
-        theta = checked_tensor(self.theta, (None,), "pattern theta", do)
-        phi = checked_tensor(self.phi, (None,), "pattern phi", do)
+        theta, phi = checked_angles(self.theta, self.phi, "a pattern", do)
         gains = checked_tensor(self.gains, (len(theta), len(phi)), "pattern gains", do)
-        _check_angles(theta, phi)
-        if any(value.requires_grad for value in (theta, phi, gains)):
-            raise InputError(
-                "expected a pattern without derivatives, got values that require grad; patterns "
-                "are resampled and cannot be fitted: detach them"
-            )
+        for value in (theta, phi, gains):
+            do = "patterns are resampled and cannot be fitted: detach them"
+            refuse_derivatives(value, "a pattern", do)
         if bool((gains < 0).any()):
             raise InputError(
                 f"expected linear power gains >= 0, got {float(gains.min()):g}; "
@@ -215,18 +221,11 @@ class AntennaArray:
     def __post_init__(self) -> None:
         do = "give one position [x, y, z] in metres per element"
         positions = checked_tensor(self.positions, (None, 3), "element positions", do)
-        if len(positions) == 0:
-            raise InputError(f"expected at least one antenna element, got none; {do}")
-        if positions.requires_grad:
-            raise InputError(
-                "expected element positions without derivatives, got positions that require "
-                "grad; spectra do not differentiate their steering: detach them"
-            )
-        if not isinstance(self.pattern, Pattern):
-            raise InputError(
-                f"expected a Pattern, got {type(self.pattern).__name__}; "
-                "give Isotropic(), Cosine(exponent) or Table(theta, phi, gains)"
-            )
+        check_some(positions, "antenna element", do)
+        do = "spectra do not differentiate their steering: detach them"
+        refuse_derivatives(positions, "element positions", do)
+        do = "give Isotropic(), Cosine(exponent) or Table(theta, phi, gains)"
+        checked_type(self.pattern, Pattern, "a pattern", do)
         jones = Polarisation.from_jones(self.polarisation, self.leakage, len(positions))
         set_fields(self, positions=positions, jones=jones)
 
@@ -256,10 +255,7 @@ def linear_array(
     Raises:
         InputError: no elements, a spacing that is not positive, or another axis.
     """
-    if axis not in ("y", "z"):
-        raise InputError(
-            f"expected axis y or z, got {axis!r}; arrays lie in the y-z plane, and x is boresight"
-        )
+    check_choice(axis, ("y", "z"), "axis", "arrays lie in the y-z plane, and x is boresight")
     counts = (count, 1) if axis == "y" else (1, count)
     return planar_array(counts, (spacing, spacing), pattern, polarisation, leakage)
 
@@ -296,25 +292,6 @@ def _centre_positions(count: int, spacing: float, what: str) -> Tensor:
     number = checked_count(count, what, 1)
     distance = checked_number(spacing, "element spacing [m]", 0.0, open_low=True)
     return (torch.arange(number, dtype=torch.float64) - (number - 1) / 2) * distance
-
-
-def _check_angles(theta: Tensor, phi: Tensor) -> None:
-    ascending = bool((theta.diff() > 0).all()) and bool((phi.diff() > 0).all())
-    if len(theta) < 2 or len(phi) < 1 or not ascending:
-        raise InputError(
-            f"expected at least 2 ascending theta and 1 phi, got {len(theta)} and {len(phi)} "
-            f"({'' if ascending else 'not '}ascending); sort the pattern by angle"
-        )
-    if theta[0] != 0 or theta[-1] > torch.pi + 1e-9:
-        raise InputError(
-            f"expected theta from 0 to at most pi rad, got {float(theta[0]):g} to "
-            f"{float(theta[-1]):g}; convert degrees to rad and start at boresight"
-        )
-    if phi[-1] - phi[0] >= 2 * torch.pi - 1e-9:
-        raise InputError(
-            f"expected phi spanning less than 2 pi rad, got {float(phi[-1] - phi[0]):g}; "
-            "convert degrees to rad and leave out the repeated last angle"
-        )
 
 
 def _resample_gains(theta: Tensor, phi: Tensor, gains: Tensor) -> Tensor:

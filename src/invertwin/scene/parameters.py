@@ -149,6 +149,7 @@ class RigidMotion(nn.Module):
         rotation_axes: free components of the rotation vector.
 
     Attributes:
+        moved: name of what moves.
         translation: parameter [3], metres.
         rotation: parameter [4], q = (w, r) with the quaternion ∝ (w, r/2); near the identity (1, 0,
             0, 0), r is the rotation vector in world axes [rad]. Any q but zero is a rotation, and
@@ -157,6 +158,8 @@ class RigidMotion(nn.Module):
     Raises:
         InputError: wrong shapes, NaN, q = 0, or an unknown axis.
     """
+
+    moved: str
 
     def __init__(
         self,
@@ -191,13 +194,9 @@ class RigidMotion(nn.Module):
         """Return the rotation vector [rad], to first order about the identity."""
         return {"rotation": Entries("rotation", slice(1, None))}
 
-    def named_coordinates(self, name: str) -> list[Coordinate]:
-        """Return x, y, z and the rotations about these world axes: roll, pitch, yaw [rad].
-
-        Args:
-            name: name of the moving object.
-        """
-        found = position_coordinates(name, "translation", self._axes)
+    def coordinates(self) -> list[Coordinate]:
+        """Return x, y, z and the rotations about these world axes: roll, pitch, yaw [rad]."""
+        found = position_coordinates(self.moved, "translation", self._axes)
         free = self._rotation_axes[1:]
         w, r = self.rotation.detach()[0], self.rotation.detach()[1:]
         for turn, axis in zip(("roll", "pitch", "yaw"), torch.eye(3, dtype=r.dtype), strict=True):
@@ -205,14 +204,14 @@ class RigidMotion(nn.Module):
                 # The product of the quaternion (1, axis/2) and the present one (w, r/2).
                 change = torch.cat([-axis @ r[:, None] / 4, w * axis + axis.cross(r, 0) / 2])
                 tangents = {"rotation": change * self._rotation_axes}
-                found.append(Coordinate(f"{name}.{turn}", "rad", tangents, _ROTATION_SCALE))
+                found.append(Coordinate(f"{self.moved}.{turn}", "rad", tangents, _ROTATION_SCALE))
         return found
 
-    def named_values(self, name: str) -> dict[str, Tensor]:
-        """Return translation [m] and rotation vector [rad] of `name`, for progress and reports."""
+    def values(self) -> dict[str, Tensor]:
+        """Return translation [m] and rotation vector [rad] by name, for progress and reports."""
         return {
-            f"{name}.translation": self.translation.detach().clone(),
-            f"{name}.rotation": vector_from_quaternion(self._quaternion.detach()),
+            f"{self.moved}.translation": self.translation.detach().clone(),
+            f"{self.moved}.rotation": vector_from_quaternion(self._quaternion.detach()),
         }
 
 
@@ -232,7 +231,7 @@ class Pose(RigidMotion):
         rotation_axes: Axes = "xyz",
     ) -> None:
         super().__init__(translation, rotation, axes, rotation_axes)
-        self.object = object
+        self.object = self.moved = object
 
     def forward(self, scene: Scene) -> Scene:
         """Return the scene with the object moved."""
@@ -240,14 +239,6 @@ class Pose(RigidMotion):
         rotation, center = self.rotation_matrix, before.center
         motion = rigid(rotation, self.shift + center - rotation @ center)
         return scene.replace(self.object, pose=compose(before.transform, motion))
-
-    def values(self) -> dict[str, Tensor]:
-        """Return translation [m] and rotation vector [rad] by name, for progress and reports."""
-        return self.named_values(self.object)
-
-    def coordinates(self) -> list[Coordinate]:
-        """Return the free coordinates of position and rotation."""
-        return self.named_coordinates(self.object)
 
 
 class Scale(ObjectModule):
@@ -401,7 +392,9 @@ class MaterialValues(nn.Module):
                 f"expected a {where} with {', '.join(self.raw)} for {self.object!r}, got "
                 f"{type(holder).__name__}; give it another material"
             )
-        changed = replace(holder, **self._bounded_values())
+        values = {name: _to_bounded(name, raw) for name, raw in self.raw.items()}
+        images = {n: replace(t, image=values[n]) for n, t in self._textures.items()}
+        changed = replace(holder, **(values | images))
         if self.layer is not None:
             layers = [*material.layers]
             layers[self.layer] = changed
@@ -429,10 +422,6 @@ class MaterialValues(nn.Module):
         spans = {name: RANGES[name].high - RANGES[name].low for name in places}
         near = {n: 1e-4 if math.isinf(span) else 0.01 * span for n, span in spans.items()}
         return [f"{self.object}.{n}" for n, p in places.items() if bool((p < near[n]).any())]
-
-    def _bounded_values(self) -> dict[str, Tensor | Texture]:
-        values = {name: _to_bounded(name, raw) for name, raw in self.raw.items()}
-        return {**values, **{n: replace(t, image=values[n]) for n, t in self._textures.items()}}
 
 
 class Compose(nn.Module):

@@ -15,7 +15,13 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, checked_tensor, set_fields
+from invertwin.checks import (
+    ArrayLike,
+    checked_ascending,
+    checked_tensor,
+    refuse_derivatives,
+    set_fields,
+)
 from invertwin.errors import InputError
 
 JONES: Mapping[str, tuple[complex, complex]] = MappingProxyType(
@@ -36,10 +42,7 @@ def jones_basis(polarisation: str | ArrayLike) -> Complex128[Tensor, "2 2"]:
     Raises:
         InputError: an unknown name, or not two numbers of non-zero length.
     """
-    if isinstance(polarisation, str):
-        if polarisation not in JONES:
-            raise InputError(f"expected {_LEVELS}, got {polarisation!r}; use one of them")
-        polarisation = JONES[polarisation]
+    polarisation = JONES.get(polarisation, ()) if isinstance(polarisation, str) else polarisation
     try:
         first = torch.as_tensor(polarisation, dtype=torch.complex128)
         length = float(first.detach().norm())
@@ -47,9 +50,37 @@ def jones_basis(polarisation: str | ArrayLike) -> Complex128[Tensor, "2 2"]:
         length, first = 0.0, torch.zeros(0)
     if first.shape != (2,) or not 0 < length < math.inf:
         raise InputError(f"expected {_LEVELS}, got {polarisation!r}; give two, not both zero")
-    if first.requires_grad:
-        raise InputError(f"expected a polarisation without derivatives, got some; {_DETACHED}")
+    refuse_derivatives(first, "a polarisation", _DETACHED)
     return torch.stack([first / length, orthogonal_vectors(first / length)], 1)
+
+
+def checked_angles(
+    theta: ArrayLike, phi: ArrayLike, of: str, do: str
+) -> tuple[Float64[Tensor, " n"], Float64[Tensor, " m"]]:
+    """Convert the angles of a table over direction to ascending tensors [rad].
+
+    Args:
+        theta: angles to boresight, from 0 to π at most.
+        phi: angles around boresight, which span less than 2π.
+        of: what the table is of, for the message.
+        do: what the user can do about wrong shapes, for the message.
+
+    Raises:
+        InputError: angles that do not ascend or are out of range.
+    """
+    around = checked_ascending(phi, f"angles phi of {of}", do, 1)
+    away = checked_ascending(theta, f"angles theta of {of}", do)
+    if away[0] != 0 or away[-1] > math.pi + 1e-9:
+        raise InputError(
+            f"expected theta from 0 to at most pi rad, got {float(away[0]):g} to "
+            f"{float(away[-1]):g}; convert degrees to rad and start at boresight"
+        )
+    if around[-1] - around[0] >= 2 * math.pi - 1e-9:
+        raise InputError(
+            f"expected phi spanning less than 2 pi rad, got {float(around[-1] - around[0]):g}; "
+            "convert degrees to rad and leave out the repeated last angle"
+        )
+    return away, around
 
 
 def orthogonal_vectors(vector: Complex128[Tensor, "*row 2"]) -> Complex128[Tensor, "*row 2"]:
@@ -85,18 +116,12 @@ class JonesTable:
 
     def __post_init__(self) -> None:
         do = "give theta [n], phi [m] in rad and complex vectors [n, m, 2]"
-        theta = checked_tensor(self.theta, (None,), "angles theta of a polarisation", do)
-        phi = checked_tensor(self.phi, (None,), "angles phi of a polarisation", do)
+        theta, phi = checked_angles(self.theta, self.phi, "a polarisation", do)
         vectors = torch.as_tensor(self.vectors, dtype=torch.complex128)
         shape = (len(theta), len(phi), 2)
         parts = checked_tensor(torch.view_as_real(vectors), (*shape, 2), "Jones vectors", do)
-        ascending = bool((theta.diff() > 0).all() & (phi.diff() > 0).all())
-        if not (ascending and len(theta) > 1 and len(phi) and theta[0] == 0):
-            raise InputError(f"expected ascending theta from 0 and phi, got others; {do}")
-        if phi[-1] - phi[0] >= 2 * math.pi - 1e-9:
-            raise InputError("expected phi spanning less than 2 pi rad, got more; leave out 2 pi")
-        if any(value.requires_grad for value in (theta, phi, parts)):
-            raise InputError(f"expected a polarisation without derivatives, got some; {_DETACHED}")
+        for value in (theta, phi, parts):
+            refuse_derivatives(value, "a polarisation", _DETACHED)
         length = parts.flatten(-2).norm(dim=-1)
         if not bool((length > 0).all()):
             raise InputError(f"expected Jones vectors of some length, got zeros; {do}")
@@ -231,8 +256,7 @@ def _leakage(value: complex | ArrayLike, elements: int) -> Tensor:
         raise InputError(
             f"expected one finite leakage or {elements}, got shape {list(found.shape)}; {do}"
         )
-    if found.requires_grad:
-        raise InputError(f"expected leakage without derivatives, got some; {_DETACHED}")
+    refuse_derivatives(found, "leakage", _DETACHED)
     return found.expand(elements)
 
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, checked_tensor
+from invertwin.checks import ArrayLike, check_choice, checked_tensor
 from invertwin.errors import InputError
 
 
@@ -226,11 +226,8 @@ def from_frame(value: Convertible | ArrayLike, frame: FrameName) -> Any:
 
 
 def _basis_of(frame: str) -> Basis:
-    if frame not in _AXES:
-        raise InputError(
-            f"expected a frame among {', '.join(_AXES)}, got {frame!r}; choose one (ROS, ISO 8855, "
-            "Sionna RT, Blender and CAD files have ours)"
-        )
+    do = "choose one (ROS, ISO 8855, Sionna RT, Blender and CAD files have ours)"
+    check_choice(frame, _AXES, "a frame among", do)
     axes = _AXES[frame]
     order = tuple("xyz".index(axis[-1]) for axis in axes)
     return Basis(order, tuple(-1 if axis.startswith("-") else 1 for axis in axes))

@@ -81,11 +81,8 @@ def closest_points(mesh: Mesh, points: np.ndarray) -> np.ndarray:
         mesh: the surface.
         points: positions in the mesh's frame [p, 3] [m].
     """
-    return np.asarray(igl.point_mesh_squared_distance(points, *_mesh_arrays(mesh))[2])
-
-
-def _mesh_arrays(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    return mesh.vertices.detach().numpy(), mesh.faces.numpy()
+    surface = mesh.vertices.detach().numpy(), mesh.faces.numpy()
+    return np.asarray(igl.point_mesh_squared_distance(points, *surface)[2])
 
 
 class _EditableMesh:

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
-from invertwin.checks import checked_number
-from invertwin.errors import InputError
+from invertwin.checks import check_choice, checked_number
 from invertwin.limits import Positive
 from invertwin.scene.material.materials import RoughDielectric
 from invertwin.scene.mesh import Mesh, concatenate_meshes
@@ -60,11 +59,8 @@ def room(
     w = checked_number(width, "width of the room [m]", 4)
     d = checked_number(depth, "depth of the room [m]", 4)
     h = checked_number(height, "height of the room [m]", 2.1)
-    unknown = [name for name in furniture if name not in _FURNITURE]
-    if isinstance(furniture, str) or unknown:
-        raise InputError(
-            f"expected furniture among {', '.join(_FURNITURE)}, got {furniture!r}; give a list"
-        )
+    for name in furniture:
+        check_choice(name, _FURNITURE, "furniture among", "give a list")
     sides = {
         "floor": _panel([d / 2, 0, 0], [d / 2, 0, 0], [0, w / 2, 0]),
         "ceiling": _panel([d / 2, 0, h], [0, w / 2, 0], [d / 2, 0, 0]),

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.checks import checked_number, checked_tensor
+from invertwin.checks import check_choice, checked_number, checked_tensor
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.material.roughness import ROUGH_LOBE_WIDTH, lobe_exponent
@@ -183,11 +183,7 @@ class Scene:
         Raises:
             InputError: no object of that name.
         """
-        if name not in self.objects:
-            raise InputError(
-                f"expected the name of an object in the scene ({', '.join(self.names)}), "
-                f"got {name!r}; use one of these names"
-            )
+        check_choice(name, self.objects, "the name of an object in the scene:", "use one of these")
         return self.objects[name]
 
     @property
@@ -205,12 +201,8 @@ class Scene:
         Raises:
             InputError: no such object or field; the mesh or material of a cloud, which do nothing.
         """
-        unknown = sorted(set(changes) - set(Object.__dataclass_fields__))
-        if unknown:
-            raise InputError(
-                f"expected changes of {', '.join(Object.__dataclass_fields__)}, "
-                f"got {', '.join(unknown)}; use one of these fields"
-            )
+        for key in changes:
+            check_choice(key, Object.__dataclass_fields__, "changes of", "use one of these")
         changed = replace(self[name], **changes)
         shaped = [field for field in ("mesh", "material") if field in changes]
         if shaped and changed.cloud is not None:

@@ -66,15 +66,15 @@ def test_a_model_becomes_a_template_in_our_axes():
 
 @pytest.mark.usefixtures("stick")
 def test_unknown_phenotypes_are_named():
-    with pytest.raises(InputError, match="among age, height, got wings; use Anny's names"):
+    with pytest.raises(InputError, match="among age, height, got 'wings'; use Anny's names"):
         load_anny(coordinates=["wings"])
-    with pytest.raises(InputError, match="got size"):
+    with pytest.raises(InputError, match="got 'size'"):
         load_anny({"size": 0.5})
 
 
 def test_without_anny_the_message_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "anny", None)
-    with pytest.raises(InputError, match=r"install it with pip install 'invertwin\[anny\]'"):
+    with pytest.raises(InputError, match=r"type: pip install 'invertwin\[anny\]'"):
         load_anny()
 
 

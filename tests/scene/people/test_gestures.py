@@ -135,7 +135,7 @@ def test_velocities_do_not_jump(motion):
         (lambda: Sitting(BODY, 0.9), "height of the seat"),
         (lambda: Sitting(BODY, 0.1), "height of the seat"),
         (lambda: Sitting(BODY, 0.45, duration=0.0), "duration"),
-        (lambda: Waving(BODY, "up"), "side left or right"),
+        (lambda: Waving(BODY, "up"), "side left, right"),
         (lambda: Waving(BODY, rate=0.0), "rate"),
         (lambda: Waving(BODY, duration=1.0), "duration"),
         (lambda: Waving(BODY, during=Walking(person(spacing=0.05), 1.0)), "one body"),

@@ -10,13 +10,19 @@ from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from invertwin.checks import ArrayLike, checked_count, checked_tensor, set_fields
+from invertwin.checks import (
+    ArrayLike,
+    check_shape,
+    checked_count,
+    checked_tensor,
+    set_fields,
+)
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh, concatenate_meshes
 from invertwin.scene.parameters import Entries, ObjectModule, axes_mask, free_part
 from invertwin.scene.pose import from_frame, rotation_angle, rotation_from_vector
-from invertwin.storage.untrusted import read_arrays, safe_reader
+from invertwin.storage.untrusted import existing_file, read_arrays, safe_reader
 
 _DO = "give arrays of one template"
 _SINGLE_JOINT_WEIGHT = 0.95  # skinning weight of a vertex dominated by one joint
@@ -397,26 +403,18 @@ def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
     Raises:
         InputError: no such file, pickled objects in it, or arrays missing or of wrong shapes.
     """
-    path = Path(file)
-    if not path.is_file():
-        raise InputError(f"expected a body model, got no file {path}; give the path of a .npz file")
+    path = existing_file(file, "a body model")
     names = ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs")
     do = "save sparse matrices and pickled objects as arrays with numpy.savez first"
     arrays = read_arrays(path, do, (*names, "posedirs"))
-    missing = [name for name in names if name not in arrays]
-    if missing:
-        raise InputError(
-            f"expected {', '.join(names)} in {path.name}, got no {', '.join(missing)}; "
-            "give a file of SMPL's layout"
-        )
+    for name in names:
+        if name not in arrays:
+            do = "give a file of SMPL's layout"
+            raise InputError(f"expected {name} in {path.name}, got no {name}; {do}")
     turn: Tensor = from_frame(torch.eye(3, dtype=torch.float64), "smpl").T
     rest = checked_tensor(arrays["v_template"], (None, 3), "v_template", _DO) @ turn.T
     table = arrays["kintree_table"].astype(np.int64)
-    if table.ndim != 2 or len(table) != 2:
-        raise InputError(
-            f"expected kintree_table of shape [2, any], got {list(table.shape)}; "
-            "give a file of SMPL's layout"
-        )
+    check_shape(torch.from_numpy(table), (2, None), "kintree_table", "give a file of SMPL's layout")
     count = table.shape[1]
     directions = checked_tensor(arrays["shapedirs"], (len(rest), 3, None), "shapedirs", _DO)
     directions = turn @ directions[..., : checked_count(shapes, "shape coordinates", 1)]

@@ -1,16 +1,195 @@
-"""Articulated bodies by the name of their model, or from a file."""
+"""Articulated bodies by the name of their model, or from a file.
 
-from collections.abc import Mapping
+`person` is a procedural standing person, one closed skin over eleven joints; Anny is an open model
+people of all ages and builds.
+"""
+
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from invertwin.checks import Point
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from invertwin.checks import Point, check_choice, checked_number
+from invertwin.errors import import_optional
 from invertwin.limits import RADIANS, Positive
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.people.anny_body import load_anny
 from invertwin.scene.people.body import BodyTemplate, load_smpl
-from invertwin.scene.people.person import person
+from invertwin.scene.shape_models.iso_surface import iso_surface
+from invertwin.scene.shape_models.lattice import Lattice
+
+# Joints of a standing person 1.75 m tall with arms held out, relative to the pelvis [m].
+_JOINTS: dict[str, tuple[str | None, tuple[float, float, float]]] = {
+    "pelvis": (None, (0.0, 0.0, 0.0)),
+    "chest": ("pelvis", (0.0, 0.0, 0.22)),
+    "neck": ("chest", (0.0, 0.0, 0.52)),
+    "left_shoulder": ("chest", (0.0, -0.19, 0.45)),
+    "left_elbow": ("left_shoulder", (0.0, -0.47, 0.45)),
+    "right_shoulder": ("chest", (0.0, 0.19, 0.45)),
+    "right_elbow": ("right_shoulder", (0.0, 0.47, 0.45)),
+    "left_hip": ("pelvis", (0.0, -0.10, -0.06)),
+    "left_knee": ("left_hip", (0.0, -0.10, -0.48)),
+    "right_hip": ("pelvis", (0.0, 0.10, -0.06)),
+    "right_knee": ("right_hip", (0.0, 0.10, -0.48)),
+}
+# Cones with round ends: their joint, both ends, both radii [m].
+_CONES = [
+    ("pelvis", (0.0, -0.06, -0.02), (0.0, 0.06, -0.02), 0.115, 0.115),
+    ("pelvis", (0.0, 0.0, 0.0), (0.0, 0.0, 0.2), 0.12, 0.115),
+    ("chest", (0.0, 0.0, 0.22), (0.0, 0.0, 0.40), 0.12, 0.12),
+    ("chest", (0.0, -0.13, 0.43), (0.0, 0.13, 0.43), 0.075, 0.075),
+    ("neck", (0.0, 0.0, 0.5), (-0.01, 0.0, 0.6), 0.055, 0.055),
+    ("neck", (-0.02, 0.0, 0.66), (-0.01, 0.0, 0.73), 0.085, 0.09),
+]
+_LIMBS = [
+    ("shoulder", (0.0, 0.19, 0.45), (0.0, 0.47, 0.45), 0.06, 0.045),
+    ("elbow", (0.0, 0.47, 0.45), (0.0, 0.72, 0.45), 0.045, 0.033),
+    ("elbow", (0.0, 0.72, 0.45), (-0.01, 0.85, 0.44), 0.038, 0.032),
+    ("hip", (0.0, 0.10, -0.06), (0.0, 0.10, -0.48), 0.088, 0.058),
+    ("knee", (0.0, 0.10, -0.48), (0.0, 0.10, -0.90), 0.056, 0.04),
+    ("knee", (0.02, 0.10, -0.90), (-0.16, 0.10, -0.92), 0.045, 0.035),
+]
+_FILLET = 0.02  # blending width between parts [m]
+_BLEND = 0.08  # width over which skinning weights change [m]
+_DEFAULT_HEIGHT = 1.75  # m
+
+
+def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
+    """Build a person who faces −x, z up, arms held out along ±y, in the frame of the pelvis.
+
+    One closed skin around blended tapered cylinders; its weights are smooth between joints. The
+    joints are pelvis, chest, neck, and shoulder, elbow, hip and knee of both sides, ``left_`` at
+    −y; their axes are those of the object in the rest pose: elbows bend about z, knees about y.
+
+    Args:
+        height: height [m].
+        spacing: vertex spacing [m].
+
+    Raises:
+        InputError: a height or spacing out of range.
+    """
+    tall = checked_number(height, "height [m]", 0.5, 2.5)
+    step = checked_number(spacing, "spacing of the triangles [m]", 0.01, 0.05)
+    low = torch.tensor([-0.24, -0.93, -1.0], dtype=torch.float64)
+    high = torch.tensor([0.18, 0.93, 0.86], dtype=torch.float64)
+    counts = ((high - low) * tall / _DEFAULT_HEIGHT / step).ceil().int() + 1
+    mesh = iso_surface(_distance, Lattice.from_bounds(low, high, counts.tolist()))
+    names = list(_JOINTS)
+    parents = [-1 if parent is None else names.index(parent) for parent, _ in _JOINTS.values()]
+    joints = torch.tensor([place for _, place in _JOINTS.values()], dtype=torch.float64)
+    template = BodyTemplate(
+        mesh.vertices,
+        mesh.faces,
+        _weights(mesh.vertices),
+        tuple(parents),
+        joints,
+        names=tuple(names),
+    )
+    return template.scale(tall / _DEFAULT_HEIGHT)
+
+
+def _parts() -> list[tuple[str, Tensor, Tensor, float, float]]:
+    """Return all cones: joint, ends, radii."""
+    parts = []
+    for name, *ends, first, last in [*_CONES, *_LIMBS]:
+        start, end = torch.tensor(ends, dtype=torch.float64)
+        sides = {f"left_{name}": -1.0, f"right_{name}": 1.0}
+        for own, sign in ({name: 1.0} if name in _JOINTS else sides).items():
+            mirror = start.new_tensor([1.0, sign, 1.0])
+            parts.append((own, start * mirror, end * mirror, first, last))
+    return parts
+
+
+def _cone(
+    points: Tensor, start: Tensor, end: Tensor, first: float, last: float
+) -> Float64[Tensor, " p"]:
+    """Return the approximate distance to a cone with round ends, negative inside."""
+    axis = end - start
+    share = ((points - start) @ axis / axis.square().sum()).clamp(0.0, 1.0)
+    return (points - start - share[:, None] * axis).norm(dim=1) - (first + share * (last - first))
+
+
+def _distance(points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
+    """Return the approximate signed distance to the skin: a soft minimum over the parts."""
+    found = torch.stack([_cone(points, *part[1:]) for part in _parts()])
+    return -_FILLET * torch.logsumexp(-found / _FILLET, dim=0)
+
+
+def _weights(points: Float64[Tensor, "p 3"]) -> Float64[Tensor, "p j"]:
+    """Return skinning weights from the distances to the parts of each joint."""
+    parts = _parts()
+    nearest = []
+    for name in _JOINTS:
+        own = [_cone(points, *part[1:]) for part in parts if part[0] == name]
+        nearest.append(torch.stack(own).amin(0))
+    found = torch.stack(nearest, dim=1)
+    share = (1 - (found - found.amin(1, keepdim=True)) / _BLEND).clamp_min(0.0).square()
+    return share / share.sum(1, keepdim=True)
+
+
+_STEP = 0.05  # step of a phenotype for its central difference
+# Anny's bodies face −y, z up; here they face −x, z up.
+_ANNY_TO_BODY_AXES = torch.tensor(
+    [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64
+)
+
+
+def load_anny(
+    phenotypes: Mapping[str, float] | None = None, coordinates: Sequence[str] = ()
+) -> BodyTemplate:
+    """Load a body of the model Anny (Apache-2.0), which the optional extra ``anny`` installs.
+
+    The joints are its 104 bones by their names, such as ``upperarm01.L`` and ``lowerarm01.L``; the
+    rest pose is Anny's, rotated to face −x, z up. The first use of Anny prepares files for about a
+    minute.
+
+    Args:
+        phenotypes: values by their names in Anny ("gender", "age", "muscle", "weight", "height",
+            "proportions"), from 0 to 1; the default is 0.5.
+        coordinates: phenotypes that become shape coordinates, as changes from the given values.
+            They follow Anny's own blending to first order.
+
+    Raises:
+        InputError: Anny is not installed, or has no such phenotype.
+    """
+    anny = import_optional("anny", "anny")
+    model = anny.Anny(skinning_method="lbs").to(dtype=torch.float64)
+    values = dict.fromkeys(model.phenotype_labels, 0.5)
+    for name in (*(phenotypes or {}), *coordinates):
+        check_choice(name, values, "phenotypes among", "use Anny's names")
+    values |= {name: float(value) for name, value in (phenotypes or {}).items()}
+    rest, places = _rest(model, values)
+    skin, bones = [], []
+    for name in coordinates:
+        ends = [_rest(model, values | {name: values[name] + s * _STEP}) for s in (1.0, -1.0)]
+        (up, heads_up), (down, heads_down) = ends
+        skin.append((up - down) / (2 * _STEP))
+        bones.append((heads_up - heads_down) / (2 * _STEP))
+    share = torch.zeros(len(rest), len(model.bone_labels), dtype=torch.float64)
+    share.scatter_add_(1, model.vertex_bone_indices.long(), model.vertex_bone_weights.double())
+    return BodyTemplate(
+        rest,
+        model.get_triangular_faces().long(),
+        share,
+        (-1, *(int(parent) for parent in model.bone_parents[1:])),
+        places,
+        torch.stack(skin, dim=-1) if skin else None,
+        torch.stack(bones, dim=-1) if bones else None,
+        names=tuple(model.bone_labels),
+    )
+
+
+def _rest(model: Any, values: Mapping[str, float]) -> tuple[Tensor, Tensor]:
+    """Return skin and joints of the rest pose in this package's axes."""
+    given = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
+    with torch.no_grad():
+        found = model(pose_parameters=None, phenotype_kwargs=given)
+    rest, places = (found[name][0].double() for name in ("rest_vertices", "rest_bone_heads"))
+    return rest @ _ANNY_TO_BODY_AXES.T, places @ _ANNY_TO_BODY_AXES.T
+
 
 Model = Literal["person", "anny"]
 _AT_REST: dict[str, Point] = {}

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from invertwin.checks import checked_number
+from invertwin.checks import check_choice, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Positive
 from invertwin.scene.people.body import BodyTemplate
@@ -149,8 +149,7 @@ class Waving:
 
     def __post_init__(self) -> None:
         check_joints(self.body)
-        if self.side not in ("left", "right"):
-            raise InputError(f"expected the side left or right, got {self.side!r}; choose one")
+        check_choice(self.side, ("left", "right"), "the side")
         checked_number(self.rate, "rate [1/s]", 0.0, open_low=True)
         checked_number(self.start, "start [s]", -math.inf)
         checked_number(self.duration, "duration [s]", 2 * _RAISE_DURATION)

@@ -12,6 +12,7 @@ from torch import Tensor
 from invertwin.checks import (
     ArrayLike,
     Point,
+    checked_ascending,
     checked_number,
     checked_tensor,
     checked_type,
@@ -124,12 +125,7 @@ class SplineTrajectory:
     positions: ArrayLike
 
     def __post_init__(self) -> None:
-        times = checked_tensor(self.times, (None,), "times [s]", "give one for each place")
-        if len(times) < 2 or bool((times.diff() <= 0).any()):
-            raise InputError(
-                f"expected at least two rising times [s], got {times.tolist()}; sort the places "
-                "by time"
-            )
+        times = checked_ascending(self.times, "times [s]", "sort the places by time")
         shape = (len(times), 3)
         places = checked_tensor(self.positions, shape, "places [m]", "give x, y, z for each time")
         from scipy.interpolate import CubicSpline  # slow to import

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from invertwin.checks import ArrayLike, checked_count, checked_tensor, set_fields
 from invertwin.errors import InputError
+from invertwin.runtime.memory import require_at_most
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
 
@@ -47,11 +48,8 @@ class ShapeSpace:
             InputError: more coordinates than the space has.
         """
         count = len(latent)
-        if count > len(self.deviations):
-            raise InputError(
-                f"expected at most {len(self.deviations)} coordinates of the shape space, "
-                f"got {count}; give fewer"
-            )
+        most = len(self.deviations)
+        require_at_most(count, most, "coordinates of the shape space", "give fewer")
         offsets = self.components[..., :count] @ (latent * self.deviations[:count])
         return Mesh(self.mean + offsets, self.faces)
 
