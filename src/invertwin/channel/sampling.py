@@ -6,6 +6,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Le
 
+from invertwin.checks import check_fields, checked_number
 from invertwin.deprecation import warn_renamed
 from invertwin.errors import InputError
 from invertwin.limits import MAX_COUNT, Count
@@ -90,38 +91,20 @@ class Sampling:
     interior_edges: bool = True
     contacts: bool = True
     points_per_m2: Densities = 20_000.0
-    rough_paths: int = 200_000
+    rough_paths: Annotated[int, Ge(1)] = 200_000
     memory_budget: float = 0.25e9
     backend: str | None = None
     conductor_samples: Count | None = None
 
     def __post_init__(self) -> None:
-        if not 1 <= self.depth <= _MAX_DEPTH:
-            raise InputError(
-                f"expected a depth from 1 to {_MAX_DEPTH}, got {self.depth}; give the most bounces "
-                "of a path"
-            )
-        if not (1 <= self.samples <= MAX_COUNT and 0 <= self.boundary_samples <= MAX_COUNT):
-            raise InputError(
-                f"expected samples from 1 and boundary_samples from 0 to {MAX_COUNT}, got "
-                f"{self.samples} and {self.boundary_samples}; give the number of rays over all "
-                "frames"
-            )
+        check_fields(self)
         if isinstance(self.points_per_m2, Mapping):
             object.__setattr__(self, "points_per_m2", dict(self.points_per_m2))
             densities = list(self.points_per_m2.values())
         else:
             densities = [self.points_per_m2]
-        if not all(density > 0 for density in densities) or self.rough_paths < 1:
-            raise InputError(
-                "expected points_per_m2 > 0 and rough_paths >= 1, got "
-                f"{self.points_per_m2} and {self.rough_paths}; try 2e4 points per m²"
-            )
-        if self.conductor_samples is not None and not 1 <= self.conductor_samples <= MAX_COUNT:
-            raise InputError(
-                f"expected conductor_samples from 1 to {MAX_COUNT}, got {self.conductor_samples}; "
-                "give the number of points per frame on smooth conductors"
-            )
+        for density in densities:
+            checked_number(density, "points_per_m2", 0.0, open_low=True)
 
     def count_conductor_samples(self) -> int:
         """Return the number of points per frame on smooth conductors.

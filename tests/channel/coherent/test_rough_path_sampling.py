@@ -8,7 +8,7 @@ from torch import Tensor
 
 from invertwin.channel import Link
 from invertwin.channel.coherent.radar_equation import SurfacePaths, evaluate_paths, find_unblocked
-from invertwin.channel.coherent.rough_paths import draw_rough_paths
+from invertwin.channel.coherent.speckle import draw_rough_paths
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry, flatten
 from invertwin.scene import RoughConductor, Scene, plate

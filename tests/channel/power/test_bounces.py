@@ -194,7 +194,7 @@ def test_depth_adds_to_what_is_there():
 
 @pytest.mark.parametrize("depth", [0, 17])
 def test_a_depth_out_of_range_is_named(depth):
-    with pytest.raises(InputError, match=f"expected a depth from 1 to 16, got {depth}"):
+    with pytest.raises(InputError, match=rf"expected depth of at (least 1|most 16), got {depth}"):
         deposit_power(occluder(), link(), GRID, sampling=replace(COUNTS, depth=depth), seed=3)
 
 

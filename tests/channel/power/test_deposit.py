@@ -259,10 +259,10 @@ def test_one_frame_at_a_time_is_all_frames():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"samples": 0}, "samples from 1"),
-        ({"boundary_samples": -1}, "boundary_samples from 0"),
-        ({"depth": 0}, "expected a depth from 1 to 16, got 0"),
-        ({"points_per_m2": 0.0}, "expected points_per_m2 > 0"),
+        ({"samples": 0}, "samples of at least 1"),
+        ({"boundary_samples": -1}, "boundary_samples of at least 0"),
+        ({"depth": 0}, "expected depth of at least 1, got 0"),
+        ({"points_per_m2": 0.0}, r"expected points_per_m2 in \(0, inf\), got 0"),
         ({"backend": "tpu"}, "expected backend 'cpu', 'cuda' or 'auto', got 'tpu'"),
     ],
 )

@@ -583,7 +583,7 @@ def test_padded_links_may_be_empty():
         ({"rx": []}, "rx"),
         ({"tx": [float("nan"), 0.0, 0.0]}, "finite tx positions"),
         ({"frequency": -1.0}, "frequency"),
-        ({"depth": 7}, "depth of at most 6"),
+        ({"depth": 7}, r"at most 6 reflections \(depth\), got 7"),
         ({"rays": 0}, "rays"),
         ({"rx_velocity": [[1.0, 2.0, 3.0]] * 2}, "rx velocities"),
     ],

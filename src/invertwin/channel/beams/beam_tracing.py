@@ -214,8 +214,12 @@ def _trace_order(
     wave = beams.wave_vector, beams.medium, beams.transmitted
     spreading = torch.ones(len(source), dtype=torch.float64)
     bounce = IlluminatedPatches(*hit, source, *wave, spreading)
-    if previous is not None:
-        bounce = _clip_to_beams(facets, bounce, previous, departing)
+    if previous is not None:  # clip facets to the beams that leave the previous patches
+        beam, plane = previous.polygon[departing.parent[source]], departing.source_normal[source]
+        polygon = _clip_in_front(bounce.polygon, plane, beam[:, 0], 0.0)
+        for plane, point, proper in _side_planes(beam, bounce.direction):
+            polygon = clip(polygon, plane, torch.where(proper, dot(plane, point), -1.0))
+        bounce = _drop_degenerate(facets, bounce, polygon)
     bounce = _remove_occluded(facets, bounce, None if previous is None else departing, solids)
     bounce = replace(bounce, parent=departing.parent[bounce.parent])
     if solids is None:
@@ -281,21 +285,6 @@ def _attach_to_facets(facets: Facets, patches: IlluminatedPatches) -> Illuminate
     sides = corners[:, 1:] - corners[:, :1]
     coordinates = (patches.polygon - corners[:, :1]).detach() @ torch.linalg.pinv(sides.detach())
     return replace(patches, polygon=corners[:, :1] + coordinates @ sides)
-
-
-def _clip_to_beams(
-    facets: Facets,
-    patches: IlluminatedPatches,
-    previous: IlluminatedPatches,
-    departing: _DepartingBeams,
-) -> IlluminatedPatches:
-    """Clip facets to the beams that leave the previous patches."""
-    source_polygon = previous.polygon[departing.parent[patches.parent]]
-    plane = departing.source_normal[patches.parent]
-    polygon = _clip_in_front(patches.polygon, plane, source_polygon[:, 0], 0.0)
-    for plane, point, proper in _side_planes(source_polygon, patches.direction):
-        polygon = clip(polygon, plane, torch.where(proper, dot(plane, point), -1.0))
-    return _drop_degenerate(facets, patches, polygon)
 
 
 def _remove_occluded(

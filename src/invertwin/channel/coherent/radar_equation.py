@@ -161,17 +161,13 @@ def radar_equation(
         for point, back, on in turns
     )
     arriving = math.prod(earlier, start=(link.wavelength / (4 * torch.pi)) ** 2 * spread)
-    turned = [_depolarisation(geometry, point, -back, on) for point, back, on in turns]
+    turned = []  # χ of what is scattered; what passes through a skin keeps its polarisation
+    for point, back, on in turns:
+        same_side = (point.normal * -back).sum(1) * (point.normal * on).sum(1) > 0
+        kept = geometry.surfaces.depolarisation[point.row]
+        turned.append(torch.where(same_side, kept, 0.0))
     power = arriving * last * ending
     return PathTransfer(frame, points, power, arriving, spread * ending, length, turned)
-
-
-def _depolarisation(
-    geometry: Geometry, point: MaterialPoints, incident: Tensor, outgoing: Tensor
-) -> Tensor:
-    """χ of what is scattered; what passes through a skin keeps its polarisation."""
-    incident, outgoing = ((point.normal * way).sum(1) for way in (incident, outgoing))
-    return torch.where(incident * outgoing > 0, geometry.surfaces.depolarisation[point.row], 0.0)
 
 
 def evaluate_scattering(

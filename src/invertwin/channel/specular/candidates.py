@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from invertwin.channel.rays.arrays import to_float, to_index, to_torch, to_vectors
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.specular.image_method import DIRECT, CandidateSurfaces, Planes
-from invertwin.errors import InputError
+from invertwin.runtime.memory import require_at_most
 
 _LANES = 1 << 20
 _MAX_SEQUENCES = 1_000_000  # limit of the exhaustive search
@@ -68,11 +68,8 @@ def enumerate_sequences(
     sheets = 2 * planes.face_plane[interactions.transmit & known] + 1
     options = torch.cat([mirrors, sheets]).unique()
     count = sum(len(options) ** step for step in range(1, depth + 1))
-    if count > _MAX_SEQUENCES:
-        raise InputError(
-            f"expected at most {_MAX_SEQUENCES:,} sequences to test one by one, got {count:.3g} of "
-            f"{len(planes)} planes and depth {depth}; give a number of rays, or a smaller depth"
-        )
+    what = f"sequences to test one by one (of {len(planes)} planes, depth {depth})"
+    require_at_most(count, _MAX_SEQUENCES, what, "give a number of rays, or a smaller depth")
     found, last = [], DIRECT
     for _ in range(depth):
         row = torch.arange(len(last)).repeat_interleave(len(options))
@@ -140,7 +137,8 @@ def shoot_sequences(
     leaves = torch.zeros(0, depth, dtype=torch.int64)
     count = torch.zeros(0, dtype=torch.int64)
     for number, origin in enumerate(origins):
-        rotation = _random_rotation(seed, number)
+        generator = np.random.default_rng(np.random.SeedSequence([seed, number]))
+        rotation = torch.from_numpy(np.linalg.qr(generator.standard_normal((3, 3)))[0])
         for start in range(0, rays, chunk):
             index = torch.arange(start, min(start + chunk, rays))
             directions = _spiral_directions(index, rays) @ rotation.T
@@ -196,12 +194,6 @@ def _spiral_directions(index: Tensor, count: int) -> Float64[Tensor, "n 3"]:
     around = _GOLDEN * index.double()
     ring = (1 - z**2).clamp_min(0).sqrt()
     return torch.stack([ring * around.cos(), ring * around.sin(), z], 1)
-
-
-def _random_rotation(seed: int, number: int) -> Float64[Tensor, "3 3"]:
-    draws = np.random.default_rng(np.random.SeedSequence([seed, number])).standard_normal((3, 3))
-    q, _ = np.linalg.qr(draws)
-    return torch.from_numpy(q)
 
 
 class _SequenceTracer:

@@ -46,12 +46,13 @@ from invertwin.checks import (
     ArrayLike,
     checked_count,
     checked_number,
+    checked_rows,
     checked_tensor,
     strip_derivatives,
 )
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.errors import InputError
 from invertwin.limits import MAX_COUNT
+from invertwin.runtime.memory import require_at_most
 from invertwin.scene import FieldCoefficients
 from invertwin.scene.scene import Scene
 
@@ -142,15 +143,12 @@ def trace_paths(
     """
     path_scene = prepare_path_scene(scene, tx, rx, frequency, tx_velocity, rx_velocity)
     limit = checked_count(depth, "depth", 0)
-    if limit > _MAX_DEPTH:
-        raise InputError(
-            f"expected a depth of at most {_MAX_DEPTH}, got {limit}; paths of more reflections "
-            "are weak"
-        )
-    if checked_count(edges, "edges", 0) > _MAX_EDGES:
-        raise InputError(f"expected at most {_MAX_EDGES} edges on a path, got {edges}")
-    if rays is not None and not 1 <= checked_count(rays, "rays", 1) <= MAX_COUNT:
-        raise InputError(f"expected at most {MAX_COUNT:,} rays, got {rays}; shoot fewer")
+    for count, most, what, do in (
+        (limit, _MAX_DEPTH, "reflections (depth)", "paths of more reflections are weak"),
+        (checked_count(edges, "edges", 0), _MAX_EDGES, "edges on a path", "ask for fewer"),
+        (1 if rays is None else checked_count(rays, "rays", 1), MAX_COUNT, "rays", "shoot fewer"),
+    ):
+        require_at_most(count, most, what, do)
     with tracing():
         interactions = face_interactions(path_scene)
         # Discrete: `torch.func` would claim the intermediate tensors.
@@ -207,7 +205,7 @@ def prepare_path_scene(
     """
     objects = scene.objects.values()
     require_surfaces(scene)
-    ends = _check_positions(tx, "tx"), _check_positions(rx, "rx")
+    ends = checked_rows(tx, "tx positions [m]"), checked_rows(rx, "rx positions [m]")
     speeds = (
         _check_velocities(tx_velocity, len(ends[0]), "tx"),
         _check_velocities(rx_velocity, len(ends[1]), "rx"),
@@ -224,17 +222,6 @@ def prepare_path_scene(
         *speeds,
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True),
     )
-
-
-def _check_positions(positions: ArrayLike, what: str) -> Tensor:
-    found = torch.as_tensor(positions, dtype=torch.float64)
-    rows = found[None] if found.ndim == 1 else found
-    rows = checked_tensor(rows, (None, 3), f"{what} positions [m]", "give x, y, z of each")
-    if not len(rows):
-        raise InputError(
-            f"expected at least one position of {what}, got none; give x, y, z of each"
-        )
-    return rows
 
 
 def _check_velocities(value: ArrayLike, count: int, what: str) -> Tensor:
