@@ -9,7 +9,7 @@ import torch
 import xarray as xr
 
 from invertwin.capture import Capture, Track, read
-from invertwin.capture.readers.netcdf import write_dataset
+from invertwin.capture.readers.radar_fields import write_dataset
 from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.radar.processing.beamforming import exact_spectrum

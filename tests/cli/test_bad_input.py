@@ -6,7 +6,7 @@ import torch
 
 from cli.small import BEHIND, MATERIAL, RUN, call, read_metrics
 from invertwin.capture import Capture
-from invertwin.capture.readers.netcdf import write_dataset
+from invertwin.capture.readers.radar_fields import write_dataset
 from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import build
 from invertwin.scene import Mesh, plate

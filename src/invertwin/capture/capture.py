@@ -1,5 +1,9 @@
-"""Measured or simulated radar data with everything needed to model it."""
+"""Measured or simulated radar data with everything needed to model it.
 
+Complex range profiles are interpolated between their samples.
+"""
+
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,27 +12,81 @@ from typing import Literal
 import numpy as np
 import torch
 import xarray as xr
-from jaxtyping import Complex, Float, Float64, Int64
+from jaxtyping import Complex, Complex128, Float, Float64, Int64
 from torch import Tensor
 
-from invertwin.capture.range_interpolation import RangeInterpolator
-from invertwin.capture.readers.netcdf import read_dataset, write_dataset
 from invertwin.capture.readers.radar_fields import (
     convert_old_axes,
     radar_fields,
     radar_from_fields,
+    read_dataset,
     read_tensor,
     to_data_array,
+    write_dataset,
 )
 from invertwin.capture.track import Track
 from invertwin.channel import Grid
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.radar.processing.backprojection import UPSAMPLING, interpolate_samples
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.storage.untrusted import convert_read_errors
 
 BeatUnit = Literal["1", "count"]
+
+class RangeInterpolator:
+    """A profile as a function of range, band-limited between its samples.
+
+    The profile is an analytic signal at radio frequency: an echo from R turns by
+    ``4π f/c · (r − R)`` along range r. It is moved to frequency zero, upsampled through its
+    Fourier transform, interpolated linearly, and moved back.
+
+    Args:
+        profile: complex amplitude at ``ranges``.
+        ranges: uniform, ascending [m].
+        center_frequency: centre frequency of the radar [Hz].
+    """
+
+    def __init__(
+        self,
+        profile: Complex[Tensor, "frame range"],
+        ranges: Float64[Tensor, " range"],
+        center_frequency: float,
+    ) -> None:
+        count = len(ranges)
+        step = float(ranges[-1] - ranges[0]) / (count - 1)
+        # The nearest frequency of the transform, so that moving the band is a plain shift of it.
+        shift = round(2 * center_frequency / SPEED_OF_LIGHT * count * step)
+        self._wavenumber = 2 * math.pi * shift / (count * step)
+        self._first = float(ranges[0])
+        self._last = float(ranges[-1])
+        self._step = step / UPSAMPLING
+        band = torch.fft.fft(profile.to(torch.complex128), dim=1).roll(-shift, dims=1)
+        padded = band.new_zeros(len(profile), count * UPSAMPLING)
+        half = (count + 1) // 2
+        padded[:, :half] = band[:, :half]
+        padded[:, half - count :] = band[:, half:]
+        self._samples = torch.fft.ifft(padded, dim=1) * UPSAMPLING
+
+    def __call__(self, ranges: Float64[Tensor, "frame point"]) -> Complex128[Tensor, "frame point"]:
+        """Amplitude of every frame at its own ranges [m]; not differentiable.
+
+        Raises:
+            InputError: a range before the first or after the last sample.
+        """
+        low, high = float(ranges.min()), float(ranges.max())
+        if low < self._first - 1e-9 or high > self._last + 1e-9:
+            raise InputError(
+                f"expected ranges within the profile, {self._first:g} to {self._last:g} m, got "
+                f"{low:g} to {high:g} m; choose a smaller grid or nearer points"
+            )
+        offset = ranges - self._first
+        value = interpolate_samples(self._samples, offset / self._step)
+        return value * torch.polar(torch.ones_like(offset), self._wavenumber * offset)
+
+
 BEAT_DIMS = ("frame", "tx", "rx", "sample")
 PROFILE_DIMS = ("frame", "range")
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from invertwin import limits
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.checks import check_fields, check_shape, checked_number
+from invertwin.checks import check_fields, check_shape, check_some, checked_number
 from invertwin.errors import InputError
 from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.radar.radar import Radar
@@ -135,8 +135,7 @@ class ChirpData:
         expected = (None, settings.loops, *elements, settings.samples)
         do = "data and settings must describe the same recording"
         check_shape(self.samples, expected, "samples (frame, chirp, tx, rx, sample)", do)
-        if not len(self.samples):
-            raise InputError(f"expected at least one frame of samples, got none; {do}")
+        check_some(self.samples, "frame of samples", do)
         if not torch.isfinite(torch.view_as_real(self.samples)).all():
             raise InputError("expected finite samples, got NaN or infinity; drop those frames")
 

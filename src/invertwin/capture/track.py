@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.checks import checked_tensor
+from invertwin.checks import checked_ascending, checked_tensor
 from invertwin.errors import InputError
 
 
@@ -27,12 +27,8 @@ class Track:
 
     def __post_init__(self) -> None:
         do = "give one position per time, and drop samples that are not finite"
-        times = checked_tensor(self.times, (None,), "track times", do)
+        times = checked_ascending(self.times, "track times", f"sort the track by time, and {do}")
         checked_tensor(self.positions, (len(times), 3), "track positions", do)
-        if len(times) < 2 or not bool((times.diff() > 0).all()):
-            raise InputError(
-                "expected at least 2 ascending track times, got others; sort the track by time"
-            )
 
     def interpolate(self, times: Float64[Tensor, " frame"]) -> Float64[Tensor, "frame 3"]:
         """Interpolate positions linearly at these times; differentiable with respect to the times.

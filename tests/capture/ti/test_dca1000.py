@@ -270,7 +270,7 @@ def test_a_setup_is_enough(tmp_path):
         write_setup(tmp_path / "x.setup.json", "bench.mmwave.json", ["adc_Raw_1.bin"])
     with pytest.raises(InputError, match="existing folder"):
         write_setup(tmp_path / "nowhere" / "x.setup.json", "bench.mmwave.json", [])
-    with pytest.raises(InputError, match=r"settings in a .cfg or .json file"):
+    with pytest.raises(InputError, match=r"to end in .cfg, .json, got"):
         read(tmp_path / "adc_Raw_0.bin", board=mounted)
 
 

@@ -148,7 +148,7 @@ def test_a_cfg_that_cannot_be_used_is_refused(cfg, old, new, message):
 def test_files_of_another_kind_are_refused(tmp_path):
     with pytest.raises(InputError, match="no file"):
         read_cfg(tmp_path / "missing.cfg")
-    with pytest.raises(InputError, match=r"in a .cfg or .json file"):
+    with pytest.raises(InputError, match=r"to end in .cfg, .json, got"):
         read_settings(tmp_path / "profile.txt")
     path = tmp_path / "adc.cfg"
     path.write_bytes(b"\xff\xfe\x00\x80" * 10)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from invertwin.capture.track import Track
+from invertwin.checks import check_choice
 from invertwin.errors import InputError
 from invertwin.storage.untrusted import safe_reader
 
@@ -206,10 +207,7 @@ def _field_array(message: Any, field: str) -> NDArray[Any]:
     held = message
     for part in field.split("."):
         known = [name for name in getattr(held, "__dataclass_fields__", {}) if name[0] != "_"]
-        if part not in known:
-            raise InputError(
-                f"expected a field of the messages, got {field!r}; they have {', '.join(known)}"
-            )
+        check_choice(part, known, f"{field!r} to name fields among")
         held = getattr(held, part)
     value = np.asarray(held)
     if value.dtype.kind not in "iufb":

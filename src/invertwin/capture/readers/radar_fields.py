@@ -1,7 +1,11 @@
-"""Convert a radar to labelled arrays and attributes, and back."""
+"""Convert a radar to labelled arrays and attributes, and back.
+
+Captures on disk are NetCDF in HDF5, written in one step.
+"""
 
 from collections.abc import Hashable, Mapping
 from dataclasses import asdict, fields, replace
+from pathlib import Path
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -9,13 +13,16 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-from invertwin.checks import check_shape
+from invertwin.checks import check_choice, check_shape
 from invertwin.constants import OLD_AXES
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
 from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Pattern, TabulatedPattern
 from invertwin.scene.polarisation import JonesTable, Polarisation
+from invertwin.storage.folders import replace_file
+from invertwin.storage.isolated_reader import read_isolated
+from invertwin.storage.untrusted import convert_read_errors, existing_file
 
 WAVEFORMS: dict[str, type[Waveform]] = {
     kind.__name__: kind for kind in (FMCW, Impulse, SteppedFrequency, OFDM)
@@ -143,11 +150,8 @@ def _get_entry(entries: Mapping[Any, Any], name: str, what: str = "an attribute"
 
 def _get_choice(attributes: Mapping[Hashable, Any], name: str, choices: Mapping[str, Any]) -> Any:
     value = _get_entry(attributes, name)
-    if value not in choices:
-        raise InputError(
-            f"expected {name} to be one of {', '.join(choices)}, got {value!r}; "
-            "the capture was written by another version or program"
-        )
+    do = "the capture was written by another version or program"
+    check_choice(value, choices, f"{name} to be one of", do)
     return choices[value]
 
 
@@ -212,3 +216,62 @@ def _jones_fields(end: str, jones: Polarisation) -> dict[str, xr.DataArray]:
 
 def _read_complex(dataset: xr.Dataset, name: str) -> Tensor:
     return torch.view_as_complex(read_tensor(dataset, name).contiguous())
+
+
+def write_dataset(dataset: xr.Dataset, path: Path) -> None:
+    """Write a dataset, complex variables as two real ones. The file is complete or not there.
+
+    Args:
+        dataset: what to write.
+        path: file; an old one is replaced.
+
+    Raises:
+        InputError: the folder does not exist.
+    """
+    with replace_file(path) as part:
+        real = _split_complex(dataset)
+        # No fill values: they would mark numbers as missing.
+        encoding = {str(variable): {"_FillValue": None} for variable in real.variables}
+        real.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+
+
+def read_dataset(path: Path, *, trusted: bool = False) -> xr.Dataset:
+    """Read what `write_dataset` wrote.
+
+    Args:
+        path: file.
+        trusted: read it in this process, not in a child process.
+
+    Raises:
+        InputError: no such file, or one that is damaged or no NetCDF.
+    """
+    existing_file(path, "a capture file")
+    with convert_read_errors(path, "a whole NetCDF file"):
+        stored = read_isolated(path, "netcdf", trusted=trusted)
+        return _join_complex(xr.Dataset(stored.arrays, attrs=stored.attributes))
+
+
+def _split_complex(dataset: xr.Dataset) -> xr.Dataset:
+    for name, whole in dataset.data_vars.items():
+        if whole.dtype.kind == "c":
+            parts = {f"{name}_real": whole.real, f"{name}_imag": whole.imag}
+            parts = {key: part.assign_attrs(whole.attrs) for key, part in parts.items()}
+            dataset = dataset.drop_vars([name]).assign(parts)
+    return dataset
+
+
+def _join_complex(dataset: xr.Dataset) -> xr.Dataset:
+    for name in [str(key) for key in dataset.data_vars if str(key).endswith("_real")]:
+        real, whole = dataset[name], name.removesuffix("_real")
+        imaginary = dataset.get(f"{whole}_imag")
+        if imaginary is None or imaginary.dims != real.dims:
+            raise InputError(
+                f"expected {whole}_imag beside {name} with the same shape, got none; "
+                "the file is incomplete, copy or record it again"
+            )
+        # Part by part: real + 1j * imaginary would lose the signs of zeros.
+        values = np.empty(real.shape, dtype=f"c{2 * real.dtype.itemsize}")
+        values.real, values.imag = real.values, imaginary.values
+        dataset = dataset.drop_vars([name, f"{whole}_imag"])
+        dataset = dataset.assign({whole: (real.dims, values, real.attrs)})
+    return dataset

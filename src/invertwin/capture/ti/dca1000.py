@@ -18,6 +18,7 @@ from invertwin.capture.chirps import ChirpData, ChirpSettings
 from invertwin.capture.ti import layouts
 from invertwin.capture.ti.mmwave_studio import read_studio, setup_files
 from invertwin.capture.ti.sdk_cfg import read_cfg
+from invertwin.checks import check_choice
 from invertwin.errors import InputError
 from invertwin.radar.waveform import PhysicsWarning
 from invertwin.storage.folders import replace_file
@@ -60,11 +61,8 @@ def read_settings(path: str | Path) -> ChirpSettings:
     """
     endings = {".cfg": read_cfg, ".json": read_studio}
     ending = Path(path).suffix.lower()
-    if ending not in endings:
-        raise InputError(
-            f"expected settings in a .cfg or .json file, got {path}; "
-            "name the file the recording was set up with"
-        )
+    do = "name the file the recording was set up with"
+    check_choice(ending, endings, f"{path} to end in", do)
     return endings[ending](path)
 
 

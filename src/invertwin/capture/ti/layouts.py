@@ -17,6 +17,7 @@ from torch import Tensor
 
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.prediction import covariances, prediction_coefficients
+from invertwin.checks import check_choice
 from invertwin.errors import InputError
 
 LANE_COUNT = 4
@@ -50,12 +51,9 @@ def change_settings(settings: ChirpSettings, changes: Mapping[str, Any]) -> Chir
     Raises:
         InputError: Another name, or values that settings cannot have.
     """
-    unknown = set(changes) - set(CHANGEABLE_SETTINGS)
-    if unknown:
-        raise InputError(
-            f"expected changes of {', '.join(CHANGEABLE_SETTINGS)}, got {sorted(unknown)}; "
-            "correct other numbers in the settings file"
-        )
+    for name in changes:
+        do = "correct other numbers in the settings file"
+        check_choice(name, CHANGEABLE_SETTINGS, "changes of", do)
     values = {
         _COUNTS.get(name, name): tuple(range(1, value + 1)) if name in _COUNTS else value
         for name, value in changes.items()
@@ -225,13 +223,9 @@ def _solve_sizes(
     elif len(free) == 1:
         yield {free[0]: whole}
     elif len(free) == 2:
-        for value in _divisors(whole):
+        low = [n for n in range(1, math.isqrt(whole) + 1) if whole % n == 0]
+        for value in sorted({*low, *(whole // n for n in low)}):
             yield {free[0]: value, free[1]: whole // value}
-
-
-def _divisors(number: int) -> list[int]:
-    low = [n for n in range(1, math.isqrt(number) + 1) if number % n == 0]
-    return sorted({*low, *(number // n for n in low)})
 
 
 def _apply_changes(changes: dict[str, Any], settings: ChirpSettings) -> ChirpSettings | None:
