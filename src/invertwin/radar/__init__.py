@@ -16,6 +16,7 @@ from invertwin.radar.processing.detection import cell_averaging_cfar as cell_ave
 from invertwin.radar.processing.detection import ordered_statistics_cfar as ordered_statistics_cfar
 from invertwin.radar.processing.detection import peaks as peaks
 from invertwin.radar.processing.detection import point_cloud as point_cloud
+from invertwin.radar.processing.detection import save_points as save_points
 from invertwin.radar.processing.direction import capon as capon
 from invertwin.radar.processing.direction import music as music
 from invertwin.radar.processing.direction import source_count as source_count
@@ -34,7 +35,6 @@ from invertwin.radar.processing.doppler_maps import doppler_maps as doppler_maps
 from invertwin.radar.processing.doppler_maps import doppler_snapshots as doppler_snapshots
 from invertwin.radar.processing.doppler_maps import find_peak as find_peak
 from invertwin.radar.processing.doppler_maps import high_resolution_map as high_resolution_map
-from invertwin.radar.processing.point_files import save_points as save_points
 from invertwin.radar.processing.reflectors import detect_points as detect_points
 from invertwin.radar.processing.reflectors import format_points_csv as format_points_csv
 from invertwin.radar.processing.reflectors import noise_power as noise_power

@@ -17,8 +17,10 @@ from invertwin.checks import (
     ArrayLike,
     check_fields,
     check_shape,
+    check_some,
     checked_tensor,
     is_differentiated,
+    refuse_derivatives,
     set_fields,
 )
 from invertwin.constants import SPEED_OF_LIGHT
@@ -82,8 +84,7 @@ class Radar:
     def __post_init__(self) -> None:
         do = "give one position [x, y, z] in metres per pose"
         positions = checked_tensor(self.positions, (None, 3), "radar positions", do)
-        if len(positions) == 0:
-            raise InputError(f"expected at least one radar pose, got none; {do}")
+        check_some(positions, "radar pose", do)
         set_fields(self, positions=positions)
         if self.rotations is not None:
             set_fields(self, rotations=_checked_rotations(self.rotations, len(positions)))
@@ -372,11 +373,8 @@ def checked_beat(
 
 def _checked_origin(value: object, frames: int) -> Tensor:
     origin = checked_tensor(value, (frames,), "range_origin", "give one range in metres per frame")
-    if is_differentiated(origin):
-        raise InputError(
-            "expected range_origin without derivatives, got one that carries them; it is what the "
-            "recording was compensated with: detach it"
-        )
+    do = "it is what the recording was compensated with: detach it"
+    refuse_derivatives(origin, "range_origin", do)
     return origin
 
 

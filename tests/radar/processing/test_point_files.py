@@ -66,5 +66,5 @@ def test_no_points_are_a_file_too(tmp_path, points, suffix):
 
 
 def test_other_suffixes_are_refused(tmp_path, points):
-    with pytest.raises(InputError, match=r"ending in .ply or .pcd, got points.las"):
+    with pytest.raises(InputError, match=r"points.las to end in .ply, .pcd"):
         save_points(tmp_path / "points.las", points)

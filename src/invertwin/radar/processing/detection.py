@@ -1,8 +1,9 @@
-"""CFAR detection of targets in power maps. Not differentiable."""
+"""CFAR detection of targets in power maps, and export of the points. Not differentiable."""
 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,11 +15,17 @@ from scipy.stats import beta, f
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.checks import check_shape, checked_number, is_differentiated
+from invertwin.checks import (
+    check_choice,
+    check_shape,
+    checked_number,
+    refuse_derivatives,
+)
 from invertwin.errors import InputError
 from invertwin.radar.processing.doppler import velocity_axis, velocity_span
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
+from invertwin.storage.folders import replace_file
 
 _QUADRATURE = 4096  # quadrature nodes over the distribution of an order statistic
 _Values = Float64[Tensor, " point"]  # one at every point
@@ -242,11 +249,8 @@ def world_positions(
 
 
 def _refuse_gradients(power: Tensor, name: str) -> None:
-    if is_differentiated(power):
-        raise InputError(
-            f"expected power without gradients in {name}, got a tensor that has them; a detection "
-            "is not differentiable: pass power.detach(), and fit with the power itself"
-        )
+    do = "a detection is not differentiable: pass power.detach(), and fit with the power itself"
+    refuse_derivatives(power, f"power in {name}", do)
 
 
 def _check_rates(false_alarm: float, looks: int) -> None:
@@ -324,3 +328,43 @@ def _refinement(
     if not wrap:
         inside &= (here > 0) & (here < size - 1)
     return torch.where(inside, offset, 0.0)
+
+
+def save_points(path: str | Path, points: PointCloud) -> None:
+    """Write points as binary PLY or PCD, one record each, the strongest first.
+
+    Fields are ``x``, ``y``, ``z`` in the world [m], ``range`` [m], ``velocity`` [m/s], ``u``,
+    ``v``, ``power`` [dB] and ``frame``, all as float32, which all readers of either format support.
+
+    Args:
+        path: output file, ending in .ply or .pcd, in an existing folder.
+        points: points to write.
+
+    Raises:
+        InputError: Another suffix, or no such folder.
+    """
+    file = Path(path)
+    headers, ending = {".ply": _ply_header, ".pcd": _pcd_header}, file.suffix.lower()
+    check_choice(ending, headers, f"{file.name} to end in", "rename the output")
+    columns = dict(zip("xyz", points.position.detach().cpu().numpy().T, strict=True))
+    for name in ("range", "velocity", "u", "v", "power", "frame"):
+        columns[name] = getattr(points, name).detach().cpu().numpy()
+    order = np.argsort(-columns["power"], kind="stable")
+    columns["power"] = 10 * np.log10(columns["power"])
+    table = np.stack([values[order] for values in columns.values()], axis=1).astype("<f4")
+    with replace_file(file) as part:
+        header = headers[ending](list(columns), len(table))
+        part.write_bytes(header.encode("ascii") + table.tobytes())
+
+
+def _ply_header(fields: list[str], count: int) -> str:
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    return "\n".join([*lines, *(f"property float {name}" for name in fields), "end_header\n"])
+
+
+def _pcd_header(fields: list[str], count: int) -> str:
+    lines = ["VERSION 0.7", " ".join(["FIELDS", *fields])]
+    for word, value in (("SIZE", "4"), ("TYPE", "F"), ("COUNT", "1")):
+        lines.append(" ".join([word, *[value] * len(fields)]))
+    lines += [f"WIDTH {count}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {count}"]
+    return "\n".join([*lines, "DATA binary\n"])

@@ -9,7 +9,7 @@ from jaxtyping import Complex, Float, Float64, Int64, Num
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.checks import check_shape
+from invertwin.checks import check_shape, check_some
 from invertwin.errors import InputError
 from invertwin.radar.processing.beamforming import beamform
 from invertwin.radar.radar import Radar
@@ -178,8 +178,7 @@ def resolve_fold(
     Raises:
         InputError: No candidates, or a spectrum that does not fit radar and grid.
     """
-    if not candidates:
-        raise InputError("expected at least one candidate, got none; (0, -1, 1) are usual")
+    check_some(candidates, "candidate", "(0, -1, 1) are usual")
     parts = (compensate_tdm(spectrum.detach(), radar, chirps, fold) for fold in candidates)
     best = torch.stack([_steer_beams(part, radar, grid).amax((-2, -1)) for part in parts])
     # Break ties independently of rounding errors.

@@ -20,7 +20,7 @@ from jaxtyping import Complex, Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import Paths
-from invertwin.checks import check_fields, checked_number
+from invertwin.checks import check_fields, checked_number, refuse_derivatives
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, NonNegative, Positive, UsualValue
 from invertwin.radar.radar import Radar, require_sampled_waveform
@@ -392,11 +392,8 @@ def quantize(
         InputError: A signal that requires a gradient, or samples that are not taken in time.
     """
     _require_time_samples(radar)
-    if beat.requires_grad:
-        raise InputError(
-            "expected a beat signal without a gradient, got one that carries it; codes are "
-            "constant between their steps: quantise data only, or detach() first"
-        )
+    do = "codes are constant between their steps: quantise data only, or detach() first"
+    refuse_derivatives(beat, "a beat signal", do)
     codes = torch.round(torch.view_as_real(beat.resolve_conj()) / adc.step)
     lowest, highest = -(2 ** (adc.bits - 1)), 2 ** (adc.bits - 1) - 1
     clipped = int(((codes < lowest) | (codes > highest)).any(-1).sum())

@@ -183,7 +183,8 @@ class Surrogate:
         _check_map(power, grid)
         for dim, sigma in self._blur_sigmas(radar, grid).items():
             if (count := grid.shape[dim - 1]) > 1 and sigma > 0:
-                power = _identity_kernel(dim, count).apply(power, [sigma])
+                flat = torch.ones_like(_frequencies((count,))[0])
+                power = _SurrogateKernel((dim,), (count,), flat).apply(power, [sigma])
         return power
 
     def spread(self, radar: Radar, grid: Grid, ranges: _Values, u: _Values, v: _Values) -> _Values:
@@ -354,17 +355,14 @@ class _SurrogateKernel:
             if sigma > 0:
                 transfer = transfer * torch.exp(-2 * (math.pi * sigma * frequency).square())
         if len(self.dims) > 1:
-            return self._apply_by_fft(power, transfer)
+            size = [_fft_length(count) for count in self.counts]
+            spectrum = torch.fft.rfftn(power, size, self.dims)
+            full = torch.fft.irfftn(spectrum * transfer.to(spectrum.real), size, self.dims)
+            return full[..., : self.counts[0], : self.counts[1]]
         if offset is not None:
             ramp = _frequencies(self.counts)[0] * (-2 * math.pi * offset.cpu().double())
             transfer = transfer * torch.polar(torch.ones_like(ramp), ramp)
         return self._apply_by_matrix(power, transfer)
-
-    def _apply_by_fft(self, power: Tensor, transfer: Tensor) -> Tensor:
-        size = [_fft_length(count) for count in self.counts]
-        spectrum = torch.fft.rfftn(power, size, self.dims)
-        full = torch.fft.irfftn(spectrum * transfer.to(spectrum.real), size, self.dims)
-        return full[..., : self.counts[0], : self.counts[1]]
 
     def _apply_by_matrix(self, power: Tensor, transfer: Tensor) -> Tensor:
         # At these sizes a Toeplitz matrix per axis is about 30 times faster than a padded FFT.
@@ -431,10 +429,6 @@ def _compensate_spline(
     for frequency in _frequencies(counts):
         transfer = transfer / torch.sinc(frequency) ** 3
     return _SurrogateKernel(dims, counts, transfer)
-
-
-def _identity_kernel(dim: int, count: int) -> _SurrogateKernel:
-    return _SurrogateKernel((dim,), (count,), torch.ones_like(_frequencies((count,))[0]))
 
 
 def _fft_length(count: int) -> int:
