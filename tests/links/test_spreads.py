@@ -62,7 +62,7 @@ def test_spreads_of_two_paths():
 @pytest.mark.usefixtures("unchecked")
 def test_another_end_is_refused():
     paths = made([1e-8], [2.0], [[1.0, 0.0, 0.0]])
-    with pytest.raises(InputError, match="departure or arrival"):
+    with pytest.raises(InputError, match="departure, arrival"):
         angle_spread(paths, "both")  # type: ignore[arg-type]
 
 

@@ -28,7 +28,7 @@ def test_frames_are_transmitters():
     ("positions", "power", "text"),
     [
         ([[1.0, 2.0]], 0.0, "positions of transmitters"),
-        (torch.zeros(0, 3), 0.0, "at least one transmitter, got none"),
+        (torch.zeros(0, 3), 0.0, "at least one row of positions of transmitters .*, got none"),
         ([1.0, 2.0, 3.0], float64([1.0, 2.0]), "powers of transmitters"),
         ([1.0, float("nan"), 3.0], 0.0, "finite positions"),
     ],

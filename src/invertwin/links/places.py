@@ -7,8 +7,7 @@ from typing import ClassVar
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.checks import checked_tensor, set_fields
-from invertwin.errors import InputError
+from invertwin.checks import check_some, checked_tensor, set_fields
 from invertwin.links.received import LinkStatistics, PropagationSettings
 from invertwin.links.transmitters import Transmitters
 from invertwin.scene.scene import Scene
@@ -70,8 +69,7 @@ class ReceiverPoints(ReceiverLocations):
     def __post_init__(self) -> None:
         do = "give a row of x, y, z for each"
         places = checked_tensor(self.positions, (None, 3), "positions of receivers [m]", do)
-        if not len(places):
-            raise InputError(f"expected at least one point of a map, got none; {do}")
+        check_some(places, "point of a map", do)
         set_fields(self, positions=places)
 
     @property

@@ -25,7 +25,13 @@ from invertwin.checks import checked_number
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links.metasurface.panel import Metasurface, panel_paths
-from invertwin.links.responses import AntennaMount, frequency_response, path_amplitudes, phasor
+from invertwin.links.responses import (
+    AntennaMount,
+    frequency_response,
+    path_amplitudes,
+    phasor,
+    sum_over_paths,
+)
 from invertwin.links.scattered import scattered_moments
 from invertwin.links.spreads import path_powers, safe_sqrt
 from invertwin.links.transmitters import Transmitters
@@ -182,7 +188,7 @@ class PropagationSettings:
             positions: Of the receivers [m].
         """
         each = self.path_moments(paths, sensor.positions, positions, sensor.mount)
-        return _sum_over_paths(paths, each).view(*paths.counts, 3)
+        return sum_over_paths(paths, each)
 
     def panel_and_rough_moments(
         self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
@@ -310,19 +316,13 @@ def received_gain(
     """
     amplitude, delay = path_amplitudes(paths, tx, rx)
     if bandwidth is None:
-        total = _sum_over_paths(paths, torch.view_as_real(amplitude).square().sum(-1))
+        total = sum_over_paths(paths, torch.view_as_real(amplitude).square().sum(-1))
     elif not bandwidth:
-        field = _sum_over_paths(paths, amplitude * phasor(-paths.frequency * delay))
+        field = sum_over_paths(paths, amplitude * phasor(-paths.frequency * delay))
         total = torch.view_as_real(field).square().sum(-1)
     else:
         total = _band_mean(paths, amplitude * phasor(-paths.frequency * delay), delay, bandwidth)
-    return total.mean((1, 2)).view(paths.counts).T
-
-
-def _sum_over_paths(paths: RayPaths, values: Tensor) -> Tensor:
-    """Sums over the paths of each link, [link, …]."""
-    total = values.new_zeros(paths.counts[0] * paths.counts[1], *values.shape[1:])
-    return total.index_add(0, paths.link, values)
+    return total.mean((-2, -1)).view(paths.counts).T
 
 
 def _band_mean(paths: RayPaths, field: Tensor, delay: Tensor, bandwidth: float) -> Tensor:
@@ -337,7 +337,9 @@ def _band_mean(paths: RayPaths, field: Tensor, delay: Tensor, bandwidth: float) 
         ]
         middle = torch.where(there.any(1), 0.5 * (ends[0] - ends[1]), 0.0)
         widest = float((ends[0] + ends[1]).clamp_min(0.0).max())
-    nodes = _node_count(math.pi * bandwidth * widest)
+    # Nodes of Gauss's rule by which the mean of cos(phase·x), |x| < 1, is right to 1e-13.
+    phase = math.pi * bandwidth * widest
+    nodes = math.ceil(0.5 * phase + 4.5 * phase ** (1 / 3) + 5)
     pairs = nodes > min(row.shape[1], _MAX_NODES)
     cost = row.shape[1] * (row.shape[1] if pairs else nodes) * field.shape[1] * field.shape[2]
     found = []
@@ -364,11 +366,6 @@ def _mean_over_nodes(field: Tensor, delay_cycles: Tensor, count: int) -> Tensor:
     places, weights = _gauss_nodes(count)
     total = torch.einsum("lirt,lirtn->lrtn", field, phasor(-0.5 * delay_cycles[..., None] * places))
     return 0.5 * torch.view_as_real(total).square().sum(-1) @ weights
-
-
-def _node_count(phase: float) -> int:
-    """Nodes of Gauss's rule by which the mean of cos(phase·x), |x| < 1, is right to 1e-13."""
-    return math.ceil(0.5 * phase + 4.5 * phase ** (1 / 3) + 5)
 
 
 @cache

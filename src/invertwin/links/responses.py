@@ -16,6 +16,7 @@ from invertwin.channel import RayPaths, polarisations
 from invertwin.checks import (
     ArrayLike,
     check_orthonormal,
+    check_some,
     checked_count,
     checked_number,
     checked_tensor,
@@ -35,10 +36,6 @@ def _world_axes() -> Tensor:
     return torch.eye(3, dtype=torch.float64)
 
 
-def _isotropic_element() -> AntennaArray:
-    return AntennaArray(torch.zeros(1, 3, dtype=torch.float64))
-
-
 @dataclass(frozen=True, eq=False)
 class AntennaMount:
     """Antenna array mounted at each position of transmitters, or of receivers.
@@ -55,7 +52,7 @@ class AntennaMount:
         InputError: Rotations of another shape, or that are not orthonormal.
     """
 
-    array: AntennaArray = field(default_factory=_isotropic_element)
+    array: AntennaArray = field(default_factory=lambda: AntennaArray(torch.zeros(1, 3)))
     rotations: Float64[Tensor, "*place 3 3"] = field(default_factory=_world_axes)
 
     def __post_init__(self) -> None:
@@ -305,8 +302,7 @@ def _evaluate_responses(
     paths: RayPaths, frequencies: Tensor, times: Tensor, tx: AntennaMount, rx: AntennaMount
 ) -> Tensor:
     """H over [rx, rx_ant, tx, tx_ant, time, frequency]."""
-    if not len(frequencies):
-        raise InputError("expected at least one frequency, got none; give one or several [Hz]")
+    check_some(frequencies, "frequency", "give one or several [Hz]")
     amplitude, delay = path_amplitudes(paths, tx, rx)
     _require_channel_memory(paths, len(times) * len(frequencies), tx, rx)
     pairs = amplitude.shape[1] * amplitude.shape[2]
@@ -332,11 +328,21 @@ def _require_channel_memory(
 
 
 def _sum_by_link(paths: RayPaths, values: Tensor) -> Tensor:
-    """Sums over the paths of each link: [rx, rx_ant, tx, tx_ant, ...]."""
-    sent, received = paths.counts
-    total = torch.zeros(sent * received, *values.shape[1:], dtype=values.dtype)
-    total = total.index_add(0, paths.link, values).unflatten(0, (sent, received))
-    return total.movedim((1, 2, 0, 3), (0, 1, 2, 3))
+    """Sum values [path, rx_ant, tx_ant, …] over the paths of each link, receivers first."""
+    return sum_over_paths(paths, values).movedim((1, 2, 0, 3), (0, 1, 2, 3))
+
+
+def sum_over_paths(
+    paths: RayPaths, values: Float64[Tensor, "path *value"] | Complex128[Tensor, "path *value"]
+) -> Float64[Tensor, "tx rx *value"] | Complex128[Tensor, "tx rx *value"]:
+    """Sum values of paths over those of each link.
+
+    Args:
+        paths: Paths.
+        values: One or several numbers of each.
+    """
+    total = values.new_zeros(paths.counts[0] * paths.counts[1], *values.shape[1:])
+    return total.index_add(0, paths.link, values).unflatten(0, paths.counts)
 
 
 def phasor(cycles: Float64[Tensor, "*any"]) -> Complex128[Tensor, "*any"]:

@@ -19,6 +19,7 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, RayPaths, Sampling, deposit_power, trace_single_scattering
+from invertwin.checks import refuse_derivatives
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links.responses import AntennaMount
@@ -67,11 +68,9 @@ def scattered_moments(
     rough = _incoherent_scene(scene, frequency)
     if rough is None:
         return positions.new_zeros(len(sensor.positions), len(positions), 3)
-    if sensor.mount.rotations.requires_grad or receivers.rotations.requires_grad:
-        raise InputError(
-            "expected axes of antennas without derivatives where rough surfaces scatter, got some "
-            "that carry them; scattered power has none by axes: detach them"
-        )
+    for axes in (sensor.mount.rotations, receivers.rotations):
+        do = "scattered power has none by axes: detach them"
+        refuse_derivatives(axes, "axes of antennas where rough surfaces scatter", do)
     grid = _length_grid(rough, (sensor.positions.detach(), positions.detach()), sampling.depth)
     parts = positions.split(_POSITIONS_PER_BATCH)
     rows: list[Tensor] = []
@@ -80,7 +79,9 @@ def scattered_moments(
         found: list[Tensor] = []
         for batch, some in enumerate(parts):
             link = _build_link(one, receivers, some, frequency)
-            drawn = _scale_sampling(sampling, len(some) / len(positions))
+            counts = (sampling.samples, sampling.boundary_samples)
+            samples, edges = (math.ceil(n * (len(some) / len(positions))) for n in counts)
+            drawn = replace(sampling, samples=samples, boundary_samples=edges)
             power = deposit_power(rough, link, grid, sampling=drawn, seed=seed + batch)
             found.append(_delay_moments(power[..., 0, 0].double(), grid, link))
         rows.append(torch.cat(found))
@@ -91,7 +92,10 @@ def scattered_moments(
     def measure(
         tx_paths: RayPaths, rx_paths: RayPaths, cross_polar: Tensor, tx: Tensor, rx: Tensor
     ) -> Tensor:
-        power = _received_power(sensor.mount, tx_paths, receivers, rx_paths, cross_polar)
+        ends = (sensor.mount, tx_paths), (receivers, rx_paths)
+        sent, taken = (_stokes(p, end.element_weights(p.departure, p.tx)) for end, p in ends)
+        whole, q, u, v = (0.5 * sent * taken).unbind(1)
+        power = whole + (1 - 2 * cross_polar) * (q + u) - (1 - 4 * cross_polar) * v
         straight = (rx[rx_paths.tx] - tx[tx_paths.tx]).norm(dim=1)
         excess = tx_paths.delay + rx_paths.delay - straight / SPEED_OF_LIGHT
         return torch.stack([power, power * excess, power * excess**2], 1)
@@ -108,24 +112,6 @@ def scattered_moments(
         sampling=replace(sampling, depth=depth),
         seed=seed,
     )
-
-
-def _received_power(
-    tx: AntennaMount,
-    tx_paths: RayPaths,
-    rx: AntennaMount,
-    rx_paths: RayPaths,
-    cross_polar: Float64[Tensor, " pair"],
-) -> Float64[Tensor, " pair"]:
-    """Power received from scattering points, V and H about the world's z axis.
-
-    In Stokes parameters, as ``channel.coupling`` has it for one bounce: ``½(I I' + (1 − 2χ)(q q' +
-    u u') − (1 − 4χ) v v')``, here of the fields that ways bring to the points.
-    """
-    sent = _stokes(tx_paths, tx.element_weights(tx_paths.departure, tx_paths.tx))
-    taken = _stokes(rx_paths, rx.element_weights(rx_paths.departure, rx_paths.tx))
-    whole, q, u, v = (0.5 * sent * taken).unbind(1)
-    return whole + (1 - 2 * cross_polar) * (q + u) - (1 - 4 * cross_polar) * v
 
 
 def _stokes(
@@ -155,13 +141,6 @@ def _build_link(
         tx_jones=sensor.mount.array.jones,
         rx_jones=receivers.array.jones,
     )
-
-
-def _scale_sampling(sampling: Sampling, fraction: float) -> Sampling:
-    """So much of all that is drawn."""
-    samples = math.ceil(sampling.samples * fraction)
-    edges = math.ceil(sampling.boundary_samples * fraction)
-    return replace(sampling, samples=samples, boundary_samples=edges)
 
 
 def _delay_moments(power: Float64[Tensor, "place bin"], grid: Grid, link: Link) -> Tensor:

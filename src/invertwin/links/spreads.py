@@ -7,8 +7,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.channel import KINDS, RayPaths
-from invertwin.errors import InputError
-from invertwin.links.responses import AntennaMount, path_amplitudes
+from invertwin.checks import check_choice
+from invertwin.links.responses import AntennaMount, path_amplitudes, sum_over_paths
 
 _DEFAULT = AntennaMount()
 
@@ -53,8 +53,7 @@ def angle_spread(
     Source: Fleury, "First- and second-order characterization of direction dispersion and space
     selectivity in the radio channel", IEEE Trans. Information Theory 46, 2000.
     """
-    if end not in ("departure", "arrival"):
-        raise InputError(f"expected end as departure or arrival, got {end!r}; choose one of them")
+    check_choice(end, ("departure", "arrival"), "end as")
     power = path_powers(paths, tx, rx)
     total = _nonzero(_sum_links(paths, power))
     direction: Tensor = getattr(paths, end)
@@ -100,9 +99,7 @@ def path_powers(paths: RayPaths, tx: AntennaMount, rx: AntennaMount) -> Float64[
 
 
 def _sum_links(paths: RayPaths, values: Tensor) -> Tensor:
-    """Sums over the paths of each link, [rx, tx]."""
-    total = torch.zeros(paths.counts[0] * paths.counts[1], dtype=torch.float64)
-    return total.index_add(0, paths.link, values).view(paths.counts).T
+    return sum_over_paths(paths, values).T
 
 
 def _nonzero(total: Tensor) -> Tensor:

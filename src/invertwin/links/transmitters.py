@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.checks import ArrayLike, checked_tensor, set_fields
+from invertwin.checks import ArrayLike, checked_rows, checked_tensor, set_fields
 from invertwin.errors import InputError
 from invertwin.limits import Axes
 from invertwin.links.responses import AntennaMount
@@ -33,11 +33,7 @@ class Transmitters:
 
     def __post_init__(self) -> None:
         do = "give x, y, z, or a row of them for each"
-        given = torch.as_tensor(self.positions, dtype=torch.float64)
-        shape = (3,) if given.ndim == 1 else (None, 3)
-        places = checked_tensor(given, shape, "positions of transmitters [m]", do).reshape(-1, 3)
-        if not len(places):
-            raise InputError(f"expected at least one transmitter, got none; {do}")
+        places = checked_rows(self.positions, "positions of transmitters [m]", do)
         power = torch.as_tensor(self.power_dbm, dtype=torch.float64)
         power = power.expand(len(places)) if power.ndim == 0 else power
         do = "give one for all, or one each"

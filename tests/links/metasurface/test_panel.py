@@ -261,7 +261,7 @@ def test_wrong_calls_are_refused():
         panel_paths(aside(), [], far, far, FREQUENCY)
     with pytest.raises(InputError, match="got one on it; move it"):
         panel_paths(aside(), panel(4), far, [0.001, 0.001, 0.0], FREQUENCY)
-    with pytest.raises(InputError, match="at least one position of rx"):
+    with pytest.raises(InputError, match="at least one row of rx places"):
         panel_paths(aside(), panel(4), far, torch.zeros(0, 3), FREQUENCY)
     with pytest.raises(InputError, match=r"frequency \[Hz\]"):
         panel_paths(aside(), panel(4), far, far, 0.0)

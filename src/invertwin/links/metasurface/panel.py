@@ -28,14 +28,17 @@ from invertwin.channel import (
 from invertwin.checks import (
     ArrayLike,
     check_orthonormal,
+    check_some,
     checked_count,
     checked_number,
+    checked_rows,
     checked_tensor,
     set_fields,
 )
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
+from invertwin.runtime.memory import require_at_most
 from invertwin.scene import Scene
 
 _VALUES_PER_CHUNK = 1 << 22  # of antennas and elements
@@ -80,8 +83,7 @@ class Metasurface:
         check_orthonormal(axes, f"axes {what}", "give the normal, y and z")
         do = "give one for each element, along y and z"
         phase = checked_tensor(self.phase, (None, None), f"phases {what} [rad]", do)
-        if not phase.numel():
-            raise InputError(f"expected at least one element {what}, got none; {do}")
+        check_some(phase.ravel(), f"element {what}", do)
         amplitude = torch.as_tensor(self.amplitude, dtype=torch.float64)
         amplitude = amplitude.expand(phase.shape) if amplitude.ndim == 0 else amplitude
         do = "give one, or one for each"
@@ -89,8 +91,9 @@ class Metasurface:
         if bool((amplitude.detach() < 0).any()):
             raise InputError(f"expected amplitudes {what} of at least 0, got less; turn the phase")
         checked_number(self.spacing, f"spacing {what} [m]", 0.0, open_low=True)
-        if self.bits is not None and checked_count(self.bits, f"bits {what}", 1) > _MAX_BITS:
-            raise InputError(f"expected at most {_MAX_BITS} bits {what}, got {self.bits}; use None")
+        if self.bits is not None:
+            bits = checked_count(self.bits, f"bits {what}", 1)
+            require_at_most(bits, _MAX_BITS, f"bits {what}", "use None")
         set_fields(self, position=place, axes=axes, phase=phase, amplitude=amplitude)
 
     @property
@@ -246,7 +249,7 @@ def panel_paths(
     Source: derivations §12.
     """
     several = [panels] if isinstance(panels, Metasurface) else list(panels)
-    ends = _check_positions(tx, "tx"), _check_positions(rx, "rx")
+    ends = checked_rows(tx, "tx places [m]"), checked_rows(rx, "rx places [m]")
     checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
     checked_number(blur, "width of shadows [m]", 0.0)
     rows: list[RayPaths] = []
@@ -256,8 +259,7 @@ def panel_paths(
             scene, panel, *ends, frequency, blur=blur, boundary=boundary, far_field=far_field
         )
         rows.append(_paths_over_panel(panel, ends, response, frequency, scene.names))
-    if not rows:
-        raise InputError("expected at least one metasurface, got none; give one")
+    check_some(rows, "metasurface", "give one")
     return sum(rows[1:], start=rows[0]).sort_rows()
 
 
@@ -295,17 +297,6 @@ def _paths_over_panel(
         names,
         torch.zeros(len(link), dtype=torch.float64),
     )
-
-
-def _check_positions(value: ArrayLike, what: str) -> Tensor:
-    given = torch.as_tensor(value, dtype=torch.float64)
-    given = given[None] if given.ndim == 1 else given
-    found = checked_tensor(given, (None, 3), f"{what} places [m]", "give x, y, z of each")
-    if not len(found):
-        raise InputError(
-            f"expected at least one position of {what}, got none; give x, y, z of each"
-        )
-    return found
 
 
 def _require_clearance(panel: Metasurface, positions: Tensor) -> None:
