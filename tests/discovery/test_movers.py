@@ -9,8 +9,7 @@ import torch
 
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
-from invertwin.discovery.movers import detect_strongest_target, point_response
-from invertwin.discovery.moving_body import MovingBody
+from invertwin.discovery.movers import MovingBody, detect_strongest_target, point_response
 from invertwin.errors import InputError
 from invertwin.inversion import CorrelationLoss, Observation, Optimizer, Schedule, reconstruct
 from invertwin.models.doppler import RangeDopplerMap

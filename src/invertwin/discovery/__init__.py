@@ -6,12 +6,12 @@ from invertwin.discovery.clutter import choose_result as choose_result
 from invertwin.discovery.clutter import estimate_clutter as estimate_clutter
 from invertwin.discovery.clutter import needs_clutter as needs_clutter
 from invertwin.discovery.clutter import reconstruct_among_clutter as reconstruct_among_clutter
+from invertwin.discovery.movers import DetectedEcho as DetectedEcho
+from invertwin.discovery.movers import MovingBody as MovingBody
 from invertwin.discovery.movers import MovingTargetFit as MovingTargetFit
 from invertwin.discovery.movers import MovingTargetMaps as MovingTargetMaps
 from invertwin.discovery.movers import detect_strongest_target as detect_strongest_target
 from invertwin.discovery.movers import point_response as point_response
-from invertwin.discovery.moving_body import DetectedEcho as DetectedEcho
-from invertwin.discovery.moving_body import MovingBody as MovingBody
 from invertwin.discovery.outcome import DetectedObject as DetectedObject
 from invertwin.discovery.outcome import GroundImage as GroundImage
 from invertwin.discovery.outcome import ObjectTrack as ObjectTrack

@@ -33,7 +33,7 @@ from invertwin.discovery.imaging.point_detections import (
     locate_coherent_points,
     platform_velocities,
 )
-from invertwin.discovery.imaging.reflectivity import ImageResponse, compute_response
+from invertwin.discovery.imaging.reflectivity import compute_response
 from invertwin.discovery.outcome import DetectedObject, GroundImage, Twin
 from invertwin.discovery.search import ImageGrid, ShapeSearch
 from invertwin.discovery.self_calibration import calibrate_on_scene, phase_spread
@@ -229,7 +229,11 @@ def _find_static_objects(
     if aside is not None:
         shapes = fit_outlines(fitted, aside, shapes)
         seen_there = compute_response(aside.radar, coarse, positions)
-        if _image_likelihood_gain(aside, seen_there, picture) > aside.total_gain(shapes):
+        there = aside.coarse_maps
+        powers = torch.zeros_like(there.power), seen_there.predict_maps(picture)
+        nothing, image = (there.loss.bin_losses(power, there.power) for power in powers)
+        gain = float((nothing - image).sum()) / count_bins_per_draw(aside.radar, there.grid)
+        if gain > aside.total_gain(shapes):
             notes = (_IMAGE_BETTER_NOTE,)
     shapes, found = one.fit(shapes, _FINAL_FIT_STEPS)
     among = find_hypotheses(one, shapes)
@@ -256,22 +260,6 @@ def _describe_objects(
         kind = shape.effective_kind
         found.append(DetectedObject(name, kind, kinds, center, shape, wide, probability))
     return tuple(found)
-
-
-def _image_likelihood_gain(
-    likelihood: ShapeLikelihood, response: ImageResponse, strength: Tensor
-) -> float:
-    """Compute the log-likelihood of an image over that of the background alone.
-
-    Args:
-        likelihood: likelihood of the maps.
-        response: response of the image points in thinned maps.
-        strength: image [point].
-    """
-    coarse = likelihood.coarse_maps
-    nothing, image = torch.zeros_like(coarse.power), response.predict_maps(strength)
-    losses = [coarse.loss.bin_losses(power, coarse.power) for power in (nothing, image)]
-    return float((losses[0] - losses[1]).sum()) / count_bins_per_draw(likelihood.radar, coarse.grid)
 
 
 def _sort_objects(things: list[DetectedObject]) -> tuple[DetectedObject, ...]:

@@ -227,9 +227,10 @@ class ShapeSearch:
             born: groups of the image, and their proposed shapes.
         """
         found, tried = list(born), set[tuple[int, int]]()
+        places = self.image_grid.positions
         while True:
             pairs = [
-                (self._group_gap(a[0], b[0]), a, b)
+                (float(torch.cdist(places[a[0] > 0], places[b[0] > 0]).min()), a, b)
                 for a, b in combinations(found, 2)
                 if (id(a[0]), id(b[0])) not in tried
             ]
@@ -244,10 +245,6 @@ class ShapeSearch:
             one = self.select_best(known, self.propose_for_group(part))
             if self.evidence([*known, one]) > self.evidence([*known, a[1], b[1]]):
                 found = [*others, (part, one)]
-
-    def _group_gap(self, first: Tensor, second: Tensor) -> float:
-        places = self.image_grid.positions
-        return float(torch.cdist(places[first > 0], places[second > 0]).min())
 
     def propose_for_group(self, group: Tensor) -> list[ShapeParameters]:
         """Propose shapes for a group of bright points.

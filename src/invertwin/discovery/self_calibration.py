@@ -115,7 +115,12 @@ def _estimate_gains(
     count, ranges = cells.shape[-1], cells.shape[1]
     eye = torch.eye(count, dtype=torch.complex128)
     total, draws = torch.zeros(count, count, dtype=torch.complex128), 0.0
-    for frame, waves in enumerate(_channel_phasors(radar, positions)):
+    wave_number = 2 * math.pi / require_sampled_waveform(radar).wavelength
+    rotations = radar.link().rotations.detach()
+    for frame, origin in enumerate(radar.positions.detach()):
+        seen = torch.nn.functional.normalize(positions - origin, dim=1) @ rotations[frame]
+        phase = -wave_number * (seen[:, 1:] @ radar.virtual_positions[:, 1:].T)
+        waves = torch.polar(torch.ones_like(phase), phase)  # of the channels, for echoes at points
         model = level[:, None, None] * eye
         for k in range(ranges):
             row = predicted[frame * ranges + k]
@@ -130,19 +135,6 @@ def _estimate_gains(
         total += torch.einsum("r,ri,rij,rj->ij", weight.to(x), x.conj(), inverse, x)
         draws += float(weight.sum())
     return ChannelCalibration((1 / _minimise_gains(total, draws)).reshape(capture.beat.shape[1:3]))
-
-
-def _channel_phasors(
-    radar: Radar, positions: Float64[Tensor, "point 3"]
-) -> list[Complex128[Tensor, "p c"]]:
-    """Compute channel phasors of every frame for echoes at points."""
-    found = []
-    for origin, axes in zip(radar.positions.detach(), radar.link().rotations.detach(), strict=True):
-        seen = torch.nn.functional.normalize(positions - origin, dim=1) @ axes
-        path = seen[:, 1:] @ radar.virtual_positions[:, 1:].T
-        phase = -2 * math.pi / require_sampled_waveform(radar).wavelength * path
-        found.append(torch.polar(torch.ones_like(phase), phase))
-    return found
 
 
 def _minimise_gains(matrix: Complex128[Tensor, "c c"], draws: float) -> Complex128[Tensor, " c"]:
