@@ -19,7 +19,7 @@ from invertwin.checks import (
     checked_count,
     checked_number,
     checked_tensor,
-    is_differentiated,
+    refuse_derivatives,
 )
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.deprecation import rename_attributes, rename_members
@@ -248,11 +248,7 @@ def _check_sweep(
         (receiver_directions, "receivers"),
         (sweep, "frequencies"),
     ):
-        if is_differentiated(value):
-            raise InputError(
-                f"expected {what} without derivatives, got some that require grad; turn the scene "
-                "instead, or detach them"
-            )
+        refuse_derivatives(value, what, "turn the scene instead, or detach them")
     return transmitters, receiver_directions, sweep
 
 

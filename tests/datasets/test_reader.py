@@ -82,7 +82,7 @@ def test_parts_are_read_as_one_set_in_order(tmp_path):
 def test_only_what_is_kept_is_read(tmp_path):
     found = SampleDataset(written(tmp_path, [(0, 10)]), entries=["map"])
     assert set(found[2]) == {"map"}
-    with pytest.raises(InputError, match="index, map, labels, run, got mask"):
+    with pytest.raises(InputError, match="index, map, labels, run, got 'mask'"):
         SampleDataset(tmp_path, entries=["mask"])
 
 

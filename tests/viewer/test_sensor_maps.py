@@ -17,7 +17,7 @@ from invertwin.viewer import (
     build_display,
     display_mesh,
 )
-from invertwin.viewer.sensor_maps import SensorMaps, collect_sensor_maps
+from invertwin.viewer.page import SensorMaps, collect_sensor_maps
 
 GRID = Grid(1.0, 0.05, 40, -0.5, 0.05, 21)
 FINE = Grid(1.0, 0.01, 200, -0.5, 0.05, 21)

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from invertwin.checks import check_some
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive, UnitFraction
 
@@ -160,8 +161,7 @@ class Choice(Distribution):
     weights: Sequence[NonNegative] | None = None
 
     def __post_init__(self) -> None:
-        if not self.values:
-            raise InputError("expected values to choose from, got none; give some")
+        check_some(self.values, "value to choose from", "give some")
         if self.weights is None:
             return
         if len(self.weights) != len(self.values):

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from invertwin.checks import check_choice
 from invertwin.datasets.labels import convert_old_labels
 from invertwin.datasets.shards import (
     OLD_FORMAT,
@@ -57,11 +58,8 @@ class SampleDataset(Dataset[Any]):
         parts = read_manifests(Path(folder))
         self.manifest: DatasetManifest = parts[0][1]
         known = ["index", *self.manifest.arrays, "labels", "run"]
-        unknown = [name for name in entries or () if name not in known]
-        if unknown:
-            raise InputError(
-                f"expected entries among {', '.join(known)}, got {', '.join(unknown)}; choose some"
-            )
+        for name in entries or ():
+            check_choice(name, known, "entries among")
         self._keep = set(known if entries is None else entries)
         self._transform = transform
         found = [(place / shard.name, shard) for place, m in parts for shard in m.shards]

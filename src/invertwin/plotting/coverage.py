@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from invertwin.errors import InputError
+from invertwin.checks import check_shape, check_some
 from invertwin.links import MapPlane, Transmitters
 from invertwin.plotting.figures import add_colorbar, label_axes, numbers, row_of_axes, signed_colors
 from invertwin.plotting.triangles import sharp_edges
@@ -51,14 +51,10 @@ def coverage(
         InputError: No map, or one of other cells.
     """
     rates = derivatives or {}
-    if not levels and not rates:
-        raise InputError("expected at least one map, got none; give levels or derivatives")
+    check_some([*levels, *rates], "map", "give levels or derivatives")
     for title, values in [*levels.items(), *rates.items()]:
-        if tuple(values.shape) != plane.shape:
-            raise InputError(
-                f"expected a map {list(plane.shape)} of the plane's cells for {title!r}, got "
-                f"{list(values.shape)}; give one of a single transmitter"
-            )
+        what = f"a map of the plane's cells for {title!r}"
+        check_shape(values, plane.shape, what, "give one of a single transmitter")
     count = len(levels) + len(rates)
     grid = _project_to_plane(plane, _corners(plane))
     width, height = np.ptp(grid[..., 0]), np.ptp(grid[..., 1])

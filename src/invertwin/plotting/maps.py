@@ -1,4 +1,7 @@
-"""Figures of maps over range and direction or range rate: power in dB, derivatives."""
+"""Figures of maps over range and direction or range rate: power in dB, derivatives.
+
+And of a camera's images and their derivatives.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,11 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.checks import check_shape
+from invertwin.checks import check_shape, check_some
 from invertwin.deprecation import rename_arguments
-from invertwin.errors import InputError
 from invertwin.inversion.confidence.realisations import coarsen_map
-from invertwin.plotting.figures import add_colorbar, label_axes, numbers, row_of_axes
+from invertwin.plotting.figures import add_colorbar, label_axes, numbers, row_of_axes, signed_colors
 from invertwin.radar import DopplerMaps
 
 U_LABEL, V_LABEL = "direction cosine u (to the left)", "direction cosine v (up)"
@@ -200,8 +202,7 @@ def residuals(residual: Float[Tensor, "range u v"], grid: Grid, *, marked: float
 
 def _title_maps(maps: Maps) -> Mapping[str, Tensor]:
     titled = maps if isinstance(maps, Mapping) else {"": maps}
-    if not titled:
-        raise InputError("expected at least one map, got none; give a tensor or a dict of them")
+    check_some(titled, "map", "give a tensor or a dict of them")
     return titled
 
 
@@ -272,3 +273,38 @@ def _bin_edges(positions: Tensor) -> tuple[float, float]:
     """Outer edges of the first and the last bin."""
     half = 0.5 * float(positions[1] - positions[0]) if len(positions) > 1 else 0.5
     return float(positions[0]) - half, float(positions[-1]) + half
+
+
+_SHARE = 0.995  # of the pixels have derivatives within the colours
+
+
+@rename_arguments(shown="panels")
+def images(
+    panels: Mapping[str, Float[Tensor, "row column"]],
+    derivatives: Mapping[str, Float[Tensor, "row column"]] | None = None,
+    derivative_label: str = "",
+) -> Figure:
+    """Images side by side in grey, then derivatives on one symmetric scale of colours.
+
+    Args:
+        panels: Masks or depths by title, each on its own scale.
+        derivatives: By title; what grows with θ is red, what falls is blue.
+        derivative_label: Of the derivatives, with their unit.
+
+    Raises:
+        InputError: No image.
+    """
+    rates = derivatives or {}
+    every = [*panels.values(), *rates.values()]
+    check_some(every, "image", "give images or derivatives")
+    rows, columns = every[0].shape
+    size = (1.6 + 3.0 * len(every), min(max(3.0 * rows / columns, 1.4), 5.0) + 0.9)
+    figure, cells = row_of_axes(len(every), size)
+    styles = [{"cmap": "gray"}] * len(panels)
+    styles += [signed_colors(rates.values(), _SHARE)] * len(rates)
+    for axes, name, values, style in zip(cells, [*panels, *rates], every, styles, strict=True):
+        image = axes.imshow(numbers(values), **style)
+        label_axes(axes, name)
+        if values is every[-1] and rates:
+            add_colorbar(figure, image, cells[len(panels) :], derivative_label)
+    return figure

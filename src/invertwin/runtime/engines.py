@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from typing import Any, Literal, NamedTuple, TypeVar
 
-from invertwin.errors import InputError
+from invertwin.errors import InputError, import_optional
 from invertwin.runtime import threads
 
 Engine = Literal["processes", "ray"]
@@ -148,13 +148,7 @@ def _exit_with_parent(alive: Connection) -> None:
 
 @contextmanager
 def _ray_cluster() -> Iterator[tuple[int, Any, Any]]:
-    try:
-        import ray  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise InputError(
-            "expected the package ray for engine 'ray', got none; type: pip install "
-            "'invertwin[ray]'"
-        ) from None
+    ray = import_optional("ray", "ray")
     ours = not ray.is_initialized()
     if ours:
         ray.init(include_dashboard=False, log_to_driver=False)

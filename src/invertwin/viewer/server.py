@@ -1,6 +1,5 @@
 """A display in the browser that answers: `viser` draws, one thread of ours traces rays."""
 
-import importlib
 import io
 import socket
 import threading
@@ -15,7 +14,7 @@ import numpy as np
 import torch
 
 from invertwin.deprecation import rename_arguments
-from invertwin.errors import InputError
+from invertwin.errors import InputError, import_optional
 from invertwin.scene import rigid, rotation_from_quaternion
 from invertwin.viewer.display import Display, DisplayLayer, DisplayMaps, DisplayStep
 from invertwin.viewer.guard import LOOPBACK, AccessGuard, install_guard
@@ -393,13 +392,7 @@ class Viewer:
 
 def _start_server(guard: AccessGuard, host: str, port: int) -> Any:
     """The server of viser, behind a guard."""
-    try:
-        viser: Any = importlib.import_module("viser")
-    except ImportError:
-        raise InputError(
-            "expected the package viser for the viewer, got none; type: "
-            'pip install "invertwin[view]"'
-        ) from None
+    viser = import_optional("viser", "view")
 
     class _LocalServer(viser.ViserServer):
         """One that never opens a tunnel to a server of others, which any browser might ask for."""
