@@ -219,7 +219,7 @@ def test_channels_are_calibrated_on_a_reflector(recording, monkeypatch):
     [
         (["none.bin"], ["none.bin", "check the path"]),
         (["notes.txt"], ["notes.txt", ".setup.json"]),
-        (["adc.bin", *BOARD], ["settings in a .cfg or .json file"]),
+        (["adc.bin", *BOARD], ["to end in .cfg, .json, got"]),
         (["adc.bin", "-c", "bench.cfg"], ["--board", "preset"]),
         (["adc.bin", "-c", "bench.cfg", "-b", "xWR9999"], ["xWR9999", "IWR6843ISK"]),
         (["adc.bin", "-c", "bench.cfg", "-b", "IWR6843ISK"], ["elevation=+1 or -1"]),
@@ -240,7 +240,7 @@ def test_channels_are_calibrated_on_a_reflector(recording, monkeypatch):
         (["adc.bin", "-c", "bench.cfg", *BOARD, "--set", "samples"], ["NAME=NUMBER", "'samples'"]),
         (["adc.bin", "-c", "bench.cfg", *BOARD, "--set", "x=1"], ["lanes, real,", "'x'"]),
         (["adc.toml", "--set", "samples=64"], ["--set with a .bin", "adc.toml"]),
-        (["adc.toml", "--frame", "2"], ["--frame from 0 to 1"]),
+        (["adc.toml", "--frame", "2"], ["--frame in [0, 1]"]),
         (["adc.toml", "--chirp", "16"], ["number from 0 to 15"]),
         (["adc.toml", "--range-max", "900"], ["--range-max within"]),
         (["adc.toml", "--channels", "bench.cfg"], ["expected a calibration", "bench.cfg"]),

@@ -18,7 +18,7 @@ from pydantic_core import ErrorDetails
 
 from invertwin.constants import FRAME
 from invertwin.errors import InputError
-from invertwin.registry.section import TAG_MARK
+from invertwin.registry.section import TAG_MARK, suggest_name
 from invertwin.registry.section import prefix_errors as prefix_errors
 from invertwin.registry.section import require_section as require_section
 from invertwin.storage.untrusted import convert_read_errors
@@ -156,7 +156,7 @@ def unknown_object_message(path: str, name: str, known: Sequence[str]) -> str:
     """Return the message for a key that names an object which the scene does not have."""
     return (
         f"{path}: expected the name of an object of the scene ({', '.join(known)}), "
-        f"got {_format_value(name)}; " + _suggest_name(name, known, "add it to the scene")
+        f"got {_format_value(name)}; " + suggest_name(name, known, "add it to the scene")
     )
 
 
@@ -190,7 +190,7 @@ def _explain_error(error: ErrorDetails) -> str:
             advice = _MOVED_WITHIN.get(at) or _MOVED_KEYS.get(key)
             if at in _STUDY_NAMES:
                 advice = _INSTALL_STUDIES_ADVICE
-            return f"{at}: {said}{advice or _suggest_name(key, allowed, 'remove the key')}"
+            return f"{at}: {said}{advice or suggest_name(key, allowed, 'remove the key')}"
         case "unknown_object":
             at = ".".join(filter(None, (path, context["path"])))
             return unknown_object_message(at, context["name"], context["known"])
@@ -205,13 +205,13 @@ def _explain_error(error: ErrorDetails) -> str:
             tags = [t.strip(f" '{TAG_MARK}") for t in context["expected_tags"].split(",")]
             allowed = [tag for tag in tags if tag not in (*others, "points")]
             tag = context["tag"].strip(TAG_MARK)
-            advice = _suggest_name(tag, allowed, "choose one")
+            advice = suggest_name(tag, allowed, "choose one")
             advice = _INSTALL_STUDIES_ADVICE if tag in _STUDY_NAMES else advice
             said = f"expected one of {', '.join(allowed)}, got {_format_value(tag)}"
             return f"{path}.{key}: {said}; {advice}"
         case "literal_error":
             allowed = [t.strip(" '") for t in context["expected"].replace(" or ", ", ").split(",")]
-            advice = _suggest_name(str(error["input"]), allowed, "choose one")
+            advice = suggest_name(str(error["input"]), allowed, "choose one")
             if len(allowed) == 1:
                 return f"{path}: expected {allowed[0]}, got {got}; correct the value"
             return f"{path}: expected one of {', '.join(allowed)}, got {got}; {advice}"
@@ -238,8 +238,3 @@ def _format_value(value: Any) -> str:
     except TypeError:
         text = " ".join(str(value).split())
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _suggest_name(given: str, allowed: Sequence[str], otherwise: str) -> str:
-    close = difflib.get_close_matches(given, allowed, n=1, cutoff=0.5)
-    return f"did you mean `{close[0]}`?" if close else otherwise

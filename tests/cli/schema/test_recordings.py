@@ -14,7 +14,7 @@ from invertwin.capture import Capture, ChannelCalibration, ChirpData
 from invertwin.capture.readers import described_arrays
 from invertwin.capture.ti import read_cfg, read_recording, read_settings
 from invertwin.cli import schema
-from invertwin.cli.commands.raw_files import make_chirp_settings
+from invertwin.cli.commands.simulate import make_chirp_settings
 from invertwin.cli.run_file import to_toml, validate_run
 from invertwin.cli.schema import build, sensors
 from invertwin.cli.schema.recordings import build_capture

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 
 from invertwin import __version__
-from invertwin.channel import Paths
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact
 from invertwin.cli.report import ReportTable, quantity_table, write_report
@@ -129,7 +128,11 @@ def run_dataset(
     """
     table, begin = require_section(run, "dataset", "a data set"), time.perf_counter()
     wanted = shards.shard_ranges(table.samples, table.shard, part)
-    _check_first(run, wanted[0][1])
+    # A sample is built before any work is done: its errors and its warnings come at once.
+    own = make_sample_run(run, wanted[0][1])
+    with prefix_file_errors(Path(f"sample {wanted[0][1]}")):
+        scene, sensor = _build_sample(own)
+        require_resources(own, scene, {"": sensor})
     found = {number: _read_finished_shard(folder, number) for number, _, _ in wanted}
     missing = [row for row in wanted if found[row[0]] is None]
     text = to_toml(run)
@@ -143,9 +146,29 @@ def run_dataset(
             found[number] = shards.describe_shard(name, first, count, content).model_dump()
             folder.write_json(_shard_row_path(number), found[number])
     rows = [shards.Shard.model_validate(found[number]) for number, _, _ in wanted]
-    _write_manifest(run, folder, part, rows)
-    seconds = time.perf_counter() - begin
-    return _write_report(run, folder, rows, sum(count for _, _, count in missing), seconds)
+    versions = {name: metadata.version(name) for name in _NUMERICAL_PACKAGES}
+    manifest = shards.DatasetManifest(
+        format=shards.FORMAT,
+        samples=table.samples,
+        part=part,
+        fingerprint=hashlib.sha256(text.encode()).hexdigest(),
+        versions={"invertwin": __version__, **versions},
+        arrays=_describe_arrays(run),
+        shards=rows,
+    )
+    folder.write_text(shards.MANIFEST, manifest.model_dump_json(indent=1) + "\n")
+    count, seconds = sum(shard.samples for shard in rows), time.perf_counter() - begin
+    metrics = {
+        "task": "dataset",
+        "dataset_samples": count,
+        "shards": len(rows),
+        "dataset_bytes": sum(shard.size for shard in rows),
+        "samples_per_second": sum(made for _, _, made in missing) / seconds,
+        "wall_seconds": seconds,
+    }
+    status = f"{count} samples in {len(rows)} shards."
+    parts, title = [quantity_table("Data set", metrics)], run.title or "Data set"
+    return write_report(folder, metrics, title, status, parts, again="dataset", note=run.note)
 
 
 def make_shard(job: tuple[str, int, int]) -> bytes:
@@ -215,14 +238,6 @@ def _build_sample(run: RunFile) -> tuple[Scene, SensorSetup]:
     return scene, SensorSetup(run, radar, grid)
 
 
-def _check_first(run: RunFile, index: int) -> None:
-    """Build a sample before any work is done: its errors and its warnings come at once."""
-    own = make_sample_run(run, index)
-    with prefix_file_errors(Path(f"sample {index}")):
-        scene, sensor = _build_sample(own)
-        require_resources(own, scene, {"": sensor})
-
-
 def _simulate_signals(
     run: RunFile, scene: Scene, sensor: SensorSetup, table: Any
 ) -> dict[str, np.ndarray]:
@@ -230,7 +245,8 @@ def _simulate_signals(
     if run.chirps is None:
         simulated = simulate_exact(run, scene, sensor.radar, sensor.grid)
         beat, power = simulated.beat, simulated.spectrum
-        more = _path_arrays(simulated.paths) if table.paths else {}
+        kept = ("frame", "delay", "coefficient", "first", "last") if table.paths else ()
+        more = {f"paths_{n}": getattr(simulated.paths, n).detach().numpy() for n in kept}
     else:
         chirps = run.chirps.build()
         beat, more = simulate_chirp_beats(run, scene, sensor.radar, chirps), {}
@@ -246,11 +262,6 @@ def _labelled_scene(run: RunFile, scene: Scene, radar: Radar) -> Scene:
     if run.chirps is None:
         return scene
     return scene_at_start(run, scene, float(run.chirps.build().times(radar.shape[1]).max()))
-
-
-def _path_arrays(paths: Paths) -> dict[str, np.ndarray]:
-    kept = ("frame", "delay", "coefficient", "first", "last")
-    return {f"paths_{name}": getattr(paths, name).detach().numpy() for name in kept}
 
 
 def _describe_arrays(run: RunFile) -> dict[str, shards.ArrayInfo]:
@@ -271,39 +282,6 @@ def _describe_arrays(run: RunFile) -> dict[str, shards.ArrayInfo]:
     held = {_ARRAY_NAMES[name] for name in table.signals}
     held |= {"masks"} if table.masks else set()
     return {n: a for n, a in known.items() if n in held or (table.paths and "paths_" in n)}
-
-
-def _write_manifest(
-    run: RunFile, folder: RunFolder, part: tuple[int, int], rows: list[shards.Shard]
-) -> None:
-    versions = {name: metadata.version(name) for name in _NUMERICAL_PACKAGES}
-    found = shards.DatasetManifest(
-        format=shards.FORMAT,
-        samples=require_section(run, "dataset", "a data set").samples,
-        part=part,
-        fingerprint=hashlib.sha256(to_toml(run).encode()).hexdigest(),
-        versions={"invertwin": __version__, **versions},
-        arrays=_describe_arrays(run),
-        shards=rows,
-    )
-    folder.write_text(shards.MANIFEST, found.model_dump_json(indent=1) + "\n")
-
-
-def _write_report(
-    run: RunFile, folder: RunFolder, rows: list[shards.Shard], made: int, seconds: float
-) -> list[ReportTable]:
-    count = sum(shard.samples for shard in rows)
-    metrics = {
-        "task": "dataset",
-        "dataset_samples": count,
-        "shards": len(rows),
-        "dataset_bytes": sum(shard.size for shard in rows),
-        "samples_per_second": made / seconds,
-        "wall_seconds": seconds,
-    }
-    status = f"{count} samples in {len(rows)} shards."
-    parts, title = [quantity_table("Data set", metrics)], run.title or "Data set"
-    return write_report(folder, metrics, title, status, parts, again="dataset", note=run.note)
 
 
 def _read_finished_shard(folder: RunFolder, number: int) -> dict[str, Any] | None:

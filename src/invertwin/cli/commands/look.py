@@ -23,6 +23,7 @@ from invertwin.capture import (
 )
 from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid
+from invertwin.checks import checked_number
 from invertwin.cli.options import LookOptions, RecordingOptions
 from invertwin.cli.report import ReportTable, load_texts, quantity_table, save_picture, write_report
 from invertwin.errors import InputError, PhysicsWarning
@@ -64,11 +65,7 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
     if isinstance(recording, ChirpCapture) and recording.chirps.count > 1:
         chirps = recording
     radar = capture.radar()
-    if not 0 <= options.frame < radar.frame_count:
-        raise InputError(
-            f"expected a --frame from 0 to {radar.frame_count - 1}, got {options.frame}; choose "
-            "one of the recording"
-        )
+    checked_number(options.frame, "--frame", 0, radar.frame_count - 1)
     grid = _make_grid(options, capture, recording)
     said += map(str, find_faults(as_recorded, options.range_min, options.range_max))
     metrics |= {

@@ -70,10 +70,19 @@ def _compute_rcs(name: str, run: RunFile, folder: RunFolder) -> _RcsMetrics:
     with prefix_errors("rcs"):
         found = table.build({Scene: scene})
     levels = {name: found.dbsm[:, :, i, j] for name, (i, j) in table.channels.items()}
-    kept: _RcsMetrics = {"peak_dbsm": {name: _peak_level(own) for name, own in levels.items()}}
+    peaks = {name: float(own.max()) for name, own in levels.items()}
+    peaks = {name: level if level > _MIN_LEVEL else None for name, level in peaks.items()}
+    kept: _RcsMetrics = {"peak_dbsm": peaks}
     if table.cases:
         kept["error_db"] = {case: _case_error(table, case, found) for case in table.cases}
-    measured, skipped = _load_measurements(table, found)
+    measured: dict[str, _MeasuredRows] = {}
+    skipped: list[str] = []
+    for number, measurement in enumerate(table.measured):
+        if not Path(measurement.file).exists():
+            skipped.append(measurement.file)
+            continue
+        with prefix_errors(f"rcs.measured[{number}]"):
+            measured |= _match_measurement(table, measurement, found)
     if measured:
         kept["mean_db"] = _mean_differences(found.dbsm, measured)
         optics = [v for part, v in found.parts.items() if part.startswith("order")]
@@ -83,12 +92,6 @@ def _compute_rcs(name: str, run: RunFile, folder: RunFolder) -> _RcsMetrics:
     folder.write_text(f"{name}.csv", _format_csv(table, found))
     kept["pictures"] = _draw_pictures(name, table, found, measured, folder)
     return kept | {"seconds": time.perf_counter() - begin}
-
-
-def _peak_level(levels: Tensor) -> float | None:
-    """Return the largest level; None without levels."""
-    level = float(levels.max())
-    return level if level > _MIN_LEVEL else None
 
 
 def _case_error(table: RcsTable, name: str, found: Signature) -> float:
@@ -105,21 +108,6 @@ def _case_error(table: RcsTable, name: str, found: Signature) -> float:
     truth = 10 * torch.log10(oracle.section(found.frequencies, found.directions))
     error = to_dbsm(whole[:, :, i, j]) - truth
     return float(error.square().mean().sqrt() if case.statistic == "rms" else error.abs().max())
-
-
-def _load_measurements(
-    table: RcsTable, found: Signature
-) -> tuple[dict[str, _MeasuredRows], list[str]]:
-    """Load measured rows of the sweep by frequency and polarisation, and list the missing ones."""
-    rows: dict[str, _MeasuredRows] = {}
-    skipped: list[str] = []
-    for number, measurement in enumerate(table.measured):
-        if not Path(measurement.file).exists():
-            skipped.append(measurement.file)
-            continue
-        with prefix_errors(f"rcs.measured[{number}]"):
-            rows |= _match_measurement(table, measurement, found)
-    return rows, skipped
 
 
 def _match_measurement(

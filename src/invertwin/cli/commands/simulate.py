@@ -1,4 +1,7 @@
-"""`invertwin simulate`: exact radar signals of a scene, saved as a capture."""
+"""`invertwin simulate`: exact radar signals of a scene, saved as a capture.
+
+And as the files that boards and their tools write.
+"""
 
 import math
 import time
@@ -6,18 +9,20 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from jaxtyping import Complex
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from invertwin import plotting
-from invertwin.capture import Capture, ChirpData
+from invertwin.capture import Capture, ChirpData, ChirpSettings, adc_counts, make_settings, ti
 from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid, Sampling
-from invertwin.cli.commands.raw_files import make_chirp_settings, write_raw_files
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import require_simulated_data, simulate_chirp_beats, simulate_exact
 from invertwin.cli.report import ReportTable, quantity_table, save_picture, write_report
 from invertwin.cli.run_file import prefix_errors, require_section
-from invertwin.cli.schema import RunFile, build
+from invertwin.cli.schema import RawTable, RunFile, build
+from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, doppler_maps, velocity_span
 from invertwin.radar.processing.doppler_maps import find_peak
@@ -117,3 +122,76 @@ def _simulate_moving_frames(
         "wall_seconds": seconds,
     }
     return beat, metrics, plotting.range_doppler(maps), "doppler"
+
+
+# A largest sample at this part of the full scale leaves room for those of other seeds.
+_FULL_SCALE_MARGIN = 1.25
+
+
+def make_chirp_settings(run: RunFile, radar: Radar) -> ChirpSettings:
+    """Return the board settings that would record the simulated data of the run file.
+
+    Raises:
+        InputError: A radar without ramps, simultaneous transmitters, or ramps that
+            do not fit their interval.
+    """
+    if not isinstance(radar.waveform, FMCW):
+        raise InputError(
+            f'raw: expected radar.waveform.kind = "fmcw", got {type(radar.waveform).__name__}; '
+            "raw files are those of FMCW boards: remove [raw]"
+        )
+    raw = run.raw or RawTable()
+    ramp = raw.adc_start_time + radar.waveform.duration
+    idle = 0.0
+    if run.chirps is not None:
+        if not run.chirps.tdm:
+            raise InputError(
+                "raw: expected transmitters that take turns, got chirps.tdm = false; "
+                "raw files of transmitters that send at once cannot be separated"
+            )
+        idle = run.chirps.interval - ramp
+        if idle < -1e-12:
+            raise InputError(
+                f"chirps.interval: expected at least the ramp's {ramp:g} s, got "
+                f"{run.chirps.interval:g}; idle time comes on top"
+            )
+    board = None if run.radar is None else run.radar.board
+    with prefix_errors("raw"):
+        return make_settings(
+            radar.waveform,
+            (board and board.transmitters) or len(radar.transmitters.positions),
+            (board and board.receivers) or len(radar.receivers.positions),
+            loops=1 if run.chirps is None else run.chirps.count,
+            frames=radar.frame_count,
+            # To the nanosecond, as settings files have it.
+            idle_time=round(max(idle, 0.0), 9),
+            **raw.model_dump(exclude={"full_scale"}),
+        )
+
+
+def write_raw_files(
+    run: RunFile,
+    radar: Radar,
+    beat: Complex[Tensor, "frame chirp tx rx sample"] | Complex[Tensor, "frame tx rx sample"],
+    folder: RunFolder,
+) -> dict[str, float]:
+    """Write raw/capture.bin and its settings files; return numbers for metrics.json.
+
+    Raises:
+        InputError: Data that no such file can hold.
+    """
+    assert run.raw is not None
+    settings = make_chirp_settings(run, radar)
+    full_scale = run.raw.full_scale
+    if full_scale is None:
+        largest = float(torch.view_as_real(beat.resolve_conj()).abs().max())
+        full_scale = _FULL_SCALE_MARGIN * largest if largest > 0 else 1.0
+    with prefix_errors("raw"):
+        data = adc_counts(beat, settings, full_scale)
+        samples = folder.file("raw/capture.bin")
+        ti.write_samples(samples, data)
+        ti.write_cfg(folder.file("raw/capture.cfg"), settings)
+        studio = folder.file("raw/capture.mmwave.json")
+        ti.write_studio(studio, settings)
+        ti.write_setup(folder.file("raw/capture.setup.json"), studio, [samples])
+    return {"raw_full_scale": full_scale, "raw_bytes": samples.stat().st_size}

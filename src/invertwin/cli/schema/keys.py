@@ -1,7 +1,6 @@
 """Reference tables of run-file keys, made from the JSON Schema."""
 
 import contextlib
-import difflib
 import hashlib
 import importlib.util
 import json
@@ -14,6 +13,7 @@ from typing import Any
 from invertwin.cli.report import ReportTable
 from invertwin.errors import InputError
 from invertwin.registry.kinds import PLUGINS
+from invertwin.registry.section import suggest_name
 from invertwin.runtime.doctor import cache_folder
 from invertwin.storage.folders import replace_file
 
@@ -82,11 +82,9 @@ def key_tables(section: str) -> list[ReportTable]:
     names = [name for name in found if f"{_plain_path(name)}.".startswith(f"{wanted}.")]
     if not names:
         known = [_plain_path(name) for name in found if name]
-        close = difflib.get_close_matches(wanted, known, n=1)
-        advice = f"did you mean `{close[0]}`?" if close else "choose one"
         raise InputError(
             f"expected a section ({', '.join(n for n in known if '.' not in n)}), "
-            f"got {section}; {advice}"
+            f"got {section}; {suggest_name(wanted, known, 'choose one', 0.6)}"
         )
     return [table for name in names for table in found[name]]
 

@@ -1,7 +1,6 @@
 """Random variation of run files: key paths, drawn values, and the resulting run file."""
 
 import copy
-import difflib
 import re
 from collections.abc import Iterable
 from typing import Any
@@ -11,7 +10,7 @@ from pydantic import TypeAdapter
 
 from invertwin.datasets import UNCHANGED
 from invertwin.errors import InputError
-from invertwin.registry.section import raise_key_error
+from invertwin.registry.section import raise_key_error, suggest_name
 from invertwin.seeds import derive_seed
 
 KeyPath = tuple[str | int, ...]
@@ -135,9 +134,8 @@ def _get_entry(holder: Any, step: str | int, path: str) -> Any:
     known = list(holder) if isinstance(holder, dict) else []
     if step in known:
         return holder[step]
-    close = difflib.get_close_matches(step, known, n=1)
     raise InputError(
         f"{path}: expected a table that the run file has "
         f"({', '.join(known[:_MAX_LISTED_NAMES]) or 'none'}), "
-        f'got "{step}"; ' + (f"did you mean `{close[0]}`?" if close else "add it")
+        f'got "{step}"; {suggest_name(step, known, "add it", 0.6)}'
     )
