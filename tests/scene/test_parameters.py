@@ -240,6 +240,8 @@ SLAB: dict[str, Any] = {
     "permittivity": 2.7,
     "conductivity": 0.1,
     "loss_tangent": 0.01,
+    "permeability": 1.2,
+    "magnetic_loss_tangent": 0.02,
     "thickness": 12.5e-3,
     "scattering": 0.4,
     "rms_slope": 0.2,

@@ -321,9 +321,9 @@ class MaterialValues(nn.Module):
         object: name of the object.
         layer: index of the layer of a `Multilayer`; None for values of the material itself.
         start: initial values by the names of `RANGES`, strictly inside their ranges: permittivity,
-            conductivity [S/m], loss_tangent, thickness [m], diffuse, lobe_width [rad], scattering,
-            rms_slope, lambertian, directive, directive_exponent, backscatter_exponent, rms_height
-            [m], depolarisation.
+            conductivity [S/m], loss_tangent, permeability, magnetic_loss_tangent, thickness [m],
+            diffuse, lobe_width [rad], scattering, rms_slope, lambertian, directive,
+            directive_exponent, backscatter_exponent, rms_height [m], depolarisation.
 
     Attributes:
         raw: unbounded parameters by field: for one-sided ranges, such as the permittivity, the

@@ -54,6 +54,7 @@ def material_of(table: dict[str, Any], folder: Path = Path()) -> Any:
         ({"kind": "dielectric", "permittivity": 4.0, "loss_tangent": 0.1}, Dielectric),
         ({"kind": "refracting_body", "permittivity": 4.0, **ROUGHNESS}, RefractingBody),
         ({"kind": "slab", "permittivity": 2.0, "thickness": 0.01, **ROUGHNESS}, Slab),
+        ({"kind": "dielectric", "permittivity": 4.0, "permeability": 2.0}, Dielectric),
     ],
 )
 def test_keys_are_the_names_of_the_library(table, kind):

@@ -57,6 +57,44 @@ def test_coefficients_equal_the_closed_forms_in_360_cases():
     assert worst < 2e-6
 
 
+def test_magnetic_half_spaces_equal_the_closed_forms():
+    """By impedances η = √(μ/ε) and the angle of refraction, as textbooks have it."""
+    worst = 0.0
+    for epsilon, mu in itertools.product((1.0, 4.0 - 1j, 9.0 - 0.2j), (0.8 - 0.1j, 1.0, 5.0 - 2j)):
+        material = RoughDielectric(
+            epsilon.real, loss_tangent=-epsilon.imag / epsilon.real,
+            permeability=mu.real, magnetic_loss_tangent=-mu.imag / mu.real,
+        )  # fmt: skip
+        for node in (20, 120, 255):
+            c = float(NODES[node])
+            eta, index = np.sqrt(mu / epsilon + 0j), np.sqrt(mu * epsilon + 0j)
+            inside = np.sqrt(1 - (1 - c**2) / index**2)
+            expected = (
+                (eta * c - inside) / (eta * c + inside),
+                (c - eta * inside) / (c + eta * inside),
+                2 * eta * c / (eta * c + inside),
+                2 * eta * c / (c + eta * inside),
+            )
+            permittivity, permeability = (torch.tensor(complex(v)) for v in (epsilon, mu))
+            got = fresnel_coefficients(permittivity, cosines(c), permeability)
+            worst = max(worst, *(abs(complex(a) - b) for a, b in zip(got, expected, strict=True)))
+            mean = (abs(expected[0]) ** 2 + abs(expected[1]) ** 2) / 2
+            table = material.scattering_law(FREQUENCY).amplitude[node]
+            worst = max(worst, abs(float(table) - math.sqrt(mean)))
+    assert worst < 2e-6
+
+
+def test_a_medium_of_equal_permittivity_and_permeability_reflects_nothing_at_normal_incidence():
+    mu = torch.tensor(3.0, dtype=torch.float64, requires_grad=True)
+    law = RefractingBody(3.0, permeability=mu).scattering_law(FREQUENCY)
+    assert law.amplitude[-1] == 0
+    assert law.refraction[-1] == 1
+    assert float(law.index.detach()) == pytest.approx(3.0)
+    assert float(law.amplitude[100].detach()) > 0.01
+    (slope,) = torch.autograd.grad(law.amplitude.sum(), mu)
+    assert torch.isfinite(slope)
+
+
 def test_power_into_a_half_space_is_what_it_does_not_reflect():
     # By Poynting's vector behind the interface, from the transmitted fields.
     epsilon, c = complex_permittivity(3.0, 2.0, FREQUENCY), ANGLES[1:]

@@ -102,6 +102,8 @@ VALUES = {
     "permittivity": 3.0,
     "conductivity": 0.5,
     "loss_tangent": 0.02,
+    "permeability": 1.5,
+    "magnetic_loss_tangent": 0.03,
     "thickness": 1.3e-3,
     "diffuse": 0.4,
     "lobe_width": 0.3,

@@ -40,6 +40,84 @@ def airy(epsilon, thickness, cosine, polarisation):
     return first * (1 - once**2) / echo, (1 - first**2) * once / echo
 
 
+def transfer_matrix(layers, cosine, polarisation, frequency=FREQUENCY):
+    """Reflection of tangential E (s) and H (p), and transmission: products of 2 × 2 matrices.
+
+    Layers are (ε, μ, thickness). A matrix takes tangential E and H of one face to those of the
+    other (Born and Wolf, section 1.6).
+    """
+    k, whole = 2 * math.pi * frequency / SPEED_OF_LIGHT, np.eye(2)
+    for epsilon, mu, thickness in layers:
+        root = cmath.sqrt(epsilon * mu - 1 + cosine**2)
+        wave = root / mu if polarisation == "s" else root / epsilon
+        delta = k * root * thickness
+        row = [[cmath.cos(delta), 1j * cmath.sin(delta) / wave]]
+        whole = whole @ np.array([*row, [1j * wave * cmath.sin(delta), cmath.cos(delta)]])
+    first, second = whole @ np.array([1.0, cosine])
+    return (cosine * first - second) / (cosine * first + second), 2 * cosine / (
+        cosine * first + second
+    )
+
+
+def test_magnetic_stacks_equal_the_transfer_matrix():
+    worst = 0.0
+    one = [(3.0 - 0.1j, 2.0 - 0.5j, 1.3e-3)]
+    three = [(4.0, 1.0, 0.7e-3), (1.0, 5.0 - 1j, 0.4e-3), (2.0 - 1j, 1.5, 2e-3)]
+    for sizes in (one, three):
+        layers = [
+            Layer(e.real, loss_tangent=-e.imag / e.real, permeability=m.real,
+                  magnetic_loss_tangent=-m.imag / m.real, thickness=d)
+            for e, m, d in sizes
+        ]  # fmt: skip
+        cosine = torch.from_numpy(NODES)
+        sheets = [layer.sheet(FREQUENCY) for layer in layers]
+        got = slab_coefficients(sheets, cosine, FREQUENCY)
+        for node, polarisation in itertools.product(ANGLES, "sp"):
+            reflection, transmission = transfer_matrix(sizes, NODES[node], polarisation)
+            found = (
+                getattr(got, f"{name}_{polarisation}") for name in ("reflection", "transmission")
+            )
+            for value, expected in zip(found, (reflection, transmission), strict=True):
+                worst = max(worst, abs(complex(value[node]) - expected))
+    assert worst < 1e-10
+
+
+def test_group_delay_of_a_magnetic_slab_is_that_of_its_index():
+    """Matched, so that no echo inside adds to it: ε = μ = 2.5, at normal incidence."""
+    slab = Slab(2.5, permeability=2.5, thickness=0.02)
+    extra = float(slab.scattering_law(FREQUENCY).extra_length[-1])
+    assert extra == pytest.approx(1.5 * 0.02, rel=1e-9)
+    assert float(slab.scattering_law(FREQUENCY).transmittance[-1]) == pytest.approx(1.0)
+
+
+def test_a_dallenbach_absorber_has_its_null():
+    """A magnetic layer on metal whose input impedance √(μ/ε) tanh(jkd√(εμ)) is 1 at 10 GHz."""
+    frequency, thickness, epsilon = 10e9, 2e-3, 12.0 - 0.3j
+    depth = 2j * math.pi * frequency / SPEED_OF_LIGHT * thickness
+
+    def mismatch(mu):
+        return cmath.sqrt(mu / epsilon) * cmath.tanh(depth * cmath.sqrt(epsilon * mu)) - 1
+
+    before, mu = 1.0 - 1.0j, 1.1 - 1.2j
+    for _ in range(60):  # secant
+        low, high = mismatch(before), mismatch(mu)
+        if high == low:
+            break
+        before, mu = mu, mu - high * (mu - before) / (high - low)
+    assert abs(mismatch(mu)) < 1e-9
+    assert mu.real > 0 > mu.imag
+    coat = Layer(
+        epsilon.real, loss_tangent=-epsilon.imag / epsilon.real, permeability=mu.real,
+        magnetic_loss_tangent=-mu.imag / mu.real, thickness=thickness,
+    )  # fmt: skip
+    wall = Multilayer([coat, Layer(1.0, 1e14, thickness=1e-3)])
+    null, beside = (wall.scattering_law(f).amplitude[-1] for f in (frequency, 1.3 * frequency))
+    assert float(null) < 1e-4
+    assert float(beside) > 0.1
+    plain = Multilayer([Layer(12.0, loss_tangent=0.025, thickness=thickness), wall.layers[1]])
+    assert float(plain.scattering_law(frequency).amplitude[-1]) > 0.8
+
+
 def layers_of(material, frequency=FREQUENCY):
     return [layer.sheet(frequency) for layer in material.layers]
 
@@ -276,6 +354,8 @@ def test_power_is_kept_at_the_ends(permittivity, conductivity, thickness):
         (lambda: Layer(2.0, -1.0, thickness=0.01), "conductivity"),
         (lambda: Layer(2.0, loss_tangent=-1.0, thickness=0.01), "loss tangent"),
         (lambda: Layer(2.0, thickness=math.nan), "thickness"),
+        (lambda: Slab(2.0, permeability=0.0, thickness=0.01), r"permeability in \(0, inf\), got 0"),
+        (lambda: Slab(2.0, magnetic_loss_tangent=-1.0, thickness=0.01), "magnetic loss tangent"),
         (lambda: Multilayer([]), "at least one Layer, got none"),
         (lambda: Multilayer([3.0]), "at least one Layer, got float"),  # pyright: ignore[reportArgumentType]
         (lambda: slab_coefficients([], torch.ones(1).double(), 1e9), "at least one layer"),

@@ -487,7 +487,7 @@ def _smooth_interfaces(scene: Scene, topology: Topology, frequency: float) -> Sm
             )
         conducting = torch.tensor(interface.permittivity is None)
         epsilon = torch.ones(()) if interface.permittivity is None else interface.permittivity
-        values = (conducting, epsilon.to(torch.complex128), *interface[1:])
+        values = (conducting, epsilon.to(torch.complex128), *interface[1:4])
         for column, value in zip(columns, values, strict=True):
             column.append(value.expand(len(item.mesh.faces)))
     return SmoothInterfaces(*map(torch.cat, columns))

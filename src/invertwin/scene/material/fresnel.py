@@ -1,4 +1,4 @@
-"""Half spaces: complex permittivity, Fresnel reflection and transmission."""
+"""Half spaces: complex permittivity and permeability, Fresnel reflection and transmission."""
 
 import math
 from typing import NamedTuple
@@ -13,6 +13,7 @@ from invertwin.scene.material.values import Value, checked_value, evaluate_value
 
 LEAST_COSINE = 1e-9
 """Shift that avoids 0/0 at grazing incidence on ε = 1, below rounding elsewhere."""
+_SAFE_POWER = 1e-30  # smaller reflectances are zero, without derivative of their root
 
 
 class FieldCoefficients(NamedTuple):
@@ -59,50 +60,67 @@ def complex_permittivity(
 
 
 def fresnel_coefficients(
-    permittivity: Shaped[Tensor, "*#angle"], cos_theta: Float[Tensor, "*#angle"]
+    permittivity: Shaped[Tensor, "*#angle"],
+    cos_theta: Float[Tensor, "*#angle"],
+    permeability: Shaped[Tensor, "*#angle"] | None = None,
 ) -> FieldCoefficients:
     """Compute the complex field coefficients of a half space for waves from air.
 
-    r_s = (c − s)/(c + s), r_p = (εc − s)/(εc + s), t_s = 2c/(c + s), t_p = 2√ε c/(εc + s), with
-    c = cosθ and s² = ε − 1 + c². Source: Fresnel.
+    r_s = (μc − s)/(μc + s), r_p = (εc − s)/(εc + s), t_s = 2μc/(μc + s), t_p = 2√(εμ) c/(εc + s),
+    with c = cosθ and s² = εμ − 1 + c². Source: Fresnel.
 
     Args:
         permittivity: complex relative permittivity; broadcasts with the angles.
         cos_theta: cosine of the angle of incidence, in [0, 1].
+        permeability: complex relative permeability; None = 1.
     """
     epsilon = permittivity.to(torch.complex128)
+    mu = torch.ones_like(epsilon) if permeability is None else permeability
     cosine = cos_theta.double().clamp(min=LEAST_COSINE)
-    sine = torch.sqrt(epsilon - 1 + cosine**2)
+    sine = torch.sqrt(epsilon * mu - 1 + cosine**2)
     return FieldCoefficients(
-        (cosine - sine) / (cosine + sine),
+        (mu * cosine - sine) / (mu * cosine + sine),
         (epsilon * cosine - sine) / (epsilon * cosine + sine),
-        2 * cosine / (cosine + sine),
-        2 * torch.sqrt(epsilon) * cosine / (epsilon * cosine + sine),
+        2 * mu * cosine / (mu * cosine + sine),
+        2 * torch.sqrt(epsilon * mu) * cosine / (epsilon * cosine + sine),
     )
 
 
 def fresnel_amplitude(
-    permittivity: Shaped[Tensor, "*#angle"], cos_theta: Float[Tensor, "*#angle"]
+    permittivity: Shaped[Tensor, "*#angle"],
+    cos_theta: Float[Tensor, "*#angle"],
+    permeability: Shaped[Tensor, "*#angle"] | None = None,
 ) -> Float[Tensor, "*angle"]:
     """Compute the square root of the unpolarised Fresnel power reflectance of a half space.
 
     Fresnel coefficients with the factor ε − 1 extracted: r_s = −(ε−1)/(c+s)² and r_p =
     (ε−1)((ε+1)c² − 1)/(εc+s)² with c = cosθ, s² = ε − 1 + c². The amplitude and its gradient then
-    stay finite at grazing incidence and for ε → 1.
+    stay finite at grazing incidence and for ε → 1. Where a permeability makes both zero, their
+    derivative is, too.
 
     Args:
         permittivity: complex relative permittivity; broadcasts with the angles.
         cos_theta: cosine of the angle of incidence, in [0, 1].
+        permeability: complex relative permeability; None = 1.
 
     Returns:
         sqrt((|r_s|² + |r_p|²)/2), in [0, 1].
     """
+    if permeability is not None:
+        found = fresnel_coefficients(permittivity, cos_theta, permeability)
+        return safe_root((found.reflection_s.abs() ** 2 + found.reflection_p.abs() ** 2) / 2)
     cosine = cos_theta.clamp(min=LEAST_COSINE)
     sine = torch.sqrt(permittivity - 1 + cosine**2)
     perpendicular = 1 / (cosine + sine) ** 2
     parallel = ((permittivity + 1) * cosine**2 - 1) / (permittivity * cosine + sine) ** 2
     mean = (perpendicular.abs() ** 2 + parallel.abs() ** 2) / 2
     return (permittivity - 1).abs() * torch.sqrt(mean)
+
+
+def safe_root(power: Float[Tensor, "*row"]) -> Float[Tensor, "*row"]:
+    """Compute √x, with a derivative of zero where x is, which is infinite by itself."""
+    seen = power > _SAFE_POWER
+    return torch.where(seen, torch.where(seen, power, 1.0).sqrt(), 0.0)
 
 
 def fresnel_reflectance(

@@ -22,8 +22,8 @@ from invertwin.scene.material.fresnel import (
     attenuation,
     complex_permittivity,
     fresnel_amplitude,
-    fresnel_transmittance,
     refractive_index,
+    safe_root,
 )
 from invertwin.scene.material.itu import Itu
 from invertwin.scene.material.roughness import (
@@ -39,7 +39,6 @@ from invertwin.scene.material.surface import ANGLE_COUNT, Material, ScatteringLa
 from invertwin.scene.material.values import RANGES, Value, checked_value, evaluate_value, row_count
 
 AnyMedium = TypeVar("AnyMedium", bound="Medium")
-_SAFE_POWER = 1e-30  # smaller reflectances are zero, without derivative of their root
 _COSINES = torch.linspace(0, 1, ANGLE_COUNT, dtype=torch.float64)
 _FULL_REFLECTANCE = torch.ones_like(_COSINES)
 
@@ -75,12 +74,14 @@ class _MaterialRecord:
 
 @dataclass(frozen=True)
 class Medium(_MaterialRecord):
-    """Dielectric, by numbers or from the ITU table.
+    """Dielectric or magnetic medium, by numbers or from the ITU table.
 
     Attributes:
         permittivity: relative permittivity ε' ≥ 1.
         conductivity: conductivity σ ≥ 0 [S/m].
         loss_tangent: tanδ ≥ 0 of other losses: ε = ε' (1 − j tanδ) − jσ/(ωε0).
+        permeability: relative permeability μ' > 0.
+        magnetic_loss_tangent: tanδ_m ≥ 0: μ = μ' (1 − j tanδ_m), at all frequencies.
 
     Raises:
         InputError: a value outside its range.
@@ -89,6 +90,20 @@ class Medium(_MaterialRecord):
     permittivity: Value | Itu
     conductivity: Value | Itu = 0.0
     loss_tangent: Value = field(default=0.0, kw_only=True)
+    permeability: Value = field(default=1.0, kw_only=True)
+    magnetic_loss_tangent: Value = field(default=0.0, kw_only=True)
+
+    @property
+    def complex_permeability(self) -> Shaped[Tensor, "*row"]:
+        """Relative permeability μ."""
+        loss = evaluate_value(self.magnetic_loss_tangent)
+        return evaluate_value(self.permeability) * (1 - 1j * loss)
+
+    @property
+    def is_magnetic(self) -> bool:
+        """True if μ is not simply 1."""
+        values = self.permeability, self.magnetic_loss_tangent
+        return not all(isinstance(value, int | float) for value in values) or values != (1, 0)
 
     @classmethod
     def itu(cls: type[AnyMedium], name: str, **values: object) -> AnyMedium:
@@ -106,6 +121,12 @@ class Medium(_MaterialRecord):
     def complex_permittivity(self, frequency: float) -> Shaped[Tensor, "*row"]:
         """Return ε at `frequency` [Hz]. Warns (`OutsideTableWarning`) outside the ITU table."""
         return self._epsilon(frequency)[0]
+
+    def _amplitude(self, frequency: float) -> Tensor:
+        """Return the root of the reflectance of a half space, over the nodes of the tables."""
+        epsilon = self.complex_permittivity(frequency)[..., None]
+        mu = self.complex_permeability[..., None] if self.is_magnetic else None
+        return fresnel_amplitude(epsilon, _COSINES, mu)
 
     def _epsilon(self, frequency: float) -> tuple[Tensor, Tensor]:
         """Return ε and its dispersion ω dε/dω."""
@@ -195,7 +216,7 @@ class RoughDielectric(Medium, Material):
     and a lobe.
 
     Attributes:
-        permittivity, conductivity, loss_tangent: see `Medium`.
+        permittivity, conductivity, loss_tangent, permeability, magnetic_loss_tangent: see `Medium`.
         diffuse: fraction of the reflected power in the Lambertian part, in [0, 1]; the rest goes
             into the lobe.
         lobe_width: full width at half maximum of the lobe around the specular direction [rad], in
@@ -210,11 +231,9 @@ class RoughDielectric(Medium, Material):
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
         """Return the scattering law at `frequency` [Hz], differentiable w.r.t. all values."""
-        epsilon = self.complex_permittivity(frequency)
         weights = specular_weights(evaluate_value(self.diffuse), lobe_exponent(self.lobe_width))
-        amplitude = fresnel_amplitude(epsilon[..., None], _COSINES)
         depolarisation = evaluate_value(self.depolarisation)
-        return ScatteringLaw(amplitude, *weights, depolarisation=depolarisation)
+        return ScatteringLaw(self._amplitude(frequency), *weights, depolarisation=depolarisation)
 
 
 @dataclass(frozen=True)
@@ -224,20 +243,21 @@ class Dielectric(Medium, EffectiveRoughness, Material):
     In `invertwin.rcs` a closed mesh of it is a penetrable solid.
 
     Attributes:
-        permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
-            `EffectiveRoughness`; it scatters by default.
+        permittivity, conductivity, loss_tangent, permeability, magnetic_loss_tangent: see `Medium`;
+            the other fields are those of `EffectiveRoughness`; it scatters by default.
     """
 
     scattering: Value = field(default=ROUGH_SCATTERING, kw_only=True)
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
         """Return the scattering law at `frequency` [Hz], differentiable w.r.t. all values."""
-        amplitude = fresnel_amplitude(self.complex_permittivity(frequency)[..., None], _COSINES)
+        amplitude = self._amplitude(frequency)
         return ScatteringLaw(amplitude, *self.weights(), **self.depolarisation_terms)
 
     def smooth_interface(self, frequency: float) -> SmoothInterface | None:
         """Return the coherent interface at `frequency` [Hz]."""
-        return self.make_interface(self.complex_permittivity(frequency))
+        epsilon = self.complex_permittivity(frequency)
+        return self.make_interface(epsilon, permeability=self.complex_permeability)
 
 
 @dataclass(frozen=True)
@@ -245,30 +265,32 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
     """Solid body with a closed mesh, which rays enter and leave by Snell's law.
 
     Each face transmits the power it does not reflect; inside, power is absorbed. The direction
-    follows the real part of √ε, which is valid for small losses per wavelength.
+    follows the real part of √(εμ), which is valid for small losses per wavelength.
 
     Attributes:
-        permittivity, conductivity, loss_tangent: see `Medium`; the other fields are those of
-            `EffectiveRoughness`, of what the outside reflects.
+        permittivity, conductivity, loss_tangent, permeability, magnetic_loss_tangent: see `Medium`;
+            the other fields are those of `EffectiveRoughness`, of what the outside reflects.
     """
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
         """Return the scattering law of one face at `frequency` [Hz]; differentiable with respect to
         all values.
         """
-        epsilon = self.complex_permittivity(frequency)
+        square = self.complex_permittivity(frequency) * self.complex_permeability
+        amplitude = self._amplitude(frequency)
         return ScatteringLaw(
-            fresnel_amplitude(epsilon[..., None], _COSINES),
+            amplitude,
             *self.weights(),
-            refraction=fresnel_transmittance(epsilon[..., None], _COSINES),
-            index=refractive_index(epsilon),
-            attenuation=attenuation(epsilon, frequency),
+            refraction=1 - amplitude**2,
+            index=refractive_index(square),
+            attenuation=attenuation(square, frequency),
             **self.depolarisation_terms,
         )
 
     def smooth_interface(self, frequency: float) -> SmoothInterface | None:
         """Return the coherent interface of the outer face at `frequency` [Hz]."""
-        return self.make_interface(self.complex_permittivity(frequency))
+        epsilon = self.complex_permittivity(frequency)
+        return self.make_interface(epsilon, permeability=self.complex_permeability)
 
 
 @dataclass(frozen=True)
@@ -276,7 +298,7 @@ class Layer(Medium):
     """Layer of a slab.
 
     Attributes:
-        permittivity, conductivity, loss_tangent: see `Medium`.
+        permittivity, conductivity, loss_tangent, permeability, magnetic_loss_tangent: see `Medium`.
         thickness: thickness ≥ 0 [m].
     """
 
@@ -285,7 +307,8 @@ class Layer(Medium):
     def sheet(self, frequency: float) -> SlabLayer:
         """Return the layer as numbers at `frequency` [Hz], for `slab_tables`."""
         epsilon, dispersion = self._epsilon(frequency)
-        values = (epsilon, dispersion, evaluate_value(self.thickness))
+        thickness = evaluate_value(self.thickness)
+        values = (epsilon, dispersion, thickness, self.complex_permeability)
         return SlabLayer(*(value[..., None] for value in values))
 
 
@@ -297,8 +320,8 @@ class Slab(Layer, EffectiveRoughness, Material):
     Transmitted paths are straight and delayed by the sheet's group delay.
 
     Attributes:
-        permittivity, conductivity, loss_tangent, thickness: see `Layer`; the other fields are
-            those of `EffectiveRoughness`, of what it reflects.
+        permittivity, conductivity, loss_tangent, permeability, magnetic_loss_tangent, thickness:
+            see `Layer`; the other fields are those of `EffectiveRoughness`, of what it reflects.
     """
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
@@ -309,7 +332,8 @@ class Slab(Layer, EffectiveRoughness, Material):
 
     def smooth_interface(self, frequency: float) -> SmoothInterface | None:
         """Return the coherent interface of the sheet at `frequency` [Hz]."""
-        return self.make_interface(self.complex_permittivity(frequency), self.thickness)
+        epsilon = self.complex_permittivity(frequency)
+        return self.make_interface(epsilon, self.thickness, self.complex_permeability)
 
 
 @dataclass(frozen=True)
@@ -378,9 +402,6 @@ def _slab_scattering_law(
     layers: Sequence[Layer], roughness: EffectiveRoughness, frequency: float
 ) -> ScatteringLaw:
     tables = slab_tables([layer.sheet(frequency) for layer in layers], _COSINES, frequency)
-    # The derivative of the root is infinite at zero; the amplitude has none there.
-    seen = tables.reflectance > _SAFE_POWER
-    amplitude = torch.where(seen, torch.where(seen, tables.reflectance, 1.0).sqrt(), 0.0)
     through = {"transmittance": tables.transmittance, "extra_length": tables.extra_length}
     through |= roughness.depolarisation_terms
-    return ScatteringLaw(amplitude, *roughness.weights(), **through)
+    return ScatteringLaw(safe_root(tables.reflectance), *roughness.weights(), **through)

@@ -62,7 +62,9 @@ def radio_bsdf(material: Material, name: str) -> ElementTree.Element:
     if stated:
         given = {word: given[word] for word in ("thickness", "scattering_coefficient")}
     plain = all(isinstance(value, int | float) for value in given.values())
-    if not (isinstance(material, Slab) and plain and material.loss_tangent == 0):
+    if isinstance(material, Slab):
+        plain &= material.loss_tangent == 0 and not material.is_magnetic
+    if not (isinstance(material, Slab) and plain):
         raise InputError(
             f"expected a Slab of single numbers or of the ITU table for {name!r}, got "
             f"{type(material).__name__}; Sionna RT has sheets only: replace it before writing"

@@ -24,6 +24,7 @@ from invertwin.scene.material.values import Value, checked_value, evaluate_value
 
 SPECULAR_LOBE_WIDTH = math.radians(5.0)
 ROUGH_LOBE_WIDTH = math.radians(20.0)
+_ONE = torch.ones((), dtype=torch.float64)
 ROUGH_SCATTERING = 0.4
 """S of building walls, as measured (Degli-Esposti et al. 2007)."""
 
@@ -115,17 +116,21 @@ class EffectiveRoughness:
     depolarisation: Value = 0.0
 
     def make_interface(
-        self, permittivity: Tensor | None, thickness: Value = math.inf
+        self,
+        permittivity: Tensor | None,
+        thickness: Value = math.inf,
+        permeability: Tensor = _ONE,
     ) -> SmoothInterface:
         """Return the coherent interface, which keeps the fraction 1 − S² of the power.
 
         Args:
             permittivity: complex relative permittivity; None for a conductor.
             thickness: thickness of a sheet [m].
+            permeability: complex relative permeability.
         """
         coherent = (1 - evaluate_value(self.scattering) ** 2).sqrt()
         depth, height = evaluate_value(thickness), evaluate_value(self.rms_height)
-        return SmoothInterface(permittivity, depth, coherent, height)
+        return SmoothInterface(permittivity, depth, coherent, height, permeability)
 
     @property
     def depolarisation_terms(self) -> dict[str, Tensor]:

@@ -1,7 +1,8 @@
 """Layered sheets in air: reflectance, transmittance and group delay.
 
-A plane wave in layer j has the normal wave number k s_j, s_j² = ε_j − sin²θ, and crosses it with
-the phase δ_j = k s_j d_j. With u_j = s_j for perpendicular and s_j/ε_j for parallel polarisation,
+A plane wave in layer j has the normal wave number k s_j, s_j² = ε_j μ_j − sin²θ, and crosses it
+with the phase δ_j = k s_j d_j. With u_j = s_j/μ_j for perpendicular and s_j/ε_j for parallel
+polarisation,
 every interface has r = (u_i − u_j)/(u_i + u_j) and t = 2u_i/(u_i + u_j), and one more layer in
 front of a stack (r', t') makes
 
@@ -33,6 +34,8 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene.material.fresnel import LEAST_COSINE, FieldCoefficients
 
+_ONE = torch.ones((), dtype=torch.float64)
+
 
 class SlabLayer(NamedTuple):
     """Layer as numbers: each 0-d or one per triangle with a last axis of 1 for the angles.
@@ -41,11 +44,13 @@ class SlabLayer(NamedTuple):
         permittivity: complex relative permittivity ε.
         dispersion: ω dε/dω.
         thickness: thickness [m].
+        permeability: complex relative permeability μ, without dispersion.
     """
 
     permittivity: Tensor
     dispersion: Tensor
     thickness: Tensor
+    permeability: Tensor = _ONE
 
 
 class SlabTables(NamedTuple):
@@ -170,15 +175,16 @@ def _response(
     air = cosine.to(torch.complex128)
     media, phases = [(air, torch.zeros_like(air))], []
     for layer in layers:
-        root = torch.sqrt(layer.permittivity - 1 + cosine**2)
-        root_slope = layer.dispersion / (2 * root)
+        mu = layer.permeability
+        root = torch.sqrt(layer.permittivity * mu - 1 + cosine**2)
+        root_slope = mu * layer.dispersion / (2 * root)
         thickness = wave_number * layer.thickness
         phases.append((thickness * root, thickness * (root + root_slope)))
         if parallel:
             u = root / layer.permittivity
             media.append((u, (root_slope - u * layer.dispersion) / layer.permittivity))
         else:
-            media.append((root, root_slope))
+            media.append((root / mu, root_slope / mu))
     media.append(media[0])
     total = _interface(media[-2], media[-1])
     for k in reversed(range(len(layers))):

@@ -139,12 +139,14 @@ class SmoothInterface(NamedTuple):
         thickness: thickness of a sheet centred on the surface [m]; infinite for a body.
         coherence: fraction of the reflected field in the specular direction, in [0, 1].
         rms_height: rms height of the roughness [m].
+        permeability: complex relative permeability.
     """
 
     permittivity: Tensor | None
     thickness: Tensor
     coherence: Tensor
     rms_height: Tensor
+    permeability: Tensor = _ONE
 
     def select_triangles(self, triangle: Int64[Tensor, " n"]) -> "SmoothInterface":
         """Return the values of some triangles; values for all triangles are kept."""
@@ -211,10 +213,10 @@ class Material(ABC):
             return FieldCoefficients(-kept * one, kept * one, 0 * one, 0 * one)
         if bool(torch.isfinite(skin.thickness).all()):
             none = torch.zeros_like(skin.permittivity)  # dispersion, unused here
-            sheet = SlabLayer(skin.permittivity, none, skin.thickness)
+            sheet = SlabLayer(skin.permittivity, none, skin.thickness, skin.permeability)
             found = sheet_coefficients([sheet], cosine, frequency)
         else:
-            half = fresnel_coefficients(skin.permittivity, cosine)
+            half = fresnel_coefficients(skin.permittivity, cosine, skin.permeability)
             found = half._replace(transmission_s=0 * one, transmission_p=0 * one)
         return found.scale_reflection(kept)
 

@@ -119,6 +119,8 @@ RANGES: Mapping[str, ValueRange] = {
     "permittivity": ValueRange("relative permittivity", 1.0),
     "conductivity": ValueRange("conductivity [S/m]", 0.0),
     "loss_tangent": ValueRange("loss tangent", 0.0),
+    "permeability": ValueRange("relative permeability", 0.0, open_low=True),
+    "magnetic_loss_tangent": ValueRange("magnetic loss tangent", 0.0),
     "thickness": ValueRange("thickness [m]", 0.0),
     "diffuse": ValueRange("diffuse fraction", 0.0, 1.0),
     "lobe_width": ValueRange("lobe width [rad]", 3.4e-4, math.pi),
