@@ -20,6 +20,7 @@ from invertwin.scene import (
     sphere,
     trihedral,
 )
+from invertwin.scene.mesh import concatenate_meshes
 from invertwin.signatures import aspect_directions, to_dbsm
 from scenes import float64
 
@@ -150,6 +151,24 @@ def test_bad_arguments_are_named(change, text):
     given = {"directions": AHEAD, "frequencies": 30e9} | change
     with pytest.raises(InputError, match=text):
         iw.rcs(target(plate(0.1, 0.1)), **given)
+
+
+@pytest.mark.parametrize(
+    ("parts", "named"),
+    [
+        ([plate(0.1, 0.1), plate(0.05, 0.05, 2)], "10 triangles on others"),
+        ([sphere(0.1, 2), sphere(0.08, 2)], "closed parts that overlap or touch"),
+    ],
+)
+def test_what_a_ray_meets_twice_is_named(parts, named):
+    with pytest.raises(InputError, match=f"place of target, got {named}"):
+        iw.rcs(target(concatenate_meshes(parts)), AHEAD, 30e9)
+
+
+def test_magnetic_materials_are_refused():
+    tile = iw.Object(plate(0.1, 0.1), Slab(4.0, permeability=2.0, thickness=0.002))
+    with pytest.raises(InputError, match="permeability of 1 of tile"):
+        iw.rcs(iw.Scene({"tile": tile}), AHEAD, 30e9)
 
 
 def test_uneven_frequencies_have_no_range_profile():

@@ -26,6 +26,8 @@ from invertwin.deprecation import rename_attributes, rename_members
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.scene import Scene
+from invertwin.scene.material.materials import Medium
+from invertwin.scene.mesh_defects import require_single_surfaces
 from invertwin.scene.polarisation import jones_basis
 
 _VALUES_PER_CHUNK = 1 << 22  # frequencies × aspects × points
@@ -127,6 +129,15 @@ class Signature:
         return torch.cat(found).reshape(*positions.shape[:-1], 2, 2)
 
 
+def _require_dielectrics(scene: Scene) -> None:
+    for name, item in scene.objects.items():
+        if isinstance(item.material, Medium) and item.material.is_magnetic:
+            raise InputError(
+                f"expected a permeability of 1 of {name} for its cross-section, got a magnetic "
+                "material; signatures know dielectrics only"
+            )
+
+
 def rcs(
     scene: Scene,
     directions: ArrayLike,
@@ -170,12 +181,15 @@ def rcs(
     Raises:
         InputError: no direction or frequency, a rough surface, a cloud, derivatives of a scene of
             more than 24 triangles or with respect to directions or frequencies, dielectrics in
-            contact with or inside each other.
+            contact with or inside each other, a magnetic material, an object whose parts overlap
+            or are doubled.
 
     Source: derivations §4, §13, §14.
     """
     transmitters, receiver_directions, sweep = _check_sweep(directions, receivers, frequencies)
     axis = checked_tensor(up, (3,), "up", "give a vector such as 0, 0, 1")
+    _require_dielectrics(scene)
+    require_single_surfaces(scene)
     tubes = checked_number(tubes_per_wavelength, "tubes per wavelength", 0.0, open_low=True)
     parts = trace_far_field(
         scene,

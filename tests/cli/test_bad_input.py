@@ -158,7 +158,8 @@ def test_one_line_code_2_and_results_untouched(folder, monkeypatch, capfd, text,
 def shapes() -> dict[str, Mesh]:
     """Meshes that are odd but mean something, all in the y-z plane or near it."""
     corners = [[0.0, -0.2, -0.2], [0.0, 0.2, -0.2], [0.0, 0.0, 0.2], [-0.2, 0.0, 0.0]]
-    fins = [[0, 2, 1], [0, 1, 3], [0, 3, 1]]  # three faces on one edge
+    corners.append([0.2, 0.0, 0.0])
+    fins = [[0, 2, 1], [0, 1, 3], [0, 1, 4]]  # three faces on one edge
     return {
         "open": Mesh(torch.tensor(corners).double(), torch.tensor([[0, 2, 1]])),
         "non-manifold": Mesh(torch.tensor(corners).double(), torch.tensor(fins)),

@@ -4,6 +4,7 @@ import time
 import tomllib
 
 import pytest
+import torch
 
 from cli.small import GRADCHECK, RUN, STARTS, call
 from invertwin.cli import estimate as estimates
@@ -17,6 +18,7 @@ from invertwin.errors import PhysicsWarning
 from invertwin.runtime.progress import format_duration
 from invertwin.scene import Mesh, shapes
 from invertwin.scene.files import save_mesh
+from invertwin.scene.mesh import concatenate_meshes
 
 PAINT = 'material = { kind = "rough_dielectric", permittivity = 4.0 }\n'
 TEXT = f'\n[scene.letter]\nshape = "text"\ntext = "AB"\nsize = 0.6\n{PAINT}'
@@ -137,6 +139,22 @@ def test_check_says_memory_and_time_and_leaves_nothing(run_file, monkeypatch, ca
     assert "GB free" in said
     assert f"{8 * 24_000:.2g} rays" in said
     assert [path.name for path in run_file.parent.iterdir()] == ["small.toml"]
+
+
+@pytest.mark.filterwarnings("default::invertwin.errors.PhysicsWarning")
+def test_check_names_what_is_wrong_with_a_mesh(run_file, monkeypatch, capsys):
+    """Two halves of a plate, a hundredth of a millimetre apart."""
+    half, aside = shapes.plate(0.2, 0.3), torch.tensor([0.0, 0.20001, 0.0]).double()
+    cracked = concatenate_meshes([half, Mesh(half.vertices + aside, half.faces)])
+    save_mesh(run_file.with_name("cracked.ply"), cracked)
+    drawn = 'shape = "plate"\nwidth = 0.4\nheight = 0.3\ndivisions = 3\n'
+    run_file.write_text(RUN.replace(drawn, 'file = "cracked.ply"\n'))
+    assert call(monkeypatch, "check", run_file) == 0
+    said, warned = capsys.readouterr()
+    rows = [line.split("│")[1:-1] for line in said.splitlines() if "│" in line]
+    defects = {row[0].strip(): row[-1].strip() for row in rows if len(row) == 6}
+    assert defects == {"plate": "2 edges along cracks", "wall": "none"}
+    assert "the mesh has 2 edges along cracks" in warned
 
 
 def test_points_of_every_object_are_counted(run_file, monkeypatch, capsys):

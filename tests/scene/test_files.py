@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,7 @@ from invertwin.scene import (
     sphere,
     text,
 )
+from invertwin.scene.mesh import concatenate_meshes
 from invertwin.storage.untrusted import read_arrays
 
 
@@ -86,10 +88,44 @@ def test_text_obj_with_normals_and_quads(tmp_path):
 
 def test_open_and_degenerate_meshes_are_read(tmp_path):
     path = tmp_path / "odd.obj"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 1 3\nf 1 1 2\n")
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 1 2\n")
     mesh = load_mesh(path)
     assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    assert mesh.faces.tolist() == [[0, 1, 2], [0, 1, 3], [1, 0, 2], [0, 0, 1]]
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 1, 3], [0, 0, 1]]
+
+
+def test_repeated_triangles_are_left_out(tmp_path):
+    """Whichever way their corners go round, as programs write surfaces with two sides."""
+    path = tmp_path / "double.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 1 3\nf 4 1 2\n")
+    with pytest.warns(PhysicsWarning, match="repeated.*4 triangles are 2"):
+        mesh = load_mesh(path)
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 1, 3]]
+
+
+@pytest.mark.parametrize(
+    ("offset", "named"),
+    [((-0.15, 0.05, 0.02), "4 triangles on others"), ((-0.15 - 2e-5, 0, 0), None)],
+    ids=["a patch", "in front of it"],
+)
+def test_patches_on_a_face_are_named(tmp_path, offset, named):
+    body, patch = box((0.3, 0.4, 0.5)), plate(0.2, 0.25)
+    patch = Mesh(patch.vertices + torch.tensor(offset).double(), patch.faces)
+    save_mesh(tmp_path / "body.ply", concatenate_meshes([body, patch]))
+    with warnings.catch_warnings(record=True) as issued:
+        warnings.simplefilter("always")
+        load_mesh(tmp_path / "body.ply")
+    assert [named in str(w.message) for w in issued] == ([True] if named else [])
+
+
+def test_cracks_are_named(tmp_path):
+    """One plate of a box a hundredth of a millimetre off."""
+    plates = [Mesh(box(0.4).vertices, pair) for pair in box(0.4).faces.split(2)]
+    normal = torch.linalg.cross(*(plates[0].vertices[plates[0].faces[0]].diff(dim=0)))
+    off = plates[0].vertices + 2e-5 * torch.nn.functional.normalize(normal, dim=0)
+    save_mesh(tmp_path / "body.ply", concatenate_meshes([Mesh(off, plates[0].faces), *plates[1:]]))
+    with pytest.warns(PhysicsWarning, match="8 edges along cracks"):
+        load_mesh(tmp_path / "body.ply")
 
 
 def test_glb_keeps_names_and_materials(tmp_path):
@@ -98,7 +134,7 @@ def test_glb_keeps_names_and_materials(tmp_path):
         {
             "plate": Object(plate(1.0, 1.0), PerfectConductor()),
             "ball": Object(sphere(0.1, 1), paint),
-            "wall": Object(plate(2.0, 1.0), paint),
+            "wall": Object(plate(2.0, 1.0), paint, rigid(translation=torch.eye(3).double()[0])),
         }
     )
     save_mesh(tmp_path / "scene.glb", scene)
@@ -462,6 +498,7 @@ def test_written_scenes_are_read_again(tmp_path):
         RoughDielectric(4.0),
         Slab([3.0] * 12, thickness=0.1),
         Slab(3.0, thickness=0.1, loss_tangent=0.1),
+        Slab(3.0, thickness=0.1, permeability=2.0),
     ],
 )
 def test_what_sionna_has_no_words_for_is_not_written(tmp_path, material):

@@ -70,3 +70,33 @@ def test_a_file_of_overlapping_parts_is_repaired_and_says_so(tmp_path):
         read = load_mesh(tmp_path / "halves.ply")
     assert volume(read) == pytest.approx(0.06)
     assert math.isclose(read.area, box((0.4, 0.5, 0.3)).area)
+
+
+def other_diagonals(mesh):
+    """A box whose quadrilaterals are split along the other diagonal."""
+    turned = mesh.vertices * torch.tensor([1.0, -1.0, 1.0]).double()
+    return Mesh(turned, mesh.faces.flip(1))
+
+
+@pytest.mark.parametrize("again", [lambda mesh: mesh, other_diagonals])
+def test_equal_bricks_that_touch_in_a_whole_face_are_one(again):
+    """The face of contact is in both: by the same triangles, or by others."""
+    brick = box((0.2, 0.3, 0.1))
+    wall = [brick, moved(again(brick), 0.2, 0, 0), moved(brick, 0, 0, 0.1)]
+    whole = merge_meshes(wall)
+    assert whole.area == pytest.approx(3 * brick.area - 2 * 0.03 - 2 * 0.06)
+    assert whole.summary().open_edges == whole.summary().nonmanifold_edges == 0
+
+
+def test_four_bricks_around_an_edge_are_one():
+    brick = box(0.2)
+    whole = merge_meshes([moved(brick, x, y, 0) for x in (0.0, 0.2) for y in (0.0, 0.2)])
+    assert whole.area == pytest.approx(box((0.4, 0.4, 0.2)).area)
+
+
+def test_a_sheet_with_two_sides_stays():
+    sheet = plate(0.3, 0.3)
+    both = Mesh(sheet.vertices, torch.cat([sheet.faces, sheet.faces.flip(1)]))
+    beside = merge_meshes([both, box(0.2), moved(box(0.2), 0.1, 0, 0)])
+    assert beside.area == pytest.approx(sheet.area + box((0.3, 0.2, 0.2)).area)
+    assert len(merge_meshes([both]).faces) == 2 * len(sheet.faces)

@@ -28,6 +28,8 @@ from invertwin.scene.material.materials import (
 from invertwin.scene.material.radio_materials import radio_bsdf, read_radio_material
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
+from invertwin.scene.mesh_defects import find_defects
+from invertwin.scene.mesh_topology import sort_rows
 from invertwin.scene.mesh_union import unite_parts
 from invertwin.scene.pose import Basis
 from invertwin.scene.scene import Object, Scene
@@ -50,7 +52,8 @@ def load_mesh(file: str | Path, unit: Unit = "m") -> Mesh:
     """Load a triangle mesh from a file; `Mesh.summary` describes it.
 
     Vertices at equal positions are merged, unused vertices are dropped, the rest keep their order.
-    Closed parts that overlap or touch become one surface, which a warning says.
+    Closed parts that overlap or touch become one surface, and triangles that are repeated are left
+    out, which a warning says; it also names cracks, and triangles that lie on others.
     All parts of the file become one mesh (`load_parts` separates them). Axes are kept, except those
     of glTF, whose standard says y up: they are turned about x to z up, as Blender does. A mesh
     larger than 100 m causes a warning, since it may be in millimetres. From Abaqus and AVS UCD
@@ -125,19 +128,20 @@ def _load_with(
         for vertices, faces in found.values():
             Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
         merged = {name: _merge_vertices(*part) for name, part in found.items()}
-        meshes = {name: unite_parts(mesh) for name, mesh in merged.items()}
+        meshes = {name: _drop_repetitions(unite_parts(mesh)) for name, mesh in merged.items()}
         if not meshes:
             raise InputError("expected triangles, got none; export the mesh again")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     for name, mesh in meshes.items():
+        notes = [f"the mesh has {text}" for text in find_defects(mesh).in_words()]
         if mesh is not merged[name]:
-            warnings.warn(
-                f"{path}: parts of the mesh overlap or touch; without what lies inside of others, "
-                f"{len(merged[name].faces)} triangles are {len(mesh.faces)}",
-                PhysicsWarning,
-                stacklevel=3,
+            notes.append(
+                "parts of the mesh overlap or touch, or are repeated; without what lies inside of "
+                f"others, {len(merged[name].faces)} triangles are {len(mesh.faces)}"
             )
+        if notes:
+            warnings.warn(f"{path}: {'; '.join(notes)}", PhysicsWarning, stacklevel=3)
     extent = max(float(np.ptp(vertices, axis=0).max()) for vertices, _ in found.values())
     if extent > _LARGE:
         warnings.warn(
@@ -337,6 +341,14 @@ def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     renumbered[used] = rank[group.ravel()]
     merged = vertices[used][first[order]]
     return Mesh(torch.from_numpy(merged), torch.from_numpy(renumbered[faces]))
+
+
+def _drop_repetitions(mesh: Mesh) -> Mesh:
+    """Return the mesh with each triangle once, whichever way its corners go round."""
+    corners = np.sort(mesh.faces.numpy(), axis=1)
+    order, start = sort_rows(*corners.T, count=len(mesh.vertices))
+    kept = np.sort(order[start])
+    return mesh if len(kept) == len(order) else Mesh(mesh.vertices, mesh.faces[kept])
 
 
 def _viewer_material(material: Material | None) -> PBRMaterial:

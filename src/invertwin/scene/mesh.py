@@ -69,8 +69,7 @@ class Mesh:
         """Return its size and topology, of welded vertices and divided edges as rays meet them."""
         points = strip_derivatives(self.vertices).numpy()
         welded, places = mesh_topology.weld_faces(points, strip_derivatives(self.faces).numpy())
-        ends, _, _ = mesh_topology.half_edges(welded, places)
-        _, _, counts = mesh_topology.unique_edges(ends, len(places))
+        counts = mesh_topology.find_edges(welded, places).counts
         x, y, z = np.ptp(points, axis=0).tolist()
         edges = int((counts == 1).sum()), int((counts > 2).sum())
         return MeshSummary((x, y, z), len(self.faces), *edges)

@@ -7,12 +7,13 @@ only where no other triangle continues it.
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias
 
 import igl
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -21,9 +22,9 @@ WELD_TOLERANCE = 1e-6
 
 Points: TypeAlias = Float64[np.ndarray, "v 3"]
 Groups: TypeAlias = Int64[np.ndarray, " v"]
-# Of a hash of three numbers: odd constants of good mixing.
-_MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+_LINE = 0.8191, 0.4731, 0.3244  # a direction across no planes that people draw
 _MAX_PARTS = 2000  # whose boxes are compared in pairs
+_SAME_SIDE = 1e-3  # rad between half planes at an edge that count as one
 
 
 def weld_faces(
@@ -47,28 +48,63 @@ def weld_vertices(places: Points) -> Int64[np.ndarray, " v"]:
     Args:
         places: positions in units of the size of their group, as ``separate_groups`` returns them.
     """
-    # Equal to the last bit first: files repeat each corner about six times.
-    first, inverse = _unique_rows(np.ascontiguousarray(places).view(np.int64))
-    tree = cKDTree(places[first], balanced_tree=False, compact_nodes=False)
-    pairs = first[tree.query_pairs(WELD_TOLERANCE, output_type="ndarray")]
-    welded = first[inverse]
+    # Copies of a place follow each other along any line, and close places are close there.
+    along = places[:, 0] * _LINE[0] + places[:, 1] * _LINE[1] + places[:, 2] * _LINE[2]
+    along -= along.min()
+    cell = (along * ((2**40 - 1) / max(along.max(), 1.0))).astype(np.int64)
+    order, _ = sort_rows(cell >> 20, cell & (2**20 - 1), count=2**20)
+    start = _find_runs([column[order] for column in places.T])
+    lowest = order[start]
+    pairs = _find_close_pairs(places[lowest], along[lowest])
     if len(pairs):
-        chain = label_components(pairs, len(places))[welded]
-        lowest = np.full(chain.max() + 1, len(places))
-        np.minimum.at(lowest, chain, welded)
-        welded = lowest[chain]
+        chain = label_components(pairs, len(start))
+        least = np.full(chain.max() + 1, len(places))
+        np.minimum.at(least, chain, lowest)
+        lowest = least[chain]
+    welded = np.empty_like(order)
+    welded[order] = np.repeat(lowest, np.diff(start, append=len(order)))
     return welded
 
 
-def _unique_rows(
-    rows: Int64[np.ndarray, "n 3"],
-) -> tuple[Int64[np.ndarray, " u"], Int64[np.ndarray, " n"]]:
-    """Return the first row of each kind, and the kind of each row; by hashes, which sort faster."""
-    mixed = (rows.view(np.uint64) * _MIXERS).sum(1, dtype=np.uint64)
-    _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
-    if not np.array_equal(rows[first][inverse], rows):  # two kinds with one hash
-        _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    return first, inverse.ravel()
+def _find_close_pairs(places: Points, along: Float64[np.ndarray, " v"]) -> Int64[np.ndarray, "n 2"]:
+    """Return pairs of places within the tolerance, of places in their order along a line."""
+    pairs, first, step = list[Int64[np.ndarray, "n 2"]](), np.arange(len(places) - 1), 1
+    while len(first):
+        first = first[along[first + step] - along[first] <= 1.1 * WELD_TOLERANCE]
+        gap = places[first + step] - places[first]
+        close = first[np.einsum("ei,ei->e", gap, gap) <= WELD_TOLERANCE**2]
+        pairs.append(np.stack([close, close + step], 1))
+        step += 1
+        first = first[first + step < len(places)]
+    return np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])
+
+
+def sort_rows(
+    *columns: Int64[np.ndarray, " n"], count: int
+) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " u"]]:
+    """Return the stable order of rows, and where in it runs of equal ones begin; in linear time.
+
+    Args:
+        columns: numbers of the rows, from 0, the first column counting most.
+        count: more than all numbers.
+    """
+    size = len(columns[0])
+    order, entries, ends = np.arange(size), np.ones(size, dtype=bool), np.arange(size + 1)
+    if count > 32 * size:
+        order = np.lexsort(columns[::-1])
+    else:
+        # Columns of a sparse matrix list their rows in order: a counting sort.
+        for column in reversed(columns):
+            table = csr_array((entries, column[order], ends), shape=(size, count))
+            order = order[table.tocsc().indices]
+    return order, _find_runs([column[order] for column in columns])
+
+
+def _find_runs(columns: Sequence[np.ndarray]) -> Int64[np.ndarray, " u"]:
+    """Return where runs of equal rows begin."""
+    begins = np.ones(len(columns[0]), dtype=bool)
+    begins[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
+    return np.flatnonzero(begins)
 
 
 def label_components(pairs: Int64[np.ndarray, "n 2"], count: int) -> Int64[np.ndarray, " node"]:
@@ -103,7 +139,7 @@ def triangle_sides(faces: Int64[np.ndarray, "f 3"]) -> Int64[np.ndarray, "h 2"]:
     Args:
         faces: vertices of each triangle.
     """
-    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return np.stack([faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()], 1)
 
 
 def separate_groups(points: Points, groups: Groups) -> Points:
@@ -113,157 +149,269 @@ def separate_groups(points: Points, groups: Groups) -> Points:
         points: positions [m].
         groups: number of the group of each vertex, from 0.
     """
-    index = np.argsort(groups, kind="stable")
-    present, start = np.unique(groups[index], return_index=True)
-    low, high = (f.reduceat(points[index], start) for f in (np.minimum, np.maximum))
-    size = np.linalg.norm(high - low, axis=1)
-    row = np.searchsorted(present, groups)
-    places = (points - low[row]) / np.where(size > 0, size, 1.0)[row, None]
-    places[:, 0] += 2.0 * row
-    return places + 0.0  # −0 and 0 are one place
+    index, start = sort_rows(groups, count=int(groups.max()) + 1)
+    places = points[index]
+    for row, own in enumerate(np.split(places, start[1:])):
+        own -= own.min(0)
+        own /= np.linalg.norm(own.max(0)) or 1.0
+        own[:, 0] += 2.0 * row
+    found = np.empty_like(places)
+    found[index] = places
+    return found
 
 
-def half_edges(
+class MeshEdges(NamedTuple):
+    """Edges of triangles, and their half edges (sides of triangles), one edge after the other.
+
+    Attributes:
+        ends: vertices of each edge, in ascending order.
+        counts: number of half edges of each edge.
+        apex: opposite vertex of each half edge.
+        triangle: triangle of each half edge.
+    """
+
+    ends: Int64[np.ndarray, "e 2"]
+    counts: Int64[np.ndarray, " e"]
+    apex: Int64[np.ndarray, " h"]
+    triangle: Int64[np.ndarray, " h"]
+
+
+def find_edges(
     faces: Int64[np.ndarray, "f 3"], places: Points, owner: Int64[np.ndarray, " f"] | int = 0
-) -> tuple[Int64[np.ndarray, "h 2"], Int64[np.ndarray, " h"], Int64[np.ndarray, " h"]]:
-    """Return the sides of triangles: ends in ascending order, opposite vertex, and triangle.
+) -> MeshEdges:
+    """Find the edges of triangles.
 
-    Slivers and repetitions of a triangle in one object have no sides. A side on which vertices of
+    Slivers and repetitions of a triangle in one object have none. A side on which vertices of
     other edges lie is several, from one to the next.
+
+    Args:
+        faces: welded vertices of each triangle.
+        places: positions in units of the size of their group.
+        owner: object of each triangle; repetitions in others count.
+    """
+    number = np.flatnonzero(~find_slivers(places[faces]))
+    whole = _sides_of(faces, number, len(places))
+    # A repeated triangle has two half edges of one apex at its edges.
+    if whole.counts.max(initial=0) > 2 or (np.diff(_pairs_at_edges(whole, whole.apex)) == 0).any():
+        whole = _sides_of(faces, find_distinct_faces(faces, places, owner), len(places))
+    return _split_at_vertices(whole, places)
+
+
+def _sides_of(
+    faces: Int64[np.ndarray, "f 3"], number: Int64[np.ndarray, " n"], vertex_count: int
+) -> MeshEdges:
+    """Group the sides of some triangles by edges."""
+    a, b, c = faces[number].T
+    sides = np.stack([np.concatenate([a, b, c]), np.concatenate([b, c, a])], 1)
+    return _group_sides(sides, np.concatenate([c, a, b]), np.tile(number, 3), vertex_count)
+
+
+def find_distinct_faces(
+    faces: Int64[np.ndarray, "f 3"], places: Points, owner: Int64[np.ndarray, " f"] | int = 0
+) -> Int64[np.ndarray, " n"]:
+    """Return the numbers of triangles that are neither slivers nor repetitions in one object.
 
     Args:
         faces: welded vertices of each triangle.
         places: positions in units of the size of their group.
         owner: object of each triangle.
     """
-    number = np.flatnonzero(~_is_sliver(places[faces]))
-    kinds = np.sort(faces, axis=1) + np.reshape(owner, (-1, 1)) * len(places)
-    number = number[np.sort(_unique_rows(kinds[number])[0])]
-    corners = faces[number]
-    ends = np.sort(triangle_sides(corners), axis=1)
-    apex = corners[:, [2, 0, 1]].T.ravel()
-    return _split_at_vertices(ends, apex, np.tile(number, 3), places)
+    number = np.flatnonzero(~find_slivers(places[faces]))
+    a, b, c = faces[number].T
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    body = np.broadcast_to(owner, len(faces))[number]
+    order, start = sort_rows(low, a + b + c - low - high, high, body, count=len(places))
+    return number if len(start) == len(order) else number[np.sort(order[start])]
 
 
-def _is_sliver(corners: Float64[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, " f"]:
-    """Mask of triangles that are narrower than the tolerance."""
-    sides = corners[:, [1, 2, 0]] - corners
-    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    return area <= WELD_TOLERANCE * np.linalg.norm(sides, axis=2).max(1, initial=0.0)
+def merge_doubled_sides(
+    edges: MeshEdges, places: Points, owner: Int64[np.ndarray, " f"] | int = 0
+) -> MeshEdges:
+    """Keep one of the half edges of an object that lie in one half plane at an edge.
+
+    Where faces are doubled, by other triangles or by bodies with planes in common, the surface
+    goes on once.
+
+    Args:
+        edges: edges of triangles.
+        places: positions in units of the size of their group.
+        owner: object of each triangle.
+    """
+    side, _, plane = _sort_around_edges(edges, places)
+    body = edges.triangle[side] * 0 if isinstance(owner, int) else owner[edges.triangle[side]]
+    order = np.lexsort((body, plane))
+    kept = np.ones(len(edges.apex), dtype=bool)
+    kept[side[order[1:]]] = (np.diff(plane[order]) != 0) | (np.diff(body[order]) != 0)
+    counts = np.bincount(np.repeat(np.arange(len(edges.counts)), edges.counts)[kept])
+    return MeshEdges(edges.ends, counts, edges.apex[kept], edges.triangle[kept])
 
 
-def _split_at_vertices(
+def _sort_around_edges(
+    edges: MeshEdges, places: Points, least: int = 3
+) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
+    """Sort the half edges at edges of some and more by angle: number, edge and half plane.
+
+    Half planes are numbered in the order of the angle, one edge after the other.
+    """
+    edge = np.repeat(np.arange(len(edges.counts)), edges.counts)
+    side = np.flatnonzero((edges.counts >= least)[edge])
+    edge, (start, end) = edge[side], np.moveaxis(places[edges.ends[edge[side]]], 1, 0)
+    axis, into = _unit(end - start), places[edges.apex[side]] - start
+    into = _unit(into - (into * axis).sum(1)[:, None] * axis)
+    x = into[np.searchsorted(edge, edge)]  # of the first half edge
+    angle = np.arctan2((into * np.cross(axis, x)).sum(1), (into * x).sum(1))
+    angle = (angle + _SAME_SIDE) % (2 * np.pi)
+    order = np.lexsort((angle, edge))
+    turns = np.diff(angle[order], prepend=0.0) > _SAME_SIDE
+    turns |= np.diff(edge[order], prepend=-1) != 0
+    return side[order], edge[order], np.cumsum(turns)
+
+
+def _unit(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    return vectors / np.linalg.norm(vectors, axis=1)[:, None]
+
+
+def _group_sides(
     ends: Int64[np.ndarray, "h 2"],
     apex: Int64[np.ndarray, " h"],
     triangle: Int64[np.ndarray, " h"],
-    places: Points,
-) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " p"], Int64[np.ndarray, " p"]]:
-    """Split half edges at the vertices of other edges that lie on them."""
-    edges, group, counts = unique_edges(ends, len(places))
+    vertex_count: int,
+) -> MeshEdges:
+    low, high = (pick(*ends.T) for pick in (np.minimum, np.maximum))
+    order, start = sort_rows(low, high, count=vertex_count)
+    ends = np.stack([low[order[start]], high[order[start]]], 1)
+    return MeshEdges(ends, np.diff(start, append=len(order)), apex[order], triangle[order])
+
+
+def find_slivers(corners: Float64[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, " f"]:
+    """Mask of triangles that are narrower than the tolerance.
+
+    Args:
+        corners: in units of the size of their group.
+    """
+    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    square, across, common = (
+        np.einsum("fi,fi->f", *pair) for pair in ((one, one), (other, other), (one, other))
+    )
+    longest = np.maximum(np.maximum(square, across), square + across - 2 * common)
+    # |a × b|² = a² b² − (a · b)², whose rounding is far below the square of the tolerance.
+    return square * across - common**2 <= WELD_TOLERANCE**2 * longest
+
+
+def _split_at_vertices(edges: MeshEdges, places: Points) -> MeshEdges:
+    """Split edges at the vertices of others that lie on them."""
     # Two triangles complete an edge, except where another part of the mesh touches it.
-    candidates = counts != 2
-    pairs = _pairs_of_triangles(triangle, group, counts)
+    candidates = edges.counts != 2
+    pairs = _pairs_at_edges(edges, edges.triangle)
     if len(pairs):
-        candidates[~candidates] = _near_other_parts(edges[~candidates], pairs, places)
+        part = label_components(pairs, int(pairs.max()) + 1)[pairs[:, 0]]
+        complete = places[edges.ends[~candidates]]
+        candidates[~candidates] = near_other_parts(complete, part)
     rows = np.flatnonzero(candidates)
-    row, vertex, share = find_vertices_on_edges(edges[rows], np.unique(edges[rows]), places)
-    inner = (vertex[:, None] != edges[rows[row]]).all(1)
+    ends = edges.ends[rows]
+    row, vertex, share = find_vertices_on_edges(ends, np.unique(ends), places)
+    inner = (vertex[:, None] != ends[row]).all(1)
     if not inner.any():
-        return ends, apex, triangle
+        return edges
     order = np.flatnonzero(inner)[np.lexsort((share[inner], row[inner]))]
     row, vertex = row[order], vertex[order]
-    pieces = np.bincount(rows[row], minlength=len(edges)) + 1
+    pieces = np.bincount(rows[row], minlength=len(edges.ends)) + 1
     # Stations along each edge, one edge after the other: an end, the vertices on it, the other end.
     first = np.cumsum(pieces + 1) - (pieces + 1)
     stations = np.empty(int((pieces + 1).sum()), dtype=np.int64)
-    stations[first], stations[first + pieces] = edges.T
+    stations[first], stations[first + pieces] = edges.ends.T
     inner = np.ones(len(stations), dtype=bool)
     inner[first] = inner[first + pieces] = False
     stations[inner] = vertex
+    group = np.repeat(np.arange(len(pieces)), edges.counts)
     count = pieces[group]
-    piece = np.repeat(np.arange(len(ends)), count)
+    piece = np.repeat(np.arange(len(group)), count)
     step = np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count)
     at = first[group[piece]] + step
-    return np.sort(np.stack([stations[at], stations[at + 1]], 1), 1), apex[piece], triangle[piece]
-
-
-def unique_edges(
-    ends: Int64[np.ndarray, "h 2"], vertex_count: int
-) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, " h"], Int64[np.ndarray, " e"]]:
-    """Return edges in ascending order, the edge of each half edge, and the numbers of these.
-
-    Args:
-        ends: ends of half edges, in ascending order each.
-        vertex_count: number of vertices.
-    """
-    code = ends[:, 0] * vertex_count + ends[:, 1]
-    _, first, group, counts = np.unique(
-        code, return_index=True, return_inverse=True, return_counts=True
-    )
-    return ends[first], group.ravel(), counts
+    parts = np.stack([stations[at], stations[at + 1]], 1)
+    return _group_sides(parts, edges.apex[piece], edges.triangle[piece], len(places))
 
 
 def find_parts(faces: Int64[np.ndarray, "f 3"], places: Points) -> Int64[np.ndarray, " f"]:
-    """Return the part of each triangle, connected across edges of two triangles; −1 = none.
+    """Return the part of each triangle, connected across edges; −1 = none.
 
-    Slivers and repetitions of a triangle belong to no part.
+    Where bodies touch along an edge, neighbours are those that bound one body by their normals.
+    Triangles that lie on each other at an edge are none: a sheet and its other side are two parts.
+    Slivers and repetitions of a triangle, except those of the opposite normal, belong to no part.
 
     Args:
         faces: welded vertices of each triangle.
         places: positions in units of the size of their group.
     """
-    ends, _, triangle = half_edges(faces, places)
-    _, group, counts = unique_edges(ends, len(places))
-    pairs = _pairs_of_triangles(triangle, group, counts)
-    label, found = label_components(pairs, len(faces)), np.full(len(faces), -1)
-    real = np.unique(triangle)
+    a, b, c = faces.T
+    winding = ((a > b) ^ (b > c) ^ (a > c)).astype(np.int64)
+    edges = find_edges(faces, places, winding)
+    side, edge, plane = _sort_around_edges(edges, places, 2)
+    two = (edges.counts == 2)[edge]
+    flat = np.diff(plane[two].reshape(-1, 2))[:, 0] != 0
+    beside = edges.triangle[side[two]].reshape(-1, 2)[flat]
+    around = _pairs_of_bodies(edges, (side[~two], edge[~two], plane[~two]), faces, places)
+    label = label_components(np.concatenate([beside, around]), len(faces))
+    real, found = np.unique(edges.triangle), np.full(len(faces), -1)
     found[real] = np.unique(label[real], return_inverse=True)[1].ravel()
     return found
 
 
-def _pairs_of_triangles(
-    triangle: Int64[np.ndarray, " h"],
-    group: Int64[np.ndarray, " h"],
-    counts: Int64[np.ndarray, " e"],
-) -> Int64[np.ndarray, "e2 2"]:
-    """Return the triangles of each edge that has two."""
-    order = np.argsort(group, kind="stable")
-    return triangle[order[np.repeat(counts == 2, counts)]].reshape(-1, 2)
+def _pairs_at_edges(edges: MeshEdges, values: Int64[np.ndarray, " h"]) -> Int64[np.ndarray, "e2 2"]:
+    """Return the values of both half edges of each edge that has two."""
+    return values[np.repeat(edges.counts == 2, edges.counts)].reshape(-1, 2)
 
 
-def _near_other_parts(
-    edges: Int64[np.ndarray, "e 2"],
-    pairs: Int64[np.ndarray, "e 2"],
-    places: Points,
-) -> Bool[np.ndarray, " e"]:
-    """Mask of edges of two triangles that are near another part, connected by such edges.
+def _pairs_of_bodies(
+    edges: MeshEdges, around: Sequence[np.ndarray], faces: Int64[np.ndarray, "f 3"], places: Points
+) -> Int64[np.ndarray, "n 2"]:
+    """Return triangles that follow each other around an edge of several, with a body in between."""
+    side, edge, plane = around
+    triangle = edges.triangle[side]
+    a, b, c = np.moveaxis(places[faces[triangle]], 1, 0)
+    start, end = np.moveaxis(places[edges.ends[edge]], 1, 0)
+    onwards = np.cross(end - start, places[edges.apex[side]] - start)
+    opens = (np.cross(b - a, c - a) * onwards).sum(1) < 0  # the body lies at greater angles
+    # Of two faces in contact, the one at which a body ends is first; doubled ones are ambiguous.
+    order = np.lexsort((opens, plane))
+    single = np.bincount(2 * plane + opens)[2 * plane + opens] == 1
+    triangle, opens, single = triangle[order], opens[order], single[order]
+    last = np.append(np.flatnonzero(np.diff(edge)), len(edge) - 1)[: len(edge)]
+    following = np.arange(1, len(edge) + 1)
+    following[last] = np.searchsorted(edge, edge[last])
+    found = opens & ~opens[following] & single & single[following]
+    return np.stack([triangle, triangle[following]], 1)[found]
+
+
+def near_other_parts(
+    corners: Float64[np.ndarray, "n corner 3"], part: Int64[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Mask of edges or triangles whose boxes meet those of other parts.
 
     Args:
-        edges: ends of each edge.
-        pairs: its two triangles.
-        places: positions in units of the size of their group.
+        corners: ends or corners of each, in units of the size of their group.
+        part: part of each.
     """
-    ones, part = np.ones(len(pairs), dtype=bool), label_components(pairs, int(pairs.max()) + 1)
-    part = part[pairs[:, 0]]
     order = np.argsort(part, kind="stable")
     present, start = np.unique(part[order], return_index=True)
-    if len(present) == 1:
-        return ~ones
-    if len(present) > _MAX_PARTS:
-        return ones
-    ends = places[edges]
-    low = np.minimum.reduceat(ends.min(1)[order], start) - WELD_TOLERANCE
-    high = np.maximum.reduceat(ends.max(1)[order], start) + WELD_TOLERANCE
+    if not 1 < len(present) <= _MAX_PARTS:
+        return np.full(len(part), len(present) > 1)
+    lowest, highest = corners.min(1), corners.max(1)
+    low = np.minimum.reduceat(lowest[order], start) - WELD_TOLERANCE
+    high = np.maximum.reduceat(highest[order], start) + WELD_TOLERANCE
     one, other = np.nonzero(overlapping_boxes(low, high))
     reach = np.full_like(low, np.inf), np.full_like(high, -np.inf)
     np.minimum.at(reach[0], one, np.maximum(low[one], low[other]))
     np.maximum.at(reach[1], one, np.minimum(high[one], high[other]))
     own = np.searchsorted(present, part)
-    return ((ends.min(1) <= reach[1][own]) & (ends.max(1) >= reach[0][own])).all(1)
+    return ((lowest <= reach[1][own]) & (highest >= reach[0][own])).all(1)
 
 
 def find_vertices_on_edges(
-    edges: Int64[np.ndarray, "e 2"], vertices: Int64[np.ndarray, " c"], places: Points
+    edges: Int64[np.ndarray, "e 2"],
+    vertices: Int64[np.ndarray, " c"],
+    places: Points,
+    tolerance: float = WELD_TOLERANCE,
 ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """Return edge, vertex and position along the edge, 0 to 1, of vertices that lie on edges.
 
@@ -271,21 +419,21 @@ def find_vertices_on_edges(
         edges: ends of each edge.
         vertices: vertices that count.
         places: positions of all vertices, in units of the size of their group.
+        tolerance: greatest distance from the edge, in these units.
     """
     if not len(edges) or not len(vertices):
         return edges[:0, 0], edges[:0, 0], np.zeros(0)
     start, side = places[edges[:, 0]], places[edges[:, 1]] - places[edges[:, 0]]
     length = np.linalg.norm(side, axis=1)
     tree = cKDTree(places[vertices], balanced_tree=False, compact_nodes=False)
-    radius = 0.5 * length + WELD_TOLERANCE
+    radius = 0.5 * length + tolerance
     near = tree.query_ball_point(start + 0.5 * side, radius, return_sorted=False)
     row = np.repeat(np.arange(len(edges)), [len(found) for found in near])
     vertex = vertices[np.concatenate(near).astype(np.int64)]
     offset = places[vertex] - start[row]
     along = (offset * side[row]).sum(1) / length[row]
     aside = np.linalg.norm(offset - (along / length[row])[:, None] * side[row], axis=1)
-    on = (aside <= WELD_TOLERANCE) & (along >= -WELD_TOLERANCE)
-    on &= along <= length[row] + WELD_TOLERANCE
+    on = (aside <= tolerance) & (along >= -tolerance) & (along <= length[row] + tolerance)
     return row[on], vertex[on], along[on] / length[row[on]]
 
 
@@ -315,10 +463,17 @@ def find_inward_faces(
 
 
 def _is_consistent(faces: Int64[np.ndarray, "f 3"], vertex_count: int) -> bool:
-    """Test that no two triangles run along an edge in the same direction."""
-    start, end = triangle_sides(faces).T
-    code = start * vertex_count + end
-    return len(np.unique(code)) == len(code)
+    """Test that triangles run along each edge as often in one direction as in the other.
+
+    The sum over all sides of a product of random numbers of their ends decides, with the sign of
+    the direction.
+    """
+    chance = np.random.default_rng(0).integers(1 << 62, size=vertex_count)
+    corners = [(corner, chance[corner]) for corner in faces.T]
+    total = 0
+    for (start, one), (end, other) in zip(corners, corners[1:] + corners[:1], strict=True):
+        total += int((one * other * np.sign(end - start)).sum())
+    return total % (1 << 64) == 0
 
 
 def _point_inwards(
@@ -342,5 +497,6 @@ def _volumes(
     faces: Int64[np.ndarray, "f 3"], points: Float64[np.ndarray, "v 3"]
 ) -> Float64[np.ndarray, " f"]:
     """Signed volumes between triangles and the middle of all points [m³]."""
-    a, b, c = np.moveaxis((points - points.mean(0))[faces], 1, 0)
-    return (a * np.cross(b, c)).sum(1) / 6
+    centred = points - points.mean(0)
+    a, b, c = (centred[corner] for corner in faces.T)
+    return np.einsum("fi,fi->f", a, np.cross(b, c)) / 6

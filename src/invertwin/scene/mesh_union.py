@@ -62,7 +62,8 @@ def unite_parts(mesh: Mesh) -> Mesh:
     outer = whole.as_original().simplify(mesh_topology.WELD_TOLERANCE * size).to_mesh64()
     vertices = np.asarray(outer.vert_properties, dtype=np.float64)
     faces = np.asarray(outer.tri_verts, dtype=np.int64)
-    kept = welded[~united & (part >= 0)]
+    distinct = mesh_topology.find_distinct_faces(welded, places)
+    kept = welded[distinct[~united[distinct]]]
     used, kept = np.unique(kept, return_inverse=True)
     return Mesh(
         torch.from_numpy(np.concatenate([vertices, points[used]])),

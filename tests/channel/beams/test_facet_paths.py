@@ -21,6 +21,7 @@ from invertwin.scene import (
     rotation_from_vector,
     trihedral,
 )
+from invertwin.scene.mesh import concatenate_meshes
 from invertwin.scene.polarisation import Polarisation
 from scenes import float64, link, thing
 
@@ -124,3 +125,10 @@ def test_chains_are_polarised(pair):
     )
     ratio = fields(trace_facet_paths(scene, far, 2)) / fields(sampled)
     assert float((ratio[0] - 1).abs()) < 0.05  # the other places are off its lobe
+
+
+def test_doubled_facets_are_refused():
+    double = concatenate_meshes([plate(0.1, 0.1), plate(0.05, 0.05)])
+    scene = Scene({"tile": thing(double, material=PerfectConductor())})
+    with pytest.raises(InputError, match="one surface in each place of tile, got 4 triangles"):
+        trace_facet_paths(scene, antennas(), 1)

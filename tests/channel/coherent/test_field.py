@@ -20,6 +20,7 @@ from invertwin.scene import (
     plate,
     sphere,
 )
+from invertwin.scene.mesh import concatenate_meshes
 from scenes import WAVELENGTH, float64, link, occluder, thing
 
 METAL = PerfectConductor()
@@ -392,3 +393,11 @@ def test_silhouettes_without_samples_are_refused():
     ):
         with pytest.raises(InputError, match="expected boundary_samples >= 1"):
             call()
+
+
+def test_doubled_conductors_are_refused():
+    """Points on both of two surfaces in one place would radiate: twice the field."""
+    double = concatenate_meshes([plate(0.1, 0.1), plate(0.1, 0.1, 2)])
+    scene, antennas = Scene({"a": thing(double, material=METAL)}), link(((-2.0, 0.0, 0.0),))
+    with pytest.raises(InputError, match="got 10 triangles on others; merge_meshes"):
+        trace_field(scene, antennas, sampling=Sampling(depth=1), seed=1)

@@ -21,6 +21,7 @@ from invertwin.scene import (
     Object,
     RoughDielectric,
     Scene,
+    Slab,
     TabulatedPattern,
     box,
     plate,
@@ -28,6 +29,7 @@ from invertwin.scene import (
     rotation_from_vector,
     sphere,
 )
+from invertwin.scene.mesh import concatenate_meshes
 from oracles import autodiff_deposit
 from oracles.deposit_by_paths import deposit_by_paths
 from scenes import GRID, float64, link, occluder, relative, thing
@@ -399,3 +401,17 @@ def test_a_call_leaves_nothing_to_the_garbage_collector(monkeypatch):
         assert [ref() for ref in alive] == [None]
     finally:
         gc.enable()
+
+
+def test_derivatives_with_doubled_sheets_are_refused():
+    """Both panes count at silhouettes behind them; values meet one of them."""
+    glass, turn = Slab(6.0, thickness=0.004), torch.zeros(3).double().requires_grad_()
+    pane = Object(concatenate_meshes([plate(1.0, 1.0), plate(0.5, 0.5, 2)]), glass)
+    at = float64([2.0, 0.0, 0.0])
+    for pose in (rigid(translation=at), rigid(rotation_from_vector(turn), at)):
+        scene = Scene({"pane": replace(pane, pose=pose)})
+        if not pose.requires_grad:
+            deposit_power(scene, link(), GRID, sampling=COUNTS, seed=1)
+            continue
+        with pytest.raises(InputError, match="place of pane, got 10 triangles on others"):
+            deposit_power(scene, link(), GRID, sampling=COUNTS, seed=1)

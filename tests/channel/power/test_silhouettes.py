@@ -11,7 +11,16 @@ from torch import Tensor
 from invertwin.channel import Grid, Sampling, deposit_power, use_backend
 from invertwin.channel.power.discrete import DiscreteSampler
 from invertwin.channel.rays.backend import mi
-from invertwin.scene import Mesh, Object, Scene, plate, sphere
+from invertwin.scene import (
+    Mesh,
+    Object,
+    RoughDielectric,
+    Scene,
+    plate,
+    rigid,
+    rotation_from_vector,
+    sphere,
+)
 from scenes import float64, link, noise, thing
 
 
@@ -115,3 +124,39 @@ def test_a_large_object_does_not_drown_a_small_one():
     sampling = Sampling(depth=1, samples=50_000, boundary_samples=50_000)
     derivatives = [growth([ball], ground, grid, sampling, seed) for seed in range(8)]
     assert noise(derivatives) < 0.002  # without shares for objects: 0.02
+
+
+def floor_and_fin(conforming: bool) -> Mesh:
+    """A panel on the middle of a floor; its lower edge lies within the floor's triangles."""
+    x, y = (torch.tensor(v).double() for v in ([-0.5, 0.1, 0.5], [-0.6, -0.2, 0.3, 0.6]))
+    if not conforming:
+        x, y = x[[0, 2]], y[[0, 3]]
+    floor = torch.cartesian_prod(x, y)
+    corner = torch.arange(len(floor)).reshape(len(x), len(y))
+    quads = torch.stack([corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]], -1)
+    fin = float64([[0.1, -0.2, 0.0], [0.1, 0.3, 0.0], [0.1, 0.3, 0.4], [0.1, -0.2, 0.4]])
+    vertices = torch.cat([torch.nn.functional.pad(floor, (0, 1)), fin])
+    quads = torch.cat([quads.reshape(-1, 4), len(floor) + torch.arange(4)[None]])
+    return Mesh(vertices, torch.cat([quads[:, :3], quads[:, [0, 2, 3]]]))
+
+
+@pytest.mark.parametrize("depth", [1, 2])
+def test_an_edge_within_another_triangle_of_its_mesh_casts_no_shadow_beneath(depth):
+    """The wall below the floor must not show through where the panel stands."""
+    sampling, grid = Sampling(depth, 200_000, 200_000), Grid(0.5, 0.1, 40)
+    found = []
+    for conforming in (True, False):
+        with forward_ad.dual_level():
+            shift = forward_ad.make_dual(float64(0.0), float64(1.0))
+            turn = rotation_from_vector(float64([0.2, 0.3, 0.4]))
+            moved = rigid(turn, float64([1.5, 0, 0]) + shift * float64([-0.4, 0.3, 0.2]))
+            body = Object(floor_and_fin(conforming), RoughDielectric(4.0), moved)
+            wall = Object(
+                plate(4.0, 4.0), RoughDielectric(4.0), rigid(translation=float64([2.6, 0, 0]))
+            )
+            power = deposit_power(
+                Scene({"body": body, "wall": wall}), link(), grid, sampling=sampling, seed=1
+            )
+            found.append(forward_ad.unpack_dual(power.double()).tangent)
+    conforming, other = found
+    assert float((other - conforming).norm() / conforming.norm()) < 2e-3

@@ -7,11 +7,18 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
+from invertwin.channel.rays import rigid_groups
 from invertwin.channel.rays.rigid_groups import find_rigid_groups
 from invertwin.channel.rays.topology import edge_tables, topology_of
 from invertwin.scene import Mesh, box, merge_meshes, plate, rotation_from_vector, sphere
 from invertwin.scene.mesh import concatenate_meshes
-from invertwin.scene.mesh_topology import WELD_TOLERANCE, separate_groups, weld_faces, weld_vertices
+from invertwin.scene.mesh_topology import (
+    WELD_TOLERANCE,
+    find_vertices_on_edges,
+    separate_groups,
+    weld_faces,
+    weld_vertices,
+)
 
 HALF = math.pi / 2
 TURNS = ((0, 0, 0), (0, 0, 2 * HALF), (0, 0, HALF), (0, 0, -HALF), (0, HALF, 0), (0, -HALF, 0))
@@ -102,7 +109,23 @@ def test_boxes_that_touch_along_part_of_an_edge_share_it():
     chair = concatenate_meshes([seat, Mesh(leg.vertices + place, leg.faces)])
     numbers = table(chair)
     assert 1 not in numbers
-    assert numbers[4] == 2  # the two sides of the corner that both have
+    assert numbers[3] == 2  # the two sides of the corner that both have, and the contact once
+
+
+def test_doubled_faces_count_once_at_their_edges():
+    """Two triangles of a face of a box again, split along the other diagonal."""
+    whole = box((0.4, 0.5, 0.3))
+    first = next(k for k in range(3) if int(whole.faces[0, k]) not in whole.faces[1])
+    ring = [int(whole.faces[0, (first + k) % 3]) for k in range(3)]
+    ring.insert(2, next(int(v) for v in whole.faces[1] if int(v) not in ring))
+    again = torch.tensor([[ring[0], ring[1], ring[2]], [ring[0], ring[2], ring[3]]])
+    doubled = Mesh(whole.vertices, torch.cat([whole.faces, again]))
+    assert table(doubled) == {2: 19}  # and the other diagonal
+    two = torch.cat([torch.zeros(12), torch.ones(2)]).long()  # of an object of its own
+    _, _, faces = edge_tables(
+        *weld_faces(doubled.vertices.numpy(), doubled.faces.numpy()), two.numpy()
+    )
+    assert ((faces >= 0).sum(1) == 3).sum() == 4
 
 
 def test_groups_of_vertices_stay_apart():
@@ -171,6 +194,33 @@ def test_poses_of_their_own_are_several_parameters():
     faces, points, _ = panels()
     moved = [own + shift for own, shift in zip(points, shifts, strict=True)]
     assert find_rigid_groups(faces, moved).tolist() == list(range(6))
+
+
+def test_contacts_of_copies_of_a_mesh_are_found_once(monkeypatch):
+    """Four bricks in a row share their triangles; they are searched again where one slides."""
+    brick, searches = box(0.2), []
+
+    def find(*arguments):
+        searches.append(arguments)
+        return find_vertices_on_edges(*arguments)
+
+    monkeypatch.setattr(rigid_groups, "find_vertices_on_edges", find)
+    points = [brick.vertices + k * float64(0.2, 0, 0) for k in range(4)]
+    faces = [brick.faces] * 4
+    turn = rotation_from_vector(float64(0.3, 0.2, 0.1))
+    slid = [own + (k == 3) * float64(0, 0.5, 0) for k, own in enumerate(points)]
+    apart = [own + (k == 3) * float64(0.5, 0, 0) for k, own in enumerate(points)]
+    for places, groups, count in (
+        (points, [0, 0, 0, 0], 6),  # both ways of three pairs
+        (points, [0, 0, 0, 0], 0),
+        ([own @ turn.T + 2.0 for own in points], [0, 0, 0, 0], 0),
+        (slid, [0, 0, 0, 1], 0),
+        (apart, [0, 0, 0, 1], 0),
+        ([own + (k > 1) * float64(0, 0.1, 0) for k, own in enumerate(points)], [0, 0, 0, 0], 2),
+    ):
+        searches.clear()
+        assert find_rigid_groups(faces, places).tolist() == groups
+        assert len(searches) == count
 
 
 def test_a_seam_is_found_again_where_objects_slide():

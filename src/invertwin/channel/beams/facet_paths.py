@@ -31,6 +31,7 @@ from invertwin.channel.paths import Link, Paths, concatenate_paths
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.scene.mesh_defects import require_single_surfaces
 from invertwin.scene.scene import Scene
 
 
@@ -57,7 +58,7 @@ def trace_facet_paths(
     Source: derivations §13.
 
     Raises:
-        InputError: too many triangles, or another material.
+        InputError: too many triangles, another material, or surfaces that are doubled.
     """
     facets = _conductor_facets(scene, link)
     centre = facets.corners.mean((0, 1))
@@ -93,6 +94,7 @@ def _conductor_facets(scene: Scene, link: Link) -> Facets:
             f"expected at most {MAX_FACETS_BEAM_TRACING} triangles for facet paths, got "
             f"{len(geometry.faces)}; use power paths, or simulate"
         )
+    require_single_surfaces(scene)
     return build_facets(geometry.vertices, geometry.topology)
 
 

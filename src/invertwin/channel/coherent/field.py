@@ -40,6 +40,7 @@ from invertwin.channel.rays.scene_tables import (
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.runtime.progress import track
+from invertwin.scene.mesh_defects import require_single_surfaces
 from invertwin.scene.polarisation import JonesTable, Polarisation
 from invertwin.scene.scene import Scene
 
@@ -67,12 +68,14 @@ def trace_field(
     Raises:
         InputError: A derivative of rough field paths with ``boundary`` on: single points appear
             and vanish, so a realisation has no boundary term. Use power paths, or switch
-            ``boundary`` off to accept fixed visibility. A speckle of fewer bounces.
+            ``boundary`` off to accept fixed visibility. A speckle of fewer bounces. Doubled
+            surfaces.
     """
     depth = sampling.depth
     with tracing(sampling.backend):
         geometry = flatten(scene, link.wavelength, motion="fixed")
         moves = sampling.boundary and is_visibility_differentiated(geometry, link)
+        require_single_surfaces(scene, allows_overlaps=True)
         rays = RayScene(geometry, link)
         parts: list[Paths] = []
         if any(geometry.coherent):

@@ -44,6 +44,7 @@ from invertwin.checks import strip_derivatives
 
 SIDE_OFFSET = 10.0  # margins between a boundary and the points compared on its two sides
 _MIN_COSINE = 1e-4  # of the angle between a ray and the normal of the receiving surface
+_ON_ONE_SIDE = 1e-9  # relative height across the plane through edge and transmitter
 _MAX_SURFACE_HITS = 64  # triangles of the surface on one segment of a path
 
 
@@ -217,7 +218,8 @@ def sample_illumination_boundaries(
     """
     found: list[IlluminationBoundarySamples] = []
     for number, source in enumerate(tx):
-        edges = _sample_edges(surfaces, samples, seed, number)
+        casts = _casting_edges(surfaces, None if depth else source, powers)
+        edges = _sample_edges(surfaces, casts, samples, seed, number)
         if not len(edges.fraction):
             continue
         ends = [surfaces.exact_vertices[vertex] for vertex in (edges.first, edges.second)]
@@ -238,16 +240,40 @@ def sample_illumination_boundaries(
     return found
 
 
-def _sample_edges(
-    surfaces: CandidateSurfaces, samples: int, seed: int, number: int
-) -> _EdgeSamples:
-    """Sample points evenly on all edges that can cast a boundary."""
+def _casting_edges(
+    surfaces: CandidateSurfaces, source: Tensor | None, powers: FaceInteractions
+) -> Int64[Tensor, " edge"]:
+    """Return edges that can cast a boundary: where surfaces fold, on direct paths silhouettes.
+
+    Args:
+        surfaces: surfaces of the scene.
+        source: transmitter position in world axes [m]; None = paths with interactions count, too.
+        powers: interactions of the triangles.
+    """
     topology, planes = surfaces.topology, surfaces.planes.face_plane
-    edge_faces = topology.edge_faces
-    # Coplanar triangles of one object are one surface.
-    plane = torch.where(edge_faces >= 0, planes[edge_faces.clamp_min(0)], -1)
-    flat = (plane == plane[:, :1]).all(1) & (edge_faces >= 0).all(1)
-    edge = torch.nonzero(~flat)[:, 0]
+    # Coplanar triangles of one object are one surface; the table is as wide as any edge needs.
+    is_there, faces = topology.edge_faces >= 0, topology.edge_faces.clamp_min(0)
+    plane = planes[faces]
+    casts = (is_there & (plane != plane[:, :1])).any(1) | ~is_there[:, 1]
+    if source is not None:
+        y0, y1 = surfaces.exact_vertices[topology.edges].unbind(1)
+        apex = surfaces.exact_vertices[topology.edge_apexes.clamp_min(0)] - y0[:, None]
+        height = dot(apex, cross(y0 - (source - surfaces.origin), y1 - y0)[:, None])
+        height = torch.where(is_there, height, 0.0)
+        tolerance = _ON_ONE_SIDE * height.abs().amax(1)
+        casts &= (
+            (height.amin(1) >= -tolerance)
+            | (height.amax(1) <= tolerance)
+            | (is_there & powers.transmit[faces]).any(1)
+        )
+    return torch.nonzero(casts)[:, 0]
+
+
+def _sample_edges(
+    surfaces: CandidateSurfaces, edge: Tensor, samples: int, seed: int, number: int
+) -> _EdgeSamples:
+    """Sample points evenly on edges."""
+    topology = surfaces.topology
     ends = surfaces.exact_vertices[topology.edges[edge]]
     length = (ends[:, 1] - ends[:, 0]).norm(dim=1)
     row, fraction, weight = sample_along_curves(length, samples, seed, number)

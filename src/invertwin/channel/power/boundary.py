@@ -129,17 +129,17 @@ class BoundarySamples:
         samples = sampling.boundary_samples * rays.scene_count
         centres = ("tx",) if rays.link.shared_visibility and depth == 1 else ("tx", "rx")
         inner = depth > 1 and sampling.interior_edges
-        close = curves is not None and curves.has_close_surfaces
+        touching = sampling.contacts
         crossing = curves.select(~curves.touching) if curves is not None else None
         meet = crossing is not None and len(crossing.first) > 0
         share = samples // (len(centres) + inner + meet)
         count = len(centres) * share
-        antennas = SilhouetteSampler(rays, inputs, centres, count, seed, has_close_surfaces=close)
+        antennas = SilhouetteSampler(rays, inputs, centres, count, seed, meets_touching=touching)
         self._samplers: list[_Sampler] = [antennas]
         self._path_builders: list[_PathBuilder] = [_antenna_silhouette_paths]
         if inner:
             self._samplers.append(
-                InteriorSilhouetteSampler(rays, inputs, share, seed + 2, has_close_surfaces=close)
+                InteriorSilhouetteSampler(rays, inputs, share, seed + 2, meets_touching=touching)
             )
             self._path_builders.append(_interior_silhouette_paths)
         if crossing is not None and meet:

@@ -33,6 +33,7 @@ from invertwin.checks import is_differentiated, strip_derivatives
 from invertwin.errors import InputError
 from invertwin.limits import MAX_COUNT
 from invertwin.runtime.concurrency import torch_threads
+from invertwin.scene.mesh_defects import require_single_surfaces
 from invertwin.scene.scene import Object, Scene
 
 
@@ -74,7 +75,7 @@ def deposit_power(
     Raises:
         InputError: No silhouette samples for a derivative that needs them, an antenna pattern that
             carries derivatives, objects in motion, an unknown backend, a polarisation that depends
-            on direction.
+            on direction, a derivative with sheets that are doubled.
     """
     if scheme not in ("rays", "area"):
         raise InputError(f"expected scheme 'rays' or 'area', got {scheme!r}; choose one")
@@ -83,7 +84,7 @@ def deposit_power(
     if surfaces is None:
         return torch.stack(soft).sum(0)
     with tracing(sampling.backend), torch_threads(1):
-        geometry = flatten(surfaces, link.wavelength)
+        geometry = _flatten_surfaces(surfaces, link)
         fixed = None
         if reference is not None and (hard := _split_clouds(reference[0])[0]) is not None:
             fixed = flatten(hard, link.wavelength), reference[1]
@@ -138,10 +139,20 @@ def deposit_batch(
             "samples at a time"
         )
     with tracing(sampling.backend), torch_threads(1):
-        geometry = flatten(Scene(objects), link.wavelength, scenes=owners)
+        geometry = _flatten_surfaces(Scene(objects), link, owners)
         geometry, links = arrange_scenes(geometry, link, torch.tensor(owners))
         total = _sum_maps(_deposit_surfaces(geometry, links, grid, sampling, seed))
     return total.unflatten(0, (len(scenes), link.frame_count))
+
+
+def _flatten_surfaces(scene: Scene, link: Link, scenes: Sequence[int] | None = None) -> Geometry:
+    """Flatten a scene; refuse doubled sheets, through which derivatives count both."""
+    geometry = flatten(scene, link.wavelength, scenes=scenes)
+    if geometry.has_sheets and any(geometry.differentiated):
+        sheets = geometry.surfaces.transmittance.any(1)[geometry.face_surface]
+        names = [geometry.names[k] for k in geometry.face_object[sheets].unique().tolist()]
+        require_single_surfaces(scene, names, allows_overlaps=True)
+    return geometry
 
 
 def _deposit_surfaces(

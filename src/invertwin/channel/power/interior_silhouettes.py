@@ -40,7 +40,7 @@ class InteriorSilhouetteSampler:
         seed: seed of the points.
         importance_sampling: False draws edges by length alone and directions from the whole
             sphere, for comparison in benchmarks.
-        has_close_surfaces: True if other surfaces may be close to edges.
+        meets_touching: True if rays past edges meet surfaces in which the edges lie.
     """
 
     def __init__(
@@ -51,11 +51,11 @@ class InteriorSilhouetteSampler:
         seed: int,
         *,
         importance_sampling: bool = True,
-        has_close_surfaces: bool = False,
+        meets_touching: bool = True,
     ) -> None:
         topology = rays.topology
         self.rays, self.inputs = rays, inputs
-        self.importance_sampling, self.has_close_surfaces = importance_sampling, has_close_surfaces
+        self.importance_sampling, self.meets_touching = importance_sampling, meets_touching
         edge = dr.arange(mi.UInt32, len(topology.edges))
         y0, y1 = rays.exact_ends(edge)
         length = mi.Float(dr.norm(y1 - y0))
@@ -154,7 +154,7 @@ class InteriorSilhouetteSampler:
         for sign, seed in zip((-1.0, 1.0), self.transmission_seeds, strict=True):
             hit = trace_past_edge(
                 rays, self.inputs, (edge, along), beside, omega * (sign * dr.norm(y)), valid,
-                (index, seed), has_close_surfaces=self.has_close_surfaces and sign > 0,
+                (index, seed), meets_touching=self.meets_touching and sign > 0,
             )  # fmt: skip
             valid &= hit.valid & is_not_grazing(rays, hit.point.face, omega, hit.valid)
             valid &= rays.is_in_scene(frame, hit.point.face, hit.valid)

@@ -150,7 +150,7 @@ class SilhouetteSampler:
         antennas: antennas whose silhouettes count: ``tx``, ``rx`` or both.
         samples: number of points over all frames and scenes.
         seed: seed of the points.
-        has_close_surfaces: True if other surfaces may be close to edges.
+        meets_touching: True if rays past edges meet surfaces in which the edges lie.
     """
 
     def __init__(
@@ -161,15 +161,11 @@ class SilhouetteSampler:
         samples: int,
         seed: int,
         *,
-        has_close_surfaces: bool = False,
+        meets_touching: bool = True,
     ) -> None:
         topology = rays.topology
-        self.rays, self.inputs, self.antennas, self.has_close_surfaces = (
-            rays,
-            inputs,
-            antennas,
-            has_close_surfaces,
-        )
+        self.rays, self.inputs, self.antennas = rays, inputs, antennas
+        self.meets_touching = meets_touching
         entries = len(antennas) * rays.poses_per_scene * len(topology.edges)
         edge, _, receiver, origin = self._decode_entry(dr.arange(mi.UInt32, entries))
         y0, y1 = rays.exact_ends(edge)
@@ -218,7 +214,7 @@ class SilhouetteSampler:
         sides = classify_sides(rays, self.inputs, edge, exact)
         aside = EDGE_OFFSET * (dr.norm(y) + dr.norm(y1 - y0))
         beside, away = mi.Point3f(y + sides.outward * aside), mi.Vector3f(exact)
-        reach = beside - away * _START_OFFSET if self.has_close_surfaces else beside
+        reach = beside - away * _START_OFFSET if self.meets_touching else beside
         before = trace_transmission(rays, self.inputs, reach, origin, pmf > 0)
         valid = (pmf > 0) & (before.transmittance > 0) & sides.has_contrast
         hit = trace_past_edge(
@@ -229,7 +225,7 @@ class SilhouetteSampler:
             away,
             valid,
             (index, self.transmission_seed),
-            has_close_surfaces=self.has_close_surfaces,
+            meets_touching=self.meets_touching,
             stratified_bits=index,
         )
         face = hit.point.face
@@ -347,15 +343,16 @@ def trace_past_edge(
     active: mit.Bool,
     key: tuple[mit.UInt32, mit.UInt32],
     *,
-    has_close_surfaces: bool,
+    meets_touching: bool,
     stratified_bits: mit.UInt32 | None = None,
 ) -> SegmentHit:
     """Trace rays past points on edges.
 
-    Among close surfaces the ray starts before the edge, so that it meets those in which the edge
-    lies; float64 decides whether the edge is in front of them. Behind a surface that it has
-    crossed, an edge casts no shadow: there the intersection curve counts. Rays are not coherent,
-    since Embree loses some of those of a bundle that start close to a surface.
+    The ray starts before the edge, so that it meets surfaces in which the edge lies (a box on a
+    floor, a shelf on a wall, of several objects or of one mesh); float64 decides whether the edge
+    is in front of them. Behind a surface that it has crossed, an edge casts no shadow: there the
+    intersection curve counts. Rays are not coherent, since Embree loses some of those of a bundle
+    that start close to a surface.
 
     Args:
         rays: ray scene.
@@ -365,40 +362,55 @@ def trace_past_edge(
         direction: directions, as long as the distance of the edge.
         active: mask of active lanes.
         key: index and seed of the random numbers, see ``trace_to_surface``.
-        has_close_surfaces: True if other surfaces may be close to edges.
+        meets_touching: True if rays past edges meet surfaces in which the edges lie.
         stratified_bits: see ``trace_to_surface``.
     """
     towards, distance = dr.normalize(direction), dr.norm(direction)
-    past = mi.Ray3f(mi.Point3f(origin + direction * RAY_EPSILON), mi.Vector3f(towards))  # type: ignore[operator]
-    if not has_close_surfaces:
-        return trace_to_surface(
-            rays, inputs, past, active, key, coherent=False, stratified_bits=stratified_bits
-        )
-    early = mi.Ray3f(mi.Point3f(origin - direction * _START_OFFSET), mi.Vector3f(towards))  # type: ignore[operator]
+    start = mi.Point3f(origin + direction * RAY_EPSILON)  # type: ignore[operator]
+    touches = crossed = mi.Bool(False)
+    touched = mi.UInt32(0)
+    if meets_touching:
+        early = mi.Point3f(origin - direction * _START_OFFSET)  # type: ignore[operator]
+        reach = mi.Float(2 * _START_OFFSET * distance)
+        found = rays.find_nearest(mi.Ray3f(early, mi.Vector3f(towards), reach, 0.0, []), active)
+        touched = dr.select(found.valid, found.point.face, rays.fallback_face)
+        touches = found.valid & ~_is_beside(rays, edge_point[0], touched)
+        crossed = _has_crossed(rays, edge_point, touched, direction)
+        start = dr.select(touches, early, start)
     hit = trace_to_surface(
-        rays, inputs, early, active, key, coherent=False, stratified_bits=stratified_bits
+        rays,
+        inputs,
+        mi.Ray3f(start, mi.Vector3f(towards)),
+        active,
+        key,
+        coherent=False,
+        stratified_bits=stratified_bits,
     )
-    face = hit.point.face
-    point = interpolate_position(rays.corners(face, hit.valid), hit.point.b1, hit.point.b2)
-    near = hit.valid & (dr.norm(point - origin) < 2 * _START_OFFSET * distance)
-    edge, along = edge_point
-    own = mi.Bool(False)
-    for beside_edge, apex in zip(
-        rays.topology.device_edge_faces, rays.topology.device_edge_apexes, strict=True
-    ):
+    return replace(hit, valid=hit.valid & ~(touches & crossed & (hit.point.face == touched)))
+
+
+def _is_beside(rays: RayScene, edge: mit.UInt32, face: mit.UInt32) -> mit.Bool:
+    """Compute the mask of triangles that are at edges."""
+    found = mi.Bool(False)
+    topology = rays.topology
+    for column, apex in zip(topology.device_edge_faces, topology.device_edge_apexes, strict=True):
         is_there = dr.gather(mi.Int32, apex, edge) >= 0
-        own |= is_there & (dr.gather(mi.UInt32, beside_edge, edge) == face)
-    own &= near
-    y0, y1 = rays.exact_ends(edge)
+        found |= is_there & (dr.gather(mi.UInt32, column, edge) == face)
+    return found
+
+
+def _has_crossed(
+    rays: RayScene,
+    edge_point: tuple[mit.UInt32, mit.Float],
+    face: mit.UInt32,
+    direction: mit.Vector3f,
+) -> mit.Bool:
+    """Compute the mask of points on edges that are behind triangles, in float64."""
+    y0, y1 = rays.exact_ends(edge_point[0])
     p0, p1, p2 = map(rays.exact_vertex, dr.gather(mi.Vector3u, rays.topology.device_faces, face))
     normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
-    height = dr.dot(normal, y0 + (y1 - y0) * mi.Float64(along) - p0)
-    crossed = -dr.mulsign(height, dr.dot(normal, mi.Vector3d(direction))) < -PLANE_TOLERANCE
-    again = trace_to_surface(
-        rays, inputs, past, active & own, key, coherent=False, stratified_bits=stratified_bits
-    )
-    hit: SegmentHit = dr.select(own, again, hit)
-    return replace(hit, valid=hit.valid & ~(near & ~own & crossed))
+    height = dr.dot(normal, y0 + (y1 - y0) * mi.Float64(edge_point[1]) - p0)
+    return -dr.mulsign(height, dr.dot(normal, mi.Vector3d(direction))) < -PLANE_TOLERANCE
 
 
 def is_not_grazing(

@@ -4,7 +4,7 @@ Edges are rays through the tree: each end of such a segment is where an edge of 
 the other. The tree, in float32, only proposes pairs; float64 decides (derivations §3).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float64, Int64
@@ -31,7 +31,6 @@ class IntersectionCurves(Rows):
         first, second: triangle indices.
         start, end: ends of the segments in the world [m].
         touching: True if one surface ends in the other, so that the segment is no crossing.
-        has_close_surfaces: True if two objects are so close that edges of one may lie in the other.
     """
 
     first: Int64[Tensor, " n"]
@@ -39,7 +38,6 @@ class IntersectionCurves(Rows):
     start: Float64[Tensor, "n 3"]
     end: Float64[Tensor, "n 3"]
     touching: Bool[Tensor, " n"]
-    has_close_surfaces: bool = False
 
 
 def find_possible_intersections(
@@ -136,7 +134,7 @@ def find_intersection_curves(rays: RayScene) -> IntersectionCurves | None:
         pairs_met = torch.stack(torch.broadcast_tensors(around[0][:, :, None], around[1][:, None]))
         pairs_met = pairs_met.flatten(1)
         pairs_met = pairs_met[:, (pairs_met >= 0).all(0)]
-    return replace(concatenate_rows(parts), has_close_surfaces=bool(others.any()))
+    return concatenate_rows(parts)
 
 
 def _trace_edges(

@@ -6,6 +6,7 @@ together. Objects that move apart keep edges of their own, so that derivatives s
 
 from __future__ import annotations
 
+import itertools
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
@@ -25,11 +26,13 @@ from invertwin.scene.mesh_topology import (
     triangle_sides,
 )
 
+Contacts = Float64[Tensor, "n 4"]
 _MAX_CACHED_PAIRS = 10_000
 _SAME_MOTION = 1e-9  # relative difference of velocities that count as one
-_contacts: OrderedDict[tuple[int, int], tuple[list[Tensor], Tensor]] = OrderedDict()
-
-Contacts = Float64[Tensor, "n 4"]
+_SAME_PLACE = 1e-9  # relative distance of points that count as one
+#: By numbers and faces of two objects, since several may share their faces: the faces, whose ids
+#: stay theirs, all points, and the contacts.
+_contacts: OrderedDict[tuple[int, ...], tuple[list[Tensor], Tensor, Contacts]] = OrderedDict()
 
 
 def find_rigid_groups(
@@ -55,30 +58,37 @@ def find_rigid_groups(
     near = overlapping_boxes(low - reach, high + reach) & (moves[:, None] == moves)
     if scenes is not None:
         near &= np.equal.outer(scenes, scenes)
-    pairs = []
+    pairs, gaps = [], []
     for a, b in np.argwhere(np.triu(near)).tolist():
-        contacts = _find_contacts((faces[a], faces[b]), (fixed[a], fixed[b]))
-        if _keep_together(contacts, vertices[a], vertices[b]):
+        key = a, b, id(faces[a]), id(faces[b])
+        contacts = _find_contacts(key, (faces[a], faces[b]), (fixed[a], fixed[b]))
+        if len(contacts) > 1:
             pairs.append((a, b))
+            gaps.append(_ends_of_gap(contacts, torch.cat([vertices[a], vertices[b]])))
+    # One comparison for all pairs, as a rule; else one for each.
+    if pairs and not _move_as_one(*map(torch.cat, zip(*gaps, strict=True))):
+        kept = [_move_as_one(*gap) for gap in gaps]
+        pairs = list(itertools.compress(pairs, kept))
     return label_components(np.array(pairs, dtype=np.int64).reshape(-1, 2), len(faces))
 
 
-def _find_contacts(faces: tuple[Tensor, Tensor], points: tuple[Tensor, Tensor]) -> Contacts:
-    """Find where vertices of one object lie on edges of another, kept while neither moves.
+def _find_contacts(
+    key: tuple[int, ...], faces: tuple[Tensor, Tensor], points: tuple[Tensor, Tensor]
+) -> Contacts:
+    """Find where vertices of one object lie on edges of another, kept while they move as one.
 
     Returns:
         Rows of vertex, two ends of the edge (numbers of both objects' vertices, one after the
         other), and position between the ends.
     """
-    key = id(faces[0]), id(faces[1])
+    both = torch.cat(points)
     if key in _contacts:
-        (*_, one, other), found = _contacts[key]
-        if torch.equal(one, points[0]) and torch.equal(other, points[1]):
+        _, before, found = _contacts[key]
+        if _is_one_motion(before, both):
             _contacts.move_to_end(key)
             return found
     low = torch.maximum(points[0].amin(0), points[1].amin(0))
     high = torch.minimum(points[0].amax(0), points[1].amax(0))
-    both = torch.cat(points)
     size = float((both.amax(0) - both.amin(0)).norm())
     margin = WELD_TOLERANCE * size
     places = (both / size).numpy()
@@ -93,33 +103,36 @@ def _find_contacts(faces: tuple[Tensor, Tensor], points: tuple[Tensor, Tensor]) 
         row, vertex, share = find_vertices_on_edges(edges[own], np.unique(edges[other]), places)
         parts.append(np.column_stack([vertex, edges[own][row], share]))
     found = torch.from_numpy(np.concatenate(parts).astype(np.float64))
-    _contacts[key] = [*faces, *points], found
+    _contacts[key] = [*faces], both, found
     while len(_contacts) > _MAX_CACHED_PAIRS:
         _contacts.popitem(last=False)
     return found
 
 
-def _keep_together(contacts: Contacts, first: Tensor, second: Tensor) -> bool:
-    """Test whether two objects touch along an edge and their points of contact move as one."""
-    if len(contacts) < 2:
-        return False
-    if not is_differentiated(first):
+def _is_one_motion(before: Tensor, after: Tensor) -> bool:
+    """Test whether a rotation and a translation take points to others, the best of all (Kabsch)."""
+    if before.shape != after.shape or torch.equal(before, after):
+        return before.shape == after.shape
+    one, other = before - before.mean(0), after - after.mean(0)
+    u, _, v = torch.linalg.svd(one.T @ other)
+    return bool((one @ (u @ v) - other).abs().amax() <= _SAME_PLACE * other.abs().amax())
+
+
+def _ends_of_gap(contacts: Contacts, points: Float64[Tensor, "v 3"]) -> tuple[Tensor, Tensor]:
+    """Compute the points of contact as vertices of one object, and on edges of the other."""
+    vertex, start, end = points[contacts[:, :3].long()].unbind(1)
+    return vertex, torch.lerp(start, end, contacts[:, 3:])
+
+
+def _move_as_one(first: Float64[Tensor, "n 3"], second: Float64[Tensor, "n 3"]) -> bool:
+    """Test whether points in one place have the same derivatives, if any."""
+    if not is_differentiated(first) and not is_differentiated(second):
         return True
-    index, share = contacts[:, :3].long(), contacts[:, 3:]
-
-    def ends_of_gap(values: Tensor) -> tuple[Tensor, Tensor]:
-        vertex, start, end = values[index].unbind(1)
-        return vertex, (1 - share) * start + share * end
-
     pair = [forward_ad.unpack_dual(points).tangent for points in (first, second)]
     if any(tangent is not None for tangent in pair):
-        rates = [
-            torch.zeros_like(points) if tangent is None else tangent
-            for points, tangent in zip((first, second), pair, strict=True)
-        ]
-        one, other = ends_of_gap(strip_derivatives(torch.cat(rates)))
-        return _are_close(one, other)
-    return _have_one_gradient(*ends_of_gap(torch.cat([first, second])))
+        rates = [torch.zeros_like(first) if rate is None else rate for rate in pair]
+        return _are_close(*map(strip_derivatives, rates))
+    return _have_one_gradient(first, second)
 
 
 def _have_one_gradient(first: Tensor, second: Tensor) -> bool:

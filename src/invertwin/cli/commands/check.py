@@ -32,6 +32,7 @@ from invertwin.models.radar import SurrogateMap
 from invertwin.runtime.memory import format_gigabytes, free_memory
 from invertwin.runtime.progress import format_duration
 from invertwin.scene import Scene, Translation
+from invertwin.scene.mesh_defects import find_defects
 
 _PROBE_FRAMES = 4  # of the radar, or aspects, in the probe
 # Rays or paths that are timed: less than a second of work.
@@ -161,12 +162,13 @@ def _check_rcs(run: RunFile) -> _Needs:
 
 
 def _mesh_table(scene: Scene) -> ReportTable:
-    heads = ("object", "size [m]", "triangles", "open edges", "non-manifold edges")
+    heads = ("object", "size [m]", "triangles", "open edges", "non-manifold edges", "defects")
     rows = []
     for name, item in scene.objects.items():
         found = item.mesh.summary()
         edges = found.open_edges, found.nonmanifold_edges
-        rows.append([name, list(found.extent), found.triangles, *edges])
+        defects = ", ".join(find_defects(item.mesh).in_words()) or "none"
+        rows.append([name, list(found.extent), found.triangles, *edges, defects])
     return ReportTable("Meshes", heads, rows)
 
 
