@@ -6,7 +6,12 @@ import torch
 
 from invertwin.channel.rays.topology import topology_of
 from invertwin.scene import Mesh, box, merge_meshes, sphere
-from invertwin.scene.mesh_topology import find_inward_faces
+from invertwin.scene.mesh_topology import (
+    WELD_TOLERANCE,
+    find_inward_faces,
+    sort_rows,
+    weld_vertices,
+)
 
 
 def volume(mesh):
@@ -57,3 +62,30 @@ def test_an_open_mesh_stays():
     lid = Mesh(mesh.vertices, mesh.faces[2:].flip(1))
     assert topology_of([lid]).faces.equal(lid.faces)
     assert np.isfinite(volume(lid))
+
+
+@pytest.mark.parametrize("count", [40, 100_000], ids=["counted", "compared"])
+def test_rows_are_sorted_stably(count):
+    columns = np.random.default_rng(1).integers(40, size=(3, 500))
+    columns[:, 250:] = columns[:, :250]
+    order, start = sort_rows(*columns, count=count)
+    assert order.tolist() == np.lexsort(columns[::-1]).tolist()
+    kinds, first = np.unique(columns, axis=1, return_index=True)
+    assert order[start].tolist() == first.tolist()
+    assert columns[:, order[start]].tolist() == kinds.tolist()
+
+
+def test_vertices_are_welded_to_the_first_of_their_chain():
+    """Copies on a lattice, equal or off by up to half the tolerance, and a chain of four."""
+    generator = np.random.default_rng(2)
+    axis = np.linspace(0.0, 1.0, 8)
+    sites = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    number = generator.permutation(np.repeat(np.arange(len(sites)), 3))
+    away = generator.normal(size=(len(number), 3))
+    away *= 0.5 * WELD_TOLERANCE / np.linalg.norm(away, axis=1)[:, None]
+    places = sites[number] + away * generator.integers(2, size=(len(number), 1))
+    chain = np.array([[0.05 + 0.9 * k * WELD_TOLERANCE, 0.05, 0.05] for k in (2, 0, 3, 1)])
+    _, first = np.unique(number, return_index=True)
+    welded = weld_vertices(np.concatenate([places, chain]))
+    assert welded[:-4].tolist() == first[number].tolist()
+    assert welded[-4:].tolist() == [len(number)] * 4
