@@ -496,7 +496,6 @@ def _point_inwards(
 def _volumes(
     faces: Int64[np.ndarray, "f 3"], points: Float64[np.ndarray, "v 3"]
 ) -> Float64[np.ndarray, " f"]:
-    """Signed volumes between triangles and the middle of all points [m³]."""
-    centred = points - points.mean(0)
-    a, b, c = (centred[corner] for corner in faces.T)
-    return np.einsum("fi,fi->f", a, np.cross(b, c)) / 6
+    """Signed volumes between triangles and the middle of their first corners [m³]."""
+    a, b, c = (points[corner] for corner in faces.T)
+    return np.einsum("fi,fi->f", a - a.mean(0), np.cross(b - a, c - a)) / 6
