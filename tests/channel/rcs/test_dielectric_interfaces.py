@@ -1,15 +1,21 @@
 """What waves do at faces of solids: Fresnel's law from either side, currents, power."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from invertwin.channel.beams.beam_tracing import IlluminatedPatches
 from invertwin.channel.em.dielectric_solids import DielectricSolids, normal_component, refract_waves
 from invertwin.channel.em.plane_waves import SmoothInterfaces, dot, reflect_field, reflect_vectors
-from invertwin.channel.rcs.dielectric_interfaces import apply_fresnel, scatter_at_interfaces
+from invertwin.channel.rcs.dielectric_interfaces import (
+    apply_fresnel,
+    incident_power,
+    scatter_at_interfaces,
+)
 from invertwin.scene.material.fresnel import fresnel_coefficients
 from scenes import complex128, float64
 
@@ -92,10 +98,42 @@ def inner_bounce(k: Tensor) -> IlluminatedPatches:
     """A patch of a solid's face that is met from within: the normal is that of the inner side."""
     number, plain = torch.tensor([0]), complex128([1.0])
     place = torch.zeros(1, 3, 3, dtype=torch.float64)
-    d = torch.nn.functional.normalize(k.real, dim=1)
+    d = normalize(k.real, dim=1)
     return IlluminatedPatches(
         number, number, UPWARDS, d, plain, place, number, k, number, number >= 0, plain
     )
+
+
+@pytest.mark.parametrize("bend", [0.3, 1.2, 3.0])
+def test_power_is_kept_where_the_phase_does_not_advance_along_the_ray(bend):
+    """K of a tube's corners, which may be any behind a curved face, is not that of its power."""
+    k, field = wave(LOSSLESS, 0.5)
+    patch = replace(inner_bounce(k), wave_vector=k + complex128([[bend, 0.7 * bend, bend]]))
+    met = scatter_at_interfaces(BLOCK, BODY, K, patch, field, UPWARDS)
+    p, q = -k[0, 2].real, normal_component(AIR, k, UPWARDS).real
+    power = p * met.reflected.abs().square().sum(2) + q * met.transmitted.abs().square().sum(2)
+    assert torch.allclose(power, p * torch.ones_like(power), rtol=1e-12)
+    plain = scatter_at_interfaces(BLOCK, BODY, K, inner_bounce(k), field, UPWARDS)
+    for one, other in zip(met, plain, strict=True):
+        assert torch.allclose(one, other, atol=1e-12 * K)
+
+
+def test_the_field_of_a_tube_is_turned_orthogonal_to_its_ray():
+    k, field = wave(LOSSLESS, 0.5)
+    patch = replace(inner_bounce(k), wave_vector=k + 0.3)
+    tilted = field + 0.4 * normalize(k.real, dim=1)[:, None]
+    met = scatter_at_interfaces(BLOCK, BODY, K, patch, tilted, UPWARDS)
+    straight = scatter_at_interfaces(BLOCK, BODY, K, patch, field, UPWARDS)
+    # The same power, √(1² + 0.4²) in amplitude.
+    assert torch.allclose(met.reflected, math.hypot(1, 0.4) * straight.reflected)
+
+
+def test_incident_power_is_that_through_the_cross_section():
+    k, field = wave(LOSSLESS, 0.5)
+    triangle = float64([[[0, 0, 0], [3, 0, 0], [0, 4, 0]]])
+    patch = replace(inner_bounce(k), polygon=triangle)
+    expected = 2 * 2.5**0.5 * 6 * math.cos(0.5)
+    assert incident_power(BLOCK, patch, field) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, 0.6])

@@ -19,8 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
@@ -29,6 +27,7 @@ from invertwin.channel.em.plane_waves import cross, dot, phasor
 from invertwin.channel.em.transition_functions import EXP_J_PI_4, transition
 from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.checks import strip_derivatives
+from invertwin.scene.mesh_topology import label_components
 
 MIN_EDGE_ANGLE = math.radians(10.0)
 """Smallest angle to a sheet's plane and to the edge at which fringe currents are valid [rad]."""
@@ -140,9 +139,7 @@ def select_body_edges(wedges: Wedges, min_length: float) -> Bool[Tensor, " row"]
         continued &= node[own] == node[other]
         continued &= (opening[own] - opening[other]).abs() < _OPENING_TOLERANCE
         pairs.append(torch.stack([own[continued], other[continued]]) % count)
-    row, column = torch.cat(pairs, 1).numpy()
-    graph = coo_array((np.ones(len(row)), (row, column)), shape=(count, count))
-    line = torch.from_numpy(connected_components(graph, directed=False)[1]).long()
+    line = torch.from_numpy(label_components(torch.cat(pairs, 1).T.numpy(), count))
     lines = int(line.max()) + 1
     index = line.repeat(2)[:, None].expand(-1, 3)
     none = torch.zeros(lines, 3, dtype=torch.float64)

@@ -4,17 +4,21 @@ The field is E exp(−jk(K·x + c)) with K·K = ε and ηH = K × E. The field s
 is radiated by the tangential fields on the outer side of its faces alone, in air.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Complex128
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from invertwin.channel.beams.beam_tracing import IlluminatedPatches
 from invertwin.channel.em.dielectric_solids import DielectricSolids, normal_component
 from invertwin.channel.em.plane_waves import (
     SmoothInterfaces,
     Vectors,
+    area_vector,
+    cross,
     dot,
     project_transverse,
     radiate_currents,
@@ -22,6 +26,9 @@ from invertwin.channel.em.plane_waves import (
     reflect_field,
     roughness_attenuation,
 )
+from invertwin.scene.material.fresnel import refractive_index
+
+_MAX_BEND = 1e-6  # component of Re K across its ray, rounding errors excluded
 
 
 class InterfaceCoefficients(NamedTuple):
@@ -111,6 +118,7 @@ def scatter_at_interfaces(
 
     Source: derivations §13 and §14.
     """
+    patches, field = _straighten_waves(solids, patches, field)
     radiated, reflected, transmitted = (torch.zeros_like(field) for _ in range(3))
     outside, conducting = patches.medium < 0, solids.conducting[patches.facet]
     rows = torch.nonzero(outside)[:, 0]
@@ -137,6 +145,38 @@ def scatter_at_interfaces(
     radiated = radiated.index_copy(0, rows, outer)
     reflected = reflected.index_copy(0, rows, inner * losses[1][:, None, None])
     return InterfaceFields(radiated, reflected, transmitted.index_copy(0, rows, onward))
+
+
+def incident_power(
+    solids: DielectricSolids, patches: IlluminatedPatches, field: Complex128[Tensor, "row 2 3"]
+) -> float:
+    """Compute the power √ε|E|²A cosθ incident on all patches, without losses on the way [V²].
+
+    Args:
+        solids: dielectric solids.
+        patches: illuminated patches.
+        field: incident field E on the surface [V/m].
+    """
+    index = refractive_index(solids.permittivity_in(patches.medium))
+    facing = area_vector(patches.polygon).norm(dim=1) * -dot(patches.normal, patches.direction)
+    return float((field.abs().square().sum((1, 2)) * index * facing).detach().sum())
+
+
+def _straighten_waves(
+    solids: DielectricSolids, patches: IlluminatedPatches, field: Tensor
+) -> tuple[IlluminatedPatches, Tensor]:
+    """Replace waves whose phase does not advance along their ray by plane waves that do.
+
+    Behind curved faces K follows the phases at the corners of a tube, so that K·K ≠ ε. Fresnel's
+    equations conserve power for plane waves alone, with E orthogonal to K.
+    """
+    wave, direction = patches.wave_vector, patches.direction
+    bent = torch.nonzero(cross(wave.real, direction).norm(dim=1) > _MAX_BEND)[:, 0]
+    index = solids.permittivity_in(patches.medium[bent]).sqrt()
+    wave = wave.index_copy(0, bent, index[:, None] * direction[bent])
+    turned = normalize(project_transverse(field[bent], direction[bent]), dim=2)
+    turned = turned * field[bent].norm(dim=2, keepdim=True)
+    return replace(patches, wave_vector=wave), field.index_copy(0, bent, turned)
 
 
 def _refract_at_faces(

@@ -9,6 +9,7 @@ transmitter and receiver exchanged, which is reciprocal; in the monostatic case 
 cross-polar terms.
 """
 
+import itertools
 import math
 import warnings
 from collections.abc import Iterator, Sequence
@@ -55,7 +56,7 @@ from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.ray_scene import Occluders, is_visible
 from invertwin.channel.rays.scene_tables import require_surfaces
 from invertwin.channel.rays.topology import Topology, topology_of
-from invertwin.channel.rcs.dielectric_interfaces import scatter_at_interfaces
+from invertwin.channel.rcs.dielectric_interfaces import incident_power, scatter_at_interfaces
 from invertwin.channel.rcs.moments.efie_solver import EFIESolver
 from invertwin.channel.rcs.moments.mfie import MFIESolver
 from invertwin.channel.rcs.moments.solver import Refusal, warn_not_solved
@@ -82,6 +83,7 @@ _SEGMENTS_PER_WAVELENGTH = 2.0  # pieces of an edge, each visible or not
 _MIN_EDGE_RUN = 2.0  # wavelengths: least length of an edge that ends in a smooth surface
 _EDGE_OFFSET = 1e-5  # of the scene's size: distance of rays' ends from an edge
 _ROWS_AT_ONCE = 1 << 18
+_MAX_POWER_GAIN = 1.1  # of an order over the one before: power at a focus is approximate
 
 _PatchOrders = tuple[Sequence[IlluminatedPatches], DielectricSolids | None, Sequence[int]]
 """Patches of all orders, dielectric solids, and indices of the frequencies for which they hold."""
@@ -322,6 +324,7 @@ class _FarFieldTracer:
     ) -> list[Tensor]:
         """Amplitudes S per m² of all patches, order by order: [row, receive, transmit] each."""
         found: list[Tensor] = []
+        powers: list[float] = []
         reflected = transmitted = torch.zeros(0)
         for patches in patch_orders:
             if not found:
@@ -337,11 +340,13 @@ class _FarFieldTracer:
                 surface = (surface_rows, k, patches.normal, patches.direction, field)
                 radiated, reflected = radiate_field(*surface, receiver), reflect_field(*surface)
             else:
+                powers.append(incident_power(solids, patches, field))
                 radiated, reflected, transmitted = scatter_at_interfaces(
                     solids, surface_rows, k, patches, field, receiver
                 )
             received = polarisations(self.receivers, self.target.up)[patches.aspect]
             found.append(dot(received[:, :, None], radiated[:, None]))
+        _warn_power_gain(powers)
         return found
 
     def _trace_edges(self, max_diffractions: int) -> dict[str, Tensor]:
@@ -491,6 +496,15 @@ def _smooth_interfaces(scene: Scene, topology: Topology, frequency: float) -> Sm
         for column, value in zip(columns, values, strict=True):
             column.append(value.expand(len(item.mesh.faces)))
     return SmoothInterfaces(*map(torch.cat, columns))
+
+
+def _warn_power_gain(powers: Sequence[float]) -> None:
+    """Warn about orders of dielectric solids with more incident power than the order before."""
+    for n, (before, after) in enumerate(itertools.pairwise(powers), start=2):
+        if after > _MAX_POWER_GAIN * before:
+            gain = f"{after / before:.3g} times the incident power of order {n - 1}"
+            text = f"order {n} has {gain}: tubes in a dielectric solid gain energy; mesh it finer"
+            warnings.warn(text, PhysicsWarning, stacklevel=2)
 
 
 def _warn_validity(

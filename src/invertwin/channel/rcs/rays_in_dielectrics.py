@@ -1,21 +1,17 @@
 """Ray tubes inside dielectric bodies (shooting and bouncing rays), with rays at their corners.
 
-A tube starts as an illuminated triangle of a face. Its three corner rays are refracted with
+A tube starts as an illuminated piece of a face. Its three corner rays are refracted with
 interpolated normals, so that adjacent tubes stay adjacent behind curved faces: a tube's field
-follows from its cross section, and its phase is linear between its corners. Behind flat faces that
-is a plane wave.
+follows from its power and its cross section, and its phase is linear between its corners. Behind
+flat faces that is a plane wave.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -28,6 +24,7 @@ from invertwin.channel.beams.beam_tracing import (
 )
 from invertwin.channel.em.dielectric_solids import DielectricSolids
 from invertwin.channel.em.plane_waves import (
+    area_vector,
     barycentric_coordinates,
     cross,
     dot,
@@ -39,14 +36,17 @@ from invertwin.channel.rays.ray_scene import Occluders, find_next_surface
 from invertwin.channel.rcs.shooting_bouncing_rays import (
     inset_points,
     ray_offset,
+    split_large_triangles,
     subdivide_triangles,
 )
 from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.errors import InputError
 from invertwin.scene.material.fresnel import refractive_index
+from invertwin.scene.mesh_topology import label_components
 
 MAX_SMOOTH_ANGLE = 0.35
 """Angle between normals of adjacent triangles [rad], above which their edge is sharp."""
+_MAX_LAUNCH_RATIO = 4.0  # times the least width, over √ε: wider tubes are split at curved faces
 _MIN_TUBE_AREA = 1e-14  # of the scene's size squared: smaller tubes are dropped
 _MIN_COSINE = 1e-6  # cosine of rays at grazing incidence
 _CONTACT_TOLERANCE = 1e-6  # of the scene's size, and of a normal: equal planes
@@ -68,14 +68,14 @@ class SmoothFaces:
     normals: Float64[Tensor, "facet 3 3"]
 
     def normals_at(
-        self, facet: Int64[Tensor, "row 3"], points: Float64[Tensor, "row 3 3"], directions: Tensor
-    ) -> Float64[Tensor, "row 3 3"]:
+        self, facet: Int64[Tensor, "row n"], points: Float64[Tensor, "row n 3"], directions: Tensor
+    ) -> Float64[Tensor, "row n 3"]:
         """Return interpolated normals at points, towards the origin of rays.
 
         Args:
             facet: facet of each point.
             points: points on the facets [m].
-            directions: unit directions of the rays, [row, 3, 3].
+            directions: unit directions of the rays, [row, n or 1, 3].
         """
         found = interpolate_vectors(self.normals[facet], self.facets.corners[facet], points)
         side = -dot(self.facets.normal[facet], directions).sign()
@@ -93,10 +93,7 @@ def group_smooth_faces(facets: Facets, edge_faces: Int64[Tensor, "edge k"]) -> S
     pairs = edge_faces[:, :2]
     pairs = pairs[(pairs >= 0).all(1)]
     is_smooth = dot(normal[pairs[:, 0]], normal[pairs[:, 1]]) > math.cos(MAX_SMOOTH_ANGLE)
-    first, second = pairs[is_smooth].numpy().T
-    count = len(normal)
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
-    face = torch.from_numpy(connected_components(graph, directed=False)[1]).long()
+    face = torch.from_numpy(label_components(pairs[is_smooth].numpy(), len(normal)))
     rounded = torch.round(corners.reshape(-1, 3) / (1e-9 * facets.size))
     keys = torch.cat([face.repeat_interleave(3)[:, None].double(), rounded], 1)
     _, vertex = keys.unique(dim=0, return_inverse=True)
@@ -104,7 +101,7 @@ def group_smooth_faces(facets: Facets, edge_faces: Int64[Tensor, "edge k"]) -> S
     angle = torch.atan2(cross(a, b).norm(dim=2), dot(a, b))
     weighted = (angle[..., None] * normal[:, None]).reshape(-1, 3)
     total = torch.zeros(int(vertex.max()) + 1, 3, dtype=torch.float64)
-    total = normalize(total.index_add(0, vertex, weighted), dim=1)[vertex].view(count, 3, 3)
+    total = normalize(total.index_add(0, vertex, weighted), dim=1)[vertex].view(-1, 3, 3)
     # The tip of a face has no normal.
     is_valid = dot(total, normal[:, None]) > math.cos(MAX_SMOOTH_ANGLE)
     return SmoothFaces(facets, face, torch.where(is_valid[..., None], total, normal[:, None]))
@@ -120,6 +117,7 @@ class _RayTubes(Rows):
         directions: unit directions of arrival.
         normals: unit normals of the surface, towards the source.
         phases: optical lengths Σ √ε × length of the rays, from the plane of phase zero [m].
+        area: cross section A [m²], by which a tube of field E carries √ε|E|²A.
         from_outside: mask of waves in air, whose reflections are traced elsewhere.
     """
 
@@ -128,6 +126,7 @@ class _RayTubes(Rows):
     directions: Float64[Tensor, "row 3 3"]
     normals: Float64[Tensor, "row 3 3"]
     phases: Complex128[Tensor, "row 3"]
+    area: Float64[Tensor, " patch"]
     from_outside: Bool[Tensor, " patch"]
 
 
@@ -149,7 +148,7 @@ def trace_inner_tubes(
         occluders: ray scene of the triangles.
         solids: dielectric solids.
         outer_orders: patches of waves that have stayed outside, per order.
-        min_tube_width: width below which tubes are not split [m].
+        min_tube_width: width below which tubes are not split between faces [m].
         depth: maximum number of interactions.
 
     Raises:
@@ -163,8 +162,9 @@ def trace_inner_tubes(
     for order in range(depth):
         parts, begun = [], []
         if order < len(outer_orders):
-            parts.append(_to_complex(outer_orders[order]))
-            begun.append(_launch_inner_tubes(surface, solids, outer_orders[order]))
+            outer = outer_orders[order]
+            parts.append(_to_complex(outer))
+            begun.append(_launch_inner_tubes(surface, solids, outer, min_tube_width))
         if tubes is not None:
             last = found[-1]
             inner, tubes = _trace_tubes(surface, occluders, solids, last, tubes, min_tube_width)
@@ -185,56 +185,65 @@ def _to_complex(patches: IlluminatedPatches) -> IlluminatedPatches:
 
 
 def _launch_inner_tubes(
-    surface: SmoothFaces, solids: DielectricSolids, patches: IlluminatedPatches
+    surface: SmoothFaces,
+    solids: DielectricSolids,
+    patches: IlluminatedPatches,
+    min_tube_width: float,
 ) -> _RayTubes:
-    """Launch tubes of waves in air into solids."""
+    """Launch tubes of waves in air into solids, in narrow pieces where the surface is curved."""
     row = torch.nonzero(solids.transparent[patches.facet])[:, 0]
-    corners, d = patches.polygon[row], patches.direction[row]
-    normals = surface.normals_at(patches.facet[row, None].expand(-1, 3), corners, d[:, None])
-    phases = dot(corners, d[:, None]) + patches.phase_offset[row, None]
-    directions = d[:, None].expand(-1, 3, 3)
-    from_outside = torch.ones_like(row, dtype=torch.bool)
-    return _RayTubes(row, corners, directions, normals, phases.to(torch.complex128), from_outside)
+    own = patches.select(row)
+    inside = solids.permittivity[solids.owner[own.facet]]
+    width = _MAX_LAUNCH_RATIO * min_tube_width / refractive_index(inside)[:, None]
 
+    def normals_at(piece: Tensor, points: Tensor) -> Tensor:
+        facet = own.facet[piece, None].expand(-1, 3)
+        return surface.normals_at(facet, points, own.direction[piece, None])
 
-class _DepartingTubes(NamedTuple):
-    """Tubes that leave surfaces; ``refractive_index`` is √ε of their medium."""
+    def is_wide(piece: Tensor, corners: Tensor) -> Tensor:
+        """Mask of wide pieces, across the direction in which the normal does not turn."""
+        sides, turns = (x.roll(-1, 1) - x for x in (corners, normals_at(piece, corners)))
+        extent = dot(sides, turns).abs() - width[piece] * turns.norm(dim=2)
+        return (extent > _MIN_COSINE * width[piece]).any(1)
 
-    parent: Tensor
-    corners: Tensor
-    directions: Tensor
-    phases: Tensor
-    source_normal: Tensor
-    medium: Tensor
-    transmitted: Tensor
-    refractive_index: Tensor
+    piece, corners = split_large_triangles(own.polygon, is_wide)
+    d = own.direction[piece, None]
+    phases = (dot(corners, d) + own.phase_offset[piece, None]).to(torch.complex128)
+    area = dot(area_vector(corners), d[:, 0]).abs()
+    waves = d.expand(-1, 3, 3), normals_at(piece, corners), phases, area
+    return _RayTubes(row[piece], corners, *waves, torch.ones_like(piece, dtype=torch.bool))
 
 
 def _continue_tubes(
     solids: DielectricSolids, previous: IlluminatedPatches, tubes: _RayTubes
-) -> _DepartingTubes:
-    """Continue tubes by reflection, followed by transmission."""
-    facet, medium = previous.facet[tubes.patch], previous.medium[tubes.patch]
+) -> tuple[IlluminatedPatches, _RayTubes]:
+    """Continue tubes by reflection, followed by transmission, with the patch that each leaves."""
+    patches = previous.select(tubes.patch)
     again = torch.nonzero(~tubes.from_outside)[:, 0]
-    behind = solids.medium_behind(facet, medium)
-    inside, outside = (refractive_index(solids.permittivity_in(m)) for m in (medium, behind))
+    behind = solids.medium_behind(patches.facet, patches.medium)
+    inside, outside = (
+        refractive_index(solids.permittivity_in(m)) for m in (patches.medium, behind)
+    )
     cosine = -dot(tubes.normals, tubes.directions)
     ratio = (inside / outside)[:, None]
     square = 1 - ratio**2 * (1 - cosine**2)
     factor = ratio * cosine - square.clamp_min(0).sqrt()
     directions = ratio[..., None] * tubes.directions + factor[..., None] * tubes.normals
-    propagates = (square > 0).all(1) & (cosine > _MIN_COSINE).all(1) & solids.transparent[facet]
-    propagates = torch.nonzero(propagates)[:, 0]
+    propagates = (square > 0).all(1) & (cosine > _MIN_COSINE).all(1)
+    propagates = torch.nonzero(propagates & solids.transparent[patches.facet])[:, 0]
     row = torch.cat([again, propagates])
     transmitted = torch.arange(len(row)) >= len(again)
     mirror = reflect_vectors(tubes.directions, tubes.normals)[again]
     directions = normalize(torch.cat([mirror, directions[propagates]]), dim=2)
-    normal = previous.normal[tubes.patch[row]]
-    source_normal = torch.where(transmitted[:, None], -normal, normal)
-    medium = torch.where(transmitted, behind[row], medium[row])
-    index, own = solids.permittivity_in(medium).sqrt(), tubes.select(row)
-    waves = directions, own.phases, source_normal, medium, transmitted, index
-    return _DepartingTubes(own.patch, own.corners, *waves)
+    # Refraction changes the cross section as Fresnel's equations assume, at the patch's normal.
+    cosine = -dot(patches.normal, patches.direction)
+    widening = (1 - ratio[:, 0] ** 2 * (1 - cosine**2)).clamp_min(0).sqrt() / cosine
+    area = tubes.area[row] * torch.where(transmitted, widening[row], 1.0)
+    left = patches.select(row)
+    medium = torch.where(transmitted, behind[row], left.medium)
+    normal = torch.where(transmitted[:, None], -left.normal, left.normal)
+    left = replace(left, medium=medium, normal=normal, transmitted=transmitted)
+    return left, replace(tubes.select(row), directions=directions, area=area)
 
 
 def _trace_tubes(
@@ -247,8 +256,8 @@ def _trace_tubes(
 ) -> tuple[IlluminatedPatches, _RayTubes]:
     """Trace tubes to their next surface, split so that each piece sees one smooth face."""
     facets = surface.facets
-    departing = _continue_tubes(solids, previous, tubes)
-    departing = _DepartingTubes(*(x[_has_area(facets, departing.corners)] for x in departing))
+    left, departing = _continue_tubes(solids, previous, tubes)
+    left, departing = (x.select(_has_area(facets, departing.corners)) for x in (left, departing))
 
     def directions_at(row: Tensor, points: Tensor) -> Tensor:
         directions, corners = departing.directions[row], departing.corners[row]
@@ -256,8 +265,8 @@ def _trace_tubes(
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
         shape, many = points.shape[:2], row.repeat_interleave(points.shape[1])
-        starts = (points + ray_offset(facets, departing.source_normal[row])[:, None]).flatten(0, 1)
-        medium, ways = departing.medium[many], directions_at(row, points).flatten(0, 1)
+        starts = (points + ray_offset(facets, left.normal[row])[:, None]).flatten(0, 1)
+        medium, ways = left.medium[many], directions_at(row, points).flatten(0, 1)
         return _find_first_facets(facets, occluders, solids, medium, starts, ways).view(shape)
 
     def visible_faces(row: Tensor, points: Tensor) -> Tensor:
@@ -277,7 +286,7 @@ def _trace_tubes(
     fallback = hit.gather(1, (~is_other_face).int().argmax(1, keepdim=True))
     facet = torch.where(is_other_face, fallback, hit)[is_valid]
     row, corners = row[is_valid], corners[is_valid]
-    return _terminate_tubes(surface, solids, previous, departing, row, corners, facet)
+    return _terminate_tubes(surface, solids, left, departing, row, corners, facet)
 
 
 def _find_first_facets(
@@ -315,8 +324,8 @@ def _find_first_facets(
 def _terminate_tubes(
     surface: SmoothFaces,
     solids: DielectricSolids,
-    previous: IlluminatedPatches,
-    departing: _DepartingTubes,
+    left: IlluminatedPatches,
+    departing: _RayTubes,
     row: Tensor,
     corners: Tensor,
     facet: Tensor,
@@ -325,7 +334,7 @@ def _terminate_tubes(
     facets, start = surface.facets, departing.corners[row]
     weights = barycentric_coordinates(start[:, None], corners)
     directions = normalize((weights[..., None] * departing.directions[row][:, None]).sum(2), dim=2)
-    index = departing.refractive_index[row]
+    index = solids.permittivity_in(left.medium[row]).sqrt()
     # The phase is quadratic between corners of known slope.
     slopes = dot(departing.directions[row][:, None], corners[:, :, None] - start[:, None])
     phases = (weights * (departing.phases[row][:, None] + index[:, None, None] * slopes / 2)).sum(2)
@@ -345,25 +354,29 @@ def _terminate_tubes(
     normal = normalize(normals.sum(1), dim=1)
     is_valid = (dot(normal, direction) < -_MIN_COSINE) & (dot(normals, directions) < 0).all(1)
     wave_vector = _fit_wave_vector(index[:, None] * direction, ends, phases)
-    parent = departing.parent[row]
-    patches = IlluminatedPatches(
-        aspect=previous.aspect[parent],
+    whole, piece = (area_vector(x).norm(dim=1) for x in (departing.corners[row], corners))
+    before = departing.area[row] * piece / whole
+    # A focus of all that the scene may gather is at least half a wavelength in the medium wide.
+    focus = (math.pi / (solids.wave_number * facets.size * index.real)).clamp_max(1)
+    spreading, area = _spreading_factor(direction, normal, before, before * focus**2, corners, ends)
+    patches = replace(
+        left.select(row),
         facet=middle,
         normal=normal,
         direction=direction,
         phase_offset=phases[:, 0] - dot(wave_vector, ends[:, 0]),
         polygon=ends,
-        parent=parent,
+        parent=departing.patch[row],
         wave_vector=wave_vector,
-        medium=departing.medium[row],
-        transmitted=departing.transmitted[row],
-        spreading=_spreading_factor(direction, corners, ends),
+        spreading=spreading,
     )
     keep = is_valid & exceeds_min_amplitude(patches, solids.wave_number)
     solids.require_gaps(patches.facet[keep], patches.medium[keep])
     number = torch.arange(int(keep.sum()))
     fresh = torch.zeros_like(number, dtype=torch.bool)
-    tubes = _RayTubes(number, ends[keep], directions[keep], normals[keep], phases[keep], fresh)
+    tubes = _RayTubes(
+        number, ends[keep], directions[keep], normals[keep], phases[keep], area[keep], fresh
+    )
     return patches.select(keep), tubes
 
 
@@ -379,21 +392,33 @@ def _fit_wave_vector(wave_vector: Tensor, corners: Tensor, phases: Tensor) -> Te
 
 def _spreading_factor(
     direction: Float64[Tensor, "row 3"],
+    normal: Float64[Tensor, "row 3"],
+    before: Float64[Tensor, " row"],
+    least: Float64[Tensor, " row"],
     start: Float64[Tensor, "row 3 3"],
     end: Float64[Tensor, "row 3 3"],
-) -> Complex128[Tensor, " row"]:
-    """Spreading factor √(A/A′) of tube cross sections, times j for each caustic line."""
+) -> tuple[Complex128[Tensor, " row"], Float64[Tensor, " row"]]:
+    """Spreading factor √(A/A′) of tubes, times j for each caustic line, and cross section A′ [m²].
+
+    Args:
+        direction: unit direction of each tube.
+        normal: unit normal of the smooth surface at the end.
+        before: cross section A [m²].
+        least: least A′ [m²]: at a focus the field is finite.
+        start, end: triangles at both ends [m].
+    """
+    section = area_vector(end)
+    # A facet that is more oblique than the smooth surface is larger than the tube's footprint.
+    oblique = section.norm(dim=1) * dot(normal, direction).abs()
+    area = torch.maximum(dot(section, direction).abs(), oblique).maximum(least)
     first = orthogonal_unit_vectors(direction)
     axes = torch.stack([first, cross(direction, first)], 1)
-    a, b = ((x[:, 1:] - x[:, :1]) @ axes.mT for x in (start, end))
-    a, b = a.mT, b.mT
-    before, after = torch.linalg.det(a), torch.linalg.det(b)
-    # b = J a; one caustic where det J < 0, two where both eigenvalues of J are negative.
-    trace = b[:, 0, 0] * a[:, 1, 1] - b[:, 0, 1] * a[:, 1, 0]
-    trace = (trace + b[:, 1, 1] * a[:, 0, 0] - b[:, 1, 0] * a[:, 0, 1]) / before
-    caustics = torch.where(before * after < 0, 1, torch.where(trace < 0, 2, 0))
+    # One caustic where the determinant is negative, two where both eigenvalues are.
+    turn, _ = torch.linalg.solve_ex(*((x[:, 1:] - x[:, :1]) @ axes.mT for x in (start, end)))
+    trace = turn[:, 0, 0] + turn[:, 1, 1]
+    caustics = torch.where(torch.linalg.det(turn) < 0, 1, torch.where(trace < 0, 2, 0))
     quarter = torch.tensor([1.0, 1j, -1.0], dtype=torch.complex128)[caustics]
-    return (before / after).abs().sqrt() * quarter
+    return (before / area).sqrt() * quarter, area
 
 
 def _has_area(facets: Facets, corners: Float64[Tensor, "row 3 3"]) -> Bool[Tensor, " row"]:

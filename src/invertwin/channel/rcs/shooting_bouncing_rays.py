@@ -35,11 +35,10 @@ def find_illuminated_triangles(
         incident: direction d of each wave.
         min_side: side below which pieces are not split [m].
     """
-    number = torch.arange(len(facets.normal))
-    corners = facets.corners.detach()
-    while bool((large := _longest_sides(corners) > _MAX_SIDE_RATIO * min_side).any()):
-        corners = torch.cat([corners[~large], _quarter_triangles(corners[large])])
-        number = torch.cat([number[~large], number[large].repeat_interleave(4)])
+    number, corners = split_large_triangles(
+        facets.corners.detach(),
+        lambda _, pieces: _longest_sides(pieces) > _MAX_SIDE_RATIO * min_side,
+    )
     for waves in torch.arange(len(incident)).split(max(1, _ROWS_AT_ONCE // len(number))):
         aspect = waves.repeat_interleave(len(number))
         row = torch.arange(len(number)).repeat(len(waves))
@@ -74,6 +73,22 @@ def _illuminate_triangles(
     normal = _orient_normals(facets.normal[number], d)
     before = torch.full_like(aspect, -1)
     return patches_in_air(aspect, number, normal, d, torch.zeros_like(d[:, 0]), corners, before)
+
+
+def split_large_triangles(
+    corners: Float64[Tensor, "row 3 3"], is_large: Callable[[Tensor, Tensor], Tensor]
+) -> tuple[Int64[Tensor, " piece"], Float64[Tensor, "piece 3 3"]]:
+    """Split triangles in four until none is large; returns the row and corners of every piece.
+
+    Args:
+        corners: corners of the triangles [m].
+        is_large: function of rows and pieces; returns a mask.
+    """
+    row = torch.arange(len(corners))
+    while bool((large := is_large(row, corners)).any()):
+        corners = torch.cat([corners[~large], _quarter_triangles(corners[large])])
+        row = torch.cat([row[~large], row[large].repeat_interleave(4)])
+    return row, corners
 
 
 def subdivide_triangles(
