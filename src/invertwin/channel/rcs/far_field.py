@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Complex128, Float64
+from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -122,6 +122,11 @@ class _FarFieldTarget:
     def smooth_faces(self) -> SmoothFaces:
         """Smooth faces that the facets approximate."""
         return group_smooth_faces(self.facets, self.topology.edge_faces)
+
+    @cached_property
+    def metal_faces(self) -> Int64[Tensor, " facet"]:
+        """Number of the smooth face of each facet of conductors; −1 = other materials."""
+        return torch.where(self.interfaces[0].conducting, self.smooth_faces.face, -1)
 
     def max_refractive_index(self, number: int) -> float:
         """Return the largest refractive index inside an object; 1 for opaque ones."""
@@ -306,8 +311,8 @@ class _FarFieldTracer:
         for first in find_illuminated_triangles(
             target.facets, target.is_unoccluded, -self.transmitters, tube_width
         ):
-            tubes = trace_tubes(target.facets, target.occluders, first, tube_width, depth)
-            outside = [first, *tubes]
+            bodies = target.facets, target.occluders, target.metal_faces
+            outside = [first, *trace_tubes(*bodies, first, tube_width, depth)]
             for solids, members in target.interiors:
                 patch_orders = outside
                 if solids is not None:

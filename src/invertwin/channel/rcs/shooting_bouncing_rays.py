@@ -1,7 +1,10 @@
 """Shooting and bouncing rays: illuminated triangles of a mesh, and their reflected ray tubes.
 
 A fully illuminated triangle is exact. A partly illuminated one is split in four down to a given
-size; the smallest pieces are cut along the shadow boundary.
+size; the smallest pieces are cut along the shadow boundary. Reflected tubes are split likewise
+where they meet several surfaces. On one smooth surface of metal narrow tubes are kept whole, as
+plane waves on the plane of one facet: cut between facets, their number would grow with every
+bounce.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,6 +21,8 @@ _MAX_SIDE_RATIO = 8.0  # times the smallest piece: larger triangles are split in
 _CORNER_INSET = 0.02  # fraction from a corner to the centre at which the corner is tested
 _BISECTIONS = 4  # bisection steps along a side
 _ROWS_AT_ONCE = 1 << 18
+_MAX_HEIGHT = 1 / 16  # of the least tube width: hits over the plane of a tube that is kept whole
+_MAX_UNEVENNESS = 1e-3  # of the least tube width: the same of a wide tube, on flat faces
 _RAY_OFFSET = 2e-6  # of the scene's size: offset of ray origins from a surface
 
 
@@ -95,6 +100,7 @@ def subdivide_triangles(
     corners: Float64[Tensor, "row 3 3"],
     classify: Callable[[Tensor, Tensor], Tensor],
     is_narrow: Callable[[Tensor, Tensor], Tensor],
+    is_flat: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None,
 ) -> tuple[Int64[Tensor, " piece"], Float64[Tensor, "piece 3 3"], Int64[Tensor, " piece"]]:
     """Subdivide triangles into pieces of uniform label.
 
@@ -103,6 +109,8 @@ def subdivide_triangles(
         classify: function of rows and their points [row, point, 3]; returns labels [row, point].
         is_narrow: function of rows and pieces; returns a mask of pieces to cut along a line instead
             of splitting in four.
+        is_flat: function of rows, their centres and corners [row, 4, 3] and the labels of these;
+            returns a mask of pieces to keep whole, with the label of their centre.
 
     Returns:
         Row, corners and label of every piece.
@@ -110,8 +118,12 @@ def subdivide_triangles(
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     row = torch.arange(len(corners))
     while True:
-        labels = classify(row, inset_points(corners))
+        points = inset_points(corners)
+        labels = classify(row, points)
         is_uniform = (labels == labels[:, :1]).all(1)
+        if is_flat is not None:
+            mixed = torch.nonzero(~is_uniform)[:, 0]
+            is_uniform[mixed] = is_flat(row[mixed], points[mixed], labels[mixed])
         found.append((row[is_uniform], corners[is_uniform], labels[is_uniform, 0]))
         row, corners, labels = row[~is_uniform], corners[~is_uniform], labels[~is_uniform]
         if not len(row):
@@ -190,6 +202,7 @@ def _quarter_triangles(corners: Float64[Tensor, "row 3 3"]) -> Float64[Tensor, "
 def trace_tubes(
     facets: Facets,
     occluders: Occluders,
+    metal_face: Int64[Tensor, " facet"],
     first_order: IlluminatedPatches,
     min_tube_width: float,
     depth: int,
@@ -199,51 +212,85 @@ def trace_tubes(
     Args:
         facets: facets of all triangles.
         occluders: ray scene of the triangles.
+        metal_face: number of the smooth face of each facet of metal; −1 = other materials.
         first_order: directly illuminated triangles.
         min_tube_width: width below which tubes are not split [m].
         depth: maximum number of bounces.
 
     Source: derivations §13.
 
-    Differs from the source: tubes start as illuminated triangles and are cut between facets,
+    Differs from the source: tubes start as illuminated triangles and are cut between surfaces,
     instead of a square grid of tubes that count as a whole or not at all.
     """
     last = first_order
     for _ in range(1, depth):
-        last = _trace_next_order(facets, occluders, last, min_tube_width)
+        last = _trace_next_order(facets, occluders, metal_face, last, min_tube_width)
         if not len(last.aspect):
             return
         yield last
 
 
 def _trace_next_order(
-    facets: Facets, occluders: Occluders, previous: IlluminatedPatches, min_tube_width: float
+    facets: Facets,
+    occluders: Occluders,
+    metal_face: Tensor,
+    previous: IlluminatedPatches,
+    min_tube_width: float,
 ) -> IlluminatedPatches:
     """Trace the tubes of one order to their next surface."""
     directions = reflect_vectors(previous.direction, previous.normal)
+    max_height, far = _MAX_HEIGHT * min_tube_width, 3 * facets.size
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
-        starts = points + ray_offset(facets, previous.normal[row])[:, None]
-        ends = starts + 3 * facets.size * directions[row][:, None]
-        found, _ = find_next_surface(occluders, starts.flatten(0, 1), ends.flatten(0, 1))
-        return found.view(starts.shape[:2])
+        row = row.repeat_interleave(points.shape[1])
+        normal, way = previous.normal[row], far * directions[row]
+        starts = points.flatten(0, 1) + ray_offset(facets, normal)
+        found, along = find_next_surface(occluders, starts, starts + way)
+        # A tube that was kept whole overhangs its facet, and may start behind the neighbours.
+        other, face = facets.normal[found], metal_face[found]
+        behind = (along * dot(normal, way) < max_height) & (
+            dot(other, way) * dot(other, normal) > 0
+        )
+        behind &= (face >= 0) & (face == metal_face[previous.facet[row]])
+        again = torch.nonzero(behind & (found >= 0))[:, 0]
+        way = way[again]
+        starts = starts[again] + along[again, None] * way + 2 * ray_offset(facets, way / far)
+        found[again] = find_next_surface(occluders, starts, starts + way)[0]
+        return found.view(points.shape[:2])
+
+    def is_flat(row: Tensor, points: Tensor, facet: Tensor) -> Tensor:
+        face, d = metal_face[facet], directions[row][:, None]
+        hits = points + _distance_to_facets(facets, facet, points, d)[..., None] * d
+        centre = facet[:, :1]
+        height = dot(facets.normal[centre], hits - facets.corners[centre, 0]).abs()
+        is_thin = is_narrow(row, 2 * points[:, 1:])
+        limit = torch.where(is_thin, _MAX_HEIGHT, _MAX_UNEVENNESS)
+        same = (facet >= 0) & (face >= 0) & (face == face[:, :1])
+        return (same & (height <= limit[:, None] * min_tube_width)).all(1)
 
     def is_narrow(row: Tensor, pieces: Tensor) -> Tensor:
         d = directions[row][:, None]
         transverse = pieces - dot(pieces, d)[..., None] * d
         return (transverse.roll(-1, 1) - transverse).norm(dim=2).amax(1) <= min_tube_width
 
-    parent, corners, facet = subdivide_triangles(previous.polygon, hit_facets, is_narrow)
+    parent, corners, facet = subdivide_triangles(previous.polygon, hit_facets, is_narrow, is_flat)
     parent, corners, facet = (x[facet >= 0] for x in (parent, corners, facet))
     normal, d = facets.normal[facet], directions[parent]
     facing = dot(normal, d)
     keep = (facing.abs() > 1e-9) & ~(facets.solid[facet] & (facing > 0))
     columns = parent, facet, corners, normal, d, facing
     parent, facet, corners, normal, d, facing = (column[keep] for column in columns)
-    # The ray tracer finds the triangle; the intersection with its plane is computed in float64.
-    distance = dot(normal[:, None], facets.corners[facet, :1] - corners) / facing[:, None]
+    distance = _distance_to_facets(facets, facet[:, None], corners, d[:, None])
     polygon = corners + distance[..., None] * d[:, None]
     # Phase matching on the reflecting face.
     offset = previous.phase_offset[parent] + dot(previous.direction[parent] - d, corners[:, 0])
     normal = -facing.sign()[:, None] * normal
     return patches_in_air(previous.aspect[parent], facet, normal, d, offset, polygon, parent)
+
+
+def _distance_to_facets(
+    facets: Facets, facet: Tensor, points: Tensor, directions: Tensor
+) -> Float64[Tensor, "row point"]:
+    """Distance of points from planes of facets along rays, in float64 [m]."""
+    normal = facets.normal[facet]
+    return dot(normal, facets.corners[facet, 0] - points) / dot(normal, directions)
