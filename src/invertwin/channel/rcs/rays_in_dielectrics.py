@@ -257,7 +257,8 @@ def _trace_tubes(
     """Trace tubes to their next surface, split so that each piece sees one smooth face."""
     facets = surface.facets
     left, departing = _continue_tubes(solids, previous, tubes)
-    left, departing = (x.select(_has_area(facets, departing.corners)) for x in (left, departing))
+    keep = _has_area(facets, departing.corners)
+    left, departing = left.select(keep), departing.select(keep)
 
     def directions_at(row: Tensor, points: Tensor) -> Tensor:
         directions, corners = departing.directions[row], departing.corners[row]
