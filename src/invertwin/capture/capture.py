@@ -36,6 +36,7 @@ from invertwin.storage.untrusted import convert_read_errors
 
 BeatUnit = Literal["1", "count"]
 
+
 class RangeInterpolator:
     """A profile as a function of range, band-limited between its samples.
 
