@@ -1,10 +1,18 @@
 """Entry point of the command line. An interruption prints one line, also during imports."""
 
+import os
+import sys
+
 from invertwin.errors import exit_on_interrupt
 
 
 def main() -> None:
     """Run the command line."""
+    # Where a standard stream is closed, the next file that is opened would get its number.
+    while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(handle)
+    sys.stdout, sys.stderr = sys.stdout or os.fdopen(1, "w"), sys.stderr or os.fdopen(2, "w")
     with exit_on_interrupt():
         from invertwin.cli import app
 

@@ -29,9 +29,10 @@ from invertwin.cli.options import (
 )
 from invertwin.cli.report import ReportTable
 from invertwin.cli.run_file import prefix_file_errors
-from invertwin.cli.terminal import load_runs, print_tables, run_each, run_folder, show_progress
+from invertwin.cli.terminal import load_runs, print_tables, run_each, run_in_folder, show_progress
 from invertwin.errors import InputError, exit_on_interrupt, to_one_line
 from invertwin.runtime.threads import available_threads
+from invertwin.storage.run_folder import RunFolder
 
 
 class _CommandGroup(TyperGroup):
@@ -105,12 +106,14 @@ def invertwin(
 def simulate(options: RunOptions, file: FileArgument) -> None:
     """Simulate exact radar signals of a scene, and their spectra."""
     runs = load_runs([file], options, "simulate", ("radar", "grid", "data"))
-    with run_folder(options, Path("out", file.stem), runs) as folder:
+
+    def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         from invertwin.cli.commands.simulate import run_simulate
 
         with prefix_file_errors(file), show_progress(console):
-            tables = run_simulate(runs[file.stem], folder)
-        print_tables(tables)
+            return run_simulate(runs[file.stem], folder), ""
+
+    run_in_folder(options, Path("out", file.stem), work, runs)
 
 
 @_command_with(DatasetOptions)
@@ -121,13 +124,14 @@ def dataset(options: DatasetOptions, file: FileArgument) -> None:
     part = command.parse_part(options.shard)
     runs = load_runs([file], options, "dataset", command.DATASET_SECTIONS)
     chosen = replace(options, out=command.part_folder(options.out or Path("out", file.stem), part))
-    with run_folder(chosen, Path("out"), runs) as folder:
-        if folder.complete:
-            return
+
+    def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         with prefix_file_errors(file), show_progress(console):
             workers = options.workers or available_threads()
-            tables = command.run_dataset(runs[file.stem], folder, part, options.engine, workers)
-        print_tables(tables)
+            run = runs[file.stem]
+            return command.run_dataset(run, folder, part, options.engine, workers), ""
+
+    run_in_folder(chosen, Path("out"), work, runs)
 
 
 @_command_with(FitOptions)
@@ -140,14 +144,14 @@ def reconstruct(options: FitOptions, file: FileArgument) -> None:
 def plan(options: ResumableOptions, file: FileArgument) -> None:
     """State the error bars of a fit before anything is recorded, and rank positions to add."""
     runs = load_runs([file], options, "plan", ("radar", "data", "grid", "parameters"))
-    with run_folder(options, Path("out", file.stem), runs) as folder:
-        if folder.complete:
-            return
+
+    def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         from invertwin.cli.commands.plan import run_plan
 
         with prefix_file_errors(file):
-            tables = run_plan(runs[file.stem], folder, console)
-        print_tables(tables)
+            return run_plan(runs[file.stem], folder, console), ""
+
+    run_in_folder(options, Path("out", file.stem), work, runs)
 
 
 @app.command()
@@ -292,17 +296,18 @@ def _run_recording(
 ) -> None:
     """One recording, by default in a folder of its name and an ending."""
     default = Path("out", options.recording.name.split(".")[0] + ending)
-    with run_folder(options, default) as folder:
+
+    def work_on(folder: RunFolder) -> tuple[list[ReportTable], str]:
         with show_progress(console):
-            tables = work(options, folder)
-        print_tables(tables)
+            return work(options, folder), ""
+
+    run_in_folder(options, default, work_on)
 
 
 def _run_one_reconstruction(file: Path, options: ResumableOptions, default: Path) -> None:
     runs = load_runs([file], options, "reconstruct", _reconstruct_sections)
-    with run_folder(options, default, runs) as folder:
-        if folder.complete:
-            return
+
+    def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         from invertwin.cli.commands.reconstruct import run_reconstruct
         from invertwin.cli.fits.spreading import FitWorkers
 
@@ -310,9 +315,9 @@ def _run_one_reconstruction(file: Path, options: ResumableOptions, default: Path
         workers = FitWorkers.from_options(options.engine, options.workers) if fits else None
         view = isinstance(options, FitOptions) and options.view
         with prefix_file_errors(file):
-            tables, outcome = run_reconstruct(runs[file.stem], folder, console, workers, view=view)
-        print_tables(tables)
-        console.print(outcome, markup=False, soft_wrap=True)
+            return run_reconstruct(runs[file.stem], folder, console, workers, view=view)
+
+    run_in_folder(options, default, work, runs)
 
 
 def _reconstruct_sections(run: Any) -> tuple[str, ...]:

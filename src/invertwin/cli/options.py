@@ -12,8 +12,31 @@ from typing import Annotated, Any, Literal, get_type_hints
 import typer
 from rich.console import Console
 
+
+class _TolerantOutput:
+    """Standard output that may be gone, as a closed pipe or a full disk: no run ends for it."""
+
+    def write(self, text: str) -> int:
+        self._try(lambda: sys.stdout.write(text))
+        return len(text)
+
+    def flush(self) -> None:
+        self._try(lambda: sys.stdout.flush())
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(sys.stdout, name)
+
+    def _try(self, step: Callable[[], Any]) -> None:
+        """Take a step; if it fails, drop this and all further output."""
+        try:
+            step()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 # Tables in a log file or a pipe keep the width that holds their columns.
-console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+_output: Any = _TolerantOutput()
+console = Console(file=_output, highlight=False, width=None if sys.stdout.isatty() else 120)
 
 
 def _use_backend(value: str | None) -> str | None:

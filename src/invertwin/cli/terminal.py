@@ -27,15 +27,19 @@ Result = dict[str, Any]
 Sections = Sequence[str] | Callable[[Any], Sequence[str]]  # that a command needs, of a run file
 
 
-@contextmanager
-def run_folder(
-    options: OutputOptions, default: Path, runs: Mapping[str, Any] | None = None
-) -> Iterator[RunFolder]:
-    """The run's folder, as of `open_run`; says where the results are, or how to resume.
+def run_in_folder(
+    options: OutputOptions,
+    default: Path,
+    work: Callable[[RunFolder], tuple[Sequence[ReportTable], str]],
+    runs: Mapping[str, Any] | None = None,
+) -> None:
+    """Work in the run's folder, as of `open_run`; say what came out once the folder is complete.
 
     Args:
         options: Options of the user.
         default: The folder if the user has chosen none.
+        work: Function of the folder that returns tables and a last line; not called where an
+            earlier run has completed it.
         runs: Run files by stem.
     """
     path, resume = options.out or default, getattr(options, "resume", False)
@@ -43,15 +47,17 @@ def run_folder(
     folder = open_run(path, texts, overwrite=options.overwrite, resume=resume)
     try:
         with folder:
-            yield folder
+            tables, outcome = ([], "") if folder.complete else work(folder)
     except KeyboardInterrupt:
         line = "invertwin: interrupted"
         if folder.resumable:
             line += f"; the same command with --resume goes on (results so far in {path})"
         print(line, file=sys.stderr)
         sys.exit(130)
+    print_tables(tables)
     done = "was complete already" if folder.complete else "complete"
-    console.print(f"{done}: {path / 'report.html'}", markup=False, soft_wrap=True)
+    for line in filter(None, (outcome, f"{done}: {path / 'report.html'}")):
+        console.print(line, markup=False, soft_wrap=True)
 
 
 def load_runs(
@@ -137,13 +143,14 @@ def run_each(
     """
     runs = load_runs(files, options, command, sections)
     default = Path("out", files[0].stem if len(files) == 1 else command)
-    with run_folder(options, default, runs) as folder:
-        if folder.complete:
-            return
+
+    def work_on(folder: RunFolder) -> tuple[list[ReportTable], str]:
         with console.status("tracing") as status:
             say = status.update if console.is_terminal else limit_rate()
-            tables = work(RunBatch(runs, {file.stem: file for file in files}, folder), say)
-        print_tables(tables)
+            batch = RunBatch(runs, {file.stem: file for file in files}, folder)
+            return work(batch, say), ""
+
+    run_in_folder(options, default, work_on, runs)
 
 
 @contextmanager
