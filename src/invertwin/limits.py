@@ -18,6 +18,8 @@ MAX_COUNT = 2**31 - 1
 Count = Annotated[int, Ge(1), Le(MAX_COUNT)]
 CountOfTwo = Annotated[int, Ge(2), Le(MAX_COUNT)]
 
+Decibels = Annotated[float, Ge(-300), Le(300)]
+"""A ratio of powers whose square is a number."""
 RADIANS = "rad"
 """Marks a value in radians. Its key in a run file ends in `_deg` and is in degrees."""
 Angle = Annotated[float, RADIANS]

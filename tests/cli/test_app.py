@@ -4,6 +4,7 @@ import io
 import math
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -168,6 +169,18 @@ def test_gradcheck_of_several_files(run_file, monkeypatch, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "second" in said
     assert "2 for a right gradient" in said
+
+
+@pytest.mark.parametrize("gone", ["full", "closed", "pipe"])
+def test_a_terminal_that_is_gone_ends_no_run(run_file, gone):
+    """The folder is complete, and nothing else is said."""
+    command = [sys.executable, "-c", "from invertwin.__main__ import main; main()"]
+    line = shlex.join([*command, "simulate", str(run_file), "-o", "kept"])
+    line += {"full": " > /dev/full", "closed": " >&-", "pipe": " | true"}[gone]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run(line, shell=True, env=environment, stderr=subprocess.PIPE, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert read_metrics(run_file.parent / "kept")["task"] == "simulate"
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Run files: what is accepted, and what the errors say."""
 
+import os
 import tomllib
 from pathlib import Path
 
@@ -226,8 +227,21 @@ def test_missing_file_folder_and_broken_toml_are_input_errors(tmp_path):
             load_run(path)
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match="expected a run file, got a folder; name a file in it"):
-        load_run(tmp_path)
+    os.mkfifo(tmp_path / "pipe.toml")
+    for path, got in ((tmp_path, "a folder"), (tmp_path / "pipe.toml", "a pipe or a device")):
+        with pytest.raises(InputError, match=f"expected a run file, got {got}; name a file in it"):
+            load_run(path)
+
+
+@pytest.mark.parametrize(
+    "value", ["0x" + "f" * 5_000, "[" * 300 + "]" * 300, '"' + "a" * 10_000 + '"']
+)
+def test_values_that_cannot_be_shown_are_one_short_line(tmp_path, value):
+    file = tmp_path / "long.toml"
+    file.write_text(f'task = "simulate"\nframe = 2\nseed = {value}\n')
+    with pytest.raises(InputError, match="seed: expected") as caught:
+        load_run(file)
+    assert len(str(caught.value)) < 400 + len(str(file))
 
 
 @pytest.mark.parametrize(

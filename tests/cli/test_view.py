@@ -55,6 +55,13 @@ def test_a_fit_leaves_its_steps_and_a_report_in_which_no_name_acts(run_file, mon
     assert content_security_policy() in html.unescape(report)
     assert call(monkeypatch, "view", folder, "--record", "page.html") == 0
     assert "<script>alert" not in Path("page.html").read_text()
+    Path("notes.txt").write_text("mine")
+    for path, said in (("notes.txt", "--overwrite"), ("no/folder/page.html", "existing folder")):
+        assert call(monkeypatch, "view", folder, "--record", path) == 2
+        assert said in capsys.readouterr().err
+    assert Path("notes.txt").read_text() == "mine"
+    assert call(monkeypatch, "view", folder, "--record", "notes.txt", "--overwrite") == 0
+    assert "<!DOCTYPE html>" in Path("notes.txt").read_text()
 
 
 def test_a_capture_shows_its_maps(run_file, monkeypatch):

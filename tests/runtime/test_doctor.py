@@ -341,3 +341,12 @@ def test_install_command(monkeypatch, conda, platform, tools, root, command):
     monkeypatch.setattr(doctor.shutil, "which", lambda name: name if name in tools else None)
     monkeypatch.setattr(doctor.os, "geteuid", lambda: 0 if root else 1000)
     assert doctor.install_command() == command
+
+
+def test_without_a_home_there_is_no_cache(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
+    with pytest.raises(OSError, match="Not a directory"):
+        doctor.cache_folder().mkdir(parents=True, exist_ok=True)
+    assert list(tmp_path.iterdir()) == []

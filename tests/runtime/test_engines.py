@@ -67,6 +67,17 @@ def test_ray_that_is_not_installed_is_told(monkeypatch):
         list(run_jobs(squared, [1], engine="ray"))
 
 
+def test_code_of_the_current_folder_does_not_run(tmp_path, monkeypatch):
+    """Workers and the process that looks after what they share import modules of their own."""
+    mark = tmp_path / "mark"
+    for name in ("multiprocessing", "numpy", "signal"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(mark)!r}, 'w')\nraise SystemExit(1)\n")
+    monkeypatch.chdir(tmp_path)
+    found = dict(run_jobs(squared, [1, 2], workers=2))
+    assert [found[number][0] for number in (0, 1)] == [1, 4]
+    assert not mark.exists()
+
+
 SLEEPER = """
 import time
 from invertwin.runtime.engines import run_jobs

@@ -115,6 +115,15 @@ def test_headers_that_lie_are_refused_before_memory_is_asked_for(tmp_path):
         read_arrays(tmp_path / "b.npz", "copy it again")
 
 
+def test_an_archive_that_expands_beyond_reason_is_refused(tmp_path):
+    """By what it says of itself: no byte of the array is read."""
+    file = tmp_path / "bomb.npz"
+    np.savez_compressed(file, zeros=np.zeros(2**26, dtype=np.float64))
+    assert file.stat().st_size < 2**20
+    with pytest.raises(InputError, match=r"0.54 GB in zeros of a small file"):
+        read_arrays(file, "make it again")
+
+
 def test_all_of_a_reader_is_wrapped():
     @safe_reader("a mesh", "export it")
     def read(path, number=0):

@@ -216,12 +216,15 @@ def view(
         Path | None,
         typer.Option(help="Write an HTML page that needs no server, and end.", show_default=False),
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the page of --record.")
+    ] = False,
     backend: BackendOption = None,
 ) -> None:
     """Show a run, a scene or a capture in the browser, in three dimensions."""
     from invertwin.cli.commands.view import run_view
 
-    run_view(target, console, host=host, port=port, token=token, record=record)
+    run_view(target, console, host=host, port=port, token=token, record=record, overwrite=overwrite)
 
 
 @_command_with(ResumableOptions)
@@ -311,9 +314,10 @@ def _run_one_reconstruction(file: Path, options: ResumableOptions, default: Path
         from invertwin.cli.commands.reconstruct import run_reconstruct
         from invertwin.cli.fits.spreading import FitWorkers
 
-        fits = isinstance(options, FitOptions)
-        workers = FitWorkers.from_options(options.engine, options.workers) if fits else None
-        view = isinstance(options, FitOptions) and options.view
+        workers, view = None, False
+        if isinstance(options, FitOptions):
+            workers = FitWorkers.from_options(options.engine, options.workers)
+            view = options.view
         with prefix_file_errors(file):
             return run_reconstruct(runs[file.stem], folder, console, workers, view=view)
 

@@ -71,8 +71,9 @@ def read_text(path: Path) -> str:
     Raises:
         InputError: The file is missing or is no text.
     """
-    if path.is_dir():
-        raise InputError(f"{path}: expected a run file, got a folder; name a file in it")
+    if path.exists() and not path.is_file():
+        got = "a folder" if path.is_dir() else "a pipe or a device"
+        raise InputError(f"{path}: expected a run file, got {got}; name a file in it")
     try:
         return path.read_bytes().decode("utf-8")
     except FileNotFoundError:
@@ -237,4 +238,6 @@ def _format_value(value: Any) -> str:
         text = json.dumps(value, ensure_ascii=False)
     except TypeError:
         text = " ".join(str(value).split())
+    except (ValueError, RecursionError):  # of thousands of digits or levels
+        text = "a value too long to show"
     return text if len(text) <= 60 else text[:57] + "..."

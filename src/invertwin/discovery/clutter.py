@@ -88,7 +88,7 @@ def reconstruct_among_clutter(
             "expected a parameter that moves an object, got none: clutter is what is away from the "
             "fitted objects; give a Pose or a shape, or use reconstruct"
         )
-    for number, blur in enumerate((1.0, 0.0)):
+    for number, blur in ((0, 1.0), (1, 0.0)):
         blurred = [replace(o, model=o.model.scale_blur(blur)) for o in given]
         clutter = [estimate_clutter(present, o, fitted, seed=seed).background for o in blurred]
         whitened = _whiten([o.model for o in blurred], clutter)

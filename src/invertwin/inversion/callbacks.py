@@ -91,7 +91,7 @@ class Checkpoint(Callback):
             InputError: A file that cannot be read, or of another fit.
         """
         path = self._path(fit)
-        if not (self.resume and path.exists()):
+        if not (self.resume and path.is_file()):
             return
         with convert_read_errors(path, "a whole checkpoint", "delete it or start without resume"):
             state = torch.load(path, weights_only=True)

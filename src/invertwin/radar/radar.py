@@ -37,6 +37,7 @@ _SHARED_VISIBILITY_DISTANCE = 0.1
 # Arrays have λ/2 at some frequency of the band, not exactly at its centre.
 _SPACING_TOLERANCE = 1.05
 _MAX_CHANNELS = 1e6
+_MAX_BINS = 2**28  # 2 GB for one frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,7 +310,10 @@ class Radar:
             side = min(math.ceil(limit / spacing - 1e-9), math.floor(1 / spacing + 1e-9))
             axes |= {f"{name}_start": -side * spacing, f"{name}_step": spacing}
             axes |= {f"{name}_count": 2 * side + 1}
-        return Grid(first * step, step, last - first + 1, **axes)
+        found = Grid(first * step, step, last - first + 1, **axes)
+        do = "check units of the frequency and of the antennas' positions, or narrow the limits"
+        require_at_most(math.prod(found.shape), _MAX_BINS, "bins", do, "range_max")
+        return found
 
     @property
     def _rotations(self) -> Float64[Tensor, "frame 3 3"]:

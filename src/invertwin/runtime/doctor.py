@@ -427,8 +427,10 @@ def _probe_cached(path: str, probe: _Probe) -> LlvmProbeResult:
 
 def cache_folder() -> Path:
     """Return the folder of caches on disk; it may not exist."""
-    root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    return Path(root, "invertwin")
+    home = os.path.expanduser("~")
+    # Without a home there is no cache: nothing can be written below a file.
+    own = os.devnull if home.startswith("~") else os.path.join(home, ".cache")
+    return Path(os.environ.get("XDG_CACHE_HOME") or own, "invertwin")
 
 
 def _cache_file() -> Path:

@@ -26,7 +26,8 @@ _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
 
 _QUEUED_PER_WORKER = 2  # pieces that wait for each worker, so that none is idle
-_ONE_THREAD: dict[str, str] = dict.fromkeys(threads.COUNT_VARIABLES, "1")
+# One thread each; code of the folder that they are started in does not run.
+_CHILD_VARIABLES = {**dict.fromkeys(threads.COUNT_VARIABLES, "1"), "PYTHONSAFEPATH": "1"}
 
 
 class _WorkerError(NamedTuple):
@@ -98,7 +99,7 @@ def _processes(workers: int) -> Iterator[tuple[int, Any, Any]]:
     spawn = multiprocessing.get_context("spawn")
     alive, ours = spawn.Pipe(duplex=False)
     with (
-        _single_threaded_children(),
+        _child_environment(),
         ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(alive,)) as pool,
     ):
 
@@ -121,10 +122,10 @@ def _processes(workers: int) -> Iterator[tuple[int, Any, Any]]:
 
 
 @contextmanager
-def _single_threaded_children() -> Iterator[None]:
-    """Limit processes started in the block to one thread; libraries read that at import."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(_ONE_THREAD)
+def _child_environment() -> Iterator[None]:
+    """Set variables of processes started in the block; libraries read them at import."""
+    before = {name: os.environ.get(name) for name in _CHILD_VARIABLES}
+    os.environ.update(_CHILD_VARIABLES)
     try:
         yield
     finally:
@@ -153,7 +154,7 @@ def _ray_cluster() -> Iterator[tuple[int, Any, Any]]:
     if ours:
         ray.init(include_dashboard=False, log_to_driver=False)
     try:
-        task = ray.remote(num_cpus=1, runtime_env={"env_vars": _ONE_THREAD})(_run_remote_job)
+        task = ray.remote(num_cpus=1, runtime_env={"env_vars": _CHILD_VARIABLES})(_run_remote_job)
         count = max(1, int(ray.cluster_resources().get("CPU", 1)))
 
         def wait_for_results(pending: Any) -> list[tuple[Any, Any]]:

@@ -122,7 +122,7 @@ class RunFolder:
     def read_json(self, name: str) -> Any | None:
         """A JSON file that this run wrote before it was interrupted, or None."""
         path = self.file(name)
-        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
 
     def _finish(self) -> None:
         work = self._manifest.unfinished

@@ -17,6 +17,8 @@ if TYPE_CHECKING:  # the command line starts without NumPy
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+# Bytes of an array in an archive, and over those that it takes there: more is a bomb.
+_MAX_EXPANDED, _MAX_EXPANSION = 2**28, 100
 _DAMAGED_ADVICE = "it is damaged or of another kind; copy or export it again"
 
 
@@ -156,6 +158,8 @@ def read_arrays(
         for entry in archive.infolist():
             name = entry.filename.removesuffix(".npy")
             if names is None or name in names:
+                if entry.file_size > max(_MAX_EXPANDED, _MAX_EXPANSION * entry.compress_size):
+                    raise ValueError(f"{entry.file_size / 1e9:.2g} GB in {name} of a small file")
                 with archive.open(entry) as opened:
                     _check_header(opened, entry.file_size)
                     found[name] = np.load(opened, allow_pickle=False)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.prediction import covariances, prediction_coefficients
-from invertwin.checks import check_choice
+from invertwin.checks import check_choice, checked_count
 from invertwin.errors import InputError
 
 LANE_COUNT = 4
@@ -55,7 +55,9 @@ def change_settings(settings: ChirpSettings, changes: Mapping[str, Any]) -> Chir
         do = "correct other numbers in the settings file"
         check_choice(name, CHANGEABLE_SETTINGS, "changes of", do)
     values = {
-        _COUNTS.get(name, name): tuple(range(1, value + 1)) if name in _COUNTS else value
+        _COUNTS.get(name, name): tuple(range(1, checked_count(value, name, 1) + 1))
+        if name in _COUNTS
+        else value
         for name, value in changes.items()
     }
     return replace(settings, **values)

@@ -117,6 +117,7 @@ def _check_checked_map(run: RunFile) -> _Needs:
 def _check_image(run: RunFile) -> _Needs:
     """Check `[image]`, whose memory is constant: the time of one image."""
     scene, check = build.scene(run), require_section(run, "gradcheck", run.task)
+    require_section(run, "camera", "an image")
     model, camera = build.build_section(run, "image"), build.build_section(run, "camera")
     rays = len(camera.positions) * camera.width * camera.height * model.sampling.samples
     ends, slopes = 4 * check.max_pairs, 4 * check.repeats

@@ -157,11 +157,13 @@ def _parse_changes(given: list[str]) -> dict[str, Any]:
     for text in given:
         name, _, value = text.partition("=")
         try:
-            found[name.strip()] = json.loads(value.strip().lower())
-        except json.JSONDecodeError:
+            found[name.strip()] = number = json.loads(value.strip().lower())
+            if not isinstance(number, int | float):
+                raise ValueError
+        except (ValueError, RecursionError):  # also of thousands of digits or levels
             raise InputError(
-                f"expected --set NAME=NUMBER, such as samples=128, or real=true, got {text!r}; "
-                "write it so"
+                f"expected --set NAME=NUMBER, such as samples=128, or real=true, got "
+                f"{text[:60]!r}; write it so"
             ) from None
     return found
 

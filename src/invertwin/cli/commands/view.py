@@ -15,10 +15,18 @@ from invertwin.cli.run_file import load_run, prefix_file_errors
 from invertwin.cli.schema import RunFile, build
 from invertwin.errors import InputError
 from invertwin.radar import Radar
+from invertwin.storage.folders import replace_file
 
 
 def run_view(
-    target: Path, console: Console, *, host: str, port: int, token: str | None, record: Path | None
+    target: Path,
+    console: Console,
+    *,
+    host: str,
+    port: int,
+    token: str | None,
+    record: Path | None,
+    overwrite: bool = False,
 ) -> None:
     """Show a target until Ctrl-C, or write a page of it.
 
@@ -27,15 +35,22 @@ def run_view(
         console: Console that prints the address.
         host, port, token: See ``Viewer``.
         record: Path of the page.
+        overwrite: Replace what is at that path.
 
     Raises:
-        InputError: A target that is none of these, or a host without a token.
+        InputError: A target that is none of these, a host without a token, or a path that is taken.
     """
+    if record is not None and record.exists() and not overwrite:
+        raise InputError(
+            f"expected a new file for --record, got {record}, which exists; name another, or give "
+            "--overwrite"
+        )
     if record is None:
         viewer.AccessGuard(host, token)  # its errors come before any work
     display, links = load_display(target)
     if record is not None:
-        record.write_text(viewer.page_html(display, links), encoding="utf-8")
+        with replace_file(record) as part:
+            part.write_text(viewer.page_html(display, links), encoding="utf-8")
         console.print(f"written: {record}", markup=False, soft_wrap=True)
         return
     with viewer.Viewer(display, links, host=host, port=port, token=token) as shown:
@@ -56,7 +71,7 @@ def load_display(target: Path) -> tuple[viewer.Display, dict[str, viewer.Interac
     """
     if target.is_dir():
         files = [target / name for name in ("run.toml", "twin.toml")]
-        file = next((file for file in files if file.exists()), None)
+        file = next((file for file in files if file.is_file()), None)
         if file is None:
             raise InputError(
                 f"expected a run folder with its run.toml, got {target} without one; name a folder "
@@ -83,7 +98,7 @@ def _display_of_run(
         title = run.title or file.stem
         names = run.fitted_objects
         # Without a fit, show objects at their current pose.
-        own = truth if folder is None or not (folder / VIEW_FILE).exists() else scene
+        own = truth if folder is None or not (folder / VIEW_FILE).is_file() else scene
         depth = run.reconstruct.depth if run.reconstruct else getattr(run.data, "depth", 1)
         links = {
             name: viewer.InteractiveSensor(own, radar, grid, depth)
@@ -91,12 +106,12 @@ def _display_of_run(
             if grid is not None
         }
         display = viewer.build_display(own, radars, title, fitted=names or list(run.truth))
-    if folder is not None and (folder / VIEW_FILE).exists():
+    if folder is not None and (folder / VIEW_FILE).is_file():
         display = viewer.Display.load(folder / VIEW_FILE)
         for link in links.values():
             if display.steps:
                 link.replace_meshes(display.steps[-1].bodies)
-    elif folder is not None and (folder / "capture.nc").exists() and "" in links:
+    elif folder is not None and (folder / "capture.nc").is_file() and "" in links:
         capture, grid = Capture.load(folder / "capture.nc"), links[""].grid
         maps = viewer.DisplayMaps.from_spectra({viewer.MEASURED: capture.spectrum(grid)}, grid)
         display = replace(display, maps={"": maps})

@@ -104,7 +104,7 @@ def load_steps(file: Path) -> list[viewer.DisplayStep]:
     Args:
         file: Of `StepRecorder`.
     """
-    return list(viewer.Display.load(file).steps) if file.exists() else []
+    return list(viewer.Display.load(file).steps) if file.is_file() else []
 
 
 def make_fit_display(

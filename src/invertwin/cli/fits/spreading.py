@@ -80,7 +80,7 @@ def distribute_fits(
         )
     text, begun = to_minimal_toml(run), f"{PARTS}/calibration.pt"
     path = folder.path / UNFINISHED / begun
-    files = {begun: path.read_bytes()} if path.exists() else {}
+    files = {begun: path.read_bytes()} if path.is_file() else {}
     jobs = [fit for fit in fits if folder.read_json(f"{fit_file_stem(*fit)}.json") is None]
     work = partial(run_fit_job, fit_one, text, files)
     found = run_jobs(work, jobs, engine=workers.engine, workers=workers.count)

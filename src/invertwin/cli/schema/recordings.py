@@ -11,7 +11,7 @@ from invertwin.capture.readers import described_arrays, described_sweeps
 from invertwin.capture.readers.radar_fields import WAVEFORMS
 from invertwin.cli.schema.sensors import RadarPoseTable
 from invertwin.errors import InputError
-from invertwin.limits import Count, Positive
+from invertwin.limits import Count, Decibels, Positive
 from invertwin.radar.boards import Mounting
 from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry, registry
 from invertwin.registry.section import (
@@ -35,8 +35,8 @@ class SimulatedData(Section):
     samples: Count = key("coherent paths", 200_000)
     depth: Depth = key("most bounces of a path; with [chirps] it is one", 3)
     rough_paths: Count = key("paths to draw of two bounces, and of each larger number", 200_000)
-    snr_db: float | None = key("signal-to-noise ratio per sample; without it no noise", None)
-    noise_figure_db: float | None = key("thermal noise of a receiver instead of snr_db", None)
+    snr_db: Decibels | None = key("signal-to-noise ratio per sample; without it no noise", None)
+    noise_figure_db: Decibels | None = key("thermal noise of a receiver instead of snr_db", None)
     seed: Seed | None = key("without it the run's", None)
     every_start: bool = key("a recording of its own for every start: coverage of error bars", False)
 

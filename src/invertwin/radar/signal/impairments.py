@@ -22,7 +22,7 @@ from torch import Tensor
 from invertwin.channel import Paths
 from invertwin.checks import check_fields, checked_number, refuse_derivatives
 from invertwin.errors import InputError
-from invertwin.limits import RADIANS, NonNegative, Positive, UsualValue
+from invertwin.limits import RADIANS, Decibels, NonNegative, Positive, UsualValue
 from invertwin.radar.radar import Radar, require_sampled_waveform
 from invertwin.radar.signal.chirps import Chirps, moving_beat
 from invertwin.radar.signal.range_profile import add_noise, beat_signal, check_paths
@@ -145,7 +145,7 @@ class Impairments:
     leakage: Leakage | None = None
     gain_std_db: NonNegative = 0.0
     phase_std: Annotated[NonNegative, RADIANS] = 0.0
-    snr_db: float | None = None
+    snr_db: Decibels | None = None
     noise_figure_db: NonNegative | None = None
     transmit_power: Positive = 0.01
     adc: ADC | None = None

@@ -8,6 +8,7 @@ from jaxtyping import Complex, Complex128
 from torch import Tensor
 
 from invertwin.channel import Grid, Paths
+from invertwin.checks import checked_number
 from invertwin.constants import BOLTZMANN, SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar, checked_beat, require_sampled_waveform
@@ -110,6 +111,7 @@ def add_noise(
             "give exactly one"
         )
     if snr_db is not None:
+        snr_db = checked_number(snr_db, "snr_db", -300.0, 300.0)
         power = float(beat.detach().abs().square().mean()) * 10 ** (-snr_db / 10)
     elif noise_figure_db is not None and radar is not None:
         rate = require_sampled_waveform(radar).noise_bandwidth
