@@ -183,7 +183,9 @@ class RecordingOptions(OutputOptions):
             if field.name in ("out", "overwrite", "backend") or value in (field.default, None):
                 continue
             kind = get_type_hints(type(self), include_extras=True)[field.name].__metadata__[0]
-            flags = [flag for flag in kind.param_decls or () if flag.startswith("--")]
+            # Typer's first argument is a name, too, within an annotation.
+            names = (str(kind.default), *(kind.param_decls or ()))
+            flags = [name for name in names if name.startswith("--")]
             flags = flags or [f"--{field.name.replace('_', '-')}"]
             values = value if isinstance(value, list | tuple) else [value]
             values = [os.path.relpath(v, folder) if isinstance(v, Path) else str(v) for v in values]
