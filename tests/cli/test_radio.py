@@ -221,3 +221,11 @@ def test_ends_that_scatter_beyond_the_bars_are_told(tmp_path, ends, near, inside
     )
     assert "spread of other ends" in shown.columns
     assert ("take the spread" in shown.note) == (inside == 0)
+
+
+@pytest.mark.parametrize(("word", "hold"), [("consistent", True), ("inconsistent", False)])
+def test_bars_of_a_fit_that_the_data_speak_against_are_not_stated_as_if_they_held(word, hold):
+    bars = {"standard_deviations": {"x": 0.01}, "within_95": {"x": 0.02}, "units": {"x": "m"}}
+    note = error_bar_table({**bars, "verdict": word}).note
+    assert ("hold only as far as the model does" in note) != hold
+    assert ("near the minimum that was found" in note) == hold

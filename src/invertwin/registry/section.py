@@ -204,7 +204,7 @@ def raise_key_error(text: str, path: str = "") -> NoReturn:
 
 
 def suggest_name(given: str, allowed: Sequence[str], otherwise: str, cutoff: float = 0.5) -> str:
-    """What a user may have meant, as the end of an error.
+    """Suggest the name that a user may have meant, as the end of an error.
 
     Args:
         given: The name.

@@ -205,5 +205,7 @@ def error_bar_table(metrics: Row) -> ReportTable:
     told = ("verdict_reasons", "ambiguities", "unobserved")
     said = [text for key in told for text in metrics.get(key, [])]
     said += [metrics["spread_note"]] if "spread_note" in metrics else []
-    said.append(metrics.get("no_error_bars", load_texts("notes")["error_bars"]))
+    doubted = metrics.get("verdict") in ("inconsistent", "worse", "lost")
+    note = "error_bars_without_model" if doubted else "error_bars"
+    said.append(metrics.get("no_error_bars", load_texts("notes")[note]))
     return ReportTable("Error bars", heads, cells, "\n".join(said))
