@@ -120,8 +120,21 @@ def test_noise_has_nothing_in_it(tmp_path: Path, monkeypatch, capsys):
     assert metrics["count"] == 0
     (note,) = metrics["notes"]
     assert note.startswith("nothing is above the noise from 0.15 to ")
+    assert metrics["warnings"] == []
     assert not (tmp_path / "found" / "twin.glb").exists()
     assert "nothing is above the noise" in (tmp_path / "found" / "report.html").read_text()
+
+
+def test_faults_of_the_samples_are_said(tmp_path: Path, monkeypatch, capsys):
+    chirp = iw.FMCW(start_frequency=77e9, bandwidth=4e9, duration=50e-6, samples=64)
+    radar = iw.Radar(linear_array(1, 1.8e-3), linear_array(4, 1.8e-3), chirp, STILL)
+    beat = torch.randn(1, 1, 4, 64, dtype=torch.complex128, generator=torch.manual_seed(0))
+    Capture.from_beat(1e-6 * beat.real.to(beat.dtype), radar).save(tmp_path / "real.nc")
+    given = ["twin", str(tmp_path / "real.nc"), "-o", str(tmp_path / "found")]
+    assert call(monkeypatch, *given) == 0, capsys.readouterr().err
+    (fault,) = json.loads((tmp_path / "found" / "metrics.json").read_text())["warnings"]
+    assert fault.startswith("complex only by type: ")
+    assert "complex only by type" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import json
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -103,14 +103,17 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
         for suffix in ("ply", "pcd"):
             save_points(folder.file(f"points.{suffix}"), points)
     title, note = options.recording.name, load_texts("notes")["look"]
-    tables = [quantity_table(title, metrics)]
-    if said:
-        rows = [line.split(": ", 1) for line in said]
-        tables.append(ReportTable("Warnings", ["fault", "evidence"], rows))
+    tables = [quantity_table(title, metrics), *warning_tables(said)]
     drawn = save_picture(folder, "look", panels(shown), f"Frame {options.frame}", "doppler")
     status, parts = f"{radar.frame_count} frames, read as {reader}.", [*tables, drawn]
     again = options.command("look", folder.path)
     return write_report(folder, metrics, title, status, parts, again=again, note=note)
+
+
+def warning_tables(said: Sequence[str]) -> list[ReportTable]:
+    """The table of faults of a recording; none without faults."""
+    rows = [line.split(": ", 1) for line in said]
+    return [ReportTable("Warnings", ["fault", "evidence"], rows)] if rows else []
 
 
 @contextmanager

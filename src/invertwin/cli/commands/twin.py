@@ -8,8 +8,8 @@ from typing import Any
 import tomli_w
 import torch
 
-from invertwin.capture import Capture
-from invertwin.cli.commands.look import AnyRecording, read_recording
+from invertwin.capture import Capture, find_faults
+from invertwin.cli.commands.look import AnyRecording, read_recording, warning_tables
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.options import TwinOptions
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
@@ -50,6 +50,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
         options = table | options
     else:
         _, recording = read_recording(arguments)
+    faults = [str(fault) for fault in find_faults(recording)]
     found = twin(recording, **options)
     sure = sum(one.existence_probability > _MIN_EXISTENCE_PROBABILITY for one in found.objects)
     metrics: dict[str, Any] = {
@@ -58,6 +59,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
         "count": sure,
         "unsure": len(found.objects) - sure,
         "notes": list(found.notes),
+        "warnings": faults,
     }
     if found.image is not None:
         metrics["never_seen_share"] = float((found.image.view_counts == 0).double().mean())
@@ -73,7 +75,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
         folder.write_text("twin.toml", tomli_w.dumps(_describe_as_run(found, folder)))
     figure = pictures.ground(found)
     above = save_picture(folder, "ground", figure, "The ground from above", "ground")
-    parts = [_object_table(found), above, *_draw_maps(found, folder)]
+    parts = [_object_table(found), *warning_tables(faults), above, *_draw_maps(found, folder)]
     said = "; ".join(found.notes) or f"{sure} things, {metrics['unsure']} unsure ones"
     title = arguments.recording.name
     still = average_chirps(recording)
