@@ -28,6 +28,8 @@ from invertwin.models.radar import SurrogateMap
 from invertwin.models.whitened import WhitenedMap
 from invertwin.scene import Mesh, Scene, signed_distance
 
+# Of the power of fitted objects: more clutter may be parts of them, of a letter that stands turned.
+_RIVAL_SHARE = 0.05
 _RESOLUTIONS = 2.0  # range resolutions about a fitted object that clutter leaves free, without blur
 
 
@@ -108,7 +110,24 @@ def reconstruct_among_clutter(
         unknowns = {
             name: replace(unknown, module=modules.pop(0)) for name, unknown in unknowns.items()
         }
-    return found
+    return replace(found, doubts=_find_rivals(present, given, fitted, seed))
+
+
+def _find_rivals(
+    scene: Scene, observations: Sequence[Observation], fitted: Sequence[str], seed: int
+) -> tuple[str, ...]:
+    """Name clutter that is so bright that it may be parts of the fitted objects, elsewhere."""
+    found = []
+    for observation in observations:
+        clutter = estimate_clutter(scene, observation, fitted, seed=seed)
+        share = float(clutter.echoes.sum()) / max(clutter.fitted_power, 1e-300)
+        if share > _RIVAL_SHARE:
+            place = ", ".join(f"{value:.2f}" for value in clutter.strongest_position.tolist())
+            found.append(
+                f"echoes that the scene does not explain have {min(share, 999.0):.2g} times the "
+                f"power of the fitted objects, strongest at ({place}) m: they may be parts of these"
+            )
+    return tuple(found)
 
 
 def _whiten(models: Sequence[ForwardModel], backgrounds: Sequence[Tensor]) -> list[WhitenedMap]:
@@ -148,12 +167,14 @@ class Clutter:
     Attributes:
         noise: mean power of noise in a bin, in the unit of the recording.
         echoes: mean power of the echoes in every bin.
+        fitted_power: sum over all bins of what the fitted objects reflect.
         positions: points that reflect the echoes [m].
         strengths: their radar cross-sections [m²], in the unit of the recording.
     """
 
     noise: float
     echoes: Float64[Tensor, "frame range u v"]
+    fitted_power: float
     positions: Float64[Tensor, "point 3"]
     strengths: Float64[Tensor, " point"]
 
@@ -192,8 +213,10 @@ def estimate_clutter(
             f"expected a SurrogateMap for clutter, got a {type(model).__name__}; fit without"
         )
     power = observation.observed_map()
+    sharp, rest = model.scale_blur(0.0), {n: o for n, o in scene.objects.items() if n not in fitted}
     with torch.no_grad():
-        predicted = model.scale_blur(0.0).predict(scene, radar, seed).clamp_min(0.0)
+        predicted = sharp.predict(scene, radar, seed).clamp_min(0.0)
+        own = predicted - sharp.predict(Scene(rest), radar, seed) if rest else predicted
     law = SpectrumLoss()
     gain = law.fitted_gain(predicted, power)
     # The weakest range bin: a level fitted to the whole map would hold the clutter.
@@ -208,4 +231,6 @@ def estimate_clutter(
     response = compute_response(radar, model.grid, points)
     known = (gain * predicted + noise).double()
     strengths = reconstruct_reflectivity(response, power.double(), known)
-    return Clutter(noise, response.predict_maps(strengths), points, strengths)
+    power_of_own = gain * float(own.clamp_min(0.0).sum())
+    echoes = response.predict_maps(strengths)
+    return Clutter(noise, echoes, power_of_own, points, strengths)

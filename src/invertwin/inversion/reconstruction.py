@@ -42,6 +42,7 @@ class Reconstruction:
         steps: number of completed steps.
         loss: final loss; if the fit diverged, the unblurred loss of the best state.
         result: final maps and simulated realisations of them.
+        doubts: evidence against the twin that its maps do not show.
     """
 
     scene: Scene
@@ -52,6 +53,7 @@ class Reconstruction:
     steps: int
     loss: float
     result: FitResult = field(repr=False)
+    doubts: tuple[str, ...] = ()
 
     @cached_property
     def is_uninformative(self) -> bool:
@@ -73,7 +75,11 @@ class Reconstruction:
     @cached_property
     def verdict(self) -> Verdict:
         """Goodness of fit and ambiguities, computed at first access."""
-        return judge_fit(self.result)
+        found = judge_fit(self.result)
+        if not self.doubts:
+            return found
+        word = "ambiguous" if found.is_consistent else found.word
+        return replace(found, word=word, reasons=(*found.reasons, *self.doubts))
 
 
 def reconstruct(

@@ -10,6 +10,7 @@ from invertwin.cli.estimate import require_resources
 from invertwin.cli.fits import radar_models, scores
 from invertwin.cli.fits.fitting import calibrate_problem
 from invertwin.cli.fits.problem import (
+    OF_SENSORS,
     OWN_METHOD,
     DataKind,
     Fits,
@@ -31,6 +32,8 @@ from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.runtime.memory import peak_memory
 from invertwin.scene import Scene
 from invertwin.storage.run_folder import RunFolder
+
+_RIGID = {"translation", "pose", "material", *OF_SENSORS}
 
 
 class RadarMaps(DataKind):
@@ -63,12 +66,13 @@ class RadarMaps(DataKind):
         return radar_models.make_radar_models(problem)
 
     def allows_clutter(self, problem: Problem) -> bool:
-        """True with the likelihood of mean power."""
+        """True with the likelihood of mean power, while objects keep their shapes."""
         loss = build.build_loss(problem.run)
         likely = isinstance(loss, SpectrumLoss) and loss.kind != "mse"
         models = all(isinstance(model, SurrogateMap) for model in self.models(problem))
+        rigid = {p.kind for p in problem.run.parameters} <= _RIGID
         shared = not radar_models.has_recording_per_start(problem.run)
-        return likely and models and shared and problem.run.search is None
+        return likely and models and rigid and shared and problem.run.search is None
 
     def sensor_unknowns(self, problem: Problem, name: str) -> dict[str, Any]:
         """Nuisances of a radar."""
