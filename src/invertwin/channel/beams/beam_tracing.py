@@ -10,7 +10,6 @@ term.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
@@ -172,21 +171,6 @@ def trace_beams(
         yield last
 
 
-class _DepartingBeams(NamedTuple):
-    """Beams that leave facets, one row each; ``source_normal`` points to their side."""
-
-    aspect: Tensor
-    source_facet: Tensor
-    parent: Tensor
-    source_normal: Tensor
-    source_point: Tensor
-    direction: Tensor
-    phase_offset: Tensor
-    wave_vector: Tensor
-    medium: Tensor
-    transmitted: Tensor
-
-
 def _trace_order(
     facets: Facets,
     incident: Tensor,
@@ -206,18 +190,14 @@ def _trace_order(
     if solids is not None:
         within = departing.medium[source] == solids.owner[facet]
         is_front = torch.where(within, facing > 0, is_front)
-    keep = (facet != departing.source_facet[source]) & (facing.abs() > 1e-9) & is_front
+    keep = (facet != departing.facet[source]) & (facing.abs() > 1e-9) & is_front
     source, facet = source[keep], facet[keep]
     normal = -facing[keep].sign()[:, None] * facets.normal[facet]
-    beams = _DepartingBeams(*(column[source] for column in departing))
-    hit = beams.aspect, facet, normal, beams.direction, beams.phase_offset, facets.corners[facet]
-    wave = beams.wave_vector, beams.medium, beams.transmitted
-    spreading = torch.ones(len(source), dtype=torch.float64)
-    bounce = IlluminatedPatches(*hit, source, *wave, spreading)
+    beams, corners = departing.select(source), facets.corners[facet]
+    bounce = replace(beams, facet=facet, normal=normal, polygon=corners, parent=source)
     if previous is not None:  # clip facets to the beams that leave the previous patches
-        beam, plane = previous.polygon[departing.parent[source]], departing.source_normal[source]
-        polygon = _clip_in_front(bounce.polygon, plane, beam[:, 0], 0.0)
-        for plane, point, proper in _side_planes(beam, bounce.direction):
+        polygon = _clip_in_front(corners, beams.normal, beams.polygon[:, 0], 0.0)
+        for plane, point, proper in _side_planes(beams.polygon, bounce.direction):
             polygon = clip(polygon, plane, torch.where(proper, dot(plane, point), -1.0))
         bounce = _drop_degenerate(facets, bounce, polygon)
     bounce = _remove_occluded(facets, bounce, None if previous is None else departing, solids)
@@ -229,41 +209,43 @@ def _trace_order(
     return bounce
 
 
-def _launch_plane_waves(incident: Tensor, solids: DielectricSolids | None) -> _DepartingBeams:
-    """Launch plane waves from infinity."""
-    none = torch.full((len(incident),), -1)
-    wave = incident if solids is None else incident.to(torch.complex128)
-    zeros = torch.zeros(len(incident), dtype=wave.dtype)
-    aspect = torch.arange(len(incident))
-    zero, transmitted = torch.zeros_like(incident), none >= 0
-    return _DepartingBeams(aspect, none, none, zero, zero, incident, zeros, wave, none, transmitted)
+def _launch_plane_waves(incident: Tensor, solids: DielectricSolids | None) -> IlluminatedPatches:
+    """Launch plane waves from infinity, from patches without place or normal."""
+    aspect, zero = torch.arange(len(incident)), torch.zeros_like(incident)
+    none = torch.full_like(aspect, -1)
+    waves = patches_in_air(aspect, none, zero, incident, zero[:, 0], zero[:, None], none)
+    if solids is None:
+        return waves
+    names = ("wave_vector", "phase_offset")
+    return replace(waves, **{name: getattr(waves, name).to(torch.complex128) for name in names})
 
 
 def _continue_beams(
     previous: IlluminatedPatches, solids: DielectricSolids | None
-) -> _DepartingBeams:
-    """Continue beams by reflection, followed by transmission into solids."""
+) -> IlluminatedPatches:
+    """Continue beams by reflection, followed by transmission into solids: patches that they leave.
+
+    The normal of a patch points to the side of its beam, and ``parent`` is its row.
+    """
     direction = reflect_vectors(previous.direction, previous.normal)
     wave = reflect_vectors(previous.wave_vector, previous.normal)
-    row, p = torch.arange(len(previous.aspect)), previous.polygon[:, 0]
-    transmitted = torch.zeros_like(row, dtype=torch.bool)
-    medium, n = previous.medium, previous.normal
+    row = torch.arange(len(previous.aspect))
+    left = replace(previous, transmitted=torch.zeros_like(row, dtype=torch.bool), parent=row)
     if solids is not None:
         behind = solids.medium_behind(previous.facet, previous.medium)
         epsilon = solids.permittivity_in(behind)
         refracted, propagates = refract_waves(epsilon, previous.wave_vector, previous.normal)
         rows = torch.nonzero(propagates & solids.transparent[previous.facet])[:, 0]
-        row = torch.cat([row, rows])
-        p = p[row]
-        transmitted = torch.cat([transmitted, torch.ones_like(rows, dtype=torch.bool)])
         wave = torch.cat([wave, refracted[rows]])
         direction = torch.cat([direction, normalize(refracted[rows].real, dim=1)])
-        medium = torch.cat([medium, behind[rows]])
-        n = torch.cat([n, -previous.normal[rows]])
+        passing = replace(
+            left, medium=behind, normal=-left.normal, transmitted=torch.ones_like(left.transmitted)
+        )
+        left = concatenate_rows([left, passing.select(rows)])
     # Phase matching on the face.
-    offset = previous.phase_offset[row] + dot(previous.wave_vector[row] - wave, p.to(wave.dtype))
-    aspect, facet = previous.aspect[row], previous.facet[row]
-    return _DepartingBeams(aspect, facet, row, n, p, direction, offset, wave, medium, transmitted)
+    change = dot(left.wave_vector - wave, left.polygon[:, 0].to(wave.dtype))
+    offset = left.phase_offset + change
+    return replace(left, direction=direction, phase_offset=offset, wave_vector=wave)
 
 
 def exceeds_min_amplitude(patches: IlluminatedPatches, wave_number: float) -> Bool[Tensor, " row"]:
@@ -290,7 +272,7 @@ def _attach_to_facets(facets: Facets, patches: IlluminatedPatches) -> Illuminate
 def _remove_occluded(
     facets: Facets,
     patches: IlluminatedPatches,
-    departing: _DepartingBeams | None,
+    departing: IlluminatedPatches | None,
     solids: DielectricSolids | None,
 ) -> IlluminatedPatches:
     """Subtract the shadows of all other facets, leaving convex pieces."""
@@ -304,8 +286,7 @@ def _remove_occluded(
         shadow = facets.corners[other].expand(len(patches.aspect), 3, 3)
         shadow = _clip_in_front(shadow, patches.normal, patches.polygon[:, 0], above)
         if departing is not None:
-            source = departing.source_normal, departing.source_point
-            plane, point = (column[patches.parent] for column in source)
+            plane, point = (x[patches.parent] for x in (departing.normal, departing.polygon[:, 0]))
             shadow = _clip_in_front(shadow, plane, point, _OCCLUSION_TOLERANCE * facets.size)
         patches = _subtract_shadows(facets, patches, shadow)
     return patches
