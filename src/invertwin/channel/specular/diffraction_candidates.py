@@ -384,11 +384,7 @@ def _find_corner_paths(
         main = numbers[1:] if corner == "first" else numbers[:-1]
         source, target = antennas[0][part.tx], antennas[1][part.rx]
         between = [wedges.select(part.edge[:, n]) for n in main]
-        if len(main) == 1:
-            points, valid = diffraction_points(between[0], source, target)
-            points = points[:, None]
-        else:
-            points, valid = multiple_diffraction_points(between, source, target)
+        points, valid = multiple_diffraction_points(between, source, target)
         both = [points, at[rows, None]] if corner == "last" else [at[rows, None], points]
         yield from _select_unobstructed(wedge_scene, part, antennas, torch.cat(both, 1), valid)
 

@@ -157,7 +157,7 @@ def diffraction_points(
 def multiple_diffraction_points(
     wedges: Sequence[Wedges], tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
 ) -> tuple[Float64[Tensor, "row edge 3"], Bool[Tensor, " row"]]:
-    """As ``diffraction_points``, for paths over several edges.
+    """As ``diffraction_points``, for paths over one edge or several.
 
     Args:
         wedges: edges in the order of the path, one row each.
@@ -204,7 +204,7 @@ class Route:
     @property
     def spread(self) -> Tensor:
         """Spreading factor √det H."""
-        return _determinant(self.hessian).clamp_min(1e-300).sqrt()
+        return _cofactors(self.hessian)[1].clamp_min(1e-300).sqrt()
 
     @property
     def covariance(self) -> Float64[Tensor, "row edge edge"]:
@@ -289,7 +289,7 @@ class Route:
                 excess = excess + _excess(radial[:, None], axial[:, None], distance)
             return distance, (wave_number * excess).sqrt()
         others = [number for number in range(len(self.edges)) if number != edge_index]
-        minor = _determinant(self.hessian[:, others][:, :, others])
+        _, minor = _cofactors(self.hessian[:, others][:, :, others])
         stiffness = self.spread**2 / minor.clamp_min(1e-300)
         second_order = 0.5 * stiffness[:, None] * distance**2
         excess = self._lengths_over_ends(edge_index) - self.legs.sum(1, keepdim=True)
@@ -411,27 +411,13 @@ def _length_hessian(vertices: Tensor, axes: Tensor) -> Tensor:
     legs = direction.norm(dim=2).clamp_min(1e-300)
     direction = direction / legs[..., None]
 
-    def entry(a: int, b: int, leg: int) -> Tensor:
-        first, second, u = axes[:, a], axes[:, b], direction[:, leg]
-        return (dot(first, second) - dot(first, u) * dot(second, u)) / legs[:, leg]
+    def entry(first: Tensor, second: Tensor, chosen: slice) -> Tensor:
+        u = direction[:, chosen]
+        return (dot(first, second) - dot(first, u) * dot(second, u)) / legs[:, chosen]
 
-    count = axes.shape[1]
-    none = torch.zeros_like(legs[:, 0])
-    found = [[none] * count for _ in range(count)]
-    for a in range(count):
-        found[a][a] = entry(a, a, a) + entry(a, a, a + 1)
-        if a:
-            found[a][a - 1] = found[a - 1][a] = -entry(a - 1, a, a)
-    return torch.stack([torch.stack(row, 1) for row in found], 1)
-
-
-def _determinant(matrix: Tensor) -> Tensor:
-    """Determinants of symmetric tridiagonal matrices."""
-    before, last = torch.ones_like(matrix[:, 0, 0]), matrix[:, 0, 0]
-    for n in range(1, matrix.shape[1]):
-        step = matrix[:, n, n] * last - matrix[:, n - 1, n] ** 2 * before
-        before, last = last, step
-    return last
+    own = entry(axes, axes, slice(None, -1)) + entry(axes, axes, slice(1, None))
+    both = -entry(axes[:, :-1], axes[:, 1:], slice(1, -1))
+    return torch.diag_embed(own) + torch.diag_embed(both, 1) + torch.diag_embed(both, -1)
 
 
 def _cofactors(matrix: Tensor) -> tuple[Tensor, Tensor]:

@@ -416,24 +416,20 @@ def intersects_planes(
         images: result of ``image_positions``, relative to the scene's origin [m].
         target: positions relative to the scene's origin [m].
     """
-    planes, x = surfaces.planes, target
+    planes, plane, transmitted = surfaces.planes, steps >> 1, (steps & 1).bool()
+    point, normal = planes.point[plane], planes.normal[plane]
+    nodes = torch.stack([*interaction_points(target, images, point, normal), target], 1)
+    start, ray = nodes[:, 1:], torch.stack(images, 1)[:, 1:] - nodes[:, 1:]
+    slope, length = dot(ray, normal), ray.norm(dim=2)
+    distance = dot(point - start, normal) / replace_zeros(slope) * length
+    at = torch.einsum("rsx,rsax->rsa", nodes[:, :-1] - point, planes.axes[plane])
+    inside = (at >= planes.low[plane] - surfaces.margin) & (
+        at <= planes.high[plane] + surfaces.margin
+    )
     tolerance = _EXACT_TOLERANCE * surfaces.size
-    valid = torch.ones(len(target), dtype=torch.bool)
-    for step in reversed(range(steps.shape[1])):
-        plane, transmitted = steps[:, step] >> 1, (steps[:, step] & 1).bool()
-        point, normal, ray = planes.point[plane], planes.normal[plane], images[step + 1] - x
-        slope = dot(ray, normal)
-        valid &= slope != 0
-        share = dot(point - x, normal) / replace_zeros(slope)
-        length = ray.norm(dim=1)
-        # A receiver in a reflecting plane has a reflection; one in a sheet is not behind it.
-        valid &= share * length > torch.where(transmitted, tolerance, -tolerance)
-        valid &= share * length < length - tolerance
-        x = x + share[:, None] * ray
-        at = torch.einsum("rx,rax->ra", x - point, planes.axes[plane])
-        valid &= (at >= planes.low[plane] - surfaces.margin).all(1)
-        valid &= (at <= planes.high[plane] + surfaces.margin).all(1)
-    return valid
+    # A receiver in a reflecting plane has a reflection; one in a sheet is not behind it.
+    valid = (slope != 0) & (distance > torch.where(transmitted, tolerance, -tolerance))
+    return (valid & (distance < length - tolerance) & inside.all(2)).all(1)
 
 
 def find_unobstructed_paths(
