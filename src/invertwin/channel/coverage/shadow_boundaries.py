@@ -12,7 +12,7 @@ where the line from S through y intersects the surface: ``ΔI = f · T · (x_c �
 Source: derivations §3 and §11, for specular paths.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -139,17 +139,14 @@ class _EdgeSamples(Rows):
     """Points on edges, one row each; detached.
 
     Attributes:
-        first, second: vertices at the ends.
+        ends: vertices at the ends, [row, 2].
         fraction: position from the first to the second, 0 to 1.
         weight: reciprocal of samples × probability per ``fraction``.
-        faces: triangles at the edge (−1: none).
     """
 
-    first: Tensor
-    second: Tensor
+    ends: Tensor
     fraction: Tensor
     weight: Tensor
-    faces: Tensor
 
 
 @dataclass(frozen=True)
@@ -222,7 +219,7 @@ def sample_illumination_boundaries(
         edges = _sample_edges(surfaces, casts, samples, seed, number)
         if not len(edges.fraction):
             continue
-        ends = [surfaces.exact_vertices[vertex] for vertex in (edges.first, edges.second)]
+        ends = surfaces.exact_vertices[edges.ends].unbind(1)
         y = torch.lerp(ends[0], ends[1], edges.fraction[:, None])
         paths = find_paths_along(surfaces, sequences, source[None], y + surfaces.origin)
         hits: dict[int, list[tuple[_RaysPastEdges, Tensor]]] = {}
@@ -273,13 +270,10 @@ def _sample_edges(
     surfaces: CandidateSurfaces, edge: Tensor, samples: int, seed: int, number: int
 ) -> _EdgeSamples:
     """Sample points evenly on edges."""
-    topology = surfaces.topology
-    ends = surfaces.exact_vertices[topology.edges[edge]]
-    length = (ends[:, 1] - ends[:, 0]).norm(dim=1)
-    row, fraction, weight = sample_along_curves(length, samples, seed, number)
-    chosen = edge[row]
-    first, second = topology.edges[chosen].unbind(1)
-    return _EdgeSamples(first, second, fraction, weight, topology.edge_faces[chosen])
+    ends = surfaces.topology.edges[edge]
+    start, end = surfaces.exact_vertices[ends].unbind(1)
+    row, *sample = sample_along_curves((end - start).norm(dim=1), samples, seed, number)
+    return _EdgeSamples(ends[row], *sample)
 
 
 def sample_along_curves(
@@ -308,7 +302,7 @@ def _launch_past_edges(
     surfaces: CandidateSurfaces,
     source: Tensor,
     edge_points: Tensor,
-    ends: list[Tensor],
+    ends: Sequence[Tensor],
     chains: SpecularPaths,
     depth: int,
 ) -> Iterator[_RaysPastEdges]:
@@ -417,7 +411,7 @@ def evaluate_illumination_boundary(
     image = image_positions(tx[legs.source], point, normal, legs.through)[-1]
     # Only surfaces after the edge reflect the edge point.
     direct = legs.through | (torch.arange(legs.faces.shape[1]) < legs.steps_before_edge[:, None])
-    y0, y1 = vertices[edges.first], vertices[edges.second]
+    y0, y1 = vertices[edges.ends].unbind(1)
     y = image_positions(torch.lerp(y0, y1, edges.fraction[:, None]), point, normal, direct)[-1]
     facets = receiving_corners[samples.face]
     p0, up = facets[:, 0], triangle_normals(facets)

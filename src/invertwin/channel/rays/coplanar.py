@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
+from invertwin.channel.em.plane_waves import barycentric_coordinates, triangle_normals
 from invertwin.channel.rays.intersections import find_overlapping_boxes
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene, is_visible
 from invertwin.channel.rays.scene_tables import Geometry
@@ -121,7 +122,7 @@ def _pair_coplanar_triangles(
     triangles: Float64[Tensor, "n 3 3"], owners: Int64[Tensor, " n"]
 ) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
     """Pair triangles whose planes have the same distance from the origin, on the same side."""
-    normal = _unit_normal(triangles)
+    normal = triangle_normals(triangles)
     largest = normal.gather(1, normal.abs().argmax(1, keepdim=True))
     away = (normal * triangles[:, 0]).sum(1) * largest[:, 0].sign()
     most = _ray_tolerance(triangles).max()
@@ -158,18 +159,13 @@ def _find_common_points(
 ) -> tuple[Int64[Tensor, " m"], Float64[Tensor, "m 3"], Float64[Tensor, "m 3"]]:
     """Find common points of pairs of triangles: number of the pair, point and normal."""
     parts = []
-    normals = [_unit_normal(triangles[face]) for face in (first, second)]
+    normals = [triangle_normals(triangles[face]) for face in (first, second)]
     alike = torch.linalg.cross(*normals).norm(dim=1) < _MAX_PLANE_SINE
     for own, other, normal in ((first, second, normals[1]), (second, first, normals[0])):
         places = (_TEST_POINTS[:, :, None] * triangles[own][:, None]).sum(2)  # [n, 7, 3]
-        a, b, c = triangles[other][:, None].unbind(2)
-        height = ((places - a) * normal[:, None]).sum(2)
-        area = (torch.linalg.cross(b - a, c - a) * normal[:, None]).sum(2)
-        shares = [
-            (torch.linalg.cross(y - x, places - x) * normal[:, None]).sum(2) / area
-            for x, y in ((a, b), (b, c), (c, a))
-        ]
-        inside = torch.stack(shares).amin(0) > _MIN_BARYCENTRIC
+        corners = triangles[other][:, None]
+        height = ((places - corners[:, :, 0]) * normal[:, None]).sum(2)
+        inside = barycentric_coordinates(corners, places).amin(2) > _MIN_BARYCENTRIC
         pair, place = (
             (inside & (height.abs() <= _ray_tolerance(places)) & alike[:, None]).nonzero().T
         )
@@ -193,8 +189,3 @@ def _is_any_visible(
     ends = antennas[:, None].expand_as(above)
     clear = tilt.abs() > _MAX_PLANE_SINE
     return bool(is_visible(rays, above[clear] + rays.origin, ends[clear] + rays.origin).any())
-
-
-def _unit_normal(triangles: Float64[Tensor, "n 3 3"]) -> Float64[Tensor, "n 3"]:
-    a, b, c = triangles.unbind(1)
-    return torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)

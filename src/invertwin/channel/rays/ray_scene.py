@@ -209,10 +209,8 @@ class RayScene(Occluders):
         Args:
             edge: edge indices.
         """
-        first, second = self.topology.device_edges
-        return tuple(
-            self.exact_vertex(dr.gather(mi.UInt32, ends, edge)) for ends in (first, second)
-        )  # type: ignore[return-value]
+        ends = (dr.gather(mi.UInt32, column, edge) for column in self.topology.device_edges)
+        return tuple(map(self.exact_vertex, ends))  # type: ignore[return-value]
 
     def object_scene(self, number: mit.UInt32) -> mit.UInt32:
         """Look up the scenes of objects.
@@ -230,8 +228,6 @@ class RayScene(Occluders):
         Args:
             edge: edge indices.
         """
-        if self._scene_of_object is None:
-            return mi.UInt32(0)
         return self.object_scene(dr.gather(mi.UInt32, self.topology.device_edge_object, edge))
 
     def frame_scene(self, frame: mit.UInt32) -> mit.UInt32:

@@ -190,10 +190,13 @@ def flatten(
     frequency, owner = SPEED_OF_LIGHT / wavelength, topology.face_object
     surfaces, face_surface = _collect_scattering_laws(objects, frequency, owner)
     skins = surfaces.refraction.any(1)
-    for number, name in enumerate(scene.objects) if bool(skins.any()) else ():
-        own = topology.face_object == number
-        if bool(skins[face_surface[own]].any()):
-            _require_closed(name, number in topology.open_objects)
+    for number in owner[skins[face_surface]].unique().tolist():
+        if number in topology.open_objects:
+            raise InputError(
+                "expected a closed mesh for the refracting body "
+                f"{list(scene.objects)[number]}, got an open one; close it "
+                "(merge_meshes joins panels), or use a Slab for a sheet"
+            )
     _warn_coarse_facets(list(scene.objects), topology, vertices, surfaces, face_surface)
     deforming = tuple(is_differentiated(item.mesh.vertices) for item in objects)
     weights, free = surfaces.lobes, is_differentiated(surfaces.lobes)
@@ -238,15 +241,6 @@ def _warn_coarse_facets(
                 PhysicsWarning,
                 stacklevel=2,
             )
-
-
-def _require_closed(name: str, is_open: bool) -> None:
-    """Refuse a refracting body without an inside."""
-    if is_open:
-        raise InputError(
-            f"expected a closed mesh for the refracting body {name}, got an open one; close it "
-            "(merge_meshes joins panels), or use a Slab for a sheet"
-        )
 
 
 def _scattering_law(material: Material, frequency: float) -> ScatteringLaw:

@@ -141,25 +141,17 @@ class Topology:
 
     def ray_scene(self, vertices: Tensor) -> Any:
         """The Mitsuba scene with these vertices (float32, never changed in place hereafter)."""
-        if self._uploaded is vertices:
-            return self._scene
-        if self._uploaded is not None and torch.equal(self._uploaded, vertices):
-            self._uploaded = vertices
-            return self._scene
-        self._build_tree(vertices)
-        self._uploaded = vertices
-        return self._scene
-
-    def _build_tree(self, vertices: Tensor) -> None:
-        if self._scene is None:
-            self._parameters["vertex_positions"] = to_float(vertices)
-            self._parameters.update()
-            self._scene = mi.load_dict({"type": "scene", **self._shapes()})
-            self._parameters = mi.traverse(self._scene)
-        else:
+        if self._uploaded is None or not (
+            self._uploaded is vertices or torch.equal(self._uploaded, vertices)
+        ):
             key = next(k for k, _ in self._parameters.items() if k.endswith("vertex_positions"))
             self._parameters[key] = to_float(vertices)
             self._parameters.update()
+            if self._scene is None:
+                self._scene = mi.load_dict({"type": "scene", **self._shapes()})
+                self._parameters = mi.traverse(self._scene)
+        self._uploaded = vertices
+        return self._scene
 
     def _shapes(self) -> dict[str, Any]:
         """The mesh; on the CPU in a group, for which Embree builds its tree three times faster.
