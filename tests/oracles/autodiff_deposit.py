@@ -27,7 +27,7 @@ def gradients(
     dr.enable_grad(list(tables.values()))
     inputs, out = trace.inputs(tables), mi.Float(0)
     for records in trace.iterate_records():
-        number, antennas = mi.UInt32(0), replay._AntennaPoses.look_up(inputs, records.frame)
+        number, antennas = mi.UInt32(0), replay._locate_antennas(inputs, records.frame)
         near = replay._VertexNeighbours.read(inputs, records, number, records.depth)
         vertex = replay._evaluate_vertex(trace.rays, inputs, records, antennas, number, near)
         path, arriving = vertex.to_contribution(), vertex.incident_factor

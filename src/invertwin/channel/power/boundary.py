@@ -135,17 +135,16 @@ class BoundarySamples:
         share = samples // (len(centres) + inner + meet)
         count = len(centres) * share
         antennas = SilhouetteSampler(rays, inputs, centres, count, seed, meets_touching=touching)
-        self._samplers: list[_Sampler] = [antennas]
-        self._path_builders: list[_PathBuilder] = [_antenna_silhouette_paths]
+        found: list[tuple[_Sampler, _PathBuilder]] = [(antennas, _antenna_silhouette_paths)]
         if inner:
-            self._samplers.append(
-                InteriorSilhouetteSampler(rays, inputs, share, seed + 2, meets_touching=touching)
+            inside = InteriorSilhouetteSampler(
+                rays, inputs, share, seed + 2, meets_touching=touching
             )
-            self._path_builders.append(_interior_silhouette_paths)
+            found.append((inside, _interior_silhouette_paths))
         if crossing is not None and meet:
             contacts = IntersectionCurveSampler(rays, inputs, crossing, share, depth, seed)
-            self._samplers.append(contacts)
-            self._path_builders.append(intersection_curve_paths)
+            found.append((contacts, intersection_curve_paths))
+        self._samplers, self._path_builders = zip(*found, strict=True)
         self._chunks = chunks
         self._prefetched = [
             list(map(s.draw, itertools.islice(chunks(s.size), 1))) for s in self._samplers

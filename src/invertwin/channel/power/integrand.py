@@ -7,7 +7,6 @@ Values carry derivatives if the ``Inputs`` do. The torch form of these formulas,
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypedDict
 
 import numpy as np
 from torch import Tensor
@@ -217,60 +216,28 @@ def corners(inputs: Inputs, face: mit.UInt32, active: mit.Bool | bool = True) ->
     return surface_point.corners(inputs.vertices, inputs.faces, face, active)
 
 
-def edge_ends(
-    inputs: Inputs, first: mit.UInt32, second: mit.UInt32
-) -> tuple[mit.Point3f, mit.Point3f]:
-    """Gather the ends of edges, attached.
-
-    Args:
-        inputs: attached inputs.
-        first, second: vertex indices of the ends.
-    """
-    return gather_points(inputs.vertices, first), gather_points(inputs.vertices, second)
-
-
-class InteractionState(TypedDict):
-    """Detached surface interaction, as loops carry it."""
-
-    position: mit.Point3f
-    normal: mit.Vector3f
-    surface: mit.UInt32
-
-
-@dataclass(frozen=True)
+@dataclass
 class SurfaceInteraction:
     """Location and orientation of a material point; all but its surface is attached.
+
+    Not frozen, since loops of Dr.Jit assign their state field by field.
 
     Attributes:
         position: position about the local origin [m].
         normal: unit normal.
-        jacobian: area of the triangle over its detached area: 1 in value.
         surface_row: row in the tables of surfaces.
+        jacobian: area of the triangle over its detached area: 1 in value; None in loops.
     """
 
     position: mit.Point3f
     normal: mit.Vector3f
-    jacobian: mit.Float
     surface_row: mit.UInt32
+    jacobian: mit.Float | None
 
-    @property
-    def detached_state(self) -> InteractionState:
-        """Detached form for the state of a loop."""
-        return {
-            "position": mi.Point3f(dr.detach(self.position)),
-            "normal": mi.Vector3f(dr.detach(self.normal)),
-            "surface": self.surface_row,
-        }
-
-    @staticmethod
-    def from_state(state: InteractionState) -> SurfaceInteraction:
-        """Restore an interaction from the state of a loop.
-
-        Args:
-            state: state with the keys of ``detached_state``.
-        """
-        position, normal, one = state["position"], state["normal"], mi.Float(1.0)
-        return SurfaceInteraction(position, normal, one, state["surface"])
+    def detach(self) -> SurfaceInteraction:
+        """Return the detached form that loops carry."""
+        position, normal = mi.Point3f(dr.detach(self.position)), mi.Vector3f(dr.detach(self.normal))
+        return SurfaceInteraction(position, normal, self.surface_row, None)
 
 
 def compute_interaction(
@@ -291,13 +258,13 @@ def compute_interaction(
         )
         position = mi.Point3f(p0.xyz + b1 * first.xyz + b2 * second.xyz)
         normal = mi.Vector3f(p0.w, first.w, second.w)
-        return SurfaceInteraction(position, normal, mi.Float(1.0), surface)
+        return SurfaceInteraction(position, normal, surface, mi.Float(1.0))
     triangle = p0, p1, p2 = corners(inputs, face, active)
     normal = dr.cross(p1 - p0, p2 - p0)
     double_area = dr.norm(normal)
     position = interpolate_position(triangle, b1, b2)
     jacobian = double_area / dr.detach(double_area)
-    return SurfaceInteraction(position, normal / double_area, jacobian, surface)
+    return SurfaceInteraction(position, normal / double_area, surface, jacobian)
 
 
 def pull_interaction(
@@ -347,18 +314,15 @@ def direction_and_distance(start: mit.Point3f, end: mit.Point3f) -> tuple[mit.Ve
     return offset / distance, distance  # type: ignore[return-value]
 
 
-def to_radar_frame(
-    inputs: Inputs, frame: mit.UInt32, direction: mit.Vector3f, active: mit.Bool | bool = True
-) -> mit.Vector3f:
+def to_radar_frame(inputs: Inputs, frame: mit.UInt32, direction: mit.Vector3f) -> mit.Vector3f:
     """Rotate world directions into the radar frame.
 
     Args:
         inputs: inputs of the kernel.
         frame: radar poses.
         direction: unit directions in the world.
-        active: mask of active lanes.
     """
-    return project_to_axes(radar_axes(inputs, frame, active), direction)
+    return project_to_axes(radar_axes(inputs, frame), direction)
 
 
 def radar_axes(
@@ -477,8 +441,8 @@ def connect_antenna(
     receiver: mit.Bool | bool = True,
     active: mit.Bool | bool = True,
     *,
+    antenna: AntennaPose,
     is_same_antenna: bool = False,
-    antenna: AntennaPose | None = None,
 ) -> AntennaConnection:
     """Evaluate the scattering from the incident direction towards an antenna.
 
@@ -489,10 +453,9 @@ def connect_antenna(
         incident: unit directions from the vertex to the one before, or to the first antenna.
         receiver: True for the receiver (a bool, or one per lane).
         active: mask of active lanes.
+        antenna: pose of the antenna.
         is_same_antenna: True if the path starts at that very antenna.
-        antenna: pose of the antenna, if it has been looked up.
     """
-    antenna = antenna or AntennaPose.look_up(inputs, frame, receiver, active)
     to_antenna, distance = direction_and_distance(point.position, antenna.position)
     in_radar_frame = project_to_axes(antenna.axes, -to_antenna)
     value = inputs.surfaces.evaluate_scattering(

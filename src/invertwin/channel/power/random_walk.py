@@ -48,7 +48,7 @@ class PathState(TypedDict):
         length: optical length up to the latest vertex [m].
         transmittance, extra: transmission of the first segment: power factor and added length [m].
         last: number of vertices at which a path ends.
-        position, normal, surface: location of the latest vertex (see ``SurfaceInteraction``).
+        interaction: location of the latest vertex.
         weight: one over the probability of the path's points per area.
         previous_vertices: vertices of the subpath that this one continues.
         to_receiver: True for paths that end at the receiver.
@@ -72,9 +72,7 @@ class PathState(TypedDict):
     transmittance: mit.Float
     extra: mit.Float
     last: mit.UInt32
-    position: mit.Point3f
-    normal: mit.Vector3f
-    surface: mit.UInt32
+    interaction: SurfaceInteraction
     weight: mit.Float
     previous_vertices: mit.UInt32
     to_receiver: mit.Bool | bool
@@ -175,13 +173,13 @@ class RandomWalk:
         last = opaque(depth) if isinstance(depth, int) else depth
         lanes = dr.width(state["index"])
         # The loop carries the position, since a vertex is located when it is sampled.
-        position = self._compute_interaction(state).detached_state
+        located = self._compute_interaction(state).detach()
         last = mi.UInt32(last) + dr.zeros(mi.UInt32, lanes)
-        state = update_state(state, last=last, **position)
+        state = update_state(state, last=last, interaction=located)
 
         def extend(state: PathState) -> tuple[PathState]:
             state = state.copy()
-            self._extend(state, SurfaceInteraction.from_state(state), directions)
+            self._extend(state, state["interaction"], directions)
             return (state,)
 
         def stop(state: PathState) -> tuple[PathState]:
@@ -189,7 +187,7 @@ class RandomWalk:
 
         def body(state: PathState) -> tuple[PathState]:
             state = state.copy()
-            visit(state, SurfaceInteraction.from_state(state))
+            visit(state, state["interaction"])
             # Packets of paths at their last vertex skip the next one.
             going = state["active"] & (state["number"] < state["last"])
             return dr.if_stmt((state,), going, extend, stop, mode="symbolic")
@@ -284,7 +282,7 @@ class RandomWalk:
         if "weight" in state:
             state["weight"] = state["weight"] * dr.square(distance) / odds
         state["face"], state["b1"], state["b2"] = hit.point.face, hit.point.b1, hit.point.b2
-        state.update(found.detached_state)  # type: ignore[arg-type]
+        state["interaction"] = found.detach()
         state["incident"] = mi.Vector3f(to_point)
         state["length"] = state["length"] + medium.refractive_index * distance
         state["length"] = state["length"] + hit.transmission.extra_length

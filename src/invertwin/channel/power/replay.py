@@ -11,11 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from functools import partial
+from typing import Any, TypeVar
 
 from invertwin.channel.power import integrand
 from invertwin.channel.power.bins import FourFloats, PathContribution
-from invertwin.channel.power.integrand import Inputs, InteractionState, SurfaceInteraction
+from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
 from invertwin.channel.power.random_walk import PathRecords, PathVertex
 from invertwin.channel.power.transmission import (
     Carry,
@@ -131,7 +132,7 @@ class _VertexNeighbours:
         assert self.previous_interaction is not None
         known, one = self.interaction, dr.ones(mi.Float, dr.width(self.vertex.face))
         position, normal = mi.Point3f(known.position), mi.Vector3f(known.normal)
-        here = SurfaceInteraction(position, normal, one, known.surface_row)
+        here = SurfaceInteraction(position, normal, known.surface_row, one)
         before = self.previous_interaction
         before = replace(before, position=mi.Point3f(before.position))
         after = mi.Point3f(self.next_position)
@@ -139,40 +140,23 @@ class _VertexNeighbours:
         return replace(self, interaction=here, previous_interaction=before, next_position=after)
 
 
-@dataclass(frozen=True)
-class _AntennaPoses:
-    """Poses of the antennas; looked up once unless they carry derivatives.
+_Antennas = Callable[[bool, Any], integrand.AntennaPose]
+"""Function of True for the receiver and of the mask of active lanes; returns the pose."""
 
-    Attributes:
-        inputs: attached inputs.
-        frame: radar poses.
-        poses: transmitter and receiver, if looked up.
-    """
 
-    inputs: Inputs
-    frame: mit.UInt32
-    poses: tuple[integrand.AntennaPose, integrand.AntennaPose] | None
-
-    @staticmethod
-    def look_up(inputs: Inputs, frame: mit.UInt32) -> _AntennaPoses:
-        if any(dr.grad_enabled(inputs.table(name)) for name in ("tx", "rx", "rotations")):
-            return _AntennaPoses(inputs, frame, None)
-        first, second = (
-            integrand.AntennaPose.look_up(inputs, frame, receiver) for receiver in (False, True)
-        )
-        return _AntennaPoses(inputs, frame, (first, second))
-
-    def pose(self, receiver: bool, active: mit.Bool) -> integrand.AntennaPose:
-        if self.poses is not None:
-            return self.poses[receiver]
-        return integrand.AntennaPose.look_up(self.inputs, self.frame, receiver, active)
+def _locate_antennas(inputs: Inputs, frame: mit.UInt32) -> _Antennas:
+    """Locate the antennas, once unless they carry derivatives."""
+    if any(dr.grad_enabled(inputs.table(name)) for name in ("tx", "rx", "rotations")):
+        return partial(integrand.AntennaPose.look_up, inputs, frame)
+    poses = [integrand.AntennaPose.look_up(inputs, frame, end) for end in (False, True)]
+    return lambda receiver, _: poses[receiver]
 
 
 def _evaluate_vertex(
     rays: RayScene,
     inputs: Inputs,
     records: PathRecords,
-    antennas: _AntennaPoses,
+    antennas: _Antennas,
     number: mit.UInt32,
     neighbours: _VertexNeighbours,
 ) -> _VertexFactors:
@@ -183,7 +167,7 @@ def _evaluate_vertex(
     inner = mi.Bool(False) if single else active & (number > 0)
 
     def locate_previous(locate: Callable[[], SurfaceInteraction | None]) -> mit.Point3f:
-        start = antennas.pose(False, active).position
+        start = antennas(False, active).position
         previous = locate()
         return start if previous is None else dr.select(inner, previous.position, start)
 
@@ -196,17 +180,17 @@ def _evaluate_vertex(
         )
         optical, loss = distance * medium.refractive_index, dr.exp(-medium.attenuation * distance)
     first = active if single else active & (number == 0)
-    departure = integrand.project_to_axes(antennas.pose(False, first).axes, -incident)
+    departure = integrand.project_to_axes(antennas(False, first).axes, -incident)
     gain = dr.select(first, inputs.gain(frame, False, departure), 1.0)
     arriving = gain * here.jacobian * loss / dr.square(distance)
-    receiver = antennas.pose(True, active)
+    receiver = antennas(True, active)
     connection = integrand.connect_antenna(
         inputs, frame, here, incident, True, active,
         is_same_antenna=single and inputs.monostatic, antenna=receiver,
     )  # fmt: skip
     scattered = mi.Float(1.0)
     if not single:
-        start = antennas.pose(False, active).position
+        start = antennas(False, active).position
         after = dr.select(has_next, neighbours.next_position, start)
         direction, _ = integrand.direction_and_distance(here.position, after)
         scattered = inputs.surfaces.evaluate_scattering(
@@ -231,7 +215,7 @@ def _evaluate_vertex(
         endpoints=(
             lambda: locate_previous(locate_attached),
             lambda: integrand.compute_interaction(inputs, vertex, active).position,
-            lambda: antennas.pose(True, active).position,
+            lambda: antennas(True, active).position,
         ),
         active=active,
         has_next=has_next,
@@ -269,7 +253,7 @@ class _PendingVertex:
 
     vertex: PathVertex
     following: PathVertex
-    interaction: InteractionState
+    interaction: SurfaceInteraction
     next_position: mit.Point3f
     position: mit.Point3f
     normal: mit.Vector3f
@@ -291,7 +275,7 @@ class _PendingVertex:
         return _PendingVertex(
             last,
             PathVertex(last.face, last.b1, last.b2, dr.zeros(mi.Float, lanes), None),
-            here.detached_state,
+            here.detach(),
             next_position=dr.zeros(mi.Point3f, lanes),
             position=dr.zeros(mi.Point3f, lanes),
             normal=dr.zeros(mi.Vector3f, lanes),
@@ -310,27 +294,25 @@ class _PendingVertex:
             number: vertex number, from 0.
         """
 
-        def read(number: mit.UInt32) -> tuple[PathVertex, InteractionState]:
+        def read(number: mit.UInt32) -> tuple[PathVertex, SurfaceInteraction]:
             previous = records.read_vertex(number - 1)
-            return previous, integrand.compute_interaction(inputs, previous).detached_state
+            return previous, integrand.compute_interaction(inputs, previous).detach()
 
-        def skip(_: mit.UInt32) -> tuple[PathVertex, InteractionState]:
+        def skip(_: mit.UInt32) -> tuple[PathVertex, SurfaceInteraction]:
             # The first vertex has none before it: nothing is read.
             lanes = records.path_count
             face, zero = dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes)
-            return PathVertex(face, zero, zero, zero, dr.zeros(mi.Bool, lanes)), {
-                "position": dr.zeros(mi.Point3f, lanes),
-                "normal": dr.zeros(mi.Vector3f, lanes),
-                "surface": face,
-            }
+            vertex = PathVertex(face, zero, zero, zero, dr.zeros(mi.Bool, lanes))
+            position, normal = dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Vector3f, lanes)
+            return vertex, SurfaceInteraction(position, normal, face, None)
 
         previous, before = dr.if_stmt((number,), number > 0, read, skip, mode="symbolic")
         return _VertexNeighbours(
             self.vertex,
             previous,
             self.vertex.exists & self.following.exists,
-            SurfaceInteraction.from_state(self.interaction),
-            SurfaceInteraction.from_state(before),
+            self.interaction,
+            before,
             self.next_position,
         )
 
@@ -355,11 +337,11 @@ class _PendingVertex:
         return _PendingVertex(
             previous,
             replace(neighbours.vertex, is_visible=None),
-            before.detached_state,
+            before.detach(),
             next_position=dr.detach(here.position),
             position=self.previous_position + gradient(here.position),  # type: ignore[arg-type]
             normal=gradient(here.normal),
-            jacobian=gradient(here.jacobian),
+            jacobian=gradient(here.jacobian),  # type: ignore[arg-type]
             previous_position=gradient(before.position),
         )
 
@@ -397,7 +379,7 @@ def pull(
         gather: adjoints of paths: ∂loss/∂power, and power · ∂loss/∂(range, u, v).
     """
     depth = opaque(records.depth)
-    antennas = _AntennaPoses.look_up(inputs, records.frame)
+    antennas = _locate_antennas(inputs, records.frame)
     # With neighbours, the gradient of a vertex is complete before its triangle is gathered.
     carried = records.depth > 1 and dr.grad_enabled(inputs.vertices)
     fixed = inputs.detach()
@@ -485,7 +467,7 @@ def push(
             lanes in which they exist.
     """
     depth = opaque(records.depth)
-    antennas = _AntennaPoses.look_up(inputs, records.frame)
+    antennas = _locate_antennas(inputs, records.frame)
 
     def sweep(number: mit.UInt32, sums: Sums, pending: None) -> tuple[Sums, None]:
         growth, longer = sums

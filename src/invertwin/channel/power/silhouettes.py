@@ -308,30 +308,21 @@ def classify_sides(
         most = dr.select(dr.square(height) > dr.square(most), height, most)
         offsets.append(offset)
         heights.append(height)
-    transmittances, lengths = [mi.Float(1.0), mi.Float(1.0)], [mi.Float(0.0), mi.Float(0.0)]
+    sides = [SegmentTransmission.clear(), SegmentTransmission.clear()]
     for number, (offset, height) in enumerate(zip(offsets, heights, strict=True)):
-        transmittance, extra = mi.Float(0.0), mi.Float(0.0)
+        own = SegmentTransmission(mi.Float(0.0), mi.Float(0.0))
         if inputs.surfaces.has_sheets:
             face = dr.gather(mi.UInt32, topology.device_edge_faces[number], edge)
             row = dr.gather(mi.UInt32, inputs.face_surface, face)
             normal = dr.cross(y1 - y0, offset)
             cosine = dr.abs(dr.dot(normal, direction)) / (dr.norm(normal) * dr.norm(direction))
-            transmittance, extra = inputs.surfaces.sheet_transmission(
-                row, mi.Float(cosine), height != 0
-            )
+            passed = inputs.surfaces.sheet_transmission(row, mi.Float(cosine), height != 0)
+            own = SegmentTransmission(*passed)
         for index, on in enumerate((height * most < 0, height * most > 0)):
-            transmittances[index] = dr.select(
-                on, transmittances[index] * transmittance, transmittances[index]
-            )
-            lengths[index] = dr.select(on, lengths[index] + extra, lengths[index])
-    free = (transmittances[0] == 1) & (lengths[0] == 0)
+            sides[index] = dr.select(on, sides[index].then(own), sides[index])
+    free = (sides[0].transmittance == 1) & (sides[0].extra_length == 0)
     outwards = dr.select(free, -dr.mulsign(dr.normalize(plane), most), 0.0)
-    return _EdgeSides(
-        mi.Float(dr.sign(most)),
-        SegmentTransmission(transmittances[0], lengths[0]),
-        SegmentTransmission(transmittances[1], lengths[1]),
-        mi.Vector3d(outwards),
-    )
+    return _EdgeSides(mi.Float(dr.sign(most)), sides[0], sides[1], mi.Vector3d(outwards))
 
 
 def trace_past_edge(
@@ -448,7 +439,8 @@ def shadow_speed(
         sampling density, attached.
     """
     c, fixed = source, inputs.detach()
-    y0, y1 = integrand.edge_ends(inputs, samples.first_vertex, samples.second_vertex)
+    ends = samples.first_vertex, samples.second_vertex
+    y0, y1 = (gather_points(inputs.vertices, end) for end in ends)
     y = y0 + (y1 - y0) * samples.edge_parameter  # type: ignore[operator]
     triangle = p0, p1, p2 = integrand.corners(inputs, samples.face)
     plane = dr.cross(p1 - p0, p2 - p0)

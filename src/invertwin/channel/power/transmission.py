@@ -8,7 +8,7 @@ number of sheets may follow one another.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypedDict
 
 from invertwin.channel.power import integrand
@@ -27,9 +27,11 @@ STRATIFIED_SHEETS = 6  # sheets with stratified random decisions
 Carry = dict[str, mit.Float]
 
 
-@dataclass(frozen=True)
+@dataclass
 class SegmentTransmission:
     """Transmission of a segment.
+
+    Not frozen, since loops of Dr.Jit assign their state field by field.
 
     Attributes:
         transmittance: power factor; 0 if blocked.
@@ -64,11 +66,8 @@ class _SurfaceState(TypedDict):
 
     going: mit.Bool
     valid: mit.Bool
-    face: mit.UInt32
-    b1: mit.Float
-    b2: mit.Float
-    transmittance: mit.Float
-    extra: mit.Float
+    point: SurfacePoint
+    transmission: SegmentTransmission
     probability: mit.Float
     origin: mit.Point3f
     count: mit.UInt32
@@ -228,7 +227,7 @@ def trace_to_surface(
         hit = rays.find_nearest(mi.Ray3f(origin, ray.d), going)
         found = hit.valid
         face = dr.select(found, hit.point.face, rays.fallback_face)
-        point: mit.Point3f = origin + ray.d * dr.select(found, hit.t, 0.0)  # type: ignore[operator]
+        place: mit.Point3f = origin + ray.d * dr.select(found, hit.t, 0.0)  # type: ignore[operator]
         sheet = _sheet_transmission(inputs, face, origin, origin + ray.d, found)  # type: ignore[operator]
         probability = dr.select(sheet.transmittance > 0, _PASS_PROBABILITY, 0.0)
         uniform, _ = uniform_pair(index, seed + state["count"] * 0x85EBCA6B)
@@ -237,41 +236,28 @@ def trace_to_surface(
             uniform = dr.select(state["count"] < STRATIFIED_SHEETS, mi.Float(bit), uniform)
         passes = found & (uniform < probability)
         ends = found & ~passes
-        state["face"] = dr.select(ends, face, state["face"])
-        state["b1"] = dr.select(ends, hit.point.b1, state["b1"])
-        state["b2"] = dr.select(ends, hit.point.b2, state["b2"])
+        state["point"] = dr.select(ends, replace(hit.point, face=face), state["point"])
         state["valid"] = state["valid"] | ends
-        passed = state["transmittance"] * sheet.transmittance
-        state["transmittance"] = dr.select(passes, passed, state["transmittance"])
-        state["extra"] = dr.select(passes, state["extra"] + sheet.extra_length, state["extra"])
+        passed = state["transmission"].then(sheet)
+        state["transmission"] = dr.select(passes, passed, state["transmission"])
         odds = dr.select(passes, probability, dr.select(ends, 1 - probability, 1.0))
         state["probability"] = state["probability"] * odds
-        step = RAY_EPSILON * (hit.t + dr.norm(point))
-        state["origin"] = dr.select(passes, point + ray.d * step, origin)
+        step = RAY_EPSILON * (hit.t + dr.norm(place))
+        state["origin"] = dr.select(passes, place + ray.d * step, origin)
         state["count"] = state["count"] + 1
         state["going"] = passes & (state["count"] < _MAX_SHEETS)
         return (state,)
 
-    first = _initial_surface_state(rays, ray, hit.valid, lanes)
-    (last,) = rays.loop((first,), lambda state: state["going"], body)
-    point = SurfacePoint(last["face"], last["b1"], last["b2"])
-    passed = SegmentTransmission(last["transmittance"], last["extra"])
-    return SegmentHit(last["valid"], point, passed, last["probability"])
-
-
-def _initial_surface_state(
-    rays: RayScene, ray: mit.Ray3f, going: mit.Bool, lanes: int
-) -> _SurfaceState:
-    """Create the state before the first surface."""
-    return {
-        "going": going,
+    fallback = rays.fallback_face + dr.zeros(mi.UInt32, lanes)
+    b1, b2 = (dr.full(mi.Float, 0.25, lanes) for _ in range(2))
+    first: _SurfaceState = {
+        "going": hit.valid,
         "valid": dr.zeros(mi.Bool, lanes),
-        "face": dr.zeros(mi.UInt32, lanes) + rays.fallback_face,
-        "b1": dr.full(mi.Float, 0.25, lanes),
-        "b2": dr.full(mi.Float, 0.25, lanes),
-        "transmittance": dr.ones(mi.Float, lanes),
-        "extra": dr.zeros(mi.Float, lanes),
+        "point": SurfacePoint(fallback, b1, b2),
+        "transmission": SegmentTransmission(dr.ones(mi.Float, lanes), dr.zeros(mi.Float, lanes)),
         "probability": dr.ones(mi.Float, lanes),
         "origin": mi.Point3f(ray.o) + dr.zeros(mi.Point3f, lanes),
         "count": dr.zeros(mi.UInt32, lanes),
     }
+    (last,) = rays.loop((first,), lambda state: state["going"], body)
+    return SegmentHit(last["valid"], last["point"], last["transmission"], last["probability"])
