@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Complex128, Float, Float64, Int64
@@ -206,23 +206,14 @@ class Paths(Rows):
 
 def concatenate_paths(parts: Sequence[Paths]) -> Paths:
     """All paths in order."""
-    own = ("kind", "velocity", "matrix", "face", "barycentric")
-    names = [f.name for f in fields(Paths) if f.name not in own]
-    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-    velocity = None
-    if any(part.velocity is not None for part in parts):
-        still = [torch.zeros_like(p.last) if p.velocity is None else p.velocity for p in parts]
-        velocity = torch.cat(still)
-    bound = bool(parts) and all(part.face is not None for part in parts)
+    joined: dict[str, Any] = {}
+    for field in fields(Paths):
+        columns = [getattr(part, field.name) for part in parts]
+        if field.name == "velocity" and any(column is not None for column in columns):
+            columns = [
+                torch.zeros_like(p.last) if p.velocity is None else p.velocity for p in parts
+            ]
+        if field.name != "kind":
+            joined[field.name] = None if any(c is None for c in columns) else torch.cat(columns)
     kinds = {part.kind for part in parts}
-    matrices = [part.matrix for part in parts if part.matrix is not None]
-    return Paths(
-        **columns,
-        kind=kinds.pop() if len(kinds) == 1 else "field",
-        velocity=velocity,
-        matrix=torch.cat(matrices) if len(matrices) == len(parts) else None,
-        face=torch.cat([part.face for part in parts if part.face is not None]) if bound else None,
-        barycentric=torch.cat([p.barycentric for p in parts if p.barycentric is not None])
-        if bound
-        else None,
-    )
+    return Paths(**joined, kind=kinds.pop() if len(kinds) == 1 else "field")

@@ -22,7 +22,7 @@ from invertwin.channel.beams.beam_tracing import (
 )
 from invertwin.channel.em.antenna_fields import (
     antenna_fields,
-    combine_elements,
+    coherent_paths,
     conductor_field,
     current_kernel,
 )
@@ -137,19 +137,9 @@ def _field_paths(
     kernel = current_kernel(patches.normal, arriving, transmit, -leaving_direction, receive)
     spread, leaving = gain / (length * distance) ** 2, dot(patches.normal, leaving_direction)
     fields = conductor_field(spread, kernel, leaving)
-    integral = area(2 * torch.pi / (stretch * link.wavelength))
-    coefficient, matrix = combine_elements(link, fields * integral[:, None, None])
-    return Paths(
-        frame=frame,
-        delay=(length + distance) / SPEED_OF_LIGHT,
-        coefficient=coefficient,
-        power=torch.zeros_like(length),
-        first=image,
-        last=centroid,
-        kind="coherent",
-        boundary=torch.zeros(len(frame), dtype=torch.bool),
-        matrix=matrix,
-    )
+    fields = fields * area(2 * torch.pi / (stretch * link.wavelength))[:, None, None]
+    delay = (length + distance) / SPEED_OF_LIGHT
+    return coherent_paths(link, frame, delay, fields, image, centroid)
 
 
 def _polygon_centroid(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tensor, "row 3"]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from invertwin.channel.coherent.radar_equation import SurfacePaths, trace_transmittance
 from invertwin.channel.em.antenna_fields import (
     antenna_fields,
-    combine_elements,
+    coherent_paths,
     conductor_field,
     current_kernel,
 )
@@ -133,20 +133,11 @@ def _follow_rays(
         received = antenna_fields(other_jones, link.rotations[frame], -onwards)
         kernel = current_kernel(lit_normal, direction, sent, -onwards, received)
         fields = conductor_field(spread, kernel, dot(lit_normal, onwards)) * area[:, None, None]
-        coefficient, matrix = combine_elements(link, fields.mT if from_receiver else fields)
+        fields = fields.mT if from_receiver else fields
+        delay = (length + distance + extra + more) / SPEED_OF_LIGHT
         image = here[frame] + length[:, None] * start  # the last point, unfolded
-        first, last = (position, image) if from_receiver else (image, position)
-        yield Paths(
-            frame=frame,
-            delay=(length + distance + extra + more) / SPEED_OF_LIGHT,
-            coefficient=coefficient,
-            matrix=matrix,
-            power=torch.zeros_like(length),
-            first=first,
-            last=last,
-            kind="coherent",
-            boundary=torch.zeros(len(frame), dtype=torch.bool),
-        )
+        ends = (position, image) if from_receiver else (image, position)
+        yield coherent_paths(link, frame, delay, fields, *ends)
 
 
 def sample_surface_points(areas: Float64[Tensor, " f"], count: int, seed: int) -> SurfacePaths:

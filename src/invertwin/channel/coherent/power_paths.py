@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -19,11 +19,11 @@ from invertwin.channel.coherent.radar_equation import (
     radar_equation,
 )
 from invertwin.channel.em.depolarisation import received_power_fraction
-from invertwin.channel.em.plane_waves import dot
+from invertwin.channel.em.plane_waves import barycentric_coordinates, dot
 from invertwin.channel.paths import Link, Paths, concatenate_paths
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.random_walk import PathRecords
-from invertwin.channel.power.silhouettes import SilhouetteSampler
+from invertwin.channel.power.silhouettes import SilhouetteSample, SilhouetteSampler
 from invertwin.channel.power.trace import PowerTracer
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
@@ -38,20 +38,6 @@ from invertwin.channel.rays.scene_tables import (
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
-
-
-@dataclass(frozen=True)
-class _EdgePoints:
-    """Silhouette samples as torch tensors, see ``SilhouetteSample``."""
-
-    is_receiver: Bool[Tensor, " n"] | bool
-    frame: Int64[Tensor, " n"]
-    first_vertex: Int64[Tensor, " n"]
-    second_vertex: Int64[Tensor, " n"]
-    face: Int64[Tensor, " n"]
-    side: Float64[Tensor, " n"]
-    edge_parameter: Float64[Tensor, " n"]
-    weight: Float64[Tensor, " n"]
 
 
 @dataclass(frozen=True)
@@ -74,7 +60,7 @@ class ProjectedSilhouettes:
     area_rate: Float64[Tensor, " n"]
 
 
-def project_silhouettes(rays: RayScene, points: "_EdgePoints") -> ProjectedSilhouettes:
+def project_silhouettes(rays: RayScene, points: SilhouetteSample) -> ProjectedSilhouettes:
     """Turn edge points into shadow points with the attached speed of the shadow's edge.
 
     ``T · (x_c − x_m)``: x_c is where the attached ray meets the attached plane behind the edge,
@@ -83,20 +69,26 @@ def project_silhouettes(rays: RayScene, points: "_EdgePoints") -> ProjectedSilho
 
     Args:
         rays: The scene and its antennas.
-        points: Points on silhouettes, as torch tensors.
+        points: Points on silhouettes.
     """
     geometry, link = rays.geometry, rays.link
-    tx, rx = link.tx[points.frame], link.rx[points.frame]
-    from_receiver = torch.as_tensor(points.is_receiver, dtype=torch.bool).reshape(-1, 1)
+    indices = points.frame, points.first_vertex, points.second_vertex, points.face
+    frame, first, second, face = (to_torch(column).long() for column in indices)
+    numbers = points.side, points.edge_parameter, points.weight
+    side, share, weight = (to_torch(column).double() for column in numbers)
+    receiver = points.is_receiver
+    receiver = torch.tensor(receiver) if isinstance(receiver, bool) else to_torch(receiver).bool()
+    tx, rx, from_receiver = link.tx[frame], link.rx[frame], receiver.reshape(-1, 1)
     c, other = torch.where(from_receiver, rx, tx), torch.where(from_receiver, tx, rx)
-    y0, y1 = geometry.vertices[points.first_vertex], geometry.vertices[points.second_vertex]
-    y = y0 + (y1 - y0) * points.edge_parameter[:, None]
-    p0, p1, p2 = geometry.corners(points.face)
+    y0, y1 = geometry.vertices[first], geometry.vertices[second]
+    y = y0 + (y1 - y0) * share[:, None]
+    p0, p1, p2 = geometry.corners(face)
     plane = torch.linalg.cross(p1 - p0, p2 - p0)
     moving = c + (y - c) * (dot(plane, p0 - c) / dot(plane, y - c))[:, None]
 
     shadow, normal = moving.detach(), normalize(plane.detach(), dim=1)
-    b1, b2 = _barycentric(shadow, p0.detach(), p1.detach(), p2.detach())
+    corners = torch.stack([p0, p1, p2], 1).detach()
+    b1, b2 = barycentric_coordinates(corners, shadow)[:, 1:].unbind(1)
     material = interpolate_values((p0, p1, p2), b1, b2)
 
     ray, edge = (y - c).detach(), (y1 - y0).detach()
@@ -106,14 +98,13 @@ def project_silhouettes(rays: RayScene, points: "_EdgePoints") -> ProjectedSilho
         along = dot(normal, vector) / dot(normal, ray)
         return stretch[:, None] * (vector - ray * along[:, None])
 
-    covered = points.side * dot(normal, ray).sign()
+    covered = side * dot(normal, ray).sign()
     tangent = torch.linalg.cross(normal, project(edge)) * covered[:, None]
-    weight = points.weight
     if not link.shared_visibility:
         weight = weight * is_visible(rays, shadow, other)
     speed = dot(tangent, moving - material) * weight
-    place = MaterialPoints(shadow, normal, torch.ones_like(b1), geometry.face_surface[points.face])
-    return ProjectedSilhouettes(points.frame, points.face, b1, b2, place, speed)
+    place = MaterialPoints(shadow, normal, torch.ones_like(b1), geometry.face_surface[face])
+    return ProjectedSilhouettes(frame, face, b1, b2, place, speed)
 
 
 def trace_shadow_boundary_paths(
@@ -136,26 +127,10 @@ def trace_shadow_boundary_paths(
     if not sampler.size:
         return []
     drawn = sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress()
-    receiver = drawn.is_receiver
-    indices = drawn.frame, drawn.first_vertex, drawn.second_vertex, drawn.face
-    numbers = drawn.side, drawn.edge_parameter, drawn.weight
-    points = _EdgePoints(
-        receiver if isinstance(receiver, bool) else to_torch(receiver).bool(),
-        *(to_torch(column).long() for column in indices),
-        *(to_torch(column).double() for column in numbers),
-    )
-    edge = project_silhouettes(rays, points)
+    edge = project_silhouettes(rays, drawn)
     with torch.no_grad():
         echo = radar_equation(rays.geometry, rays.link, edge.frame, [edge.point])
     return [make_paths(edge, echo)]
-
-
-def _barycentric(point: Tensor, p0: Tensor, p1: Tensor, p2: Tensor) -> tuple[Tensor, Tensor]:
-    """Second and third barycentric coordinates of points in the planes of triangles."""
-    a, b, r = p1 - p0, p2 - p0, point - p0
-    aa, ab, bb, ra, rb = dot(a, a), dot(a, b), dot(b, b), dot(r, a), dot(r, b)
-    determinant = aa * bb - ab * ab
-    return (bb * ra - ab * rb) / determinant, (aa * rb - ab * ra) / determinant
 
 
 def trace_power(scene: Scene, link: Link, *, sampling: Sampling, seed: int) -> Paths:

@@ -1,11 +1,11 @@
 """Fields of antennas at a surface, and of currents on conductors at an antenna."""
 
 import torch
-from jaxtyping import Complex128, Float64
+from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.em.plane_waves import cross, polarisations
-from invertwin.channel.paths import Link
+from invertwin.channel.paths import Link, Paths
 from invertwin.scene.polarisation import Polarisation
 
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)  # of the radar
@@ -80,3 +80,24 @@ def combine_elements(
     transmit, receive = link.tx_jones.mean, link.rx_jones.mean
     coefficient = torch.einsum("r,nrt,t->n", receive, matrix, transmit)
     return coefficient, None if matrix.shape[1:] == (1, 1) else matrix
+
+
+def coherent_paths(
+    link: Link,
+    frame: Int64[Tensor, " row"],
+    delay: Float64[Tensor, " row"],
+    fields: Complex128[Tensor, "row r t"],
+    first: Float64[Tensor, "row 3"],
+    last: Float64[Tensor, "row 3"],
+) -> Paths:
+    """Coherent field paths at rest.
+
+    Args:
+        link: antennas.
+        frame, delay, first, last: as in ``Paths``.
+        fields: coefficients between the Jones vectors of both arrays.
+    """
+    coefficient, matrix = combine_elements(link, fields)
+    zero, boundary = torch.zeros_like(delay), torch.zeros_like(frame, dtype=torch.bool)
+    columns = frame, delay, coefficient, zero, first, last
+    return Paths(*columns, kind="coherent", boundary=boundary, matrix=matrix)

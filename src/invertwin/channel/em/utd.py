@@ -382,14 +382,20 @@ def _geometric_optics_dyads(diffraction: EdgeDiffraction) -> list[Complex128[Ten
         normal = diffraction.wedges.normals[:, face]
         unit_s, unit_p, reflected_p = (v[:, 0] for v in plane_of_incidence(normal, direction))
         law = diffraction.face_coefficients(face, dot(normal, direction).abs())
-        reflection = _outer_product(law.reflection_s, unit_s, unit_s)
-        reflection = reflection + _outer_product(law.reflection_p, reflected_p, unit_p)
+        reflection = outer_product(law.reflection_s, unit_s, unit_s)
+        reflection = reflection + outer_product(law.reflection_p, reflected_p, unit_p)
         reflected = reflect_vectors(direction, normal)
         dyads.append(_rotate_dyad(basis, _ray_fixed_basis(axis, reflected), reflection))
     return dyads
 
 
-def _outer_product(strength: Tensor, left: Tensor, right: Tensor) -> Complex128[Tensor, "row 3 3"]:
+def outer_product(strength: Tensor, left: Tensor, right: Tensor) -> Complex128[Tensor, "row 3 3"]:
+    """Dyads from the component along one vector to a multiple of another.
+
+    Args:
+        strength: complex factors, [row].
+        left, right: vectors of the result and of the component, [row, 3].
+    """
     return strength[:, None, None] * (left[:, :, None] * right[:, None])
 
 
@@ -407,7 +413,7 @@ def _transmission_dyad(diffraction: EdgeDiffraction) -> Complex128[Tensor, "row 
         normal = diffraction.wedges.normals[:, face]
         unit_s, unit_p, _ = (v[:, 0] for v in plane_of_incidence(normal, direction))
         law = diffraction.face_coefficients(face, dot(normal, direction).abs())
-        through = _outer_product(law.transmission_s, unit_s, unit_s)
-        through = through + _outer_product(law.transmission_p, unit_p, unit_p)
+        through = outer_product(law.transmission_s, unit_s, unit_s)
+        through = through + outer_product(law.transmission_p, unit_p, unit_p)
         total = through if face == 0 else torch.where(flat, total, through @ total)
     return total

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import dot, phasor, plane_of_incidence, reflect_vectors
+from invertwin.channel.em.utd import outer_product
 from invertwin.channel.em.wedges import edge_axis
 from invertwin.channel.specular.corner_diffraction import diffract_round_corner
 from invertwin.channel.specular.diffraction_candidates import (
@@ -158,10 +159,7 @@ class _AntennaLeg(UnfoldedPaths):
             law = self.coefficients(self.faces[:, step], dot(normal, way).abs())
             s, before, after = (v[:, 0] for v in plane_of_incidence(normal, way))
             both = torch.where(through[:, None], before, after)
-            strength_s = torch.where(through, law.transmission_s, law.reflection_s)
-            strength_p = torch.where(through, law.transmission_p, law.reflection_p)
-            across = s[:, :, None] * s[:, None]
-            inside = both[:, :, None] * before[:, None]
-            step_dyad = strength_s[:, None, None] * across + strength_p[:, None, None] * inside
-            total = step_dyad @ total
+            across = torch.where(through, law.transmission_s, law.reflection_s)
+            inside = torch.where(through, law.transmission_p, law.reflection_p)
+            total = (outer_product(across, s, s) + outer_product(inside, both, before)) @ total
         return total

@@ -32,10 +32,7 @@ from invertwin.channel.specular.candidates import (
     shoot_sequences_from_edges,
 )
 from invertwin.channel.specular.corner_diffraction import face_weight
-from invertwin.channel.specular.edge_path_geometry import (
-    diffraction_points,
-    multiple_diffraction_points,
-)
+from invertwin.channel.specular.edge_path_geometry import multiple_diffraction_points
 from invertwin.channel.specular.image_method import (
     find_unobstructed_paths,
     intersects_planes,
@@ -245,7 +242,8 @@ def _diffract_once(
     for first, last in _match_edges(one, other, len(wedge_scene.detached_wedges.start)):
         outbound, inbound = one.select(first), other.select(last)
         wedges = wedge_scene.detached_wedges.select(outbound.edge)
-        points, valid = diffraction_points(wedges, outbound.image, inbound.image)
+        points, valid = multiple_diffraction_points([wedges], outbound.image, inbound.image)
+        points = points[:, 0]
         valid &= wedge_scene.is_diffracting(outbound.edge, points)
         beside = wedge_scene.offset_points(outbound.edge, points)
         for side in (outbound, inbound):

@@ -139,29 +139,14 @@ def transfer_dyads(
     return [dyad * amplitude[:, None, None] for dyad in found]
 
 
-def diffraction_points(
-    wedges: Wedges, tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
-) -> tuple[Float64[Tensor, "row 3"], Bool[Tensor, " row"]]:
-    """Diffraction points of paths over one edge, on its line, and a mask of existing paths.
-
-    Args:
-        wedges: sharp edges, one row each.
-        tx, rx: positions of the antennas, or of their images [m].
-    """
-    axis = _normalise(wedges.end - wedges.start)
-    points = wedges.start + _closest_offset(wedges.start, axis, tx, rx)[:, None] * axis
-    before, after = (points - tx).norm(dim=1), (rx - points).norm(dim=1)
-    return points, torch.minimum(before, after) > _MIN_LENGTH_FRACTION * (before + after)
-
-
 def multiple_diffraction_points(
     wedges: Sequence[Wedges], tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
 ) -> tuple[Float64[Tensor, "row edge 3"], Bool[Tensor, " row"]]:
-    """As ``diffraction_points``, for paths over one edge or several.
+    """Diffraction points of paths, on the lines of their edges, and a mask of existing paths.
 
     Args:
-        wedges: edges in the order of the path, one row each.
-        tx, rx: antenna positions [m].
+        wedges: one edge or several, in the order of the path, one row each.
+        tx, rx: positions of the antennas, or of their images [m].
     """
     route = find_route([PathEdge(each) for each in wedges], tx, rx)
     return route.points, route.stationary

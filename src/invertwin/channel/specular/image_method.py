@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import (
+    barycentric_coordinates,
     cross,
     dot,
     orthogonal_unit_vectors,
@@ -547,10 +548,9 @@ def _test_exactly(
 ) -> tuple[Tensor, Tensor]:
     """Test segments in float64 over all triangles, which include their edges."""
     planes, vertices = surfaces.planes, surfaces.exact_vertices
-    a, b, c = vertices[surfaces.topology.faces].unbind(1)
-    first, second = b - a, c - a
-    area = cross(first, second)
-    square = dot(area, area).clamp_min(1e-300)
+    corners = vertices[surfaces.topology.faces]
+    a, b, c = corners.unbind(1)
+    area = cross(b - a, c - a)
     valid = torch.ones(len(segments.start), dtype=torch.bool)
     hit_faces = torch.full((len(valid),), -1)
     tolerance, rim = _EXACT_TOLERANCE * surfaces.size, 1e-9
@@ -558,14 +558,11 @@ def _test_exactly(
         start, end = segments.start[row, None], segments.end[row, None]
         direction = end - start
         length = direction.norm(dim=2)
-        slope = dot(direction, area.expand(len(row), -1, -1))
-        fraction = dot(a - start, area.expand(len(row), -1, -1)) / replace_zeros(slope)
+        slope = dot(direction, area)
+        fraction = dot(a - start, area) / replace_zeros(slope)
 
         def inside(point: Tensor) -> Tensor:
-            offset = point - a
-            v = dot(cross(first.expand_as(offset), offset), area.expand_as(offset)) / square
-            u = dot(cross(offset, second.expand_as(offset)), area.expand_as(offset)) / square
-            return torch.minimum(torch.minimum(u, v), 1 - u - v)
+            return barycentric_coordinates(corners, point).amin(2)
 
         own = planes.face_plane
         ends = (own == segments.plane_before[row, None]) | (own == segments.plane[row, None])

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.channel.em.antenna_fields import antenna_fields, combine_elements
+from invertwin.channel.em.antenna_fields import antenna_fields, coherent_paths
 from invertwin.channel.em.plane_waves import polarisations
 from invertwin.channel.paths import Link, Paths, concatenate_paths
 from invertwin.channel.specular.ray_paths import RayPaths
@@ -99,20 +99,11 @@ def _echo_paths(
     rotation = torch.einsum("nix,njx->nij", leaves, arrives).to(outgoing.dtype)
     matrix = torch.einsum("nri,nij,ntj->nrt", returning, rotation, outgoing)
     matrix = matrix * strength[outbound.rx][:, None, None]
-    coefficient, whole = combine_elements(link, matrix)
-    delay = outbound.delay + inbound.delay
-    return Paths(
-        frame=torch.full((len(outbound),), frame),
-        delay=delay,
-        coefficient=coefficient,
-        power=torch.zeros_like(delay),
-        # Array elements see the target at its image.
-        first=link.tx[frame] + outbound.length[:, None] * outbound.departure,
-        last=link.rx[frame] + inbound.length[:, None] * inbound.departure,
-        kind="coherent",
-        boundary=torch.zeros(len(outbound), dtype=torch.bool),
-        matrix=whole,
-    )
+    # Array elements see the target at its image.
+    first = link.tx[frame] + outbound.length[:, None] * outbound.departure
+    last = link.rx[frame] + inbound.length[:, None] * inbound.departure
+    numbers, delay = torch.full((len(outbound),), frame), outbound.delay + inbound.delay
+    return coherent_paths(link, numbers, delay, matrix, first, last)
 
 
 def _antenna_amplitudes(

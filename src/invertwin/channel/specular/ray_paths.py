@@ -159,9 +159,8 @@ def _add_slopes(paths: RayPaths) -> RayPaths:
 
 
 def _pad_columns(value: Tensor, width: int, fill: float) -> Tensor:
-    value = value[:, :width]
-    more = value.new_full((len(value), width - value.shape[1], *value.shape[2:]), fill)
-    return torch.cat([value, more], 1)
+    more = (0, 0) * (value.ndim - 2) + (0, width - value.shape[1])
+    return torch.nn.functional.pad(value, more, value=fill)
 
 
 def match_rows(
