@@ -28,8 +28,6 @@ from invertwin.channel.em.plane_waves import (
     reflect_vectors,
     triangle_normals,
 )
-from invertwin.channel.rays.arrays import to_torch, to_vectors
-from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.rows import Rows, concatenate_rows
@@ -81,7 +79,7 @@ class ReceivingSurface(Occluders):
                 return
             rows, reach = rows[ahead], reach[ahead]
             origin, direction = rays.origin[rows], rays.direction[rows]
-            face, distance = _intersect_rays(self, origin + reach[:, None] * direction, direction)
+            face, distance = self.find_first_hits(origin + reach[:, None] * direction, direction)
             reach = reach + distance
             is_hit = torch.nonzero((face >= 0) & (reach < max_distance[rows]))[:, 0]
             rows, reach = rows[is_hit], reach[is_hit]
@@ -351,7 +349,7 @@ def _follow_rays(
     """Follow rays through the scene to the surface: last legs with the triangle that they hit."""
     step = int(rays.steps_before_edge[0]) if len(rays.edge_point) else depth
     while len(rays.edge_point):
-        face, distance = _intersect_rays(surfaces, rays.origin, rays.direction)
+        face, distance = surfaces.find_first_hits(rays.origin, rays.direction)
         for rows, triangle in receiver.find_received(rays, face, distance):
             part = rays.select(rows)
             steps = {"faces": part.faces[:, :step], "through": part.through[:, :step]}
@@ -375,18 +373,6 @@ def _follow_rays(
             branches.append(replace(part, faces=faces, through=through))
         rays = concatenate_rows(branches)
         step += 1
-
-
-def _intersect_rays(
-    occluders: Occluders, origin: Tensor, direction: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Triangle that each ray hits (−1: none), and its distance [m] (infinite without a hit)."""
-    ray = mi.Ray3f(to_vectors(mi.Point3f, origin), to_vectors(mi.Vector3f, direction))
-    hit = occluders.scene.ray_intersect_preliminary(ray)
-    face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
-    distance = dr.select(hit.is_valid(), hit.t, dr.inf)
-    dr.eval(face, distance)
-    return to_torch(face).long(), to_torch(distance).double()
 
 
 def evaluate_illumination_boundary(

@@ -208,7 +208,8 @@ class _SingleScatteringTracer:
             def sum_part(part: _ScatteringPoints = part, legs: _PathLegs = legs) -> Tensor:
                 point = part.points.material_points(geometry)[0]
                 area = part.points.weight * point.jacobian
-                return self._sum_pairs(self._evaluate_pairs(stage, geometry, legs, point, area))
+                link, _, amount = self._evaluate_pairs(stage, geometry, legs, point, area)
+                return self._sum_links(link, amount)
 
             total = total + (checkpoint(sum_part, use_reentrant=False) if recompute else sum_part())
         return total
@@ -240,9 +241,10 @@ class _SingleScatteringTracer:
                 with torch.no_grad():
                     point = _material_points_at(geometry, boundary.point, boundary.face)
                     area = torch.full((len(boundary.face),), 1.0 if end else receivers).double()
-                    pairs = self._evaluate_pairs(stage.detach(), geometry, legs, point, area)
-                amount = strip_derivatives(pairs.amount) * boundary.area_rate[pairs.point, None]
-                total = total + self._sum_pairs(replace(pairs, amount=amount))
+                    found = self._evaluate_pairs(stage.detach(), geometry, legs, point, area)
+                link, index, amount = found
+                amount = strip_derivatives(amount) * boundary.area_rate[index, None]
+                total = total + self._sum_links(link, amount)
         return total
 
     def _sample_points(self, geometry: Geometry) -> _ScatteringPoints:
@@ -292,8 +294,8 @@ class _SingleScatteringTracer:
         path_legs: _PathLegs,
         point: MaterialPoints,
         area: Float64[Tensor, " row"],
-    ) -> "_LegPairs":
-        """Values of all pairs of legs to the same points, times an area of each point."""
+    ) -> tuple[Tensor, Tensor, Float64[Tensor, "pair amount"]]:
+        """Pairs of legs to the same points: link, point, and values times an area of the point."""
         outbound, inbound = (
             join_ray_paths([part for some in legs for part in evaluate_paths(material, some)])
             for material, legs in zip(
@@ -317,30 +319,13 @@ class _SingleScatteringTracer:
         law = k**2 * area[index] * law
         chi = geometry.surfaces.depolarisation[material.row]
         amount = law[:, None] * self.measure(outbound, inbound, chi, stage.tx, stage.rx)
-        return _LegPairs(outbound.tx, inbound.tx, index, amount)
+        return outbound.tx * len(self.antennas[1]) + inbound.tx, index, amount
 
-    def _sum_pairs(self, pairs: "_LegPairs") -> Float64[Tensor, "tx rx amount"]:
+    def _sum_links(self, link: Tensor, amount: Tensor) -> Float64[Tensor, "tx rx amount"]:
         """Sum the values of the pairs of each link."""
         counts = [len(places) for places in self.antennas]
         total = torch.zeros(counts[0] * counts[1], self.value_count, dtype=torch.float64)
-        total = total.index_add(0, pairs.tx * counts[1] + pairs.rx, pairs.amount)
-        return total.unflatten(0, counts)
-
-
-@dataclass(frozen=True)
-class _LegPairs:
-    """Pairs of legs to one point, one row each.
-
-    Attributes:
-        tx, rx: antenna numbers.
-        point: number of the point.
-        amount: values that the pair contributes.
-    """
-
-    tx: Int64[Tensor, " pair"]
-    rx: Int64[Tensor, " pair"]
-    point: Int64[Tensor, " pair"]
-    amount: Float64[Tensor, "pair amount"]
+        return total.index_add(0, link, amount).unflatten(0, counts)
 
 
 def _replace_antennas(stage: PathScene, tx: Tensor, rx: Tensor) -> PathScene:

@@ -20,6 +20,7 @@ from invertwin.channel.rays.arrays import (
     to_index,
     to_points,
     to_torch,
+    to_vectors,
 )
 from invertwin.channel.rays.backend import backend, dr, mi, mit, tracing
 from invertwin.channel.rays.bounding_spheres import BoundingSpheres, State
@@ -127,6 +128,22 @@ class Occluders:
         valid = active & hit.is_valid()
         point = SurfacePoint(hit.prim_index, hit.prim_uv.x, hit.prim_uv.y)
         return RayIntersection(valid, point, hit.t)
+
+    def find_first_hits(
+        self, origin: Tensor, direction: Tensor
+    ) -> tuple[Int64[Tensor, " n"], Float64[Tensor, " n"]]:
+        """Find the first triangle on rays (−1: none), and its distance (infinite without a hit).
+
+        Args:
+            origin: origins about the local origin, [n, 3] [m].
+            direction: directions [n, 3], in whose lengths distances count.
+        """
+        ray = mi.Ray3f(to_vectors(mi.Point3f, origin), to_vectors(mi.Vector3f, direction))
+        hit = self.scene.ray_intersect_preliminary(ray)
+        face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
+        distance = dr.select(hit.is_valid(), hit.t, dr.inf)
+        dr.eval(face, distance)
+        return to_torch(face).long(), to_torch(distance).double()
 
     def to_local_points(self, points: Float64[Tensor, "n 3"]) -> mit.Point3f:
         """Convert world points [n, 3] to Dr.Jit points about the local origin."""

@@ -16,12 +16,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import cross, dot
-from invertwin.channel.rays.arrays import to_float, to_torch
-from invertwin.channel.rays.backend import dr, mi, tracing
+from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.intersections import find_overlapping_pairs, intersect_triangles
 from invertwin.channel.rays.ray_scene import Occluders
 from invertwin.channel.rays.scene_tables import require_surfaces
 from invertwin.channel.rays.topology import topology_of
+from invertwin.channel.rows import concatenate_rows
 from invertwin.checks import is_differentiated, strip_derivatives
 from invertwin.deprecation import rename_arguments
 from invertwin.scene.scene import Scene
@@ -88,10 +88,7 @@ class ViewpointScene:
             return torch.zeros(0, dtype=torch.int64)
         way = normalize(strip_derivatives(directions), dim=1).to(torch.float32)
         with tracing():
-            ray = mi.Ray3f(mi.Point3f(0.0), mi.Vector3f(*(to_float(way[:, k]) for k in range(3))))
-            hit = self._occluders.scene.ray_intersect_preliminary(ray)
-            face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
-            return to_torch(face).long()
+            return self._occluders.find_first_hits(torch.zeros_like(way), way)[0]
 
     def plane_distances(
         self, face: Int64[Tensor, " n"], directions: Float64[Tensor, "n 3"]
@@ -126,7 +123,8 @@ class ViewpointScene:
         points, topology = strip_derivatives(self._vertices), self._topology
         corners = points[topology.faces]
         low, high = corners.amin(1), corners.amax(1)
-        parts = []
+        none = topology.edges[:0, 0]
+        parts = [intersect_triangles(points, topology, none, none)]
         for one, other in itertools.combinations(range(len(self.names)), 2):
             own = [torch.nonzero(self.face_object == number)[:, 0] for number in (one, other)]
             for number in (0, 1):
@@ -141,14 +139,9 @@ class ViewpointScene:
             here, there = find_overlapping_pairs(corners[own[0]], corners[own[1]])
             met = intersect_triangles(points, topology, own[0][here], own[1][there])
             parts.append(met.select(~met.touching))
-        none = topology.edges[:0, 0]
-        return DiscontinuityCurves(
-            torch.cat([corners[:0, 0], *(part.start for part in parts)]),
-            torch.cat([corners[:0, 0], *(part.end for part in parts)]),
-            torch.cat([none, *(part.first for part in parts)]),
-            torch.cat([none, *(part.second for part in parts)]),
-            is_intersection=True,
-        )
+        found = concatenate_rows(parts)
+        ends = found.start, found.end
+        return DiscontinuityCurves(*ends, found.first, found.second, is_intersection=True)
 
     def points_on_curves(
         self,
