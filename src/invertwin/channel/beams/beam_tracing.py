@@ -101,6 +101,11 @@ class IlluminatedPatches(Rows):
     transmitted: Bool[Tensor, " row"]
     spreading: Tensor
 
+    def to_complex(self) -> "IlluminatedPatches":
+        """Return the patches with complex waves, which may decay."""
+        names = ("wave_vector", "phase_offset", "spreading")
+        return replace(self, **{name: getattr(self, name).to(torch.complex128) for name in names})
+
     def phase_integral(
         self, scattering_direction: Float64[Tensor, "row 3"]
     ) -> Callable[[float], Complex128[Tensor, " row"]]:
@@ -214,10 +219,7 @@ def _launch_plane_waves(incident: Tensor, solids: DielectricSolids | None) -> Il
     aspect, zero = torch.arange(len(incident)), torch.zeros_like(incident)
     none = torch.full_like(aspect, -1)
     waves = patches_in_air(aspect, none, zero, incident, zero[:, 0], zero[:, None], none)
-    if solids is None:
-        return waves
-    names = ("wave_vector", "phase_offset")
-    return replace(waves, **{name: getattr(waves, name).to(torch.complex128) for name in names})
+    return waves if solids is None else waves.to_complex()
 
 
 def _continue_beams(

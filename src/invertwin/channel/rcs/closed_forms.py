@@ -256,12 +256,8 @@ def strip_section_te(
     green = _potentials(nodes, k)
     # A triangle is half a pulse on either segment, with charges +1/l and −1/l.
     count = len(length) - 1
-    pulse = np.zeros((count, len(length)))
-    charge = np.zeros((count, len(length)))
-    inner = np.arange(count)
-    for side, sign in ((0, 1.0), (1, -1.0)):
-        pulse[inner, inner + side] = 0.5
-        charge[inner, inner + side] = sign
+    before, after = np.eye(count, count + 1), np.eye(count, count + 1, 1)
+    pulse, charge = (before + after) / 2, before - after
     vector = (pulse * length) @ ((tangent @ tangent.T) * green) @ pulse.T
     scalar = charge @ (green / length) @ charge.T
     impedance = 1j * k * vector + scalar / (1j * k)

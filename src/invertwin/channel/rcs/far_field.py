@@ -266,37 +266,28 @@ class _FarFieldTracer:
         self, depth: int, tube_width: float | None, boundary: bool
     ) -> dict[str, Tensor]:
         """Physical optics of every order, by beams or, with a tube width, by ray tubes."""
+        target = self.target
         orders = [list(self._zero_amplitudes()) for _ in range(depth)]
         for patch_orders, solids, members in (
             self._trace_beam_orders(depth, boundary)
             if tube_width is None
             else self._trace_tube_orders(depth, tube_width)
         ):
-            self._add_orders(orders, patch_orders, solids, members)
+            currents: list[Tensor] = []
+            integrals = [
+                found.phase_integral(self.receivers[found.aspect]) for found in patch_orders
+            ]
+            for f in members:
+                k = target.wave_numbers[f]
+                if not (target.is_smooth_metal and currents):
+                    skins, scale = target.interfaces[f], 1.0 if target.is_smooth_metal else k
+                    currents = self._patch_amplitudes(patch_orders, solids, skins, scale)
+                rows = zip(orders, patch_orders, integrals, currents, strict=False)
+                for order, patches, integral, current in rows:
+                    strength = integral(k) * (k if target.is_smooth_metal else 1.0)
+                    fields = current * strength[:, None, None]
+                    order[f] = order[f].index_add(0, patches.aspect, fields)
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
-
-    def _add_orders(
-        self,
-        orders: list[list[Tensor]],
-        patch_orders: Sequence[IlluminatedPatches],
-        solids: DielectricSolids | None,
-        frequency_indices: Sequence[int],
-    ) -> None:
-        """Add the radiation of patches to the fields of their orders, at some frequencies."""
-        target = self.target
-        currents: list[Tensor] = []
-        integrals = [
-            patches.phase_integral(self.receivers[patches.aspect]) for patches in patch_orders
-        ]
-        for f in frequency_indices:
-            k = target.wave_numbers[f]
-            if not (target.is_smooth_metal and currents):
-                skins, scale = target.interfaces[f], 1.0 if target.is_smooth_metal else k
-                currents = self._patch_amplitudes(patch_orders, solids, skins, scale)
-            rows = zip(orders, patch_orders, integrals, currents, strict=False)
-            for order, patches, integral, current in rows:
-                strength = integral(k) * (k if target.is_smooth_metal else 1.0)
-                order[f] = order[f].index_add(0, patches.aspect, current * strength[:, None, None])
 
     def _trace_beam_orders(self, depth: int, boundary: bool) -> Iterator[_PatchOrders]:
         """Trace few facets by clipped beams."""

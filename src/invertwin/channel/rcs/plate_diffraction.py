@@ -10,7 +10,6 @@ aspect angle", IEEE TAP 14, 1966.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -18,8 +17,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.channel.em.plane_waves import cross, dot, parallelogram_integral
-from invertwin.channel.em.wedges import MIN_EDGE_ANGLE, Wedges
-from invertwin.channel.rows import concatenate_rows
+from invertwin.channel.em.wedges import MIN_EDGE_ANGLE, Wedges, merge_collinear_wedges
+from invertwin.scene.mesh_topology import label_components
 
 _SAMPLES_PER_EDGE = 16  # of the illuminated part of the last edge
 _TOLERANCE = 1e-6
@@ -73,24 +72,15 @@ def find_plates(wedges: Wedges) -> list[Wedges]:
     Args:
         wedges: sharp edges; those of solid bodies and creases are left out.
     """
-    left = torch.nonzero(wedges.opening > 2 - _TOLERANCE)[:, 0].tolist()
-    found: list[Wedges] = []
-    while left:
-        plate, others, grown = [left[0]], left[1:], True
-        while grown:
-            near = [e for e in others if any(_are_coplanar_neighbours(wedges, e, p) for p in plate)]
-            plate, others, grown = plate + near, [e for e in others if e not in near], bool(near)
-        left = others
-        edges = wedges.select(torch.tensor(plate))
-        if _is_convex(edges):
-            found.append(_merge_collinear_edges(edges))
-    return found
-
-
-def _are_coplanar_neighbours(wedges: Wedges, one: int, other: int) -> bool:
-    """Test if two edges share a corner and a plane."""
-    turn = cross(wedges.normals[one, 0], wedges.normals[other, 0]).norm()
-    return bool(turn < _TOLERANCE) and _share_corner(wedges, one, other)
+    sides = wedges.select(wedges.opening > 2 - _TOLERANCE)
+    ends = torch.stack([sides.start, sides.end], 1).detach()
+    gap = (ends[:, None, :, None] - ends[:, None]).norm(dim=-1).amin((2, 3))
+    turn = cross(sides.normals[:, None, 0], sides.normals[:, 0]).norm(dim=2)
+    size = (ends[:, 1] - ends[:, 0]).norm(dim=1, keepdim=True)
+    pairs = torch.nonzero((gap < _TOLERANCE * size) & (turn < _TOLERANCE))
+    plate = torch.from_numpy(label_components(pairs.numpy(), len(sides.start)))
+    plates = [sides.select(plate == number) for number in plate.unique()]
+    return [merge_collinear_wedges(edges) for edges in plates if _is_convex(edges)]
 
 
 def _share_corner(wedges: Wedges, one: int, other: int) -> bool:
@@ -105,20 +95,6 @@ def _is_convex(edges: Wedges) -> bool:
     middles = (edges.start + edges.end) / 2
     depth = (edges.face_tangents[:, :1] * (middles[None] - middles[:, None])).sum(2)
     return bool((depth > -_TOLERANCE * depth.abs().max()).all())
-
-
-def _merge_collinear_edges(edges: Wedges) -> Wedges:
-    """Merge collinear edges of a convex plate."""
-    inward, left, sides = edges.face_tangents[:, 0], list(range(len(edges.start))), []
-    while left:
-        line = [e for e in left if bool((inward[e] - inward[left[0]]).norm() < _TOLERANCE)]
-        left = [e for e in left if e not in line]
-        points = torch.cat([edges.start[line], edges.end[line]])
-        along = points @ (edges.end[line[0]] - edges.start[line[0]])
-        first, ends = edges.select(torch.tensor(line[:1])), (along.argmin(), along.argmax())
-        start, end = (points[number][None] for number in ends)
-        sides.append(replace(first, start=start, end=end))
-    return concatenate_rows(sides)
 
 
 def _diffract_sequence(

@@ -163,7 +163,7 @@ def trace_inner_tubes(
         parts, begun = [], []
         if order < len(outer_orders):
             outer = outer_orders[order]
-            parts.append(_to_complex(outer))
+            parts.append(outer.to_complex())
             begun.append(_launch_inner_tubes(surface, solids, outer, min_tube_width))
         if tubes is not None:
             last = found[-1]
@@ -177,11 +177,6 @@ def trace_inner_tubes(
         if not len(found[-1].aspect):
             return found[:-1]
     return found
-
-
-def _to_complex(patches: IlluminatedPatches) -> IlluminatedPatches:
-    names = ("wave_vector", "phase_offset", "spreading")
-    return replace(patches, **{name: getattr(patches, name).to(torch.complex128) for name in names})
 
 
 def _launch_inner_tubes(

@@ -196,17 +196,12 @@ class EFIEMatrix:
 
         face, corner = self.basis.face.numpy(), self.basis.corner.numpy()
         shape = (self.count, 3 * count)
+        row = np.tile(np.repeat(np.arange(self.count), 3), 2)
+        indices = row, (3 * face.T[..., None] + np.arange(3)).ravel()
         parts = []
         for part in products.numpy().transpose(3, 0, 1, 2).astype(points.numpy().dtype):
-            value, columns = [], []
-            for half, sign in ((0, 1.0), (1, -1.0)):
-                value.append(sign * part[face[:, half], corner[:, half]])
-                columns.append(3 * face[:, half, None] + np.arange(3))
-            row = np.repeat(np.arange(self.count), 3)
-            indices = (np.concatenate([row, row]), np.concatenate([p.ravel() for p in columns]))
-            # Keep 32-bit integers and single precision.
-            values = np.concatenate([v.ravel() for v in value])
-            parts.append(csr_array((values, indices), shape=shape))
+            first, second = part[face.T, corner.T]
+            parts.append(csr_array((np.stack([first, -second]).ravel(), indices), shape=shape))
         scale = [1.0, 1.0, 1.0, -1 / self.k**2]
         total = torch.zeros(self.count, self.count, dtype=self.complex_dtype)
         bounds = torch.searchsorted(pairs[:, 0].contiguous(), torch.arange(count + 1))

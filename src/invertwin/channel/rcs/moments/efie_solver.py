@@ -12,7 +12,13 @@ import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.em.plane_waves import cross, dot, phasor, polarisations
+from invertwin.channel.em.plane_waves import (
+    barycentric_coordinates,
+    cross,
+    dot,
+    phasor,
+    polarisations,
+)
 from invertwin.channel.rcs.moments.efie_matrix import EFIEMatrix, build_rwg_basis
 from invertwin.channel.rcs.moments.meshing import ConformingMesh, build_conforming_mesh
 from invertwin.channel.rcs.moments.solver import CurrentSolver, Refusal, power_error, too_many
@@ -204,20 +210,12 @@ def _find_opposite_faces(
     target: EFIESolver, start: Tensor, direction: Tensor, corners: Tensor
 ) -> tuple[Tensor, Tensor]:
     """First triangle of a closed body that rays hit, and the mask of rays that hit one."""
-    found, is_hit = [], []
     size = 1e-9 * float(np.ptp(target.vertices.detach().numpy(), axis=0).max())
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    for origin, ray in zip(start, direction, strict=True):
-        ray_cross_second = cross(ray.expand_as(second), second)
-        scale = dot(first, ray_cross_second)
-        safe = torch.where(scale == 0, torch.ones_like(scale), scale)
-        offset = origin - corners[:, 0]
-        u = dot(offset, ray_cross_second) / safe
-        offset_cross_first = torch.linalg.cross(offset, first)
-        v = dot(ray.expand_as(offset_cross_first), offset_cross_first) / safe
-        distance = dot(second, offset_cross_first) / safe
-        hit = target.solid & (scale != 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > size)
-        distance = torch.where(hit, distance, math.inf)
-        found.append(int(distance.argmin()))
-        is_hit.append(bool(hit.any()))
-    return torch.tensor(found, dtype=torch.int64), torch.tensor(is_hit, dtype=torch.bool)
+    first = corners[:, 0]
+    normal = cross(corners[:, 1] - first, corners[:, 2] - first)
+    slope, offset = dot(direction[:, None], normal), dot(first - start[:, None], normal)
+    distance = offset / torch.where(slope == 0, 1.0, slope)
+    place = start[:, None] + distance[..., None] * direction[:, None]
+    hit = target.solid & (slope != 0) & (distance > size)
+    hit &= barycentric_coordinates(corners, place).amin(2) >= 0
+    return torch.where(hit, distance, math.inf).argmin(1), hit.any(1)

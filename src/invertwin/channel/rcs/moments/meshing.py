@@ -189,11 +189,12 @@ def _interior_points(corners: Array, outwards: Array) -> Array:
 def _smooth_points(points: Array, triangles: Index) -> Array:
     """Move points to the mean of their neighbours (Laplacian smoothing)."""
     total, count = np.zeros_like(points), np.zeros(len(points))
-    for corner in range(3):
-        for other in (1, 2):
-            own, neighbour = triangles[:, corner], triangles[:, (corner + other) % 3]
-            np.add.at(total, own, points[neighbour])
-            np.add.at(count, own, 1)
+    own, neighbour = (
+        triangles.T[[0, 0, 1, 1, 2, 2]].ravel(),
+        triangles.T[[1, 2, 2, 0, 0, 1]].ravel(),
+    )
+    np.add.at(total, own, points[neighbour])
+    np.add.at(count, own, 1)
     return np.asarray(total / np.maximum(count, 1)[:, None], dtype=np.float64)
 
 
