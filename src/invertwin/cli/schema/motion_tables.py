@@ -6,10 +6,9 @@ from invertwin.cli.run_file import prefix_errors
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.shape_tables import ObjectTable, joint_positions, require_body
 from invertwin.errors import InputError
-from invertwin.scene import MovingScene, ObjectMotion, Scene, Sitting, Walking, Waving
+from invertwin.scene import MovingScene, ObjectMotion, Scene, Waving
 from invertwin.scene.people.body import BodyTemplate
-
-_PERSON_MOTIONS = (Walking, Sitting, Waving)
+from invertwin.scene.people.gait import PersonMotion
 
 
 def build_moving_scene(run: RunFile, scene: Scene) -> Scene | MovingScene:
@@ -88,7 +87,7 @@ def _build_motions(table: ObjectTable) -> list[ObjectMotion]:
             if "body" not in row.made_from:
                 found.append(row.build())
                 continue
-            earlier = [mover for mover in found if isinstance(mover, _PERSON_MOTIONS)]
+            earlier = [mover for mover in found if isinstance(mover, PersonMotion)]
             if earlier and (row.kind != "waving" or isinstance(earlier[0], Waving)):
                 raise InputError(
                     "expected one motion of a person, or waving after another, got two; remove one"

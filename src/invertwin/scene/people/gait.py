@@ -13,7 +13,7 @@ there, which would be discontinuous. Bodies have no ankles, so feet do not rotat
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -44,8 +44,33 @@ Posture = tuple[Float64[Tensor, "j 3 3"], Float64[Tensor, "3"]]
 """Rotation of every joint in the frame of its parent, and the shift of the pelvis [m]."""
 
 
+class PersonMotion:
+    """Motion of a person, which is its posture over time."""
+
+    body: BodyTemplate
+
+    def posture(self, time: float) -> Posture:
+        """Return joint rotations in the frames of their parents, and the shift of the pelvis [m].
+
+        Args:
+            time: time [s].
+        """
+        raise NotImplementedError
+
+    def __call__(self, item: Object, time: float) -> Object:
+        """Return the object at a time [s], with the posed skin, moved in its own frame.
+
+        Args:
+            item: object at the position of the person at time 0.
+            time: time [s].
+        """
+        rotations, shift = self.posture(time)
+        mesh = Mesh(self.body.apply_pose(rotations)[0], self.body.faces)
+        return replace(item, mesh=mesh, pose=compose(rigid(translation=shift), item.transform))
+
+
 @dataclass(frozen=True, eq=False)
-class Walking:
+class Walking(PersonMotion):
     """Person who walks straight ahead along −x of the object's frame, or on the spot.
 
     The object's pose is that of the pelvis of a standing person, see ``standing_height``.
@@ -90,28 +115,24 @@ class Walking:
             phase: phase in cycles.
         """
         v, curves = self.relative_speed, _curves(self.relative_speed)
-        found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
         cycle = math.cos(2 * math.pi * phase)
         yaw, roll = math.radians(4.0 * v) * cycle, -_evaluate_series(curves["tilt"], phase)
         pelvis = rotation_about_axis("z", yaw) @ rotation_about_axis("x", roll)
         lean = math.radians(_swing(v, 8.0)) * (math.sin(2 * math.pi * (2 * phase - 0.1)) - 1)
         twist = rotation_about_axis("z", -_evaluate_series(curves["thorax"], phase))
         chest = twist @ rotation_about_axis("y", lean)
-        found[self.body.joint("pelvis")] = pelvis
-        found[self.body.joint("chest")] = pelvis.T @ chest
+        turns = {"pelvis": pelvis, "chest": pelvis.T @ chest}
         for side, later in (("right", 0.0), ("left", 0.5)):
             own = phase + later
             swing = 9.88 * v
             arm = math.radians(3.0 - swing / 2 - swing * math.cos(2 * math.pi * own))
-            turns = {
-                "hip": rotation_about_axis("y", _evaluate_series(curves["hip"], own)),
-                "knee": rotation_about_axis("y", -_evaluate_series(curves["knee"], own)),
-                "shoulder": rotation_about_axis("y", arm) @ hanging_arm_rotation(side),
-                "elbow": elbow_rotation(side, _evaluate_series(curves["elbow"], own)),
+            turns |= {
+                f"{side}_hip": rotation_about_axis("y", _evaluate_series(curves["hip"], own)),
+                f"{side}_knee": rotation_about_axis("y", -_evaluate_series(curves["knee"], own)),
+                f"{side}_shoulder": rotation_about_axis("y", arm) @ hanging_arm_rotation(side),
+                f"{side}_elbow": elbow_rotation(side, _evaluate_series(curves["elbow"], own)),
             }
-            for name, turn in turns.items():
-                found[self.body.joint(f"{side}_{name}")] = turn
-        return found
+        return joint_rotations(self.body, turns)
 
     def pelvis_offset(self, phase: float) -> Float64[Tensor, "3"]:
         """Return the offset of the pelvis from uniform motion, x, y and z [m].
@@ -137,15 +158,6 @@ class Walking:
         way = 0.0 if self.on_spot else self.speed * time
         shift = self.pelvis_offset(phase) + torch.tensor([-way, 0.0, 0.0], dtype=torch.float64)
         return self.rotations(phase), shift
-
-    def __call__(self, item: Object, time: float) -> Object:
-        """Return the object at a time [s].
-
-        Args:
-            item: object at its position at time 0.
-            time: time [s].
-        """
-        return pose_object(item, self.body, *self.posture(time))
 
 
 def standing_height(body: BodyTemplate) -> float:
@@ -174,19 +186,19 @@ def check_joints(body: BodyTemplate) -> None:
         )
 
 
-def pose_object(
-    item: Object, body: BodyTemplate, rotations: Float64[Tensor, "j 3 3"], shift: Tensor
-) -> Object:
-    """Return an object with the posed skin of a body, moved in its own frame.
+def joint_rotations(
+    body: BodyTemplate, turns: Mapping[str, Float64[Tensor, "3 3"]]
+) -> Float64[Tensor, "j 3 3"]:
+    """Return the rotations of all joints in the frames of their parents.
 
     Args:
-        item: object to pose.
         body: body template.
-        rotations: rotation of every joint in the frame of its parent.
-        shift: translation of the pelvis [m].
+        turns: rotations by the joint's name; the others have none.
     """
-    mesh = Mesh(body.apply_pose(rotations)[0], body.faces)
-    return replace(item, mesh=mesh, pose=compose(rigid(translation=shift), item.transform))
+    found = torch.eye(3, dtype=torch.float64).repeat(len(body.parents), 1, 1)
+    for name, turn in turns.items():
+        found[body.joint(name)] = turn
+    return found
 
 
 def rotation_about_axis(axis: str, angle: float) -> Float64[Tensor, "3 3"]:

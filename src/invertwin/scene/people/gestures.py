@@ -14,23 +14,23 @@ import math
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from scipy.spatial.transform import Rotation
 
 from invertwin.checks import check_choice, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Positive
 from invertwin.scene.people.body import BodyTemplate
 from invertwin.scene.people.gait import (
+    PersonMotion,
     Posture,
     Walking,
     check_joints,
     elbow_rotation,
     hanging_arm_rotation,
-    pose_object,
+    joint_rotations,
     rotation_about_axis,
     standing_height,
 )
-from invertwin.scene.scene import Object
 
 _LEAN = math.radians(40.0)  # lean of the trunk at seat contact
 _SEAT_CONTACT_SHARE = 0.6  # fraction of the duration at seat contact
@@ -42,7 +42,7 @@ _WAVE = math.radians(30.0)  # swing of the forearm to either side
 
 
 @dataclass(frozen=True, eq=False)
-class Sitting:
+class Sitting(PersonMotion):
     """Person who sits down, or stands up: the reverse motion.
 
     Feet are fixed; the seat is behind the person, who faces −x of the object's frame. The object's
@@ -89,31 +89,19 @@ class Sitting:
         upright = _minimum_jerk((u - _SEAT_CONTACT_SHARE) / (1 - _SEAT_CONTACT_SHARE))
         lean = _LEAN * (lowered - upright)
         shoulder, elbow = (angle * _minimum_jerk(u) for angle in _LAP)
-        found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
-        pelvis = rotation_about_axis("y", -lean / 2)
-        found[self.body.joint("pelvis")] = pelvis
-        found[self.body.joint("chest")] = rotation_about_axis("y", -lean / 2)
+        pelvis, raised = (rotation_about_axis("y", angle) for angle in (-lean / 2, lean + shoulder))
+        turns = {"pelvis": pelvis, "chest": pelvis}
         for side in ("left", "right"):
-            turns = {
-                "hip": pelvis.T @ rotation_about_axis("y", bent),
-                "knee": rotation_about_axis("y", -bent),
-                "shoulder": rotation_about_axis("y", lean + shoulder) @ hanging_arm_rotation(side),
-                "elbow": elbow_rotation(side, elbow),
+            turns |= {
+                f"{side}_hip": pelvis.T @ rotation_about_axis("y", bent),
+                f"{side}_knee": rotation_about_axis("y", -bent),
+                f"{side}_shoulder": raised @ hanging_arm_rotation(side),
+                f"{side}_elbow": elbow_rotation(side, elbow),
             }
-            for name, turn in turns.items():
-                found[self.body.joint(f"{side}_{name}")] = turn
         hip = self.body.joints[self.body.joint("left_hip")] * torch.tensor([1.0, 0.0, 1.0])
         away = [thigh * math.sin(bent), 0.0, thigh * (math.cos(bent) - 1)]
-        return found, hip - pelvis @ hip + torch.tensor(away, dtype=torch.float64)
-
-    def __call__(self, item: Object, time: float) -> Object:
-        """Return the object at a time [s].
-
-        Args:
-            item: object at the position of the standing person.
-            time: time [s].
-        """
-        return pose_object(item, self.body, *self.posture(time))
+        shift = hip - pelvis @ hip + torch.tensor(away, dtype=torch.float64)
+        return joint_rotations(self.body, turns), shift
 
     def _leg(self) -> tuple[float, float]:
         """Return the height of the knee above the sole, and the length of the thigh [m]."""
@@ -122,7 +110,7 @@ class Sitting:
 
 
 @dataclass(frozen=True, eq=False)
-class Waving:
+class Waving(PersonMotion):
     """Person who raises an arm, waves, and lowers it again.
 
     ``MovingScene`` applies it; the object's pose is that of a standing person.
@@ -165,7 +153,11 @@ class Waving:
         Args:
             time: time [s].
         """
-        found, shift = self._rest_rotations(time)
+        hanging = {f"{side}_shoulder": hanging_arm_rotation(side) for side in ("left", "right")}
+        found = joint_rotations(self.body, hanging)
+        shift = torch.zeros(3, dtype=torch.float64)
+        if self.during is not None:
+            found, shift = self.during.posture(time)
         since = time - self.start
         down = _minimum_jerk(1 - (self.duration - since) / _RAISE_DURATION)
         up = _minimum_jerk(since / _RAISE_DURATION) - down
@@ -178,36 +170,12 @@ class Waving:
         }
         for name, turn in raised.items():
             row = self.body.joint(f"{self.side}_{name}")
-            found[row] = _interpolate_rotation(found[row], turn, up)
+            way = Rotation.from_matrix((found[row].T @ turn).numpy()).as_rotvec()
+            found[row] @= torch.from_numpy(Rotation.from_rotvec(up * way).as_matrix())
         return found, shift
-
-    def __call__(self, item: Object, time: float) -> Object:
-        """Return the object at a time [s].
-
-        Args:
-            item: object at the position of the standing person.
-            time: time [s].
-        """
-        return pose_object(item, self.body, *self.posture(time))
-
-    def _rest_rotations(self, time: float) -> Posture:
-        if self.during is not None:
-            return self.during.posture(time)
-        found = torch.eye(3, dtype=torch.float64).repeat(len(self.body.parents), 1, 1)
-        for side in ("left", "right"):
-            found[self.body.joint(f"{side}_shoulder")] = hanging_arm_rotation(side)
-        return found, torch.zeros(3, dtype=torch.float64)
 
 
 def _minimum_jerk(share: float) -> float:
     """Minimum-jerk curve from 0 to 1 for fractions of the time from 0 to 1."""
     u = min(max(share, 0.0), 1.0)
     return u**3 * (10 - 15 * u + 6 * u**2)
-
-
-def _interpolate_rotation(first: Tensor, last: Tensor, share: float) -> Tensor:
-    """Interpolate between two rotations by a fraction of the angle between them."""
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_matrix((first.T @ last).numpy()).as_rotvec()
-    return first @ torch.from_numpy(Rotation.from_rotvec(share * turn).as_matrix())

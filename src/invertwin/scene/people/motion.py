@@ -92,8 +92,7 @@ class AxisRotation:
         set_fields(self, axis=axis / axis.norm())
         checked_number(self.rate, "rate [rad/s]", -math.inf)
         if self.center is not None:
-            given = checked_tensor(self.center, (3,), "center [m]", "give x, y, z")
-            set_fields(self, center=given)
+            set_fields(self, center=checked_tensor(self.center, (3,), "center [m]", "give x, y, z"))
 
     def __call__(self, item: Object, time: float) -> Object:
         """Return the object rotated for a time [s].
