@@ -47,20 +47,12 @@ def mean_over_views(
         total += value.detach()
         # One graph per view: its memory is freed before the next view.
         parts = torch.autograd.grad(value, free, allow_unused=True, materialize_grads=True)
-        for own, part in zip(sums, parts, strict=True):
-            own += part
+        sums = [own + part for own, part in zip(sums, parts, strict=True)]
     if count > 1:
-        sums, total = _sum_over_processes(sums, total)
+        flat = torch.cat([total.reshape(1), *(own.double().flatten() for own in sums)])
+        distributed.all_reduce(flat)
+        total, pieces = flat[0], flat[1:].split([own.numel() for own in sums])
+        pairs = zip(pieces, sums, strict=True)
+        sums = [piece.reshape(own.shape).to(own.dtype) for piece, own in pairs]
     torch.autograd.backward(free, sums)  # adds the sums to ``grad``
     return float(total)
-
-
-def _sum_over_processes(parts: list[Tensor], total: Tensor) -> tuple[list[Tensor], Tensor]:
-    """Sum gradients and loss over all processes."""
-    flat = torch.cat([total.reshape(1), *(part.double().flatten() for part in parts)])
-    distributed.all_reduce(flat)
-    pieces = flat[1:].split([part.numel() for part in parts])
-    shaped = [
-        piece.reshape(part.shape).to(part.dtype) for piece, part in zip(pieces, parts, strict=True)
-    ]
-    return shaped, flat[0]

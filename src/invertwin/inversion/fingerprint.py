@@ -84,7 +84,11 @@ class Fingerprint:
             self._update_digest("method", value.__func__.__qualname__)
             self._add([value.__func__, value.__self__])
         elif isinstance(value, types.FunctionType):
-            self._add_function(value)
+            self._update_digest("function", value.__module__, value.__qualname__)
+            used = inspect.getclosurevars(value)
+            around = {n: v for n, v in sorted(used.globals.items()) if not _is_foreign(v, value)}
+            enclosed = dict(used.nonlocals)
+            self._add([value.__code__, value.__defaults__, value.__kwdefaults__, enclosed, around])
         elif isinstance(value, types.CodeType):
             self._update_digest("code", value.co_code.hex(), *value.co_names)
             self._add(value.co_consts)
@@ -93,13 +97,6 @@ class Fingerprint:
             self._update_digest(getattr(value, "__module__", ""), name)
         else:
             self._add_object(value)
-
-    def _add_function(self, value: types.FunctionType) -> None:
-        self._update_digest("function", value.__module__, value.__qualname__)
-        used = inspect.getclosurevars(value)
-        around = {n: v for n, v in sorted(used.globals.items()) if not _is_foreign(v, value)}
-        enclosed = dict(used.nonlocals)
-        self._add([value.__code__, value.__defaults__, value.__kwdefaults__, enclosed, around])
 
     def _add_object(self, value: Any) -> None:
         self._update_digest("object", type(value).__module__, type(value).__qualname__)

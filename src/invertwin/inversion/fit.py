@@ -4,8 +4,8 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import partial, reduce
 from typing import Any, Literal
 
 import numpy as np
@@ -175,7 +175,8 @@ class Fit:
         if self.progress.ended is None:
             with torch_threads(max(1, torch.get_num_threads() // 2)):
                 status = self._run_steps(callbacks)
-            self._update_progress(ended=self._select_best(status))
+            ended = self._select_best(status)
+            self.progress = replace(self.progress, ended=ended)
         for callback in callbacks:
             callback.end(self)
         assert self.progress.ended is not None
@@ -183,15 +184,9 @@ class Fit:
 
     def apply_modules(self) -> tuple[Scene, list[Any]]:
         """Return the scene and all sensors under the present parameters."""
-        scene = self.scene
-        for module in self.unknowns:
-            scene = module(scene)
-        sensors = []
-        for observation, modules in zip(self.observations, self.sensor_unknowns, strict=True):
-            sensor = observation.sensor
-            for module in modules:
-                sensor = module(sensor)
-            sensors.append(sensor)
+        targets = [self.scene, *(observation.sensor for observation in self.observations)]
+        every = zip(targets, [self.unknowns, *self.sensor_unknowns], strict=True)
+        scene, *sensors = (reduce(lambda x, module: module(x), own, x) for x, own in every)
         return scene, sensors
 
     def twin(self) -> Scene:
@@ -207,9 +202,8 @@ class Fit:
         scene, sensors = self.apply_modules()
         share = max(0.0, 1 - step / self.stage.blur_end)
         pairs = []
-        for k, (model, sensor, observed) in enumerate(
-            zip(self._models, sensors, self._observed, strict=True)
-        ):
+        every = zip(self._models, sensors, self._observed, strict=True)
+        for k, (model, sensor, observed) in enumerate(every):
             sensor, observed = self._select_frames(k, step, sensor, observed)
             model = model.scale_blur(share)
             key = (self.number, step, k) if model.redraws else (k,)
@@ -238,12 +232,9 @@ class Fit:
     def loss_at_start(self) -> float:
         """Return the loss without blur at the initial parameters of the stage."""
         present = self.parameters()
-        self.modules.load_state_dict(self.progress.first)
         try:
-            with torch.no_grad():
-                return float(self.objective(self.unblurred_maps(0)))
-        except InputError:  # out of bounds
-            return math.inf
+            first = self.progress.first
+            return self._loss_at(first, lambda: float(self.objective(self.unblurred_maps(0))))
         finally:
             self.modules.load_state_dict(present)
 
@@ -263,10 +254,9 @@ class Fit:
 
     def penalty(self) -> Tensor:
         """Return the sum of the regularisers."""
-        scene, total = self.apply_modules()[0], torch.zeros((), dtype=torch.float64)
-        for term in self._settings.regularizers:
-            total = total + term(scene)
-        return total
+        scene = self.apply_modules()[0]
+        terms = (term(scene) for term in self._settings.regularizers)
+        return sum(terms, start=torch.zeros((), dtype=torch.float64))
 
     def evaluate(self, step: int) -> Tensor:
         """Return the loss with the random numbers of a step."""
@@ -328,9 +318,6 @@ class Fit:
         """Return whether the added blur is zero from this step on."""
         return step >= self.stage.blur_end or not any(m.has_blur for m in self._models)
 
-    def _update_progress(self, **changes: Any) -> None:
-        self.progress = FitProgress(**{**vars(self.progress), **changes})
-
     def _select_frames(
         self, number: int, step: int, sensor: Any, observed: Tensor
     ) -> tuple[Any, Tensor]:
@@ -349,6 +336,15 @@ class Fit:
         """Return the indices of the held-out frames among ``count`` frames."""
         every = self.stage.held_out
         return range(0) if every is None else range(every - 1, count, every)
+
+    def _loss_at(self, parameters: dict[str, Tensor], loss: Callable[[], float]) -> float:
+        """Load parameters, and return their loss: infinite where they are out of bounds."""
+        self.modules.load_state_dict(parameters)
+        try:
+            with torch.no_grad():
+                return loss()
+        except InputError:
+            return math.inf
 
     def _selection_loss(self) -> float:
         """Return the loss that decides whether the fit is better than its start."""
@@ -379,7 +375,7 @@ class Fit:
             self._keep_if_better(number, before)
             row: dict[str, Any] = {"step": self._before + step, "stage": self.number}
             row |= {"loss": number, "values": parameter_values(self.modules)}
-            self._update_progress(step=step + 1)
+            self.progress = replace(self.progress, step=step + 1)
             for callback in callbacks:
                 row |= callback.annotate(self)
             self.progress.history.append(row)
@@ -410,7 +406,7 @@ class Fit:
             first = self.is_unblurred(step) and not self.is_unblurred(best[0])
             if not first and loss >= best[1]:
                 return
-        self._update_progress(best=(step, loss, parameters))
+        self.progress = replace(self.progress, best=(step, loss, parameters))
 
     def _select_best(self, status: Status) -> Status:
         """Load the best parameters, and return ``diverged`` if the fit ends worse than it began."""
@@ -420,14 +416,7 @@ class Fit:
         ends = {"first": self.progress.first, "best": best[2]}
         if status != "diverged":
             ends["last"] = self.parameters()
-        losses = {}
-        with torch.no_grad():
-            for name, parameters in ends.items():
-                self.modules.load_state_dict(parameters)
-                try:
-                    losses[name] = self._selection_loss()
-                except InputError:  # out of bounds
-                    losses[name] = math.inf
+        losses = {name: self._loss_at(own, self._selection_loss) for name, own in ends.items()}
         last = losses.get("last", math.inf)
         if math.isfinite(last) and last <= _MAX_LOSS_INCREASE * losses["first"]:
             self.modules.load_state_dict(ends["last"])
@@ -435,7 +424,8 @@ class Fit:
         # Losses of steps are of the fitted frames only; recompute on the selection frames.
         kept = min(("first", "best"), key=lambda name: losses[name])
         self.modules.load_state_dict(ends[kept])
-        self._update_progress(best=(self.progress.step, losses[kept], ends[kept]))
+        reached = (self.progress.step, losses[kept], ends[kept])
+        self.progress = replace(self.progress, best=reached)
         return "diverged"
 
     def _has_converged(self, tolerance: float) -> bool:
@@ -497,9 +487,5 @@ def parameter_values(modules: nn.ModuleList) -> dict[str, Any]:
     """Return the named parameters as plain numbers; long ones (vertices) are in the checkpoint
     only.
     """
-    rows: dict[str, Any] = {}
-    for module in modules:
-        for name, value in getattr(module, "values", dict)().items():
-            if value.numel() <= 16:
-                rows[name] = value.tolist()
-    return rows
+    named = (item for module in modules for item in getattr(module, "values", dict)().items())
+    return {name: value.tolist() for name, value in named if value.numel() <= 16}

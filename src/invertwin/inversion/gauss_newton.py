@@ -101,9 +101,8 @@ class GaussNewton:
         value = self.objective(pairs)
         if penalty is not None:
             value = value + penalty()
-        found: Sequence[Tensor | None] = [None] * len(parameters)
-        if value.requires_grad:
-            found = grad(value, parameters, allow_unused=True)
+        none = [None] * len(parameters)
+        found = grad(value, parameters, allow_unused=True) if value.requires_grad else none
         for path, slopes in zip(self._parameters, found, strict=True):
             if slopes is None:
                 owner, _, name = path.rpartition(".")
@@ -122,7 +121,13 @@ class GaussNewton:
         if not bool(free.any()):
             return before
         if self._known is None or self._age >= self.every or not torch.equal(free, self._known[1]):
-            self._known = self._compute_curvature(maps, pairs, free), free
+            fixed = [(predicted.detach(), observed) for predicted, observed in pairs]
+            columns = [
+                map_tangents(self._modules, lambda: [found for found, _ in maps()], tangents)
+                for tangents in map(self._unit_tangents, free.nonzero()[:, 0].tolist())
+            ]
+            rows = [torch.stack(column) for column in zip(*columns, strict=True)]
+            self._known = self.objective.curvature(fixed, rows), free
             self._age = 0
         self._age += 1
         curvature = self._known[0]
@@ -192,17 +197,6 @@ class GaussNewton:
             parts = whole.split([value.numel() for value in start])
             for parameter, value, part in zip(self._parameters.values(), start, parts, strict=True):
                 parameter.copy_(value + part.reshape(value.shape).to(value))
-
-    def _compute_curvature(
-        self, maps: Callable[[], MapPairs], pairs: MapPairs, free: Bool[Tensor, " q"]
-    ) -> Float64[Tensor, "p p"]:
-        fixed = [(predicted.detach(), observed) for predicted, observed in pairs]
-        columns = [
-            map_tangents(self._modules, lambda: [predicted for predicted, _ in maps()], tangents)
-            for tangents in map(self._unit_tangents, free.nonzero()[:, 0].tolist())
-        ]
-        rows = [torch.stack(column) for column in zip(*columns, strict=True)]
-        return self.objective.curvature(fixed, rows)
 
     def _unit_tangents(self, index: int) -> dict[str, Tensor]:
         """Return the unit tangent along one of the entries of all parameters."""

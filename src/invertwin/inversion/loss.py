@@ -211,10 +211,10 @@ class SpectrumLoss:
 
     def _normalisations(self, simulated: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
         """Return the divisors of the simulated and the measured map."""
-        scale = _mean_magnitude(measured)
+        scale = measured.detach().abs().mean()
         if not scale > 0:
             raise InputError("expected a measured map with power in it, got zeros; check the grid")
-        unit = _mean_magnitude(simulated) if self.gain == "fitted" else scale
+        unit = simulated.detach().abs().mean() if self.gain == "fitted" else scale
         return torch.where(unit > 0, unit, 1.0), scale
 
     def _resolutions(self, power: Tensor) -> list[Tensor]:
@@ -317,8 +317,7 @@ class SpectrumLoss:
 
     def _divergence(self, simulated: Tensor, measured: Tensor) -> Tensor:
         # torch has no public function for this.
-        transformed = torch._C._are_functorch_transforms_active()  # pyright: ignore[reportPrivateUsage]
-        if not transformed:
+        if not torch._C._are_functorch_transforms_active():  # pyright: ignore[reportPrivateUsage]
             value, slope = self._divergence_and_gradient(simulated, measured)
             return _ScalarWithGradient.apply(simulated, value, slope)
         # For example a second derivative.
@@ -549,11 +548,6 @@ class Objective:
 
 def _check_shapes(simulated: Tensor, measured: Tensor) -> None:
     check_shape(simulated, measured.shape, "a map like the measured one", "use one grid for both")
-
-
-def _mean_magnitude(power: Tensor) -> Tensor:
-    """Return the mean of the absolute values, detached."""
-    return power.detach().abs().mean()
 
 
 def halve_resolution(power: Tensor) -> Tensor:

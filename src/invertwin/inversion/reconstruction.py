@@ -126,12 +126,11 @@ def reconstruct(
     unknowns = name_unknowns(parameters)
     own = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(watched)]
     names = [*unknowns, *(name for found in own for name in found)]
-    settings = FitSettings(loss, optimizer or Optimizer(), tuple(regularizers), seed)
     stages = make_stages(schedule, names)
     made = [_build_modules(o.sensor, found) for o, found in zip(watched, own, strict=True)]
     sensor_modules = [found for found, _ in made]
     penalties = [term for _, found in made for term in found]
-    settings = replace(settings, regularizers=(*settings.regularizers, *penalties))
+    settings = FitSettings(loss, optimizer or Optimizer(), (*regularizers, *penalties), seed)
     begun, fit, status = scene, None, "budget"
     history: list[dict[str, Any]] = []
     modules, terms = _build_modules(begun, unknowns)
@@ -261,9 +260,5 @@ class _FreeParameters:
 
     def learning_rates(self, unknowns: Mapping[str, Unknown]) -> dict[nn.Parameter, float]:
         """Return the learning rates of single parameters."""
-        found = {}
-        for name, module in self._modules.items():
-            rate = unknowns[name].rate
-            if rate is not None:
-                found |= dict.fromkeys(module.parameters(), rate)
-        return found
+        rated = ((unknowns[name].rate, module) for name, module in self._modules.items())
+        return {p: rate for rate, module in rated if rate is not None for p in module.parameters()}

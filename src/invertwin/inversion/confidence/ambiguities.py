@@ -63,11 +63,11 @@ def find_ambiguities(result: FitResult) -> Iterator[Ambiguity]:
     twin = result.fit.twin()
     for number, module in enumerate(result.fit.unknowns):
         for turn in candidate_rotations(module, twin):
-            found = _refit(result.fit, number, turn)
-            if found is not None and not are_same_poses(found.twin(), twin, [_object_name(module)]):
+            found, names = _refit(result.fit, number, turn), [str(module.object)]
+            if found is not None and not are_same_poses(found.twin(), twin, names):
                 other = FitResult(found)
                 better = found.objective(other.maps) < result.fit.objective(result.maps)
-                text = describe_difference(twin, found.twin(), [_object_name(module)])
+                text = describe_difference(twin, found.twin(), names)
                 yield Ambiguity(other, difference_score(result, other), bool(better), text)
 
 
@@ -155,8 +155,12 @@ def are_same_poses(first: Scene, second: Scene, names: Sequence[str]) -> bool:
         off = pose_error(a, b)
         if off is None or off.distance >= SAME_POSE_DISTANCE:
             return False
-        if off.angle >= SAME_POSE_ANGLE and not _have_same_surface(a, b):
-            return False
+        if off.angle >= SAME_POSE_ANGLE:
+            # Displacement of points by the largest rotation that counts as none.
+            most, moved = 0.13 * SAME_POSE_ANGLE, b.center.detach() - a.center.detach()
+            placed = Mesh(a.vertices.detach() + moved, a.mesh.faces)
+            if not _surface_distance(placed, _world_mesh(b)) < most:
+                return False
     return True
 
 
@@ -179,18 +183,18 @@ def describe_difference(best: Scene, other: Scene, names: Sequence[str]) -> str:
     return ", ".join(texts) or "another shape"
 
 
-def _have_same_surface(first: Object, second: Object) -> bool:
-    """Return whether two objects with nearly equal centres have equal surfaces."""
-    a, b = _world_mesh(first), _world_mesh(second)
-    a = Mesh(a.vertices - first.center.detach() + second.center.detach(), a.faces)
-    # Displacement of points by the largest rotation that counts as none.
-    return _surface_distance(a, b) < 0.13 * SAME_POSE_ANGLE
-
-
 def _refit(fit: Fit, number: int, rotation: Tensor) -> Fit | None:
     """Refit from a rotated pose of an object; None if Gauss–Newton does not apply."""
     found = fit.copy()
-    _rotate_pose(found.unknowns[number], rotation)
+    module = found.unknowns[number]
+    assert isinstance(module, Pose)
+    with torch.no_grad():  # about the object's own centre
+        halves = module.rotation.new_tensor([1.0, 0.5, 0.5, 0.5])
+        (w, *_), (a, *_) = (q := quaternion_from_vector(rotation)), (p := module.rotation * halves)
+        product = torch.cat(
+            [(w * a - q[1:] @ p[1:])[None], w * p[1:] + a * q[1:] + q[1:].cross(p[1:], 0)]
+        )
+        module.rotation.copy_(product / halves)
     first, last = (1 - _REFIT_BLUR) * fit.stage.blur_end, fit.stage.steps
     try:
         descent = GaussNewton(found.modules, found.objective, trust_radius=_REFIT_TRUST_RADIUS)
@@ -199,18 +203,6 @@ def _refit(fit: Fit, number: int, rotation: Tensor) -> Fit | None:
     except InputError:  # many parameters, another loss, out of bounds
         return None
     return found
-
-
-@torch.no_grad()
-def _rotate_pose(module: nn.Module, rotation: Tensor) -> None:
-    """Rotate the pose of an object about its own centre."""
-    assert isinstance(module, Pose)
-    halves = module.rotation.new_tensor([1.0, 0.5, 0.5, 0.5])
-    (w, *_), (a, *_) = (q := quaternion_from_vector(rotation)), (p := module.rotation * halves)
-    product = torch.cat(
-        [(w * a - q[1:] @ p[1:])[None], w * p[1:] + a * q[1:] + q[1:].cross(p[1:], 0)]
-    )
-    module.rotation.copy_(product / halves)
 
 
 def _world_mesh(item: Object) -> Mesh:
@@ -227,11 +219,6 @@ def _surface_distance(first: Mesh, second: Mesh) -> float:
     ]
     extent = first.vertices.amax(0) - first.vertices.amin(0)
     return math.sqrt(sum(squares) / 2) / float(extent.norm())
-
-
-def _object_name(module: nn.Module) -> str:
-    assert isinstance(module, Pose)
-    return module.object
 
 
 rename_members(Ambiguity, better="has_lower_loss", end="result", told="description")

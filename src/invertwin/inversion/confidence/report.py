@@ -29,9 +29,8 @@ def confidence_metrics(fit: Reconstruction, truth: Mapping[str, Object]) -> dict
     for name, item in truth.items():
         off = pose_error(fit.scene[name], item)
         if off is not None:
-            values = [*off.offset.tolist(), *off.rotation.tolist()]
-            keys = [f"{name}.{coordinate}" for coordinate in _COORDINATES]
-            errors |= dict(zip(keys, values, strict=True))
+            values = zip(_COORDINATES, [*off.offset.tolist(), *off.rotation.tolist()], strict=True)
+            errors |= {f"{name}.{coordinate}": value for coordinate, value in values}
     rows |= {"errors": errors} if errors else {}
     try:
         return rows | error_bar_metrics(fit.uncertainty)

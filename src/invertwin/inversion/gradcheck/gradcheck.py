@@ -234,7 +234,9 @@ def _average_differences(
     while len(pairs) < settings.max_pairs and (len(pairs) < _MIN_PAIRS or reached > settings.noise):
         pairs.append(difference(len(pairs)))
         if len(pairs) >= 2:
-            reached = _relative_noise(torch.stack(pairs))
+            every = torch.stack(pairs)
+            error = every.std(0) / math.sqrt(len(pairs))
+            reached = float(error.abs().sum() / every.mean(0).abs().sum().clamp_min(1e-300))
             if progress:
                 # Noise falls with the square root of the number of pairs.
                 enough = len(pairs) * (reached / max(settings.noise, 1e-9)) ** 2
@@ -243,13 +245,6 @@ def _average_differences(
                 noise = f"difference noise {reached:.4f}, about {left:.0f} s left"
                 progress(f"{len(pairs)} pairs, {noise}")
     return torch.stack(pairs), reached
-
-
-def _relative_noise(pairs: Tensor) -> float:
-    """‖standard error of the mean‖₁ / ‖mean‖₁."""
-    mean = pairs.mean(0)
-    error = pairs.std(0) / math.sqrt(len(pairs))
-    return float(error.abs().sum() / mean.abs().sum().clamp_min(1e-300))
 
 
 def _measure_agreement(

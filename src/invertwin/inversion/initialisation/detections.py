@@ -67,11 +67,10 @@ def detect_echoes(
     """
     box = Lattice.from_bounds(low, high, (2, 2, 2))
     power = capture.spectrum(grid).detach().double()
-    strongest = power.amax(3)
     # A frame at a time: the training cells of all take much memory.
     detections = [
         ordered_statistics_cfar(frame, false_alarm=false_alarm, rank=_CFAR_RANK)
-        for frame in strongest
+        for frame in power.amax(3)
     ]
     found = peaks(power, torch.stack(detections), capture.radar(), grid).position
     inside = (found >= box.low) & (found <= box.high)
@@ -332,10 +331,10 @@ def estimate_density(
     low: ArrayLike,
     high: ArrayLike,
     counts: Sequence[int],
-    *,
-    depth: float = 1.0,
 ) -> DensityGrid:
     """Estimate a density proportional to the backprojected power.
+
+    At the strongest echo, the optical depth of one node spacing is one.
 
     Args:
         capture: recorded data.
@@ -344,7 +343,6 @@ def estimate_density(
         name: name of the object.
         low, high: opposite corners of the box in the object's frame [m].
         counts: number of nodes along x, y and z.
-        depth: optical depth ∫σ ds over one node spacing at the strongest echo.
 
     Raises:
         InputError: no echoes in the box.
@@ -353,7 +351,7 @@ def estimate_density(
     pose = item.transform.detach()
     places = lattice.nodes @ pose[:3, :3].T + pose[:3, 3]
     image = _require_echoes(backproject_power(capture, grid, places))
-    density = depth / float(lattice.spacing.mean()) * image / image.max()
+    density = 1 / float(lattice.spacing.mean()) * image / image.max()
     return DensityGrid(name, low, high, density)
 
 

@@ -2,10 +2,11 @@
 
 import copy
 import math
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
-from typing import Any
+from functools import partial
+from itertools import islice, product
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -36,9 +37,10 @@ from invertwin.scene.scene import Object, Scene, displace
 from invertwin.seeds import derive_seed
 
 _MAX_POSES = 1e4
-_FULL_FIT_COUNT = 4  # number of full fits from the best starts
 _SCREENING_DIVISOR = 8  # samples of a fit over those of a screened start
 _SAME_START_DISTANCE, _SAME_START_ANGLE = 0.1, 0.35  # m and rad: closer starts are fitted once
+
+_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Screening:
     """
 
     starts: Mapping[str, Sequence[Object]] | Sequence[Candidate]
-    fits: Count = _FULL_FIT_COUNT
+    fits: Count = 4
     shortlist: bool = False
 
     def candidates(self, scene: Scene, observations: Sequence[Observation]) -> list[Candidate]:
@@ -82,15 +84,14 @@ class Screening:
         Raises:
             InputError: There are none.
         """
-        if not isinstance(self.starts, Mapping):
-            found = list(self.starts)
-        else:
-            poses = [(name, item) for name, items in self.starts.items() for item in items]
+        found = self.starts
+        if isinstance(found, Mapping):
+            poses = [(name, item) for name, items in found.items() for item in items]
             scenes = [scene.replace(name, pose=item.transform) for name, item in poses]
             found = [Candidate(begun, observations) for begun in scenes]
         if not found:
             raise InputError("expected at least one start, got none; give poses of an object")
-        return found
+        return list(found)
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,8 @@ def search(
     score_start = _make_screening_loss(watched, loss, seed)
     losses = [score_start(candidate) for candidate in track(begun, "starts")]
     order = sorted(range(len(begun)), key=losses.__getitem__)
-    kept = _select_distinct_starts([begun[k] for k in order], names, screening.fits)
+    distinct = _drop_repeats((begun[k] for k in order), partial(_are_near, names=names))
+    kept = list(islice(distinct, screening.fits))
 
     def fit(start: Candidate, number: int, parts: Sequence[Schedule]) -> Reconstruction:
         return reconstruct(
@@ -235,10 +237,8 @@ def _compare_ends(
     found: Sequence[Reconstruction], offset: int, names: Sequence[str], losses: Sequence[float]
 ) -> Search:
     """Keep the ends that differ, the best first, and test which of them the data reject."""
-    ends: list[Reconstruction] = []
-    for end in sorted(found, key=_unblurred_loss):
-        if not any(are_same_poses(end.scene, other.scene, names) for other in ends):
-            ends.append(end)
+    ordered = sorted(found, key=_unblurred_loss)
+    ends = list(_drop_repeats(ordered, lambda a, b: are_same_poses(a.scene, b.scene, names)))
     scores = [None, *(difference_score(ends[0].result, end.result) for end in ends[1:])]
     texts = tuple(
         f"{describe_difference(ends[0].scene, end.scene, names)} explains the data nearly as "
@@ -293,17 +293,13 @@ def _rotated_starts(found: Reconstruction) -> Iterator[Scene]:
             yield found.scene.replace(str(module.object), pose=moved.transform.detach())
 
 
-def _select_distinct_starts(
-    candidates: Sequence[Candidate], names: Sequence[str], most: int
-) -> list[Candidate]:
-    """The first candidates, without those that a better one stands for."""
-    kept: list[Candidate] = []
-    for candidate in candidates:
-        if len(kept) == most:
-            break
-        if not any(_are_near(candidate, other, names) for other in kept):
-            kept.append(candidate)
-    return kept
+def _drop_repeats(items: Iterable[_Item], alike: Callable[[_Item, _Item], bool]) -> Iterator[_Item]:
+    """Yield items, without those that an earlier one stands for."""
+    kept: list[_Item] = []
+    for item in items:
+        if not any(alike(item, other) for other in kept):
+            kept.append(item)
+            yield item
 
 
 def _are_near(first: Candidate, second: Candidate, names: Sequence[str]) -> bool:
