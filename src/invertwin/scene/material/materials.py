@@ -236,8 +236,17 @@ class RoughDielectric(Medium, Material):
         return ScatteringLaw(self._amplitude(frequency), *weights, depolarisation=depolarisation)
 
 
+class _RoughMedium(Medium, EffectiveRoughness, Material):
+    """Medium with a rough surface."""
+
+    def smooth_interface(self, frequency: float) -> SmoothInterface | None:
+        """Return the coherent interface of the outer face at `frequency` [Hz]."""
+        epsilon = self.complex_permittivity(frequency)
+        return self.make_interface(epsilon, permeability=self.complex_permeability)
+
+
 @dataclass(frozen=True)
-class Dielectric(Medium, EffectiveRoughness, Material):
+class Dielectric(_RoughMedium):
     """Half space with effective roughness; the refracted power is lost.
 
     In `invertwin.rcs` a closed mesh of it is a penetrable solid.
@@ -254,14 +263,9 @@ class Dielectric(Medium, EffectiveRoughness, Material):
         amplitude = self._amplitude(frequency)
         return ScatteringLaw(amplitude, *self.weights(), **self.depolarisation_terms)
 
-    def smooth_interface(self, frequency: float) -> SmoothInterface | None:
-        """Return the coherent interface at `frequency` [Hz]."""
-        epsilon = self.complex_permittivity(frequency)
-        return self.make_interface(epsilon, permeability=self.complex_permeability)
-
 
 @dataclass(frozen=True)
-class RefractingBody(Medium, EffectiveRoughness, Material):
+class RefractingBody(_RoughMedium):
     """Solid body with a closed mesh, which rays enter and leave by Snell's law.
 
     Each face transmits the power it does not reflect; inside, power is absorbed. The direction
@@ -286,11 +290,6 @@ class RefractingBody(Medium, EffectiveRoughness, Material):
             attenuation=attenuation(square, frequency),
             **self.depolarisation_terms,
         )
-
-    def smooth_interface(self, frequency: float) -> SmoothInterface | None:
-        """Return the coherent interface of the outer face at `frequency` [Hz]."""
-        epsilon = self.complex_permittivity(frequency)
-        return self.make_interface(epsilon, permeability=self.complex_permeability)
 
 
 @dataclass(frozen=True)

@@ -62,8 +62,12 @@ def extract_surface(
             "start with a surface inside of the box"
         )
     corners, faces = march_cubes(values.detach(), 0.0, "descent")
-    start = lattice.low + corners * lattice.spacing
-    points = _refine_vertices(field, start, lattice)
+    points, reach = lattice.low + corners * lattice.spacing, 0.5 * float(lattice.spacing.min())
+    for _ in range(_NEWTON_STEPS):
+        value, slope = _value_and_gradient(field, points)
+        step = slope * (value / slope.square().sum(1).clamp_min(_MIN_GRADIENT**2))[:, None]
+        points = points - step * (reach / step.norm(dim=1, keepdim=True).clamp_min(reach))
+        points = points.clamp(lattice.low, lattice.high)
     return points, faces, _value_and_gradient(field, points)[1]
 
 
@@ -97,16 +101,6 @@ def attach_shape_derivative(
     direction = slope / slope.square().sum(1, keepdim=True).clamp_min(_MIN_GRADIENT**2)
     value = field(fixed)
     return fixed - direction * (value - value.detach())[:, None]
-
-
-def _refine_vertices(field: Field, points: Tensor, lattice: Lattice) -> Tensor:
-    reach = 0.5 * float(lattice.spacing.min())
-    for _ in range(_NEWTON_STEPS):
-        value, slope = _value_and_gradient(field, points)
-        step = slope * (value / slope.square().sum(1).clamp_min(_MIN_GRADIENT**2))[:, None]
-        points = points - step * (reach / step.norm(dim=1, keepdim=True).clamp_min(reach))
-        points = points.clamp(lattice.low, lattice.high)
-    return points
 
 
 def _value_and_gradient(field: Field, points: Tensor) -> tuple[Tensor, Tensor]:

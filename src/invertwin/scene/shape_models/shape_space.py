@@ -48,8 +48,7 @@ class ShapeSpace:
             InputError: more coordinates than the space has.
         """
         count = len(latent)
-        most = len(self.deviations)
-        require_at_most(count, most, "coordinates of the shape space", "give fewer")
+        require_at_most(count, len(self.deviations), "coordinates of the shape space", "give fewer")
         offsets = self.components[..., :count] @ (latent * self.deviations[:count])
         return Mesh(self.mean + offsets, self.faces)
 
@@ -79,11 +78,9 @@ class LinearShape(ObjectModule):
     def __init__(self, object: str, space: ShapeSpace, initial: ArrayLike | int) -> None:
         super().__init__(object)
         self.space = space
-        start = (
-            torch.zeros(checked_count(initial, "coordinates", 1), dtype=torch.float64)
-            if isinstance(initial, int)
-            else checked_tensor(initial, (None,), "coordinates", "give numbers, or how many")
-        )
+        if isinstance(initial, int):
+            initial = torch.zeros(checked_count(initial, "coordinates", 1))
+        start = checked_tensor(initial, (None,), "coordinates", "give numbers, or how many")
         space.mesh(start.detach())
         self.latent = nn.Parameter(start.detach().clone())
 

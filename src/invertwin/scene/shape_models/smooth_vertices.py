@@ -60,7 +60,10 @@ class LatticeDeformation(ObjectModule):
             )
         # Control points begin one step before the first node: that of cell i is number i of them.
         index, t = self.lattice.cell(points)
-        return tensor_product(self.offsets, index, _cubic_spline(t))
+        r = 1 - t
+        inner = (3 * t**3 - 6 * t**2 + 4) / 6, (3 * r**3 - 6 * r**2 + 4) / 6
+        weights = torch.stack([r**3 / 6, *inner, t**3 / 6], dim=-1)  # of uniform cubic B-splines
+        return tensor_product(self.offsets, index, weights)
 
     def update_mesh(self, mesh: Mesh) -> Mesh:
         """Return the deformed mesh.
@@ -73,13 +76,6 @@ class LatticeDeformation(ObjectModule):
     def values(self) -> dict[str, Tensor]:
         """Return offsets [m] of the control points by name, for progress and reports."""
         return {f"{self.object}.control_offsets": self.offsets.detach().clone()}
-
-
-def _cubic_spline(t: Tensor) -> Tensor:
-    """Return weights of the four control points around positions t in [0, 1] of a cell; sum 1."""
-    r = 1 - t
-    inner = (3 * t**3 - 6 * t**2 + 4) / 6, (3 * r**3 - 6 * r**2 + 4) / 6
-    return torch.stack([r**3 / 6, *inner, t**3 / 6], dim=-1)
 
 
 class SmoothVertices(ObjectModule):
