@@ -41,6 +41,7 @@ _RECEIVERS_PER_BATCH = 512
 _VALUES_PER_CHUNK = 1 << 21
 _MAX_NODES = 1000  # Gauss's rule of more takes long to find
 _DEFAULT = AntennaMount()
+_gauss_nodes = cache(leggauss)
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,11 +364,6 @@ def _sum_over_pairs(field: Tensor, delay_cycles: Tensor) -> Tensor:
 
 def _mean_over_nodes(field: Tensor, delay_cycles: Tensor, count: int) -> Tensor:
     """The same as a mean of |H|² over frequencies in the band, those of Gauss's rule."""
-    places, weights = _gauss_nodes(count)
+    places, weights = map(torch.from_numpy, _gauss_nodes(count))
     total = torch.einsum("lirt,lirtn->lrtn", field, phasor(-0.5 * delay_cycles[..., None] * places))
     return 0.5 * torch.view_as_real(total).square().sum(-1) @ weights
-
-
-@cache
-def _gauss_nodes(count: int) -> tuple[Tensor, Tensor]:
-    return tuple(torch.from_numpy(values) for values in leggauss(count))  # type: ignore[return-value]

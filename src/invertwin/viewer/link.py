@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invertwin.channel import Grid, Paths, Sampling, trace_power
+from invertwin.channel import Grid, Sampling, trace_power
 from invertwin.deprecation import rename_members
 from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap
@@ -124,9 +124,6 @@ class InteractiveSensor:
             except InputError:  # silhouettes of sheets have no explicit paths
                 sampling = replace(sampling, boundary=False)
                 paths = trace_power(scene, link, sampling=sampling, seed=_SEED)
-        return self._sort_paths(paths, frame)
-
-    def _sort_paths(self, paths: Paths, frame: int) -> PositionSample:
         place = self.radar.positions[frame].detach()
         rotation, grid = self.radar.link().rotations[frame].detach(), self.grid
         edges = paths.last[paths.boundary]

@@ -1,6 +1,7 @@
 """Maps as pictures that stand beside the scene: measured, simulated, and what is left."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -65,22 +66,17 @@ class MapPanels:
             choose: Takes the numbers of its range and its u.
         """
         for name, node in self._nodes.items():
-            node.on_click(self._click_handler(name, choose))
+            node.on_click(partial(self._choose_bin, name, choose))
 
-    def _click_handler(
-        self, name: str, choose: Callable[[tuple[int, int]], None]
-    ) -> Callable[[Any], None]:
-        def handle_click(event: Any) -> None:
-            origin, toward = np.array(event.ray_origin), np.array(event.ray_direction)
-            left, up = self._axes
-            normal = np.cross(left, up)
-            distance = (self._places[name] - origin) @ normal / (toward @ normal)
-            away = origin + distance * toward - self._places[name]
-            shares = 0.5 + away @ np.stack([up, left], axis=1) / self._size
-            found = np.floor(shares * self._shape).astype(int).clip(0, np.array(self._shape) - 1)
-            choose((int(found[0]), int(found[1])))
-
-        return handle_click
+    def _choose_bin(self, name: str, choose: Callable[[tuple[int, int]], None], event: Any) -> None:
+        origin, toward = np.array(event.ray_origin), np.array(event.ray_direction)
+        left, up = self._axes
+        normal = np.cross(left, up)
+        distance = (self._places[name] - origin) @ normal / (toward @ normal)
+        away = origin + distance * toward - self._places[name]
+        shares = 0.5 + away @ np.stack([up, left], axis=1) / self._size
+        found = np.floor(shares * self._shape).astype(int).clip(0, np.array(self._shape) - 1)
+        choose((int(found[0]), int(found[1])))
 
     def show(self, maps: Mapping[str, NDArray[np.float32]], chosen: tuple[int, int] | None) -> None:
         """Draw maps, each below its own peak; the residual where both are known.

@@ -5,9 +5,10 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -95,7 +96,6 @@ class Viewer:
         self._found: dict[int, Mapping[str, DisplayMaps]] = {}
         self._taken: int | None = None  # the step whose bodies the link has
         self._times: deque[float] = deque(maxlen=_RATE_WINDOW)
-        self._seen: PositionSample | None = None
         self._nodes: dict[str, Any] = {}
         self._visible = display.groups | {x: x != SAMPLED_PATHS for x in POSITION_LAYERS if sensors}
         self._build_window()
@@ -176,7 +176,7 @@ class Viewer:
         self._build_sensor_controls()
         with gui.add_folder("layers"):
             for group, shown in self._visible.items():
-                gui.add_checkbox(group, shown).on_update(self._visibility_handler(group))
+                gui.add_checkbox(group, shown).on_update(partial(self._set_visibility, group))
         self._said = gui.add_text("note", "", disabled=True, visible=False)
         for layer in display.layers:
             self._draw_layer(layer)
@@ -229,14 +229,11 @@ class Viewer:
         )
         self._update_state(sensor=name, frame=0, bin=None)
 
-    def _visibility_handler(self, group: str) -> Callable[[Any], None]:
-        def set_visibility(event: Any) -> None:
-            self._visible[group] = bool(event.target.value)
-            for name, node in list(self._nodes.items()):
-                if name.split("/")[0] == group:
-                    node.visible = self._visible[group]
-
-        return set_visibility
+    def _set_visibility(self, group: str, event: Any) -> None:
+        self._visible[group] = bool(event.target.value)
+        for name, node in list(self._nodes.items()):
+            if name.split("/")[0] == group:
+                node.visible = self._visible[group]
 
     def _select_object(self, name: str) -> None:
         """Let the person move an object, from where the step has it."""

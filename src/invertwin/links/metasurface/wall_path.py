@@ -183,7 +183,11 @@ class PanelPlacement(nn.Module):
 
     def forward(self, panel: Metasurface) -> Metasurface:
         """The panel where it stands, with its phases."""
-        self._keep_inside()
+        with torch.no_grad():
+            for name, limit in self._limits.items():
+                getattr(self, name).data.clamp_(-limit, limit)
+            if not self.path.closed:
+                self.along.data.clamp_(0.0, self.path.length)
         place, normal = self.path.locate(self.along)
         turned = normal * self.yaw.cos() + torch.linalg.cross(_UP, normal) * self.yaw.sin()
         axes = torch.stack([turned, torch.linalg.cross(_UP, turned), _UP], 1)
@@ -196,13 +200,6 @@ class PanelPlacement(nn.Module):
             phase = phase + self.shift
         placed = replace(panel, position=place, axes=axes, phase=phase)
         return placed.focus(self._tx, self._target, self._frequency)
-
-    @torch.no_grad()
-    def _keep_inside(self) -> None:
-        for name, limit in self._limits.items():
-            getattr(self, name).data.clamp_(-limit, limit)
-        if not self.path.closed:
-            self.along.data.clamp_(0.0, self.path.length)
 
     def values(self) -> dict[str, Tensor]:
         """Place [m], yaw and spread [rad] by name, for progress and reports."""
