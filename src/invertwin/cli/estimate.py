@@ -200,7 +200,10 @@ def estimate_sensor_resources(sensor: SensorSetup, scene: Scene) -> tuple[list[M
     frames, senders, receivers = radar.shape
     channels, chirps = senders * receivers, run.chirps.count if run.chirps else 1
     across, bins = grid.u_count + grid.v_count, math.prod(grid.shape)
-    beams = bins // grid.range_count if not _is_separable(radar) else across
+    # Beams are separable where the virtual array is a product of a row and a column.
+    places = (radar.virtual_positions / (1e-3 * radar.waveform.wavelength)).round()
+    y, z, both = (len(part.unique(dim=0)) for part in (places[:, 1:2], places[:, 2:], places))
+    beams = across if y * z == both else bins // grid.range_count
     counts = {"radar.positions": frames, "grid.range_max": grid.range_count}
     counts |= {"grid.u_max": grid.u_count, "grid.v_max": grid.v_count}
     largest = max(counts, key=lambda name: counts[name])
@@ -327,10 +330,3 @@ def _check_starts_and_stages(run: RunFile, scene: Scene) -> None:
         for name in free if stage.remesh else ():
             with prefix_errors(f"stages[{i}].remesh"):
                 require_edge_length(scene[name].mesh, stage.remesh or 0.0)
-
-
-def _is_separable(radar: Radar) -> bool:
-    """Return whether the virtual array is a product of a row and a column."""
-    places = (radar.virtual_positions / (1e-3 * radar.waveform.wavelength)).round()
-    y, z, both = (len(part.unique(dim=0)) for part in (places[:, 1:2], places[:, 2:], places))
-    return y * z == both

@@ -6,7 +6,6 @@ import re
 import time
 import tomllib
 import warnings
-from collections.abc import Iterator
 from contextlib import closing
 from importlib import metadata
 from pathlib import Path
@@ -179,14 +178,10 @@ def make_shard(job: tuple[str, int, int]) -> bytes:
     """
     text, first, count = job
     run = validate_run(tomllib.loads(text), Path("run.toml"))
-
-    def iterate_samples() -> Iterator[tuple[int, dict[str, bytes]]]:
-        for index in range(first, first + count):
-            yield index, make_sample(run, index)
-
+    samples = ((index, make_sample(run, index)) for index in range(first, first + count))
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore", PhysicsWarning)  # told once, where the run began
-        return shards.pack_shard(iterate_samples())
+        return shards.pack_shard(samples)
 
 
 def make_sample(run: RunFile, index: int) -> dict[str, bytes]:

@@ -68,7 +68,12 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
         explained = found.observed.double().log() - found.predicted.double().log()
         metrics["residual_log_std"] = float(explained.std())
     if truth is not None and scene is not None:
-        metrics |= _score_twin(scene, truth)
+        whole = [
+            merge_meshes([Mesh(o.vertices.detach(), o.mesh.faces) for o in one.objects.values()])
+            for one in (scene, truth)
+        ]
+        metrics["chamfer_m"] = compare_shapes(*whole, voxel=None).chamfer
+        metrics["true_count"] = len(truth.names)
     metrics["wall_seconds"] = time.perf_counter() - begin
     if scene is not None:
         save_mesh(folder.file("twin.glb"), scene)
@@ -105,14 +110,6 @@ def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, di
         grid = build.grid(require_section(run, "grid", "simulated data"), radar)
         truth = build.true_scene(run)
         return Capture.from_beat(simulate_exact(run, truth, radar, grid).beat, radar), truth, given
-
-
-def _score_twin(scene: Scene, truth: Scene) -> dict[str, Any]:
-    whole = [
-        merge_meshes([Mesh(o.vertices.detach(), o.mesh.faces) for o in one.objects.values()])
-        for one in (scene, truth)
-    ]
-    return {"chamfer_m": compare_shapes(*whole, voxel=None).chamfer, "true_count": len(truth.names)}
 
 
 def _object_table(twin: Twin) -> ReportTable:

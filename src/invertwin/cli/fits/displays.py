@@ -46,8 +46,7 @@ class StepRecorder(Callback):
 
     def begin(self, fit: Fit) -> None:
         """Note the start, or read what an interrupted run has kept."""
-        if not self._steps:
-            self._steps = load_steps(self.file)
+        self._steps = self._steps or load_steps(self.file)
         if not self._steps:
             self._keep(fit, 0, "start")
 

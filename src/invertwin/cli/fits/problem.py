@@ -34,7 +34,6 @@ from invertwin.storage.run_folder import RunFolder
 OWN_METHOD, INTERIOR_ONLY, AMONG_CLUTTER = "full", "interior_only", "among_clutter"
 OF_SENSORS = ("radar_pose", "radar_path", "transmitter", "panel", "panel_phases")
 """Kinds of parameters that belong to a sensor."""
-_POSED = ("translation", "pose", "scale", "body", "vertices", "mover")
 HISTORIES = ("losses", "curve", "checkpoint", "screened")
 """Keys of rows that metrics.json leaves out."""
 Row = dict[str, Any]
@@ -416,12 +415,6 @@ def sensor_runs(run: RunFile) -> dict[str, RunFile]:
 def about_sensor(name: str) -> AbstractContextManager[None]:
     """Add the table of a sensor to errors; the only sensor has none."""
     return prefix_errors(f"observations.{name}") if name else nullcontext()
-
-
-def posed_object_name(run: RunFile) -> str | None:
-    """The first object whose pose or shape is fitted."""
-    moved = (p.object for p in run.parameters if p.kind in _POSED)
-    return run.starts.object if run.starts else next(moved, None)
 
 
 def known_truth(problem: Problem) -> dict[str, Object]:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from rich.console import Console
 from torch import Tensor
 
@@ -95,7 +96,13 @@ class RadarMaps(DataKind):
 
     def predict_maps(self, problem: Problem, scene: Scene, sensors: Sequence[Any]) -> list[Tensor]:
         """Sharp spectra of a scene."""
-        return scores.predict_unblurred_maps(problem, scene, sensors)
+        counts = {"samples": 4 * problem.run.fit_settings.samples, "boundary_samples": 0}
+        models = zip(radar_models.make_display_models(problem), sensors, strict=True)
+        with torch.no_grad():
+            return [
+                model.with_sampling(**counts).predict(scene, radar, problem.run.seed)
+                for model, radar in models
+            ]
 
     def metrics(self, fits: Fits) -> Row:
         """See ``DataKind.metrics``."""

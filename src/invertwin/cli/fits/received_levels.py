@@ -22,7 +22,6 @@ from invertwin.cli.fits.problem import (
     SensorData,
     Start,
     Summary,
-    posed_object_name,
     rank,
     require_sections,
 )
@@ -43,6 +42,7 @@ from invertwin.scene import Scene
 from invertwin.seeds import derive_seed
 from invertwin.storage.run_folder import RunFolder
 
+_POSED = ("translation", "pose", "scale", "body", "vertices", "mover")  # kinds of parameters
 _FEW_ENDS = 2  # of other starts: fewer say nothing about how ends scatter
 
 
@@ -60,7 +60,9 @@ class ReceivedLevels(DataKind):
         require_sections(self, run, "[map]")
         with prefix_errors("transmitter"):
             sensor = require_section(run, "transmitter", "[map]").build()
-        data, target = require_section(run, "data", "reconstruct"), posed_object_name(run)
+        data = require_section(run, "data", "reconstruct")
+        moved = (parameter.object for parameter in run.parameters if parameter.kind in _POSED)
+        target = run.starts.object if run.starts else next(moved, None)
         if isinstance(data, ReceivedFile):
             with prefix_errors("data"):
                 points, levels = data.read()
@@ -79,7 +81,14 @@ class ReceivedLevels(DataKind):
         with prefix_errors("data"):
             real = sensor if data.positions is None else _with_positions(sensor, data.positions)
         console.print("simulating the levels of the true scene")
-        item = SensorData((_simulate_levels(run, data, truth, real), None), sensor)
+        model, seed = radio_map(run, None), run.seed if data.seed is None else data.seed
+        given = {name: getattr(data, name) for name in ("bandwidth", "depth", "edges", "rays")}
+        richer = {name: value for name, value in given.items() if value is not None}
+        with prefix_errors("data"), torch.no_grad():
+            model = replace(model, propagation=replace(model.propagation, **richer))
+            mean = model.predict(truth, real, derive_seed(seed, 0))
+        draw = replace(model, scatter=data.noise).realisations_about(mean)
+        item = SensorData((draw(derive_seed(seed, 1), 0.0), None), sensor)
         return Problem(run, scene, truth, frozenset(truth.names), {"": item}, target, self, real)
 
     def prepare(self, problem: Problem, folder: RunFolder, console: Console) -> Problem:
@@ -202,19 +211,6 @@ def radio_map(run: RunFile, points: ReceiverPoints | None) -> RadioMap:
 def has_transmitter(run: RunFile) -> bool:
     """Return True if a transmitter is fitted."""
     return any(table.kind == "transmitter" for table in run.parameters)
-
-
-def _simulate_levels(
-    run: RunFile, data: ReceivedData, truth: Scene, sensor: Transmitters
-) -> Tensor:
-    """Levels of the true scene with errors of measurement [tx, point]."""
-    model, seed = radio_map(run, None), run.seed if data.seed is None else data.seed
-    given = {name: getattr(data, name) for name in ("bandwidth", "depth", "edges", "rays")}
-    richer = {name: value for name, value in given.items() if value is not None}
-    with prefix_errors("data"), torch.no_grad():
-        model = replace(model, propagation=replace(model.propagation, **richer))
-        mean = model.predict(truth, sensor, derive_seed(seed, 0))
-    return replace(model, scatter=data.noise).realisations_about(mean)(derive_seed(seed, 1), 0.0)
 
 
 def _with_positions(sensor: Transmitters, positions: Sequence[Sequence[float]]) -> Transmitters:

@@ -150,18 +150,6 @@ def drop_histories(rows: Sequence[Row], dropped: Sequence[str] = HISTORIES) -> l
     return [{key: value for key, value in row.items() if key not in dropped} for row in rows]
 
 
-def predict_unblurred_maps(
-    problem: Problem, scene: Scene, radars: Sequence[Radar]
-) -> list[torch.Tensor]:
-    """The surrogate's map of every sensor, as fitted, without extra widths."""
-    counts = {"samples": 4 * problem.run.fit_settings.samples, "boundary_samples": 0}
-    with torch.no_grad():
-        return [
-            model.with_sampling(**counts).predict(scene, radar, problem.run.seed)
-            for model, radar in zip(radar_models.make_display_models(problem), radars, strict=True)
-        ]
-
-
 def surrogate_agreement(problem: Problem, twin: Scene, radar: Radar) -> dict[str, float]:
     """Correlation of the surrogate with the mean of exact spectra: one bounce, first frame."""
     if not isinstance(radar.waveform, SampledWaveform):

@@ -187,21 +187,17 @@ def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, ParameterC
         sensor = require_section(run, "transmitter", "a transmitter that moves").build()
         module: nn.Module = table.parameter.build(None, initial=sensor.positions[0])
     else:
-        own, panel = run.scene, _panel_values(run, scene)
-        module = _build_module(table.parameter, "gradcheck.parameter", own, scene, panel)
+        panel: dict[type, object] = {}
+        if (own := run.placement) is not None:
+            coverage = own.coverage(scene, run.seed)
+            panel = {PanelPlacement: own.place(coverage, own.initial, phases=True)}
+        module = _build_module(table.parameter, "gradcheck.parameter", run.scene, scene, panel)
     changes = {
         n: c.build() if isinstance(c, ConstructorTable) else c for n, c in table.tangent.items()
     }
     with prefix_errors("gradcheck.tangent"):
         parameter_changes(module, changes)
     return module, changes
-
-
-def _panel_values(run: RunFile, scene: Scene) -> dict[type, object]:
-    if (table := run.placement) is None:
-        return {}
-    coverage = table.coverage(scene, run.seed)
-    return {PanelPlacement: table.place(coverage, table.initial, phases=True)}
 
 
 def _build_module(

@@ -36,10 +36,6 @@ class Receivers(Section):
     batch: CountOfTwo = key("of them, in one evaluation", 1200)
     scored: CountOfTwo = key("others, of another seed, that score what was found", 4000)
 
-    def draw(self, count: int, seed: int) -> Tensor:
-        """Places [count, 3] [m]."""
-        return random_points(self.low, self.high, count, seed).positions
-
 
 class Walls(Section):
     """Places of the panel: a level path along walls, the room on its left."""
@@ -102,12 +98,13 @@ class Placement(Section):
             scored: Whether for the score.
         """
         seed = run_seed if self.seed is None else self.seed
-        count = self.receivers.scored if scored else self.receivers.count
+        box = self.receivers
+        count = box.scored if scored else box.count
         with prefix_errors("placement"):
             tx = torch.tensor(self.transmitter, dtype=torch.float64)
-            points = self.receivers.draw(count, derive_seed(seed, int(scored)))
+            points = random_points(box.low, box.high, count, derive_seed(seed, int(scored)))
             how = {"depth": self.depth, "edges": self.edges, "seed": seed}
-            return Coverage.of(scene, tx, points, self.frequency, self.share, **how)
+            return Coverage.of(scene, tx, points.positions, self.frequency, self.share, **how)
 
     def path(self) -> WallPath:
         """Positions where the panel may stand."""

@@ -356,7 +356,8 @@ class _RunFile(Section):
         used = [(f"truth.{name}", name) for name in self.truth]
         if self.dataset is not None:
             used += [(f"dataset.classes.{name}", name) for name in self.dataset.classes]
-        for path, table in self.parameter_tables.items():
+        sections = {name: getattr(self, name) for name in type(self).model_fields}
+        for path, table in (self.parameter_tables | sections).items():
             if getattr(table, "object", None) is not None:
                 used.append((f"{path}.object", table.object))
         used += [("image.objects", name) for name in getattr(self.image, "objects", [])]
@@ -366,10 +367,6 @@ class _RunFile(Section):
             found = getattr(table, "points_per_m2", None)
             if isinstance(found, dict):
                 used += [(f"{path}.points_per_m2.{n}", n) for n in found if n != ALL_OTHERS]
-        for section in type(self).model_fields:
-            name = getattr(getattr(self, section), "object", None)
-            if name is not None:
-                used.append((f"{section}.object", name))
         return used
 
 

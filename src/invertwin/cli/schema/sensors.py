@@ -171,11 +171,9 @@ class RadarTable(RadarPoseTable):
         """The radar, one frame per position."""
         if self.board is not None:
             with prefix_errors("board"):
-                arrays = self.board.build().arrays()
-            more |= {"transmitters": arrays[0], "receivers": arrays[1]}
+                more["transmitters"], more["receivers"] = self.board.build().arrays()
         more["positions"], more["rotations"] = self.poses(1)
-        found = super().build(given, **more)
-        found = self.apply_range_center(found)
+        found = self.apply_range_center(super().build(given, **more))
         WAVEFORMS.setdefault(type(found.waveform).__name__, type(found.waveform))
         return found
 

@@ -23,16 +23,10 @@ def parse_key_path(path: str) -> KeyPath:
 
     A name with dots stands in quotes.
     """
-    steps: list[str | int] = []
-    place = 0
-    while place < len(path):
-        found = _KEY_PATH_PATTERN.match(path, place)
-        if found is None:
-            return ()
-        quoted, name, number = found.groups()
-        steps.append(int(number) if number else quoted or name)
-        place = found.end()
-    return tuple(steps)
+    found = list(_KEY_PATH_PATTERN.finditer(path))
+    if "".join(step[0] for step in found) != path:
+        return ()
+    return tuple(int(step[3]) if step[3] else step[1] or step[2] for step in found)
 
 
 def check_samples(run: Any, raw: dict[str, Any], info: Any) -> None:
