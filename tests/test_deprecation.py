@@ -49,6 +49,8 @@ def ball() -> iw.Scene:
 def renamed() -> Iterator[tuple[Any, str, str]]:
     """Every old name of every menu."""
     for module, names in read_renamed_attributes().items():
+        if module.rpartition(".")[2][0].isupper():
+            continue  # members of a class
         room = importlib.import_module(module)
         for old, new in names.items():
             yield room, old, new

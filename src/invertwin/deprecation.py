@@ -24,9 +24,10 @@ def warn_renamed(old: str, new: str, stacklevel: int = 3) -> None:
 
 
 def rename_attributes(module: str) -> None:
-    """Let a module find attributes by the old names of ``renamed.toml``, with a warning.
+    """Let a module, and its classes, find attributes by the old names of ``renamed.toml``.
 
-    It sets the module's ``__getattr__``, so that type checkers know the new names alone.
+    It sets the module's ``__getattr__``, so that type checkers know the new names alone. Call it
+    where the classes are defined.
 
     Args:
         module: dotted name of the module, ``__name__``.
@@ -47,11 +48,15 @@ def rename_attributes(module: str) -> None:
         return reduce(getattr, full.split(".")[1:], sys.modules[package])
 
     found["__getattr__"] = find_attribute
+    for title, members in read_renamed_attributes().items():
+        owner, _, name = title.rpartition(".")
+        if owner == module and isinstance(found.get(name), type):
+            rename_members(found[name], **members)
 
 
 @cache
 def read_renamed_attributes() -> dict[str, dict[str, str]]:
-    """Read old names of modules and the new ones, by dotted name of the module."""
+    """Read old names and the new ones, by dotted name of the module or class."""
     text = files(__name__.partition(".")[0]).joinpath("renamed.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 

@@ -22,7 +22,7 @@ from invertwin.checks import (
     refuse_derivatives,
 )
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.deprecation import rename_attributes, rename_members
+from invertwin.deprecation import rename_attributes
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.scene import Scene
@@ -280,5 +280,4 @@ def _hann_window(count: int) -> Tensor:
     return window / window.mean()
 
 
-rename_members(Signature, section="cross_section")
 rename_attributes(__name__)

@@ -7,14 +7,6 @@ from invertwin.camera.images import depths as depths
 from invertwin.camera.images import silhouettes as silhouettes
 from invertwin.camera.photographs import Photograph as Photograph
 from invertwin.camera.photographs import photograph as photograph
-from invertwin.deprecation import rename_members
+from invertwin.deprecation import rename_attributes
 
-rename_members(
-    Camera,
-    detached="detach",
-    local="to_camera_axes",
-    looking="look_at",
-    middle="principal_point",
-    moved="transform_rigidly",
-    moves="is_differentiated",
-)
+rename_attributes(__name__)

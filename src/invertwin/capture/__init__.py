@@ -30,11 +30,6 @@ from invertwin.capture.readers.touchstone import Touchstone as Touchstone
 from invertwin.capture.readers.touchstone import load_rcs as load_rcs
 from invertwin.capture.readers.touchstone import load_touchstone as load_touchstone
 from invertwin.capture.track import Track as Track
-from invertwin.deprecation import rename_attributes, rename_members
+from invertwin.deprecation import rename_attributes
 
 rename_attributes(__name__)
-rename_members(BagMessages, stacked="stack")
-rename_members(Capture, recalibrated="recalibrate")
-rename_members(ChirpCapture, capture="to_capture", loops="select_chirps", placed="with_poses")
-rename_members(ChirpData, recorded="to_chirp_capture")
-rename_members(Track, at="interpolate")

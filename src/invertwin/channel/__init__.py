@@ -46,34 +46,6 @@ from invertwin.channel.specular.ray_paths import KINDS as KINDS
 from invertwin.channel.specular.ray_paths import METASURFACE as METASURFACE
 from invertwin.channel.specular.ray_paths import RayPaths as RayPaths
 from invertwin.channel.specular.trace_paths import trace_paths as trace_paths
-from invertwin.deprecation import rename_attributes, rename_members
+from invertwin.deprecation import rename_attributes
 
 rename_attributes(__name__)
-rename_members(DiscontinuityCurves, crossing="is_intersection")
-rename_members(PanelCells, places="centers")
-rename_members(
-    Paths,
-    carries="has_field",
-    chosen="select",
-    cosines="direction_cosines",
-    share="barycentric",
-    weighted="scale_fields",
-)
-rename_members(
-    RayPaths,
-    between="select_link",
-    chosen="select",
-    missed="missed_fraction",
-    padded="pad_links",
-    reversed="reverse",
-    sorted="sort_rows",
-)
-rename_members(
-    ViewpointScene,
-    along="plane_distances",
-    crossings="find_intersections",
-    first="find_first_faces",
-    moves="is_differentiated",
-    outlines="find_silhouettes",
-    points="points_on_curves",
-)

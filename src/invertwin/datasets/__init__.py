@@ -13,7 +13,6 @@ from invertwin.datasets.labels import radar_labels as radar_labels
 from invertwin.datasets.labels import triangle_visibility as triangle_visibility
 from invertwin.datasets.reader import SampleDataset as SampleDataset
 from invertwin.datasets.shards import DatasetManifest as DatasetManifest
-from invertwin.deprecation import rename_attributes, rename_members
+from invertwin.deprecation import rename_attributes
 
 rename_attributes(__name__)
-rename_members(Distribution, ends="extreme_values")

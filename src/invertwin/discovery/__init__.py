@@ -1,6 +1,6 @@
 """Automatic reconstruction: objects in a recording with uncertainties, without an initial guess."""
 
-from invertwin.deprecation import rename_attributes, rename_members
+from invertwin.deprecation import rename_attributes
 from invertwin.discovery.clutter import Clutter as Clutter
 from invertwin.discovery.clutter import choose_result as choose_result
 from invertwin.discovery.clutter import estimate_clutter as estimate_clutter
@@ -23,19 +23,3 @@ from invertwin.discovery.shapes.primitives import PrimitiveModel as PrimitiveMod
 from invertwin.discovery.shapes.primitives import ShapeParameters as ShapeParameters
 
 rename_attributes(__name__)
-rename_members(DetectedEcho, rate="range_rate")
-rename_members(DetectedObject, confidence="existence_probability", figure="shape", row="to_metrics")
-rename_members(GroundImage, places="positions", views="view_counts")
-rename_members(MovingTargetFit, maps="predict_maps", outcome="reconstruction")
-rename_members(MovingTargetMaps, point="point_map", twin="twin_map")
-rename_members(ObjectTrack, row="to_metrics")
-rename_members(PrimitiveModel, figure="shape")
-rename_members(
-    ShapeParameters,
-    ball="has_free_height",
-    boxed="is_rectangular",
-    named="effective_kind",
-    place="position",
-    turned="has_yaw",
-)
-rename_members(Twin, picture="image", things="objects")

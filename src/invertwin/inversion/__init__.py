@@ -1,6 +1,6 @@
 """Inversion: observations, losses, schedules, fits, confidence and gradient checks."""
 
-from invertwin.deprecation import rename_attributes, rename_members
+from invertwin.deprecation import rename_attributes
 from invertwin.inversion.callbacks import Checkpoint as Checkpoint
 from invertwin.inversion.callbacks import Report as Report
 from invertwin.inversion.callbacks import Watch as Watch
@@ -54,26 +54,3 @@ from invertwin.scene.remeshing import require_edge_length as require_edge_length
 from invertwin.scene.scene import displace as displace
 
 rename_attributes(__name__)
-rename_members(
-    Fit,
-    annealed="is_unblurred",
-    applied="apply_modules",
-    copied="copy",
-    descended="gauss_newton_step",
-    last="is_last",
-    looks="realisations",
-    sharp_maps="unblurred_maps",
-)
-rename_members(GaussianBump, over="evaluate")
-rename_members(InitialEstimate, points="detection_count", size="rectangle_size")
-rename_members(InitialPoseEstimator, find="estimate")
-rename_members(Observation, observed="observed_map")
-rename_members(Optimizer, apply="set_rates")
-rename_members(PoseError, turn="rotation")
-rename_members(Reconstruction, end="result", lost="is_uninformative")
-rename_members(Schedule, widths_end="blur_end")
-rename_members(Search, ends="minima", number="best_number", rivals="scores", rows="to_metrics")
-rename_members(Stage, renews="rebuilds_modules", widths_end="blur_end")
-rename_members(Uncertainty, by="source")
-rename_members(Unknown, depends="depends_on_target", made="build_module")
-rename_members(Verdict, consistent="is_consistent", rivals="ambiguities")

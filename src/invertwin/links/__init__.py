@@ -1,6 +1,6 @@
 """Propagation paths between antennas as responses, OFDM channels, spreads and radio maps."""
 
-from invertwin.deprecation import rename_attributes, rename_members
+from invertwin.deprecation import rename_attributes
 from invertwin.links.cells import CellSampling as CellSampling
 from invertwin.links.cells import MapMesh as MapMesh
 from invertwin.links.cells import MapPlane as MapPlane
@@ -29,16 +29,3 @@ from invertwin.links.transmitters import TransmitterPosition as TransmitterPosit
 from invertwin.links.transmitters import Transmitters as Transmitters
 
 rename_attributes(__name__)
-rename_members(
-    AntennaMount, advances="element_advances", slopes="element_slopes", weights="element_weights"
-)
-rename_members(CellSampling, side="points_per_side")
-rename_members(Metasurface, focused="focus")
-rename_members(
-    PropagationSettings, at="link_statistics", paths="trace_links", responses="frequency_responses"
-)
-rename_members(
-    ReceiverLocations, finer="with_sample_count", random="is_random", received="link_statistics"
-)
-rename_members(Transmitters, terminals="mount")
-rename_members(WallPath, at="locate")

@@ -1,6 +1,6 @@
 """Forward models, one file a kind of sensor."""
 
-from invertwin.deprecation import rename_attributes, rename_members
+from invertwin.deprecation import rename_attributes
 from invertwin.models.camera import DepthMap as DepthMap
 from invertwin.models.camera import SilhouetteMap as SilhouetteMap
 from invertwin.models.doppler import RangeDopplerMap as RangeDopplerMap
@@ -18,8 +18,3 @@ from invertwin.models.rcs import RcsMap as RcsMap
 from invertwin.models.whitened import WhitenedMap as WhitenedMap
 
 rename_attributes(__name__)
-rename_members(RadioMap, looks_about="realisations_about", reception="propagation")
-rename_members(RadioMap, received="link_statistics")
-rename_members(RangeDopplerMap, around="crop_around", expected="predict_paths", of="from_chirps")
-rename_members(RcsMap, signature="compute")
-rename_members(ResponseMap, reception="propagation")

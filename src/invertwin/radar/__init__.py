@@ -1,6 +1,6 @@
 """Radar data from paths: exact signals and their smooth surrogate, in plain torch."""
 
-from invertwin.deprecation import rename_attributes, rename_members
+from invertwin.deprecation import rename_attributes
 from invertwin.radar.boards import BOARDS as BOARDS
 from invertwin.radar.boards import Board as Board
 from invertwin.radar.boards import board as board
@@ -70,13 +70,3 @@ from invertwin.radar.waveform import SteppedFrequency as SteppedFrequency
 from invertwin.radar.waveform import Waveform as Waveform
 
 rename_attributes(__name__)
-rename_members(
-    DopplerMaps,
-    everything="total_power",
-    mover="moving_peak",
-    movers="moving_power",
-    strongest="strongest_peak",
-)
-rename_members(OFDM, received="receive_symbols")
-rename_members(Radar, biased="has_range_bias", centered="center_on", moved="transform_rigidly")
-rename_members(Surrogate, narrowed="scale_blur", widened="has_blur")

@@ -1,6 +1,6 @@
 """Scenes as torch values: meshes, materials, antennas, and fitted parameters."""
 
-from invertwin.deprecation import rename_attributes, rename_members
+from invertwin.deprecation import rename_attributes
 from invertwin.scene.antenna import AntennaArray as AntennaArray
 from invertwin.scene.antenna import Cosine as Cosine
 from invertwin.scene.antenna import Isotropic as Isotropic
@@ -97,21 +97,3 @@ from invertwin.scene.shapes import text as text
 from invertwin.scene.shapes import trihedral as trihedral
 
 rename_attributes(__name__)
-rename_members(BodyTemplate, posed="apply_pose", rotations_of="estimate_rotations", scaled="scale")
-rename_members(DensityGrid, even="from_optical_depth", of_object="from_object")
-rename_members(DistanceGrid, of_mesh="from_mesh", sampled="from_function")
-rename_members(FieldCoefficients, mirroring="scale_reflection")
-rename_members(
-    Material, incoherent="incoherent_law", skin="smooth_interface", surface="scattering_law"
-)
-rename_members(MaterialValues, of="from_object")
-rename_members(MovingScene, movers="motions")
-rename_members(Object, at="advance")
-rename_members(ScatteringLaw, less_mirror="without_specular", scaled="scale")
-rename_members(Scene, at="advance", show="viewer.show")
-rename_members(SkinnedBody, of="from_mesh", turned="perturb_joints")
-rename_members(SplineTrajectory, places="positions")
-rename_members(TabulatedPattern, of_decibels="from_decibels")
-rename_members(Texture, over="from_projection")
-rename_members(TrajectoryMotion, path="trajectory")
-rename_members(Walking, shift="pelvis_offset")

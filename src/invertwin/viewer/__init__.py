@@ -1,6 +1,6 @@
 """Three-dimensional displays: in a browser that answers, and on a page that stands alone."""
 
-from invertwin.deprecation import rename_attributes, rename_members
+from invertwin.deprecation import rename_attributes
 from invertwin.viewer.display import Display as Display
 from invertwin.viewer.display import DisplayLayer as DisplayLayer
 from invertwin.viewer.display import DisplayMaps as DisplayMaps
@@ -26,13 +26,3 @@ from invertwin.viewer.panels import SIMULATED as SIMULATED
 from invertwin.viewer.server import Viewer as Viewer
 
 rename_attributes(__name__)
-rename_members(AccessGuard, before="wrap_handler")
-rename_members(Display, at_step="show_step")
-rename_members(DisplayMaps, at="maps_of_frame", of="from_spectra")
-rename_members(
-    InteractiveSensor,
-    map="predict_map",
-    moved="move_object",
-    seen="sample_paths",
-    take="replace_meshes",
-)
