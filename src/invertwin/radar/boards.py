@@ -5,8 +5,10 @@ wavelengths at the design frequency of the board. Electrical phase centres diffe
 millimetre: estimate them with a reflector (`invertwin.capture.estimate_channels`).
 """
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from types import MappingProxyType
 from typing import Annotated
 
@@ -193,87 +195,12 @@ class Mounting:
         return found.arrays(**how)
 
 
-def _row(*columns: float) -> tuple[tuple[float, float], ...]:
-    return tuple((column, 0.0) for column in columns)
+def _load_presets() -> dict[str, Board]:
+    text = files(__package__).joinpath("boards.toml").read_text(encoding="utf-8")
+    return {name: Board(name, **table) for name, table in tomllib.loads(text).items()}
 
 
-# Two azimuth transmitters 2λ apart and one raised by λ/2 between them.
-_RAISED_MIDDLE = ((0.0, 0.0), (2.0, 1.0), (4.0, 0.0))
-_FOUR = _row(0, 1, 2, 3)
-
-_CASCADE_TX = (
-    ((11.0, 6.0), (10.0, 4.0), (9.0, 1.0)),  # master
-    _row(32, 28, 24),
-    _row(20, 16, 12),
-    _row(8, 4, 0),
-)
-_CASCADE_RX = (_row(11, 12, 13, 14), _row(50, 51, 52, 53), _row(46, 47, 48, 49), _FOUR)
-
-_PRESETS = (
-    Board(
-        "xWR1443",
-        _RAISED_MIDDLE,
-        _FOUR,
-        79e9,
-        "M. E. Yanik and M. Torlak, MIMO-SAR toolbox, getAntennaLocations.m (there turned "
-        "by 90°, with the middle TX at −λ/2; 79 GHz)",
-    ),
-    Board(
-        "xWR1642",
-        _row(0, 4),
-        _FOUR,
-        79e9,
-        "OpenRadar's recording, whose 8 channels are a plane wave on this grid, and its "
-        "issue 15 (no elevation)",
-    ),
-    Board(
-        "xWR1843",
-        _RAISED_MIDDLE,
-        _FOUR,
-        79e9,
-        "OpenRadar, dsp/angle_estimation.py and issue 61: in the order TX1, TX3, TX2, "
-        "channels 9 to 12 are the raised row over channels 3 to 6",
-    ),
-    Board(
-        "IWR6843ISK",
-        _RAISED_MIDDLE,
-        _FOUR,
-        62e9,
-        "mmWave SDK 3D people tracking, ISK_6m_default.cfg: antGeometry0 0 -1 -2 -3 -2 -3 "
-        "-4 -5 -4 -5 -6 -7, antGeometry1 -1 -1 -1 -1 0 0 0 0 -1 -1 -1 -1",
-    ),
-    Board(
-        "IWR6843AOP",
-        ((0.0, 2.0), (2.0, 0.0), (0.0, 0.0)),
-        ((1.0, 0.0), (1.0, 1.0), (0.0, 0.0), (0.0, 1.0)),
-        62e9,
-        "mmWave SDK 3D people tracking, AOP_6m_default.cfg: antGeometry0 -1 -1 0 0 -3 -3 "
-        "-2 -2 -1 -1 0 0, antGeometry1 -1 0 -1 0 -3 -2 -3 -2 -3 -2 -3 -2; the signs of "
-        "its antPhaseRot (half of the elements are fed from the other side) are a channel "
-        "calibration, not a place",
-    ),
-    Board(
-        "AWR2944",
-        # Rows are 0.8 λ apart, not λ/2.
-        ((0.0, 0.0), (2.0, 1.6), (4.0, 0.0), (8.0, 0.0)),
-        _FOUR,
-        77e9,
-        "mmWave MCU+ SDK, AWR294X profiles: antGeometryCfg 1 0 1 1 1 2 1 3 0 2 0 3 0 4 0 5 "
-        "1 4 1 5 1 6 1 7 1 8 1 9 1 10 1 11 0.5 0.8",
-    ),
-    Board(
-        "MMWCAS-RF",
-        sum(_CASCADE_TX, ()),
-        sum(_CASCADE_RX, ()),
-        76.8e9,
-        "TI mmWave Studio, 4chip_cascade_MIMO_example, module_param.m: "
-        "TI_Cascade_TX_position_azi/ele and RX_position_azi, in the order of the devices; "
-        "86 azimuth places as in TI's JAJU737A, whose text has the last two RX groups "
-        "farther apart",
-    ),
-)
-
-BOARDS: Mapping[str, Board] = MappingProxyType({board.name: board for board in _PRESETS})
+BOARDS: Mapping[str, Board] = MappingProxyType(_load_presets())
 """Name → preset. xWR boards serve the AWR and the IWR of that number."""
 
 
