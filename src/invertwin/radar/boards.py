@@ -196,7 +196,7 @@ class Mounting:
 
 
 def _load_presets() -> dict[str, Board]:
-    text = files(__package__).joinpath("boards.toml").read_text(encoding="utf-8")
+    text = files("invertwin.radar").joinpath("boards.toml").read_text(encoding="utf-8")
     return {name: Board(name, **table) for name, table in tomllib.loads(text).items()}
 
 

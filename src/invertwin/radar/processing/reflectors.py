@@ -67,9 +67,9 @@ def detect_points(
     # What lies outside of the grid has sidelobes in it.
     period = math.floor(require_sampled_waveform(radar).max_range / grid.range_step + 1e-9)
     whole = replace(grid, range_count=max(grid.range_count, period))
+    rates = torch.full((1, grid.range_count), math.nan, dtype=torch.float64)
     if chirps is None:
         cube = range_profile(signal[:, 0], radar, whole)[:, None]
-        rates = torch.full((1, grid.range_count), math.nan, dtype=torch.float64)
     else:
         cube = range_doppler(signal, radar, whole, chirps)
     everywhere = cube[0].abs().square().double().mean((1, 2))
