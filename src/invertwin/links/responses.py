@@ -52,7 +52,7 @@ class AntennaMount:
         InputError: Rotations of another shape, or that are not orthonormal.
     """
 
-    array: AntennaArray = field(default_factory=lambda: AntennaArray(torch.zeros(1, 3)))
+    array: AntennaArray = field(default_factory=lambda: AntennaArray(torch.zeros(1, 3).double()))
     rotations: Float64[Tensor, "*place 3 3"] = field(default_factory=_world_axes)
 
     def __post_init__(self) -> None:

@@ -33,6 +33,7 @@ from invertwin.scene import (
     Scene,
     box,
     linear_array,
+    merge_meshes,
     rigid,
     rotation_angle,
 )
@@ -57,8 +58,12 @@ def radar_along(count: int = 10, width: float = 4.0) -> Radar:
 def truck() -> Mesh:
     """A wide cab before a narrow bed: front and back differ from above."""
     cab, bed = box((1.0, 0.8, 0.6), 2), box((0.6, 1.4, 0.4), 2)
-    parts = [cab.vertices + float64([0.0, 0.7, 0.0]), bed.vertices - float64([0.0, 0.4, 0.0])]
-    return Mesh(torch.cat(parts), torch.cat([cab.faces, bed.faces + len(cab.vertices)]))
+    return merge_meshes(
+        [
+            Mesh(cab.vertices + float64([0.0, 0.7, 0.0]), cab.faces),
+            Mesh(bed.vertices - float64([0.0, 0.4, 0.0]), bed.faces),
+        ]
+    )
 
 
 def parked(yaw_deg: float) -> Scene:
