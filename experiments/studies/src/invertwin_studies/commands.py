@@ -1,26 +1,32 @@
 """The commands of the studies. Heavy imports wait until a command is called."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from invertwin.cli.options import FileArgument, OutputOptions, RunOptions, with_options
+
+if TYPE_CHECKING:
+    from invertwin.cli.report import ReportTable
+    from invertwin.storage.run_folder import RunFolder
 
 
 @with_options(RunOptions)
 def loss_scan(options: RunOptions, file: FileArgument) -> None:
     """Show the losses of signals and of the surrogate along a line."""
     from invertwin.cli.run_file import prefix_file_errors
-    from invertwin.cli.terminal import load_runs, print_tables, run_folder
+    from invertwin.cli.terminal import load_runs, run_in_folder
 
     runs = load_runs([file], options, "loss-scan", ("loss_scan", "radar", "grid", "data"))
-    with run_folder(options, Path("out", file.stem), runs) as folder:
+
+    def work(folder: "RunFolder") -> "tuple[list[ReportTable], str]":
         from invertwin_studies.loss_scan import run_loss_scan
 
         with prefix_file_errors(file):
-            tables = run_loss_scan(runs[file.stem], folder)
-        print_tables(tables)
+            return run_loss_scan(runs[file.stem], folder), ""
+
+    run_in_folder(options, Path("out", file.stem), work, runs)
 
 
 @with_options(OutputOptions)
@@ -33,13 +39,15 @@ def train_prior(
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
 ) -> None:
     """Train a shape prior on cars of the generator; the packaged one by default."""
-    from invertwin.cli.terminal import limit_rate, print_tables, run_folder
+    from invertwin.cli.terminal import limit_rate, run_in_folder
     from invertwin_studies import train_prior as training
     from invertwin_studies.prior_training import Training
 
     settings = Training(cars=cars, latent=latent, epochs=epochs, wheels=wheels, seed=seed)
     again = f"train-prior --cars {cars} --latent {latent} --epochs {epochs} --seed {seed}"
     again += " --wheels" if wheels else ""
-    with run_folder(options, Path("out/train_prior")) as folder:
-        tables = training.run_train_prior(settings, folder, again, limit_rate())
-        print_tables(tables)
+
+    def work(folder: "RunFolder") -> "tuple[list[ReportTable], str]":
+        return training.run_train_prior(settings, folder, again, limit_rate()), ""
+
+    run_in_folder(options, Path("out/train_prior"), work)
