@@ -120,7 +120,7 @@ def _find_rivals(
     found = []
     for observation in observations:
         clutter = estimate_clutter(scene, observation, fitted, seed=seed)
-        share = float(clutter.echoes.sum()) / max(clutter.fitted_power, 1e-300)
+        share = float(clutter.echoes.sum()) / _predict_power_of(fitted, scene, observation, seed)
         if share > _RIVAL_SHARE:
             place = ", ".join(f"{value:.2f}" for value in clutter.strongest_position.tolist())
             found.append(
@@ -128,6 +128,19 @@ def _find_rivals(
                 f"power of the fitted objects, strongest at ({place}) m: they may be parts of these"
             )
     return tuple(found)
+
+
+def _predict_power_of(
+    fitted: Sequence[str], scene: Scene, observation: Observation, seed: int
+) -> float:
+    """Predict the sum over all bins of what objects add to a map, > 0, in the recording's unit."""
+    model, radar = observation.model.scale_blur(0.0), observation.initial_sensor()
+    rest = {name: item for name, item in scene.objects.items() if name not in fitted}
+    with torch.no_grad():
+        predicted = model.predict(scene, radar, seed).clamp_min(0.0)
+        own = predicted - model.predict(Scene(rest), radar, seed) if rest else predicted
+    gain = SpectrumLoss().fitted_gain(predicted, observation.observed_map())
+    return max(gain * float(own.clamp_min(0.0).sum()), 1e-300)
 
 
 def _whiten(models: Sequence[ForwardModel], backgrounds: Sequence[Tensor]) -> list[WhitenedMap]:
@@ -167,14 +180,12 @@ class Clutter:
     Attributes:
         noise: mean power of noise in a bin, in the unit of the recording.
         echoes: mean power of the echoes in every bin.
-        fitted_power: sum over all bins of what the fitted objects reflect.
         positions: points that reflect the echoes [m].
         strengths: their radar cross-sections [m²], in the unit of the recording.
     """
 
     noise: float
     echoes: Float64[Tensor, "frame range u v"]
-    fitted_power: float
     positions: Float64[Tensor, "point 3"]
     strengths: Float64[Tensor, " point"]
 
@@ -213,10 +224,8 @@ def estimate_clutter(
             f"expected a SurrogateMap for clutter, got a {type(model).__name__}; fit without"
         )
     power = observation.observed_map()
-    sharp, rest = model.scale_blur(0.0), {n: o for n, o in scene.objects.items() if n not in fitted}
     with torch.no_grad():
-        predicted = sharp.predict(scene, radar, seed).clamp_min(0.0)
-        own = predicted - sharp.predict(Scene(rest), radar, seed) if rest else predicted
+        predicted = model.scale_blur(0.0).predict(scene, radar, seed).clamp_min(0.0)
     law = SpectrumLoss()
     gain = law.fitted_gain(predicted, power)
     # The weakest range bin: a level fitted to the whole map would hold the clutter.
@@ -231,6 +240,4 @@ def estimate_clutter(
     response = compute_response(radar, model.grid, points)
     known = (gain * predicted + noise).double()
     strengths = reconstruct_reflectivity(response, power.double(), known)
-    power_of_own = gain * float(own.clamp_min(0.0).sum())
-    echoes = response.predict_maps(strengths)
-    return Clutter(noise, echoes, power_of_own, points, strengths)
+    return Clutter(noise, response.predict_maps(strengths), points, strengths)

@@ -96,7 +96,8 @@ def twin(
     if isinstance(recording, ChirpCapture):
         recording = recording.merge_single_ramps()
     capture = average_chirps(recording)
-    if max(map(len, (aperture(capture.radar()).y, aperture(capture.radar()).z))) <= _FEW_CHANNELS:
+    array = aperture(capture.radar())
+    if max(len(array.y), len(array.z)) <= _FEW_CHANNELS:
         # A taper would leave two of four channels, and one of three: no direction.
         capture = Capture(capture.dataset.assign_attrs(array_window="rectangular"))
     if isinstance(recording, ChirpCapture) and recording.real:
