@@ -177,12 +177,12 @@ class RecordingOptions(OutputOptions):
             name: of the command.
             folder: where it is called; paths are relative to it.
         """
-        words = [name]
+        words, hints = [name], get_type_hints(type(self), include_extras=True)
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name in ("out", "overwrite", "backend") or value in (field.default, None):
                 continue
-            kind = get_type_hints(type(self), include_extras=True)[field.name].__metadata__[0]
+            kind = hints[field.name].__metadata__[0]
             # Typer's first argument is a name, too, within an annotation.
             names = (str(kind.default), *(kind.param_decls or ()))
             flags = [name for name in names if name.startswith("--")]

@@ -56,8 +56,8 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
     said: list[str] = []
     with _collect_warnings(said):
         reader, recording = read_recording(options)
-    if isinstance(recording, ChirpCapture) and recording.merge_single_ramps() is not recording:
-        recording = recording.merge_single_ramps()
+    given = recording
+    if isinstance(given, ChirpCapture) and (recording := given.merge_single_ramps()) is not given:
         said.append(f"reading: {recording.chirps.count} frames of one ramp are shown as one train")
     as_recorded = recording
     recording, metrics = _calibrate_channels(options, recording, folder)

@@ -17,6 +17,8 @@ from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.signal.range_profile import range_profile
 from invertwin.radar.waveform import unit_window
 
+_Power = Float[Tensor, "*bin"]
+
 
 @dataclass(frozen=True, eq=False)
 class Spectrogram:
@@ -147,11 +149,21 @@ def interpolate_rates(
     Args:
         power: of ``range_doppler``, averaged over channels.
     """
-    level = power.double().clamp_min(torch.finfo(torch.float64).tiny).log()
-    before, after = level.roll(1, 0), level.roll(-1, 0)
-    curvature = before - 2 * level + after
-    vertex = 0.5 * (before - after) / torch.where(curvature < 0, curvature, torch.inf)
-    return vertex.clamp(-0.5, 0.5) / len(power)
+    return interpolate_peak(power.roll(1, 0), power, power.roll(-1, 0)) / len(power)
+
+
+def interpolate_peak(before: _Power, middle: _Power, after: _Power) -> _Power:
+    """Return the peak offset of the parabola through the logarithms of three levels: within half a
+    step.
+
+    Args:
+        before, middle, after: levels of neighbouring bins.
+    """
+    tiny = torch.finfo(torch.float64).tiny
+    low, level, high = (part.double().clamp_min(tiny).log() for part in (before, middle, after))
+    curvature = low - 2 * level + high
+    vertex = 0.5 * (low - high) / torch.where(curvature < 0, curvature, torch.inf)
+    return vertex.clamp(-0.5, 0.5)
 
 
 def resolve_fold(

@@ -116,23 +116,37 @@ def doppler_maps(
     radar, signal = radar.frames([frame]), beat[frame : frame + 1]
     cube = range_doppler(signal, radar, grid, chirps)
     flat = cube.abs().square().mean((2, 3))[0]
-    everything, strongest = _sum_range_rates(cube, radar, grid, chirps, torch.ones_like(flat) > 0)
+    anywhere = torch.ones_like(flat) > 0
+    everything, strongest = _sum_range_rates(cube, flat, radar, grid, chirps, anywhere)
     moving = range_doppler(signal - signal.mean(1, keepdim=True), radar, grid, chirps)
     power = moving.abs().square().mean((2, 3))[0]
     cells = _detect_moving_cells(power, flat, len(radar.virtual_positions))
     movers, mover = None, None
     if bool(cells.any()):
-        movers, mover = _sum_range_rates(moving, radar, grid, chirps, cells)
+        movers, mover = _sum_range_rates(moving, power, radar, grid, chirps, cells)
     velocities = velocity_axis(radar, chirps)
     return DopplerMaps(grid, velocities, flat, everything, movers, strongest, mover)
 
 
 def _sum_range_rates(
-    cube: _Cube, radar: Radar, grid: Grid, chirps: Chirps, candidates: _Cells
+    cube: _Cube,
+    level: Float[Tensor, "velocity range"],
+    radar: Radar,
+    grid: Grid,
+    chirps: Chirps,
+    candidates: _Cells,
 ) -> tuple[Float64[Tensor, "range u v"], Peak]:
-    """Sum power over all range rates, and return the strongest of the candidate cells."""
-    rates = interpolate_rates(cube.abs().square().mean((2, 3))[0])
-    cube = compensate_tdm(cube, radar, chirps, rates)[0]
+    """Sum power over all range rates, and return the strongest of the candidate cells.
+
+    Args:
+        cube: spectrum of one frame.
+        level: its mean power over channels.
+        radar: radar that recorded it.
+        grid: ranges and directions.
+        chirps: chirp timing.
+        candidates: cells of which the strongest is returned.
+    """
+    cube = compensate_tdm(cube, radar, chirps, interpolate_rates(level))[0]
     velocities = velocity_axis(radar, chirps)
     chunk = max(1, int(_BINS_AT_ONCE / math.prod(grid.shape)))
     total = torch.zeros(grid.shape, dtype=torch.float64)

@@ -20,6 +20,7 @@ from invertwin.radar.processing.detection import (
 )
 from invertwin.radar.processing.doppler import (
     compensate_tdm,
+    interpolate_peak,
     interpolate_rates,
     range_doppler,
     velocity_axis,
@@ -84,7 +85,7 @@ def detect_points(
     rows: list[list[float]] = []
     for v, r in track(_find_cells(everywhere, radar, grid, looks), "points"):
         near = [max(r - 1, 0), r, min(r + 1, grid.range_count - 1)]
-        place = float(grid.ranges[r]) + _vertex(flat[v, near]) * grid.range_step
+        place = float(grid.ranges[r]) + float(interpolate_peak(*flat[v, near])) * grid.range_step
         directions = _resolve_directions(cube[v, :, :, r], radar, grid, noise)
         rows += [[place, float(rates[v, r]), *direction] for direction in directions]
     table = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5)
@@ -235,16 +236,5 @@ def _refine_direction(
                 moved[axis] += step * width / shrink
                 wave = _plane_wave(radar, grid, moved[0], moved[1])
                 levels.append(torch.vdot(wave, channels).abs().square())
-            place[axis] += _vertex(torch.stack(levels)) * width / shrink
+            place[axis] += float(interpolate_peak(*levels)) * width / shrink
     return max(-1.0, min(1.0, place[0])), max(-1.0, min(1.0, place[1]))
-
-
-def _vertex(levels: Float64[Tensor, "3"]) -> float:
-    """Return the peak offset of the parabola through the logarithms of three levels: within half a
-    step.
-    """
-    before, middle, after = levels.clamp_min(torch.finfo(torch.float64).tiny).log().tolist()
-    curvature = before - 2 * middle + after
-    if curvature >= 0:
-        return 0.0
-    return max(-0.5, min(0.5, 0.5 * (before - after) / curvature))
