@@ -14,6 +14,7 @@ from invertwin.discovery.imaging.likelihood import (
     HeavyTailedLoss,
     count_bins_per_draw,
     estimate_background,
+    map_axes,
 )
 from invertwin.discovery.imaging.reflectivity import ImageResponse
 from invertwin.discovery.proposals import propose_people_and_vehicles
@@ -49,7 +50,7 @@ def search_of(
         board,
         power,
         HeavyTailedLoss(estimate_background(power)),
-        count_bins_per_draw(board, grid),
+        count_bins_per_draw(map_axes(board, grid)),
         0.0,
         0,
     )

@@ -24,7 +24,9 @@ from invertwin.discovery.certainty import (
 from invertwin.discovery.imaging.likelihood import (
     HeavyTailedLoss,
     count_bins_per_draw,
+    direction_axes,
     estimate_background,
+    map_axes,
 )
 from invertwin.discovery.imaging.point_detections import (
     detect_moving_targets,
@@ -52,7 +54,6 @@ _DEFAULT_RADAR_HEIGHT = 0.6  # default height of radars above the ground [m]
 _FEW_CHANNELS = 4  # along an axis of the array, whose maps have no taper
 _FINAL_FIT_STEPS = 50  # steps of the final fit
 _MAX_IMAGE_POINTS = 40_000  # maximum number of points of an image
-_MIN_EXISTENCE_PROBABILITY = 0.05  # less probable moving targets are dropped
 _HELD_OUT_EVERY = 4  # every fourth frame is held out, where there are twice as many
 _Corner = Sequence[float] | None  # x and y [m]; None = all that is seen
 
@@ -128,7 +129,8 @@ def twin(
     grid = radar.grid(*reach)
     still = _find_static_objects(capture, grid, floor, places, step, rays, seed)
     notes = () if gains is None else (_CALIBRATION_NOTE.format(phase_spread(gains, radar)),)
-    objects = _sort_objects([*still.objects, *moving])
+    resting = [one for one in still.objects if one.shape or not _is_moving(one, moving)]
+    objects = _sort_objects([*resting, *moving])
     return replace(still, objects=objects, notes=(*notes, *still.notes), calibration=gains)
 
 
@@ -166,11 +168,7 @@ def _find_moving_targets(
     grid = radar.grid(near, min(range_max or math.inf, recording.max_range))
     if recording.frame_period is not None and recording.frame_count > 2:
         return track_moving_targets(recording, grid)
-    return [
-        one
-        for one in detect_moving_targets(recording, grid)
-        if one.existence_probability > _MIN_EXISTENCE_PROBABILITY
-    ]
+    return detect_moving_targets(recording, grid)
 
 
 _CALIBRATION_NOTE = (
@@ -182,8 +180,8 @@ _NO_SIGNAL_NOTE = (
     "over it, chance reaches {:.1f} dB; record more frames, or change what is searched"
 )
 _NO_SHAPE_NOTE = (
-    "no shape explains the maps better than noise does; what a detector finds in the first frame "
-    "is listed as points"
+    "no shape explains the maps better than noise does; what a detector finds in the first frame, "
+    "but for what moves, is listed as points"
 )
 _IMAGE_BETTER_NOTE = (
     "the image explains frames that were held out better than the things do: shapes may be wrong, "
@@ -205,7 +203,7 @@ def _find_static_objects(
     radar, frames = capture.radar(), capture.frame_count
     model = SurrogateMap(grid, sampling=make_sampling(frames, rays))
     level_of_bins = _estimate_background(power, radar, grid)
-    loss, draw = HeavyTailedLoss(level_of_bins), count_bins_per_draw(radar, grid)
+    loss, draw = HeavyTailedLoss(level_of_bins), count_bins_per_draw(map_axes(radar, grid))
     one = ShapeLikelihood(model, radar, power, loss, draw, level, seed)
     held = list(range(_HELD_OUT_EVERY - 1, frames, _HELD_OUT_EVERY))
     held = held if frames >= 2 * _HELD_OUT_EVERY else []
@@ -233,7 +231,9 @@ def _find_static_objects(
         there = aside.coarse_maps
         powers = torch.zeros_like(there.power), seen_there.predict_maps(picture)
         nothing, image = (there.loss.bin_losses(power, there.power) for power in powers)
-        gain = float((nothing - image).sum()) / count_bins_per_draw(aside.radar, there.grid)
+        gain = float((nothing - image).sum()) / count_bins_per_draw(
+            map_axes(aside.radar, there.grid)
+        )
         if gain > aside.total_gain(shapes):
             notes = (_IMAGE_BETTER_NOTE,)
     shapes, found = one.fit(shapes, _FINAL_FIT_STEPS)
@@ -261,6 +261,15 @@ def _describe_objects(
         kind = shape.effective_kind
         found.append(DetectedObject(name, kind, kinds, center, shape, wide, probability))
     return tuple(found)
+
+
+def _is_moving(point: DetectedObject, moving: Sequence[DetectedObject]) -> bool:
+    """Return whether a point lies within 3 standard deviations of a target that moves, which leaves
+    some of its power in the mean of a frame's chirps.
+    """
+    places = [one.position if one.track is None else one.track.positions[0] for one in moving]
+    reach = 3 * math.hypot(*point.deviations.values())
+    return any((point.position - place).norm() < reach for place in places)
 
 
 def _sort_objects(things: list[DetectedObject]) -> tuple[DetectedObject, ...]:
@@ -318,7 +327,7 @@ def _relate_to_noise(
 def _estimate_background(
     power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
 ) -> Float64[Tensor, " range"]:
-    return estimate_background(power, count_bins_per_draw(radar, replace(grid, range_count=1)))
+    return estimate_background(power, count_bins_per_draw(direction_axes(radar, grid)))
 
 
 def image_points(

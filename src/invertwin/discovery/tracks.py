@@ -18,8 +18,6 @@ _ACCELERATION_DEVIATION = 1.0  # standard deviation of the acceleration of a tar
 _CROSS_RANGE_SPEED = 3.0  # standard deviation of the cross-range velocity [m/s]
 _MIN_TRACK_FRAMES = 3  # minimum number of frames of a track
 _MAX_MISSED_FRAMES = 3  # maximum number of missed frames
-# Minimum existence probability of detections that continue a track.
-_MIN_EXISTENCE_PROBABILITY = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +62,7 @@ def track_moving_targets(recording: ChirpCapture, grid: Grid) -> list[DetectedOb
     step, spread = _motion_model(recording.frame_period)
     live, ended = list[_KalmanTrack](), list[_KalmanTrack]()
     for frame in range(recording.frame_count):
-        found = [
-            one
-            for one in detect_moving_targets(recording, grid, frame)
-            if one.existence_probability > _MIN_EXISTENCE_PROBABILITY
-        ]
+        found = detect_moving_targets(recording, grid, frame)
         seen = [_make_measurement(one, recording, frame) for one in found]
         for path in live:
             state, error = path.states[-1]

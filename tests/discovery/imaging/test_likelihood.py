@@ -10,6 +10,7 @@ from invertwin.discovery.imaging.likelihood import (
     HeavyTailedLoss,
     count_bins_per_draw,
     estimate_background,
+    map_axes,
 )
 from invertwin.scene import AntennaArray, linear_array
 
@@ -73,4 +74,6 @@ def test_noise_has_as_many_draws_as_bins_over_the_shared_ones():
     power = power[:, :, 8:-8]  # the outermost directions see less of their neighbours
     mean = power.flatten(1).mean(1)
     draws = float((mean.mean() / mean.std()) ** 2)
-    assert power[0].numel() / count_bins_per_draw(device, grid) == pytest.approx(draws, rel=0.25)
+    assert power[0].numel() / count_bins_per_draw(map_axes(device, grid)) == pytest.approx(
+        draws, rel=0.25
+    )

@@ -1,6 +1,7 @@
 """Likelihood of echo power under an approximate model, and the effective number of bins."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -46,18 +47,17 @@ def estimate_background(
     return level.clamp_min(1e-12 * float(power.max()))
 
 
-def count_bins_per_draw(radar: Radar, grid: Grid) -> float:
+def count_bins_per_draw(axes: Sequence["MapAxis"]) -> float:
     """Compute the number of correlated bins per independent draw of a map.
 
     Noise fields in bins of lag l are correlated by the windows; powers by the square. The sum over
     all lags is the number of bins that share one draw.
 
     Args:
-        radar: radar with its windows.
-        grid: bins of the map.
+        axes: axes of the map.
     """
     total = 1.0
-    for axis in map_axes(radar, grid):
+    for axis in axes:
         if axis.count > 1:
             lags = torch.arange(-axis.count + 1, axis.count, dtype=torch.float64)
             # Fraction of the pairs of bins of the axis with this lag.
@@ -105,12 +105,23 @@ def map_axes(radar: Radar, grid: Grid) -> list[MapAxis]:
     Raises:
         InputError: A radar that does not sample its echoes.
     """
-    waveform, array = require_sampled_waveform(radar), aperture(radar)
+    waveform = require_sampled_waveform(radar)
     window = unit_window(radar.window, waveform.samples)
     sample = torch.arange(waveform.samples, dtype=torch.float64) / waveform.max_range
-    y, z = array.y[array.column] / waveform.wavelength, array.z[array.row] / waveform.wavelength
+    along = MapAxis(window, sample, grid.range_start, grid.range_step, grid.range_count)
+    return [along, *direction_axes(radar, grid)]
+
+
+def direction_axes(radar: Radar, grid: Grid) -> list[MapAxis]:
+    """Return the axes of the directions of a map: u and v.
+
+    Args:
+        radar: radar with its array and its window.
+        grid: bins of the map.
+    """
+    array, wavelength = aperture(radar), radar.waveform.wavelength
+    y, z = array.y[array.column] / wavelength, array.z[array.row] / wavelength
     return [
-        MapAxis(window, sample, grid.range_start, grid.range_step, grid.range_count),
         MapAxis(array.weight, y, grid.u_start, grid.u_step, grid.u_count),
         MapAxis(array.weight, z, grid.v_start, grid.v_step, grid.v_count),
     ]

@@ -20,6 +20,7 @@ _MIN_RELATIVE_PEAK = 0.1  # relative to the strongest: weaker peaks may be sidel
 _TARGET_SIDELOBE_LEVEL = 3e-3  # relative to the strongest target: weaker ones may be its sidelobes
 _NO_SIDELOBE_LEVEL = 0.5  # relative to the strongest: stronger peaks are no sidelobes
 _DIRECTION_ERROR_BEAMS = 0.3  # standard deviation of a direction in beamwidths
+_MIN_EXISTENCE_PROBABILITY = 0.1  # less probable moving targets are dropped
 _MAX_POINTS = 50  # strongest of one frame
 _POINTS_PER_CHUNK = 20_000  # points of an image per chunk
 
@@ -63,7 +64,7 @@ def detect_moving_targets(
     # Noise reduction of beams over all channels relative to one channel.
     noise = noise_power(flat.abs().square(), 1) / len(radar.virtual_positions)
     draws, top = flat.numel(), float(points.power[rows].max())
-    found: list[DetectedObject] = []
+    found: list[tuple[float, DetectedObject]] = []
     for number in range(int(labels.max()) + 1):
         own = rows[labels == number]
         best = own[points.power[own].argmax()]
@@ -83,13 +84,12 @@ def detect_moving_targets(
         }
         sure = max(0.0, 1 - draws * math.exp(-min(power / noise, 700.0)))
         sure *= min(1.0, power / (_TARGET_SIDELOBE_LEVEL * top))
-        name, velocity = f"mover_{number + 1}", float(rates[best]) * aways[best]
-        found.append(DetectedObject.point(name, position, deviations, sure, velocity))
-    strength = {
-        target.name: float(points.power[rows[labels == k]].max()) for k, target in enumerate(found)
-    }
-    found.sort(key=lambda target: -strength[target.name])
-    return [replace(target, name=f"mover_{k}") for k, target in enumerate(found, 1)]
+        if sure > _MIN_EXISTENCE_PROBABILITY:
+            velocity = float(rates[best]) * aways[best]
+            target = DetectedObject.point("mover", position, deviations, sure, velocity)
+            found.append((power, target))
+    found.sort(key=lambda one: -one[0])
+    return [replace(target, name=f"mover_{k}") for k, (_, target) in enumerate(found, 1)]
 
 
 def detect_static_points(capture: Capture, grid: Grid) -> list[DetectedObject]:
