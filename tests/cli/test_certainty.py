@@ -1,5 +1,8 @@
 """Verdicts and error bars in run folders, and how often they hold over recordings."""
 
+import math
+import re
+
 import pytest
 
 from cli.small import RUN, STARTS, call, read_metrics
@@ -18,10 +21,20 @@ def test_a_run_states_verdict_and_error_bars(run_file, monkeypatch, capsys):
     assert metrics["verdict"] in ("consistent", "inconsistent")
     assert (metrics["loss_excess"] > 3.5) == (metrics["verdict"] == "inconsistent")
     said = " ".join(capsys.readouterr().out.split())
-    assert "Error bars" in said
+    place = re.search(r"plate at \((.*?)\)( ± ([0-9.]+))? m\.", metrics["answer"] + ".")
+    assert metrics["answer"] in said
+    offset = metrics["parameters"]["plate.translation"]
+    start = [1.2, 0.0, 0.0]  # position in the run file
+    expected = [begun + moved for begun, moved in zip(start, offset, strict=True)]
+    assert [float(x) for x in place[1].split(",")] == pytest.approx(expected, abs=6e-4)
+    assert (place[2] is None) == (metrics["verdict"] == "inconsistent")
+    if place[2] is not None:
+        bars = metrics["standard_deviations"].values()
+        assert float(place[3]) == pytest.approx(math.hypot(*bars), rel=0.06)
+    assert "standard deviation" in said
     assert "95 % of errors within" in said
     assert "recordings of the twin" in said.lower()
-    assert "Error bars" in (run_file.parent / "out" / "report.html").read_text()
+    assert "standard deviation" in (run_file.parent / "out" / "report.html").read_text()
 
 
 @pytest.mark.claim

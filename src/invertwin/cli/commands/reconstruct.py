@@ -20,6 +20,7 @@ from invertwin.cli.fits.problem import OWN_METHOD, Fits, Problem, known_truth
 from invertwin.cli.fits.scores import drop_histories
 from invertwin.cli.fits.shape_scores import check_measures
 from invertwin.cli.fits.spreading import QUIET_CONSOLE, FitWorkers, distribute_fits
+from invertwin.cli.fits.writing import state_positions
 from invertwin.cli.report import ReportTable, ReportView, save_picture, write_report
 from invertwin.cli.run_file import to_minimal_toml, validate_run
 from invertwin.cli.schema import RunFile, SimulatedData
@@ -98,6 +99,7 @@ def _metrics(fits: Fits, confidence: dict[str, Any]) -> dict[str, Any]:
         **confidence,
         **{key: best[key] for key in kept if key in best and key not in confidence},
         "parameters": best["values"],
+        "answer": state_positions(fits, confidence),
         **problem.notes,
         **{f"starts_{name}": own for name, own in lean.items() if name != OWN_METHOD},
         "starts": lean[OWN_METHOD],

@@ -22,7 +22,7 @@ from invertwin.cli.run_file import (
 from invertwin.cli.schema import build
 from invertwin.cli.schema.recordings import SimulatedData
 from invertwin.constants import FRAME
-from invertwin.discovery import Twin, average_chirps, twin
+from invertwin.discovery import DetectedObject, Twin, average_chirps, twin
 from invertwin.discovery.shapes.primitives import MAX_DIELECTRIC_REFLECTANCE
 from invertwin.inversion.metrics import compare_shapes
 from invertwin.plotting import found as pictures
@@ -31,6 +31,7 @@ from invertwin.scene import Mesh, RoughDielectric, Scene, merge_meshes, save_mes
 from invertwin.storage.run_folder import RunFolder
 
 _MIN_EXISTENCE_PROBABILITY = 0.5  # confidence of things that are counted
+_MAX_STATED = 6  # things in the sentence that says what was found
 # Of the command line; they win over those of a run file.
 _TWIN_OPTION_NAMES = ("low", "high", "range_max", "level", "height", "rays", "seed")
 
@@ -52,9 +53,10 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
         _, recording = read_recording(arguments)
     faults = [str(fault) for fault in find_faults(recording)]
     found = twin(recording, **options)
-    sure = sum(one.existence_probability > _MIN_EXISTENCE_PROBABILITY for one in found.objects)
+    sure, answer = _state_objects(found)
     metrics: dict[str, Any] = {
         "task": "twin",
+        "answer": answer,
         "things": [thing.to_metrics() for thing in found.objects],
         "count": sure,
         "unsure": len(found.objects) - sure,
@@ -81,7 +83,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
     figure = pictures.ground(found)
     above = save_picture(folder, "ground", figure, "The ground from above", "ground")
     parts = [_object_table(found), *warning_tables(faults), above, *_draw_maps(found, folder)]
-    said = "; ".join(found.notes) or f"{sure} things, {metrics['unsure']} unsure ones"
+    said = "; ".join((answer, *found.notes))
     title = arguments.recording.name
     still = average_chirps(recording)
     if found.calibration is not None:
@@ -112,14 +114,30 @@ def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, di
         return Capture.from_beat(simulate_exact(run, truth, radar, grid).beat, radar), truth, given
 
 
+def _state_objects(found: Twin) -> tuple[int, str]:
+    """Count the likely objects, and state where they are."""
+    likely = [
+        one for one in found.objects if one.existence_probability > _MIN_EXISTENCE_PROBABILITY
+    ]
+    said = [f"{len(likely)} things found, {len(found.objects) - len(likely)} doubtful ones"]
+    for thing in likely[:_MAX_STATED]:
+        place = ", ".join(f"{value:.2f}" for value in thing.position[:2].tolist())
+        said.append(f"{thing.kind} at ({place}) ± {_position_deviation(thing):.2g} m")
+    said += [f"{len(likely) - _MAX_STATED} more"] if len(likely) > _MAX_STATED else []
+    return len(likely), "; ".join(said)
+
+
+def _position_deviation(thing: DetectedObject) -> float:
+    """The largest standard deviation of a position along the ground [m]."""
+    return max(thing.deviations.get(name, 0.0) for name in ("x", "y", "range", "across"))
+
+
 def _object_table(twin: Twin) -> ReportTable:
     heads = ["thing", "kind", "confidence", *(f"{axis} [m]" for axis in "xyz")]
     heads += ["± [m]", "yaw [°]", "length, width, height [m]", "speed [m/s]"]
     rows: list[list[Any]] = []
     for thing in twin.objects:
         figure = thing.shape
-        along = ("x", "y", "range", "across")
-        known = [thing.deviations[name] for name in along if name in thing.deviations]
         size, yaw, rate = None, None, None
         if figure is not None:
             size = None if figure.kind == "corner" else [figure.length, figure.width, figure.height]
@@ -128,7 +146,7 @@ def _object_table(twin: Twin) -> ReportTable:
             rate = float(thing.velocity.norm())
         share = f"{thing.kind} {thing.probabilities.get(thing.kind, 1.0):.2f}"
         row = [thing.name, share, thing.existence_probability, *thing.position.tolist()]
-        rows.append([*row, max(known) if known else None, yaw, size, rate])
+        rows.append([*row, _position_deviation(thing) or None, yaw, size, rate])
     return ReportTable("Things", heads, rows, load_texts("notes")["things"])
 
 

@@ -26,7 +26,7 @@ from invertwin.cli.fits.problem import (
     require_sections,
 )
 from invertwin.cli.fits.scores import error_bar_table, score_fit
-from invertwin.cli.fits.writing import describe_outcome
+from invertwin.cli.fits.writing import describe_outcome, parameter_values
 from invertwin.cli.report import ReportTable, quantity_table, save_picture
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile
@@ -188,7 +188,10 @@ class ReceivedLevels(DataKind):
         drawn = [save_picture(folder, "loss", plotting.convergence(fits.losses))]
         if has_transmitter(fits.problem.run):
             drawn.append(save_picture(folder, "plan", _plan(fits)))
-        tables = [_parameters(fits, metrics), error_bar_table(metrics)]
+        values = parameter_values(fits)
+        for name, real in metrics.get("true_values", {}).items():
+            values[name][2] = real
+        tables = [error_bar_table(metrics, values)]
         if "errors_m" in metrics:
             tables.append(_method_table(fits, metrics))
         result = quantity_table("Result", metrics)
@@ -354,14 +357,6 @@ def _plan(fits: Fits) -> Figure:
     ends = [[row["start_position"], row["values"]["transmitter.position"]] for row in rows]
     starts = torch.tensor(ends, dtype=torch.float64)
     return plotting.transmitter_fits(fits.found.scene, float(place[0, 2]), shown, starts)
-
-
-def _parameters(fits: Fits, metrics: Row) -> ReportTable:
-    true = dict(metrics.get("true_values", {}))
-    if fits.problem.reference is not None and has_transmitter(fits.problem.run):
-        true["transmitter.position"] = fits.problem.reference.positions[0].tolist()
-    cells = [[name, value, true.get(name)] for name, value in metrics["parameters"].items()]
-    return ReportTable("Parameters", ["parameter", "result", "truth"], cells)
 
 
 def _method_table(fits: Fits, metrics: Row) -> ReportTable:

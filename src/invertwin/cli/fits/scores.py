@@ -23,6 +23,15 @@ from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene import Mesh, Scene, SkinnedBody
 from invertwin.scene.shape_models.density import replace_clouds
 
+ANGLES = ("roll", "pitch", "yaw")
+"""Names of the coordinates of a rotation vector among parameters."""
+DOUBTED = ("inconsistent", "worse", "lost")
+"""Verdicts on fits whose error bars do not hold."""
+_BAR_COLUMNS = {
+    "predicted_over_observed": "over that of simulated fits",
+    "spread_of_ends": "spread of other ends",
+}
+
 
 def score_fit(problem: Problem, start: Scene, twin: Scene) -> Row:
     """Errors of start and twin, where the truth is known."""
@@ -174,26 +183,33 @@ def total_loss(
         return None
 
 
-def error_bar_table(metrics: Row) -> ReportTable:
-    """The error bars of the best fit."""
-    cells = []
-    for name, value in metrics.get("standard_deviations", {}).items():
-        unit, factor = metrics["units"][name], 1.0
-        if unit == "rad":
+def error_bar_table(metrics: Row, values: Mapping[str, Sequence[Any]] | None = None) -> ReportTable:
+    """Tabulate the parameters of the best fit with their error bars.
+
+    Args:
+        metrics: numbers of the run.
+        values: start, result and truth by the names of the error bars; angles in degrees.
+    """
+    bars, values, cells = metrics.get("standard_deviations", {}), values or {}, []
+    for name in dict.fromkeys((*values, *bars)):
+        tail, factor = name.split(".")[-1], 1.0
+        unit = metrics.get("units", {}).get(name) or ("m" if tail in ("x", "y", "z") else "")
+        if unit == "rad" or tail in ANGLES:
             unit, factor = "°", math.degrees(1)
-        row = [f"{name} [{unit}]" if unit else name, factor * value]
-        row += [factor * metrics["within_95"][name]]
-        row += [metrics.get("coverage_95", {}).get(name.split(".")[-1])]
-        row += [metrics.get("predicted_over_observed", {}).get(name)]
-        cells.append([*row, metrics.get("spread_of_ends", {}).get(name)])
-    heads = ["parameter", "standard deviation", "95 % of errors within"]
-    heads += ["coverage", "over that of simulated fits", "spread of other ends"]
-    kept = [k for k in range(len(heads)) if k < 3 or any(row[k] is not None for row in cells)]
+        start, result, truth = values.get(name, (None, None, None))
+        found = [bars.get(name), metrics.get("within_95", {}).get(name)]
+        row = [f"{name} [{unit}]" if unit else name, start, result]
+        row += [bar if bar is None else factor * bar for bar in found]
+        row += [truth, metrics.get("coverage_95", {}).get(tail)]
+        row += [metrics.get(key, {}).get(name) for key in _BAR_COLUMNS]
+        cells.append(row)
+    heads = ["parameter", "start", "result", "standard deviation", "95 % of errors within", "truth"]
+    heads += ["coverage", *_BAR_COLUMNS.values()]
+    kept = [k for k in range(len(heads)) if not k or any(row[k] is not None for row in cells)]
     heads, cells = [heads[k] for k in kept], [[row[k] for k in kept] for row in cells]
     told = ("verdict_reasons", "ambiguities", "unobserved")
     said = [text for key in told for text in metrics.get(key, [])]
     said += [metrics["spread_note"]] if "spread_note" in metrics else []
-    doubted = metrics.get("verdict") in ("inconsistent", "worse", "lost")
-    note = "error_bars_without_model" if doubted else "error_bars"
+    note = "error_bars_without_model" if metrics.get("verdict") in DOUBTED else "error_bars"
     said.append(metrics.get("no_error_bars", load_texts("notes")[note]))
-    return ReportTable("Error bars", heads, cells, "\n".join(said))
+    return ReportTable("Parameters" if values else "Error bars", heads, cells, "\n".join(said))

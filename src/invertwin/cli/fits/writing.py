@@ -4,10 +4,12 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from scipy.spatial.transform import Rotation
+
 from invertwin import plotting
 from invertwin.cli.fits.problem import INTERIOR_ONLY, OWN_METHOD, Fits, Problem, Row
 from invertwin.cli.fits.radar_models import blur_end_step
-from invertwin.cli.fits.scores import error_bar_table
+from invertwin.cli.fits.scores import ANGLES, DOUBTED, error_bar_table
 from invertwin.cli.fits.shape_scores import CURVE_KEY, is_shape_key, shape_label, short_label
 from invertwin.cli.report import (
     ReportPicture,
@@ -18,14 +20,12 @@ from invertwin.cli.report import (
     save_picture,
 )
 from invertwin.cli.schema import RunFile, SimulatedData
-from invertwin.inversion.metrics import pose_error
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.material.values import RANGES
 from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.run_folder import RunFolder
 
 _MATERIAL_ERRORS = {f"{name}_error": name for name in RANGES}
-_UNITS = {"translation": " [m]", "rotation": " [rad, rotation vector]", "scale": " [factor]"}
 _INITIAL_METRICS = (
     ("distance to the truth [m]", "start_distance_m", "position_error_m"),
     ("angle to the truth [°]", "start_angle_deg", "rotation_error_deg"),
@@ -58,10 +58,7 @@ def make_tables(fits: Fits, metrics: Row) -> list[ReportTable]:
             tables.append(ReportTable(f"Starts, {way}", heads, cells))
     if len(fits.rows) > 1 and any(is_shape_key(key) for key in metrics):
         tables.append(_method_table(fits))
-    tables += [_pose_table(fits, metrics), error_bar_table(metrics)]
-    moves = [[k + _UNITS.get(k.split(".")[-1], ""), v] for k, v in metrics["parameters"].items()]
-    if moves:
-        tables.append(ReportTable("Moves from the start", ["parameter", "value"], moves))
+    tables.append(error_bar_table(metrics, parameter_values(fits)))
     if "initial_seconds" in metrics:
         tables.append(_refinement_table(fits.problem.run, metrics))
     return tables
@@ -124,22 +121,56 @@ def _method_table(fits: Fits) -> ReportTable:
     return ReportTable("Ways to fit", ["fit", *(short_label(key) for key in keys)], cells)
 
 
-def _pose_table(fits: Fits, metrics: Row) -> ReportTable:
-    """Positions and turns of the fitted objects."""
-    problem, cells = fits.problem, []
+def parameter_values(fits: Fits) -> dict[str, list[Any]]:
+    """Return start, result and truth of all that is fitted; angles of rotation vectors in degrees.
+
+    Args:
+        fits: all fits of a run.
+    """
+    problem, values = fits.problem, dict[str, list[Any]]()
     ends = replace_clouds(fits.start.scene), replace_clouds(fits.found.scene)
     for name in dict.fromkeys(problem.run.fitted_objects):
-        known = name in problem.known_objects
-        scenes = [*ends, *([problem.truth] if known else [])]
-        centers = [scene[name].center.detach().tolist() for scene in scenes]
-        for i, axis in enumerate("xyz"):
-            cells.append([f"{name}.{axis} [m]", *(_round_zero(center[i]) for center in centers)])
-        if known and "rotation_error_deg" in metrics:
-            off = [pose_error(scene[name], problem.truth[name]) for scene in scenes]
-            angles = [_round_zero(math.degrees(found.angle)) if found else None for found in off]
-            cells.append([f"{name}, angle to the truth [°]", *angles])
-    cells = [row + [None] * (4 - len(row)) for row in cells]
-    return ReportTable("Parameters", ["parameter", "start", "result", "truth"], cells)
+        scenes = [*ends, *([problem.truth] if name in problem.known_objects else [])]
+        turns = [Rotation.from_matrix(one[name].transform[:3, :3].detach()) for one in scenes]
+        rows = zip("xyz", *(one[name].center.detach().tolist() for one in scenes), strict=True)
+        angles = list(zip(ANGLES, *(one.as_rotvec(degrees=True) for one in turns), strict=True))
+        # An angle that stays where the run file has it is no unknown.
+        rows = [*rows, *(row for row in angles if not math.isclose(*row[1:3], abs_tol=1e-9))]
+        for coordinate, *row in rows:
+            found = [_round_zero(float(value)) for value in row]
+            values[f"{name}.{coordinate}"] = found + [None] * (3 - len(found))
+    for name, value in fits.best["values"].items():
+        if name.split(".")[-1] == "position" and isinstance(value, list):
+            starts, truth = fits.start.transmitter, problem.reference
+            real = [None] * 3 if truth is None else truth.positions[0].tolist()
+            begun = [None] * 3 if starts is None else starts.tolist()
+            for row in zip("xyz", begun, value, real, strict=True):
+                values[f"{name.split('.')[0]}.{row[0]}"] = list(row[1:])
+        elif name.split(".")[-1] not in ("translation", "rotation"):
+            values[name] = [None, value, None]
+    return values
+
+
+def state_positions(fits: Fits, confidence: Row) -> str:
+    """State positions and angles of what was fitted, with error bars where these hold.
+
+    Args:
+        fits: all fits of a run.
+        confidence: verdict and error bars of the best one.
+    """
+    bars = {} if confidence["verdict"] in DOUBTED else confidence.get("standard_deviations", {})
+    values, said = parameter_values(fits), []
+    for name in dict.fromkeys(key.split(".")[0] for key in values if key.endswith(".x")):
+        place = ", ".join(f"{values[f'{name}.{axis}'][1]:.3f}" for axis in "xyz")
+        own = [bars.get(f"{name}.{axis}", 0.0) for axis in "xyz"]
+        text = f"{name} at ({place}){f' ± {math.hypot(*own):.2g}' if any(own) else ''} m"
+        for axis in (axis for axis in ANGLES if f"{name}.{axis}" in values):
+            width = math.degrees(bars.get(f"{name}.{axis}", 0.0))
+            text += (
+                f", {axis} {values[f'{name}.{axis}'][1]:.1f}{f' ± {width:.2g}' if width else ''}°"
+            )
+        said.append(text)
+    return "; ".join(said)
 
 
 def _is_own_shape_key(run: RunFile, key: str) -> bool:
@@ -238,7 +269,8 @@ def describe_outcome(run: RunFile, metrics: dict[str, Any], *, counted: bool = F
         counted: Count the successes of a single start, too.
     """
     count = metrics.get("starts_count", 1)
-    which = f"Best of {count} starts: " if count > 1 else ""
+    which = f"{metrics['answer']}. " if metrics.get("answer") else ""
+    which += f"Best of {count} starts: " if count > 1 else ""
     ended, believed = _stop_reason(metrics), load_texts("verdicts")[metrics["verdict"]]
     many = counted or "joint_error_after_deg" in metrics or count > 1
     if "joint_error_after_deg" in metrics:
