@@ -5,8 +5,9 @@ import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 import typer.main
@@ -60,11 +61,13 @@ class _CommandGroup(TyperGroup):
 
         found = typer.Typer()
         for name, function in load_plugins().commands.items():
-            found.command(name)(function)
+            found.command(name, rich_help_panel="Plugins")(function)
         if found.registered_commands:
             self.commands = {**self.commands, **typer.main.get_group(found).commands}
 
 
+# Panels of the list of commands.
+_RUN, _DATA, _LEARN, _DEVELOP = "Run files", "Recordings", "Begin", "Develop"
 app = typer.Typer(
     name="invertwin",
     cls=_CommandGroup,
@@ -74,11 +77,13 @@ app = typer.Typer(
 )
 
 
-def _command_with(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def _command_with(
+    kind: type, panel: str = _RUN
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Add a command whose options are the fields of a dataclass."""
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        return app.command()(with_options(kind)(function))
+        return app.command(rich_help_panel=panel)(with_options(kind)(function))
 
     return decorate
 
@@ -104,16 +109,26 @@ def invertwin(
 
 @_command_with(RunOptions)
 def simulate(options: RunOptions, file: FileArgument) -> None:
-    """Simulate exact radar signals of a scene, and their spectra."""
-    runs = load_runs([file], options, "simulate", ("radar", "grid", "data"))
+    """Simulate exact radar signals of a scene, and their spectra; or a coverage map."""
+    runs = load_runs([file], options, "simulate", _simulate_sections)
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
-        from invertwin.cli.commands.simulate import run_simulate
-
+        run = runs[file.stem]
         with prefix_file_errors(file), show_progress(console):
-            return run_simulate(runs[file.stem], folder), ""
+            if run.radar is None and run.map is not None:
+                from invertwin.cli.commands.coverage import run_coverage
+
+                return run_coverage(run, folder), ""
+            from invertwin.cli.commands.simulate import run_simulate
+
+            return run_simulate(run, folder), ""
 
     run_in_folder(options, Path("out", file.stem), work, runs)
+
+
+def _simulate_sections(run: Any) -> tuple[str, ...]:
+    radio = run.radar is None and run.map is not None
+    return ("map", "transmitter") if radio else ("radar", "grid", "data")
 
 
 @_command_with(DatasetOptions)
@@ -154,7 +169,7 @@ def plan(options: ResumableOptions, file: FileArgument) -> None:
     run_in_folder(options, Path("out", file.stem), work, runs)
 
 
-@app.command()
+@app.command(rich_help_panel=_DEVELOP)
 def check(file: FileArgument, backend: BackendOption = None) -> None:
     """Say what a run file needs, memory and time, and do nothing else."""
     from invertwin.cli.run_file import load_run
@@ -168,7 +183,7 @@ def check(file: FileArgument, backend: BackendOption = None) -> None:
     console.print(line, markup=False, soft_wrap=True)
 
 
-@app.command()
+@app.command(rich_help_panel=_DEVELOP)
 def convert(files: FilesArgument) -> None:
     """Rewrite run files of the first frame (x right, y up) in today's: x ahead, y left, z up."""
     from invertwin_convert import run_convert
@@ -177,7 +192,26 @@ def convert(files: FilesArgument) -> None:
         console.print(line, markup=False, soft_wrap=True)
 
 
-@_command_with(ResumableOptions)
+@app.command(rich_help_panel=_LEARN)
+def new(
+    kind: Annotated[Literal["fit", "simulate", "twin", "coverage", "dataset"], typer.Argument()],
+    file: Annotated[Path | None, typer.Argument(help="Default: the kind.toml.")] = None,
+) -> None:
+    """Write a commented run file to start from."""
+    text = (resources.files("invertwin.cli") / "templates" / f"{kind}.toml").read_text("utf-8")
+    path = file or Path(f"{kind}.toml")
+    try:
+        with path.open("x", encoding="utf-8") as out:
+            out.write(text)
+    except OSError as error:
+        raise InputError(
+            f"expected a new file in a folder, got {path}: {error.strerror}; name another"
+        ) from None
+    command = {"fit": "reconstruct", "coverage": "simulate"}.get(kind, kind)
+    console.print(f"wrote {path}; try: invertwin {command} {path}", markup=False, soft_wrap=True)
+
+
+@_command_with(ResumableOptions, _LEARN)
 def demo(options: ResumableOptions) -> None:
     """Find a hidden letter from its radar echoes."""
     # In its own folder the demo replaces what it left there before.
@@ -185,7 +219,7 @@ def demo(options: ResumableOptions) -> None:
     _run_one_reconstruction(_find_demo_file(), replace(options, overwrite=again), Path("out/demo"))
 
 
-@_command_with(LookOptions)
+@_command_with(LookOptions, _DATA)
 def look(options: LookOptions) -> None:
     """Show a recording: range, range rate, direction; and write it as a capture."""
     from invertwin.cli.commands.look import run_look
@@ -193,7 +227,7 @@ def look(options: LookOptions) -> None:
     _run_recording(options, "", run_look)
 
 
-@_command_with(TwinOptions)
+@_command_with(TwinOptions, _DATA)
 def twin(options: TwinOptions) -> None:
     """Find what stands in a recording, with no start: things, places, sizes, confidences."""
     from invertwin.cli.commands.twin import run_twin
@@ -201,7 +235,7 @@ def twin(options: TwinOptions) -> None:
     _run_recording(options, "_twin", run_twin)
 
 
-@app.command()
+@app.command(rich_help_panel=_DATA)
 def view(
     target: Annotated[
         Path,
@@ -227,7 +261,7 @@ def view(
     run_view(target, console, host=host, port=port, token=token, record=record, overwrite=overwrite)
 
 
-@_command_with(ResumableOptions)
+@_command_with(ResumableOptions, _DEVELOP)
 def gradcheck(options: ResumableOptions, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
     from invertwin.cli.commands.gradcheck import run_gradcheck
@@ -252,7 +286,7 @@ def rcs(options: ResumableOptions, files: FilesArgument) -> None:
     run_each(options, files, "rcs", ("rcs",), run_rcs)
 
 
-@app.command()
+@app.command(rich_help_panel=_LEARN)
 def keys(
     section: Annotated[
         str | None,
@@ -273,7 +307,7 @@ def keys(
         print_tables([key_index()] if section is None else key_tables(section))
 
 
-@app.command()
+@app.command(rich_help_panel=_LEARN)
 def doctor(backend: BackendOption = None) -> None:
     """Check that this machine can trace rays, and say how to fix it if not."""
     from invertwin.runtime import doctor as machine

@@ -95,7 +95,10 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
         profiles = capture.spectrum(replace(grid, u_count=1, v_count=1))
         times = torch.arange(radar.frame_count)
         shown["all frames"] = MapPanel(profiles[:, :, 0, 0].T.double(), grid.ranges, times, "frame")
-    metrics["warnings"] = said
+    answer = f"strongest echo {metrics['peak_range_m']:.2f} m away"
+    if "peak_azimuth_deg" in metrics:
+        answer += f", azimuth {metrics['peak_azimuth_deg']:.1f}° (left > 0)"
+    metrics |= {"warnings": said, "answer": answer}
     capture.save(folder.file("capture.nc"))
     if points is not None:
         metrics["points"] = len(points)
@@ -105,7 +108,8 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
     title, note = options.recording.name, load_texts("notes")["look"]
     tables = [quantity_table(title, metrics), *warning_tables(said)]
     drawn = save_picture(folder, "look", panels(shown), f"Frame {options.frame}", "doppler")
-    status, parts = f"{radar.frame_count} frames, read as {reader}.", [*tables, drawn]
+    status = f"{answer}; {radar.frame_count} frames, read as {reader}."
+    parts = [*tables, drawn]
     again = options.command("look", folder.path)
     return write_report(folder, metrics, title, status, parts, again=again, note=note)
 

@@ -1,0 +1,57 @@
+"""`invertwin simulate` without a radar: levels that transmitters reach, as a coverage map."""
+
+import io
+import time
+from typing import Any
+
+import numpy as np
+import torch
+
+from invertwin import plotting
+from invertwin.cli.fits.received_levels import radio_map
+from invertwin.cli.report import ReportTable, quantity_table, save_picture, write_report
+from invertwin.cli.run_file import prefix_errors, require_section
+from invertwin.cli.schema import RunFile, build
+from invertwin.errors import InputError
+from invertwin.links import MapPlane, ReceiverPoints
+from invertwin.storage.run_folder import RunFolder
+
+_UNITS = {"received_power": "dBm", "path_gain": "dB", "sinr": "dB", "delay_spread": "s"}
+
+
+def run_coverage(run: RunFile, folder: RunFolder) -> list[ReportTable]:
+    """Compute the map of a run file, write the folder, return the tables to print."""
+    begin, scene = time.perf_counter(), build.true_scene(run)
+    model = radio_map(run, None)
+    with prefix_errors("transmitter"):
+        sensor = require_section(run, "transmitter", "a coverage map").build()
+    places, unit = model.places, _UNITS.get(model.quantity, "1")
+    if not isinstance(places, MapPlane | ReceiverPoints):
+        raise InputError("map.places: expected points or a plane, got a mesh; choose one of these")
+    with torch.no_grad():
+        values = model.predict(scene, sensor, run.seed)
+    at = places.centres.reshape(-1, 3) if isinstance(places, MapPlane) else places.positions
+    table = io.BytesIO()
+    heads = ",".join(["x,y,z", *(f"transmitter_{k + 1}" for k in range(len(values)))])
+    rows = torch.cat([at, values.flatten(1).T], 1).numpy()
+    np.savetxt(table, rows, "%.9g", ",", header=heads, comments="")
+    folder.write_bytes("map.csv", table.getvalue())
+    best = values.amax(0).flatten()
+    tenth, median = best.quantile(torch.tensor([0.1, 0.5]).double()).tolist()
+    name = f"{model.quantity.replace('_', ' ')} [{unit}]"
+    metrics: dict[str, Any] = {
+        "task": "simulate",
+        "answer": f"{name} of the best transmitter at {len(best)} places: median {median:.4g}, a "
+        f"tenth is below {tenth:.4g}, the largest is {float(best.max()):.4g}",
+        "median": median,
+        "tenth": tenth,
+        "largest": float(best.max()),
+        "wall_seconds": time.perf_counter() - begin,
+    }
+    parts: list[Any] = [quantity_table("Coverage", metrics, label_table="coverage")]
+    if isinstance(places, MapPlane):
+        maps = {f"transmitter {k}": one for k, one in enumerate(values, 1)}
+        figure = plotting.coverage(maps, places, scene=scene, transmitters=sensor, label=name)
+        parts.append(save_picture(folder, "coverage", figure, "Coverage"))
+    title, status = run.title or "Coverage", f"{metrics['answer']}."
+    return write_report(folder, metrics, title, status, parts, again="simulate", note=run.note)

@@ -1,0 +1,72 @@
+"""Run files to start from: they are valid as written, and never replace a file."""
+
+import csv
+import math
+
+import pytest
+
+from cli.small import call, read_metrics
+from invertwin.cli.run_file import load_run
+
+KINDS = {
+    "fit": "reconstruct",
+    "simulate": "simulate",
+    "twin": "twin",
+    "coverage": "simulate",
+    "dataset": "dataset",
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_new_run_file_is_valid_and_says_how_to_run_it(kind, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, "new", kind) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"invertwin {KINDS[kind]} {kind}.toml" in said
+    text = (tmp_path / f"{kind}.toml").read_text()
+    assert f"# Run it: invertwin {KINDS[kind]} {kind}.toml" in text
+    assert load_run(tmp_path / f"{kind}.toml").task == KINDS[kind]
+    # A second one would replace what the user has written since.
+    (tmp_path / f"{kind}.toml").write_text("mine")
+    assert call(monkeypatch, "new", kind) == 2
+    assert "expected a new file" in capsys.readouterr().err
+    assert (tmp_path / f"{kind}.toml").read_text() == "mine"
+
+
+def test_a_coverage_map_without_a_radar_can_be_fitted(tmp_path, monkeypatch, capsys):
+    """Free space: levels follow the inverse square of the distance, in dBm."""
+    (tmp_path / "room.toml").write_text(
+        """
+task = "simulate"
+frame = 2
+[scene.plate]
+shape = "plate"
+width = 0.2
+height = 0.2
+position = [0.0, 50.0, -50.0]
+material = { kind = "perfect_conductor" }
+[transmitter]
+positions = [[0.0, 0.0, 2.0]]
+power_dbm = 20.0
+[map]
+places = { kind = "plane", low = [-4.0, -4.0], high = [4.0, 4.0], height = 0.0, cell = 0.5 }
+frequency = 3e9
+depth = 0
+"""
+    )
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, "simulate", tmp_path / "room.toml", "-o", "out") == 0
+    metrics = read_metrics(tmp_path / "out")
+    rows = list(csv.DictReader((tmp_path / "out" / "map.csv").read_text().splitlines()))
+    assert len(rows) == 16 * 16
+    for row in (rows[0], rows[100]):
+        x, y = float(row["x"]), float(row["y"])
+        gain = 20 * math.log10(299792458.0 / 3e9 / (4 * math.pi * math.hypot(x, y, 2.0)))
+        # The mean over a cell of half a metre is that of its middle to a few hundredths of a dB.
+        assert float(row["transmitter_1"]) == pytest.approx(20 + gain, abs=0.1)
+    levels = sorted(float(row["transmitter_1"]) for row in rows)
+    assert metrics["largest"] == pytest.approx(levels[-1], abs=1e-6)
+    assert metrics["median"] == pytest.approx(levels[len(levels) // 2], abs=0.05)
+    said = " ".join(capsys.readouterr().out.split())
+    assert metrics["answer"] in said
+    assert (tmp_path / "out" / "coverage.png").exists()
