@@ -38,7 +38,7 @@ def run_coverage(run: RunFile, folder: RunFolder) -> list[ReportTable]:
     folder.write_bytes("map.csv", table.getvalue())
     best = values.amax(0).flatten()
     tenth, median = best.quantile(torch.tensor([0.1, 0.5]).double()).tolist()
-    name = f"{model.quantity.replace('_', ' ')} [{unit}]"
+    name = f"{model.quantity.replace('_', ' ').capitalize()} [{unit}]"
     metrics: dict[str, Any] = {
         "task": "simulate",
         "answer": f"{name} of the best transmitter at {len(best)} places: median {median:.4g}, a "

@@ -95,7 +95,7 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
         profiles = capture.spectrum(replace(grid, u_count=1, v_count=1))
         times = torch.arange(radar.frame_count)
         shown["all frames"] = MapPanel(profiles[:, :, 0, 0].T.double(), grid.ranges, times, "frame")
-    answer = f"strongest echo {metrics['peak_range_m']:.2f} m away"
+    answer = f"Strongest echo {metrics['peak_range_m']:.2f} m away"
     if "peak_azimuth_deg" in metrics:
         answer += f", azimuth {metrics['peak_azimuth_deg']:.1f}° (left > 0)"
     metrics |= {"warnings": said, "answer": answer}

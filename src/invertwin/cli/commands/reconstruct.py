@@ -136,7 +136,8 @@ def _write(
         for name, item in displays.radar_data(problem).items()
     }
     shown = ReportView(view_html(display, links))
-    parts = [summary.result, shown, *summary.pictures, *summary.tables]
+    found, *details = summary.tables
+    parts = [shown, found, *summary.pictures, *details, summary.result]
     save_mesh(folder.file("twin.ply"), twin)
     if run.measures is not None:
         save_mesh(folder.file("twin.glb"), twin)

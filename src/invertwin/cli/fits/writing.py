@@ -46,7 +46,8 @@ def make_tables(fits: Fits, metrics: Row) -> list[ReportTable]:
         fits: all fits of a run to maps of radars.
         metrics: numbers of the run.
     """
-    tables = [_result_table(fits.problem.run, metrics)]
+    parameters = error_bar_table(metrics, parameter_values(fits))
+    tables = [_result_table(fits.problem.run, metrics), parameters]
     for way, rows in _rows_by_way(fits):
         if len(rows) > 1:
             keys = [key for key in START_COLUMNS if key in rows[0]]
@@ -58,7 +59,6 @@ def make_tables(fits: Fits, metrics: Row) -> list[ReportTable]:
             tables.append(ReportTable(f"Starts, {way}", heads, cells))
     if len(fits.rows) > 1 and any(is_shape_key(key) for key in metrics):
         tables.append(_method_table(fits))
-    tables.append(error_bar_table(metrics, parameter_values(fits)))
     if "initial_seconds" in metrics:
         tables.append(_refinement_table(fits.problem.run, metrics))
     return tables
@@ -269,7 +269,7 @@ def describe_outcome(run: RunFile, metrics: dict[str, Any], *, counted: bool = F
         counted: Count the successes of a single start, too.
     """
     count = metrics.get("starts_count", 1)
-    which = f"{metrics['answer']}. " if metrics.get("answer") else ""
+    which = f"Found: {metrics['answer']}. " if metrics.get("answer") else ""
     which += f"Best of {count} starts: " if count > 1 else ""
     ended, believed = _stop_reason(metrics), load_texts("verdicts")[metrics["verdict"]]
     many = counted or "joint_error_after_deg" in metrics or count > 1
