@@ -1,7 +1,6 @@
 """Physical constants in SI units (CODATA 2018), and the mark of our axes in files."""
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
-VACUUM_PERMEABILITY = 1.256_637_062_12e-6  # H/m
 VACUUM_PERMITTIVITY = 8.854_187_812_8e-12  # F/m
 BOLTZMANN = 1.380_649e-23  # J/K
 

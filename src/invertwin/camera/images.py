@@ -170,7 +170,9 @@ class _ImageRenderer:
         piece = torch.nonzero(high > low)[:, 0]
         ends = ends[:, piece]
         cut = [torch.lerp(ends[0], ends[1], share[piece, None]) for share in (low, high)]
-        marks = torch.stack([_project_points(fixed, point) for point in cut])
+        marks = torch.stack(
+            [fixed.principal_point + fixed.focal * p[:, :2] / p[:, 2:] for p in cut]
+        )
         length = (marks[1] - marks[0]).norm(dim=1)
         count = int(np.ceil(float(length.sum()) * self.sampling.outline_samples))
         if not count:
@@ -200,11 +202,6 @@ class _ImageRenderer:
         added = (low_side - high_side)[rows] * sweep[rows]
         flat = torch.zeros(camera.width * camera.height, dtype=torch.float64)
         return flat.index_add(0, line * camera.width + column, added)
-
-
-def _project_points(camera: Camera, local: Tensor) -> Tensor:
-    """Project points in camera axes to u, v."""
-    return camera.principal_point + camera.focal * local[:, :2] / local[:, 2:]
 
 
 def _clip_segments(

@@ -71,7 +71,7 @@ def report_html(
     from invertwin.viewer import content_security_policy
 
     pages = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    pages.filters |= {"shown": format_cell, "base64": _encode_base64}
+    pages.filters |= {"shown": format_cell, "base64": lambda png: base64.b64encode(png).decode()}
     backend = os.environ.get("INVERTWIN_BACKEND")
     return pages.from_string(_read_resource("report.html.jinja")).render(
         title=title,
@@ -163,10 +163,6 @@ def load_texts(name: str) -> dict[str, str]:
 
 def _read_resource(name: str) -> str:
     return (resources.files("invertwin.cli") / name).read_text(encoding="utf-8")
-
-
-def _encode_base64(png: bytes) -> str:
-    return base64.b64encode(png).decode("ascii")
 
 
 def is_numeric_cell(value: Any) -> bool:

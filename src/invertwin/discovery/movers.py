@@ -302,12 +302,11 @@ class MovingTargetMaps:
     def correlations(self, recording: ChirpCapture) -> dict[str, dict[str, float]]:
         """Correlations of ``twin`` and ``bare_psf`` with a frame of chirps, by scale."""
         seen = self.model.observe(recording)[0]
-        found = {}
-        for scale in get_args(CorrelationScale):
-            loss = CorrelationLoss(scale)
-            pair = ("twin", self.twin_map), ("bare_psf", self.point_map)
-            found[scale] = {name: 1 - float(loss(power, seen)) for name, power in pair}
-        return found
+        pair = ("twin", self.twin_map), ("bare_psf", self.point_map)
+        return {
+            scale: {name: 1 - float(CorrelationLoss(scale)(power, seen)) for name, power in pair}
+            for scale in get_args(CorrelationScale)
+        }
 
 
 @dataclass(frozen=True, eq=False)

@@ -551,18 +551,13 @@ def propose_splits(shape: ShapeParameters) -> list[tuple[ShapeParameters, ShapeP
         position = box.position[0] + x, box.position[1] + y
         return replace(box, position=position, length=sides[0], width=sides[1])
 
-    found: list[tuple[ShapeParameters, ShapeParameters]] = []
+    whole = 1.0, 0.0
     slim = [(_SLIM_FRACTION, off) for off in (_SLIM_FRACTION - 1, 0.0, 1 - _SLIM_FRACTION)]
-    for along in (0, 1):
-        for share in (1 / 3, 1 / 2, 2 / 3):
-            whole, other = (share, share - 1), (1 - share, share)
-            for first, second in (
-                ((1.0, 0.0), (1.0, 0.0)),
-                *((one, (1.0, 0.0)) for one in slim),
-                *(((1.0, 0.0), one) for one in slim),
-            ):
-                found.append((part(along, *whole, *first), part(along, *other, *second)))
-    return found
+    widths = [(whole, whole), *((one, whole) for one in slim), *((whole, one) for one in slim)]
+    return [
+        (part(along, share, share - 1, *first), part(along, 1 - share, share, *second))
+        for along, share, (first, second) in product((0, 1), (1 / 3, 1 / 2, 2 / 3), widths)
+    ]
 
 
 def shape_gap(first: ShapeParameters, second: ShapeParameters) -> float:

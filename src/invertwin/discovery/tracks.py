@@ -80,8 +80,7 @@ def track_moving_targets(recording: ChirpCapture, grid: Grid) -> list[DetectedOb
 def _motion_model(period: float) -> tuple[Tensor, Tensor]:
     """Return the transition matrix between frames, and the process noise covariance."""
     two = torch.eye(2, dtype=torch.float64)
-    step = torch.eye(4, dtype=torch.float64)
-    step[:2, 2:] = period * two
+    step = torch.eye(4, dtype=torch.float64) + period * torch.diag(torch.ones(2).double(), 2)
     gain = torch.cat([0.5 * period**2 * two, period * two])
     return step, _ACCELERATION_DEVIATION**2 * gain @ gain.T
 

@@ -104,14 +104,10 @@ def pose_error(found: Object, truth: Object) -> PoseError | None:
         return None
     a, b = found.vertices.detach(), truth.vertices.detach()
     a0, b0 = a - a.mean(0), b - b.mean(0)
-    u, values, vt = torch.linalg.svd(b0.T @ a0)
-    sign = torch.ones(3, dtype=torch.float64)
-    sign[2] = torch.det(u @ vt).sign()
-    rotation = u @ torch.diag(sign) @ vt
-    scale = float(b0.square().sum() / (values * sign).sum())
+    rotation = Rotation.align_vectors(a0.numpy(), b0.numpy())[0]
+    scale = float((a0 * torch.from_numpy(rotation.apply(b0.numpy()))).sum() / b0.square().sum())
     offset = found.center.detach() - truth.center.detach()
-    vector = torch.from_numpy(Rotation.from_matrix(rotation.T.numpy()).as_rotvec())
-    return PoseError(offset, vector, 1 / scale if scale else math.nan)
+    return PoseError(offset, torch.from_numpy(rotation.as_rotvec()), scale)
 
 
 def axis_error(found: Object, truth: Object, axis: ArrayLike) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import igl
 import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
@@ -74,15 +75,11 @@ class LatentNorm:
 def cotangent_edges(mesh: Mesh) -> tuple[Tensor, Float64[Tensor, " edge"], float]:
     """Compute edges, their cotangent weights (at least 0.01), and the mean edge length [m]."""
     positions = mesh.vertices.detach()
-    corners = positions[mesh.faces]
-    pairs, weights = [], []
-    for k in range(3):
-        a, b, c = corners[:, k], corners[:, (k + 1) % 3], corners[:, (k + 2) % 3]
-        dot = ((a - c) * (b - c)).sum(1)
-        area = torch.linalg.cross(a - c, b - c).norm(dim=1).clamp_min(1e-12)
-        pairs.append(torch.stack([mesh.faces[:, k], mesh.faces[:, (k + 1) % 3]], dim=1))
-        weights.append(0.5 * dot / area)
-    edges, group = torch.cat(pairs).sort(dim=1).values.unique(dim=0, return_inverse=True)
-    total = torch.zeros(len(edges), dtype=torch.float64).index_add(0, group, torch.cat(weights))
+    # Half cotangents of the angles opposite to the sides; a triangle without area has none.
+    halves = torch.from_numpy(igl.cotmatrix_entries(positions.numpy(), mesh.faces.numpy()))
+    pairs = mesh.faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
+    edges, group = pairs.sort(dim=1).values.unique(dim=0, return_inverse=True)
+    halves = halves.nan_to_num(0.0, 0.0, 0.0).flatten()
+    total = torch.zeros(len(edges), dtype=torch.float64).index_add(0, group, halves)
     lengths = (positions[edges[:, 0]] - positions[edges[:, 1]]).norm(dim=1)
     return edges, total.clamp_min(0.01), float(lengths.mean())

@@ -17,7 +17,6 @@ from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.metrics import pose_error, sample_surface
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import Pose
-from invertwin.scene.pose import quaternion_from_vector
 from invertwin.scene.remeshing import closest_points
 from invertwin.scene.scene import Object, Scene, displace
 
@@ -188,13 +187,10 @@ def _refit(fit: Fit, number: int, rotation: Tensor) -> Fit | None:
     found = fit.copy()
     module = found.unknowns[number]
     assert isinstance(module, Pose)
-    with torch.no_grad():  # about the object's own centre
-        halves = module.rotation.new_tensor([1.0, 0.5, 0.5, 0.5])
-        (w, *_), (a, *_) = (q := quaternion_from_vector(rotation)), (p := module.rotation * halves)
-        product = torch.cat(
-            [(w * a - q[1:] @ p[1:])[None], w * p[1:] + a * q[1:] + q[1:].cross(p[1:], 0)]
-        )
-        module.rotation.copy_(product / halves)
+    # About the object's own centre, before the fitted rotation.
+    turn = module.rotation_matrix.detach().T @ rotation
+    moved = displace(fit.scene[module.object], torch.zeros_like(turn), turn)
+    found.scene = fit.scene.replace(module.object, pose=moved.transform)
     first, last = (1 - _REFIT_BLUR) * fit.stage.blur_end, fit.stage.steps
     try:
         descent = GaussNewton(found.modules, found.objective, trust_radius=_REFIT_TRUST_RADIUS)

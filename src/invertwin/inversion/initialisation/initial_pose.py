@@ -24,7 +24,7 @@ from invertwin.inversion.initialisation.detections import (
 )
 from invertwin.limits import Positive
 from invertwin.radar.surrogate.surrogate import Surrogate
-from invertwin.scene.mesh import Mesh
+from invertwin.scene.parameters import Scale
 from invertwin.scene.pose import rigid
 from invertwin.scene.scene import Scene
 
@@ -128,10 +128,7 @@ class InitialPoseEstimator:
             resolution = radar.waveform.range_resolution
             rectangle = fit_rectangle(points, radar, resolution=resolution)
         if self.scale:
-            factor = estimate_scale(item, rectangle)
-            middle = item.mesh.center
-            mesh = Mesh(middle + (item.mesh.vertices - middle) * factor, item.mesh.faces)
-            scene = scene.replace(name, mesh=mesh)
+            scene = Scale(name, estimate_scale(item, rectangle)).requires_grad_(False)(scene)
         poses = candidate_poses(scene[name], rectangle, radar)
         how: dict[str, Any] = {"loss": loss, "surrogate": _POSE_SURROGATE, "seed": seed}
         scene, losses = select_pose(scene, name, poses, radar, capture, grid, **how)
