@@ -100,3 +100,22 @@ class Ripple(Blob):
         turn = 2 * torch.pi * scene["ball"].center[1] / self.period
         power = 1 + 0.16 * self.period * torch.sin(turn + torch.pi * BINS)
         return power.expand(self.frames, -1)[..., None, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Faces(Blob):
+    """Shows two faces of the ball along y: one blob at each, the far one dimmer.
+
+    Attributes:
+        share: of the far blob in power.
+        size: factor on the ball's size in the data.
+    """
+
+    share: float = 0.0
+    size: float = 1.0
+
+    def predict(self, scene: Scene, sensor: Any, seed: int) -> Tensor:
+        y = scene["ball"].vertices[:, 1]
+        middle, half = scene["ball"].center[1], 0.5 * self.size * (y.max() - y.min())
+        near, far = (torch.exp(-((BINS - middle - s * half) ** 2) / 0.02) for s in (-1.0, 1.0))
+        return (0.05 + near + self.share * far).expand(self.frames, -1)[..., None, None]

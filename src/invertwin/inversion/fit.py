@@ -267,11 +267,17 @@ class Fit:
         """Return a copy of the present parameters."""
         return {k: v.detach().clone() for k, v in self.modules.state_dict().items()}
 
-    def copy(self) -> "Fit":
-        """Return a copy of the fit with its own parameters, at their present values."""
+    def copy(self, *unknowns: nn.Module) -> "Fit":
+        """Return a copy of the fit with its own parameters, at their present values.
+
+        Args:
+            unknowns: further modules of the scene, applied after the others.
+        """
         other = copy.copy(self)
         own = (self.unknowns, self.sensor_unknowns, self.modules)
         other.unknowns, other.sensor_unknowns, other.modules = copy.deepcopy(own)
+        other.unknowns += unknowns
+        other.modules.extend(unknowns)
         return other
 
     def gauss_newton_step(self, optimizer: GaussNewton, step: int) -> float:

@@ -70,7 +70,7 @@ class Reconstruction:
         Raises:
             InputError: See :class:`invertwin.inversion.confidence.uncertainty.CovarianceEstimator`.
         """
-        return CovarianceEstimator(self.result).error_bars()
+        return CovarianceEstimator(self.result, size_errors=True).error_bars()
 
     @cached_property
     def verdict(self) -> Verdict:

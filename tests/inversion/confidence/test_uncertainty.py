@@ -1,5 +1,6 @@
 """Error bars: against the Cramér–Rao bound of a model without rays, and what is not observed."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -7,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from blobs import LAW, Blob, Ripple, deviation, scene
+from blobs import LAW, Blob, Faces, Ripple, deviation, scene
 from invertwin.errors import InputError
 from invertwin.inversion import (
     Observation,
@@ -16,16 +17,18 @@ from invertwin.inversion import (
     Schedule,
     reconstruct,
 )
-from invertwin.inversion.confidence.uncertainty import iterate_coordinates
+from invertwin.inversion.confidence.uncertainty import CovarianceEstimator, iterate_coordinates
 from invertwin.radar.parameters import RadarPose, RangeBias
 from invertwin.scene import Pose, Scale, Scene, Translation
 from invertwin.scene.parameters import Coordinate
 from scenes import float64
 
 
-def fitted(model: Blob, seed: int = 0, axes: str = "y", loss: Any = LAW) -> Reconstruction:
-    """A fit of one look at a ball at y = 0.1."""
-    look = replace(model, known=True).realisations(scene(0.1), None, 0)
+def fitted(
+    model: Blob, seed: int = 0, axes: str = "y", loss: Any = LAW, seen: Blob | None = None
+) -> Reconstruction:
+    """A fit of one look at a ball at y = 0.1, as another model sees it."""
+    look = replace(seen or model, known=True).realisations(scene(0.1), None, 0)
     assert look is not None
     return reconstruct(
         scene(0.05),
@@ -61,6 +64,50 @@ def test_stated_errors_hold():
     assert sum(inside) >= 53
     spread = float(torch.tensor(errors).std())
     assert fits[0].uncertainty.deviations["ball.y"] == pytest.approx(spread, rel=0.3)
+
+
+def half_size() -> float:
+    y = scene()["ball"].vertices[:, 1]
+    return 0.5 * float(y.max() - y.min())
+
+
+def test_a_size_that_nothing_tells_displaces_by_its_own_deviation():
+    """Of a ball of which one face shows, a size 10 % off moves the centre by as much."""
+    found = fitted(Faces())
+    bars = found.uncertainty
+    alone = CovarianceEstimator(found.result).error_bars().deviations["ball.y"]
+    assert bars.size_errors["ball"] == pytest.approx(0.1, rel=0.02)
+    assert bars.deviations["ball.y"] == pytest.approx(math.hypot(alone, 0.1 * half_size()), 0.02)
+
+
+def test_a_size_that_the_data_contradict_is_in_the_error_bars():
+    """The data show a ball a quarter smaller: its far face is dim and yields to the near one."""
+    kind = Faces(frames=400, share=0.02)
+    found = fitted(kind, seen=replace(kind, size=0.75))
+    error = float(found.scene["ball"].center[1].detach()) - 0.1
+    alone = CovarianceEstimator(found.result).error_bars().deviations["ball.y"]
+    assert abs(error) > 5 * alone
+    assert abs(error) < 3 * found.uncertainty.deviations["ball.y"]
+    assert found.uncertainty.size_errors["ball"] > 0.1
+
+
+def test_a_size_that_the_data_confirm_hardly_widens_error_bars():
+    kind = Faces(frames=400, share=1.0)
+    found = fitted(kind)
+    alone = CovarianceEstimator(found.result).error_bars().deviations["ball.y"]
+    assert found.uncertainty.deviations["ball.y"] == pytest.approx(alone, rel=0.1)
+    assert found.uncertainty.size_errors["ball"] < 0.03
+
+
+def test_a_fitted_size_and_a_size_without_effect_change_nothing():
+    bars = fitted(Blob()).uncertainty
+    alone = CovarianceEstimator(fitted(Blob()).result).error_bars()
+    torch.testing.assert_close(bars.covariance, alone.covariance, rtol=1e-12, atol=0.0)
+    assert bars.size_errors["ball"] == pytest.approx(0.1)
+    observation = Observation(Faces(), Faces().predict(scene(0.1), None, 0), sensor=None)
+    both = [Translation("ball", axes="y"), Scale("ball")]
+    schedule = Schedule(1)
+    assert reconstruct(scene(), observation, both, schedule=schedule).uncertainty.size_errors == {}
 
 
 def test_without_looks_the_frames_tell():

@@ -50,6 +50,7 @@ def error_bar_metrics(uncertainty: Uncertainty) -> dict[str, Any]:
         "units": dict(zip(uncertainty.names, uncertainty.units, strict=True)),
         "correlations": uncertainty.correlations,
         "unobserved": list(uncertainty.unobserved),
+        "size_errors": dict(uncertainty.size_errors),
     }
 
 

@@ -1,8 +1,8 @@
 """Error bars of a fit from the statistics of its data, and unobserved parameters."""
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
@@ -17,7 +17,7 @@ from invertwin.inversion.forward_mode import map_tangents
 from invertwin.inversion.gauss_newton import penalty_curvature
 from invertwin.inversion.loss import CURVED
 from invertwin.runtime.progress import track
-from invertwin.scene.parameters import Coordinate, Entries
+from invertwin.scene.parameters import Coordinate, Entries, Scale
 
 _MAX_COORDINATES = 64  # each coordinate costs derivatives of the map
 # Relative to the apparent information due to noise of the derivatives.
@@ -29,14 +29,16 @@ _WEAK_VARIANCE = 1 / 16  # spans squared: directions with more variance are prof
 _PROFILE_DISTANCE = 2.0  # spans: displacement of a profiled direction
 _PROFILE_REFITS = 3  # Gauss–Newton steps of the other coordinates
 _MIN_LOSS_RISE = 1e-3  # lower limit of the rise of the loss, relative to the quadratic model
+_SIZE_DEVIATION = 0.1  # of the sizes of objects whose pose alone is fitted, before the data
 
 
 @dataclass(frozen=True)
 class Uncertainty:
     """Error bars of a fit.
 
-    They state the effect of speckle and noise on the estimate near its minimum. The verdict
-    assesses wrong minima, models and starts. A direction that is known to a quarter of its span at
+    They state the effect of speckle and noise on the estimate near its minimum, and of the error of
+    sizes that the fit holds (``size_errors``). The verdict assesses wrong minima, models and
+    starts. A direction that is known to a quarter of its span at
     best has the error bar of the loss profile two spans away, if the profile rises less than the
     curvature at the minimum predicts.
 
@@ -49,6 +51,8 @@ class Uncertainty:
             coordinates.
         count: number of realisations, or of frames, from whose scatter the covariance is estimated.
         source: ``looks`` (realisations of the twin) or ``frames`` of the data.
+        size_errors: root mean square error of the size of every object whose pose alone is fitted,
+            relative, given the data and a deviation of a tenth before them.
     """
 
     names: tuple[str, ...]
@@ -57,6 +61,7 @@ class Uncertainty:
     unobserved: tuple[str, ...]
     count: int
     source: Literal["looks", "frames"]
+    size_errors: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def deviations(self) -> dict[str, float]:
@@ -89,19 +94,26 @@ class CovarianceEstimator:
     samples, to remove the apparent information of their noise. For models without realisations,
     Cov(g) is the scatter over frames of the data, assuming independent speckle in each frame.
 
-    Source: the sandwich covariance of estimators; derivations §16.
+    An object whose pose alone is fitted has a size n of deviation σ = 0.1. The gradient of the loss
+    by n, at coordinates that follow, is a linear measurement of it. By the mean square of n given
+    this measurement the coordinates are displaced, ``H_θθ⁻¹ H_θn n`` (consider parameters).
+
+    Source: the sandwich covariance of estimators, derivations §16; Schmidt, "Application of
+    state-space methods to navigation problems", Advances in Control Systems 3, 1966.
     Differs from the source: Cov(g) from realisations, which accounts for correlated bins and
-    frames.
+    frames. The mean square of a considered value is that given the data.
 
     Args:
         result: result of the fit.
+        size_errors: whether sizes that the fit holds are uncertain.
 
     Raises:
         InputError: More than 64 coordinates, or a loss without a curvature.
     """
 
-    def __init__(self, result: FitResult) -> None:
-        fit = result.fit
+    def __init__(self, result: FitResult, *, size_errors: bool = False) -> None:
+        self._sizes = _find_held_sizes(result.fit) if size_errors else []
+        fit = result.fit.copy(*map(Scale, self._sizes))
         found = list(iterate_coordinates(fit.modules))
         others = [x for x in fit.objective.losses if not isinstance(x, CURVED)]
         if len(found) > _MAX_COORDINATES or others:
@@ -111,15 +123,13 @@ class CovarianceEstimator:
                 "not available"
             )
         self._end = result
-        first, second = (map_derivatives(fit, found, number) for number in (0, 1))
+        rows = _mean_derivatives(fit, found)
         # Coordinates without effect are dropped, unless they have a span.
-        moves = [any(bool(rows[k].any()) for rows in first) for k in range(len(found))]
+        moves = [any(bool(part[k].any()) for part in rows[0]) for k in range(len(found))]
         kept = [k for k, c in enumerate(found) if moves[k] or math.isfinite(c.span)]
-        self._kept, self._found = kept, [found[k] for k in kept]
-        first, second = ([rows[kept] for rows in side] for side in (first, second))
-        # J₁J₂ᵀ + J₂J₁ᵀ = 2 (mean mean − half half), with half the difference of J₁ and J₂.
-        pairs = list(zip(first, second, strict=True))
-        self._rows = [(a + b) / 2 for a, b in pairs], [(a - b) / 2 for a, b in pairs]
+        self._rows = [[part[kept] for part in side] for side in rows]
+        self._kept = kept[: len(kept) - len(self._sizes)]
+        self._found = [found[k] for k in self._kept]
 
     def error_bars(
         self, frames: Sequence[int] | None = None, realisations: Sequence[Any] = ()
@@ -133,16 +143,17 @@ class CovarianceEstimator:
         Raises:
             InputError: A single frame of a model without realisations.
         """
-        end, found, rows = self._end, self._found, self._rows
+        end, found, rows, sizes = self._end, self._found, self._rows, self._sizes
         if frames is not None:
             end = end.select_frames(frames, realisations)
             rows = [[part[:, frames] for part in side] for side in rows]
         objective = end.fit.objective
         curvature, feigned = (objective.curvature(end.maps, some) for some in rows)
+        slopes = end.loss_gradients(end.maps)[1]
         if end.realisation_statistics is not None:
             count, by = len(end.realisation_statistics.losses), "looks"
             looks = end.realisation_statistics.gradients
-            scatter, chance = (_gradient_covariance(looks, some) for some in rows)
+            scatter, chance = (torch.cov(_project(looks, r).T).reshape_as(curvature) for r in rows)
         else:
             count, by = min(len(b) for _, b in end.maps), "frames"
             if count < 2:
@@ -150,31 +161,41 @@ class CovarianceEstimator:
                     "expected a model with realisations or several frames for error bars, got one "
                     "frame of a model without realisations; error bars are not available"
                 )
-            slopes = end.loss_gradients(end.maps)[1]
             scatter, chance = (_frame_covariance(slopes, some) for some in rows)
-        curvature = curvature - feigned + _penalty_curvature(end.fit, found)
+        curvature, own = curvature - feigned, slice(len(found))
+        curvature[own, own] += _penalty_curvature(end.fit, found)
         spans = torch.tensor([c.span for c in found], dtype=torch.float64)
-        own = curvature.diagonal().clamp_min(1e-30).rsqrt()
-        spans = torch.where(spans.isinf(), own, spans)
+        spans = spans.where(spans.isfinite(), curvature.diagonal()[own].clamp_min(1e-30).rsqrt())
         square = spans * spans[:, None]
-        parts = (m * square for m in (curvature, feigned, scatter, chance))
-        covariance = _sandwich_covariance(*parts)
+        parts = (curvature, feigned, scatter, chance)
+        covariance, inverse = _sandwich_covariance(*(m[own, own] * square for m in parts))
         if frames is None:
             covariance = self._widen_covariance(covariance, spans)
-        names, units = tuple(c.name for c in found), tuple(c.unit for c in found)
         blind = tuple(_describe_unobserved(found, covariance))
-        return Uncertainty(names, units, covariance * square, blind, count, by)
+        names, units = tuple(c.name for c in found), tuple(c.unit for c in found)
+        bars = Uncertainty(names, units, covariance * square, blind, count, by)
+        if not sizes:
+            return bars
+        shift = (inverse * square) @ curvature[own, len(found) :]
+        follow = torch.cat([-shift, torch.eye(len(sizes))]).T.double()
+        slope, noise = (follow @ part @ follow.T for part in (curvature, scatter))
+        square = _held_mean_square(slope, noise, -follow @ _project([slopes], rows[0])[0])
+        errors = dict(zip(sizes, square.diagonal().sqrt().tolist(), strict=True))
+        covariance = bars.covariance + shift @ square @ shift.T
+        return replace(bars, covariance=covariance, size_errors=errors)
 
     def _widen_covariance(self, covariance: Tensor, spans: Tensor) -> Tensor:
         """Widen weak directions of the covariance (in spans) by profiles of the loss."""
         fit, known = self._end.fit, torch.tensor([math.isfinite(c.span) for c in self._found])
-        pairs = zip(*_eigen_rows(covariance[known][:, known]), strict=True)
-        weak = [(float(error), axis) for error, axis in pairs if _WEAK_VARIANCE < error < 1]
+        errors, axes = torch.linalg.eigh(covariance[known][:, known])
+        pairs = zip(errors.tolist(), axes.T, strict=True)
+        weak = [(error, axis) for error, axis in pairs if _WEAK_VARIANCE < error < 1]
         if not weak or bool(_penalty_curvature(fit, self._found).any()):
             return covariance
         with torch.no_grad():
             target = [predicted for predicted, _ in fit.unblurred_maps(0)]
-        own = fit.objective.curvature([(a, a) for a in target], self._rows[0])
+        rows = [part[: len(spans)] for part in self._rows[0]]
+        own = fit.objective.curvature([(a, a) for a in target], rows)
         inverse = torch.linalg.pinv(own * spans * spans[:, None], hermitian=True)
         for error, axis in weak:
             vector = torch.zeros(len(spans), dtype=torch.float64)
@@ -277,16 +298,37 @@ def map_derivatives(fit: Fit, coordinates: Sequence[Coordinate], seed_number: in
     return [torch.stack(column) for column in zip(*rows, strict=True)]
 
 
-def _gradient_covariance(
-    loss_gradients: Sequence[Sequence[Tensor]], map_derivatives: Sequence[Tensor]
-) -> Tensor:
-    """Estimate the covariance of the gradient over realisations."""
-    flat = [part.flatten(1) for part in map_derivatives]
-    scores = [
-        torch.stack([f @ s.flatten() for f, s in zip(flat, own, strict=True)]).sum(0)
-        for own in loss_gradients
-    ]
-    return torch.cov(torch.stack(scores).T.double()).reshape(len(flat[0]), -1)
+def _mean_derivatives(fit: Fit, coordinates: Sequence[Coordinate]) -> list[list[Tensor]]:
+    """Return the means and the half differences of independent derivatives of each map.
+
+    J₁J₂ᵀ + J₂J₁ᵀ = 2 (mean mean − half half) is free of the noise of both.
+    """
+    first, second = (map_derivatives(fit, coordinates, number) for number in (0, 1))
+    pairs = list(zip(first, second, strict=True))
+    return [[(a + b) / 2 for a, b in pairs], [(a - b) / 2 for a, b in pairs]]
+
+
+def _find_held_sizes(fit: Fit) -> list[str]:
+    """Return the names of meshes of which a fit moves the pose, but not the shape."""
+    with torch.enable_grad():
+        objects = fit.apply_modules()[0].objects
+    meshes = {name: item for name, item in objects.items() if item.cloud is None}
+    moved = {name: item.mesh for name, item in meshes.items() if item.transform.requires_grad}
+    return [name for name, mesh in moved.items() if not mesh.vertices.requires_grad]
+
+
+def _held_mean_square(slope: Tensor, noise: Tensor, score: Tensor) -> Tensor:
+    """Return the mean square of held sizes, given minus a gradient: slope · sizes, and noise."""
+    before = _SIZE_DEVIATION**2 * torch.eye(len(slope), dtype=torch.float64)
+    gain = before @ slope.T @ torch.linalg.pinv(slope @ before @ slope.T + noise, hermitian=True)
+    return before - gain @ slope @ before + torch.outer(gain @ score, gain @ score)
+
+
+def _project(loss_gradients: Sequence[Sequence[Tensor]], rows: Sequence[Tensor]) -> Tensor:
+    """Return gradients by coordinates from gradients by maps: one row for each of these."""
+    flat = [part.flatten(1) for part in rows]
+    terms = ([f @ s.flatten() for f, s in zip(flat, own, strict=True)] for own in loss_gradients)
+    return torch.stack([torch.stack(own).sum(0) for own in terms]).double()
 
 
 def _frame_covariance(
@@ -316,21 +358,22 @@ def _penalty_curvature(fit: Fit, coordinates: Sequence[Coordinate]) -> Tensor:
 
 def _sandwich_covariance(
     curvature: Tensor, curvature_bias: Tensor, scatter: Tensor, scatter_bias: Tensor
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
     """Compute the sandwich covariance in units of the spans; uninformed directions get large
-    errors.
+    errors. Return it, and the inverse curvature without these directions.
     """
     values, axes = torch.linalg.eigh(curvature)
     least = _MIN_INFORMATION_FRACTION * (axes.T @ curvature_bias @ axes).diagonal().clamp_min(1e-30)
     seen = values > least
     values = values.clamp_min(least)
+    inverse = (axes * (seen / values)) @ axes.T
     inner = axes.T @ (scatter - scatter_bias) @ axes * (seen * seen[:, None])
     noise = (axes.T @ scatter_bias @ axes).diagonal()
     blind = torch.maximum(noise, 2 * _UNOBSERVED_VARIANCE * values.square())
     inner += torch.diag(torch.where(seen, 0.0, blind))
     powers, turned = torch.linalg.eigh(inner / (values * values[:, None]))
     axes = axes @ turned
-    return axes @ torch.diag(powers.clamp_min(1e-30)) @ axes.T
+    return axes @ torch.diag(powers.clamp_min(1e-30)) @ axes.T, inverse
 
 
 def _describe_unobserved(coordinates: Sequence[Coordinate], covariance: Tensor) -> Iterator[str]:
@@ -340,7 +383,8 @@ def _describe_unobserved(coordinates: Sequence[Coordinate], covariance: Tensor) 
     known = [k for k, c in enumerate(coordinates) if math.isfinite(c.span)]
     own = covariance[known][:, known]
     most = _UNOBSERVED_VARIANCE_RATIO * float(own.diagonal().min()) if known else math.inf
-    for error, axis in zip(*_eigen_rows(own), strict=True):
+    errors, axes = torch.linalg.eigh(own)
+    for error, axis in zip(errors, axes.T, strict=True):
         if not error > max(1.0, min(most, _UNOBSERVED_VARIANCE)):
             continue
         order = axis.abs().argsort(descending=True).tolist()
@@ -361,9 +405,3 @@ def _describe_unobserved(coordinates: Sequence[Coordinate], covariance: Tensor) 
         best = max(shares, key=lambda name: shares[name], default=None)
         ending = "" if best is None else f"; {1 / shares[best]:.1g} of the information of {best}"
         yield f"{names}: not observed{ending}"
-
-
-def _eigen_rows(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Return eigenvalues, and eigenvectors as rows."""
-    values, vectors = torch.linalg.eigh(matrix)
-    return values, vectors.T
