@@ -72,7 +72,72 @@ def test_loopback_admits_its_own_names_and_pages_alone():
     assert not guard.admits("/", headers(Host="rebound.example:8080"), 8080)
     other = headers(Host="127.0.0.1:8080", Origin="http://other.example")
     assert not guard.admits("/", other, 8080)
-    assert not guard.admits("/", headers(), 8080)
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        *("127.0.0.1", "127.0.0.1:8081", "127.0.0.1:08080", "localhost.:8080", "0.0.0.0:8080"),
+        *("LOCALHOST.evil:8080", "127.0.0.2:8080", "[::1]:8081", "2130706433:8080"),
+    ],
+)
+def test_loopback_has_an_exact_set_of_hosts(host):
+    assert not AccessGuard("127.0.0.1").admits("/", headers(Host=host), 8080)
+
+
+@pytest.mark.parametrize(
+    ("origin", "admitted"),
+    [
+        ("http://127.0.0.1:8080", True),
+        ("http://127.0.0.1:8080/", False),
+        ("http://127.0.0.1:80800", False),
+        ("http://127.0.0.1:8080@evil", False),
+        ("http://evil@127.0.0.1:8080", False),
+        ("ftp://127.0.0.1:8080", False),
+        ("http://[", False),
+        ("null", False),
+        ("", False),
+    ],
+)
+def test_origins_are_those_of_the_host(origin, admitted):
+    given = headers(Host="127.0.0.1:8080", Origin=origin)
+    assert AccessGuard("127.0.0.1").admits("/", given, 8080) == admitted
+
+
+MALFORMED = ("evil\\@127.0.0.1:8080", "127.0.0.1:8080:evil", "[", "a b", "é:8080", "", "a@b:80")
+
+
+@pytest.mark.parametrize("host", MALFORMED)
+@pytest.mark.parametrize("token", [None, TOKEN])
+def test_a_malformed_host_is_malformed_with_a_token_too(host, token):
+    with pytest.raises(ValueError, match="one host"):
+        AccessGuard("127.0.0.1", token).admits(f"/?token={TOKEN}", headers(Host=host), 8080)
+
+
+@pytest.mark.parametrize("path", ["/\0", "/%00", "/%0a", "/" + "a" * 5000, "/?token=%ff%fe%00"])
+def test_a_malformed_path_is_malformed(path):
+    with pytest.raises(ValueError, match="plain path"):
+        AccessGuard("127.0.0.1").admits(path, headers(Host="127.0.0.1:8080"), 8080)
+
+
+@NEEDS_VISER
+def test_malformed_requests_are_400_and_no_path_raises(capfd):
+    with Viewer(build_display(cube(), {}, "cube"), port=0) as viewer:
+        for host in MALFORMED:
+            if host.isascii():
+                assert answered(viewer, Host=host).status == 400
+        statuses = {
+            answered(viewer, path).status
+            for path in (
+                *("/%00", "/%0d%0a", "/" + "a" * 300, "/" + "a/" * 400, "/%ff", "//[", "/?[", "/%"),
+                *("/.", "/..", "/%2e", "/\\..\\..", "//evil.example/", "/index.html/x"),
+                *("/http://[evil", "/;a=b", "/~", "/%F0%9F%98%80"),
+            )
+        }
+        assert statuses <= {200, 400, 403, 404}
+        assert answered(viewer, Cookie="a=b; (=[;;; =; expires").status == 200
+        assert answered(viewer).status == 200
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_the_token_is_asked_for_in_address_or_cookie():

@@ -18,7 +18,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import require_sampled_waveform
 from invertwin.radar.waveform import unit_window
 from invertwin.storage.folders import replace_file
-from invertwin.storage.untrusted import convert_read_errors, existing_file
+from invertwin.storage.untrusted import convert_read_errors, read_text
 
 RecordingT = TypeVar("RecordingT", bound=Capture | ChirpCapture)
 _MIN_RELATIVE_GAIN = 1e-3
@@ -69,9 +69,10 @@ class ChannelCalibration:
         Raises:
             InputError: no such file, or one that holds no calibration.
         """
-        path = existing_file(path, "a calibration")
         with convert_read_errors(path, "a calibration, gains [tx][rx][real, imaginary]"):
-            parts = torch.tensor(json.loads(path.read_text())["gains"], dtype=torch.float64)
+            parts = torch.tensor(
+                json.loads(read_text(path, "a calibration"))["gains"], dtype=torch.float64
+            )
             if parts.ndim != 3 or parts.shape[2] != 2:
                 raise ValueError(f"shape {tuple(parts.shape)}")
         calibration = cls(torch.view_as_complex(parts))

@@ -24,6 +24,7 @@ from invertwin.registry.section import require_section as require_section
 from invertwin.storage.untrusted import convert_read_errors
 
 _MAX_ERRORS = 20  # in one line
+_MAX_BYTES = 4_000_000  # tens of thousands of objects or places
 # Sections and kinds of the package in experiments/studies.
 _STUDY_NAMES = ("methods", "loss_scan", "openradar", "rail_sar", "vehicle", "shape_space")
 _KEYS_BY_TABLE = {
@@ -75,6 +76,8 @@ def read_text(path: Path) -> str:
         got = "a folder" if path.is_dir() else "a pipe or a device"
         raise InputError(f"{path}: expected a run file, got {got}; name a file in it")
     try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ValueError(f"more than {_MAX_BYTES / 1e6:.0f} MB")
         return path.read_bytes().decode("utf-8")
     except FileNotFoundError:
         raise InputError(

@@ -21,7 +21,7 @@ from invertwin.datasets.shards import (
 )
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
-from invertwin.storage.untrusted import convert_read_errors
+from invertwin.storage.untrusted import convert_read_errors, existing_file
 
 
 class SampleDataset(Dataset[Any]):
@@ -92,6 +92,7 @@ class SampleDataset(Dataset[Any]):
             InputError: One that is damaged or missing.
         """
         for path, shard in self._shards:
+            existing_file(path, "a shard of a data set")
             with convert_read_errors(path, "a shard of a data set"), path.open("rb") as opened:
                 digest = hashlib.file_digest(opened, "sha256").hexdigest()
             if digest != shard.sha256:

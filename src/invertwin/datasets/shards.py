@@ -13,12 +13,15 @@ import io
 import tarfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Le, MinLen
 from pydantic import BaseModel
 
 from invertwin.errors import InputError
-from invertwin.storage.untrusted import convert_read_errors
+from invertwin.limits import MAX_COUNT, Count
+from invertwin.storage.untrusted import convert_read_errors, existing_file
 
 MANIFEST = "manifest.json"
 FORMAT = "invertwin data set 2"
@@ -32,8 +35,8 @@ class Shard(BaseModel):
     """A tar file of a data set."""
 
     name: str
-    first: int  # number of its first sample
-    samples: int
+    first: Annotated[int, Ge(0), Le(MAX_COUNT)]  # number of its first sample
+    samples: Count
     size: int  # bytes
     sha256: str
 
@@ -49,12 +52,12 @@ class DatasetManifest(BaseModel):
     """Contents of a folder of shards."""
 
     format: str
-    samples: int  # of the whole data set
-    part: tuple[int, int]  # which of how many parts of the data set this folder holds
+    samples: Count  # of the whole data set
+    part: tuple[Count, Count]  # which of how many parts of the data set this folder holds
     fingerprint: str  # SHA-256 of the run file as used
     versions: dict[str, str]  # of what computed the samples
     arrays: dict[str, ArrayInfo]
-    shards: list[Shard]
+    shards: Annotated[list[Shard], MinLen(1)]
 
 
 def shard_name(number: int) -> str:
@@ -134,7 +137,8 @@ def locate_members(path: Path) -> dict[int, dict[str, tuple[int, int]]]:
         InputError: No tar file, or one that is no shard.
     """
     found: dict[int, dict[str, tuple[int, int]]] = {}
-    with convert_read_errors(path, "a shard of a data set"), tarfile.open(path, mode="r:") as tar:
+    what = "a shard of a data set"
+    with convert_read_errors(path, what), tarfile.open(existing_file(path, what), "r:") as tar:
         for entry in tar:
             number, _, end = entry.name.partition(".")
             found.setdefault(int(number), {})[end] = (entry.offset_data, entry.size)
@@ -157,6 +161,7 @@ def read_manifests(folder: Path) -> list[tuple[Path, DatasetManifest]]:
         with convert_read_errors(file, "the manifest of a data set"):
             manifest = DatasetManifest.model_validate_json(file.read_bytes())
         known = manifest.format in (FORMAT, OLD_FORMAT)
+        known &= manifest.part[0] <= manifest.part[1]
         if not known or any(Path(s.name).name != s.name for s in manifest.shards):
             raise InputError(f"expected {FORMAT!r}, got {file} of another format; make it again")
         found.append((file.parent, manifest))

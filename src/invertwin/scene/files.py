@@ -14,6 +14,7 @@ import trimesh
 from torch import Tensor
 from trimesh import transformations
 from trimesh.exchange.gltf import export_glb
+from trimesh.resolvers import FilePathResolver
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
@@ -265,9 +266,17 @@ def save_scene_xml(path: str | Path, scene: Scene) -> None:
         part.write_bytes(ElementTree.tostring(root))
 
 
+class _FileResolver(FilePathResolver):
+    """Files that a mesh names, such as its materials: no pipes."""
+
+    def get(self, name: str) -> bytes:
+        existing_file(Path(self.parent, name))
+        return super().get(name)
+
+
 def _load_trimesh_scene(path: Path) -> trimesh.Scene:
     if path.suffix.lower() != ".inp":
-        return trimesh.load_scene(path, process=False)
+        return trimesh.load_scene(path, process=False, resolver=_FileResolver(str(path)))
     text = read_text(path, "an .inp mesh")
     vertices, faces = _ucd(text) if _UCD_HEADER.match(text) else _abaqus(text)
     return trimesh.Scene(trimesh.Trimesh(vertices, faces, process=False))

@@ -15,6 +15,7 @@ from filelock import FileLock, Timeout
 from pydantic import BaseModel, ValidationError
 
 from invertwin.errors import InputError
+from invertwin.storage.untrusted import existing_file
 
 MANIFEST = ".invertwin.json"
 LOCK = ".invertwin.lock"
@@ -116,10 +117,11 @@ def read_manifest(path: Path) -> Manifest:
     Raises:
         InputError: It is damaged, or names what does not lie in the folder.
     """
-    try:
-        manifest = Manifest.model_validate_json((path / MANIFEST).read_bytes())
-    except FileNotFoundError:
+    if not (path / MANIFEST).exists():
         return Manifest()
+    try:
+        file = existing_file(path / MANIFEST, f"a readable {MANIFEST}")
+        manifest = Manifest.model_validate_json(file.read_bytes())
     except ValidationError:
         raise InputError(
             f"expected a readable {MANIFEST}, got a damaged one in {path}; choose another -o"

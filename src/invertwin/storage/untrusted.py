@@ -17,8 +17,9 @@ if TYPE_CHECKING:  # the command line starts without NumPy
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-# Bytes of an array in an archive, and over those that it takes there: more is a bomb.
+# Bytes of a file or an array, and over those that it takes on disk: more is a bomb.
 _MAX_EXPANDED, _MAX_EXPANSION = 2**28, 100
+_MAX_TEXT = 2**28  # bytes
 _DAMAGED_ADVICE = "it is damaged or of another kind; copy or export it again"
 
 
@@ -77,7 +78,7 @@ def existing_file(path: str | Path, what: str = "an existing file") -> Path:
         what: What it should be, for the error.
 
     Raises:
-        InputError: No such file, or a name that cannot be one.
+        InputError: No such file, a name that cannot be one, or a file of holes.
     """
     file = Path(path)
     try:
@@ -86,7 +87,17 @@ def existing_file(path: str | Path, what: str = "an existing file") -> Path:
         found = False
     if not found:
         raise InputError(f"expected {what}, got no file {str(file)[:300]}; check the path")
+    known = file.stat()
+    if _expands(known.st_size, 512 * getattr(known, "st_blocks", known.st_size)):
+        raise InputError(
+            f"expected {what}, got {file}, {known.st_size / 1e9:.2g} GB of holes; copy it again"
+        )
     return file
+
+
+def _expands(size: int, stored: int) -> bool:
+    """Return True for many more bytes than are stored."""
+    return size > max(_MAX_EXPANDED, _MAX_EXPANSION * stored)
 
 
 def read_text(path: str | Path, what: str) -> str:
@@ -104,6 +115,8 @@ def read_text(path: str | Path, what: str) -> str:
     """
     file = existing_file(path, what)
     with convert_read_errors(file, what, "it is no text; name the settings, not the data"):
+        if file.stat().st_size > _MAX_TEXT:
+            raise ValueError("more than 256 MB")
         content = file.read_bytes()
         if b"\0" in content:
             raise ValueError("zero bytes")
@@ -158,7 +171,7 @@ def read_arrays(
         for entry in archive.infolist():
             name = entry.filename.removesuffix(".npy")
             if names is None or name in names:
-                if entry.file_size > max(_MAX_EXPANDED, _MAX_EXPANSION * entry.compress_size):
+                if _expands(entry.file_size, entry.compress_size):
                     raise ValueError(f"{entry.file_size / 1e9:.2g} GB in {name} of a small file")
                 with archive.open(entry) as opened:
                     _check_header(opened, entry.file_size)

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float32, Int32
 from numpy.typing import NDArray
+from pydantic import ConfigDict, TypeAdapter
 from torch import Tensor
 
 from invertwin.channel import Grid
@@ -29,8 +31,8 @@ class DisplayMesh:
         faces: Corners of the triangles, int32 [t, 3].
     """
 
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int32]
+    vertices: Float32[np.ndarray, "vertex 3"]
+    faces: Int32[np.ndarray, "triangle 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +51,10 @@ class DisplayLayer:
 
     name: str
     kind: Literal["surface", "lines", "points"]
-    points: NDArray[np.float32]
-    faces: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
+    points: Float32[np.ndarray, "point 3"]
+    faces: Int32[np.ndarray, "triangle 3"] = field(
+        default_factory=lambda: np.zeros((0, 3), np.int32)
+    )
     color: tuple[int, int, int] = (185, 190, 199)
     opacity: float = 1.0
     shown: bool = True
@@ -90,7 +94,7 @@ class DisplayMaps:
     frames: list[int]
     ranges: list[float]
     across: list[float]
-    power: Mapping[str, NDArray[np.float32]]
+    power: Mapping[str, Float32[np.ndarray, "frame range u"]]
 
     @classmethod
     @rename_arguments(most="max_values")
@@ -137,6 +141,10 @@ class Display:
         up: The direction that points up.
         ahead: The direction in which the radar looks.
     """
+
+    __pydantic_config__ = ConfigDict(
+        arbitrary_types_allowed=True, extra="forbid", allow_inf_nan=False
+    )
 
     title: str
     layers: Sequence[DisplayLayer]
@@ -215,22 +223,23 @@ class Display:
             read = json.loads(str(arrays["header"]), object_hook=restore_array)
             if read.pop("format") != _FORMAT_VERSION:
                 raise ValueError("of another version")
-            maps = {name: DisplayMaps(**own) for name, own in read.pop("maps").items()}
-            steps, layers = [], []
-            for step in read.pop("steps"):
-                bodies = {name: DisplayMesh(**body) for name, body in step.pop("bodies").items()}
-                steps.append(DisplayStep(**step, bodies=bodies))
-            for layer in read.pop("layers"):
-                layers.append(DisplayLayer(**layer | {"color": tuple(layer["color"])}))
-            read |= {key: tuple(read[key]) for key in ("up", "ahead")}
-            for body in (*layers, *(body for step in steps for body in step.bodies.values())):
+            found = _STORED.validate_python(read)
+            bodies = [body for step in found.steps for body in step.bodies.values()]
+            for body in (*found.layers, *bodies):
                 _check_triangles(body)
-            return cls(**read, layers=layers, steps=steps, maps=maps)
+            for maps in found.maps.values():
+                shape = len(maps.frames), len(maps.ranges), len(maps.across)
+                if 0 in shape or any(power.shape != shape for power in maps.power.values()):
+                    raise ValueError(f"expected maps of {shape} values")
+            return found
+
+
+_STORED = TypeAdapter(Display)
 
 
 def _check_triangles(mesh: DisplayLayer | DisplayMesh) -> None:
     """Refuse what would crash the graphics of a browser."""
     points = mesh.points if isinstance(mesh, DisplayLayer) else mesh.vertices
     inside = not mesh.faces.size or 0 <= mesh.faces.min() <= mesh.faces.max() < len(points)
-    if points.ndim != 2 or points.shape[1] != 3 or mesh.faces.shape[1:] != (3,) or not inside:
+    if not inside or not np.isfinite(points).all():
         raise ValueError("triangles without corners")

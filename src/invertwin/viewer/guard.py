@@ -1,22 +1,30 @@
-"""Access to the viewer: loopback only, or a token in the address; no page of another site."""
+"""Access to the viewer: loopback only, or a token in the address; no page of another site.
+
+And what a client may say: the value of a control, a place, a click, each within its range.
+"""
 
 import http
 import ipaddress
+import math
 import re
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from http.cookies import SimpleCookie
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from http.cookies import CookieError, SimpleCookie
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, unquote, urlsplit
 
 from invertwin.errors import InputError
 
 LOOPBACK = "127.0.0.1"
 _MIN_TOKEN_LENGTH = 16  # characters of a token
 _TOKEN = re.compile(rf"[A-Za-z0-9_-]{{{_MIN_TOKEN_LENGTH},}}")
+_HOST = re.compile(r"([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\])(:\d{1,5})?")
+_MAX_MESSAGE, _MAX_TEXT, _MAX_NUMBER = 2**16, 1000, 1e6  # bytes, characters, metres or pixels
+_VECTORS = {"wxyz": 4, "screen_pos": 2}  # numbers of a message's lists; all others have three
+_MESSAGES = ("ViewerCameraMessage", "TransformControlsUpdateMessage", "SceneNodeClickMessage")
 _patch_lock = threading.Lock()
 
 
@@ -67,13 +75,19 @@ class AccessGuard:
             path: With the query.
             headers: Of the request.
             port: Where it came in.
+
+        Raises:
+            ValueError: A malformed request.
         """
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-        if len(hosts) != 1 or any(urlsplit(origin).netloc != hosts[0] for origin in origins):
+        plain = unquote(path).isprintable() and len(path) <= _MAX_TEXT
+        if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]) or not plain:
+            raise ValueError("expected one host and a plain path")
+        if not {*origins} <= {f"http://{hosts[0]}", f"https://{hosts[0]}"}:
             return False
         if self._token is None:
             # A name of a stranger's that points to this machine is no loopback address.
-            return urlsplit(f"//{hosts[0]}").hostname in ("127.0.0.1", "localhost", "::1")
+            return hosts[0] in [f"{name}:{port}" for name in (LOOPBACK, "localhost", "[::1]")]
         given = parse_qs(urlsplit(path).query).get("token", [])
         cookies = SimpleCookie("; ".join(headers.get_all("Cookie")))
         given += [cookies[_cookie_name(port)].value] if _cookie_name(port) in cookies else []
@@ -88,9 +102,12 @@ class AccessGuard:
 
         def handle_request(connection: Any, request: Any) -> Any:
             port = connection.local_address[1]
-            if not self.admits(request.path, request.headers, port):
-                return connection.respond(http.HTTPStatus.FORBIDDEN, "wrong or missing token\n")
-            response = handler(connection, request)
+            try:
+                if not self.admits(request.path, request.headers, port):
+                    return connection.respond(http.HTTPStatus.FORBIDDEN, "wrong or missing token\n")
+                response = handler(connection, request)
+            except (ValueError, OSError, CookieError):  # OSError: of a name that no file can have
+                return connection.respond(http.HTTPStatus.BAD_REQUEST, "malformed request\n")
             if response is not None and self._token is not None:
                 kept = f"{_cookie_name(port)}={self._token}; HttpOnly; SameSite=Strict; Path=/"
                 response.headers["Set-Cookie"] = kept
@@ -101,22 +118,85 @@ class AccessGuard:
         return handle_request
 
 
+def is_valid_message(raw: Any, controls: Mapping[str, Any]) -> bool:
+    """Return True for a message of a client that viser may act on.
+
+    viser sets whatever attribute of a control a client names, to whatever it says.
+
+    Args:
+        raw: As it came in.
+        controls: Of the panel, by their identifiers.
+    """
+    import msgspec  # comes with viser
+
+    try:
+        match msgspec.msgpack.decode(raw):
+            case {
+                "type": "GuiUpdateMessage",
+                "uuid": str(name),
+                "updates": {"value": value} as new,
+            }:
+                return len(new) == 1 and _accepts(controls.get(name), value)
+            case {"type": kind, **rest}:
+                return kind in _MESSAGES and all(_is_plain(*item) for item in rest.items())
+    except (TypeError, msgspec.DecodeError):  # text, or no message
+        pass
+    return False
+
+
+def _accepts(control: Any, value: Any) -> bool:
+    """Return True for a value within the range of a control."""
+    if hasattr(control, "options"):
+        return value in control.options
+    if hasattr(control, "min"):
+        return type(value) in (int, float) and control.min <= value <= control.max
+    return type(value) is bool and type(getattr(control, "value", None)) is bool
+
+
+def _is_plain(name: str, value: Any) -> bool:
+    """Return True for a short text, a number of a usual size, or a vector as its name says."""
+    if isinstance(value, list):
+        numbers = all(type(x) in (int, float) and _is_plain(name, x) for x in value)
+        return numbers and len(value) == _VECTORS.get(name, 3)
+    if isinstance(value, str):
+        return len(value) <= _MAX_TEXT
+    numeric = type(value) in (int, float)
+    return value is None or (numeric and math.isfinite(value) and abs(value) <= _MAX_NUMBER)
+
+
 @contextmanager
-def install_guard(guard: AccessGuard) -> Iterator[None]:
+def install_guard(guard: AccessGuard, controls: Callable[[], Mapping[str, Any]]) -> Iterator[None]:
     """Servers that are started in the block ask the guard before they answer.
 
-    viser has no place for one: it hands its answers straight to `websockets`.
+    Messages that are not valid are dropped. viser has no place for a guard: it hands its answers
+    straight to `websockets`.
 
     Args:
         guard: The guard.
+        controls: Returns the controls of the panel, by their identifiers.
     """
     import websockets.asyncio.server as server  # pyright: ignore[reportMissingImports]
 
     with _patch_lock:
         plain = server.serve
 
-        def serve(*args: Any, process_request: Callable[..., Any], **given: Any) -> Any:
-            return plain(*args, process_request=guard.wrap_handler(process_request), **given)
+        def serve(
+            handler: Any, *args: Any, process_request: Callable[..., Any], **given: Any
+        ) -> Any:
+            async def handle(connection: Any) -> None:
+                receive = connection.recv
+
+                async def receive_valid() -> Any:
+                    while not is_valid_message(raw := await receive(), controls()):
+                        pass
+                    return raw
+
+                connection.recv = receive_valid
+                with suppress(Exception):  # whatever a client causes ends its own connection
+                    await handler(connection)
+
+            given |= {"process_request": guard.wrap_handler(process_request)}
+            return plain(handle, *args, **given | {"max_size": _MAX_MESSAGE})
 
         server.serve = serve
         try:

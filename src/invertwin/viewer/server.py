@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from invertwin.deprecation import rename_arguments
-from invertwin.errors import InputError, import_optional
+from invertwin.errors import import_optional, to_one_line
 from invertwin.scene import rigid, rotation_from_quaternion
 from invertwin.viewer.display import Display, DisplayLayer, DisplayMaps, DisplayStep
 from invertwin.viewer.guard import LOOPBACK, AccessGuard, install_guard
@@ -313,8 +313,9 @@ class Viewer:
                 if self._sensors:
                     self._update_maps(wish)
                 self._said.visible = False
-            except InputError as error:
-                self._said.value, self._said.visible = str(error), True
+            # Nobody is answered any more if this thread ends, so nothing may end it.
+            except Exception as error:
+                self._said.value, self._said.visible = to_one_line(str(error)), True
 
     def _show_step(self, state: _ViewerState) -> None:
         if not self._steps or state.step == self._taken:
@@ -397,5 +398,10 @@ def _start_server(guard: AccessGuard, host: str, port: int) -> Any:
         def request_share_url(self, verbose: bool = True) -> None:
             return None
 
-    with install_guard(guard), redirect_stdout(io.StringIO()):
-        return _LocalServer(host=host, port=port, verbose=False)
+    made: list[Any] = []  # clients may come before the constructor ends
+    with (
+        install_guard(guard, lambda: made[0].gui._gui_input_handle_from_uuid if made else {}),
+        redirect_stdout(io.StringIO()),
+    ):
+        made.append(_LocalServer(host=host, port=port, verbose=False))
+        return made[0]

@@ -1,5 +1,6 @@
 """Samples in NumPy, HDF5 or MATLAB files, described by a small TOML file beside them."""
 
+import io
 import tomllib
 import warnings
 from collections.abc import Mapping
@@ -18,6 +19,7 @@ from invertwin.checks import checked_tensor
 from invertwin.constants import FRAME, OLD_AXES
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar.boards import Mounting, TxRxArrays
+from invertwin.runtime.memory import require_memory
 from invertwin.scene.antenna import AntennaArray
 from invertwin.storage.folders import replace_file
 from invertwin.storage.isolated_reader import read_isolated
@@ -26,6 +28,7 @@ from invertwin.storage.untrusted import (
     existing_file,
     read_arrays,
     read_npy,
+    read_text,
     safe_reader,
 )
 
@@ -176,8 +179,10 @@ def write_chirps(
         elif target.suffix == ".mat":
             scipy.io.savemat(part, {"adc": array})
         else:
-            with h5py.File(part, "w") as opened:
+            # In memory first: on a full disk libhdf5 fails again, and crashes, at the end.
+            with h5py.File(written := io.BytesIO(), "w") as opened:
                 opened["adc"] = array
+            part.write_bytes(written.getbuffer())
     named = {} if target.suffix == ".npy" else {"variable": "adc"}
     settings = {name: getattr(s, name) for name in sorted(_KEYS["settings"])}
     description: dict[str, Any] = {
@@ -231,9 +236,9 @@ def load_description(
     Raises:
         InputError: no such file, no TOML, or another frame, other sections or keys.
     """
-    existing_file(path, "a TOML description")
+    text = read_text(path, "a TOML description")
     with convert_read_errors(path, "TOML", "give the description of the data, not the data"):
-        description = tomllib.loads(path.read_text(encoding="utf-8"))
+        description = tomllib.loads(text)
     frame = description.pop("frame", None)
     if frame not in (None, FRAME):
         raise InputError(
@@ -278,6 +283,7 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
         raise InputError(
             f"expected a file that ends in {', '.join(_SUFFIXES)}, got {path.name}; convert it"
         )
+    require_memory(3.0 * path.stat().st_size, f"the samples of {path.name}", "split the file")
     if ending != ".npy" and variable is None:
         raise InputError(f"expected a variable in {path.name}, got none; add it to [data]")
     with convert_read_errors(path, f"a whole {ending} file"):

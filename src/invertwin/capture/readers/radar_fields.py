@@ -232,7 +232,8 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
         real = _split_complex(dataset)
         # No fill values: they would mark numbers as missing.
         encoding = {str(variable): {"_FillValue": None} for variable in real.variables}
-        real.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+        # In memory first: on a full disk libhdf5 fails again, and crashes, at the end.
+        part.write_bytes(real.to_netcdf(engine="h5netcdf", encoding=encoding))
 
 
 def read_dataset(path: Path, *, trusted: bool = False) -> xr.Dataset:

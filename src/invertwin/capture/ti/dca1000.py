@@ -21,6 +21,7 @@ from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.checks import check_choice
 from invertwin.errors import InputError
 from invertwin.radar.waveform import PhysicsWarning
+from invertwin.runtime.memory import require_memory
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import existing_file, safe_reader
 
@@ -97,6 +98,7 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
             f"expected 16-bit samples in {name}, got an odd number of bytes ({size}); "
             "the file is damaged or no raw recording, copy it again"
         )
+    require_memory(10.0 * size, f"the samples of {name}", "split the recording")
     words = np.frombuffer(b"".join(part.read_bytes() for part in paths), _WORD)
     if settings.bits < 16:
         # Negative numbers may come without their sign bits.

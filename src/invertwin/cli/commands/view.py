@@ -15,7 +15,7 @@ from invertwin.cli.run_file import load_run, prefix_file_errors
 from invertwin.cli.schema import RunFile, build
 from invertwin.errors import InputError
 from invertwin.radar import Radar
-from invertwin.storage.folders import replace_file
+from invertwin.storage.folders import convert_os_errors, replace_file
 
 
 def run_view(
@@ -40,16 +40,17 @@ def run_view(
     Raises:
         InputError: A target that is none of these, a host without a token, or a path that is taken.
     """
-    if record is not None and record.exists() and not overwrite:
+    own = record is not None and record.resolve() == target.resolve()
+    if record is not None and (own or (record.exists() and not overwrite)):
         raise InputError(
-            f"expected a new file for --record, got {record}, which exists; name another, or give "
-            "--overwrite"
+            f"expected a new file for --record, got {record}, which exists; name another"
+            + ("" if own else ", or give --overwrite")
         )
     if record is None:
         viewer.AccessGuard(host, token)  # its errors come before any work
     display, links = load_display(target)
     if record is not None:
-        with replace_file(record) as part:
+        with convert_os_errors(""), replace_file(record) as part:
             part.write_text(viewer.page_html(display, links), encoding="utf-8")
         console.print(f"written: {record}", markup=False, soft_wrap=True)
         return

@@ -37,6 +37,7 @@ from invertwin.radar.surrogate.point_spread import (
     range_point_spread,
 )
 from invertwin.radar.waveform import PhysicsWarning, Waveform
+from invertwin.runtime.memory import require_memory
 from invertwin.scene.scene import Scene
 
 # Minimum extent of tabulated kernels, so that short grids do not truncate them.
@@ -390,6 +391,8 @@ def _kernels(
     lags = _lags(grid.range_count) * grid.range_step
     spread = range_point_spread(waveform, lags, window, surrogate.range_kernel)
     kernels = [_compensate_spline((1,), (grid.range_count,), spread)]
+    needed = 8.0 * max(grid.shape) ** 2  # of the largest matrix of `_apply_by_matrix`
+    require_memory(needed, "a map of that many bins", "narrow the grid, or check units", "grid")
     if array is None:
         return tuple(kernels)
     array.check_resolved(grid)

@@ -102,6 +102,8 @@ def _checked_image(image: object) -> Tensor:
     return pixels
 
 
+_MAX_VALUE = 1e15  # of any field; the kernel's float32 holds its square
+
 Value = float | ArrayLike | Texture
 """A number or 0-d tensor for the whole object, one number per triangle [f], or a texture."""
 
@@ -159,13 +161,18 @@ def checked_value(value: object, name: str) -> Value:
             raise InputError(f"expected {span.what} of some triangles, got none; {do}")
         _check_bounds(row, span)
         return row
-    checked_number(value, span.what, span.low, span.high, open_low=span.open_low)
+    _check_number(value, span)
     return value  # type: ignore[return-value]
 
 
 def _check_bounds(numbers: Tensor, span: ValueRange) -> None:
     for end in (numbers.detach().min(), numbers.detach().max()):
-        checked_number(end, span.what, span.low, span.high, open_low=span.open_low)
+        _check_number(end, span)
+
+
+def _check_number(number: object, span: ValueRange) -> None:
+    high = min(span.high, _MAX_VALUE)
+    checked_number(number, span.what, span.low, high, open_low=span.open_low)
 
 
 def evaluate_value(value: Value) -> Float64[Tensor, "*row"]:
