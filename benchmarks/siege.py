@@ -86,7 +86,7 @@ def run(case: Case) -> Outcome:
         (tools / "launch.py").write_text(LAUNCHER)
         made = case.make(folder) or Made()
         before = dict(_contents(folder, made.keep))
-        env = os.environ | {"PYTHONPATH": _library(), "MPLBACKEND": "Agg"} | made.env
+        env = os.environ | {"PYTHONPATH": _library(), "MPLBACKEND": "Agg"} | dict(made.env)
         env = {name: value for name, value in env.items() if value is not None}
         env |= {"INVERTWIN": f'"{sys.executable}" "{tools / "launch.py"}"'}
         call = ["bash", "-c", case.shell.replace("invertwin ", "eval $INVERTWIN ", 1)]

@@ -143,7 +143,7 @@ class Made:
     env: Mapping[str, Any] = field(default_factory=dict)
     keep: Sequence[str] = ()
     check: Callable[[Path], str] = lambda _: ""
-    undo: Sequence[Callable[[], None]] = ()
+    undo: Sequence[Callable[[], Any]] = ()
 
 
 @dataclass(frozen=True)
@@ -278,7 +278,7 @@ def arrays_in(ending: str, write: Callable[[Path], None]) -> Callable[[Path], No
 
 
 def sparse(
-    name: str, size: int = 4 * GIGABYTE, head: bytes = b"", *, real: bool = False, **others: str
+    name: str, size: int = 4 * GIGABYTE, head: bytes = b"", real: bool = False, **others: Any
 ) -> Any:
     """A file that is a hole, or real zeros, beyond its first bytes, and others."""
 
@@ -509,7 +509,13 @@ add(
 _CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 for _word in ("g", "o", "usemtl"):
     _file = _CORNERS + "".join(f"{_word} x{k}\nf 1 2 3\n" for k in _MANY)
-    code("counts", f"OBJ of 100 000 {_word}", texts(part__obj=_file), _LOAD_MESH.format(".obj"))
+    code(
+        "counts",
+        f"OBJ of 100 000 {_word}",
+        texts(part__obj=_file),
+        _LOAD_MESH.format(".obj"),
+        expects="refused" if _word == "usemtl" else "done",
+    )
 _STL = bytes(80) + struct.pack("<I", 8_000_000)
 code(
     "counts",
@@ -689,7 +695,7 @@ def mounted(kilobytes: int, run: str) -> Callable[[Path], Made]:
         mount = f"mount -t tmpfs -o size={kilobytes}k tmpfs '{disk}'"
         if os.system(mount + " 2> /dev/null"):
             return Made()
-        return Made(undo=[lambda: os.system(f"umount '{disk}'") and None])
+        return Made(undo=[lambda: os.system(f"umount '{disk}'")])
 
     return make
 
@@ -889,7 +895,12 @@ for _which in ("check", "reconstruct"):
     add(
         "check",
         f"{_which}: capture that is missing",
-        texts(s__toml=FIT[: FIT.index("[data]")] + _table + FIT[FIT.index("[truth.") :]),
+        texts(
+            s__toml=FIT[: FIT.index("[radar]")]
+            + FIT[FIT.index("[grid]") : FIT.index("[data]")]
+            + _table
+            + FIT[FIT.index("[[parameters]]") :]
+        ),
         *(_which, "s.toml"),
         says=["none.nc"],
     )
@@ -1069,7 +1080,7 @@ for _label, _member in {
 # What the folder and the environment say
 
 
-def styled(text: str) -> Callable[[Path], Made]:
+def styled(text: str | bytes) -> Callable[[Path], Made]:
     """A `matplotlibrc` in the working folder, which changes nothing."""
 
     def make(folder: Path) -> Made:
@@ -1082,6 +1093,7 @@ def styled(text: str) -> Callable[[Path], Made]:
 for _label, _text in {
     "runs TeX": "text.usetex: True\n",
     "is damaged": "figure.figsize: x\n\0\n:::\n",
+    "is no text": b"figure.figsize: \xff\xfe\n",
     "changes pictures": "figure.figsize: 400, 400\nfigure.dpi: 4000\nsavefig.dpi: 4000\n",
 }.items():
     add(

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from io import TextIOWrapper
 
 from invertwin.errors import exit_on_interrupt
 
@@ -13,6 +14,8 @@ def main() -> None:
         pass
     os.close(handle)
     sys.stdout, sys.stderr = sys.stdout or os.fdopen(1, "w"), sys.stderr or os.fdopen(2, "w")
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal of ASCII has no ² and no frames
     with exit_on_interrupt():
         from invertwin.cli import app
 

@@ -488,5 +488,5 @@ def test_line_ends_are_kept(tmp_path, monkeypatch):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match="expected a run file, got a path that does not exist"):
+    with pytest.raises(InputError, match="expected a run file, got no file"):
         convert_file(tmp_path / "none.toml")

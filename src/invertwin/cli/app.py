@@ -28,7 +28,7 @@ from invertwin.cli.options import (
     console,
     with_options,
 )
-from invertwin.cli.report import ReportTable
+from invertwin.cli.report import ReportTable, use_plain_style
 from invertwin.cli.run_file import prefix_file_errors
 from invertwin.cli.terminal import load_runs, print_tables, run_each, run_in_folder, show_progress
 from invertwin.errors import InputError, exit_on_interrupt, to_one_line
@@ -175,6 +175,7 @@ def check(file: FileArgument, backend: BackendOption = None) -> None:
     from invertwin.cli.run_file import load_run
 
     run = load_run(file)
+    use_plain_style()
     from invertwin.cli.commands.check import run_check
 
     with prefix_file_errors(file):
@@ -256,6 +257,7 @@ def view(
     backend: BackendOption = None,
 ) -> None:
     """Show a run, a scene or a capture in the browser, in three dimensions."""
+    use_plain_style()
     from invertwin.cli.commands.view import run_view
 
     run_view(target, console, host=host, port=port, token=token, record=record, overwrite=overwrite)

@@ -5,9 +5,11 @@ import math
 import os
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import chdir
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from invertwin import __version__
@@ -113,6 +115,16 @@ def write_report(
     html = report_html(title, status, note, parts, again, files)
     folder.write_text("report.html", html)
     return [part for part in parts if isinstance(part, ReportTable)]
+
+
+def use_plain_style() -> None:
+    """Draw as the library says, not as a `matplotlibrc` does, such as that of the working folder.
+
+    Call it before anything else imports Matplotlib, which reads that file.
+    """
+    with chdir(Path(__file__).parent):
+        import matplotlib
+    matplotlib.rcdefaults()
 
 
 def save_picture(

@@ -16,44 +16,19 @@ import tomli_w
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
+from invertwin.cli.report import load_texts
 from invertwin.constants import FRAME
 from invertwin.errors import InputError
 from invertwin.registry.section import TAG_MARK, suggest_name
 from invertwin.registry.section import prefix_errors as prefix_errors
 from invertwin.registry.section import require_section as require_section
-from invertwin.storage.untrusted import convert_read_errors
+from invertwin.storage.untrusted import convert_read_errors, existing_file
 
 _MAX_ERRORS = 20  # in one line
 _MAX_BYTES = 4_000_000  # tens of thousands of objects or places
 # Sections and kinds of the package in experiments/studies.
 _STUDY_NAMES = ("methods", "loss_scan", "openradar", "rail_sar", "vehicle", "shape_space")
-_KEYS_BY_TABLE = {
-    "reconstruct": "steps samples boundary_samples boundary annealing observations",
-    "optimizer": "rate final_rate",
-    "surrogate": "range_width angle_width",
-    "parameters": "smooth",
-}
-_MOVED_KEYS = {
-    key: f"write it in `{place}`" for place, keys in _KEYS_BY_TABLE.items() for key in keys.split()
-}
-_MOVED_KEYS["also_interior_only"] = "add [variants.interior_only] with reconstruct.boundary = false"
-_MOVED_KEYS |= {
-    "descent": "write it in [search], [[stages]] and [optimizer], see docs/run_files.md",
-    "annealed_starts": "run benchmarks/panel_annealing.py",
-}
-_MOVED_WITHIN = {
-    "placement.grid": 'write it in [variants.exhaustive] as search = { kind = "panel_grid", ... }',
-    "placement.annealing": "run benchmarks/panel_annealing.py",
-}
-"""Places of keys that stand in the wrong table, or are gone."""
 _INSTALL_STUDIES_ADVICE = "install the studies: pip install -e ./experiments/studies"
-_PHRASE_REPLACEMENTS = {
-    r"a valid dictionary( or .*)?": "a table",
-    r"a valid string": "a text in quotes",
-    r"a valid boolean": "true or false",
-    r"a valid integer": "an integer",
-    r"a valid ": "a ",
-}
 
 
 def load_run(path: Path) -> Any:
@@ -72,22 +47,11 @@ def read_text(path: Path) -> str:
     Raises:
         InputError: The file is missing or is no text.
     """
-    if path.exists() and not path.is_file():
-        got = "a folder" if path.is_dir() else "a pipe or a device"
-        raise InputError(f"{path}: expected a run file, got {got}; name a file in it")
-    try:
-        if path.stat().st_size > _MAX_BYTES:
+    file = existing_file(path, "a run file")
+    with convert_read_errors(file, "a readable run file", "give a TOML text file"):
+        if file.stat().st_size > _MAX_BYTES:
             raise ValueError(f"more than {_MAX_BYTES / 1e6:.0f} MB")
-        return path.read_bytes().decode("utf-8")
-    except FileNotFoundError:
-        raise InputError(
-            f"{path}: expected a run file, got a path that does not exist; check the path"
-        ) from None
-    except (OSError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"{path}: expected a readable run file, got an error: {reason}; give a TOML text file"
-        ) from None
+        return file.read_bytes().decode("utf-8")
 
 
 def parse_toml(path: Path, text: str) -> dict[str, Any]:
@@ -191,7 +155,7 @@ def _explain_error(error: ErrorDetails) -> str:
             key, allowed = context["key"], context["allowed"]
             said = f"expected one of the keys {', '.join(allowed)}, got {_format_value(key)}; "
             at = f"{path}.{key}".lstrip(".")
-            advice = _MOVED_WITHIN.get(at) or _MOVED_KEYS.get(key)
+            advice = load_texts("moved_keys").get(at) or load_texts("moved_keys").get(key)
             if at in _STUDY_NAMES:
                 advice = _INSTALL_STUDIES_ADVICE
             return f"{at}: {said}{advice or suggest_name(key, allowed, 'remove the key')}"
@@ -200,7 +164,7 @@ def _explain_error(error: ErrorDetails) -> str:
             return unknown_object_message(at, context["name"], context["known"])
         case "union_tag_not_found":
             keys = context["discriminator"].removesuffix("()").split(",")
-            present = list(error["input"]) if isinstance(error["input"], dict) else []
+            present = [*error["input"]][:_MAX_ERRORS] if isinstance(error["input"], dict) else []
             guesses = [k for p in present for k in difflib.get_close_matches(p, keys, n=1)]
             advice = f"did you mean `{guesses[0]}`?" if guesses else f"add `{keys[0]}`"
             return f"{path}: expected a table with the key {' or '.join(keys)}, got {got}; {advice}"
@@ -231,7 +195,7 @@ def _explain_error(error: ErrorDetails) -> str:
             return ".".join(filter(None, (path, context["path"]))) + f": {error['msg']}"
     # Pydantic says "..., got a number with a fractional part": the value itself says it, too.
     expected = error["msg"].removeprefix("Input should be ").split(", got ")[0]
-    for words, ours in _PHRASE_REPLACEMENTS.items():
+    for words, ours in load_texts("phrases").items():
         expected = re.sub(words, ours, expected)
     return f"{path}: expected {expected}, got {got}; correct the value"
 

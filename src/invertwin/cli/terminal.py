@@ -14,7 +14,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from invertwin.cli.options import OutputOptions, ResumableOptions, RunOptions, console
-from invertwin.cli.report import ReportTable, format_cell, is_numeric_cell
+from invertwin.cli.report import ReportTable, format_cell, is_numeric_cell, use_plain_style
 from invertwin.cli.run_file import load_run, prefix_file_errors, require_section, to_toml
 from invertwin.errors import InputError
 from invertwin.runtime.progress import format_duration, progress_callback
@@ -45,6 +45,7 @@ def run_in_folder(
     path, resume = options.out or default, getattr(options, "resume", False)
     texts = {name: to_toml(run) for name, run in (runs or {}).items()}
     folder = open_run(path, texts, overwrite=options.overwrite, resume=resume)
+    use_plain_style()
     try:
         with folder:
             tables, outcome = ([], "") if folder.complete else work(folder)

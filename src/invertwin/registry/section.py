@@ -34,6 +34,8 @@ _PYDANTIC_ERRORS = frozenset(get_args(ErrorType))  # kinds of errors that pydant
 # Pydantic puts the tag of a union into an error's location; the mark tells it from a key.
 TAG_MARK = "→"
 
+_MAX_UNKNOWN = 20  # keys that errors name
+
 # Beside the checkout; for an installed package this is a folder that does not exist.
 _CHECKOUT_DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 
@@ -105,11 +107,12 @@ class Section(BaseModel):
     @model_validator(mode="wrap")
     @classmethod
     def _check_unknown_keys(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
-        """Tell all unknown keys, beside what is wrong with the known ones."""
+        """Tell unknown keys, beside what is wrong with the known ones."""
         names = list(cls.model_fields)
         unknown = [name for name in data if name not in names] if isinstance(data, dict) else []
         if not unknown:
             return handler(data)
+        unknown = unknown[:_MAX_UNKNOWN]
         # Pydantic's own error for an extra key does not carry the keys that are allowed.
         told = [{"key": name, "allowed": names} for name in unknown]
         kinds = [PydanticCustomError("unknown_key", "unknown key", context) for context in told]

@@ -20,6 +20,7 @@ from trimesh.visual.texture import TextureVisuals
 
 from invertwin.checks import checked_tensor
 from invertwin.errors import InputError, PhysicsWarning
+from invertwin.runtime.memory import require_at_most
 from invertwin.scene import shapes
 from invertwin.scene.material.materials import (
     PerfectConductor,
@@ -44,6 +45,7 @@ _CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # corners of shell elements by the 
 Unit = Literal["m", "cm", "mm", "um", "in", "ft"]
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 _UCD_HEADER = re.compile(r"(#.*\n|\s)*(\d+\s+){4}\d+\s*\n")  # counts: nodes, cells, data
+_MAX_GROUPS = 10_000
 _LARGE = 100.0  # size of a suspicious mesh [m]
 CONCRETE = RoughDielectric(permittivity=5.24)
 """Default material of a scene file (ITU-R P.2040 concrete)."""
@@ -275,6 +277,10 @@ class _FileResolver(FilePathResolver):
 
 
 def _load_trimesh_scene(path: Path) -> trimesh.Scene:
+    if path.suffix.lower() == ".obj":
+        # Trimesh takes a time that grows with the square of their number.
+        groups = path.read_bytes().count(b"usemtl ")
+        require_at_most(groups, _MAX_GROUPS, "groups of a material", "join groups of one material")
     if path.suffix.lower() != ".inp":
         return trimesh.load_scene(path, process=False, resolver=_FileResolver(str(path)))
     text = read_text(path, "an .inp mesh")

@@ -82,12 +82,14 @@ def existing_file(path: str | Path, what: str = "an existing file") -> Path:
     """
     file = Path(path)
     try:
-        found = file.is_file()
-    except OSError:  # a name that is too long
-        found = False
-    if not found:
-        raise InputError(f"expected {what}, got no file {str(file)[:300]}; check the path")
-    known = file.stat()
+        known = file.stat()
+    except (OSError, ValueError):  # also of a name that is too long
+        raise InputError(
+            f"expected {what}, got no file {str(file)[:300]}; check the path"
+        ) from None
+    if not file.is_file():
+        kind = "a folder" if file.is_dir() else "a pipe or a device"
+        raise InputError(f"expected {what}, got {kind}, {file}; name a file")
     if _expands(known.st_size, 512 * getattr(known, "st_blocks", known.st_size)):
         raise InputError(
             f"expected {what}, got {file}, {known.st_size / 1e9:.2g} GB of holes; copy it again"

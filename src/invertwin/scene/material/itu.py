@@ -1,9 +1,11 @@
 """Building materials and grounds of Recommendation ITU-R P.2040-3."""
 
 import difflib
+import tomllib
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import NamedTuple
 
 from invertwin.checks import checked_number
@@ -25,29 +27,12 @@ class Coefficients(NamedTuple):
     d: float
 
 
-ITU_MATERIALS: Mapping[str, tuple[Coefficients, ...]] = {
-    "vacuum": (Coefficients(0.001, 100, 1.0, 0.0, 0.0, 0.0),),
-    "concrete": (Coefficients(1, 100, 5.24, 0.0, 0.0462, 0.7822),),
-    "brick": (Coefficients(1, 40, 3.91, 0.0, 0.0238, 0.16),),
-    "plasterboard": (Coefficients(1, 100, 2.73, 0.0, 0.0085, 0.9395),),
-    "wood": (Coefficients(0.001, 100, 1.99, 0.0, 0.0047, 1.0718),),
-    "glass": (
-        Coefficients(0.1, 100, 6.31, 0.0, 0.0036, 1.3394),
-        Coefficients(220, 450, 5.79, 0.0, 0.0004, 1.658),
-    ),
-    "ceiling_board": (
-        Coefficients(1, 100, 1.48, 0.0, 0.0011, 1.0750),
-        Coefficients(220, 450, 1.52, 0.0, 0.0029, 1.029),
-    ),
-    "chipboard": (Coefficients(1, 100, 2.58, 0.0, 0.0217, 0.7800),),
-    "plywood": (Coefficients(1, 40, 2.71, 0.0, 0.33, 0.0),),
-    "marble": (Coefficients(1, 60, 7.074, 0.0, 0.0055, 0.9262),),
-    "floorboard": (Coefficients(50, 100, 3.66, 0.0, 0.0044, 1.3515),),
-    "metal": (Coefficients(1, 100, 1.0, 0.0, 1e7, 0.0),),
-    "very_dry_ground": (Coefficients(1, 10, 3.0, 0.0, 0.00015, 2.52),),
-    "medium_dry_ground": (Coefficients(1, 10, 15.0, -0.1, 0.035, 1.63),),
-    "wet_ground": (Coefficients(1, 10, 30.0, -0.4, 0.15, 1.30),),
-}
+def _load_table() -> dict[str, tuple[Coefficients, ...]]:
+    text = files("invertwin.scene.material").joinpath("itu.toml").read_text(encoding="utf-8")
+    return {name: tuple(Coefficients(*row) for row in r) for name, r in tomllib.loads(text).items()}
+
+
+ITU_MATERIALS: Mapping[str, tuple[Coefficients, ...]] = _load_table()
 """Table of the recommendation by name, with one entry per frequency range.
 
 Source: ITU-R P.2040-3 (2023), §3, table of material properties."""

@@ -4,8 +4,10 @@
 people of all ages and builds.
 """
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,37 +23,10 @@ from invertwin.scene.people.body import BodyTemplate, load_smpl
 from invertwin.scene.shape_models.iso_surface import iso_surface
 from invertwin.scene.shape_models.lattice import Lattice
 
-# Joints of a standing person 1.75 m tall with arms held out, relative to the pelvis [m].
-_JOINTS: dict[str, tuple[str | None, tuple[float, float, float]]] = {
-    "pelvis": (None, (0.0, 0.0, 0.0)),
-    "chest": ("pelvis", (0.0, 0.0, 0.22)),
-    "neck": ("chest", (0.0, 0.0, 0.52)),
-    "left_shoulder": ("chest", (0.0, -0.19, 0.45)),
-    "left_elbow": ("left_shoulder", (0.0, -0.47, 0.45)),
-    "right_shoulder": ("chest", (0.0, 0.19, 0.45)),
-    "right_elbow": ("right_shoulder", (0.0, 0.47, 0.45)),
-    "left_hip": ("pelvis", (0.0, -0.10, -0.06)),
-    "left_knee": ("left_hip", (0.0, -0.10, -0.48)),
-    "right_hip": ("pelvis", (0.0, 0.10, -0.06)),
-    "right_knee": ("right_hip", (0.0, 0.10, -0.48)),
-}
-# Cones with round ends: their joint, both ends, both radii [m].
-_CONES = [
-    ("pelvis", (0.0, -0.06, -0.02), (0.0, 0.06, -0.02), 0.115, 0.115),
-    ("pelvis", (0.0, 0.0, 0.0), (0.0, 0.0, 0.2), 0.12, 0.115),
-    ("chest", (0.0, 0.0, 0.22), (0.0, 0.0, 0.40), 0.12, 0.12),
-    ("chest", (0.0, -0.13, 0.43), (0.0, 0.13, 0.43), 0.075, 0.075),
-    ("neck", (0.0, 0.0, 0.5), (-0.01, 0.0, 0.6), 0.055, 0.055),
-    ("neck", (-0.02, 0.0, 0.66), (-0.01, 0.0, 0.73), 0.085, 0.09),
-]
-_LIMBS = [
-    ("shoulder", (0.0, 0.19, 0.45), (0.0, 0.47, 0.45), 0.06, 0.045),
-    ("elbow", (0.0, 0.47, 0.45), (0.0, 0.72, 0.45), 0.045, 0.033),
-    ("elbow", (0.0, 0.72, 0.45), (-0.01, 0.85, 0.44), 0.038, 0.032),
-    ("hip", (0.0, 0.10, -0.06), (0.0, 0.10, -0.48), 0.088, 0.058),
-    ("knee", (0.0, 0.10, -0.48), (0.0, 0.10, -0.90), 0.056, 0.04),
-    ("knee", (0.02, 0.10, -0.90), (-0.16, 0.10, -0.92), 0.045, 0.035),
-]
+_BODY: dict[str, Any] = tomllib.loads(
+    files("invertwin.scene.people").joinpath("body.toml").read_text(encoding="utf-8")
+)
+_JOINTS = _BODY["joints"]
 _FILLET = 0.02  # blending width between parts [m]
 _BLEND = 0.08  # width over which skinning weights change [m]
 _DEFAULT_HEIGHT = 1.75  # m
@@ -78,8 +53,8 @@ def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
     counts = ((high - low) * tall / _DEFAULT_HEIGHT / step).ceil().int() + 1
     mesh = iso_surface(_distance, Lattice.from_bounds(low, high, counts.tolist()))
     names = list(_JOINTS)
-    parents = [-1 if parent is None else names.index(parent) for parent, _ in _JOINTS.values()]
-    joints = torch.tensor([place for _, place in _JOINTS.values()], dtype=torch.float64)
+    parents = [names.index(row["parent"]) if "parent" in row else -1 for row in _JOINTS.values()]
+    joints = torch.tensor([row["place"] for row in _JOINTS.values()], dtype=torch.float64)
     template = BodyTemplate(
         mesh.vertices,
         mesh.faces,
@@ -94,7 +69,7 @@ def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
 def _parts() -> list[tuple[str, Tensor, Tensor, float, float]]:
     """Return all cones: joint, ends, radii."""
     parts = []
-    for name, *ends, first, last in [*_CONES, *_LIMBS]:
+    for name, *ends, first, last in [*_BODY["cones"], *_BODY["limbs"]]:
         start, end = torch.tensor(ends, dtype=torch.float64)
         sides = {f"left_{name}": -1.0, f"right_{name}": 1.0}
         for own, sign in ({name: 1.0} if name in _JOINTS else sides).items():
