@@ -311,7 +311,7 @@ add(
     "look",
     "data.nc",
 )
-_HOLE = {"adc__toml": ARRAYS}
+_HOLE: dict[str, Any] = {"adc__toml": ARRAYS}
 add(
     "expands", "sparse .npy", sparse("adc.npy", 8 * GIGABYTE, npy_header(GIGABYTE), **_HOLE), *_LOOK
 )
@@ -982,7 +982,7 @@ _SHOWN = (
 )
 code("contents", "view.npz as it is", other("a0", lambda a: a), _SHOWN, expects="done")
 for _array in ("a0", "a1", "a2"):
-    for _kind in ("complex", "bool", "U8", "S8", "M8[s]", ">f8", "u8", "f2"):
+    for _kind in ("complex", "U8", ">f8"):
         code(
             "contents",
             f"view.npz: {_array} as {_kind}",

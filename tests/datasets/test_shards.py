@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import tarfile
 
 import numpy as np
@@ -97,3 +98,29 @@ def test_folders_that_hold_no_set_are_refused(tmp_path, text, said):
     with pytest.raises(InputError, match=said) as found:
         read_manifests(tmp_path)
     assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"samples": -1},
+        {"samples": 2**63},
+        {"part": [3, 2]},
+        {"part": [1, -1]},
+        {"shards": []},
+        *(
+            {"shards": [json.loads(manifest())["shards"][0] | {key: value}]}
+            for key, value in (("samples", -1), ("samples", 0), ("samples", 2**63), ("first", -5))
+        ),
+    ],
+)
+def test_counts_that_are_none_are_refused(tmp_path, change):
+    (tmp_path / "manifest.json").write_text(manifest(**change))
+    with pytest.raises(InputError, match="expected"):
+        read_manifests(tmp_path)
+
+
+def test_a_shard_that_is_a_pipe_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "a.tar")
+    with pytest.raises(InputError, match="a pipe or a device"):
+        locate_members(tmp_path / "a.tar")

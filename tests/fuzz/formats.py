@@ -1,12 +1,17 @@
 """Every format that invertwin reads: small valid files, and what reads them."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from email.message import Message
+from http.cookies import CookieError
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
+import msgspec
 import numpy as np
 import torch
 from torch import nn
@@ -17,6 +22,15 @@ from invertwin.capture import Capture, ChannelCalibration, ChirpData, ChirpSetti
 from invertwin.capture.readers.described_arrays import write_chirps
 from invertwin.cli.run_file import load_run, to_toml
 from invertwin.cli.schema import build
+from invertwin.datasets import SampleDataset
+from invertwin.datasets.shards import (
+    FORMAT,
+    ArrayInfo,
+    DatasetManifest,
+    describe_shard,
+    npy_bytes,
+    pack_shard,
+)
 from invertwin.inversion.callbacks import Checkpoint
 from invertwin.inversion.fingerprint import Fingerprint
 from invertwin.inversion.fit import Fit, FitProgress
@@ -30,6 +44,16 @@ from invertwin.scene.people.body import load_smpl
 from invertwin.scene.shape_models.lattice import Lattice
 from invertwin.scene.shape_models.prior import Decoder, ShapePrior, load_prior
 from invertwin.storage.run_folder import open_run
+from invertwin.viewer import (
+    AccessGuard,
+    Display,
+    DisplayLayer,
+    DisplayMaps,
+    DisplayMesh,
+    DisplayStep,
+    page_html,
+)
+from invertwin.viewer.guard import is_valid_message
 
 ALL = ("bytes", "words", "values")
 
@@ -458,6 +482,110 @@ def _read_manifest(path: Path) -> None:
                 raise
 
 
+# Displays, data sets, and what clients of a viewer say
+
+
+def _views() -> list[Files]:
+    def write(folder: Path) -> str:
+        points, faces = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)
+        step = DisplayStep(0, "step 0", {"a": DisplayMesh(points, faces)})
+        maps = DisplayMaps([0], [1.0, 2.0], [0.0, 0.1], {"measured": np.ones((1, 2, 2), "f4")})
+        layers = [DisplayLayer("twin/a", "surface", points, faces)]
+        Display("title", layers, [step], {"": maps}).save(folder / "view.npz")
+        return "view.npz"
+
+    return _written(write)
+
+
+def _read_view(path: Path) -> None:
+    found = Display.load(path)
+    page_html(found)
+    _ = found.box, found.groups, [found.show_step(step) for step in found.steps]
+
+
+def _data_sets() -> list[Files]:
+    members = {"map.npy": npy_bytes(np.ones((2, 3), np.float32)), "labels.json": b'{"a": 1}'}
+    content = pack_shard((k, members) for k in range(2))
+    manifest = DatasetManifest(
+        format=FORMAT,
+        samples=2,
+        part=(1, 1),
+        fingerprint="f",
+        versions={"invertwin": "0"},
+        arrays={"map": ArrayInfo(dims=["range", "u"], unit="1")},
+        shards=[describe_shard("shard-000000.tar", 0, 2, content)],
+    )
+    text = manifest.model_dump_json().encode()
+    return [{"manifest.json": text, "shard-000000.tar": content}]
+
+
+def _read_data_set(path: Path) -> None:
+    found = SampleDataset(path.parent)
+    _ = found[0], found[len(found) - 1]
+
+
+_MESSAGES = (
+    {"type": "GuiUpdateMessage", "uuid": "slider", "updates": {"value": 3}},
+    {"type": "GuiUpdateMessage", "uuid": "choice", "updates": {"value": "a"}},
+    {"type": "TransformControlsUpdateMessage", "name": "/gizmo", "wxyz": [1.0, 0.0, 0.0, 0.0]},
+    {"type": "SceneNodeClickMessage", "name": "/maps/a", "ray_origin": [0.0, 0.0, 0.0]},
+)
+_GUARD = AccessGuard("127.0.0.1")
+_CONTROLS = {
+    "slider": SimpleNamespace(min=0, max=4, value=1),
+    "choice": SimpleNamespace(options=("a", "b"), value="a"),
+    "box": SimpleNamespace(value=True),
+}
+
+
+def _messages() -> list[Files]:
+    request = b"GET /?token=a HTTP/1.1\r\nHost: 127.0.0.1:8080\r\nOrigin: http://127.0.0.1:8080\r\n"
+    request += b"Cookie: invertwin_8080=a\r\n\r\n"
+    return [
+        *({"message.json": json.dumps(message).encode()} for message in _MESSAGES),
+        {"request.txt": request},
+    ]
+
+
+def _read_message(path: Path) -> None:
+    data = path.read_bytes()
+    if path.suffix == ".txt":
+        _read_request(data)
+        return
+    is_valid_message(data, _CONTROLS)
+    try:
+        message = json.loads(data)
+        packed = msgspec.msgpack.encode(message)
+    except (ValueError, OverflowError, RecursionError):
+        return
+    if is_valid_message(packed, _CONTROLS) and message["type"] == "GuiUpdateMessage":
+        value = message["updates"]["value"]
+        assert list(message["updates"]) == ["value"]
+        assert value in ("a", "b", True, False) or 0 <= value <= 4
+
+
+def _read_request(data: bytes) -> None:
+    class Headers(Message):
+        def get_all(self, name: str) -> list[str]:  # type: ignore[override]
+            return super().get_all(name, [])
+
+    line, *rest = data.decode("latin-1").split("\r\n")
+    headers = Headers()
+    for row in rest:
+        name, _, value = row.partition(":")
+        try:
+            headers[name] = value.strip()
+        except ValueError:
+            return
+    path = [*line.split(" "), "/"][1]
+    try:
+        admitted = _GUARD.admits(path, headers, 8080)
+    except (ValueError, CookieError):
+        return  # answered by 400
+    hosts = {"127.0.0.1:8080", "localhost:8080", "[::1]:8080"}
+    assert not admitted or set(map(str, headers.get_all("Host"))) <= hosts
+
+
 FORMATS: dict[str, Format] = {
     "run_file": Format(_runs, _read_run, ("words", "values", "values")),
     "mesh": Format(_meshes, _read_mesh),
@@ -468,5 +596,8 @@ FORMATS: dict[str, Format] = {
     "dca1000": Format(_boards, _read_board),
     "channels": Format(_channels, ChannelCalibration.load),
     "checkpoint": Format(_checkpoints, _read_checkpoint, ("bytes", "values", "values")),
+    "view": Format(_views, _read_view, ("bytes", "values", "values")),
+    "data_set": Format(_data_sets, _read_data_set, ("bytes", "values", "values")),
+    "message": Format(_messages, _read_message),
     "manifest": Format(_manifests, _read_manifest, intact=("victim", "notes.txt")),
 }

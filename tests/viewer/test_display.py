@@ -1,5 +1,6 @@
 """Displays as arrays: layers of scenes, radars and error bars; files."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -163,3 +164,67 @@ def test_a_link_says_what_feeds_a_bin_and_follows():
     assert link.predict_map(link.scene, 0) == pytest.approx(
         after, rel=0.05, abs=float(after.max()) * 0.05
     )
+
+
+def spoil_array(folder, spoil, which):
+    """A file with another array: the first one with so many dimensions."""
+    display().save(folder / "view.npz")
+    arrays = dict(np.load(folder / "view.npz"))
+    name = next(n for n, a in arrays.items() if (a.ndim, a.dtype.kind) == which and n != "header")
+    np.savez(folder / "view.npz", **arrays | {name: spoil(arrays[name])})
+    return folder / "view.npz"
+
+
+@pytest.mark.parametrize("which", [(2, "f"), (2, "i"), (3, "f")])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        *(lambda a, k=k: a.astype(k) for k in ("complex", "bool", "U8", "S8", ">f8", "u8", "f2")),
+        lambda a: a.reshape(-1),
+        lambda a: a.reshape(-1)[0],
+        lambda a: a[..., :1],
+        lambda a: np.zeros(a.shape, [("x", "f8"), ("y", "f8")]),
+    ],
+)
+def test_arrays_of_other_kinds_and_shapes_are_refused(tmp_path, spoil, which):
+    with pytest.raises(InputError, match="what a fit leaves to be viewed"):
+        Display.load(spoil_array(tmp_path, spoil, which))
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("title",), 5),
+        (("layers", 0, "name"), None),
+        (("layers", 0, "kind"), "cube"),
+        (("layers", 0, "color"), [1, 2]),
+        (("layers", 0, "points"), [1, 2]),
+        (("layers",), {}),
+        (("steps", 0, "label"), 7),
+        (("steps", 0, "bodies"), []),
+        (("up",), [0, 0]),
+        (("up",), [0, 0, math.inf]),
+        (("maps", "", "frames"), []),
+        (("maps", "", "frames"), [0, 1, 2]),
+        (("maps", "", "ranges"), [1.0]),
+        (("maps", "", "power"), [1]),
+        (("strange",), 1),
+        (("format",), 3),
+    ],
+)
+def test_headers_of_other_values_are_refused(tmp_path, path, value):
+    display().save(tmp_path / "view.npz")
+    arrays = dict(np.load(tmp_path / "view.npz"))
+    header = json.loads(str(arrays["header"]))
+    box = header
+    for step in path[:-1]:
+        box = box[step]
+    box[path[-1]] = value
+    np.savez(tmp_path / "view.npz", **arrays | {"header": np.array(json.dumps(header))})
+    with pytest.raises(InputError, match="what a fit leaves to be viewed"):
+        Display.load(tmp_path / "view.npz")
+
+
+def test_points_that_are_not_finite_are_refused(tmp_path):
+    with pytest.raises(InputError, match="triangles without corners"):
+        Display.load(spoil_array(tmp_path, lambda a: a * np.float32(np.nan), (2, "f")))
