@@ -9,14 +9,7 @@ from jaxtyping import Complex128, Float
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
-from invertwin.channel import (
-    Grid,
-    Paths,
-    Sampling,
-    Speckle,
-    draw_speckle,
-    trace_field,
-)
+from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_field
 from invertwin.checks import checked_count, checked_type
 from invertwin.errors import InputError
 from invertwin.radar.processing.beamforming import exact_spectrum

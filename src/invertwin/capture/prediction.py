@@ -36,8 +36,7 @@ def prediction_coefficients(
     mean = products[mask].sum(0)
     level = mean.diagonal().real.mean().clamp_min(torch.finfo(torch.float64).tiny)
     inner = mean[1:, 1:] + _DIAGONAL_LOADING * level * torch.eye(len(mean) - 1, dtype=mean.dtype)
-    past = -torch.linalg.solve(inner, mean[1:, 0])
-    return torch.cat([torch.ones(1, dtype=mean.dtype), past])
+    return torch.cat([torch.ones(1, dtype=mean.dtype), -torch.linalg.solve(inner, mean[1:, 0])])
 
 
 def prediction_residuals(

@@ -34,9 +34,7 @@ from invertwin.channel.rcs.closed_forms import DihedralByMoments as DihedralByMo
 from invertwin.channel.rcs.closed_forms import DihedralSection as DihedralSection
 from invertwin.channel.rcs.closed_forms import PlateSection as PlateSection
 from invertwin.channel.rcs.closed_forms import SphereSection as SphereSection
-from invertwin.channel.rcs.closed_forms import (
-    SquareTrihedralSection as SquareTrihedralSection,
-)
+from invertwin.channel.rcs.closed_forms import SquareTrihedralSection as SquareTrihedralSection
 from invertwin.channel.rcs.closed_forms import TrihedralSection as TrihedralSection
 from invertwin.channel.rcs.far_field import trace_far_field as trace_far_field
 from invertwin.channel.sampling import Densities as Densities

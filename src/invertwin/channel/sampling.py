@@ -115,7 +115,6 @@ class Sampling:
             return self.conductor_samples
         if self.samples != _DEFAULT_SAMPLES:
             warn_renamed(
-                "Sampling(samples=...) for fields of conductors",
-                "Sampling(conductor_samples=...)",
+                "Sampling(samples=...) for fields of conductors", "Sampling(conductor_samples=...)"
             )
         return self.samples

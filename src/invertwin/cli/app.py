@@ -143,8 +143,7 @@ def dataset(options: DatasetOptions, file: FileArgument) -> None:
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         with prefix_file_errors(file), show_progress(console):
             workers = options.workers or available_threads()
-            run = runs[file.stem]
-            return command.run_dataset(run, folder, part, options.engine, workers), ""
+            return command.run_dataset(runs[file.stem], folder, part, options.engine, workers), ""
 
     run_in_folder(chosen, Path("out"), work, runs)
 
@@ -239,8 +238,7 @@ def twin(options: TwinOptions) -> None:
 @app.command(rich_help_panel=_DATA)
 def view(
     target: Annotated[
-        Path,
-        typer.Argument(help="Run folder, run file or capture (.nc).", show_default=False),
+        Path, typer.Argument(help="Run folder, run file or capture (.nc).", show_default=False)
     ],
     host: Annotated[str, typer.Option(help="Others than this machine need a token.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="The first that is tried.")] = 8080,

@@ -166,8 +166,7 @@ def estimate_rcs_resources(run: RunFile, scene: Scene) -> ResourceEstimate:
     parts = [_triangle_item(run, scene)]
     parts.append(MemoryItem("values of the field", values, size, f"rcs.{largest}"))
     if table.image is not None:
-        pixels = table.image.pixels**2
-        parts.append(MemoryItem("pixels", pixels, _MATRIX_BYTES, "rcs.image.pixels"))
+        parts.append(MemoryItem("pixels", table.image.pixels**2, _MATRIX_BYTES, "rcs.image.pixels"))
     ordered = tuple(sorted(parts, key=lambda part: -part.memory))
     return ResourceEstimate(ordered, 0, 0, "rcs.frequencies", 0, 0)
 

@@ -112,8 +112,7 @@ def write_report(
     files = folder.run_files
     if files:
         again += " run.toml" if len(files) == 1 else " runs/*.toml"
-    html = report_html(title, status, note, parts, again, files)
-    folder.write_text("report.html", html)
+    folder.write_text("report.html", report_html(title, status, note, parts, again, files))
     return [part for part in parts if isinstance(part, ReportTable)]
 
 

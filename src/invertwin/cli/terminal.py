@@ -150,8 +150,7 @@ def run_each(
     def work_on(folder: RunFolder) -> tuple[list[ReportTable], str]:
         with console.status("tracing") as status:
             say = status.update if console.is_terminal else limit_rate()
-            batch = RunBatch(runs, {file.stem: file for file in files}, folder)
-            return work(batch, say), ""
+            return work(RunBatch(runs, {file.stem: file for file in files}, folder), say), ""
 
     run_in_folder(options, default, work_on, runs)
 

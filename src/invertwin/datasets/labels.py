@@ -78,8 +78,7 @@ def radar_labels(radar: Radar) -> dict[str, Any]:
 
     The columns of a rotation are the radar's axes: boresight, left, up.
     """
-    rotations = radar.link().rotations
-    return {"positions": radar.positions.tolist(), "rotations": rotations.tolist()}
+    return {"positions": radar.positions.tolist(), "rotations": radar.link().rotations.tolist()}
 
 
 def convert_old_labels(labels: Any, name: str = "") -> Any:

@@ -13,12 +13,7 @@ from torch.utils.data import Dataset
 
 from invertwin.checks import check_choice
 from invertwin.datasets.labels import convert_old_labels
-from invertwin.datasets.shards import (
-    OLD_FORMAT,
-    DatasetManifest,
-    locate_members,
-    read_manifests,
-)
+from invertwin.datasets.shards import OLD_FORMAT, DatasetManifest, locate_members, read_manifests
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.storage.untrusted import convert_read_errors, existing_file

@@ -108,10 +108,7 @@ def find_hypotheses(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[Sh
     """
     together = likelihood.log_likelihood_gains(shapes)
     found = [[ShapeHypothesis(shape, 1.0)] for shape in shapes]
-    for changed in (
-        *propose_kinds(likelihood, shapes),
-        rotate_headed_shapes(shapes, math.pi),
-    ):
+    for changed in (*propose_kinds(likelihood, shapes), rotate_headed_shapes(shapes, math.pi)):
         if not changed:
             continue
         fitted, _ = likelihood.fit(changed, _SHORT_FIT_STEPS)

@@ -160,6 +160,5 @@ def propose_people_and_vehicles(box: ShapeParameters) -> list[ShapeParameters]:
     if 0.8 * low < long < high and short < wide:
         ahead = box.yaw if box.length >= box.width else box.yaw + 0.5 * math.pi
         sizes = {"length": max(long, low), "width": max(short, 0.8 * wide), "height": 0.6 * height}
-        turns = (ahead, ahead + math.pi)
-        rows += [replace(box, kind="vehicle", yaw=yaw, **sizes) for yaw in turns]
+        rows += [replace(box, kind="vehicle", yaw=yaw, **sizes) for yaw in (ahead, ahead + math.pi)]
     return rows

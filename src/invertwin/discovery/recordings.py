@@ -190,13 +190,7 @@ _IMAGE_BETTER_NOTE = (
 
 
 def _find_static_objects(
-    capture: Capture,
-    grid: Grid,
-    level: float,
-    positions: Tensor,
-    step: float,
-    rays: int,
-    seed: int,
+    capture: Capture, grid: Grid, level: float, positions: Tensor, step: float, rays: int, seed: int
 ) -> Twin:
     """Find the shapes that explain the maps of a recording."""
     power = capture.spectrum(grid).detach().float()

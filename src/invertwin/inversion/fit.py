@@ -430,8 +430,7 @@ class Fit:
         # Losses of steps are of the fitted frames only; recompute on the selection frames.
         kept = min(("first", "best"), key=lambda name: losses[name])
         self.modules.load_state_dict(ends[kept])
-        reached = (self.progress.step, losses[kept], ends[kept])
-        self.progress = replace(self.progress, best=reached)
+        self.progress = replace(self.progress, best=(self.progress.step, losses[kept], ends[kept]))
         return "diverged"
 
     def _has_converged(self, tolerance: float) -> bool:

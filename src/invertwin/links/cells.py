@@ -314,8 +314,7 @@ class MapMesh(Cells):
     sampling: CellSampling = CellSampling()
 
     def __post_init__(self) -> None:
-        mesh = replace(self.mesh, vertices=strip_derivatives(self.mesh.vertices))
-        set_fields(self, mesh=mesh)
+        set_fields(self, mesh=replace(self.mesh, vertices=strip_derivatives(self.mesh.vertices)))
         if not bool((self.areas > 0).all()):
             raise InputError(
                 "expected triangles with an area for the cells of a map, got one without; remove it"

@@ -294,8 +294,7 @@ def impulse_response(
     shape = (len(paths), *amplitude.shape[1:], count)
     require_memory(16.0 * math.prod(shape), "an impulse response", "ask for fewer taps", "taps")
     times = first + torch.arange(count, dtype=torch.float64) / band
-    values = turned[..., None] * torch.sinc(band * (delay[..., None] - times))
-    return _sum_by_link(paths, values)
+    return _sum_by_link(paths, turned[..., None] * torch.sinc(band * (delay[..., None] - times)))
 
 
 def _evaluate_responses(

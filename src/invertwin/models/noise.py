@@ -29,8 +29,7 @@ def noisy_realisations(
     """
 
     def white_noise(key: int) -> Tensor:
-        generator = torch.Generator().manual_seed(key)
-        return torch.randn(shape, dtype=dtype, generator=generator)
+        return torch.randn(shape, dtype=dtype, generator=torch.Generator().manual_seed(key))
 
     whole = to_map(white_noise(seed))
     share = float((whole.square() if holds_fields else whole).mean())

@@ -231,8 +231,7 @@ class RadioMap(ForwardModel):
         """The model with so many points on the cells, and so many scattered paths."""
         reception, rough = self.propagation, self.propagation.rough
         if rough is not None:
-            finer = replace(rough, samples=samples, boundary=False)
-            reception = replace(reception, rough=finer)
+            reception = replace(reception, rough=replace(rough, samples=samples, boundary=False))
         return replace(self, places=self.places.with_sample_count(samples), propagation=reception)
 
     def ablations(self) -> dict[str, ForwardModel]:

@@ -116,9 +116,7 @@ def _views(radar: Radar | None) -> list[_OrthographicView]:
     sign = [-1 if frame[k, c] < 0 else 1 for c, k in enumerate(nearest)]
     return [
         _OrthographicView(
-            title,
-            tuple(nearest[c] for c, _ in axes),
-            tuple(way * sign[c] for c, way in axes),
+            title, tuple(nearest[c] for c, _ in axes), tuple(way * sign[c] for c, way in axes)
         )
         for title, axes in _VIEWS.items()
     ]
@@ -207,13 +205,7 @@ def _legend(
     if positions is not None:
         label = f"radar, {len(positions)} positions" if len(positions) > 1 else "radar"
         handles.append(Line2D([], [], color="black", ls="", label=label, **_draw_marks(positions)))
-    figure.legend(
-        handles=handles,
-        loc="outside lower center",
-        ncols=6,
-        fontsize=8,
-        frameon=False,
-    )
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
 
 
 _FRAMES = 24  # of one turn

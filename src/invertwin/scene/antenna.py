@@ -281,8 +281,7 @@ def planar_array(
     """
     require_at_most(count[0] * count[1], _MAX_ELEMENTS, "antenna elements", "lower count", "count")
     y = _centre_positions(count[0], spacing[0], "elements along y")
-    z = _centre_positions(count[1], spacing[1], "elements along z")
-    plane = torch.cartesian_prod(y, z)
+    plane = torch.cartesian_prod(y, _centre_positions(count[1], spacing[1], "elements along z"))
     positions = torch.cat([torch.zeros_like(plane[:, :1]), plane], dim=1)
     gain = Isotropic() if pattern is None else pattern
     return AntennaArray(positions, gain, polarisation, leakage)

@@ -22,11 +22,7 @@ from invertwin.checks import checked_tensor
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene import shapes
-from invertwin.scene.material.materials import (
-    PerfectConductor,
-    RoughConductor,
-    RoughDielectric,
-)
+from invertwin.scene.material.materials import PerfectConductor, RoughConductor, RoughDielectric
 from invertwin.scene.material.radio_materials import radio_bsdf, read_radio_material
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
@@ -354,14 +350,12 @@ def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     rank = np.argsort(order)
     renumbered = np.empty(len(vertices), dtype=np.int64)
     renumbered[used] = rank[group.ravel()]
-    merged = vertices[used][first[order]]
-    return Mesh(torch.from_numpy(merged), torch.from_numpy(renumbered[faces]))
+    return Mesh(torch.from_numpy(vertices[used][first[order]]), torch.from_numpy(renumbered[faces]))
 
 
 def _drop_repetitions(mesh: Mesh) -> Mesh:
     """Return the mesh with each triangle once, whichever way its corners go round."""
-    corners = np.sort(mesh.faces.numpy(), axis=1)
-    order, start = sort_rows(*corners.T, count=len(mesh.vertices))
+    order, start = sort_rows(*np.sort(mesh.faces.numpy(), axis=1).T, count=len(mesh.vertices))
     kept = np.sort(order[start])
     return mesh if len(kept) == len(order) else Mesh(mesh.vertices, mesh.faces[kept])
 

@@ -125,8 +125,7 @@ class DisplayMaps:
         """
         if frame not in self.frames:
             return {}
-        number = self.frames.index(frame)
-        return {name: power[number] for name, power in self.power.items()}
+        return {name: power[self.frames.index(frame)] for name, power in self.power.items()}
 
 
 @dataclass(frozen=True, eq=False)

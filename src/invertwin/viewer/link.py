@@ -129,8 +129,7 @@ class InteractiveSensor:
         edges = paths.last[paths.boundary]
         paths = paths.select(~paths.boundary)
         toward = torch.nn.functional.normalize(paths.last - place, dim=1) @ rotation
-        origin = float(self.radar.origins[frame])
-        rows = (paths.range - origin - grid.range_start) / grid.range_step
+        rows = (paths.range - float(self.radar.origins[frame]) - grid.range_start) / grid.range_step
         columns = (toward[:, 1] - grid.u_start) / grid.u_step * (grid.u_count > 1)
         points, bins = torch.stack([paths.first, paths.last], 1), torch.stack([rows, columns], 1)
         return PositionSample(place, points, paths.power, bins, edges)

@@ -317,8 +317,7 @@ def _parse_point(radar: dict[str, Any], name: str, axes: list[int]) -> Float64[T
     """A point in the world that a description may state."""
     if name not in radar:
         return None
-    do = "give x, y, z in metres"
-    return checked_tensor(radar[name], (3,), f"{name} in [radar]", do)[axes]
+    return checked_tensor(radar[name], (3,), f"{name} in [radar]", "give x, y, z in metres")[axes]
 
 
 def _set_range_origin(

@@ -396,7 +396,6 @@ def concatenate_patches(parts: Sequence[IlluminatedPatches]) -> IlluminatedPatch
     width = max(part.polygon.shape[1] for part in parts)
 
     def pad_corners(polygon: Tensor) -> Tensor:
-        last = polygon[:, -1:].expand(-1, width - polygon.shape[1], -1)
-        return torch.cat([polygon, last], 1)
+        return torch.cat([polygon, polygon[:, -1:].expand(-1, width - polygon.shape[1], -1)], 1)
 
     return concatenate_rows(parts, polygon=torch.cat([pad_corners(p.polygon) for p in parts]))

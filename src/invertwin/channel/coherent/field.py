@@ -10,10 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.coherent.multibounce_po import sample_surface_points, trace_multibounce_paths
-from invertwin.channel.coherent.power_paths import (
-    ProjectedSilhouettes,
-    trace_shadow_boundary_paths,
-)
+from invertwin.channel.coherent.power_paths import ProjectedSilhouettes, trace_shadow_boundary_paths
 from invertwin.channel.coherent.radar_equation import (
     PathTransfer,
     SurfacePaths,

@@ -87,8 +87,7 @@ def project_silhouettes(rays: RayScene, points: SilhouetteSample) -> ProjectedSi
     moving = c + (y - c) * (dot(plane, p0 - c) / dot(plane, y - c))[:, None]
 
     shadow, normal = moving.detach(), normalize(plane.detach(), dim=1)
-    corners = torch.stack([p0, p1, p2], 1).detach()
-    b1, b2 = barycentric_coordinates(corners, shadow)[:, 1:].unbind(1)
+    b1, b2 = barycentric_coordinates(torch.stack([p0, p1, p2], 1).detach(), shadow)[:, 1:].unbind(1)
     material = interpolate_values((p0, p1, p2), b1, b2)
 
     ray, edge = (y - c).detach(), (y1 - y0).detach()
@@ -186,8 +185,7 @@ def _boundary_paths(
     amount = echo.power * received_power_fraction(link, echo.depolarisation) * shadow.area_rate
     velocity = geometry.velocity(shadow.face, shadow.b1, shadow.b2)
     velocity = None if velocity is None else velocity.detach()
-    power = amount - amount.detach()
-    return echo.to_paths("power", power=power, boundary=True, velocity=velocity)
+    return echo.to_paths("power", power=amount - amount.detach(), boundary=True, velocity=velocity)
 
 
 def _read_random_walk(trace: PowerTracer, records: PathRecords) -> Iterator[Paths]:

@@ -246,8 +246,7 @@ class _CoverageTracer:
 
 def _detach_stage(stage: PathScene, points: Tensor) -> PathScene:
     """Replace the receivers and detach all positions."""
-    rest = torch.zeros_like(points)
-    return replace(stage, rx=points, rx_velocity=rest, velocities=None).detach()
+    return replace(stage, rx=points, rx_velocity=torch.zeros_like(points), velocities=None).detach()
 
 
 @dataclass(frozen=True)
@@ -304,9 +303,7 @@ def sample_intersection_curves(
 
 
 def intersection_area_rates(
-    surfaces: CandidateSurfaces,
-    points: IntersectionCurvePoints,
-    vertices: Float64[Tensor, "v 3"],
+    surfaces: CandidateSurfaces, points: IntersectionCurvePoints, vertices: Float64[Tensor, "v 3"]
 ) -> Float64[Tensor, " row"]:
     """Rates of the area lost on the side of the normal; zero in value, with derivatives [m²].
 

@@ -263,8 +263,7 @@ def _couple_cotangents(diffraction: EdgeDiffraction, wave_number: float) -> _Cou
         columns.append((quotient, factor * ratio**2 / opening, curve, s))
     value, slope, curve, s = (torch.stack(column) for column in zip(*columns, strict=True))
     signs = [[sign * other, sign] for other, sign in _term_signs(diffraction)]
-    sides = torch.tensor(signs).double().T
-    return _CoupledCotangents(value, slope, curve, s, sides)
+    return _CoupledCotangents(value, slope, curve, s, torch.tensor(signs).double().T)
 
 
 def _directional_dyads(

@@ -15,12 +15,7 @@ from invertwin.channel.power.silhouettes import (
     is_not_grazing,
     trace_past_edge,
 )
-from invertwin.channel.rays.arrays import (
-    gather_points,
-    sample_sphere,
-    scramble_seed,
-    uniform_pair,
-)
+from invertwin.channel.rays.arrays import gather_points, sample_sphere, scramble_seed, uniform_pair
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.differentiated_objects import NO_TARGET, DifferentiatedObjects
 from invertwin.channel.rays.ray_scene import RayScene

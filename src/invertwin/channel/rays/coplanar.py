@@ -145,8 +145,7 @@ def _has_near_neighbour(
     change = (owner[1:] != owner[:-1]).nonzero()[:, 0]  # the last number of every run
     if not len(change):
         return torch.zeros(len(offsets), dtype=torch.bool)
-    number = torch.arange(len(offsets))
-    run = torch.searchsorted(change, number)
+    run = torch.searchsorted(change, torch.arange(len(offsets)))
     after = (run < len(change)) & (
         offsets[change[run.clamp_max(len(change) - 1)] + 1] - offsets <= max_distance
     )

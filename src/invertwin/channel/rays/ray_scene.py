@@ -270,8 +270,7 @@ class RayScene(Occluders):
         if self._scene_of_object is None:
             return mi.Bool(True)
         owner = dr.gather(mi.UInt32, self.topology.device_face_object, face, active)
-        scene = dr.gather(mi.UInt32, self._scene_of_object, owner, active)
-        return scene == self.frame_scene(frame)
+        return dr.gather(mi.UInt32, self._scene_of_object, owner, active) == self.frame_scene(frame)
 
     def corners(self, face: mit.UInt32, active: mit.Bool | bool = True) -> Triangle:
         """Gather the corners of triangles, detached.

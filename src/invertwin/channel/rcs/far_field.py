@@ -227,8 +227,7 @@ def trace_far_field(
         parts = {name: (found[0][name] + found[-1][name].mT) / 2 for name in found[0]}
         residual = None
         if edges > 0 and target.is_smooth_metal:
-            modelled = torch.stack([*parts.values()]).sum(0)
-            residual = _residual_field(target, antenna_pairs, modelled)
+            residual = _residual_field(target, antenna_pairs, torch.stack([*parts.values()]).sum(0))
         _warn_validity(scene, target, tubes_per_wavelength, spacing, residual is not None)
         return parts if residual is None else parts | {"rest": residual}
 

@@ -502,8 +502,7 @@ def _test_segments(
     undecided = torch.nonzero((votes > 0) & (votes < 4))[:, 0]
     valid = votes == 4
     if len(undecided):
-        exact = _test_exactly(surfaces, segments.select(undecided))
-        valid[undecided], faces[undecided] = exact
+        valid[undecided], faces[undecided] = _test_exactly(surfaces, segments.select(undecided))
     return faces, valid
 
 

@@ -159,8 +159,7 @@ def trace_paths(
             specular, missed = _find_specular(bare, surfaces, interactions, limit, rays, seed)
             ends, options = (bare.tx, bare.rx), (edges, limit, rays, seed)
             wedges = _wedge_scene(bare, surfaces)
-            found = find_diffraction_candidates(wedges, interactions, *ends, *options)
-            diffracted = list(found)
+            diffracted = list(find_diffraction_candidates(wedges, interactions, *ends, *options))
         paths = [part for group in specular for part in evaluate_paths(path_scene, group)]
         wedge_scene = _wedge_scene(path_scene, surfaces)
         for candidates in diffracted:

@@ -181,12 +181,7 @@ def _radio_map_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _
             number = torch.arange(len(places.positions), dtype=torch.float64)
             return plotting.rcs_derivatives(rates, number, "receiver", label)
         return plotting.coverage(
-            {},
-            places,
-            derivatives=rates,
-            scene=scene,
-            transmitters=sensor,
-            derivative_label=label,
+            {}, places, derivatives=rates, scene=scene, transmitters=sensor, derivative_label=label
         )
 
     return _GradcheckTarget(model, sensor, None, draw)

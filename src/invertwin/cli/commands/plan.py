@@ -80,10 +80,7 @@ def _prepare_fit_at_truth(problem: Problem) -> Any:
 
 
 def _compare_with_fits(
-    problem: Problem,
-    predicted_deviations: dict[str, float],
-    folder: RunFolder,
-    console: Console,
+    problem: Problem, predicted_deviations: dict[str, float], folder: RunFolder, console: Console
 ) -> dict[str, Any]:
     """Fit simulated recordings from the truth, and return the scatter of the results."""
     count = problem.run.plan.fits if problem.run.plan else 0

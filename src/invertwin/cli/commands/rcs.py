@@ -194,8 +194,7 @@ def _image_axes(found: Signature) -> tuple[Tensor, Tensor]:
     across = across - (across @ middle) * middle
     if float(across.norm()) < _MATCH_TOLERANCE:
         raise InputError(
-            "expected several aspects for an image, got one direction; sweep an angle",
-            "rcs.image",
+            "expected several aspects for an image, got one direction; sweep an angle", "rcs.image"
         )
     return middle, across / across.norm()
 

@@ -77,8 +77,7 @@ def _simulate_frames(
     found = simulate_exact(run, scene, radar, grid)
     seconds = time.perf_counter() - begin
     data = require_simulated_data(run)
-    sampling = Sampling(depth=data.depth, samples=_SURROGATE_SAMPLES)
-    model = SurrogateMap(grid, sampling=sampling)
+    model = SurrogateMap(grid, sampling=Sampling(depth=data.depth, samples=_SURROGATE_SAMPLES))
     with torch.no_grad():
         smooth = model.predict(scene, radar, run.seed)
     Capture.from_beat(found.beat, radar).save(folder.file("capture.nc"))

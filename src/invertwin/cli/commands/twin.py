@@ -13,12 +13,7 @@ from invertwin.cli.commands.look import AnyRecording, read_recording, warning_ta
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.options import TwinOptions
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
-from invertwin.cli.run_file import (
-    is_run_file,
-    load_run,
-    prefix_file_errors,
-    require_section,
-)
+from invertwin.cli.run_file import is_run_file, load_run, prefix_file_errors, require_section
 from invertwin.cli.schema import build
 from invertwin.cli.schema.recordings import SimulatedData
 from invertwin.constants import FRAME

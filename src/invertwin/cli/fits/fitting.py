@@ -236,8 +236,7 @@ def _fit_or_search(
 
 def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:
     """Goes on from its own unfinished part; open_run has settled what may be there."""
-    every = problem.run.fit_settings.checkpoint_every
-    return Checkpoint(folder.file(name), every, resume=True)
+    return Checkpoint(folder.file(name), problem.run.fit_settings.checkpoint_every, resume=True)
 
 
 def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> Problem:

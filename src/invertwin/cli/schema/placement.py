@@ -119,8 +119,7 @@ class Placement(Section):
             none = torch.zeros(*table.counts, dtype=torch.float64)
             place, axes = torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
             panel = Metasurface(place, axes, none, table.spacing)
-            pattern = table.pattern and table.pattern.build()
-            return replace(panel, bits=table.bits, pattern=pattern)
+            return replace(panel, bits=table.bits, pattern=table.pattern and table.pattern.build())
 
     def place(self, coverage: Coverage, trial: Trial, phases: bool = False) -> PanelPlacement:
         """The module of a panel that starts at a trial.

@@ -67,8 +67,7 @@ class ChirpRecordingTable(RecordingTable, RadarPoseTable):
     """Raw chirps of a board, made one signal per frame."""
 
     chirp: Annotated[int, Ge(0)] | None = key(
-        "number of one chirp, from 0; without it the mean over a frame, in which movers fade",
-        None,
+        "number of one chirp, from 0; without it the mean over a frame, in which movers fade", None
     )
     frame: Annotated[int, Ge(0)] | None = key(
         "number of the only frame that is used, from 0; without it all", None

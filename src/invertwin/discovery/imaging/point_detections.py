@@ -58,8 +58,7 @@ def detect_moving_targets(
     rows = moves.nonzero()[:, 0]
     if not len(rows):
         return []
-    where = torch.stack([points.range, rates], dim=1)[rows] / scales
-    labels = label_groups(where, 1.0)
+    labels = label_groups(torch.stack([points.range, rates], dim=1)[rows] / scales, 1.0)
     flat = range_doppler(beat[frame : frame + 1], radar.frames([frame]), grid, chirps)
     # Noise reduction of beams over all channels relative to one channel.
     noise = noise_power(flat.abs().square(), 1) / len(radar.virtual_positions)

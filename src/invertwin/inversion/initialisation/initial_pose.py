@@ -125,8 +125,7 @@ class InitialPoseEstimator:
         if self.pose == "axes":
             rectangle = principal_rectangle(points)
         else:
-            resolution = radar.waveform.range_resolution
-            rectangle = fit_rectangle(points, radar, resolution=resolution)
+            rectangle = fit_rectangle(points, radar, resolution=radar.waveform.range_resolution)
         if self.scale:
             scene = Scale(name, estimate_scale(item, rectangle)).requires_grad_(False)(scene)
         poses = candidate_poses(scene[name], rectangle, radar)

@@ -15,12 +15,7 @@ from scipy.stats import beta, f
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.checks import (
-    check_choice,
-    check_shape,
-    checked_number,
-    refuse_derivatives,
-)
+from invertwin.checks import check_choice, check_shape, checked_number, refuse_derivatives
 from invertwin.errors import InputError
 from invertwin.radar.processing.doppler import velocity_axis, velocity_span
 from invertwin.radar.radar import Radar

@@ -138,9 +138,7 @@ def compensate_tdm(
     return spectrum * turn[:, :, :, None].to(spectrum)
 
 
-def interpolate_rates(
-    power: Float[Tensor, "velocity range"],
-) -> Float64[Tensor, "velocity range"]:
+def interpolate_rates(power: Float[Tensor, "velocity range"]) -> Float64[Tensor, "velocity range"]:
     """Interpolate the range rate of the target in each bin, in spans from the centre of the bin.
 
     A parabola through the logarithms of a bin and its neighbours has its vertex there, at most half

@@ -116,10 +116,7 @@ class EffectiveRoughness:
     depolarisation: Value = 0.0
 
     def make_interface(
-        self,
-        permittivity: Tensor | None,
-        thickness: Value = math.inf,
-        permeability: Tensor = _ONE,
+        self, permittivity: Tensor | None, thickness: Value = math.inf, permeability: Tensor = _ONE
     ) -> SmoothInterface:
         """Return the coherent interface, which keeps the fraction 1 − S² of the power.
 

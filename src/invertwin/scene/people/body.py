@@ -10,13 +10,7 @@ from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from invertwin.checks import (
-    ArrayLike,
-    check_shape,
-    checked_count,
-    checked_tensor,
-    set_fields,
-)
+from invertwin.checks import ArrayLike, check_shape, checked_count, checked_tensor, set_fields
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh, concatenate_meshes
@@ -421,8 +415,7 @@ def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
     regressor = checked_tensor(arrays["J_regressor"], (count, len(rest)), "J_regressor", _DO)
     poses = None
     if "posedirs" in arrays:
-        columns = (len(rest), 3, 9 * (count - 1))
-        poses = checked_tensor(arrays["posedirs"], columns, "posedirs", _DO)
+        poses = checked_tensor(arrays["posedirs"], (len(rest), 3, 9 * (count - 1)), "posedirs", _DO)
         # The correctives and the rotation matrices that they belong to turn alike.
         poses = torch.einsum(
             "ab,cd,ef,vbjdf->vajce", turn, turn, turn, poses.unflatten(2, (-1, 3, 3))

@@ -130,8 +130,7 @@ def load_anny(
     Raises:
         InputError: Anny is not installed, or has no such phenotype.
     """
-    anny = import_optional("anny", "anny")
-    model = anny.Anny(skinning_method="lbs").to(dtype=torch.float64)
+    model = import_optional("anny", "anny").Anny(skinning_method="lbs").to(dtype=torch.float64)
     values = dict.fromkeys(model.phenotype_labels, 0.5)
     for name in (*(phenotypes or {}), *coordinates):
         check_choice(name, values, "phenotypes among", "use Anny's names")

@@ -170,8 +170,7 @@ def cloud_surface(cloud: Cloud, level: float | None = None) -> Mesh:
             f"{float(density.max()):.3g} [1/m], got {level:.3g}; give another"
         )
     # A layer of zero density closes the surface at the faces of the box.
-    padded = nn.functional.pad(density, (1, 1, 1, 1, 1, 1))
-    corners, faces = march_cubes(padded, level, "ascent")
+    corners, faces = march_cubes(nn.functional.pad(density, (1, 1, 1, 1, 1, 1)), level, "ascent")
     return Mesh(cloud.low + (corners - 1) * cloud.spacing, faces)
 
 

@@ -237,8 +237,7 @@ class EFIEMatrix:
         shares, weights = QUADRATURE_3
         offset = shares @ (corners - centroid[:, None])
         linear = offset[:, None] - (corners - centroid[:, None])[:, :, None]
-        ones = torch.ones_like(linear[..., :1])
-        products = torch.cat([linear / 2, ones], -1) * weights[:, None]
+        products = torch.cat([linear / 2, torch.ones_like(linear[..., :1])], -1) * weights[:, None]
         return offset + (centroid - vertices.detach().mean(0))[:, None], products
 
     def _greens_function(self, points: Tensor, others: Tensor) -> Tensor:

@@ -60,8 +60,7 @@ def build_conforming_mesh(
     faces = merged[faces]
     corners = vertices[faces]
     longest = np.linalg.norm(np.roll(corners, -1, 1) - corners, axis=2).max(1)
-    area = np.linalg.norm(_double_area_vectors(corners), axis=1)
-    is_valid = area > _MIN_FLATNESS * longest**2
+    is_valid = np.linalg.norm(_double_area_vectors(corners), axis=1) > _MIN_FLATNESS * longest**2
     numbers = np.flatnonzero(is_valid)
     faces = faces[is_valid]
     if not len(faces) or not _is_conforming(vertices, faces, _MIN_GAP * side):

@@ -191,8 +191,7 @@ def warn_not_solved(wave_number: float, refusals: Sequence[Refusal]) -> None:
 def _scattered_field(equation: CurrentEquation, transmitters: Tensor, receivers: Tensor) -> Tensor:
     """Scattered field S, in batches of waves."""
     sent, received = (x.split(_ASPECTS_AT_ONCE) for x in (transmitters, receivers))
-    currents = map(equation.solve_currents, sent)
-    return torch.cat([*map(equation.far_field, currents, sent, received)])
+    return torch.cat([*map(equation.far_field, map(equation.solve_currents, sent), sent, received)])
 
 
 def power_error(
