@@ -15,7 +15,7 @@ from invertwin.cli.run_file import load_run
 from invertwin.errors import InputError
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import linear_array
-from invertwin.scene.files import load_mesh
+from invertwin.scene.files import load_mesh, load_scene_xml
 from invertwin.storage.folders import MANIFEST, read_manifest
 from invertwin.storage.untrusted import existing_file, read_npy
 
@@ -91,3 +91,13 @@ def test_a_capture_on_a_full_disk_is_an_oserror_and_leaves_nothing(tmp_path):
     assert torch.equal(Capture.load(tmp_path / "a.nc").beat, capture.beat)
     with h5py.File(io.BytesIO((tmp_path / "a.nc").read_bytes())) as file:
         assert np.asarray(file["beat_real"]).sum() == 128
+
+
+def test_meshes_and_scene_files_are_limited_before_they_are_read(tmp_path):
+    (tmp_path / "a.stl").write_bytes(bytes(100_000_001))
+    with pytest.raises(InputError, match="at most 100,000,000 bytes of a mesh"):
+        load_mesh(tmp_path / "a.stl")
+    shapes = '<shape type="sphere"/>' * 10_001
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0">{shapes}</scene>')
+    with pytest.raises(InputError, match="at most 10,000 shapes"):
+        load_scene_xml(tmp_path / "a.xml")

@@ -41,7 +41,7 @@ _CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # corners of shell elements by the 
 Unit = Literal["m", "cm", "mm", "um", "in", "ft"]
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 _UCD_HEADER = re.compile(r"(#.*\n|\s)*(\d+\s+){4}\d+\s*\n")  # counts: nodes, cells, data
-_MAX_GROUPS = 10_000
+_MAX_GROUPS, _MAX_BYTES = 10_000, 1e8  # of a file: two million triangles
 _LARGE = 100.0  # size of a suspicious mesh [m]
 CONCRETE = RoughDielectric(permittivity=5.24)
 """Default material of a scene file (ITU-R P.2040 concrete)."""
@@ -114,6 +114,7 @@ def _load_with(
         raise InputError(
             f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), got {path.name}; convert it first"
         )
+    require_at_most(path.stat().st_size, _MAX_BYTES, "bytes of a mesh", "simplify it first")
     found = {}
     with convert_read_errors(path, f"a readable {path.suffix} mesh"):
         for name, part in split(_load_trimesh_scene(path)).items():
@@ -218,6 +219,7 @@ def load_scene_xml(
     file = existing_file(path)
     with convert_read_errors(file, "an XML scene"):
         root = ElementTree.parse(file).getroot()
+        require_at_most(len(root), _MAX_GROUPS, "shapes", "join those of one material")
     try:
         return _build_scene(root, file.parent, dict(materials or {}), default)
     except InputError as error:

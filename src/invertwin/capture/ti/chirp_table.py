@@ -1,25 +1,22 @@
 """Units, channel masks and the order of transmitters, common to both kinds of settings file."""
 
 import re
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from decimal import Decimal
+from importlib.resources import files
 from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings, shortest_loop
 from invertwin.errors import InputError
 
+_TEXT = files("invertwin.capture.ti").joinpath("fields.toml").read_text(encoding="utf-8")
+FIELDS: dict[str, Any] = tomllib.loads(_TEXT)
+"""Names and places of numbers in both kinds of file."""
 # By the first two digits of the device; later ones record through several kinds of link.
 _LANES = {"12": 4, "14": 4, "16": 2, "18": 2, "68": 2}
 # Numbers of a profile, and the power of ten of the units in which both kinds of file have them.
-_PROFILE = {
-    "start_frequency": 9,
-    "idle_time": -6,
-    "adc_start_time": -6,
-    "ramp_end_time": -6,
-    "slope": 12,
-    "samples": 0,
-    "sample_rate": 3,
-}
+_PROFILE: dict[str, int] = FIELDS["profile"]
 _MAX_CHIRPS = 512  # that a front end can define
 BITS = {0: 12, 1: 14, 2: 16}
 """Code → resolution of the ADC."""

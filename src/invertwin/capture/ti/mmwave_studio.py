@@ -13,22 +13,9 @@ from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, existing_file, read_text, safe_reader
 
 # Names of the numbers of a profile, and of the frame.
-_PROFILE = (
-    "startFreqConst_GHz",
-    "idleTimeConst_usec",
-    "adcStartTimeConst_usec",
-    "rampEndTime_usec",
-    "freqSlopeConst_MHz_usec",
-    "numAdcSamples",
-    "digOutSampleRate",
-)
+_PROFILE = chirp_table.FIELDS["studio_profile"]
 _FRAME = ("chirpStartIdx", "chirpEndIdx", "numLoops", "numFrames", "framePeriodicity_msec")
-_VARIATIONS = (
-    "startFreqVar_MHz",
-    "freqSlopeVar_KHz_usec",
-    "idleTimeVar_usec",
-    "adcStartTimeVar_usec",
-)
+_VARIATIONS = chirp_table.FIELDS["studio_variations"]
 
 
 @safe_reader("settings of mmWave Studio", "save them again with mmWave Studio")

@@ -9,15 +9,7 @@ from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import read_text, safe_reader
 
 # Fewest arguments of the commands that are read.
-_ARGUMENTS = {
-    "channelCfg": 2,
-    "adcCfg": 2,
-    "adcbufCfg": 4,
-    "profileCfg": 11,
-    "chirpCfg": 8,
-    "frameCfg": 5,
-    "lvdsStreamCfg": 2,
-}
+_ARGUMENTS = chirp_table.FIELDS["arguments"]
 _UNIQUE_COMMANDS = ("channelCfg", "adcCfg", "frameCfg")
 _BAND_EDGE = 70e9  # Hz, between the devices of 60 and 77 GHz
 # Places of the numbers of a profile in its command.

@@ -1,8 +1,10 @@
 """Types and ranges of material values: numbers, one per triangle, or textures."""
 
 import math
+import tomllib
 from collections.abc import Mapping
 from dataclasses import InitVar, dataclass
+from importlib.resources import files
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -117,24 +119,10 @@ class ValueRange(NamedTuple):
     open_low: bool = False
 
 
+_TEXT = files("invertwin.scene.material").joinpath("ranges.toml").read_text(encoding="utf-8")
 RANGES: Mapping[str, ValueRange] = {
-    "permittivity": ValueRange("relative permittivity", 1.0),
-    "conductivity": ValueRange("conductivity [S/m]", 0.0),
-    "loss_tangent": ValueRange("loss tangent", 0.0),
-    "permeability": ValueRange("relative permeability", 0.0, open_low=True),
-    "magnetic_loss_tangent": ValueRange("magnetic loss tangent", 0.0),
-    "thickness": ValueRange("thickness [m]", 0.0),
-    "diffuse": ValueRange("diffuse fraction", 0.0, 1.0),
-    "lobe_width": ValueRange("lobe width [rad]", 3.4e-4, math.pi),
-    "scattering": ValueRange("scattering coefficient", 0.0, 1.0),
-    "rms_slope": ValueRange("rms slope", 1e-4, 1.0),
-    "rms_height": ValueRange("rms height [m]", 0.0),
-    "lambertian": ValueRange("Lambertian share", 0.0, 1.0),
-    "directive": ValueRange("directive share", 0.0, 1.0),
-    "directive_exponent": ValueRange("exponent of the directive lobe", 0.0, 1e8),
-    "depolarisation": ValueRange("depolarisation", 0.0, 0.25),
-    "backscatter_exponent": ValueRange("exponent of the backscattering lobe", 0.0, 1e8),
-}  # The kernel's float32 holds lobes down to an rms slope of 1e-4.
+    name: ValueRange(**row) for name, row in tomllib.loads(_TEXT).items()
+}
 """Ranges of the material values by field name."""
 
 MaterialValue = Annotated[str, AllowedValues(tuple(RANGES))]
