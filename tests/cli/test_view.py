@@ -157,3 +157,10 @@ def test_no_file_has_no_steps(tmp_path):
     assert load_steps(tmp_path / "none.npz") == []
     Display("", []).save(tmp_path / "empty.npz")
     assert load_steps(tmp_path / "empty.npz") == []
+
+
+def test_the_run_file_is_never_replaced_by_its_page(run_file, monkeypatch, capsys):
+    before = run_file.read_bytes()
+    assert call(monkeypatch, "view", run_file, "--record", run_file, "--overwrite") == 2
+    assert "expected a new file for --record" in capsys.readouterr().err
+    assert run_file.read_bytes() == before

@@ -87,8 +87,8 @@ class SampleDataset(Dataset[Any]):
             InputError: One that is damaged or missing.
         """
         for path, shard in self._shards:
-            existing_file(path, "a shard of a data set")
-            with convert_read_errors(path, "a shard of a data set"), path.open("rb") as opened:
+            what = "a shard of a data set"
+            with convert_read_errors(path, what), existing_file(path, what).open("rb") as opened:
                 digest = hashlib.file_digest(opened, "sha256").hexdigest()
             if digest != shard.sha256:
                 raise InputError(

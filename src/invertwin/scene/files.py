@@ -270,7 +270,8 @@ class _FileResolver(FilePathResolver):
     """Files that a mesh names, such as its materials: no pipes."""
 
     def get(self, name: str) -> bytes:
-        existing_file(Path(self.parent, name))
+        if not Path(self.parent, name).is_file():
+            raise OSError(f"no file {name}")
         return super().get(name)
 
 

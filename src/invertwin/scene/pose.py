@@ -8,7 +8,6 @@ CAD files need no change: they are x forward, y left, z up, or have no forward a
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from types import MappingProxyType
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
@@ -127,20 +126,18 @@ def compose(*transforms: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
 
 FrameName = Literal["ti", "opencv", "smpl", "unity"]
 
-_AXES: Mapping[str, tuple[str, str, str]] = MappingProxyType(
-    {
-        # x right, y forward, z up (TI MMWAVE-L-SDK, mpdProc_SceneryParams: X is left (negative) to
-        # right, Y near to far, Z = 0 the floor).
-        "ti": ("-y", "x", "z"),
-        # x right, y down, z forward (OpenCV manual, calib3d: the pinhole camera model).
-        "opencv": ("-y", "-z", "x"),
-        # y up, the body faces +z, its left is +x (Loper et al. 2015, the template of SMPL); our
-        # bodies face −x.
-        "smpl": ("-y", "z", "-x"),
-        # Left-handed: x right, y up, z forward (Unity manual, "Rotation and orientation").
-        "unity": ("-y", "z", "x"),
-    }
-)
+_AXES: Mapping[str, tuple[str, str, str]] = {
+    # x right, y forward, z up (TI MMWAVE-L-SDK, mpdProc_SceneryParams: X is left (negative) to
+    # right, Y near to far, Z = 0 the floor).
+    "ti": ("-y", "x", "z"),
+    # x right, y down, z forward (OpenCV manual, calib3d: the pinhole camera model).
+    "opencv": ("-y", "-z", "x"),
+    # y up, the body faces +z, its left is +x (Loper et al. 2015, the template of SMPL); our
+    # bodies face −x.
+    "smpl": ("-y", "z", "-x"),
+    # Left-handed: x right, y up, z forward (Unity manual, "Rotation and orientation").
+    "unity": ("-y", "z", "x"),
+}
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ And what a client may say: the value of a control, a place, a click, each within
 
 import http
 import ipaddress
-import math
 import re
 import secrets
 import socket
@@ -131,12 +130,8 @@ def is_valid_message(raw: Any, controls: Mapping[str, Any]) -> bool:
 
     try:
         match msgspec.msgpack.decode(raw):
-            case {
-                "type": "GuiUpdateMessage",
-                "uuid": str(name),
-                "updates": {"value": value} as new,
-            }:
-                return len(new) == 1 and _accepts(controls.get(name), value)
+            case {"type": "GuiUpdateMessage", "uuid": str(name), "updates": dict(new)}:
+                return [*new] == ["value"] and _accepts(controls.get(name), new["value"])
             case {"type": kind, **rest}:
                 return kind in _MESSAGES and all(_is_plain(*item) for item in rest.items())
     except (TypeError, msgspec.DecodeError):  # text, or no message
@@ -155,13 +150,13 @@ def _accepts(control: Any, value: Any) -> bool:
 
 def _is_plain(name: str, value: Any) -> bool:
     """Return True for a short text, a number of a usual size, or a vector as its name says."""
-    if isinstance(value, list):
-        numbers = all(type(x) in (int, float) and _is_plain(name, x) for x in value)
-        return numbers and len(value) == _VECTORS.get(name, 3)
-    if isinstance(value, str):
-        return len(value) <= _MAX_TEXT
-    numeric = type(value) in (int, float)
-    return value is None or (numeric and math.isfinite(value) and abs(value) <= _MAX_NUMBER)
+    if isinstance(value, str | None):
+        return len(value or "") <= _MAX_TEXT
+    wanted = _VECTORS.get(name, 3) if isinstance(value, list) else 1
+    numbers = value if isinstance(value, list) else [value]
+    # Comparisons with NaN are false.
+    usual = [type(x) in (int, float) and abs(x) <= _MAX_NUMBER for x in numbers]
+    return len(usual) == wanted and all(usual)
 
 
 @contextmanager
@@ -180,9 +175,7 @@ def install_guard(guard: AccessGuard, controls: Callable[[], Mapping[str, Any]])
     with _patch_lock:
         plain = server.serve
 
-        def serve(
-            handler: Any, *args: Any, process_request: Callable[..., Any], **given: Any
-        ) -> Any:
+        def serve(handler: Any, *args: Any, **given: Any) -> Any:
             async def handle(connection: Any) -> None:
                 receive = connection.recv
 
@@ -195,7 +188,7 @@ def install_guard(guard: AccessGuard, controls: Callable[[], Mapping[str, Any]])
                 with suppress(Exception):  # whatever a client causes ends its own connection
                     await handler(connection)
 
-            given |= {"process_request": guard.wrap_handler(process_request)}
+            given |= {"process_request": guard.wrap_handler(given["process_request"])}
             return plain(handle, *args, **given | {"max_size": _MAX_MESSAGE})
 
         server.serve = serve

@@ -391,17 +391,10 @@ class Viewer:
 def _start_server(guard: AccessGuard, host: str, port: int) -> Any:
     """The server of viser, behind a guard."""
     viser = import_optional("viser", "view")
-
-    class _LocalServer(viser.ViserServer):
-        """One that never opens a tunnel to a server of others, which any browser might ask for."""
-
-        def request_share_url(self, verbose: bool = True) -> None:
-            return None
-
     made: list[Any] = []  # clients may come before the constructor ends
     with (
         install_guard(guard, lambda: made[0].gui._gui_input_handle_from_uuid if made else {}),
         redirect_stdout(io.StringIO()),
     ):
-        made.append(_LocalServer(host=host, port=port, verbose=False))
+        made.append(viser.ViserServer(host=host, port=port, verbose=False))
         return made[0]
