@@ -170,9 +170,8 @@ class _ImageRenderer:
         piece = torch.nonzero(high > low)[:, 0]
         ends = ends[:, piece]
         cut = [torch.lerp(ends[0], ends[1], share[piece, None]) for share in (low, high)]
-        marks = torch.stack(
-            [fixed.principal_point + fixed.focal * p[:, :2] / p[:, 2:] for p in cut]
-        )
+        slopes = torch.stack([point[:, :2] / point[:, 2:] for point in cut])
+        marks = fixed.principal_point + fixed.focal * slopes
         length = (marks[1] - marks[0]).norm(dim=1)
         count = int(np.ceil(float(length.sum()) * self.sampling.outline_samples))
         if not count:

@@ -56,7 +56,9 @@ def coverage(
         what = f"a map of the plane's cells for {title!r}"
         check_shape(values, plane.shape, what, "give one of a single transmitter")
     count = len(levels) + len(rates)
-    grid = _project_to_plane(plane, _corners(plane))
+    s, t = (torch.linspace(0, 1, n + 1, dtype=torch.float64) for n in plane.count)
+    corners = plane.corner + s[:, None, None] * plane.first + t[:, None] * plane.second
+    grid = _project_to_plane(plane, corners)
     width, height = np.ptp(grid[..., 0]), np.ptp(grid[..., 1])
     tall = min(max(3.4 * height / width, 1.6), 5.0)
     figure, cells = row_of_axes(count, (1.4 + 3.4 * count, tall + 0.9), sharey=True)
@@ -76,12 +78,6 @@ def coverage(
             add_colorbar(figure, image, part, name)
     cells[0].set_ylabel(_names(plane)[1], fontsize=8)
     return figure
-
-
-def _corners(plane: MapPlane) -> Tensor:
-    """Corners of all cells [m]."""
-    s, t = (torch.linspace(0, 1, n + 1, dtype=torch.float64) for n in plane.count)
-    return plane.corner + s[:, None, None] * plane.first + t[:, None] * plane.second
 
 
 def _axes(plane: MapPlane) -> Tensor:

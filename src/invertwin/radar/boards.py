@@ -195,12 +195,8 @@ class Mounting:
         return found.arrays(**how)
 
 
-def _load_presets() -> dict[str, Board]:
-    text = files("invertwin.radar").joinpath("boards.toml").read_text(encoding="utf-8")
-    return {name: Board(name, **table) for name, table in tomllib.loads(text).items()}
-
-
-BOARDS: Mapping[str, Board] = MappingProxyType(_load_presets())
+_TABLES = tomllib.loads(files("invertwin.radar").joinpath("boards.toml").read_text("utf-8"))
+BOARDS: Mapping[str, Board] = MappingProxyType({n: Board(n, **t) for n, t in _TABLES.items()})
 """Name → preset. xWR boards serve the AWR and the IWR of that number."""
 
 

@@ -407,7 +407,8 @@ def _build_scene(
         name = element.get("id") or f"{element.get('type')}_{number}"
         if name in objects:
             raise InputError(f"expected different shape ids, got {name!r} twice; rename one")
-        material = _material_id(element)
+        named = [part for part in map(element.find, ("ref", "bsdf")) if part is not None]
+        material = named[0].get("id", "") if named else ""
         referred.add(material)
         try:
             mesh = _shape(element, folder)
@@ -435,11 +436,6 @@ def _read_materials(root: ElementTree.Element) -> dict[str, Material]:
         if material is not None:
             found[name] = material
     return found
-
-
-def _material_id(shape: ElementTree.Element) -> str:
-    found = [element for element in map(shape.find, ("ref", "bsdf")) if element is not None]
-    return found[0].get("id", "") if found else ""
 
 
 def _shape(element: ElementTree.Element, folder: Path) -> Mesh:

@@ -203,9 +203,9 @@ def _sides_of(
     faces: Int64[np.ndarray, "f 3"], number: Int64[np.ndarray, " n"], vertex_count: int
 ) -> MeshEdges:
     """Group the sides of some triangles by edges."""
-    a, b, c = faces[number].T
-    sides = np.stack([np.concatenate([a, b, c]), np.concatenate([b, c, a])], 1)
-    return _group_sides(sides, np.concatenate([c, a, b]), np.tile(number, 3), vertex_count)
+    used = faces[number]
+    apex = used[:, [2, 0, 1]].T.ravel()
+    return _group_sides(triangle_sides(used), apex, np.tile(number, 3), vertex_count)
 
 
 def find_distinct_faces(

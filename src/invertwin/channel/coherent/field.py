@@ -178,7 +178,8 @@ def conductor_matrix(link: Link, echo: PathTransfer) -> Complex128[Tensor, "row 
     offsets = (point.position - antenna[echo.frame] for antenna in (link.tx, link.rx))
     ways = [normalize(offset, dim=1) for offset in offsets]
     normal = -dot(point.normal, ways[0]).sign()[:, None] * point.normal
-    if torch.equal(link.tx, link.rx) and not _has_directional_jones(link):
+    directional = any(isinstance(own.base, JonesTable) for own in (link.tx_jones, link.rx_jones))
+    if torch.equal(link.tx, link.rx) and not directional:
         sent, received = link.tx_jones.evaluate(ways[0]), link.rx_jones.evaluate(ways[1])
         kernel = -0.5 * dot(normal, ways[0] + ways[1])[:, None, None] * (received @ sent.mT)
     else:
@@ -188,10 +189,6 @@ def conductor_matrix(link: Link, echo: PathTransfer) -> Complex128[Tensor, "row 
         kernel = current_kernel(normal, ways[0], sent, ways[1], received)
     field = conductor_field(echo.spreading, kernel, -dot(normal, ways[1]))
     return field * point.jacobian[:, None, None]
-
-
-def _has_directional_jones(link: Link) -> bool:
-    return any(isinstance(jones.base, JonesTable) for jones in (link.tx_jones, link.rx_jones))
 
 
 def rough_path_matrix(

@@ -124,9 +124,14 @@ class _FarFieldTarget:
         return group_smooth_faces(self.facets, self.topology.edge_faces)
 
     @cached_property
-    def metal_faces(self) -> Int64[Tensor, " facet"]:
-        """Number of the smooth face of each facet of conductors; −1 = other materials."""
-        return torch.where(self.interfaces[0].conducting, self.smooth_faces.face, -1)
+    def metal_faces(self) -> Int64[Tensor, " facet+1"]:
+        """Number of the smooth face of conductors, or of the single facet of others; −1 at the end.
+
+        Facets are numbered from 0, and −1 is none.
+        """
+        face = self.smooth_faces.face
+        own = torch.where(self.interfaces[0].conducting, face, len(face) + torch.arange(len(face)))
+        return torch.nn.functional.pad(own, (0, 1), value=-1)
 
     def max_refractive_index(self, number: int) -> float:
         """Return the largest refractive index inside an object; 1 for opaque ones."""

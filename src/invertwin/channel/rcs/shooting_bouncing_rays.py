@@ -19,7 +19,7 @@ from invertwin.channel.rays.ray_scene import Occluders, find_next_surface
 
 _MAX_SIDE_RATIO = 8.0  # times the smallest piece: larger triangles are split in advance
 _CORNER_INSET = 0.02  # fraction from a corner to the centre at which the corner is tested
-_BISECTIONS = 4  # bisection steps along a side
+_BISECTIONS = 8  # bisection steps along a side
 _ROWS_AT_ONCE = 1 << 18
 _MAX_HEIGHT = 1 / 16  # of the least tube width: hits over the plane of a tube that is kept whole
 _MAX_UNEVENNESS = 1e-3  # of the least tube width: the same of a wide tube, on flat faces
@@ -101,6 +101,7 @@ def subdivide_triangles(
     classify: Callable[[Tensor, Tensor], Tensor],
     is_narrow: Callable[[Tensor, Tensor], Tensor],
     is_flat: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None,
+    group: Callable[[Tensor], Tensor] = torch.Tensor.clone,
 ) -> tuple[Int64[Tensor, " piece"], Float64[Tensor, "piece 3 3"], Int64[Tensor, " piece"]]:
     """Subdivide triangles into pieces of uniform label.
 
@@ -111,6 +112,8 @@ def subdivide_triangles(
             of splitting in four.
         is_flat: function of rows, their centres and corners [row, 4, 3] and the labels of these;
             returns a mask of pieces to keep whole, with the label of their centre.
+        group: function of labels; returns equal numbers for labels between which nothing is cut, if
+            others are in the piece.
 
     Returns:
         Row, corners and label of every piece.
@@ -129,23 +132,31 @@ def subdivide_triangles(
         if not len(row):
             break
         narrow = is_narrow(row, corners)
-        found += _split_triangles(row[narrow], corners[narrow], labels[narrow], classify)
+        found += _split_triangles(row[narrow], corners[narrow], labels[narrow], classify, group)
         row, corners = row[~narrow].repeat_interleave(4), _quarter_triangles(corners[~narrow])
     pieces = zip(*found, strict=True)
     return torch.cat(next(pieces)), torch.cat(next(pieces)), torch.cat(next(pieces))
 
 
 def _split_triangles(
-    row: Tensor, corners: Tensor, labels: Tensor, classify: Callable[[Tensor, Tensor], Tensor]
+    row: Tensor,
+    corners: Tensor,
+    labels: Tensor,
+    classify: Callable[[Tensor, Tensor], Tensor],
+    group: Callable[[Tensor], Tensor],
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Cut triangles with one corner of another label; others take the label of their centre."""
-    first, second, third = labels[:, 1:].unbind(1)
-    pairs = (first == second).long() + (second == third).long() + (third == first).long()
-    single = pairs != 1
+    """Cut triangles with one corner of another group; others take the label of their centre."""
+    is_one = (group(labels) == group(labels[:, :1])).all(1, keepdim=True)
+
+    def key(found: Tensor) -> Tensor:
+        return torch.where(is_one, found, group(found))
+
+    keys = key(labels)[:, 1:]
+    others_agree = keys.roll(-1, 1) == keys.roll(1, 1)  # those of the other two corners
+    single = others_agree.sum(1) != 1
     yield row[single], corners[single], labels[single, 0]
-    odd = torch.where(second == third, 0, torch.where(third == first, 1, 2))[~single]
-    order = (odd[:, None] + torch.arange(3)) % 3
-    row, labels = row[~single], labels[~single, 1:].gather(1, order)
+    order = (others_agree[~single].long().argmax(1, keepdim=True) + torch.arange(3)) % 3
+    row, is_one, labels = row[~single], is_one[~single], labels[~single, 1:].gather(1, order)
     corners = corners[~single].gather(1, order[..., None].expand(-1, -1, 3))
     inner = inset_points(corners)[:, 1:]
     # Fraction of the sides from the odd corner with its label.
@@ -153,7 +164,7 @@ def _split_triangles(
     for step in range(1, _BISECTIONS + 1):
         middle = low + 0.5**step
         points = inner[:, :1] + middle[..., None] * (inner[:, 1:] - inner[:, :1])
-        low = torch.where(classify(row, points) == labels[:, :1], middle, low)
+        low = torch.where(key(classify(row, points)) == key(labels[:, :1]), middle, low)
     fraction = (low + 0.5 ** (_BISECTIONS + 1))[..., None]
     a, b, c = corners.unbind(1)
     p, q = (a[:, None] + fraction * (corners[:, 1:] - a[:, None])).unbind(1)
@@ -202,7 +213,7 @@ def _quarter_triangles(corners: Float64[Tensor, "row 3 3"]) -> Float64[Tensor, "
 def trace_tubes(
     facets: Facets,
     occluders: Occluders,
-    metal_face: Int64[Tensor, " facet"],
+    metal_face: Int64[Tensor, " facet+1"],
     first_order: IlluminatedPatches,
     min_tube_width: float,
     depth: int,
@@ -212,7 +223,8 @@ def trace_tubes(
     Args:
         facets: facets of all triangles.
         occluders: ray scene of the triangles.
-        metal_face: number of the smooth face of each facet of metal; −1 = other materials.
+        metal_face: number of the smooth face of each facet of metal; of other facets one of their
+            own; and of no facet, −1, at the end.
         first_order: directly illuminated triangles.
         min_tube_width: width below which tubes are not split [m].
         depth: maximum number of bounces.
@@ -251,8 +263,7 @@ def _trace_next_order(
         behind = (along * dot(normal, way) < max_height) & (
             dot(other, way) * dot(other, normal) > 0
         )
-        behind &= (face >= 0) & (face == metal_face[previous.facet[row]])
-        again = torch.nonzero(behind & (found >= 0))[:, 0]
+        again = torch.nonzero(behind & (face == metal_face[previous.facet[row]]))[:, 0]
         way = way[again]
         starts = starts[again] + along[again, None] * way + 2 * ray_offset(facets, way / far)
         found[again] = find_next_surface(occluders, starts, starts + way)[0]
@@ -265,7 +276,7 @@ def _trace_next_order(
         height = dot(facets.normal[centre], hits - facets.corners[centre, 0]).abs()
         is_thin = is_narrow(row, 2 * points[:, 1:])
         limit = torch.where(is_thin, _MAX_HEIGHT, _MAX_UNEVENNESS)
-        same = (facet >= 0) & (face >= 0) & (face == face[:, :1])
+        same = (facet >= 0) & (face == face[:, :1])
         return (same & (height <= limit[:, None] * min_tube_width)).all(1)
 
     def is_narrow(row: Tensor, pieces: Tensor) -> Tensor:
@@ -273,11 +284,12 @@ def _trace_next_order(
         transverse = pieces - dot(pieces, d)[..., None] * d
         return (transverse.roll(-1, 1) - transverse).norm(dim=2).amax(1) <= min_tube_width
 
-    parent, corners, facet = subdivide_triangles(previous.polygon, hit_facets, is_narrow, is_flat)
-    parent, corners, facet = (x[facet >= 0] for x in (parent, corners, facet))
+    parent, corners, facet = subdivide_triangles(
+        previous.polygon, hit_facets, is_narrow, is_flat, metal_face.__getitem__
+    )
     normal, d = facets.normal[facet], directions[parent]
     facing = dot(normal, d)
-    keep = (facing.abs() > 1e-9) & ~(facets.solid[facet] & (facing > 0))
+    keep = (facet >= 0) & (facing.abs() > 1e-9) & ~(facets.solid[facet] & (facing > 0))
     columns = parent, facet, corners, normal, d, facing
     parent, facet, corners, normal, d, facing = (column[keep] for column in columns)
     distance = _distance_to_facets(facets, facet[:, None], corners, d[:, None])
