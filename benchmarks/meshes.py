@@ -8,8 +8,9 @@ face), `junctions` (one face of eight triangles against undivided neighbours), `
 boxes with shared planes, united), `raw` (these as they are), `doubled` (a face twice, along both
 diagonals), `inside_out`, `mixed` (every third triangle turned), `cracked` (by 1e-9 m), `soup`
 (three float32 corners a triangle, as in an STL file). Of a car, a chair and a room (`bodies.py`):
-`file` (a float32 STL, loaded), `raw` (all parts in one mesh) and `objects` (each part one). Prints
-tables and writes `metrics.json` into DIR (default `out/meshes`):
+`file` (a float32 STL, loaded), `raw` (all parts in one mesh) and `objects` (each part one). Of a
+wall on part of a floor's edge: `raw`, `objects`, and both with the wall 1e-9 m below the floor
+(`sunk`) or above. Prints tables and writes `metrics.json` into DIR (default `out/meshes`):
 
 - `value.<mechanism>.<mesh>`, `derivative.<mechanism>.<mesh>`: ⟨a, b⟩/⟨b, b⟩ of a quantity a and
   that of the clean mesh, b; its derivative is with respect to a translation that turns.
@@ -168,8 +169,32 @@ def other_diagonal(pair: Tensor) -> Tensor:
     return torch.stack([quad[0], quad[1], quad[3], quad[1], quad[2], quad[3]]).reshape(2, 3)
 
 
+def corner_meshes() -> dict[str, Parts]:
+    """A wall that stands on part of a floor's far edge: the clean mesh first."""
+
+    def quad(*corners: tuple[float, float, float]) -> Mesh:
+        return Mesh(torch.tensor(corners).double(), torch.tensor([[0, 1, 2], [0, 2, 3]]))
+
+    def wall(low: float) -> Mesh:
+        return quad((0.25, -0.15, low), (0.25, 0.2, low), (0.25, 0.2, 0.2), (0.25, -0.15, 0.2))
+
+    low = -0.25
+    floor = quad((-0.2, -0.25, low), (0.25, -0.25, low), (0.25, 0.25, low), (-0.2, 0.25, low))
+    points = torch.cat([floor.vertices, wall(low).vertices])
+    around = [[0, 1, 4], [0, 4, 5], [0, 5, 3], [3, 5, 2]]
+    upright = [[4, 5, 6], [4, 6, 7]]
+    moved = {"": low, "sunk": low - 1e-9, "lifted": low + 1e-9}
+    return {
+        "clean": [Mesh(points, torch.tensor(around + upright))],
+        **{f"raw {k}".strip(): [concatenate_meshes([floor, wall(z)])] for k, z in moved.items()},
+        **{f"objects {k}".strip(): [floor, wall(z)] for k, z in moved.items()},
+    }
+
+
 def body_meshes(name: str) -> dict[str, Parts]:
     """The clean surface of a body first, then the file, the parts in one mesh, and as objects."""
+    if name == "corner":
+        return corner_meshes()
     parts, clean = {
         "car": lambda: (bodies.car(), merge_meshes(bodies.car())),
         "chair": lambda: (bodies.chair(), bodies.clean_chair()),
@@ -398,6 +423,10 @@ BODIES: dict[str, dict[str, tuple[Mechanism, tuple[str, ...]]]] = {
             "chair": ("power", "two bounces", "coverage", "links, diffraction", "masks"),
             "room": ("power", "two bounces", "coverage", "links", "links, diffraction", "masks"),
         }.items()
+    },
+    "corner": {
+        name: (MECHANISMS[name], tuple(corner_meshes())[1:])
+        for name in ("power", "two bounces", "coverage", "links, diffraction", "rcs", "masks")
     },
 }  # fmt: skip
 

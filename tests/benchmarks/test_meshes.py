@@ -74,3 +74,20 @@ def test_a_room_of_panels_is_the_clean_room(meshes, monkeypatch):
     assert metrics["worst_ratio"] < 0.01
     assert not metrics["refused"]
     assert set(metrics["derivative"]["power"]) == {f"room {k}" for k in ("file", "raw", "objects")}
+
+
+@pytest.mark.parametrize(
+    ("mechanism", "off"),
+    [("coverage", 0.005), ("masks", 0.001), ("depths", 0.001), ("links, diffraction", 1e-6)],
+)
+def test_a_wall_on_part_of_an_edge_is_the_clean_corner(meshes, mechanism, off):
+    """A T-junction that rounding moves by a nanometre, in each value and not only in their sum."""
+    columns = meshes.corner_meshes()
+    compute = meshes.MECHANISMS[mechanism]
+    if mechanism == "coverage":
+        compute = meshes.coverage(meshes.METAL, 0, 100, 20_000)
+    clean = meshes.evaluate(compute, columns["clean"])
+    assert float(clean[1].norm()) > 0
+    for name in ("raw", "raw sunk", "objects sunk"):
+        for found, exact in zip(meshes.evaluate(compute, columns[name]), clean, strict=True):
+            assert float((found - exact).norm() / exact.norm()) < off, name

@@ -559,6 +559,9 @@ def _test_exactly(
         length = direction.norm(dim=2)
         slope = dot(direction, area)
         fraction = dot(a - start, area) / replace_zeros(slope)
+        # Points of seams lie in their surfaces to within rounding only; rays end before them, too.
+        is_free = segments.plane[row].maximum(segments.target_plane[row]) < 0
+        reach = length - torch.where(is_free, surfaces.margin, tolerance)[:, None]
 
         def inside(point: Tensor) -> Tensor:
             return barycentric_coordinates(corners, point).amin(2)
@@ -566,7 +569,7 @@ def _test_exactly(
         own = planes.face_plane
         ends = (own == segments.plane_before[row, None]) | (own == segments.plane[row, None])
         ends |= (own == segments.target_plane[row, None]) & (own >= 0)
-        between = (fraction * length > tolerance) & (fraction * length < length - tolerance)
+        between = (fraction * length > tolerance) & (fraction * length < reach)
         crossing = between & (slope != 0) & ~ends & (own >= 0)
         blocked = crossing & (inside(start + fraction[..., None] * direction) >= -rim)
         best, face = torch.where(own == segments.plane[row, None], inside(end), -torch.inf).max(1)
