@@ -446,7 +446,7 @@ def test_reciprocity(kind, few, monkeypatch):
     ("few", "kind"), [(24, "metal"), (0, "metal"), (24, "solid"), (0, "solid")]
 )
 def test_solids_of_dielectric_have_not_changed_what_metal_sends(few, kind, monkeypatch):
-    """The values of commit 0fafbd84, and of tubes with finer cuts, which are nearer to the beams."""
+    """The values of commit 0fafbd84, and of tubes with finer cuts, nearer to the beams."""
     monkeypatch.setattr(signature, "MAX_FACETS_BEAM_TRACING", few)
     found = total(crowd(kind), random_directions(2, 11), random_directions(2, 12), edges=0)
     before = {

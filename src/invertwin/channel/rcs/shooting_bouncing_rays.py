@@ -274,8 +274,7 @@ def _trace_next_order(
         hits = points + _distance_to_facets(facets, facet, points, d)[..., None] * d
         centre = facet[:, :1]
         height = dot(facets.normal[centre], hits - facets.corners[centre, 0]).abs()
-        is_thin = is_narrow(row, 2 * points[:, 1:])
-        limit = torch.where(is_thin, _MAX_HEIGHT, _MAX_UNEVENNESS)
+        limit = torch.where(is_narrow(row, 2 * points[:, 1:]), _MAX_HEIGHT, _MAX_UNEVENNESS)
         same = (facet >= 0) & (face == face[:, :1])
         return (same & (height <= limit[:, None] * min_tube_width)).all(1)
 

@@ -553,15 +553,15 @@ def _test_exactly(
     valid = torch.ones(len(segments.start), dtype=torch.bool)
     hit_faces = torch.full((len(valid),), -1)
     tolerance, rim = _EXACT_TOLERANCE * surfaces.size, 1e-9
+    # Points of seams lie in their surfaces to within rounding only; rays end before them, too.
+    is_free = segments.plane.maximum(segments.target_plane) < 0
+    gap = torch.where(is_free, surfaces.margin, tolerance)
     for row in torch.arange(len(valid)).split(max(1, _MAX_PAIRS // len(a))):
         start, end = segments.start[row, None], segments.end[row, None]
         direction = end - start
         length = direction.norm(dim=2)
         slope = dot(direction, area)
         fraction = dot(a - start, area) / replace_zeros(slope)
-        # Points of seams lie in their surfaces to within rounding only; rays end before them, too.
-        is_free = segments.plane[row].maximum(segments.target_plane[row]) < 0
-        reach = length - torch.where(is_free, surfaces.margin, tolerance)[:, None]
 
         def inside(point: Tensor) -> Tensor:
             return barycentric_coordinates(corners, point).amin(2)
@@ -569,7 +569,7 @@ def _test_exactly(
         own = planes.face_plane
         ends = (own == segments.plane_before[row, None]) | (own == segments.plane[row, None])
         ends |= (own == segments.target_plane[row, None]) & (own >= 0)
-        between = (fraction * length > tolerance) & (fraction * length < reach)
+        between = (fraction * length > tolerance) & (fraction * length < length - gap[row, None])
         crossing = between & (slope != 0) & ~ends & (own >= 0)
         blocked = crossing & (inside(start + fraction[..., None] * direction) >= -rim)
         best, face = torch.where(own == segments.plane[row, None], inside(end), -torch.inf).max(1)

@@ -94,7 +94,8 @@ def judge_fit(result: FitResult) -> Verdict:
         return Verdict("inconsistent", excess, structure, tuple(reasons), residuals)
     others = tuple(find_ambiguities(result))
     open_ = [
-        f"{other.description} explains the data as well{_format_score(other)}"
+        f"{other.description} explains the data as well"
+        + ("" if other.score is None else f": z = {other.score:.1f}")
         for other in others
         if not other.is_rejected
     ]
@@ -112,10 +113,6 @@ def explained_fractions(result: FitResult) -> list[float]:
         gain * float(a.abs().mean()) / max(float(b.abs().mean()), 1e-300)
         for gain, (a, b) in zip(result.gains, result.maps, strict=True)
     ]
-
-
-def _format_score(ambiguity: Ambiguity) -> str:
-    return "" if ambiguity.score is None else f": z = {ambiguity.score:.1f}"
 
 
 def _test_deeper_paths(result: FitResult, limit: float) -> Iterator[str]:
