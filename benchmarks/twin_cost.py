@@ -103,7 +103,7 @@ def measure(positions: list[int], samples: list[int], objects: list[int]) -> dic
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("-o", "--out", type=Path, default=Path("out/twin_cost"))
     parser.add_argument("--positions", type=int, nargs="+", default=[8, 16, 32, 64])
     parser.add_argument("--samples", type=int, nargs="*", default=[64, 128, 256])

@@ -22,6 +22,7 @@ def test_a_run_states_verdict_and_error_bars(run_file, monkeypatch, capsys):
     assert (metrics["loss_excess"] > 3.5) == (metrics["verdict"] == "inconsistent")
     said = " ".join(capsys.readouterr().out.split())
     place = re.search(r"plate at \((.*?)\)( ± ([0-9.]+))? m\.", metrics["answer"] + ".")
+    assert place is not None
     assert metrics["answer"] in said
     offset = metrics["parameters"]["plate.translation"]
     start = [1.2, 0.0, 0.0]  # position in the run file

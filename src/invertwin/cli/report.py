@@ -73,7 +73,7 @@ def report_html(
     from invertwin.viewer import content_security_policy
 
     pages = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    pages.filters |= {"shown": format_cell, "base64": lambda png: base64.b64encode(png).decode()}
+    pages.filters |= {"shown": format_cell, "base64": base64.b64encode}
     backend = os.environ.get("INVERTWIN_BACKEND")
     return pages.from_string(_read_resource("report.html.jinja")).render(
         title=title,

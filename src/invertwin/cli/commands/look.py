@@ -109,9 +109,8 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
     tables = [quantity_table(title, metrics), *warning_tables(said)]
     drawn = save_picture(folder, "look", panels(shown), f"Frame {options.frame}", "doppler")
     status = f"{answer}; {radar.frame_count} frames, read as {reader}."
-    parts = [*tables, drawn]
     again = options.command("look", folder.path)
-    return write_report(folder, metrics, title, status, parts, again=again, note=note)
+    return write_report(folder, metrics, title, status, [*tables, drawn], again=again, note=note)
 
 
 def warning_tables(said: Sequence[str]) -> list[ReportTable]:

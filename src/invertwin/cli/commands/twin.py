@@ -111,15 +111,13 @@ def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, di
 
 def _state_objects(found: Twin) -> tuple[int, str]:
     """Count the likely objects, and state where they are."""
-    likely = [
-        one for one in found.objects if one.existence_probability > _MIN_EXISTENCE_PROBABILITY
-    ]
-    said = [f"{len(likely)} things found, {len(found.objects) - len(likely)} doubtful ones"]
-    for thing in likely[:_MAX_STATED]:
+    sure = [one for one in found.objects if one.existence_probability > _MIN_EXISTENCE_PROBABILITY]
+    said = [f"{len(sure)} things found, {len(found.objects) - len(sure)} doubtful ones"]
+    for thing in sure[:_MAX_STATED]:
         place = ", ".join(f"{value:.2f}" for value in thing.position[:2].tolist())
         said.append(f"{thing.kind} at ({place}) ± {_position_deviation(thing):.2g} m")
-    said += [f"{len(likely) - _MAX_STATED} more"] if len(likely) > _MAX_STATED else []
-    return len(likely), "; ".join(said)
+    said += [f"{len(sure) - _MAX_STATED} more"] if len(sure) > _MAX_STATED else []
+    return len(sure), "; ".join(said)
 
 
 def _position_deviation(thing: DetectedObject) -> float:
