@@ -200,11 +200,12 @@ def _trace_order(
     normal = -facing[keep].sign()[:, None] * facets.normal[facet]
     beams, corners = departing.select(source), facets.corners[facet]
     bounce = replace(beams, facet=facet, normal=normal, polygon=corners, parent=source)
+    polygon = corners
     if previous is not None:  # clip facets to the beams that leave the previous patches
         polygon = _clip_in_front(corners, beams.normal, beams.polygon[:, 0], 0.0)
         for plane, point, proper in _side_planes(beams.polygon, bounce.direction):
             polygon = clip(polygon, plane, torch.where(proper, dot(plane, point), -1.0))
-        bounce = _drop_degenerate(facets, bounce, polygon)
+    bounce = _drop_degenerate(facets, bounce, polygon)
     bounce = _remove_occluded(facets, bounce, None if previous is None else departing, solids)
     bounce = replace(bounce, parent=departing.parent[bounce.parent])
     if solids is None:

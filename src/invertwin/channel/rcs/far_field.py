@@ -124,7 +124,7 @@ class _FarFieldTarget:
         return group_smooth_faces(self.facets, self.topology.edge_faces)
 
     @cached_property
-    def metal_faces(self) -> Int64[Tensor, " facet+1"]:
+    def metal_faces(self) -> Int64[Tensor, " entry"]:
         """Number of the smooth face of conductors, or of the single facet of others; −1 at the end.
 
         Facets are numbered from 0, and −1 is none.

@@ -213,7 +213,7 @@ def _quarter_triangles(corners: Float64[Tensor, "row 3 3"]) -> Float64[Tensor, "
 def trace_tubes(
     facets: Facets,
     occluders: Occluders,
-    metal_face: Int64[Tensor, " facet+1"],
+    metal_face: Int64[Tensor, " entry"],
     first_order: IlluminatedPatches,
     min_tube_width: float,
     depth: int,
