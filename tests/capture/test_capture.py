@@ -187,11 +187,12 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     beat_capture().save(path)
     before = path.read_bytes()
 
-    def fail(self, target, **_):
-        target.write_bytes(b"half")
+    def fail(self, data):
+        with self.open("wb") as file:
+            file.write(data[: len(data) // 2])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(xr.Dataset, "to_netcdf", fail)
+    monkeypatch.setattr(Path, "write_bytes", fail)
     with pytest.raises(KeyboardInterrupt):
         beat_capture().save(path)
     assert path.read_bytes() == before

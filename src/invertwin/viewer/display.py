@@ -31,8 +31,8 @@ class DisplayMesh:
         faces: Corners of the triangles, int32 [t, 3].
     """
 
-    vertices: Float32[np.ndarray, "vertex 3"]
-    faces: Int32[np.ndarray, "triangle 3"]
+    vertices: Float32[np.ndarray, "_ 3"]
+    faces: Int32[np.ndarray, "_ 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +51,8 @@ class DisplayLayer:
 
     name: str
     kind: Literal["surface", "lines", "points"]
-    points: Float32[np.ndarray, "point 3"]
-    faces: Int32[np.ndarray, "triangle 3"] = field(
+    points: Float32[np.ndarray, "_ 3"]
+    faces: Int32[np.ndarray, "_ 3"] = field(
         default_factory=lambda: np.zeros((0, 3), np.int32)
     )
     color: tuple[int, int, int] = (185, 190, 199)
@@ -94,7 +94,7 @@ class DisplayMaps:
     frames: list[int]
     ranges: list[float]
     across: list[float]
-    power: Mapping[str, Float32[np.ndarray, "frame range u"]]
+    power: Mapping[str, Float32[np.ndarray, "_ _ _"]]
 
     @classmethod
     @rename_arguments(most="max_values")
