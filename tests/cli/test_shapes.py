@@ -207,7 +207,7 @@ def test_a_start_that_is_lost_says_so_in_the_table(tmp_path):
         for k, (loss, lost) in enumerate([(0.7, False), (1.0, True)])
     ]
     metrics = {"steps": 9, "status": "converged", "verdict": "unknown", "parameters": {}}
-    starts = make_tables(fits_that_end(problem, rows, problem.scene), metrics)[1]
+    starts = make_tables(fits_that_end(problem, rows, problem.scene), metrics)[2]
     ended = starts.columns.index("ended as")
     assert [row[ended] for row in starts.rows] == [
         "the loss no longer falls",

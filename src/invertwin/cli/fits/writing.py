@@ -139,7 +139,7 @@ def parameter_values(fits: Fits) -> dict[str, list[Any]]:
         for coordinate, *row in rows:
             found = [_round_zero(float(value)) for value in row]
             values[f"{name}.{coordinate}"] = found + [None] * (3 - len(found))
-    for name, value in fits.best["values"].items():
+    for name, value in fits.best.get("values", {}).items():
         if name.split(".")[-1] == "position" and isinstance(value, list):
             starts, truth = fits.start.transmitter, problem.reference
             real = [None] * 3 if truth is None else truth.positions[0].tolist()
