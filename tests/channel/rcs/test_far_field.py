@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+import invertwin as iw
 from invertwin.channel import SphereSection, trace_far_field
 from invertwin.channel.beams.beam_tracing import clip
 from invertwin.channel.em.plane_waves import (
@@ -616,3 +617,27 @@ def test_triangles_without_area_and_empty_views_give_zeros():
     assert torch.isfinite(total(metal(flat), [[-1.0, 0.1, 0.2]], edges=2)).all()
     edge_on = total(metal(lone), [[0.0, 1.0, 0.0]])
     assert float(edge_on.abs().max()) == 0
+
+
+def test_triangles_without_area_among_others_change_nothing():
+    """A mesh program divides a face at the middle of its diagonal, on one side alone."""
+    plain = box([0.3, 0.5, 0.4])
+    vertices, faces = [*plain.vertices], []
+    for one, other in plain.faces.view(-1, 2, 3).tolist():
+        first, last = (corner for corner in one if corner in other)
+        (apex,) = (corner for corner in one if corner not in other)
+        middle = len(vertices)
+        vertices.append((plain.vertices[first] + plain.vertices[last]) / 2)
+        parts = [[middle if c == old else c for c in one] for old in (first, last, apex)]
+        faces += [other, *parts]  # the last one has its corners on a line
+    divided = Mesh(torch.stack(vertices), torch.tensor(faces))
+    ways = normalize(float64([[-1.0, 0.2, 0.1], [-1.0, -0.3, 0.4], [1.0, -0.5, -0.4]]))
+    # Turned, so that rounding gives these triangles areas of 1e-17 and normals of any direction.
+    pose = rigid(rotation_from_vector(float64([0.1, 0.2, 0.3])))
+    for edges in (0, 1):
+        found, expected = (
+            iw.rcs(Scene({"box": Object(mesh, PerfectConductor(), pose)}), ways, [9e9], edges=edges)
+            for mesh in (divided, plain)
+        )
+        gap = (found.cross_section - expected.cross_section).abs().max()
+        assert float(gap) < 1e-9 * float(expected.cross_section.abs().max())
