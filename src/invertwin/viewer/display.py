@@ -52,9 +52,7 @@ class DisplayLayer:
     name: str
     kind: Literal["surface", "lines", "points"]
     points: Float32[np.ndarray, "_ 3"]
-    faces: Int32[np.ndarray, "_ 3"] = field(
-        default_factory=lambda: np.zeros((0, 3), np.int32)
-    )
+    faces: Int32[np.ndarray, "_ 3"] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
     color: tuple[int, int, int] = (185, 190, 199)
     opacity: float = 1.0
     shown: bool = True
