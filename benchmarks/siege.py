@@ -96,6 +96,7 @@ def run(case: Case) -> Outcome:
         with Path(scratch, "out").open("w+b") as out, Path(scratch, "err").open("w+b") as err:
             process = subprocess.Popen(call, cwd=folder, env=env, stdout=out, stderr=err)
             status, used = _wait(process, begun)
+            process.returncode = status  # `wait4` has collected it, for its memory and time
             wall = time.monotonic() - begun
             out.seek(0)
             err.seek(0)
