@@ -115,10 +115,10 @@ def simulate(options: RunOptions, file: FileArgument) -> None:
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         run = runs[file.stem]
         with prefix_file_errors(file), show_progress(console):
-            if run.radar is None and run.map is not None:
+            if _simulates_coverage(run):
                 from invertwin.cli.commands.coverage import run_coverage
 
-                return run_coverage(run, folder), ""
+                return run_coverage(run, folder)
             from invertwin.cli.commands.simulate import run_simulate
 
             return run_simulate(run, folder), ""
@@ -126,9 +126,12 @@ def simulate(options: RunOptions, file: FileArgument) -> None:
     run_in_folder(options, Path("out", file.stem), work, runs)
 
 
+def _simulates_coverage(run: Any) -> bool:
+    return run.radar is None and run.map is not None
+
+
 def _simulate_sections(run: Any) -> tuple[str, ...]:
-    radio = run.radar is None and run.map is not None
-    return ("map", "transmitter") if radio else ("radar", "grid", "data")
+    return ("map", "transmitter") if _simulates_coverage(run) else ("radar", "grid", "data")
 
 
 @_command_with(DatasetOptions)
@@ -329,14 +332,14 @@ def main() -> None:
 
 
 def _run_recording(
-    options: RecordingOptions, ending: str, work: Callable[..., list[ReportTable]]
+    options: RecordingOptions, ending: str, work: Callable[..., tuple[list[ReportTable], str]]
 ) -> None:
     """One recording, by default in a folder of its name and an ending."""
     default = Path("out", options.recording.name.split(".")[0] + ending)
 
     def work_on(folder: RunFolder) -> tuple[list[ReportTable], str]:
         with show_progress(console):
-            return work(options, folder), ""
+            return work(options, folder)
 
     run_in_folder(options, default, work_on)
 

@@ -49,8 +49,6 @@ def run_in_folder(
     try:
         with folder:
             tables, outcome = ([], "") if folder.complete else work(folder)
-            if not (outcome or folder.complete):
-                outcome = (folder.read_json("metrics.json") or {}).get("answer", "")
     except KeyboardInterrupt:
         line = "invertwin: interrupted"
         if folder.resumable:

@@ -5,10 +5,8 @@ wavelengths at the design frequency of the board. Electrical phase centres diffe
 millimetre: estimate them with a reflector (`invertwin.capture.estimate_channels`).
 """
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from types import MappingProxyType
 from typing import Annotated
 
@@ -17,7 +15,7 @@ from annotated_types import Len, MinLen
 from torch import Tensor
 
 from invertwin.checks import ArrayLike, check_choice, check_fields, checked_tensor
-from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.constants import SPEED_OF_LIGHT, read_table
 from invertwin.errors import InputError
 from invertwin.limits import AllowedValues, Frequency, Positive
 from invertwin.scene.antenna import AntennaArray, Isotropic, Pattern, Polarised
@@ -195,7 +193,7 @@ class Mounting:
         return found.arrays(**how)
 
 
-_TABLES = tomllib.loads(files("invertwin.radar").joinpath("boards.toml").read_text("utf-8"))
+_TABLES = read_table("invertwin.radar", "boards.toml")
 BOARDS: Mapping[str, Board] = MappingProxyType({n: Board(n, **t) for n, t in _TABLES.items()})
 """Name → preset. xWR boards serve the AWR and the IWR of that number."""
 

@@ -123,7 +123,8 @@ class DisplayMaps:
         """
         if frame not in self.frames:
             return {}
-        return {name: power[self.frames.index(frame)] for name, power in self.power.items()}
+        number = self.frames.index(frame)
+        return {name: power[number] for name, power in self.power.items()}
 
 
 @dataclass(frozen=True, eq=False)

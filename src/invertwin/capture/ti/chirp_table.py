@@ -1,17 +1,15 @@
 """Units, channel masks and the order of transmitters, common to both kinds of settings file."""
 
 import re
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from decimal import Decimal
-from importlib.resources import files
 from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings, shortest_loop
+from invertwin.constants import read_table
 from invertwin.errors import InputError
 
-_TEXT = files("invertwin.capture.ti").joinpath("fields.toml").read_text(encoding="utf-8")
-FIELDS: dict[str, Any] = tomllib.loads(_TEXT)
+FIELDS = read_table("invertwin.capture.ti", "fields.toml")
 """Names and places of numbers in both kinds of file."""
 # By the first two digits of the device; later ones record through several kinds of link.
 _LANES = {"12": 4, "14": 4, "16": 2, "18": 2, "68": 2}

@@ -19,8 +19,8 @@ from invertwin.storage.run_folder import RunFolder
 _UNITS = {"received_power": "dBm", "path_gain": "dB", "sinr": "dB", "delay_spread": "s"}
 
 
-def run_coverage(run: RunFile, folder: RunFolder) -> list[ReportTable]:
-    """Compute the map of a run file, write the folder, return the tables to print."""
+def run_coverage(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], str]:
+    """Compute the map of a run file, write the folder, return tables and a sentence to print."""
     begin, scene = time.perf_counter(), build.true_scene(run)
     model = radio_map(run, None)
     with prefix_errors("transmitter"):
@@ -54,4 +54,5 @@ def run_coverage(run: RunFile, folder: RunFolder) -> list[ReportTable]:
         figure = plotting.coverage(maps, places, scene=scene, transmitters=sensor, label=name)
         parts.append(save_picture(folder, "coverage", figure, "Coverage"))
     title, status = run.title or "Coverage", f"{metrics['answer']}."
-    return write_report(folder, metrics, title, status, parts, again="simulate", note=run.note)
+    tables = write_report(folder, metrics, title, status, parts, again="simulate", note=run.note)
+    return tables, metrics["answer"]

@@ -47,8 +47,8 @@ from invertwin.storage.run_folder import RunFolder
 AnyRecording = Capture | ChirpCapture
 
 
-def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
-    """Read a recording, write capture, pictures and numbers, return the tables to print.
+def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable], str]:
+    """Read a recording, write capture, pictures and numbers, return tables and a sentence to print.
 
     Raises:
         InputError: A recording or options that do not fit each other; nothing has been written.
@@ -110,7 +110,8 @@ def run_look(options: LookOptions, folder: RunFolder) -> list[ReportTable]:
     drawn = save_picture(folder, "look", panels(shown), f"Frame {options.frame}", "doppler")
     status = f"{answer}; {radar.frame_count} frames, read as {reader}."
     again = options.command("look", folder.path)
-    return write_report(folder, metrics, title, status, [*tables, drawn], again=again, note=note)
+    parts = [*tables, drawn]
+    return write_report(folder, metrics, title, status, parts, again=again, note=note), answer
 
 
 def warning_tables(said: Sequence[str]) -> list[ReportTable]:

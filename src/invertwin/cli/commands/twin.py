@@ -31,8 +31,8 @@ _MAX_STATED = 6  # things in the sentence that says what was found
 _TWIN_OPTION_NAMES = ("low", "high", "range_max", "level", "height", "rays", "seed")
 
 
-def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
-    """Read a recording, search it, write the twin; return the tables to print.
+def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[ReportTable], str]:
+    """Read a recording, search it, write the twin; return tables and a sentence to print.
 
     Raises:
         InputError: A recording or options that do not fit each other; nothing has been written.
@@ -91,7 +91,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> list[ReportTable]:
         arguments = replace(arguments, recording=own, config=None, board=None, **stated)
     # Else movers are in the chirps alone, which a capture does not keep.
     again = arguments.command("twin", folder.path)
-    return write_report(folder, metrics, title, f"{said}.", parts, again=again)
+    return write_report(folder, metrics, title, f"{said}.", parts, again=again), answer
 
 
 def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, dict[str, Any]]:

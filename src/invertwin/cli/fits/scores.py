@@ -15,6 +15,7 @@ from invertwin.cli.fits.shape_scores import score_shape
 from invertwin.cli.report import ReportTable, load_texts
 from invertwin.cli.schema import SimulatedData, build
 from invertwin.errors import InputError
+from invertwin.inversion.confidence.report import COORDINATES
 from invertwin.inversion.loss import Objective
 from invertwin.inversion.metrics import axis_error, material_errors, pose_error
 from invertwin.models.radar import surrogate_correlation
@@ -23,7 +24,7 @@ from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene import Mesh, Scene, SkinnedBody
 from invertwin.scene.shape_models.density import replace_clouds
 
-ANGLES = ("roll", "pitch", "yaw")
+ANGLES = COORDINATES[3:]
 """Names of the coordinates of a rotation vector among parameters."""
 DOUBTED = ("inconsistent", "worse", "lost")
 """Verdicts on fits whose error bars do not hold."""
@@ -193,7 +194,7 @@ def error_bar_table(metrics: Row, values: Mapping[str, Sequence[Any]] | None = N
     bars, values, cells = metrics.get("standard_deviations", {}), values or {}, []
     for name in dict.fromkeys((*values, *bars)):
         tail, factor = name.split(".")[-1], 1.0
-        unit = metrics.get("units", {}).get(name) or ("m" if tail in ("x", "y", "z") else "")
+        unit = metrics.get("units", {}).get(name) or ("m" if tail in COORDINATES[:3] else "")
         if unit == "rad" or tail in ANGLES:
             unit, factor = "°", math.degrees(1)
         start, result, truth = values.get(name, (None, None, None))

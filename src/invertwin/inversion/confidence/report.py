@@ -10,7 +10,8 @@ from invertwin.inversion.metrics import pose_error
 from invertwin.inversion.reconstruction import Reconstruction
 from invertwin.scene.scene import Object
 
-_COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
+COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Names of the coordinates of a position and of a rotation vector among parameters."""
 
 
 def confidence_metrics(fit: Reconstruction, truth: Mapping[str, Object]) -> dict[str, Any]:
@@ -29,7 +30,7 @@ def confidence_metrics(fit: Reconstruction, truth: Mapping[str, Object]) -> dict
     for name, item in truth.items():
         off = pose_error(fit.scene[name], item)
         if off is not None:
-            values = zip(_COORDINATES, [*off.offset.tolist(), *off.rotation.tolist()], strict=True)
+            values = zip(COORDINATES, [*off.offset.tolist(), *off.rotation.tolist()], strict=True)
             errors |= {f"{name}.{coordinate}": value for coordinate, value in values}
     rows |= {"errors": errors} if errors else {}
     try:

@@ -1,14 +1,13 @@
 """Building materials and grounds of Recommendation ITU-R P.2040-3."""
 
 import difflib
-import tomllib
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from typing import NamedTuple
 
 from invertwin.checks import checked_number
+from invertwin.constants import read_table
 from invertwin.errors import InputError
 
 
@@ -27,12 +26,10 @@ class Coefficients(NamedTuple):
     d: float
 
 
-def _load_table() -> dict[str, tuple[Coefficients, ...]]:
-    text = files("invertwin.scene.material").joinpath("itu.toml").read_text(encoding="utf-8")
-    return {name: tuple(Coefficients(*row) for row in r) for name, r in tomllib.loads(text).items()}
-
-
-ITU_MATERIALS: Mapping[str, tuple[Coefficients, ...]] = _load_table()
+ITU_MATERIALS: Mapping[str, tuple[Coefficients, ...]] = {
+    name: tuple(Coefficients(*row) for row in rows)
+    for name, rows in read_table("invertwin.scene.material", "itu.toml").items()
+}
 """Table of the recommendation by name, with one entry per frequency range.
 
 Source: ITU-R P.2040-3 (2023), §3, table of material properties."""

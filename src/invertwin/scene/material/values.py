@@ -1,10 +1,8 @@
 """Types and ranges of material values: numbers, one per triangle, or textures."""
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import InitVar, dataclass
-from importlib.resources import files
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -13,6 +11,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.checks import ArrayLike, checked_number, checked_tensor, set_fields
+from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.limits import AllowedValues
 from invertwin.scene.mesh import Mesh, checked_faces
@@ -119,9 +118,9 @@ class ValueRange(NamedTuple):
     open_low: bool = False
 
 
-_TEXT = files("invertwin.scene.material").joinpath("ranges.toml").read_text(encoding="utf-8")
 RANGES: Mapping[str, ValueRange] = {
-    name: ValueRange(**row) for name, row in tomllib.loads(_TEXT).items()
+    name: ValueRange(**row)
+    for name, row in read_table("invertwin.scene.material", "ranges.toml").items()
 }
 """Ranges of the material values by field name."""
 

@@ -4,10 +4,8 @@
 people of all ages and builds.
 """
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,6 +14,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.checks import Point, check_choice, checked_number
+from invertwin.constants import read_table
 from invertwin.errors import import_optional
 from invertwin.limits import RADIANS, Positive
 from invertwin.scene.mesh import Mesh
@@ -23,9 +22,7 @@ from invertwin.scene.people.body import BodyTemplate, load_smpl
 from invertwin.scene.shape_models.iso_surface import iso_surface
 from invertwin.scene.shape_models.lattice import Lattice
 
-_BODY: dict[str, Any] = tomllib.loads(
-    files("invertwin.scene.people").joinpath("body.toml").read_text(encoding="utf-8")
-)
+_BODY = read_table("invertwin.scene.people", "body.toml")
 _JOINTS = _BODY["joints"]
 _FILLET = 0.02  # blending width between parts [m]
 _BLEND = 0.08  # width over which skinning weights change [m]
