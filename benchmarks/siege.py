@@ -14,8 +14,8 @@ and what came out; `metrics.json` goes into DIR (default `out/siege`).
 """
 
 import argparse
+import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -92,18 +92,18 @@ def run(case: Case) -> Outcome:
         call = ["bash", "-c", case.shell.replace("invertwin ", "eval $INVERTWIN ", 1)]
         if not case.shell:
             call = [sys.executable, str(tools / "launch.py"), *case.words]
-        begun = time.monotonic()
+        used, begun = Path(scratch, "used.json"), time.monotonic()
+        measured = [str(used), str(_HANGS), str(_KILLED_GB), *call]
         with Path(scratch, "out").open("w+b") as out, Path(scratch, "err").open("w+b") as err:
-            process = subprocess.Popen(call, cwd=folder, env=env, stdout=out, stderr=err)
-            status, used = _wait(process, begun)
-            process.returncode = status  # `wait4` has collected it, for its memory and time
+            starter = [sys.executable, "-I", str(Path(__file__).with_name("siege_measure.py"))]
+            subprocess.run([*starter, *measured], cwd=folder, env=env, stdout=out, stderr=err)
             wall = time.monotonic() - begun
+            status, seconds, gigabytes = json.loads(used.read_text())
             out.seek(0)
             err.seek(0)
             said = [one.read().decode(errors="replace") for one in (out, err)]
         for undo in made.undo:
             undo()
-        seconds, gigabytes = used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9
         failure = _judge(case, status, *said)
         if not failure and seconds > case.seconds:
             failure = f"took {seconds:.0f} s"
@@ -124,28 +124,6 @@ def _library() -> str:
     assert found is not None
     assert found.origin is not None
     return str(Path(found.origin).parents[1])
-
-
-def _wait(process: subprocess.Popen[bytes], begun: float) -> tuple[int, Any]:
-    """Wait for a process; kill what hangs, or takes more memory than a machine may have."""
-    while True:
-        number, status, used = os.wait4(process.pid, os.WNOHANG)
-        if number:
-            return os.waitstatus_to_exitcode(status), used
-        late = time.monotonic() - begun > _HANGS
-        if late or _held_gb(process.pid) > _KILLED_GB:
-            process.kill()
-            _, status, used = os.wait4(process.pid, 0)
-            return 1000 if late else 1001, used
-        time.sleep(0.05)
-
-
-def _held_gb(number: int) -> float:
-    try:
-        pages = int(Path(f"/proc/{number}/statm").read_text().split()[1])
-    except (OSError, IndexError):
-        return 0.0
-    return pages * resource.getpagesize() / 1e9
 
 
 def _contents(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, bytes | None]]:

@@ -38,3 +38,10 @@ def test_files_of_the_user_must_stay(siege):
 
     case = siege.Case("kind", "name", make, ("-c", "open('mine', 'w')"), expects="done")
     assert siege.run(case).failure == "the user's files have changed"
+
+
+def test_memory_is_that_of_the_case_not_of_who_runs_it(siege):
+    held = bytearray(600_000_000)
+    case = siege.Case("kind", "name", lambda _: None, ("-c", "print('well')"), expects="done")
+    assert siege.run(case).gigabytes < 0.4
+    assert len(held) == 600_000_000
