@@ -31,7 +31,8 @@ from invertwin.scene import Object, Scene, rigid
 from invertwin.seeds import derive_seed
 from invertwin.storage.run_folder import RunFolder
 
-OWN_METHOD, INTERIOR_ONLY, AMONG_CLUTTER = "full", "interior_only", "among_clutter"
+OWN_METHOD, INTERIOR_ONLY = "full", "interior_only"
+AMONG_CLUTTER, FROM_IMAGE = "among_clutter", "from_image"
 OF_SENSORS = ("radar_pose", "radar_path", "transmitter", "panel", "panel_phases")
 """Kinds of parameters that belong to a sensor."""
 HISTORIES = ("losses", "curve", "checkpoint", "screened")

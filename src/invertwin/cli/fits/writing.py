@@ -87,6 +87,9 @@ def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
             rows.append(["the same without boundary terms", text])
     if "share" in metrics.get("clutter", {}):
         rows.append(["echoes that the scene lacks", _describe_clutter(**metrics["clutter"])])
+    if "image_peak_m" in metrics:
+        place = ", ".join(f"{value:.2f}" for value in metrics["image_peak_m"])
+        rows.append(["made again from the echo of the image", f"({place}) m"])
     skip = () if blur_end_step(run) else ("start_loss_sharp", "loss_sharp")
     rows.extend(map(list, quantity_table("", metrics, skip=skip).rows))
     made_of = {key: name for key, name in _MATERIAL_ERRORS.items() if key in metrics}

@@ -22,6 +22,8 @@ _NO_SIDELOBE_LEVEL = 0.5  # relative to the strongest: stronger peaks are no sid
 _DIRECTION_ERROR_BEAMS = 0.3  # standard deviation of a direction in beamwidths
 _MIN_EXISTENCE_PROBABILITY = 0.1  # less probable moving targets are dropped
 _MAX_POINTS = 50  # strongest of one frame
+_MIN_COHERENCE = 0.2  # 0.4 at the measured peak of a corner, below 0.1 between echoes
+_MAX_STEPS = 100  # nodes of an image on either side of its middle
 _POINTS_PER_CHUNK = 20_000  # points of an image per chunk
 
 
@@ -159,6 +161,41 @@ def coherent_image(
     field, power = (torch.cat(column) for column in zip(*parts, strict=True))
     image = field.abs().square().double()
     return image, image / power.clamp_min(1e-300)
+
+
+def find_image_peak(
+    capture: Capture, center: Float64[Tensor, "3"], radius: float
+) -> tuple[Float64[Tensor, "3"], float] | None:
+    """Find the brightest point of the coherent image in a horizontal disc, and its power.
+
+    Args:
+        capture: recording of a radar.
+        center: middle of the disc, at the height of the target [m].
+        radius: of the disc [m].
+
+    Returns:
+        None without a coherent echo in the disc, or without a dense track.
+    """
+    if not is_dense_track(capture):
+        return None
+    radar, waveform = capture.radar(), capture.radar().waveform
+    places = radar.positions.detach()
+    length = float(torch.cdist(places, places).max())
+    across = waveform.wavelength * float((places - center).norm(dim=1).max()) / (2 * length)
+    step = max(min(waveform.range_resolution, across) / 4, radius / _MAX_STEPS)
+    line = torch.arange(-radius, radius + step, step, dtype=torch.float64)
+    offsets = torch.nn.functional.pad(torch.cartesian_prod(line, line), (0, 1))
+    points = center + offsets[offsets.norm(dim=1) <= radius]
+    is_profile = "range_profile" in capture.dataset
+    low, high = capture.ranges[[0, -1]] if is_profile else radar.range_limits
+    ranges = torch.cdist(points, places) - radar.origins
+    points = points[((ranges > low + across) & (ranges < high - across)).all(1)]
+    if not len(points):
+        return None
+    image, coherent = coherent_image(capture, points)
+    image = torch.where(coherent > _MIN_COHERENCE, image, 0.0)
+    peak = int(image.argmax())
+    return (points[peak], float(image[peak])) if image[peak] > 0 else None
 
 
 def _single_frame_power(capture: Capture, positions: Tensor, count: int) -> Tensor:
