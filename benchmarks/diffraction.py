@@ -65,7 +65,7 @@ from invertwin.channel.em.utd import (
     EdgeDiffraction,
     FaceCoefficients,
     conductor_coefficients,
-    diffraction_dyad,
+    diffraction_dyads,
 )
 from invertwin.channel.em.wedges import Wedges, edge_axis, exterior_azimuth
 from invertwin.channel.rays.backend import tracing
@@ -262,7 +262,7 @@ def plane_wave_error(opening: float, distance: float, truth: Callable[..., Any])
         azimuth,
         torch.full_like(azimuth, distance),
     )
-    dyad = diffraction_dyad(turn, WAVE_NUMBER)
+    dyad = diffraction_dyads(turn, WAVE_NUMBER, ("value",))[0]
     axis = edge_axis(wedges)
     parts = {
         # E along the edge, and H along it, of both waves.

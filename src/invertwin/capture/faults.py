@@ -221,8 +221,7 @@ def detect_iq_images(beat: _LimitedBeat) -> Fault | None:
     total = products[:, ~own].sum(1, keepdim=True)
     turned = (products * torch.polar(torch.ones_like(total.real), -total.angle())).real
     weighted = float(turned[:, ~own].sum() / level[:, ~own].sum())
-    tiny = torch.finfo(torch.float64).tiny
-    least = float((turned.sum(0) / level.sum(0).clamp_min(tiny)).min())
+    least = float((turned.sum(0) / level.sum(0).clamp_min(torch.finfo(torch.float64).tiny)).min())
     if weighted < _MIN_TOTAL_COHERENCE or least < _MIN_BIN_COHERENCE:
         return None
     return Fault(

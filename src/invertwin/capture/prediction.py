@@ -51,5 +51,4 @@ def prediction_residuals(
         coefficients: Of ``prediction_coefficients``.
     """
     both = torch.stack([coefficients, coefficients.conj().flip(0)])
-    form = torch.einsum("dk,nkl,dl->n", both.conj(), products, both)
-    return 0.5 * form.real.clamp_min(0.0)
+    return 0.5 * torch.einsum("dk,nkl,dl->n", both.conj(), products, both).real.clamp_min(0.0)

@@ -131,8 +131,7 @@ def _sample_triangles(mesh: Mesh) -> Float64[Tensor, "face point 3"]:
 
     Source: M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018 (R₂).
     """
-    count = math.ceil(_POINTS / len(mesh.faces))
-    numbers = torch.arange(1, count + 1, dtype=torch.float64)
+    numbers = torch.arange(1, math.ceil(_POINTS / len(mesh.faces)) + 1, dtype=torch.float64)
     u, v = ((0.5 + numbers[:, None] * _R2_STEPS) % 1.0).unbind(1)
     over = u + v > 1
     u, v = torch.where(over, 1 - u, u), torch.where(over, 1 - v, v)

@@ -126,8 +126,7 @@ def twin(
         found, image = locate_coherent_points(capture, places, separation)
         picture = GroundImage(places[:, :2], image, _count_views(radar, places, None))
         return Twin(_sort_objects([*found, *moving]), floor, picture)
-    grid = radar.grid(*reach)
-    still = _find_static_objects(capture, grid, floor, places, step, rays, seed)
+    still = _find_static_objects(capture, radar.grid(*reach), floor, places, step, rays, seed)
     notes = () if gains is None else (_CALIBRATION_NOTE.format(phase_spread(gains, radar)),)
     resting = [one for one in still.objects if one.shape or not _is_moving(one, moving)]
     objects = _sort_objects([*resting, *moving])

@@ -184,8 +184,7 @@ def compare_shapes(
     within = {float(t): [float((d <= t).mean()) for d in distances] for t in thresholds}
     iou = None
     if voxel is not None and is_watertight(found) and is_watertight(truth):
-        keep = None if seen_from is None else (clouds, masks)
-        iou = _shared_volume(found, truth, voxel, keep)
+        iou = _shared_volume(found, truth, voxel, None if seen_from is None else (clouds, masks))
     return ShapeMetrics(
         chamfer=float(np.mean([d.mean() for d in distances])),
         fscore={t: 2 * a * b / max(a + b, 1e-300) for t, (a, b) in within.items()},

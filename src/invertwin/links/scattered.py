@@ -145,11 +145,9 @@ def _build_link(
 
 def _delay_moments(power: Float64[Tensor, "place bin"], grid: Grid, link: Link) -> Tensor:
     """Sums of power, of power × excess delay and of power × its square."""
-    straight = (link.rx - link.tx).norm(dim=1, keepdim=True)
-    excess = (2 * grid.ranges - straight) / SPEED_OF_LIGHT
+    excess = (2 * grid.ranges - (link.rx - link.tx).norm(dim=1, keepdim=True)) / SPEED_OF_LIGHT
     # A path lies in three bins, with weights whose second moment is a quarter of a squared step.
-    wide = (grid.range_step / SPEED_OF_LIGHT) ** 2
-    parts = power, power * excess, power * (excess**2 - wide)
+    parts = power, power * excess, power * (excess**2 - (grid.range_step / SPEED_OF_LIGHT) ** 2)
     return torch.stack([part.sum(1) for part in parts], -1)
 
 

@@ -82,8 +82,7 @@ def rician_factor(
     direct = _sum_links(paths, torch.where(straight, power, 0.0))
     others = _sum_links(paths, torch.where(straight, 0.0, power))
     ratio = direct / _nonzero(others)
-    alone = torch.where(direct > 0, torch.inf, 0.0)
-    return torch.where(others > 0, ratio, alone)
+    return torch.where(others > 0, ratio, torch.where(direct > 0, torch.inf, 0.0))
 
 
 def path_powers(paths: RayPaths, tx: AntennaMount, rx: AntennaMount) -> Float64[Tensor, " path"]:

@@ -96,8 +96,7 @@ class WhitenedMap(ForwardModel):
 
     def _whiten(self, power: Tensor, sensor: Any) -> Tensor:
         """Divide a map by the background, with the same blur."""
-        blurred = self.model.blur_observed(self.background, sensor)
-        return power / self._relative(blurred).to(power)
+        return power / self._relative(self.model.blur_observed(self.background, sensor)).to(power)
 
     def _relative(self, background: Tensor) -> Tensor:
         """Relate a background to its mean without blur."""

@@ -109,8 +109,7 @@ class Radar:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Numbers of poses, transmitters and receivers."""
-        elements = len(self.transmitters.positions), len(self.receivers.positions)
-        return self.frame_count, *elements
+        return self.frame_count, len(self.transmitters.positions), len(self.receivers.positions)
 
     @property
     def virtual_positions(self) -> Float64[Tensor, "virtual 3"]:

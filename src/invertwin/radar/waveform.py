@@ -358,5 +358,4 @@ def gaussian_response(waveform: Waveform, distance: _Values) -> _Values:
         waveform: waveform with the range cell.
         distance: distance from the peak [m].
     """
-    sigma = SIGMA_PER_FWHM * waveform.range_resolution
-    return torch.exp(-0.5 * (distance / sigma).square())
+    return torch.exp(-0.5 * (distance / (SIGMA_PER_FWHM * waveform.range_resolution)).square())

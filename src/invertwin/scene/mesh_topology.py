@@ -191,8 +191,7 @@ def find_edges(
         places: positions in units of the size of their group.
         owner: object of each triangle; repetitions in others count.
     """
-    number = np.flatnonzero(~find_slivers(places[faces]))
-    whole = _sides_of(faces, number, len(places))
+    whole = _sides_of(faces, np.flatnonzero(~find_slivers(places[faces])), len(places))
     # A repeated triangle has two half edges of one apex at its edges.
     if whole.counts.max(initial=0) > 2 or (np.diff(_pairs_at_edges(whole, whole.apex)) == 0).any():
         whole = _sides_of(faces, find_distinct_faces(faces, places, owner), len(places))
@@ -307,8 +306,7 @@ def _split_at_vertices(edges: MeshEdges, places: Points) -> MeshEdges:
     pairs = _pairs_at_edges(edges, edges.triangle)
     if len(pairs):
         part = label_components(pairs, int(pairs.max()) + 1)[pairs[:, 0]]
-        complete = places[edges.ends[~candidates]]
-        candidates[~candidates] = near_other_parts(complete, part)
+        candidates[~candidates] = near_other_parts(places[edges.ends[~candidates]], part)
     rows = np.flatnonzero(candidates)
     ends = edges.ends[rows]
     row, vertex, share = find_vertices_on_edges(ends, np.unique(ends), places)

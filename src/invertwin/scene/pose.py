@@ -70,8 +70,7 @@ def rotation_angle(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*bat
     skew = rotation - rotation.transpose(-1, -2)
     axis = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
     sine = torch.linalg.vector_norm(axis, dim=-1)
-    trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return torch.atan2(sine, trace - 1)
+    return torch.atan2(sine, rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
 
 
 def rigid(

@@ -255,8 +255,7 @@ def warn_if_purely_specular(scene: Scene, frequency: float) -> None:
 def _has_diffuse_scattering(material: Material, frequency: float) -> bool:
     surface = material.scattering_law(frequency)
     wide = surface.exponents[..., 0] <= 1.01 * lobe_exponent(ROUGH_LOBE_WIDTH)
-    others = surface.lobes[..., 1:] > 0
-    return bool(((surface.diffuse > 0) | wide | others.any(dim=-1)).any())
+    return bool(((surface.diffuse > 0) | wide | (surface.lobes[..., 1:] > 0).any(dim=-1)).any())
 
 
 def _checked_pose(pose: object) -> Tensor:

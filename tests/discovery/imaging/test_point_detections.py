@@ -7,19 +7,25 @@ from discovery.rail import OTHER, TARGET, rail_capture
 from invertwin.discovery.imaging.point_detections import find_image_peak
 
 
+def image_peak(capture, center, radius):
+    found = find_image_peak(capture, center, radius)
+    assert found is not None
+    return found
+
+
 def test_the_brightest_echo_of_a_disc_is_found():
     capture = rail_capture({TARGET: 1.0, OTHER: 3.0})
     start = torch.tensor(TARGET, dtype=torch.float64) + torch.tensor([0.2, -0.1, 0.0]).double()
-    place, power = find_image_peak(capture, start, 0.4)
+    place, power = image_peak(capture, start, 0.4)
     assert (place - torch.tensor(TARGET)).norm() < 0.03
     assert power == pytest.approx(1.0, abs=0.05)
-    place, power = find_image_peak(capture, start, 1.5)
+    place, power = image_peak(capture, start, 1.5)
     assert (place - torch.tensor(OTHER)).norm() < 0.03
     assert power == pytest.approx(9.0, abs=0.5)
 
 
 def test_a_disc_may_leave_the_measured_ranges():
-    place, _ = find_image_peak(rail_capture({TARGET: 1.0}), torch.tensor(TARGET).double(), 2.6)
+    place, _ = image_peak(rail_capture({TARGET: 1.0}), torch.tensor(TARGET).double(), 2.6)
     assert (place - torch.tensor(TARGET)).norm() < 0.03
 
 

@@ -246,8 +246,7 @@ def _continue_beams(
         )
         left = concatenate_rows([left, passing.select(rows)])
     # Phase matching on the face.
-    change = dot(left.wave_vector - wave, left.polygon[:, 0].to(wave.dtype))
-    offset = left.phase_offset + change
+    offset = left.phase_offset + dot(left.wave_vector - wave, left.polygon[:, 0].to(wave.dtype))
     return replace(left, direction=direction, phase_offset=offset, wave_vector=wave)
 
 

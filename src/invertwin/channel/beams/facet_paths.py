@@ -148,5 +148,4 @@ def _polygon_centroid(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tenso
     spokes = polygon - polygon[:, :1]
     fan = torch.linalg.cross(spokes[:, 1:-1], spokes[:, 2:], dim=-1)
     weight = dot(fan, normal[:, None])[..., None]
-    third = (spokes[:, 1:-1] + spokes[:, 2:]) / 3
-    return polygon[:, 0] + (weight * third).sum(1) / weight.sum(1)
+    return polygon[:, 0] + (weight * (spokes[:, 1:-1] + spokes[:, 2:]) / 3).sum(1) / weight.sum(1)

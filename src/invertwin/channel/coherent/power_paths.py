@@ -97,8 +97,7 @@ def project_silhouettes(rays: RayScene, points: SilhouetteSample) -> ProjectedSi
         along = dot(normal, vector) / dot(normal, ray)
         return stretch[:, None] * (vector - ray * along[:, None])
 
-    covered = side * dot(normal, ray).sign()
-    tangent = torch.linalg.cross(normal, project(edge)) * covered[:, None]
+    tangent = torch.linalg.cross(normal, project(edge)) * (side * dot(normal, ray).sign())[:, None]
     if not link.shared_visibility:
         weight = weight * is_visible(rays, shadow, other)
     speed = dot(tangent, moving - material) * weight

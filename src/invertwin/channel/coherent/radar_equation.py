@@ -227,8 +227,7 @@ def _outer_cosine(geometry: Geometry, row: Tensor, cosine: Tensor) -> tuple[Tens
     inside = cosine < 0
     square = 1 - geometry.surfaces.index[row] ** 2 * (1 - cosine**2)
     total = inside & (square <= 1e-6)
-    refracted = torch.where(inside & ~total, square, 1.0).sqrt()
-    return torch.where(inside, refracted, cosine), total
+    return torch.where(inside, torch.where(inside & ~total, square, 1.0).sqrt(), cosine), total
 
 
 def _segment_medium(

@@ -307,8 +307,7 @@ def _radiate_sheet(
     front = torch.exp(1j * k * (cosine + dot(scattered_direction, normal)) * thickness / 2)
     r_s, r_p = _fresnel(epsilon, root, cosine)
     for r, both, unit in ((r_s, cosine + root, unit_s), (r_p, epsilon * cosine + root, unit_p)):
-        t = 2 * cosine / both
-        amplitude = dot(unit, field) * (t / (1 - r**2 * once**2))[:, None]
+        amplitude = dot(unit, field) * (2 * cosine / both / (1 - r**2 * once**2))[:, None]
         for sign, strength in ((1.0, torch.ones_like(r)), (-1.0, -r * once**2)):
             phase = k * (sign * root + dot(scattered_direction, normal)) * thickness / 2
             depth = thickness * _sinc(phase) * torch.exp(-1j * phase)
@@ -371,8 +370,7 @@ def polygon_integral(
     # ∫(1 + jw·x − (w·x)²/2) over the fan of triangles at the first corner.
     first = dot(tangential[:, None], corners)
     spokes = corners - corners[:, :1]
-    fan = torch.linalg.cross(spokes[:, 1:-1], spokes[:, 2:], dim=-1)
-    weight = dot(fan, normal[:, None]) / 2
+    weight = dot(torch.linalg.cross(spokes[:, 1:-1], spokes[:, 2:], dim=-1), normal[:, None]) / 2
     a, b, c = first[:, :1], first[:, 1:-1], first[:, 2:]
     mean = (weight * (a + b + c)).sum(1) / 3
     second = (weight * (a * a + b * b + c * c + a * b + a * c + b * c)).sum(1) / 6

@@ -107,19 +107,6 @@ class EdgeDiffraction:
         return cross(edge_axis(self.wedges), self.incident_direction).norm(dim=1)
 
 
-def diffraction_dyad(
-    diffraction: EdgeDiffraction, wave_number: float, order: DyadDerivative = "value"
-) -> Tensor:
-    """Diffraction dyad, one of ``diffraction_dyads``, [row, 3, 3].
-
-    Args:
-        diffraction: edge diffraction geometry.
-        wave_number: wave number k [1/m].
-        order: the dyad, or its derivative with respect to an azimuth.
-    """
-    return diffraction_dyads(diffraction, wave_number, (order,))[0]
-
-
 def diffraction_dyads(
     diffraction: EdgeDiffraction, wave_number: float, orders: Sequence[DyadDerivative]
 ) -> Complex128[Tensor, "order row 3 3"]:
@@ -138,8 +125,7 @@ def diffraction_dyads(
         return forward
     exchanged: dict[DyadDerivative, DyadDerivative] = {"value": "value", "in": "out", "out": "in"}
     others: list[DyadDerivative] = [exchanged[order] for order in orders]
-    backward = _directional_dyads(diffraction.reverse(), wave_number, others)
-    return (forward + backward.mT) / 2
+    return (forward + _directional_dyads(diffraction.reverse(), wave_number, others).mT) / 2
 
 
 def double_dyad(

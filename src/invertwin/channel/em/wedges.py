@@ -326,8 +326,7 @@ def _fringe_coefficients(
     electric = torch.sin(azimuth / opening) / (opening * delta) - optics * torch.sin(azimuth)
     magnetic = torch.sin(rest / opening) / (opening * torch.sin(rest) * delta) - optics
     shares = _strip_shares(math.sqrt(2) * torch.cos(azimuth / 2).abs(), 1 - mu, phase)
-    is_solid = opening < 2 - _SHEET_TOLERANCE
-    shares = torch.where(is_solid, shares, torch.ones_like(shares))
+    shares = torch.where(opening < 2 - _SHEET_TOLERANCE, shares, torch.ones_like(shares))
     return electric * shares[0], magnetic * shares[1]
 
 

@@ -163,8 +163,7 @@ class _CloudRays:
         return_length = back.norm(dim=2)
         rotation = link.rotations[self.frame]
         ways = direction[:, None], back / return_length[..., None]
-        turn = rotation.mT @ self.rotation
-        towards = [torch.einsum("rij,rkj->rki", turn, way) for way in ways]
+        towards = [torch.einsum("rij,rkj->rki", rotation.mT @ self.rotation, way) for way in ways]
         gain = link.tx_pattern.gain(towards[0]) * link.rx_pattern.gain(towards[1])
         scale = (link.wavelength / (4 * math.pi)) ** 2 * self.cloud.albedo / (4 * math.pi)
         (share,) = polarisation_shares(link, depolarising=False)

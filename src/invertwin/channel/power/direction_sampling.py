@@ -161,8 +161,7 @@ class DirectionSampler:
             height = 2 * dr.select(fall > -0.01, series, 1 - dr.exp(fall))
             lobe = sample_cap(axis, height, [mi.Float(1.0), numbers[3]])
             share = self._lobe_fraction(point, number + 1)
-            chosen = (numbers[0] >= limit) & (numbers[0] < limit + share)
-            omega = dr.select(chosen, lobe, omega)
+            omega = dr.select((numbers[0] >= limit) & (numbers[0] < limit + share), lobe, omega)
             limit += share
         if self.surfaces.has_refracting_bodies:
             refracted = self._sample_refraction(point, incident, numbers)
@@ -208,8 +207,7 @@ class DirectionSampler:
         facing: mit.Vector3f,
         omega: mit.Vector3f,
     ) -> mit.Float:
-        cosine = dr.dot(facing, omega)
-        density = self._lobe_fraction(point, 0) * dr.maximum(cosine, 0.0) * dr.inv_pi
+        density = self._lobe_fraction(point, 0) * dr.maximum(dr.dot(facing, omega), 0.0) * dr.inv_pi
         for number, present in enumerate(self.surfaces.has_lobe):
             if present:
                 lobe, exponent = self.surfaces.evaluate_lobe(

@@ -167,8 +167,7 @@ class InteriorSilhouetteSampler:
         source = behind.point
         triangle = rays.corners(source.face, valid)
         point = interpolate_position(triangle, source.b1, source.b2)
-        cosine = dr.abs(dr.dot(face_normal(triangle), omega))
-        measure = dr.squared_norm(point - y) / cosine
+        measure = dr.squared_norm(point - y) / dr.abs(dr.dot(face_normal(triangle), omega))
         probability = behind.probability * ahead.probability
         samples = SilhouetteSample(
             index,

@@ -276,8 +276,7 @@ class _CoveredSide:
         if not fixed.surfaces.has_sheets:
             return SegmentTransmission(dr.select(cosine > 0, 1.0, 0.0), mi.Float(0.0))
         passed = fixed.surfaces.sheet_transmission(hiding.surface_row, dr.abs(cosine))
-        sheet = SegmentTransmission(*passed)
-        return dr.select(cosine > 0, SegmentTransmission.clear(), sheet)
+        return dr.select(cosine > 0, SegmentTransmission.clear(), SegmentTransmission(*passed))
 
     def initial_state(self) -> PathState:
         """Create the state of the paths at the curve, for unit velocity."""

@@ -459,5 +459,4 @@ def shadow_speed(
         return stretch * (vector - ray * (dr.dot(normal, vector) * slope))
 
     tangent = dr.mulsign(dr.cross(normal, project_to_surface(edge)), samples.side * slope)
-    speed = dr.dot(tangent, moving - material) * samples.weight
-    return SurfacePoint(samples.face, b1, b2), speed
+    return SurfacePoint(samples.face, b1, b2), dr.dot(tangent, moving - material) * samples.weight

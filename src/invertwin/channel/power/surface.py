@@ -222,8 +222,7 @@ class ScatteringLawTables:
         inside = dr.detach(cosine) < 0
         square = 1 - dr.square(self.value("index", row, active)) * (1 - dr.square(cosine))
         total = inside & (dr.detach(square) <= 1e-6)
-        refracted = dr.sqrt(dr.select(inside & ~total, square, 1.0))
-        return dr.select(inside, refracted, cosine), total
+        return dr.select(inside, dr.sqrt(dr.select(inside & ~total, square, 1.0)), cosine), total
 
     def evaluate_refraction(
         self,

@@ -248,5 +248,4 @@ def _fit_spheres(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
     corners = geometry.vertices.detach().numpy()[used]
     low, high = (f.reduceat(corners, first) for f in (np.minimum, np.maximum))
     centre = 0.5 * (low + high)
-    away = np.square(corners - centre[owner]).sum(1)
-    return centre, np.sqrt(np.maximum.reduceat(away, first))
+    return centre, np.sqrt(np.maximum.reduceat(np.square(corners - centre[owner]).sum(1), first))

@@ -129,8 +129,7 @@ def _pair_coplanar_triangles(
     away, order = away.sort()
     near = _has_near_neighbour(away, owners[order], most)
     away, order = away[near], order[near]
-    until = torch.searchsorted(away, away + most, right=True)
-    counts = until - torch.arange(len(away)) - 1
+    counts = torch.searchsorted(away, away + most, right=True) - torch.arange(len(away)) - 1
     total, sums = int(counts.sum()), counts.cumsum(0)
     chosen = torch.arange(0, total, max(1, -(-total // _MAX_PAIRS)))
     first = torch.searchsorted(sums, chosen, right=True)
@@ -182,8 +181,7 @@ def _is_any_visible(
     )
     link = rays.link
     antennas = torch.cat([link.tx.detach()[looks], link.rx.detach()[looks]]) - rays.origin
-    towards = torch.nn.functional.normalize(antennas[:, None] - points, dim=2)
-    tilt = (towards * normal).sum(2)
+    tilt = (torch.nn.functional.normalize(antennas[:, None] - points, dim=2) * normal).sum(2)
     above = points + normal * (2 * tilt.sign() * _ray_tolerance(points))[..., None]
     ends = antennas[:, None].expand_as(above)
     clear = tilt.abs() > _MAX_PLANE_SINE

@@ -112,8 +112,7 @@ class DifferentiatedObjects:
             at = spheres.table_index(dr.gather(mi.UInt32, self._numbers, number))
             ahead, within = spheres.cap_density(at, point, direction, target)
             behind, _ = spheres.cap_density(at, point, -direction, NO_TARGET)
-            found = dr.select(within, 1 / (4 * dr.pi), 0.5 * (ahead + behind))
-            return number + 1, total + found
+            return number + 1, total + dr.select(within, 1 / (4 * dr.pi), 0.5 * (ahead + behind))
 
         lanes = dr.width(direction)
         initial = dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes)

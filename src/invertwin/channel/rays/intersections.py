@@ -111,8 +111,7 @@ def find_intersection_curves(rays: RayScene) -> IntersectionCurves | None:
     ends = points[topology.edges]
     inside = (ends.amin(1) <= high[owner]) & (ends.amax(1) >= low[owner])
     edges = torch.nonzero(inside.all(1))[:, 0]
-    others = pairs.clone().fill_diagonal_(False).any(1)
-    edge, face = _trace_edges(rays, edges, others[owner[edges]])
+    edge, face = _trace_edges(rays, edges, pairs.clone().fill_diagonal_(False).any(1)[owner[edges]])
     beside, face = topology.edge_faces[edge], face[:, None].expand(-1, topology.edge_faces.shape[1])
     pairs_met = torch.stack([beside[beside >= 0], face[beside >= 0]])
     seen, parts = torch.zeros(0, dtype=torch.int64), []

@@ -113,8 +113,7 @@ class ViewpointScene:
         ends = points[topology.edges]
         across = cross(ends[:, 1] - ends[:, 0], ends[:, 0] - strip_derivatives(self._viewpoint))
         one, other = (dot(points[apex[:, k].clamp_min(0)] - ends[:, 0], across) for k in range(2))
-        turns = one * other >= 0
-        first, second = topology.edges[torch.nonzero(alone | turns)[:, 0]].unbind(1)
+        first, second = topology.edges[torch.nonzero(alone | (one * other >= 0))[:, 0]].unbind(1)
         ends = points[first], points[second]
         return DiscontinuityCurves(*ends, first, second, is_intersection=False)
 

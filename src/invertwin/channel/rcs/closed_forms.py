@@ -164,8 +164,7 @@ class SphereSection(CrossSection):
         n = np.arange(1, int(x + 4 * x ** (1 / 3) + 12))
         j, h = spherical_jn(n, x), spherical_jn(n, x) - 1j * spherical_yn(n, x)
         dj = spherical_jn(n, x, derivative=True)
-        dh = dj - 1j * spherical_yn(n, x, derivative=True)
-        xj, xh = j + x * dj, h + x * dh
+        xj, xh = j + x * dj, h + x * (dj - 1j * spherical_yn(n, x, derivative=True))
         if self.permittivity is None:
             a, b = j / h, xj / xh
         else:
@@ -236,8 +235,7 @@ def strip_section_tm(
     middle, length, _ = _segments(nodes)
     current = np.linalg.inv(1j * k * _potentials(nodes, k))
     wave = np.exp(1j * k * directions @ middle.T)
-    sent = np.einsum("ai,ij,aj,i->a", wave, current, wave, length)
-    return k / 4 * np.abs(sent) ** 2
+    return k / 4 * np.abs(np.einsum("ai,ij,aj,i->a", wave, current, wave, length)) ** 2
 
 
 def strip_section_te(
@@ -259,13 +257,11 @@ def strip_section_te(
     before, after = np.eye(count, count + 1), np.eye(count, count + 1, 1)
     pulse, charge = (before + after) / 2, before - after
     vector = (pulse * length) @ ((tangent @ tangent.T) * green) @ pulse.T
-    scalar = charge @ (green / length) @ charge.T
-    impedance = 1j * k * vector + scalar / (1j * k)
+    impedance = 1j * k * vector + charge @ (green / length) @ charge.T / (1j * k)
     across = np.stack([-directions[:, 1], directions[:, 0]], 1)
     wave = np.exp(1j * k * directions @ middle.T) * (across @ tangent.T) * length
     driven = wave @ pulse.T
-    sent = np.einsum("ai,ij,aj->a", driven, np.linalg.inv(impedance), driven)
-    return k / 4 * np.abs(sent) ** 2
+    return k / 4 * np.abs(np.einsum("ai,ij,aj->a", driven, np.linalg.inv(impedance), driven)) ** 2
 
 
 def _segments(
@@ -286,6 +282,5 @@ def _potentials(nodes: NDArray[np.float64], k: float) -> NDArray[np.complex128]:
         distance = np.linalg.norm(middle[:, None] - place, axis=2)
         np.fill_diagonal(distance, 1.0)
         found += weight / 2 * length * hankel2(0, k * distance) / 4j
-    own = 1 - 2j / np.pi * (np.log(_EULER * k * length / 4) - 1)
-    np.fill_diagonal(found, length / 4j * own)
+    np.fill_diagonal(found, length / 4j * (1 - 2j / np.pi * (np.log(_EULER * k * length / 4) - 1)))
     return found

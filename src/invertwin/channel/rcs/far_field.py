@@ -159,8 +159,7 @@ class _FarFieldTarget:
     def is_smooth_metal(self) -> bool:
         """True if all objects are smooth metal, with fields independent of frequency."""
         first = self.interfaces[0]
-        smooth = (first.coherence == 1) & (first.rms_height == 0)
-        return bool((first.conducting & smooth).all())
+        return bool((first.conducting & (first.coherence == 1) & (first.rms_height == 0)).all())
 
     @property
     def is_closed(self) -> bool:

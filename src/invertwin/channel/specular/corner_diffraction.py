@@ -121,8 +121,7 @@ def _deficit_weight(
     wedges = route.edges[-1].wedges
     outwards = normalize(wedges.end - wedges.start, dim=1) * (2.0 * end - 1)[:, None]
     corner = torch.where(end[:, None] > 0, wedges.end, wedges.start)
-    middle = (last.start + last.end) / 2
-    cosine = -dot(normalize(middle - corner, dim=1), outwards)
+    cosine = -dot(normalize((last.start + last.end) / 2 - corner, dim=1), outwards)
     sine = (1 - cosine**2).clamp_min(1e-12).sqrt()
     axial = dot(normalize(route.vertices[:, -1] - route.vertices[:, -2], dim=1), outwards)
     radial = (1 - axial**2).clamp_min(1e-12).sqrt()

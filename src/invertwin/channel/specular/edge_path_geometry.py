@@ -135,8 +135,7 @@ def transfer_dyads(
     else:
         found = list(diffraction_dyads(diffractions[0], wave_number, orders))
     sines = torch.stack([diffraction.sin_beta for diffraction in diffractions]).prod(0)
-    amplitude = sines / (route.legs.prod(1) * route.spread)
-    return [dyad * amplitude[:, None, None] for dyad in found]
+    return [dyad * (sines / (route.legs.prod(1) * route.spread))[:, None, None] for dyad in found]
 
 
 def multiple_diffraction_points(

@@ -171,8 +171,7 @@ def interaction_points(
     position = target
     for step in reversed(range(point.shape[1])):
         n, direction = normal[:, step], images[step + 1] - position
-        slope = dot(direction, n)
-        fraction = dot(point[:, step] - position, n) / replace_zeros(slope)
+        fraction = dot(point[:, step] - position, n) / replace_zeros(dot(direction, n))
         position = position + fraction[:, None] * direction
         found.insert(0, position)
     return found
@@ -554,8 +553,7 @@ def _test_exactly(
     hit_faces = torch.full((len(valid),), -1)
     tolerance, rim = _EXACT_TOLERANCE * surfaces.size, 1e-9
     # Points of seams lie in their surfaces to within rounding only; rays end before them, too.
-    is_free = segments.plane.maximum(segments.target_plane) < 0
-    gap = torch.where(is_free, surfaces.margin, tolerance)
+    gap = torch.where(segments.plane.maximum(segments.target_plane) < 0, surfaces.margin, tolerance)
     for row in torch.arange(len(valid)).split(max(1, _MAX_PAIRS // len(a))):
         start, end = segments.start[row, None], segments.end[row, None]
         direction = end - start

@@ -85,8 +85,7 @@ def _check_other_data(run: RunFile) -> _Needs:
         known: dict[str, None] = dict.fromkeys(("bandwidth", "depth", "edges", "rays"))
         run = run.model_copy(update={"data": run.data.model_copy(update=known)})
     problem = build_problem(run, Console(quiet=True))
-    observation = make_observations(problem, problem.starts()[0])[0]
-    sensor = observation.initial_sensor()
+    sensor = make_observations(problem, problem.starts()[0])[0].initial_sensor()
     rows: list[list[object]] = []
     seconds, maps = 0.0, 0.0
     for method in problem.methods:

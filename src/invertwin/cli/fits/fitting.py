@@ -101,48 +101,46 @@ def fit_all(
 def _fit_from_image(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     """Make the best fit again from the image, without blur, if it has left the echo there."""
     problem, number, start = fits.problem, fits.best["start"], fits.start
-    peak = None if fits.found.verdict.is_consistent else _find_abandoned_echo(fits)
+    name, capture = problem.scored_object or "", problem.first_sensor.recording
+    moved = {p.object for p in problem.run.parameters if p.kind in ("translation", "pose")}
+    alone = len(problem.sensor_data) == 1 and isinstance(capture, Capture)
+    if not alone or name not in moved or fits.found.verdict.is_consistent:
+        return fits
+    peak, left = _find_abandoned_echo(fits, name, capture), fits.found.scene[name].center.detach()
     if peak is None:
         return fits
-    name, rows = str(problem.scored_object), dict(fits.rows)
-    moved = displace(start.scene[name], peak - start.scene[name].center)
-    start = replace(start, scene=start.scene.replace(name, pose=moved.transform))
+    begun = displace(start.scene[name], peak - start.scene[name].center)
+    start = replace(start, scene=start.scene.replace(name, pose=begun.transform))
     row, outcome = run_fit(problem, start, number, FROM_IMAGE, folder, console, None)
-    left = fits.found.scene[name].center.detach()
     doubt = "with blurred kernels the fit left the echo of the image at ({}) m for ({}) m"
     places = (", ".join(f"{value:.2f}" for value in place.tolist()) for place in (peak, left))
     found = outcome()
     found = replace(found, doubts=(*found.doubts, doubt.format(*places)))
+    rows = {**fits.rows, FROM_IMAGE: [row]}
     problem = replace(problem, notes={**problem.notes, "image_peak_m": peak.tolist()})
-    return replace(fits, problem=problem, rows={**rows, FROM_IMAGE: [row]}, best=row, found=found)
+    return replace(fits, problem=problem, rows=rows, best=row, found=found)
 
 
-def _find_abandoned_echo(fits: Fits) -> torch.Tensor | None:
+def _find_abandoned_echo(fits: Fits, name: str, capture: Capture) -> torch.Tensor | None:
     """Find the brightest echo about the starts if the best fit does not explain it.
 
     The disc has the radius of the starts and of the blur. Where neither it nor the end of the fit
     has an echo, it is as wide as the fit has moved.
     """
-    problem, name, found = fits.problem, fits.problem.scored_object, fits.found.scene
-    capture, model = problem.first_sensor.recording, problem.kind.models(problem)[0]
-    moved = {p.object for p in problem.run.parameters if p.kind in ("translation", "pose")}
-    alone = len(problem.sensor_data) == 1 and isinstance(capture, Capture)
-    if name is None or name not in moved or not (alone and isinstance(model, SurrogateMap)):
+    problem, item = fits.problem, fits.found.scene[name]
+    model, end = problem.kind.models(problem)[0], item.center.detach()
+    if not isinstance(model, SurrogateMap):
         return None
     starts = torch.stack([start.scene[name].center.detach() for start in problem.starts()])
-    cell, center, end = (
-        capture.radar().waveform.range_resolution,
-        starts.mean(0),
-        found[name].center,
-    )
+    cell, center = capture.radar().waveform.range_resolution, starts.mean(0)
     radius = float((starts - center).norm(dim=1).max()) + cell * max(1.0, model.kernels.range_width)
     near = find_image_peak(capture, center, radius)
-    there = find_image_peak(capture, end.detach(), 2 * cell)
+    there = find_image_peak(capture, end, 2 * cell)
     if near is None and there is None:
-        near = find_image_peak(capture, center, radius + float((end.detach() - center).norm()))
+        near = find_image_peak(capture, center, radius + float((end - center).norm()))
     if near is None or (there is not None and near[1] < _MIN_RELATIVE_PEAK * there[1]):
         return None
-    mesh = Mesh(found[name].vertices.detach(), found[name].mesh.faces)
+    mesh = Mesh(item.vertices.detach(), item.mesh.faces)
     return near[0] if float(signed_distance(mesh, near[0][None])) > cell else None
 
 
@@ -273,20 +271,12 @@ def _fit_or_search(
     how["optimizer"] = build.build_section(run, "optimizer")
     if method == FROM_IMAGE:
         # Kernels without blur reach far, too: all steps together move a tenth of a cell.
-        cell = problem.first_sensor.sensor.waveform.range_resolution
-        slow = replace(how["optimizer"], rate=0.1 * cell / sum(stage.steps for stage in stages))
-        sharp = [[model.scale_blur(0.0) for model in stage.models] for stage in stages]
-        how["optimizer"] = replace(slow, final_rate=None)
-        how["schedule"] = [
-            replace(stage, models=models, optimizer=None)
-            for stage, models in zip(stages, sharp, strict=True)
-        ]
-        given = (
-            start.scene,
-            [replace(o, model=o.model.scale_blur(0.0)) for o in given[1]],
-            {name: replace(unknown, rate=None) for name, unknown in given[2].items()},
-        )
-        return reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
+        rate = 0.1 * problem.first_sensor.sensor.waveform.range_resolution / stages[0].steps
+        slow = replace(how["optimizer"], rate=rate, final_rate=None)
+        sharp = [replace(o, model=o.model.scale_blur(0.0)) for o in given[1]]
+        unknowns = {name: replace(unknown, rate=None) for name, unknown in given[2].items()}
+        how["schedule"] = replace(stages[0], models=(), optimizer=slow)
+        return reconstruct(start.scene, sharp, unknowns, callbacks=callbacks(checkpoint), **how), {}
     if method == AMONG_CLUTTER:
         # Every frame has clutter of its own.
         how["schedule"] = [replace(stage, frames_per_step=None) for stage in stages]

@@ -131,8 +131,7 @@ class MovingTarget(DataKind):
         truth = scene_at_start(problem.run, problem.truth, float(times.max()))[name]
         still = torch.zeros(1, 3, dtype=torch.float64)
         velocity = (still if truth.velocity is None else truth.velocity).reshape(-1, 3).mean(0)
-        place = truth.center + velocity * times.mean()
-        off = float((values["position_m"] - place).norm())
+        off = float((values["position_m"] - (truth.center + velocity * times.mean())).norm())
         return row | {
             "position_error_m": off,
             "velocity_error_m_s": float((values["velocity_m_s"] - velocity).norm()),
@@ -268,8 +267,7 @@ def _pictures(fits: Fits, folder: RunFolder) -> list[ReportPicture]:
     table = _table(problem.run)
     with torch.no_grad():
         unknown = problem.kind.make_unknown(problem, "", table, fits.start)
-        begun = unknown.build_module(fits.start.scene)
-        scenes = {"start": begun(scene), "twin": whole.body(scene)}
+        scenes = {"start": unknown.build_module(fits.start.scene)(scene), "twin": whole.body(scene)}
     names = {OWN_METHOD: "twin", HALF: "twin of the first half"}
     losses = {names.get(how, how.replace("_", " ")): own for how, own in fits.losses.items()}
     seen = doppler_maps(recording.beat, radar, whole.model.grid, recording.chirps)

@@ -53,8 +53,7 @@ def detect_moving_targets(
     rates = points.velocity + aways @ own_velocity
     # Clutter removal subtracts the mean only; a direction is known to a fraction of a beam.
     beam = direction_cell(aperture(radar).y, radar)
-    blur = float(own_velocity.norm()) * beam * _DIRECTION_ERROR_BEAMS
-    moves = rates.abs() > cell + blur
+    moves = rates.abs() > cell + float(own_velocity.norm()) * beam * _DIRECTION_ERROR_BEAMS
     cells = torch.tensor([radar.waveform.range_resolution, cell], dtype=torch.float64)
     scales = cells * _MAX_GROUP_CELLS
     rows = moves.nonzero()[:, 0]

@@ -136,8 +136,7 @@ class OutlineModel(UnknownShape):
             local = points - place
             beside = local.index_fill(1, torch.tensor([2]), 0.0)
             half = 0.5 * self.height
-            above = (local[:, 2] - half).abs() - half
-            return torch.maximum(self.sides.distance(beside), above)
+            return torch.maximum(self.sides.distance(beside), (local[:, 2] - half).abs() - half)
 
         at = place.detach()
         return iso_surface(signed_distance_field, Lattice.from_bounds(at + low, at + high, counts))

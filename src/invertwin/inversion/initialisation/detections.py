@@ -351,8 +351,7 @@ def estimate_density(
     pose = item.transform.detach()
     places = lattice.nodes @ pose[:3, :3].T + pose[:3, 3]
     image = _require_echoes(backproject_power(capture, grid, places))
-    density = 1 / float(lattice.spacing.mean()) * image / image.max()
-    return DensityGrid(name, low, high, density)
+    return DensityGrid(name, low, high, 1 / float(lattice.spacing.mean()) * image / image.max())
 
 
 def _bounding_rectangle(points: Tensor, yaw: float) -> GroundRectangle:

@@ -55,8 +55,7 @@ def sample_nearby_poses(
         offset = draw_uniform(*distance) * draw_direction(axes)
         about = draw_direction("xyz")
         if rotation_axis is not None:
-            sign = 1 if draw_uniform(0, 1) < 0.5 else -1
-            about = rotation_axis / rotation_axis.norm() * sign
+            about = rotation_axis / rotation_axis.norm() * (1 if draw_uniform(0, 1) < 0.5 else -1)
         yield displace(item, offset, draw_uniform(*angle) * about)
 
 

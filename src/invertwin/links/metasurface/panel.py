@@ -276,8 +276,7 @@ def _paths_over_panel(
     source, target = link // hearers, link % hearers
     ways = [panel.position - ends[0][source], panel.position - ends[1][target]]
     units = [normalize(way, dim=1) for way in ways]
-    up = torch.tensor(_UP, dtype=torch.float64)
-    sent, received = (polarisations(unit, up) for unit in units)
+    sent, received = (polarisations(unit, torch.tensor(_UP, dtype=torch.float64)) for unit in units)
     normal = panel.axes[:, 0]
     turned = sent - 2 * (sent @ normal)[..., None] * normal
     one = torch.ones(len(link), 1, dtype=torch.int64)

@@ -277,8 +277,7 @@ def _training_cells(
     around = torch.nn.functional.pad(values, beside, value=math.inf)
     around = around.unfold(-2, sizes[0], 1).unfold(-2, sizes[1], 1)
     offsets = [(torch.arange(size) - r).abs() for size, r in zip(sizes, reach, strict=True)]
-    kept = (offsets[0][:, None] > guard[0]) | (offsets[1] > guard[1])
-    cells = around[..., kept]
+    cells = around[..., (offsets[0][:, None] > guard[0]) | (offsets[1] > guard[1])]
     count = torch.isfinite(cells).sum(-1)
     if int(count.min()) < 1:
         raise InputError(

@@ -83,8 +83,7 @@ def capon(
     level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1)
     identity = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
     # Empty bins have no scale; any finite value results in power zero.
-    scale = torch.where(level > 0, level, 1.0)
-    loaded = covariance / scale[..., None, None] + loading * identity
+    loaded = covariance / torch.where(level > 0, level, 1.0)[..., None, None] + loading * identity
     manifold = snapshots.manifold(grid)
     waves, root = manifold.mT.expand(*level.shape, -1, -1), torch.linalg.cholesky(loaded)
     whitened = torch.linalg.solve_triangular(root, waves, upper=False)
@@ -222,8 +221,7 @@ def _projector_change(values: Tensor, vectors: Tensor, chosen: Tensor, change: T
     # Zero matrices have no scale; their derivative is set to zero.
     damped = gap / (gap.square() + smallest.square()).clamp(min=torch.finfo(gap.dtype).tiny)
     sign = torch.where(chosen[..., :, None], 1.0, -1.0)
-    inner = (vectors.mH @ change @ vectors) * (between * sign * damped)
-    return vectors @ inner @ vectors.mH
+    return vectors @ ((vectors.mH @ change @ vectors) * (between * sign * damped)) @ vectors.mH
 
 
 def _snapshots(

@@ -132,8 +132,7 @@ def compensate_tdm(
     folds = torch.as_tensor(fold).cpu().expand(frames, count, ranges).to(torch.float64)
     rate = velocity_axis(radar, chirps, count)[:, None] + folds * velocity_span(radar, chirps)
     frequency = 2 / radar.waveform.wavelength * rate
-    starts = chirps.times(transmitters)[0]
-    cycles = frequency[:, :, None, :] * starts[:, None]
+    cycles = frequency[:, :, None, :] * chirps.times(transmitters)[0][:, None]
     turn = torch.exp(-2j * math.pi * (cycles - cycles.round()))
     return spectrum * turn[:, :, :, None].to(spectrum)
 

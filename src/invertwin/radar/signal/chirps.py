@@ -285,8 +285,7 @@ class ChirpTrain:
         waveform = require_sampled_waveform(self.radar)
         per_sample = instants_derivative(waveform.samples, len(points)).to(points.device)
         velocity = torch.einsum("kl,lpc->kpc", per_sample, points) / sample_interval(waveform)
-        lag = (points - receiver).norm(dim=-1, keepdim=True) / SPEED_OF_LIGHT
-        return points - lag * velocity
+        return points - (points - receiver).norm(dim=-1, keepdim=True) / SPEED_OF_LIGHT * velocity
 
 
 def _uniform_trajectory(paths: Paths) -> PointTrajectory:

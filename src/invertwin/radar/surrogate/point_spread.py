@@ -147,8 +147,7 @@ def airy_field(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
     """Return the field pattern of the same disc, 2 J1(z)/z; differentiable."""
     near = z.abs() < 1e-3
     away = torch.where(near, torch.ones_like(z), z)
-    series = 1 - z.square() / 8 + z**4 / 192
-    return torch.where(near, series, 2 * bessel_j1(away) / away)
+    return torch.where(near, 1 - z.square() / 8 + z**4 / 192, 2 * bessel_j1(away) / away)
 
 
 def bessel_j1(z: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:

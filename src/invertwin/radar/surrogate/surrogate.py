@@ -369,8 +369,7 @@ class _SurrogateKernel:
         # At these sizes a Toeplitz matrix per axis is about 30 times faster than a padded FFT.
         (dim,), (count,) = self.dims, self.counts
         taps = torch.fft.irfft(transfer, _fft_length(count)).to(power)
-        lags = taps.roll(count - 1)[: 2 * count - 1]
-        matrix = lags.flip(0).unfold(0, count, 1).flip(0)
+        matrix = taps.roll(count - 1)[: 2 * count - 1].flip(0).unfold(0, count, 1).flip(0)
         if dim == power.ndim - 1:
             return power @ matrix.T
         first = power.transpose(1, dim)  # one large product per frame, not one per row

@@ -139,8 +139,7 @@ class Medium(_MaterialRecord):
             sigma, sigma_slope = sigma.conductivity(frequency), sigma.coefficients(frequency).d
         epsilon = complex_permittivity(real, sigma, frequency, self.loss_tangent)
         polarised = evaluate_value(real) * (1 - 1j * evaluate_value(self.loss_tangent))
-        dispersion = real_slope * polarised + (sigma_slope - 1) * (epsilon - polarised)
-        return epsilon, dispersion
+        return epsilon, real_slope * polarised + (sigma_slope - 1) * (epsilon - polarised)
 
 
 def select_layer(material: Any, layer: int | None, name: str) -> Any:
@@ -306,8 +305,7 @@ class Layer(Medium):
     def sheet(self, frequency: float) -> SlabLayer:
         """Return the layer as numbers at `frequency` [Hz], for `slab_tables`."""
         epsilon, dispersion = self._epsilon(frequency)
-        thickness = evaluate_value(self.thickness)
-        values = (epsilon, dispersion, thickness, self.complex_permeability)
+        values = (epsilon, dispersion, evaluate_value(self.thickness), self.complex_permeability)
         return SlabLayer(*(value[..., None] for value in values))
 
 

@@ -122,8 +122,7 @@ class ScatteringLaw:
             return replace(self, lobes=self.lobes * self.lobes.new_tensor([0.0, 1.0, 1.0]))
         k = 2 * math.pi * frequency / SPEED_OF_LIGHT
         share = -torch.expm1(-((2 * k * height[..., None] * _COSINES) ** 2))
-        width = (2 / self.exponents[..., :1]).sqrt()
-        at = _COSINES / width
+        at = _COSINES / (2 / self.exponents[..., :1]).sqrt()
         above = at * torch.special.ndtr(at) + torch.exp(-0.5 * at**2) / math.sqrt(2 * math.pi)
         share = share * above[..., -1:] / above
         positive = share > 0  # a root of zero has no derivative

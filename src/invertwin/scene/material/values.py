@@ -158,8 +158,7 @@ def _check_bounds(numbers: Tensor, span: ValueRange) -> None:
 
 
 def _check_number(number: object, span: ValueRange) -> None:
-    high = min(span.high, _MAX_VALUE)
-    checked_number(number, span.what, span.low, high, open_low=span.open_low)
+    checked_number(number, span.what, span.low, min(span.high, _MAX_VALUE), open_low=span.open_low)
 
 
 def evaluate_value(value: Value) -> Float64[Tensor, "*row"]:

@@ -120,8 +120,7 @@ class Walking(PersonMotion):
         pelvis = rotation_about_axis("z", yaw) @ rotation_about_axis("x", roll)
         lean = math.radians(_swing(v, 8.0)) * (math.sin(2 * math.pi * (2 * phase - 0.1)) - 1)
         twist = rotation_about_axis("z", -_evaluate_series(curves["thorax"], phase))
-        chest = twist @ rotation_about_axis("y", lean)
-        turns = {"pelvis": pelvis, "chest": pelvis.T @ chest}
+        turns = {"pelvis": pelvis, "chest": pelvis.T @ (twist @ rotation_about_axis("y", lean))}
         for side, later in (("right", 0.0), ("left", 0.5)):
             own = phase + later
             swing = 9.88 * v

@@ -49,8 +49,7 @@ class Decoder(nn.Module):
 
     def forward(self, latent: Float[Tensor, "*any latent"]) -> Float[Tensor, "*any nodes"]:
         """Return distances at the nodes, x slowest."""
-        bent = self.leave(torch.tanh(self.enter(latent)))
-        return self.basis(self.straight(latent) + bent)
+        return self.basis(self.straight(latent) + self.leave(torch.tanh(self.enter(latent))))
 
 
 class ShapePrior:

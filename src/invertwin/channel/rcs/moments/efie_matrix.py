@@ -112,8 +112,7 @@ class EFIEMatrix:
         shares, weights = QUADRATURE_7
         centroid = corners.mean(1)
         offset = shares @ (corners - centroid[:, None])
-        phase = self.k * ((offset + centroid[:, None]) @ directions.T)
-        wave = phasor(phase) * weights[:, None] / 2
+        wave = phasor(self.k * ((offset + centroid[:, None]) @ directions.T)) * weights[:, None] / 2
         linear = torch.einsum("fqa,fqx,atx->fat", wave, offset + 0j, fields + 0j)
         corner_fields = torch.einsum("fvx,atx->fvat", corners - centroid[:, None], fields)
         return self._combine_halves(linear[:, None] - wave.sum(1)[:, None, :, None] * corner_fields)
@@ -404,8 +403,7 @@ class EFIEMatrix:
             part = linear[:, None] - constant[:, None, :, None] * offset[:, :, None]
             return self._combine_halves(0.5j * self.k * part + 1j / self.k * charge[:, None])
 
-        size = max(1, (_ENTRIES_AT_ONCE >> 6) // len(corners))
-        chunks = interior_points.split(size)
+        chunks = interior_points.split(max(1, (_ENTRIES_AT_ONCE >> 6) // len(corners)))
         found = [checkpoint(evaluate_chunk, chunk, use_reentrant=False) for chunk in chunks]
         return torch.cat(found, 1).flatten(1).T
 

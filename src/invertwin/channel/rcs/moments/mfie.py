@@ -132,8 +132,7 @@ def _cluster_pieces(feature: Array, area: Array, side: float) -> NDArray[np.int6
     for pieces in [seeding] * _SEEDING_ROUNDS + [order] * _FINAL_ROUNDS:
         owner = _find_nearest(centre, feature[pieces])
         cell_area = np.bincount(owner, area[pieces], len(centre)).astype(np.float64)
-        occupied = cell_area > 0
-        centre = _cell_means(owner, area[pieces], feature[pieces], cell_area)[occupied]
+        centre = _cell_means(owner, area[pieces], feature[pieces], cell_area)[cell_area > 0]
     return np.unique(_find_nearest(centre, feature), return_inverse=True)[1]
 
 
@@ -381,5 +380,4 @@ def _greens_gradient(k: float, square: Tensor, weight: Tensor) -> Tensor:
     """Factor of ∇G = factor · (r − r′), G = exp(−jkR)/4πR, in single precision."""
     distance = square.clamp_min(1e-20).sqrt()
     phase = k * distance
-    amplitude = torch.polar(-weight / distance**3, -phase)
-    return amplitude * torch.complex(torch.ones_like(phase), phase)
+    return torch.polar(-weight / distance**3, -phase) * torch.complex(torch.ones_like(phase), phase)
