@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from discovery.rail import OTHER, TARGET, rail_capture
-from invertwin.discovery.imaging.point_detections import find_image_peak
+from invertwin.discovery.imaging.point_detections import find_image_peak, locate_coherent_points
 
 
 def image_peak(capture, center, radius):
@@ -42,3 +42,12 @@ def test_a_sparse_track_has_no_image():
 def test_beyond_the_measured_ranges_is_no_image():
     far = torch.tensor([30.0, 0.0, 0.1], dtype=torch.float64)
     assert find_image_peak(rail_capture({TARGET: 1.0}), far, 0.5) is None
+
+
+def test_points_lie_on_their_peaks_not_on_the_nodes_of_the_search():
+    line = torch.arange(-1.0, 1.01, 0.09, dtype=torch.float64)
+    nodes = torch.nn.functional.pad(torch.cartesian_prod(7.04 + line, 0.44 + line), (0, 1))
+    nodes[:, 2] = 0.1
+    (found, *_), _ = locate_coherent_points(rail_capture({TARGET: 1.0}), nodes, 0.3)
+    assert float((nodes - torch.tensor(TARGET)).norm(dim=1).min()) > 0.035
+    assert (found.position - torch.tensor(TARGET)).norm() < 0.02

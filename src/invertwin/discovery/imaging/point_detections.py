@@ -236,6 +236,8 @@ def locate_coherent_points(
         chance = len(positions) * math.exp(-min(count * float(agree[peak]), 700.0))
         deviations = dict(zip("xyz", spread.clamp_min(0.3 * cell).tolist(), strict=True))
         sure = max(0.0, 1 - chance) * min(1.0, value / (_NO_SIDELOBE_LEVEL * top))
-        name, place = f"point_{len(found) + 1}", positions[peak].double()
+        finer = find_image_peak(capture, positions[peak].double(), cell)
+        place = positions[peak].double() if finer is None else finer[0]
+        name = f"point_{len(found) + 1}"
         found.append(DetectedObject.point(name, place, deviations, sure))
     return found, image
