@@ -7,6 +7,7 @@ import torch
 
 import invertwin as iw
 from invertwin.capture import Capture, ChirpCapture
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.discovery import Twin, average_chirps, twin
 from invertwin.discovery.imaging.point_detections import is_dense_track
 from invertwin.discovery.search import ShapeSearch
@@ -280,3 +281,26 @@ def test_a_region_that_nothing_sees_is_refused():
         twin(capture, low=(1.0, 1.0), high=(-1.0, 1.0))
     with pytest.raises(InputError, match="range_max"):
         twin(capture, range_max=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("receivers", [2, 4])
+def test_echoes_of_few_receivers_are_where_a_detector_finds_them(receivers):
+    ramp = iw.FMCW(77e9, 1e9, 50e-6, 128)
+    row = linear_array(receivers, ramp.wavelength / 2)
+    radar = iw.Radar(linear_array(1, 1.0), row, ramp, torch.zeros(1, 3, dtype=torch.float64))
+    beat = torch.zeros(1, 1, receivers, 128, dtype=torch.complex128)
+    truth = {}
+    for distance, sine, amplitude in ((2.0, -0.3, 1.0), (3.7, 0.3, 0.3)):
+        cosine = math.sqrt(1 - sine * sine)
+        place = distance * torch.tensor([cosine, sine, 0.0], dtype=torch.float64)
+        truth[distance] = place[:2]
+        ways = place.norm() + (place - row.positions).norm(dim=1)
+        delays = ways[:, None] / SPEED_OF_LIGHT
+        cycles = 77e9 * delays + 1e9 / 50e-6 * delays * ramp.sample_times
+        beat[0, 0] += amplitude * torch.exp(2j * math.pi * cycles)
+    capture = iw.Capture.from_beat(add_noise(beat, snr_db=40.0, seed=0), radar)
+    found = [one.position[:2] for one in twin(capture, range_max=6.0, rays=1000).objects]
+    assert len(found) == 2
+    for place in truth.values():
+        assert min(float((place - one).norm()) for one in found) < 0.2

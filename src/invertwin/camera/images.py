@@ -195,8 +195,7 @@ class _ImageRenderer:
             for sign in (-1.0, 1.0)
         )
         sweep = ((place - here) * across).sum(1) * (float(until[-1]) / count)
-        inside = ((here >= 0) & (here < size)).all(1)
-        rows = torch.nonzero(inside & (low_side != high_side))[:, 0]
+        rows = torch.nonzero(((here >= 0) & (here < size)).all(1) & (low_side != high_side))[:, 0]
         column, line = here[rows].long().unbind(1)
         added = (low_side - high_side)[rows] * sweep[rows]
         flat = torch.zeros(camera.width * camera.height, dtype=torch.float64)

@@ -30,8 +30,7 @@ def standard_deviations(
     fit = reconstruction.result.fit
     rows = list(iterate_coordinates(fit.modules))
     mean, power = reconstruction.result.maps[0]
-    level = likelihood.loss.level.to(mean)[:, None, None]
-    mean = (mean.detach().clamp_min(0.0) + level).double()
+    mean = (mean.detach().clamp_min(0.0) + likelihood.loss.level.to(mean)[:, None, None]).double()
     ratio, nu = power.double() / mean, likelihood.loss.degrees
     score = 1 - ratio * speckle_weight(ratio, nu)
     first, second = (

@@ -209,11 +209,15 @@ def _find_static_objects(
     aside = one.select_frames(held) if held else None
     search = ShapeSearch(fitted, aside, lattice)
     picture = search.first_image
-    shapes = search.run()
+    shapes, points = search.run(), tuple(detect_static_points(capture, grid))
+    if frames == 1:
+        # Of one view a blurred echo has many outlines: the search may end in a wrong one.
+        spheres = search.fit_spheres(one.position for one in points)
+        shapes = max(shapes, spheres, key=search.evidence)
     level_map = one.loss.level[:, None, None].to(power)
     if not shapes:
         seen = GroundImage(flat, picture, _count_views(radar, positions, None))
-        nothing, points = level_map.expand_as(power), tuple(detect_static_points(capture, grid))
+        nothing = level_map.expand_as(power)
         nothing_found = "nothing" + _relate_to_noise(power, radar, grid)[2]
         notes = (_NO_SHAPE_NOTE if points else nothing_found,)
         return Twin(points, level, seen, nothing, power, grid, notes)
@@ -359,8 +363,7 @@ def image_points(
         for place, axis in _boresights(radar):
             way = places - place
             distance = way.norm(dim=1)
-            ahead = way @ axis > 0.05 * distance
-            near |= ahead & (distance > ranges[0]) & (distance < ranges[1])
+            near |= (way @ axis > 0.05 * distance) & (distance > ranges[0]) & (distance < ranges[1])
         if int(near.sum()) <= _MAX_IMAGE_POINTS:
             break
         cell *= 1.25

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations, product
+from itertools import combinations, islice, product
 
 import torch
 from jaxtyping import Float64
@@ -30,6 +30,7 @@ from invertwin.discovery.shapes.prisms import PrismParameters, prism_contour
 
 _MAX_SHAPES = 24  # maximum number of objects
 _BIRTH_ROUNDS = 3  # rounds of births
+_DETECTION_SIZES = 0.1, 0.1  # m, across an echo that is a point to the radar
 _MAX_MERGE_GAP = 0.5  # gap between shapes that may merge [m]
 _MAX_EVIDENCE_DEFICIT = 100.0  # evidence that a fit may recover
 _SLIM_FRACTION = 0.4  # initial width of the slimmer half of a split, relative to a side
@@ -146,6 +147,22 @@ class ShapeSearch:
         shapes, _ = self.fitted_frames.fit(shapes, _LONG_FIT_STEPS)
         shapes = self.refine(self.select_heights(shapes))
         return self.prune(shapes)
+
+    def fit_spheres(self, places: Iterable[Tensor]) -> list[ShapeParameters]:
+        """Fit small spheres at detections; the evidence supports those that are returned.
+
+        Args:
+            places: positions of detections, the strongest first [m].
+        """
+        lattice, found = self.image_grid, list[ShapeParameters]()
+        for place in islice(places, _MAX_SHAPES):
+            x, y = place[:2].tolist()
+            ball = ShapeParameters("sphere", (x, y), 0.0, *_DETECTION_SIZES, lattice.height)
+            near = (lattice.positions - place[:2]).norm(dim=1) < _MAX_MERGE_GAP
+            usual = float(self.first_image[near].sum().clamp_min(1e-4)) / mean_rcs(ball)
+            options = [replace(ball, brightness=10**k * usual) for k in (-1.0, -0.5, 0.0, 0.5, 1.0)]
+            found.append(self.select_best(found, options))
+        return self.prune(self.refine(found)) if found else []
 
     def propose_births(self, shapes: Shapes) -> list[ShapeParameters]:
         """Propose shapes at bright groups of the residual image.

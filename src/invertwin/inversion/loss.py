@@ -65,8 +65,7 @@ def speckle_divergence(ratio: Tensor, degrees: float = math.inf) -> Tensor:
     """
     if math.isinf(degrees):
         return ratio - ratio.log() - 1
-    tail = torch.log1p(ratio / degrees) - math.log1p(1 / degrees)
-    return (degrees + 1) * tail - ratio.log()
+    return (degrees + 1) * (torch.log1p(ratio / degrees) - math.log1p(1 / degrees)) - ratio.log()
 
 
 def speckle_weight(ratio: PowerArray, degrees: float) -> PowerArray:

@@ -77,8 +77,7 @@ def rician_factor(
         rx: At the receivers.
     """
     power = path_powers(paths, tx, rx)
-    passing = (paths.kinds == 0) | (paths.kinds == KINDS.index("transmission"))
-    straight = passing.all(1)
+    straight = ((paths.kinds == 0) | (paths.kinds == KINDS.index("transmission"))).all(1)
     direct = _sum_links(paths, torch.where(straight, power, 0.0))
     others = _sum_links(paths, torch.where(straight, 0.0, power))
     ratio = direct / _nonzero(others)

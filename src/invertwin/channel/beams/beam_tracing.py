@@ -375,8 +375,7 @@ def clip(
     width = max(3, int(number.max()))
     # Unused corners repeat the last one.
     slot = torch.minimum(torch.arange(width), (number[:, None] - 1).clamp_min(0))
-    index = order.gather(1, slot)
-    return points.gather(1, index[..., None].expand(-1, -1, 3))
+    return points.gather(1, order.gather(1, slot)[..., None].expand(-1, -1, 3))
 
 
 def _drop_degenerate(

@@ -124,8 +124,7 @@ def _trace_point_fields(
         velocity = kept.velocity(rays.geometry)
         coefficient, matrix = combine_elements(rays.link, field(kept, echo))
         rows = echo.to_paths(kind, coefficient=coefficient, matrix=matrix, velocity=velocity)
-        single = kept.face.shape[1] == 1
-        face = kept.face[:, 0] if single else torch.full_like(kept.face[:, 0], -1)
+        face = kept.face[:, 0] if kept.face.shape[1] == 1 else torch.full_like(kept.face[:, 0], -1)
         share = torch.stack([kept.b1[:, 0], kept.b2[:, 0]], dim=1)
         rows = replace(rows, face=face, barycentric=share)
         found.append(rows.select(rows.has_field))

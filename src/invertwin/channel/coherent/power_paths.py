@@ -94,8 +94,7 @@ def project_silhouettes(rays: RayScene, points: SilhouetteSample) -> ProjectedSi
     stretch = (shadow - c.detach()).norm(dim=1) / ray.norm(dim=1)
 
     def project(vector: Tensor) -> Tensor:
-        along = dot(normal, vector) / dot(normal, ray)
-        return stretch[:, None] * (vector - ray * along[:, None])
+        return stretch[:, None] * (vector - ray * (dot(normal, vector) / dot(normal, ray))[:, None])
 
     tangent = torch.linalg.cross(normal, project(edge)) * (side * dot(normal, ray).sign())[:, None]
     if not link.shared_visibility:
@@ -124,8 +123,7 @@ def trace_shadow_boundary_paths(
     sampler = SilhouetteSampler(rays, Inputs.from_rays(rays), centres, count, seed)
     if not sampler.size:
         return []
-    drawn = sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress()
-    edge = project_silhouettes(rays, drawn)
+    edge = project_silhouettes(rays, sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress())
     with torch.no_grad():
         echo = radar_equation(rays.geometry, rays.link, edge.frame, [edge.point])
     return [make_paths(edge, echo)]

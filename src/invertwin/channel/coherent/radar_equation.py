@@ -164,8 +164,7 @@ def radar_equation(
     turned = []  # χ of what is scattered; what passes through a skin keeps its polarisation
     for point, back, on in turns:
         same_side = (point.normal * -back).sum(1) * (point.normal * on).sum(1) > 0
-        kept = geometry.surfaces.depolarisation[point.row]
-        turned.append(torch.where(same_side, kept, 0.0))
+        turned.append(torch.where(same_side, geometry.surfaces.depolarisation[point.row], 0.0))
     power = arriving * last * ending
     return PathTransfer(frame, points, power, arriving, spread * ending, length, turned)
 

@@ -242,8 +242,7 @@ def _evaluate_shifted(s: Tensor, shift: Tensor) -> Tensor:
 
 
 def _shifted_derivatives(s: Tensor, w: Tensor, x: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    argument = s - EXP_J_PI_4.conjugate() * w * x
-    by_s = 2j * argument * value - 2j * torch.exp(-((w * x) ** 2))
+    by_s = 2j * (s - EXP_J_PI_4.conjugate() * w * x) * value - 2j * torch.exp(-((w * x) ** 2))
     return by_s, -EXP_J_PI_4.conjugate() * x * by_s - 2 * w * x * x * value
 
 

@@ -219,5 +219,4 @@ class InteriorSilhouetteSampler:
         s, c = dr.sincos(start + span * (2 * second - dr.select(second < 0.5, 0.0, 1.0)))
         height = 2 * first - 1
         across = sign * dr.sqrt(dr.maximum(1 - height * height, 0.0))
-        omega = along * height + (x * c + y * s) * across
-        return mi.Vector3f(dr.normalize(omega)), 1 / (4 * span)
+        return mi.Vector3f(dr.normalize(along * height + (x * c + y * s) * across)), 1 / (4 * span)

@@ -133,8 +133,7 @@ def _pair_coplanar_triangles(
     total, sums = int(counts.sum()), counts.cumsum(0)
     chosen = torch.arange(0, total, max(1, -(-total // _MAX_PAIRS)))
     first = torch.searchsorted(sums, chosen, right=True)
-    second = first + 1 + chosen - (sums - counts)[first]
-    return order[first], order[second]
+    return order[first], order[first + 1 + chosen - (sums - counts)[first]]
 
 
 def _has_near_neighbour(
@@ -148,8 +147,7 @@ def _has_near_neighbour(
     after = (run < len(change)) & (
         offsets[change[run.clamp_max(len(change) - 1)] + 1] - offsets <= max_distance
     )
-    before = (run > 0) & (offsets - offsets[change[(run - 1).clamp_min(0)]] <= max_distance)
-    return after | before
+    return after | (run > 0) & (offsets - offsets[change[(run - 1).clamp_min(0)]] <= max_distance)
 
 
 def _find_common_points(

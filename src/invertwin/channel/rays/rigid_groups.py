@@ -67,8 +67,7 @@ def find_rigid_groups(
             gaps.append(_ends_of_gap(contacts, torch.cat([vertices[a], vertices[b]])))
     # One comparison for all pairs, as a rule; else one for each.
     if pairs and not _move_as_one(*map(torch.cat, zip(*gaps, strict=True))):
-        kept = [_move_as_one(*gap) for gap in gaps]
-        pairs = list(itertools.compress(pairs, kept))
+        pairs = list(itertools.compress(pairs, [_move_as_one(*gap) for gap in gaps]))
     return label_components(np.array(pairs, dtype=np.int64).reshape(-1, 2), len(faces))
 
 

@@ -259,8 +259,7 @@ def strip_section_te(
     vector = (pulse * length) @ ((tangent @ tangent.T) * green) @ pulse.T
     impedance = 1j * k * vector + charge @ (green / length) @ charge.T / (1j * k)
     across = np.stack([-directions[:, 1], directions[:, 0]], 1)
-    wave = np.exp(1j * k * directions @ middle.T) * (across @ tangent.T) * length
-    driven = wave @ pulse.T
+    driven = np.exp(1j * k * directions @ middle.T) * (across @ tangent.T) * length @ pulse.T
     return k / 4 * np.abs(np.einsum("ai,ij,aj->a", driven, np.linalg.inv(impedance), driven)) ** 2
 
 

@@ -173,8 +173,7 @@ def source_count(
         )
     values = eigenvalues.detach().to(torch.float64).sort(-1).values
     # Eigenvalues below the rounding of the largest one are numerical noise.
-    floor = 1e-14 * values[..., -1:].clamp(min=torch.finfo(torch.float64).tiny)
-    values = values.maximum(floor)
+    values = values.maximum(1e-14 * values[..., -1:].clamp(min=torch.finfo(torch.float64).tiny))
     remaining = torch.arange(1, elements + 1, dtype=torch.float64, device=values.device)
     spread = (values.cumsum(-1) / remaining).log() - values.log().cumsum(-1) / remaining
     found = elements - remaining  # k for each entry

@@ -159,8 +159,7 @@ def interpolate_peak(before: _Power, middle: _Power, after: _Power) -> _Power:
     tiny = torch.finfo(torch.float64).tiny
     low, level, high = (part.double().clamp_min(tiny).log() for part in (before, middle, after))
     curvature = low - 2 * level + high
-    vertex = 0.5 * (low - high) / torch.where(curvature < 0, curvature, torch.inf)
-    return vertex.clamp(-0.5, 0.5)
+    return (0.5 * (low - high) / torch.where(curvature < 0, curvature, torch.inf)).clamp(-0.5, 0.5)
 
 
 def resolve_fold(

@@ -93,8 +93,7 @@ class Chirps:
             wavelength: wavelength [m].
             transmitters: number of time-multiplexed transmitters.
         """
-        turns = transmitters if self.tdm else 1
-        return wavelength / (4 * self.interval * turns)
+        return wavelength / (4 * self.interval * (transmitters if self.tdm else 1))
 
 
 def check_order(order: Sequence[int], transmitters: int) -> list[int]:

@@ -100,8 +100,7 @@ def tensor_product(
         index: first node of each point along every axis.
         weights: weights of four nodes along every axis.
     """
-    steps = torch.arange(4)
-    x, y, z = (index[:, k, None] + steps for k in range(3))
+    x, y, z = (index[:, k, None] + torch.arange(4) for k in range(3))
     near = values[x[:, :, None, None], y[:, None, :, None], z[:, None, None, :]]
     return torch.einsum("pi,pj,pk,pijk...->p...", weights[:, 0], weights[:, 1], weights[:, 2], near)
 
