@@ -262,7 +262,7 @@ def plane_wave_error(opening: float, distance: float, truth: Callable[..., Any])
         azimuth,
         torch.full_like(azimuth, distance),
     )
-    dyad = diffraction_dyads(turn, WAVE_NUMBER, ("value",))[0]
+    (dyad,) = diffraction_dyads(turn, WAVE_NUMBER, ("value",))
     axis = edge_axis(wedges)
     parts = {
         # E along the edge, and H along it, of both waves.

@@ -9,6 +9,8 @@ as many of Python (`load_kind` says which). What else runs on the machine counts
 should be nothing; `load_before` is what the system says of that.
 
 - `version_seconds`: processor time of `invertwin --version`, the least of five [s].
+- `refusal_seconds`: the most of all commands that are given a file that is missing, a folder, or a
+  board that there is not, of each the least of three [s]; `refusals` has them all.
 - `idle_seconds`, `busy_seconds`: wall time of the fit, alone and beside the load [s].
 - `busy_ratio`: of the two.
 - `idle_processor_seconds`, `busy_processor_seconds`: processor time of the two [s]. Threads that
@@ -34,10 +36,20 @@ import tomli_w
 from report import MetricTable, Required, write
 
 STEPS, LOAD, TIMES = 120, 8, 5
+RUN_FILE_COMMANDS = (
+    *("simulate", "dataset", "reconstruct", "plan", "check", "convert", "gradcheck", "rcs"),
+)
+# A run file is refused for its board before it is for its task.
+WRONG_BOARD = 'task = "simulate"\nframe = 2\nradar = { board = { name = "xWR9999" } }\n'
 DEMO = Path(__file__).parents[1] / "experiments" / "demo.toml"
-REQUIRED: Required = {"version_seconds": ("<=", 0.4), "busy_ratio": ("<=", 6.0)}
+REQUIRED: Required = {
+    "version_seconds": ("<=", 0.3),
+    "refusal_seconds": ("<=", 0.5),
+    "busy_ratio": ("<=", 6.0),
+}
 COUNTED = {
     "version_seconds": "processor time of invertwin --version [s]",
+    "refusal_seconds": "the most of all commands that are refused [s]",
     "idle_seconds": "the demo alone [s]",
     "busy_seconds": "the demo beside the load [s]",
     "busy_ratio": "of the two",
@@ -46,18 +58,41 @@ COUNTED = {
 }
 
 
-def taken(arguments: Sequence[str]) -> tuple[float, float]:
+def taken(arguments: Sequence[str], code: int = 0) -> tuple[float, float]:
     """Wall time and processor time of a command of invertwin with all its children [s].
 
     Args:
         arguments: Of the command line.
+        code: With which it must end.
     """
     call = "from invertwin.cli.app import main; main()"
     begun, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, "-c", call, *arguments], stdout=subprocess.DEVNULL, check=True)
+    line = [sys.executable, "-c", call, *arguments]
+    done = subprocess.run(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == code, done.stderr
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return time.monotonic() - begun, used
+
+
+def refusals(folder: Path) -> dict[str, list[str]]:
+    """Arguments that every command refuses, by the command and what is wrong.
+
+    Args:
+        folder: Where files for them are written.
+    """
+    board, raw, empty = folder / "board.toml", folder / "raw.bin", folder / "empty"
+    board.write_text(WRONG_BOARD, encoding="utf-8")
+    raw.write_bytes(b"")
+    empty.mkdir()
+    wrong = {"missing": str(folder / "none.toml"), "folder": str(empty), "board": str(board)}
+    found = {f"{c} {what}": [c, file] for c in RUN_FILE_COMMANDS for what, file in wrong.items()}
+    del found["convert board"]  # it converts what states no frame
+    for command in ("look", "twin", "view"):
+        found |= {f"{command} {what}": [command, wrong[what]] for what in ("missing", "folder")}
+    for command in ("look", "twin"):
+        found[f"{command} board"] = [command, str(raw), "-c", str(board), "-b", "xWR9999"]
+    return found
 
 
 @contextmanager
@@ -117,6 +152,10 @@ def measure(steps: int, load: int) -> dict[str, Any]:
     version = min(taken(["--version"])[1] for _ in range(TIMES))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        refused = {
+            case: min(taken(arguments, code=2)[1] for _ in range(3))
+            for case, arguments in refusals(folder).items()
+        }
         call = ["reconstruct", str(demo(folder, steps)), "--overwrite", "-o", str(folder / "out")]
         warm = ["reconstruct", str(demo(folder, 1)), "-o", str(folder / "warm")]
         taken(warm)
@@ -126,6 +165,8 @@ def measure(steps: int, load: int) -> dict[str, Any]:
             slow, used_then = taken(call)
     return {
         "version_seconds": version,
+        "refusal_seconds": max(refused.values()),
+        "refusals": refused,
         "idle_seconds": idle,
         "busy_seconds": slow,
         "busy_ratio": slow / idle,

@@ -14,22 +14,11 @@ from typing import Any, ClassVar, Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from invertwin.deprecation import rename_members, warn_renamed
+from invertwin.deprecation import read_renamed_attributes, rename_attributes, warn_renamed
 from invertwin.scene.scene import Scene
 
 Realisations = Callable[[int, float], Tensor]
 """A map of a seed and of the mean noise in a bin: a recording that was simulated."""
-
-# Names of version 0.3. A subclass that defines one overrides the method of the new name.
-_RENAMED_METHODS = {
-    "blurred": "blur_observed",
-    "looks": "realisations",
-    "narrowed": "scale_blur",
-    "prepared": "prepare",
-    "sampled_by": "with_sampling",
-    "widened": "has_blur",
-}
-_RENAMED_FLAGS = {"fields": "holds_fields", "random": "is_random", "smooth": "is_smooth"}
 
 
 class ForwardModel(ABC):
@@ -61,9 +50,8 @@ class ForwardModel(ABC):
         """Adopt methods and flags that a subclass defines by their names of version 0.3."""
         super().__init_subclass__(**options)
         own = dict(vars(cls))
-        for old, new in (_RENAMED_METHODS | _RENAMED_FLAGS).items():
-            kinds = (FunctionType, property, *((bool,) if old in _RENAMED_FLAGS else ()))
-            if new not in own and isinstance(own.get(old), kinds):
+        for old, new in read_renamed_attributes()[f"{__name__}.ForwardModel"].items():
+            if new not in own and isinstance(own.get(old), FunctionType | property | bool):
                 warn_renamed(f"{cls.__qualname__}.{old}", f"{cls.__qualname__}.{new}")
                 setattr(cls, new, own[old])
 
@@ -158,4 +146,4 @@ class ForwardModel(ABC):
         return observed
 
 
-rename_members(ForwardModel, **_RENAMED_METHODS, **_RENAMED_FLAGS)
+rename_attributes(__name__)

@@ -30,3 +30,20 @@ def test_the_version_costs_little_processor_time(starting, monkeypatch):
     wall, used = starting.taken(["--version"])
     assert 0 < used <= 1.0  # `benchmarks/starting.py` has the limit, on a machine of its own
     assert wall > 0
+
+
+def test_every_command_with_a_file_is_refused_in_every_way(starting, tmp_path):
+    from invertwin.cli.app import app
+
+    cases = starting.refusals(tmp_path)
+    commands = {getattr(one.callback, "__name__", "") for one in app.registered_commands}
+    assert {case.split()[0] for case in cases} == commands - {"new", "demo", "keys", "doctor"}
+    assert len(cases) == 3 * 10 + 2 - 1  # `view` has no board, `convert` reads none
+    assert (tmp_path / "empty").is_dir()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["convert folder", "view missing", "twin board"])
+def test_a_refusal_ends_with_code_2(starting, monkeypatch, tmp_path, case):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    assert starting.taken(starting.refusals(tmp_path)[case], code=2)[1] > 0

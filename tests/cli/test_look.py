@@ -219,10 +219,13 @@ def test_channels_are_calibrated_on_a_reflector(recording, monkeypatch):
     [
         (["none.bin"], ["none.bin", "check the path"]),
         (["notes.txt"], ["notes.txt", ".setup.json"]),
-        (["adc.bin", *BOARD], ["to end in .cfg, .json, got"]),
+        (["adc.bin", *BOARD], ["expected --config, got none; name the .cfg"]),
         (["adc.bin", "-c", "bench.cfg"], ["--board", "preset"]),
         (["adc.bin", "-c", "bench.cfg", "-b", "xWR9999"], ["xWR9999", "IWR6843ISK"]),
-        (["adc.bin", "-c", "bench.cfg", "-b", "IWR6843ISK"], ["elevation=+1 or -1"]),
+        (
+            ["adc.bin", "-c", "bench.cfg", "-b", "IWR6843ISK"],
+            ["--elevation 1 or -1 for IWR6843ISK"],
+        ),
         (["adc.bin", "-c", "bench.cfg", "-b", "xWR1642"], ["TX numbers of xWR1642 from 1 to 2"]),
         (["odd.bin", "-c", "bench.cfg", *BOARD], ["odd number of bytes"]),
         (

@@ -2,6 +2,10 @@
 
 import csv
 import math
+import os
+import re
+import subprocess
+import sys
 
 import pytest
 
@@ -70,3 +74,28 @@ depth = 0
     said = " ".join(capsys.readouterr().out.split())
     assert metrics["answer"] in said
     assert (tmp_path / "out" / "coverage.png").exists()
+
+
+def test_a_new_plugin_runs_and_gives_run_files_its_shape(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    assert call(monkeypatch, "new", "plugin") == 0
+    assert "wrote plugin.py; try: python plugin.py" in " ".join(capsys.readouterr().out.split())
+
+    def run(*words: str) -> str:
+        line = [sys.executable, "plugin.py", *words]
+        return subprocess.run(line, check=True, capture_output=True, text=True).stdout
+
+    found = re.fullmatch(r"strongest echo ([\d.]+) m away\n", run())
+    assert found is not None
+    # The nearest of the pyramid's points is 2.5 m ahead on the ground, the farthest seen its top.
+    assert math.hypot(2.5, 0.4) < float(found[1]) < math.hypot(3.0, 0.5, 0.4)
+    assert "side" in run("keys", "scene")
+    assert call(monkeypatch, "new", "simulate") == 0
+    text = (tmp_path / "simulate.toml").read_text()
+    text = re.sub(r'shape = "box".*\nsize = .*', 'shape = "pyramid"\nside = 0.4', text)
+    (tmp_path / "own.toml").write_text(text)
+    run("simulate", "own.toml")
+    assert read_metrics(tmp_path / "out" / "own")["paths"] > 1000
+    assert call(monkeypatch, "simulate", tmp_path / "own.toml", "-o", "other") == 2
+    assert "pyramid" in capsys.readouterr().err

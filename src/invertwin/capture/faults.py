@@ -16,6 +16,7 @@ from torch import Tensor
 from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.prediction import covariances, prediction_coefficients, prediction_residuals
+from invertwin.constants import read_table
 from invertwin.radar.processing.reflectors import noise_power
 from invertwin.radar.radar import require_sampled_waveform
 from invertwin.radar.waveform import SampledWaveform, unit_window
@@ -240,15 +241,7 @@ _MIN_PEAK_TO_SURROUNDINGS = 10.0
 # Share of a spectrum without echoes; what its window leaves.
 _NOISE_ONLY_FRACTION, _WINDOW_FLOOR = 0.2, 1e-10
 _MAX_IQ_IMAGE = 0.7  # of the echo's amplitude
-_ODD_SAMPLES = (
-    ", half the unambiguous range away: odd samples differ from even ones (interleaved converters, "
-    "samples dropped or doubled); calibrate the converter, or read the samples in their right order"
-)
-_UNLIKE_IQ = (
-    " but for their sign, where the unambiguous range less its own is: I and Q differ in gain or "
-    "are not 90° apart, so that every echo has an image with the opposite direction and range "
-    "rate; balance I and Q, or look at half of the range (--range-max)"
-)
+_CAUSES = read_table("invertwin.capture", "faults.toml")
 _MIN_RELATIVE_ECHO = 1e-4  # of the strongest one's power, that is searched for ghosts
 
 
@@ -314,7 +307,7 @@ def detect_ghosts(
                     f"{at * waveform.max_range:.3g} m, {level:.0f} dB weaker and alike in all "
                     "channels"
                 )
-                return Fault("ghosts", shown + (_ODD_SAMPLES if offset else _UNLIKE_IQ))
+                return Fault("ghosts", shown + _CAUSES["odd_samples" if offset else "unlike_iq"])
     return None
 
 

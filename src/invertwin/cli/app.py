@@ -14,6 +14,12 @@ import typer.main
 from typer.core import TyperGroup
 
 from invertwin import __version__
+from invertwin.cli.inputs import (
+    DATASET_SECTIONS,
+    find_viewed_file,
+    require_files,
+    require_recording,
+)
 from invertwin.cli.options import (
     BackendOption,
     DatasetOptions,
@@ -21,7 +27,6 @@ from invertwin.cli.options import (
     FilesArgument,
     FitOptions,
     LookOptions,
-    RecordingOptions,
     ResumableOptions,
     RunOptions,
     TwinOptions,
@@ -121,7 +126,7 @@ def simulate(options: RunOptions, file: FileArgument) -> None:
                 return run_coverage(run, folder)
             from invertwin.cli.commands.simulate import run_simulate
 
-            return run_simulate(run, folder), ""
+            return run_simulate(run, folder)
 
     run_in_folder(options, Path("out", file.stem), work, runs)
 
@@ -137,10 +142,10 @@ def _simulate_sections(run: Any) -> tuple[str, ...]:
 @_command_with(DatasetOptions)
 def dataset(options: DatasetOptions, file: FileArgument) -> None:
     """Simulate a data set: many samples of a run file with other values each, and their labels."""
+    runs = load_runs([file], options, "dataset", DATASET_SECTIONS)
     from invertwin.cli.commands import dataset as command
 
     part = command.parse_part(options.shard)
-    runs = load_runs([file], options, "dataset", command.DATASET_SECTIONS)
     chosen = replace(options, out=command.part_folder(options.out or Path("out", file.stem), part))
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
@@ -189,6 +194,7 @@ def check(file: FileArgument, backend: BackendOption = None) -> None:
 @app.command(rich_help_panel=_DEVELOP)
 def convert(files: FilesArgument) -> None:
     """Rewrite run files of the first frame (x right, y up) in today's: x ahead, y left, z up."""
+    require_files((file, "a run file") for file in files)
     from invertwin_convert import run_convert
 
     for line in run_convert(files):
@@ -197,12 +203,16 @@ def convert(files: FilesArgument) -> None:
 
 @app.command(rich_help_panel=_LEARN)
 def new(
-    kind: Annotated[Literal["fit", "simulate", "twin", "coverage", "dataset"], typer.Argument()],
-    file: Annotated[Path | None, typer.Argument(help="Default: the kind.toml.")] = None,
+    kind: Annotated[
+        Literal["fit", "simulate", "twin", "coverage", "dataset", "plugin"], typer.Argument()
+    ],
+    file: Annotated[Path | None, typer.Argument(help="Default: kind.toml, or plugin.py.")] = None,
 ) -> None:
-    """Write a commented run file to start from."""
-    text = (resources.files("invertwin.cli") / "templates" / f"{kind}.toml").read_text("utf-8")
-    path = file or Path(f"{kind}.toml")
+    """Write a commented run file, or a plugin, to start from."""
+    # As a text: a module among the templates would be part of the package.
+    name, default = ("plugin.txt", "plugin.py") if kind == "plugin" else (f"{kind}.toml",) * 2
+    text = (resources.files("invertwin.cli") / "templates" / name).read_text("utf-8")
+    path = file or Path(default)
     try:
         with path.open("x", encoding="utf-8") as out:
             out.write(text)
@@ -210,8 +220,9 @@ def new(
         raise InputError(
             f"expected a new file in a folder, got {path}: {error.strerror}; name another"
         ) from None
-    command = {"fit": "reconstruct", "coverage": "simulate"}.get(kind, kind)
-    console.print(f"wrote {path}; try: invertwin {command} {path}", markup=False, soft_wrap=True)
+    call = {"fit": "invertwin reconstruct", "coverage": "invertwin simulate", "plugin": "python"}
+    line = f"wrote {path}; try: {call.get(kind, f'invertwin {kind}')} {path}"
+    console.print(line, markup=False, soft_wrap=True)
 
 
 @_command_with(ResumableOptions, _LEARN)
@@ -225,17 +236,13 @@ def demo(options: ResumableOptions) -> None:
 @_command_with(LookOptions, _DATA)
 def look(options: LookOptions) -> None:
     """Show a recording: range, range rate, direction; and write it as a capture."""
-    from invertwin.cli.commands.look import run_look
-
-    _run_recording(options, "", run_look)
+    _run_recording(options, "")
 
 
 @_command_with(TwinOptions, _DATA)
 def twin(options: TwinOptions) -> None:
     """Find what stands in a recording, with no start: things, places, sizes, confidences."""
-    from invertwin.cli.commands.twin import run_twin
-
-    _run_recording(options, "_twin", run_twin)
+    _run_recording(options, "_twin")
 
 
 @app.command(rich_help_panel=_DATA)
@@ -258,18 +265,26 @@ def view(
     backend: BackendOption = None,
 ) -> None:
     """Show a run, a scene or a capture in the browser, in three dimensions."""
+    find_viewed_file(target)
+    own = record is not None and record.resolve() == target.resolve()
+    if record is not None and (own or (record.exists() and not overwrite)):
+        raise InputError(
+            f"expected a new file for --record, got {record}, which exists; name another"
+            + ("" if own else ", or give --overwrite")
+        )
     use_plain_style()
     from invertwin.cli.commands.view import run_view
 
-    run_view(target, console, host=host, port=port, token=token, record=record, overwrite=overwrite)
+    run_view(target, console, host=host, port=port, token=token, record=record)
 
 
 @_command_with(ResumableOptions, _DEVELOP)
 def gradcheck(options: ResumableOptions, files: FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
+    runs = load_runs(files, options, "gradcheck", _gradcheck_sections)
     from invertwin.cli.commands.gradcheck import run_gradcheck
 
-    run_each(options, files, "gradcheck", _gradcheck_sections, run_gradcheck)
+    run_each(options, files, "gradcheck", runs, run_gradcheck)
 
 
 def _gradcheck_sections(run: Any) -> tuple[str, ...]:
@@ -284,9 +299,10 @@ def _gradcheck_sections(run: Any) -> tuple[str, ...]:
 @_command_with(ResumableOptions)
 def rcs(options: ResumableOptions, files: FilesArgument) -> None:
     """Compute radar signatures: cross-sections, range profiles, images."""
+    runs = load_runs(files, options, "rcs", ("rcs",))
     from invertwin.cli.commands.rcs import run_rcs
 
-    run_each(options, files, "rcs", ("rcs",), run_rcs)
+    run_each(options, files, "rcs", runs, run_rcs)
 
 
 @app.command(rich_help_panel=_LEARN)
@@ -331,17 +347,21 @@ def main() -> None:
         sys.exit(2)
 
 
-def _run_recording(
-    options: RecordingOptions, ending: str, work: Callable[..., tuple[list[ReportTable], str]]
-) -> None:
+def _run_recording(options: LookOptions | TwinOptions, ending: str) -> None:
     """One recording, by default in a folder of its name and an ending."""
-    default = Path("out", options.recording.name.split(".")[0] + ending)
+    require_recording(options)
 
-    def work_on(folder: RunFolder) -> tuple[list[ReportTable], str]:
+    def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         with show_progress(console):
-            return work(options, folder)
+            if isinstance(options, TwinOptions):
+                from invertwin.cli.commands.twin import run_twin
 
-    run_in_folder(options, default, work_on)
+                return run_twin(options, folder)
+            from invertwin.cli.commands.look import run_look
+
+            return run_look(options, folder)
+
+    run_in_folder(options, Path("out", options.recording.name.split(".")[0] + ending), work)
 
 
 def _run_one_reconstruction(file: Path, options: ResumableOptions, default: Path) -> None:

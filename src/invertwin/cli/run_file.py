@@ -7,7 +7,7 @@ import difflib
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from invertwin.cli.report import load_texts
-from invertwin.constants import FRAME
+from invertwin.constants import FRAME, read_table
 from invertwin.errors import InputError
 from invertwin.registry.section import TAG_MARK, suggest_name
 from invertwin.registry.section import prefix_errors as prefix_errors
@@ -25,6 +25,7 @@ from invertwin.registry.section import require_section as require_section
 from invertwin.storage.untrusted import convert_read_errors, existing_file
 
 _MAX_ERRORS = 20  # in one line
+_SENSORS = ("radar", "data", "observations")  # sections with boards
 _MAX_BYTES = 4_000_000  # tens of thousands of objects or places
 # Sections and kinds of the package in experiments/studies.
 _STUDY_NAMES = ("methods", "loss_scan", "openradar", "rail_sar", "vehicle", "shape_space")
@@ -38,7 +39,9 @@ def load_run(path: Path) -> Any:
         InputError: The file is missing, is not TOML, or does not fit the schema; the message
             names the key's path, what is allowed there and the nearest match, in one line.
     """
-    return validate_run(parse_toml(path, read_text(path)), path)
+    raw = parse_toml(path, read_text(path))
+    _raise_errors(path, _unknown_boards(raw))
+    return validate_run(raw, path)
 
 
 def read_text(path: Path) -> str:
@@ -106,8 +109,24 @@ def validate_run(raw: dict[str, Any], source: Path) -> Any:
 
         return RunFile.model_validate(raw, context={"folder": source.parent})
     except ValidationError as error:
-        lines = dict.fromkeys(_explain_error(item) for item in error.errors(include_url=False))
-        raise InputError(f"{source}: {' — also '.join([*lines][:_MAX_ERRORS])}") from None
+        _raise_errors(source, error.errors(include_url=False))
+
+
+def _unknown_boards(table: dict[str, Any], *place: str) -> Iterator[ErrorDetails]:
+    """Errors of boards as those of the schema, which needs seconds for its imports."""
+    boards = [*read_table("invertwin", "radar/boards.toml")]
+    for name, value in table.items():
+        at = (*place, name)
+        if isinstance(value, dict):
+            yield from _unknown_boards(value, *at)
+        elif at[-2:] == ("board", "name") and at[0] in _SENSORS and value not in boards:
+            known = {"expected": ", ".join(boards)}
+            yield {"type": "literal_error", "loc": at, "msg": "", "input": value, "ctx": known}
+
+
+def _raise_errors(source: Path, errors: Iterable[ErrorDetails]) -> None:
+    if lines := [*dict.fromkeys(map(_explain_error, errors))]:
+        raise InputError(f"{source}: {' — also '.join(lines[:_MAX_ERRORS])}") from None
 
 
 def to_toml(run: Any) -> str:

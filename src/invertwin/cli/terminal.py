@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from invertwin.cli.inputs import require_files
 from invertwin.cli.options import OutputOptions, ResumableOptions, RunOptions, console
 from invertwin.cli.report import ReportTable, format_cell, is_numeric_cell, use_plain_style
 from invertwin.cli.run_file import load_run, prefix_file_errors, require_section, to_toml
@@ -74,6 +75,7 @@ def load_runs(
         command: Command whose task they must have.
         sections: Required sections, or a function that returns them for a run file.
     """
+    require_files((file, "a run file") for file in files)
     runs: dict[str, Any] = {}
     for file in files:
         if file.stem in runs:
@@ -130,7 +132,7 @@ def run_each(
     options: ResumableOptions,
     files: Sequence[Path],
     command: str,
-    sections: Sections,
+    runs: Mapping[str, Any],
     work: Callable[..., list[ReportTable]],
 ) -> None:
     """Work on several run files with one report.
@@ -138,11 +140,10 @@ def run_each(
     Args:
         options: Options of the user.
         files: Paths of the run files.
-        command: Command whose task they must have.
-        sections: Required sections, or a function that returns them for a run file.
+        command: Names the folder of several.
+        runs: Run files by stem.
         work: Function of a `RunBatch` and of a function that takes lines of progress.
     """
-    runs = load_runs(files, options, command, sections)
     default = Path("out", files[0].stem if len(files) == 1 else command)
 
     def work_on(folder: RunFolder) -> tuple[list[ReportTable], str]:

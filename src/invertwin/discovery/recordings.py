@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 from invertwin.capture import Capture, ChirpCapture
 from invertwin.channel import Grid, ViewpointScene
 from invertwin.checks import checked_count, checked_number, checked_tensor
+from invertwin.constants import read_table
 from invertwin.discovery.assembly import ShapeLikelihood, make_sampling
 from invertwin.discovery.certainty import (
     Hypotheses,
@@ -127,7 +128,7 @@ def twin(
         picture = GroundImage(places[:, :2], image, _count_views(radar, places, None))
         return Twin(_sort_objects([*found, *moving]), floor, picture)
     still = _find_static_objects(capture, radar.grid(*reach), floor, places, step, rays, seed)
-    notes = () if gains is None else (_CALIBRATION_NOTE.format(phase_spread(gains, radar)),)
+    notes = () if gains is None else (_NOTES["calibration"].format(phase_spread(gains, radar)),)
     resting = [one for one in still.objects if one.shape or not _is_moving(one, moving)]
     objects = _sort_objects([*resting, *moving])
     return replace(still, objects=objects, notes=(*notes, *still.notes), calibration=gains)
@@ -170,22 +171,7 @@ def _find_moving_targets(
     return detect_moving_targets(recording, grid)
 
 
-_CALIBRATION_NOTE = (
-    "the phases of the channels were {:.0f}° apart (root mean square, but for a ramp): they were "
-    "calibrated on the scene itself"
-)
-_NO_SIGNAL_NOTE = (
-    " is above the noise from {:.2f} to {:.2f} m: the brightest bin, at {:.2f} m, is {:.1f} dB "
-    "over it, chance reaches {:.1f} dB; record more frames, or change what is searched"
-)
-_NO_SHAPE_NOTE = (
-    "no shape explains the maps better than noise does; what a detector finds in the first frame, "
-    "but for what moves, is listed as points"
-)
-_IMAGE_BETTER_NOTE = (
-    "the image explains frames that were held out better than the things do: shapes may be wrong, "
-    "trust the image"
-)
+_NOTES = read_table("invertwin.discovery", "notes.toml")
 
 
 def _find_static_objects(
@@ -219,7 +205,7 @@ def _find_static_objects(
         seen = GroundImage(flat, picture, _count_views(radar, positions, None))
         nothing = level_map.expand_as(power)
         nothing_found = "nothing" + _relate_to_noise(power, radar, grid)[2]
-        notes = (_NO_SHAPE_NOTE if points else nothing_found,)
+        notes = (_NOTES["no_shape"] if points else nothing_found,)
         return Twin(points, level, seen, nothing, power, grid, notes)
     notes = ()
     if aside is not None:
@@ -232,7 +218,7 @@ def _find_static_objects(
             map_axes(aside.radar, there.grid)
         )
         if gain > aside.total_gain(shapes):
-            notes = (_IMAGE_BETTER_NOTE,)
+            notes = (_NOTES["image_better"],)
     shapes, found = one.fit(shapes, _FINAL_FIT_STEPS)
     among = find_hypotheses(one, shapes)
     likelier = [max(row, key=lambda one: one.probability).shape for row in among]
@@ -318,7 +304,7 @@ def _relate_to_noise(
     chance = 2 * math.log(power.numel()) + 5
     levels = (10 * math.log10(level) for level in (float(strongest.max()), chance))
     places = (float(grid.ranges[k]) for k in (0, -1, int(strongest.argmax())))
-    return strongest, chance, _NO_SIGNAL_NOTE.format(*places, *levels)
+    return strongest, chance, _NOTES["no_signal"].format(*places, *levels)
 
 
 def _estimate_background(

@@ -32,6 +32,7 @@ from typing import (
 from annotated_types import Len, MinLen
 from pydantic import Discriminator, GetCoreSchemaHandler, Tag, create_model, model_validator
 
+from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, AllowedLetters
 from invertwin.registry.section import (
@@ -46,14 +47,7 @@ from invertwin.registry.section import (
 )
 
 PLUGINS = "invertwin.plugins"
-_ARGUMENT_DOCS = {
-    "object": "name in the scene",
-    "axis": "direction, or axis of the turn",
-    "low": "corner of the box, in the object's frame [m]",
-    "high": "the opposite corner [m]",
-    "counts": "nodes along x, y and z",
-    "smooth": "λ of steps preconditioned by (I + λL)⁻²; 0 = none",
-}
+_ARGUMENT_DOCS = read_table("invertwin.registry", "arguments.toml")
 """Meaning of keys of many tables, where a constructor says nothing."""
 _TASKS = ("simulate", "reconstruct", "gradcheck", "rcs", "dataset", "twin", "loss-scan", "demo")
 _PLAIN_TYPES = (bool, int, float, str, list, tuple, dict)

@@ -5,7 +5,7 @@ CAD files need no change: they are x forward, y left, z up, or have no forward a
 `to_frame` converts to the axes of other programs.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -15,6 +15,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from invertwin.checks import ArrayLike, check_choice, checked_tensor
+from invertwin.constants import read_table
 from invertwin.errors import InputError
 
 
@@ -125,18 +126,7 @@ def compose(*transforms: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
 
 FrameName = Literal["ti", "opencv", "smpl", "unity"]
 
-_AXES: Mapping[str, tuple[str, str, str]] = {
-    # x right, y forward, z up (TI MMWAVE-L-SDK, mpdProc_SceneryParams: X is left (negative) to
-    # right, Y near to far, Z = 0 the floor).
-    "ti": ("-y", "x", "z"),
-    # x right, y down, z forward (OpenCV manual, calib3d: the pinhole camera model).
-    "opencv": ("-y", "-z", "x"),
-    # y up, the body faces +z, its left is +x (Loper et al. 2015, the template of SMPL); our
-    # bodies face −x.
-    "smpl": ("-y", "z", "-x"),
-    # Left-handed: x right, y up, z forward (Unity manual, "Rotation and orientation").
-    "unity": ("-y", "z", "x"),
-}
+_AXES = read_table("invertwin.scene", "frames.toml")
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from invertwin.checks import check_choice, checked_number
+from invertwin.constants import read_table
 from invertwin.limits import Positive
 from invertwin.scene.material.materials import RoughDielectric
 from invertwin.scene.mesh import Mesh, concatenate_meshes
@@ -17,18 +18,7 @@ _LEG = 0.05  # width of legs [m]
 _SHELF_BOARDS = 5
 _FURNITURE = ("table", "chair_1", "chair_2", "shelf", "sofa")
 
-# All of them are in ITU-R P.2040 up to 100 GHz. Upholstery is not; the board of suspended
-# ceilings, of ε' 1.5, is closest to foam and cloth.
-_ITU = {
-    "floor": "concrete",
-    "ceiling": "ceiling_board",
-    "wall": "plasterboard",
-    "table": "wood",
-    "chair_1": "wood",
-    "chair_2": "wood",
-    "shelf": "chipboard",
-    "sofa": "ceiling_board",
-}
+_ITU = read_table("invertwin.scene", "rooms.toml")["itu"]
 
 
 def room(

@@ -17,6 +17,7 @@ import torch
 from invertwin import __version__
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact
+from invertwin.cli.inputs import DATASET_SECTIONS
 from invertwin.cli.report import ReportTable, quantity_table, write_report
 from invertwin.cli.run_file import load_run, prefix_file_errors, to_toml, validate_run
 from invertwin.cli.schema import RunFile, build
@@ -33,7 +34,6 @@ from invertwin.scene import Scene
 from invertwin.storage.folders import PARTS, UNFINISHED
 from invertwin.storage.run_folder import RunFolder, open_run
 
-DATASET_SECTIONS = ("dataset", "radar", "grid", "data")
 _NUMERICAL_PACKAGES = ("drjit", "finufft", "mitsuba", "numpy", "torch")
 _ARRAY_NAMES = {"raw": "beat", "map": "map"}  # of arrays, by what the run file calls them
 _FIELD_UNIT = "√(received over sent)"

@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -24,6 +23,7 @@ from invertwin.capture import (
 from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid
 from invertwin.checks import checked_number
+from invertwin.cli.inputs import find_plugin_recording
 from invertwin.cli.options import LookOptions, RecordingOptions
 from invertwin.cli.report import ReportTable, load_texts, quantity_table, save_picture, write_report
 from invertwin.errors import InputError, PhysicsWarning
@@ -41,7 +41,7 @@ from invertwin.radar import (
     velocity_span,
 )
 from invertwin.radar.boards import Mounting
-from invertwin.registry.kinds import load_plugins, registry
+from invertwin.registry.kinds import registry
 from invertwin.storage.run_folder import RunFolder
 
 AnyRecording = Capture | ChirpCapture
@@ -95,9 +95,7 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
         profiles = capture.spectrum(replace(grid, u_count=1, v_count=1))
         times = torch.arange(radar.frame_count)
         shown["all frames"] = MapPanel(profiles[:, :, 0, 0].T.double(), grid.ranges, times, "frame")
-    answer = f"Strongest echo {metrics['peak_range_m']:.2f} m away"
-    if "peak_azimuth_deg" in metrics:
-        answer += f", azimuth {metrics['peak_azimuth_deg']:.1f}° (left > 0)"
+    answer = describe_peak(metrics)
     metrics |= {"warnings": said, "answer": answer}
     capture.save(folder.file("capture.nc"))
     if points is not None:
@@ -112,6 +110,14 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
     again = options.command("look", folder.path)
     parts = [*tables, drawn]
     return write_report(folder, metrics, title, status, parts, again=again, note=note), answer
+
+
+def describe_peak(metrics: dict[str, Any]) -> str:
+    """Where the strongest echo is, in a sentence."""
+    answer = f"Strongest echo {metrics['peak_range_m']:.2f} m away"
+    if "peak_azimuth_deg" in metrics:
+        answer += f", azimuth {metrics['peak_azimuth_deg']:.1f}° (left > 0)"
+    return answer
 
 
 def warning_tables(said: Sequence[str]) -> list[ReportTable]:
@@ -135,10 +141,10 @@ def _collect_warnings(messages: list[str]) -> Iterator[None]:
 def read_recording(options: RecordingOptions) -> tuple[str, AnyRecording]:
     """Return the name of the reader, and the recording."""
     path, ending = options.recording, options.recording.suffix.lower()
-    if not path.exists():
-        raise InputError(f"expected a recording, got no file {path}; check the path")
     if path.is_dir() or ending == ".npz":
-        return _read_plugin_recording(options, path if path.is_dir() else path.parent)
+        folder, kind, preset = find_plugin_recording(path)
+        more = {} if preset is None else {"board": _mount_board(options, options.board or preset)}
+        return kind, registry.kind_table("data", kind).made_by(str(folder), **more)
     if is_sweeps(path):
         return "sweeps", read(path)
     raw, board, settings = ending in (".bin", ".json"), None, options.config
@@ -146,7 +152,7 @@ def read_recording(options: RecordingOptions) -> tuple[str, AnyRecording]:
         stated = options.board, options.elevation, options.azimuth
         board = described_arrays.load_described_board(path, *stated)
     elif raw:
-        board = _require_board(options, options.board)
+        board = _mount_board(options, options.board or "")
     if options.change:
         if not raw:
             raise InputError(
@@ -175,25 +181,7 @@ def _parse_changes(given: list[str]) -> dict[str, Any]:
     return found
 
 
-def _read_plugin_recording(options: RecordingOptions, folder: Path) -> tuple[str, AnyRecording]:
-    known = load_plugins().recordings
-    for file, (kind, board) in known.items():
-        if (folder / file).is_file() and options.recording.name in (file, folder.name):
-            more = (
-                {} if board is None else {"board": _require_board(options, options.board or board)}
-            )
-            return kind, registry.kind_table("data", kind).made_by(str(folder), **more)
-    raise InputError(
-        f"expected a folder with {' or '.join(known) or 'a recording that a plugin reads'}, got "
-        f"{options.recording}; of other arrays name the TOML description"
-    )
-
-
-def _require_board(options: RecordingOptions, board: str | None) -> Mounting:
-    if board is None:
-        raise InputError(
-            "expected a --board, got none; name the preset that recorded, and its --elevation"
-        )
+def _mount_board(options: RecordingOptions, board: str) -> Mounting:
     return Mounting(board, options.elevation, 1 if options.azimuth is None else options.azimuth)
 
 

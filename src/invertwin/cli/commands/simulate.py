@@ -17,6 +17,7 @@ from invertwin import plotting
 from invertwin.capture import Capture, ChirpData, ChirpSettings, adc_counts, make_settings, ti
 from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid, Sampling
+from invertwin.cli.commands.look import describe_peak
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import require_simulated_data, simulate_chirp_beats, simulate_exact
 from invertwin.cli.report import ReportTable, quantity_table, save_picture, write_report
@@ -36,8 +37,8 @@ _SURROGATE_SAMPLES = 2_000_000
 _SimulationOutcome = tuple[torch.Tensor, dict[str, Any], Figure, str]
 
 
-def run_simulate(run: RunFile, folder: RunFolder) -> list[ReportTable]:
-    """Simulate the true scene of a run file, write the folder, return the tables to print."""
+def run_simulate(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], str]:
+    """Simulate the true scene of a run file, write the folder, return tables and a sentence."""
     scene = build.true_scene(run)
     radar = build.radar(require_section(run, "radar", "simulate"))
     grid = build.grid(require_section(run, "grid", "simulate"), radar)
@@ -52,6 +53,7 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[ReportTable]:
         "channels": len(radar.virtual_positions),
         "bins": list(grid.shape),
         **found,
+        "answer": (answer := describe_peak(found)),
     }
     if run.raw is not None:
         metrics |= write_raw_files(run, radar, beat, folder)
@@ -64,9 +66,9 @@ def run_simulate(run: RunFile, folder: RunFolder) -> list[ReportTable]:
         save_picture(folder, shown[0], figure, shown[1], note),
     ]
     count = f"{found['chirps']} chirps a frame" if run.chirps else f"{found['paths']} paths"
-    status = f"{count}, {radar.frame_count} frames."
-    title = run.title or "Simulation"
-    return write_report(folder, metrics, title, status, parts, again="simulate", note=run.note)
+    title, status = run.title or "Simulation", f"{answer}; {count}, {radar.frame_count} frames."
+    tables = write_report(folder, metrics, title, status, parts, again="simulate", note=run.note)
+    return tables, answer
 
 
 def _simulate_frames(
@@ -84,12 +86,11 @@ def _simulate_frames(
     one_bounce = replace(model, sampling=Sampling(1, points_per_m2=data.points_per_m2))
     alike = surrogate_correlation(scene, radar.frames([0]), one_bounce, seed=run.seed)
     peak, power = find_peak(found.spectrum.sum(0), grid), float(found.spectrum.max())
+    hidden = ("peak_velocity_m_s", "peak_azimuth_deg" if grid.u_count == 1 else "")
     metrics = {
         "paths": len(found.paths),
+        **{name: value for name, value in peak.metrics("peak").items() if name not in hidden},
         "peak_power_db": 10 * math.log10(power) if power > 0 else None,  # of a single frame
-        "peak_range_m": peak.range,
-        "peak_u": peak.u,
-        "peak_v": peak.v,
         "surrogate_correlation": alike,
         "wall_seconds": seconds,
     }

@@ -11,9 +11,9 @@ from invertwin.capture import Capture, search_ranges
 from invertwin.channel import Grid
 from invertwin.cli.fits.displays import VIEW_FILE
 from invertwin.cli.fits.radar_models import build_sensors
+from invertwin.cli.inputs import find_viewed_file
 from invertwin.cli.run_file import load_run, prefix_file_errors
 from invertwin.cli.schema import RunFile, build
-from invertwin.errors import InputError
 from invertwin.radar import Radar
 from invertwin.storage.folders import convert_os_errors, replace_file
 
@@ -26,7 +26,6 @@ def run_view(
     port: int,
     token: str | None,
     record: Path | None,
-    overwrite: bool = False,
 ) -> None:
     """Show a target until Ctrl-C, or write a page of it.
 
@@ -34,18 +33,11 @@ def run_view(
         target: A run folder, a run file or a capture.
         console: Console that prints the address.
         host, port, token: See ``Viewer``.
-        record: Path of the page.
-        overwrite: Replace what is at that path.
+        record: Path of the page; what is there is replaced.
 
     Raises:
-        InputError: A target that is none of these, a host without a token, or a path that is taken.
+        InputError: A target that is none of these, or a host without a token.
     """
-    own = record is not None and record.resolve() == target.resolve()
-    if record is not None and (own or (record.exists() and not overwrite)):
-        raise InputError(
-            f"expected a new file for --record, got {record}, which exists; name another"
-            + ("" if own else ", or give --overwrite")
-        )
     if record is None:
         viewer.AccessGuard(host, token)  # its errors come before any work
     display, links = load_display(target)
@@ -70,23 +62,10 @@ def load_display(target: Path) -> tuple[viewer.Display, dict[str, viewer.Interac
     Raises:
         InputError: The target is none of these.
     """
-    if target.is_dir():
-        files = [target / name for name in ("run.toml", "twin.toml")]
-        file = next((file for file in files if file.is_file()), None)
-        if file is None:
-            raise InputError(
-                f"expected a run folder with its run.toml, got {target} without one; name a folder "
-                "of invertwin reconstruct, simulate or twin, a run file, or a capture (.nc)"
-            )
-        return _display_of_run(file, target)
-    if target.suffix == ".nc":
-        return _display_of_capture(target), {}
-    if target.suffix == ".toml":
-        return _display_of_run(target, None)
-    raise InputError(
-        f"expected a run folder, a run file (.toml) or a capture (.nc), got {target}; read other "
-        "recordings with invertwin look, which writes a capture"
-    )
+    file = find_viewed_file(target)
+    if file.suffix == ".nc":
+        return _display_of_capture(file), {}
+    return _display_of_run(file, target if target.is_dir() else None)
 
 
 def _display_of_run(

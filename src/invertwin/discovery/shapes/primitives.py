@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from torch import Tensor, nn
 
 from invertwin.checks import check_fields
+from invertwin.constants import read_table
 from invertwin.limits import Positive
 from invertwin.scene import (
     Material,
@@ -37,16 +38,9 @@ MAX_POINT_SIZE = 0.06
 CORNER_EXPONENT = 9.0
 """Cosine exponent of the echo of a trihedral corner about its axis."""
 _CORNER_FALLOFF = CORNER_EXPONENT - 2  # in addition to the cos² of any plate
-_CORNER_PLATE_SIDE = 0.03  # side of the plate that represents a corner reflector [m]
 _MIN_SIZES, _MAX_SIZES = (0.01, 0.01, 0.01), (10.0, 10.0, 10.0)
-SIZE_LIMITS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
-    "person": ((0.2, 0.4, 1.2), (0.5, 0.9, 2.1)),
-    "vehicle": ((3.0, 1.4, 1.2), (6.5, 2.3, 2.6)),
-    "corner": (
-        (_CORNER_PLATE_SIDE, _CORNER_PLATE_SIDE, 0.01),
-        (_CORNER_PLATE_SIDE, _CORNER_PLATE_SIDE, 10.0),
-    ),
-}
+_TABLES = read_table("invertwin.discovery.shapes", "primitives.toml")
+SIZE_LIMITS: dict[str, list[list[float]]] = _TABLES["size_limits"]
 """Minimum and maximum length, width and height of kinds with specific sizes [m]."""
 _RECTANGULAR_KINDS = ("wall", "box", "person", "vehicle")
 _FREE_HEIGHT_KINDS = ("sphere", "point", "corner")
@@ -368,28 +362,16 @@ def _person_mesh() -> Mesh:
 def _vehicle_mesh() -> Mesh:
     """Return a car facing x: stacked octagonal layers joined by a skin."""
     sides = 8
-    layers = [_vehicle_layer(*layer) for layer in _VEHICLE_LAYERS]
+    layers = [_vehicle_layer(*layer) for layer in _TABLES["vehicle_layers"]]
     rings = torch.tensor(layers, dtype=torch.float64).flatten(0, 1)
     faces: list[list[int]] = []
-    for layer in range(len(_VEHICLE_LAYERS) - 1):
+    for layer in range(len(layers) - 1):
         for k in range(sides):
             a, b = layer * sides + k, layer * sides + (k + 1) % sides
             faces += [[a, b, a + sides], [b, b + sides, a + sides]]
-    for first in (0, (len(_VEHICLE_LAYERS) - 1) * sides):
+    for first in (0, (len(layers) - 1) * sides):
         faces += [[first, first + k, first + k + 1] for k in range(1, sides - 1)]
     return Mesh(rings, torch.tensor(faces))
-
-
-# Height, rear end, front end and width, as shares of those of a car: underbody, sills, bumpers and
-# shoulders, belt line, foot of the screens, roof.
-_VEHICLE_LAYERS = (
-    (0.0, -0.30, 0.30, 0.5),
-    (0.15, -0.47, 0.46, 0.94),
-    (0.36, -0.50, 0.50, 1.0),
-    (0.58, -0.48, 0.45, 0.98),
-    (0.66, -0.45, 0.24, 0.92),
-    (1.0, -0.30, -0.02, 0.7),
-)
 
 
 def _vehicle_layer(high: float, rear: float, front: float, wide: float) -> list[list[float]]:
