@@ -351,6 +351,7 @@ class Registry:
 
     def _field(self, hint: Any, name: str, default: Any, words: str) -> Any:
         kind = self.run_file_type(hint, name)
+        words = words.replace("[rad]", "[°]") if _is_angle(hint) else words
         if default is inspect.Parameter.empty:
             return kind, key(words)
         if not isinstance(default, _PLAIN_TYPES):

@@ -22,6 +22,16 @@ def test_every_key_of_every_section_is_listed_and_explained():
             assert field.get("description") or "const" in field, (section["title"], key)
 
 
+def test_keys_in_degrees_are_explained_in_degrees():
+    sections = [found.get("properties", {}) for found in json_schema()["$defs"].values()]
+    keys = [(k, f) for section in sections for k, f in section.items() if k.endswith("_deg")]
+    assert len(keys) > 30
+    assert [key for key, field in keys if "rad]" in field.get("description", "")] == []
+    (pattern,) = [t for t in key_tables("radar.board.pattern") if '"table"' in t.title]
+    (angles,) = [row for row in pattern.rows if row[0] == "theta_deg"]
+    assert angles[-1] == "angles to boresight, from 0 on [°]"
+
+
 def test_units_limits_and_defaults_are_shown():
     (table,) = key_tables("grid")
     rows = {row[0]: row[1:] for row in table.rows}
