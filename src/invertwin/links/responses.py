@@ -12,16 +12,8 @@ import torch
 from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 
+from invertwin import checks
 from invertwin.channel import RayPaths, polarisations
-from invertwin.checks import (
-    ArrayLike,
-    check_orthonormal,
-    check_some,
-    checked_count,
-    checked_number,
-    checked_tensor,
-    set_fields,
-)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.runtime.memory import require_memory
@@ -59,9 +51,9 @@ class AntennaMount:
         do = "give the axes as columns, for all or for each place"
         given = torch.as_tensor(self.rotations, dtype=torch.float64)
         shape = (3, 3) if given.ndim < 3 else (None, 3, 3)
-        turns = checked_tensor(given, shape, "rotations of terminals", do)
-        check_orthonormal(turns, "rotations of terminals", do)
-        set_fields(self, rotations=turns)
+        turns = checks.checked_tensor(given, shape, "rotations of terminals", do)
+        checks.check_orthonormal(turns, "rotations of terminals", do)
+        checks.set_fields(self, rotations=turns)
 
     def element_weights(
         self, direction: Float64[Tensor, "path 3"], index: Int64[Tensor, " path"]
@@ -192,7 +184,7 @@ def _slope_diffraction(
 
 def frequency_response(
     paths: RayPaths,
-    frequencies: ArrayLike,
+    frequencies: checks.ArrayLike,
     *,
     tx: AntennaMount = _DEFAULT,
     rx: AntennaMount = _DEFAULT,
@@ -215,10 +207,10 @@ def frequency_response(
     return _evaluate_responses(paths, swept, start, tx, rx)[..., 0, :]
 
 
-def checked_frequencies(frequencies: ArrayLike) -> Float64[Tensor, " frequency"]:
+def checked_frequencies(frequencies: checks.ArrayLike) -> Float64[Tensor, " frequency"]:
     """One or several frequencies [Hz] as a row."""
     swept = torch.atleast_1d(torch.as_tensor(frequencies, dtype=torch.float64))
-    return checked_tensor(swept, (None,), "frequencies [Hz]", "give one or several")
+    return checks.checked_tensor(swept, (None,), "frequencies [Hz]", "give one or several")
 
 
 def ofdm_channel(
@@ -250,10 +242,10 @@ def ofdm_channel(
     Raises:
         InputError: A number out of range.
     """
-    count = checked_count(subcarriers, "subcarriers", 1)
-    step = checked_number(spacing, "subcarrier spacing [Hz]", 0.0, open_low=True)
-    prefix = checked_number(cyclic_prefix, "cyclic prefix [s]", 0.0)
-    instants = checked_count(symbols, "symbols", 1)
+    count = checks.checked_count(subcarriers, "subcarriers", 1)
+    step = checks.checked_number(spacing, "subcarrier spacing [Hz]", 0.0, open_low=True)
+    prefix = checks.checked_number(cyclic_prefix, "cyclic prefix [s]", 0.0)
+    instants = checks.checked_count(symbols, "symbols", 1)
     _require_channel_memory(paths, count * instants, tx, rx)
     number = torch.arange(instants, dtype=torch.float64)
     grid = torch.arange(count, dtype=torch.float64) - count // 2
@@ -286,9 +278,9 @@ def impulse_response(
     Raises:
         InputError: A number out of range.
     """
-    band = checked_number(bandwidth, "bandwidth [Hz]", 0.0, open_low=True)
-    count = checked_count(taps, "taps", 1)
-    first = checked_number(start, "start [s]", -math.inf)
+    band = checks.checked_number(bandwidth, "bandwidth [Hz]", 0.0, open_low=True)
+    count = checks.checked_count(taps, "taps", 1)
+    first = checks.checked_number(start, "start [s]", -math.inf)
     amplitude, delay = path_amplitudes(paths, tx, rx)
     turned = amplitude * phasor(-paths.frequency * delay)
     shape = (len(paths), *amplitude.shape[1:], count)
@@ -301,7 +293,7 @@ def _evaluate_responses(
     paths: RayPaths, frequencies: Tensor, times: Tensor, tx: AntennaMount, rx: AntennaMount
 ) -> Tensor:
     """H over [rx, rx_ant, tx, tx_ant, time, frequency]."""
-    check_some(frequencies, "frequency", "give one or several [Hz]")
+    checks.check_some(frequencies, "frequency", "give one or several [Hz]")
     amplitude, delay = path_amplitudes(paths, tx, rx)
     _require_channel_memory(paths, len(times) * len(frequencies), tx, rx)
     pairs = amplitude.shape[1] * amplitude.shape[2]

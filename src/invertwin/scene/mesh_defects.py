@@ -13,19 +13,8 @@ from scipy.spatial import cKDTree
 
 from invertwin.checks import strip_derivatives
 from invertwin.errors import InputError
+from invertwin.scene import mesh_topology
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.mesh_topology import (
-    WELD_TOLERANCE,
-    MeshEdges,
-    Points,
-    find_distinct_faces,
-    find_edges,
-    find_parts,
-    find_slivers,
-    find_vertices_on_edges,
-    near_other_parts,
-    weld_faces,
-)
 from invertwin.scene.mesh_union import unite_parts
 from invertwin.scene.scene import Scene
 
@@ -67,10 +56,10 @@ def find_defects(mesh: Mesh) -> MeshDefects:
     """
     if mesh not in _found:
         plain = Mesh(*map(strip_derivatives, (mesh.vertices, mesh.faces)))
-        welded, places = weld_faces(plain.vertices.numpy(), plain.faces.numpy())
+        welded, places = mesh_topology.weld_faces(plain.vertices.numpy(), plain.faces.numpy())
         _found[mesh] = MeshDefects(
             int(find_doubled_faces(welded, places).sum()),
-            count_cracks(find_edges(welded, places), places),
+            count_cracks(mesh_topology.find_edges(welded, places), places),
             unite_parts(plain) is not plain,
         )
     return _found[mesh]
@@ -99,18 +88,20 @@ def require_single_surfaces(
             )
 
 
-def find_doubled_faces(faces: Int64[np.ndarray, "f 3"], places: Points) -> Bool[np.ndarray, " f"]:
+def find_doubled_faces(
+    faces: Int64[np.ndarray, "f 3"], places: mesh_topology.Points
+) -> Bool[np.ndarray, " f"]:
     """Mask of triangles that repeat others, or lie on those of other parts of the mesh.
 
     Args:
         faces: welded vertices of each triangle.
         places: positions in units of the size of the mesh.
     """
-    corners, part = places[faces], find_parts(faces, places)
-    distinct = find_distinct_faces(faces, places)
-    doubled = ~find_slivers(corners)
+    corners, part = places[faces], mesh_topology.find_parts(faces, places)
+    distinct = mesh_topology.find_distinct_faces(faces, places)
+    doubled = ~mesh_topology.find_slivers(corners)
     doubled[distinct] = False  # all but the first of each kind remain
-    near = distinct[near_other_parts(corners[distinct], part[distinct])]
+    near = distinct[mesh_topology.near_other_parts(corners[distinct], part[distinct])]
     small, large = near[_find_near_pairs(corners[near])]
     other = part[small] != part[large]
     small, large = small[other], large[other]
@@ -145,14 +136,14 @@ def _overlap_in_plane(
     x, normal = (v / np.linalg.norm(v, axis=1)[:, None] for v in (x, normal))
     axes = np.stack([x, np.cross(normal, x), normal], 1)
     flat = [np.einsum("nak,nck->nca", axes, points - start) for points in (one, other)]
-    found = (np.abs(flat[1][..., 2]) <= 2 * WELD_TOLERANCE).all(1)
+    found = (np.abs(flat[1][..., 2]) <= 2 * mesh_topology.WELD_TOLERANCE).all(1)
     shapes = [shapely.polygons(points[found, :, :2]) for points in flat]
     least = np.minimum(shapely.area(shapes[0]), shapely.area(shapes[1]))
     found[found] = shapely.area(shapely.intersection(*shapes)) > _LEAST_SHARE * least
     return found
 
 
-def count_cracks(edges: MeshEdges, places: Points) -> int:
+def count_cracks(edges: mesh_topology.MeshEdges, places: mesh_topology.Points) -> int:
     """Count open edges that run beside others, farther than the tolerance within which both join.
 
     Args:
@@ -162,5 +153,5 @@ def count_cracks(edges: MeshEdges, places: Points) -> int:
     ends = edges.ends[edges.counts == 1]
     middle = len(places) + np.arange(len(ends))
     points = np.concatenate([places, places[ends].mean(1)])
-    row, vertex, _ = find_vertices_on_edges(ends, middle, points, _WIDEST_CRACK)
+    row, vertex, _ = mesh_topology.find_vertices_on_edges(ends, middle, points, _WIDEST_CRACK)
     return len(np.unique(vertex[row != vertex - len(places)]))

@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
+from invertwin.channel.power import silhouettes
 from invertwin.channel.power.discrete import DiscreteSampler, balance_by_scene, sample_edge_point
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.mesh_folds import is_hidden_by_fold
-from invertwin.channel.power.silhouettes import (
-    EDGE_OFFSET,
-    MIN_OPENING,
-    MISS_DISTANCE,
-    SampleBatch,
-    SilhouetteSample,
-    classify_sides,
-    is_not_grazing,
-    trace_past_edge,
-)
 from invertwin.channel.rays.arrays import gather_points, sample_sphere, scramble_seed, uniform_pair
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.differentiated_objects import NO_TARGET, DifferentiatedObjects
@@ -55,7 +46,7 @@ class InteriorSilhouetteSampler:
         y0, y1 = rays.exact_ends(edge)
         length = mi.Float(dr.norm(y1 - y0))
         _, span = self._tangential_azimuths(edge, y0, y1)
-        weight = dr.select(span > MIN_OPENING, length, 0.0)
+        weight = dr.select(span > silhouettes.MIN_OPENING, length, 0.0)
         if importance_sampling:
             middle = mi.Point3f(0.5 * (y0 + y1))
             near, first = mi.Float(0.0), rays.edge_scene(edge) * rays.poses_per_scene
@@ -98,7 +89,7 @@ class InteriorSilhouetteSampler:
         for column in topology.device_edge_apexes[2:]:
             unsure |= dr.gather(mi.Int32, column, edge) >= 0
         if self.inputs.surfaces.has_sheets:
-            unsure |= self._is_transmissive(edge) & (span > MIN_OPENING)
+            unsure |= self._is_transmissive(edge) & (span > silhouettes.MIN_OPENING)
         return dr.select(unsure, 0.0, start), dr.select(unsure, dr.pi, span)
 
     def _is_transmissive(self, edge: mit.UInt32) -> mit.Bool:
@@ -118,7 +109,7 @@ class InteriorSilhouetteSampler:
         x = dr.normalize(offset - along * dr.dot(along, offset))
         return x, dr.cross(along, x)
 
-    def draw(self, index: mit.UInt32) -> SampleBatch[SilhouetteSample]:
+    def draw(self, index: mit.UInt32) -> silhouettes.SampleBatch[silhouettes.SilhouetteSample]:
         """Draw the samples of given numbers; those without a shadow are void.
 
         The weight of a sample holds the change of measure from directions to area.
@@ -141,17 +132,17 @@ class InteriorSilhouetteSampler:
                 moving, index, edge, exact_point, omega, density
             )
         exact = mi.Vector3d(omega)
-        sides = classify_sides(rays, self.inputs, edge, exact)
-        aside = EDGE_OFFSET * (dr.norm(exact_point) + dr.norm(y1 - y0))
+        sides = silhouettes.classify_sides(rays, self.inputs, edge, exact)
+        aside = silhouettes.EDGE_OFFSET * (dr.norm(exact_point) + dr.norm(y1 - y0))
         y, beside = mi.Point3f(exact_point), mi.Point3f(exact_point + sides.outward * aside)
         valid = (pmf > 0) & sides.has_contrast
         hits = []
         for sign, seed in zip((-1.0, 1.0), self.transmission_seeds, strict=True):
-            hit = trace_past_edge(
+            hit = silhouettes.trace_past_edge(
                 rays, self.inputs, (edge, along), beside, omega * (sign * dr.norm(y)), valid,
                 (index, seed), meets_touching=self.meets_touching and sign > 0,
             )  # fmt: skip
-            valid &= hit.valid & is_not_grazing(rays, hit.point.face, omega, hit.valid)
+            valid &= hit.valid & silhouettes.is_not_grazing(rays, hit.point.face, omega, hit.valid)
             valid &= rays.is_in_scene(frame, hit.point.face, hit.valid)
             hits.append(hit)
         if moving is not None:
@@ -159,7 +150,7 @@ class InteriorSilhouetteSampler:
             for hit in hits:
                 counts |= moving.has_face(hit.point.face, hit.valid)
             valid &= counts
-        near = MISS_DISTANCE * dr.norm(exact_point)
+        near = silhouettes.MISS_DISTANCE * dr.norm(exact_point)
         valid &= ~is_hidden_by_fold(
             rays, edge, exact_point, exact, sides.outward, aside, near, valid
         )
@@ -169,7 +160,7 @@ class InteriorSilhouetteSampler:
         point = interpolate_position(triangle, source.b1, source.b2)
         measure = dr.squared_norm(point - y) / dr.abs(dr.dot(face_normal(triangle), omega))
         probability = behind.probability * ahead.probability
-        samples = SilhouetteSample(
+        samples = silhouettes.SilhouetteSample(
             index,
             False,
             frame,
@@ -184,7 +175,7 @@ class InteriorSilhouetteSampler:
             covered=sides.covered,
             source=source,
         )
-        return SampleBatch(valid, samples)
+        return silhouettes.SampleBatch(valid, samples)
 
     def _aim_at_differentiated(
         self,

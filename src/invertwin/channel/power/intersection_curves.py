@@ -23,15 +23,7 @@ from invertwin.channel.power.transmission import (
     trace_to_surface,
     trace_transmission,
 )
-from invertwin.channel.rays.arrays import (
-    gather_points,
-    opaque,
-    sample_sphere,
-    scramble_seed,
-    to_index,
-    to_points,
-    uniform_pair,
-)
+from invertwin.channel.rays import arrays
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.intersections import IntersectionCurves
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
@@ -97,23 +89,23 @@ class IntersectionCurveSampler:
     ) -> None:
         self.rays, self.inputs, self.size, self.depth = rays, inputs, samples, depth
         ends = [(end - rays.origin).float() for end in (curves.start, curves.end)]
-        self.ends = list(map(to_points, ends))
-        self.faces = [to_index(face) for face in (curves.first, curves.second)]
+        self.ends = list(map(arrays.to_points, ends))
+        self.faces = [arrays.to_index(face) for face in (curves.first, curves.second)]
         self.segments = len(curves.first)
         owner = rays.geometry.face_object[curves.first]
-        self.first_frame = rays.object_scene(to_index(owner)) * rays.poses_per_scene
+        self.first_frame = rays.object_scene(arrays.to_index(owner)) * rays.poses_per_scene
         entries = dr.arange(mi.UInt32, self.segments * rays.poses_per_scene)
         start, offset, frame = self._segment(entries)
         middle = start + 0.5 * offset  # type: ignore[operator]
-        legs = [dr.norm(middle - gather_points(t, frame)) for t in (rays.tx, rays.rx)]
+        legs = [dr.norm(middle - arrays.gather_points(t, frame)) for t in (rays.tx, rays.rx)]
         weight = dr.norm(offset) / (legs[0] * legs[1])
         self.choice = DiscreteSampler(balance_by_scene(rays, rays.frame_scene(frame), weight))
-        self.seeds = [scramble_seed(seed, stream) for stream in (12, 13, 14)]
+        self.seeds = [arrays.scramble_seed(seed, stream) for stream in (12, 13, 14)]
 
     def _segment(self, entry: mit.UInt32) -> tuple[mit.Point3f, mit.Vector3f, mit.UInt32]:
         """Decode an entry: start and offset of the segment [m], and radar pose."""
         segment = entry % self.segments
-        start, end = (gather_points(ends, segment) for ends in self.ends)
+        start, end = (arrays.gather_points(ends, segment) for ends in self.ends)
         frame = entry // self.segments
         if self.rays.scene_count > 1:
             frame += dr.gather(mi.UInt32, self.first_frame, segment)
@@ -140,7 +132,7 @@ class IntersectionCurveSampler:
         antenna = inputs.antenna_position(frame, receiver)
         incident = dr.normalize(antenna - x)
         if deep:
-            sphere = sample_sphere(*uniform_pair(index, self.seeds[1]))
+            sphere = arrays.sample_sphere(*arrays.uniform_pair(index, self.seeds[1]))
             incident = dr.select(count > 0, sphere, incident)
         origin = _offset_into_wedge(interactions[0], normals, incident).position
         transmission = trace_transmission(rays, inputs, origin, antenna, valid & (count == 0))
@@ -171,7 +163,7 @@ def decode_subpath(index: mit.UInt32, depth: int) -> tuple[mit.UInt32, mit.Bool 
     """
     if depth == 1:
         return mi.UInt32(0), False
-    return (index // 2) % opaque(depth), (index % 2) == 1
+    return (index // 2) % arrays.opaque(depth), (index % 2) == 1
 
 
 def _offset_into_wedge(
@@ -334,13 +326,13 @@ class _CoveredSide:
         def visit_connection(state: PathState, point: SurfaceInteraction) -> None:
             visit(state, *walk.connect_path(rays, fixed, state, point, state["to_receiver"]))
 
-        state["active"] &= before.count + 1 < opaque(depth)
+        state["active"] &= before.count + 1 < arrays.opaque(depth)
         state = walker.step(state, _offset_into_wedge(here, normals, before.incident))
         passed = self.transmit(-state["incident"])
         state["active"] &= passed.transmittance > 0
         state["throughput"] = state["throughput"] * passed.transmittance
         state["length"] = state["length"] + passed.extra_length
-        return walker.run(state, opaque(depth) - before.count, visit_connection)
+        return walker.run(state, arrays.opaque(depth) - before.count, visit_connection)
 
 
 def intersection_curve_paths(

@@ -12,16 +12,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.paths import Link
-from invertwin.channel.rays import surface_point
-from invertwin.channel.rays.arrays import (
-    opaque,
-    to_double,
-    to_float,
-    to_index,
-    to_points,
-    to_torch,
-    to_vectors,
-)
+from invertwin.channel.rays import arrays, surface_point
 from invertwin.channel.rays.backend import backend, dr, mi, mit, tracing
 from invertwin.channel.rays.bounding_spheres import BoundingSpheres, State
 from invertwin.channel.rays.brute_force import BruteForceIntersector
@@ -138,17 +129,19 @@ class Occluders:
             origin: origins about the local origin, [n, 3] [m].
             direction: directions [n, 3], in whose lengths distances count.
         """
-        ray = mi.Ray3f(to_vectors(mi.Point3f, origin), to_vectors(mi.Vector3f, direction))
+        ray = mi.Ray3f(
+            arrays.to_vectors(mi.Point3f, origin), arrays.to_vectors(mi.Vector3f, direction)
+        )
         hit = self.scene.ray_intersect_preliminary(ray)
         face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
         distance = dr.select(hit.is_valid(), hit.t, dr.inf)
         dr.eval(face, distance)
-        return to_torch(face).long(), to_torch(distance).double()
+        return arrays.to_torch(face).long(), arrays.to_torch(distance).double()
 
     def to_local_points(self, points: Float64[Tensor, "n 3"]) -> mit.Point3f:
         """Convert world points [n, 3] to Dr.Jit points about the local origin."""
         local = (points.detach() - self.origin).to(torch.float32)
-        return mi.Point3f(*(to_float(local[:, k]) for k in range(3)))
+        return mi.Point3f(*(arrays.to_float(local[:, k]) for k in range(3)))
 
 
 class RayScene(Occluders):
@@ -172,16 +165,16 @@ class RayScene(Occluders):
             )
         self.geometry = geometry
         self.link = link
-        self.vertices = to_points(self.local_vertices)
-        self.tx = to_points(link.tx - origin)
-        self.rx = to_points(link.rx - origin)
+        self.vertices = arrays.to_points(self.local_vertices)
+        self.tx = arrays.to_points(link.tx - origin)
+        self.rx = arrays.to_points(link.rx - origin)
         # Lanes without a hit are evaluated on a valid triangle, then masked: no NaN can leak.
-        self.fallback_face = opaque(_find_fallback_face(geometry))
+        self.fallback_face = arrays.opaque(_find_fallback_face(geometry))
         owners = geometry.object_scene
         self.scene_count = 1 if owners is None else int(owners.max()) + 1
         #: Radar poses per scene; those of the first scene come first.
         self.poses_per_scene = link.frame_count // self.scene_count
-        self._scene_of_object = None if owners is None else to_index(owners)
+        self._scene_of_object = None if owners is None else arrays.to_index(owners)
         some = any(geometry.differentiated) and not all(geometry.differentiated)
         #: Objects with derivatives, if others and the antennas have none; else None.
         self.differentiated_objects = None
@@ -204,12 +197,12 @@ class RayScene(Occluders):
         p0, p1, p2 = (self.local_vertices[self.geometry.faces[:, k]] for k in range(3))
         normal = torch.nn.functional.normalize(torch.linalg.cross(p1 - p0, p2 - p0), dim=1)
         rows = torch.stack([p0, p1 - p0, p2 - p0], dim=1)
-        return to_float(torch.cat([rows, normal[:, :, None]], dim=2))
+        return arrays.to_float(torch.cat([rows, normal[:, :, None]], dim=2))
 
     @cached_property
     def exact_vertices(self) -> mit.Float64:
         """Vertices in float64, three numbers each."""
-        return to_double(self.geometry.vertices.detach() - self.origin)
+        return arrays.to_double(self.geometry.vertices.detach() - self.origin)
 
     def exact_vertex(self, vertex: mit.UInt32, active: mit.Bool | bool = True) -> mit.Vector3d:
         """Gather vertices in float64.
@@ -315,7 +308,9 @@ def is_visible(
     """
     if not len(start):
         return torch.zeros(0, dtype=torch.bool)
-    return to_torch(rays.is_clear(rays.to_local_points(start), rays.to_local_points(end))).bool()
+    return arrays.to_torch(
+        rays.is_clear(rays.to_local_points(start), rays.to_local_points(end))
+    ).bool()
 
 
 def find_next_surface(
@@ -338,7 +333,7 @@ def find_next_surface(
     hit = rays.scene.ray_intersect_preliminary(ray)
     face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
     along = dr.select(hit.is_valid(), hit.t + RAY_EPSILON, 1.0)
-    return to_torch(face).long(), to_torch(along).double()
+    return arrays.to_torch(face).long(), arrays.to_torch(along).double()
 
 
 def visible_points(

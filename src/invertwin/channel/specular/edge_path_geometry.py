@@ -23,16 +23,8 @@ import torch
 from jaxtyping import Bool, Complex128, Float64
 from torch import Tensor
 
+from invertwin.channel.em import utd
 from invertwin.channel.em.plane_waves import cross, dot
-from invertwin.channel.em.utd import (
-    DyadDerivative,
-    EdgeDiffraction,
-    FaceCoefficients,
-    conductor_coefficients,
-    diffraction_dyads,
-    double_dyad,
-    triple_dyad,
-)
 from invertwin.channel.em.wedges import Wedges, edge_axis, exterior_azimuth
 
 _MAX_STEPS = 40  # of the search for the shortest path over several edges
@@ -55,7 +47,7 @@ class PathEdge:
     """
 
     wedges: Wedges
-    face_coefficients: FaceCoefficients = conductor_coefficients
+    face_coefficients: utd.FaceCoefficients = utd.conductor_coefficients
     azimuth_in: Float64[Tensor, " row"] | None = None
     azimuth: Float64[Tensor, " row"] | None = None
     infinite: bool = False
@@ -107,7 +99,7 @@ def diffract_over_edges(
     """
     route = find_route(edges, tx, rx)
     diffractions = route.edge_diffractions(wave_number)
-    orders: tuple[DyadDerivative, ...] = ("value", "in", "out") if slopes else ("value",)
+    orders: tuple[utd.DyadDerivative, ...] = ("value", "in", "out") if slopes else ("value",)
     transfer, *derivatives = transfer_dyads(route, diffractions, wave_number, orders)
     found = None
     if slopes:
@@ -118,9 +110,9 @@ def diffract_over_edges(
 
 def transfer_dyads(
     route: "Route",
-    diffractions: Sequence[EdgeDiffraction],
+    diffractions: Sequence[utd.EdgeDiffraction],
     wave_number: float,
-    orders: Sequence[DyadDerivative] = ("value",),
+    orders: Sequence[utd.DyadDerivative] = ("value",),
 ) -> list[Complex128[Tensor, "row 3 3"]]:
     """Transfer dyads of ``EdgePaths``, or their derivatives with respect to azimuths at one edge.
 
@@ -133,7 +125,7 @@ def transfer_dyads(
     if len(diffractions) > 1:
         found = [_multiple_dyad(route, diffractions, wave_number)]
     else:
-        found = list(diffraction_dyads(diffractions[0], wave_number, orders))
+        found = list(utd.diffraction_dyads(diffractions[0], wave_number, orders))
     sines = torch.stack([diffraction.sin_beta for diffraction in diffractions]).prod(0)
     return [dyad * (sines / (route.legs.prod(1) * route.spread))[:, None, None] for dyad in found]
 
@@ -213,7 +205,7 @@ class Route:
                     lateral = dot(lateral, sides[0])[:, None] * sides[1] + cosine[:, None] * out[b]
         return torch.stack([torch.stack(row, 1) for row in found], 1)
 
-    def edge_diffractions(self, wave_number: float) -> list[EdgeDiffraction]:
+    def edge_diffractions(self, wave_number: float) -> list[utd.EdgeDiffraction]:
         """Return the diffraction geometry at every edge.
 
         Args:
@@ -231,7 +223,7 @@ class Route:
             length = parameters[:, number] * cross(edge_axis(wedges), incident).square().sum(1)
             ends = None if edge.infinite else self.end_parameters(number, wave_number)
             law = edge.face_coefficients, ends, edge.absorbing
-            found.append(EdgeDiffraction(wedges, incident, diffracted, *angles, length, *law))
+            found.append(utd.EdgeDiffraction(wedges, incident, diffracted, *angles, length, *law))
         return found
 
     @property
@@ -483,7 +475,7 @@ def _iterate_offsets(
 
 
 def _multiple_dyad(
-    route: Route, diffractions: Sequence[EdgeDiffraction], wave_number: float
+    route: Route, diffractions: Sequence[utd.EdgeDiffraction], wave_number: float
 ) -> Tensor:
     """Dyads of several edges.
 
@@ -494,9 +486,9 @@ def _multiple_dyad(
     """
     couplings = route.couplings
     if len(diffractions) == 2:
-        total = double_dyad(diffractions[0], diffractions[1], couplings[:, 0, 1], wave_number)
+        total = utd.double_dyad(diffractions[0], diffractions[1], couplings[:, 0, 1], wave_number)
     else:
-        total = triple_dyad(diffractions, couplings, wave_number)
+        total = utd.triple_dyad(diffractions, couplings, wave_number)
     weight = torch.ones_like(couplings[:, 0, 0])
     for number, (one, other) in enumerate(pairwise(route.edges), start=1):
         if one.azimuth is not None and other.azimuth_in is not None:

@@ -17,16 +17,8 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.signal.impairments import Impairments
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
+from invertwin.registry import section
 from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, OneOf, Registry, TableOf
-from invertwin.registry.section import (
-    TAG_MARK,
-    Section,
-    Vector,
-    check_presence,
-    key,
-    prefix_errors,
-    tag_by,
-)
 from invertwin.scene import TabulatedPattern as PatternTable
 
 ElementNumbers = Annotated[list[Count], MinLen(1)]
@@ -43,9 +35,9 @@ _LEAKAGE_HELP = "field of the orthogonal polarisation over that of the wanted on
 class ArrayTable(ConstructorTable):
     """Antenna elements in the radar frame (x boresight, y left, z up)."""
 
-    center: Vector = key("m, in the radar frame", [0.0, 0.0, 0.0])
-    polarisation: PolarisationValue = key(_POLARISATION_HELP, "V")
-    leakage: _NumberOrEach = key(_LEAKAGE_HELP + ", of all elements or of each", 0.0)
+    center: section.Vector = section.key("m, in the radar frame", [0.0, 0.0, 0.0])
+    polarisation: PolarisationValue = section.key(_POLARISATION_HELP, "V")
+    leakage: _NumberOrEach = section.key(_LEAKAGE_HELP + ", of all elements or of each", 0.0)
 
     def build(self, given: Any = None, /, **more: Any) -> scene.AntennaArray:
         """The elements about their centre."""
@@ -56,27 +48,27 @@ class ArrayTable(ConstructorTable):
 class BoardTable(ConstructorTable):
     """Elements on a board's grid of half wavelengths."""
 
-    elevation: Literal[-1, 1] | None = key(
+    elevation: Literal[-1, 1] | None = section.key(
         "1 = rows grow upwards, -1 = downwards; required where there are several rows", None
     )
-    azimuth: Literal[-1, 1] = key(
+    azimuth: Literal[-1, 1] = section.key(
         "1 = columns grow to the left of the radar (y), the right of who faces it, -1 = to its "
         "right",
         1,
     )
-    transmitters: ElementNumbers | None = key(
+    transmitters: ElementNumbers | None = section.key(
         "numbers from 1 in the order of sending; without it all, or those of the recording", None
     )
-    receivers: ElementNumbers | None = key(
+    receivers: ElementNumbers | None = section.key(
         "numbers from 1, ascending; without it all, or those of the recording", None
     )
-    pattern: Annotated[Any, OneOf("pattern")] | None = key(
+    pattern: Annotated[Any, OneOf("pattern")] | None = section.key(
         "pattern of every element; else isotropic", None
     )
-    polarisation: PolarisationValue | None = key(
+    polarisation: PolarisationValue | None = section.key(
         _POLARISATION_HELP + "; without it the board's", None
     )
-    leakage: float = key(_LEAKAGE_HELP, 0.0)
+    leakage: float = section.key(_LEAKAGE_HELP, 0.0)
 
     def build(self, given: Any = None, /, **more: Any) -> boards.Mounting:
         """The board as it is mounted."""
@@ -86,17 +78,17 @@ class BoardTable(ConstructorTable):
         return boards.Mounting(super().build(given, **more), pattern=pattern, **stated)
 
 
-class LookAtOrientation(Section):
-    look_at: Vector = key("m, the point that boresight is turned to")
+class LookAtOrientation(section.Section):
+    look_at: section.Vector = section.key("m, the point that boresight is turned to")
 
     def rotations(self, places: Tensor) -> Tensor:
         """Axes [place, 3, 3] at places [place, 3] [m]."""
-        with prefix_errors("orientation.look_at"):
+        with section.prefix_errors("orientation.look_at"):
             return scene.look_at(places, self.look_at)
 
 
-class RotatedOrientation(Section):
-    rotation_deg: Vector = key("rotation vector, the same at every position")
+class RotatedOrientation(section.Section):
+    rotation_deg: section.Vector = section.key("rotation vector, the same at every position")
 
     def rotations(self, places: Tensor) -> Tensor:
         """Axes [3, 3], the same at all places."""
@@ -105,23 +97,23 @@ class RotatedOrientation(Section):
 
 TrackValue = Annotated[Any, OneOf("track")]
 Orientation = Annotated[
-    Annotated[LookAtOrientation, Tag(TAG_MARK + "look_at")]
-    | Annotated[RotatedOrientation, Tag(TAG_MARK + "rotation_deg")],
-    tag_by(("look_at", "rotation_deg")),
+    Annotated[LookAtOrientation, Tag(section.TAG_MARK + "look_at")]
+    | Annotated[RotatedOrientation, Tag(section.TAG_MARK + "rotation_deg")],
+    section.tag_by(("look_at", "rotation_deg")),
 ]
 
 
 class RadarPoseTable(ConstructorTable):
     """Pose of a radar in every frame."""
 
-    positions: TrackValue = key(
+    positions: TrackValue = section.key(
         "m, one for each frame: a list of points or a track; for a recording also one for all",
         [[0.0, 0.0, 0.0]],
     )
-    orientation: Orientation = key(
+    orientation: Orientation = section.key(
         "look_at or rotation_deg", RotatedOrientation(rotation_deg=[0.0, 0.0, 0.0])
     )
-    range_center: Vector | None = key(
+    range_center: section.Vector | None = section.key(
         "m, a point in the world that has range 0 in every frame, as in data that are motion "
         "compensated to a scene; without it ranges count from the radar",
         None,
@@ -156,21 +148,23 @@ class RadarPoseTable(ConstructorTable):
 class RadarTable(RadarPoseTable):
     """Arrays, waveform and poses; one frame per position."""
 
-    board: Annotated[Any, OneOf("board")] | None = key("antenna elements of a board, or:", None)
-    transmitters: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
-    receivers: Annotated[Any, OneOf("array")] | None = key("antenna elements", None)
+    board: Annotated[Any, OneOf("board")] | None = section.key(
+        "antenna elements of a board, or:", None
+    )
+    transmitters: Annotated[Any, OneOf("array")] | None = section.key("antenna elements", None)
+    receivers: Annotated[Any, OneOf("array")] | None = section.key("antenna elements", None)
 
     @model_validator(mode="after")
     def _check_elements(self) -> "RadarTable":
         arrays = self.board is None
         wanted = {"transmitters": arrays, "receivers": arrays}
-        check_presence(self, wanted, f"with{'out' if arrays else ''} `board`")
+        section.check_presence(self, wanted, f"with{'out' if arrays else ''} `board`")
         return self
 
     def build(self, given: Any = None, /, **more: Any) -> Radar:
         """The radar, one frame per position."""
         if self.board is not None:
-            with prefix_errors("board"):
+            with section.prefix_errors("board"):
                 more["transmitters"], more["receivers"] = self.board.build().arrays()
         more["positions"], more["rotations"] = self.poses(1)
         found = self.apply_range_center(super().build(given, **more))
@@ -181,13 +175,13 @@ class RadarTable(RadarPoseTable):
 class ChirpsTable(ConstructorTable):
     """Several ramps a frame: objects move between them, and range rates are resolved."""
 
-    count: Annotated[int, Ge(2)] = key("ramps of each transmitter in a frame (loops)")
-    retrace: bool = key(
+    count: Annotated[int, Ge(2)] = section.key("ramps of each transmitter in a frame (loops)")
+    retrace: bool = section.key(
         "trace rays anew at every ramp, instead of moving what is seen at the start of the frame; "
         "always where something has a motion",
         False,
     )
-    visibility_every: Count = key(
+    visibility_every: Count = section.key(
         "with `retrace` or a motion: loops for which one trace serves; points follow their "
         "surfaces meanwhile",
         1,
@@ -208,7 +202,7 @@ def register(registry: Registry) -> None:
     registry.groups["waveform"] = KindGroup(product=Waveform)
     registry.groups["array"] = KindGroup(base=ArrayTable, product=scene.AntennaArray)
     registry.groups["board"] = KindGroup(base=BoardTable, product=boards.Mounting)
-    registry.groups["track"] = KindGroup(points=Annotated[list[Vector], MinLen(1)])
+    registry.groups["track"] = KindGroup(points=Annotated[list[section.Vector], MinLen(1)])
     waveforms = {"fmcw": FMCW, "stepped": SteppedFrequency, "ofdm": OFDM, "impulse": Impulse}
     for name, waveform in waveforms.items():
         registry.add("waveform", name, waveform)
@@ -243,7 +237,7 @@ def radar(table: Any) -> Radar:
     Raises:
         InputError: Values the radar refuses, or a target straight above a position.
     """
-    with prefix_errors("radar"):
+    with section.prefix_errors("radar"):
         return table.build()
 
 
@@ -253,14 +247,14 @@ def grid(table: Any, radar: Radar) -> Grid:
     Raises:
         InputError: Limits that the radar refuses or does not reach.
     """
-    with prefix_errors("grid"):
+    with section.prefix_errors("grid"):
         return table.build(self=radar)
 
 
 def impairments(table: Any, data: Any) -> Impairments:
     """The front end of the `[impairments]` table, if any, with the noise of simulated `[data]`."""
     noise = {"snr_db": data.snr_db, "noise_figure_db": data.noise_figure_db}
-    with prefix_errors("impairments"):
+    with section.prefix_errors("impairments"):
         return Impairments(**noise) if table is None else table.build(**noise)
 
 

@@ -12,17 +12,7 @@ import torch
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
-from invertwin.channel import (
-    Grid,
-    Link,
-    Sampling,
-    as_absorbers,
-    combine_coherently,
-    deposit_paths,
-    deposit_power,
-    trace_target,
-    use_backend,
-)
+from invertwin import channel
 from invertwin.checks import check_choice, check_fields, check_shape, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
@@ -142,7 +132,7 @@ class Surrogate:
         widths = {"range_width": self.range_width * share, "angle_width": self.angle_width * share}
         return replace(self, **widths)
 
-    def shape(self, deposit: _Maps, radar: Radar, grid: Grid) -> _Maps:
+    def shape(self, deposit: _Maps, radar: Radar, grid: channel.Grid) -> _Maps:
         """Convolve deposited power with the point spread: the radar's mean over random phases.
 
         The convolution (peak 1) is divided in the Fourier domain by the transform sinc³ of the
@@ -170,7 +160,7 @@ class Surrogate:
             deposit = kernel.apply(deposit, [sigmas[dim] for dim in kernel.dims], offset)
         return deposit
 
-    def blur(self, power: _Maps, radar: Radar, grid: Grid) -> _Maps:
+    def blur(self, power: _Maps, radar: Radar, grid: channel.Grid) -> _Maps:
         """Blur a measured spectrum with the added Gaussian widths only.
 
         Args:
@@ -188,7 +178,9 @@ class Surrogate:
                 power = _SurrogateKernel((dim,), (count,), flat).apply(power, [sigma])
         return power
 
-    def spread(self, radar: Radar, grid: Grid, ranges: _Values, u: _Values, v: _Values) -> _Values:
+    def spread(
+        self, radar: Radar, grid: channel.Grid, ranges: _Values, u: _Values, v: _Values
+    ) -> _Values:
         """Return the point spread at offsets from its peak of 1, without added widths.
 
         Args:
@@ -214,12 +206,12 @@ class Surrogate:
             return power * airy(2 * math.pi / array.wavelength * away)
         return power * paired_array_spread(array, u, v)
 
-    def _kernels(self, radar: Radar, grid: Grid) -> "tuple[_SurrogateKernel, ...]":
+    def _kernels(self, radar: Radar, grid: channel.Grid) -> "tuple[_SurrogateKernel, ...]":
         array = aperture(radar) if grid.u_count > 1 or grid.v_count > 1 else None
         radii, sharp = airy_radii(radar, self.aperture_radius), self.scale_blur(0.0)
         return _kernels(sharp, radii, radar.waveform, radar.window, array, grid)
 
-    def _blur_sigmas(self, radar: Radar, grid: Grid) -> dict[int, float]:
+    def _blur_sigmas(self, radar: Radar, grid: channel.Grid) -> dict[int, float]:
         """Return the standard deviation of the added Gaussian along each map dimension, in bins."""
         u, v = radar.beamwidth
         return {
@@ -257,13 +249,13 @@ def resolve_surrogate(surrogate: Surrogate | str | None) -> Surrogate | None:
 def surrogate_spectrum(
     scene: Scene,
     radar: Radar,
-    grid: Grid,
+    grid: channel.Grid,
     surrogate: Surrogate,
     *,
-    sampling: Sampling,
+    sampling: channel.Sampling,
     seed: int,
     scheme: Literal["rays", "area"] = "rays",
-    reference: tuple[Scene, Link] | None = None,
+    reference: tuple[Scene, channel.Link] | None = None,
     coherent: Sequence[str] = (),
     stretch: float = 1.0,
 ) -> _Maps:
@@ -291,19 +283,19 @@ def surrogate_spectrum(
     parts = deposit_targets(scene, radar, grid, surrogate, sampling, coherent, stretch)
     if set(scene.objects) - set(coherent):
         if reference is not None:
-            reference = as_absorbers(reference[0], coherent), reference[1]
-        rest = as_absorbers(scene, coherent)
+            reference = channel.as_absorbers(reference[0], coherent), reference[1]
+        rest = channel.as_absorbers(scene, coherent)
         how: Any = {"seed": seed, "scheme": scheme, "reference": reference}
-        parts.append(deposit_power(rest, link, grid, sampling=sampling, **how))
+        parts.append(channel.deposit_power(rest, link, grid, sampling=sampling, **how))
     return surrogate.shape(torch.stack(parts).sum(0), radar, grid).clamp_min(0.0)
 
 
 def deposit_targets(
     scene: Scene,
     radar: Radar,
-    grid: Grid,
+    grid: channel.Grid,
     surrogate: Surrogate,
-    sampling: Sampling,
+    sampling: channel.Sampling,
     names: Sequence[str],
     stretch: float,
 ) -> list[Float32[Tensor, "frame range u v"]]:
@@ -326,11 +318,11 @@ def deposit_targets(
     def overlap(*gaps: Tensor) -> Tensor:
         return surrogate.spread(radar, grid, *(0.5 * gap for gap in gaps))
 
-    with use_backend(sampling.backend):
+    with channel.use_backend(sampling.backend):
         for name in names:
-            fields = trace_target(scene, name, link, sampling=sampling, stretch=stretch)
-            powers = combine_coherently(fields, link, overlap, stretch=stretch)
-            deposits.append(deposit_paths(powers, link, grid))
+            fields = channel.trace_target(scene, name, link, sampling=sampling, stretch=stretch)
+            powers = channel.combine_coherently(fields, link, overlap, stretch=stretch)
+            deposits.append(channel.deposit_paths(powers, link, grid))
     return deposits
 
 
@@ -383,7 +375,7 @@ def _kernels(
     waveform: Waveform,
     window: str,
     array: Aperture | None,
-    grid: Grid,
+    grid: channel.Grid,
 ) -> tuple[_SurrogateKernel, ...]:
     """Return the kernels without added widths, cached for the steps of a fit."""
     angle_kernel = surrogate.angle_kernel
@@ -452,7 +444,7 @@ def _frequencies(counts: tuple[int, ...]) -> list[Tensor]:
     return [*axes, torch.fft.rfftfreq(half, dtype=torch.float64)]
 
 
-def _warn_if_coarse(radar: Radar, grid: Grid, sigmas: dict[int, float]) -> None:
+def _warn_if_coarse(radar: Radar, grid: channel.Grid, sigmas: dict[int, float]) -> None:
     """Warn about axes with less than two bins per cell and without an added width of a bin."""
     cells = radar.waveform.range_resolution, *(0.5 * width for width in radar.beamwidth)
     steps = grid.range_step, grid.u_step, grid.v_step
@@ -471,5 +463,5 @@ def _warn_if_coarse(radar: Radar, grid: Grid, sigmas: dict[int, float]) -> None:
         )
 
 
-def _check_map(power: Tensor, grid: Grid) -> None:
+def _check_map(power: Tensor, grid: channel.Grid) -> None:
     check_shape(power, (None, *grid.shape), "a map", "use the grid that it was made on")

@@ -19,18 +19,8 @@ from scipy.spatial.transform import Rotation
 from invertwin.checks import check_choice, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import Positive
+from invertwin.scene.people import gait
 from invertwin.scene.people.body import BodyTemplate
-from invertwin.scene.people.gait import (
-    PersonMotion,
-    Posture,
-    Walking,
-    check_joints,
-    elbow_rotation,
-    hanging_arm_rotation,
-    joint_rotations,
-    rotation_about_axis,
-    standing_height,
-)
 
 _LEAN = math.radians(40.0)  # lean of the trunk at seat contact
 _SEAT_CONTACT_SHARE = 0.6  # fraction of the duration at seat contact
@@ -42,7 +32,7 @@ _WAVE = math.radians(30.0)  # swing of the forearm to either side
 
 
 @dataclass(frozen=True, eq=False)
-class Sitting(PersonMotion):
+class Sitting(gait.PersonMotion):
     """Person who sits down, or stands up: the reverse motion.
 
     Feet are fixed; the seat is behind the person, who faces −x of the object's frame. The object's
@@ -68,14 +58,14 @@ class Sitting(PersonMotion):
     rising: bool = False
 
     def __post_init__(self) -> None:
-        check_joints(self.body)
+        gait.check_joints(self.body)
         checked_number(self.start, "start [s]", -math.inf)
         checked_number(self.duration, "duration [s]", 0.0, open_low=True)
         knee, thigh = self._leg()
         low = knee + thigh * (math.cos(_MAX_THIGH_ANGLE) - _THIGH)
         checked_number(self.seat, "height of the seat [m]", low, knee + thigh * (1 - _THIGH))
 
-    def posture(self, time: float) -> Posture:
+    def posture(self, time: float) -> gait.Posture:
         """Return joint rotations in the frames of their parents, and the shift of the pelvis [m].
 
         Args:
@@ -89,28 +79,30 @@ class Sitting(PersonMotion):
         upright = _minimum_jerk((u - _SEAT_CONTACT_SHARE) / (1 - _SEAT_CONTACT_SHARE))
         lean = _LEAN * (lowered - upright)
         shoulder, elbow = (angle * _minimum_jerk(u) for angle in _LAP)
-        pelvis, raised = (rotation_about_axis("y", angle) for angle in (-lean / 2, lean + shoulder))
+        pelvis, raised = (
+            gait.rotation_about_axis("y", angle) for angle in (-lean / 2, lean + shoulder)
+        )
         turns = {"pelvis": pelvis, "chest": pelvis}
         for side in ("left", "right"):
             turns |= {
-                f"{side}_hip": pelvis.T @ rotation_about_axis("y", bent),
-                f"{side}_knee": rotation_about_axis("y", -bent),
-                f"{side}_shoulder": raised @ hanging_arm_rotation(side),
-                f"{side}_elbow": elbow_rotation(side, elbow),
+                f"{side}_hip": pelvis.T @ gait.rotation_about_axis("y", bent),
+                f"{side}_knee": gait.rotation_about_axis("y", -bent),
+                f"{side}_shoulder": raised @ gait.hanging_arm_rotation(side),
+                f"{side}_elbow": gait.elbow_rotation(side, elbow),
             }
         hip = self.body.joints[self.body.joint("left_hip")] * torch.tensor([1.0, 0.0, 1.0])
         away = [thigh * math.sin(bent), 0.0, thigh * (math.cos(bent) - 1)]
         shift = hip - pelvis @ hip + torch.tensor(away, dtype=torch.float64)
-        return joint_rotations(self.body, turns), shift
+        return gait.joint_rotations(self.body, turns), shift
 
     def _leg(self) -> tuple[float, float]:
         """Return the height of the knee above the sole, and the length of the thigh [m]."""
         hip, knee = (self.body.joints[self.body.joint(f"left_{name}")] for name in ("hip", "knee"))
-        return float(knee[2]) + standing_height(self.body), float((hip - knee).norm())
+        return float(knee[2]) + gait.standing_height(self.body), float((hip - knee).norm())
 
 
 @dataclass(frozen=True, eq=False)
-class Waving(PersonMotion):
+class Waving(gait.PersonMotion):
     """Person who raises an arm, waves, and lowers it again.
 
     ``MovingScene`` applies it; the object's pose is that of a standing person.
@@ -133,10 +125,10 @@ class Waving(PersonMotion):
     rate: Positive = 1.5
     start: float = 0.0
     duration: float = 4.0
-    during: Walking | Sitting | None = None
+    during: gait.Walking | Sitting | None = None
 
     def __post_init__(self) -> None:
-        check_joints(self.body)
+        gait.check_joints(self.body)
         check_choice(self.side, ("left", "right"), "the side")
         checked_number(self.rate, "rate [1/s]", 0.0, open_low=True)
         checked_number(self.start, "start [s]", -math.inf)
@@ -147,14 +139,16 @@ class Waving(PersonMotion):
                 "same one to both"
             )
 
-    def posture(self, time: float) -> Posture:
+    def posture(self, time: float) -> gait.Posture:
         """Return joint rotations in the frames of their parents, and the shift of the pelvis [m].
 
         Args:
             time: time [s].
         """
-        hanging = {f"{side}_shoulder": hanging_arm_rotation(side) for side in ("left", "right")}
-        found = joint_rotations(self.body, hanging)
+        hanging = {
+            f"{side}_shoulder": gait.hanging_arm_rotation(side) for side in ("left", "right")
+        }
+        found = gait.joint_rotations(self.body, hanging)
         shift = torch.zeros(3, dtype=torch.float64)
         if self.during is not None:
             found, shift = self.during.posture(time)
@@ -165,8 +159,8 @@ class Waving(PersonMotion):
         sign = 1.0 if self.side == "right" else -1.0
         # Held out to the side, forearm upwards: the arm of the rest pose with a bent elbow.
         raised = {
-            "shoulder": rotation_about_axis("x", 0.0),
-            "elbow": rotation_about_axis("x", sign * (math.pi / 2 + swing)),
+            "shoulder": gait.rotation_about_axis("x", 0.0),
+            "elbow": gait.rotation_about_axis("x", sign * (math.pi / 2 + swing)),
         }
         for name, turn in raised.items():
             row = self.body.joint(f"{self.side}_{name}")
