@@ -286,7 +286,7 @@ def test_bad_tracks_are_refused(unchecked, times, positions, message):
 def test_nan_is_refused():
     beat = beat_capture().beat
     beat.imag[1, 0, 2, 7] = float("nan")
-    with pytest.raises(InputError, match="finite beat, got 1 NaN or infinite of 768"):
+    with pytest.raises(InputError, match=r"finite beat, got 1 NaN, .* of 768"):
         Capture.from_beat(beat, fmcw_radar())
 
 

@@ -127,3 +127,50 @@ def test_what_the_reader_itself_refuses_is_told(tmp_path):
     for trusted, said in ((False, "NetCDF file, got .*refuses"), (True, "NetCDF file, got")):
         with pytest.raises(InputError, match=rf"expected a whole {said}.*OSError"):
             Capture.load(tmp_path / "a.nc", trusted=trusted)
+
+
+def external(file, secret):
+    file["adc"] = h5py.ExternalLink(secret, "adc")
+
+
+def hidden(file, secret):
+    file.create_group("a")["b"] = h5py.ExternalLink(secret, "/")
+    file["adc"] = h5py.SoftLink("/a/b/adc")
+
+
+def stored_outside(file, secret):
+    file.create_dataset("adc", (2, 3), "f4", external=[(secret, 0, 24)])
+
+
+def virtual(file, secret):
+    layout = h5py.VirtualLayout((2, 3), "f4")
+    layout[:] = h5py.VirtualSource(secret, "adc", (2, 3))
+    file.create_virtual_dataset("adc", layout)
+
+
+@pytest.mark.parametrize("make", [external, hidden, stored_outside, virtual])
+@pytest.mark.parametrize("kind", ["netcdf", "hdf5", "matlab"])
+def test_numbers_of_other_files_are_not_handed_over(tmp_path, make, kind):
+    """A stranger's file may name any file of ours as where its numbers are."""
+    secret = tmp_path / "secret.h5"
+    with h5py.File(secret, "w") as file:
+        file["adc"] = np.ones((2, 3), np.float32)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        make(file, str(secret))
+    with pytest.raises(InputError, match=r"refuses \(ValueError: .* in another file"):
+        read_isolated(tmp_path / "a.h5", kind, "adc")
+
+
+def test_links_within_a_file_are_followed_and_loops_are_refused(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["x/adc"] = np.arange(3.0)
+        file["adc"] = h5py.SoftLink("/x/adc")
+        file["loop"] = h5py.SoftLink("/loop")
+        file["x/up"] = file["/"]
+    assert read_isolated(tmp_path / "a.h5", "hdf5", "adc").arrays["adc"].values.tolist() == [
+        0,
+        1,
+        2,
+    ]
+    with pytest.raises(InputError, match="expected a whole HDF5 file"):
+        read_isolated(tmp_path / "a.h5", "hdf5", "loop")

@@ -8,12 +8,14 @@ import pytest
 
 from invertwin.capture.channel_calibration import ChannelCalibration
 from invertwin.capture.readers import described_arrays
+from invertwin.capture.readers.described_sweeps import read_sweeps
 from invertwin.capture.ti.mmwave_studio import read_studio
 from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import build
 from invertwin.errors import InputError
-from invertwin.scene.files import load_mesh, load_scene_xml
+from invertwin.scene import plate
+from invertwin.scene.files import load_mesh, load_scene_xml, save_mesh
 from invertwin.storage.untrusted import (
     convert_read_errors,
     read_arrays,
@@ -168,3 +170,83 @@ def test_errors_of_readers_name_the_file_and_pass_input_errors_on():
         raise ValueError("x\ny")
     with pytest.raises(InputError, match=r"^as it was$"), convert_read_errors("a.ply", "a mesh"):
         raise InputError("as it was")
+
+
+@pytest.mark.parametrize(
+    ("line", "passes"),
+    [
+        ("no_such_name", NameError),
+        ("len.no_such_attribute", AttributeError),
+        ("'a value of JSON'.get('key')", None),
+        ("None.get('key')", None),
+        ("import no_such_module", ImportError),
+        ("def f():\n  x += 1\nf()", UnboundLocalError),
+        ("assert not 1", AssertionError),
+        ("int('x')", None),
+        ("import json; json.loads('{')", None),
+    ],
+)
+def test_faults_of_our_own_lines_are_not_those_of_a_file(line, passes):
+    """A name that we forgot passes; what a library raises of itself is one line."""
+    for module in ("invertwin.capture.readers.new", "pandas.io"):
+        ours = passes is not None and module.startswith("invertwin")
+        kept = passes if ours else InputError
+        with pytest.raises(kept or InputError), convert_read_errors("a.ply", "a mesh"):
+            exec(line, {"__name__": module})
+
+
+SWEEP = "# Hz S RI R 50\n1e9 0.5 0\n2e9 0.5 0\n"
+ELSEWHERE = ("../out/b.{}", "link.{}", "in/b.{}", "here/../../out/b.{}", "{}/out/b.{}")
+
+
+@pytest.mark.parametrize("named", ELSEWHERE)
+@pytest.mark.parametrize("key", ["file", "files", "glob", "background", "positions"])
+def test_descriptions_read_nothing_beyond_their_folder(tmp_path, key, named):
+    """By `..`, by absolute names, by links to files and to folders, also among patterns."""
+    ending = "csv" if key == "positions" else "s1p"
+    named = named.format(*[ending] if named.count("{}") == 1 else [tmp_path, ending])
+    folder, out = tmp_path / "set", tmp_path / "out"
+    for place in (folder, out, folder / "here"):
+        place.mkdir()
+    (out / "b.s1p").write_text(SWEEP)
+    (out / "b.csv").write_text("x,y,z\n0,0,0\n")
+    (folder / "a.s1p").write_text(SWEEP)
+    (folder / f"link.{ending}").symlink_to(out / f"b.{ending}")
+    (folder / "in").symlink_to(out)
+    data = {
+        "file": f'file = "{named}"\n',
+        "files": f'files = ["a.s1p", "{named}"]\n',
+        "glob": f'files = "{named.replace("b.", "*.").replace("link", "l*")}"\n',
+    }.get(key, 'file = "a.s1p"\n')
+    more = {
+        "background": f'[sweep]\nbackground = "{named}"\n',
+        "positions": f'[radar]\npositions = "{named}"\n',
+    }
+    (folder / "a.toml").write_text("frame = 2\n[data]\n" + data + more.get(key, ""))
+    with pytest.raises(InputError, match=r"expected names of files in the folder of .*elsewhere"):
+        read_sweeps(folder / "a.toml")
+
+
+def test_descriptions_read_what_lies_in_their_folder_or_below(tmp_path):
+    """Also where the folder itself is reached by a link."""
+    (tmp_path / "set" / "in").mkdir(parents=True)
+    for name in ("a.s1p", "in/b.s1p", "in/c.s1p"):
+        (tmp_path / "set" / name).write_text(SWEEP)
+    (tmp_path / "set" / "to.s1p").symlink_to("a.s1p")
+    (tmp_path / "link").symlink_to(tmp_path / "set")
+    points = "[radar]\npositions = [[0, 0, 0], [0, 1, 0]]\n"
+    for data in ('files = "in/*.s1p"', 'files = ["to.s1p", "in/../a.s1p"]'):
+        (tmp_path / "set" / "a.toml").write_text(f"frame = 2\n[data]\n{data}\n{points}")
+        assert read_sweeps(tmp_path / "link" / "a.toml").frame_count == 2
+    (tmp_path / "set" / "a.toml").write_text('[data]\nfiles = "z*.s1p"\n')
+    with pytest.raises(InputError, match=r"expected files 'z\*\.s1p' beside"):
+        read_sweeps(tmp_path / "set" / "a.toml")
+
+
+def test_meshes_of_a_scene_file_lie_beside_it(tmp_path):
+    (tmp_path / "set").mkdir()
+    save_mesh(tmp_path / "a.ply", plate(1.0, 1.0))
+    text = '<scene version="3.0.0"><shape type="ply" id="a"><string name="filename" value="{}"/>'
+    (tmp_path / "set" / "a.xml").write_text(text.format("../a.ply") + "</shape></scene>")
+    with pytest.raises(InputError, match=r"got '\.\./a\.ply', which is elsewhere"):
+        load_scene_xml(tmp_path / "set" / "a.xml")

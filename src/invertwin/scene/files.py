@@ -31,8 +31,8 @@ from invertwin.scene.mesh_topology import sort_rows
 from invertwin.scene.mesh_union import unite_parts
 from invertwin.scene.pose import Basis
 from invertwin.scene.scene import Object, Scene
+from invertwin.storage import untrusted
 from invertwin.storage.folders import replace_file
-from invertwin.storage.untrusted import convert_read_errors, existing_file, read_text, safe_reader
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".inp")
 _Y_UP = (".gltf", ".glb")
@@ -103,11 +103,11 @@ def load_parts(file: str | Path, unit: Unit = "m") -> dict[str, Mesh]:
     return _load_with(file, unit, split_parts)
 
 
-@safe_reader("a readable mesh")
+@untrusted.safe_reader("a readable mesh")
 def _load_with(
     file: str | Path, unit: Unit, split: Callable[[trimesh.Scene], Mapping[str, trimesh.Trimesh]]
 ) -> dict[str, Mesh]:
-    path = existing_file(file)
+    path = untrusted.existing_file(file)
     if unit not in _METRES:
         raise InputError(f"expected a unit among {', '.join(_METRES)}, got {unit!r}; choose one")
     if path.suffix.lower() not in MESH_SUFFIXES:
@@ -116,7 +116,7 @@ def _load_with(
         )
     require_at_most(path.stat().st_size, _MAX_BYTES, "bytes of a mesh", "simplify it first")
     found = {}
-    with convert_read_errors(path, f"a readable {path.suffix} mesh"):
+    with untrusted.convert_read_errors(path, f"a readable {path.suffix} mesh"):
         for name, part in split(_load_trimesh_scene(path)).items():
             vertices = np.asarray(part.vertices, dtype=np.float64).reshape(-1, 3)
             if path.suffix.lower() in _Y_UP:
@@ -196,7 +196,7 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
         part.write_bytes(export_glb(written) if glb else _ply(written.to_mesh()))
 
 
-@safe_reader("a readable scene")
+@untrusted.safe_reader("a readable scene")
 def load_scene_xml(
     path: str | Path, materials: Mapping[str, Material] | None = None, default: Material = CONCRETE
 ) -> Scene:
@@ -216,12 +216,12 @@ def load_scene_xml(
         InputError: no such file, broken XML, something unsupported that would lose geometry, or a
             material id that no shape refers to.
     """
-    file = existing_file(path)
-    with convert_read_errors(file, "an XML scene"):
+    file = untrusted.existing_file(path)
+    with untrusted.convert_read_errors(file, "an XML scene"):
         root = ElementTree.parse(file).getroot()
         require_at_most(len(root), _MAX_GROUPS, "shapes", "join those of one material")
     try:
-        return _build_scene(root, file.parent, dict(materials or {}), default)
+        return _build_scene(root, file, dict(materials or {}), default)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
 
@@ -267,10 +267,10 @@ def save_scene_xml(path: str | Path, scene: Scene) -> None:
 
 
 class _FileResolver(FilePathResolver):
-    """Files that a mesh names, such as its materials: no pipes."""
+    """Files that a mesh names, such as its materials: in its folder, and no pipes."""
 
     def get(self, name: str) -> bytes:
-        if not Path(self.parent, name).is_file():
+        if not untrusted.named_file(self.file_path, name).is_file():
             raise OSError(f"no file {name}")
         return super().get(name)
 
@@ -282,7 +282,7 @@ def _load_trimesh_scene(path: Path) -> trimesh.Scene:
         require_at_most(groups, _MAX_GROUPS, "groups of a material", "join groups of one material")
     if path.suffix.lower() != ".inp":
         return trimesh.load_scene(path, process=False, resolver=_FileResolver(str(path)))
-    text = read_text(path, "an .inp mesh")
+    text = untrusted.read_text(path, "an .inp mesh")
     vertices, faces = _ucd(text) if _UCD_HEADER.match(text) else _abaqus(text)
     return trimesh.Scene(trimesh.Trimesh(vertices, faces, process=False))
 
@@ -394,7 +394,7 @@ def _ply(mesh: trimesh.Trimesh) -> bytes:
 
 
 def _build_scene(
-    root: ElementTree.Element, folder: Path, materials: dict[str, Material], default: Material
+    root: ElementTree.Element, file: Path, materials: dict[str, Material], default: Material
 ) -> Scene:
     if root.tag != "scene" or root.find("include") is not None:
         raise InputError(
@@ -411,7 +411,7 @@ def _build_scene(
         material = named[0].get("id", "") if named else ""
         referred.add(material)
         try:
-            mesh = _shape(element, folder)
+            mesh = _shape(element, file)
         except InputError as error:
             raise InputError(f"shape {name!r}: {error}") from None
         objects[name] = Object(mesh, known.get(material, default))
@@ -438,12 +438,14 @@ def _read_materials(root: ElementTree.Element) -> dict[str, Material]:
     return found
 
 
-def _shape(element: ElementTree.Element, folder: Path) -> Mesh:
+def _shape(element: ElementTree.Element, file: Path) -> Mesh:
     kind = element.get("type")
     if kind in ("obj", "ply"):
         with warnings.catch_warnings():  # scene files are in metres, however large
             warnings.simplefilter("ignore", PhysicsWarning)
-            mesh = load_mesh(folder / _property(element, "string", "filename", ""))
+            mesh = load_mesh(
+                untrusted.named_file(file, _property(element, "string", "filename", ""))
+            )
     elif kind == "rectangle":
         # Mitsuba's rectangle lies in the x-y plane and faces +z; ours in y-z faces −x.
         upright = shapes.plate(2.0, 2.0)

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -133,8 +134,14 @@ def run_child_reader(kind: str, path: str, variable: str, memory: str, seconds: 
     with os.fdopen(os.dup(1), "wb") as handed:
         os.dup2(2, 1)
         try:
+            import h5py
             import numpy as np
 
+            if h5py.is_hdf5(path):
+                with h5py.File(path) as opened:
+                    outside = opened.visititems_links(partial(_name_stored_elsewhere, opened))
+                if outside is not None:
+                    raise ValueError(f"{outside} is stored in another file")
             np.savez(handed, *_pack_arrays(_READERS[kind](path, variable)))
         except MemoryError:
             sys.exit(_TOO_LARGE)
@@ -144,6 +151,15 @@ def run_child_reader(kind: str, path: str, variable: str, memory: str, seconds: 
                 sys.exit(_MISSING)
             handed.write(ascii(f"{type(error).__name__}: {error}"[:200])[1:-1].encode())
             sys.exit(_REFUSED)
+
+
+def _name_stored_elsewhere(opened: Any, name: str, link: Any) -> str | None:
+    """Return the name of a link to another file, or of numbers that lie in others."""
+    import h5py
+
+    found = opened[name] if isinstance(link, h5py.HardLink) else None
+    outside = isinstance(found, h5py.Dataset) and (found.external or found.is_virtual)
+    return name if outside or not isinstance(link, h5py.HardLink | h5py.SoftLink) else None
 
 
 def _netcdf(path: str, _variable: str) -> StoredArrays:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
+from traceback import walk_tb
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 from zipfile import ZipFile
 
@@ -20,6 +21,8 @@ _R = TypeVar("_R")
 # Bytes of a file or an array, and over those that it takes on disk: more is a bomb.
 _MAX_EXPANDED, _MAX_EXPANSION = 2**28, 100
 _MAX_TEXT = 2**28  # bytes
+_PLAIN = (str, bytes, int, float, list, dict, type(None))
+_OWN_FAULTS = (NameError, AttributeError, ImportError, NotImplementedError, AssertionError)
 _DAMAGED_ADVICE = "it is damaged or of another kind; copy or export it again"
 
 
@@ -28,6 +31,8 @@ def convert_read_errors(
     path: str | Path, expected: str, do: str = _DAMAGED_ADVICE
 ) -> Iterator[None]:
     """Tell whatever a reader raises as an InputError of one line; warnings stay warnings.
+
+    A name that our own lines miss is no fault of the file: it passes as it is.
 
     Args:
         path: The file.
@@ -43,8 +48,19 @@ def convert_read_errors(
         raise
     # A damaged file can make readers fail in any way; every one means the same to the user.
     except Exception as error:
+        if _is_own_fault(error):
+            raise
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise InputError(f"expected {expected}, got {path} ({reason}); {do}") from None
+
+
+def _is_own_fault(error: Exception) -> bool:
+    """Return True for what a line of this package itself raises, and no content can cause."""
+    plain = isinstance(getattr(error, "obj", error), _PLAIN)  # a value of JSON, not of its kind
+    if plain or not isinstance(error, _OWN_FAULTS):
+        return False
+    *_, (frame, _) = walk_tb(error.__traceback__)
+    return str(frame.f_globals.get("__name__")).partition(".")[0] == __name__.partition(".")[0]
 
 
 def safe_reader(
@@ -93,6 +109,25 @@ def existing_file(path: str | Path, what: str = "an existing file") -> Path:
     if _expands(known.st_size, 512 * getattr(known, "st_blocks", known.st_size)):
         raise InputError(
             f"expected {what}, got {file}, {known.st_size / 1e9:.2g} GB of holes; copy it again"
+        )
+    return file
+
+
+def named_file(path: str | Path, name: str) -> Path:
+    """The file that another file names: it lies in its folder or below, also where links lead.
+
+    Args:
+        path: The other file.
+        name: The name in it.
+
+    Raises:
+        InputError: It lies elsewhere.
+    """
+    file = Path(path).parent / name
+    if not file.resolve().is_relative_to(Path(path).parent.resolve()):
+        raise InputError(
+            f"expected names of files in the folder of {path}, got {name[:100]!r}, which is "
+            "elsewhere; copy it there"
         )
     return file
 

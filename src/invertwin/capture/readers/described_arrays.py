@@ -21,16 +21,9 @@ from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.runtime.memory import require_memory
 from invertwin.scene.antenna import AntennaArray
+from invertwin.storage import untrusted
 from invertwin.storage.folders import replace_file
 from invertwin.storage.isolated_reader import read_isolated
-from invertwin.storage.untrusted import (
-    convert_read_errors,
-    existing_file,
-    read_arrays,
-    read_npy,
-    read_text,
-    safe_reader,
-)
 
 # The data tell these settings by their shape and kind.
 _KNOWN_FROM_DATA = {"samples", "loops", "frames", "real", "swap_iq", "lanes"}
@@ -43,7 +36,7 @@ _PLACES = {"positions", "look_at", "tx_positions", "rx_positions", "range_center
 _SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 
 
-@safe_reader("a description of samples")
+@untrusted.safe_reader("a description of samples")
 def load_described_board(
     path: str | Path,
     board: str | None = None,
@@ -83,7 +76,7 @@ def load_described_board(
     )
 
 
-@safe_reader("samples as their description says")
+@untrusted.safe_reader("samples as their description says")
 def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
     """Read every chirp of described samples.
 
@@ -120,7 +113,9 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
     path = Path(path)
     description, _ = _load_chirp_description(path)
     data, given = description["data"], description["settings"]
-    array = load_array(path.parent / str(data["file"]), data.get("variable"), trusted=trusted)
+    array = load_array(
+        untrusted.named_file(path, str(data["file"])), data.get("variable"), trusted=trusted
+    )
     real = array.dtype.kind != "c"
     order = data.get("dimensions", list(CHIRP_DIMS))
     samples = arrange_dimensions(array, order, len(given.get("transmit_order", [])) or None)
@@ -236,8 +231,10 @@ def load_description(
     Raises:
         InputError: no such file, no TOML, or another frame, other sections or keys.
     """
-    text = read_text(path, "a TOML description")
-    with convert_read_errors(path, "TOML", "give the description of the data, not the data"):
+    text = untrusted.read_text(path, "a TOML description")
+    with untrusted.convert_read_errors(
+        path, "TOML", "give the description of the data, not the data"
+    ):
         description = tomllib.loads(text)
     frame = description.pop("frame", None)
     if frame not in (None, FRAME):
@@ -277,7 +274,7 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
     Raises:
         InputError: no such file or variable, a damaged file, or something else than numbers.
     """
-    existing_file(path, "the data file that [data] names")
+    untrusted.existing_file(path, "the data file that [data] names")
     ending = path.suffix.lower()
     if ending not in _SUFFIXES:
         raise InputError(
@@ -286,7 +283,7 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
     require_memory(3.0 * path.stat().st_size, f"the samples of {path.name}", "split the file")
     if ending != ".npy" and variable is None:
         raise InputError(f"expected a variable in {path.name}, got none; add it to [data]")
-    with convert_read_errors(path, f"a whole {ending} file"):
+    with untrusted.convert_read_errors(path, f"a whole {ending} file"):
         try:
             array = _load_file(path, ending, variable, trusted=trusted)
         except KeyError:
@@ -307,9 +304,11 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
 
 def _load_file(path: Path, suffix: str, variable: str | None, *, trusted: bool) -> np.ndarray:
     if suffix == ".npy":
-        return read_npy(path)
+        return untrusted.read_npy(path)
     if suffix == ".npz":
-        return read_arrays(path, "it is damaged or of another kind", [str(variable)])[str(variable)]
+        return untrusted.read_arrays(path, "it is damaged or of another kind", [str(variable)])[
+            str(variable)
+        ]
     kind = "matlab" if suffix == ".mat" else "hdf5"
     return read_isolated(path, kind, str(variable), trusted=trusted).arrays[str(variable)].values
 

@@ -24,7 +24,7 @@ from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SteppedFrequency
 from invertwin.scene import look_at
-from invertwin.storage.untrusted import convert_read_errors, read_npy, read_text, safe_reader
+from invertwin.storage import untrusted
 
 TOUCHSTONE = re.compile(r"\.s\d+p", re.IGNORECASE)
 """Ending of a Touchstone file."""
@@ -51,11 +51,11 @@ def describes_sweeps(path: str | Path) -> bool:
     Raises:
         InputError: no such file.
     """
-    text = read_text(path, "a TOML description")
+    text = untrusted.read_text(path, "a TOML description")
     return re.search(r"^\s*\[sweep\]", text, re.MULTILINE) is not None
 
 
-@safe_reader("sweeps over frequency")
+@untrusted.safe_reader("sweeps over frequency")
 def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     """Read sweeps over equally spaced frequencies: one signal per frame.
 
@@ -113,14 +113,14 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     if not TOUCHSTONE.fullmatch(path.suffix):
         description, axes = load_description(path, _KEYS)
     data, sweep, radar = (description.get(name, {}) for name in ("data", "sweep", "radar"))
-    files = _find_data_files(path.parent, data)
+    files = _find_data_files(path, data)
     tx, rx = (
         element_array(radar.get(f"{end}_positions", [[0.0, 0.0, 0.0]]), end.upper(), axes)
         for end in ("tx", "rx")
     )
     source = _SweepFile(files[0], trusted)
     if TOUCHSTONE.fullmatch(files[0].suffix):
-        frequencies, beat = _load_touchstone_sweeps(files, sweep, path.parent)
+        frequencies, beat = _load_touchstone_sweeps(files, sweep, path)
     else:
         beat = _load_sweep_array(files, data, len(tx.positions), trusted)
         frequencies = _load_frequencies(source, sweep, beat.shape[-1])
@@ -185,9 +185,9 @@ class _SweepFile:
         """Numbers as they are given, or those of the name."""
         if not isinstance(given, str):
             return given
-        beside = self.file.parent / given
+        beside = untrusted.named_file(self.file, given)
         if beside.suffix == ".npy":
-            return read_npy(beside)
+            return untrusted.read_npy(beside)
         if TOUCHSTONE.fullmatch(self.file.suffix) or self.file.suffix == ".npy":
             raise InputError(
                 f"expected numbers, or the name of a .csv or .npy file, got {given!r}; "
@@ -196,7 +196,7 @@ class _SweepFile:
         return load_array(self.file, given, trusted=self.trusted)
 
 
-def _find_data_files(folder: Path, data: dict[str, Any]) -> list[Path]:
+def _find_data_files(path: Path, data: dict[str, Any]) -> list[Path]:
     """The data files of a description, at least one."""
     if ("file" in data) == ("files" in data):
         raise InputError(
@@ -204,25 +204,30 @@ def _find_data_files(folder: Path, data: dict[str, Any]) -> list[Path]:
             "name what holds the samples"
         )
     if "file" in data:
-        return [folder / str(data["file"])]
+        return [untrusted.named_file(path, str(data["file"]))]
     named = data["files"]
-    found = (
-        sorted(folder.glob(named)) if isinstance(named, str) else [folder / str(n) for n in named]
-    )
+    if isinstance(named, str):
+        pattern = untrusted.named_file(
+            path, named
+        )  # of names, not of folders: those may be many, or links
+        matches = pattern.parent.glob(pattern.name)
+        named = sorted(str(file.relative_to(path.parent)) for file in matches)
+    found = [untrusted.named_file(path, str(name)) for name in named]
     if not found:
-        raise InputError(f"expected files {named!r} beside the description, got none; check them")
+        raise InputError(f"expected files {data['files']!r} beside {path}, got none; check them")
     return found
 
 
 def _load_touchstone_sweeps(
-    files: list[Path], sweep: dict[str, Any], folder: Path
+    files: list[Path], sweep: dict[str, Any], path: Path
 ) -> tuple[_Frequencies, Complex128[Tensor, "frame 1 1 sample"]]:
     """Frequencies, and the beat signal of every file less the background."""
     frequencies, first = _load_parameter(files[0], sweep)
     rows = [first, *(_load_response(file, sweep, frequencies) for file in files[1:])]
     response = torch.stack(rows)
     if "background" in sweep:
-        response = response - _load_response(folder / str(sweep["background"]), sweep, frequencies)
+        empty = untrusted.named_file(path, str(sweep["background"]))
+        response = response - _load_response(empty, sweep, frequencies)
     # The beat signal is conj(H), as that of OFDM.
     return frequencies, response.conj().resolve_conj()[:, None, None]
 
@@ -298,7 +303,7 @@ def _load_positions(source: _SweepFile, given: Any, frames: int) -> Float64[Tens
     if given is None:
         return torch.zeros(1, 3, dtype=torch.float64)
     if isinstance(given, str) and given.lower().endswith(".csv"):
-        given = _read_position_rows(source.file.parent / given)
+        given = _read_position_rows(untrusted.named_file(source.file, given))
     elif isinstance(given, list) and any(isinstance(name, str) for name in given):
         given = np.stack([np.ravel(source.values(name)) for name in given], axis=-1)
     do = "give x, y, z in metres of every frame"
@@ -308,8 +313,8 @@ def _load_positions(source: _SweepFile, given: Any, frames: int) -> Float64[Tens
 def _read_position_rows(file: Path) -> list[list[float]]:
     """x, y, z of a CSV file whose first line says which column is which."""
     what = "lines of x,y,z [m] after a line of these heads"
-    text = read_text(file, what)
-    with convert_read_errors(file, what, "write them with points as decimal marks"):
+    text = untrusted.read_text(file, what)
+    with untrusted.convert_read_errors(file, what, "write them with points as decimal marks"):
         return [[float(row[axis]) for axis in "xyz"] for row in csv.DictReader(text.splitlines())]
 
 
