@@ -14,7 +14,7 @@ from torch import Tensor
 from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wrapped_tensor
 
 from invertwin.errors import InputError
-from invertwin.limits import AllowedValues, UsualValue, annotation_parts
+from invertwin.limits import MAX_LENGTH, MAX_NUMBER, AllowedValues, UsualValue, annotation_parts
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 Point = Annotated[ArrayLike, Len(3, 3)]
@@ -27,7 +27,9 @@ _LIMITS: dict[type, tuple[str, str, Any]] = {
 }
 
 
-def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: str) -> Tensor:
+def checked_tensor(
+    value: object, shape: tuple[int | None, ...], what: str, do: str, most: float = MAX_NUMBER
+) -> Tensor:
     """Convert a value to a finite float64 tensor of the given shape; gradients are kept.
 
     Args:
@@ -35,9 +37,10 @@ def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: 
         shape: expected size of every dimension, None where any size will do.
         what: what the value is, for the message.
         do: what the user can do about it, for the message.
+        most: greatest magnitude.
 
     Raises:
-        InputError: not numbers, wrong shape, NaN or infinite.
+        InputError: not numbers, wrong shape, NaN, infinite or too large.
     """
     try:
         tensor = torch.as_tensor(value, dtype=torch.float64)
@@ -45,10 +48,11 @@ def checked_tensor(value: object, shape: tuple[int | None, ...], what: str, do: 
         expected = f"expected {what} as numbers of shape {_format_shape(shape)}"
         raise InputError(f"{expected}, got {type(value).__name__}; {do}") from None
     check_shape(refuse_batch(tensor), shape, f"{what} as numbers", do)
-    bad = int((~torch.isfinite(tensor)).sum())
+    bad = int((~(tensor.detach().abs() <= most)).sum())
     if bad:
         raise InputError(
-            f"expected finite {what}, got {bad} NaN or infinite of {tensor.numel()}; {do}"
+            f"expected finite {what}, got {bad} NaN, infinite or above {most:g} of "
+            f"{tensor.numel()}; {do}"
         )
     return tensor
 
@@ -111,8 +115,9 @@ def checked_rows(value: object, what: str, do: str = "give x, y, z of each") -> 
     Raises:
         InputError: wrong shape, NaN or infinite, or no point.
     """
-    given = torch.as_tensor(value, dtype=torch.float64)
-    rows = checked_tensor(given[None] if given.ndim == 1 else given, (None, 3), what, do)
+    rows = torch.as_tensor(value, dtype=torch.float64)
+    rows = rows[None] if rows.ndim == 1 else rows
+    rows = checked_tensor(rows, (None, 3), what, do, MAX_LENGTH)
     check_some(rows, f"row of {what}", do)
     return rows
 

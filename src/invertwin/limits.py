@@ -10,13 +10,17 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le
 
-Positive = Annotated[float, Gt(0)]
-NonNegative = Annotated[float, Ge(0)]
 UnitFraction = Annotated[float, Ge(0), Le(1)]
+MAX_NUMBER = 1e30
+"""In SI units; larger numbers are a mistake, and their products are none any more."""
+Positive = Annotated[float, Gt(0), Le(MAX_NUMBER)]
+NonNegative = Annotated[float, Ge(0), Le(MAX_NUMBER)]
 MAX_COUNT = 2**31 - 1
 """Larger counts are a mistake; the ray tracer numbers its rays by 32 bits."""
 Count = Annotated[int, Ge(1), Le(MAX_COUNT)]
 CountOfTwo = Annotated[int, Ge(2), Le(MAX_COUNT)]
+MAX_LENGTH = 1e9
+"""[m], beyond the Moon; farther away, a double does not tell the phase of a millimetre wave."""
 
 Decibels = Annotated[float, Ge(-300), Le(300)]
 """A ratio of powers whose square is a number."""
@@ -67,10 +71,12 @@ class UsualValue:
         return f"{number:g}e{min((9, 6, 3, -3, -6, -9, -12), key=lambda e: abs(e - decades))}"
 
 
-Frequency = Annotated[Positive, UsualValue("Hz", 77e9, low=1e6)]
-SweptFrequency = Annotated[Positive, UsualValue("Hz", 77e9, low=1e3)]  # analysers start at 9 kHz
-Bandwidth = Annotated[Positive, UsualValue("Hz", 1e9, low=1e6)]
-FrequencyStep = Annotated[Positive, UsualValue("Hz", 1e6, low=1e3)]
+_MAX_RADIO = 3e12  # Hz; waves of higher frequencies are called infrared
+Frequency = Annotated[Positive, UsualValue("Hz", 77e9, 1e6, _MAX_RADIO)]
+# Analysers start at 9 kHz.
+SweptFrequency = Annotated[Positive, UsualValue("Hz", 77e9, 1e3, _MAX_RADIO)]
+Bandwidth = Annotated[Positive, UsualValue("Hz", 1e9, 1e6, _MAX_RADIO)]
+FrequencyStep = Annotated[Positive, UsualValue("Hz", 1e6, 1e3, _MAX_RADIO)]
 Duration = Annotated[Positive, UsualValue("seconds", 4e-5, high=1.0)]
 
 

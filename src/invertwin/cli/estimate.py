@@ -18,7 +18,7 @@ from invertwin.inversion import require_edge_length
 from invertwin.radar import SampledWaveform
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import fft_bins
-from invertwin.runtime.memory import format_gigabytes, free_memory
+from invertwin.runtime.memory import format_gigabytes, free_memory, require_at_most
 from invertwin.scene import Mesh, Object, Scene
 from invertwin.scene.scene import warn_if_purely_specular
 
@@ -134,7 +134,7 @@ def estimate_resources(
     Raises:
         InputError: Too many starts, or a stage that makes too many triangles.
     """
-    _check_starts_and_stages(run, truth)
+    _check_starts_and_stages(run, truth, sensors)
     parts, rows, one_channel = [_triangle_item(run, truth)], 0.0, 0.0
     for name, sensor in sensors.items():
         found, traced = estimate_sensor_resources(sensor, truth)
@@ -315,7 +315,17 @@ def _count_recordings(run: RunFile) -> int:
     return anew + (run.plan.fits if run.plan is not None else 0)
 
 
-def _check_starts_and_stages(run: RunFile, scene: Scene) -> None:
+def _farthest_range(sensor: SensorSetup) -> float:
+    """The range of the last bin from the middle of the radar's positions [m]."""
+    places, origin = sensor.radar.positions.detach(), sensor.radar.range_origin
+    shift = 0.0 if origin is None else float(origin.abs().max())
+    spread = float((places.amax(0) - places.amin(0)).norm())
+    return float(sensor.grid.ranges.abs().max()) + shift + spread / 2
+
+
+def _check_starts_and_stages(
+    run: RunFile, scene: Scene, sensors: Mapping[str, SensorSetup]
+) -> None:
     """Refuse starts and stages beyond the limits of what makes them, before any of them begins."""
     chance = torch.Generator()
     for section, more in (("starts", {"generator": chance}), ("search", {})):
@@ -324,6 +334,11 @@ def _check_starts_and_stages(run: RunFile, scene: Scene) -> None:
             given = {Object: scene[table.object], torch.Generator: chance}
             with prefix_errors(section):
                 next(iter(table.build(given, **more)), None)
+    if run.starts is not None:
+        # The truth and the start are both within the range of the map from a position.
+        most = max(2 * _farthest_range(sensor) for sensor in sensors.values())
+        what, do = "m from the truth to a start, which the maps can show", "start nearer to it"
+        require_at_most(run.starts.distance[1], most, what, do, "starts.distance")
     free = [table.object for table in run.parameters if table.kind == "vertices"]
     for i, stage in enumerate(run.stages):
         for name in free if stage.remesh else ():

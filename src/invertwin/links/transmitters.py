@@ -37,7 +37,7 @@ class Transmitters:
         power = torch.as_tensor(self.power_dbm, dtype=torch.float64)
         power = power.expand(len(places)) if power.ndim == 0 else power
         do = "give one for all, or one each"
-        power = checked_tensor(power, (len(places),), "powers of transmitters [dBm]", do)
+        power = checked_tensor(power, (len(places),), "powers of transmitters [dBm]", do, 300.0)
         set_fields(self, positions=places, power_dbm=power)
 
     @property

@@ -25,7 +25,7 @@ from invertwin.checks import (
 )
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
-from invertwin.limits import MAX_COUNT, AllowedValues
+from invertwin.limits import MAX_COUNT, MAX_LENGTH, AllowedValues
 from invertwin.radar.waveform import WINDOWS, PhysicsWarning, SampledWaveform, Waveform
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.antenna import AntennaArray
@@ -84,7 +84,7 @@ class Radar:
 
     def __post_init__(self) -> None:
         do = "give one position [x, y, z] in metres per pose"
-        positions = checked_tensor(self.positions, (None, 3), "radar positions", do)
+        positions = checked_tensor(self.positions, (None, 3), "radar positions", do, MAX_LENGTH)
         check_some(positions, "radar pose", do)
         set_fields(self, positions=positions)
         if self.rotations is not None:
@@ -375,7 +375,8 @@ def checked_beat(
 
 
 def _checked_origin(value: object, frames: int) -> Tensor:
-    origin = checked_tensor(value, (frames,), "range_origin", "give one range in metres per frame")
+    do = "give one range in metres per frame"
+    origin = checked_tensor(value, (frames,), "range_origin", do, MAX_LENGTH)
     do = "it is what the recording was compensated with: detach it"
     refuse_derivatives(origin, "range_origin", do)
     return origin

@@ -15,24 +15,14 @@ from annotated_types import MinLen
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.checks import (
-    ArrayLike,
-    check_choice,
-    check_some,
-    checked_count,
-    checked_number,
-    checked_tensor,
-    checked_type,
-    refuse_derivatives,
-    set_fields,
-)
+from invertwin import checks
 from invertwin.errors import InputError
-from invertwin.limits import RADIANS, Count, NonNegative, Positive
+from invertwin.limits import MAX_LENGTH, RADIANS, Count, NonNegative, Positive
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.polarisation import JonesTable, Polarisation, checked_angles
 from invertwin.scene.pose import Basis
 
-Polarised = str | ArrayLike | JonesTable
+Polarised = str | checks.ArrayLike | JonesTable
 _MAX_ELEMENTS = 1e5
 COSINE_COUNT = 2049
 """Nodes of a pattern table over cosθ, at linspace(−1, 1, 2049)."""
@@ -85,7 +75,7 @@ class Cosine(Pattern):
     exponent: NonNegative
 
     def __post_init__(self) -> None:
-        checked_number(self.exponent, "pattern exponent", 0.0)
+        checks.checked_number(self.exponent, "pattern exponent", 0.0)
 
     def gain(self, direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Return the linear power gain."""
@@ -130,17 +120,17 @@ class TabulatedPattern(Pattern):
     def __post_init__(self) -> None:
         do = "give theta [n], phi [m] in rad and linear gains [n, m]"
         theta, phi = checked_angles(self.theta, self.phi, "a pattern", do)
-        gains = checked_tensor(self.gains, (len(theta), len(phi)), "pattern gains", do)
+        gains = checks.checked_tensor(self.gains, (len(theta), len(phi)), "pattern gains", do)
         for value in (theta, phi, gains):
             do = "patterns are resampled and cannot be fitted: detach them"
-            refuse_derivatives(value, "a pattern", do)
+            checks.refuse_derivatives(value, "a pattern", do)
         if bool((gains < 0).any()):
             raise InputError(
                 f"expected linear power gains >= 0, got {float(gains.min()):g}; "
                 "convert decibels with 10**(dB/10)"
             )
         grid = _resample_gains(theta, phi, gains)
-        set_fields(self, theta=theta, phi=phi, gains=gains, _grid=grid)
+        checks.set_fields(self, theta=theta, phi=phi, gains=gains, _grid=grid)
 
     @classmethod
     def from_decibels(
@@ -215,19 +205,21 @@ class AntennaArray:
     positions: Float64[Tensor, "n 3"]
     pattern: Pattern = field(default_factory=Isotropic)
     polarisation: Polarised = "V"
-    leakage: float | ArrayLike = 0.0
+    leakage: float | checks.ArrayLike = 0.0
     jones: Polarisation = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         do = "give one position [x, y, z] in metres per element"
-        positions = checked_tensor(self.positions, (None, 3), "element positions", do)
-        check_some(positions, "antenna element", do)
+        positions = checks.checked_tensor(
+            self.positions, (None, 3), "element positions", do, MAX_LENGTH
+        )
+        checks.check_some(positions, "antenna element", do)
         do = "spectra do not differentiate their steering: detach them"
-        refuse_derivatives(positions, "element positions", do)
+        checks.refuse_derivatives(positions, "element positions", do)
         do = "give Isotropic(), Cosine(exponent) or Table(theta, phi, gains)"
-        checked_type(self.pattern, Pattern, "a pattern", do)
+        checks.checked_type(self.pattern, Pattern, "a pattern", do)
         jones = Polarisation.from_jones(self.polarisation, self.leakage, len(positions))
-        set_fields(self, positions=positions, jones=jones)
+        checks.set_fields(self, positions=positions, jones=jones)
 
     def change_basis(self, basis: Basis) -> "AntennaArray":
         """Return the array with positions along other axes."""
@@ -240,7 +232,7 @@ def linear_array(
     axis: Literal["y", "z"] = "y",
     pattern: Pattern | None = None,
     polarisation: Polarised = "V",
-    leakage: float | ArrayLike = 0.0,
+    leakage: float | checks.ArrayLike = 0.0,
 ) -> AntennaArray:
     """Build a row of elements, centred at the origin of the radar frame.
 
@@ -255,7 +247,7 @@ def linear_array(
     Raises:
         InputError: no elements, a spacing that is not positive, or another axis.
     """
-    check_choice(axis, ("y", "z"), "axis", "arrays lie in the y-z plane, and x is boresight")
+    checks.check_choice(axis, ("y", "z"), "axis", "arrays lie in the y-z plane, and x is boresight")
     counts = (count, 1) if axis == "y" else (1, count)
     return planar_array(counts, (spacing, spacing), pattern, polarisation, leakage)
 
@@ -265,7 +257,7 @@ def planar_array(
     spacing: tuple[Positive, Positive],
     pattern: Pattern | None = None,
     polarisation: Polarised = "V",
-    leakage: float | ArrayLike = 0.0,
+    leakage: float | checks.ArrayLike = 0.0,
 ) -> AntennaArray:
     """Build a grid of elements, centred at the origin of the radar frame; z runs fastest.
 
@@ -288,8 +280,8 @@ def planar_array(
 
 
 def _centre_positions(count: int, spacing: float, what: str) -> Tensor:
-    number = checked_count(count, what, 1)
-    distance = checked_number(spacing, "element spacing [m]", 0.0, open_low=True)
+    number = checks.checked_count(count, what, 1)
+    distance = checks.checked_number(spacing, "element spacing [m]", 0.0, open_low=True)
     return (torch.arange(number, dtype=torch.float64) - (number - 1) / 2) * distance
 
 

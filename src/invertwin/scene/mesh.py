@@ -12,6 +12,7 @@ from torch import Tensor
 
 from invertwin.checks import checked_tensor, strip_derivatives
 from invertwin.errors import InputError
+from invertwin.limits import MAX_LENGTH
 from invertwin.scene import mesh_topology
 from invertwin.scene.pose import Basis
 
@@ -59,9 +60,8 @@ class Mesh:
     faces: Int64[Tensor, "f 3"]
 
     def __post_init__(self) -> None:
-        vertices = checked_tensor(
-            self.vertices, (None, 3), "mesh vertices", "repair the mesh before loading it"
-        )
+        do = "repair the mesh before loading it"
+        vertices = checked_tensor(self.vertices, (None, 3), "mesh vertices", do, MAX_LENGTH)
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", checked_faces(self.faces, len(vertices)))
 

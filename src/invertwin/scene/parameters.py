@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.deprecation import rename_members
 from invertwin.errors import InputError
-from invertwin.limits import Axes
+from invertwin.limits import MAX_LENGTH, Axes
 from invertwin.scene.material.itu import Itu
 from invertwin.scene.material.materials import select_layer
 from invertwin.scene.material.values import (
@@ -530,7 +530,7 @@ def free_part(parameter: Tensor, mask: Tensor) -> Tensor:
 
 def _vector(value: ArrayLike, what: str) -> Tensor:
     # A copy, since the optimiser changes the parameter in place.
-    return checked_tensor(value, (3,), what, "give x, y, z").detach().clone()
+    return checked_tensor(value, (3,), what, "give x, y, z", MAX_LENGTH).detach().clone()
 
 
 def _rotation_numbers(value: ArrayLike) -> Tensor:

@@ -17,6 +17,7 @@ from torch import Tensor
 from invertwin.checks import ArrayLike, check_choice, checked_tensor
 from invertwin.constants import read_table
 from invertwin.errors import InputError
+from invertwin.limits import MAX_LENGTH
 
 
 def quaternion_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
@@ -86,7 +87,7 @@ def rigid(
     Raises:
         InputError: wrong shapes, or NaN.
     """
-    moved = checked_tensor(translation, (3,), "translation [m]", "give x, y, z")
+    moved = checked_tensor(translation, (3,), "translation [m]", "give x, y, z", MAX_LENGTH)
     turned = torch.eye(3, dtype=torch.float64) if rotation is None else rotation
     turned = checked_tensor(turned, (3, 3), "rotation", "give a 3 × 3 matrix")
     top = torch.cat([turned, moved[:, None]], dim=1)

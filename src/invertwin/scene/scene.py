@@ -11,7 +11,9 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.checks import check_choice, checked_number, checked_tensor
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
+from invertwin.limits import MAX_LENGTH
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.material.roughness import ROUGH_LOBE_WIDTH, lobe_exponent
 from invertwin.scene.material.surface import Material
@@ -70,7 +72,7 @@ class Object:
             count = len(self.mesh.vertices)
             do = f"give one vector [3] or one per vertex [{count}, 3]"
             shape = (count, 3) if getattr(self.velocity, "ndim", 1) == 2 else (3,)
-            velocity = checked_tensor(self.velocity, shape, "velocity [m/s]", do)
+            velocity = checked_tensor(self.velocity, shape, "velocity [m/s]", do, SPEED_OF_LIGHT)
             object.__setattr__(self, "velocity", velocity)
 
     @property
@@ -260,7 +262,7 @@ def _has_diffuse_scattering(material: Material, frequency: float) -> bool:
 
 def _checked_pose(pose: object) -> Tensor:
     do = "build one with rigid(rotation, translation)"
-    matrix = checked_tensor(pose, (4, 4), "pose", do)
+    matrix = checked_tensor(pose, (4, 4), "pose", do, MAX_LENGTH)
     fixed = matrix.detach()
     rotation, bottom = fixed[:3, :3], fixed[3]
     gram = rotation @ rotation.T - torch.eye(3, dtype=torch.float64)

@@ -226,7 +226,7 @@ def prepare_path_scene(
 def _check_velocities(value: ArrayLike, count: int, what: str) -> Tensor:
     found = torch.as_tensor(value, dtype=torch.float64)
     rows = found.expand(count, 3) if found.ndim == 1 and len(found) == 3 else found
-    return checked_tensor(rows, (count, 3), f"{what} velocities [m/s]", _VELOCITY_HINT)
+    return checked_tensor(rows, (count, 3), f"{what} velocities", _VELOCITY_HINT, SPEED_OF_LIGHT)
 
 
 def face_interactions(path_scene: PathScene) -> FaceInteractions:

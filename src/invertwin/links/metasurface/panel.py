@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
+from invertwin import checks
 from invertwin.channel import (
     METASURFACE,
     GainPattern,
@@ -25,19 +26,10 @@ from invertwin.channel import (
     polarisations,
     visible_fractions,
 )
-from invertwin.checks import (
-    ArrayLike,
-    check_orthonormal,
-    check_some,
-    checked_count,
-    checked_number,
-    checked_rows,
-    checked_tensor,
-    set_fields,
-)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
+from invertwin.limits import MAX_LENGTH
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene import Scene
 
@@ -78,23 +70,25 @@ class Metasurface:
 
     def __post_init__(self) -> None:
         what = "of a metasurface"
-        place = checked_tensor(self.position, (3,), f"position {what} [m]", "give x, y, z")
-        axes = checked_tensor(self.axes, (3, 3), f"axes {what}", "give them as columns")
-        check_orthonormal(axes, f"axes {what}", "give the normal, y and z")
+        place = checks.checked_tensor(
+            self.position, (3,), f"position {what}", "give x, y, z", MAX_LENGTH
+        )
+        axes = checks.checked_tensor(self.axes, (3, 3), f"axes {what}", "give them as columns")
+        checks.check_orthonormal(axes, f"axes {what}", "give the normal, y and z")
         do = "give one for each element, along y and z"
-        phase = checked_tensor(self.phase, (None, None), f"phases {what} [rad]", do)
-        check_some(phase.ravel(), f"element {what}", do)
+        phase = checks.checked_tensor(self.phase, (None, None), f"phases {what} [rad]", do)
+        checks.check_some(phase.ravel(), f"element {what}", do)
         amplitude = torch.as_tensor(self.amplitude, dtype=torch.float64)
         amplitude = amplitude.expand(phase.shape) if amplitude.ndim == 0 else amplitude
         do = "give one, or one for each"
-        amplitude = checked_tensor(amplitude, tuple(phase.shape), f"amplitudes {what}", do)
+        amplitude = checks.checked_tensor(amplitude, tuple(phase.shape), f"amplitudes {what}", do)
         if bool((amplitude.detach() < 0).any()):
             raise InputError(f"expected amplitudes {what} of at least 0, got less; turn the phase")
-        checked_number(self.spacing, f"spacing {what} [m]", 0.0, open_low=True)
+        checks.checked_number(self.spacing, f"spacing {what} [m]", 0.0, open_low=True)
         if self.bits is not None:
-            bits = checked_count(self.bits, f"bits {what}", 1)
+            bits = checks.checked_count(self.bits, f"bits {what}", 1)
             require_at_most(bits, _MAX_BITS, f"bits {what}", "use None")
-        set_fields(self, position=place, axes=axes, phase=phase, amplitude=amplitude)
+        checks.set_fields(self, position=place, axes=axes, phase=phase, amplitude=amplitude)
 
     @property
     def cells(self) -> PanelCells:
@@ -116,7 +110,9 @@ class Metasurface:
         assert isinstance(self.amplitude, Tensor)
         return torch.polar(self.amplitude.ravel(), phase)
 
-    def focus(self, tx: ArrayLike, target: ArrayLike, frequency: float) -> "Metasurface":
+    def focus(
+        self, tx: checks.ArrayLike, target: checks.ArrayLike, frequency: float
+    ) -> "Metasurface":
         """The panel with phases that focus a transmitter on a point, added to its own.
 
         Args:
@@ -125,7 +121,7 @@ class Metasurface:
             frequency: [Hz].
         """
         do = "give x, y, z"
-        ends = [checked_tensor(p, (3,), "ends of a focus [m]", do) for p in (tx, target)]
+        ends = [checks.checked_tensor(p, (3,), "ends of a focus [m]", do) for p in (tx, target)]
         length = (self.cells.centers[:, None] - torch.stack(ends)).norm(dim=2).sum(1)
         turn = 2 * math.pi * frequency / SPEED_OF_LIGHT * length
         return replace(self, phase=self.phase + turn.view(self.phase.shape))
@@ -218,8 +214,8 @@ def _element_waves(
 def panel_paths(
     scene: Scene,
     panels: Metasurface | Sequence[Metasurface],
-    tx: ArrayLike,
-    rx: ArrayLike,
+    tx: checks.ArrayLike,
+    rx: checks.ArrayLike,
     frequency: float,
     *,
     blur: float = 0.0,
@@ -249,9 +245,9 @@ def panel_paths(
     Source: derivations §12.
     """
     several = [panels] if isinstance(panels, Metasurface) else list(panels)
-    ends = checked_rows(tx, "tx places [m]"), checked_rows(rx, "rx places [m]")
-    checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
-    checked_number(blur, "width of shadows [m]", 0.0)
+    ends = checks.checked_rows(tx, "tx places [m]"), checks.checked_rows(rx, "rx places [m]")
+    checks.checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
+    checks.checked_number(blur, "width of shadows [m]", 0.0)
     rows: list[RayPaths] = []
     for panel in several:
         _require_clearance(panel, torch.cat(ends))
@@ -259,7 +255,7 @@ def panel_paths(
             scene, panel, *ends, frequency, blur=blur, boundary=boundary, far_field=far_field
         )
         rows.append(_paths_over_panel(panel, ends, response, frequency, scene.names))
-    check_some(rows, "metasurface", "give one")
+    checks.check_some(rows, "metasurface", "give one")
     return sum(rows[1:], start=rows[0]).sort_rows()
 
 
