@@ -1,6 +1,7 @@
 """The command line `invertwin`: from run files and recordings to folders of results."""
 
 import json
+import shlex
 import sys
 import warnings
 from collections.abc import Callable
@@ -220,9 +221,10 @@ def new(
         raise InputError(
             f"expected a new file in a folder, got {path}: {error.strerror}; name another"
         ) from None
-    call = {"fit": "invertwin reconstruct", "coverage": "invertwin simulate", "plugin": "python"}
-    line = f"wrote {path}; try: {call.get(kind, f'invertwin {kind}')} {path}"
-    console.print(line, markup=False, soft_wrap=True)
+    commands = {"fit": ["invertwin", "reconstruct"], "plugin": ["python"]}
+    commands["coverage"] = ["invertwin", "simulate"]
+    call = shlex.join([*commands.get(kind, ["invertwin", kind]), str(path)])
+    console.print(f"wrote {path}; try: {call}", markup=False, soft_wrap=True)
 
 
 @_command_with(ResumableOptions, _LEARN)

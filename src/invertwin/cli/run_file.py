@@ -10,6 +10,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import tomli_w
@@ -101,8 +102,8 @@ def validate_run(raw: dict[str, Any], source: Path) -> Any:
     """
     if "task" in raw and "frame" not in raw:
         raise InputError(
-            f"{source}: expected frame = {FRAME} (x ahead, y to the left, z up), got a run file of "
-            f"the first frame, which had no such key; convert it: invertwin convert {source}"
+            f"{source}: expected frame = {FRAME} (x ahead, y to the left, z up), got one of the "
+            f"first frame, which had none; convert it: invertwin convert {quote(str(source))}"
         )
     try:
         from invertwin.cli.schema import RunFile

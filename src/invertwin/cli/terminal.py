@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from rich.console import Console
@@ -86,7 +87,7 @@ def load_runs(
         other = "reconstruct" if run.task == "demo" else run.task
         cure = "add it"
         if other != command:
-            cure = f"its task is {run.task}: use `invertwin {other} {file}`"
+            cure = f"its task is {run.task}: use `invertwin {other} {quote(str(file))}`"
         with prefix_file_errors(file):
             for section in sections(run) if callable(sections) else sections:
                 require_section(run, section, command, cure)
