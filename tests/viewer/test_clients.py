@@ -161,7 +161,15 @@ def test_places_are_vectors_of_usual_numbers(change, accepted):
     assert is_valid_message(msgspec.msgpack.encode(message), {}) == accepted
 
 
-@pytest.mark.parametrize("raw", [b"", b"\xc1", b"\x93\1\2\3", "text", b"\xff" * 100, b"\xa1x"])
+@pytest.mark.parametrize(
+    "raw",
+    [
+        *(b"", b"\xc1", b"\x93\1\2\3", "text", b"\xff" * 100, b"\xa1x"),
+        b"\xa1\xdd",  # no UTF-8
+        b"\x91" * 60_000,  # deeper than Python calls
+        b"\x81\xa4type\xc7\x0c\xff" + b"\xff" * 12,  # a time that is none
+    ],
+)
 def test_what_is_no_message_is_none(raw):
     assert not is_valid_message(raw, {})
 
@@ -223,23 +231,31 @@ def test_the_worker_survives_an_exception_and_says_it(viewer):
 
 @pytest.mark.slow
 def test_fifty_clients_and_a_hundred_slow_ones_hinder_no_good_one(viewer):
+    """Every answer within a second, while 1 000 malformed messages come in beside it."""
+    draw = random.Random(2)
     with ExitStack() as stack:
         for _ in range(100):
             slow = socket.create_connection(("127.0.0.1", viewer._server.get_port()))
             stack.callback(slow.close)
             slow.send(b"GET / HTTP/1.1\r\nHo")
-        for _ in range(50):
-            client = Client(viewer)
-            client.look()
+        others = [Client(viewer) for _ in range(50)]
+        for client in others:
             stack.callback(client.close)
-        times = []
-        for value in (0, 3, 1):
-            good = Client(viewer)
-            stack.callback(good.close)
-            good.look()
+            client.look()
+        good, times = Client(viewer), []
+        stack.callback(good.close)
+        good.look()
+        for number in range(20):
+            for client in others:
+                if draw.random() < 0.5:
+                    client.say_raw(draw.randbytes(draw.randrange(200)))
+                else:
+                    updates = {draw.choice(["value", "max"]): draw.choice(HOSTILE[2:])}
+                    client.say("GuiUpdateMessage", uuid=draw.choice(HOSTILE), updates=updates)
+            value = number % 4
             begun = time.monotonic()
             good.say("GuiUpdateMessage", uuid=control(viewer, "_step"), updates={"value": value})
             until(lambda value=value: viewer._where.value == f"step {value}")
-            times.append(time.monotonic() - begun)
             assert answered(viewer).status == 200
-        assert min(times) < 1.0
+            times.append(time.monotonic() - begun)
+        assert max(times) < 1.0

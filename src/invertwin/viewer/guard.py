@@ -134,7 +134,7 @@ def is_valid_message(raw: Any, controls: Mapping[str, Any]) -> bool:
                 return [*new] == ["value"] and _accepts(controls.get(name), new["value"])
             case {"type": kind, **rest}:
                 return kind in _MESSAGES and all(_is_plain(*item) for item in rest.items())
-    except (TypeError, msgspec.DecodeError):  # text, or no message
+    except (TypeError, ValueError, RecursionError, msgspec.DecodeError):  # text, or no message
         pass
     return False
 
