@@ -77,7 +77,7 @@ Frequency = Annotated[Positive, UsualValue("Hz", 77e9, 1e6, _MAX_RADIO)]
 SweptFrequency = Annotated[Positive, UsualValue("Hz", 77e9, 1e3, _MAX_RADIO)]
 Bandwidth = Annotated[Positive, UsualValue("Hz", 1e9, 1e6, _MAX_RADIO)]
 FrequencyStep = Annotated[Positive, UsualValue("Hz", 1e6, 1e3, _MAX_RADIO)]
-Duration = Annotated[Positive, UsualValue("seconds", 4e-5, high=1.0)]
+Duration = Annotated[Positive, UsualValue("seconds", 4e-5, 1e-12, 1.0)]
 
 
 def annotation_parts(hint: Any) -> Iterator[Any]:

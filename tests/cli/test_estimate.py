@@ -57,6 +57,7 @@ CASES = {
     "points on 4.12 m²": (RUN, "points_per_m2 = 2e3", "points_per_m2 = 2e12"),
     "data.samples": (RUN, "points_per_m2", "samples = 3_000_000_000\npoints_per_m2"),
     "starts.count": (RUN + STARTS, "count = 2", "count = 2_000_000"),
+    "starts.distance": (RUN + STARTS, "[0.05, 0.08]", "[0.05, 80.0]"),
     "reconstruct.steps": (RUN, "steps = 8", "steps = 2_000_000_000"),
     "reconstruct.samples": (RUN, "20_000", "20_000_000_000_000"),
     "stages[0].remesh": (

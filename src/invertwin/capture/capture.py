@@ -28,6 +28,7 @@ from invertwin.capture.track import Track
 from invertwin.channel import Grid
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.limits import MAX_NUMBER
 from invertwin.radar.processing.backprojection import UPSAMPLING, interpolate_samples
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
@@ -393,10 +394,10 @@ def _check_dataset(dataset: xr.Dataset) -> Radar:
             f"{data.dims}; label the data that way"
         )
     for name, variable in dataset.variables.items():
-        bad = int((~np.isfinite(variable.values)).sum())
+        bad = int((~(np.abs(variable.values) <= MAX_NUMBER)).sum())
         if bad:
             raise InputError(
-                f"expected finite {name}, got {bad} NaN or infinite of {variable.size}; "
+                f"expected finite {name}, got {bad} NaN, infinite or too large of {variable.size}; "
                 "drop those frames or samples"
             )
     radar = radar_from_fields(dataset)

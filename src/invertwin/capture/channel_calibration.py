@@ -15,6 +15,7 @@ from invertwin.capture.readers.radar_fields import to_data_array
 from invertwin.checks import check_shape, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.limits import MAX_NUMBER
 from invertwin.radar.radar import require_sampled_waveform
 from invertwin.radar.waveform import unit_window
 from invertwin.storage.folders import replace_file
@@ -41,7 +42,7 @@ class ChannelCalibration:
 
     def __post_init__(self) -> None:
         gains = self.gains
-        finite = bool(torch.isfinite(torch.view_as_real(gains)).all()) if gains.numel() else False
+        finite = bool(gains.numel()) and bool((gains.abs() <= MAX_NUMBER).all())
         if gains.ndim != 2 or not finite:
             raise InputError(
                 f"expected finite gains [tx, rx], got shape {tuple(gains.shape)}; "

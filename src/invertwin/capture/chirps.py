@@ -60,7 +60,7 @@ class ChirpSettings:
     receivers: tuple[int, ...]
     loops: limits.Count
     frames: limits.Count | None = None
-    frame_period: float | None = None
+    frame_period: limits.Positive | None = None
     idle_time: IdleTime = 0.0
     adc_start_time: IdleTime = 0.0
     ramp_end_time: float | None = None
@@ -136,7 +136,7 @@ class ChirpData:
         do = "data and settings must describe the same recording"
         check_shape(self.samples, expected, "samples (frame, chirp, tx, rx, sample)", do)
         check_some(self.samples, "frame of samples", do)
-        if not torch.isfinite(torch.view_as_real(self.samples)).all():
+        if not bool((torch.view_as_real(self.samples).abs() <= limits.MAX_NUMBER).all()):
             raise InputError("expected finite samples, got NaN or infinity; drop those frames")
 
     @property

@@ -338,7 +338,8 @@ def _check_starts_and_stages(
         # The truth and the start are both within the range of the map from a position.
         most = max(2 * _farthest_range(sensor) for sensor in sensors.values())
         what, do = "m from the truth to a start, which the maps can show", "start nearer to it"
-        require_at_most(run.starts.distance[1], most, what, do, "starts.distance")
+        with prefix_errors("starts"):
+            require_at_most(run.starts.distance[1], most, what, do, "distance")
     free = [table.object for table in run.parameters if table.kind == "vertices"]
     for i, stage in enumerate(run.stages):
         for name in free if stage.remesh else ():
