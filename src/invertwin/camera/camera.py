@@ -60,7 +60,9 @@ class Camera:
         do = "give x, y, z, or a row of them for each frame"
         given = torch.as_tensor(self.positions, dtype=torch.float64)
         shape = (3,) if given.ndim == 1 else (None, 3)
-        places = checked_tensor(given, shape, "camera positions", do, MAX_LENGTH).reshape(-1, 3)
+        places = checked_tensor(given, shape, "positions of a camera", do, MAX_LENGTH).reshape(
+            -1, 3
+        )
         axes = torch.as_tensor(self.rotations, dtype=torch.float64)
         axes = axes.expand(len(places), 3, 3) if axes.ndim == 2 else axes
         do = "give the camera's axes as columns, once or for each frame"

@@ -12,6 +12,7 @@ from typing import Any
 
 from invertwin.cli.report import ReportTable
 from invertwin.errors import InputError
+from invertwin.limits import MAX_NUMBER
 from invertwin.registry.kinds import PLUGINS
 from invertwin.registry.section import suggest_name
 from invertwin.runtime.doctor import cache_folder
@@ -170,7 +171,9 @@ def _describe_value(value: JsonSchema) -> str:
         return f"{least} × {item}" if exact else f"list of {item}"
     if "$ref" in value or value.get("type", "object") == "object":
         return "table"
-    signs = [f"{sign} {value[name]:.10g}" for name, sign in _LIMIT_SIGNS.items() if name in value]
+    # The limit of all numbers is not worth a word.
+    own = {name: value[name] for name in _LIMIT_SIGNS if value.get(name, MAX_NUMBER) != MAX_NUMBER}
+    signs = [f"{_LIMIT_SIGNS[name]} {limit:.10g}" for name, limit in own.items()]
     kind: str = value["type"]
     return " ".join([_TYPE_NAMES.get(kind, kind), ", ".join(signs)]).strip()
 
