@@ -35,6 +35,7 @@ import numpy as np
 from report import MetricTable, Required, write
 
 from invertwin.capture import Capture
+from invertwin.datasets import SampleDataset
 from invertwin.storage.folders import UNFINISHED
 
 KILLS, PAIRS, SECONDS = 100, 20, 900.0
@@ -108,21 +109,42 @@ MANY = RUN + '\n[starts]\nobject = "ball"\ncount = 2\ndistance = [0.03, 0.05]\na
 STAGED = (
     RUN + "\n[[stages]]\nreconstruct = { steps = 4 }\n\n[[stages]]\nreconstruct = { steps = 3 }\n"
 )
+DATASET = (
+    RUN.replace("reconstruct", "dataset", 1)
+    + """
+[dataset]
+samples = 4
+shard = 1
+signals = ["map"]
+
+[[vary]]
+key = "data.snr_db"
+kind = "uniform"
+low = 10.0
+high = 30.0
+"""
+)
 #: By name: the run file, and the arguments before its folder.
 COMMANDS = {
     "reconstruct": (RUN, ["reconstruct", "reconstruct.toml"]),
     "starts": (MANY, ["reconstruct", "starts.toml"]),
     "stages": (STAGED, ["reconstruct", "stages.toml"]),
     "simulate": (RUN.replace("reconstruct", "simulate", 1), ["simulate", "simulate.toml"]),
+    "dataset": (DATASET, ["dataset", "dataset.toml"]),
+    "twin": (RUN, ["twin", "twin.toml"]),
+    "view": (RUN, ["view", "view.toml"]),
     "train-prior": ("", ["train-prior", "--cars", "100", "--latent", "4", "--epochs", "2"]),
 }
+RESUMED = ("reconstruct", "starts", "stages", "dataset")
+PAGE = "page.html"  # of `view --record`, which has no run folder
 OWN = "notes.txt"  # a file of the user's
 
 
 def command(name: str, out: Path, *more: str) -> list[str]:
     """The command line of a case."""
     call = "from invertwin.cli.app import main; main()"
-    return [sys.executable, "-c", call, *COMMANDS[name][1], "-o", str(out), *more]
+    where = ["--record", str(out / PAGE)] if name == "view" else ["-o", str(out)]
+    return [sys.executable, "-c", call, *COMMANDS[name][1], *where, *more]
 
 
 def ended(name: str, out: Path, *more: str) -> tuple[int, str]:
@@ -142,11 +164,17 @@ def results(out: Path) -> dict[str, bytes]:
     """The files of a folder, without those of a run in progress."""
     files = [path for path in out.rglob("*") if path.is_file()]
     found = {str(path.relative_to(out)): path.read_bytes() for path in files}
-    return {k: v for k, v in found.items() if not k.startswith((".invertwin", UNFINISHED))}
+    # The draft of a page stays after a kill: nobody may remove it.
+    passing = (".invertwin", f".{Path(PAGE).stem}.", UNFINISHED)
+    return {k: v for k, v in found.items() if not k.startswith(passing)}
 
 
 def numbers(out: Path) -> list[np.ndarray]:
     """What a run found, as numbers that another run of it must find again."""
+    if (out / PAGE).exists():
+        return [np.frombuffer((out / PAGE).read_bytes(), np.uint8).astype(float)]
+    if (out / "manifest.json").exists():
+        return [sample["map"].numpy() / sample["map"].max().item() for sample in SampleDataset(out)]
     metrics = json.loads((out / "metrics.json").read_text())
     if (out / "capture.nc").exists():
         beat = Capture.load(out / "capture.nc").beat.numpy()
@@ -171,6 +199,8 @@ class Case:
         self.name, self.out = name, folder / name
         if COMMANDS[name][0]:
             (folder / COMMANDS[name][1][1]).write_text(COMMANDS[name][0])
+        if name == "view":
+            self.out.mkdir()
         for more in ((), ("--overwrite",)):  # the second time kernels are in the cache
             begun = time.monotonic()
             code, said = ended(name, self.out, *more)
@@ -203,7 +233,7 @@ class Case:
         begun = (self.out / UNFINISHED).exists()
         renewed = not begun and set(after) == set(before) and self.same()
         whole = after == before or renewed
-        resumes = self.name not in ("simulate", "train-prior")
+        resumes = self.name in RESUMED
         code, said = ended(self.name, self.out, "--resume" if begun and resumes else "--overwrite")
         moving = begun and not whole
         lost = code != 0 or not (whole or moving) or (self.out / OWN).read_text() != "mine"

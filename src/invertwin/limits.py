@@ -68,7 +68,9 @@ class UsualValue:
     def suggest_value(self, number: float) -> str:
         """The number times the power of ten that brings it nearest to the usual value."""
         decades = math.log10(self.value / number)
-        return f"{number:g}e{min((9, 6, 3, -3, -6, -9, -12), key=lambda e: abs(e - decades))}"
+        shift = min((9, 6, 3, -3, -6, -9, -12), key=lambda e: abs(e - decades))
+        text = f"{number:g}"
+        return f"{number * 10.0**shift:g}" if "e" in text else f"{text}e{shift}"
 
 
 _MAX_RADIO = 3e12  # Hz; waves of higher frequencies are called infrared
