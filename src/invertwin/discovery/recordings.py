@@ -13,15 +13,8 @@ from invertwin.capture import Capture, ChirpCapture
 from invertwin.channel import Grid, ViewpointScene
 from invertwin.checks import checked_count, checked_number, checked_tensor
 from invertwin.constants import read_table
+from invertwin.discovery import certainty
 from invertwin.discovery.assembly import ShapeLikelihood, make_sampling
-from invertwin.discovery.certainty import (
-    Hypotheses,
-    existence_probabilities,
-    find_hypotheses,
-    kind_probabilities,
-    standard_deviations,
-    widen_deviations,
-)
 from invertwin.discovery.imaging.likelihood import (
     HeavyTailedLoss,
     count_bins_per_draw,
@@ -220,27 +213,30 @@ def _find_static_objects(
         if gain > aside.total_gain(shapes):
             notes = (_NOTES["image_better"],)
     shapes, found = one.fit(shapes, _FINAL_FIT_STEPS)
-    among = find_hypotheses(one, shapes)
+    among = certainty.find_hypotheses(one, shapes)
     likelier = [max(row, key=lambda one: one.probability).shape for row in among]
     if any(new is not old for new, old in zip(likelier, shapes, strict=True)):
         shapes, found = one.fit(likelier, _FINAL_FIT_STEPS)
-        among = find_hypotheses(one, shapes)
+        among = certainty.find_hypotheses(one, shapes)
     objects = _describe_objects(one, found, shapes, among)
     seen = GroundImage(flat, picture, _count_views(radar, positions, one.build_scene(shapes)))
     return Twin(objects, level, seen, one.predict(shapes) + level_map, power, grid, notes)
 
 
 def _describe_objects(
-    likelihood: ShapeLikelihood, fit: Reconstruction, shapes: Shapes, among: Sequence[Hypotheses]
+    likelihood: ShapeLikelihood,
+    fit: Reconstruction,
+    shapes: Shapes,
+    among: Sequence[certainty.Hypotheses],
 ) -> tuple[DetectedObject, ...]:
     """Return fitted shapes as objects with error bars, kinds and existence probabilities."""
-    errors = standard_deviations(likelihood, fit)
-    found, present = [], existence_probabilities(likelihood, shapes)
+    errors = certainty.standard_deviations(likelihood, fit)
+    found, present = [], certainty.existence_probabilities(likelihood, shapes)
     for k, (shape, own, probability) in enumerate(zip(shapes, among, present, strict=True), 1):
-        name, kinds, start = f"object_{k}", kind_probabilities(own), f"object_{k}."
+        name, kinds, start = f"object_{k}", certainty.kind_probabilities(own), f"object_{k}."
         center = shape_center(shape, likelihood.level)
         mine = {n.removeprefix(start): v for n, v in errors.items() if n.startswith(start)}
-        wide = widen_deviations(likelihood, mine, own)
+        wide = certainty.widen_deviations(likelihood, mine, own)
         kind = shape.effective_kind
         found.append(DetectedObject(name, kind, kinds, center, shape, wide, probability))
     return tuple(found)

@@ -10,16 +10,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.discovery import proposals
 from invertwin.discovery.assembly import ShapeLikelihood
 from invertwin.discovery.imaging.reflectivity import ImageResponse, reconstruct_reflectivity
-from invertwin.discovery.proposals import (
-    MAX_CORNER_EXTENT,
-    bright_weights,
-    group_bright_points,
-    propose_headings,
-    propose_people_and_vehicles,
-    propose_shapes,
-)
 from invertwin.discovery.shapes.primitives import (
     ShapeParameters,
     Shapes,
@@ -172,8 +165,10 @@ class ShapeSearch:
         """
         strength = self.residual_image(shapes) if shapes else self.first_image
         # Skip groups that the residual image does not distinguish from speckle.
-        weight = bright_weights(strength)
-        parts = group_bright_points(self.image_grid.positions, weight, 3.5 * self.image_grid.step)
+        weight = proposals.bright_weights(strength)
+        parts = proposals.group_bright_points(
+            self.image_grid.positions, weight, 3.5 * self.image_grid.step
+        )
         total = float(strength.sum())
         parts = [part for part in parts if float(part.sum()) > _MIN_GROUP_FRACTION * total]
         known, born = list(shapes), list[tuple[Tensor, ShapeParameters]]()
@@ -270,7 +265,9 @@ class ShapeSearch:
             group: strength of every point [m²], zero outside the group.
         """
         lattice = self.image_grid
-        rows = propose_shapes(lattice.positions, group, step=lattice.step, height=lattice.height)
+        rows = proposals.propose_shapes(
+            lattice.positions, group, step=lattice.step, height=lattice.height
+        )
         total = float(group.sum())
         return [replace(row, brightness=max(total / mean_rcs(row), 1e-4)) for row in rows]
 
@@ -403,7 +400,7 @@ class ShapeSearch:
             rest = [shape for shape in found if shape is not a and shape is not b]
             boxes = [enclosing_box((a, b), turn) for turn in _BOX_YAWS]
             least = min(boxes, key=lambda one: one.length * one.width)
-            one = self.select_best(rest, [*boxes, *propose_people_and_vehicles(least)])
+            one = self.select_best(rest, [*boxes, *proposals.propose_people_and_vehicles(least)])
             if self.evidence([*rest, one]) < self.evidence(found) - _MAX_EVIDENCE_DEFICIT:
                 continue
             new = self.refine([*rest, one])
@@ -472,10 +469,10 @@ def _propose_headed_shapes(shape: ShapeParameters) -> list[ShapeParameters]:
     if shape.kind == "prism":
         return []
     box = shape if shape.is_rectangular else convert_kind(shape, "box")
-    rows = propose_people_and_vehicles(box)
-    if max(shape.length, shape.width) < MAX_CORNER_EXTENT:
+    rows = proposals.propose_people_and_vehicles(box)
+    if max(shape.length, shape.width) < proposals.MAX_CORNER_EXTENT:
         middle = shape.height if shape.has_free_height else 0.5 * shape.height
-        rows += propose_headings(ShapeParameters("corner", shape.position, height=middle))
+        rows += proposals.propose_headings(ShapeParameters("corner", shape.position, height=middle))
     strength = shape.brightness * mean_rcs(shape)
     found = [replace(row, brightness=strength / mean_rcs(row)) for row in rows]
     # A shape that is bright on one side only was fitted as a weak round one.

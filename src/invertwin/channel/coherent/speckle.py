@@ -21,14 +21,7 @@ from invertwin.channel.coherent.radar_equation import (
 from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand
 from invertwin.channel.power import random_walk as walk
-from invertwin.channel.rays.arrays import (
-    opaque,
-    scramble_seed,
-    to_float,
-    to_index,
-    to_torch,
-    uniform_pair,
-)
+from invertwin.channel.rays import arrays
 from invertwin.channel.rays.backend import dr, mi, tracing
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry, flatten
@@ -87,14 +80,14 @@ class _RoughPathSampler:
         self.rays = RayScene(geometry, link)
         self.inputs = integrand.Inputs.from_rays(self.rays)
         self.walk = walk.RandomWalk(self.rays, self.inputs, seed)
-        self.seeds = scramble_seed(seed, 12), scramble_seed(seed, 13)
+        self.seeds = arrays.scramble_seed(seed, 12), arrays.scramble_seed(seed, 13)
         self.generator = torch.Generator().manual_seed(seed)
         areas = face_areas(geometry)
         owners = torch.zeros(len(geometry.coherent), dtype=torch.float64)
         owners = owners.index_add(0, geometry.face_object, areas)
         share = areas / owners[geometry.face_object] / len(owners)
-        self.areas = to_float(areas)
-        self.faces = mi.DiscreteDistribution(to_float(share))
+        self.areas = arrays.to_float(areas)
+        self.faces = mi.DiscreteDistribution(arrays.to_float(share))
         frames = torch.linspace(0, link.frame_count - 1, min(link.frame_count, _REFERENCE_FRAMES))
         self.frames = frames.round().long()
 
@@ -133,13 +126,17 @@ class _RoughPathSampler:
     def _start_paths(self, start: int, lanes: int) -> walk.PathState:
         """First points, and for each a reference frame that lights it, or its mirror image."""
         lane = dr.arange(mi.UInt32, lanes)
-        index = lane + opaque(start)
-        place, side = uniform_pair(index, self.seeds[0])
+        index = lane + arrays.opaque(start)
+        place, side = arrays.uniform_pair(index, self.seeds[0])
         face, pmf = self.faces.sample_pmf((mi.Float(lane) + place) / lanes)
-        b = mi.warp.square_to_uniform_triangle(mi.Point2f(*uniform_pair(index, self.seeds[1])))
+        b = mi.warp.square_to_uniform_triangle(
+            mi.Point2f(*arrays.uniform_pair(index, self.seeds[1]))
+        )
         vertex = SurfacePoint(face, b.x, b.y)
         point = integrand.compute_interaction(self.inputs, vertex)
-        frame = dr.gather(mi.UInt32, to_index(self.frames), index % opaque(len(self.frames)))
+        frame = dr.gather(
+            mi.UInt32, arrays.to_index(self.frames), index % arrays.opaque(len(self.frames))
+        )
         tx = self.inputs.antenna_position(frame, False)
         back, distance = integrand.direction_and_distance(point.position, tx)
         turned = back - 2 * dr.dot(back, point.normal) * point.normal
@@ -156,7 +153,7 @@ class _RoughPathSampler:
         """Places of all lanes' points, the lanes that are alive, and their paths."""
         names = ("face", "b1", "b2", "weight", "active")
         dr.eval(*(state[name] for name in names))
-        *latest, weight, active = (to_torch(state[name]) for name in names)
+        *latest, weight, active = (arrays.to_torch(state[name]) for name in names)
         places = [latest[0].long()[:, None], *(b.double()[:, None] for b in latest[1:])]
         if previous:
             places = [torch.cat(pair, dim=1) for pair in zip(previous, places, strict=True)]
@@ -169,13 +166,13 @@ class _RoughPathSampler:
         self, state: walk.PathState, parent: Tensor, weight: Tensor
     ) -> walk.PathState:
         """Resample lanes; each has its own index, and so its own random numbers."""
-        at = to_index(parent)
+        at = arrays.to_index(parent)
         incident = [dr.gather(mi.Float, state["incident"][k], at) for k in range(3)]
         return walk.update_state(
             state,
             **{n: dr.gather(type(state[n]), state[n], at) for n in ("face", "b1", "b2", "number")},
             incident=mi.Vector3f(*incident),
-            weight=to_float(weight),
+            weight=arrays.to_float(weight),
             active=dr.full(mi.Bool, True, len(parent)),
         )
 

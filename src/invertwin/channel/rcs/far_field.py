@@ -28,20 +28,12 @@ from invertwin.channel.beams.beam_tracing import (
     build_facets,
     trace_beams,
 )
+from invertwin.channel.em import plane_waves
 from invertwin.channel.em.dielectric_solids import (
     DielectricSolids,
     group_solids,
     is_homogeneous,
     require_whole_solids,
-)
-from invertwin.channel.em.plane_waves import (
-    SmoothInterfaces,
-    dot,
-    parallelogram_integral,
-    phasor,
-    polarisations,
-    radiate_field,
-    reflect_field,
 )
 from invertwin.channel.em.wedges import (
     MIN_EDGE_ANGLE,
@@ -108,7 +100,7 @@ class _FarFieldTarget:
     topology: Topology
     vertices: Float64[Tensor, "v 3"]
     occluders: Occluders
-    interfaces: Sequence[SmoothInterfaces]
+    interfaces: Sequence[plane_waves.SmoothInterfaces]
     wave_numbers: Sequence[float]
     up: Float64[Tensor, "3"]
     interiors: Sequence[tuple[DielectricSolids | None, Sequence[int]]]
@@ -254,7 +246,7 @@ class _FarFieldTracer:
     @property
     def _incident_fields(self) -> Tensor:
         """Incident fields of 1 V/m, V and H, per aspect."""
-        return polarisations(self.transmitters, self.target.up)
+        return plane_waves.polarisations(self.transmitters, self.target.up)
 
     def _zero_amplitudes(self) -> Tensor:
         shape = (len(self.target.wave_numbers), len(self.transmitters), 2, 2)
@@ -262,8 +254,8 @@ class _FarFieldTracer:
 
     def _add_received(self, total: Tensor, aspect: Tensor, radiated: Tensor) -> Tensor:
         """Add the components of F along the receiving polarisations to a total."""
-        received = polarisations(self.receivers, self.target.up)[aspect]
-        return total.index_add(0, aspect, dot(received[:, :, None], radiated[:, None]))
+        received = plane_waves.polarisations(self.receivers, self.target.up)[aspect]
+        return total.index_add(0, aspect, plane_waves.dot(received[:, :, None], radiated[:, None]))
 
     def _trace_bounces(
         self, depth: int, tube_width: float | None, boundary: bool
@@ -318,7 +310,7 @@ class _FarFieldTracer:
         self,
         patch_orders: Sequence[IlluminatedPatches],
         solids: DielectricSolids | None,
-        interfaces: SmoothInterfaces,
+        interfaces: plane_waves.SmoothInterfaces,
         k: float,
     ) -> list[Tensor]:
         """Amplitudes S per m² of all patches, order by order: [row, receive, transmit] each."""
@@ -337,14 +329,17 @@ class _FarFieldTracer:
             receiver, surface_rows = self.receivers[patches.aspect], interfaces.rows(patches.facet)
             if solids is None:
                 surface = (surface_rows, k, patches.normal, patches.direction, field)
-                radiated, reflected = radiate_field(*surface, receiver), reflect_field(*surface)
+                radiated, reflected = (
+                    plane_waves.radiate_field(*surface, receiver),
+                    plane_waves.reflect_field(*surface),
+                )
             else:
                 powers.append(incident_power(solids, patches, field))
                 radiated, reflected, transmitted = scatter_at_interfaces(
                     solids, surface_rows, k, patches, field, receiver
                 )
-            received = polarisations(self.receivers, self.target.up)[patches.aspect]
-            found.append(dot(received[:, :, None], radiated[:, None]))
+            received = plane_waves.polarisations(self.receivers, self.target.up)[patches.aspect]
+            found.append(plane_waves.dot(received[:, :, None], radiated[:, None]))
         _warn_power_gain(powers)
         return found
 
@@ -395,8 +390,8 @@ class _FarFieldTracer:
             for f, k in enumerate(target.wave_numbers):
                 radiated = fringe_field(pieces, k, d, field, s, widths)
                 wave = k * (s - d)
-                width = parallelogram_integral(wave, side, torch.zeros_like(side))
-                scale = phasor(dot(wave, centre)) * width * side.norm(dim=1)
+                width = plane_waves.parallelogram_integral(wave, side, torch.zeros_like(side))
+                scale = plane_waves.phasor(plane_waves.dot(wave, centre)) * width * side.norm(dim=1)
                 total[f] = self._add_received(total[f], aspect, radiated * scale[:, None, None])
         if left_out:
             warnings.warn(
@@ -478,9 +473,11 @@ def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTar
     return _FarFieldTarget(facets, topology, vertices, occluders, tables, wave_numbers, up, solids)
 
 
-def _smooth_interfaces(scene: Scene, topology: Topology, frequency: float) -> SmoothInterfaces:
+def _smooth_interfaces(
+    scene: Scene, topology: Topology, frequency: float
+) -> plane_waves.SmoothInterfaces:
     """Smooth interfaces of all triangles."""
-    columns: list[list[Tensor]] = [[] for _ in SmoothInterfaces._fields]
+    columns: list[list[Tensor]] = [[] for _ in plane_waves.SmoothInterfaces._fields]
     for name, item in scene.objects.items():
         interface = item.material.smooth_interface(frequency)
         if interface is None:
@@ -494,7 +491,7 @@ def _smooth_interfaces(scene: Scene, topology: Topology, frequency: float) -> Sm
         values = (conducting, epsilon.to(torch.complex128), *interface[1:4])
         for column, value in zip(columns, values, strict=True):
             column.append(value.expand(len(item.mesh.faces)))
-    return SmoothInterfaces(*map(torch.cat, columns))
+    return plane_waves.SmoothInterfaces(*map(torch.cat, columns))
 
 
 def _warn_power_gain(powers: Sequence[float]) -> None:

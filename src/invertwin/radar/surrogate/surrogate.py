@@ -18,14 +18,7 @@ from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.aperture import Aperture, aperture
 from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate.point_spread import (
-    airy,
-    airy_radii,
-    array_point_spread,
-    interpolate_response,
-    paired_array_spread,
-    range_point_spread,
-)
+from invertwin.radar.surrogate import point_spread
 from invertwin.radar.waveform import PhysicsWarning, Waveform
 from invertwin.runtime.memory import require_memory
 from invertwin.scene.scene import Scene
@@ -191,24 +184,28 @@ class Surrogate:
         """
 
         def range_spread(places: Tensor) -> Tensor:
-            return range_point_spread(radar.waveform, places, radar.window, self.range_kernel)
+            return point_spread.range_point_spread(
+                radar.waveform, places, radar.window, self.range_kernel
+            )
 
-        power = interpolate_response(ranges, radar.waveform.range_resolution, range_spread)
+        power = point_spread.interpolate_response(
+            ranges, radar.waveform.range_resolution, range_spread
+        )
         u, v = u * (grid.u_count > 1), v * (grid.v_count > 1)
         if grid.u_count == grid.v_count == 1:
             return power
         array = aperture(radar)
         if self.angle_kernel == "airy":
-            across, up = airy_radii(radar, self.aperture_radius)
+            across, up = point_spread.airy_radii(radar, self.aperture_radius)
             away = (across * u).square() + (up * v).square()
             near = away == 0  # a root of zero has no derivative
             away = torch.where(near, 0.0, torch.where(near, 1.0, away).sqrt())
-            return power * airy(2 * math.pi / array.wavelength * away)
-        return power * paired_array_spread(array, u, v)
+            return power * point_spread.airy(2 * math.pi / array.wavelength * away)
+        return power * point_spread.paired_array_spread(array, u, v)
 
     def _kernels(self, radar: Radar, grid: channel.Grid) -> "tuple[_SurrogateKernel, ...]":
         array = aperture(radar) if grid.u_count > 1 or grid.v_count > 1 else None
-        radii, sharp = airy_radii(radar, self.aperture_radius), self.scale_blur(0.0)
+        radii, sharp = point_spread.airy_radii(radar, self.aperture_radius), self.scale_blur(0.0)
         return _kernels(sharp, radii, radar.waveform, radar.window, array, grid)
 
     def _blur_sigmas(self, radar: Radar, grid: channel.Grid) -> dict[int, float]:
@@ -380,7 +377,7 @@ def _kernels(
     """Return the kernels without added widths, cached for the steps of a fit."""
     angle_kernel = surrogate.angle_kernel
     lags = _lags(grid.range_count) * grid.range_step
-    spread = range_point_spread(waveform, lags, window, surrogate.range_kernel)
+    spread = point_spread.range_point_spread(waveform, lags, window, surrogate.range_kernel)
     kernels = [_compensate_spline((1,), (grid.range_count,), spread)]
     needed = 8.0 * max(grid.shape) ** 2  # of the largest matrix of `_apply_by_matrix`
     require_memory(needed, "a map of that many bins", "narrow the grid, or check units", "grid")
@@ -406,9 +403,9 @@ def _angle_spread(
     kernel: str, radii: tuple[float, float], array: Aperture, du: Tensor, dv: Tensor
 ) -> Tensor:
     if kernel == "response":
-        return array_point_spread(array, du, dv)
+        return point_spread.array_point_spread(array, du, dv)
     wavenumber = 2 * math.pi / array.wavelength
-    return airy(wavenumber * torch.hypot(radii[0] * du[:, None], radii[1] * dv[None]))
+    return point_spread.airy(wavenumber * torch.hypot(radii[0] * du[:, None], radii[1] * dv[None]))
 
 
 def _compensate_spline(

@@ -17,14 +17,7 @@ from torch import Tensor
 from invertwin.checks import checked_number
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS
-from invertwin.scene.material.fresnel import (
-    FieldCoefficients,
-    attenuation,
-    complex_permittivity,
-    fresnel_amplitude,
-    refractive_index,
-    safe_root,
-)
+from invertwin.scene.material import fresnel
 from invertwin.scene.material.itu import Itu
 from invertwin.scene.material.roughness import (
     ROUGH_LOBE_WIDTH,
@@ -126,7 +119,7 @@ class Medium(_MaterialRecord):
         """Return the root of the reflectance of a half space, over the nodes of the tables."""
         epsilon = self.complex_permittivity(frequency)[..., None]
         mu = self.complex_permeability[..., None] if self.is_magnetic else None
-        return fresnel_amplitude(epsilon, _COSINES, mu)
+        return fresnel.fresnel_amplitude(epsilon, _COSINES, mu)
 
     def _epsilon(self, frequency: float) -> tuple[Tensor, Tensor]:
         """Return ε and its dispersion ω dε/dω."""
@@ -137,7 +130,7 @@ class Medium(_MaterialRecord):
         sigma, sigma_slope = self.conductivity, 0.0
         if isinstance(sigma, Itu):
             sigma, sigma_slope = sigma.conductivity(frequency), sigma.coefficients(frequency).d
-        epsilon = complex_permittivity(real, sigma, frequency, self.loss_tangent)
+        epsilon = fresnel.complex_permittivity(real, sigma, frequency, self.loss_tangent)
         polarised = evaluate_value(real) * (1 - 1j * evaluate_value(self.loss_tangent))
         return epsilon, real_slope * polarised + (sigma_slope - 1) * (epsilon - polarised)
 
@@ -285,8 +278,8 @@ class RefractingBody(_RoughMedium):
             amplitude,
             *self.weights(),
             refraction=1 - amplitude**2,
-            index=refractive_index(square),
-            attenuation=attenuation(square, frequency),
+            index=fresnel.refractive_index(square),
+            attenuation=fresnel.attenuation(square, frequency),
             **self.depolarisation_terms,
         )
 
@@ -373,7 +366,7 @@ class Multilayer(_MaterialRecord, EffectiveRoughness, Material):
 
     def coefficients(
         self, frequency: float, cosine: Float64[Tensor, " n"], triangle: Int64[Tensor, " n"]
-    ) -> FieldCoefficients:
+    ) -> fresnel.FieldCoefficients:
         """Return the coherent field coefficients of the stack, about its middle."""
         layers = [_select_triangles(layer.sheet(frequency), triangle) for layer in self.layers]
         skin = self.make_interface(None).select_triangles(triangle)
@@ -401,4 +394,4 @@ def _slab_scattering_law(
     tables = slab_tables([layer.sheet(frequency) for layer in layers], _COSINES, frequency)
     through = {"transmittance": tables.transmittance, "extra_length": tables.extra_length}
     through |= roughness.depolarisation_terms
-    return ScatteringLaw(safe_root(tables.reflectance), *roughness.weights(), **through)
+    return ScatteringLaw(fresnel.safe_root(tables.reflectance), *roughness.weights(), **through)
