@@ -2,15 +2,6 @@
 
 from invertwin.registry.kinds import registry
 
-registry.built_in = (
-    "invertwin.cli.schema.sensors",
-    "invertwin.cli.schema.materials",
-    "invertwin.cli.schema.shape_tables",
-    "invertwin.cli.schema.recordings",
-    "invertwin.cli.schema.fit_tables",
-    "invertwin.cli.schema.placement",
-    "invertwin.cli.schema.cross_sections",
-    "invertwin.cli.schema.radio_tables",
-    "invertwin.cli.schema.camera_tables",
-    "invertwin.cli.schema.dataset",
-)
+_SCHEMA = ("sensors", "materials", "shape_tables", "recordings", "fit_tables", "placement")
+_SCHEMA += ("cross_sections", "radio_tables", "camera_tables", "dataset")
+registry.built_in = tuple(f"invertwin.cli.schema.{name}" for name in _SCHEMA)

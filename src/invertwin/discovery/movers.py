@@ -20,13 +20,8 @@ from invertwin.inversion.loss import CorrelationLoss, CorrelationScale
 from invertwin.inversion.reconstruction import Reconstruction
 from invertwin.models.doppler import RangeDopplerMap
 from invertwin.radar.aperture import aperture
+from invertwin.radar.processing import doppler
 from invertwin.radar.processing.detection import ordered_statistics_cfar, point_cloud
-from invertwin.radar.processing.doppler import (
-    compensate_tdm,
-    interpolate_rates,
-    range_doppler,
-    velocity_axis,
-)
 from invertwin.radar.radar import Radar
 from invertwin.scene import RoughDielectric
 from invertwin.scene.mesh import Mesh
@@ -271,12 +266,12 @@ def _channel_coherence(
 ) -> float:
     """|mean of the channels' phases| against the best plane wave, at the cell nearest a place."""
     radar, chirps = recording.radar(), recording.chirps
-    row = int((velocity_axis(radar, chirps) - range_rate).abs().argmin())
+    row = int((doppler.velocity_axis(radar, chirps) - range_rate).abs().argmin())
     column = int((grid.ranges - range_).abs().argmin())
     moving = recording.beat - recording.beat.mean(1, keepdim=True)
-    slow = range_doppler(moving.to(torch.complex128), radar, grid, chirps)
-    rates = interpolate_rates(slow.abs().square().mean((2, 3))[0])
-    channels = compensate_tdm(slow, radar, chirps, rates)[0, row, :, :, column].flatten()
+    slow = doppler.range_doppler(moving.to(torch.complex128), radar, grid, chirps)
+    rates = doppler.interpolate_rates(slow.abs().square().mean((2, 3))[0])
+    channels = doppler.compensate_tdm(slow, radar, chirps, rates)[0, row, :, :, column].flatten()
     y, z = radar.virtual_positions[:, 1], radar.virtual_positions[:, 2]
     # Fine enough that the nearest direction costs less than a thousandth.
     cosines = [torch.linspace(-1, 1, 257 if len(p.unique()) > 1 else 1) for p in (y, z)]

@@ -15,19 +15,13 @@ from invertwin.checks import checked_count, checked_number, checked_tensor
 from invertwin.constants import read_table
 from invertwin.discovery import certainty
 from invertwin.discovery.assembly import ShapeLikelihood, make_sampling
+from invertwin.discovery.imaging import point_detections
 from invertwin.discovery.imaging.likelihood import (
     HeavyTailedLoss,
     count_bins_per_draw,
     direction_axes,
     estimate_background,
     map_axes,
-)
-from invertwin.discovery.imaging.point_detections import (
-    detect_moving_targets,
-    detect_static_points,
-    is_dense_track,
-    locate_coherent_points,
-    platform_velocities,
 )
 from invertwin.discovery.imaging.reflectivity import compute_response
 from invertwin.discovery.outcome import DetectedObject, GroundImage, Twin
@@ -112,12 +106,12 @@ def twin(
     if gains is not None:
         recording, capture = gains.apply(recording), gains.apply(capture)
     moving = _find_moving_targets(recording, range_max)
-    if is_dense_track(capture):
+    if point_detections.is_dense_track(capture):
         # Average over frames, where all of them have an echo.
         far = torch.cdist(places, radar.positions.detach())
         places = places[(far.amin(1) > reach[0]) & (far.amax(1) < reach[1])]
         separation = 4 * max(step, radar.waveform.wavelength)
-        found, image = locate_coherent_points(capture, places, separation)
+        found, image = point_detections.locate_coherent_points(capture, places, separation)
         picture = GroundImage(places[:, :2], image, _count_views(radar, places, None))
         return Twin(_sort_objects([*found, *moving]), floor, picture)
     still = _find_static_objects(capture, radar.grid(*reach), floor, places, step, rays, seed)
@@ -140,7 +134,7 @@ def average_chirps(recording: Capture | ChirpCapture) -> Capture:
         return recording
     chirps, radar = recording.chirps, recording.radar()
     lasts = float(chirps.times(radar.shape[1])[-1].max())
-    path_length = float(platform_velocities(recording).norm(dim=1).max()) * lasts
+    path_length = float(point_detections.platform_velocities(recording).norm(dim=1).max()) * lasts
     if path_length > 0.25 * radar.waveform.wavelength:
         return recording.to_capture(chirps.count // 2)
     # At 2.5 bins of range rate a plain mean passes 1.7 % of the power, this one 0.05 %.
@@ -161,7 +155,7 @@ def _find_moving_targets(
     grid = radar.grid(near, min(range_max or math.inf, recording.max_range))
     if recording.frame_period is not None and recording.frame_count > 2:
         return track_moving_targets(recording, grid)
-    return detect_moving_targets(recording, grid)
+    return point_detections.detect_moving_targets(recording, grid)
 
 
 _NOTES = read_table("invertwin.discovery", "notes.toml")
@@ -188,7 +182,7 @@ def _find_static_objects(
     aside = one.select_frames(held) if held else None
     search = ShapeSearch(fitted, aside, lattice)
     picture = search.first_image
-    shapes, points = search.run(), tuple(detect_static_points(capture, grid))
+    shapes, points = search.run(), tuple(point_detections.detect_static_points(capture, grid))
     if frames == 1:
         # Of one view a blurred echo has many outlines: the search may end in a wrong one.
         spheres = search.fit_spheres(one.position for one in points)

@@ -27,6 +27,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from invertwin.constants import read_table
 from invertwin.errors import InputError
 
 LIBLLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -35,20 +36,7 @@ BACKEND_VARIABLE = "INVERTWIN_BACKEND"
 # Dr.Jit must not go and find a library of its own when every one we know of fails.
 _NO_LIBRARY = "no-usable-libLLVM--run-invertwin-doctor"
 
-_FOLDERS = (
-    "/usr/lib",
-    "/usr/lib64",
-    "/usr/lib/*-linux-gnu*",
-    "/usr/lib/llvm*/lib",
-    "/usr/lib/llvm/*/lib*",
-    "/usr/lib64/llvm*/lib*",
-    "/usr/local/lib",
-    "/usr/local/llvm*/lib",
-    "/opt/llvm*/lib",
-    "/opt/homebrew/opt/llvm*/lib",
-    "/usr/local/opt/llvm*/lib",
-    "/home/linuxbrew/.linuxbrew/opt/llvm*/lib",
-)
+_FOLDERS = read_table("invertwin.runtime", "llvm.toml")["folders"]
 _LIBRARY = re.compile(r"libLLVM(-\d[\w.]*)?(\.\d[\d.]*)?\.(so|dylib)(\.\d[\w.]*)?$")
 _PROBE_SECONDS = 60.0
 

@@ -12,12 +12,7 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
-from invertwin.capture.readers.described_arrays import (
-    arrange_dimensions,
-    element_array,
-    load_array,
-    load_description,
-)
+from invertwin.capture.readers import described_arrays
 from invertwin.capture.readers.touchstone import load_touchstone
 from invertwin.checks import checked_tensor
 from invertwin.errors import InputError
@@ -111,11 +106,13 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     description: dict[str, dict[str, Any]] = {"data": {"file": path.name}}
     axes = [0, 1, 2]
     if not TOUCHSTONE.fullmatch(path.suffix):
-        description, axes = load_description(path, _KEYS)
+        description, axes = described_arrays.load_description(path, _KEYS)
     data, sweep, radar = (description.get(name, {}) for name in ("data", "sweep", "radar"))
     files = _find_data_files(path, data)
     tx, rx = (
-        element_array(radar.get(f"{end}_positions", [[0.0, 0.0, 0.0]]), end.upper(), axes)
+        described_arrays.element_array(
+            radar.get(f"{end}_positions", [[0.0, 0.0, 0.0]]), end.upper(), axes
+        )
         for end in ("tx", "rx")
     )
     source = _SweepFile(files[0], trusted)
@@ -162,9 +159,9 @@ def _load_sweep_array(
             f"expected one data file or Touchstone files, got {len(files)} of {files[0].name}; "
             "put the arrays into one"
         )
-    array = load_array(files[0], data.get("variable"), trusted=trusted)
+    array = described_arrays.load_array(files[0], data.get("variable"), trusted=trusted)
     order = data.get("dimensions", ["frame", "tx", "rx", "sample"])
-    samples = torch.from_numpy(arrange_dimensions(array, order, tx_count))
+    samples = torch.from_numpy(described_arrays.arrange_dimensions(array, order, tx_count))
     if samples.shape[1] != 1:
         raise InputError(
             f"expected one sweep a frame, got {samples.shape[1]} chirps; name that dimension "
@@ -193,7 +190,7 @@ class _SweepFile:
                 f"expected numbers, or the name of a .csv or .npy file, got {given!r}; "
                 f"{self.file.name} has no variables"
             )
-        return load_array(self.file, given, trusted=self.trusted)
+        return described_arrays.load_array(self.file, given, trusted=self.trusted)
 
 
 def _find_data_files(path: Path, data: dict[str, Any]) -> list[Path]:

@@ -16,13 +16,7 @@ from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
-from invertwin.channel.coverage.shadow_boundaries import (
-    SIDE_OFFSET,
-    ReceivingSurface,
-    evaluate_illumination_boundary,
-    sample_along_curves,
-    sample_illumination_boundaries,
-)
+from invertwin.channel.coverage import shadow_boundaries
 from invertwin.channel.em.plane_waves import dot, interpolate_vectors, triangle_normals
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.intersections import find_overlapping_pairs, intersect_triangles
@@ -158,7 +152,7 @@ class _CoverageTracer:
             vertices, ends = strip_derivatives(stage.vertices), torch.cat([self.tx, places])
             self.surfaces = CandidateSurfaces(vertices, stage.topology, ends)
             own, origin = topology_of([surface]), self.surfaces.origin
-            self.receiving_surface = ReceivingSurface(places, own, origin)
+            self.receiving_surface = shadow_boundaries.ReceivingSurface(places, own, origin)
             self.meshes = [*(item.mesh for item in stage.scene.objects.values()), surface]
             self.sequences = find_sequences(self.surfaces, powers, self.tx, depth, rays, seed).steps
 
@@ -199,13 +193,15 @@ class _CoverageTracer:
         """Boundary paths to illumination boundaries: path values times the boundary's area rate."""
         with _DisableFuncTorch():
             search = self.receiving_surface, self.tx, self.sequences, self.powers
-            groups = sample_illumination_boundaries(
+            groups = shadow_boundaries.sample_illumination_boundaries(
                 self.surfaces, *search, depth=self.depth, samples=samples, seed=seed
             )
         boundary_paths: list[CoverageBoundaryPaths] = []
         for some in groups:
             corners, moving = self.receiving_surface.corners, (stage.tx, stage.vertices)
-            boundary = evaluate_illumination_boundary(self.surfaces, corners, some, *moving)
+            boundary = shadow_boundaries.evaluate_illumination_boundary(
+                self.surfaces, corners, some, *moving
+            )
             detached = _detach_stage(stage, boundary.point)
             with torch.no_grad():
                 paths = join_ray_paths(evaluate_paths(detached, boundary.paths))
@@ -227,7 +223,7 @@ class _CoverageTracer:
             curve_points = sample_intersection_curves(own, receiver, joint_topology, samples, seed)
             if not len(curve_points.face):
                 return []
-            offset = SIDE_OFFSET * self.surfaces.margin * curve_points.across
+            offset = shadow_boundaries.SIDE_OFFSET * self.surfaces.margin * curve_points.across
             points = torch.cat([curve_points.point + offset, curve_points.point - offset])
         with torch.no_grad():
             sums = self.sum_paths(_detach_stage(stage, points), self.find_paths(points))
@@ -272,7 +268,7 @@ class IntersectionCurvePoints:
 
 def sample_intersection_curves(
     surfaces: CandidateSurfaces,
-    receiving_surface: ReceivingSurface,
+    receiving_surface: shadow_boundaries.ReceivingSurface,
     joint_topology: Topology,
     samples: int,
     seed: int,
@@ -292,7 +288,7 @@ def sample_intersection_curves(
     points = torch.cat([vertices, receiving_surface.vertices])
     segments = intersect_triangles(points, joint_topology, face, receiving_face + len(corners))
     span = segments.end - segments.start
-    row, fraction, weight = sample_along_curves(span.norm(dim=1), samples, seed)
+    row, fraction, weight = shadow_boundaries.sample_along_curves(span.norm(dim=1), samples, seed)
     face, receiving_face = segments.first[row], segments.second[row] - len(corners)
     normal = triangle_normals(corners[face])
     up = triangle_normals(receiving_surface.corners[receiving_face])

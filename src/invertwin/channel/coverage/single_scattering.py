@@ -42,13 +42,8 @@ from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry, flatten
 from invertwin.channel.rows import Rows
 from invertwin.channel.sampling import Sampling
+from invertwin.channel.specular import image_method
 from invertwin.channel.specular.candidates import enumerate_sequences, shoot_sequences_from_edges
-from invertwin.channel.specular.image_method import (
-    DIRECT,
-    CandidateSurfaces,
-    SpecularPaths,
-    find_paths_from,
-)
 from invertwin.channel.specular.ray_paths import REFLECTION, RayPaths, join_ray_paths, match_rows
 from invertwin.channel.specular.trace_paths import (
     PathScene,
@@ -88,7 +83,7 @@ class _ScatteringPoints(Rows):
 
 
 #: Paths to points from transmitters, and from receivers; detached.
-_PathLegs = tuple[list[SpecularPaths], list[SpecularPaths]]
+_PathLegs = tuple[list[image_method.SpecularPaths], list[image_method.SpecularPaths]]
 
 
 @rename_arguments(rough="scattering_scene", width="value_count")
@@ -170,7 +165,7 @@ class _SingleScatteringTracer:
             rows &= (strip_derivatives(geometry.surfaces.amplitude) > 0).any(1)
             self.is_scattering: Bool[Tensor, " f"] = rows[geometry.face_surface]
             vertices, ends = strip_derivatives(stage.vertices), torch.cat(self.antennas)
-            self.surfaces = CandidateSurfaces(vertices, stage.topology, ends)
+            self.surfaces = image_method.CandidateSurfaces(vertices, stage.topology, ends)
             self.sequences = tuple(self._find_sequences(number, rays) for number in range(2))
 
     def _find_sequences(self, end: int, rays: int | None) -> tuple[Tensor, ...]:
@@ -268,16 +263,16 @@ class _SingleScatteringTracer:
 
     def _find_legs(
         self, end: int, points: Tensor, receiver: Int64[Tensor, " row"] | None, face: Tensor
-    ) -> list[SpecularPaths]:
+    ) -> list[image_method.SpecularPaths]:
         """Find paths from all antennas of one end to points, or each from its own antenna."""
         plane, sources = self.surfaces.planes.face_plane, self.antennas[end]
         every = torch.ones(len(points), dtype=torch.int64)
         numbers = [receiver] if receiver is not None else [every * k for k in range(len(sources))]
-        found: list[SpecularPaths] = []
-        for steps in (DIRECT, *self.sequences[end]):
+        found: list[image_method.SpecularPaths] = []
+        for steps in (image_method.DIRECT, *self.sequences[end]):
             for antenna_number in numbers:
                 used, number = antenna_number.unique(return_inverse=True)
-                for part in find_paths_from(
+                for part in image_method.find_paths_from(
                     self.surfaces, steps, sources[used], number, points, plane[face]
                 ):
                     # A point has no image in its own plane.

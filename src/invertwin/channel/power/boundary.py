@@ -11,17 +11,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-from invertwin.channel.power import integrand
+from invertwin.channel.power import integrand, intersection_curves
 from invertwin.channel.power import random_walk as walk
 from invertwin.channel.power.bins import PathContribution
 from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
 from invertwin.channel.power.interior_silhouettes import InteriorSilhouetteSampler
-from invertwin.channel.power.intersection_curves import (
-    IntersectionCurveSampler,
-    PathParts,
-    PathVisitor,
-    intersection_curve_paths,
-)
 from invertwin.channel.power.random_walk import PathState, RandomWalk
 from invertwin.channel.power.silhouettes import (
     SampleBatch,
@@ -39,7 +33,7 @@ from invertwin.channel.sampling import Sampling
 _SECOND_PART_OFFSET = 1 << 30  # added to indices, so that both parts have their own random numbers
 
 
-_PathBuilder = Callable[..., Iterator[PathParts]]
+_PathBuilder = Callable[..., Iterator[intersection_curves.PathParts]]
 """Function of the ray scene, attached inputs, a walker, sampled points and the depth."""
 
 
@@ -65,7 +59,7 @@ class BoundaryPaths:
 
     speed: mit.Float
     state: PathState
-    run: Callable[[PathState, PathVisitor], PathState]
+    run: Callable[[PathState, intersection_curves.PathVisitor], PathState]
 
     def sum_weighted(self, gather: Callable[[PathContribution, mit.Bool], mit.Float]) -> mit.Float:
         """Sum power × ``gather(path, exists)`` over the paths of each lane.
@@ -142,8 +136,10 @@ class BoundarySamples:
             )
             found.append((inside, _interior_silhouette_paths))
         if crossing is not None and meet:
-            contacts = IntersectionCurveSampler(rays, inputs, crossing, share, depth, seed)
-            found.append((contacts, intersection_curve_paths))
+            contacts = intersection_curves.IntersectionCurveSampler(
+                rays, inputs, crossing, share, depth, seed
+            )
+            found.append((contacts, intersection_curves.intersection_curve_paths))
         self._samplers, self._path_builders = zip(*found, strict=True)
         self._chunks = chunks
         self._prefetched = [
@@ -198,7 +194,7 @@ def trace_boundary_paths(
 
 def _antenna_silhouette_paths(
     rays: RayScene, inputs: Inputs, walker: RandomWalk, samples: SilhouetteSample, depth: int
-) -> Iterator[PathParts]:
+) -> Iterator[intersection_curves.PathParts]:
     """First family: the shadow that an edge casts from an antenna, and the path to the other."""
     at_receiver = samples.is_receiver
     fixed, frame = inputs.detach(), samples.frame
@@ -214,7 +210,7 @@ def _antenna_silhouette_paths(
     departure = integrand.to_radar_frame(fixed, frame, -incident)
     throughput = fixed.scale * fixed.gain(frame, at_receiver, departure) / dr.square(distance)
 
-    def run(state: PathState, visit: PathVisitor) -> PathState:
+    def run(state: PathState, visit: intersection_curves.PathVisitor) -> PathState:
         def visit_connection(state: PathState, point: SurfaceInteraction) -> None:
             to_receiver = state.get("to_receiver", True)
             # If one test serves both antennas, single vertices count in the transmitter's shadows.
@@ -244,7 +240,7 @@ def _antenna_silhouette_paths(
 
 def _interior_silhouette_paths(
     rays: RayScene, inputs: Inputs, walker: RandomWalk, samples: SilhouetteSample, depth: int
-) -> Iterator[PathParts]:
+) -> Iterator[intersection_curves.PathParts]:
     """Second family: a shadow that one surface point casts past an edge on another surface.
 
     The part before the shadow has a random number of vertices, the part after it all that the depth
@@ -271,7 +267,7 @@ def _interior_silhouette_paths(
     first = walk.initial_state(samples.index, samples.frame, source, -to_behind, throughput, zero)
     done = walker.trace_subpath(first, count, ends_at_receiver)
 
-    def run(state: PathState, visit: PathVisitor) -> PathState:
+    def run(state: PathState, visit: intersection_curves.PathVisitor) -> PathState:
         def visit_connection(state: PathState, point: SurfaceInteraction) -> None:
             visit(state, *walk.connect_path(rays, fixed, state, point, state["to_receiver"]))
 

@@ -48,18 +48,12 @@ from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.ray_scene import Occluders, is_visible
 from invertwin.channel.rays.scene_tables import require_surfaces
 from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.channel.rcs import rays_in_dielectrics
 from invertwin.channel.rcs.dielectric_interfaces import incident_power, scatter_at_interfaces
 from invertwin.channel.rcs.moments.efie_solver import EFIESolver
 from invertwin.channel.rcs.moments.mfie import MFIESolver
 from invertwin.channel.rcs.moments.solver import Refusal, warn_not_solved
 from invertwin.channel.rcs.plate_diffraction import find_plates, trace_multiple_diffractions
-from invertwin.channel.rcs.rays_in_dielectrics import (
-    MAX_SMOOTH_ANGLE,
-    SmoothFaces,
-    group_smooth_faces,
-    require_separate_conductors,
-    trace_inner_tubes,
-)
 from invertwin.channel.rcs.shooting_bouncing_rays import find_illuminated_triangles, trace_tubes
 from invertwin.channel.rcs.surface_paths import face_path_lengths
 from invertwin.checks import is_differentiated
@@ -111,9 +105,9 @@ class _FarFieldTarget:
         return 2 * math.pi / max(self.wave_numbers)
 
     @cached_property
-    def smooth_faces(self) -> SmoothFaces:
+    def smooth_faces(self) -> rays_in_dielectrics.SmoothFaces:
         """Smooth faces that the facets approximate."""
-        return group_smooth_faces(self.facets, self.topology.edge_faces)
+        return rays_in_dielectrics.group_smooth_faces(self.facets, self.topology.edge_faces)
 
     @cached_property
     def metal_faces(self) -> Int64[Tensor, " entry"]:
@@ -303,7 +297,9 @@ class _FarFieldTracer:
                 patch_orders = outside
                 if solids is not None:
                     bodies = target.smooth_faces, target.occluders, solids
-                    patch_orders = trace_inner_tubes(*bodies, outside, tube_width, depth)
+                    patch_orders = rays_in_dielectrics.trace_inner_tubes(
+                        *bodies, outside, tube_width, depth
+                    )
                 yield patch_orders, solids, members
 
     def _patch_amplitudes(
@@ -416,7 +412,7 @@ def _check_inner_tubes(target: _FarFieldTarget) -> None:
                 "tubes inside are discontinuous at edges; detach them, use fewer triangles, or an "
                 "open mesh, of which only the front face reflects"
             )
-        require_separate_conductors(target.facets, solids)
+        rays_in_dielectrics.require_separate_conductors(target.facets, solids)
 
 
 def _residual_field(
@@ -520,7 +516,7 @@ def _warn_validity(
     ends = target.vertices.detach()[target.topology.edges]
     # A triangle of side ℓ with angles α to its neighbours is ℓα/√12 off the curved surface.
     sagittas = (ends[:, 1] - ends[:, 0]).norm(dim=1) * angle / math.sqrt(12)
-    smooth = (angle > _MIN_TURN_ANGLE) & (angle < MAX_SMOOTH_ANGLE)
+    smooth = (angle > _MIN_TURN_ANGLE) & (angle < rays_in_dielectrics.MAX_SMOOTH_ANGLE)
     for number, name in enumerate(scene.objects):
         own = faces == number
         points = target.facets.corners.detach()[own].reshape(-1, 3)

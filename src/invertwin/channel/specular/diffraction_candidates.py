@@ -26,6 +26,7 @@ from torch import Tensor
 
 from invertwin.channel.em.plane_waves import dot
 from invertwin.channel.rows import Rows, concatenate_rows
+from invertwin.channel.specular import image_method
 from invertwin.channel.specular.candidates import (
     FaceInteractions,
     enumerate_sequences,
@@ -33,12 +34,6 @@ from invertwin.channel.specular.candidates import (
 )
 from invertwin.channel.specular.corner_diffraction import face_weight
 from invertwin.channel.specular.edge_path_geometry import multiple_diffraction_points
-from invertwin.channel.specular.image_method import (
-    find_unobstructed_paths,
-    intersects_planes,
-    is_unobstructed,
-    replace_zeros,
-)
 from invertwin.channel.specular.ray_paths import REFLECTION, TRANSMISSION, match_rows
 from invertwin.channel.specular.wedge_scene import WedgeScene, is_exterior
 
@@ -219,7 +214,7 @@ def _may_cross_planes(
         for number, end in enumerate(points):
             direction = images[step + 1] - end
             slope = dot(direction, normal)
-            fraction = dot(point - end, normal) / replace_zeros(slope)
+            fraction = dot(point - end, normal) / image_method.replace_zeros(slope)
             within = (fraction > -_PLANE_TOLERANCE) & (fraction < 1 + _PLANE_TOLERANCE)
             valid.append((slope != 0) & within)
             points[number] = end + fraction[:, None] * direction
@@ -250,11 +245,11 @@ def _diffract_once(
             rows = torch.nonzero(valid)[:, 0]
             steps, end = side.steps[rows].flip(1), beside[rows] - surfaces.origin
             images = surfaces.images(side.position[rows], steps)
-            valid[rows] = intersects_planes(surfaces, steps, images, end)
+            valid[rows] = image_method.intersects_planes(surfaces, steps, images, end)
         faces = [torch.full_like(side.steps, -1) for side in (outbound, inbound)]
         for side, side_faces in zip((outbound, inbound), faces, strict=True):
             rows = torch.nonzero(valid)[:, 0]
-            valid[rows], side_faces[rows] = find_unobstructed_paths(
+            valid[rows], side_faces[rows] = image_method.find_unobstructed_paths(
                 surfaces, side.steps[rows].flip(1), side.position[rows], beside[rows]
             )
         if bool(valid.any()):
@@ -320,7 +315,7 @@ def _are_mutually_visible(
         for edge, position in zip(pairs[rows].T, (fraction, other_fraction), strict=True):
             point = wedges.start[edge] + position * (wedges.end[edge] - wedges.start[edge])
             points.append(wedge_scene.offset_points(edge, point))
-        found[rows] = is_unobstructed(wedge_scene.surfaces, *points)
+        found[rows] = image_method.is_unobstructed(wedge_scene.surfaces, *points)
     return found
 
 
@@ -402,7 +397,7 @@ def _select_unobstructed(
     nodes.append(ends[1][candidates.rx])
     for start, end in pairwise(nodes):
         rows = torch.nonzero(valid)[:, 0]
-        valid[rows] = is_unobstructed(wedge_scene.surfaces, start[rows], end[rows])
+        valid[rows] = image_method.is_unobstructed(wedge_scene.surfaces, start[rows], end[rows])
     if bool(valid.any()):
         yield candidates.select(torch.nonzero(valid)[:, 0])
 

@@ -8,13 +8,7 @@ from invertwin.cli.fits.problem import Problem, Row
 from invertwin.cli.report import load_texts
 from invertwin.cli.run_file import prefix_errors
 from invertwin.errors import InputError
-from invertwin.inversion.metrics import (
-    ShapeMetrics,
-    compare_shapes,
-    count_topology,
-    is_watertight,
-    volume_iou,
-)
+from invertwin.inversion import metrics
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.shape_models.density import replace_clouds
 
@@ -60,8 +54,8 @@ def check_measures(problem: Problem, start: Scene) -> None:
     with prefix_errors("measures"):
         _compare_surfaces(problem, start, table.seen)
         truth = _world_mesh(problem.truth, table.object)
-        if is_watertight(truth):
-            volume_iou(truth, truth, table.voxel)
+        if metrics.is_watertight(truth):
+            metrics.volume_iou(truth, truth, table.voxel)
 
 
 def score_shape(problem: Problem, start: Scene, twin: Scene) -> Row:
@@ -100,13 +94,15 @@ def make_shape_metric(problem: Problem) -> Callable[[Scene], dict[str, float]] |
 
 def _compare_surfaces(
     problem: Problem, scene: Scene, visible_only: bool, volume: bool = True
-) -> ShapeMetrics:
+) -> metrics.ShapeMetrics:
     table = problem.measures
     assert table is not None
     eyes = [item.sensor.positions.detach() for item in problem.sensor_data.values()]
     shapes = [_world_mesh(one, table.object) for one in (scene, problem.truth)]
     seen_from, voxel = torch.cat(eyes) if visible_only else None, table.voxel if volume else None
-    return compare_shapes(*shapes, seen_from=seen_from, thresholds=table.thresholds, voxel=voxel)
+    return metrics.compare_shapes(
+        *shapes, seen_from=seen_from, thresholds=table.thresholds, voxel=voxel
+    )
 
 
 def _shape_metrics(problem: Problem, scene: Scene, visible_only: bool, suffix: str = "") -> Row:
@@ -124,7 +120,7 @@ def _shape_metrics(problem: Problem, scene: Scene, visible_only: bool, suffix: s
 
 
 def _topology_metrics(mesh: Mesh) -> Row:
-    return dict(vars(count_topology(mesh))) if is_watertight(mesh) else {}
+    return dict(vars(metrics.count_topology(mesh))) if metrics.is_watertight(mesh) else {}
 
 
 def _world_mesh(scene: Scene, name: str) -> Mesh:

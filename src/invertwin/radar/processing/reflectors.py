@@ -11,21 +11,8 @@ from scipy.special import gammaincinv
 from torch import Tensor
 
 from invertwin.channel import Grid
+from invertwin.radar.processing import detection, doppler
 from invertwin.radar.processing.beamforming import beamform
-from invertwin.radar.processing.detection import (
-    PointCloud,
-    cell_averaging_cfar,
-    ordered_statistics_cfar,
-    world_positions,
-)
-from invertwin.radar.processing.doppler import (
-    compensate_tdm,
-    interpolate_peak,
-    interpolate_rates,
-    range_doppler,
-    velocity_axis,
-    velocity_span,
-)
 from invertwin.radar.radar import Radar, require_sampled_waveform
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.radar.signal.range_profile import range_profile
@@ -49,7 +36,7 @@ _Beat = Complex[Tensor, "frame chirp tx rx sample"]  # of every ramp
 
 def detect_points(
     beat: _Beat, radar: Radar, grid: Grid, chirps: Chirps | None, frame: int
-) -> PointCloud:
+) -> detection.PointCloud:
     """Detect the reflectors in one frame by CFAR.
 
     Detected cells of range and range rate are points, unless they are sidelobes of stronger points.
@@ -72,30 +59,35 @@ def detect_points(
     if chirps is None:
         cube = range_profile(signal[:, 0], radar, whole)[:, None]
     else:
-        cube = range_doppler(signal, radar, whole, chirps)
+        cube = doppler.range_doppler(signal, radar, whole, chirps)
     everywhere = cube[0].abs().square().double().mean((1, 2))
     flat, cube = everywhere[:, : grid.range_count], cube[..., : grid.range_count]
     if chirps is not None:
-        offsets = interpolate_rates(flat)
-        cube = compensate_tdm(cube, radar, chirps, offsets)
-        rates = velocity_axis(radar, chirps)[:, None] + offsets * velocity_span(radar, chirps)
+        offsets = doppler.interpolate_rates(flat)
+        cube = doppler.compensate_tdm(cube, radar, chirps, offsets)
+        rates = doppler.velocity_axis(radar, chirps)[:, None] + offsets * doppler.velocity_span(
+            radar, chirps
+        )
     cube = cube[0].to(torch.complex128)
     looks = len(radar.virtual_positions)
     noise = noise_power(flat, looks)
     rows: list[list[float]] = []
     for v, r in track(_find_cells(everywhere, radar, grid, looks), "points"):
         near = [max(r - 1, 0), r, min(r + 1, grid.range_count - 1)]
-        place = float(grid.ranges[r]) + float(interpolate_peak(*flat[v, near])) * grid.range_step
+        place = (
+            float(grid.ranges[r])
+            + float(doppler.interpolate_peak(*flat[v, near])) * grid.range_step
+        )
         directions = _resolve_directions(cube[v, :, :, r], radar, grid, noise)
         rows += [[place, float(rates[v, r]), *direction] for direction in directions]
     table = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5)
     ranges, found, u, v, power = table.T
     frames = torch.zeros(len(table), dtype=torch.int64)
-    places = world_positions(radar, frames, ranges, u, v)
-    return PointCloud(frames + frame, ranges, found, u, v, power, places)
+    places = detection.world_positions(radar, frames, ranges, u, v)
+    return detection.PointCloud(frames + frame, ranges, found, u, v, power, places)
 
 
-def format_points_csv(points: PointCloud) -> str:
+def format_points_csv(points: detection.PointCloud) -> str:
     """Return one line per point, the strongest first."""
     lines = ["range_m,velocity_m_s,u,v,power_db,x_m,y_m,z_m"]
     for i in points.power.argsort(descending=True).tolist():
@@ -153,9 +145,9 @@ def _local_maxima(levels: _Levels) -> Bool[Tensor, "velocity range"]:
 
 def _threshold_cells(flat: _Levels, looks: int) -> Bool[Tensor, "velocity range"]:
     if len(flat) >= _MIN_RATES_2D:
-        return cell_averaging_cfar(flat, looks=looks)
+        return detection.cell_averaging_cfar(flat, looks=looks)
     how: Any = {"guard": _GUARD, "training": _TRAINING, "rank": _RANK, "looks": looks}
-    return torch.cat([ordered_statistics_cfar(row[None], **how) for row in flat])
+    return torch.cat([detection.ordered_statistics_cfar(row[None], **how) for row in flat])
 
 
 def _sidelobe_response(
@@ -236,5 +228,5 @@ def _refine_direction(
                 moved[axis] += step * width / shrink
                 wave = _plane_wave(radar, grid, moved[0], moved[1])
                 levels.append(torch.vdot(wave, channels).abs().square())
-            place[axis] += float(interpolate_peak(*levels)) * width / shrink
+            place[axis] += float(doppler.interpolate_peak(*levels)) * width / shrink
     return max(-1.0, min(1.0, place[0])), max(-1.0, min(1.0, place[1]))

@@ -15,12 +15,7 @@ from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.radar.radar import Radar, require_sampled_waveform
-from invertwin.radar.signal.nufft import (
-    beat_of_delays,
-    instants_derivative,
-    phase_cycles,
-    ramp_instants,
-)
+from invertwin.radar.signal import nufft
 from invertwin.radar.signal.range_profile import beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, SampledWaveform, SteppedFrequency
 from invertwin.runtime.concurrency import tracer_lock
@@ -247,7 +242,7 @@ class ChirpTrain:
         placed = self._points_at_instants(start, 1 if sample_interval(waveform) == 0 else 3)
         if len(placed) > 1 and len(paths):
             length = _segment_length(placed, span, *ends)
-            cycles = phase_cycles((length / SPEED_OF_LIGHT).detach(), waveform)
+            cycles = nufft.phase_cycles((length / SPEED_OF_LIGHT).detach(), waveform)
             bend = math.pi * float((cycles[0] - 2 * cycles[1] + cycles[2]).abs().max())
             count = _count_instants(bend)
             placed = placed if count == 3 else self._points_at_instants(start, count)
@@ -264,7 +259,7 @@ class ChirpTrain:
                 for rx, segment in enumerate(back):
                     field = self.radar.coefficient(own, tx, rx)
                     delay = (forth + segment) / SPEED_OF_LIGHT + rest
-                    channels.append(beat_of_delays(field, delay, waveform, self.tolerance))
+                    channels.append(nufft.beat_of_delays(field, delay, waveform, self.tolerance))
                 found.append(torch.stack(channels))
         return torch.stack([torch.stack(found) for found in signals], dim=1)
 
@@ -272,7 +267,7 @@ class ChirpTrain:
         """Return the points at the instants of a ramp."""
         waveform = require_sampled_waveform(self.radar)
         interval = sample_interval(waveform)
-        instants = ramp_instants(waveform.samples, count) if interval else torch.zeros(1)
+        instants = nufft.ramp_instants(waveform.samples, count) if interval else torch.zeros(1)
         return torch.stack([self.trajectory(start + interval * n) for n in instants.tolist()])
 
     def _scattering_points(
@@ -282,7 +277,7 @@ class ChirpTrain:
         if len(points) == 1:
             return points
         waveform = require_sampled_waveform(self.radar)
-        per_sample = instants_derivative(waveform.samples, len(points)).to(points.device)
+        per_sample = nufft.instants_derivative(waveform.samples, len(points)).to(points.device)
         velocity = torch.einsum("kl,lpc->kpc", per_sample, points) / sample_interval(waveform)
         return points - (points - receiver).norm(dim=-1, keepdim=True) / SPEED_OF_LIGHT * velocity
 
