@@ -17,10 +17,12 @@ from invertwin.scene import (
     Scene,
     Slab,
     box,
+    merge_meshes,
     plate,
     rigid,
     rotation_from_vector,
 )
+from invertwin.scene.mesh import concatenate_meshes
 from scenes import float64, level_plate
 
 FREQUENCY = 5.8e9
@@ -295,3 +297,41 @@ def test_a_leak_between_coplanar_faces_is_none():
     assert len(paths) == 4 * 101
     torch.testing.assert_close(outside, torch.full_like(outside, 1.5))
     assert float(paths.length.min()) > 6.0
+
+
+def diffracted_power(parts: list[Mesh], move: Tensor, order: int = 1) -> Tensor:
+    """Sum of the diffracted fields at places behind bodies that move and turn together."""
+    turn = rotation_from_vector(move[0] * float64([0.3, 0.2, -0.1]) + float64([0.1, 0.15, 0.5]))
+    pose = rigid(turn, float64([1.4, 0.0, 0.0]) + move[0] * float64([-0.4, 0.3, 0.2]))
+    bodies = Scene({str(n): Object(part, METAL, pose) for n, part in enumerate(parts)})
+    rx = float64([[2.2, 0.1, 0.05], [2.3, -0.1, 0.1], [2.0, 0.35, -0.1]])
+    found = trace_paths(
+        bodies, float64([0.0, 0.03, 0.02]), rx, 3.5e9, depth=0, edges=order, rays=None
+    )
+    phase = -2 * math.pi * 3.5e9 * found.delay
+    field = found.coefficient[:, 0, 0] * torch.polar(torch.ones_like(phase), phase)
+    return torch.zeros(3, dtype=torch.complex128).index_add(0, found.rx, field).abs().square()
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.3])
+def test_bodies_that_cross_diffract_as_their_united_surface_does(turned):
+    """Edges end where they enter the other body, with the waves of these corners."""
+    turn = rotation_from_vector(turned * float64([0.7, 1.0, 1.3]))
+    bar = Mesh(box((0.3, 0.18, 0.5)).vertices @ turn.T, box((0.3, 0.18, 0.5)).faces)
+    parts = [box((0.18, 0.5, 0.18)), bar]
+    zero, one = torch.zeros(1).double(), torch.ones(1).double()
+    clean = merge_meshes(parts)
+    expected = jvp(lambda move: diffracted_power([clean], move), (zero,), (one,))
+    for found in (parts, [concatenate_meshes(parts)]):
+        pair = jvp(lambda move: diffracted_power(found, move), (zero,), (one,))  # noqa: B023
+        for value, clean in zip(pair, expected, strict=True):
+            assert float((value - clean).norm() / clean.norm()) < 5e-3
+
+
+def test_a_plate_on_the_whole_face_of_a_box_changes_no_diffraction():
+    body, zero = box((0.25, 0.4, 0.5)), torch.zeros(1).double()
+    front = plate(0.4, 0.5)
+    cover = Mesh(front.vertices - float64([0.125, 0.0, 0.0]), front.faces)
+    both, alone = diffracted_power([body, cover], zero), diffracted_power([body], zero)
+    torch.testing.assert_close(both, alone, rtol=1e-9, atol=0.0)
+    assert (alone > 0).any()

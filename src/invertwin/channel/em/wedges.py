@@ -34,6 +34,7 @@ MIN_EDGE_ANGLE = math.radians(10.0)
 _MERGE_TOLERANCE = 1e-6  # rad, and fraction of the scene's size: equal lines and planes
 _GENERIC_DIRECTION = torch.tensor([0.8123, 0.4571, 0.3623], dtype=torch.float64)
 _SWAPPED_FACES = torch.tensor([1, 0])
+_SAME_SIDE = 1e-3  # rad between half planes at an edge that count as one
 _MIN_CREASE_ANGLE = 0.35  # rad between adjacent normals; less is a curved surface
 _POLE_WIDTH = 1e-5
 _MIN_PHASE = math.pi  # along a strip: over narrower faces currents go on round the next edge
@@ -81,6 +82,9 @@ def find_wedges(
         edge_faces: triangles at each edge (−1: none).
     """
     found: list[Wedges] = []
+    with _DisableFuncTorch():  # discrete, as below
+        fixed = strip_derivatives(corners), strip_derivatives(endpoints)
+        edge_faces = _drop_doubled_sides(*fixed, edge_faces)
     number = (edge_faces >= 0).sum(1)
     for count in (1, 2):
         edge = torch.nonzero(number == count)[:, 0]
@@ -108,6 +112,19 @@ def find_wedges(
             normals = torch.stack([sign * normal[:, 0], -sign * normal[:, 1]], 1)
             found.append(Wedges(*ends, t, normals, angle / math.pi, faces).select(keep))
     return concatenate_rows(found)
+
+
+def _drop_doubled_sides(corners: Tensor, endpoints: Tensor, edge_faces: Tensor) -> Tensor:
+    """Keep one of the triangles in one half plane at an edge, as those of a doubled face."""
+    edge_faces, several = edge_faces.clone(), torch.nonzero((edge_faces >= 0).sum(1) > 2)[:, 0]
+    faces, (start, end) = edge_faces[several], endpoints[several].unbind(1)
+    axis = normalize(end - start, dim=1)[:, None]
+    into = corners[faces].mean(2) - start[:, None]
+    into = normalize(into - dot(into, axis)[..., None] * axis, dim=2)
+    alike = (into[:, :, None] - into[:, None]).norm(dim=3) < _SAME_SIDE
+    alike &= (faces >= 0)[:, :, None] & (faces >= 0)[:, None]
+    edge_faces[several] = torch.where(alike.tril(-1).any(2), -1, faces)
+    return edge_faces
 
 
 def select_body_edges(wedges: Wedges, min_length: float) -> Bool[Tensor, " row"]:

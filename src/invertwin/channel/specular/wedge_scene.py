@@ -11,6 +11,7 @@ from itertools import pairwise
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
+from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import dot
@@ -21,6 +22,7 @@ from invertwin.channel.em.wedges import (
     find_wedges,
     merge_collinear_wedges,
 )
+from invertwin.channel.rays.edge_crossings import find_crossings, split_at_crossings
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.specular.edge_path_geometry import PathEdge
 from invertwin.channel.specular.image_method import CandidateSurfaces, is_unobstructed
@@ -55,13 +57,23 @@ class WedgeScene:
 
     @cached_property
     def wedges(self) -> Wedges:
-        """Sharp edges, with collinear edges merged."""
-        return _sharp_edges(self.vertices, self.topology)
+        """Sharp edges: collinear ones merged, and split where they pass through surfaces."""
+        return self._split_edges(self.vertices)
 
     @cached_property
     def detached_wedges(self) -> Wedges:
         """Detached sharp edges."""
-        return _sharp_edges(strip_derivatives(self.vertices), self.topology)
+        return self._split_edges(strip_derivatives(self.vertices))
+
+    def _split_edges(self, vertices: Float64[Tensor, "v 3"]) -> Wedges:
+        wedges = _sharp_edges(vertices, self.topology)
+        return split_at_crossings(wedges, self._crossings, vertices[self.topology.faces])
+
+    @cached_property
+    def _crossings(self) -> Int64[Tensor, "n 2"]:
+        with _DisableFuncTorch():  # discrete
+            wedges = _sharp_edges(strip_derivatives(self.vertices), self.topology)
+            return find_crossings(self.surfaces, wedges, self.ray_offset)
 
     @property
     def ray_offset(self) -> float:
