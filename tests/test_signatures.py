@@ -13,6 +13,7 @@ from invertwin.scene import (
     Mesh,
     PerfectConductor,
     Slab,
+    box,
     dihedral,
     merge_meshes,
     plate,
@@ -200,3 +201,25 @@ def test_materials_have_derivatives():
         step[i] = 1e-6
         difference = float(power(start.detach() + step) - power(start.detach() - step)) / 2e-6
         assert float(gradient[i]) == pytest.approx(difference, rel=1e-5)
+
+
+@pytest.mark.parametrize("divisions", [1, 3])  # by beams and by tubes
+def test_what_two_objects_have_in_one_place_is_refused_from_where_it_is_seen(divisions):
+    """A plate on the front of a box, in it or over its edge; the floor below it from below."""
+    body, metal = iw.Object(box(0.2), PerfectConductor()), PerfectConductor()
+
+    def found(height: float, side: float, x: float, way: float) -> Tensor:
+        pose = rigid(translation=float64([x, 0.0, height]))
+        patch = iw.Object(plate(side, side, divisions=divisions), metal, pose)
+        scene = iw.Scene({"body": body, "patch": patch})
+        return iw.rcs(scene, [[-way, 0.2, 0.1], [-way, -0.1, 0.3]], 10e9, edges=1).cross_section
+
+    for height, side in ((0.0, 0.2), (0.02, 0.1), (0.1, 0.2)):
+        with pytest.raises(InputError, match="got body and patch in one plane, in a place that is"):
+            found(height, side, -0.1, 1.0)
+        assert found(height, side, -0.101, 1.0).isfinite().all()
+    with pytest.raises(InputError, match="got body and patch in one plane"):
+        found(0.0, 0.5, 0.1, -1.0)
+    torch.testing.assert_close(
+        found(0.0, 0.5, 0.1, 1.0), found(0.0, 0.5, 0.1001, 1.0), rtol=0.05, atol=0.0
+    )

@@ -132,3 +132,13 @@ def test_doubled_facets_are_refused():
     scene = Scene({"tile": thing(double, material=PerfectConductor())})
     with pytest.raises(InputError, match="one surface in each place of tile, got 4 triangles"):
         trace_facet_paths(scene, antennas(), 1)
+
+
+def test_plates_of_two_objects_in_one_plane_are_refused_where_both_would_count():
+    tile, patch = thing(plate(0.1, 0.1), material=PerfectConductor()), plate(0.05, 0.04)
+    with pytest.raises(InputError, match="got tile and patch in one plane, in a place that is"):
+        trace_facet_paths(
+            Scene({"tile": tile, "patch": Object(patch, tile.material, tile.transform)}),
+            antennas(),
+            1,
+        )

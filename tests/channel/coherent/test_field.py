@@ -17,6 +17,7 @@ from invertwin.scene import (
     PerfectConductor,
     RoughDielectric,
     Scene,
+    box,
     plate,
     sphere,
 )
@@ -401,3 +402,14 @@ def test_doubled_conductors_are_refused():
     scene, antennas = Scene({"a": thing(double, material=METAL)}), link(((-2.0, 0.0, 0.0),))
     with pytest.raises(InputError, match="got 10 triangles on others; merge_meshes"):
         trace_field(scene, antennas, sampling=Sampling(depth=1), seed=1)
+
+
+def test_plates_of_two_objects_in_one_plane_are_refused_where_both_would_count():
+    """Rough and smooth; a box on the floor hides what it stands on."""
+    sampling = Sampling(depth=1, conductor_samples=1_000, points_per_m2=500.0, boundary=False)
+    for material in (METAL, RoughDielectric(4.0)):
+        tile, patch = (thing(plate(w, w), (1.0, 0.0, 0.0), material=material) for w in (0.4, 0.2))
+        with pytest.raises(InputError, match="got tile and patch in one plane, in a place that is"):
+            trace_field(Scene({"tile": tile, "patch": patch}), link(), sampling=sampling, seed=1)
+        chest = thing(box(0.2), (0.9, 0.0, 0.0), material=material)
+        trace_field(Scene({"tile": tile, "chest": chest}), link(), sampling=sampling, seed=1)

@@ -28,6 +28,9 @@ from invertwin.channel.em.antenna_fields import (
 )
 from invertwin.channel.em.plane_waves import area_vector, dot, polygon_integral
 from invertwin.channel.paths import Link, Paths, concatenate_paths
+from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.coplanar import refuse_coplanar_surfaces
+from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -95,6 +98,10 @@ def _conductor_facets(scene: Scene, link: Link) -> Facets:
             f"{len(geometry.faces)}; use power paths, or simulate"
         )
     require_single_surfaces(scene)
+    viewers = torch.cat([link.tx, link.rx])
+    with tracing():
+        rays = RayScene(geometry, link)
+        refuse_coplanar_surfaces(rays, geometry.vertices, viewers, geometry.names)
     return build_facets(geometry.vertices, geometry.topology)
 
 

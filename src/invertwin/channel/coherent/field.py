@@ -28,6 +28,7 @@ from invertwin.channel.em.depolarisation import random_scattering_matrix
 from invertwin.channel.em.plane_waves import dot
 from invertwin.channel.paths import Link, Paths, concatenate_paths
 from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.coplanar import refuse_coplanar_surfaces
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import (
     flatten,
@@ -74,6 +75,8 @@ def trace_field(
         moves = sampling.boundary and is_visibility_differentiated(geometry, link)
         require_single_surfaces(scene, allows_overlaps=True)
         rays = RayScene(geometry, link)
+        viewers = torch.cat([link.tx, link.rx])
+        refuse_coplanar_surfaces(rays, geometry.vertices, viewers, geometry.names)
         parts: list[Paths] = []
         if any(geometry.coherent):
             if sampling.boundary:

@@ -1,6 +1,7 @@
 """Visible coplanar surfaces: rounding decides which of them a ray meets."""
 
 import warnings
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float64, Int64
@@ -8,9 +9,10 @@ from torch import Tensor
 
 from invertwin.channel.em.plane_waves import barycentric_coordinates, triangle_normals
 from invertwin.channel.rays.intersections import find_overlapping_boxes
-from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene, is_visible
+from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders, RayScene, is_visible
 from invertwin.channel.rays.scene_tables import Geometry
-from invertwin.errors import PhysicsWarning
+from invertwin.checks import strip_derivatives
+from invertwin.errors import InputError, PhysicsWarning
 
 _MAX_PAIRS = 20_000  # most coplanar pairs of triangles that are compared, evenly chosen
 _MAX_POINTS = 64  # most tested points of a pair of objects
@@ -48,6 +50,32 @@ def warn_coplanar_surfaces(rays: RayScene) -> None:
         )
 
 
+def refuse_coplanar_surfaces(
+    rays: Occluders,
+    vertices: Float64[Tensor, "v 3"],
+    viewers: Float64[Tensor, "n 3"],
+    names: Sequence[str],
+) -> None:
+    """Raise an error for coplanar surfaces of two objects that are seen, where both would count.
+
+    Args:
+        rays: occluders.
+        vertices: world positions [m].
+        viewers: positions from where surfaces are seen [m].
+        names: names of the objects.
+
+    Raises:
+        InputError: such surfaces.
+    """
+    pairs = ~torch.eye(len(names), dtype=torch.bool)
+    for one, other in sorted(_find_seen_pairs(rays, strip_derivatives(vertices), pairs, viewers)):
+        raise InputError(
+            f"expected one surface in each place, got {names[one]} and {names[other]} in one "
+            "plane, in a place that is seen: both would count; lift one of them off the other, or "
+            "cut a hole"
+        )
+
+
 def _find_coplanar_pairs(
     rays: RayScene, pairs: Bool[Tensor, "object object"]
 ) -> set[tuple[int, int]]:
@@ -71,12 +99,26 @@ def _find_visible_pairs(
     rays: RayScene, pairs: Bool[Tensor, "object object"]
 ) -> set[tuple[int, int]]:
     """Find those of some pairs of objects that are coplanar at a point that an antenna sees."""
-    geometry, found = rays.geometry, set[tuple[int, int]]()
-    pairs, low, high = find_overlapping_boxes(geometry, pairs)
-    if not bool(pairs.any()):
-        return found
-    points = geometry.vertices.detach() - rays.origin
-    triangles, owner = points[geometry.faces], geometry.face_object
+    geometry, link, count = rays.geometry, rays.link, rays.poses_per_scene
+    looks = torch.arange(0, count, max(1, -(-count // _MAX_POSES)))
+    views = torch.cat(
+        [ends.detach().unflatten(0, (-1, count))[:, looks] for ends in (link.tx, link.rx)], 1
+    )
+    return _find_seen_pairs(rays, geometry.vertices.detach(), pairs, views, geometry.object_scene)
+
+
+def _find_seen_pairs(
+    rays: Occluders,
+    vertices: Float64[Tensor, "v 3"],
+    pairs: Bool[Tensor, "object object"],
+    viewers: Float64[Tensor, "*scene n 3"],
+    object_scene: Int64[Tensor, " object"] | None = None,
+) -> set[tuple[int, int]]:
+    """Find those of some pairs of objects that are coplanar at a point that a viewer sees."""
+    topology, found = rays.topology, set[tuple[int, int]]()
+    pairs, low, high = find_overlapping_boxes(topology, vertices, pairs)
+    points = vertices - rays.origin
+    triangles, owner = points[topology.faces], topology.face_object
     near = (triangles.amin(1) <= (high - rays.origin)[owner]) & (
         triangles.amax(1) >= (low - rays.origin)[owner]
     )
@@ -92,8 +134,8 @@ def _find_visible_pairs(
     for one, other in couple.unique(dim=0).tolist():
         here = ((couple[:, 0] == one) & (couple[:, 1] == other)).nonzero()[:, 0]
         here = here[:: -(-len(here) // _MAX_POINTS)]
-        scene = 0 if geometry.object_scene is None else int(geometry.object_scene[one])
-        if _is_any_visible(rays, place[here], normal[here], scene):
+        views = viewers if object_scene is None else viewers[object_scene[one]]
+        if _is_any_visible(rays, place[here], normal[here], views.reshape(-1, 3)):
             found.add((one, other))
     return found
 
@@ -171,14 +213,13 @@ def _find_common_points(
 
 
 def _is_any_visible(
-    rays: RayScene, points: Float64[Tensor, "n 3"], normal: Float64[Tensor, "n 3"], scene: int
+    rays: Occluders,
+    points: Float64[Tensor, "n 3"],
+    normal: Float64[Tensor, "n 3"],
+    viewers: Float64[Tensor, "m 3"],
 ) -> bool:
-    """Test whether an antenna sees any of some points, ignoring surfaces in their plane."""
-    looks = scene * rays.poses_per_scene + torch.arange(
-        0, rays.poses_per_scene, max(1, -(-rays.poses_per_scene // _MAX_POSES))
-    )
-    link = rays.link
-    antennas = torch.cat([link.tx.detach()[looks], link.rx.detach()[looks]]) - rays.origin
+    """Test whether a viewer sees any of some points, ignoring surfaces in their plane."""
+    antennas = viewers - rays.origin
     tilt = (torch.nn.functional.normalize(antennas[:, None] - points, dim=2) * normal).sum(2)
     above = points + normal * (2 * tilt.sign() * _ray_tolerance(points))[..., None]
     ends = antennas[:, None].expand_as(above)

@@ -59,27 +59,26 @@ def find_possible_intersections(
     pairs = (moving[:, None] | moving).fill_diagonal_(False) | torch.diag(deforming)
     groups = geometry.topology.object_group
     pairs &= (groups[:, None] != groups) | deforming[:, None] | deforming
-    return find_overlapping_boxes(geometry, pairs)
+    return find_overlapping_boxes(geometry.topology, geometry.vertices.detach(), pairs)
 
 
 def find_overlapping_boxes(
-    geometry: Geometry, pairs: Bool[Tensor, "object object"]
+    topology: Topology, vertices: Float64[Tensor, "v 3"], pairs: Bool[Tensor, "object object"]
 ) -> tuple[Bool[Tensor, "object object"], Tensor, Tensor]:
     """Find those of some pairs of objects whose boxes overlap.
 
     Args:
-        geometry: scene as flat tables.
+        topology: triangles of the vertices.
+        vertices: world positions, detached [m].
         pairs: pairs of objects.
 
     Returns:
         The pairs, and per object the bounds of all overlaps, low and high [m].
     """
-    count = len(geometry.differentiated)
-    owner = geometry.topology.vertex_object[:, None].expand(-1, 3)
-    points = geometry.vertices.detach()
-    none = points.new_zeros(count, 3)
-    low = none.scatter_reduce(0, owner, points, "amin", include_self=False)
-    high = none.scatter_reduce(0, owner, points, "amax", include_self=False)
+    owner = topology.vertex_object[:, None].expand(-1, 3)
+    none = vertices.new_zeros(len(pairs), 3)
+    low = none.scatter_reduce(0, owner, vertices, "amin", include_self=False)
+    high = none.scatter_reduce(0, owner, vertices, "amax", include_self=False)
     margin = 1e-5 * (high - low).amax().clamp_min(1.0)
     low, high = low - margin, high + margin
     for axis in range(3):

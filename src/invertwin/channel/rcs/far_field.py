@@ -45,6 +45,7 @@ from invertwin.channel.em.wedges import (
     select_body_edges,
 )
 from invertwin.channel.rays.backend import tracing
+from invertwin.channel.rays.coplanar import refuse_coplanar_surfaces
 from invertwin.channel.rays.ray_scene import Occluders, is_visible
 from invertwin.channel.rays.scene_tables import require_surfaces
 from invertwin.channel.rays.topology import Topology, topology_of
@@ -68,6 +69,7 @@ _MIN_TURN_ANGLE = 1e-6  # rad between adjacent normals of a curved surface
 _SEGMENTS_PER_WAVELENGTH = 2.0  # pieces of an edge, each visible or not
 _MIN_EDGE_RUN = 2.0  # wavelengths: least length of an edge that ends in a smooth surface
 _EDGE_OFFSET = 1e-5  # of the scene's size: distance of rays' ends from an edge
+_FAR = 10.0  # of the scene's size: distance from where surfaces are seen
 _ROWS_AT_ONCE = 1 << 18
 _MAX_POWER_GAIN = 1.1  # of an order over the one before: power at a focus is approximate
 
@@ -193,10 +195,14 @@ def trace_far_field(
     Raises:
         InputError: a cloud, a rough surface, derivatives of a scene of many triangles, or of a
             small one with coincident vertices, a dielectric inside or in contact with another
-            transmitting one, a conductor in contact with one of many triangles.
+            transmitting one, a conductor in contact with one of many triangles, surfaces of two
+            objects in one place.
     """
     with tracing():
         target = _build_target(scene, frequencies, up)
+        ends = transmitters if receivers is None else torch.cat([transmitters, receivers])
+        viewers = target.occluders.origin + _FAR * target.facets.size * ends
+        refuse_coplanar_surfaces(target.occluders, target.vertices, viewers, list(scene.objects))
         count = len(target.facets.normal)
         if count > MAX_FACETS_BEAM_TRACING and is_differentiated(target.vertices):
             raise InputError(
