@@ -154,8 +154,8 @@ def test_check_names_what_is_wrong_with_a_mesh(run_file, monkeypatch, capsys):
     said, warned = capsys.readouterr()
     rows = [line.split("│")[1:-1] for line in said.splitlines() if "│" in line]
     defects = {row[0].strip(): row[-1].strip() for row in rows if len(row) == 6}
-    assert defects == {"plate": "2 edges along cracks", "wall": "none"}
-    assert "the mesh has 2 edges along cracks" in warned
+    assert defects == {"plate": "2 edges along cracks 1e-05 m wide", "wall": "none"}
+    assert "the mesh has 2 edges along cracks 1e-05 m wide" in warned
 
 
 def test_points_of_every_object_are_counted(run_file, monkeypatch, capsys):

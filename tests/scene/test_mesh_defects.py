@@ -18,14 +18,14 @@ def moved(mesh, *offset):
 
 @pytest.mark.parametrize("mesh", [box(0.2), plate(0.3, 0.2), sphere(0.1, 2)])
 def test_clean_meshes_have_none(mesh):
-    assert find_defects(mesh) == (0, 0, False)
+    assert find_defects(mesh) == (0, 0, 0.0, False)
     assert find_defects(mesh).in_words() == []
 
 
 def test_both_sides_of_a_sheet_count_once():
     sheet = plate(0.3, 0.3)
     both = Mesh(sheet.vertices, torch.cat([sheet.faces, sheet.faces.flip(1)]))
-    assert find_defects(both) == (2, 0, False)
+    assert find_defects(both) == (2, 0, 0.0, False)
 
 
 def test_bricks_that_touch_are_overlapping_parts_whose_faces_of_contact_are_doubled():

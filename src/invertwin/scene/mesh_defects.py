@@ -28,11 +28,13 @@ class MeshDefects(NamedTuple):
     Attributes:
         doubled_triangles: number of triangles that repeat others, or lie on those of other parts.
         cracked_edges: number of open edges that run beside others, up to 10⁻⁴ of the diagonal off.
+        crack_width: greatest distance of these from the others [m].
         has_overlapping_parts: True if closed parts overlap or touch; `merge_meshes` unites them.
     """
 
     doubled_triangles: int
     cracked_edges: int
+    crack_width: float
     has_overlapping_parts: bool
 
     def in_words(self) -> list[str]:
@@ -40,7 +42,9 @@ class MeshDefects(NamedTuple):
         named = {
             "closed parts that overlap or touch": self.has_overlapping_parts,
             f"{self.doubled_triangles} triangles on others": self.doubled_triangles,
-            f"{self.cracked_edges} edges along cracks": self.cracked_edges,
+            f"{self.cracked_edges} edges along cracks {self.crack_width:.2g} m wide": (
+                self.cracked_edges > 0
+            ),
         }
         return [text for text, is_there in named.items() if is_there]
 
@@ -57,16 +61,22 @@ def find_defects(mesh: Mesh) -> MeshDefects:
     if mesh not in _found:
         plain = Mesh(*map(strip_derivatives, (mesh.vertices, mesh.faces)))
         welded, places = mesh_topology.weld_faces(plain.vertices.numpy(), plain.faces.numpy())
+        count, width = measure_cracks(mesh_topology.find_edges(welded, places), places)
         _found[mesh] = MeshDefects(
             int(find_doubled_faces(welded, places).sum()),
-            count_cracks(mesh_topology.find_edges(welded, places), places),
+            count,
+            width * float(np.linalg.norm(np.ptp(plain.vertices.numpy(), axis=0))),
             unite_parts(plain) is not plain,
         )
     return _found[mesh]
 
 
 def require_single_surfaces(
-    scene: Scene, names: Iterable[str] | None = None, *, allows_overlaps: bool = False
+    scene: Scene,
+    names: Iterable[str] | None = None,
+    *,
+    allows_overlaps: bool = False,
+    allows_doubled: bool = False,
 ) -> None:
     """Raise an error for meshes with two surfaces in one place, of which both would count.
 
@@ -74,13 +84,15 @@ def require_single_surfaces(
         scene: scene of the objects.
         names: objects that count; None = all.
         allows_overlaps: True where surfaces inside of others are hidden.
+        allows_doubled: True where of two surfaces in one place one counts.
 
     Raises:
         InputError: an object with doubled triangles, or closed parts that overlap.
     """
     for name in scene.objects if names is None else names:
         found = find_defects(scene.objects[name].mesh)
-        if found.doubled_triangles or (found.has_overlapping_parts and not allows_overlaps):
+        overlaps = found.has_overlapping_parts and not allows_overlaps
+        if overlaps or (found.doubled_triangles and not allows_doubled):
             raise InputError(
                 f"expected one surface in each place of {name}, got "
                 f"{' and '.join(found.in_words())}; merge_meshes and load_mesh unite closed parts: "
@@ -143,15 +155,23 @@ def _overlap_in_plane(
     return found
 
 
-def count_cracks(edges: mesh_topology.MeshEdges, places: mesh_topology.Points) -> int:
-    """Count open edges that run beside others, farther than the tolerance within which both join.
+def measure_cracks(
+    edges: mesh_topology.MeshEdges, places: mesh_topology.Points
+) -> tuple[int, float]:
+    """Count open edges that run beside others, beyond the tolerance within which both join.
 
     Args:
         edges: edges of the mesh.
         places: positions in units of the size of the mesh.
+
+    Returns:
+        Their number, and the greatest distance from another one, in these units.
     """
     ends = edges.ends[edges.counts == 1]
     middle = len(places) + np.arange(len(ends))
     points = np.concatenate([places, places[ends].mean(1)])
-    row, vertex, _ = mesh_topology.find_vertices_on_edges(ends, middle, points, _WIDEST_CRACK)
-    return len(np.unique(vertex[row != vertex - len(places)]))
+    row, vertex, share = mesh_topology.find_vertices_on_edges(ends, middle, points, _WIDEST_CRACK)
+    start, end = np.moveaxis(places[ends[row]], 1, 0)
+    width = np.linalg.norm(points[vertex] - start - share[:, None] * (end - start), axis=1)
+    other = row != vertex - len(places)
+    return len(np.unique(vertex[other])), float(width[other].max(initial=0.0))

@@ -415,3 +415,14 @@ def test_derivatives_with_doubled_sheets_are_refused():
             continue
         with pytest.raises(InputError, match="place of pane, got 10 triangles on others"):
             deposit_power(scene, link(), GRID, sampling=COUNTS, seed=1)
+
+
+def test_sheets_within_others_are_refused():
+    """Light passes a wall within another one twice; metal within hides itself."""
+    inner = Mesh(box(0.3).vertices + float64([0.0, 0.2, 0.0]), box(0.3).faces)
+    both, at = concatenate_meshes([box(0.4), inner]), float64([2.0, 0.0, 0.0])
+    walls = Object(both, Slab(6.0, thickness=0.004), rigid(translation=at))
+    with pytest.raises(InputError, match="place of walls, got closed parts that overlap or touch"):
+        deposit_power(Scene({"walls": walls}), link(), GRID, sampling=COUNTS, seed=1)
+    solid = replace(walls, material=RoughDielectric(4.0))
+    assert deposit_power(Scene({"walls": solid}), link(), GRID, sampling=COUNTS, seed=1).sum() > 0

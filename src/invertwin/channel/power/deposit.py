@@ -75,7 +75,7 @@ def deposit_power(
     Raises:
         InputError: No silhouette samples for a derivative that needs them, an antenna pattern that
             carries derivatives, objects in motion, an unknown backend, a polarisation that depends
-            on direction, a derivative with sheets that are doubled.
+            on direction, sheets whose closed parts overlap, a derivative with doubled ones.
     """
     if scheme not in ("rays", "area"):
         raise InputError(f"expected scheme 'rays' or 'area', got {scheme!r}; choose one")
@@ -146,12 +146,12 @@ def deposit_batch(
 
 
 def _flatten_surfaces(scene: Scene, link: Link, scenes: Sequence[int] | None = None) -> Geometry:
-    """Flatten a scene; refuse doubled sheets, through which derivatives count both."""
+    """Flatten a scene; refuse sheets within others, and doubled ones where derivatives count."""
     geometry = flatten(scene, link.wavelength, scenes=scenes)
-    if geometry.has_sheets and any(geometry.differentiated):
+    if geometry.has_sheets:
         sheets = geometry.surfaces.transmittance.any(1)[geometry.face_surface]
         names = [geometry.names[k] for k in geometry.face_object[sheets].unique().tolist()]
-        require_single_surfaces(scene, names, allows_overlaps=True)
+        require_single_surfaces(scene, names, allows_doubled=not any(geometry.differentiated))
     return geometry
 
 
