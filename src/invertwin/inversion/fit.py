@@ -327,8 +327,7 @@ class Fit:
         self, number: int, step: int, sensor: Any, observed: Tensor
     ) -> tuple[Any, Tensor]:
         """Select the frames of one observation that a step compares."""
-        every = np.arange(len(observed))
-        fitted = np.setdiff1d(every, self._held_out_frames(len(observed)))
+        fitted = np.setdiff1d(np.arange(len(observed)), self._held_out_frames(len(observed)))
         count = min(self.stage.frames_per_step or len(fitted), len(fitted))
         if count == len(observed):
             return sensor, observed

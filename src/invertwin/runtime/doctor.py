@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import textwrap
+import tomllib
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -27,7 +28,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from invertwin.constants import read_table
 from invertwin.errors import InputError
 
 LIBLLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -36,7 +36,7 @@ BACKEND_VARIABLE = "INVERTWIN_BACKEND"
 # Dr.Jit must not go and find a library of its own when every one we know of fails.
 _NO_LIBRARY = "no-usable-libLLVM--run-invertwin-doctor"
 
-_FOLDERS = read_table("invertwin.runtime", "llvm.toml")["folders"]
+_FOLDERS = tomllib.loads(Path(__file__).with_name("llvm.toml").read_text())["folders"]
 _LIBRARY = re.compile(r"libLLVM(-\d[\w.]*)?(\.\d[\d.]*)?\.(so|dylib)(\.\d[\w.]*)?$")
 _PROBE_SECONDS = 60.0
 

@@ -344,8 +344,7 @@ def find_parts(faces: Int64[np.ndarray, "f 3"], places: Points) -> Int64[np.ndar
         places: positions in units of the size of their group.
     """
     a, b, c = faces.T
-    winding = ((a > b) ^ (b > c) ^ (a > c)).astype(np.int64)
-    edges = find_edges(faces, places, winding)
+    edges = find_edges(faces, places, ((a > b) ^ (b > c) ^ (a > c)).astype(np.int64))
     side, edge, plane = _sort_around_edges(edges, places, 2)
     two = (edges.counts == 2)[edge]
     flat = np.diff(plane[two].reshape(-1, 2))[:, 0] != 0
@@ -426,8 +425,7 @@ def find_vertices_on_edges(
     start, side = places[edges[:, 0]], places[edges[:, 1]] - places[edges[:, 0]]
     length = np.linalg.norm(side, axis=1)
     tree = cKDTree(places[vertices], balanced_tree=False, compact_nodes=False)
-    radius = 0.5 * length + tolerance
-    near = tree.query_ball_point(start + 0.5 * side, radius, return_sorted=False)
+    near = tree.query_ball_point(start + 0.5 * side, 0.5 * length + tolerance, return_sorted=False)
     row = np.repeat(np.arange(len(edges)), [len(found) for found in near])
     vertex = vertices[np.concatenate(near).astype(np.int64)]
     offset = places[vertex] - start[row]

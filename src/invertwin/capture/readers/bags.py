@@ -21,13 +21,8 @@ from invertwin.errors import InputError
 from invertwin.storage.untrusted import safe_reader
 
 # Where messages with poses keep the place, by the names of their fields.
-_POSITION_FIELDS = (
-    "pose.pose.position",
-    "pose.position",
-    "transform.translation",
-    "point",
-    "position",
-)
+_POSITION_FIELDS = ("pose.pose.position", "pose.position", "transform.translation")
+_POSITION_FIELDS += ("point", "position")
 # Numbers of `sensor_msgs/PointField`, and what they are to NumPy.
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 

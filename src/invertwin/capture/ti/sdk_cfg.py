@@ -127,8 +127,7 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
         InputError: the folder does not exist.
     """
     s = chirp_settings
-    low_band = s.start_frequency < _BAND_EDGE
-    devices = {2: "xWR68xx" if low_band else "xWR18xx", 4: "xWR1443"}
+    devices = {2: "xWR68xx" if s.start_frequency < _BAND_EDGE else "xWR18xx", 4: "xWR1443"}
     start, idle, adc, end, slope, samples, rate = chirp_table.profile_texts(s)
     receivers = chirp_table.numbers_to_bits(s.receivers)
     lines = [

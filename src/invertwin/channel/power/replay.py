@@ -440,8 +440,7 @@ def _pull_sheets(
 
     def pull_segment(start: Position, active: mit.Bool, sums: Sums) -> None:
         def act(_: Carry, transmittance: mit.Float, extra: mit.Float) -> None:
-            known = dr.detach(transmittance) > 0
-            factor = _log_derivative_factor(known, sums[0], transmittance)
+            factor = _log_derivative_factor(dr.detach(transmittance) > 0, sums[0], transmittance)
             dr.backward_from(factor * transmittance + sums[1] * extra)
 
         visit_sheets(rays, inputs, start, vertex.endpoints[1], active, {}, act)

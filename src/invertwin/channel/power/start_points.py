@@ -20,14 +20,7 @@ from invertwin.channel.power.transmission import (
     trace_to_surface,
     trace_transmission,
 )
-from invertwin.channel.rays.arrays import (
-    gather_points,
-    scramble_seed,
-    tangent_frame,
-    to_float,
-    to_points,
-    uniform_pair,
-)
+from invertwin.channel.rays import arrays
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.bounding_spheres import BoundingSpheres
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
@@ -71,12 +64,15 @@ class RaySampler:
         self.rays, self.spheres, self.origins = rays, rays.spheres, rays.tx
         if reference:
             self.spheres = BoundingSpheres(reference[0], rays.origin, margin=1.1)
-            self.origins = to_points(reference[1].tx.detach() - rays.origin)
+            self.origins = arrays.to_points(reference[1].tx.detach() - rays.origin)
         blocks = rays.poses_per_scene * self.spheres.object_count
         self.rows = max(1, int(np.sqrt(samples / blocks)))
         self.columns = max(1, samples // blocks // self.rows)
         self.size = blocks * self.rows * self.columns
-        self.seed, self.transmission_seed = scramble_seed(seed, 0), scramble_seed(seed, 8)
+        self.seed, self.transmission_seed = (
+            arrays.scramble_seed(seed, 0),
+            arrays.scramble_seed(seed, 8),
+        )
 
     def draw(self, index: mit.UInt32, inputs: Inputs) -> StartPoints:
         """Draw the samples of given numbers.
@@ -89,9 +85,9 @@ class RaySampler:
         block, cell = index // per_block, index % per_block
         own, scene = self.spheres.table_entry(block % self.spheres.object_count)
         frame = scene * rays.poses_per_scene + block // self.spheres.object_count
-        centre = gather_points(self.origins, frame)
+        centre = arrays.gather_points(self.origins, frame)
         axis, height, _ = self.spheres.cap(own, centre)
-        jitter = uniform_pair(index, self.seed)
+        jitter = arrays.uniform_pair(index, self.seed)
         column, row = cell % self.columns, cell // self.columns
         x = (mi.Float(column) + jitter[0]) / self.columns
         y = (mi.Float(row) + jitter[1]) / self.rows
@@ -99,12 +95,12 @@ class RaySampler:
         depth = dr.squared_norm(disk) * height
         spread = dr.sqrt(height * (2 - depth))
         local = mi.Vector3f(disk.x * spread, disk.y * spread, 1 - depth)
-        direction = dr.normalize(tangent_frame(axis).to_world(local))
+        direction = dr.normalize(arrays.tangent_frame(axis).to_world(local))
         group = own // self.spheres.group_size
         every = mi.Bool(True)
         found, around = self.spheres.group_density(rays, group, centre, direction, every, own)
         density = per_block * (found + around / (4 * dr.pi))
-        centre = gather_points(rays.tx, frame)
+        centre = arrays.gather_points(rays.tx, frame)
         ray, key = mi.Ray3f(centre, direction), (index, self.transmission_seed)
         bits = _stratified_bits(column, row)
         hit = trace_to_surface(rays, inputs, ray, every, key, coherent=True, stratified_bits=bits)
@@ -151,8 +147,8 @@ class AreaSampler:
         self.rays = rays
         self.per_frame = max(1, samples // rays.link.frame_count)
         self.size = self.per_frame * rays.link.frame_count
-        self.distribution = mi.DiscreteDistribution(to_float(areas / areas.mean()))
-        self.seeds = scramble_seed(seed, 1), scramble_seed(seed, 2)
+        self.distribution = mi.DiscreteDistribution(arrays.to_float(areas / areas.mean()))
+        self.seeds = arrays.scramble_seed(seed, 1), arrays.scramble_seed(seed, 2)
 
     def draw(self, index: mit.UInt32, inputs: Inputs) -> StartPoints:
         """Draw the samples of given numbers.
@@ -163,13 +159,15 @@ class AreaSampler:
         """
         rays = self.rays
         frame, number = index // self.per_frame, index % self.per_frame
-        jitter, _ = uniform_pair(index, self.seeds[0])
+        jitter, _ = arrays.uniform_pair(index, self.seeds[0])
         face, pmf = self.distribution.sample_pmf((mi.Float(number) + jitter) / self.per_frame)
-        b = mi.warp.square_to_uniform_triangle(mi.Point2f(*uniform_pair(index, self.seeds[1])))
+        b = mi.warp.square_to_uniform_triangle(
+            mi.Point2f(*arrays.uniform_pair(index, self.seeds[1]))
+        )
         triangle = p0, p1, p2 = rays.corners(face)
         area = 0.5 * dr.norm(dr.cross(p1 - p0, p2 - p0))
         position = interpolate_position(triangle, b.x, b.y)
-        tx = gather_points(rays.tx, frame)
+        tx = arrays.gather_points(rays.tx, frame)
         passed = trace_transmission(rays, inputs, tx, position, mi.Bool(True))
         weight = dr.select(passed.transmittance > 0, area / (pmf * self.per_frame), 0.0)
         return StartPoints(frame, SurfacePoint(face, b.x, b.y), weight, passed)

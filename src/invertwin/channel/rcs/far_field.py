@@ -28,13 +28,7 @@ from invertwin.channel.beams.beam_tracing import (
     build_facets,
     trace_beams,
 )
-from invertwin.channel.em import plane_waves
-from invertwin.channel.em.dielectric_solids import (
-    DielectricSolids,
-    group_solids,
-    is_homogeneous,
-    require_whole_solids,
-)
+from invertwin.channel.em import dielectric_solids, plane_waves
 from invertwin.channel.em.wedges import (
     MIN_EDGE_ANGLE,
     Wedges,
@@ -73,7 +67,9 @@ _FAR = 10.0  # of the scene's size: distance from where surfaces are seen
 _ROWS_AT_ONCE = 1 << 18
 _MAX_POWER_GAIN = 1.1  # of an order over the one before: power at a focus is approximate
 
-_PatchOrders = tuple[Sequence[IlluminatedPatches], DielectricSolids | None, Sequence[int]]
+_PatchOrders = tuple[
+    Sequence[IlluminatedPatches], dielectric_solids.DielectricSolids | None, Sequence[int]
+]
 """Patches of all orders, dielectric solids, and indices of the frequencies for which they hold."""
 
 
@@ -99,7 +95,7 @@ class _FarFieldTarget:
     interfaces: Sequence[plane_waves.SmoothInterfaces]
     wave_numbers: Sequence[float]
     up: Float64[Tensor, "3"]
-    interiors: Sequence[tuple[DielectricSolids | None, Sequence[int]]]
+    interiors: Sequence[tuple[dielectric_solids.DielectricSolids | None, Sequence[int]]]
 
     @property
     def wavelength(self) -> float:
@@ -311,7 +307,7 @@ class _FarFieldTracer:
     def _patch_amplitudes(
         self,
         patch_orders: Sequence[IlluminatedPatches],
-        solids: DielectricSolids | None,
+        solids: dielectric_solids.DielectricSolids | None,
         interfaces: plane_waves.SmoothInterfaces,
         k: float,
     ) -> list[Tensor]:
@@ -470,8 +466,10 @@ def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTar
     tables = [_smooth_interfaces(scene, topology, frequency) for frequency in frequencies.tolist()]
     wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in frequencies.tolist()]
     owner, names = topology.face_object, list(objects)
-    require_whole_solids(tables[0], topology.panels, owner, names)
-    solids = group_solids(tables, wave_numbers, facets.corners, facets.solid, owner, names)
+    dielectric_solids.require_whole_solids(tables[0], topology.panels, owner, names)
+    solids = dielectric_solids.group_solids(
+        tables, wave_numbers, facets.corners, facets.solid, owner, names
+    )
     return _FarFieldTarget(facets, topology, vertices, occluders, tables, wave_numbers, up, solids)
 
 
@@ -541,7 +539,7 @@ def _warn_validity(
                 f"the facets of {name} are {sagitta * index:.2g} wavelengths off the curved "
                 "surface, more than 1/50: use a finer mesh"
             )
-        is_mixed = not is_homogeneous(target.interfaces[0].rows(own))
+        is_mixed = not dielectric_solids.is_homogeneous(target.interfaces[0].rows(own))
         if bool(target.facets.solid[own].all()) and is_mixed:
             found.append(
                 f"{name} is closed and its permittivity differs between triangles: only "

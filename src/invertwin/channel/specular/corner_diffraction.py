@@ -92,8 +92,7 @@ def diffract_round_corner(
     sine = cross(edge_axis(last.wedges), leg).norm(dim=1)
     if last.azimuth_in is None:
         raise ValueError("no face lies between both edges")
-    azimuth = exterior_azimuth(last.wedges, leg, 0)
-    angles, reduced = (last.azimuth_in, azimuth), length * sine**2
+    angles, reduced = (last.azimuth_in, exterior_azimuth(last.wedges, leg, 0)), length * sine**2
     final = EdgeDiffraction(last.wedges, leg, leg, *angles, reduced, last.face_coefficients)
     orders: tuple[DyadDerivative, ...] = ("value", "out") if len(before) == 1 else ("value",)
     fields = transfer_dyads(route, first, wave_number, orders)

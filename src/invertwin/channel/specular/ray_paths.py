@@ -177,5 +177,4 @@ def match_rows(
     begin = many.cumsum(0) - many
     times = many[first]
     row = torch.arange(len(first)).repeat_interleave(times)
-    within = torch.arange(len(row)) - (times.cumsum(0) - times)[row]
-    return row, order[begin[first[row]] + within]
+    return row, order[begin[first[row]] + (torch.arange(len(row)) - (times.cumsum(0) - times)[row])]

@@ -238,6 +238,5 @@ def locate_coherent_points(
         sure = max(0.0, 1 - chance) * min(1.0, value / (_NO_SIDELOBE_LEVEL * top))
         finer = find_image_peak(capture, positions[peak].double(), cell)
         place = positions[peak].double() if finer is None else finer[0]
-        name = f"point_{len(found) + 1}"
-        found.append(DetectedObject.point(name, place, deviations, sure))
+        found.append(DetectedObject.point(f"point_{len(found) + 1}", place, deviations, sure))
     return found, image

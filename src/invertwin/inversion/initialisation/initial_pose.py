@@ -11,17 +11,7 @@ from torch import Tensor
 from invertwin.capture import Capture
 from invertwin.channel import Grid
 from invertwin.errors import InputError
-from invertwin.inversion.initialisation.detections import (
-    candidate_poses,
-    detect_echoes,
-    estimate_position,
-    estimate_scale,
-    find_bright_nodes,
-    find_largest_group,
-    fit_rectangle,
-    principal_rectangle,
-    select_pose,
-)
+from invertwin.inversion.initialisation import detections
 from invertwin.limits import Positive
 from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.scene.parameters import Scale
@@ -112,23 +102,31 @@ class InitialPoseEstimator:
         if self.low is None or self.high is None:
             return InitialEstimate(scene)
         if self.method == "points":
-            points = detect_echoes(capture, grid, self.low, self.high, false_alarm=self.false_alarm)
+            points = detections.detect_echoes(
+                capture, grid, self.low, self.high, false_alarm=self.false_alarm
+            )
         else:
-            points = find_bright_nodes(capture, grid, self.low, self.high, step=self.step)
-        points = find_largest_group(points, self.gap)
+            points = detections.find_bright_nodes(
+                capture, grid, self.low, self.high, step=self.step
+            )
+        points = detections.find_largest_group(points, self.gap)
         item, radar = scene[name], capture.radar()
         if self.pose == "position":
-            shift = estimate_position(points) - item.center.detach()
+            shift = detections.estimate_position(points) - item.center.detach()
             shift[2] = 0.0
             moved = rigid(translation=shift) @ item.transform
             return InitialEstimate(scene.replace(name, pose=moved), len(points))
         if self.pose == "axes":
-            rectangle = principal_rectangle(points)
+            rectangle = detections.principal_rectangle(points)
         else:
-            rectangle = fit_rectangle(points, radar, resolution=radar.waveform.range_resolution)
+            rectangle = detections.fit_rectangle(
+                points, radar, resolution=radar.waveform.range_resolution
+            )
         if self.scale:
-            scene = Scale(name, estimate_scale(item, rectangle)).requires_grad_(False)(scene)
-        poses = candidate_poses(scene[name], rectangle, radar)
+            scene = Scale(name, detections.estimate_scale(item, rectangle)).requires_grad_(False)(
+                scene
+            )
+        poses = detections.candidate_poses(scene[name], rectangle, radar)
         how: dict[str, Any] = {"loss": loss, "surrogate": _POSE_SURROGATE, "seed": seed}
-        scene, losses = select_pose(scene, name, poses, radar, capture, grid, **how)
+        scene, losses = detections.select_pose(scene, name, poses, radar, capture, grid, **how)
         return InitialEstimate(scene, len(points), losses, rectangle.size)

@@ -66,8 +66,7 @@ def backproject_beat(
             # Reduce the 1e5 cycles at 77 GHz and 200 m in float64.
             phase = -2 * math.pi * (cycles - cycles.detach().round())
             image = image + (echo * torch.polar(torch.ones_like(phase), phase)).sum(0)
-    channels = radar.frame_count * tx.shape[1] * rx.shape[1]
-    return (image / channels).reshape(points.shape[:-1])
+    return (image / (radar.frame_count * tx.shape[1] * rx.shape[1])).reshape(points.shape[:-1])
 
 
 def pairwise_distances(
