@@ -36,6 +36,13 @@ SETTINGS = partial(
     receivers=(1,),
     loops=1,
 )
+
+
+def row(x: float) -> torch.Tensor:
+    """Return one place at a number along x."""
+    return torch.tensor([[x, 0.0, 0.0]], dtype=torch.float64)
+
+
 #: What is made of a number, and one with which it is made.
 MADE = {
     "start frequency": (lambda x: CHIRP(start_frequency=x), 3e12),
@@ -54,13 +61,13 @@ MADE = {
     "width": (lambda x: plate(x, 1.0), 1e9),
     "size": (lambda x: box((1.0, x, 1.0)), 1e9),
     "elements": (lambda x: linear_array(4, x), 0.002),
-    "velocity": (lambda x: Object(plate(1.0, 1.0), PerfectConductor(), None, [x, 0, 0]), 2e8),
+    "velocity": (lambda x: Object(plate(1.0, 1.0), PerfectConductor(), None, row(x)[0]), 2e8),
     "position": (
-        lambda x: Radar(linear_array(1, 1.0), linear_array(1, 1.0), CHIRP(), [[x, 0.0, 0.0]]),
+        lambda x: Radar(linear_array(1, 1.0), linear_array(1, 1.0), CHIRP(), row(x)),
         1e9,
     ),
-    "power": (lambda x: Transmitters([[0.0, 0.0, 0.0]], power_dbm=x), 300.0),
-    "place": (lambda x: Transmitters([[0.0, 0.0, x]]), 1e9),
+    "power": (lambda x: Transmitters(row(0.0), power_dbm=x), 300.0),
+    "place": (lambda x: Transmitters(row(x)), 1e9),
     "bins": (lambda x: Grid(range_start=1.0, range_step=x, range_count=4), 1.0),
 }
 

@@ -58,8 +58,7 @@ def to_one_line(text: str) -> str:
         text: May hold what strangers wrote, such as names from a file.
     """
     if not text.isprintable():
-        plain = (c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(text.split()))
-        text = "".join(plain)
+        text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(text.split()))
     if len(text) > _MAX_LENGTH:
         text = f"{text[: _MAX_LENGTH // 2]} … {text[-_MAX_LENGTH // 2 :]}"
     return text

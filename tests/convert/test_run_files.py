@@ -441,7 +441,7 @@ def test_what_cannot_be_converted_is_one_line(tmp_path, monkeypatch, capfd, text
 @pytest.mark.parametrize(
     ("frame", "said"),
     [
-        ("", "expected frame = 2 (x ahead, y to the left, z up), got a run file of the first"),
+        ("", "expected frame = 2 (x ahead, y to the left, z up), got one of the first frame"),
         ("frame = 1\n", "frame: expected 2, got 1"),
         ("frame = 3\n", "frame: expected 2, got 3"),
         ('frame = "z up"\n', 'frame: expected 2, got "z up"'),

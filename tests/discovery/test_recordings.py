@@ -151,6 +151,7 @@ def test_echoes_that_no_shape_explains_are_listed_as_points(monkeypatch):
     noise = torch.randn(1, 2, 4, 128, dtype=torch.complex128, generator=torch.manual_seed(0))
     echo = moving_point(radar, Chirps(1, 1e-4), 1.5, 0.0, 0.2)[:, 0]
     monkeypatch.setattr(ShapeSearch, "run", lambda self: [])
+    monkeypatch.setattr(ShapeSearch, "fit_spheres", lambda self, places: [])
     found = twin(Capture.from_beat(echo + 1e-2 * noise, radar))
     assert found.scene is None
     assert found.notes[0].startswith("no shape explains the maps")

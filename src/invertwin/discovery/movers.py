@@ -156,8 +156,7 @@ class MovingBody(nn.Module):
             }
 
     def _center_at(self, time: float = 0.0) -> Float64[Tensor, "3"]:
-        depth = 0.5 * self._extent[0]
-        offset = torch.stack([self.place[0] + depth, self.place[1], self.height])
+        offset = torch.stack([self.place[0] + 0.5 * self._extent[0], self.place[1], self.height])
         return self._start + self._axes @ (offset + self._velocity_vector * time)
 
     @property

@@ -175,7 +175,8 @@ class Fit:
         if self.progress.ended is None:
             with torch_threads(max(1, torch.get_num_threads() // 2)):
                 status = self._run_steps(callbacks)
-            self.progress = replace(self.progress, ended=self._select_best(status))
+            ended = self._select_best(status)
+            self.progress = replace(self.progress, ended=ended)
         for callback in callbacks:
             callback.end(self)
         assert self.progress.ended is not None

@@ -125,8 +125,7 @@ def reconstruct(
         raise InputError("expected at least one observation, got none; give Observation(...)")
     unknowns = name_unknowns(parameters)
     own = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(watched)]
-    names = [*unknowns, *(name for found in own for name in found)]
-    stages = make_stages(schedule, names)
+    stages = make_stages(schedule, [*unknowns, *(name for found in own for name in found)])
     made = [_build_modules(o.sensor, found) for o, found in zip(watched, own, strict=True)]
     sensor_modules = [found for found, _ in made]
     penalties = [term for _, found in made for term in found]

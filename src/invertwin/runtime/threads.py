@@ -42,8 +42,7 @@ def available_threads() -> int:
     if asked.isdecimal() and int(asked) > 0:
         return int(asked)
     found = getattr(os, "sched_getaffinity", None)
-    cores = len(found(0)) if found else os.cpu_count() or 1
-    return max(1, math.ceil(min(cores, cgroup_quota())))
+    return max(1, math.ceil(min(len(found(0)) if found else os.cpu_count() or 1, cgroup_quota())))
 
 
 def cgroup_quota(

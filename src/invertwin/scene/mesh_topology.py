@@ -326,8 +326,7 @@ def _split_at_vertices(edges: MeshEdges, places: Points) -> MeshEdges:
     group = np.repeat(np.arange(len(pieces)), edges.counts)
     count = pieces[group]
     piece = np.repeat(np.arange(len(group)), count)
-    step = np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count)
-    at = first[group[piece]] + step
+    at = first[group[piece]] + (np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count))
     parts = np.stack([stations[at], stations[at + 1]], 1)
     return _group_sides(parts, edges.apex[piece], edges.triangle[piece], len(places))
 
@@ -347,8 +346,7 @@ def find_parts(faces: Int64[np.ndarray, "f 3"], places: Points) -> Int64[np.ndar
     edges = find_edges(faces, places, ((a > b) ^ (b > c) ^ (a > c)).astype(np.int64))
     side, edge, plane = _sort_around_edges(edges, places, 2)
     two = (edges.counts == 2)[edge]
-    flat = np.diff(plane[two].reshape(-1, 2))[:, 0] != 0
-    beside = edges.triangle[side[two]].reshape(-1, 2)[flat]
+    beside = edges.triangle[side[two]].reshape(-1, 2)[np.diff(plane[two].reshape(-1, 2))[:, 0] != 0]
     around = _pairs_of_bodies(edges, (side[~two], edge[~two], plane[~two]), faces, places)
     label = label_components(np.concatenate([beside, around]), len(faces))
     real, found = np.unique(edges.triangle), np.full(len(faces), -1)

@@ -13,7 +13,17 @@ from invertwin.channel.rays.coplanar import warn_coplanar_surfaces
 from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.errors import PhysicsWarning
-from invertwin.scene import Mesh, Object, RoughConductor, RoughDielectric, Scene, box, plate, rigid
+from invertwin.scene import (
+    Mesh,
+    Object,
+    RoughConductor,
+    RoughDielectric,
+    Scene,
+    Slab,
+    box,
+    plate,
+    rigid,
+)
 from scenes import WAVELENGTH, float64, link, thing
 
 METAL, PAINT = RoughConductor(scattering=1.0), RoughDielectric(4.0)
@@ -83,6 +93,24 @@ def test_what_is_hidden_is_not_told():
     assert not told(floor=floor(), rug=rug(0.0, at=(0.0, 2.0)), chest=thing(
         box((0.9, 0.9, 0.4)), (2.0, 0.0, 0.21), material=METAL
     ))  # fmt: skip
+
+
+def test_a_contact_that_is_seen_through_sheets_is_told():
+    """Below a box of sheets, but not below one that only stands on a sheet."""
+    glass = Slab(2.5, thickness=0.004)
+    clear = thing(box((0.5, 0.5, 0.4)), (2.0, 0.0, 0.2), material=glass)
+    solid = thing(box((0.5, 0.5, 0.4)), (2.0, 0.0, 0.2), material=METAL)
+    pane = Object(floor().mesh, glass, floor().pose)
+    assert told(floor=floor(), chest=clear, moving="chest")
+    assert told(floor=pane, chest=clear, moving="chest")
+    assert told(floor=pane, chest=clear, moving="floor")
+    assert not told(floor=pane, chest=solid, moving="chest")
+    lifted = thing(box((0.5, 0.5, 0.4)), (2.0, 0.0, 0.201), material=glass)
+    assert not told(floor=floor(), chest=lifted, moving="chest")
+    # Their values are right, and a lid hides them.
+    assert not told(floor=floor(), chest=clear)
+    lid = thing(box((0.9, 0.9, 0.6)), (2.0, 0.0, 0.31), material=METAL)
+    assert not told(floor=floor(), chest=clear, lid=lid, moving="chest")
 
 
 def test_only_what_has_moved_is_looked_at_again(monkeypatch):

@@ -167,8 +167,7 @@ def _load_sweep_array(
             f"expected one sweep a frame, got {samples.shape[1]} chirps; name that dimension "
             '"frame"'
         )
-    beat = samples[:, 0].conj() if data.get("conjugate", False) else samples[:, 0]
-    return beat.resolve_conj()
+    return (samples[:, 0].conj() if data.get("conjugate", False) else samples[:, 0]).resolve_conj()
 
 
 @dataclass(frozen=True)

@@ -340,6 +340,5 @@ def _trace_segments(
         if again and not rays.geometry.has_sheets:
             found += found
         else:
-            ends = (end, start) if again else (start, end)
-            found.append(trace_transmittance(rays, *ends))
+            found.append(trace_transmittance(rays, *(end, start) if again else (start, end)))
     return found

@@ -6,14 +6,16 @@ from collections.abc import Sequence
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import barycentric_coordinates, triangle_normals
+from invertwin.channel.rays import ray_scene
 from invertwin.channel.rays.intersections import find_overlapping_boxes
-from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders, RayScene, is_visible
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.checks import strip_derivatives
 from invertwin.errors import InputError, PhysicsWarning
 
+_MAX_SHEETS = 8  # most sheets through which points are seen
 _MAX_PAIRS = 20_000  # most coplanar pairs of triangles that are compared, evenly chosen
 _MAX_POINTS = 64  # most tested points of a pair of objects
 _MAX_POSES = 16  # most tested radar poses
@@ -30,7 +32,7 @@ _TEST_POINTS = torch.tensor(
 )
 
 
-def warn_coplanar_surfaces(rays: RayScene) -> None:
+def warn_coplanar_surfaces(rays: ray_scene.RayScene) -> None:
     """Warn of coplanar surfaces of two objects that an antenna sees, unless they are equivalent.
 
     They are if both objects are at rest and of one material. Hidden surfaces, as the underside of a
@@ -51,7 +53,7 @@ def warn_coplanar_surfaces(rays: RayScene) -> None:
 
 
 def refuse_coplanar_surfaces(
-    rays: Occluders,
+    rays: ray_scene.Occluders,
     vertices: Float64[Tensor, "v 3"],
     viewers: Float64[Tensor, "n 3"],
     names: Sequence[str],
@@ -77,7 +79,7 @@ def refuse_coplanar_surfaces(
 
 
 def _find_coplanar_pairs(
-    rays: RayScene, pairs: Bool[Tensor, "object object"]
+    rays: ray_scene.RayScene, pairs: Bool[Tensor, "object object"]
 ) -> set[tuple[int, int]]:
     """Find pairs of objects with visible coplanar surfaces; cached for unmoved objects."""
     topology, points = rays.topology, rays.geometry.vertices.detach()
@@ -96,7 +98,7 @@ def _find_coplanar_pairs(
 
 
 def _find_visible_pairs(
-    rays: RayScene, pairs: Bool[Tensor, "object object"]
+    rays: ray_scene.RayScene, pairs: Bool[Tensor, "object object"]
 ) -> set[tuple[int, int]]:
     """Find those of some pairs of objects that are coplanar at a point that an antenna sees."""
     geometry, link, count = rays.geometry, rays.link, rays.poses_per_scene
@@ -104,15 +106,19 @@ def _find_visible_pairs(
     views = torch.cat(
         [ends.detach().unflatten(0, (-1, count))[:, looks] for ends in (link.tx, link.rx)], 1
     )
-    return _find_seen_pairs(rays, geometry.vertices.detach(), pairs, views, geometry.object_scene)
+    # Derivatives are wrong in a contact that is seen through sheets, such as below a box of them.
+    sheets = geometry.surfaces.transmittance.any(1) & any(geometry.differentiated)
+    given = geometry.vertices.detach(), pairs, views, geometry.object_scene
+    return _find_seen_pairs(rays, *given, sheets[geometry.face_surface])
 
 
 def _find_seen_pairs(
-    rays: Occluders,
+    rays: ray_scene.Occluders,
     vertices: Float64[Tensor, "v 3"],
     pairs: Bool[Tensor, "object object"],
     viewers: Float64[Tensor, "*scene n 3"],
     object_scene: Int64[Tensor, " object"] | None = None,
+    sheets: Bool[Tensor, " face"] | None = None,
 ) -> set[tuple[int, int]]:
     """Find those of some pairs of objects that are coplanar at a point that a viewer sees."""
     topology, found = rays.topology, set[tuple[int, int]]()
@@ -135,7 +141,7 @@ def _find_seen_pairs(
         here = ((couple[:, 0] == one) & (couple[:, 1] == other)).nonzero()[:, 0]
         here = here[:: -(-len(here) // _MAX_POINTS)]
         views = viewers if object_scene is None else viewers[object_scene[one]]
-        if _is_any_visible(rays, place[here], normal[here], views.reshape(-1, 3)):
+        if _is_any_visible(rays, place[here], normal[here], views.reshape(-1, 3), sheets):
             found.add((one, other))
     return found
 
@@ -157,7 +163,7 @@ def _relevant_pairs(geometry: Geometry) -> Bool[Tensor, "object object"]:
 
 def _ray_tolerance(points: Float64[Tensor, "*n 3"]) -> Float64[Tensor, "*n"]:
     """Compute the distance [m] within which rays do not separate surfaces."""
-    return RAY_EPSILON * points.norm(dim=-1) + 1e-9
+    return ray_scene.RAY_EPSILON * points.norm(dim=-1) + 1e-9
 
 
 def _pair_coplanar_triangles(
@@ -213,15 +219,26 @@ def _find_common_points(
 
 
 def _is_any_visible(
-    rays: Occluders,
+    rays: ray_scene.Occluders,
     points: Float64[Tensor, "n 3"],
     normal: Float64[Tensor, "n 3"],
     viewers: Float64[Tensor, "m 3"],
+    sheets: Bool[Tensor, " face"] | None,
 ) -> bool:
-    """Test whether a viewer sees any of some points, ignoring surfaces in their plane."""
+    """Test whether a viewer sees any of some points, also through sheets.
+
+    Surfaces in the plane of the points are ignored.
+    """
     antennas = viewers - rays.origin
-    tilt = (torch.nn.functional.normalize(antennas[:, None] - points, dim=2) * normal).sum(2)
+    tilt = (normalize(antennas[:, None] - points, dim=2) * normal).sum(2)
     above = points + normal * (2 * tilt.sign() * _ray_tolerance(points))[..., None]
-    ends = antennas[:, None].expand_as(above)
-    clear = tilt.abs() > _MAX_PLANE_SINE
-    return bool(is_visible(rays, above[clear] + rays.origin, ends[clear] + rays.origin).any())
+    clear, ends = tilt.abs() > _MAX_PLANE_SINE, antennas[:, None].expand_as(above)
+    start, end = above[clear] + rays.origin, ends[clear] + rays.origin
+    if sheets is None or not bool(sheets.any()):
+        return bool(ray_scene.is_visible(rays, start, end).any())
+    for _ in range(_MAX_SHEETS):
+        face, share = ray_scene.find_next_surface(rays, start, end)
+        if bool((face < 0).any()):
+            return True
+        start, end = (start + share[:, None] * (end - start))[sheets[face]], end[sheets[face]]
+    return False

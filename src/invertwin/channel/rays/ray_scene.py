@@ -355,6 +355,5 @@ def visible_points(
         rays = Occluders(mesh.vertices, topology_of([mesh]), viewers.detach().mean(dim=0))
         for viewer in viewers:
             hidden = torch.nonzero(~visible)[:, 0]
-            clear = is_visible(rays, points[hidden], viewer.expand(len(hidden), 3))
-            visible[hidden[clear]] = True
+            visible[hidden[is_visible(rays, points[hidden], viewer.expand(len(hidden), 3))]] = True
     return visible

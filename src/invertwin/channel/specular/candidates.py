@@ -132,8 +132,7 @@ def shoot_sequences(
     """
     tables = _SequenceTracer(surfaces, interactions)
     # A ray may split at every step.
-    branches = 2 ** (depth if bool(interactions.transmit.any()) else 0)
-    chunk = max(1, _LANES // branches)
+    chunk = max(1, _LANES // 2 ** (depth if bool(interactions.transmit.any()) else 0))
     leaves = torch.zeros(0, depth, dtype=torch.int64)
     count = torch.zeros(0, dtype=torch.int64)
     for number, origin in enumerate(origins):
