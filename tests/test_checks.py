@@ -85,7 +85,7 @@ def test_numbers_that_nothing_can_have_are_refused_in_one_line(name):
 @pytest.mark.parametrize(
     ("name", "number"),
     [
-        *[("start frequency", 3.1e12), ("bandwidth", 3.1e12), ("duration", 1e-13)],
+        *[("start frequency", 3.1e14), ("bandwidth", 3.1e14), ("duration", 1e-13)],
         *[("velocity", 3e8), ("translation", 1.1e9), ("place", -1.1e9), ("power", 301.0)],
     ],
 )

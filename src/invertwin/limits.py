@@ -73,7 +73,7 @@ class UsualValue:
         return f"{number * 10.0**shift:g}" if "e" in text else f"{text}e{shift}"
 
 
-_MAX_RADIO = 3e12  # Hz; waves of higher frequencies are called infrared
+_MAX_RADIO = 3e14  # Hz: light; models of a thousandth of the size have 77e12 Hz
 Frequency = Annotated[Positive, UsualValue("Hz", 77e9, 1e6, _MAX_RADIO)]
 # Analysers start at 9 kHz.
 SweptFrequency = Annotated[Positive, UsualValue("Hz", 77e9, 1e3, _MAX_RADIO)]
