@@ -54,12 +54,22 @@ boundary_samples = 400
 """
 
 
-def test_a_brighter_reflector_that_the_scene_lacks_pulls_no_fit_away(tmp_path, monkeypatch, capsys):
-    rail_capture({TARGET: 1.0, OTHER: 2.5}).save(tmp_path / "rail.nc")
-    (tmp_path / "run.toml").write_text(RUN)
-    run = ["reconstruct", str(tmp_path / "run.toml"), "-o", str(tmp_path / "out")]
-    assert call(monkeypatch, *run) == 0, capsys.readouterr().err
-    found = read_metrics(tmp_path / "out")
+@pytest.fixture
+def fit(tmp_path, monkeypatch, capsys):
+    """Fit the ball to echoes of points, given as amplitudes by place; return the metrics."""
+
+    def run(targets):
+        rail_capture(targets).save(tmp_path / "rail.nc")
+        (tmp_path / "run.toml").write_text(RUN)
+        words = ["reconstruct", str(tmp_path / "run.toml"), "-o", str(tmp_path / "out")]
+        assert call(monkeypatch, *words) == 0, capsys.readouterr().err
+        return read_metrics(tmp_path / "out")
+
+    return run
+
+
+def test_a_brighter_reflector_that_the_scene_lacks_pulls_no_fit_away(fit, capsys):
+    found = fit({TARGET: 1.0, OTHER: 2.5})
     (plain,), (again,) = found["starts"], found["starts_from_image"]
     assert plain["position_error_m"] > 0.5
     assert again["position_error_m"] < 0.02
@@ -69,11 +79,7 @@ def test_a_brighter_reflector_that_the_scene_lacks_pulls_no_fit_away(tmp_path, m
     assert "made again from the echo of the image" in capsys.readouterr().out
 
 
-def test_a_fit_that_explains_the_image_stays(tmp_path, monkeypatch, capsys):
-    rail_capture({TARGET: 1.0}).save(tmp_path / "rail.nc")
-    (tmp_path / "run.toml").write_text(RUN)
-    run = ["reconstruct", str(tmp_path / "run.toml"), "-o", str(tmp_path / "out")]
-    assert call(monkeypatch, *run) == 0, capsys.readouterr().err
-    found = read_metrics(tmp_path / "out")
+def test_a_fit_that_explains_the_image_stays(fit):
+    found = fit({TARGET: 1.0})
     assert "image_peak_m" not in found
     assert found["position_error_m"] < 0.02

@@ -221,9 +221,8 @@ def new(
         raise InputError(
             f"expected a new file in a folder, got {path}: {error.strerror}; name another"
         ) from None
-    commands = {"fit": ["invertwin", "reconstruct"], "plugin": ["python"]}
-    commands["coverage"] = ["invertwin", "simulate"]
-    call = shlex.join([*commands.get(kind, ["invertwin", kind]), str(path)])
+    command = {"fit": "reconstruct", "coverage": "simulate"}.get(kind, kind)
+    call = shlex.join([*(["python"] if kind == "plugin" else ["invertwin", command]), str(path)])
     console.print(f"wrote {path}; try: {call}", markup=False, soft_wrap=True)
 
 

@@ -181,6 +181,11 @@ def is_numeric_cell(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
+def format_place(place: Sequence[float]) -> str:
+    """Coordinates in metres as people read them, to the centimetre."""
+    return ", ".join(f"{value:.2f}" for value in place)
+
+
 def format_cell(value: Any) -> str:
     """A cell as people read it: four significant digits, yes and no, a dash for nothing."""
     if value is None:

@@ -36,8 +36,7 @@ def _weideman_coefficients(terms: int) -> tuple[float, list[float]]:
     scale = math.sqrt(terms / math.sqrt(2))
     node = scale * np.tan(np.arange(-count + 1, count) * math.pi / count / 2)
     sampled = np.concatenate([[0.0], np.exp(-(node**2)) * (scale**2 + node**2)])
-    found = np.fft.fft(np.fft.fftshift(sampled)).real / (2 * count)
-    return scale, found[terms:0:-1].tolist()
+    return scale, (np.fft.fft(np.fft.fftshift(sampled)).real / (2 * count))[terms:0:-1].tolist()
 
 
 def _graded_quadrature(count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -113,7 +113,7 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
 
 
 def describe_peak(metrics: dict[str, Any]) -> str:
-    """Where the strongest echo is, in a sentence."""
+    """State the place of the strongest echo in a sentence."""
     answer = f"Strongest echo {metrics['peak_range_m']:.2f} m away"
     if "peak_azimuth_deg" in metrics:
         answer += f", azimuth {metrics['peak_azimuth_deg']:.1f}° (left > 0)"

@@ -9,10 +9,10 @@ import tomli_w
 import torch
 
 from invertwin.capture import Capture, find_faults
+from invertwin.cli import report
 from invertwin.cli.commands.look import AnyRecording, read_recording, warning_tables
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.options import TwinOptions
-from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
 from invertwin.cli.run_file import is_run_file, load_run, prefix_file_errors, require_section
 from invertwin.cli.schema import build
 from invertwin.cli.schema.recordings import SimulatedData
@@ -31,7 +31,7 @@ _MAX_STATED = 6  # things in the sentence that says what was found
 _TWIN_OPTION_NAMES = ("low", "high", "range_max", "level", "height", "rays", "seed")
 
 
-def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[ReportTable], str]:
+def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[report.ReportTable], str]:
     """Read a recording, search it, write the twin; return tables and a sentence to print.
 
     Raises:
@@ -76,7 +76,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[ReportTabl
         save_mesh(folder.file("twin.glb"), scene)
         folder.write_text("twin.toml", tomli_w.dumps(_describe_as_run(found, folder)))
     figure = pictures.ground(found)
-    above = save_picture(folder, "ground", figure, "The ground from above", "ground")
+    above = report.save_picture(folder, "ground", figure, "The ground from above", "ground")
     parts = [_object_table(found), *warning_tables(faults), above, *_draw_maps(found, folder)]
     said = "; ".join((answer, *found.notes))
     title = arguments.recording.name
@@ -91,7 +91,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[ReportTabl
         arguments = replace(arguments, recording=own, config=None, board=None, **stated)
     # Else movers are in the chirps alone, which a capture does not keep.
     again = arguments.command("twin", folder.path)
-    return write_report(folder, metrics, title, f"{said}.", parts, again=again), answer
+    return report.write_report(folder, metrics, title, f"{said}.", parts, again=again), answer
 
 
 def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, dict[str, Any]]:
@@ -114,8 +114,8 @@ def _state_objects(found: Twin) -> tuple[int, str]:
     sure = [one for one in found.objects if one.existence_probability > _MIN_EXISTENCE_PROBABILITY]
     said = [f"{len(sure)} things found, {len(found.objects) - len(sure)} doubtful ones"]
     for thing in sure[:_MAX_STATED]:
-        place = ", ".join(f"{value:.2f}" for value in thing.position[:2].tolist())
-        said.append(f"{thing.kind} at ({place}) ± {_position_deviation(thing):.2g} m")
+        place, off = report.format_place(thing.position[:2].tolist()), _position_deviation(thing)
+        said.append(f"{thing.kind} at ({place}) ± {off:.2g} m")
     said += [f"{len(sure) - _MAX_STATED} more"] if len(sure) > _MAX_STATED else []
     return len(sure), "; ".join(said)
 
@@ -125,7 +125,7 @@ def _position_deviation(thing: DetectedObject) -> float:
     return max(thing.deviations.get(name, 0.0) for name in ("x", "y", "range", "across"))
 
 
-def _object_table(twin: Twin) -> ReportTable:
+def _object_table(twin: Twin) -> report.ReportTable:
     heads = ["thing", "kind", "confidence", *(f"{axis} [m]" for axis in "xyz")]
     heads += ["± [m]", "yaw [°]", "length, width, height [m]", "speed [m/s]"]
     rows: list[list[Any]] = []
@@ -140,16 +140,16 @@ def _object_table(twin: Twin) -> ReportTable:
         share = f"{thing.kind} {thing.probabilities.get(thing.kind, 1.0):.2f}"
         row = [thing.name, share, thing.existence_probability, *thing.position.tolist()]
         rows.append([*row, _position_deviation(thing) or None, yaw, size, rate])
-    return ReportTable("Things", heads, rows, load_texts("notes")["things"])
+    return report.ReportTable("Things", heads, rows, report.load_texts("notes")["things"])
 
 
-def _draw_maps(twin: Twin, folder: RunFolder) -> list[ReportPicture]:
+def _draw_maps(twin: Twin, folder: RunFolder) -> list[report.ReportPicture]:
     if twin.predicted is None or twin.observed is None or twin.grid is None:
         return []
     shown = {"recording": twin.observed, "twin": twin.predicted}
     ratio = twin.observed.double() / twin.predicted.double()
     shown["recording over twin"] = ratio.to(twin.observed)
-    return [save_picture(folder, "maps", spectrum(shown, twin.grid), "Maps", "twin_maps")]
+    return [report.save_picture(folder, "maps", spectrum(shown, twin.grid), "Maps", "twin_maps")]
 
 
 def _describe_as_run(twin: Twin, folder: RunFolder) -> dict[str, Any]:

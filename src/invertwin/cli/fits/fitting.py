@@ -27,6 +27,7 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.shape_scores import CURVE_KEY, make_shape_metric
 from invertwin.cli.fits.spreading import fit_file_stem
+from invertwin.cli.report import format_place
 from invertwin.cli.schema import build
 from invertwin.discovery import (
     choose_result,
@@ -112,10 +113,9 @@ def _fit_from_image(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     begun = displace(start.scene[name], peak - start.scene[name].center)
     start = replace(start, scene=start.scene.replace(name, pose=begun.transform))
     row, outcome = run_fit(problem, start, number, FROM_IMAGE, folder, console, None)
-    doubt = "with blurred kernels the fit left the echo of the image at ({}) m for ({}) m"
-    places = (", ".join(f"{value:.2f}" for value in place.tolist()) for place in (peak, left))
-    found = outcome()
-    found = replace(found, doubts=(*found.doubts, doubt.format(*places)))
+    ends = " for ".join(f"({format_place(place.tolist())}) m" for place in (peak, left))
+    doubt = f"with blurred kernels the fit left the echo of the image at {ends}"
+    found = replace(outcome(), doubts=(doubt,))
     rows = {**fits.rows, FROM_IMAGE: [row]}
     problem = replace(problem, notes={**problem.notes, "image_peak_m": peak.tolist()})
     return replace(fits, problem=problem, rows=rows, best=row, found=found)
@@ -140,8 +140,8 @@ def _find_abandoned_echo(fits: Fits, name: str, capture: Capture) -> torch.Tenso
         near = find_image_peak(capture, center, radius + float((end - center).norm()))
     if near is None or (there is not None and near[1] < _MIN_RELATIVE_PEAK * there[1]):
         return None
-    mesh = Mesh(item.vertices.detach(), item.mesh.faces)
-    return near[0] if float(signed_distance(mesh, near[0][None])) > cell else None
+    gap = signed_distance(Mesh(item.vertices.detach(), item.mesh.faces), near[0][None])
+    return near[0] if float(gap) > cell else None
 
 
 def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:

@@ -27,7 +27,7 @@ from invertwin.cli.fits.problem import (
 )
 from invertwin.cli.fits.scores import error_bar_table, score_fit
 from invertwin.cli.fits.writing import describe_outcome, parameter_values
-from invertwin.cli.report import ReportTable, quantity_table, save_picture
+from invertwin.cli.report import ReportTable, format_place, quantity_table, save_picture
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.radio_tables import ReceivedData, ReceivedFile
@@ -269,7 +269,7 @@ def _find_other_ends(fits: Fits) -> Row:
         kept.append(place)
         found = difference_score(best.result, end.result)
         if found is not None and found < REJECTION_ZSCORE:
-            where = ", ".join(f"{x:.2f}" for x in place.tolist())
+            where = format_place(place.tolist())
             told.append(f"a transmitter at {where} m explains the data as well: z = {found:.1f}")
     return {"ambiguities": told} if told else {}
 

@@ -15,6 +15,7 @@ from invertwin.cli.report import (
     ReportPicture,
     ReportTable,
     format_cell,
+    format_place,
     load_texts,
     quantity_table,
     save_picture,
@@ -88,7 +89,7 @@ def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
     if "share" in metrics.get("clutter", {}):
         rows.append(["echoes that the scene lacks", _describe_clutter(**metrics["clutter"])])
     if "image_peak_m" in metrics:
-        place = ", ".join(f"{value:.2f}" for value in metrics["image_peak_m"])
+        place = format_place(metrics["image_peak_m"])
         rows.append(["made again from the echo of the image", f"({place}) m"])
     skip = () if blur_end_step(run) else ("start_loss_sharp", "loss_sharp")
     rows.extend(map(list, quantity_table("", metrics, skip=skip).rows))
@@ -106,9 +107,8 @@ def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
 
 
 def _describe_clutter(kept: bool, share: float, strongest_m: list[float]) -> str:
-    place = ", ".join(f"{value:.2f}" for value in strongest_m)
     use = "count as background" if kept else "but a fit among them is no better"
-    return f"{100 * share:.2g} % of the power, strongest at ({place}) m; {use}"
+    return f"{100 * share:.2g} % of the power, strongest at ({format_place(strongest_m)}) m; {use}"
 
 
 def _method_table(fits: Fits) -> ReportTable:

@@ -14,6 +14,7 @@ from invertwin.discovery.outcome import DetectedObject
 from invertwin.inversion.initialisation.detections import label_groups
 from invertwin.radar import detect_points, noise_power, range_doppler, velocity_span
 from invertwin.radar.aperture import aperture
+from invertwin.radar.processing.backprojection import pairwise_distances
 
 _MAX_GROUP_CELLS = 3.0  # cells of range and rate between echoes of one target
 _MIN_RELATIVE_PEAK = 0.1  # relative to the strongest: weaker peaks may be sidelobes
@@ -177,17 +178,16 @@ def find_image_peak(
     """
     if not is_dense_track(capture):
         return None
-    radar, waveform = capture.radar(), capture.radar().waveform
-    places = radar.positions.detach()
-    length = float(torch.cdist(places, places).max())
+    radar = capture.radar()
+    waveform, places = radar.waveform, radar.positions.detach()
+    length = float(pairwise_distances(places, places).max())
     across = waveform.wavelength * float((places - center).norm(dim=1).max()) / (2 * length)
     step = max(min(waveform.range_resolution, across) / 4, radius / _MAX_STEPS)
     line = torch.arange(-radius, radius + step, step, dtype=torch.float64)
     offsets = torch.nn.functional.pad(torch.cartesian_prod(line, line), (0, 1))
     points = center + offsets[offsets.norm(dim=1) <= radius]
-    is_profile = "range_profile" in capture.dataset
-    low, high = capture.ranges[[0, -1]] if is_profile else radar.range_limits
-    ranges = torch.cdist(points, places) - radar.origins
+    low, high = radar.range_limits if "beat" in capture.dataset else capture.ranges[[0, -1]]
+    ranges = pairwise_distances(points, places) - radar.origins
     points = points[((ranges > low + across) & (ranges < high - across)).all(1)]
     if not len(points):
         return None
