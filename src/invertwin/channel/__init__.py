@@ -30,7 +30,6 @@ from invertwin.channel.rays.ray_scene import visible_points as visible_points
 from invertwin.channel.rays.visibility import DiscontinuityCurves as DiscontinuityCurves
 from invertwin.channel.rays.visibility import ViewpointScene as ViewpointScene
 from invertwin.channel.rcs.closed_forms import CrossSection as CrossSection
-from invertwin.channel.rcs.closed_forms import DihedralByMoments as DihedralByMoments
 from invertwin.channel.rcs.closed_forms import DihedralSection as DihedralSection
 from invertwin.channel.rcs.closed_forms import PlateSection as PlateSection
 from invertwin.channel.rcs.closed_forms import SphereSection as SphereSection

@@ -26,7 +26,6 @@ from invertwin.channel.em.plane_waves import (
 from invertwin.channel.em.wedges import Wedges, find_wedges, fringe_field, select_body_edges
 from invertwin.channel.rays.topology import topology_of
 from invertwin.channel.rcs import far_field as signature
-from invertwin.channel.rcs.closed_forms import strip_section_te, strip_section_tm
 from invertwin.channel.rcs.moments import efie_solver as meshed
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
@@ -49,6 +48,7 @@ from invertwin.scene import (
 )
 from invertwin.scene.material.fresnel import fresnel_coefficients
 from invertwin.scene.material.slab import slab_coefficients
+from invertwin_studies.dihedral_moments import strip_section_te, strip_section_tm
 from scenes import float64
 
 METAL = PerfectConductor()

@@ -24,6 +24,8 @@ def register(registry: Any) -> None:
     registry.add("shape", "vehicle", "invertwin_studies.vehicle_space:vehicle")
     coordinates = "invertwin_studies.vehicle_space:vehicle_coordinates"
     registry.add("parameter", "shape_space", coordinates)
+    moments = "invertwin_studies.dihedral_moments:DihedralByMoments"
+    registry.add("cross_section", "dihedral_moments", moments)
     registry.add("model", "random_phase", "invertwin_studies.random_phase:RandomPhaseMap")
     for kind, file, board in (
         ("openradar", "openradar.npz", "xWR1642"),

@@ -12,4 +12,3 @@ def register(registry: Registry) -> None:
     registry.add("cross_section", "trihedral", channel.TrihedralSection)
     registry.add("cross_section", "square_trihedral", channel.SquareTrihedralSection)
     registry.add("cross_section", "sphere", channel.SphereSection)
-    registry.add("cross_section", "dihedral_moments", channel.DihedralByMoments)
