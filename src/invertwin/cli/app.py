@@ -15,25 +15,9 @@ import typer.main
 from typer.core import TyperGroup
 
 from invertwin import __version__
-from invertwin.cli.inputs import (
-    DATASET_SECTIONS,
-    find_viewed_file,
-    require_files,
-    require_recording,
-)
-from invertwin.cli.options import (
-    BackendOption,
-    DatasetOptions,
-    FileArgument,
-    FilesArgument,
-    FitOptions,
-    LookOptions,
-    ResumableOptions,
-    RunOptions,
-    TwinOptions,
-    console,
-    with_options,
-)
+from invertwin.cli import inputs
+from invertwin.cli import options as command_options
+from invertwin.cli.options import argument, option
 from invertwin.cli.report import ReportTable, use_plain_style
 from invertwin.cli.run_file import prefix_file_errors
 from invertwin.cli.terminal import load_runs, print_tables, run_each, run_in_folder, show_progress
@@ -89,7 +73,7 @@ def _command_with(
     """Add a command whose options are the fields of a dataclass."""
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        return app.command(rich_help_panel=panel)(with_options(kind)(function))
+        return app.command(rich_help_panel=panel)(command_options.with_options(kind)(function))
 
     return decorate
 
@@ -105,22 +89,20 @@ def _show_version(wanted: bool) -> bool:
 def invertwin(
     version: Annotated[
         bool,
-        typer.Option(
-            "--version", callback=_show_version, is_eager=True, help="Show the version and end."
-        ),
+        option("--version", "Show the version and end.", callback=_show_version, is_eager=True),
     ] = False,
 ) -> None:
     """Digital twins from radar: find a scene from its echoes by differentiating ray tracing."""
 
 
-@_command_with(RunOptions)
-def simulate(options: RunOptions, file: FileArgument) -> None:
+@_command_with(command_options.RunOptions)
+def simulate(options: command_options.RunOptions, file: command_options.FileArgument) -> None:
     """Simulate exact radar signals of a scene, and their spectra; or a coverage map."""
     runs = load_runs([file], options, "simulate", _simulate_sections)
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         run = runs[file.stem]
-        with prefix_file_errors(file), show_progress(console):
+        with prefix_file_errors(file), show_progress(command_options.console):
             if _simulates_coverage(run):
                 from invertwin.cli.commands.coverage import run_coverage
 
@@ -140,31 +122,31 @@ def _simulate_sections(run: Any) -> tuple[str, ...]:
     return ("map", "transmitter") if _simulates_coverage(run) else ("radar", "grid", "data")
 
 
-@_command_with(DatasetOptions)
-def dataset(options: DatasetOptions, file: FileArgument) -> None:
+@_command_with(command_options.DatasetOptions)
+def dataset(options: command_options.DatasetOptions, file: command_options.FileArgument) -> None:
     """Simulate a data set: many samples of a run file with other values each, and their labels."""
-    runs = load_runs([file], options, "dataset", DATASET_SECTIONS)
+    runs = load_runs([file], options, "dataset", inputs.DATASET_SECTIONS)
     from invertwin.cli.commands import dataset as command
 
     part = command.parse_part(options.shard)
     chosen = replace(options, out=command.part_folder(options.out or Path("out", file.stem), part))
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
-        with prefix_file_errors(file), show_progress(console):
+        with prefix_file_errors(file), show_progress(command_options.console):
             workers = options.workers or available_threads()
             return command.run_dataset(runs[file.stem], folder, part, options.engine, workers), ""
 
     run_in_folder(chosen, Path("out"), work, runs)
 
 
-@_command_with(FitOptions)
-def reconstruct(options: FitOptions, file: FileArgument) -> None:
+@_command_with(command_options.FitOptions)
+def reconstruct(options: command_options.FitOptions, file: command_options.FileArgument) -> None:
     """Fit the parameters of a scene to radar data."""
     _run_one_reconstruction(file, options, Path("out", file.stem))
 
 
-@_command_with(ResumableOptions)
-def plan(options: ResumableOptions, file: FileArgument) -> None:
+@_command_with(command_options.ResumableOptions)
+def plan(options: command_options.ResumableOptions, file: command_options.FileArgument) -> None:
     """State the error bars of a fit before anything is recorded, and rank positions to add."""
     runs = load_runs([file], options, "plan", ("radar", "data", "grid", "parameters"))
 
@@ -172,13 +154,15 @@ def plan(options: ResumableOptions, file: FileArgument) -> None:
         from invertwin.cli.commands.plan import run_plan
 
         with prefix_file_errors(file):
-            return run_plan(runs[file.stem], folder, console), ""
+            return run_plan(runs[file.stem], folder, command_options.console), ""
 
     run_in_folder(options, Path("out", file.stem), work, runs)
 
 
 @app.command(rich_help_panel=_DEVELOP)
-def check(file: FileArgument, backend: BackendOption = None) -> None:
+def check(
+    file: command_options.FileArgument, backend: command_options.BackendOption = None
+) -> None:
     """Say what a run file needs, memory and time, and do nothing else."""
     from invertwin.cli.run_file import load_run
 
@@ -189,17 +173,17 @@ def check(file: FileArgument, backend: BackendOption = None) -> None:
     with prefix_file_errors(file):
         tables, line = run_check(run)
     print_tables(tables)
-    console.print(line, markup=False, soft_wrap=True)
+    command_options.console.print(line, markup=False, soft_wrap=True)
 
 
 @app.command(rich_help_panel=_DEVELOP)
-def convert(files: FilesArgument) -> None:
+def convert(files: command_options.FilesArgument) -> None:
     """Rewrite run files of the first frame (x right, y up) in today's: x ahead, y left, z up."""
-    require_files((file, "a run file") for file in files)
+    inputs.require_files((file, "a run file") for file in files)
     from invertwin_convert import run_convert
 
     for line in run_convert(files):
-        console.print(line, markup=False, soft_wrap=True)
+        command_options.console.print(line, markup=False, soft_wrap=True)
 
 
 @app.command(rich_help_panel=_LEARN)
@@ -207,7 +191,7 @@ def new(
     kind: Annotated[
         Literal["fit", "simulate", "twin", "coverage", "dataset", "plugin"], typer.Argument()
     ],
-    file: Annotated[Path | None, typer.Argument(help="Default: kind.toml, or plugin.py.")] = None,
+    file: Annotated[Path | None, argument("Default: kind.toml, or plugin.py.")] = None,
 ) -> None:
     """Write a commented run file, or a plugin, to start from."""
     # As a text: a module among the templates would be part of the package.
@@ -223,50 +207,43 @@ def new(
         ) from None
     command = {"fit": "reconstruct", "coverage": "simulate"}.get(kind, kind)
     call = shlex.join([*(["python"] if kind == "plugin" else ["invertwin", command]), str(path)])
-    console.print(f"wrote {path}; try: {call}", markup=False, soft_wrap=True)
+    command_options.console.print(f"wrote {path}; try: {call}", markup=False, soft_wrap=True)
 
 
-@_command_with(ResumableOptions, _LEARN)
-def demo(options: ResumableOptions) -> None:
+@_command_with(command_options.ResumableOptions, _LEARN)
+def demo(options: command_options.ResumableOptions) -> None:
     """Find a hidden letter from its radar echoes."""
     # In its own folder the demo replaces what it left there before.
     again = options.overwrite or (options.out is None and not options.resume)
     _run_one_reconstruction(_find_demo_file(), replace(options, overwrite=again), Path("out/demo"))
 
 
-@_command_with(LookOptions, _DATA)
-def look(options: LookOptions) -> None:
+@_command_with(command_options.LookOptions, _DATA)
+def look(options: command_options.LookOptions) -> None:
     """Show a recording: range, range rate, direction; and write it as a capture."""
     _run_recording(options, "")
 
 
-@_command_with(TwinOptions, _DATA)
-def twin(options: TwinOptions) -> None:
+@_command_with(command_options.TwinOptions, _DATA)
+def twin(options: command_options.TwinOptions) -> None:
     """Find what stands in a recording, with no start: things, places, sizes, confidences."""
     _run_recording(options, "_twin")
 
 
 @app.command(rich_help_panel=_DATA)
 def view(
-    target: Annotated[
-        Path, typer.Argument(help="Run folder, run file or capture (.nc).", show_default=False)
-    ],
-    host: Annotated[str, typer.Option(help="Others than this machine need a token.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="The first that is tried.")] = 8080,
-    token: Annotated[
-        str | None, typer.Option(help="16 letters or digits that the address must hold.")
-    ] = None,
+    target: Annotated[Path, argument("Run folder, run file or capture (.nc).")],
+    host: Annotated[str, option("Others than this machine need a token.")] = "127.0.0.1",
+    port: Annotated[int, option("The first that is tried.", min=0, max=65535)] = 8080,
+    token: Annotated[str | None, option("16 letters or digits that the address must hold.")] = None,
     record: Annotated[
-        Path | None,
-        typer.Option(help="Write an HTML page that needs no server, and end.", show_default=False),
+        Path | None, option("Write an HTML page that needs no server, and end.", show_default=False)
     ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the page of --record.")
-    ] = False,
-    backend: BackendOption = None,
+    overwrite: Annotated[bool, option("--overwrite", "Replace the page of --record.")] = False,
+    backend: command_options.BackendOption = None,
 ) -> None:
     """Show a run, a scene or a capture in the browser, in three dimensions."""
-    find_viewed_file(target)
+    inputs.find_viewed_file(target)
     own = record is not None and record.resolve() == target.resolve()
     if record is not None and (own or (record.exists() and not overwrite)):
         raise InputError(
@@ -276,11 +253,13 @@ def view(
     use_plain_style()
     from invertwin.cli.commands.view import run_view
 
-    run_view(target, console, host=host, port=port, token=token, record=record)
+    run_view(target, command_options.console, host=host, port=port, token=token, record=record)
 
 
-@_command_with(ResumableOptions, _DEVELOP)
-def gradcheck(options: ResumableOptions, files: FilesArgument) -> None:
+@_command_with(command_options.ResumableOptions, _DEVELOP)
+def gradcheck(
+    options: command_options.ResumableOptions, files: command_options.FilesArgument
+) -> None:
     """Compare automatic derivatives with central differences."""
     runs = load_runs(files, options, "gradcheck", _gradcheck_sections)
     from invertwin.cli.commands.gradcheck import run_gradcheck
@@ -297,8 +276,8 @@ def _gradcheck_sections(run: Any) -> tuple[str, ...]:
     return ("gradcheck",) if alone else ("gradcheck", "radar", "grid")
 
 
-@_command_with(ResumableOptions)
-def rcs(options: ResumableOptions, files: FilesArgument) -> None:
+@_command_with(command_options.ResumableOptions)
+def rcs(options: command_options.ResumableOptions, files: command_options.FilesArgument) -> None:
     """Compute radar signatures: cross-sections, range profiles, images."""
     runs = load_runs(files, options, "rcs", ("rcs",))
     from invertwin.cli.commands.rcs import run_rcs
@@ -309,14 +288,9 @@ def rcs(options: ResumableOptions, files: FilesArgument) -> None:
 @app.command(rich_help_panel=_LEARN)
 def keys(
     section: Annotated[
-        str | None,
-        typer.Argument(
-            help="Such as radar or radar.waveform; default: a list of all.", show_default=False
-        ),
+        str | None, argument("Such as radar or radar.waveform; default: a list of all.")
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json-schema", help="Print the JSON Schema, for editors.")
-    ] = False,
+    as_json: Annotated[bool, option("--json-schema", "Print a JSON Schema, for editors.")] = False,
 ) -> None:
     """Print the keys of a section of run files: units, defaults, meaning; or list the sections."""
     from invertwin.cli.schema.keys import json_schema, key_index, key_tables
@@ -328,12 +302,12 @@ def keys(
 
 
 @app.command(rich_help_panel=_LEARN)
-def doctor(backend: BackendOption = None) -> None:
+def doctor(backend: command_options.BackendOption = None) -> None:
     """Check that this machine can trace rays, and say how to fix it if not."""
     from invertwin.runtime import doctor as machine
 
     report = machine.collect_report()
-    console.print(machine.render_report(report), markup=False, soft_wrap=True)
+    command_options.console.print(machine.render_report(report), markup=False, soft_wrap=True)
     if not report["ok"]:
         raise typer.Exit(1)
 
@@ -348,13 +322,15 @@ def main() -> None:
         sys.exit(2)
 
 
-def _run_recording(options: LookOptions | TwinOptions, ending: str) -> None:
+def _run_recording(
+    options: command_options.LookOptions | command_options.TwinOptions, ending: str
+) -> None:
     """One recording, by default in a folder of its name and an ending."""
-    require_recording(options)
+    inputs.require_recording(options)
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
-        with show_progress(console):
-            if isinstance(options, TwinOptions):
+        with show_progress(command_options.console):
+            if isinstance(options, command_options.TwinOptions):
                 from invertwin.cli.commands.twin import run_twin
 
                 return run_twin(options, folder)
@@ -365,7 +341,9 @@ def _run_recording(options: LookOptions | TwinOptions, ending: str) -> None:
     run_in_folder(options, Path("out", options.recording.name.split(".")[0] + ending), work)
 
 
-def _run_one_reconstruction(file: Path, options: ResumableOptions, default: Path) -> None:
+def _run_one_reconstruction(
+    file: Path, options: command_options.ResumableOptions, default: Path
+) -> None:
     runs = load_runs([file], options, "reconstruct", _reconstruct_sections)
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
@@ -373,11 +351,13 @@ def _run_one_reconstruction(file: Path, options: ResumableOptions, default: Path
         from invertwin.cli.fits.spreading import FitWorkers
 
         workers, view = None, False
-        if isinstance(options, FitOptions):
+        if isinstance(options, command_options.FitOptions):
             workers = FitWorkers.from_options(options.engine, options.workers)
             view = options.view
         with prefix_file_errors(file):
-            return run_reconstruct(runs[file.stem], folder, console, workers, view=view)
+            return run_reconstruct(
+                runs[file.stem], folder, command_options.console, workers, view=view
+            )
 
     run_in_folder(options, default, work, runs)
 

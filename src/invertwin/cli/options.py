@@ -45,17 +45,37 @@ def _use_backend(value: str | None) -> str | None:
     return value
 
 
+def option(*words: str, **given: Any) -> Any:
+    """Return an option of a command.
+
+    Args:
+        words: Its names, if it has other ones than its parameter, and last its help.
+        given: What ``typer.Option`` takes.
+    """
+    return typer.Option(*words[:-1], help=words[-1], **given)
+
+
+def argument(text: str, **given: Any) -> Any:
+    """Return an argument of a command, whose default is not shown.
+
+    Args:
+        text: Its help.
+        given: What ``typer.Argument`` takes.
+    """
+    return typer.Argument(help=text, show_default=False, **given)
+
+
 BackendOption = Annotated[
     Literal["auto", "cpu", "cuda"] | None,
-    typer.Option(
+    option(
         "--backend",
+        "Where rays are traced; default: INVERTWIN_BACKEND, else auto.",
         callback=_use_backend,
-        help="Where rays are traced; default: INVERTWIN_BACKEND, else auto.",
         show_default=False,
     ),
 ]
-FileArgument = Annotated[Path, typer.Argument(help="Run file (TOML).", show_default=False)]
-FilesArgument = Annotated[list[Path], typer.Argument(help="Run files (TOML).", show_default=False)]
+FileArgument = Annotated[Path, argument("Run file (TOML).")]
+FilesArgument = Annotated[list[Path], argument("Run files (TOML).")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,12 +83,9 @@ class OutputOptions:
     """Output folder of a command."""
 
     out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", help="Folder for the results; default: out/<file stem>."),
+        Path | None, option("-o", "--out", "Folder for the results; default: out/<file stem>.")
     ] = None
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the results that are in the folder.")
-    ] = False
+    overwrite: Annotated[bool, option("--overwrite", "Replace the results in the folder.")] = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +93,7 @@ class RunOptions(OutputOptions):
     """Options common to commands with run files."""
 
     seed: Annotated[
-        int | None,
-        typer.Option("--seed", min=0, max=2**31 - 1, help="Replaces the run file's seed."),
+        int | None, option("--seed", "Replaces the run file's seed.", min=0, max=2**31 - 1)
     ] = None
     backend: BackendOption = None
 
@@ -86,14 +102,14 @@ class RunOptions(OutputOptions):
 class ResumableOptions(RunOptions):
     """Options of commands that resume interrupted work."""
 
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the interrupted run in the folder.")
-    ] = False
+    resume: Annotated[bool, option("--resume", "Go on with an interrupted run in the folder.")] = (
+        False
+    )
 
 
 EngineOption = Annotated[
     Literal["processes", "ray"],
-    typer.Option("--engine", help="Processes of this machine, or tasks of a Ray cluster."),
+    option("--engine", "Processes of this machine, or tasks of a Ray cluster."),
 ]
 
 
@@ -103,14 +119,11 @@ class DatasetOptions(ResumableOptions):
 
     workers: Annotated[
         int | None,
-        typer.Option(
-            "--workers", min=1, help="Processes of one thread; default: as many as cores."
-        ),
+        option("--workers", "Processes of one thread; default: as many as cores.", min=1),
     ] = None
-    shard: Annotated[
-        str | None,
-        typer.Option("--shard", help="i/n: part i of n, into a folder of its own inside."),
-    ] = None
+    shard: Annotated[str | None, option("--shard", "i/n: part i of n, in a folder of its own.")] = (
+        None
+    )
     engine: EngineOption = "processes"
 
 
@@ -120,17 +133,15 @@ class FitOptions(ResumableOptions):
 
     workers: Annotated[
         int | None,
-        typer.Option(
+        option(
             "--workers",
-            min=1,
-            help="Processes of one thread that fit starts and variants beside each other; "
+            "Processes of one thread that fit starts and variants beside each other; "
             "default: here, one after another.",
+            min=1,
         ),
     ] = None
     engine: EngineOption = "processes"
-    view: Annotated[
-        bool, typer.Option("--view", help="Show the fits in a browser while they go on.")
-    ] = False
+    view: Annotated[bool, option("--view", "Show the fits in a browser while they go on.")] = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,33 +150,27 @@ class RecordingOptions(OutputOptions):
 
     recording: Annotated[
         Path,
-        typer.Argument(
-            help="Raw .bin or .setup.json, a .toml description of arrays or sweeps, an .s1p or "
-            ".s2p sweep, or a .nc capture.",
-            show_default=False,
+        argument(
+            "Raw .bin or .setup.json, a .toml description of arrays or sweeps, an .s1p or "
+            ".s2p sweep, or a .nc capture."
         ),
     ]
     config: Annotated[
-        Path | None,
-        typer.Option("--config", "-c", help="Settings of a .bin: .cfg or .mmwave.json."),
+        Path | None, option("--config", "-c", "Settings of a .bin: .cfg or .mmwave.json.")
     ] = None
-    board: Annotated[
-        str | None, typer.Option("--board", "-b", help="Preset that recorded, such as xWR1843.")
-    ] = None
+    board: Annotated[str | None, option("--board", "-b", "Its preset, such as xWR1843.")] = None
     elevation: Annotated[
-        int | None, typer.Option(help="1: rows of the board grow upwards, -1: downwards.")
+        int | None, option("1: rows of the board grow upwards, -1: downwards.")
     ] = None
     azimuth: Annotated[
-        int | None, typer.Option(help="1: columns grow to the radar's left (y), -1: right.")
+        int | None, option("1: columns grow to the radar's left (y), -1: right.")
     ] = None
-    lanes: Annotated[
-        int | None, typer.Option(help="2 or 4 LVDS lanes, where the settings do not say.")
-    ] = None
+    lanes: Annotated[int | None, option("2 or 4 LVDS lanes, where the settings do not say.")] = None
     change: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
             "--set",
-            help="Corrects a setting of a .bin, such as samples=128; also lanes, real, receivers, "
+            "Corrects a setting of a .bin, such as samples=128; also lanes, real, receivers, "
             "transmitters, loops, frames.",
         ),
     ] = None
@@ -201,24 +206,22 @@ class LookOptions(RecordingOptions):
     """Options of `invertwin look`."""
 
     chirp: Annotated[
-        int | None, typer.Option(min=0, help="The one that the capture keeps; default: mean.")
+        int | None, option("The one that the capture keeps; default: mean.", min=0)
     ] = None
-    frame: Annotated[int, typer.Option(min=0, help="The one that the pictures show.")] = 0
-    range_min: Annotated[float | None, typer.Option(help="m; default: 3 range cells.")] = None
-    range_max: Annotated[float | None, typer.Option(help="m; default: all.")] = None
+    frame: Annotated[int, option("The one that the pictures show.", min=0)] = 0
+    range_min: Annotated[float | None, option("m; default: 3 range cells.")] = None
+    range_max: Annotated[float | None, option("m; default: all.")] = None
     method: Annotated[
         Literal["bartlett", "capon", "music"],
-        typer.Option(help="Of directions; others than bartlett are shown beside it."),
+        option("Of directions; others than bartlett are shown beside it."),
     ] = "bartlett"
-    sources: Annotated[
-        int | None, typer.Option(help="For music; default: counted in each range.")
-    ] = None
+    sources: Annotated[int | None, option("For music; default: counted in each range.")] = None
     channels: Annotated[
-        Path | None, typer.Option(help="Channel calibration to divide out (channels.json).")
+        Path | None, option("Channel calibration to divide out (channels.json).")
     ] = None
     reflector: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="x y z in m of a reflector: calibrates the channels on it."),
+        option("x y z in m of a reflector: calibrates the channels on it."),
     ] = None
 
 
@@ -228,27 +231,19 @@ class TwinOptions(RecordingOptions):
 
     low: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="Corner x y of the ground searched, m; default: all that is seen."),
+        option("Corner x y of the ground searched, m; default: all that is seen."),
     ] = None
-    high: Annotated[tuple[float, float] | None, typer.Option(help="Opposite corner, m.")] = None
-    range_max: Annotated[
-        float | None, typer.Option(help="m; default: the last range with echoes.")
-    ] = None
-    level: Annotated[
-        float | None, typer.Option(help="Height of the ground, m; default: 0.6 below the radars.")
-    ] = None
-    height: Annotated[
-        float | None,
-        typer.Option(
-            help="Above the ground, where echoes are looked for, m; default: the radars'."
-        ),
-    ] = None
-    rays: Annotated[
-        int | None, typer.Option(min=100, help="Of every frame in fits; default: 2000.")
-    ] = None
-    seed: Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Of rays; default: 0.")] = (
+    high: Annotated[tuple[float, float] | None, option("Opposite corner, m.")] = None
+    range_max: Annotated[float | None, option("m; default: the last range with echoes.")] = None
+    level: Annotated[float | None, option("z of the ground, m; default: 0.6 below the radars.")] = (
         None
     )
+    height: Annotated[
+        float | None,
+        option("Above the ground, where echoes are looked for, m; default: the radars'."),
+    ] = None
+    rays: Annotated[int | None, option("Of every frame in fits; default: 2000.", min=100)] = None
+    seed: Annotated[int | None, option("Of rays; default: 0.", min=0, max=2**31 - 1)] = None
     backend: BackendOption = None
 
 
