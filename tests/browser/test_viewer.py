@@ -76,15 +76,16 @@ def opened(watched: Any, viewer: Viewer) -> float:
 
 
 def seen_at(viewer: Viewer, place: Any) -> tuple[float, float]:
-    """Where a point of the world is on the screen [pixels]."""
+    """Where a point of the world is on the screen [pixels]; the panel is beside the scene."""
     camera = next(iter(viewer._server.get_clients().values())).camera
     ahead = camera.look_at - camera.position
     ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, camera.up_direction)
     right /= np.linalg.norm(right)
     away = np.asarray(place) - camera.position
-    scale = 320 / np.tan(camera.fov / 2) / (away @ ahead)
-    return 512 + scale * (away @ right), 320 - scale * (away @ np.cross(right, ahead))
+    width, height = camera.image_width, camera.image_height
+    scale = height / 2 / np.tan(camera.fov / 2) / (away @ ahead)
+    return width / 2 + scale * (away @ right), height / 2 - scale * (away @ np.cross(right, ahead))
 
 
 def test_it_loads_and_reaches_nobody_else(watched, viewer, pictures, note):
@@ -133,7 +134,7 @@ def test_the_map_follows_what_a_person_drags(watched, viewer, pictures, note):
 
 
 def maps_in(frames: list[bytes]) -> int:
-    """How many pictures of the simulated map have come."""
+    """How many figures of the simulated map have come."""
     import msgspec  # pyright: ignore[reportMissingImports]
     import zstandard  # pyright: ignore[reportMissingImports]
 
@@ -142,7 +143,7 @@ def maps_in(frames: list[bytes]) -> int:
         size = int.from_bytes(frame[8:16], "little")
         text = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size])
         for message in msgspec.msgpack.decode(text)["messages"]:
-            if message.get("name") == "/maps/simulated" and "_data" in str(message.get("updates")):
+            if 'alt="simulated map"' in str(message.get("updates")):
                 found += 1
     return found
 
@@ -152,23 +153,22 @@ def test_the_slider_moves_the_mesh(watched, viewer, pictures, blue):
     page = watched.page
     page.wait_for_timeout(2500)
     hidden = page.get_by_role("checkbox")  # what is seen would cover the mesh
-    hidden.nth(list(viewer._visible).index("what is seen")).click()
+    hidden.nth(1 + list(viewer._visible).index("what is seen")).click()  # the first one plays
     columns, scenes = [], {}
     for number, key in ((5, "End"), (0, "Home")):
         page.get_by_role("slider").first.press(key)
         page.wait_for_timeout(2500)
         page.screenshot(path=str(pictures / f"step_{number}.png"))
         whole = {"x": 0, "y": 0, "width": 680, "height": 640}  # left of the window's panel
-        columns.append(blue(page.screenshot(clip=whole)))
-        # Below what viser says where there is no GPU.
-        scenes[f"viewer_step_{number}"] = page.screenshot(clip=whole | {"y": 192, "height": 448})
+        scenes[f"viewer_step_{number}"] = page.screenshot(clip=whole)
+        columns.append(blue(scenes[f"viewer_step_{number}"]))
     away = [seen_at(viewer, [2.0, -0.1 * k, 0.0])[0] for k in (5, 0)]
     assert max([apart(png, name) for name, png in scenes.items()]) <= APART
     assert columns[0] - columns[1] == pytest.approx(away[0] - away[1], rel=0.25)
     assert watched.errors == []
 
 
-def test_a_click_on_a_map_lights_the_points_that_feed_it(watched, viewer, pictures):
+def test_the_cursor_lights_the_points_that_feed_its_bin(watched, viewer, pictures):
     opened(watched, viewer)
     page = watched.page
     page.wait_for_timeout(1000)
@@ -178,18 +178,63 @@ def test_a_click_on_a_map_lights_the_points_that_feed_it(watched, viewer, pictur
     # The last step has the ball at y = -0.5 m.
     row = round((math.hypot(0.5, 2.0) - 0.3 - grid.range_start) / grid.range_step)
     column = round((-0.5 / math.hypot(0.5, 2.0) - grid.u_start) / grid.u_step)
-    panels = viewer._panels
-    left, up = panels._axes
-    shares = (np.array([column, row]) + 0.5) / [grid.u_count, grid.range_count] - 0.5
-    place = panels._places["simulated"] + panels._size * (shares[0] * left + shares[1] * up)
-    page.mouse.click(*seen_at(viewer, place))
+    # Sliders: the step, the position, both of the cursor.
+    for number, value in ((2, row), (3, grid.u_count - 1 - column)):
+        page.get_by_role("slider").nth(number).press("Home")
+        for _ in range(value):
+            page.get_by_role("slider").nth(number).press("ArrowRight", delay=40)
     page.wait_for_timeout(2500)
-    page.screenshot(path=str(pictures / "clicked.png"))
+    page.screenshot(path=str(pictures / "cursor.png"))
     assert viewer._wish.bin == (row, column)
+    azimuth = math.degrees(math.asin(float(grid.u[column])))
+    assert viewer._bin.value == f"range {float(grid.ranges[row]):.2f} m, azimuth {azimuth:.1f}°"
     fed = viewer._nodes["chosen bin"].points
     ranges = np.linalg.norm(fed, axis=1)
     assert len(fed) > 3
     assert np.abs(ranges - float(grid.ranges[row])).max() <= 1.01 * grid.range_step
+    assert watched.errors == []
+
+
+def test_the_first_picture_has_the_scene_the_radar_and_readable_words(watched, viewer):
+    opened(watched, viewer)
+    page = watched.page
+    page.wait_for_timeout(2500)
+    camera = next(iter(viewer._server.get_clients().values())).camera
+    shown = [layer for layer in viewer._display.layers if layer.shown]
+    for layer in shown:
+        places = np.array([seen_at(viewer, point) for point in layer.points[::50]])
+        inside = (places > 0).all(1) & (places < [camera.image_width, camera.image_height]).all(1)
+        assert inside.mean() >= (0.9 if layer.group != "boards" else 1.0)
+    sizes = page.evaluate(
+        "[...document.querySelectorAll('body *')].filter(e => e.offsetParent && [...e.childNodes]"
+        ".some(n => n.nodeType == 3 && n.textContent.trim())).map(e => [parseFloat("
+        "getComputedStyle(e).fontSize), [...e.childNodes].filter(n => n.nodeType == 3)"
+        ".map(n => n.textContent).join('')])"
+    )
+    words = {text.strip(): size for size, text in sizes}
+    assert {"state", "step", "play", "position", "layers"} <= set(words)
+    assert any("fitted" in text and "fixed" in text for text in words)
+    # Ends of sliders are viser's own, and smaller.
+    assert min(size for text, size in words.items() if not text.isdigit()) >= 11
+    assert not page.locator("#webgl-software-rendering").is_visible()
+    assert watched.errors == []
+
+
+def test_play_goes_through_the_steps(watched, viewer):
+    opened(watched, viewer)
+    page = watched.page
+    page.wait_for_timeout(1500)
+    seen = set()
+    page.get_by_role("checkbox").first.click()
+    for _ in range(40):
+        seen.add(viewer._wish.step)
+        page.wait_for_timeout(200)
+    page.get_by_role("checkbox").first.click()
+    page.wait_for_timeout(1000)
+    ended = viewer._wish.step
+    page.wait_for_timeout(1000)
+    assert viewer._wish.step == ended
+    assert len(seen) >= 4
     assert watched.errors == []
 
 

@@ -13,8 +13,15 @@ from cli.small import RUN, call, read_metrics
 from invertwin.cli.commands.view import load_display
 from invertwin.cli.fits.displays import VIEW_FILE, load_steps
 from invertwin.cli.run_file import load_run
+from invertwin.errors import InputError
 from invertwin.viewer import Display, Viewer, content_security_policy
 
+WALKS = """
+[[scene.plate.motion]]
+kind = "along"
+times = [0.0, 2.0]
+places = [[1.2, 0.0, 0.0], [1.2, 1.0, 0.0]]
+"""
 EVIL = "<script>alert(1)</script>"
 NEEDS_VISER = pytest.mark.skipif(
     importlib.util.find_spec("viser") is None, reason='needs: pip install "invertwin[view]"'
@@ -79,6 +86,41 @@ def test_a_folder_of_a_twin_shows_what_was_found(run_file):
     display, links = load_display(folder)
     assert set(links) == {""}
     assert "twin/plate" in {layer.name for layer in display.layers}
+
+
+def test_a_folder_says_what_was_found_and_its_verdict(run_file):
+    folder = Path("found")
+    folder.mkdir()
+    (folder / "run.toml").write_text(RUN)
+    assert load_display(folder)[0].answer == ""
+    (folder / "metrics.json").write_text('{"answer": "plate at (1, 2, 3)", "verdict": "doubtful"}')
+    assert load_display(folder)[0].answer == "plate at (1, 2, 3); the fit is doubtful"
+    (folder / "metrics.json").write_text("[1")
+    with pytest.raises(InputError, match=r"metrics\.json"):
+        load_display(folder)
+
+
+def test_what_moves_has_steps_in_time(run_file):
+    text = RUN.replace("[radar]\n", WALKS + "\n[radar]\n", 1)
+    Path("walk.toml").write_text(text)
+    steps = load_display(Path("walk.toml"))[0].steps
+    assert [step.label for step in steps[:2]] == ["time 0.00 s", "time 0.05 s"]
+    middles = [step.bodies["plate"].vertices.mean(0) for step in (steps[0], steps[40])]
+    assert steps[-1].label == "time 2.00 s"  # where its trajectory ends
+    assert middles[1] - middles[0] == pytest.approx([0.0, 1.0, 0.0], abs=1e-5)
+
+
+def test_a_coverage_folder_shows_transmitters_and_levels(run_file, monkeypatch):
+    assert call(monkeypatch, "new", "coverage") == 0
+    assert call(monkeypatch, "simulate", "coverage.toml") == 0
+    display, links = load_display(Path("out/coverage"))
+    names = [layer.name for layer in display.layers]
+    assert links == {}
+    assert "transmitters" in names
+    bands = [layer for layer in display.layers if " to " in layer.name]
+    rows = Path("out/coverage/map.csv").read_text().splitlines()[1:]
+    assert 4 * len(rows) == sum(len(layer.points) for layer in bands)
+    assert "dBm" in display.answer
 
 
 @pytest.mark.parametrize("target", ["none.toml", "empty", "picture.png"])

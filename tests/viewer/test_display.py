@@ -23,6 +23,7 @@ from invertwin.viewer import (
     ellipsoid_layers,
 )
 
+SURFACES = ("twin/a/cube", "twin/wall", "truth/a/cube")
 GRID = Grid(1.0, 0.05, 60, -0.5, 0.05, 21)
 
 
@@ -57,13 +58,19 @@ def display() -> Display:
 
 def test_layers_are_where_things_are():
     found = {layer.name: layer for layer in display().layers}
-    assert list(found) == ["twin/a/cube", "twin/wall", "truth/a/cube", "radar", "beams"]
+    assert list(found) == [*SURFACES, "radar", "beams", "boards"]
     assert found["twin/a/cube"].points.min(0) == pytest.approx([1.8, 0.1, -0.2], abs=1e-6)
     assert found["radar"].points.tolist() == [[0, 0, 0], [0, 0.5, 0]]
     # A beam is as wide as the map, and as long as the scene is far.
     end = found["beams"].points[1]
     assert abs(end[1]) / np.linalg.norm(end) == pytest.approx(0.5, rel=0.01)
-    assert display().groups == {"twin": True, "truth": True, "radar": True, "beams": False}
+    shown = {"twin": True, "truth": True, "radar": True, "beams": False, "boards": True}
+    assert display().groups == shown
+    # A board is across the direction in which its radar looks, at each position.
+    boards = found["boards"].points.reshape(2, 8, 3)
+    assert boards.mean(1) == pytest.approx(found["radar"].points, abs=1e-6)
+    thick, wide, high = np.ptp(boards[0], axis=0)
+    assert thick < high < wide
 
 
 def test_a_step_moves_its_layer_alone():

@@ -13,6 +13,7 @@ from invertwin.viewer.layers import display_mesh as display_mesh
 from invertwin.viewer.layers import ellipsoid_layers as ellipsoid_layers
 from invertwin.viewer.layers import scene_layers as scene_layers
 from invertwin.viewer.link import InteractiveSensor as InteractiveSensor
+from invertwin.viewer.link_layers import link_layers as link_layers
 from invertwin.viewer.notebook import capture_html as capture_html
 from invertwin.viewer.notebook import radar_html as radar_html
 from invertwin.viewer.notebook import reconstruction_html as reconstruction_html

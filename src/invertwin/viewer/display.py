@@ -20,6 +20,8 @@ from invertwin.storage.untrusted import convert_read_errors, read_arrays
 _FORMAT_VERSION = 2
 _RERUN_ADVICE = "repeat the run with --overwrite"
 _MAX_VALUES = 2_000_000  # of maps that are kept
+SCENE_GROUPS = ("twin", "truth", "start")
+"""Groups of layers that are surfaces of a scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +140,7 @@ class Display:
         maps: Of every sensor that has data, by its name; the only one has an empty name.
         up: The direction that points up.
         ahead: The direction in which the radar looks.
+        answer: What a run found, in a sentence.
     """
 
     __pydantic_config__ = ConfigDict(
@@ -150,11 +153,12 @@ class Display:
     maps: Mapping[str, DisplayMaps] = field(default_factory=dict)
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     ahead: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    answer: str = ""
 
     @property
     def box(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Lowest and highest corner of the surfaces; of everything, where there are none."""
-        bodies = [x for x in self.layers if x.kind == "surface" and len(x.points)]
+        """Lowest and highest corner of the scene; of everything, where there is none."""
+        bodies = [x for x in self.layers if x.group in SCENE_GROUPS and len(x.points)]
         points = [x.points for x in bodies or self.layers if len(x.points)]
         every = np.concatenate(points) if points else np.zeros((1, 3), np.float32)
         return every.min(0), every.max(0)

@@ -12,13 +12,20 @@ from invertwin.capture import Capture
 from invertwin.channel import Grid
 from invertwin.deprecation import rename_arguments
 from invertwin.radar import Radar
-from invertwin.scene import Object, Scene
+from invertwin.scene import Object, Scene, box
 from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.viewer.display import Display, DisplayLayer, DisplayMesh
 
-_GREY, _RADAR = (185, 190, 199), (110, 120, 140)
-_COLORS = {"truth": (192, 20, 60), "start": (224, 128, 60)}
-_TWIN = (76, 120, 168)
+ROLES = {
+    "fitted": (76, 120, 168),
+    "fixed": (185, 190, 199),
+    "truth": (192, 20, 60),
+    "start": (224, 128, 60),
+    "radar": (110, 120, 140),
+    "transmitters": (214, 39, 40),
+    "receivers": (31, 119, 180),
+}
+"""Colours of surfaces and antennas by what they are in a fit."""
 # Layers of the present position: their names, their colours, and how large their points are.
 SAMPLED_PATHS, VISIBLE_POINTS = "sampled paths", "what is seen"
 BOUNDARY_POINTS, BIN_POINTS = "boundary paths", "chosen bin"
@@ -29,7 +36,9 @@ POSITION_LAYERS: dict[str, tuple[tuple[int, int, int], float]] = {
     BIN_POINTS: ((255, 220, 0), 1.5),
 }
 ELLIPSOID = "95 % ellipsoid"
-_MAX_BEAMS = 6  # positions whose beams are drawn
+_MAX_BEAMS, _MAX_BOARDS = 6, 64  # positions whose beams, and whose boards are drawn
+_BOARD_SIDE = 0.06  # of a board [m]
+_BOARD_SHARES = 0.04, 0.15  # of the beams: least and largest side of a drawn board
 _CIRCLE_POINTS = 32  # corners of an ellipsoid's circles
 _CHI_SQUARED_95 = 7.815  # squared radius of the ellipsoid that holds 95 % of a normal law in space
 
@@ -43,14 +52,22 @@ def to_float32(values: Any) -> NDArray[np.float32]:
     return np.ascontiguousarray(torch.as_tensor(values).detach().cpu().numpy(), np.float32)
 
 
+def to_int32(faces: torch.Tensor) -> NDArray[np.int32]:
+    """Corners of triangles as the graphics card takes them.
+
+    Args:
+        faces: Numbers of vertices [t, 3].
+    """
+    return np.ascontiguousarray(faces.cpu().numpy(), np.int32)
+
+
 def display_mesh(item: Object) -> DisplayMesh:
     """The surface of an object in the world.
 
     Args:
         item: The object.
     """
-    faces = np.ascontiguousarray(item.mesh.faces.cpu().numpy(), np.int32)
-    return DisplayMesh(to_float32(item.vertices), faces)
+    return DisplayMesh(to_float32(item.vertices), to_int32(item.mesh.faces))
 
 
 @rename_arguments(only="fitted_only")
@@ -65,11 +82,12 @@ def scene_layers(
         fitted: Names of objects that are coloured.
         fitted_only: Leave the others out.
     """
-    layers, opacity = [], 0.35 if group in _COLORS else 1.0
+    layers, opacity = [], 0.35 if group in ROLES else 1.0
     for name, item in replace_clouds(scene).objects.items():
         if name in fitted or not fitted_only:
             body, of = display_mesh(item), f"{group}/{name}"
-            look = _COLORS.get(group, _TWIN if name in fitted else _GREY), opacity, group != "start"
+            color = ROLES.get(group, ROLES["fitted" if name in fitted else "fixed"])
+            look = color, opacity, group != "start"
             layers.append(DisplayLayer(of, "surface", body.vertices, body.faces, *look))
     return layers
 
@@ -77,7 +95,7 @@ def scene_layers(
 def radar_layers(
     radar: Radar, grid: Grid | None, length: float, name: str = ""
 ) -> list[DisplayLayer]:
-    """Positions of a radar, and the pyramid that its map covers from some of them.
+    """Positions of a radar, its board, and the pyramid that its map covers from some of them.
 
     Args:
         radar: The radar.
@@ -86,21 +104,27 @@ def radar_layers(
         name: Of the radar, where there are several.
     """
     places, axes = radar.positions.detach(), radar.link().rotations.detach()
-    chosen = np.unique(np.linspace(0, len(places) - 1, _MAX_BEAMS).astype(int))
+    spread = (np.linspace(0, len(places) - 1, most) for most in (_MAX_BEAMS, _MAX_BOARDS))
+    chosen, boarded = (np.unique(numbers.astype(int)) for numbers in spread)
+    side = min(max(_BOARD_SIDE, _BOARD_SHARES[0] * length), _BOARD_SHARES[1] * length)
+    board = box([0.1 * side, side, 0.75 * side])
+    corners = places[boarded, None] + board.vertices @ axes[boarded].mT
+    faces = torch.cat([board.faces + k * len(board.vertices) for k in range(len(boarded))])
     u = torch.tensor([-1.0, 1.0, 1.0, -1.0]).double() * _largest_cosine(grid and grid.u)
     v = torch.tensor([-1.0, -1.0, 1.0, 1.0]).double() * _largest_cosine(grid and grid.v)
     w = (1 - u.square() - v.square()).clamp_min(0.0).sqrt()
-    corners = torch.stack([w, u, v], dim=1) * length
+    rays = torch.stack([w, u, v], dim=1) * length
     lines = []
     for k in chosen:
-        ends = places[k] + corners @ axes[k].T
+        ends = places[k] + rays @ axes[k].T
         sides = torch.stack([places[k].expand(4, 3), ends], dim=1)
         lines += [sides.reshape(-1, 3), torch.stack([ends, ends.roll(-1, 0)], 1).reshape(-1, 3)]
     of = f"/{name}" if name else ""
-    beams = to_float32(torch.cat(lines))
+    beams, boards = to_float32(torch.cat(lines)), to_float32(corners.reshape(-1, 3))
     return [
-        DisplayLayer(f"radar{of}", "points", to_float32(places), color=_RADAR),
-        DisplayLayer(f"beams{of}", "lines", beams, color=(150, 150, 160), shown=False),
+        DisplayLayer(f"radar{of}", "points", to_float32(places), color=ROLES["radar"]),
+        DisplayLayer(f"beams{of}", "lines", beams, color=(150, 150, 160), shown=len(chosen) == 1),
+        DisplayLayer(f"boards{of}", "surface", boards, to_int32(faces), ROLES["radar"]),
     ]
 
 
@@ -120,10 +144,10 @@ def capture_layers(capture: Capture) -> list[DisplayLayer]:
     layers = []
     if capture.survey is not None:
         points = to_float32(capture.survey)
-        layers.append(DisplayLayer("surveyed targets", "points", points, color=_COLORS["truth"]))
+        layers.append(DisplayLayer("surveyed targets", "points", points, color=ROLES["truth"]))
     if capture.track is not None:
         places = to_float32(capture.track.positions)
-        layers.append(DisplayLayer("track", "lines", _join_points(places), color=_RADAR))
+        layers.append(DisplayLayer("track", "lines", join_points(places), color=ROLES["radar"]))
     return layers
 
 
@@ -152,7 +176,7 @@ def ellipsoid_layers(scene: Scene, metrics: Mapping[str, Any]) -> list[DisplayLa
         turn = np.linspace(0, 2 * math.pi, _CIRCLE_POINTS + 1)
         circle = np.stack([np.cos(turn), np.sin(turn)])
         rings = [(radii[:, [i, j]] @ circle).T for i, j in ((0, 1), (1, 2), (0, 2))]
-        pairs = np.concatenate([_join_points(ring) for ring in rings])
+        pairs = np.concatenate([join_points(ring) for ring in rings])
         points = to_float32(pairs) + to_float32(scene[name].center)
         layers.append(DisplayLayer(f"{ELLIPSOID}/{name}", "lines", points, color=(230, 160, 0)))
     return layers
@@ -192,8 +216,12 @@ def build_display(
     return Display(title, layers, up=up, ahead=ahead)
 
 
-def _join_points(points: NDArray[Any]) -> NDArray[Any]:
-    """Both ends of each piece of the line through some points, one after the other."""
+def join_points(points: NDArray[Any]) -> NDArray[Any]:
+    """Return both ends of each piece of the line through some points, one after the other.
+
+    Args:
+        points: [point, 3], m.
+    """
     return np.stack([points[:-1], points[1:]], axis=1).reshape(-1, 3)
 
 

@@ -22,19 +22,10 @@ from torch import Tensor
 
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError, PhysicsWarning
+from invertwin.viewer import panels
 from invertwin.viewer.display import Display, DisplayStep
 from invertwin.viewer.layers import ELLIPSOID, POSITION_LAYERS, SAMPLED_PATHS, to_float32
 from invertwin.viewer.link import InteractiveSensor
-from invertwin.viewer.panels import (
-    MAX_RESIDUAL_DB,
-    MEASURED,
-    MIN_LEVEL_DB,
-    POWER_COLORMAP,
-    RESIDUAL,
-    RESIDUAL_COLORMAP,
-    SIMULATED,
-    relative_decibels,
-)
 
 _MAX_MAPS = 144  # simulated ones of a page, over sensors, steps and positions
 _MAX_FRAMES = 8  # positions of a sensor
@@ -109,8 +100,8 @@ def _collect_maps(
         return to_float32(pooled.reshape(*power.shape[:-2], *pooled.shape[-2:]))
 
     measured = None
-    if known is not None and MEASURED in known.power:
-        measured = max_pool(torch.from_numpy(known.power[MEASURED][chosen]))
+    if known is not None and panels.MEASURED in known.power:
+        measured = max_pool(torch.from_numpy(known.power[panels.MEASURED][chosen]))
     simulated = None if sensor is None else _simulate_maps(display, sensor, frames)
     places, rotations, origins = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0)
     if sensor is not None:
@@ -212,10 +203,17 @@ def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
             {"name": name, "color": color, "size": size, "shown": name != SAMPLED_PATHS}
             for name, (color, size) in POSITION_LAYERS.items()
         ],
-        "pictures": {"measured": MEASURED, "simulated": SIMULATED, "residual": RESIDUAL},
-        "colors": {"power": _colormap(POWER_COLORMAP), "apart": _colormap(RESIDUAL_COLORMAP)},
-        "depth": -MIN_LEVEL_DB,
-        "largest": MAX_RESIDUAL_DB,
+        "pictures": {
+            "measured": panels.MEASURED,
+            "simulated": panels.SIMULATED,
+            "residual": panels.RESIDUAL,
+        },
+        "colors": {
+            "power": _colormap(panels.POWER_COLORMAP),
+            "apart": _colormap(panels.RESIDUAL_COLORMAP),
+        },
+        "depth": -panels.MIN_LEVEL_DB,
+        "largest": panels.MAX_RESIDUAL_DB,
     }
     # The only character that could end the element.
     text = json.dumps(data).replace("<", "\\u003c")
@@ -239,7 +237,7 @@ def _sensor_data(name: str, maps: SensorMaps) -> dict[str, Any]:
     """Maps of a sensor, each value one byte: 255 is the peak of its map, 0 the darkest."""
 
     def pack_power(power: NDArray[np.float32]) -> str:
-        levels = 255 * (1 - relative_decibels(power) / MIN_LEVEL_DB)
+        levels = 255 * (1 - panels.relative_decibels(power) / panels.MIN_LEVEL_DB)
         return _base64(np.rint(levels).astype(np.uint8))
 
     some = maps.measured if maps.simulated is None else maps.simulated

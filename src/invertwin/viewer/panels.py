@@ -1,114 +1,74 @@
-"""Maps as pictures that stand beside the scene: measured, simulated, and what is left."""
+"""Maps in the side panel: measured, simulated, and their difference, over azimuth and range."""
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+import base64
+import io
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from invertwin.viewer.display import Display
+from PIL import Image
 
 MEASURED, SIMULATED, RESIDUAL = "measured", "simulated", "residual"
 POWER_COLORMAP, RESIDUAL_COLORMAP = "viridis", "RdBu_r"  # colour maps
 MIN_LEVEL_DB = -40.0  # dB below the peak
 MAX_RESIDUAL_DB = 15.0  # dB of a residual
-_MIN_PIXELS = 200  # along the shorter side of a picture, at least
+_DEGREE_STEPS = (5, 10, 15, 30)  # between ticks of the azimuth [°]
+_MAX_TICKS = 7
+_CURSOR_COLOR = (255, 60, 60)
 
 
 class MapPanels:
-    """Pictures in a row above the scene, each bin of which can be clicked.
+    """Figures of maps with axes in metres and degrees, a colour bar, and a cursor in all of them.
+
+    Axes are drawn once for each sensor; bins are painted into them, which is quick.
 
     Args:
-        server: Of viser.
-        display: Tells where the scene is.
-        shown: Names of the pictures.
-
-    Attributes:
-        left: The direction in which u grows.
-        offset: From the middle of the scene to that of the pictures.
+        gui: Panel of a viser server.
+        shown: Names of the maps.
     """
 
-    def __init__(self, server: Any, display: Display, shown: Sequence[str]) -> None:
-        low, high = display.box
-        up, ahead = np.array(display.up), np.array(display.ahead)
-        self.left, self.offset = np.cross(up, ahead), np.zeros(3)
-        self._shape = (1, 1)
-        self._nodes: dict[str, Any] = {}
-        self._places: dict[str, Any] = {}
-        if not shown:
-            return
-        self._size = 0.5 * (float(np.linalg.norm(high - low)) or 1.0)
-        self._axes = self.left, up
-        self.offset = up * (float((high - low) @ np.abs(up)) / 2 + 0.65 * self._size)
+    def __init__(self, gui: Any, shown: Sequence[str]) -> None:
+        self._images = {name: gui.add_html("", visible=False) for name in shown}
+        self._axes: dict[str, tuple[NDArray[np.uint8], slice, slice]] = {}
         self._known: dict[str, tuple[Any, Any]] = {}
-        # The image's first axis, which is that of u, its foot, and what is behind it.
-        turn = _quaternion(np.stack([self.left, -up, -ahead], axis=1))
-        empty = np.zeros((8, 8, 3), np.uint8)
-        unlit = {"cast_shadow": False, "receive_shadow": False}
-        for number, name in enumerate(shown):
-            # The first one stands on the left of who looks along the radar.
-            across = 1.1 * self._size * ((len(shown) - 1) / 2 - number)
-            place = (low + high) / 2 + self.offset + across * self.left
-            self._places[name] = place
-            sides, pose = (self._size, self._size), {"wxyz": turn, "position": place}
-            self._nodes[name] = server.scene.add_image(
-                f"/maps/{name}", empty, *sides, format="png", **pose, **unlit
-            )
-            server.scene.add_label(
-                f"/maps/{name}/label", name, position=(0.0, -0.55 * self._size, 0.0)
-            )
 
-    def on_click(self, choose: Callable[[tuple[int, int]], None]) -> None:
-        """Say which bin was clicked.
+    def draw_axes(self, ranges: Sequence[float], across: Sequence[float]) -> None:
+        """Draw the axes of a sensor's maps.
 
         Args:
-            choose: Takes the numbers of its range and its u.
+            ranges: Range of each row [m].
+            across: Direction cosine u of each column.
         """
-        for name, node in self._nodes.items():
-            node.on_click(partial(self._choose_bin, name, choose))
-
-    def _choose_bin(self, name: str, choose: Callable[[tuple[int, int]], None], event: Any) -> None:
-        origin, toward = np.array(event.ray_origin), np.array(event.ray_direction)
-        left, up = self._axes
-        normal = np.cross(left, up)
-        distance = (self._places[name] - origin) @ normal / (toward @ normal)
-        away = origin + distance * toward - self._places[name]
-        shares = 0.5 + away @ np.stack([up, left], axis=1) / self._size
-        found = np.floor(shares * self._shape).astype(int).clip(0, np.array(self._shape) - 1)
-        choose((int(found[0]), int(found[1])))
+        self._known.clear()
+        self._axes = {name: _draw_axes(name, ranges, across) for name in self._images}
 
     def show(self, maps: Mapping[str, NDArray[np.float32]], chosen: tuple[int, int] | None) -> None:
         """Draw maps, each below its own peak; the residual where both are known.
 
         Args:
-            maps: Power [range, u], by the name of the picture.
-            chosen: A bin that is framed.
+            maps: Power [range, u], by the name of the map.
+            chosen: Bin of the cursor.
         """
         from matplotlib import colormaps
 
-        self._shape = next(iter(maps.values())).shape if maps else (1, 1)
-        levels = {name: relative_decibels(power) for name, power in maps.items()}
-        pictures = {
-            name: colormaps[POWER_COLORMAP](1 - level / MIN_LEVEL_DB)
-            for name, level in levels.items()
-        }
+        levels, shown = {name: relative_decibels(own) for name, own in maps.items()}, POWER_COLORMAP
+        colors = {k: colormaps[shown](1 - level / MIN_LEVEL_DB) for k, level in levels.items()}
         if MEASURED in levels and SIMULATED in levels:
             apart = levels[MEASURED] - levels[SIMULATED]
-            pictures[RESIDUAL] = colormaps[RESIDUAL_COLORMAP](0.5 + apart / (2 * MAX_RESIDUAL_DB))
-        for name, node in self._nodes.items():
-            node.visible = name in pictures
-        for name, colors in pictures.items():
-            if name in self._nodes and not (
-                name in maps and self._is_current(name, maps[name], chosen)
-            ):
-                self._nodes[name].image = _draw_picture(np.uint8(255 * colors[..., :3]), chosen)
+            colors[RESIDUAL] = colormaps[RESIDUAL_COLORMAP](0.5 + apart / (2 * MAX_RESIDUAL_DB))
+        for name, image in self._images.items():
+            image.visible = name in colors
+            if name in colors and not self._is_current(name, maps.get(name), chosen):
+                painted = _paint_bins(*self._axes[name], colors[name], chosen)
+                image.content = _image_html(name, painted)
 
-    def _is_current(self, name: str, power: NDArray[np.float32], chosen: Any) -> bool:
-        """Return True if a picture is up to date, and mark it so."""
-        before, frame = self._known.get(name, (None, None))
+    def _is_current(self, name: str, power: NDArray[np.float32] | None, chosen: Any) -> bool:
+        """Return True if a figure is up to date, and mark it so."""
+        before, cursor = self._known.get(name, (None, None))
         self._known[name] = power, chosen
-        return before is not None and frame == chosen and np.array_equal(before, power)
+        same = before is not None and power is not None and np.array_equal(before, power)
+        return same and cursor == chosen
 
 
 def relative_decibels(power: NDArray[np.float32]) -> NDArray[Any]:
@@ -122,22 +82,66 @@ def relative_decibels(power: NDArray[np.float32]) -> NDArray[Any]:
     return level.clip(MIN_LEVEL_DB, 0.0)
 
 
-def _draw_picture(colors: Any, chosen: tuple[int, int] | None) -> NDArray[np.uint8]:
-    """A picture with the farthest range on top, each bin some pixels large."""
-    times = [max(1, -(-_MIN_PIXELS // count)) for count in colors.shape[:2]]
-    large = colors.repeat(times[0], axis=0).repeat(times[1], axis=1)
+def _draw_axes(
+    name: str, ranges: Sequence[float], across: Sequence[float]
+) -> tuple[NDArray[np.uint8], slice, slice]:
+    """Return an empty figure, and the rows and columns of its pixels that bins fill."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure((3.2, 2.5), dpi=200)
+    axes = figure.add_axes((0.15, 0.19, 0.64, 0.7))
+    title, low, high, cmap = f"{name} [dB below peak]", MIN_LEVEL_DB, 0.0, POWER_COLORMAP
+    if name == RESIDUAL:
+        title, cmap = f"{MEASURED} over {SIMULATED} [dB]", RESIDUAL_COLORMAP
+        low, high = -MAX_RESIDUAL_DB, MAX_RESIDUAL_DB
+    extent = (*_bin_edges(across), *_bin_edges(ranges))
+    image = axes.imshow(np.zeros((1, 1)), cmap, aspect="auto", vmin=low, vmax=high, extent=extent)
+    figure.colorbar(image, cax=figure.add_axes((0.82, 0.19, 0.03, 0.7)))
+    sines = np.clip(extent[:2], -1.0, 1.0)
+    span = float(np.ptp(np.rad2deg(np.arcsin(sines))))
+    step = next((s for s in _DEGREE_STEPS if span / s < _MAX_TICKS), _DEGREE_STEPS[-1])
+    angles = np.arange(-90, 91, step)
+    places = np.sin(np.deg2rad(angles))
+    inside = (places >= sines[0]) & (places <= sines[1])
+    axes.set_xticks(places[inside], labels=[f"{angle}" for angle in angles[inside]])
+    axes.invert_xaxis()  # the left of the radar is on the left
+    axes.set(xlabel="azimuth [°]", ylabel="range [m]")
+    axes.set_title(title, fontsize=10)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = np.asarray(canvas.buffer_rgba())[..., :3]
+    box = axes.get_window_extent()
+    rows = slice(round(len(drawn) - box.y1), round(len(drawn) - box.y0))
+    return drawn.copy(), rows, slice(round(box.x0), round(box.x1))
+
+
+def _bin_edges(centers: Sequence[float]) -> tuple[float, float]:
+    half = 0.5 * (centers[1] - centers[0]) if len(centers) > 1 else 0.5
+    return centers[0] - half, centers[-1] + half
+
+
+def _image_html(name: str, pixels: NDArray[np.uint8]) -> str:
+    """An image within its element: viser's own are fetched, and may be replaced before."""
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "png", compress_level=1)
+    data = base64.b64encode(file.getvalue()).decode()
+    return f'<img alt="{name} map" style="width: 100%" src="data:image/png;base64,{data}">'
+
+
+def _paint_bins(
+    figure: NDArray[np.uint8], rows: slice, columns: slice, colors: Any, chosen: Any
+) -> NDArray[np.uint8]:
+    """Return a figure with its bins, the farthest range on top and the largest u on the left."""
+    sizes = rows.stop - rows.start, columns.stop - columns.start
+    shares = [
+        np.arange(n)[::-1] * count // n for n, count in zip(sizes, colors.shape, strict=False)
+    ]
+    painted = figure.copy()
+    bins = (255 * colors[shares[0][:, None], shares[1], :3]).astype(np.uint8)
     if chosen is not None:
-        rows, columns = (
-            np.arange(k * size - 2, (k + 1) * size + 2).clip(0, end - 1)
-            for k, size, end in zip(chosen, times, large.shape, strict=False)
-        )
-        large[rows[:, None], columns[[0, 1, -2, -1]]] = (255, 60, 60)
-        large[rows[[0, 1, -2, -1]][:, None], columns] = (255, 60, 60)
-    return np.ascontiguousarray(large[::-1])
-
-
-def _quaternion(axes: NDArray[np.float64]) -> tuple[float, ...]:
-    """The rotation whose columns these are, w first."""
-    from scipy.spatial.transform import Rotation
-
-    return tuple(Rotation.from_matrix(axes).as_quat()[[3, 0, 1, 2]].tolist())
+        middles = [np.nonzero(s == k)[0] for s, k in zip(shares, chosen, strict=True)]
+        row, column = (int(pixels[len(pixels) // 2]) for pixels in middles)
+        bins[max(0, row - 1) : row + 1] = bins[:, max(0, column - 1) : column + 1] = _CURSOR_COLOR
+    painted[rows, columns] = bins
+    return painted

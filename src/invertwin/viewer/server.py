@@ -1,10 +1,10 @@
 """A display in the browser that answers: `viser` draws, one thread of ours traces rays."""
 
 import io
+import math
 import socket
 import threading
 import time
-from collections import deque
 from collections.abc import Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
@@ -13,28 +13,24 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import import_optional, to_one_line
 from invertwin.scene import rigid, rotation_from_quaternion
+from invertwin.viewer import layers, surroundings
 from invertwin.viewer.display import Display, DisplayLayer, DisplayMaps, DisplayStep
 from invertwin.viewer.guard import LOOPBACK, AccessGuard, install_guard
-from invertwin.viewer.layers import (
-    BIN_POINTS,
-    BOUNDARY_POINTS,
-    ELLIPSOID,
-    POSITION_LAYERS,
-    SAMPLED_PATHS,
-    VISIBLE_POINTS,
-    to_float32,
-)
+from invertwin.viewer.layers import POSITION_LAYERS, SAMPLED_PATHS, to_float32
 from invertwin.viewer.link import InteractiveSensor, PositionSample
 from invertwin.viewer.panels import MEASURED, RESIDUAL, SIMULATED, MapPanels
 
 _NO_OBJECT = "nothing"
+_NO_MAPS = "none: a run file with [radar] and [grid], or a capture with samples, has maps"
+_CURSOR = ("cursor: range", "cursor: azimuth")
+_MANY_LAYERS = 12  # of which the list is closed at first
+_PLAY_INTERVAL = 0.2  # seconds, from step to step
 _MAX_PATHS = 100  # rays that are drawn
-_RATE_WINDOW = 10  # updates over which their rate is taken
-_MAX_INTERVAL = 1.0  # seconds: later updates do not follow each other
 _SETTLE_TIME = 0.4  # seconds after which nothing moves
 
 
@@ -95,19 +91,12 @@ class Viewer:
         # What sensors see at steps as they come.
         self._found: dict[int, Mapping[str, DisplayMaps]] = {}
         self._taken: int | None = None  # the step whose bodies the link has
-        self._times: deque[float] = deque(maxlen=_RATE_WINDOW)
         self._nodes: dict[str, Any] = {}
         self._visible = display.groups | {x: x != SAMPLED_PATHS for x in POSITION_LAYERS if sensors}
         self._build_window()
         self._worker = threading.Thread(target=self._run_worker, daemon=True)
         self._worker.start()
         self._due.set()
-
-    @property
-    def rate(self) -> float:
-        """Maps a second, over the last ones that followed each other."""
-        times = list(self._times)
-        return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
 
     def add_step(self, step: DisplayStep, maps: Mapping[str, DisplayMaps] | None = None) -> None:
         """Show a further step of a fit that goes on; who looks at the last one follows.
@@ -165,44 +154,45 @@ class Viewer:
         scene.add_light_ambient("/light", intensity=1.2)
         gui.set_panel_label("invertwin")
         gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
         # Texts of fields are shown as they are; markdown would run what names hold.
         gui.add_text("shown", display.title, disabled=True)
+        if display.answer:
+            gui.add_text("found", display.answer, multiline=True, disabled=True)
         last, several = len(self._steps) - 1, len(self._steps) > 1
+        self._where = gui.add_text("state", "", disabled=True, visible=several)
         self._step = gui.add_slider("step", 0, max(1, last), 1, max(0, last), visible=several)
         self._step.on_update(lambda _: self._update_state(step=int(self._step.value)))
-        self._where = gui.add_text("fit", "", disabled=True, visible=several)
-        low, high = display.box
-        self._size = float(np.linalg.norm(high - low)) or 1.0
+        self._play = gui.add_checkbox("play", False, visible=several)
+        self._play.on_update(lambda _: self._due.set())
+        self._size = float(np.linalg.norm(np.subtract(*display.box))) or 1.0
         self._build_sensor_controls()
-        with gui.add_folder("layers"):
+        gui.add_html(surroundings.legend_html(display))
+        with gui.add_folder("layers", expand_by_default=len(self._visible) < _MANY_LAYERS):
             for group, shown in self._visible.items():
                 gui.add_checkbox(group, shown).on_update(partial(self._set_visibility, group))
         self._said = gui.add_text("note", "", disabled=True, visible=False)
         for layer in display.layers:
             self._draw_layer(layer)
-        shown = [MEASURED] if display.maps else []
-        if self._links or any(SIMULATED in maps.power for maps in display.maps.values()):
-            shown += [SIMULATED, RESIDUAL] if shown else [SIMULATED]
-        self._panels = MapPanels(self._server, display, shown)
-        self._panels.on_click(lambda found: self._update_state(bin=found))
-        camera = self._server.initial_camera
-        middle = (low + high) / 2
-        up, ahead = np.array(display.up), np.array(display.ahead)
-        # The window's own panel covers its right, where u falls.
-        camera.look_at = middle + 0.6 * self._panels.offset - 0.3 * self._size * self._panels.left
-        back = 0.15 * up - 1.6 * ahead + 0.25 * self._panels.left
-        camera.position = camera.look_at + self._size * back
-        camera.up = up
+        surroundings.draw_ground(scene, display)
+        surroundings.set_camera(self._server.initial_camera, display)
 
     def _build_sensor_controls(self) -> None:
-        gui = self._server.gui
+        gui, maps = self._server.gui, self._display.maps
         if not self._sensors:
+            if "transmitters" not in self._visible:
+                gui.add_text("maps", _NO_MAPS, multiline=True, disabled=True)
             return
         self._sensor = gui.add_dropdown("sensor", self._sensors, visible=len(self._sensors) > 1)
         self._sensor.on_update(lambda _: self._select_sensor(str(self._sensor.value)))
         self._frame = gui.add_slider("position", 0, 1, 1, 0)
         self._frame.on_update(lambda _: self._update_state(frame=int(self._frame.value)))
-        self._axes = gui.add_markdown("")
+        simulated = self._links or any(SIMULATED in one.power for one in maps.values())
+        shown = [MEASURED] * bool(maps) + [SIMULATED] * bool(simulated)
+        self._panels = MapPanels(gui, [*shown, RESIDUAL] if len(shown) > 1 else shown)
+        self._cursor = [gui.add_slider(name, 0, 1, 1, 0) for name in _CURSOR]
+        for slider in self._cursor:
+            slider.on_update(lambda _: self._move_cursor())
         self._bin = gui.add_text("bin", "", disabled=True)
         self._select_sensor(self._wish.sensor)
         if not self._links:
@@ -210,23 +200,27 @@ class Viewer:
         names = next(iter(self._links.values())).names
         self._mover = gui.add_dropdown("move", (_NO_OBJECT, *names), initial_value=_NO_OBJECT)
         self._mover.on_update(lambda _: self._select_object(str(self._mover.value)))
-        self._rate = gui.add_text("maps a second", "", disabled=True)
         self._gizmo = self._server.scene.add_transform_controls(
             "/gizmo", scale=0.4 * self._size, depth_test=False, visible=False
         )
         self._gizmo.on_update(lambda _: self._follow_gizmo())
+
+    def _move_cursor(self) -> None:
+        """Choose a bin by its range and its direction."""
+        row, column = (int(slider.value) for slider in self._cursor)
+        # As in the maps, the left of the radar is on the left.
+        self._update_state(bin=(row, self._cursor[1].max - column))
 
     def _select_sensor(self, name: str) -> None:
         """Look through another sensor, from its first position."""
         link, maps = self._links.get(name), self._display.maps.get(name)
         frames = link.radar.frame_count if link else maps.frames[-1] + 1 if maps else 1
         self._frame.max, self._frame.value = max(1, frames - 1), 0
-        self._frame.visible, self._bin.value = frames > 1, "click a map"
-        ranges, across = self._axes_of(name)
-        self._axes.content = (
-            f"Maps: range upwards from {ranges[0]:.2f} to {ranges[-1]:.2f} m, "
-            f"u from {across[-1]:.2f} on the left to {across[0]:.2f}."
-        )
+        self._frame.visible, self._bin.value = frames > 1, "move the cursor"
+        axes = self._axes_of(name)
+        self._panels.draw_axes(*axes)
+        for slider, axis in zip(self._cursor, axes, strict=True):
+            slider.max, slider.value = max(1, len(axis) - 1), 0
         self._update_state(sensor=name, frame=0, bin=None)
 
     def _set_visibility(self, group: str, event: Any) -> None:
@@ -282,13 +276,19 @@ class Viewer:
         if layer.kind == "surface":
             how |= {"color": layer.color, "opacity": None if layer.opacity == 1 else layer.opacity}
             how |= {"cast_shadow": False, "receive_shadow": False}
-            look = {"flat_shading": True, "side": "double"}
-            made = scene.add_mesh_simple(node, layer.points, layer.faces, **look, **how)
+            wall = surroundings.open_wall(layer, self._display)
+            faces, side = (layer.faces, "double") if wall is None else (wall, "front")
+            look = {"flat_shading": True, "side": side}
+            made = scene.add_mesh_simple(node, layer.points, faces, **look, **how)
+            if layer.group == "twin":
+                name, top = layer.name.split("/", 1)[1], self._top(layer)
+                label = scene.add_label(f"{node}/name", name, position=top, visible=visible)
+                self._nodes[f"{layer.name}/name"] = label
         elif layer.kind == "lines":
             pairs = layer.points.reshape(-1, 2, 3)
             thick = {"thickness": 1.5, "thickness_units": "screen"}
             made = scene.add_line_segments(node, pairs, colors=layer.color, **thick, **how)
-            if layer.group == ELLIPSOID:
+            if layer.group == layers.ELLIPSOID:
                 # It is inside of its object; only labels show through.
                 middle = (layer.points.min(0) + layer.points.max(0)) / 2
                 radius = np.linalg.norm(layer.points - middle, axis=1).max()
@@ -299,13 +299,21 @@ class Viewer:
             made = scene.add_point_cloud(node, layer.points, **how)
         self._nodes[layer.name] = made
 
+    def _top(self, layer: DisplayLayer) -> NDArray[np.float32]:
+        """The highest point of a surface."""
+        return layer.points[(layer.points @ np.array(self._display.up)).argmax()]
+
     def _run_worker(self) -> None:
         """Trace what the person wants, the latest alone; single paths when nothing moves."""
         while True:
-            self._due.wait()
+            due = self._due.wait(_PLAY_INTERVAL if self._play.value else None)
             self._due.clear()
             if self._closed:
                 return
+            if not due:  # the slider's own callback follows
+                self._step.value = (self._wish.step + 1) % len(self._steps)
+                self._update_state(step=self._step.value)
+                self._due.clear()
             with self._lock:
                 wish = self._wish
             try:
@@ -328,6 +336,7 @@ class Viewer:
                 node = self._nodes[layer.name]
                 if node.faces.shape == layer.faces.shape and (node.faces == layer.faces).all():
                     node.vertices = layer.points
+                    self._nodes[f"{layer.name}/name"].position = self._top(layer)
                 else:
                     self._draw_layer(layer)
         self._where.visible, self._where.value = True, step.label
@@ -349,16 +358,11 @@ class Viewer:
         self._panels.show(maps, state.bin)
         if state.bin is not None:
             (row, column), (ranges, across) = state.bin, self._axes_of(state.sensor)
-            self._bin.value = f"range {ranges[row]:.2f} m, u {across[column]:.3f}"
+            azimuth = math.degrees(math.asin(max(-1.0, min(1.0, across[column]))))
+            self._bin.value = f"range {ranges[row]:.2f} m, azimuth {azimuth:.1f}°"
         if link is None or scene is None:
             return
-        now = time.perf_counter()
-        if self._times and now - self._times[-1] > _MAX_INTERVAL:
-            self._times.clear()
-        self._times.append(now)
-        if len(self._times) == _RATE_WINDOW:
-            self._rate.value = f"{self.rate:.0f}"
-        if not self._due.wait(_SETTLE_TIME):
+        if not self._play.value and not self._due.wait(_SETTLE_TIME):
             self._show_paths(link.sample_paths(scene, state.frame), state.bin)
 
     def _axes_of(self, sensor: str) -> tuple[list[float], list[float]]:
@@ -377,9 +381,9 @@ class Viewer:
         fed = to_float32(sample.points_in_bin(*chosen)) if chosen else np.zeros((0, 3), np.float32)
         found = {
             SAMPLED_PATHS: corners.reshape(-1, 3),
-            VISIBLE_POINTS: points[:, 1],
-            BOUNDARY_POINTS: sample.edges,
-            BIN_POINTS: fed,
+            layers.VISIBLE_POINTS: points[:, 1],
+            layers.BOUNDARY_POINTS: sample.edges,
+            layers.BIN_POINTS: fed,
         }
         with self._server.atomic():
             for name, places in found.items():

@@ -1,9 +1,13 @@
 """`invertwin view`: a run folder, a run file or a capture in the browser, or on a page."""
 
+import io
+import json
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from invertwin import viewer
@@ -14,8 +18,14 @@ from invertwin.cli.fits.radar_models import build_sensors
 from invertwin.cli.inputs import find_viewed_file
 from invertwin.cli.run_file import load_run, prefix_file_errors
 from invertwin.cli.schema import RunFile, build
+from invertwin.cli.schema.motion_tables import build_moving_scene
+from invertwin.errors import InputError
 from invertwin.radar import Radar
+from invertwin.scene import Scene
 from invertwin.storage.folders import convert_os_errors, replace_file
+from invertwin.storage.untrusted import convert_read_errors, read_text
+
+_TIMES, _TIME_STEP = 48, 0.05  # steps in time of what moves, and their distance [s]
 
 
 def run_view(
@@ -86,6 +96,8 @@ def _display_of_run(
             if grid is not None
         }
         display = viewer.build_display(own, radars, title, fitted=names or list(run.truth))
+        display = replace(display, steps=_steps_in_time(run, own))
+        antennas = _build_link_layers(run, own, folder)
     if folder is not None and (folder / VIEW_FILE).is_file():
         display = viewer.Display.load(folder / VIEW_FILE)
         for link in links.values():
@@ -95,7 +107,45 @@ def _display_of_run(
         capture, grid = Capture.load(folder / "capture.nc"), links[""].grid
         maps = viewer.DisplayMaps.from_spectra({viewer.MEASURED: capture.spectrum(grid)}, grid)
         display = replace(display, maps={"": maps})
-    return display, links
+    answer = "" if folder is None else _read_answer(folder / "metrics.json")
+    return replace(display, layers=[*display.layers, *antennas], answer=answer), links
+
+
+def _read_answer(file: Path) -> str:
+    """What a run found, with its verdict; empty if it says nothing."""
+    if not file.is_file():
+        return ""
+    with convert_read_errors(file, "the metrics of a run"):
+        found = json.loads(read_text(file, "the metrics of a run"))
+        answer, verdict = (str(found.get(name, "")) for name in ("answer", "verdict"))
+    return f"{answer}; the fit is {verdict}" if verdict else answer
+
+
+def _steps_in_time(run: RunFile, scene: Scene) -> list[viewer.DisplayStep]:
+    """What moves, at times from the start of the recording on."""
+    moving = build_moving_scene(run, scene)
+    if isinstance(moving, Scene):
+        return []
+    steps = list[viewer.DisplayStep]()
+    with suppress(InputError):  # a trajectory ends
+        for number in range(_TIMES):
+            time = number * _TIME_STEP
+            bodies = {name: viewer.display_mesh(moving(time)[name]) for name in moving.motions}
+            steps.append(viewer.DisplayStep(number, f"time {time:.2f} s", bodies))
+    return steps
+
+
+def _build_link_layers(run: RunFile, scene: Scene, folder: Path | None) -> list[Any]:
+    """Antennas, paths and levels of a run file with receivers or a map; else none."""
+    if run.map is None or run.transmitter is None:
+        return []
+    file, levels = None if folder is None else folder / "map.csv", None
+    model = run.map.build()
+    if file is not None and file.is_file():
+        with convert_read_errors(file, "the map of a run"):
+            rows = np.loadtxt(io.StringIO(read_text(file, "the map")), delimiter=",", skiprows=1)
+            levels = rows[:, 3:].max(1).reshape(model.places.shape)
+    return viewer.link_layers(scene, run.transmitter.build(), model, levels)
 
 
 def _build_radars(run: RunFile) -> dict[str, tuple[Radar, Grid | None]]:

@@ -1,0 +1,112 @@
+"""What surrounds a scene in the window: ground with metres, first camera, legend, walls."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from invertwin.viewer.display import Display, DisplayLayer
+from invertwin.viewer.layers import ROLES
+
+_TICKS = 6  # of the ground along its longer side, about
+_ELEVATION = np.deg2rad(28.0)  # of the first camera above the sight of the radar
+_ASIDE = np.deg2rad(12.0)  # of the first camera from the sight of the radar
+_FIELD_OF_VIEW = np.deg2rad(50.0)  # of the first camera, from below to above
+_USED_TANGENT = 0.85 * np.tan(_FIELD_OF_VIEW / 2)  # of its half height, and its half width
+_WALL_SHARE = 0.6  # of the scene's sides that a wall spans
+
+
+def draw_ground(scene: Any, display: Display) -> None:
+    """Draw a grid below the scene, with metres along two sides.
+
+    Args:
+        scene: That of a viser server.
+        display: What is shown.
+    """
+    up = int(np.abs(display.up).argmax())
+    across = [axis for axis in range(3) if axis != up]
+    points = _framed_points(display)
+    low, high = points.min(0).astype(float), points.max(0).astype(float)
+    cell = _round_step(float((high - low)[across].max()) / _TICKS)
+    start, count = cell * np.floor(low / cell), np.ceil((high - low) / cell) + 1
+    count += count % 2  # the lines of viser begin at the middle
+    middle = start + 0.5 * cell * count
+    sign = np.sign(display.up[up])
+    middle[up] = display.box[0 if sign > 0 else 1][up] - 1e-3 * cell * sign  # below floors
+    plane, sides = "".join("xyz"[axis] for axis in across), (cell * count[across]).tolist()
+    lines = {"plane": plane, "cell_size": cell, "section_size": cell}
+    scene.add_grid("/ground", *sides, position=tuple(middle), **lines)
+    for axis, other, name in zip(across, across[::-1], plane, strict=True):
+        for number in range(int(count[axis]) + 1):
+            place = middle.copy()
+            place[axis], place[other] = start[axis] + number * cell, start[other]
+            text = f"{round(place[axis], 6):g}" if number < count[axis] else f"{name} [m]"
+            scene.add_label(f"/ground/{name}{number}", text, position=tuple(place))
+
+
+def set_camera(camera: Any, display: Display) -> None:
+    """Put the first camera behind and above the radar, so that it sees the radar and the scene.
+
+    Args:
+        camera: The first one of a viser server.
+        display: What is shown.
+    """
+    up, ahead = np.array(display.up), np.array(display.ahead)
+    left = np.cross(up, ahead)
+    sight = np.cos(_ASIDE) * ahead - np.sin(_ASIDE) * left
+    sight = np.cos(_ELEVATION) * sight - np.sin(_ELEVATION) * up
+    right = np.cross(sight, up) / np.linalg.norm(np.cross(sight, up))
+    points = _framed_points(display)
+    middle = 0.5 * (points.min(0) + points.max(0)).astype(float)
+    away = points - middle
+    aside = np.maximum(np.abs(away @ right), np.abs(away @ np.cross(right, sight)))
+    distance = float((aside / _USED_TANGENT - away @ sight).max()) or 1.0
+    camera.fov, camera.near, camera.far = _FIELD_OF_VIEW, 1e-3 * distance, 1e2 * distance
+    camera.look_at, camera.up = middle, up
+    camera.position = middle - distance * sight
+
+
+def legend_html(display: Display) -> str:
+    """A legend of the colours of surfaces, with a style that hides what viser says without a GPU.
+
+    Args:
+        display: What is shown.
+    """
+    used = {layer.color for layer in display.layers}
+    roles = [(color, role) for role, color in ROLES.items() if color in used]
+    rows = [f'<span style="color: rgb{color}">■</span> {role}' for color, role in roles]
+    hidden = "<style>#webgl-software-rendering { display: none }</style>"
+    return f'{hidden}<div style="padding: 0.3em 1em">{" &nbsp; ".join(rows)}</div>'
+
+
+def open_wall(layer: DisplayLayer, display: Display) -> NDArray[np.int32] | None:
+    """Return the triangles of a wall turned towards the scene; None for what is no wall.
+
+    Who stands behind a wall then sees through it.
+
+    Args:
+        layer: A surface.
+        display: What is shown.
+    """
+    low, high = display.box
+    spans = np.ptp(layer.points, axis=0) if len(layer.points) else np.zeros(3)
+    several = sum(one.kind == "surface" for one in display.layers) > 1
+    is_short = (spans < _WALL_SHARE * (high - low)).sum() > 1
+    if layer.color != ROLES["fixed"] or not several or is_short:
+        return None
+    first, second, third = layer.points[layer.faces].transpose(1, 0, 2)
+    toward = _framed_points(display).mean(0) - first
+    turned = (np.cross(second - first, third - first) * toward).sum(1) < 0
+    return np.where(turned[:, None], layer.faces[:, [0, 2, 1]], layer.faces)
+
+
+def _framed_points(display: Display) -> NDArray[np.float32]:
+    """Points of all that is to be in the first picture."""
+    layers = [layer for layer in display.layers if layer.shown and len(layer.points)]
+    return np.concatenate([x.points for x in layers] or [np.zeros((1, 3), np.float32)])
+
+
+def _round_step(length: float) -> float:
+    """Return 1, 2 or 5 times a power of ten, from a length upwards."""
+    power = 10.0 ** np.floor(np.log10(max(length, 1e-6)))
+    return float(next(k * power for k in (1, 2, 5, 10) if k * power >= 0.999 * length))

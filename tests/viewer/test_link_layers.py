@@ -1,0 +1,62 @@
+"""Antennas, paths and levels of links as layers."""
+
+import numpy as np
+import pytest
+import torch
+
+from invertwin.links import MapPlane, PropagationSettings, ReceiverPoints, Transmitters
+from invertwin.models.radio import RadioMap
+from invertwin.scene import Object, PerfectConductor, RoughDielectric, Scene, plate, rigid
+from invertwin.viewer import DisplayLayer, link_layers
+
+SENSOR = Transmitters(torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64))
+SETTINGS = PropagationSettings(5e9, depth=1)
+
+
+def layers_of(scene: Scene, model: RadioMap, levels=None) -> dict[str, DisplayLayer]:
+    return {layer.name: layer for layer in link_layers(scene, SENSOR, model, levels)}
+
+
+def floor(material) -> Scene:
+    level = rigid(torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]).double())
+    return Scene({"floor": Object(plate(20.0, 20.0), material, level)})
+
+
+def test_paths_begin_and_end_at_antennas_and_meet_the_floor_in_the_middle():
+    receivers = ReceiverPoints(torch.tensor([[4.0, 0.0, 1.0]], dtype=torch.float64))
+    found = layers_of(floor(PerfectConductor()), RadioMap(receivers, SETTINGS))
+    assert list(found) == ["transmitters", "receivers", "paths: line of sight", "paths: reflection"]
+    assert found["transmitters"].points == pytest.approx(np.array([[0.0, 0, 1]]))
+    assert found["receivers"].points == pytest.approx(np.array([[4.0, 0, 1]]))
+    direct = found["paths: line of sight"].points
+    assert direct == pytest.approx(np.array([[0.0, 0, 1], [4, 0, 1]]))
+    bent = found["paths: reflection"].points
+    assert bent == pytest.approx(np.array([[0.0, 0, 1], [2, 0, 0], [2, 0, 0], [4, 0, 1]]), abs=1e-6)
+
+
+def test_a_scene_without_such_paths_shows_its_antennas():
+    receivers = ReceiverPoints(torch.tensor([[4.0, 0.0, 1.0]], dtype=torch.float64))
+    found = layers_of(floor(RoughDielectric(4.0)), RadioMap(receivers, SETTINGS))
+    assert {"transmitters", "receivers"} <= set(found)
+
+
+def test_cells_are_in_the_band_of_their_level():
+    plane = MapPlane.horizontal([0.0, 0.0], [4.0, 2.0], 0.5, 0.5)
+    levels = np.arange(32.0).reshape(plane.shape)
+    levels[0, 0] = np.nan
+    found = layers_of(floor(PerfectConductor()), RadioMap(plane, SETTINGS), levels)
+    bands = {name: layer for name, layer in found.items() if " to " in name}
+    assert len(bands) == 8
+    assert sum(len(layer.points) for layer in bands.values()) == 4 * 31
+    centres = plane.centres.reshape(-1, 3).numpy()
+    for name, layer in bands.items():
+        low, high = (float(word) for word in name.split(" to "))
+        middles = layer.points.reshape(-1, 4, 3).mean(1)
+        away = np.linalg.norm(middles[:, None] - centres[None], axis=2)
+        assert away.min(1).max() < 1e-6
+        own = levels.ravel()[away.argmin(1)]
+        assert own.min() >= low - 0.06
+        assert own.max() <= high + 0.06
+        first, second, third = layer.points[layer.faces].transpose(1, 0, 2)
+        areas = np.linalg.norm(np.cross(second - first, third - first), axis=1) / 2
+        assert areas == pytest.approx(0.125)
