@@ -13,14 +13,8 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
+from invertwin import checks
 from invertwin.channel import trace_far_field
-from invertwin.checks import (
-    ArrayLike,
-    checked_count,
-    checked_number,
-    checked_tensor,
-    refuse_derivatives,
-)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.deprecation import rename_attributes
 from invertwin.errors import InputError
@@ -95,7 +89,7 @@ class Signature:
                 "give them as start, stop and count"
             )
         window = _hann_window(count)[:, None, None, None]
-        length = count * checked_count(padding, "padding", 1)
+        length = count * checks.checked_count(padding, "padding", 1)
         profile = torch.fft.ifft(self.matrix * window, n=length, dim=0) * length / count
         spread = SPEED_OF_LIGHT / 2 / float(steps.mean())
         ranges = torch.fft.fftfreq(length, dtype=torch.float64) * spread
@@ -105,7 +99,7 @@ class Signature:
         carrier_phasor = torch.polar(torch.ones_like(carrier), carrier)
         return ranges, profile[order] * carrier_phasor[:, None, None, None]
 
-    def image(self, points: ArrayLike) -> Complex128[Tensor, "*grid 2 2"]:
+    def image(self, points: checks.ArrayLike) -> Complex128[Tensor, "*grid 2 2"]:
         """Focus the sweep on points: the mean of S exp(−jk(u_t + u_r)·x), with Hann windows.
 
         Args:
@@ -140,10 +134,10 @@ def _require_dielectrics(scene: Scene) -> None:
 
 def rcs(
     scene: Scene,
-    directions: ArrayLike,
+    directions: checks.ArrayLike,
     frequencies: float | Sequence[float] | Tensor,
     *,
-    receivers: ArrayLike | None = None,
+    receivers: checks.ArrayLike | None = None,
     polarisation: str | Sequence[complex] = "V",
     depth: Count = 5,
     edges: int = 2,
@@ -187,17 +181,17 @@ def rcs(
     Source: derivations §4, §13, §14.
     """
     transmitters, receiver_directions, sweep = _check_sweep(directions, receivers, frequencies)
-    axis = checked_tensor(up, (3,), "up", "give a vector such as 0, 0, 1")
+    axis = checks.checked_tensor(up, (3,), "up", "give a vector such as 0, 0, 1")
     _require_dielectrics(scene)
     require_single_surfaces(scene)
-    tubes = checked_number(tubes_per_wavelength, "tubes per wavelength", 0.0, open_low=True)
+    tubes = checks.checked_number(tubes_per_wavelength, "tubes per wavelength", 0.0, open_low=True)
     parts = trace_far_field(
         scene,
         transmitters,
         receiver_directions,
         sweep,
-        depth=checked_count(depth, "depth", 1),
-        edges=checked_count(edges, "edges", 0),
+        depth=checks.checked_count(depth, "depth", 1),
+        edges=checks.checked_count(edges, "edges", 0),
         tubes_per_wavelength=tubes,
         up=axis / axis.norm(),
         boundary=boundary,
@@ -237,8 +231,8 @@ def to_dbsm(amplitude: Complex128[Tensor, "*any"]) -> Float64[Tensor, "*any"]:
 
 
 def _check_sweep(
-    directions: ArrayLike,
-    receivers: ArrayLike | None,
+    directions: checks.ArrayLike,
+    receivers: checks.ArrayLike | None,
     frequencies: float | Sequence[float] | Tensor,
 ) -> tuple[Tensor, Tensor | None, Tensor]:
     """Check directions and frequencies; returns them as tensors, directions of unit length."""
@@ -249,25 +243,27 @@ def _check_sweep(
             f"expected {len(transmitters)} receivers, one for each direction, got "
             f"{len(receiver_directions)}"
         )
-    sweep = checked_tensor(
+    sweep = checks.checked_tensor(
         torch.atleast_1d(torch.as_tensor(frequencies, dtype=torch.float64)),
         (None,),
         "frequencies [Hz]",
         "give one or more",
     )
     for frequency in sweep.tolist():
-        checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
+        checks.checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
     for value, what in (
         (transmitters, "directions"),
         (receiver_directions, "receivers"),
         (sweep, "frequencies"),
     ):
-        refuse_derivatives(value, what, "turn the scene instead, or detach them")
+        checks.refuse_derivatives(value, what, "turn the scene instead, or detach them")
     return transmitters, receiver_directions, sweep
 
 
-def _check_directions(values: ArrayLike, what: str) -> Tensor:
-    found = checked_tensor(values, (None, 3), what, "give x, y, z of each, towards the radar")
+def _check_directions(values: checks.ArrayLike, what: str) -> Tensor:
+    found = checks.checked_tensor(
+        values, (None, 3), what, "give x, y, z of each, towards the radar"
+    )
     length = found.norm(dim=1, keepdim=True)
     if not len(found) or not bool((length > 0).all()):
         raise InputError(f"expected {what} of some length, got {len(found)}; give x, y, z of each")

@@ -8,18 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.checks import (
-    ArrayLike,
-    check_choice,
-    check_orthonormal,
-    check_some,
-    checked_count,
-    checked_number,
-    checked_tensor,
-    is_differentiated,
-    set_fields,
-    strip_derivatives,
-)
+from invertwin import checks
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.limits import MAX_LENGTH
@@ -60,32 +49,34 @@ class Camera:
         do = "give x, y, z, or a row of them for each frame"
         given = torch.as_tensor(self.positions, dtype=torch.float64)
         shape = (3,) if given.ndim == 1 else (None, 3)
-        places = checked_tensor(given, shape, "positions of a camera", do, MAX_LENGTH).reshape(
-            -1, 3
-        )
+        places = checks.checked_tensor(
+            given, shape, "positions of a camera", do, MAX_LENGTH
+        ).reshape(-1, 3)
         axes = torch.as_tensor(self.rotations, dtype=torch.float64)
         axes = axes.expand(len(places), 3, 3) if axes.ndim == 2 else axes
         do = "give the camera's axes as columns, once or for each frame"
-        axes = checked_tensor(axes, (len(places), 3, 3), "rotations of a camera", do)
-        check_orthonormal(axes, "rotations of a camera", do)
-        pixels = checked_count(self.width, "width", 1) * checked_count(self.height, "height", 1)
+        axes = checks.checked_tensor(axes, (len(places), 3, 3), "rotations of a camera", do)
+        checks.check_orthonormal(axes, "rotations of a camera", do)
+        pixels = checks.checked_count(self.width, "width", 1) * checks.checked_count(
+            self.height, "height", 1
+        )
         require_at_most(pixels, _MAX_PIXELS, "pixels", "bin them")
         focal = torch.as_tensor(self.focal, dtype=torch.float64)
-        checked_number(float(focal.detach()), "focal length [pixel]", 0.0, open_low=True)
+        checks.checked_number(float(focal.detach()), "focal length [pixel]", 0.0, open_low=True)
         middle = torch.tensor([self.width / 2, self.height / 2], dtype=torch.float64)
         centre = middle if self.centre is None else self.centre
-        centre = checked_tensor(centre, (2,), "centre of an image [pixel]", "give u and v")
-        set_fields(self, positions=places, rotations=axes, focal=focal, centre=centre)
+        centre = checks.checked_tensor(centre, (2,), "centre of an image [pixel]", "give u and v")
+        checks.set_fields(self, positions=places, rotations=axes, focal=focal, centre=centre)
 
     @staticmethod
     def look_at(
-        positions: ArrayLike,
-        target: ArrayLike,
+        positions: checks.ArrayLike,
+        target: checks.ArrayLike,
         *,
         width: int,
         height: int,
         field_of_view: float,
-        up: ArrayLike = (0.0, 0.0, 1.0),
+        up: checks.ArrayLike = (0.0, 0.0, 1.0),
     ) -> "Camera":
         """Return upright cameras that look at a point; +y is on the left of one that looks along x.
 
@@ -101,16 +92,18 @@ class Camera:
         """
         do = "give x, y, z"
         given = torch.as_tensor(positions, dtype=torch.float64)
-        places = checked_tensor(given.reshape(-1, 3), (None, 3), "positions [m]", do)
-        aim = checked_tensor(target, (3,), "target of a camera [m]", do) - places
-        above = checked_tensor(up, (3,), "up of a camera", do).expand_as(aim)
+        places = checks.checked_tensor(given.reshape(-1, 3), (None, 3), "positions [m]", do)
+        aim = checks.checked_tensor(target, (3,), "target of a camera [m]", do) - places
+        above = checks.checked_tensor(up, (3,), "up of a camera", do).expand_as(aim)
         right = torch.linalg.cross(aim, above)
         if not bool((right.norm(dim=1) > 1e-9 * aim.norm(dim=1) * above.norm(dim=1)).all()):
             raise InputError("expected cameras that do not look along up, got one; give another up")
         unit = torch.nn.functional.normalize
         forward, right = unit(aim, dim=1), unit(right, dim=1)
         rotations = torch.stack([right, torch.linalg.cross(forward, right), forward], 2)
-        angle = checked_number(field_of_view, "field of view [rad]", 0.0, math.pi, open_low=True)
+        angle = checks.checked_number(
+            field_of_view, "field of view [rad]", 0.0, math.pi, open_low=True
+        )
         return Camera(places, rotations, width, height, width / (2 * math.tan(angle / 2)))
 
     @rename_arguments(chosen="indices")
@@ -142,7 +135,9 @@ class Camera:
     def detach(self) -> "Camera":
         """Return the camera without derivatives."""
         names = ("positions", "rotations", "focal", "centre")
-        return replace(self, **{name: strip_derivatives(getattr(self, name)) for name in names})
+        return replace(
+            self, **{name: checks.strip_derivatives(getattr(self, name)) for name in names}
+        )
 
     @property
     def principal_point(self) -> Float64[Tensor, "2"]:
@@ -153,7 +148,7 @@ class Camera:
     def is_differentiated(self) -> bool:
         """True if any of its values carries derivatives."""
         values = (self.positions, self.rotations, self.focal, self.centre)
-        return any(is_differentiated(torch.as_tensor(value)) for value in values)
+        return any(checks.is_differentiated(torch.as_tensor(value)) for value in values)
 
     def directions(self, pixels: Float64[Tensor, "n 2"], frame: int) -> Float64[Tensor, "n 3"]:
         """Return viewing directions of pixels in world axes, one unit forward.
@@ -195,9 +190,9 @@ def object_numbers(names: Sequence[str], objects: Sequence[str]) -> Int64[Tensor
     Raises:
         InputError: None, or an unknown one.
     """
-    check_some(objects, "object", "name those that the mask shows")
+    checks.check_some(objects, "object", "name those that the mask shows")
     for name in objects:
-        check_choice(name, names, "objects among", "name those that the mask shows")
+        checks.check_choice(name, names, "objects among", "name those that the mask shows")
     return torch.tensor([names.index(name) for name in objects])
 
 

@@ -9,19 +9,12 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin import inversion
 from invertwin.discovery.imaging.likelihood import estimate_background
 from invertwin.discovery.imaging.reflectivity import compute_response, reconstruct_reflectivity
 from invertwin.discovery.recordings import image_points
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.inversion import (
-    Callback,
-    Observation,
-    Reconstruction,
-    SpectrumLoss,
-    prepare_fit,
-    reconstruct,
-)
 from invertwin.inversion.observation import Unknowns, name_unknowns
 from invertwin.inversion.schedule import Schedule, make_stages
 from invertwin.models.radar import SurrogateMap
@@ -35,15 +28,15 @@ _RESOLUTIONS = 2.0  # range resolutions about a fitted object that clutter leave
 
 def reconstruct_among_clutter(
     scene: Scene,
-    observations: Observation | Sequence[Observation],
+    observations: inversion.Observation | Sequence[inversion.Observation],
     parameters: Unknowns,
     *,
     schedule: Schedule | Sequence[Schedule] | None = None,
     seed: int = 0,
-    callbacks: Callable[[int], Sequence[Callback]] = lambda number: (),
+    callbacks: Callable[[int], Sequence[inversion.Callback]] = lambda number: (),
     always: bool = True,
     **options: Any,
-) -> Reconstruction:
+) -> inversion.Reconstruction:
     """Fit objects among things that the scene lacks.
 
     Echoes that the scene does not explain count as background, except around the objects that are
@@ -65,10 +58,12 @@ def reconstruct_among_clutter(
         InputError: As ``reconstruct``; another model; random frames; new modules in a later stage;
             no object that moves.
     """
-    given = [observations] if isinstance(observations, Observation) else list(observations)
+    given = (
+        [observations] if isinstance(observations, inversion.Observation) else list(observations)
+    )
     unknowns = name_unknowns(parameters)
     if not always:
-        plain = reconstruct(
+        plain = inversion.reconstruct(
             scene, given, copy.deepcopy(unknowns), schedule=schedule, seed=seed, **options
         )
         if not needs_clutter(plain):
@@ -82,7 +77,7 @@ def reconstruct_among_clutter(
             "expected all frames and the same parameters in every step, got frames_per_step or a "
             "stage that rebuilds: clutter is of all frames; leave them out"
         )
-    fit = prepare_fit(scene, given, unknowns)
+    fit = inversion.prepare_fit(scene, given, unknowns)
     objects, present = fit.apply_modules()[0].objects, fit.twin()
     fitted = [name for name, item in objects.items() if item.vertices.requires_grad]
     if not fitted:
@@ -94,7 +89,7 @@ def reconstruct_among_clutter(
         blurred = [replace(o, model=o.model.scale_blur(blur)) for o in given]
         clutter = [estimate_clutter(present, o, fitted, seed=seed).background for o in blurred]
         whitened = _whiten([o.model for o in blurred], clutter)
-        found = reconstruct(
+        found = inversion.reconstruct(
             scene,
             [replace(o, model=model) for o, model in zip(given, whitened, strict=True)],
             unknowns,
@@ -114,7 +109,7 @@ def reconstruct_among_clutter(
 
 
 def _find_rivals(
-    scene: Scene, observations: Sequence[Observation], fitted: Sequence[str], seed: int
+    scene: Scene, observations: Sequence[inversion.Observation], fitted: Sequence[str], seed: int
 ) -> tuple[str, ...]:
     """Name clutter that is so bright that it may be parts of the fitted objects, elsewhere."""
     found = []
@@ -131,7 +126,7 @@ def _find_rivals(
 
 
 def _predict_power_of(
-    fitted: Sequence[str], scene: Scene, observation: Observation, seed: int
+    fitted: Sequence[str], scene: Scene, observation: inversion.Observation, seed: int
 ) -> float:
     """Predict the sum over all bins of what objects add to a map, > 0, in the recording's unit."""
     model, radar = observation.model.scale_blur(0.0), observation.initial_sensor()
@@ -139,7 +134,7 @@ def _predict_power_of(
     with torch.no_grad():
         predicted = model.predict(scene, radar, seed).clamp_min(0.0)
         own = predicted - model.predict(Scene(rest), radar, seed) if rest else predicted
-    gain = SpectrumLoss().fitted_gain(predicted, observation.observed_map())
+    gain = inversion.SpectrumLoss().fitted_gain(predicted, observation.observed_map())
     return max(gain * float(own.clamp_min(0.0).sum()), 1e-300)
 
 
@@ -148,12 +143,14 @@ def _whiten(models: Sequence[ForwardModel], backgrounds: Sequence[Tensor]) -> li
     return [WhitenedMap(*pair) for pair in zip(models, backgrounds, strict=False)]
 
 
-def needs_clutter(found: Reconstruction) -> bool:
+def needs_clutter(found: inversion.Reconstruction) -> bool:
     """Return whether the data speak against a result, so that a fit among clutter may help."""
     return found.verdict.word in ("inconsistent", "worse", "at a bound")
 
 
-def choose_result(plain: Reconstruction, among: Reconstruction) -> Reconstruction:
+def choose_result(
+    plain: inversion.Reconstruction, among: inversion.Reconstruction
+) -> inversion.Reconstruction:
     """Choose the better of two fits of the same parameters, without and among clutter.
 
     That is the second one where the data do not speak against it, else the one with the lower loss
@@ -201,7 +198,7 @@ class Clutter:
 
 
 def estimate_clutter(
-    scene: Scene, observation: Observation, fitted: Sequence[str], *, seed: int = 0
+    scene: Scene, observation: inversion.Observation, fitted: Sequence[str], *, seed: int = 0
 ) -> Clutter:
     """Estimate the mean power of noise and of echoes that a scene does not explain.
 
@@ -226,7 +223,7 @@ def estimate_clutter(
     power = observation.observed_map()
     with torch.no_grad():
         predicted = model.scale_blur(0.0).predict(scene, radar, seed).clamp_min(0.0)
-    law = SpectrumLoss()
+    law = inversion.SpectrumLoss()
     gain = law.fitted_gain(predicted, power)
     # The weakest range bin: a level fitted to the whole map would hold the clutter.
     noise = float(estimate_background(power).min()) + law.floor * float(power.mean())

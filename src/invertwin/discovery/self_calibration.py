@@ -10,12 +10,8 @@ from torch import Tensor
 
 from invertwin.capture import Capture, ChannelCalibration
 from invertwin.channel import Grid
+from invertwin.discovery.imaging import reflectivity
 from invertwin.discovery.imaging.likelihood import TAIL_DEGREES, estimate_background
-from invertwin.discovery.imaging.reflectivity import (
-    compute_response,
-    reconstruct_reflectivity,
-    thin_map,
-)
 from invertwin.inversion import speckle_weight
 from invertwin.radar import Radar, range_profile
 from invertwin.radar.radar import require_sampled_waveform
@@ -55,9 +51,11 @@ def calibrate_on_scene(
         now = found.apply(capture)
         bins = flat if number == 0 else grid
         power = now.spectrum(bins).detach().double()
-        power, coarse = thin_map(power, radar, bins)
+        power, coarse = reflectivity.thin_map(power, radar, bins)
         level = estimate_background(power)[:, None, None].expand_as(power)
-        image = reconstruct_reflectivity(compute_response(radar, coarse, positions), power, level)
+        image = reflectivity.reconstruct_reflectivity(
+            reflectivity.compute_response(radar, coarse, positions), power, level
+        )
         found = _estimate_gains(capture, flat, positions, image)
         if number == 0 and phase_spread(found, radar) < _MIN_PHASE_SPREAD:
             return None
@@ -107,11 +105,11 @@ def _estimate_gains(
     radar = capture.radar()
     profile = range_profile(capture.beat.to(torch.complex128), radar, range_grid)
     power = profile.abs().square().mean((1, 2))
-    power, coarse = thin_map(power[:, :, None, None], radar, range_grid)
+    power, coarse = reflectivity.thin_map(power[:, :, None, None], radar, range_grid)
     stride = round(coarse.range_step / range_grid.range_step)
     cells = profile[..., ::stride].flatten(1, 2).movedim(1, -1)  # frame, range, channel
     level = estimate_background(power)
-    predicted = compute_response(radar, coarse, positions).matrix
+    predicted = reflectivity.compute_response(radar, coarse, positions).matrix
     count, ranges = cells.shape[-1], cells.shape[1]
     eye = torch.eye(count, dtype=torch.complex128)
     total, draws = torch.zeros(count, count, dtype=torch.complex128), 0.0

@@ -19,15 +19,8 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from invertwin import checks
 from invertwin.channel import PathMeasure, RayPaths, trace_coverage
-from invertwin.checks import (
-    ArrayLike,
-    check_fields,
-    checked_number,
-    checked_tensor,
-    set_fields,
-    strip_derivatives,
-)
 from invertwin.deprecation import rename_arguments, rename_members
 from invertwin.errors import InputError
 from invertwin.limits import Count
@@ -56,7 +49,7 @@ class CellSampling:
     boundary: bool = True
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        checks.check_fields(self)
 
     @property
     def points_per_side(self) -> int:
@@ -197,8 +190,8 @@ class MapPlane(Cells):
     def __post_init__(self) -> None:
         for name in ("corner", "first", "second"):
             what = f"{name} of a map [m]"
-            value = checked_tensor(getattr(self, name), (3,), what, "give x, y, z")
-            set_fields(self, **{name: strip_derivatives(value)})
+            value = checks.checked_tensor(getattr(self, name), (3,), what, "give x, y, z")
+            checks.set_fields(self, **{name: checks.strip_derivatives(value)})
         if not float(self._normal.norm()) > 0:
             raise InputError(
                 "expected sides of a map that span an area, got parallel ones or none; give two "
@@ -213,8 +206,8 @@ class MapPlane(Cells):
     @rename_arguments(cell="cell_size")
     def horizontal(
         cls,
-        low: ArrayLike,
-        high: ArrayLike,
+        low: checks.ArrayLike,
+        high: checks.ArrayLike,
         height: float,
         cell_size: float,
         sampling: CellSampling = CellSampling(),
@@ -232,10 +225,10 @@ class MapPlane(Cells):
             InputError: Wrong shapes or numbers, or a map without an area.
         """
         do = "give x and y"
-        start = checked_tensor(low, (2,), "low of a map [m]", do)
-        end = checked_tensor(high, (2,), "high of a map [m]", do)
-        z = checked_number(height, "height of a map [m]", -math.inf)
-        size = checked_number(cell_size, "size of cells [m]", 0.0, open_low=True)
+        start = checks.checked_tensor(low, (2,), "low of a map [m]", do)
+        end = checks.checked_tensor(high, (2,), "high of a map [m]", do)
+        z = checks.checked_number(height, "height of a map [m]", -math.inf)
+        size = checks.checked_number(cell_size, "size of cells [m]", 0.0, open_low=True)
         x, y = (end - start).tolist()
         if not (x > 0 and y > 0):
             raise InputError("expected high beyond low in x and y; exchange them")
@@ -314,7 +307,9 @@ class MapMesh(Cells):
     sampling: CellSampling = CellSampling()
 
     def __post_init__(self) -> None:
-        set_fields(self, mesh=replace(self.mesh, vertices=strip_derivatives(self.mesh.vertices)))
+        checks.set_fields(
+            self, mesh=replace(self.mesh, vertices=checks.strip_derivatives(self.mesh.vertices))
+        )
         if not bool((self.areas > 0).all()):
             raise InputError(
                 "expected triangles with an area for the cells of a map, got one without; remove it"

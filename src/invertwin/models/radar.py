@@ -10,17 +10,8 @@ from annotated_types import Ge
 from jaxtyping import Float
 from torch import Tensor
 
+from invertwin import channel
 from invertwin.capture.capture import Capture
-from invertwin.channel import (
-    Grid,
-    Sampling,
-    Speckle,
-    as_absorbers,
-    deposit_batch,
-    draw_speckle,
-    trace_field,
-    trace_target,
-)
 from invertwin.checks import checked_count, set_fields
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
@@ -61,9 +52,9 @@ class SurrogateMap(ForwardModel):
             without targets.
     """
 
-    grid: Grid
+    grid: channel.Grid
     surrogate: Surrogate | str = "response"
-    sampling: Sampling = Sampling()
+    sampling: channel.Sampling = channel.Sampling()
     coherent: Sequence[str] = ()
     stretch: Annotated[float, Ge(1)] = 1.0
     _reference: tuple[Scene, Radar, Literal["rays", "area"]] | None = field(
@@ -126,8 +117,10 @@ class SurrogateMap(ForwardModel):
                 "expected a model for predictions, got one that was made for differences of one "
                 "scene; use predict, or the model that for_differences was called of"
             )
-        rest = [as_absorbers(scene, self.coherent) for scene in scenes]
-        deposit = deposit_batch(rest, sensor.link(), self.grid, sampling=self.sampling, seed=seed)
+        rest = [channel.as_absorbers(scene, self.coherent) for scene in scenes]
+        deposit = channel.deposit_batch(
+            rest, sensor.link(), self.grid, sampling=self.sampling, seed=seed
+        )
         if self.coherent:
             how = sensor, self.grid, self.kernels, self.sampling, self.coherent, self.stretch
             targets = [torch.stack(deposit_targets(scene, *how)).sum(0) for scene in scenes]
@@ -151,15 +144,17 @@ class SurrogateMap(ForwardModel):
 
         None for clouds and for smooth conductors that are no targets.
         """
-        rest = as_absorbers(scene, self.coherent)
+        rest = channel.as_absorbers(scene, self.coherent)
         if not isinstance(sensor.waveform, SampledWaveform) or any(
             item.cloud is not None or item.material.coherent for item in rest.objects.values()
         ):
             return None
         fields, link = replace(self.sampling, boundary=False), sensor.link()
-        looks = SpeckleRealisations(trace_field(rest, link, sampling=fields, seed=seed), sensor)
+        looks = SpeckleRealisations(
+            channel.trace_field(rest, link, sampling=fields, seed=seed), sensor
+        )
         targets = [
-            beat_signal(trace_target(scene, name, link, sampling=fields), sensor)
+            beat_signal(channel.trace_target(scene, name, link, sampling=fields), sensor)
             for name in self.coherent
         ]
 
@@ -207,9 +202,9 @@ class ExactMap(ForwardModel):
             drawn from the seed.
     """
 
-    grid: Grid
-    sampling: Sampling = Sampling()
-    speckle: Speckle | None = None
+    grid: channel.Grid
+    sampling: channel.Sampling = channel.Sampling()
+    speckle: channel.Speckle | None = None
 
     redraws: ClassVar[bool] = False
     is_smooth: ClassVar[bool] = False
@@ -238,7 +233,9 @@ class ExactMap(ForwardModel):
         """The model with rough points that stay while the scene moves."""
         if self.speckle is not None:
             return self
-        return replace(self, speckle=draw_speckle(scene, sensor.link(), self.sampling, seed))
+        return replace(
+            self, speckle=channel.draw_speckle(scene, sensor.link(), self.sampling, seed)
+        )
 
 
 @dataclass(frozen=True)
@@ -253,7 +250,7 @@ class BeatMap(ExactMap):
 
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> Tensor:
         """The beat signals [frame, tx, rx, sample]. See ``ForwardModel.predict``."""
-        paths = trace_field(
+        paths = channel.trace_field(
             scene, sensor.link(), sampling=self.sampling, seed=seed, speckle=self.speckle
         )
         return beat_signal(paths, sensor, channels=self.channels)

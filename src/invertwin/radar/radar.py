@@ -12,17 +12,8 @@ from annotated_types import Ge, Gt, Le
 from jaxtyping import Complex, Complex128, Float64, Int64
 from torch import Tensor
 
+from invertwin import checks
 from invertwin.channel import Grid, Link, Paths
-from invertwin.checks import (
-    ArrayLike,
-    check_fields,
-    check_shape,
-    check_some,
-    checked_tensor,
-    is_differentiated,
-    refuse_derivatives,
-    set_fields,
-)
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import MAX_COUNT, MAX_LENGTH, AllowedValues
@@ -84,14 +75,16 @@ class Radar:
 
     def __post_init__(self) -> None:
         do = "give one position [x, y, z] in metres per pose"
-        positions = checked_tensor(self.positions, (None, 3), "radar positions", do, MAX_LENGTH)
-        check_some(positions, "radar pose", do)
-        set_fields(self, positions=positions)
+        positions = checks.checked_tensor(
+            self.positions, (None, 3), "radar positions", do, MAX_LENGTH
+        )
+        checks.check_some(positions, "radar pose", do)
+        checks.set_fields(self, positions=positions)
         if self.rotations is not None:
-            set_fields(self, rotations=_checked_rotations(self.rotations, len(positions)))
+            checks.set_fields(self, rotations=_checked_rotations(self.rotations, len(positions)))
         if self.range_origin is not None:
-            set_fields(self, range_origin=_checked_origin(self.range_origin, len(positions)))
-        check_fields(self)
+            checks.set_fields(self, range_origin=_checked_origin(self.range_origin, len(positions)))
+        checks.check_fields(self)
         if not self._shared_visibility and self.shape[1] > 1:
             raise InputError(
                 f"expected one transmitter when TX and RX see separately, got {self.shape[1]}; "
@@ -141,7 +134,7 @@ class Radar:
         """True if ranges have a bias, or a derivative with respect to one."""
         bias = self.range_bias
         if isinstance(bias, Tensor):
-            return is_differentiated(bias) or bool(bias)
+            return checks.is_differentiated(bias) or bool(bias)
         return bias != 0
 
     @property
@@ -169,7 +162,7 @@ class Radar:
         low = max(nearest, -0.5 * self.waveform.max_range)
         return low, low + self.waveform.max_range
 
-    def center_on(self, point: ArrayLike) -> "Radar":
+    def center_on(self, point: checks.ArrayLike) -> "Radar":
         """Return the radar of data with motion compensation to a point, which has range 0 in them.
 
         The origins follow from the present positions, without derivatives.
@@ -177,7 +170,9 @@ class Radar:
         Args:
             point: centre of the scene in the world [m].
         """
-        center = checked_tensor(point, (3,), "the centre of the scene", "give [x, y, z] in metres")
+        center = checks.checked_tensor(
+            point, (3,), "the centre of the scene", "give [x, y, z] in metres"
+        )
         link = self.link()
         ways = (link.tx - center).norm(dim=1) + (link.rx - center).norm(dim=1)
         return replace(self, range_origin=0.5 * ways.detach())
@@ -213,7 +208,7 @@ class Radar:
             return paths.coefficient
         sent, received = self.transmitters.jones.mixtures, self.receivers.jones.mixtures
         expected, do = (None, received.shape[1], sent.shape[1]), "trace with the link of this radar"
-        check_shape(paths.matrix, expected, "paths (path, received, sent polarisation)", do)
+        checks.check_shape(paths.matrix, expected, "paths (path, received, sent polarisation)", do)
         return torch.einsum("r,prt,t->p", received[receiver], paths.matrix, sent[transmitter])
 
     def transform_rigidly(
@@ -239,9 +234,11 @@ class Radar:
             return replace(self, positions=self.positions[chosen])  # raises the error
         # Copy without validation, since a fit calls this in every step.
         radar, origin = copy(self), self.range_origin
-        set_fields(radar, positions=self.positions[chosen], rotations=self._rotations[chosen])
+        checks.set_fields(
+            radar, positions=self.positions[chosen], rotations=self._rotations[chosen]
+        )
         if origin is not None:
-            set_fields(radar, range_origin=origin[chosen])
+            checks.set_fields(radar, range_origin=origin[chosen])
         return radar
 
     def grid(
@@ -370,21 +367,21 @@ def checked_beat(
     """
     expected = (*radar.shape, require_sampled_waveform(radar).samples)
     what = "a beat signal (frame, tx, rx, sample)"
-    check_shape(beat, expected, what, "use the radar that recorded it")
+    checks.check_shape(beat, expected, what, "use the radar that recorded it")
     return beat
 
 
 def _checked_origin(value: object, frames: int) -> Tensor:
     do = "give one range in metres per frame"
-    origin = checked_tensor(value, (frames,), "range_origin", do, MAX_LENGTH)
+    origin = checks.checked_tensor(value, (frames,), "range_origin", do, MAX_LENGTH)
     do = "it is what the recording was compensated with: detach it"
-    refuse_derivatives(origin, "range_origin", do)
+    checks.refuse_derivatives(origin, "range_origin", do)
     return origin
 
 
 def _checked_rotations(value: object, frames: int) -> Tensor:
     do = "its columns are the radar's x (boresight), y (left) and z (up) axes in the world"
-    rotations = checked_tensor(value, (frames, 3, 3), "radar rotations", do)
+    rotations = checks.checked_tensor(value, (frames, 3, 3), "radar rotations", do)
     fixed = rotations.detach()
     error = (fixed.mT @ fixed - torch.eye(3, dtype=torch.float64, device=fixed.device)).abs()
     if not (error.amax() < 1e-6 and (torch.linalg.det(fixed) > 0).all()):

@@ -11,19 +11,12 @@ import torch
 from jaxtyping import Complex, Float, Float64
 from torch import Tensor
 
+from invertwin import limits
 from invertwin.checks import check_choice, check_fields
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.errors import PhysicsWarning as PhysicsWarning
-from invertwin.limits import (
-    Bandwidth,
-    CountOfTwo,
-    Duration,
-    Frequency,
-    FrequencyStep,
-    SweptFrequency,
-)
 
 WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
@@ -128,10 +121,10 @@ class FMCW(SampledWaveform):
         samples: Samples per ramp.
     """
 
-    start_frequency: Frequency
-    bandwidth: Bandwidth
-    duration: Duration
-    samples: CountOfTwo
+    start_frequency: limits.Frequency
+    bandwidth: limits.Bandwidth
+    duration: limits.Duration
+    samples: limits.CountOfTwo
 
     @property
     def center_frequency(self) -> float:
@@ -175,10 +168,10 @@ class SteppedFrequency(SampledWaveform):
         dwell: duration of each tone, over which its sample is averaged [s].
     """
 
-    start_frequency: SweptFrequency
-    step: FrequencyStep
-    samples: CountOfTwo
-    dwell: Duration
+    start_frequency: limits.SweptFrequency
+    step: limits.FrequencyStep
+    samples: limits.CountOfTwo
+    dwell: limits.Duration
 
     @property
     def bandwidth(self) -> float:
@@ -215,9 +208,9 @@ class OFDM(SampledWaveform):
         subcarriers: Number of subcarriers.
     """
 
-    start_frequency: Frequency
-    spacing: FrequencyStep
-    subcarriers: CountOfTwo
+    start_frequency: limits.Frequency
+    spacing: limits.FrequencyStep
+    subcarriers: limits.CountOfTwo
 
     @property
     def samples(self) -> int:
@@ -299,8 +292,8 @@ class Impulse(Waveform):
         center_frequency, bandwidth: centre frequency and bandwidth [Hz].
     """
 
-    center_frequency: Frequency
-    bandwidth: Bandwidth
+    center_frequency: limits.Frequency
+    bandwidth: limits.Bandwidth
 
     def range_response(self, distance: _Values, window: str) -> _Values:
         """Return the power of the pulse beside the target's range, peak 1.

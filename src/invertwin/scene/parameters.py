@@ -18,6 +18,7 @@ from invertwin.checks import ArrayLike, checked_count, checked_number, checked_t
 from invertwin.deprecation import rename_members
 from invertwin.errors import InputError
 from invertwin.limits import MAX_LENGTH, Axes
+from invertwin.scene import pose
 from invertwin.scene.material.itu import Itu
 from invertwin.scene.material.materials import select_layer
 from invertwin.scene.material.values import (
@@ -29,13 +30,6 @@ from invertwin.scene.material.values import (
     evaluate_value,
 )
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.pose import (
-    compose,
-    quaternion_from_vector,
-    rigid,
-    rotation_from_quaternion,
-    vector_from_quaternion,
-)
 from invertwin.scene.scene import Object, Scene
 
 ORIGIN = (0.0, 0.0, 0.0)
@@ -131,8 +125,8 @@ class Translation(ObjectModule):
 
     def forward(self, scene: Scene) -> Scene:
         """Return the scene with the object moved."""
-        motion = rigid(translation=free_part(self.translation, self._axes))
-        return scene.replace(self.object, pose=compose(scene[self.object].transform, motion))
+        motion = pose.rigid(translation=free_part(self.translation, self._axes))
+        return scene.replace(self.object, pose=pose.compose(scene[self.object].transform, motion))
 
     def coordinates(self) -> list[Coordinate]:
         """Return the free coordinates among x, y and z."""
@@ -177,7 +171,7 @@ class RigidMotion(nn.Module):
     @property
     def rotation_matrix(self) -> Float64[Tensor, "3 3"]:
         """Return the rotation as a matrix."""
-        return rotation_from_quaternion(self._quaternion)
+        return pose.rotation_from_quaternion(self._quaternion)
 
     @property
     def shift(self) -> Float64[Tensor, "3"]:
@@ -211,7 +205,7 @@ class RigidMotion(nn.Module):
         """Return translation [m] and rotation vector [rad] by name, for progress and reports."""
         return {
             f"{self.moved}.translation": self.translation.detach().clone(),
-            f"{self.moved}.rotation": vector_from_quaternion(self._quaternion.detach()),
+            f"{self.moved}.rotation": pose.vector_from_quaternion(self._quaternion.detach()),
         }
 
 
@@ -237,8 +231,8 @@ class Pose(RigidMotion):
         """Return the scene with the object moved."""
         before = scene[self.object]
         rotation, center = self.rotation_matrix, before.center
-        motion = rigid(rotation, self.shift + center - rotation @ center)
-        return scene.replace(self.object, pose=compose(before.transform, motion))
+        motion = pose.rigid(rotation, self.shift + center - rotation @ center)
+        return scene.replace(self.object, pose=pose.compose(before.transform, motion))
 
 
 class Scale(ObjectModule):
@@ -537,7 +531,7 @@ def _rotation_numbers(value: ArrayLike) -> Tensor:
     do = "give a rotation vector [3] in rad or q = (w, rx, ry, rz)"
     numbers = checked_tensor(value, (None,), "initial rotation", do)
     if len(numbers) == 3:
-        quaternion = quaternion_from_vector(numbers.detach())
+        quaternion = pose.quaternion_from_vector(numbers.detach())
         return quaternion * quaternion.new_tensor([1.0, 2.0, 2.0, 2.0])
     if len(numbers) != 4 or not bool(numbers.any()):
         raise InputError(

@@ -15,13 +15,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from invertwin.checks import (
-    ArrayLike,
-    checked_ascending,
-    checked_tensor,
-    refuse_derivatives,
-    set_fields,
-)
+from invertwin import checks
 from invertwin.errors import InputError
 
 JONES: Mapping[str, tuple[complex, complex]] = MappingProxyType(
@@ -33,7 +27,7 @@ _LEVELS = "a polarisation as V, H, circular or two complex numbers (V, H)"
 _DETACHED = "polarisations cannot be fitted: detach them"
 
 
-def jones_basis(polarisation: str | ArrayLike) -> Complex128[Tensor, "2 2"]:
+def jones_basis(polarisation: str | checks.ArrayLike) -> Complex128[Tensor, "2 2"]:
     """Return a polarisation and the orthogonal one, of unit length, as columns over (V, H).
 
     Args:
@@ -50,12 +44,12 @@ def jones_basis(polarisation: str | ArrayLike) -> Complex128[Tensor, "2 2"]:
         length, first = 0.0, torch.zeros(0)
     if first.shape != (2,) or not 0 < length < math.inf:
         raise InputError(f"expected {_LEVELS}, got {polarisation!r}; give two, not both zero")
-    refuse_derivatives(first, "a polarisation", _DETACHED)
+    checks.refuse_derivatives(first, "a polarisation", _DETACHED)
     return torch.stack([first / length, orthogonal_vectors(first / length)], 1)
 
 
 def checked_angles(
-    theta: ArrayLike, phi: ArrayLike, of: str, do: str
+    theta: checks.ArrayLike, phi: checks.ArrayLike, of: str, do: str
 ) -> tuple[Float64[Tensor, " n"], Float64[Tensor, " m"]]:
     """Convert the angles of a table over direction to ascending tensors [rad].
 
@@ -68,8 +62,8 @@ def checked_angles(
     Raises:
         InputError: angles that do not ascend or are out of range.
     """
-    around = checked_ascending(phi, f"angles phi of {of}", do, 1)
-    away = checked_ascending(theta, f"angles theta of {of}", do)
+    around = checks.checked_ascending(phi, f"angles phi of {of}", do, 1)
+    away = checks.checked_ascending(theta, f"angles theta of {of}", do)
     if away[0] != 0 or away[-1] > math.pi + 1e-9:
         raise InputError(
             f"expected theta from 0 to at most pi rad, got {float(away[0]):g} to "
@@ -119,14 +113,14 @@ class JonesTable:
         theta, phi = checked_angles(self.theta, self.phi, "a polarisation", do)
         vectors = torch.as_tensor(self.vectors, dtype=torch.complex128)
         shape = (len(theta), len(phi), 2)
-        parts = checked_tensor(torch.view_as_real(vectors), (*shape, 2), "Jones vectors", do)
+        parts = checks.checked_tensor(torch.view_as_real(vectors), (*shape, 2), "Jones vectors", do)
         for value in (theta, phi, parts):
-            refuse_derivatives(value, "a polarisation", _DETACHED)
+            checks.refuse_derivatives(value, "a polarisation", _DETACHED)
         length = parts.flatten(-2).norm(dim=-1)
         if not bool((length > 0).all()):
             raise InputError(f"expected Jones vectors of some length, got zeros; {do}")
         found = torch.view_as_complex(parts) / length[..., None]
-        set_fields(self, theta=theta, phi=phi, vectors=found)
+        checks.set_fields(self, theta=theta, phi=phi, vectors=found)
 
     def vector(self, direction: Float64[Tensor, "row 3"]) -> Complex128[Tensor, "row 2"]:
         """Return unit Jones vectors towards unit vectors in the radar frame.
@@ -172,7 +166,9 @@ class Polarisation:
 
     @staticmethod
     def from_jones(
-        polarisation: str | ArrayLike | JonesTable, leakage: complex | ArrayLike, elements: int
+        polarisation: str | checks.ArrayLike | JonesTable,
+        leakage: complex | checks.ArrayLike,
+        elements: int,
     ) -> "Polarisation":
         """Build the polarisation of an array.
 
@@ -245,7 +241,7 @@ class Polarisation:
         return same and self.mixtures.shape[1] == other.mixtures.shape[1] == 1
 
 
-def _leakage(value: complex | ArrayLike, elements: int) -> Tensor:
+def _leakage(value: complex | checks.ArrayLike, elements: int) -> Tensor:
     do = "give the field of the other polarisation over the wanted one, of all elements or of each"
     try:
         found = torch.as_tensor(value, dtype=torch.complex128)
@@ -256,7 +252,7 @@ def _leakage(value: complex | ArrayLike, elements: int) -> Tensor:
         raise InputError(
             f"expected one finite leakage or {elements}, got shape {list(found.shape)}; {do}"
         )
-    refuse_derivatives(found, "leakage", _DETACHED)
+    checks.refuse_derivatives(found, "leakage", _DETACHED)
     return found.expand(elements)
 
 

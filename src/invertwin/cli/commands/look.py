@@ -9,17 +9,8 @@ from typing import Any
 
 import torch
 
-from invertwin.capture import (
-    Capture,
-    ChannelCalibration,
-    ChirpCapture,
-    estimate_channels,
-    find_faults,
-    is_sweeps,
-    read,
-    search_ranges,
-    ti,
-)
+from invertwin import capture as captures
+from invertwin import radar as radars
 from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid
 from invertwin.checks import checked_number
@@ -28,23 +19,11 @@ from invertwin.cli.options import LookOptions, RecordingOptions
 from invertwin.cli.report import ReportTable, load_texts, quantity_table, save_picture, write_report
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.plotting import MapPanel, direction_panels, doppler_panels, panels
-from invertwin.radar import (
-    SampledWaveform,
-    detect_points,
-    doppler_maps,
-    doppler_snapshots,
-    find_peak,
-    format_points_csv,
-    high_resolution_map,
-    range_profile,
-    save_points,
-    velocity_span,
-)
 from invertwin.radar.boards import Mounting
 from invertwin.registry.kinds import registry
 from invertwin.storage.run_folder import RunFolder
 
-AnyRecording = Capture | ChirpCapture
+AnyRecording = captures.Capture | captures.ChirpCapture
 
 
 def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable], str]:
@@ -57,17 +36,20 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
     with _collect_warnings(said):
         reader, recording = read_recording(options)
     given = recording
-    if isinstance(given, ChirpCapture) and (recording := given.merge_single_ramps()) is not given:
+    if (
+        isinstance(given, captures.ChirpCapture)
+        and (recording := given.merge_single_ramps()) is not given
+    ):
         said.append(f"reading: {recording.chirps.count} frames of one ramp are shown as one train")
     as_recorded = recording
     recording, metrics = _calibrate_channels(options, recording, folder)
     capture, chirps = _to_capture(options, recording), None
-    if isinstance(recording, ChirpCapture) and recording.chirps.count > 1:
+    if isinstance(recording, captures.ChirpCapture) and recording.chirps.count > 1:
         chirps = recording
     radar = capture.radar()
     checked_number(options.frame, "--frame", 0, radar.frame_count - 1)
     grid = _make_grid(options, capture, recording)
-    said += map(str, find_faults(as_recorded, options.range_min, options.range_max))
+    said += map(str, captures.find_faults(as_recorded, options.range_min, options.range_max))
     metrics |= {
         "task": "look",
         "reader": reader,
@@ -76,7 +58,7 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
         "frequency_ghz": radar.waveform.center_frequency / 1e9,
         "range_cell_m": radar.waveform.range_resolution,
     }
-    if isinstance(radar.waveform, SampledWaveform):
+    if isinstance(radar.waveform, radars.SampledWaveform):
         metrics |= {"samples": radar.waveform.samples, "max_range_m": recording.max_range}
     if radar.range_origin is not None:
         metrics["range_origin_m"] = float(radar.range_origin.mean())
@@ -88,9 +70,9 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
         shown |= _high_resolution_panels(options, capture, chirps, grid)
     points = None
     if chirps is not None:
-        points = detect_points(chirps.beat, radar, grid, chirps.chirps, options.frame)
+        points = radars.detect_points(chirps.beat, radar, grid, chirps.chirps, options.frame)
     elif "beat" in capture.dataset:
-        points = detect_points(capture.beat[:, None], radar, grid, None, options.frame)
+        points = radars.detect_points(capture.beat[:, None], radar, grid, None, options.frame)
     if radar.frame_count > 1:
         profiles = capture.spectrum(replace(grid, u_count=1, v_count=1))
         times = torch.arange(radar.frame_count)
@@ -100,9 +82,9 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
     capture.save(folder.file("capture.nc"))
     if points is not None:
         metrics["points"] = len(points)
-        folder.write_text("points.csv", format_points_csv(points))
+        folder.write_text("points.csv", radars.format_points_csv(points))
         for suffix in ("ply", "pcd"):
-            save_points(folder.file(f"points.{suffix}"), points)
+            radars.save_points(folder.file(f"points.{suffix}"), points)
     title, note = options.recording.name, load_texts("notes")["look"]
     tables = [quantity_table(title, metrics), *warning_tables(said)]
     drawn = save_picture(folder, "look", panels(shown), f"Frame {options.frame}", "doppler")
@@ -145,8 +127,8 @@ def read_recording(options: RecordingOptions) -> tuple[str, AnyRecording]:
         folder, kind, preset = find_plugin_recording(path)
         more = {} if preset is None else {"board": _mount_board(options, options.board or preset)}
         return kind, registry.kind_table("data", kind).made_by(str(folder), **more)
-    if is_sweeps(path):
-        return "sweeps", read(path)
+    if captures.is_sweeps(path):
+        return "sweeps", captures.read(path)
     raw, board, settings = ending in (".bin", ".json"), None, options.config
     if ending == ".toml":
         stated = options.board, options.elevation, options.azimuth
@@ -158,9 +140,9 @@ def read_recording(options: RecordingOptions) -> tuple[str, AnyRecording]:
             raise InputError(
                 f"expected --set with a .bin or .setup.json, got {path.name}; correct its own file"
             )
-        known = ti.read_settings(options.config or path)
-        settings = ti.change_settings(known, _parse_changes(options.change))
-    found = read(path, settings, board=board, lanes=options.lanes)
+        known = captures.ti.read_settings(options.config or path)
+        settings = captures.ti.change_settings(known, _parse_changes(options.change))
+    found = captures.read(path, settings, board=board, lanes=options.lanes)
     return {".nc": "netcdf", ".toml": "arrays"}.get(ending, "dca1000"), found
 
 
@@ -185,9 +167,9 @@ def _mount_board(options: RecordingOptions, board: str) -> Mounting:
     return Mounting(board, options.elevation, 1 if options.azimuth is None else options.azimuth)
 
 
-def _to_capture(options: LookOptions, recording: AnyRecording) -> Capture:
+def _to_capture(options: LookOptions, recording: AnyRecording) -> captures.Capture:
     """Return the capture with one signal a frame."""
-    if isinstance(recording, Capture):
+    if isinstance(recording, captures.Capture):
         return recording
     chirp = "mean" if options.chirp is None else options.chirp
     return replace(recording, moving=False).to_capture(chirp)
@@ -200,9 +182,11 @@ def _calibrate_channels(
     if options.channels is not None and options.reflector is not None:
         raise InputError("expected --channels or --reflector, got both; choose one")
     if options.channels is not None:
-        calibration = ChannelCalibration.load(options.channels)
+        calibration = captures.ChannelCalibration.load(options.channels)
     elif options.reflector is not None:
-        calibration = estimate_channels(_to_capture(options, recording), list(options.reflector))
+        calibration = captures.estimate_channels(
+            _to_capture(options, recording), list(options.reflector)
+        )
         calibration.save(folder.file("channels.json"))
     else:
         return recording, {}
@@ -211,14 +195,14 @@ def _calibrate_channels(
     return calibration.apply(recording), {"channel_spread_db": float(spread)}
 
 
-def _make_grid(options: LookOptions, capture: Capture, recording: AnyRecording) -> Grid:
+def _make_grid(options: LookOptions, capture: captures.Capture, recording: AnyRecording) -> Grid:
     radar, profiles = capture.radar(), "range_profile" in capture.dataset
     cell, farthest = radar.waveform.range_resolution, recording.max_range
     if profiles:
         low = float(capture.ranges[0]) if options.range_min is None else options.range_min
         high = farthest if options.range_max is None else options.range_max
     else:
-        low, high = search_ranges(recording, options.range_min, options.range_max)
+        low, high = captures.search_ranges(recording, options.range_min, options.range_max)
     if high > farthest * (1 + 1e-9):
         raise InputError(
             f"expected a --range-max within {farthest:.4g} m, got {high:g}; samples "
@@ -231,7 +215,10 @@ def _make_grid(options: LookOptions, capture: Capture, recording: AnyRecording) 
 
 
 def _high_resolution_panels(
-    options: LookOptions, capture: Capture, chirps: ChirpCapture | None, grid: Grid
+    options: LookOptions,
+    capture: captures.Capture,
+    chirps: captures.ChirpCapture | None,
+    grid: Grid,
 ) -> dict[str, MapPanel]:
     """Draw direction spectra by a method other than Bartlett's."""
     radar = capture.radar()
@@ -241,29 +228,29 @@ def _high_resolution_panels(
         )
     if chirps is None:
         one = capture.frames([options.frame])
-        profile = range_profile(one.beat, one.radar(), grid)
+        profile = radars.range_profile(one.beat, one.radar(), grid)
     else:
-        profile = doppler_snapshots(chirps.beat, radar, grid, chirps.chirps, options.frame)
-    power = high_resolution_map(profile, radar, grid, options.method, options.sources)
+        profile = radars.doppler_snapshots(chirps.beat, radar, grid, chirps.chirps, options.frame)
+    power = radars.high_resolution_map(profile, radar, grid, options.method, options.sources)
     return direction_panels(f"everything, {options.method}", power, grid)
 
 
 def _make_panels(
-    capture: Capture, chirps: ChirpCapture | None, grid: Grid, frame: int
+    capture: captures.Capture, chirps: captures.ChirpCapture | None, grid: Grid, frame: int
 ) -> tuple[dict[str, MapPanel], dict[str, Any]]:
     """Make the pictures and numbers of one frame."""
     if chirps is not None:
-        maps = doppler_maps(chirps.beat, chirps.device, grid, chirps.chirps, frame)
+        maps = radars.doppler_maps(chirps.beat, chirps.device, grid, chirps.chirps, frame)
         return doppler_panels(maps), {
             "chirps": chirps.chirps.count,
-            "velocity_span_m_s": velocity_span(chirps.device, chirps.chirps),
+            "velocity_span_m_s": radars.velocity_span(chirps.device, chirps.chirps),
             **maps.strongest_peak.metrics("peak"),
             "moves": maps.moving_peak is not None,
             **({} if maps.moving_peak is None else maps.moving_peak.metrics("mover")),
         }
     spectrum = capture.frames([frame]).spectrum(grid)[0].double()
     shown = direction_panels("range and direction", spectrum, grid)
-    numbers = find_peak(spectrum, grid).metrics("peak")
+    numbers = radars.find_peak(spectrum, grid).metrics("peak")
     del numbers["peak_velocity_m_s"]
     if not shown:
         del numbers["peak_azimuth_deg"]

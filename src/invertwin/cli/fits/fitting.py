@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
+from invertwin import discovery, inversion
 from invertwin.capture import Capture, calibrate
 from invertwin.cli.fits.displays import StepRecorder, steps_path
 from invertwin.cli.fits.problem import (
@@ -29,27 +30,8 @@ from invertwin.cli.fits.shape_scores import CURVE_KEY, make_shape_metric
 from invertwin.cli.fits.spreading import fit_file_stem
 from invertwin.cli.report import format_place
 from invertwin.cli.schema import build
-from invertwin.discovery import (
-    choose_result,
-    estimate_clutter,
-    needs_clutter,
-    reconstruct_among_clutter,
-)
 from invertwin.discovery.imaging.point_detections import find_image_peak
 from invertwin.errors import InputError
-from invertwin.inversion import (
-    Callback,
-    Checkpoint,
-    Observation,
-    Reconstruction,
-    Report,
-    Screening,
-    Stage,
-    Watch,
-    reconstruct,
-    report_progress,
-    search,
-)
 from invertwin.inversion.callbacks import stage_checkpoint_path
 from invertwin.inversion.fit import Fit, parameter_values
 from invertwin.models.radar import SurrogateMap
@@ -80,7 +62,7 @@ def fit_all(
     """
     work = problem.work
     rows: dict[str, list[Row]] = {method: [] for method in problem.methods}
-    outcomes: dict[tuple[str, int], Callable[[], Reconstruction]] = {}
+    outcomes: dict[tuple[str, int], Callable[[], inversion.Reconstruction]] = {}
     for method, number in work:
         own = problem.kind.with_recording_of_start(problem, number, console)
         checkpoint = CHECKPOINT if len(work) == 1 else None
@@ -150,7 +132,7 @@ def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     wanted = problem.run.fit_settings.clutter
     if wanted == "never" or not problem.kind.allows_clutter(problem):
         return fits
-    if wanted == "auto" and not needs_clutter(fits.found):
+    if wanted == "auto" and not discovery.needs_clutter(fits.found):
         return fits
     try:
         row, outcome = run_fit(problem, fits.start, number, AMONG_CLUTTER, folder, console, None)
@@ -160,12 +142,12 @@ def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
         notes = {**problem.notes, "clutter": {"kept": False, "refused": str(error)}}
         return replace(fits, problem=replace(problem, notes=notes))
     among = outcome()
-    kept = wanted == "always" or choose_result(fits.found, among) is among
+    kept = wanted == "always" or discovery.choose_result(fits.found, among) is among
     observation = make_observations(problem, fits.start)[0]
     moved = [
         name for name in dict.fromkeys(problem.run.fitted_objects) if name in among.scene.names
     ]
-    clutter = estimate_clutter(among.scene, observation, moved, seed=problem.run.seed)
+    clutter = discovery.estimate_clutter(among.scene, observation, moved, seed=problem.run.seed)
     summary = {
         "kept": kept,
         "share": float(clutter.echoes.sum() / observation.observed_map().sum()),
@@ -186,7 +168,7 @@ def run_fit(
     console: Console,
     checkpoint: str | None,
     show: Callable[[Fit, DisplayStep], None] | None = None,
-) -> tuple[Row, Callable[[], Reconstruction]]:
+) -> tuple[Row, Callable[[], inversion.Reconstruction]]:
     """Make one fit, or read what an interrupted run has kept of it.
 
     Args:
@@ -214,7 +196,7 @@ def run_fit(
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if method == OWN_METHOD else f", {method.replace('_', ' ')}")
     steps = sum(stage.steps for stage in stages) * (2 if method == AMONG_CLUTTER else 1)
-    with report_progress(name, steps, console) as shown:
+    with inversion.report_progress(name, steps, console) as shown:
         found, found_ends = again(shown)
     curve = [[row["step"] + 1, row[CURVE_KEY]] for row in found.history if CURVE_KEY in row]
     row = {
@@ -239,23 +221,23 @@ def run_fit(
 
 def _fit_or_search(
     problem: Problem,
-    stages: Sequence[Stage],
+    stages: Sequence[inversion.Stage],
     start: Start,
     index: int,
     folder: RunFolder,
     checkpoint: str,
     show: Callable[[Fit, DisplayStep], None] | None,
     method: str,
-    shown: Sequence[Report] = (),
-) -> tuple[Reconstruction, Row]:
+    shown: Sequence[inversion.Report] = (),
+) -> tuple[inversion.Reconstruction, Row]:
     """Fit, or search about the start; return what the row says of the search, too."""
     run, watch = problem.run, make_shape_metric(problem)
     every = run.measures.every if run.measures else 1
 
-    def callbacks(file: str) -> list[Callback]:
+    def callbacks(file: str) -> list[inversion.Callback]:
         for k in range(len(stages) - 1):
             folder.file(str(stage_checkpoint_path(Path(file), k)))
-        watching = [] if watch is None else [Watch(watch, every)]
+        watching = [] if watch is None else [inversion.Watch(watch, every)]
         kept = StepRecorder(
             folder.file(steps_path(file)),
             [name for name in dict.fromkeys(run.fitted_objects) if name in start.scene.names],
@@ -276,27 +258,33 @@ def _fit_or_search(
         sharp = [replace(o, model=o.model.scale_blur(0.0)) for o in given[1]]
         unknowns = {name: replace(unknown, rate=None) for name, unknown in given[2].items()}
         how["schedule"] = replace(stages[0], models=(), optimizer=slow)
-        return reconstruct(start.scene, sharp, unknowns, callbacks=callbacks(checkpoint), **how), {}
+        return inversion.reconstruct(
+            start.scene, sharp, unknowns, callbacks=callbacks(checkpoint), **how
+        ), {}
     if method == AMONG_CLUTTER:
         # Every frame has clutter of its own.
         how["schedule"] = [replace(stage, frames_per_step=None) for stage in stages]
         part = f"{PARTS}/{Path(checkpoint).stem}_round"
-        found = reconstruct_among_clutter(
+        found = discovery.reconstruct_among_clutter(
             *given, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how
         )
         return found, {"checkpoint": f"{part}1.pt"}
     if run.search is None:
-        return reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
+        return inversion.reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
     part = f"{PARTS}/{Path(checkpoint).stem}_fit"
     starts = problem.kind.make_candidates(problem, start, torch.Generator().manual_seed(seed))
-    screening = Screening(starts, run.search.fits, run.search.shortlist)
-    ends = search(*given, screening, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how)
+    screening = inversion.Screening(starts, run.search.fits, run.search.shortlist)
+    ends = inversion.search(
+        *given, screening, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how
+    )
     return ends.best, {"checkpoint": f"{part}{ends.best_number}.pt", **ends.to_metrics()}
 
 
-def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> Checkpoint:
+def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> inversion.Checkpoint:
     """Goes on from its own unfinished part; open_run has settled what may be there."""
-    return Checkpoint(folder.file(name), problem.run.fit_settings.checkpoint_every, resume=True)
+    return inversion.Checkpoint(
+        folder.file(name), problem.run.fit_settings.checkpoint_every, resume=True
+    )
 
 
 def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> Problem:
@@ -325,10 +313,10 @@ def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> 
         bias, clock = RangeBias(), ClockOffset(capture.positions)
         own = replace(problem, run=run.apply_overrides(table))
         schedule, (model,) = own.run.fit_settings.build(), own.kind.models(own)
-        with report_progress("calibration", schedule.steps, console) as shown:
-            found = reconstruct(
+        with inversion.report_progress("calibration", schedule.steps, console) as shown:
+            found = inversion.reconstruct(
                 Scene({table.object: target}),
-                Observation(model, capture, sensor=item.sensor, parameters=[bias, clock]),
+                inversion.Observation(model, capture, sensor=item.sensor, parameters=[bias, clock]),
                 [],
                 loss=build.build_loss(run),
                 optimizer=build.build_section(own.run, "optimizer"),

@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from invertwin import plotting
+from invertwin import discovery, plotting
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
 from invertwin.cli.estimate import SensorSetup, require_resources
@@ -40,12 +40,6 @@ from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.cli.schema.motion_tables import scene_at_start
 from invertwin.cli.schema.recordings import build_chirp_capture
 from invertwin.cli.schema.shape_tables import MovingTargetParameter
-from invertwin.discovery import (
-    MovingBody,
-    MovingTargetFit,
-    MovingTargetMaps,
-    detect_strongest_target,
-)
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion import Reconstruction, Unknown
@@ -109,14 +103,14 @@ class MovingTarget(DataKind):
 
     def _build_body(
         self, problem: Problem, table: MovingTargetParameter, start: Start, scene: Scene
-    ) -> MovingBody:
+    ) -> discovery.MovingBody:
         run = problem.run
         # Starts and searches move the object of the scene; else the echo says where it is.
         placed = run.starts is not None or run.search is not None
         center = scene[table.object].center.detach() if placed else None
         with prefix_errors(f"scene.{table.object}"):
             sensor, echo = problem.first_sensor.sensor, problem.reference
-            return MovingBody(table.object, scene, sensor, echo, table.free, center)
+            return discovery.MovingBody(table.object, scene, sensor, echo, table.free, center)
 
     def score_fit(self, problem: Problem, start: Start, found: Reconstruction) -> Row:
         """Errors of position and velocity, where the truth is known.
@@ -215,7 +209,9 @@ def _detect_echo(problem: Problem) -> Any:
     with prefix_errors("initial"):
         found = None if table is None else table.build()
     box = None if found is None or found.low is None else (found.low, found.high)
-    return detect_strongest_target(problem.first_sensor.recording, _whole_map(problem), box)
+    return discovery.detect_strongest_target(
+        problem.first_sensor.recording, _whole_map(problem), box
+    )
 
 
 def _times(recording: ChirpCapture) -> Tensor:
@@ -223,22 +219,24 @@ def _times(recording: ChirpCapture) -> Tensor:
     return recording.chirps.times(len(recording.device.transmitters.positions))
 
 
-def _find_body(found: Reconstruction) -> MovingBody:
-    return next(module for module in found.parameters if isinstance(module, MovingBody))
+def _find_body(found: Reconstruction) -> discovery.MovingBody:
+    return next(module for module in found.parameters if isinstance(module, discovery.MovingBody))
 
 
-def _make_twins(fits: Fits) -> list[MovingTargetFit]:
+def _make_twins(fits: Fits) -> list[discovery.MovingTargetFit]:
     """The twin of the best fit, and that of the first half from the same start."""
     number, problem = fits.best["start"], fits.problem
     twins = []
     for method, found in ((OWN_METHOD, fits.found), (HALF, fits.outcome(HALF, number))):
         own = problem.kind.with_method(problem, method)
         model, recording = _whole_map(own), own.first_sensor.recording
-        twins.append(MovingTargetFit(recording, model, _find_body(found), found))
+        twins.append(discovery.MovingTargetFit(recording, model, _find_body(found), found))
     return twins
 
 
-def _correlations(maps: MovingTargetMaps, recording: ChirpCapture, prefix: str = "") -> Row:
+def _correlations(
+    maps: discovery.MovingTargetMaps, recording: ChirpCapture, prefix: str = ""
+) -> Row:
     """Correlations with a recording, by scale."""
     rows = maps.correlations(recording)
     headline = {f"{prefix}{name}_correlation": v for name, v in rows["magnitude"].items()}

@@ -12,20 +12,7 @@ from rich.console import Console
 from torch import Tensor
 
 from invertwin import plotting
-from invertwin.cli.fits.problem import (
-    INTERIOR_ONLY,
-    OWN_METHOD,
-    DataKind,
-    Fits,
-    Problem,
-    Row,
-    SensorData,
-    Start,
-    Summary,
-    make_observations,
-    require_sections,
-    stage_runs,
-)
+from invertwin.cli.fits import problem as problems
 from invertwin.cli.fits.scores import drop_histories, error_bar_table
 from invertwin.cli.report import ReportTable, load_texts, save_picture
 from invertwin.cli.run_file import require_section
@@ -48,7 +35,7 @@ _CELLS = 2500  # of a drawn map
 _FLOOR = 1e-16
 
 
-class PanelCoverage(DataKind):
+class PanelCoverage(problems.DataKind):
     """An aim instead of data: the path loss that the worst share of receivers exceeds."""
 
     title: ClassVar[str] = "Placement of a metasurface"
@@ -57,30 +44,34 @@ class PanelCoverage(DataKind):
         *("starts", "map", "initial"),
     )
 
-    def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:
+    def read_problem(
+        self, run: RunFile, scene: Scene, truth: Scene, console: Console
+    ) -> problems.Problem:
         """See ``DataKind.read_problem``; ``reference`` holds the receivers that score the panel."""
-        require_sections(self, run, "[placement]")
+        problems.require_sections(self, run, "[placement]")
         table = require_section(run, "placement", "reconstruct")
-        item = SensorData(table.coverage(scene, run.seed), table.metasurface())
+        item = problems.SensorData(table.coverage(scene, run.seed), table.metasurface())
         scored = table.coverage(scene, run.seed, scored=True)
-        return Problem(run, scene, truth, frozenset(), {"": item}, None, self, scored)
+        return problems.Problem(run, scene, truth, frozenset(), {"": item}, None, self, scored)
 
-    def recorded_values(self, item: SensorData) -> Tensor:
+    def recorded_values(self, item: problems.SensorData) -> Tensor:
         """The path loss without a panel [dB]."""
         return -item.recording.worst(item.recording.direct).reshape(1, 1)
 
-    def models(self, problem: Problem) -> list[ForwardModel]:
+    def models(self, problem: problems.Problem) -> list[ForwardModel]:
         """See ``DataKind.models``."""
         table, settings = _table(problem), problem.run.fit_settings
         blur, soft = table.edge_width, table.softness
         batch = table.receivers.batch
         return [CoverageMap(problem.first_sensor.recording, batch, blur, soft, settings.boundary)]
 
-    def starts(self, problem: Problem) -> list[Start]:
+    def starts(self, problem: problems.Problem) -> list[problems.Start]:
         """As many as the run file says; they differ by the random numbers of ``[search]``."""
-        return [Start(problem.scene)] * _table(problem).starts
+        return [problems.Start(problem.scene)] * _table(problem).starts
 
-    def make_unknown(self, problem: Problem, name: str, table: Any, start: Start) -> Unknown:
+    def make_unknown(
+        self, problem: problems.Problem, name: str, table: Any, start: problems.Start
+    ) -> Unknown:
         """The position and beam of the panel, or the phases of its elements."""
         own = _table(problem)
         if table.kind == "panel_phases":
@@ -90,12 +81,12 @@ class PanelCoverage(DataKind):
         return super().make_unknown(problem, name, table, start)
 
     def make_candidates(
-        self, problem: Problem, start: Start, generator: torch.Generator
+        self, problem: problems.Problem, start: problems.Start, generator: torch.Generator
     ) -> Sequence[Candidate]:
         """Placements that ``[search]`` compares."""
         named = build.tables_by_name(problem.run.parameters)
         name = next(n for n, table in named.items() if table.kind == "panel")
-        (observation,) = make_observations(problem, start)
+        (observation,) = problems.make_observations(problem, start)
         assert isinstance(observation.parameters, dict)
         found = []
         for trial in _search(problem).trials(_table(problem), generator):
@@ -104,12 +95,14 @@ class PanelCoverage(DataKind):
             found.append(Candidate(start.scene, [replace(observation, parameters=own)], group))
         return found
 
-    def score_fit(self, problem: Problem, start: Start, found: Reconstruction) -> Row:
+    def score_fit(
+        self, problem: problems.Problem, start: problems.Start, found: Reconstruction
+    ) -> problems.Row:
         """Levels of the worst receivers, of those that the fit sees and of the others [dB]."""
         panel, batch = found.sensors[0], _table(problem).receivers.batch
         seen = problem.first_sensor.recording.part(slice(0, batch))
         module = next(m for m in found.parameters if isinstance(m, PanelPlacement))
-        steps = [own.fit_settings.steps for _, own in stage_runs(problem.run)]
+        steps = [own.fit_settings.steps for _, own in problems.stage_runs(problem.run)]
         search, tried = problem.run.search, 0
         if search is not None:
             tried = len(search.trials(_table(problem), torch.Generator()))
@@ -125,12 +118,12 @@ class PanelCoverage(DataKind):
                 "evaluations": tried + (1 + _DERIVATIVE) * sum(steps),
             }
 
-    def metrics(self, fits: Fits) -> Row:
+    def metrics(self, fits: problems.Fits) -> problems.Row:
         """See ``DataKind.metrics``."""
         scored, best = fits.problem.reference, fits.best
         before = float(scored.worst(scored.direct))
-        found: Row = {
-            "evaluations": fits.rows[OWN_METHOD][0]["evaluations"],
+        found: problems.Row = {
+            "evaluations": fits.rows[problems.OWN_METHOD][0]["evaluations"],
             "worst_before_db": before,
             "worst_after_db": best["scored_db"],
             "gain_db": best["scored_db"] - before,
@@ -140,19 +133,21 @@ class PanelCoverage(DataKind):
         grid = fits.best_of(EXHAUSTIVE)
         found |= {"worst_exhaustive_db": grid["scored_db"]}
         found["evaluations_exhaustive"] = len(grid.get("screened", ()))
-        rows = [dict(row) for row in drop_histories(fits.rows[OWN_METHOD])]
-        for method, name in ((OWN_METHOD, "found"), (INTERIOR_ONLY, "interior")):
+        rows = [dict(row) for row in drop_histories(fits.rows[problems.OWN_METHOD])]
+        for method, name in ((problems.OWN_METHOD, "found"), (problems.INTERIOR_ONLY, "interior")):
             if method not in fits.rows:
                 continue
             ratios = [10 ** ((r["scored_db"] - grid["scored_db"]) / 10) for r in fits.rows[method]]
             for row, ratio in zip(rows, ratios, strict=False):
                 row[f"{name}_over_exhaustive"] = ratio
             found[f"{name}_over_exhaustive"] = statistics.median(ratios)
-            tail = "" if method == OWN_METHOD else "_interior"
+            tail = "" if method == problems.OWN_METHOD else "_interior"
             found[f"successes{tail}"] = sum(ratio >= _AS_GOOD for ratio in ratios)
         return found | {"starts": rows}
 
-    def summary(self, fits: Fits, metrics: Row, folder: RunFolder) -> Summary:
+    def summary(
+        self, fits: problems.Fits, metrics: problems.Row, folder: RunFolder
+    ) -> problems.Summary:
         """See ``DataKind.summary``."""
         problem, notes = fits.problem, load_texts("notes")
         drawn = [save_picture(folder, "loss", plotting.convergence(fits.losses))]
@@ -169,24 +164,24 @@ class PanelCoverage(DataKind):
         if "successes" in metrics:
             reached = f"{metrics['successes']} of {count} starts reach {_AS_GOOD:g} of the best of"
             outcome = f"{reached} the grid; {outcome}"
-        return Summary(outcome, result, drawn, [error_bar_table(metrics)])
+        return problems.Summary(outcome, result, drawn, [error_bar_table(metrics)])
 
 
-def _table(problem: Problem) -> Placement:
+def _table(problem: problems.Problem) -> Placement:
     return require_section(problem.run, "placement", "a metasurface")
 
 
-def _search(problem: Problem) -> Any:
+def _search(problem: problems.Problem) -> Any:
     return require_section(problem.run, "search", "placements to compare")
 
 
-def _start_panel(problem: Problem, table: Any, trial: Trial) -> Unknown:
+def _start_panel(problem: problems.Problem, table: Any, trial: Trial) -> Unknown:
     """The module of a panel that starts at a trial."""
     make = partial(_table(problem).place, problem.first_sensor.recording, trial)
     return Unknown(lambda _: make(), table.rate)
 
 
-def _landscape(fits: Fits) -> Any:
+def _landscape(fits: problems.Fits) -> Any:
     """The level of the best trial of the grid at each position, and where fits have ended."""
     problem = fits.problem.kind.with_method(fits.problem, EXHAUSTIVE)
     table, search = _table(problem), _search(problem)
@@ -196,12 +191,12 @@ def _landscape(fits: Fits) -> Any:
     levels = (-losses * before).view(search.places, -1).amax(1)
     along = torch.tensor([trial[0] for trial in trials], dtype=torch.float64)
     length = table.path().length
-    ends = [[row["along_m"] % length, row["level_db"]] for row in fits.rows[OWN_METHOD]]
+    ends = [[row["along_m"] % length, row["level_db"]] for row in fits.rows[problems.OWN_METHOD]]
     places = along.view(search.places, -1)[:, 0]
     return plotting.placements(places, levels, torch.tensor(ends, dtype=torch.float64))
 
 
-def _coverage(problem: Problem, panel: Metasurface) -> Any:
+def _coverage(problem: problems.Problem, panel: Metasurface) -> Any:
     """Path gain over the floor plan, without the panel and with it."""
     table, seen = _table(problem), problem.first_sensor.recording
     box = table.receivers

@@ -9,6 +9,7 @@ from annotated_types import MinLen
 from pydantic import BeforeValidator
 from torch import Tensor, nn
 
+from invertwin import scene as scenes
 from invertwin.checks import ArrayLike, Point
 from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
@@ -18,30 +19,6 @@ from invertwin.radar.parameters import RadarPose, RadarTrajectory
 from invertwin.radar.radar import Radar
 from invertwin.registry.kinds import ConstructorTable, KindGroup, OneOf, Registry
 from invertwin.registry.section import Counts, InputPath, Vector, key, prefix_errors
-from invertwin.scene import (
-    AxisRotation,
-    DensityGrid,
-    DistanceGrid,
-    LatticeDeformation,
-    LinearShape,
-    Mesh,
-    NeuralDistance,
-    Object,
-    PriorShape,
-    Scene,
-    Sitting,
-    SkinnedBody,
-    SmoothVertices,
-    SplineTrajectory,
-    TrajectoryMotion,
-    Walking,
-    Waving,
-    load_prior,
-    merge_meshes,
-    rigid,
-    rotation_from_vector,
-    shapes,
-)
 from invertwin.scene.files import load_mesh
 from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation, Vertices
 from invertwin.scene.people.body import BodyTemplate
@@ -55,20 +32,22 @@ class ShapePoseTable(ConstructorTable):
     rotation_deg: Vector = key("rotation vector", [0.0, 0.0, 0.0])
     scale: Positive = key("factor", 1.0)
 
-    def build_mesh(self) -> Mesh:
+    def build_mesh(self) -> scenes.Mesh:
         """Build the mesh in its own frame, scaled but not placed."""
         mesh = super().build()
-        return Mesh(mesh.vertices * self.scale, mesh.faces)
+        return scenes.Mesh(mesh.vertices * self.scale, mesh.faces)
 
     def build_pose(self) -> Tensor:
         """Build the pose matrix [4, 4]."""
         turn = torch.tensor(self.rotation_deg, dtype=torch.float64).deg2rad()
-        return rigid(rotation_from_vector(turn), torch.tensor(self.position, dtype=torch.float64))
+        return scenes.rigid(
+            scenes.rotation_from_vector(turn), torch.tensor(self.position, dtype=torch.float64)
+        )
 
     def build(self, given: Any = None, /, **more: Any) -> Any:
         """The mesh as a part of an object, placed within it."""
         mesh, pose = self.build_mesh(), self.build_pose()
-        return Mesh(mesh.vertices @ pose[:3, :3].T + pose[:3, 3], mesh.faces)
+        return scenes.Mesh(mesh.vertices @ pose[:3, :3].T + pose[:3, 3], mesh.faces)
 
 
 class _ObjectProperties(ConstructorTable):
@@ -83,14 +62,14 @@ class _ObjectProperties(ConstructorTable):
 class ObjectTable(ShapePoseTable, _ObjectProperties):
     """Object of the scene: a shape with its material and motion."""
 
-    def build(self, given: Any = None, /, **more: Any) -> Object:
+    def build(self, given: Any = None, /, **more: Any) -> scenes.Object:
         """The object; `mesh` stands in for its shape."""
         mesh = more["mesh"] if more else self.build_mesh()
         with prefix_errors("material"):
-            material = self.material.build({Mesh: mesh})
+            material = self.material.build({scenes.Mesh: mesh})
         still = self.velocity is None
         velocity = None if still else torch.tensor(self.velocity, dtype=torch.float64)
-        return Object(mesh, material, self.build_pose(), velocity)
+        return scenes.Object(mesh, material, self.build_pose(), velocity)
 
 
 class RoomTable(ConstructorTable):
@@ -100,13 +79,13 @@ class RoomTable(ConstructorTable):
         "materials by the room's objects, in place of their own", {}
     )
 
-    def build(self, given: Any = None, /, **more: Any) -> dict[str, Object]:
+    def build(self, given: Any = None, /, **more: Any) -> dict[str, scenes.Object]:
         """Its objects by name.
 
         Raises:
             InputError: A room that the library refuses, or materials of what is not in it.
         """
-        found: dict[str, Object] = super().build(given, **more)
+        found: dict[str, scenes.Object] = super().build(given, **more)
         for name, table in self.materials.items():
             with prefix_errors(f"materials.{name}"):
                 if name not in found:
@@ -114,7 +93,9 @@ class RoomTable(ConstructorTable):
                         f"expected an object of the room ({', '.join(found)}), got none of this "
                         "name; correct it"
                     )
-                found[name] = replace(found[name], material=table.build({Mesh: found[name].mesh}))
+                found[name] = replace(
+                    found[name], material=table.build({scenes.Mesh: found[name].mesh})
+                )
         return found
 
 
@@ -173,32 +154,40 @@ class PanelParameter(ParameterTable):
 
 def register(registry: Registry) -> None:
     """Add shapes, and the modules that fit them."""
-    registry.groups["shape"] = KindGroup(tag="shape", base=ShapePoseTable, product=Mesh)
+    registry.groups["shape"] = KindGroup(tag="shape", base=ShapePoseTable, product=scenes.Mesh)
     registry.groups["object"] = KindGroup(tag="shape", base=ObjectTable, includes="shape")
     registry.groups["parameter"] = KindGroup(base=ParameterTable)
-    registry.bases |= dict.fromkeys((PriorShape, LinearShape), LearnedTable)
+    registry.bases |= dict.fromkeys((scenes.PriorShape, scenes.LinearShape), LearnedTable)
     registry.bases[RadarTrajectory] = LatentTable
-    registry.given |= {Scene, Mesh, Object, ObjectTable, BodyTemplate, Walking, Sitting}
+    registry.given |= {
+        scenes.Scene,
+        scenes.Mesh,
+        scenes.Object,
+        ObjectTable,
+        BodyTemplate,
+        scenes.Walking,
+        scenes.Sitting,
+    }
     registry.groups["motion"] = KindGroup()
-    registry.add("motion", "walking", Walking, checked=False)
-    registry.add("motion", "sitting", Sitting, checked=False)
-    registry.add("motion", "waving", Waving, checked=False)
-    registry.add("motion", "turning", AxisRotation, checked=False)
+    registry.add("motion", "walking", scenes.Walking, checked=False)
+    registry.add("motion", "sitting", scenes.Sitting, checked=False)
+    registry.add("motion", "waving", scenes.Waving, checked=False)
+    registry.add("motion", "turning", scenes.AxisRotation, checked=False)
     registry.add("motion", "along", follow_spline, checked=False)
     for name in ("plate", "box", "sphere", "cylinder", "dihedral", "trihedral", "text"):
-        registry.add("shape", name, getattr(shapes, name))
+        registry.add("shape", name, getattr(scenes.shapes, name))
     registry.add("shape", "prior", learned_car)
     registry.add("shape", "body", body)
     registry.add("shape", "file", load_mesh, untagged=True)
-    registry.add("object", "parts", merge_meshes, untagged=True)
+    registry.add("object", "parts", scenes.merge_meshes, untagged=True)
     registry.add("parameter", "translation", Translation, without=("initial",))
     registry.add("parameter", "pose", Pose, without=("translation", "rotation"))
     registry.add("parameter", "scale", Scale, without=("initial",))
     registry.add("parameter", "vertices", free_vertices)
-    registry.add("parameter", "lattice", LatticeDeformation)
-    registry.add("parameter", "distance_grid", DistanceGrid.from_mesh)
-    registry.add("parameter", "neural_distance", NeuralDistance, without=("seed",))
-    registry.add("parameter", "density", DensityGrid.from_object)
+    registry.add("parameter", "lattice", scenes.LatticeDeformation)
+    registry.add("parameter", "distance_grid", scenes.DistanceGrid.from_mesh)
+    registry.add("parameter", "neural_distance", scenes.NeuralDistance, without=("seed",))
+    registry.add("parameter", "density", scenes.DensityGrid.from_object)
     registry.add("parameter", "prior", prior_shape)
     registry.add("parameter", "body", body_joints)
     registry.add("parameter", "material", MaterialValues.from_object)
@@ -211,7 +200,7 @@ def register(registry: Registry) -> None:
 
 def follow_spline(
     times: ArrayLike, places: Sequence[Point], heading: bool = False
-) -> TrajectoryMotion:
+) -> scenes.TrajectoryMotion:
     """Carry the object along a natural cubic spline; its position counts from the spline's place.
 
     Args:
@@ -219,23 +208,25 @@ def follow_spline(
         places: x, y and z of each [m].
         heading: turn it about the vertical, so that its front, −x, looks where it goes.
     """
-    return TrajectoryMotion(SplineTrajectory(times, places), heading)
+    return scenes.TrajectoryMotion(scenes.SplineTrajectory(times, places), heading)
 
 
-def learned_car(latent: Sequence[float] | None = None, prior: InputPath | None = None) -> Mesh:
+def learned_car(
+    latent: Sequence[float] | None = None, prior: InputPath | None = None
+) -> scenes.Mesh:
     """A car of the learned prior: x ahead, y to the left, z up, on the ground z = 0.
 
     Args:
         latent: coordinates; without them the mean car.
         prior: file that `invertwin train-prior` wrote; without it the prior of the package.
     """
-    found = load_prior(prior)
+    found = scenes.load_prior(prior)
     mean = torch.zeros(found.latent_size, dtype=torch.float64)
     return found.mesh(mean if latent is None else mean.new_tensor(latent))
 
 
 def free_vertices(
-    object: str, mesh: Mesh, laplacian: NonNegative = 0.0, smooth: NonNegative = 0.0
+    object: str, mesh: scenes.Mesh, laplacian: NonNegative = 0.0, smooth: NonNegative = 0.0
 ) -> nn.Module:
     """Free vertices, held together by a Laplacian term, or moved in smooth steps.
 
@@ -243,7 +234,7 @@ def free_vertices(
         laplacian: weight of the term; 0 = none.
     """
     if smooth > 0:
-        return SmoothVertices(object, mesh, smooth)
+        return scenes.SmoothVertices(object, mesh, smooth)
     return Vertices(object, len(mesh.vertices))
 
 
@@ -252,7 +243,7 @@ def prior_shape(
     table: ObjectTable | None = None,
     file: InputPath | None = None,
     counts: Counts | None = None,
-) -> PriorShape:
+) -> scenes.PriorShape:
     """Coordinates of the learned prior of vehicles, from those of its object, else the mean car.
 
     Args:
@@ -262,15 +253,17 @@ def prior_shape(
     """
     known: Any = table
     same = getattr(known, "shape", None) == "prior" and known.prior == file
-    return PriorShape(object, load_prior(file), known.latent if same else None, counts)
+    return scenes.PriorShape(
+        object, scenes.load_prior(file), known.latent if same else None, counts
+    )
 
 
 def body_joints(
     object: str,
     joints: Annotated[Mapping[str, Axes], MinLen(1)],
-    mesh: Mesh,
+    mesh: scenes.Mesh,
     table: ObjectTable | None = None,
-) -> SkinnedBody:
+) -> scenes.SkinnedBody:
     """Joint angles of an object with shape = "body", from those it has.
 
     Args:
@@ -280,22 +273,24 @@ def body_joints(
         InputError: The object is no body, or has no such joint.
     """
     body = require_body(table, f'{object}; give it this shape, or use kind = "pose"')
-    return SkinnedBody.from_mesh(object, body, mesh, joints)
+    return scenes.SkinnedBody.from_mesh(object, body, mesh, joints)
 
 
-def shape_regularizers(table: Any, module: nn.Module, scene: Scene | Radar) -> list[Regularizer]:
+def shape_regularizers(
+    table: Any, module: nn.Module, scene: scenes.Scene | Radar
+) -> list[Regularizer]:
     """Terms of the loss that keep a fitted shape, or a path, plausible."""
-    if isinstance(scene, Scene) and table.kind == "vertices" and table.laplacian > 0:
+    if isinstance(scene, scenes.Scene) and table.kind == "vertices" and table.laplacian > 0:
         return [Laplacian(scene, table.object, table.laplacian)]
     if isinstance(table, LatentTable) and table.weight > 0:
         return [LatentNorm(module, table.weight)]
     return []
 
 
-def module_values(name: str, scene: Scene, objects: Mapping[str, Any]) -> dict[type, object]:
+def module_values(name: str, scene: scenes.Scene, objects: Mapping[str, Any]) -> dict[type, object]:
     """Return the values that an object's module may require beside its keys, at the start."""
     item, table = scene[name], objects.get(name)
-    found: dict[type, object] = {Scene: scene, Object: item, Mesh: item.mesh}
+    found: dict[type, object] = {scenes.Scene: scene, scenes.Object: item, scenes.Mesh: item.mesh}
     return found if table is None else {**found, ObjectTable: table}
 
 
@@ -326,7 +321,9 @@ def require_body(table: Any, got: str) -> BodyTemplate:
     return found
 
 
-def joint_positions(table: Any, item: Object, rotations: Tensor | None = None) -> dict[str, Tensor]:
+def joint_positions(
+    table: Any, item: scenes.Object, rotations: Tensor | None = None
+) -> dict[str, Tensor]:
     """Return joint positions of a body in the world [m], by name; empty for other objects.
 
     Args:
@@ -339,6 +336,6 @@ def joint_positions(table: Any, item: Object, rotations: Tensor | None = None) -
         return {}
     if rotations is None:
         turns = {name: torch.tensor(turn).deg2rad() for name, turn in table.angles_deg.items()}
-        rotations = rotation_from_vector(template.rotations(turns))
+        rotations = scenes.rotation_from_vector(template.rotations(turns))
     world = template.apply_pose(rotations)[1] @ item.transform[:3, :3].T + item.transform[:3, 3]
     return dict(zip(template.names, world, strict=True))

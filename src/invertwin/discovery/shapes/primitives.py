@@ -10,19 +10,10 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
+from invertwin import scene as scenes
 from invertwin.checks import check_fields
 from invertwin.constants import read_table
 from invertwin.limits import Positive
-from invertwin.scene import (
-    Material,
-    Mesh,
-    Object,
-    RoughConductor,
-    RoughDielectric,
-    ScatteringLaw,
-    Scene,
-    person,
-)
 from invertwin.scene.parameters import Coordinate
 from invertwin.scene.people.gait import hanging_arm_rotation
 from invertwin.scene.shapes import box, cylinder, sphere
@@ -49,7 +40,7 @@ MAX_DIELECTRIC_REFLECTANCE = 0.9
 
 
 @dataclass(frozen=True, eq=False)
-class Matte(Material):
+class Matte(scenes.Material):
     """Surface of constant brightness in all directions, of any strength.
 
     The power of an uncalibrated radar is known up to a factor, and corners focus: unlike that of a
@@ -63,10 +54,10 @@ class Matte(Material):
     brightness: Tensor
     cosine_power: float = 0.0
 
-    def scattering_law(self, frequency: float) -> ScatteringLaw:
+    def scattering_law(self, frequency: float) -> scenes.ScatteringLaw:
         """Return the law, equal at every frequency [Hz]."""
         cosine = torch.linspace(0, 1, 256, dtype=torch.float64)
-        return ScatteringLaw(cosine ** (0.5 * self.cosine_power), self.brightness)
+        return scenes.ScatteringLaw(cosine ** (0.5 * self.cosine_power), self.brightness)
 
 
 @dataclass(frozen=True)
@@ -115,12 +106,12 @@ class ShapeParameters:
         return self.kind in _FREE_HEIGHT_KINDS
 
     @property
-    def material(self) -> RoughDielectric | RoughConductor:
+    def material(self) -> scenes.RoughDielectric | scenes.RoughConductor:
         """Nearest library material."""
         if self.brightness > MAX_DIELECTRIC_REFLECTANCE:
-            return RoughConductor()
+            return scenes.RoughConductor()
         root = math.sqrt(max(self.brightness, 1e-6))
-        return RoughDielectric(permittivity=((1 + root) / (1 - root)) ** 2)
+        return scenes.RoughDielectric(permittivity=((1 + root) / (1 - root)) ** 2)
 
     @property
     def effective_kind(self) -> ShapeKind:
@@ -169,18 +160,18 @@ class UnknownShape(nn.Module):
         """Brightness, see ``Matte``."""
         return (self.STRENGTH_SCALE * self.strength).exp()
 
-    def mesh(self) -> Mesh:
+    def mesh(self) -> scenes.Mesh:
         """Return the surface in the world, differentiable with respect to all parameters."""
         raise NotImplementedError
 
     @property
-    def item(self) -> Object:
+    def item(self) -> scenes.Object:
         """Return the object, differentiable with respect to all parameters."""
-        return Object(self.mesh(), Matte(self.brightness))
+        return scenes.Object(self.mesh(), Matte(self.brightness))
 
-    def forward(self, scene: Scene) -> Scene:
+    def forward(self, scene: scenes.Scene) -> scenes.Scene:
         """Return the scene with the object, in place of one of the same name."""
-        return Scene({**scene.objects, self.object: self.item})
+        return scenes.Scene({**scene.objects, self.object: self.item})
 
     def position_coordinates(self) -> list[Coordinate]:
         """Return the two coordinates of its position."""
@@ -245,7 +236,7 @@ class PrimitiveModel(UnknownShape):
         brightness = float(self.brightness.detach())
         return ShapeParameters(self.kind, (x, y), yaw, length, width, height, brightness)
 
-    def mesh(self) -> Mesh:
+    def mesh(self) -> scenes.Mesh:
         """Return the shape in the world, differentiable with respect to all parameters."""
         unit = _unit_mesh(self.kind)
         length, width, height = self.sides
@@ -258,14 +249,14 @@ class PrimitiveModel(UnknownShape):
         yaw = self.TURN_SCALE * self.turn
         c, s = yaw.cos(), yaw.sin()
         local = torch.stack([c * x - s * y, s * x + c * y, z], dim=-1)
-        return Mesh(local + torch.cat([self.place, middle[None]]), unit.faces)
+        return scenes.Mesh(local + torch.cat([self.place, middle[None]]), unit.faces)
 
     @property
-    def item(self) -> Object:
+    def item(self) -> scenes.Object:
         """Return the object, differentiable with respect to all parameters."""
         if self.kind == "corner":
             brightness = self.brightness * _mark_front_triangles()
-            return Object(self.mesh(), Matte(brightness, _CORNER_FALLOFF))
+            return scenes.Object(self.mesh(), Matte(brightness, _CORNER_FALLOFF))
         return super().item
 
     def values(self) -> dict[str, Tensor]:
@@ -336,7 +327,7 @@ def rotate_shape(shape: ShapeParameters, rotation: float) -> ShapeParameters:
 
 
 @cache
-def _unit_mesh(kind: str) -> Mesh:
+def _unit_mesh(kind: str) -> scenes.Mesh:
     """Return the mesh of a shape of unit size about the origin."""
     if kind in ("wall", "box"):
         return box(1.0)
@@ -348,18 +339,18 @@ def _unit_mesh(kind: str) -> Mesh:
     return builders[kind]() if kind in builders else cylinder(0.5, 1.0)
 
 
-def _person_mesh() -> Mesh:
+def _person_mesh() -> scenes.Mesh:
     """Return a person with hanging arms facing −x, stretched to a cube."""
-    body = person(spacing=0.05)
+    body = scenes.person(spacing=0.05)
     turns = torch.eye(3, dtype=torch.float64).repeat(len(body.names), 1, 1)
     for side in ("left", "right"):
         turns[body.joint(f"{side}_shoulder")] = hanging_arm_rotation(side)
     skin, _ = body.apply_pose(turns)
     low, high = skin.amin(0), skin.amax(0)
-    return Mesh((skin - 0.5 * (low + high)) / (high - low), body.faces)
+    return scenes.Mesh((skin - 0.5 * (low + high)) / (high - low), body.faces)
 
 
-def _vehicle_mesh() -> Mesh:
+def _vehicle_mesh() -> scenes.Mesh:
     """Return a car facing x: stacked octagonal layers joined by a skin."""
     sides = 8
     layers = [_vehicle_layer(*layer) for layer in _TABLES["vehicle_layers"]]
@@ -371,7 +362,7 @@ def _vehicle_mesh() -> Mesh:
             faces += [[a, b, a + sides], [b, b + sides, a + sides]]
     for first in (0, (len(layers) - 1) * sides):
         faces += [[first, first + k, first + k + 1] for k in range(1, sides - 1)]
-    return Mesh(rings, torch.tensor(faces))
+    return scenes.Mesh(rings, torch.tensor(faces))
 
 
 def _vehicle_layer(high: float, rear: float, front: float, wide: float) -> list[list[float]]:

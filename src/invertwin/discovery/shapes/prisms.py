@@ -8,12 +8,7 @@ from jaxtyping import Float64
 from skimage.measure import find_contours
 from torch import Tensor, nn
 
-from invertwin.discovery.shapes.primitives import (
-    PrimitiveModel,
-    ShapeParameters,
-    Shapes,
-    UnknownShape,
-)
+from invertwin.discovery.shapes import primitives
 from invertwin.scene import DistanceGrid, Mesh, iso_surface, signed_distance
 from invertwin.scene.parameters import Coordinate
 from invertwin.scene.shape_models.lattice import Lattice
@@ -24,7 +19,7 @@ _MAX_NODES = 60  # maximum number of nodes along a side
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PrismParameters(ShapeParameters):
+class PrismParameters(primitives.ShapeParameters):
     """Shape with vertical sides and any outline, without a yaw.
 
     Attributes:
@@ -38,7 +33,7 @@ class PrismParameters(ShapeParameters):
     middle: tuple[float, float]
 
 
-def merge_into_prism(shapes: Shapes, level: float, spacing: float) -> PrismParameters:
+def merge_into_prism(shapes: primitives.Shapes, level: float, spacing: float) -> PrismParameters:
     """Merge shapes into one prism: their union, with the height of the largest.
 
     Args:
@@ -77,7 +72,7 @@ def merge_into_prism(shapes: Shapes, level: float, spacing: float) -> PrismParam
     )
 
 
-class OutlineModel(UnknownShape):
+class OutlineModel(primitives.UnknownShape):
     """Prism as an unknown: outline, position, height and brightness.
 
     Args:
@@ -155,8 +150,8 @@ class OutlineModel(UnknownShape):
 
 
 def make_shape_model(
-    name: str, shape: ShapeParameters, level: float
-) -> PrimitiveModel | OutlineModel:
+    name: str, shape: primitives.ShapeParameters, level: float
+) -> primitives.PrimitiveModel | OutlineModel:
     """Build the module of an unknown shape.
 
     Args:
@@ -166,7 +161,7 @@ def make_shape_model(
     """
     if isinstance(shape, PrismParameters):
         return OutlineModel(name, shape, level)
-    return PrimitiveModel(name, shape, level)
+    return primitives.PrimitiveModel(name, shape, level)
 
 
 def prism_contour(prism: PrismParameters) -> Float64[Tensor, "corner 2"]:

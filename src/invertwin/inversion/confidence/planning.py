@@ -6,12 +6,8 @@ from dataclasses import dataclass
 import torch
 
 from invertwin.errors import InputError
+from invertwin.inversion.confidence import uncertainty
 from invertwin.inversion.confidence.realisations import FitResult
-from invertwin.inversion.confidence.uncertainty import (
-    CovarianceEstimator,
-    Uncertainty,
-    iterate_coordinates,
-)
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.runtime.progress import track
@@ -32,10 +28,12 @@ class CandidatePosition:
 
     frame: int
     deviation_ratio: float
-    error_bars: Uncertainty
+    error_bars: uncertainty.Uncertainty
 
 
-def plan_error_bars(fit: Fit, candidates: int = 0) -> tuple[Uncertainty, list[CandidatePosition]]:
+def plan_error_bars(
+    fit: Fit, candidates: int = 0
+) -> tuple[uncertainty.Uncertainty, list[CandidatePosition]]:
     """Compute error bars of a fit that ends at the truth, and the gain of further frames.
 
     Args:
@@ -51,7 +49,7 @@ def plan_error_bars(fit: Fit, candidates: int = 0) -> tuple[Uncertainty, list[Ca
         InputError: Candidates for several observations; see ``CovarianceEstimator``.
     """
     end = FitResult(fit)
-    evidence = CovarianceEstimator(end)
+    evidence = uncertainty.CovarianceEstimator(end)
     if not candidates:
         return evidence.error_bars(), []
     if len(end.maps) > 1:
@@ -79,7 +77,7 @@ def fit_errors(fit: Fit) -> dict[str, float]:
     Args:
         fit: fit at the truth; its parameters change.
     """
-    found = list(iterate_coordinates(fit.modules))
+    found = list(uncertainty.iterate_coordinates(fit.modules))
     before = {name: p.detach().clone() for name, p in fit.modules.named_parameters()}
     descent = GaussNewton(
         fit.modules, fit.objective, trust_radius=_TRUST_RADIUS, curvature_every=_DESCENT_STEPS

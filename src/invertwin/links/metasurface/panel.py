@@ -17,15 +17,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
-from invertwin import checks
-from invertwin.channel import (
-    METASURFACE,
-    GainPattern,
-    PanelCells,
-    RayPaths,
-    polarisations,
-    visible_fractions,
-)
+from invertwin import channel, checks
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
@@ -66,7 +58,7 @@ class Metasurface:
     spacing: float
     amplitude: float | Float64[Tensor, "_ _"] = 1.0
     bits: int | None = None
-    pattern: GainPattern | None = None
+    pattern: channel.GainPattern | None = None
 
     def __post_init__(self) -> None:
         what = "of a metasurface"
@@ -91,14 +83,14 @@ class Metasurface:
         checks.set_fields(self, position=place, axes=axes, phase=phase, amplitude=amplitude)
 
     @property
-    def cells(self) -> PanelCells:
+    def cells(self) -> channel.PanelCells:
         """The cells of the elements; y runs slowest."""
         offsets = [
             (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * self.spacing
             for count in self.phase.shape
         ]
         grid = torch.stack(torch.meshgrid(*offsets, indexing="ij"), -1).reshape(-1, 2)
-        return PanelCells(self.position, self.axes, grid, (self.spacing, self.spacing))
+        return channel.PanelCells(self.position, self.axes, grid, (self.spacing, self.spacing))
 
     @property
     def response(self) -> Complex128[Tensor, " element"]:
@@ -153,7 +145,7 @@ def panel_response(
         far_field: Waves are plane over the panel: quicker, right beyond 2D²/λ.
     """
     cells, k = panel.cells, 2 * math.pi * frequency / SPEED_OF_LIGHT
-    lit = visible_fractions(scene, torch.cat([tx, rx]), cells, blur=blur, boundary=boundary)
+    lit = channel.visible_fractions(scene, torch.cat([tx, rx]), cells, blur=blur, boundary=boundary)
     sent = _element_waves(panel, cells, tx, lit[: len(tx)], k, far_field)
     weights = panel.response
     scale = panel.spacing**2 * k / (2 * math.pi)
@@ -180,7 +172,7 @@ def panel_response(
 
 def _element_waves(
     panel: Metasurface,
-    cells: PanelCells,
+    cells: channel.PanelCells,
     positions: Tensor,
     visible: Tensor,
     wave_number: float,
@@ -221,7 +213,7 @@ def panel_paths(
     blur: float = 0.0,
     boundary: bool = True,
     far_field: bool = False,
-) -> RayPaths:
+) -> channel.RayPaths:
     """Paths over metasurfaces: one for each panel and link, whose coefficient sums up its elements.
 
     They have the delay of the way by the panel's centre, and polarisation as a mirror there. Add
@@ -248,7 +240,7 @@ def panel_paths(
     ends = checks.checked_rows(tx, "tx places [m]"), checks.checked_rows(rx, "rx places [m]")
     checks.checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
     checks.checked_number(blur, "width of shadows [m]", 0.0)
-    rows: list[RayPaths] = []
+    rows: list[channel.RayPaths] = []
     for panel in several:
         _require_clearance(panel, torch.cat(ends))
         response = panel_response(
@@ -265,18 +257,20 @@ def _paths_over_panel(
     response: Complex128[Tensor, "tx rx"],
     frequency: float,
     names: tuple[str, ...],
-) -> RayPaths:
+) -> channel.RayPaths:
     """One path over a panel for each pair of antennas between which it passes something on."""
     total, (senders, hearers) = response.ravel(), response.shape
     link = torch.nonzero(total.detach() != 0)[:, 0]
     source, target = link // hearers, link % hearers
     ways = [panel.position - ends[0][source], panel.position - ends[1][target]]
     units = [normalize(way, dim=1) for way in ways]
-    sent, received = (polarisations(unit, torch.tensor(_UP, dtype=torch.float64)) for unit in units)
+    sent, received = (
+        channel.polarisations(unit, torch.tensor(_UP, dtype=torch.float64)) for unit in units
+    )
     normal = panel.axes[:, 0]
     turned = sent - 2 * (sent @ normal)[..., None] * normal
     one = torch.ones(len(link), 1, dtype=torch.int64)
-    return RayPaths(
+    return channel.RayPaths(
         (senders, hearers),
         frequency,
         source,
@@ -286,7 +280,7 @@ def _paths_over_panel(
         units[0],
         units[1],
         panel.position.expand(len(link), 1, 3),
-        METASURFACE * one,
+        channel.METASURFACE * one,
         -one,
         -one,
         names,

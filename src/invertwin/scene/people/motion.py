@@ -9,15 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.checks import (
-    ArrayLike,
-    Point,
-    checked_ascending,
-    checked_number,
-    checked_tensor,
-    checked_type,
-    set_fields,
-)
+from invertwin import checks
 from invertwin.errors import InputError
 from invertwin.scene.pose import compose, rigid, rotation_from_vector
 from invertwin.scene.scene import Object, Scene
@@ -46,7 +38,9 @@ class MovingScene:
     motions: Mapping[str, ObjectMotion | Sequence[ObjectMotion]]
 
     def __post_init__(self) -> None:
-        checked_type(self.scene, Scene, "a scene", "build one with Scene({name: Object(...)})")
+        checks.checked_type(
+            self.scene, Scene, "a scene", "build one with Scene({name: Object(...)})"
+        )
         for name in self.motions:
             if self.scene[name].velocity is not None:
                 raise InputError(
@@ -81,18 +75,20 @@ class AxisRotation:
         InputError: An axis without a direction, or numbers that are not finite.
     """
 
-    axis: Point
+    axis: checks.Point
     rate: float
-    center: Point | None = None
+    center: checks.Point | None = None
 
     def __post_init__(self) -> None:
-        axis = checked_tensor(self.axis, (3,), "axis", "give x, y, z")
+        axis = checks.checked_tensor(self.axis, (3,), "axis", "give x, y, z")
         if float(axis.norm()) == 0:
             raise InputError("expected an axis with a direction, got zeros; give x, y, z")
-        set_fields(self, axis=axis / axis.norm())
-        checked_number(self.rate, "rate [rad/s]", -math.inf)
+        checks.set_fields(self, axis=axis / axis.norm())
+        checks.checked_number(self.rate, "rate [rad/s]", -math.inf)
         if self.center is not None:
-            set_fields(self, center=checked_tensor(self.center, (3,), "center [m]", "give x, y, z"))
+            checks.set_fields(
+                self, center=checks.checked_tensor(self.center, (3,), "center [m]", "give x, y, z")
+            )
 
     def __call__(self, item: Object, time: float) -> Object:
         """Return the object rotated for a time [s].
@@ -120,17 +116,19 @@ class SplineTrajectory:
         InputError: Fewer than two times, times that do not ascend, or another number of positions.
     """
 
-    times: ArrayLike
-    positions: ArrayLike
+    times: checks.ArrayLike
+    positions: checks.ArrayLike
 
     def __post_init__(self) -> None:
-        times = checked_ascending(self.times, "times [s]", "sort the places by time")
+        times = checks.checked_ascending(self.times, "times [s]", "sort the places by time")
         shape = (len(times), 3)
-        places = checked_tensor(self.positions, shape, "places [m]", "give x, y, z for each time")
+        places = checks.checked_tensor(
+            self.positions, shape, "places [m]", "give x, y, z for each time"
+        )
         from scipy.interpolate import CubicSpline  # slow to import
 
         curve = CubicSpline(times.detach().numpy(), places.detach().numpy(), bc_type="natural")
-        set_fields(self, times=times.detach(), positions=places.detach(), _curve=curve)
+        checks.set_fields(self, times=times.detach(), positions=places.detach(), _curve=curve)
 
     def position(self, time: float) -> Float64[Tensor, "3"]:
         """Return the position at a time [m].
