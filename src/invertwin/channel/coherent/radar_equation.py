@@ -17,12 +17,10 @@ from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import triangle_normals
 from invertwin.channel.paths import Link, Paths
-from invertwin.channel.rays.ray_scene import RayScene, find_next_surface, is_visible
+from invertwin.channel.rays.ray_scene import RayScene, find_passed_sheets
 from invertwin.channel.rays.scene_tables import Geometry, interpolate_values
 from invertwin.channel.rows import Rows
 from invertwin.constants import SPEED_OF_LIGHT
-
-_MAX_SHEETS = 8  # that a segment of an explicit path may pass
 
 
 @dataclass(frozen=True)
@@ -264,30 +262,18 @@ def trace_transmittance(
         start, end: Points.
     """
     geometry, surfaces = rays.geometry, rays.geometry.surfaces
-    if not geometry.has_sheets:
-        clear = is_visible(rays, start, end).to(start)
-        return clear, torch.zeros_like(clear)
-    transmittance = torch.ones(len(start), dtype=torch.float64)
-    extra = torch.zeros_like(transmittance)
-    at = torch.zeros_like(transmittance)
-    rows = torch.arange(len(start))
-    offset = end - start
-    for _ in range(_MAX_SHEETS + 1):
-        if not len(rows):
-            break
-        fixed = start.detach()[rows] + offset.detach()[rows] * at[rows, None]
-        hit, step = find_next_surface(rays, fixed, end.detach()[rows])
-        rows, hit, step = rows[hit >= 0], hit[hit >= 0], step[hit >= 0]
-        at = at.index_add(0, rows, step * (1 - at[rows]))
-        row = geometry.face_surface[hit]
-        normal = triangle_normals(geometry.vertices[geometry.faces[hit]])
-        cosine = (normal * normalize(offset[rows], dim=1)).sum(1)
-        transmittance = transmittance * torch.ones_like(transmittance).index_copy(
-            0, rows, _interpolate_table(surfaces.transmittance, row, cosine)
-        )
-        extra = extra.index_add(0, rows, _interpolate_table(surfaces.extra_length, row, cosine))
-        rows = rows[transmittance.detach()[rows] > 0]
-    return transmittance * torch.ones_like(transmittance).index_fill(0, rows, 0.0), extra
+    sheets = surfaces.transmittance.any(1)[geometry.face_surface]
+    clear, passed = find_passed_sheets(rays, start.detach(), end.detach(), sheets)
+    transmittance, extra = clear.to(start), torch.zeros_like(start[:, 0])
+    for number, face in passed:
+        row, corners = geometry.face_surface[face], geometry.vertices[geometry.faces[face]]
+        way = normalize((end - start)[number], dim=1)
+        cosine = (triangle_normals(corners) * way).sum(1)
+        share = _interpolate_table(surfaces.transmittance, row, cosine)
+        transmittance = transmittance * torch.ones_like(extra).index_copy(0, number, share)
+        added = _interpolate_table(surfaces.extra_length, row, cosine)
+        extra = extra.index_add(0, number, added)
+    return transmittance, extra
 
 
 def find_unblocked(

@@ -15,7 +15,6 @@ from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.checks import strip_derivatives
 from invertwin.errors import InputError, PhysicsWarning
 
-_MAX_SHEETS = 8  # most sheets through which points are seen
 _MAX_PAIRS = 20_000  # most coplanar pairs of triangles that are compared, evenly chosen
 _MAX_POINTS = 64  # most tested points of a pair of objects
 _MAX_POSES = 16  # most tested radar poses
@@ -70,7 +69,9 @@ def refuse_coplanar_surfaces(
         InputError: such surfaces.
     """
     pairs = ~torch.eye(len(names), dtype=torch.bool)
-    for one, other in sorted(_find_seen_pairs(rays, strip_derivatives(vertices), pairs, viewers)):
+    sheets = torch.zeros(len(rays.topology.faces), dtype=torch.bool)
+    given = strip_derivatives(vertices), pairs, viewers, sheets
+    for one, other in sorted(_find_seen_pairs(rays, *given)):
         raise InputError(
             f"expected one surface in each place, got {names[one]} and {names[other]} in one "
             "plane, in a place that is seen: both would count; lift one of them off the other, or "
@@ -108,8 +109,8 @@ def _find_visible_pairs(
     )
     # Derivatives are wrong in a contact that is seen through sheets, such as below a box of them.
     sheets = geometry.surfaces.transmittance.any(1) & any(geometry.differentiated)
-    given = geometry.vertices.detach(), pairs, views, geometry.object_scene
-    return _find_seen_pairs(rays, *given, sheets[geometry.face_surface])
+    given = geometry.vertices.detach(), pairs, views, sheets[geometry.face_surface]
+    return _find_seen_pairs(rays, *given, geometry.object_scene)
 
 
 def _find_seen_pairs(
@@ -117,8 +118,8 @@ def _find_seen_pairs(
     vertices: Float64[Tensor, "v 3"],
     pairs: Bool[Tensor, "object object"],
     viewers: Float64[Tensor, "*scene n 3"],
+    sheets: Bool[Tensor, " face"],
     object_scene: Int64[Tensor, " object"] | None = None,
-    sheets: Bool[Tensor, " face"] | None = None,
 ) -> set[tuple[int, int]]:
     """Find those of some pairs of objects that are coplanar at a point that a viewer sees."""
     topology, found = rays.topology, set[tuple[int, int]]()
@@ -223,7 +224,7 @@ def _is_any_visible(
     points: Float64[Tensor, "n 3"],
     normal: Float64[Tensor, "n 3"],
     viewers: Float64[Tensor, "m 3"],
-    sheets: Bool[Tensor, " face"] | None,
+    sheets: Bool[Tensor, " face"],
 ) -> bool:
     """Test whether a viewer sees any of some points, also through sheets.
 
@@ -234,11 +235,4 @@ def _is_any_visible(
     above = points + normal * (2 * tilt.sign() * _ray_tolerance(points))[..., None]
     clear, ends = tilt.abs() > _MAX_PLANE_SINE, antennas[:, None].expand_as(above)
     start, end = above[clear] + rays.origin, ends[clear] + rays.origin
-    if sheets is None or not bool(sheets.any()):
-        return bool(ray_scene.is_visible(rays, start, end).any())
-    for _ in range(_MAX_SHEETS):
-        face, share = ray_scene.find_next_surface(rays, start, end)
-        if bool((face < 0).any()):
-            return True
-        start, end = (start + share[:, None] * (end - start))[sheets[face]], end[sheets[face]]
-    return False
+    return bool(ray_scene.find_passed_sheets(rays, start, end, sheets)[0].any())

@@ -27,6 +27,7 @@ from invertwin.scene.mesh import Mesh
 # Offset along a ray, relative to its length: fifty float32 roundings of a coordinate, and so small
 # that the shadowed side of a 0.3 m ball stays dark from a kilometre away.
 RAY_EPSILON = 3e-6
+_MAX_SHEETS = 8  # that a segment may pass
 _MIN_RELATIVE_AREA = 1e-3  # least area over squared sides of a triangle that is not a sliver
 
 
@@ -334,6 +335,35 @@ def find_next_surface(
     face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
     along = dr.select(hit.is_valid(), hit.t + RAY_EPSILON, 1.0)
     return arrays.to_torch(face).long(), arrays.to_torch(along).double()
+
+
+def find_passed_sheets(
+    rays: Occluders,
+    start: Float64[Tensor, "n 3"],
+    end: Float64[Tensor, "n 3"],
+    sheets: Bool[Tensor, " f"],
+) -> tuple[Bool[Tensor, " n"], list[tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]]]:
+    """Find the sheets between pairs of world points.
+
+    Args:
+        rays: occluders.
+        start, end: ends of the segments, [n, 3] in the world [m].
+        sheets: mask of triangles that let waves pass.
+
+    Returns:
+        Mask of segments that nothing but sheets blocks, and numbers of segments with the triangle
+        of the first sheet on each, of the second, and so on.
+    """
+    clear, passed = torch.zeros(len(start), dtype=torch.bool), list[tuple[Tensor, Tensor]]()
+    row = torch.arange(len(start))
+    for _ in range(_MAX_SHEETS + 1):
+        face, share = find_next_surface(rays, start, end[row])
+        clear[row[face < 0]] = True
+        through = (face >= 0) & sheets[face]
+        start = torch.lerp(start, end[row], share[:, None])[through]
+        row = row[through]
+        passed.append((row, face[through]))
+    return clear, passed
 
 
 def visible_points(

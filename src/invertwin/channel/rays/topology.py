@@ -36,22 +36,20 @@ class Topology:
 
     Args:
         faces: Vertex indices of all triangles; those of closed objects are turned outwards.
-        face_object: Object of every triangle.
+        vertex_object: Object of every vertex, in ascending order.
         vertices: In the objects' own frames, or in the world where objects share edges.
         groups: Group of each object, within which vertices at one place count as one.
     """
 
     def __init__(
-        self, faces: Tensor, face_object: Tensor, vertices: Tensor, groups: np.ndarray
+        self, faces: Tensor, vertex_object: Tensor, vertices: Tensor, groups: np.ndarray
     ) -> None:
-        self.face_object = face_object
+        self.face_object = face_object = vertex_object[faces[:, 0]]
         self.object_group = torch.from_numpy(groups)
         self.fallback_face: int | None = None  # a triangle that was no sliver when last looked at
         #: Objects in one place, when last looked at, and for which pairs, antennas and vertices.
         self.coplanar_cache: tuple[set[tuple[int, int]], Tensor, Tensor, Tensor] | None = None
-        owner = torch.zeros(len(vertices), dtype=torch.int64)
-        owner[faces.ravel()] = face_object.repeat_interleave(3)
-        self.vertex_object = owner
+        self.vertex_object = owner = vertex_object
         used = torch.bincount(faces.ravel()).nonzero()[:, 0]
         # Vertices of triangles, the first of each object among them, and the object of each.
         first = torch.searchsorted(owner[used], torch.arange(int(owner.max()) + 1))
@@ -201,12 +199,12 @@ def topology_of(
             found = found if same else None
         if found is None:
             starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
-            own = [strip_derivatives(f) + start for f, start in zip(faces, starts, strict=False)]
-            objects = [torch.full((len(f),), n) for n, f in enumerate(own)]
-            # Joined objects in the world; else in their own frames, where no pose changes a seam.
             fixed = [strip_derivatives(mesh.vertices) for mesh in meshes]
+            own = [strip_derivatives(f) + start for f, start in zip(faces, starts, strict=False)]
+            owner = torch.cat([torch.full((len(v),), n) for n, v in enumerate(fixed)])
+            # Joined objects in the world; else in their own frames, where no pose changes a seam.
             points = torch.cat([world.get(n, own_frame) for n, own_frame in enumerate(fixed)])
-            found = Topology(torch.cat(own), torch.cat(objects), points, groups)
+            found = Topology(torch.cat(own), owner, points, groups)
             _topologies[key] = faces, relative, found
         while len(_topologies) > _MAX_CACHED_TOPOLOGIES:
             _topologies.popitem(last=False)
@@ -291,4 +289,4 @@ def morton_order(positions: np.ndarray) -> np.ndarray:
     spread = (bits << 3 * np.arange(10)).sum(1)  # two zeros between the bits of a number
     x, y, z = spread[cells.T]
     code = x << 2 | z << 1 | y  # boresight in the highest bits
-    return mesh_topology.sort_rows(code >> 15, code & (2**15 - 1), count=2**15)[0]
+    return code.argsort(kind="stable")
