@@ -1,5 +1,7 @@
 """Edges that pass through surfaces without a vertex there."""
 
+import numpy as np
+import pytest
 import torch
 
 from invertwin.channel.em.wedges import find_wedges, merge_collinear_wedges
@@ -7,7 +9,7 @@ from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.edge_crossings import find_crossings, split_at_crossings
 from invertwin.channel.rays.ray_scene import Occluders
 from invertwin.channel.rays.topology import topology_of
-from invertwin.scene import Mesh, box, plate
+from invertwin.scene import Mesh, box, plate, rotation_from_vector
 from scenes import float64
 
 
@@ -56,3 +58,15 @@ def test_corners_at_crossings_move_with_both_bodies():
 def test_edges_that_only_touch_or_end_at_a_surface_stay_whole():
     low, high = box(0.2), Mesh(box(0.1).vertices + float64([0.0, 0.0, 0.15]), box(0.1).faces)
     assert len(split_edges([low, high], torch.cat([low.vertices, high.vertices])).start) == 24
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_edges_in_the_plane_of_a_face_do_not_cross_it(seed):
+    """Two plates, turned, of which one goes on beside part of the other, in one plane to rounding.
+
+    Rays beside the common edge lie in that plane.
+    """
+    turn = rotation_from_vector(torch.from_numpy(np.random.default_rng(seed).normal(size=3)))
+    one, other = plate(0.3, 0.3), plate(0.3, 0.15)
+    points = torch.cat([one.vertices, other.vertices + float64([0.0, 0.3, 0.01])]) @ turn.T
+    assert len(split_edges([one, other], points).start) == 8

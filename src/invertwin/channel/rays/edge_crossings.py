@@ -7,9 +7,11 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.em.plane_waves import cross, dot
-from invertwin.channel.em.wedges import Wedges
+from invertwin.channel.em.plane_waves import cross, dot, triangle_normals
+from invertwin.channel.em.wedges import Wedges, edge_axis
 from invertwin.channel.rays.ray_scene import Occluders, find_next_surface
+
+_MIN_SINE = 1e-3  # of the angle between an edge and a face that it passes through
 
 
 def find_crossings(rays: Occluders, wedges: Wedges, offset: float) -> Int64[Tensor, "n 2"]:
@@ -32,6 +34,9 @@ def find_crossings(rays: Occluders, wedges: Wedges, offset: float) -> Int64[Tens
     pairs = torch.cat(found)
     pairs = pairs[pairs[:, 0].argsort(stable=True)]  # hits follow each other along an edge
     corners = rays.local_vertices.double()[rays.topology.faces] + rays.origin
+    # Rays beside an edge also meet faces in whose plane it lies.
+    normal = triangle_normals(corners[pairs[:, 1]])
+    pairs = pairs[dot(edge_axis(wedges)[pairs[:, 0]], normal).abs() > _MIN_SINE]
     length = (wedges.end - wedges.start).norm(dim=1)[pairs[:, 0]]
     along = length * _crossing_shares(wedges, pairs, corners)
     inside = (along > offset) & (along < length - offset)
