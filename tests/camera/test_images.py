@@ -183,6 +183,22 @@ def test_a_mask_ends_where_objects_cross(monkeypatch):
     assert float(forward(area, 0.1)) != pytest.approx(found, rel=0.2)
 
 
+@pytest.mark.parametrize("angle", [2e-3, 0.1])
+def test_a_strip_of_floor_behind_a_slanted_plate_that_slides_aside(angle):
+    """Seen 2 m away at small angles [rad]: what appears is a small part of a pixel high."""
+    camera = Camera(float64([0.0, 0.0, 2.0 * angle]), AXES, 40, 30, 60.0)
+    floor = Object(level_plate(6.0, 6.0), METAL, rigid(translation=[2.0, 0.0, 0.0]))
+
+    def area(side: Tensor) -> Tensor:
+        place = torch.stack([0 * side + 2.0, side + 3.0 / math.cos(0.6), 0 * side])
+        pose = rigid(rotation_from_vector(float64([0.6, 0.0, 0.0])), place)
+        scene = Scene({"plate": Object(plate(6.0, 6.0), METAL, pose), "floor": floor})
+        return silhouettes(scene, camera, ["floor"], ImageSampling(4, 4000), 0).sum()
+
+    height = 60.0 * 2.0 * angle * (1 / 2 - 1 / 5)
+    assert float(forward(area, 0.0)) == pytest.approx(60.0 / 2 * height, rel=0.02)
+
+
 def test_other_names_are_refused():
     with pytest.raises(InputError, match="tower"):
         silhouettes(CROWD, NEAR_BOX, ["tower"], FINE, 0)

@@ -23,8 +23,7 @@ from invertwin.checks import strip_derivatives
 from invertwin.limits import Count
 from invertwin.scene.scene import Scene
 
-_OUTLINE_OFFSET = 0.01  # distance of an outline and the rays on its sides [pixel]
-_MIN_OUTLINE_OFFSET = 2e-5  # minimum angle, since rays are float32 [rad]
+_OUTLINE_OFFSET = 5e-6  # angle between an outline and rays on its sides, in float32 [rad]
 _NEAR_PLANE = 1e-3  # near clipping distance of outlines [m]
 _ROWS_AT_ONCE = 1 << 20
 _R2_STEPS = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
@@ -189,7 +188,7 @@ class _ImageRenderer:
         here = strip_derivatives(place)
         along = (marks[1] - marks[0])[row] / length[row, None]
         across = torch.stack([-along[:, 1], along[:, 0]], 1)
-        aside = max(_OUTLINE_OFFSET, _MIN_OUTLINE_OFFSET * float(torch.as_tensor(fixed.focal)))
+        aside = _OUTLINE_OFFSET * fixed.focal
         low_side, high_side = (
             strip_derivatives(self.sample_image(here + sign * aside * across, fixed))
             for sign in (-1.0, 1.0)
